@@ -1,0 +1,61 @@
+"""The errors that reach a user: one located line and an exit code each, never a traceback."""
+
+from __future__ import annotations
+
+import enum
+
+
+class ExitCode(enum.IntEnum):
+    """Process exit codes, as documented in the README."""
+
+    DONE = 0
+    CHECK_FAILED = 1
+    USAGE = 2
+    BACKEND = 3
+    OUT_OF_MEMORY = 4
+    NON_FINITE = 5
+    INTERRUPTED = 130
+
+
+class ReslrbError(Exception):
+    """Base of all errors that `reslrb` reports itself; `str()` of one is the line that the user sees."""
+
+    exit_code: ExitCode = ExitCode.USAGE
+
+
+class ConfigError(ReslrbError):
+    """Wrong configuration or input, located by file and key.
+
+    `source` is the file as the user named it, `key` the place in it (`parameters[0].bounds`; empty for the file as a
+    whole), `message` says what is wrong and what would be right.
+    """
+
+    exit_code = ExitCode.USAGE
+
+    def __init__(self, source: object, key: str, message: str) -> None:
+        self.source, self.key, self.message = str(source), key, " ".join(message.split())
+        super().__init__(": ".join(part for part in (self.source, self.key, self.message) if part))
+
+
+class UnsupportedScene(ReslrbError):
+    """A scene that light tracing cannot render; the message gives the reason."""
+
+    exit_code = ExitCode.USAGE
+
+
+class BackendError(ReslrbError):
+    """No usable CUDA device or libLLVM; the message says what to install."""
+
+    exit_code = ExitCode.BACKEND
+
+
+class OutOfMemory(ReslrbError):
+    """The device or the host ran out of memory."""
+
+    exit_code = ExitCode.OUT_OF_MEMORY
+
+
+class NonFinite(ReslrbError):
+    """A value that must be finite is not; raised before it reaches a parameter."""
+
+    exit_code = ExitCode.NON_FINITE
