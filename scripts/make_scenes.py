@@ -1,0 +1,219 @@
+#!/usr/bin/env python3
+"""Make the assets of the scenes in `scenes/`: textures, an environment map and a mesh.
+
+    scripts/make_scenes.py [FOLDER]
+
+writes them below FOLDER (default: `scenes/` of this repository). The result does not depend on the machine, apart
+from the last bits of sines and cosines, which are rounded away; a test compares the files in the repository with it.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import OpenEXR
+
+SCENES = Path(__file__).resolve().parent.parent / "scenes"
+
+Image = np.ndarray  # (H, W, 3) float32, linear Rec. 709
+
+
+def main(arguments: list[str]) -> None:
+    """Write all assets below the folder named on the command line."""
+    folder = Path(arguments[0]) if arguments else SCENES
+    for name, image in images().items():
+        write_exr(folder / name, image)
+    write_ply(folder / "caustic_slab" / "slab.ply", *slab())
+
+
+def images() -> dict[str, Image]:
+    """Every image asset by its path below the scenes folder."""
+    return {
+        "cornell_floor/floor.exr": carpet(64),
+        "grey_room/planks.exr": planks(96),
+        "grey_room/painting.exr": painting(48),
+        "grey_room/sky.exr": sky(64),
+        "caustic_slab/paper.exr": paper(64),
+    }
+
+
+# ---- Textures -------------------------------------------------------------------------------------------------------
+
+
+def carpet(size: int) -> Image:
+    """A woven carpet: borders, corners and a medallion, each stitch (texel) of a shade of its own."""
+    x, y = grid(size)
+    square = np.maximum(abs(x), abs(y))
+    diamond = abs(x) + abs(y)
+    octagon = np.maximum(square, diamond / np.sqrt(2))
+    petals = octagon * (1 + 0.12 * np.cos(8 * np.arctan2(y, x)))
+
+    color = np.empty((size, size, 3))
+    color[:] = (0.10, 0.16, 0.42)  # field, indigo
+    lattice = (np.floor(x).astype(int) + 2 * np.floor(y).astype(int)) % 5 == 0
+    color[lattice] = (0.82, 0.62, 0.16)  # single stitches of gold
+    corner = np.hypot(size / 2 - abs(x), size / 2 - abs(y)) < size * 0.30
+    color[corner] = (0.07, 0.42, 0.34)
+    color[corner & (np.floor(diamond).astype(int) % 4 == 0)] = (0.80, 0.72, 0.52)
+
+    ring = np.floor(petals / (size * 0.052)).astype(int)
+    palette = [(0.86, 0.68, 0.18), (0.62, 0.06, 0.08), (0.84, 0.76, 0.60), (0.08, 0.35, 0.50), (0.88, 0.38, 0.10)]
+    palette += [(0.55, 0.05, 0.12)]
+    for k, value in enumerate(palette):
+        color[ring == k] = value
+
+    stitch = (np.floor(x).astype(int) + np.floor(y).astype(int)) % 2 == 0
+    border = square > size * 0.40
+    color[border] = (0.62, 0.07, 0.07)
+    color[border & (np.floor(diamond).astype(int) % 6 < 2)] = (0.86, 0.74, 0.50)
+    edge = square > size * 0.47
+    color[edge] = np.where(stitch[..., None], (0.10, 0.12, 0.30), (0.85, 0.66, 0.22))[edge]
+    color[(square > size * 0.385) & ~border] = (0.84, 0.78, 0.62)
+
+    shade = 0.65 + 0.6 * noise(size, size, 1)[..., None] + 0.16 * (noise(size, size, 3, channels=3) - 0.5)
+    return quantise(np.clip(color * shade, 0.05, 0.95))
+
+
+def planks(size: int) -> Image:
+    """A floor of oak planks, eight across, with grain along their length and dark joints."""
+    rows, columns = np.mgrid[0:size, 0:size]
+    width, length = size // 8, size // 2
+    plank = columns // width
+    offset = (plank * 19) % length
+    piece = plank * 7 + (rows + offset) // length
+    tone = noise(64, 1, 5)[piece % 64, 0]
+    grain = noise(size, size, 7)
+    grain = (grain + np.roll(grain, 1, 0) + np.roll(grain, 2, 0) + np.roll(grain, 3, 0)) / 4
+    joint = (columns % width == 0) | ((rows + offset) % length == 0)
+    shade = (0.62 + 0.5 * tone + 0.45 * (grain - 0.5)) * np.where(joint, 0.45, 1.0)
+    return quantise(np.clip(shade[..., None] * np.array([0.44, 0.27, 0.15]), 0.02, 0.95))
+
+
+def painting(size: int) -> Image:
+    """A landscape in flat colours: sky, sun, hills."""
+    x, y = grid(size)
+    x, y = x / size, -y / size
+    color = np.empty((size, size, 3))
+    color[:] = (0.20, 0.42, 0.62)
+    color += (0.5 - y)[..., None] * np.array([0.30, 0.16, 0.02])
+    color[np.hypot(x - 0.2, y - 0.2) < 0.13] = (0.92, 0.62, 0.16)
+    color[y < 0.02 + 0.12 * np.sin(7 * x + 1)] = (0.16, 0.30, 0.26)
+    color[y < -0.12 + 0.10 * np.sin(5 * x - 1.2)] = (0.34, 0.42, 0.12)
+    color[y < -0.30 + 0.07 * np.sin(9 * x + 2)] = (0.56, 0.26, 0.09)
+    return quantise(np.clip(color * (0.92 + 0.16 * noise(size, size, 11)[..., None]), 0.03, 0.95))
+
+
+def paper(size: int) -> Image:
+    """Warm paper with a printed grid and a frame."""
+    x, y = grid(size)
+    color = np.empty((size, size, 3))
+    color[:] = (0.78, 0.74, 0.66)
+    line = (np.floor(x).astype(int) % 8 == 0) | (np.floor(y).astype(int) % 8 == 0)
+    color[line] = (0.38, 0.56, 0.68)
+    square = np.maximum(abs(x), abs(y))
+    color[(square > size * 0.44) & (square < size * 0.47)] = (0.62, 0.22, 0.14)
+    return quantise(color)
+
+
+def sky(height: int) -> Image:
+    """A small latitude-longitude sky: haze, blue, ground, and a sun that is bright but wider than a texel.
+
+    The sun stands where `grey_room` needs it once the map is turned: in the map's own frame in direction SUN.
+    """
+    v, u = (np.mgrid[0:height, 0 : 2 * height] + 0.5) / height
+    theta, phi = v * np.pi, u * np.pi
+    direction = np.stack([np.sin(phi) * np.sin(theta), np.cos(theta), -np.cos(phi) * np.sin(theta)], -1)
+    sun = np.array(SUN) / np.linalg.norm(SUN)
+    cosine = direction @ sun
+    # "Up" of the turned map is not the map's pole: the horizon follows the world's vertical, UP.
+    elevation = direction @ (np.array(UP) / np.linalg.norm(UP))
+    above = np.clip(elevation, 0, 1)[..., None]
+    color = np.array([0.95, 1.0, 1.05]) * (1 - above) ** 4 + np.array([0.30, 0.55, 1.0]) * (1 - (1 - above) ** 4)
+    color = np.where(elevation[..., None] > 0, color * 1.6, np.array([0.26, 0.24, 0.20]))
+    color += np.array([1.0, 0.86, 0.62]) * (260 * np.exp((cosine - 1) * 900) + 2.5 * np.exp((cosine - 1) * 30))[..., None]
+    return quantise(color, 1 / 256)
+
+
+# What `rotate x 25, then rotate y -40` of grey_room/scene.xml turns into the sun's and the upward direction.
+SUN = (-0.42, 0.71, -0.57)
+UP = (0.0, 0.9063, -0.4226)
+
+
+# ---- Mesh -----------------------------------------------------------------------------------------------------------
+
+
+def slab(cells: int = 96) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The rippled lower face of the glass slab: positions and normals (V, 3) float32, triangles (F, 3) int32.
+
+    A height field over [-1, 1]^2, normals downwards, out of the glass.
+    """
+    # Waves of 2 to 4 ripples across the slab in fixed directions: (wave vector, phase, amplitude).
+    waves = [
+        ((5.1, 2.3), 0.4, 0.0135), ((-3.7, 5.9), 1.9, 0.0120), ((7.9, -4.6), 4.1, 0.0062),
+        ((2.2, -8.8), 2.7, 0.0055), ((-9.6, -7.1), 5.2, 0.0032), ((11.8, 3.9), 0.9, 0.0028),
+    ]  # fmt: skip
+    axis = np.linspace(-1, 1, cells + 1)
+    x, z = np.meshgrid(axis, axis, indexing="ij")
+    y, dx, dz = np.zeros_like(x), np.zeros_like(x), np.zeros_like(x)
+    for (kx, kz), phase, amplitude in waves:
+        argument = kx * x + kz * z + phase
+        y += amplitude * np.sin(argument)
+        dx += amplitude * kx * np.cos(argument)
+        dz += amplitude * kz * np.cos(argument)
+    normal = np.stack([dx, -np.ones_like(x), dz], -1)
+    normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
+
+    index = np.arange((cells + 1) ** 2).reshape(cells + 1, cells + 1)
+    a, b, c, d = index[:-1, :-1], index[1:, :-1], index[1:, 1:], index[:-1, 1:]
+    faces = np.concatenate([np.stack([a, b, c], -1).reshape(-1, 3), np.stack([a, c, d], -1).reshape(-1, 3)])
+    positions = quantise(np.stack([x, y, z], -1).reshape(-1, 3), 2.0**-20)
+    return positions, quantise(normal.reshape(-1, 3), 2.0**-20), faces.astype(np.int32)
+
+
+# ---- Tools ----------------------------------------------------------------------------------------------------------
+
+
+def grid(size: int) -> tuple[np.ndarray, np.ndarray]:
+    """Texel centres (x to the right, y down), the middle of the image being the origin, in texels."""
+    y, x = np.mgrid[0:size, 0:size] + 0.5 - size / 2
+    return x, y
+
+
+def noise(rows: int, columns: int, stream: int, channels: int = 0) -> np.ndarray:
+    """White noise in [0, 1) from an integer hash (PCG's output function), the same on every machine and version."""
+    count = rows * columns * max(channels, 1)
+    with np.errstate(over="ignore"):
+        state = (np.arange(count, dtype=np.uint32) + np.uint32(stream * 0x9E3779B1 % 2**32)) * np.uint32(747796405)
+        state += np.uint32(2891336453)
+        word = ((state >> ((state >> np.uint32(28)) + np.uint32(4))) ^ state) * np.uint32(277803737)
+    value = ((word >> np.uint32(22)) ^ word) / 2.0**32
+    return value.reshape((rows, columns, channels) if channels else (rows, columns))
+
+
+def quantise(array: np.ndarray, step: float = 1 / 4096) -> np.ndarray:
+    """Round to multiples of `step`, so that the last bits of libm do not matter."""
+    return (np.round(array / step) * step).astype(np.float32)
+
+
+def write_exr(path: Path, image: Image) -> None:
+    """Write an RGB image (H, W, 3) as OpenEXR, 32 bits a channel."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    OpenEXR.File(header, {"RGB": np.ascontiguousarray(image)}).write(str(path))
+
+
+def write_ply(path: Path, positions: np.ndarray, normals: np.ndarray, faces: np.ndarray) -> None:
+    """Write a triangle mesh as binary PLY."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    properties = "".join(f"property float {name}\n" for name in ("x", "y", "z", "nx", "ny", "nz"))
+    head = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(positions)}\n{properties}"
+    head += f"element face {len(faces)}\nproperty list uchar int vertex_index\nend_header\n"
+    polygons = np.empty(len(faces), dtype=[("count", "u1"), ("index", "<i4", 3)])
+    polygons["count"], polygons["index"] = 3, faces
+    path.write_bytes(head.encode() + np.hstack([positions, normals]).astype("<f4").tobytes() + polygons.tobytes())
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
