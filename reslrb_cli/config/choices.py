@@ -1,0 +1,214 @@
+"""Sections that are chosen by their `type`: integrators, losses and optimisers, each with the options that it knows."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+from pydantic import ConfigDict, Field, SerializerFunctionWrapHandler, Tag, model_serializer, model_validator
+from typing_extensions import Self
+
+from .base import Count, Positive, Section, by_type, located
+
+#: For JSON Schema: `type` may be left out only for the first member of a union.
+_NEEDS_TYPE = ConfigDict(json_schema_extra={"required": ["type"]})
+
+
+class Choice(Section):
+    """A section whose `type` says which options it has."""
+
+    def options(self) -> dict[str, Any]:
+        """The options of this type by name, without `type` and without those that are None."""
+        return self.model_dump(exclude={"type"}, exclude_none=True)
+
+
+# --- integrators ------------------------------------------------------------------------------------------------------
+
+
+class Integrator(Choice):
+    """Options that all integrators share."""
+
+    type: str
+    max_depth: int = Field(
+        8, ge=-1, description="Longest path in segments, from the emitter to the sensor: 1 shows only directly visible "
+        "emitters, 2 adds direct light; -1: no limit (Russian roulette alone ends a path)."
+    )  # fmt: skip
+    rr_depth: int = Field(5, ge=1, description="Path depth at which Russian roulette begins.")
+    hide_emitters: bool = Field(False, description="Whether directly visible emitters are left out of the image.")
+
+
+class LightTracer(Integrator):
+    """Options of integrators that trace from the emitters; `prb` traces all samples in one pass."""
+
+    samples_per_pass: Count | None = Field(
+        None, description="Samples per pixel that one pass traces, to bound its memory; it must divide the samples per "
+        "pixel. null: all in one pass."
+    )  # fmt: skip
+
+
+class Reslrb(LightTracer):
+    """Reservoir light replay backpropagation: light tracing whose memory does not depend on path length."""
+
+    type: Literal["reslrb"] = Field("reslrb", description="Light tracing, derivatives by a replay of each path.")
+    estimator: Literal["reservoir"] = Field(
+        "reservoir", description="How a path's connections enter its gradient. `reservoir`: one connection, kept with "
+        "probability proportional to its luminance."
+    )  # fmt: skip
+    image: Literal["all", "retained"] = Field(
+        "all", description="Which connections the image shows: `all`, or the `retained` one alone, weighted (noisier)."
+    )
+
+
+class Ptracer(LightTracer):
+    """Mitsuba's own light tracer under naive reverse-mode differentiation: memory grows with depth."""
+
+    model_config = _NEEDS_TYPE
+    type: Literal["ptracer"] = Field("ptracer", description="Mitsuba's light tracer, naively differentiated.")
+
+
+class Prb(Integrator):
+    """Mitsuba's path replay backpropagation: paths from the sensor; it cannot see caustics of small lights."""
+
+    model_config = _NEEDS_TYPE
+    type: Literal["prb"] = Field("prb", description="Mitsuba's path replay backpropagation, from the sensor.")
+
+
+class WalkAd(LightTracer):
+    """The light-path walk of `reslrb` under naive reverse-mode differentiation, for comparisons at equal seeds."""
+
+    model_config = _NEEDS_TYPE
+    type: Literal["walk_ad"] = Field("walk_ad", description="The walk of `reslrb`, naively differentiated.")
+
+
+AnyIntegrator = Annotated[
+    Annotated[Reslrb, Tag("<reslrb>")]
+    | Annotated[Ptracer, Tag("<ptracer>")]
+    | Annotated[Prb, Tag("<prb>")]
+    | Annotated[WalkAd, Tag("<walk_ad>")],
+    by_type("reslrb"),
+]
+
+# --- losses -----------------------------------------------------------------------------------------------------------
+
+
+class Loss(Choice):
+    """A mean over pixels and channels of a function of the image I and the target T."""
+
+    type: str
+
+
+class L2(Loss):
+    """Mean of (I - T)^2."""
+
+    type: Literal["l2"] = Field("l2", description="Mean of (I - T)².")
+
+
+class L1(Loss):
+    """Mean of |I - T|."""
+
+    model_config = _NEEDS_TYPE
+    type: Literal["l1"] = Field("l1", description="Mean of |I - T|.")
+
+
+class RelativeL2(Loss):
+    """Mean of (I - T)^2 / (T^2 + epsilon)."""
+
+    model_config = _NEEDS_TYPE
+    type: Literal["relative_l2"] = Field("relative_l2", description="Squared error relative to the target's square.")
+    epsilon: Positive = Field(1e-2, description="Added to the denominator; keeps dark pixels from dominating.")
+
+
+class LogL2(Loss):
+    """Mean of (log(I + epsilon) - log(T + epsilon))^2."""
+
+    model_config = _NEEDS_TYPE
+    type: Literal["log_l2"] = Field("log_l2", description="Mean of (log(I + epsilon) - log(T + epsilon))².")
+    epsilon: Positive = Field(1e-2, description="Added inside both logarithms, in units of radiance.")
+
+
+AnyLoss = Annotated[
+    Annotated[L2, Tag("<l2>")]
+    | Annotated[L1, Tag("<l1>")]
+    | Annotated[RelativeL2, Tag("<relative_l2>")]
+    | Annotated[LogL2, Tag("<log_l2>")],
+    by_type("l2"),
+]
+
+# --- optimisers -------------------------------------------------------------------------------------------------------
+
+_Decay = Annotated[float, Field(ge=0, lt=1)]
+
+
+class Optimizer(Choice):
+    """Options that all optimisers share: the learning rate and its schedule."""
+
+    type: str
+    learning_rate: Positive = Field(0.02, description="Step size at the first iteration, in the parameter's units.")
+    schedule: Literal["constant", "cosine", "exponential"] = Field(
+        "constant", description="How the learning rate runs from its first value to its last."
+    )
+    final_fraction: float = Field(
+        0.01, gt=0, le=1, description="Last learning rate over the first; only with a schedule other than `constant`."
+    )
+
+    @model_validator(mode="after")
+    def _check_schedule(self) -> Self:
+        if self.schedule == "constant" and "final_fraction" in self.model_fields_set:
+            raise located("final_fraction", "has no effect on a constant learning rate; set `schedule` or remove it")
+        return self
+
+    @model_serializer(mode="wrap")
+    def _without_unused(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        values: dict[str, Any] = handler(self)
+        if self.schedule == "constant":
+            values.pop("final_fraction", None)
+        return values
+
+    def own_options(self) -> dict[str, Any]:
+        """Options of the update rule itself (beta_1, momentum, ...): those that not all types share."""
+        return {name: value for name, value in self.options().items() if name not in Optimizer.model_fields}
+
+
+class _AdamOptions(Optimizer):
+    beta_1: _Decay = Field(0.9, description="Decay of the running mean of the gradient.")
+    beta_2: _Decay = Field(0.999, description="Decay of the running mean of the squared gradient.")
+    epsilon: Positive = Field(1e-8, description="Added to the root of the mean squared gradient.")
+
+
+class Adam(_AdamOptions):
+    """Adam (Kingma and Ba 2015)."""
+
+    type: Literal["adam"] = Field("adam", description="Adam (Kingma and Ba 2015).")
+
+
+class AdamW(_AdamOptions):
+    """Adam with decoupled weight decay (Loshchilov and Hutter 2019)."""
+
+    model_config = _NEEDS_TYPE
+    type: Literal["adamw"] = Field("adamw", description="Adam with decoupled weight decay (Loshchilov, Hutter 2019).")
+    weight_decay: float = Field(0.01, ge=0, description="Share of the value that a step removes, per learning rate.")
+
+
+class RMSProp(Optimizer):
+    """RMSProp (Hinton 2012)."""
+
+    model_config = _NEEDS_TYPE
+    type: Literal["rmsprop"] = Field("rmsprop", description="RMSProp (Hinton 2012).")
+    decay: _Decay = Field(0.99, description="Decay of the running mean of the squared gradient.")
+    epsilon: Positive = Field(1e-8, description="Added to the root of the mean squared gradient.")
+
+
+class SGD(Optimizer):
+    """Gradient descent with momentum."""
+
+    model_config = _NEEDS_TYPE
+    type: Literal["sgd"] = Field("sgd", description="Gradient descent, with momentum if that is above 0.")
+    momentum: _Decay = Field(0.0, description="Decay of the running sum of gradients; 0: none.")
+
+
+AnyOptimizer = Annotated[
+    Annotated[Adam, Tag("<adam>")]
+    | Annotated[AdamW, Tag("<adamw>")]
+    | Annotated[RMSProp, Tag("<rmsprop>")]
+    | Annotated[SGD, Tag("<sgd>")],
+    by_type("adam"),
+]

@@ -1,0 +1,259 @@
+"""The configuration: one file is one experiment. Units, defaults and meanings stand in the fields' descriptions, from
+which `reference.py` writes docs/config.md and docs/config.schema.json."""
+
+from __future__ import annotations
+
+import math
+import re
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import (
+    BeforeValidator,
+    Field,
+    PrivateAttr,
+    SerializerFunctionWrapHandler,
+    Tag,
+    WithJsonSchema,
+    field_validator,
+    model_serializer,
+    model_validator,
+)
+from typing_extensions import Self
+
+from .base import BY_KIND, ConfigPath, Count, Positive, Section, Seed, WorkPath, located, wrong
+from .choices import L2, Adam, AnyIntegrator, AnyLoss, AnyOptimizer, Integrator, Loss, Optimizer, Reslrb
+
+ColorSpace = Literal["auto", "linear", "srgb"]
+_COLOR_SPACE = "How values are encoded: `linear`, `srgb`, or `auto` (8-bit files srgb, float files linear)."
+
+
+def _list_of_one(value: Any) -> Any:
+    return [value] if isinstance(value, (str, Path)) else value
+
+
+def _scalar(value: Any) -> Any:
+    if not isinstance(value, (bool, int, float, str)) or (isinstance(value, float) and not math.isfinite(value)):
+        raise wrong("must be text, a finite number, true or false")
+    return value
+
+
+class ImageFile(Section):
+    """An image file that holds a texture."""
+
+    file: ConfigPath = Field(description="EXR, PNG, JPG or HDR file, relative to the config file.")
+    color_space: ColorSpace = Field("auto", description=_COLOR_SPACE)
+
+
+_Numbers = Annotated[list[float], Field(min_length=1)]
+#: A value for a scene parameter: one number, a list such as [r, g, b], or an image file.
+Value = Annotated[
+    Annotated[float, Tag("<number>")] | Annotated[_Numbers, Tag("<list>")] | Annotated[ImageFile, Tag("<mapping>")],
+    BY_KIND,
+]
+#: The same, or "scene": the value that the scene file gives.
+Initial = Annotated[
+    Annotated[float, Tag("<number>")]
+    | Annotated[_Numbers, Tag("<list>")]
+    | Annotated[ImageFile, Tag("<mapping>")]
+    | Annotated[Literal["scene"], Tag("<text>")],
+    BY_KIND,
+]
+
+
+class SceneConfig(Section):
+    """The scene and what it is seen through."""
+
+    file: ConfigPath = Field(description="Mitsuba scene (XML, versions 0.5 to 3), relative to the config file.")
+    options: dict[str, Annotated[bool | int | float | str, BeforeValidator(_scalar)]] = Field(
+        default_factory=dict, description="Values of the scene file's `$name` variables."
+    )
+    sensors: Annotated[
+        Annotated[Annotated[list[Annotated[int, Field(ge=0)]], Field(min_length=1)], Tag("<list>")]
+        | Annotated[Literal["all"], Tag("<text>")],
+        BY_KIND,
+    ] = Field(default_factory=lambda: [0], description="Indices of the scene's sensors that are used, or `all`.")
+
+    @field_validator("sensors")
+    @classmethod
+    def _check_sensors(cls, value: list[int] | Literal["all"]) -> list[int] | Literal["all"]:
+        if isinstance(value, list) and len(set(value)) < len(value):
+            raise wrong("must name each sensor once")
+        return value
+
+
+class Rendering(Section):
+    """A target that is rendered from the scene itself, with other parameter values."""
+
+    parameters: dict[str, Value] = Field(
+        default_factory=dict, description="True values by `mi.traverse` key: a number, a list of numbers, or an image "
+        "file. Empty: the scene as it stands."
+    )  # fmt: skip
+    spp: Count = Field(1024, description="Samples per pixel of the target.")
+    seed: Seed = Field(0, description="Seed of the target's samples.")
+    integrator: AnyIntegrator | None = Field(None, description="Integrator of the target; null: that of the run.")
+
+
+_Files = Annotated[
+    list[ConfigPath],
+    Field(min_length=1),
+    BeforeValidator(_list_of_one),
+    WithJsonSchema({"anyOf": [{"type": "string"}, {"type": "array", "items": {"type": "string"}, "minItems": 1}]}),
+]
+
+
+class TargetConfig(Section):
+    """What the image is compared with: exactly one of `file` and `render`."""
+
+    file: _Files | None = Field(
+        None, description="Target image (EXR, PNG, JPG, HDR), or a list with one for each sensor, in their order; "
+        "relative to the config file."
+    )  # fmt: skip
+    color_space: ColorSpace = Field("auto", description=f"{_COLOR_SPACE} Only with `file`.")
+    render: Rendering | None = Field(None, description="Render the target from the scene.")
+
+    @model_validator(mode="after")
+    def _check_one(self) -> Self:
+        if (self.file is None) == (self.render is None):
+            has = "none" if self.file is None else "both"
+            raise located("", f"must have exactly one of `file` and `render`, and has {has}")
+        if self.render is not None and self.color_space != "auto":
+            raise located("color_space", "has no effect on a rendered target; it goes with `file`")
+        return self
+
+    @model_serializer(mode="wrap")
+    def _without_unused(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        values: dict[str, Any] = handler(self)
+        if self.render is not None:
+            values.pop("color_space", None)
+        return values
+
+
+_Bound = Annotated[float, Field(allow_inf_nan=True)]
+
+
+class ParameterSpec(Section):
+    """One scene parameter, or all that a glob matches, to be recovered."""
+
+    key: str = Field(
+        min_length=1, description="Key as `mi.traverse` names it (`reslrb inspect` lists them), or a glob such as "
+        "`*.reflectance.data`."
+    )  # fmt: skip
+    initial: Initial = Field(
+        "scene", description="Value to start from: a number (all entries), a list of numbers (one per channel), an "
+        "image file, or `scene` (the scene's own value)."
+    )  # fmt: skip
+    bounds: Annotated[tuple[_Bound, _Bound], Field(strict=False)] | None = Field(
+        None, description="[low, high], in the parameter's units; values are clamped to them after each step. "
+        "`-.inf` and `.inf` leave a side open."
+    )  # fmt: skip
+    learning_rate: Positive | None = Field(None, description="Step size of this parameter; null: the optimizer's.")
+    resolution: Annotated[tuple[Count, Count], Field(strict=False)] | None = Field(
+        None, description="[width, height] in texels to which a texture is resampled before the start."
+    )  # fmt: skip
+
+    @field_validator("bounds")
+    @classmethod
+    def _check_bounds(cls, value: tuple[float, float] | None) -> tuple[float, float] | None:
+        if value is not None and not value[0] < value[1]:
+            raise wrong(f"must be [low, high] with low < high, not [{value[0]:g}, {value[1]:g}]")
+        return value
+
+    @model_validator(mode="after")
+    def _check_initial(self) -> Self:
+        if self.bounds is not None and isinstance(self.initial, (float, list)):
+            low, high = self.bounds
+            for number in self.initial if isinstance(self.initial, list) else [self.initial]:
+                if not low <= number <= high:
+                    raise located("initial", f"{number:g} is outside of the bounds [{low:g}, {high:g}]")
+        return self
+
+
+class RunConfig(Section):
+    """How long, with how many samples, and where to."""
+
+    name: str = Field("run", min_length=1, description="Name of the run and of its folder; default: the file's stem.")
+    output: WorkPath = Field(
+        Path("runs"), validate_default=True, description="Folder of the run folders, relative to the working directory."
+    )
+    iterations: Count = Field(200, description="Optimisation steps.")
+    spp: Count = Field(16, description="Samples per pixel and step.")
+    seed: Seed = Field(0, description="Seed of the run; every other seed is made from it.")
+    adjoint: Literal["correlated", "independent"] = Field(
+        "correlated", description="Samples that the adjoint image comes from: those of the gradient (`correlated`: "
+        "cheapest, biased by noise under a nonlinear loss) or a second set (`independent`: unbiased for l2)."
+    )  # fmt: skip
+    images_every: Annotated[int, Field(ge=0)] = Field(
+        0, description="Iterations between two saved images; 0: only the initial and the final one."
+    )
+    reach_spp: Count = Field(64, description="Samples for the mask of the texels that light and sensor reach.")
+
+    @field_validator("name")
+    @classmethod
+    def _check_name(cls, value: str) -> str:
+        if not _folder_name(value):
+            raise wrong("must hold a letter or a digit")
+        return value
+
+    @property
+    def folder_name(self) -> str:
+        """The run's name as the name of a folder: what is no letter, digit, `.`, `_`, `+`, `=` becomes `-`."""
+        return _folder_name(self.name)
+
+
+def _folder_name(name: str) -> str:
+    return re.sub(r"[^\w.+=]+", "-", name).strip("-.")
+
+
+class Config(Section):
+    """One experiment, checked; its paths are absolute."""
+
+    variant: Literal["auto", "llvm_ad_rgb", "cuda_ad_rgb", "llvm_ad_mono", "cuda_ad_mono"] = Field(
+        "auto", description="Mitsuba variant; `auto`: cuda_ad_rgb where Mitsuba can trace rays on it, else llvm_ad_rgb."
+    )
+    scene: SceneConfig = Field(description="The scene and its sensors.")
+    target: TargetConfig = Field(description="What the image is compared with.")
+    parameters: Annotated[list[ParameterSpec], Field(min_length=1)] = Field(description="What is recovered.")
+    integrator: AnyIntegrator = Field(default=Reslrb(), description="How image and gradient are computed.")
+    loss: AnyLoss = Field(default=L2(), description="How image and target are compared.")
+    optimizer: AnyOptimizer = Field(default=Adam(), description="How parameters follow their gradient.")
+    run: RunConfig = Field(default_factory=lambda: RunConfig(), description="Iterations, samples, seed and output.")
+
+    _source: Path = PrivateAttr(default=Path("config.yaml"))
+
+    @property
+    def source(self) -> Path:
+        """The file that this was loaded from, as the user named it."""
+        return self._source
+
+    def __eq__(self, other: object) -> bool:
+        """Whether all settings agree, wherever they were loaded from."""
+        return isinstance(other, Config) and self.model_dump() == other.model_dump()
+
+    __hash__ = None  # type: ignore[assignment]
+
+    @model_validator(mode="after")
+    def _check_together(self) -> Self:
+        sensors, files = self.scene.sensors, self.target.file
+        if files is not None and sensors != "all" and len(files) != len(sensors):
+            raise located("target.file", f"names {len(files)} images for {len(sensors)} sensors; give one for each")
+        keys = [spec.key for spec in self.parameters]
+        for i, key in enumerate(keys):
+            if key in keys[:i]:
+                raise located(f"parameters[{i}].key", f"`{key}` stands in parameters[{keys.index(key)}] already")
+        _check_passes(self.integrator, self.run.spp, "integrator", "run.spp")
+        if self.target.render is not None:
+            own = self.target.render.integrator
+            key = "integrator" if own is None else "target.render.integrator"
+            _check_passes(own or self.integrator, self.target.render.spp, key, "target.render.spp")
+        return self
+
+
+def _check_passes(integrator: Integrator, spp: int, key: str, spp_key: str) -> None:
+    per_pass = getattr(integrator, "samples_per_pass", None)
+    if per_pass is not None and spp % min(per_pass, spp) != 0:
+        raise located(f"{key}.samples_per_pass", f"{per_pass} does not divide {spp_key}, which is {spp}")
+
+
+__all__ = ["Config", "ImageFile", "Integrator", "Loss", "Optimizer", "ParameterSpec", "Rendering", "RunConfig",
+           "SceneConfig", "TargetConfig"]  # fmt: skip
