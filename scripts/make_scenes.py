@@ -120,14 +120,13 @@ def paper(size: int) -> Image:
 def sky(height: int) -> Image:
     """A small latitude-longitude sky: haze, blue, ground, and a sun that is bright but wider than a texel.
 
-    The sun stands where `grey_room` needs it once the map is turned: in the map's own frame in direction SUN.
+    It is painted for a map that is turned, so that its horizon (across UP) does not lie on a row of texels.
     """
     v, u = (np.mgrid[0:height, 0 : 2 * height] + 0.5) / height
     theta, phi = v * np.pi, u * np.pi
     direction = np.stack([np.sin(phi) * np.sin(theta), np.cos(theta), -np.cos(phi) * np.sin(theta)], -1)
     sun = np.array(SUN) / np.linalg.norm(SUN)
     cosine = direction @ sun
-    # "Up" of the turned map is not the map's pole: the horizon follows the world's vertical, UP.
     elevation = direction @ (np.array(UP) / np.linalg.norm(UP))
     above = np.clip(elevation, 0, 1)[..., None]
     color = np.array([0.95, 1.0, 1.05]) * (1 - above) ** 4 + np.array([0.30, 0.55, 1.0]) * (1 - (1 - above) ** 4)
@@ -136,8 +135,9 @@ def sky(height: int) -> Image:
     return quantise(color, 1 / 256)
 
 
-# What `rotate x 25, then rotate y -40` of grey_room/scene.xml turns into the sun's and the upward direction.
-SUN = (-0.42, 0.71, -0.57)
+# What grey_room/scene.xml turns (25 degrees about x, then -40 about y) into the sun's direction, (-0.83, 0.52, 0.23),
+# and into the vertical.
+SUN = (-0.487, 0.766, 0.421)
 UP = (0.0, 0.9063, -0.4226)
 
 
