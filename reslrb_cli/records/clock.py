@@ -1,0 +1,88 @@
+"""Readings of time and memory around a step."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+
+MIB = 2.0**20
+
+
+@dataclass
+class StepTimes:
+    """Times of one step in milliseconds; filled in when the step has ended.
+
+    `wall_ms` is what a user waits; `kernel_ms` the execution of kernels and `codegen_ms` their generation and compilation,
+    both from `dr.kernel_history`; `compiled` the number of kernels that the in-memory cache did not have.
+    """
+
+    wall_ms: float = 0.0
+    kernel_ms: float = 0.0
+    codegen_ms: float = 0.0
+    compiled: int = 0
+
+
+class StepClock:
+    """Times steps, and adds up the time that an optimisation takes without what is written in between."""
+
+    def __init__(self) -> None:
+        self.elapsed_s = 0.0
+
+    @contextmanager
+    def step(self) -> Iterator[StepTimes]:
+        """Time the block as one step, under kernel history; what it launches is waited for."""
+        times = StepTimes()
+        with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+            dr.sync_thread()
+            dr.kernel_history_clear()
+            with self.counted():
+                start = time.perf_counter()
+                yield times
+                dr.sync_thread()
+                times.wall_ms = 1e3 * (time.perf_counter() - start)
+            history = dr.kernel_history()
+        times.kernel_ms, times.codegen_ms, times.compiled = summarise(history)
+
+    @contextmanager
+    def counted(self) -> Iterator[None]:
+        """Count the block's time into `elapsed_s`."""
+        start = time.perf_counter()
+        yield
+        dr.sync_thread()
+        self.elapsed_s += time.perf_counter() - start
+
+
+def summarise(history: list[dict[str, Any]]) -> tuple[float, float, int]:
+    """Sum a kernel history: milliseconds of execution, of code generation and compilation, and cache misses.
+
+    Copies and reductions count as execution: they are kernels of the step like any other.
+    """
+    execution = sum(entry.get("execution_time", 0.0) for entry in history)
+    codegen = sum(entry.get("codegen_time", 0.0) + entry.get("backend_time", 0.0) for entry in history)
+    compiled = sum(1 for entry in history if not entry.get("cache_hit", True))
+    return float(execution), float(codegen), compiled
+
+
+def reset_peak() -> None:
+    """Start a new memory peak from what is alive now.
+
+    The allocator's statistics count blocks that it holds back for reuse as allocated: without the flush a peak
+    would include whatever ran before.
+    """
+    dr.sync_thread()
+    dr.flush_malloc_cache()
+    dr.sync_thread()
+    dr.detail.malloc_clear_statistics()
+
+
+def peak_mib(backend: Any) -> float:
+    """The most memory allocated at once since `reset_peak`, in MiB, on `backend` (a `dr.JitBackend`).
+
+    Thread-local memory (`dr.Local`) is not in it.
+    """
+    return float(dr.detail.malloc_watermark(backend)) / MIB

@@ -1,0 +1,30 @@
+"""Images as EXR (linear, 32-bit) and PNG (8-bit sRGB, to look at)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+
+
+def write_image(stem: Path, image: np.ndarray[Any, Any]) -> None:
+    """Write an (H, W, C) image of linear values as `<stem>.exr` and `<stem>.png`.
+
+    `stem` is appended to rather than given a new suffix: keys of parameters have dots of their own.
+    """
+    bitmap = mi.Bitmap(np.ascontiguousarray(image, dtype=np.float32))
+    bitmap.write(f"{stem}.exr")
+    write_png(stem, image)
+
+
+def write_png(stem: Path, image: np.ndarray[Any, Any]) -> None:
+    """Write an (H, W, C) image of linear values as `<stem>.png` in 8-bit sRGB, clipped to [0, 1].
+
+    Of four channels or more, and of two, only the first are shown: three and one.
+    """
+    channels = 3 if image.shape[2] >= 3 else 1
+    shown = np.clip(np.nan_to_num(image[:, :, :channels], nan=0.0), 0.0, 1.0).astype(np.float32)
+    bitmap = mi.Bitmap(np.ascontiguousarray(shown))
+    bitmap.convert(component_format=mi.Struct.Type.UInt8, srgb_gamma=True).write(f"{stem}.png")

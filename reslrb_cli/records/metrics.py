@@ -1,0 +1,83 @@
+"""`metrics.jsonl`: one object a line, one line an iteration."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+FILE_NAME = "metrics.jsonl"
+
+
+@dataclass(frozen=True)
+class Record:
+    """What one iteration was: its step, and the parameters before its update.
+
+    `step_ms` is the wall time of the step (image, loss and gradient of every sensor, evaluated; the optimiser's update
+    left out), `codegen_ms` the part of it in which kernels were generated and compiled. `primal_ms` and `adjoint_ms`
+    are None where one kernel does both. `elapsed_s` is the time since the start in steps and updates; files and
+    the reading of `parameter_rmse` are not in it. `peak_mib` is the allocator's high-water mark since the start.
+    `nonfinite` counts the entries of loss and gradient that were not finite; `grad_norm` leaves them out.
+    `parameter_rmse` is taken over the entries that light and sensor reach, None where the true value is not known.
+    """
+
+    iteration: int
+    loss: float
+    step_ms: float
+    primal_ms: float | None
+    adjoint_ms: float | None
+    codegen_ms: float
+    elapsed_s: float
+    peak_mib: float
+    spp: int
+    lr: float
+    grad_norm: float
+    nonfinite: int
+    parameter_rmse: float | None
+
+    def to_json(self) -> str:
+        """The record as one line of JSON, non-finite numbers as null (JSON has none)."""
+        values = {
+            key: None if isinstance(value, float) and not math.isfinite(value) else value
+            for key, value in asdict(self).items()
+        }
+        return json.dumps(values, allow_nan=False)
+
+
+class MetricsWriter:
+    """Appends records to `metrics.jsonl`; each line is on disk once `write` returns."""
+
+    def __init__(self, folder: Path) -> None:
+        self._file = (folder / FILE_NAME).open("a", encoding="utf-8")
+
+    def write(self, record: Record) -> None:
+        """Append one record."""
+        self._file.write(record.to_json() + "\n")
+        self._file.flush()
+
+    def __enter__(self) -> MetricsWriter:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._file.close()
+
+
+def read_metrics(folder: Path) -> list[dict[str, Any]]:
+    """Return the records in `folder`, oldest first; a last line that a crash cut short is left out."""
+    try:
+        lines = (folder / FILE_NAME).read_text(encoding="utf-8").splitlines()
+    except FileNotFoundError:
+        return []
+    records = []
+    for number, line in enumerate(lines):
+        try:
+            records.append(json.loads(line))
+        except ValueError:
+            if number + 1 < len(lines):
+                raise
+    return records

@@ -1,0 +1,55 @@
+"""`parameters/`: what was optimised, in formats that other tools read."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from reslrb_cli.records.atomic import write_atomically
+from reslrb_cli.records.images import write_image
+
+Array = np.ndarray[Any, Any]
+
+
+def file_stem(key: str) -> str:
+    """A file name for the parameter `key`: the key, with what file systems mind replaced by `_`."""
+    return re.sub(r"[^\w.\-]", "_", key)
+
+
+def write_parameters(folder: Path, values: Mapping[str, Array]) -> None:
+    """Write parameter values into `folder`.
+
+    Textures (H, W, C) as `<key>.exr`, which can stand in the scene file in place of the texture that it began with,
+    and `<key>.png` to look at; the shape of every parameter, and the values of those that are no textures, in
+    `parameters.json`; everything in `parameters.npz`.
+    """
+    summary: dict[str, Any] = {}
+    for key, value in values.items():
+        entry: dict[str, Any] = {"shape": list(value.shape)}
+        if value.ndim == 3:
+            write_image(folder / file_stem(key), value)
+            entry["file"] = file_stem(key) + ".exr"
+        elif value.size <= 64:
+            entry["value"] = value.tolist()
+        summary[key] = entry
+    text = json.dumps(summary, indent=2)
+    write_atomically(folder / "parameters.json", lambda file: file.write(text.encode() + b"\n"))
+    write_atomically(folder / "parameters.npz", lambda file: np.savez(file, **dict(values)))
+
+
+def write_mask(folder: Path, key: str, mask: Array) -> None:
+    """Write the mask of the entries that light and sensor reach: `<key>.mask.npy`, and for textures `<key>.mask.png`.
+
+    `mask` is boolean, (H, W) for a texture and of the parameter's own shape otherwise.
+    """
+    stem = file_stem(key) + ".mask"
+    write_atomically(folder / f"{stem}.npy", lambda file: np.save(file, mask))
+    if mask.ndim == 2:
+        import mitsuba as mi
+
+        mi.Bitmap(np.ascontiguousarray(mask[:, :, None] * np.uint8(255))).write(str(folder / f"{stem}.png"))

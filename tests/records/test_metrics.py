@@ -1,0 +1,63 @@
+"""metrics.jsonl: its keys, what has no number, and lines that a crash cut short."""
+
+from __future__ import annotations
+
+import json
+import math
+
+from reslrb_cli.records import MetricsWriter, Record, read_metrics, save_checkpoint
+
+KEYS = [
+    "iteration", "loss", "step_ms", "primal_ms", "adjoint_ms", "codegen_ms", "elapsed_s", "peak_mib", "spp", "lr",
+    "grad_norm", "nonfinite", "parameter_rmse",
+]  # fmt: skip
+
+
+def make_record(**changes):
+    values = {
+        "iteration": 0, "loss": 0.5, "step_ms": 3.0, "primal_ms": None, "adjoint_ms": None, "codegen_ms": 1.0,
+        "elapsed_s": 0.1, "peak_mib": 2.0, "spp": 16, "lr": 0.02, "grad_norm": 1.0, "nonfinite": 0,
+        "parameter_rmse": None,
+    }  # fmt: skip
+    return Record(**{**values, **changes})
+
+
+def test_a_record_has_the_documented_keys_in_order():
+    assert list(json.loads(make_record().to_json())) == KEYS
+
+
+def test_non_finite_numbers_become_null():
+    line = make_record(loss=math.nan, grad_norm=math.inf, nonfinite=3).to_json()
+    content = json.loads(line, parse_constant=lambda name: (_ for _ in ()).throw(ValueError(name)))
+    assert (content["loss"], content["grad_norm"], content["nonfinite"]) == (None, None, 3)
+
+
+def test_each_line_is_on_disk_at_once(tmp_path):
+    with MetricsWriter(tmp_path) as writer:
+        for iteration in range(3):
+            writer.write(make_record(iteration=iteration))
+            assert [record["iteration"] for record in read_metrics(tmp_path)] == list(range(iteration + 1))
+
+
+def test_a_torn_last_line_is_left_out(tmp_path):
+    with MetricsWriter(tmp_path) as writer:
+        writer.write(make_record())
+    with (tmp_path / "metrics.jsonl").open("a") as file:
+        file.write('{"iteration": 1, "lo')
+    assert len(read_metrics(tmp_path)) == 1
+
+
+def test_no_file_is_no_records(tmp_path):
+    assert read_metrics(tmp_path) == []
+
+
+def test_a_checkpoint_can_be_read_by_numpy(tmp_path):
+    import numpy as np
+
+    for iteration in (5, 6):
+        save_checkpoint(tmp_path, iteration, {"a.data": np.full((2, 2, 3), 0.5)}, {"a.data/0": np.array([6])})
+    with np.load(tmp_path / "state.npz") as state:
+        assert int(state["iteration"]) == 6
+        assert state["parameter/a.data"].shape == (2, 2, 3)
+        assert state["optimizer/a.data/0"] == 6
+    assert [path.name for path in tmp_path.iterdir()] == ["state.npz"]
