@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -32,27 +31,30 @@ def wrong(message: str) -> PydanticCustomError:
 # --- paths ------------------------------------------------------------------------------------------------------------
 
 
-def _path(base_key: str) -> Callable[[Any, ValidationInfo], Path]:
-    def convert(value: Any, info: ValidationInfo) -> Path:
-        if not isinstance(value, (str, Path)) or not str(value).strip() or "\0" in str(value):
-            raise wrong("must be a path")
-        try:
-            path = Path(value).expanduser()
-        except RuntimeError as error:  # ~nobody
-            raise wrong(f"must be a path: {error}") from None
-        base = (info.context or {}).get(base_key, Path.cwd())
-        # normpath would also resolve `a/../b` where `a` is a symbolic link, to the wrong file: leave `..` to the system
-        return Path(base).absolute() / path
+def _path(value: Any) -> Path:
+    if not isinstance(value, (str, Path)) or not str(value).strip() or "\0" in str(value):
+        raise wrong("must be a path")
+    try:
+        return Path(value).expanduser()
+    except RuntimeError:
+        raise wrong("must be a path: there is no such user") from None
 
-    return convert
+
+# Joined, not resolved: `..` after a symbolic link is the system's to follow.
+def _below_config(value: Any, info: ValidationInfo) -> Path:
+    return Path((info.context or {}).get("folder", "")).absolute() / _path(value)
+
+
+def _below_working_directory(value: Any) -> Path:
+    return Path.cwd() / _path(value)
 
 
 _PATH_SCHEMA = WithJsonSchema({"type": "string", "format": "path"})
 
 #: A path relative to the folder of the config file.
-ConfigPath = Annotated[Path, BeforeValidator(_path("folder")), _PATH_SCHEMA]
+ConfigPath = Annotated[Path, BeforeValidator(_below_config), _PATH_SCHEMA]
 #: A path relative to the working directory.
-WorkPath = Annotated[Path, BeforeValidator(_path("working_directory")), _PATH_SCHEMA]
+WorkPath = Annotated[Path, BeforeValidator(_below_working_directory), _PATH_SCHEMA]
 
 
 # --- unions -----------------------------------------------------------------------------------------------------------
@@ -72,19 +74,26 @@ def by_type(default: str) -> Discriminator:
     return Discriminator(tag)
 
 
-def _kind(value: Any) -> str:
-    if isinstance(value, (dict, Section)):
-        return "<mapping>"
-    if isinstance(value, list):
-        return "<list>"
-    return "<text>" if isinstance(value, str) else "<number>"
+def by_kind(expected: str, word: str | None = None) -> Discriminator:
+    """Tells the members of a union apart by the kind of the value; `expected` says in an error what is right.
 
+    Tags: `<mapping>`, `<list>`, `<number>`, and `<text>` for `word`, the only text that the union knows.
+    """
 
-#: Tells the members of a union apart by the kind of the value: Tag("<mapping>" | "<list>" | "<text>" | "<number>").
-BY_KIND = Discriminator(_kind)
+    def tag(value: Any) -> str | None:
+        if isinstance(value, (dict, Section)):
+            return "<mapping>"
+        if isinstance(value, (list, tuple)):
+            return "<list>"
+        if isinstance(value, (int, float)) and not isinstance(value, bool):
+            return "<number>"
+        return "<text>" if word is not None and value == word else None
+
+    return Discriminator(tag, custom_error_type="wrong", custom_error_message=f"must be {expected}")
+
 
 # --- numbers ----------------------------------------------------------------------------------------------------------
 
 Positive = Annotated[float, Field(gt=0)]
-Count = Annotated[int, Field(ge=1)]
+Count = Annotated[int, Field(ge=1, lt=2**31)]
 Seed = Annotated[int, Field(ge=0, lt=SEED_END)]

@@ -29,32 +29,42 @@ class Integrator(Choice):
 
     type: str
     max_depth: int = Field(
-        8, ge=-1, description="Longest path in segments, from the emitter to the sensor: 1 shows only directly visible "
-        "emitters, 2 adds direct light; -1: no limit (Russian roulette alone ends a path)."
-    )  # fmt: skip
-    rr_depth: int = Field(5, ge=1, description="Path depth at which Russian roulette begins.")
-    hide_emitters: bool = Field(False, description="Whether directly visible emitters are left out of the image.")
+        default=8,
+        ge=-1,
+        lt=2**31,
+        description="Longest path in segments, from the emitter to the sensor: 1 shows only directly visible "
+        "emitters, 2 adds direct light; -1: no limit (Russian roulette alone ends a path).",
+    )
+    rr_depth: Count = Field(default=5, description="Path depth at which Russian roulette begins.")
+    hide_emitters: bool = Field(
+        default=False, description="Whether directly visible emitters are left out of the image."
+    )
 
 
 class LightTracer(Integrator):
     """Options of integrators that trace from the emitters; `prb` traces all samples in one pass."""
 
     samples_per_pass: Count | None = Field(
-        None, description="Samples per pixel that one pass traces, to bound its memory; it must divide the samples per "
-        "pixel. null: all in one pass."
-    )  # fmt: skip
+        default=None,
+        description="Samples per pixel that one pass traces, to bound its memory; it must divide the samples per "
+        "pixel. null: all in one pass.",
+    )
 
 
 class Reslrb(LightTracer):
     """Reservoir light replay backpropagation: light tracing whose memory does not depend on path length."""
 
-    type: Literal["reslrb"] = Field("reslrb", description="Light tracing, derivatives by a replay of each path.")
+    type: Literal["reslrb"] = Field(
+        default="reslrb", description="Light tracing, derivatives by a replay of each path."
+    )
     estimator: Literal["reservoir"] = Field(
-        "reservoir", description="How a path's connections enter its gradient. `reservoir`: one connection, kept with "
-        "probability proportional to its luminance."
-    )  # fmt: skip
+        default="reservoir",
+        description="How a path's connections enter its gradient. `reservoir`: one connection, kept with "
+        "probability proportional to its luminance.",
+    )
     image: Literal["all", "retained"] = Field(
-        "all", description="Which connections the image shows: `all`, or the `retained` one alone, weighted (noisier)."
+        default="all",
+        description="Which connections the image shows: `all`, or the `retained` one alone, weighted (noisier).",
     )
 
 
@@ -62,21 +72,21 @@ class Ptracer(LightTracer):
     """Mitsuba's own light tracer under naive reverse-mode differentiation: memory grows with depth."""
 
     model_config = _NEEDS_TYPE
-    type: Literal["ptracer"] = Field("ptracer", description="Mitsuba's light tracer, naively differentiated.")
+    type: Literal["ptracer"] = Field(default="ptracer", description="Mitsuba's light tracer, naively differentiated.")
 
 
 class Prb(Integrator):
     """Mitsuba's path replay backpropagation: paths from the sensor; it cannot see caustics of small lights."""
 
     model_config = _NEEDS_TYPE
-    type: Literal["prb"] = Field("prb", description="Mitsuba's path replay backpropagation, from the sensor.")
+    type: Literal["prb"] = Field(default="prb", description="Mitsuba's path replay backpropagation, from the sensor.")
 
 
 class WalkAd(LightTracer):
     """The light-path walk of `reslrb` under naive reverse-mode differentiation, for comparisons at equal seeds."""
 
     model_config = _NEEDS_TYPE
-    type: Literal["walk_ad"] = Field("walk_ad", description="The walk of `reslrb`, naively differentiated.")
+    type: Literal["walk_ad"] = Field(default="walk_ad", description="The walk of `reslrb`, naively differentiated.")
 
 
 AnyIntegrator = Annotated[
@@ -99,30 +109,32 @@ class Loss(Choice):
 class L2(Loss):
     """Mean of (I - T)^2."""
 
-    type: Literal["l2"] = Field("l2", description="Mean of (I - T)².")
+    type: Literal["l2"] = Field(default="l2", description="Mean of (I - T)².")
 
 
 class L1(Loss):
     """Mean of |I - T|."""
 
     model_config = _NEEDS_TYPE
-    type: Literal["l1"] = Field("l1", description="Mean of |I - T|.")
+    type: Literal["l1"] = Field(default="l1", description="Mean of |I - T|.")
 
 
 class RelativeL2(Loss):
     """Mean of (I - T)^2 / (T^2 + epsilon)."""
 
     model_config = _NEEDS_TYPE
-    type: Literal["relative_l2"] = Field("relative_l2", description="Squared error relative to the target's square.")
-    epsilon: Positive = Field(1e-2, description="Added to the denominator; keeps dark pixels from dominating.")
+    type: Literal["relative_l2"] = Field(
+        default="relative_l2", description="Squared error relative to the target's square."
+    )
+    epsilon: Positive = Field(default=1e-2, description="Added to the denominator; keeps dark pixels from dominating.")
 
 
 class LogL2(Loss):
     """Mean of (log(I + epsilon) - log(T + epsilon))^2."""
 
     model_config = _NEEDS_TYPE
-    type: Literal["log_l2"] = Field("log_l2", description="Mean of (log(I + epsilon) - log(T + epsilon))².")
-    epsilon: Positive = Field(1e-2, description="Added inside both logarithms, in units of radiance.")
+    type: Literal["log_l2"] = Field(default="log_l2", description="Mean of (log(I + epsilon) - log(T + epsilon))².")
+    epsilon: Positive = Field(default=1e-2, description="Added inside both logarithms, in units of radiance.")
 
 
 AnyLoss = Annotated[
@@ -142,12 +154,17 @@ class Optimizer(Choice):
     """Options that all optimisers share: the learning rate and its schedule."""
 
     type: str
-    learning_rate: Positive = Field(0.02, description="Step size at the first iteration, in the parameter's units.")
+    learning_rate: Positive = Field(
+        default=0.02, description="Step size at the first iteration, in the parameter's units."
+    )
     schedule: Literal["constant", "cosine", "exponential"] = Field(
-        "constant", description="How the learning rate runs from its first value to its last."
+        default="constant", description="How the learning rate runs from its first value to its last."
     )
     final_fraction: float = Field(
-        0.01, gt=0, le=1, description="Last learning rate over the first; only with a schedule other than `constant`."
+        default=0.01,
+        gt=0,
+        le=1,
+        description="Last learning rate over the first; only with a schedule other than `constant`.",
     )
 
     @model_validator(mode="after")
@@ -169,40 +186,44 @@ class Optimizer(Choice):
 
 
 class _AdamOptions(Optimizer):
-    beta_1: _Decay = Field(0.9, description="Decay of the running mean of the gradient.")
-    beta_2: _Decay = Field(0.999, description="Decay of the running mean of the squared gradient.")
-    epsilon: Positive = Field(1e-8, description="Added to the root of the mean squared gradient.")
+    beta_1: _Decay = Field(default=0.9, description="Decay of the running mean of the gradient.")
+    beta_2: _Decay = Field(default=0.999, description="Decay of the running mean of the squared gradient.")
+    epsilon: Positive = Field(default=1e-8, description="Added to the root of the mean squared gradient.")
 
 
 class Adam(_AdamOptions):
     """Adam (Kingma and Ba 2015)."""
 
-    type: Literal["adam"] = Field("adam", description="Adam (Kingma and Ba 2015).")
+    type: Literal["adam"] = Field(default="adam", description="Adam (Kingma and Ba 2015).")
 
 
 class AdamW(_AdamOptions):
     """Adam with decoupled weight decay (Loshchilov and Hutter 2019)."""
 
     model_config = _NEEDS_TYPE
-    type: Literal["adamw"] = Field("adamw", description="Adam with decoupled weight decay (Loshchilov, Hutter 2019).")
-    weight_decay: float = Field(0.01, ge=0, description="Share of the value that a step removes, per learning rate.")
+    type: Literal["adamw"] = Field(
+        default="adamw", description="Adam with decoupled weight decay (Loshchilov, Hutter 2019)."
+    )
+    weight_decay: float = Field(
+        default=0.01, ge=0, description="Share of the value that a step removes, per learning rate."
+    )
 
 
 class RMSProp(Optimizer):
     """RMSProp (Hinton 2012)."""
 
     model_config = _NEEDS_TYPE
-    type: Literal["rmsprop"] = Field("rmsprop", description="RMSProp (Hinton 2012).")
-    decay: _Decay = Field(0.99, description="Decay of the running mean of the squared gradient.")
-    epsilon: Positive = Field(1e-8, description="Added to the root of the mean squared gradient.")
+    type: Literal["rmsprop"] = Field(default="rmsprop", description="RMSProp (Hinton 2012).")
+    decay: _Decay = Field(default=0.99, description="Decay of the running mean of the squared gradient.")
+    epsilon: Positive = Field(default=1e-8, description="Added to the root of the mean squared gradient.")
 
 
 class SGD(Optimizer):
     """Gradient descent with momentum."""
 
     model_config = _NEEDS_TYPE
-    type: Literal["sgd"] = Field("sgd", description="Gradient descent, with momentum if that is above 0.")
-    momentum: _Decay = Field(0.0, description="Decay of the running sum of gradients; 0: none.")
+    type: Literal["sgd"] = Field(default="sgd", description="Gradient descent, with momentum if that is above 0.")
+    momentum: _Decay = Field(default=0.0, description="Decay of the running sum of gradients; 0: none.")
 
 
 AnyOptimizer = Annotated[

@@ -21,7 +21,7 @@ from pydantic import (
 )
 from typing_extensions import Self
 
-from .base import BY_KIND, ConfigPath, Count, Positive, Section, Seed, WorkPath, located, wrong
+from .base import ConfigPath, Count, Positive, Section, Seed, WorkPath, by_kind, located, wrong
 from .choices import L2, Adam, AnyIntegrator, AnyLoss, AnyOptimizer, Integrator, Loss, Optimizer, Reslrb
 
 ColorSpace = Literal["auto", "linear", "srgb"]
@@ -42,14 +42,14 @@ class ImageFile(Section):
     """An image file that holds a texture."""
 
     file: ConfigPath = Field(description="EXR, PNG, JPG or HDR file, relative to the config file.")
-    color_space: ColorSpace = Field("auto", description=_COLOR_SPACE)
+    color_space: ColorSpace = Field(default="auto", description=_COLOR_SPACE)
 
 
 _Numbers = Annotated[list[float], Field(min_length=1)]
 #: A value for a scene parameter: one number, a list such as [r, g, b], or an image file.
 Value = Annotated[
     Annotated[float, Tag("<number>")] | Annotated[_Numbers, Tag("<list>")] | Annotated[ImageFile, Tag("<mapping>")],
-    BY_KIND,
+    by_kind("a number, a list of numbers, or {file: IMAGE}"),
 ]
 #: The same, or "scene": the value that the scene file gives.
 Initial = Annotated[
@@ -57,7 +57,7 @@ Initial = Annotated[
     | Annotated[_Numbers, Tag("<list>")]
     | Annotated[ImageFile, Tag("<mapping>")]
     | Annotated[Literal["scene"], Tag("<text>")],
-    BY_KIND,
+    by_kind("a number, a list of numbers, {file: IMAGE}, or `scene`", "scene"),
 ]
 
 
@@ -71,7 +71,7 @@ class SceneConfig(Section):
     sensors: Annotated[
         Annotated[Annotated[list[Annotated[int, Field(ge=0)]], Field(min_length=1)], Tag("<list>")]
         | Annotated[Literal["all"], Tag("<text>")],
-        BY_KIND,
+        by_kind("a list of sensor indices, or `all`", "all"),
     ] = Field(default_factory=lambda: [0], description="Indices of the scene's sensors that are used, or `all`.")
 
     @field_validator("sensors")
@@ -86,12 +86,15 @@ class Rendering(Section):
     """A target that is rendered from the scene itself, with other parameter values."""
 
     parameters: dict[str, Value] = Field(
-        default_factory=dict, description="True values by `mi.traverse` key: a number, a list of numbers, or an image "
-        "file. Empty: the scene as it stands."
-    )  # fmt: skip
-    spp: Count = Field(1024, description="Samples per pixel of the target.")
-    seed: Seed = Field(0, description="Seed of the target's samples.")
-    integrator: AnyIntegrator | None = Field(None, description="Integrator of the target; null: that of the run.")
+        default_factory=dict,
+        description="True values by `mi.traverse` key: a number, a list of numbers, or an image "
+        "file. Empty: the scene as it stands.",
+    )
+    spp: Count = Field(default=1024, description="Samples per pixel of the target.")
+    seed: Seed = Field(default=0, description="Seed of the target's samples.")
+    integrator: AnyIntegrator | None = Field(
+        default=None, description="Integrator of the target; null: that of the run."
+    )
 
 
 _Files = Annotated[
@@ -106,11 +109,12 @@ class TargetConfig(Section):
     """What the image is compared with: exactly one of `file` and `render`."""
 
     file: _Files | None = Field(
-        None, description="Target image (EXR, PNG, JPG, HDR), or a list with one for each sensor, in their order; "
-        "relative to the config file."
-    )  # fmt: skip
-    color_space: ColorSpace = Field("auto", description=f"{_COLOR_SPACE} Only with `file`.")
-    render: Rendering | None = Field(None, description="Render the target from the scene.")
+        default=None,
+        description="Target image (EXR, PNG, JPG, HDR), or a list with one for each sensor, in their order; "
+        "relative to the config file.",
+    )
+    color_space: ColorSpace = Field(default="auto", description=f"{_COLOR_SPACE} Only with `file`.")
+    render: Rendering | None = Field(default=None, description="Render the target from the scene.")
 
     @model_validator(mode="after")
     def _check_one(self) -> Self:
@@ -136,21 +140,26 @@ class ParameterSpec(Section):
     """One scene parameter, or all that a glob matches, to be recovered."""
 
     key: str = Field(
-        min_length=1, description="Key as `mi.traverse` names it (`reslrb inspect` lists them), or a glob such as "
-        "`*.reflectance.data`."
-    )  # fmt: skip
+        min_length=1,
+        description="Key as `mi.traverse` names it (`reslrb inspect` lists them), or a glob such as "
+        "`*.reflectance.data`.",
+    )
     initial: Initial = Field(
-        "scene", description="Value to start from: a number (all entries), a list of numbers (one per channel), an "
-        "image file, or `scene` (the scene's own value)."
-    )  # fmt: skip
+        default="scene",
+        description="Value to start from: a number (all entries), a list of numbers (one per channel), an "
+        "image file, or `scene` (the scene's own value).",
+    )
     bounds: Annotated[tuple[_Bound, _Bound], Field(strict=False)] | None = Field(
-        None, description="[low, high], in the parameter's units; values are clamped to them after each step. "
-        "`-.inf` and `.inf` leave a side open."
-    )  # fmt: skip
-    learning_rate: Positive | None = Field(None, description="Step size of this parameter; null: the optimizer's.")
+        default=None,
+        description="[low, high], in the parameter's units; values are clamped to them after each step. "
+        "`-.inf` and `.inf` leave a side open.",
+    )
+    learning_rate: Positive | None = Field(
+        default=None, description="Step size of this parameter; null: the optimizer's."
+    )
     resolution: Annotated[tuple[Count, Count], Field(strict=False)] | None = Field(
-        None, description="[width, height] in texels to which a texture is resampled before the start."
-    )  # fmt: skip
+        default=None, description="[width, height] in texels to which a texture is resampled before the start."
+    )
 
     @field_validator("bounds")
     @classmethod
@@ -172,21 +181,26 @@ class ParameterSpec(Section):
 class RunConfig(Section):
     """How long, with how many samples, and where to."""
 
-    name: str = Field("run", min_length=1, description="Name of the run and of its folder; default: the file's stem.")
+    name: str = Field(
+        default="run", min_length=1, description="Name of the run and of its folder; default: the file's stem."
+    )
     output: WorkPath = Field(
-        Path("runs"), validate_default=True, description="Folder of the run folders, relative to the working directory."
+        default=Path("runs"),
+        validate_default=True,
+        description="Folder of the run folders, relative to the working directory.",
     )
-    iterations: Count = Field(200, description="Optimisation steps.")
-    spp: Count = Field(16, description="Samples per pixel and step.")
-    seed: Seed = Field(0, description="Seed of the run; every other seed is made from it.")
+    iterations: Count = Field(default=200, description="Optimisation steps.")
+    spp: Count = Field(default=16, description="Samples per pixel and step.")
+    seed: Seed = Field(default=0, description="Seed of the run; every other seed is made from it.")
     adjoint: Literal["correlated", "independent"] = Field(
-        "correlated", description="Samples that the adjoint image comes from: those of the gradient (`correlated`: "
-        "cheapest, biased by noise under a nonlinear loss) or a second set (`independent`: unbiased for l2)."
-    )  # fmt: skip
-    images_every: Annotated[int, Field(ge=0)] = Field(
-        0, description="Iterations between two saved images; 0: only the initial and the final one."
+        default="correlated",
+        description="Samples that the adjoint image comes from: those of the gradient (`correlated`: "
+        "cheapest, biased by noise under a nonlinear loss) or a second set (`independent`: unbiased for l2).",
     )
-    reach_spp: Count = Field(64, description="Samples for the mask of the texels that light and sensor reach.")
+    images_every: Annotated[int, Field(ge=0)] = Field(
+        default=0, description="Iterations between two saved images; 0: only the initial and the final one."
+    )
+    reach_spp: Count = Field(default=64, description="Samples for the mask of the texels that light and sensor reach.")
 
     @field_validator("name")
     @classmethod
@@ -209,7 +223,8 @@ class Config(Section):
     """One experiment, checked; its paths are absolute."""
 
     variant: Literal["auto", "llvm_ad_rgb", "cuda_ad_rgb", "llvm_ad_mono", "cuda_ad_mono"] = Field(
-        "auto", description="Mitsuba variant; `auto`: cuda_ad_rgb where Mitsuba can trace rays on it, else llvm_ad_rgb."
+        default="auto",
+        description="Mitsuba variant; `auto`: cuda_ad_rgb where Mitsuba can trace rays on it, else llvm_ad_rgb.",
     )
     scene: SceneConfig = Field(description="The scene and its sensors.")
     target: TargetConfig = Field(description="What the image is compared with.")

@@ -1,0 +1,198 @@
+"""From pydantic's list of errors to one located line that says what would be right."""
+
+from __future__ import annotations
+
+import difflib
+import math
+import re
+from dataclasses import dataclass
+from typing import Any, get_args
+
+from pydantic import ValidationError
+from pydantic_core import ErrorDetails
+
+from .base import Section
+from .schema import Config
+from .text import Location, format_location
+
+_EXPECTED = {
+    "int_type": "an integer",
+    "int_from_float": "an integer",
+    "float_type": "a number",
+    "string_type": "text",
+    "bool_type": "true or false",
+    "list_type": "a list",
+    "tuple_type": "a list",
+    "model_type": "a mapping (key: value)",
+    "dict_type": "a mapping (key: value)",
+    "finite_number": "a finite number",
+    "greater_than": "above {gt}",
+    "greater_than_equal": "at least {ge}",
+    "less_than": "below {lt}",
+    "less_than_equal": "at most {le}",
+    "string_too_short": "nonempty text",
+    "literal_error": "{expected}",
+    "invalid_key": "given under a key that is text",
+}
+
+
+@dataclass(frozen=True)
+class Problem:
+    """One error: where it is, in the notation of `--set`, and what would be right."""
+
+    key: str
+    message: str
+    unknown_key: bool = False
+
+
+def problems(error: ValidationError, data: Any) -> list[Problem]:
+    """The problems that `error` reports of `data`, each once; unknown keys first, as they explain missing ones."""
+    found = dict.fromkeys(_problem(detail, data) for detail in error.errors(include_url=False))
+    return sorted(found, key=lambda problem: not problem.unknown_key)
+
+
+def _problem(detail: ErrorDetails, data: Any) -> Problem:
+    kind, value, context = detail["type"], detail["input"], detail.get("ctx", {})
+    location = _location(detail["loc"], data)
+    if kind == "extra_forbidden":
+        return Problem(format_location(location), _unknown_key(location, detail["loc"]), unknown_key=True)
+    if kind == "located":
+        return Problem(_join(format_location(location), context["key"]), context["message"])
+    if kind.startswith("union_tag"):
+        return _wrong_type(location, value, context)
+    if kind == "missing" and isinstance(location[-1], str):
+        return Problem(format_location(location), "missing; it has no default")
+    if kind in ("missing", "too_short", "too_long"):  # `missing`: an entry of a pair
+        return Problem(*_wrong_length(location, kind, context))
+    key = format_location(location)
+    if kind == "wrong":
+        return Problem(key, _but_is(context.get("message") or detail["msg"], value))
+    if kind == "literal_error":
+        return Problem(key, _but_is("must be " + _one_of(re.findall(r"'([^']*)'", context["expected"]), value), value))
+    if kind in _EXPECTED:
+        return Problem(key, _but_is("must be " + _EXPECTED[kind].format(**context), value))
+    return Problem(key, detail["msg"])
+
+
+# --- where ------------------------------------------------------------------------------------------------------------
+
+
+def _location(loc: tuple[int | str, ...], data: Any) -> Location:
+    """pydantic's location without what is not in the file: tags of unions, the index into a list that we made."""
+    location: list[str | int] = []
+    for part in loc:
+        if _is_tag(part) or part == "[key]" or (isinstance(part, int) and isinstance(data, str)):
+            continue
+        location.append(part)
+        try:
+            data = data[part]
+        except (LookupError, TypeError):
+            data = None
+    return tuple(location)
+
+
+def _is_tag(part: int | str) -> bool:
+    return isinstance(part, str) and re.fullmatch(r"<.*>", part) is not None
+
+
+def _join(key: str, below: str) -> str:
+    return f"{key}.{below}" if key and below else key or below
+
+
+# --- unknown keys -----------------------------------------------------------------------------------------------------
+
+
+def _sections(annotation: Any) -> list[type[Section]]:
+    """The section classes that an annotation names, at any depth."""
+    if isinstance(annotation, type) and issubclass(annotation, Section):
+        return [annotation]
+    return [section for argument in get_args(annotation) for section in _sections(argument)]
+
+
+def _candidates(loc: tuple[int | str, ...]) -> tuple[list[type[Section]], type[Section]]:
+    """All sections that could stand at `loc`, and the one that was chosen there."""
+    union: list[type[Section]] = [Config]
+    chosen: type[Section] = Config
+    for part in loc:
+        if _is_tag(part):
+            chosen = next((s for s in union if _type_name(s) == str(part)[1:-1]), chosen)
+        elif part in chosen.model_fields:
+            union = _sections(chosen.model_fields[str(part)].annotation)
+            chosen = union[0] if union else chosen
+    return union, chosen
+
+
+def _type_name(section: type[Section]) -> str | None:
+    return section.model_fields["type"].default if "type" in section.model_fields else None
+
+
+def _unknown_key(location: Location, loc: tuple[int | str, ...]) -> str:
+    key = str(location[-1])
+    union, chosen = _candidates(loc[:-1])
+    owners = [str(_type_name(section)) for section in union if key in section.model_fields]
+    if owners:
+        return f"not an option of {_type_name(chosen)} but of {', '.join(owners)}; remove it, or change the type"
+    near = difflib.get_close_matches(key, chosen.model_fields, n=1)
+    meant = near or _below(chosen, format_location(location[:-1]), key) or _below(Config, "", key)
+    if meant:
+        return f"unknown key; did you mean `{meant[0]}`?"
+    return f"unknown key; known here: {', '.join(chosen.model_fields)}"
+
+
+def _below(section: type[Section], name: str, key: str) -> list[str]:
+    """Where `key` is known one level below `section`, which stands at `name`."""
+    return [
+        _join(name, f"{child}.{key}")
+        for child, field in section.model_fields.items()
+        if any(key in candidate.model_fields for candidate in _sections(field.annotation))
+    ]
+
+
+# --- values -----------------------------------------------------------------------------------------------------------
+
+
+def _wrong_type(location: Location, value: Any, context: dict[str, Any]) -> Problem:
+    if not isinstance(value, dict):
+        return Problem(format_location(location), _but_is("must be a mapping such as {type: NAME}", value))
+    given = value.get("type")
+    known = re.findall(r"<(\w+)>", context.get("expected_tags", ""))
+    return Problem(format_location((*location, "type")), _but_is("must be " + _one_of(known, given), given))
+
+
+def _wrong_length(location: Location, kind: str, context: dict[str, Any]) -> tuple[str, str]:
+    if kind == "missing":
+        return format_location(location[:-1]), "must be a list of two: it has too few entries"
+    if kind == "too_long":
+        return format_location(location), f"must be a list of {_words(context['max_length'])}: it has too many entries"
+    return format_location(location), "must have at least one entry"
+
+
+def _words(number: int) -> str:
+    return {1: "one", 2: "two"}.get(number, str(number))
+
+
+def _one_of(known: list[str], value: Any) -> str:
+    near = difflib.get_close_matches(value, known, n=1) if isinstance(value, str) else []
+    choices = " or ".join(known) if len(known) < 3 else "one of " + ", ".join(known)
+    return choices + (f" (did you mean {near[0]}?)" if near else "")
+
+
+def _but_is(message: str, value: Any) -> str:
+    """`message` and, where it fits into a line, what stands there instead."""
+    if isinstance(value, bool):
+        shown = str(value).lower()
+    elif value is None:
+        shown = "null (empty)"
+    elif isinstance(value, float) and not math.isfinite(value):
+        shown = ".nan" if math.isnan(value) else ".inf"
+    elif isinstance(value, (int, float)):
+        shown = repr(value) if abs(value) < 1e300 else "a number that large"
+    elif isinstance(value, str):
+        shown = f"the text {value[:60]!r}" + ("..." if len(value) > 60 else "")
+    elif isinstance(value, list):
+        shown = "a list"
+    elif isinstance(value, dict):
+        shown = "a mapping"
+    else:
+        shown = f"a {type(value).__name__}"
+    return message if " not " in message else f"{message}, not {shown}"

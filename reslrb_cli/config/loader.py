@@ -1,0 +1,87 @@
+"""Reads a configuration from its file and from `--set`, and writes it as resolved."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from pydantic import ValidationError
+
+from ..errors import ConfigError
+from .errors import Problem, problems
+from .overrides import apply, parse_override
+from .schema import Config
+from .text import parse, write
+
+
+def load(path: Path | str, overrides: Sequence[str] = ()) -> Config:
+    """The configuration in the YAML file `path`, with `overrides` such as "run.spp=32" put in, in their order.
+
+    Raises ConfigError, located by the file (or the override that is at fault) and the key.
+    """
+    source = str(path)
+    parsed = [parse_override(text) for text in overrides]
+    data = parse(_read(Path(path), source), source)
+    if data is None and not parsed:
+        raise ConfigError(source, "", "is empty; it needs at least scene, target and parameters")
+    if not isinstance(data, dict) and data is not None:
+        raise ConfigError(source, "", "must hold sections (scene: ...) at its top level, not a list or a single value")
+    stages: list[dict[str, Any]] = [data or {}]
+    for override in parsed:
+        stages.append(apply(stages[-1], override))
+
+    config, found = _validate(stages[-1], Path(path))
+    if config is not None:
+        return config
+    # The last override without which the first problem is not there is to blame; without any, the file is.
+    blame = source
+    for stage, override in reversed(list(zip(stages, parsed, strict=False))):
+        if found[0] not in _validate(stage, Path(path))[1]:
+            blame = override.label
+            break
+    more = f" (and {len(found) - 1} more)" if len(found) > 1 else ""
+    raise ConfigError(blame, found[0].key, found[0].message + more)
+
+
+def dump(config: Config) -> str:
+    """The configuration as YAML, with every default and absolute paths; `load` reads it back as an equal one."""
+    return write(_plain(config.model_dump(exclude_none=True)))
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _plain(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(item) for item in value]
+    return str(value) if isinstance(value, Path) else value
+
+
+def _read(path: Path, source: str) -> str:
+    try:
+        return path.read_bytes().decode("utf-8-sig")
+    except UnicodeDecodeError:
+        raise ConfigError(source, "", "is not UTF-8 text; a configuration is a YAML file") from None
+    except FileNotFoundError:
+        raise ConfigError(source, "", "no such file") from None
+    except IsADirectoryError:
+        raise ConfigError(source, "", "is a folder; name the YAML file in it") from None
+    except (OSError, ValueError) as error:  # ValueError: a null character in the path
+        raise ConfigError(source, "", f"cannot be read: {getattr(error, 'strerror', None) or error}") from None
+
+
+def _validate(raw: dict[str, Any], path: Path) -> tuple[Config | None, list[Problem]]:
+    """The configuration, or the problems that `raw` has."""
+    # a section whose lines are all commented out reads as null
+    data = {key: value for key, value in raw.items() if value is not None or key not in Config.model_fields}
+    run = data.setdefault("run", {})
+    if isinstance(run, dict) and run.get("name") is None:
+        data["run"] = {**run, "name": path.stem}
+    try:
+        config = Config.model_validate(
+            data, context={"folder": path.absolute().parent, "working_directory": Path.cwd()}
+        )
+    except ValidationError as error:
+        return None, problems(error, data)
+    config._source = path
+    return config, []
