@@ -1,0 +1,1 @@
+"""The choice of libLLVM and of the Mitsuba variant, both made before anything is traced."""

@@ -1,0 +1,96 @@
+"""Gathers what `reslrb doctor` says: versions, libraries, device, and a trial of each backend."""
+
+from __future__ import annotations
+
+import os
+import platform
+import re
+import shutil
+import subprocess
+import sys
+from dataclasses import dataclass
+from importlib import metadata
+from pathlib import Path
+
+from reslrb_cli.backend import llvm
+from reslrb_cli.backend.probe import Probe, probe
+from reslrb_cli.backend.variant import missing_cuda, package_version
+from reslrb_cli.errors import BackendError
+
+_WITHOUT_METADATA = ["mitsuba", "drjit", "numpy"]
+
+
+@dataclass(frozen=True)
+class Backend:
+    """One backend: `missing` says in one line what it lacks (empty: nothing), `trial` what a kernel and a ray took."""
+
+    variant: str
+    missing: str
+    device: str
+    library: str
+    trial: Probe
+
+
+@dataclass(frozen=True)
+class Report:
+    """All of it; `variant` is what `auto` stands for here, None where no backend works."""
+
+    variant: str | None
+    python: str
+    platform: str
+    packages: dict[str, str | None]
+    backends: tuple[Backend, ...]
+
+
+def examine() -> Report:
+    """Looks at this machine; takes a few seconds, and never raises for what is missing."""
+    backends = (_cuda(), _llvm())
+    return Report(
+        variant=next((backend.variant for backend in backends if not backend.missing), None),
+        python=f"{platform.python_version()} ({sys.executable})",
+        platform=platform.platform(),
+        packages={name: package_version(name) for name in ["reslrb", *_required()]},
+        backends=backends,
+    )
+
+
+def _required() -> list[str]:
+    """Names of the packages that this one needs, its optional ones left out."""
+    try:
+        needs = metadata.requires("reslrb") or []
+    except metadata.PackageNotFoundError:
+        return _WITHOUT_METADATA
+    names = (re.match(r"[\w.-]+", need) for need in needs if "extra ==" not in need)
+    return [name[0] for name in names if name]
+
+
+def _cuda() -> Backend:
+    missing = missing_cuda()
+    trial = Probe(missing) if missing else probe("cuda_ad_rgb")
+    return Backend("cuda_ad_rgb", missing, "" if missing else _gpu_name(), "", trial)
+
+
+def _llvm() -> Backend:
+    device = f"{_cpu_name()}, {os.cpu_count()} threads"
+    try:
+        library = llvm.require()
+    except BackendError as error:
+        return Backend("llvm_ad_rgb", str(error), device, "", Probe(str(error)))
+    trial = probe("llvm_ad_rgb")
+    return Backend("llvm_ad_rgb", trial.failure, device, f"libLLVM {library.version}, {library.path}", trial)
+
+
+def _gpu_name() -> str:
+    command = shutil.which("nvidia-smi")
+    if command is None:
+        return "NVIDIA GPU"
+    query = [command, "--query-gpu=name,driver_version", "--format=csv,noheader"]
+    return subprocess.run(query, capture_output=True, text=True, check=False).stdout.strip().replace("\n", "; ")
+
+
+def _cpu_name() -> str:
+    try:
+        found = re.search(r"^model name\s*:\s*(.+)$", Path("/proc/cpuinfo").read_text(), re.MULTILINE)
+    except OSError:
+        found = None
+    return found[1] if found else platform.machine()

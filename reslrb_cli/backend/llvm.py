@@ -1,0 +1,195 @@
+"""Finds the libLLVM that Dr.Jit shall load: the newest on this machine that works.
+
+Dr.Jit looks into Debian's folders alone and takes what it finds there, also a version under which it ends the process
+("Cannot select fminimum", LLVM 15 and 16 on AVX-512 machines). So the choice is made here, before Dr.Jit is imported,
+and handed over in DRJIT_LIBLLVM_PATH.
+"""
+
+from __future__ import annotations
+
+import functools
+import os
+import platform
+import re
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+from reslrb_cli.backend import shared_library
+from reslrb_cli.errors import BackendError
+
+VARIABLE = "DRJIT_LIBLLVM_PATH"
+MIN_VERSION = 19
+# scripts/setup unpacks Debian's package here where the system has none
+UNPACKED = Path(__file__).resolve().parents[2] / ".cache" / "llvm"
+_NAME = re.compile(r"libLLVM(?:-(\d+)(?:\.\d+)*)?(?:\.so(?:\.(\d+)(?:\.\d+)*)?|(?:\.(\d+)(?:\.\d+)*)?\.dylib)")
+
+
+@dataclass(frozen=True)
+class Library:
+    """A libLLVM that was loaded once: its file, and its version (`19.1.7`)."""
+
+    path: Path
+    version: str
+
+
+@dataclass(frozen=True)
+class Rejected:
+    """A libLLVM that was found and is not used, and why."""
+
+    path: Path
+    reason: str
+
+
+@dataclass(frozen=True)
+class Choice:
+    """What a search came to: the library to use (None: there is none), and those that it passed over."""
+
+    library: Library | None
+    rejected: tuple[Rejected, ...]
+
+
+def prepare() -> None:
+    """Chooses libLLVM unless the user did, or Dr.Jit is loaded already. Never raises: `require` tells of what failed,
+    to those who need LLVM."""
+    if not os.environ.get(VARIABLE):
+        library = None if "drjit" in sys.modules else choose().library
+        if library is None:
+            return
+        os.environ[VARIABLE] = str(library.path)
+    chosen = Path(os.environ[VARIABLE])
+    if chosen.parent == UNPACKED:
+        with suppress(OSError):
+            shared_library.load(chosen)
+
+
+def require() -> Library:
+    """The libLLVM that Dr.Jit loads. Raises BackendError where it is missing, broken, or would end the process."""
+    named = os.environ.get(VARIABLE)
+    if named:
+        examined = _examine(Path(named))
+        if isinstance(examined, Rejected):
+            raise BackendError(f"{VARIABLE}={named}: {examined.reason}; {_what_to_install()}, or unset {VARIABLE}")
+        return examined
+    choice = choose()
+    if choice.library is None:
+        found = "; ".join(f"{r.path}: {r.reason}" for r in choice.rejected) or "none found"
+        raise BackendError(
+            f"no usable libLLVM ({MIN_VERSION} or newer) on this machine ({found}); {_what_to_install()}"
+        )
+    return choice.library
+
+
+@functools.cache
+def choose() -> Choice:
+    """Searches the machine for the newest libLLVM that loads, among those of MIN_VERSION and above."""
+    rejected: list[Rejected] = []
+    newest_first = sorted(candidates(), key=lambda path: -(version_from_name(path) or MIN_VERSION))
+    best: Library | None = None
+    for path in newest_first:
+        named = version_from_name(path)
+        if best is not None and named is not None and named <= _major(best.version):
+            break
+        examined = _examine(path)
+        if isinstance(examined, Rejected):
+            rejected.append(examined)
+        elif best is None or _major(examined.version) > _major(best.version):
+            best = examined
+    return Choice(best, tuple(rejected))
+
+
+def candidates() -> list[Path]:
+    """Every libLLVM in the known folders and in the dynamic loader's cache, each file once, nearest folder first."""
+    found = [path for folder in _folders() for path in sorted(folder.glob("libLLVM*")) if _NAME.fullmatch(path.name)]
+    unique: dict[Path, Path] = {}
+    for path in [*found, *_loader_cache()]:
+        with suppress(OSError, RuntimeError):  # a link that leads nowhere or round in a circle
+            unique.setdefault(path.resolve(strict=True), path)
+    return list(unique)
+
+
+def version_from_name(path: Path) -> int | None:
+    """Major version that the name of the file tells (`libLLVM-15.so.1`, `libLLVM.so.19.1`); None if it tells none."""
+    found = _NAME.fullmatch(path.name)
+    return next((int(part) for part in found.groups() if part), None) if found else None
+
+
+@functools.cache
+def _examine(path: Path) -> Library | Rejected:
+    """Loads `path` in a process of its own, unless its name already rules it out."""
+    named = version_from_name(path.resolve())
+    if named is not None and named < MIN_VERSION:
+        return Rejected(path, _too_old(str(named)))
+    if not path.is_file():
+        return Rejected(path, "no such file")
+    try:
+        command = [sys.executable, "-I", "-S", shared_library.__file__, str(path)]
+        probe = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    except (OSError, subprocess.TimeoutExpired) as error:
+        return Rejected(path, f"could not be tried ({error})")
+    if probe.returncode != 0:
+        message = " ".join(probe.stderr.split()) or f"loading it ended a process with code {probe.returncode}"
+        missing = shared_library.missing_library(message)
+        return Rejected(path, f"it needs {missing}, which is missing" if missing else message)
+    version = probe.stdout.strip()
+    if version == "unknown":
+        return Rejected(path, _too_old("before 16" if named is None else str(named)))
+    return Rejected(path, _too_old(version)) if _major(version) < MIN_VERSION else Library(path, version)
+
+
+def _too_old(version: str) -> str:
+    return f"version {version} is too old and would end the process"
+
+
+def _major(version: str) -> int:
+    return int(version.split(".")[0])
+
+
+def _folders() -> Iterator[Path]:
+    """Folders that may hold a libLLVM and exist, the environment's own first."""
+    yield UNPACKED
+    roots = [sys.prefix, os.environ.get("CONDA_PREFIX"), sys.base_prefix]
+    yield from (Path(root) / "lib" for root in dict.fromkeys(roots) if root)
+    patterns = [
+        f"usr/lib/{platform.machine()}-linux-gnu*",
+        "usr/lib64",
+        "usr/lib64/llvm*/lib*",
+        "usr/lib/llvm-*/lib*",
+        "usr/lib/llvm*/lib*",
+        "usr/lib",
+        "usr/local/lib",
+        "usr/local/lib64",
+        "opt/homebrew/opt/llvm*/lib",
+        "usr/local/opt/llvm*/lib",
+        "home/linuxbrew/.linuxbrew/opt/llvm*/lib",
+    ]
+    for pattern in patterns:
+        yield from sorted(Path("/").glob(pattern))
+
+
+def _loader_cache() -> list[Path]:
+    """The libLLVMs that ldconfig knows; its folder is not on an ordinary user's PATH."""
+    ldconfig = shutil.which("ldconfig", path=f"{os.environ.get('PATH', '')}:/usr/sbin:/sbin")
+    if ldconfig is None or sys.platform != "linux":
+        return []
+    try:
+        printed = subprocess.run([ldconfig, "-p"], capture_output=True, text=True, timeout=20, check=False).stdout
+    except (OSError, subprocess.TimeoutExpired):
+        return []
+    paths = [Path(line.rpartition("=> ")[2]) for line in printed.splitlines() if "libLLVM" in line and "=> " in line]
+    return [path for path in paths if _NAME.fullmatch(path.name)]
+
+
+def _what_to_install() -> str:
+    """The command that mends it on this machine."""
+    if os.environ.get("CONDA_PREFIX"):
+        return f"install it with `conda install -c conda-forge 'llvmdev>={MIN_VERSION}'`"
+    if sys.platform == "darwin":
+        return "install it with `brew install llvm`"
+    if shutil.which("apt-get"):
+        return f"install it with `apt-get install libllvm{MIN_VERSION}` (or run scripts/setup, which needs no root)"
+    return f"install the shared library of LLVM {MIN_VERSION} or newer"

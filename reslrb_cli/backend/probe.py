@@ -1,0 +1,74 @@
+"""Tries a variant in a process of its own: one kernel compiled and run, one ray traced, both timed.
+
+A driver or a libLLVM that does not work may end the process instead of raising; only a parent can tell.
+"""
+
+from __future__ import annotations
+
+import functools
+import json
+import subprocess
+import sys
+from dataclasses import dataclass
+
+# A constant that no kernel cache has seen makes the compiler run; `minimum` is what libLLVM 15 and 16 stumble over.
+_SCRIPT = """
+import json, sys, time
+import reslrb_cli
+import drjit as dr
+import mitsuba as mi
+
+mi.set_variant(sys.argv[1])
+salt = (time.time_ns() & 0xFFFFFF) * 1e-6
+
+def timed(work):
+    start = time.perf_counter()
+    value = work()
+    dr.eval(value)
+    dr.sync_thread()
+    return 1e3 * (time.perf_counter() - start), value
+
+def kernel():
+    x = dr.arange(mi.Float, 1 << 20)
+    return dr.minimum(dr.sin(x) + salt, 0.5)
+
+compile_ms, value = timed(kernel)
+run_ms, value = timed(kernel)
+assert abs(value[0] - min(salt, 0.5)) < 1e-4, f"wrong result {value[0]}"
+
+scene = mi.load_dict({"type": "scene", "shape": {"type": "sphere"}})
+ray = mi.Ray3f(mi.Point3f(0, 0, -3), mi.Vector3f(0, 0, 1))
+ray_ms, t = timed(lambda: scene.ray_intersect(ray).t)
+assert abs(t[0] - 2) < 1e-4, f"a ray met the unit sphere at {t[0]} instead of 2"
+print(json.dumps({"compile_ms": compile_ms, "run_ms": run_ms, "ray_ms": ray_ms}))
+"""
+
+
+@dataclass(frozen=True)
+class Probe:
+    """What came of trying a variant: `failure` says in one line what went wrong, and is empty where nothing did.
+
+    compile_ms: a kernel of a million entries, compiled and run; run_ms: the same kernel again; ray_ms: the first ray
+    through a scene, compilation included.
+    """
+
+    failure: str = ""
+    compile_ms: float | None = None
+    run_ms: float | None = None
+    ray_ms: float | None = None
+
+
+@functools.cache
+def probe(variant: str) -> Probe:
+    """Runs the trial for `variant`; never raises."""
+    command = [sys.executable, "-c", _SCRIPT, variant]
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
+    except subprocess.TimeoutExpired:
+        return Probe("gave no result within 300 s")
+    if done.returncode == 0:
+        return Probe(**json.loads(done.stdout.splitlines()[-1]))
+    said = [line.strip() for line in done.stderr.splitlines() if line.strip()]
+    if done.returncode < 0:
+        return Probe(f"ended by signal {-done.returncode}: {said[0] if said else 'no message'}")
+    return Probe(said[-1] if said else f"ended with code {done.returncode}")

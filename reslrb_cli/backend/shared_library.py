@@ -1,0 +1,57 @@
+"""Loads a shared library whose own needs may lie beside it; as a script, prints the LLVM version of one.
+
+Imports nothing of this package, so that it can run by path in a bare interpreter: a library that crashes or aborts when
+it is loaded then takes that interpreter along, not us.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import re
+import sys
+from pathlib import Path
+
+# glibc: "libz3.so.4: cannot open shared object file: ...", macOS: "Library not loaded: @rpath/libz3.dylib"
+_MISSING = re.compile(r"^(?P<so>[^\s/:]+\.so[^\s:]*): cannot open shared object|Library not loaded: (?P<dylib>\S+)")
+
+
+def missing_library(message: str) -> str | None:
+    """The file name of the library that `message` of the dynamic loader says it cannot find; None if it says another
+    thing."""
+    found = _MISSING.search(message)
+    return (found["so"] or Path(found["dylib"]).name) if found else None
+
+
+def load(path: Path, depth: int = 0) -> ctypes.CDLL:
+    """Loads `path`, and whatever it needs that the system lacks and the folder of `path` holds. Raises OSError.
+
+    The dynamic loader takes a library that is already in the process for one that it is asked for by name, so loading
+    the needs first is enough, without an rpath and without LD_LIBRARY_PATH.
+    """
+    while True:
+        try:
+            return ctypes.CDLL(str(path))
+        except OSError as error:
+            missing = missing_library(str(error))
+            beside = sorted(path.parent.glob(f"{missing}*")) if missing else []
+            if not beside or depth > 8:
+                raise
+            load(beside[0], depth + 1)
+            depth += 1
+
+
+def llvm_version(library: ctypes.CDLL) -> tuple[int, int, int] | None:
+    """Version of a loaded libLLVM; None before LLVM 16, which cannot say."""
+    if not hasattr(library, "LLVMGetVersion"):
+        return None
+    parts = [ctypes.c_uint() for _ in range(3)]
+    library.LLVMGetVersion(*map(ctypes.byref, parts))
+    return parts[0].value, parts[1].value, parts[2].value
+
+
+if __name__ == "__main__":
+    try:
+        version = llvm_version(load(Path(sys.argv[1])))
+    except OSError as error:
+        sys.exit(str(error))
+    print(".".join(map(str, version)) if version else "unknown")

@@ -1,0 +1,94 @@
+"""Chooses and sets the Mitsuba variant: CUDA where Mitsuba can trace rays on it, LLVM elsewhere."""
+
+from __future__ import annotations
+
+import ctypes
+import logging
+import os
+from importlib import metadata
+
+from reslrb_cli.backend import llvm
+from reslrb_cli.backend.probe import probe
+from reslrb_cli.errors import BackendError
+
+logger = logging.getLogger(__name__)
+
+
+def set_variant(name: str = "auto") -> str:
+    """Sets the variant `name` and returns what was set; `auto` is `cuda_ad_rgb` or else `llvm_ad_rgb`.
+
+    Raises BackendError, before Mitsuba is imported, where the backend that `name` needs is missing.
+    """
+    chosen, why = choose(name)
+    if chosen.startswith("cuda") and name != "auto":
+        require_cuda(chosen)
+    library = llvm.require() if chosen.startswith("llvm") else None
+    try:
+        import drjit as dr
+        import mitsuba as mi
+    except ImportError as error:
+        raise BackendError(f"Mitsuba cannot be loaded ({error}); install it with `pip install mitsuba`") from error
+    if chosen not in mi.variants():
+        raise BackendError(f"this Mitsuba has no variant {chosen}; it has {', '.join(mi.variants())}")
+    if library is not None:
+        _check_loaded_llvm(dr)
+    try:
+        mi.set_variant(chosen)
+    except ImportError as error:
+        raise BackendError(f"variant {chosen} does not start: {error}") from error
+    logger.info("variant %s%s%s", chosen, f" (libLLVM {library.version})" if library else "", why)
+    return chosen
+
+
+def choose(name: str = "auto") -> tuple[str, str]:
+    """The variant that `name` stands for, and what a log line has to add to it."""
+    if name != "auto":
+        return name, ""
+    missing = missing_cuda("cuda_ad_rgb")
+    return ("llvm_ad_rgb", f"; no CUDA: {missing}") if missing else ("cuda_ad_rgb", "")
+
+
+def require_cuda(variant: str = "cuda_ad_rgb") -> None:
+    """Raises BackendError where Mitsuba cannot trace rays with `variant`."""
+    missing = missing_cuda(variant)
+    if missing:
+        raise BackendError(
+            f"variant {variant}: {missing}; install NVIDIA's driver (535 or newer, with OptiX), "
+            "or take `variant: llvm_ad_rgb`"
+        )
+
+
+def missing_cuda(variant: str = "cuda_ad_rgb") -> str:
+    """Why Mitsuba cannot trace rays with the CUDA variant; empty where it can.
+
+    A machine without NVIDIA's driver is told at once. With one, a ray is traced in a process of its own, since a GPU
+    in a container often has CUDA but no OptiX.
+    """
+    try:
+        ctypes.CDLL(os.environ.get("DRJIT_LIBCUDA_PATH") or "libcuda.so.1")
+    except OSError:
+        return "no NVIDIA driver (libcuda.so.1) found"
+    return probe(variant).failure
+
+
+def package_version(name: str) -> str | None:
+    """Version of an installed package; None where it is not installed."""
+    try:
+        return metadata.version(name)
+    except metadata.PackageNotFoundError:
+        return None
+
+
+def _check_loaded_llvm(dr: object) -> None:
+    """Refuses a libLLVM that a Dr.Jit imported before this package chose for itself."""
+    if not dr.has_backend(dr.JitBackend.LLVM):  # type: ignore[attr-defined]
+        raise BackendError(
+            f"Dr.Jit was imported before reslrb_cli and found no usable libLLVM; import reslrb_cli first, or set "
+            f"{llvm.VARIABLE}"
+        )
+    major = dr.detail.llvm_version()[0]  # type: ignore[attr-defined]
+    if major < llvm.MIN_VERSION:
+        raise BackendError(
+            f"Dr.Jit was imported before reslrb_cli and took libLLVM {major}, which would end the process; import "
+            f"reslrb_cli first, or set {llvm.VARIABLE}"
+        )

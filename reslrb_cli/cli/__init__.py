@@ -1,0 +1,126 @@
+"""The command line: `main` finds the commands, and is the one place where an error becomes an exit code.
+
+Each command is one module here that holds a click command named `command`; it is loaded when it is called.
+"""
+
+from __future__ import annotations
+
+import importlib
+import logging
+import os
+import sys
+import traceback
+from collections.abc import Sequence
+from pkgutil import iter_modules
+from typing import Any
+
+import click
+
+from reslrb_cli import __version__
+from reslrb_cli.errors import ExitCode, ReslrbError
+
+# What `reslrb --help` says of each command, so that it need not load them; in the order of a user's work.
+_SUMMARIES = {
+    "optimize": "Recover scene parameters from target images.",
+    "render": "Render the scene of a configuration.",
+    "inspect": "List a scene's parameters and what it contains.",
+    "bench": "Measure time and memory of gradient steps.",
+    "gradcheck": "Compare gradients with references.",
+    "convergence": "Measure error against run time.",
+    "report": "Write the HTML page of finished runs.",
+    "doctor": "Say which backend is in use, and what is missing.",
+}
+
+
+class _Main(click.Group):
+    """Loads commands by name, and maps every error that a user can cause to one line and an exit code."""
+
+    debug = False
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        present = {module.name for module in iter_modules(__path__)}
+        return [name for name in _SUMMARIES if name in present]
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        if cmd_name not in self.list_commands(ctx):
+            return None
+        command: click.Command = importlib.import_module(f"{__name__}.{cmd_name}").command
+        return command
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        with formatter.section("Commands"):
+            formatter.write_dl([(name, _SUMMARIES[name]) for name in self.list_commands(ctx)])
+
+    def main(
+        self,
+        args: Sequence[str] | None = None,
+        prog_name: str | None = None,
+        complete_var: str | None = None,
+        standalone_mode: bool = True,
+        **extra: Any,
+    ) -> Any:
+        """Runs the command line `args` and exits with its code; `standalone_mode=False` hands errors through."""
+        if not standalone_mode:
+            return super().main(args, prog_name, complete_var, standalone_mode=False, **extra)
+        self.debug = os.environ.get("RESLRB_DEBUG", "0") not in ("", "0")
+        try:
+            code = super().main(args, prog_name, complete_var, standalone_mode=False, **extra)
+        except BaseException as error:
+            told = _tell(error)
+            if told is None:
+                raise
+            if self.debug:
+                traceback.print_exc()
+            line, code = told
+            click.echo(line, err=True)
+        sys.exit(code if isinstance(code, int) else ExitCode.DONE)
+
+
+def _tell(error: BaseException) -> tuple[str, int] | None:
+    """The line and the exit code for `error`; None for a fault of ours, whose traceback is wanted."""
+    if isinstance(error, ReslrbError):
+        return str(error), error.exit_code
+    if isinstance(error, click.Abort | KeyboardInterrupt):
+        return "interrupted", ExitCode.INTERRUPTED
+    if isinstance(error, click.ClickException):
+        context = getattr(error, "ctx", None)
+        where = context.command_path if context else "reslrb"
+        return f"{where}: {' '.join(error.format_message().split())} See `{where} --help`.", ExitCode.USAGE
+    if isinstance(error, MemoryError) or _is_out_of_memory(error):
+        advice = "lower run.spp or the size of the film, or set integrator.samples_per_pass"
+        return f"out of memory ({_one_line(error) or 'host'}); {advice}", ExitCode.OUT_OF_MEMORY
+    if isinstance(error, OSError) and error.filename is not None:
+        return f"{error.filename}: {error.strerror}", ExitCode.USAGE
+    return None
+
+
+def _is_out_of_memory(error: BaseException) -> bool:
+    """Whether a backend's exception, known by its text alone, says that an allocation failed."""
+    text = str(error).lower().replace("_", " ")
+    return isinstance(error, RuntimeError) and ("out of memory" in text or "bad alloc" in text)
+
+
+def _one_line(error: BaseException) -> str:
+    return " ".join(str(error).split())[:200]
+
+
+def _set_debug(ctx: click.Context, _parameter: click.Parameter, value: bool) -> None:
+    if value and isinstance(ctx.command, _Main):
+        ctx.command.debug = True
+
+
+@click.command(
+    cls=_Main, name="reslrb", no_args_is_help=False, context_settings={"help_option_names": ["-h", "--help"]}
+)
+@click.version_option(__version__, prog_name="reslrb")
+@click.option(
+    "--debug", is_flag=True, expose_value=False, callback=_set_debug, help="Show the traceback of an error as well."
+)
+def main() -> None:
+    """Recover scene parameters from images of what light paths carry, with Mitsuba 3."""
+    logger = logging.getLogger("reslrb_cli")
+    if not logger.handlers:
+        handler = logging.StreamHandler()
+        handler.setFormatter(logging.Formatter("%(message)s"))
+        logger.addHandler(handler)
+        logger.setLevel(logging.INFO)

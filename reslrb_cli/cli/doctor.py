@@ -1,0 +1,54 @@
+"""`reslrb doctor`: what this machine has, what works on it, and what to install where something is missing."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+
+import click
+
+from reslrb_cli.backend.doctor import Backend, Report, examine
+from reslrb_cli.errors import BackendError
+
+
+@click.command("doctor")
+@click.option("--json", "as_json", is_flag=True, help="Print one JSON object instead of lines.")
+def command(as_json: bool) -> None:
+    """Say which variant, device, libLLVM and versions are in use, and try them.
+
+    Each backend compiles and runs one kernel and traces one ray. Exit code 3 if none of them works.
+    """
+    report = examine()
+    if as_json:
+        click.echo(json.dumps(dataclasses.asdict(report), indent=2))
+    else:
+        for name, value in _lines(report):
+            click.echo(f"{name:12} {value}")
+    missing = [name for name, version in report.packages.items() if version is None and name != "reslrb"]
+    if missing:
+        raise BackendError(f"missing packages; install them with `pip install {' '.join(missing)}`")
+    if report.variant is None:
+        raise BackendError("no backend works; one of those above is needed")
+
+
+def _lines(report: Report) -> list[tuple[str, str]]:
+    lines = [("variant", f"auto is {report.variant}" if report.variant else "none works")]
+    lines += [pair for backend in report.backends for pair in _backend_lines(backend)]
+    lines += [("python", report.python), ("platform", report.platform)]
+    lines += [(name, version or "not installed") for name, version in report.packages.items()]
+    return lines
+
+
+def _backend_lines(backend: Backend) -> list[tuple[str, str]]:
+    if backend.missing:
+        return [(backend.variant, f"not usable: {backend.missing}")]
+    trial = backend.trial
+    return [
+        (backend.variant, f"works on {backend.device}"),
+        *([("", backend.library)] if backend.library else []),
+        (
+            "",
+            f"a kernel compiled and ran in {trial.compile_ms:.0f} ms, again in {trial.run_ms:.1f} ms; "
+            f"the first ray took {trial.ray_ms:.0f} ms",
+        ),
+    ]
