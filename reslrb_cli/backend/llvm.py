@@ -24,8 +24,8 @@ from reslrb_cli.errors import BackendError
 
 VARIABLE = "DRJIT_LIBLLVM_PATH"
 MIN_VERSION = 19
-# scripts/setup unpacks Debian's package here where the system has none
-UNPACKED = Path(__file__).resolve().parents[2] / ".cache" / "llvm"
+# scripts/setup unpacks Debian's packages here where the system lacks a library
+UNPACKED = Path(__file__).resolve().parents[2] / ".cache" / "lib"
 _NAME = re.compile(r"libLLVM(?:-(\d+)(?:\.\d+)*)?(?:\.so(?:\.(\d+)(?:\.\d+)*)?|(?:\.(\d+)(?:\.\d+)*)?\.dylib)")
 
 
@@ -54,17 +54,17 @@ class Choice:
 
 
 def prepare() -> None:
-    """Chooses libLLVM unless the user did, or Dr.Jit is loaded already. Never raises: `require` tells of what failed,
-    to those who need LLVM."""
-    if not os.environ.get(VARIABLE):
-        library = None if "drjit" in sys.modules else choose().library
-        if library is None:
-            return
-        os.environ[VARIABLE] = str(library.path)
-    chosen = Path(os.environ[VARIABLE])
-    if chosen.parent == UNPACKED:
+    """Chooses libLLVM, unless the user did or Dr.Jit is loaded already, and loads what Dr.Jit needs and the system
+    lacks. Never raises: `require` tells of what failed, to those who need LLVM."""
+    if not os.environ.get(VARIABLE) and "drjit" not in sys.modules:
+        library = choose().library
+        if library is not None:
+            os.environ[VARIABLE] = str(library.path)
+    unpacked = sorted(UNPACKED.glob("libatomic.so*"))  # Dr.Jit's wheels need it; a minimal Debian has none
+    chosen = Path(os.environ.get(VARIABLE, ""))
+    for path in [*unpacked, *([chosen] if chosen.parent == UNPACKED else [])]:
         with suppress(OSError):
-            shared_library.load(chosen)
+            shared_library.load(path)
 
 
 def require() -> Library:

@@ -11,6 +11,10 @@ import subprocess
 import sys
 from dataclasses import dataclass
 
+from reslrb_cli.backend.shared_library import missing_library
+
+MISSING_LIBRARY = "run scripts/setup, or install the package that holds it"
+
 # A constant that no kernel cache has seen makes the compiler run; `minimum` is what libLLVM 15 and 16 stumble over.
 _SCRIPT = """
 import json, sys, time
@@ -68,6 +72,9 @@ def probe(variant: str) -> Probe:
         return Probe("gave no result within 300 s")
     if done.returncode == 0:
         return Probe(**json.loads(done.stdout.splitlines()[-1]))
+    missing = missing_library(done.stderr)
+    if missing:
+        return Probe(f"Mitsuba needs {missing}, which is missing; {MISSING_LIBRARY}")
     said = [line.strip() for line in done.stderr.splitlines() if line.strip()]
     if done.returncode < 0:
         return Probe(f"ended by signal {-done.returncode}: {said[0] if said else 'no message'}")

@@ -12,12 +12,13 @@ import sys
 from pathlib import Path
 
 # glibc: "libz3.so.4: cannot open shared object file: ...", macOS: "Library not loaded: @rpath/libz3.dylib"
-_MISSING = re.compile(r"^(?P<so>[^\s/:]+\.so[^\s:]*): cannot open shared object|Library not loaded: (?P<dylib>\S+)")
+_MISSING = re.compile(
+    r"(?:^|\s)(?P<so>[^\s/:]+\.so[^\s:]*): cannot open shared object|Library not loaded: (?P<dylib>\S+)"
+)
 
 
 def missing_library(message: str) -> str | None:
-    """The file name of the library that `message` of the dynamic loader says it cannot find; None if it says another
-    thing."""
+    """The file name of the library that the dynamic loader could not find, by `message`; None if it says none."""
     found = _MISSING.search(message)
     return (found["so"] or Path(found["dylib"]).name) if found else None
 

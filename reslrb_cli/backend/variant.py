@@ -8,7 +8,8 @@ import os
 from importlib import metadata
 
 from reslrb_cli.backend import llvm
-from reslrb_cli.backend.probe import probe
+from reslrb_cli.backend.probe import MISSING_LIBRARY, probe
+from reslrb_cli.backend.shared_library import missing_library
 from reslrb_cli.errors import BackendError
 
 logger = logging.getLogger(__name__)
@@ -26,8 +27,10 @@ def set_variant(name: str = "auto") -> str:
     try:
         import drjit as dr
         import mitsuba as mi
-    except ImportError as error:
-        raise BackendError(f"Mitsuba cannot be loaded ({error}); install it with `pip install mitsuba`") from error
+    except (ImportError, NameError) as error:  # a NameError in Dr.Jit's own handler covers the ImportError
+        cause = error.__context__ or error
+        mend = MISSING_LIBRARY if missing_library(str(cause)) else "install it with `pip install mitsuba`"
+        raise BackendError(f"Mitsuba cannot be loaded ({cause}); {mend}") from error
     if chosen not in mi.variants():
         raise BackendError(f"this Mitsuba has no variant {chosen}; it has {', '.join(mi.variants())}")
     if library is not None:
