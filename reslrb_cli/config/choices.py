@@ -107,7 +107,7 @@ class Loss(Choice):
 
 
 class L2(Loss):
-    """Mean of (I - T)^2."""
+    """Mean of (I - T)², I the image, T the target, over pixels and channels; so are the others."""
 
     type: Literal["l2"] = Field(default="l2", description="Mean of (I - T)².")
 
@@ -120,17 +120,18 @@ class L1(Loss):
 
 
 class RelativeL2(Loss):
-    """Mean of (I - T)^2 / (T^2 + epsilon)."""
+    """Mean of (I - T)² / (T² + epsilon)."""
 
     model_config = _NEEDS_TYPE
-    type: Literal["relative_l2"] = Field(
-        default="relative_l2", description="Squared error relative to the target's square."
+    type: Literal["relative_l2"] = Field(default="relative_l2", description="Mean of (I - T)² / (T² + epsilon).")
+    epsilon: Positive = Field(
+        default=1e-2,
+        description="Added to the denominator, in squared units of radiance; keeps dark pixels from dominating.",
     )
-    epsilon: Positive = Field(default=1e-2, description="Added to the denominator; keeps dark pixels from dominating.")
 
 
 class LogL2(Loss):
-    """Mean of (log(I + epsilon) - log(T + epsilon))^2."""
+    """Mean of (log(I + epsilon) - log(T + epsilon))², negative values as 0."""
 
     model_config = _NEEDS_TYPE
     type: Literal["log_l2"] = Field(default="log_l2", description="Mean of (log(I + epsilon) - log(T + epsilon))².")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 import math
 import re
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any, get_args
 
@@ -83,7 +84,7 @@ def _location(loc: tuple[int | str, ...], data: Any) -> Location:
     for part in loc:
         if _is_tag(part) or part == "[key]" or (isinstance(part, int) and isinstance(data, str)):
             continue
-        location.append(part)
+        location.append(str(part) if isinstance(data, dict) else part)
         try:
             data = data[part]
         except (LookupError, TypeError):
@@ -132,11 +133,16 @@ def _unknown_key(location: Location, loc: tuple[int | str, ...]) -> str:
     owners = [str(_type_name(section)) for section in union if key in section.model_fields]
     if owners:
         return f"not an option of {_type_name(chosen)} but of {', '.join(owners)}; remove it, or change the type"
-    near = difflib.get_close_matches(key, chosen.model_fields, n=1)
-    meant = near or _below(chosen, format_location(location[:-1]), key) or _below(Config, "", key)
+    here = format_location(location[:-1])
+    meant = _nearest(key, chosen.model_fields) or _below(chosen, here, key) or _below(Config, "", key)
     if meant:
         return f"unknown key; did you mean `{meant[0]}`?"
     return f"unknown key; known here: {', '.join(chosen.model_fields)}"
+
+
+def _nearest(word: str, known: Iterable[str]) -> list[str]:
+    """The known word that is most like `word`, if any is."""
+    return difflib.get_close_matches(word.lower(), list(known), n=1)
 
 
 def _below(section: type[Section], name: str, key: str) -> list[str]:
@@ -172,7 +178,7 @@ def _words(number: int) -> str:
 
 
 def _one_of(known: list[str], value: Any) -> str:
-    near = difflib.get_close_matches(value, known, n=1) if isinstance(value, str) else []
+    near = _nearest(value, known) if isinstance(value, str) else []
     choices = " or ".join(known) if len(known) < 3 else "one of " + ", ".join(known)
     return choices + (f" (did you mean {near[0]}?)" if near else "")
 

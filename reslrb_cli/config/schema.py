@@ -1,5 +1,7 @@
-"""The configuration: one file is one experiment. Units, defaults and meanings stand in the fields' descriptions, from
-which `reference.py` writes docs/config.md and docs/config.schema.json."""
+"""The configuration: one file is one experiment.
+
+Units, defaults and meanings stand in the fields' descriptions; `reference.py` writes docs/config.md from them.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +24,7 @@ from pydantic import (
 from typing_extensions import Self
 
 from .base import ConfigPath, Count, Positive, Section, Seed, WorkPath, by_kind, located, wrong
-from .choices import L2, Adam, AnyIntegrator, AnyLoss, AnyOptimizer, Integrator, Loss, Optimizer, Reslrb
+from .choices import L2, Adam, AnyIntegrator, AnyLoss, AnyOptimizer, Integrator, Reslrb
 
 ColorSpace = Literal["auto", "linear", "srgb"]
 _COLOR_SPACE = "How values are encoded: `linear`, `srgb`, or `auto` (8-bit files srgb, float files linear)."
@@ -66,13 +68,13 @@ class SceneConfig(Section):
 
     file: ConfigPath = Field(description="Mitsuba scene (XML, versions 0.5 to 3), relative to the config file.")
     options: dict[str, Annotated[bool | int | float | str, BeforeValidator(_scalar)]] = Field(
-        default_factory=dict, description="Values of the scene file's `$name` variables."
+        default={}, description="Values of the scene file's `$name` variables."
     )
     sensors: Annotated[
         Annotated[Annotated[list[Annotated[int, Field(ge=0)]], Field(min_length=1)], Tag("<list>")]
         | Annotated[Literal["all"], Tag("<text>")],
         by_kind("a list of sensor indices, or `all`", "all"),
-    ] = Field(default_factory=lambda: [0], description="Indices of the scene's sensors that are used, or `all`.")
+    ] = Field(default=[0], description="Indices of the scene's sensors that are used, or `all`.")
 
     @field_validator("sensors")
     @classmethod
@@ -86,7 +88,7 @@ class Rendering(Section):
     """A target that is rendered from the scene itself, with other parameter values."""
 
     parameters: dict[str, Value] = Field(
-        default_factory=dict,
+        default={},
         description="True values by `mi.traverse` key: a number, a list of numbers, or an image "
         "file. Empty: the scene as it stands.",
     )
@@ -97,11 +99,12 @@ class Rendering(Section):
     )
 
 
+_PATH = {"type": "string", "format": "path"}
 _Files = Annotated[
     list[ConfigPath],
     Field(min_length=1),
     BeforeValidator(_list_of_one),
-    WithJsonSchema({"anyOf": [{"type": "string"}, {"type": "array", "items": {"type": "string"}, "minItems": 1}]}),
+    WithJsonSchema({"anyOf": [_PATH, {"type": "array", "items": _PATH, "minItems": 1}]}),
 ]
 
 
@@ -178,11 +181,19 @@ class ParameterSpec(Section):
         return self
 
 
+def _without_default(schema: dict[str, Any]) -> None:
+    """For a default that the loader fills in, from what the schema does not know."""
+    del schema["default"]
+
+
 class RunConfig(Section):
     """How long, with how many samples, and where to."""
 
     name: str = Field(
-        default="run", min_length=1, description="Name of the run and of its folder; default: the file's stem."
+        default="run",
+        min_length=1,
+        description="Name of the run and of its folder; left out: the config file's name without its suffix.",
+        json_schema_extra=_without_default,
     )
     output: WorkPath = Field(
         default=Path("runs"),
@@ -268,7 +279,3 @@ def _check_passes(integrator: Integrator, spp: int, key: str, spp_key: str) -> N
     per_pass = getattr(integrator, "samples_per_pass", None)
     if per_pass is not None and spp % min(per_pass, spp) != 0:
         raise located(f"{key}.samples_per_pass", f"{per_pass} does not divide {spp_key}, which is {spp}")
-
-
-__all__ = ["Config", "ImageFile", "Integrator", "Loss", "Optimizer", "ParameterSpec", "Rendering", "RunConfig",
-           "SceneConfig", "TargetConfig"]  # fmt: skip

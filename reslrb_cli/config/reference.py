@@ -1,0 +1,204 @@
+"""Writes the reference of the configuration: docs/config.schema.json and docs/config.md.
+
+`python -m reslrb_cli.config.reference [FOLDER]`, after every change of the schema; a test holds the two together.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from .schema import Config
+
+DOCS = Path(__file__).resolve().parents[2] / "docs"
+
+#: The example of the reference page, as a file in `configs/` would hold it.
+EXAMPLE = """\
+# Recover the floor texture of a Cornell box from a rendered target.
+scene:
+  file: ../scenes/cornell_floor/scene.xml
+  options: {resx: 128, resy: 128}
+target:
+  render:
+    spp: 1024                       # the scene as it stands, so its own texture is the truth
+parameters:
+  - key: floor.reflectance.data
+    initial: 0.5
+    bounds: [0, 1]
+integrator:
+  type: reslrb
+  max_depth: 6
+loss:
+  type: relative_l2
+  epsilon: 1e-2
+optimizer:
+  type: adam
+  learning_rate: 0.03
+  schedule: cosine
+run:
+  iterations: 100
+  spp: 16
+  adjoint: correlated
+"""
+
+_HEAD = """\
+# Configuration
+
+<!-- Written by `python -m reslrb_cli.config.reference` from reslrb_cli/config; edit the descriptions there. -->
+
+One YAML file is one experiment. Unknown keys are errors. Paths are relative to the file they stand in, except
+`run.output`, which is relative to the working directory. The file is read as YAML 1.2: `1e-3` is a number, `yes` and
+`no` are text.
+[config.schema.json](config.schema.json) is the same as JSON Schema, for editors.
+
+On the command line `--set KEY=VALUE` changes a value; VALUE is YAML too, and later ones win:
+
+    --set run.spp=64 --set parameters[0].bounds=[0,1] --set 'integrator={type: prb}'
+    --set target.render.parameters.floor.reflectance.value=[0.2,0.4,0.6]
+
+Below `scene.options` and `target.render.parameters` the rest of KEY is one name, dots and all. To change a section's
+`type` where it holds options that the new type does not have, replace the section as a whole.
+
+## Example
+"""
+
+
+def json_schema() -> dict[str, Any]:
+    """The JSON Schema of a configuration file."""
+    schema = _without_titles(Config.model_json_schema())
+    return {"$schema": "https://json-schema.org/draft/2020-12/schema", "title": "reslrb configuration", **schema}
+
+
+def _without_titles(node: Any) -> Any:
+    if isinstance(node, dict):
+        # a property may be called `title`; its value is then a mapping, not text
+        return {k: _without_titles(v) for k, v in node.items() if not (k == "title" and isinstance(v, str))}
+    return [_without_titles(item) for item in node] if isinstance(node, list) else node
+
+
+def markdown() -> str:
+    """The reference page."""
+    schema = json_schema()
+    lines = [_HEAD, "```yaml", EXAMPLE.rstrip(), "```", "", "## Top level", "", *_table([schema])]
+    for key, value in schema["properties"].items():
+        lines += _section(key, value, schema["$defs"])
+    return "\n".join(lines) + "\n"
+
+
+# --- sections ---------------------------------------------------------------------------------------------------------
+
+
+def _section(name: str, value: dict[str, Any], defs: dict[str, Any], level: int = 2) -> Iterator[str]:
+    """The lines for the section that `value` describes, if it is one, and for the sections below it."""
+    members = _members(value, defs)
+    if not members:
+        return
+    yield from ("", f"{'#' * level} `{name}`", "")
+    if len(members) == 1:
+        yield from (members[0]["description"], "")
+    else:
+        default = members[0]["properties"]["type"]["const"]
+        yield from (f"One of these types (`{default}` where `type` is left out):", "")
+        yield from (f"- `{m['properties']['type']['const']}`: {m['description']}" for m in members)
+        yield ""
+    yield from _table(members)
+    if len(members) == 1:
+        for key, child in members[0]["properties"].items():
+            if _has_own_section(key):
+                yield from _section(f"{name}.{key}", child, defs, level + 1)
+
+
+def _has_own_section(key: str) -> bool:
+    """Image files are told apart in the text of their key's type; `target.render.integrator` is as `integrator`."""
+    return key == "render"
+
+
+def _members(value: dict[str, Any], defs: dict[str, Any]) -> list[dict[str, Any]]:
+    """The definitions that `value` refers to, directly, as a union, as the items of a list or beside null."""
+    if "$ref" in value:
+        return [defs[value["$ref"].rsplit("/", 1)[1]]]
+    if value.get("type") == "array":
+        return _members(value["items"], defs)
+    return [m for option in (*value.get("oneOf", ()), *value.get("anyOf", ())) for m in _members(option, defs)]
+
+
+def _table(members: list[dict[str, Any]]) -> Iterator[str]:
+    """A table of the members' keys; one that not all of them have says who has it."""
+    yield "| key | type | default | meaning |"
+    yield "|---|---|---|---|"
+    rows: dict[tuple[str, str], tuple[dict[str, Any], bool, list[str]]] = {}  # by key and meaning
+    for member in members:
+        for key, value in member["properties"].items():
+            if key == "type" and len(members) > 1:
+                continue
+            has = rows.setdefault((key, value["description"]), (value, key in member.get("required", ()), []))[2]
+            has.append(member["properties"].get("type", {}).get("const", ""))
+    for (key, _), (value, required, has) in rows.items():
+        only = "" if len(has) == len(members) else f"*Only {', '.join(f'`{name}`' for name in has)}.* "
+        default = "**required**" if required else _default(value)
+        cells = (f"`{key}`", _type(value), default, only + value["description"])
+        yield "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
+
+
+def _default(value: dict[str, Any]) -> str:
+    default = value.get("default")
+    if isinstance(default, dict):
+        return f"type `{default['type']}`" if "type" in default else ""
+    return "" if "default" not in value else f"`{json.dumps(default) if not isinstance(default, str) else default}`"
+
+
+# --- types ------------------------------------------------------------------------------------------------------------
+
+
+def _type(value: dict[str, Any]) -> str:
+    """A key's type in words, from its JSON Schema."""
+    for union in ("oneOf", "anyOf"):
+        if union in value:
+            names = list(dict.fromkeys(_type(option) for option in value[union]))
+            if "number" in names and "integer" in names:
+                names.remove("integer")
+            return " or ".join(names) if "section" not in names else "section" + " or null" * ("null" in names)
+    if "$ref" in value:
+        return "{file, color_space}" if value["$ref"].endswith("/ImageFile") else "section"
+    if "enum" in value:
+        return ", ".join(f"`{name}`" for name in value["enum"])
+    if "const" in value:
+        return f"`{value['const']}`"
+    kind = value.get("type")
+    if kind == "array":
+        if "prefixItems" in value:
+            return "[" + ", ".join(_type(item) for item in value["prefixItems"]) + "]"
+        return "list of " + _plural(_type(value["items"]))
+    if kind == "object":
+        return "mapping from text to " + _type(value["additionalProperties"])
+    if kind == "string":
+        return "path" if value.get("format") == "path" else "text"
+    if kind in ("integer", "number"):
+        return kind + _range(value)
+    return {"boolean": "true/false"}.get(str(kind), str(kind))
+
+
+def _plural(name: str) -> str:
+    head, *rest = name.split(" ", 1)
+    return head + "s" + "".join(f" {part}" for part in rest)
+
+
+def _range(value: dict[str, Any]) -> str:
+    signs = {"minimum": "≥", "exclusiveMinimum": ">", "maximum": "≤", "exclusiveMaximum": "<"}
+    # the ends of int32 and uint32 say nothing to a reader
+    bounds = [f"{sign} {value[key]:g}" for key, sign in signs.items() if key in value and value[key] < 2**31]
+    return f" {', '.join(bounds)}" if bounds else ""
+
+
+def write(folder: Path = DOCS) -> None:
+    """Writes both files into `folder`."""
+    schema = json.dumps(json_schema(), indent=2, ensure_ascii=False) + "\n"
+    (folder / "config.schema.json").write_text(schema, encoding="utf-8")
+    (folder / "config.md").write_text(markdown(), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    write(*(Path(argument) for argument in sys.argv[1:2]))

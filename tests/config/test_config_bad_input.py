@@ -1,0 +1,295 @@
+"""What is wrong with a configuration is said in one line, with the place and what would be right."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from reslrb_cli.config import load
+from reslrb_cli.errors import ConfigError, ExitCode
+
+GOOD = """\
+scene: {file: scene.xml}
+target: {render: {}}
+parameters:
+  - {key: floor.reflectance.data}
+"""
+
+
+def line_of(tmp_path: Path, text: str | bytes, overrides: tuple[str, ...] = ()) -> str:
+    path = tmp_path / "x.yaml"
+    path.write_bytes(text if isinstance(text, bytes) else text.encode())
+    with pytest.raises(ConfigError) as caught:
+        load(path, overrides)
+    assert caught.value.exit_code == ExitCode.USAGE
+    line = str(caught.value)
+    assert "\n" not in line
+    return line.replace(str(path), "x.yaml")
+
+
+def changed(old: str, new: str) -> str:
+    assert old in GOOD
+    return GOOD.replace(old, new)
+
+
+PARAMETER = "{key: floor.reflectance.data}"
+
+#: The text of a file, and how its error line begins or what it holds.
+FILES: dict[str, tuple[str | bytes, tuple[str, ...]]] = {
+    "empty": ("", ("x.yaml: is empty", "scene, target and parameters")),
+    "comments only": ("# nothing\n", ("x.yaml: is empty",)),
+    "list at the top": ("- scene\n", ("x.yaml: must hold sections",)),
+    "text at the top": ("scene\n", ("x.yaml: must hold sections",)),
+    "not UTF-8": (b"\xff\xfe\x00a", ("x.yaml: is not UTF-8 text",)),
+    "control character": ("scene:\n  \x01", ("x.yaml:2: not valid YAML",)),
+    "syntax": (GOOD + "run: [1,\n", ("x.yaml:6: not valid YAML",)),
+    "tab": ("scene:\n\tfile: x", ("x.yaml:2: not valid YAML",)),
+    "two documents": (GOOD + "---\n" + GOOD, ("x.yaml:5: not valid YAML",)),
+    "python object": ("scene: !!python/object:os.x {}", ("x.yaml:1: not valid YAML",)),
+    "contradicting tag": ("variant: !!bool maybe", ("x.yaml: not valid YAML",)),
+    "deep nesting": ("[" * 20_000, ("x.yaml: nested too deeply",)),
+    "endless integer": ("variant: " + "1" * 6000, ("x.yaml:1: not valid YAML", "too long")),
+    "unhashable key": (GOOD + "? [a]\n: 1\n", ("x.yaml:5: not valid YAML",)),
+    "value that holds itself": (
+        changed(f"\n  - {PARAMETER}", " &a [*a]"),
+        ("x.yaml: parameters[0]: must be a mapping",),
+    ),
+    "duplicate key": (GOOD + "run: {spp: 1}\nrun: {spp: 2}\n", ("x.yaml:6: run: given twice", "line 5")),
+    "duplicate in a list": (changed(PARAMETER, "{key: a, key: b}"), ("x.yaml:4: parameters[0].key: given twice",)),
+    "key is a number": (GOOD + "1: 2\n", ("x.yaml: 1: ", "text")),
+    "unknown section": (GOOD + "optimiser: {}\n", ("x.yaml: optimiser: unknown key", "`optimizer`")),
+    "unknown key": (GOOD + "run: {iteration: 3}\n", ("x.yaml: run.iteration: unknown key", "`iterations`")),
+    "unknown key, none near": (GOOD + "run: {xyz: 3}\n", ("x.yaml: run.xyz: unknown key; known here: name, output",)),
+    "key of another section": (GOOD + "spp: 3\n", ("x.yaml: spp: unknown key", "`run.spp`")),
+    "key of the section below": (
+        changed("{render: {}}", "{render: {}, spp: 3}"),
+        ("x.yaml: target.spp: unknown key", "`target.render.spp`"),
+    ),
+    "unknown key of an image": (
+        changed(PARAMETER, "{key: a, initial: {file: x, colour_space: srgb}}"),
+        ("x.yaml: parameters[0].initial.colour_space: unknown key", "`color_space`"),
+    ),
+    "missing section": ("scene: {file: x}\ntarget: {render: {}}\n", ("x.yaml: parameters: missing",)),
+    "missing key": (changed("{file: scene.xml}", "{options: {a: 1}}"), ("x.yaml: scene.file: missing",)),
+    "misspelt, so also missing": (
+        changed("file:", "fil:"),
+        ("x.yaml: scene.fil: unknown key; did you mean `file`?", "(and 1 more)"),
+    ),
+    "several errors": (GOOD + "run: {spp: 0, seed: -1, iterations: x}\n", ("x.yaml: run.", "(and 2 more)")),
+    "section is text": (GOOD + "run: fast\n", ("x.yaml: run: must be a mapping", "'fast'")),
+    "section is a list": (GOOD + "loss: [l1]\n", ("x.yaml: loss: must be a mapping such as {type: NAME}",)),
+    "no parameters": (changed(f"\n  - {PARAMETER}", " []"), ("x.yaml: parameters: must have at least one entry",)),
+    "parameters is a mapping": (changed(f"\n  - {PARAMETER}", " {key: a}"), ("x.yaml: parameters: must be a list",)),
+    "parameter twice": (
+        changed(f"- {PARAMETER}", f"- {PARAMETER}\n  - {PARAMETER}"),
+        ("x.yaml: parameters[1].key: ", "parameters[0]"),
+    ),
+    "empty parameter key": (changed(PARAMETER, "{key: ''}"), ("x.yaml: parameters[0].key: must be nonempty text",)),
+    "bounds reversed": (
+        changed(PARAMETER, "{key: a, bounds: [1, 0]}"),
+        ("x.yaml: parameters[0].bounds: ", "low < high"),
+    ),
+    "bounds equal": (changed(PARAMETER, "{key: a, bounds: [1, 1]}"), ("x.yaml: parameters[0].bounds: ", "low < high")),
+    "bounds NaN": (changed(PARAMETER, "{key: a, bounds: [0, .nan]}"), ("x.yaml: parameters[0].bounds: ", "low < high")),
+    "bounds of one": (changed(PARAMETER, "{key: a, bounds: [1]}"), ("x.yaml: parameters[0].bounds: ", "two")),
+    "bounds of three": (changed(PARAMETER, "{key: a, bounds: [1, 2, 3]}"), ("x.yaml: parameters[0].bounds: ", "two")),
+    "bounds a number": (changed(PARAMETER, "{key: a, bounds: 1}"), ("x.yaml: parameters[0].bounds: must be a list",)),
+    "bounds of text": (
+        changed(PARAMETER, "{key: a, bounds: [0, inf]}"),
+        ("x.yaml: parameters[0].bounds[1]: must be a number", "'inf'"),
+    ),
+    "bounds exclude the initial value": (
+        changed(PARAMETER, "{key: a, bounds: [0, 1], initial: [0.5, 1.5, 0.5]}"),
+        ("x.yaml: parameters[0].initial: 1.5 is outside of the bounds [0, 1]",),
+    ),
+    "initial unknown word": (
+        changed(PARAMETER, "{key: a, initial: black}"),
+        ("x.yaml: parameters[0].initial: must be a number", "`scene`", "'black'"),
+    ),
+    "initial NaN": (
+        changed(PARAMETER, "{key: a, initial: .nan}"),
+        ("x.yaml: parameters[0].initial: must be a finite",),
+    ),
+    "initial infinite": (
+        changed(PARAMETER, "{key: a, initial: [1, .inf, 1]}"),
+        ("x.yaml: parameters[0].initial[1]: must be a finite number",),
+    ),
+    "initial true": (
+        changed(PARAMETER, "{key: a, initial: true}"),
+        ("x.yaml: parameters[0].initial: must be a number",),
+    ),
+    "initial empty list": (changed(PARAMETER, "{key: a, initial: []}"), ("x.yaml: parameters[0].initial: must have",)),
+    "resolution": (changed(PARAMETER, "{key: a, resolution: [64, 0]}"), ("x.yaml: parameters[0].resolution[1]: ", "1")),
+    "both targets": (
+        changed("{render: {}}", "{render: {}, file: a.exr}"),
+        ("x.yaml: target: must have exactly one of",),
+    ),
+    "no target": (changed("{render: {}}", "{}"), ("x.yaml: target: must have exactly one of `file` and `render`",)),
+    "target file a number": (changed("{render: {}}", "{file: 3}"), ("x.yaml: target.file: must be a list",)),
+    "target file empty": (changed("{render: {}}", "{file: ''}"), ("x.yaml: target.file: must be a path",)),
+    "fewer targets than sensors": (
+        changed("{render: {}}", "{file: [a.exr, b.exr]}"),
+        ("x.yaml: target.file: names 2 images for 1 sensors",),
+    ),
+    "colour space of a rendered target": (
+        changed("{render: {}}", "{render: {}, color_space: srgb}"),
+        ("x.yaml: target.color_space: has no effect",),
+    ),
+    "colour space unknown": (
+        changed("{render: {}}", "{file: a.png, color_space: sRGB}"),
+        ("x.yaml: target.color_space: must be one of auto, linear, srgb (did you mean srgb?)",),
+    ),
+    "target value": (
+        changed("{render: {}}", "{render: {parameters: {a.b.value: [1, x]}}}"),
+        ("x.yaml: target.render.parameters.a.b.value[1]: must be a number",),
+    ),
+    "target integrator": (
+        changed("{render: {}}", "{render: {integrator: {type: path}}}"),
+        ("x.yaml: target.render.integrator.type: must be one of reslrb, ptracer, prb, walk_ad",),
+    ),
+    "sensor negative": (changed("scene.xml", "a, sensors: [-1]"), ("x.yaml: scene.sensors[0]: must be at least 0",)),
+    "sensor twice": (
+        changed("scene.xml", "a, sensors: [0, 0]"),
+        ("x.yaml: scene.sensors: must name each sensor once",),
+    ),
+    "sensors a number": (changed("scene.xml", "a, sensors: 0"), ("x.yaml: scene.sensors: must be a list of", "`all`")),
+    "scene option a list": (changed("scene.xml", "a, options: {r: [1]}"), ("x.yaml: scene.options.r: must be text",)),
+    "scene option null": (changed("scene.xml", "a, options: {r: }"), ("x.yaml: scene.options.r: must be text",)),
+    "null character in a path": (changed("scene.xml", '"a\\0"'), ("x.yaml: scene.file: must be a path",)),
+    "home of nobody": (changed("scene.xml", "~no-such-user-here/a"), ("x.yaml: scene.file: must be a path",)),
+    "unknown integrator": (
+        GOOD + "integrator: {type: reslbr}\n",
+        ("x.yaml: integrator.type: must be one of reslrb, ptracer, prb, walk_ad (did you mean reslrb?)",),
+    ),
+    "type is a list": (GOOD + "integrator: {type: [prb]}\n", ("x.yaml: integrator.type: must be one of",)),
+    "option of another integrator": (
+        GOOD + "integrator: {type: prb, estimator: reservoir}\n",
+        ("x.yaml: integrator.estimator: not an option of prb but of reslrb",),
+    ),
+    "option of another optimiser": (
+        GOOD + "optimizer: {type: sgd, beta_1: 0.5}\n",
+        ("x.yaml: optimizer.beta_1: not an option of sgd but of adam, adamw",),
+    ),
+    "option of another loss": (
+        GOOD + "loss: {epsilon: 1}\n",
+        ("x.yaml: loss.epsilon: not an option of l2 but of relative_l2, log_l2",),
+    ),
+    "epsilon zero": (GOOD + "loss: {type: log_l2, epsilon: 0}\n", ("x.yaml: loss.epsilon: must be above 0",)),
+    "fraction of a constant": (
+        GOOD + "optimizer: {final_fraction: 0.1}\n",
+        ("x.yaml: optimizer.final_fraction: has no effect on a constant",),
+    ),
+    "learning rate text": (
+        GOOD + "optimizer: {learning_rate: fast}\n",
+        ("x.yaml: optimizer.learning_rate: must be a number",),
+    ),
+    "learning rate true": (
+        GOOD + "optimizer: {learning_rate: true}\n",
+        ("x.yaml: optimizer.learning_rate: ", "not true"),
+    ),
+    "learning rate NaN": (
+        GOOD + "optimizer: {learning_rate: .nan}\n",
+        ("x.yaml: optimizer.learning_rate: must be a finite",),
+    ),
+    "momentum one": (GOOD + "optimizer: {type: sgd, momentum: 1}\n", ("x.yaml: optimizer.momentum: must be below 1",)),
+    "depth": (GOOD + "integrator: {max_depth: -2}\n", ("x.yaml: integrator.max_depth: must be at least -1",)),
+    "flag is a number": (
+        GOOD + "integrator: {hide_emitters: 1}\n",
+        ("x.yaml: integrator.hide_emitters: must be true or false",),
+    ),
+    "flag is YAML 1.1": (
+        GOOD + "integrator: {hide_emitters: yes}\n",
+        ("x.yaml: integrator.hide_emitters: must be true or",),
+    ),
+    "passes do not divide": (
+        GOOD + "integrator: {samples_per_pass: 5}\n",
+        ("x.yaml: integrator.samples_per_pass: 5 does not divide run.spp, which is 16",),
+    ),
+    "spp a fraction": (GOOD + "run: {spp: 1.5}\n", ("x.yaml: run.spp: must be an integer, not 1.5",)),
+    "spp zero": (GOOD + "run: {spp: 0}\n", ("x.yaml: run.spp: must be at least 1",)),
+    "seed beyond 32 bits": (GOOD + "run: {seed: 4294967296}\n", ("x.yaml: run.seed: must be below 4294967296",)),
+    "adjoint": (GOOD + "run: {adjoint: correlate}\n", ("x.yaml: run.adjoint: must be correlated or independent",)),
+    "name without letters": (GOOD + "run: {name: '..'}\n", ("x.yaml: run.name: must hold a letter or a digit",)),
+    "variant": (GOOD + "variant: scalar_rgb\n", ("x.yaml: variant: must be one of auto, llvm_ad_rgb",)),
+}
+
+#: An override of the good file, and what its error line holds.
+OVERRIDES: dict[str, tuple[str, ...]] = {
+    "novalue": ("--set novalue: must be KEY=VALUE",),
+    "=3": ("--set =3: must be KEY=VALUE",),
+    "a..b=3": ("--set a..b=3: `a..b` is no key",),
+    "run.spp=[1,": ("--set run.spp=[1,: not valid YAML",),
+    "run.spp=many": ("--set run.spp=many: run.spp: must be an integer, not the text 'many'",),
+    "run.spp=": ("--set run.spp=: run.spp: must be an integer, not null",),
+    "run.spq=3": ("--set run.spq=3: run.spq: unknown key; did you mean `spp`?",),
+    "rnu.spp=3": ("--set rnu.spp=3: rnu: unknown key; did you mean `run`?",),
+    "integrator.estimater=reservoir": ("integrator.estimater: unknown key; did you mean `estimator`?",),
+    "parameters[0].bounds=[1,0]": ("--set parameters[0].bounds=[1,0]: parameters[0].bounds: must be [low, high]",),
+    "parameters.0.bounds=[1,0]": ("--set parameters.0.bounds=[1,0]: parameters[0].bounds: must be [low, high]",),
+    "parameters[2].bounds=[0,1]": (": parameters: has 1 entries; there is no [2]",),
+    "parameters.bounds=[0,1]": (": parameters: is a list; name an entry, such as parameters[0]",),
+    "scene.file.name=x": (": scene.file: is a single value",),
+    "scene[0]=x": (": scene: is no list",),
+    "scene=null": ("--set scene=null: scene: missing",),
+    "target.file=x.exr": (
+        "--set target.file=x.exr: target: must have exactly one of `file` and `render`, and has both",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", FILES)
+def test_file_errors_are_located(case: str, tmp_path: Path) -> None:
+    text, (start, *parts) = FILES[case]
+    line = line_of(tmp_path, text)
+    assert line.startswith(start)
+    for part in parts:
+        assert part in line
+
+
+@pytest.mark.parametrize("override", OVERRIDES)
+def test_override_errors_name_the_override(override: str, tmp_path: Path) -> None:
+    line = line_of(tmp_path, GOOD, (override,))
+    assert line.startswith("--set ")
+    for part in OVERRIDES[override]:
+        assert part in line
+
+
+def test_override_that_makes_an_option_unknown_is_blamed(tmp_path: Path) -> None:
+    text = GOOD + "integrator: {estimator: reservoir}\n"
+    line = line_of(tmp_path, text, ("run.spp=4", "integrator.type=ptracer", "run.seed=3"))
+    assert line.startswith("--set integrator.type=ptracer: integrator.estimator: not an option of ptracer")
+
+
+def test_file_is_blamed_for_its_own_errors(tmp_path: Path) -> None:
+    assert line_of(tmp_path, GOOD + "run: {spp: 0}\n", ("run.seed=3",)).startswith("x.yaml: run.spp")
+
+
+def test_override_can_mend_the_file(tmp_path: Path) -> None:
+    path = tmp_path / "x.yaml"
+    path.write_text(GOOD + "run: {spp: 0}\n")
+    assert load(path, ["run.spp=2"]).run.spp == 2
+
+
+def test_missing_file(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"none\.yaml: no such file"):
+        load(tmp_path / "none.yaml")
+
+
+def test_folder_in_place_of_a_file(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="is a folder"):
+        load(tmp_path)
+
+
+def test_unreadable_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(self: Path) -> bytes:
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(Path, "read_bytes", refuse)  # root may read what chmod forbids
+    with pytest.raises(ConfigError, match=r"x\.yaml: cannot be read: Permission denied"):
+        load(tmp_path / "x.yaml")
+
+
+def test_null_character_in_the_file_name() -> None:
+    with pytest.raises(ConfigError, match="cannot be read"):
+        load("a\0b.yaml")
