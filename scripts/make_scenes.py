@@ -131,7 +131,8 @@ def sky(height: int) -> Image:
     above = np.clip(elevation, 0, 1)[..., None]
     color = np.array([0.95, 1.0, 1.05]) * (1 - above) ** 4 + np.array([0.30, 0.55, 1.0]) * (1 - (1 - above) ** 4)
     color = np.where(elevation[..., None] > 0, color * 1.6, np.array([0.26, 0.24, 0.20]))
-    color += np.array([1.0, 0.86, 0.62]) * (260 * np.exp((cosine - 1) * 900) + 2.5 * np.exp((cosine - 1) * 30))[..., None]
+    glow = 260 * np.exp((cosine - 1) * 900) + 2.5 * np.exp((cosine - 1) * 30)
+    color += np.array([1.0, 0.86, 0.62]) * glow[..., None]
     return quantise(color, 1 / 256)
 
 

@@ -1,0 +1,29 @@
+"""Scenes: loading, what they contain and need, the parameters that can be recovered, and images to compare with."""
+
+from .catalog import ParameterInfo, list_parameters
+from .graph import SceneGraph
+from .inspect import SceneSummary, SensorSummary, summarise
+from .load import load_scene
+from .needs import SceneNeeds, View, check_supported, look, scene_needs
+from .parameters import Selection, select_parameters
+from .reach import visible_texels
+from .target import read_image
+
+__all__ = [
+    "ParameterInfo",
+    "SceneGraph",
+    "SceneNeeds",
+    "SceneSummary",
+    "Selection",
+    "SensorSummary",
+    "View",
+    "check_supported",
+    "list_parameters",
+    "load_scene",
+    "look",
+    "read_image",
+    "scene_needs",
+    "select_parameters",
+    "summarise",
+    "visible_texels",
+]

@@ -1,0 +1,131 @@
+"""What parameters a scene has, and which of them can be recovered."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+#: Emitter parameters that Mitsuba flags as differentiable, but that change where light goes and not how much it is.
+_BEAM_SHAPES = {
+    "cutoff_angle": "shapes the beam",
+    "beam_width": "shapes the beam",
+    "sun_direction": "moves the light",
+}
+#: What a mesh has besides attributes such as `vertex_color`.
+_MESH_GEOMETRY = ("vertex_positions", "vertex_normals", "vertex_texcoords", "vertex_count", "face_count", "faces")
+
+
+@dataclass(frozen=True)
+class ParameterInfo:
+    """One entry of `mi.traverse`.
+
+    `kind` is what it belongs to: `bsdf`, `emitter`, `attribute` (of a mesh, such as `vertex_color`), `shape`, `sensor`,
+    `film`, `medium`, `integrator` or `scene`. `type` and `shape` describe the value: (height, width, channels) for
+    textures. `obstacle` says why it cannot be recovered; None where it can.
+    """
+
+    key: str
+    kind: str
+    type: str
+    shape: tuple[int, ...]
+    differentiable: bool
+    discontinuous: bool
+    obstacle: str | None
+
+
+def list_parameters(params: Any) -> list[ParameterInfo]:
+    """Describe every entry of a `mi.traverse` result, in its order."""
+    return [describe(params, key) for key in params.properties]
+
+
+def describe(params: Any, key: str) -> ParameterInfo:
+    """Describe one entry of a `mi.traverse` result."""
+    value, node, flags = _value(params, key), params.properties[key][2], int(params.flags(key))
+    differentiable = flags & (int(mi.ParamFlags.NonDifferentiable) | int(mi.ParamFlags.ReadOnly)) == 0
+    kind = _kind(params, key, node)
+    return ParameterInfo(
+        key=key,
+        kind=kind,
+        type=type(value).__name__,
+        shape=value_shape(value),
+        differentiable=differentiable,
+        discontinuous=flags & int(mi.ParamFlags.Discontinuous) != 0,
+        obstacle=_obstacle(kind, key.rpartition(".")[2], value, differentiable, node),
+    )
+
+
+def value_shape(value: Any) -> tuple[int, ...]:
+    """Shape of a parameter as a NumPy array; () for one number."""
+    if not dr.is_array_v(value):
+        return ()
+    shape = tuple(int(n) for n in dr.shape(value))
+    return shape if dr.is_tensor_v(value) or shape[-1:] != (1,) else shape[:-1]
+
+
+def _value(params: Any, key: str) -> Any:
+    # Not params[key], which would mark every entry as one that update() has to look at.
+    value, value_type, node, _ = params.properties[key]
+    return value if value_type is None else params.get_property(value, value_type, node)
+
+
+def _kind(params: Any, key: str, node: Any) -> str:
+    kinds = {
+        "bsdf": mi.BSDF,
+        "emitter": mi.Emitter,
+        "shape": mi.Shape,
+        "sensor": mi.Sensor,
+        "film": mi.Film,
+        "medium": mi.Medium,
+        "integrator": mi.Integrator,
+    }
+    name = key.rpartition(".")[2]
+    while node is not None:
+        for kind, type_ in kinds.items():
+            if isinstance(node, type_):
+                if kind == "shape" and isinstance(node, mi.Mesh) and _is_attribute(name):
+                    return "attribute"
+                return kind
+        node = params.hierarchy[node][0]
+    return "scene"
+
+
+def _is_attribute(name: str) -> bool:
+    return name.startswith(("vertex_", "face_")) and name not in _MESH_GEOMETRY
+
+
+def _obstacle(kind: str, name: str, value: Any, differentiable: bool, node: Any) -> str | None:
+    only = "only BSDF and emission parameters have derivatives so far"
+    if kind == "shape":
+        return f"moves geometry; {only}"
+    if kind in ("sensor", "film"):
+        return f"belongs to the {kind}; {only}"
+    if kind not in ("bsdf", "emitter", "attribute"):
+        return f"is no property of a material or a light; {only}"
+    if kind == "emitter" and name in ("to_world", "position"):
+        return f"moves the light; {only}"
+    if kind == "emitter" and name in _BEAM_SHAPES:
+        return f"{_BEAM_SHAPES[name]}; of an emitter, only what it emits has derivatives"
+    bits = _storage_bits(value)
+    if bits is not None and bits < 32:
+        return (
+            f"is stored with {bits} bits a channel, too few to follow a gradient; give the texture in the scene file "
+            '<string name="format" value="variant"/>'
+        )
+    if not differentiable:
+        return f"is not differentiable ({node.class_name()})"
+    if bits is None:
+        return f"is no number with derivatives ({type(value).__name__})"
+    return None
+
+
+def _storage_bits(value: Any) -> int | None:
+    """Bits of one entry of a numeric JIT array that a parameter could be; None for anything else."""
+    if not dr.is_jit_v(value):
+        return None
+    bits = {dr.VarType.UInt8: 8, dr.VarType.Float16: 16, dr.VarType.Float32: 32, dr.VarType.Float64: 64}
+    if dr.is_matrix_v(value) or not dr.is_arithmetic_v(value):
+        return None
+    return bits.get(dr.type_v(value))

@@ -1,0 +1,99 @@
+"""What a scene contains, for `reslrb inspect`; printing is up to the caller."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import mitsuba as mi
+
+from ..errors import UnsupportedScene
+from .catalog import ParameterInfo, list_parameters
+from .graph import SceneGraph
+from .needs import SENSORS, SceneNeeds, View, check_supported, look, scene_needs
+
+
+@dataclass(frozen=True)
+class SensorSummary:
+    """One sensor: its film in pixels (`crop` is offset and size), what it sees, and what light tracing needs for it.
+
+    `obstacle` is the reason why light tracing cannot render for it, or None. `view` is None for a sensor of an unknown
+    kind.
+    """
+
+    index: int
+    id: str
+    type: str
+    film: str
+    size: tuple[int, int]
+    crop: tuple[tuple[int, int], tuple[int, int]]
+    filter: str
+    channels: int
+    needs: SceneNeeds
+    view: View | None
+    obstacle: str | None
+
+
+@dataclass(frozen=True)
+class SceneSummary:
+    """What a scene contains: class names and how often each occurs, sensors, and all parameters."""
+
+    emitters: dict[str, int]
+    bsdfs: dict[str, int]
+    shapes: dict[str, int]
+    triangles: int
+    sensors: list[SensorSummary]
+    parameters: list[ParameterInfo]
+
+    @property
+    def unnamed(self) -> bool:
+        """Whether some keys stem from objects without an id: these change from one run to the next."""
+        return any(info.key.startswith("object_") for info in self.parameters)
+
+
+def summarise(scene: Any, hide_emitters: bool = False, sensors: Sequence[int] | None = None) -> SceneSummary:
+    """Look `scene` over; `sensors` are the indices of those to describe, None for all."""
+    graph = SceneGraph.of(scene)
+    shapes = graph.shapes()
+    indices = range(len(scene.sensors())) if sensors is None else sensors
+    return SceneSummary(
+        emitters=_count(scene.emitters()),
+        bsdfs=_count(graph.of_type(mi.BSDF)),
+        shapes=_count(shapes),
+        triangles=sum(int(shape.face_count()) for shape in shapes if shape.is_mesh()),
+        sensors=[_sensor(scene, index, hide_emitters) for index in indices],
+        parameters=list_parameters(mi.traverse(scene)),
+    )
+
+
+def _count(objects: Sequence[Any]) -> dict[str, int]:
+    return dict(Counter(item.class_name() for item in objects).most_common())
+
+
+def _sensor(scene: Any, index: int, hide_emitters: bool) -> SensorSummary:
+    sensor = scene.sensors()[index]
+    film = sensor.film()
+    obstacle = None
+    try:
+        check_supported(scene, sensor, hide_emitters)
+    except UnsupportedScene as error:
+        obstacle = str(error)
+    return SensorSummary(
+        index=index,
+        id=sensor.id(),
+        type=sensor.class_name(),
+        film=film.class_name(),
+        size=_pair(film.size()),
+        crop=(_pair(film.crop_offset()), _pair(film.crop_size())),
+        filter=film.rfilter().class_name(),
+        channels=int(film.base_channels_count()),
+        needs=scene_needs(scene, sensor),
+        view=look(scene, sensor) if sensor.class_name() in SENSORS else None,
+        obstacle=obstacle,
+    )
+
+
+def _pair(values: Any) -> tuple[int, int]:
+    return int(values[0]), int(values[1])

@@ -1,0 +1,140 @@
+"""What a scene needs of a light tracer, and whether light tracing can render it at all."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..errors import UnsupportedScene
+from .graph import SceneGraph
+
+#: Sensors to which a light path can connect: `sample_direction` is there, and its density is that of `sample_ray`.
+SENSORS = ("PerspectiveCamera", "ThinLensCamera")
+#: Shapes whose shading normal is their geometric one.
+_PLAIN_SHAPES = ("Rectangle", "Disk", "Sphere", "Cylinder")
+#: How many see-through surfaces a primary ray is followed through.
+_CROSSINGS = 32
+
+
+@dataclass(frozen=True)
+class SceneNeeds:
+    """Static facts of a scene as one sensor sees it; what is false or absent here need not be compiled.
+
+    `emitters` holds class names in the order of `scene.emitters()`; `environment` is the index in it of the emitter
+    that surrounds the scene, or None.
+    """
+
+    emitters: tuple[str, ...]
+    environment: int | None
+    has_visible_emitters: bool
+    has_smooth: bool
+    has_delta_lobes: bool
+    has_null: bool
+    has_shading_normals: bool
+    moving_shutter: bool
+    thin_lens: bool
+
+
+@dataclass(frozen=True)
+class View:
+    """What primary rays meet, after see-through surfaces: fractions of the film, which sum to 1.
+
+    `smooth`: surfaces that light paths can connect to the sensor from; `specular`: only smooth specular ones (glass,
+    mirrors), which stay black; `nothing`: no surface. `emission`: the fraction in which an emitter is seen directly,
+    which overlaps with the others.
+    """
+
+    smooth: float
+    specular: float
+    nothing: float
+    emission: float
+
+
+def scene_needs(scene: Any, sensor: Any) -> SceneNeeds:
+    """Collect what light tracing of `scene` for `sensor` has to be able to do."""
+    graph = SceneGraph.of(scene)
+    flags = 0
+    for bsdf in graph.surface_bsdfs():
+        flags |= int(bsdf.flags())
+    emitters, environment = list(scene.emitters()), scene.environment()
+    pointlike = int(mi.EmitterFlags.Delta)
+    return SceneNeeds(
+        emitters=tuple(emitter.class_name() for emitter in emitters),
+        environment=None if environment is None else emitters.index(environment),
+        has_visible_emitters=any(int(emitter.flags()) & pointlike == 0 for emitter in emitters),
+        has_smooth=flags & int(mi.BSDFFlags.Smooth) != 0,
+        has_delta_lobes=flags & int(mi.BSDFFlags.Delta) != 0,
+        has_null=flags & int(mi.BSDFFlags.Null) != 0,
+        has_shading_normals=any(_has_shading_normals(shape) for shape in graph.shapes()),
+        moving_shutter=float(sensor.shutter_open_time()) > 0,
+        thin_lens=bool(sensor.needs_aperture_sample()),
+    )
+
+
+def check_supported(scene: Any, sensor: Any, hide_emitters: bool = False) -> None:
+    """Raise UnsupportedScene, with the reason, where light tracing cannot render `scene` for `sensor`."""
+    name = sensor.id() or "of the scene"
+    for shape in SceneGraph.of(scene).shapes():
+        if shape.is_medium_transition():
+            raise UnsupportedScene(f"shape {shape.id()} bounds a participating medium; media are not supported")
+    if sensor.get_medium() is not None:
+        raise UnsupportedScene(f"sensor {name} stands in a participating medium; media are not supported")
+    if sensor.class_name() not in SENSORS:
+        raise UnsupportedScene(
+            f"sensor {name} is a {sensor.class_name()}; light paths can connect to `perspective` and `thinlens` sensors"
+        )
+    if sensor.film().class_name() != "HDRFilm":
+        raise UnsupportedScene(f"sensor {name} has a {sensor.film().class_name()}; only `hdrfilm` is supported")
+    view = look(scene, sensor)
+    if view.specular > 0 and view.smooth == 0 and (hide_emitters or view.emission == 0):
+        raise UnsupportedScene(
+            f"only smooth specular surfaces (glass, mirrors) face sensor {name}: light paths cannot connect to it from "
+            "them; let it see a rough surface, or take integrator.type: prb"
+        )
+
+
+def look(scene: Any, sensor: Any, resolution: int = 128) -> View:
+    """Cast primary rays through the centres of a grid of `resolution`^2 cells of the film's crop window."""
+    count = resolution * resolution
+    lane = dr.arange(mi.UInt32, count)
+    position = mi.Point2f(lane % resolution + 0.5, lane // resolution + 0.5) / resolution
+    ray, _ = sensor.sample_ray(sensor.shutter_open(), 0.5, position, mi.Point2f(0.5), True)
+    active = dr.full(mi.Mask, True, count)
+    smooth, specular, emission = (dr.zeros(mi.Mask, count) for _ in range(3))
+    for _ in range(_CROSSINGS):
+        si = scene.ray_intersect(ray, active)
+        emission |= active & dr.any(si.emitter(scene, active).eval(si, active) > 0)
+        hit = active & si.is_valid()
+        flags = si.bsdf().flags()
+        is_smooth = hit & mi.has_flag(flags, mi.BSDFFlags.Smooth)
+        is_null = hit & ~is_smooth & mi.has_flag(flags, mi.BSDFFlags.Null)
+        smooth |= is_smooth
+        specular |= hit & ~is_smooth & ~is_null
+        ray, active = si.spawn_ray(ray.d), is_null
+        dr.eval(ray, active, smooth, specular, emission)
+        if dr.none(active):
+            break
+
+    def fraction(mask: Any) -> float:
+        return float(dr.count(mask)[0]) / count
+
+    return View(fraction(smooth), fraction(specular), fraction(~(smooth | specular)), fraction(emission))
+
+
+def _has_shading_normals(shape: Any) -> bool:
+    """Whether the shape's shading normals differ from its geometric ones anywhere."""
+    if not shape.is_mesh():
+        return shape.class_name() not in _PLAIN_SHAPES
+    if not shape.has_vertex_normals() or shape.has_face_normals():
+        return False
+    positions = np.array(shape.vertex_positions_buffer()).reshape(-1, 3)
+    normals = np.array(shape.vertex_normals_buffer()).reshape(-1, 3)
+    faces = np.array(shape.faces_buffer()).reshape(-1, 3)
+    a, b, c = (positions[faces[:, k]] for k in range(3))
+    flat = np.cross(b - a, c - a)
+    flat /= np.maximum(np.linalg.norm(flat, axis=1, keepdims=True), 1e-30)
+    return bool(any((np.sum(flat * normals[faces[:, k]], axis=1) < 1 - 1e-5).any() for k in range(3)))

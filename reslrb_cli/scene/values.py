@@ -1,0 +1,167 @@
+"""Conversion between what a configuration says about a parameter's value and what the scene holds."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import drjit as dr
+import numpy as np
+
+from ..errors import ConfigError
+from .target import read_image
+
+Array = np.ndarray[Any, Any]
+
+#: Columns that `envmap` adds at either side of its image, copies of the opposite ones.
+_HALO = 1
+
+
+class Place:
+    """Where in the configuration a value stands: `fail` raises there."""
+
+    def __init__(self, source: object, key: str) -> None:
+        self.source, self.key = source, key
+
+    def fail(self, option: str, message: str) -> ConfigError:
+        """The error for `option` of this place."""
+        return ConfigError(self.source, f"{self.key}.{option}" if option else self.key, message)
+
+
+class Slot:
+    """One parameter of a scene as a NumPy array: a texture (H, W, C), a colour (C,), a buffer (N,), a number ().
+
+    An environment map stands without the halo columns that Mitsuba adds to it.
+    """
+
+    def __init__(self, params: Any, key: str) -> None:
+        self.params, self.key = params, key
+        value, node = params[key], params.properties[key][2]
+        self.type = type(value)
+        self.is_tensor = bool(dr.is_tensor_v(value))
+        self.is_texture = self.is_tensor and len(value.shape) == 3
+        self.halo = _HALO if node.class_name() == "EnvironmentMapEmitter" and self.is_texture else 0
+        #: How many numbers a list has that fills the parameter.
+        self.channels = _channels(node, key, value, self.is_tensor)
+
+    def get(self) -> Array:
+        """The current value."""
+        value = dr.detach(self.params[self.key])
+        array = np.array(value, dtype=np.float32)
+        if not self.is_tensor and array.ndim and array.shape[-1] == 1:
+            array = array[..., 0]
+        return array[:, self.halo : array.shape[1] - self.halo] if self.halo else array
+
+    def set(self, array: Array) -> None:
+        """Set the value; `params.update()` has to follow."""
+        if self.halo:
+            array = np.concatenate([array[:, -self.halo :], array, array[:, : self.halo]], axis=1)
+        array = np.ascontiguousarray(array, dtype=np.float32)
+        value = self.type(array) if self.is_tensor or array.ndim else self.type(float(array))
+        dr.make_opaque(value)
+        self.params[self.key] = value
+
+
+def initial_array(slot: Slot, initial: Any, resolution: tuple[int, int] | None, place: Place) -> Array:
+    """The value that `initial` ("scene", a number, a list of numbers, or an image file) gives the parameter in `slot`.
+
+    `resolution` is the (width, height) to which a texture is resampled, or None. Raises ConfigError at `place`.
+    """
+    current = slot.get()
+    if resolution is not None:
+        if not slot.is_texture:
+            raise place.fail("resolution", f"`{slot.key}` is no texture and cannot be resampled")
+        least = (2, 3) if slot.halo else (2, 2)
+        if resolution[0] < least[0] or resolution[1] < least[1]:
+            raise place.fail("resolution", f"must be at least {list(least)}; Mitsuba has no smaller textures")
+    if isinstance(initial, str):
+        array = current
+    elif isinstance(initial, (int, float)):
+        array = np.full_like(current, initial)
+    elif isinstance(initial, (list, tuple)):
+        array = _fill(slot, current, list(initial), place)
+    else:
+        array = _from_file(slot, current, initial, resolution, place)
+    if resolution is not None and array.shape[:2] != resolution[::-1]:
+        array = resample(array, resolution)
+    _check_finite(slot, array, place)
+    return array
+
+
+def check_bounds(slot: Slot, array: Array, bounds: tuple[float, float], place: Place) -> None:
+    """Raise ConfigError at `place` where an entry of `array` lies outside of `bounds`."""
+    low, high = np.float32(bounds[0]), np.float32(bounds[1])
+    outside = (array < low) | (array > high)
+    if outside.any():
+        value = float(array[outside].flat[0])
+        where = _entry(array, outside)
+        raise place.fail("bounds", f"exclude the initial value of `{slot.key}`, {value:g}{where}")
+
+
+def resample(array: Array, resolution: tuple[int, int]) -> Array:
+    """Resample an (H, W, C) image bilinearly to `resolution` (width, height), smoothed first where it shrinks."""
+    from skimage.transform import resize
+
+    smaller = resolution[0] < array.shape[1] or resolution[1] < array.shape[0]
+    shape = (resolution[1], resolution[0], array.shape[2])
+    result = resize(array, shape, order=1, mode="edge", anti_aliasing=smaller, preserve_range=True)
+    return np.asarray(result, dtype=np.float32)
+
+
+def _channels(node: Any, key: str, value: Any, is_tensor: bool) -> int:
+    if is_tensor:
+        return int(value.shape[-1])
+    shape = dr.shape(value)
+    if len(shape) > 1:
+        return int(shape[0])
+    name = key.rpartition(".")[2]
+    if name.startswith(("vertex_", "face_")) and hasattr(node, "vertex_count"):
+        return int(shape[0]) // int(node.vertex_count() if name.startswith("vertex_") else node.face_count())
+    return int(shape[0])
+
+
+def _fill(slot: Slot, current: Array, numbers: list[float], place: Place) -> Array:
+    if len(numbers) != slot.channels:
+        has = "1 number" if slot.channels == 1 else f"{slot.channels} numbers"
+        raise place.fail("initial", f"has {len(numbers)} numbers; `{slot.key}` takes {has}")
+    return np.tile(np.array(numbers, dtype=np.float32), current.size // len(numbers)).reshape(current.shape)
+
+
+def _from_file(slot: Slot, current: Array, image_file: Any, resolution: tuple[int, int] | None, place: Place) -> Array:
+    if not slot.is_texture:
+        raise place.fail("initial", f"`{slot.key}` is no texture; give a number or a list of numbers")
+    path: Path = image_file.file
+    try:
+        image = read_image(path, image_file.color_space)
+    except ConfigError as error:
+        raise place.fail("initial.file", f"{path}: {error.message}") from None
+    height, width = current.shape[:2]
+    if resolution is None and image.shape[:2] != (height, width):
+        size = f"{image.shape[1]}x{image.shape[0]}"
+        raise place.fail(
+            "initial.file",
+            f"{path} is {size}, the texture {width}x{height}; give `resolution: [width, height]` to resample",
+        )
+    if slot.channels == 1:
+        if (image != image[..., :1]).any():
+            raise place.fail("initial.file", f"{path} is coloured, but `{slot.key}` has one channel; give a grey image")
+        return image[..., :1]
+    if slot.channels != 3:
+        raise place.fail("initial.file", f"{path} has 3 channels, but `{slot.key}` has {slot.channels}")
+    return image
+
+
+def _check_finite(slot: Slot, array: Array, place: Place) -> None:
+    bad = ~np.isfinite(array)
+    if bad.any():
+        value = float(array[bad].flat[0])
+        raise place.fail("initial", f"`{slot.key}` holds {value:g}{_entry(array, bad)}; all values must be finite")
+
+
+def _entry(array: Array, mask: Array) -> str:
+    if array.ndim == 0:
+        return ""
+    index = [int(n) for n in np.argwhere(mask)[0]]
+    if array.ndim == 3:
+        return f" at texel ({index[1]}, {index[0]}), channel {index[2]}"
+    return f" at entry {index[0] if len(index) == 1 else index}"
