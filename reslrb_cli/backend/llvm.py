@@ -142,7 +142,7 @@ def _examine(path: Path) -> Library | Rejected:
 
 
 def _too_old(version: str) -> str:
-    return f"version {version} is too old and would end the process"
+    return f"version {version} is too old; with some before {MIN_VERSION} Dr.Jit ends the process"
 
 
 def _major(version: str) -> int:

@@ -1,0 +1,31 @@
+"""What all tests share: libLLVM chosen before Mitsuba is imported, the variant, a clean allocator between modules."""
+
+from __future__ import annotations
+
+import gc
+import sys
+from collections.abc import Iterator
+
+import pytest
+
+import reslrb_cli  # noqa: F401  # chooses libLLVM, so it comes before any test imports Mitsuba
+from reslrb_cli.backend.variant import set_variant
+from reslrb_cli.errors import BackendError
+
+
+@pytest.fixture(scope="session")
+def llvm() -> str:
+    """Sets the variant `llvm_ad_rgb`, once; skips where there is no usable libLLVM."""
+    try:
+        return set_variant("llvm_ad_rgb")
+    except BackendError as error:
+        pytest.skip(str(error))
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _release_jit_memory() -> Iterator[None]:
+    """Gives the JIT's cached memory back after each module, so that peaks measured in one do not show in the next."""
+    yield
+    if "drjit" in sys.modules:
+        gc.collect()
+        sys.modules["drjit"].flush_malloc_cache()

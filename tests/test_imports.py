@@ -1,0 +1,119 @@
+"""Imports run one way, and the package can be imported without Mitsuba."""
+
+from __future__ import annotations
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import reslrb_cli
+
+ROOT = Path(reslrb_cli.__file__).parent
+# A module may import from its own row and from the rows above it.
+ROWS = [
+    "errors",
+    "config",
+    "records",
+    "seeds",
+    "backend",
+    "scene",
+    "transport",
+    "estimators",
+    "integrators",
+    "optimization",
+    "measure",
+    "report",
+    "cli",
+]
+# What a row must not know at all.
+FOREIGN = {
+    "errors": {"mitsuba", "drjit"},
+    "config": {"mitsuba", "drjit"},
+    "seeds": {"mitsuba", "drjit"},
+    "records": {"matplotlib"},
+}
+
+
+def violations(root: Path) -> list[str]:
+    """Every import under `root` (a folder laid out as the package) that goes the wrong way, one line each."""
+    found = []
+    for path in sorted(root.rglob("*.py")):
+        parts = path.relative_to(root).with_suffix("").parts
+        if parts == ("__init__",):
+            continue  # the package's own face, which loads what it shows on demand
+        row = parts[0]
+        if row not in ROWS:
+            found.append(f"{path.relative_to(root)}: {row} is in no row")
+            continue
+        for line, name in _imports(path, parts):
+            package, _, rest = name.partition(".")
+            target = rest.partition(".")[0]
+            if package in FOREIGN.get(row, set()):
+                found.append(f"{path.relative_to(root)}:{line}: {row} must not know {package}")
+            elif package == "reslrb_cli" and target in ROWS and ROWS.index(target) > ROWS.index(row):
+                found.append(f"{path.relative_to(root)}:{line}: {row} must not import {target}")
+    return found
+
+
+def _imports(path: Path, parts: tuple[str, ...]) -> list[tuple[int, str]]:
+    """(line, absolute dotted name) of each import of a module, those inside functions too."""
+    names = []
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            names += [(node.lineno, alias.name) for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            base = [*(["reslrb_cli", *parts][: -node.level] if node.level else []), *filter(None, [node.module])]
+            names += [(node.lineno, ".".join([*base, alias.name])) for alias in node.names]
+    return names
+
+
+def test_imports_run_one_way() -> None:
+    assert violations(ROOT) == []
+
+
+@pytest.mark.parametrize(
+    ("file", "source", "seen"),
+    [
+        ("transport/walk.py", "from reslrb_cli.estimators import base", True),
+        ("transport/walk.py", "def f():\n    import reslrb_cli.cli.optimize", True),
+        ("transport/walk.py", "from reslrb_cli import integrators", True),
+        ("transport/walk.py", "from ..estimators.base import Estimator", True),
+        ("transport/walk.py", "from .. import estimators", True),
+        ("config/schema.py", "import mitsuba as mi", True),
+        ("records/page.py", "from matplotlib import pyplot", True),
+        ("errors.py", "from reslrb_cli.config import load", True),
+        ("helpers.py", "import os", True),
+        ("transport/walk.py", "from . import emission\nfrom ..seeds import seed\nimport mitsuba as mi", False),
+        ("cli/optimize.py", "from reslrb_cli import __version__\nfrom reslrb_cli.optimization import loop", False),
+        ("estimators/base.py", "from reslrb_cli.transport import types", False),
+    ],
+)
+def test_a_planted_violation_is_seen(tmp_path: Path, file: str, source: str, seen: bool) -> None:
+    (tmp_path / file).parent.mkdir(exist_ok=True)
+    (tmp_path / file).write_text(source)
+    assert bool(violations(tmp_path)) is seen
+
+
+def test_importing_the_package_loads_no_mitsuba() -> None:
+    script = "import sys, reslrb_cli; print(sorted({'mitsuba', 'drjit', 'matplotlib', 'numpy'} & set(sys.modules)))"
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+def test_every_module_can_be_imported_without_a_variant() -> None:
+    parts = [path.relative_to(ROOT.parent).with_suffix("").parts for path in ROOT.rglob("*.py")]
+    names = sorted({".".join(part for part in module if part != "__init__") for module in parts})
+    script = (
+        f"import importlib\nfor name in {names!r}: importlib.import_module(name)\n"
+        "import mitsuba as mi; assert mi.variant() is None, mi.variant()"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+
+
+def test_an_unknown_public_name_is_an_attribute_error() -> None:
+    with pytest.raises(AttributeError, match="no attribute 'nothing'"):
+        reslrb_cli.nothing  # noqa: B018

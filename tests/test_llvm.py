@@ -1,0 +1,200 @@
+"""The choice of libLLVM: which of several, which ones are refused, and what the user is told."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from reslrb_cli.backend import llvm
+from reslrb_cli.backend.shared_library import missing_library
+from reslrb_cli.errors import BackendError, ExitCode
+
+Machine = Callable[..., list[Path]]
+
+
+@pytest.fixture(autouse=True)
+def _forget(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Each test searches anew, without the choice that the tests themselves run under."""
+    monkeypatch.delenv(llvm.VARIABLE, raising=False)
+    for cached in (llvm.choose, llvm._examine):
+        cached.cache_clear()
+    yield
+    for cached in (llvm.choose, llvm._examine):
+        cached.cache_clear()
+
+
+@pytest.fixture
+def machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Machine:
+    """`machine({"libLLVM-15.so.1": "loads"})` lays out a machine with these libraries alone.
+
+    Each says what its trial does: prints a version, or exits with a message of the dynamic loader.
+    """
+    trial = tmp_path / "trial.py"
+    trial.write_text(
+        "import sys\ntext = open(sys.argv[1]).read()\n"
+        "sys.exit(text) if ' ' in text else print(text)\n"
+        "if text == 'abort': __import__('os').abort()\n"
+    )
+
+    def make(libraries: dict[str, str]) -> list[Path]:
+        paths = []
+        for name, behaviour in libraries.items():
+            path = tmp_path / "lib" / name
+            path.parent.mkdir(exist_ok=True)
+            path.write_text(behaviour)
+            paths.append(path)
+        monkeypatch.setattr(llvm, "_folders", lambda: iter([tmp_path / "lib"]))
+        monkeypatch.setattr(llvm, "_loader_cache", list)
+        monkeypatch.setattr(llvm.shared_library, "__file__", str(trial))
+        return paths
+
+    return make
+
+
+@pytest.mark.parametrize(
+    ("name", "version"),
+    [
+        ("libLLVM-15.so.1", 15),
+        ("libLLVM-14.0.6.so.1", 14),
+        ("libLLVM-19.so", 19),
+        ("libLLVM.so.19.1", 19),
+        ("libLLVM.so.22.1", 22),
+        ("libLLVM.21.1.dylib", 21),
+        ("libLLVM.so", None),
+        ("libLLVM.dylib", None),
+        ("libLLVMSPIRVLib.so.19.1", None),
+        ("libLLVM-19.a", None),
+    ],
+)
+def test_version_from_name(name: str, version: int | None) -> None:
+    assert llvm.version_from_name(Path("/lib") / name) == version
+
+
+def test_the_newest_that_loads_is_chosen(machine: Machine) -> None:
+    machine(
+        {
+            "libLLVM-14.so.1": "must-not-be-tried",
+            "libLLVM.so.19.1": "19.1.7",
+            "libLLVM.so.20.1": "20.1.2",
+            "libLLVM.so.22.1": "libz3.so.4: cannot open shared object file: No such file or directory",
+            "libLLVM.so.23.1": "abort",
+        }
+    )
+    choice = llvm.choose()
+    assert choice.library is not None
+    assert (choice.library.path.name, choice.library.version) == ("libLLVM.so.20.1", "20.1.2")
+    reasons = {rejected.path.name: rejected.reason for rejected in choice.rejected}
+    assert reasons["libLLVM.so.22.1"] == "it needs libz3.so.4, which is missing"
+    assert "ended a process" in reasons["libLLVM.so.23.1"]
+
+
+def test_a_file_whose_name_tells_no_version_is_tried(machine: Machine) -> None:
+    machine({"libLLVM.so": "21.1.0", "libLLVM.so.20.1": "20.1.2"})
+    library = llvm.require()
+    assert library.version == "21.1.0"
+
+
+@pytest.mark.parametrize("name", ["libLLVM-14.so.1", "libLLVM-15.so.1", "libLLVM-16.so.1", "libLLVM-18.so.1"])
+def test_old_versions_are_refused(machine: Machine, name: str) -> None:
+    machine({name: "must-not-be-tried"})
+    with pytest.raises(BackendError, match=f"{name}: version 1[4-8] is too old") as refused:
+        llvm.require()
+    assert refused.value.exit_code is ExitCode.BACKEND
+
+
+@pytest.mark.parametrize("said", ["unknown", "16.0.6"])
+def test_an_old_version_behind_a_plain_name_is_refused(machine: Machine, said: str) -> None:
+    machine({"libLLVM.so": said})
+    with pytest.raises(BackendError, match="is too old"):
+        llvm.require()
+
+
+def test_a_machine_without_one_is_told_what_to_install(machine: Machine) -> None:
+    machine({})
+    with pytest.raises(BackendError, match=r"none found\); install"):
+        llvm.require()
+
+
+@pytest.mark.parametrize(
+    ("name", "behaviour", "reason"),
+    [
+        ("libLLVM-15.so.1", "15.0.6", "version 15 is too old"),
+        ("libLLVM.so", "unknown", "version before 16 is too old"),
+        ("other.so", "libedit.so.2: cannot open shared object file: No such file", "it needs libedit.so.2"),
+    ],
+)
+def test_the_users_own_choice_is_refused_too(
+    machine: Machine, monkeypatch: pytest.MonkeyPatch, name: str, behaviour: str, reason: str
+) -> None:
+    good, named = machine({"libLLVM.so.19.1": "19.1.7", name: behaviour})
+    monkeypatch.setenv(llvm.VARIABLE, str(named))
+    with pytest.raises(BackendError, match=f"{llvm.VARIABLE}=.*{reason}"):
+        llvm.require()
+    monkeypatch.setenv(llvm.VARIABLE, str(good))
+    assert llvm.require().path == good
+
+
+def test_prepare_hands_the_choice_to_dr_jit(machine: Machine, monkeypatch: pytest.MonkeyPatch) -> None:
+    (path,) = machine({"libLLVM.so.19.1": "19.1.7"})
+    monkeypatch.setenv(llvm.VARIABLE, "")
+    monkeypatch.delitem(sys.modules, "drjit", raising=False)
+    llvm.prepare()
+    assert os.environ[llvm.VARIABLE] == str(path)
+
+
+def test_prepare_leaves_the_users_choice_alone(machine: Machine, monkeypatch: pytest.MonkeyPatch) -> None:
+    machine({"libLLVM.so.19.1": "19.1.7"})
+    monkeypatch.setenv(llvm.VARIABLE, "/somewhere/libLLVM.so")
+    llvm.prepare()
+    assert os.environ[llvm.VARIABLE] == "/somewhere/libLLVM.so"
+
+
+@pytest.mark.parametrize(
+    ("message", "library"),
+    [
+        ("libz3.so.4: cannot open shared object file: No such file or directory", "libz3.so.4"),
+        ("ImportError: libatomic.so.1: cannot open shared object file: No such file", "libatomic.so.1"),
+        ("dlopen(...): Library not loaded: @rpath/libz3.4.dylib\n  Referenced from: ...", "libz3.4.dylib"),
+        ("/nope/libLLVM.so: cannot open shared object file: No such file or directory", None),
+        ("/lib/libLLVM.so: undefined symbol: x", None),
+    ],
+)
+def test_missing_library(message: str, library: str | None) -> None:
+    assert missing_library(message) == library
+
+
+@pytest.mark.skipif(shutil.which("cc") is None or sys.platform != "linux", reason="needs a C compiler")
+def test_a_library_finds_its_needs_beside_it(tmp_path: Path) -> None:
+    (tmp_path / "a.c").write_text("int one(void) { return 1; }")
+    (tmp_path / "b.c").write_text("int one(void); int two(void) { return one() + 1; }")
+    build = ["cc", "-shared", "-fPIC", "-o"]
+    subprocess.run([*build, "libneed.so.1.2", "-Wl,-soname,libneed.so.1", "a.c"], cwd=tmp_path, check=True)
+    subprocess.run([*build, "libuser.so", "b.c", "./libneed.so.1.2"], cwd=tmp_path, check=True)
+    script = (
+        "import sys; from pathlib import Path; from reslrb_cli.backend import shared_library\n"
+        "print(shared_library.load(Path(sys.argv[1])).two())"
+    )
+    command = [sys.executable, "-c", script, str(tmp_path / "libuser.so")]
+    assert subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip() == "2"
+    (tmp_path / "libneed.so.1.2").unlink()
+    assert "libneed.so.1" in subprocess.run(command, capture_output=True, text=True, check=False).stderr
+
+
+@pytest.mark.parametrize("name", ["libLLVM-15.so.1", "libLLVM-14.so.1"])
+def test_the_command_line_exits_with_3(tmp_path: Path, name: str) -> None:
+    (tmp_path / name).write_bytes(b"")
+    script = "from reslrb_cli.cli import main; main(prog_name='reslrb')"
+    env = {**os.environ, llvm.VARIABLE: str(tmp_path / name), "DRJIT_LIBCUDA_PATH": "/nonexistent"}
+    done = subprocess.run(
+        [sys.executable, "-c", script, "doctor"], capture_output=True, text=True, env=env, check=False
+    )
+    assert done.returncode == ExitCode.BACKEND
+    assert "is too old" in done.stdout
+    assert "Traceback" not in done.stderr
+    assert len(done.stderr.splitlines()) == 1
