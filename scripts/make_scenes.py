@@ -33,7 +33,7 @@ def images() -> dict[str, Image]:
     return {
         "cornell_floor/floor.exr": carpet(64),
         "grey_room/planks.exr": planks(96),
-        "grey_room/painting.exr": painting(48),
+        "grey_room/painting.exr": painting(20),
         "grey_room/sky.exr": sky(64),
         "caustic_slab/paper.exr": paper(64),
     }
