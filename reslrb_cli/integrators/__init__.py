@@ -1,0 +1,6 @@
+"""Integrators behind one interface: our light tracers as Mitsuba plugins, the stock baselines, and the gradient step."""
+
+from reslrb_cli.integrators.adapter import register
+from reslrb_cli.integrators.step import StepResult, gradient_step, make_integrator, render_image
+
+__all__ = ["StepResult", "gradient_step", "make_integrator", "register", "render_image"]

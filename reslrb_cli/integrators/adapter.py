@@ -1,0 +1,185 @@
+"""Our light tracers as Mitsuba plugins: `mi.load_dict({"type": "reslrb", ...})` after `reslrb_cli.register()`."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from reslrb_cli.errors import UnsupportedScene
+from reslrb_cli.estimators import ESTIMATORS
+from reslrb_cli.integrators import light_tracer as lt
+from reslrb_cli.integrators.differentiated import differentiated
+from reslrb_cli.scene.needs import check_supported, scene_needs
+from reslrb_cli.transport.plan import Plan, make_plan
+from reslrb_cli.transport.splat import Film
+
+_registered_with_callback = False
+
+
+def register() -> None:
+    """Make `reslrb` and `walk_ad` known to Mitsuba, in the current variant and in any that is set later."""
+    global _registered_with_callback
+    if not _registered_with_callback:
+        mi.detail.add_variant_callback(_on_variant)
+        _registered_with_callback = True
+    if mi.variant() is not None:
+        _on_variant(None, mi.variant())
+
+
+def _on_variant(old: str | None, new: str) -> None:
+    if not new.endswith(("_ad_rgb", "_ad_mono")):
+        return
+    reslrb, walk_ad = _make_classes()
+    mi.register_integrator("reslrb", lambda props: reslrb(props))
+    mi.register_integrator("walk_ad", lambda props: walk_ad(props))
+
+
+def _make_classes() -> tuple[Any, Any]:
+    """The classes derive from one of the variant's, so they exist once for each variant."""
+
+    class LightIntegrator(mi.CppADIntegrator):  # type: ignore[misc]
+        """What both have in common: `ptracer`'s options, and the image."""
+
+        def __init__(self, props: Any) -> None:
+            # Taken before the base class sees it, which has another idea of a pass and warns.
+            self.samples_per_pass: int | None = props.get("samples_per_pass", None)
+            if self.samples_per_pass is not None:
+                del props["samples_per_pass"]
+                if self.samples_per_pass <= 0:
+                    raise ValueError('"samples_per_pass" must be greater than zero')
+            super().__init__(props)
+            self.max_depth = props.get("max_depth", -1)
+            if self.max_depth < -1:
+                raise ValueError('"max_depth" must be -1 (no limit) or a value >= 0')
+            self.rr_depth = props.get("rr_depth", 5)
+            if self.rr_depth <= 0:
+                raise ValueError('"rr_depth" must be greater than zero')
+            self._track_zeros = False
+            self._plans: dict[Any, Plan] = {}
+
+        def plan(self, scene: Any, sensor: Any, params: Any = None) -> Plan:
+            """What a walk of this scene needs; refuses what cannot work. `params`: those to look for derivatives in."""
+            key = (scene.ptr, sensor.ptr)
+            if key not in self._plans:
+                check_supported(scene, sensor, self.hide_emitters)
+                needs = scene_needs(scene, sensor)
+                self._plans[key] = make_plan(needs, self.max_depth, self.rr_depth, self.hide_emitters)
+            plan = self._plans[key]
+            if params is None:
+                return plan
+            which = differentiated(params)
+            # Once needed, kept: otherwise kernels would be compiled anew whenever a texel enters or leaves zero.
+            self._track_zeros |= which.zeros
+            return plan.differentiating(which.bsdfs, which.emission, self._track_zeros)
+
+        def passes(self, scene: Any, sensor: Any, seed: Any, spp: int, params: Any = None) -> list[lt.Samples]:
+            """The samples of one image, and the sensor's own sample count where `spp` is 0."""
+            spp = spp or sensor.sampler().sample_count()
+            plan = self.plan(scene, sensor, params)
+            return lt.passes(plan, scene, sensor, seed, spp, self.samples_per_pass)
+
+        def render(self, scene: Any, sensor: Any = 0, seed: Any = 0, spp: int = 0, develop: bool = True,
+                   evaluate: bool = True) -> Any:  # fmt: skip
+            if not develop:
+                raise ValueError("develop=True must be specified when invoking AD integrators")
+            sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
+            with dr.suspend_grad():
+                film = Film(sensor)
+                block = film.block()
+                for samples in self.passes(scene, sensor, seed, spp):
+                    lt.splat_image(samples, block)
+                    if self.samples_per_pass is not None:
+                        dr.eval(block.tensor())
+                image = film.develop(block)
+                if evaluate:
+                    dr.eval(image)
+                return image
+
+        def aov_names(self) -> list[str]:
+            return []
+
+        def to_string(self) -> str:
+            return f"{type(self).__name__}[max_depth = {self.max_depth}, rr_depth = {self.rr_depth}]"
+
+    class ReslrbIntegrator(LightIntegrator):
+        """Reservoir light replay backpropagation: derivatives by a replay of each path."""
+
+        def __init__(self, props: Any) -> None:
+            super().__init__(props)
+            name, image = props.get("estimator", "reservoir"), props.get("image", "all")
+            if name not in ESTIMATORS:
+                raise ValueError(f'"estimator" must be one of {", ".join(ESTIMATORS)}, not "{name}"')
+            if image not in ("all", "retained"):
+                raise ValueError(f'"image" must be all or retained, not "{image}"')
+            self.estimator = ESTIMATORS[name](image)
+
+        def trace(self, scene: Any, sensor: Any, seed: Any, spp: int, params: Any) -> lt.Trace:
+            """The image, and what a replay of the same samples needs; both evaluated."""
+            with dr.suspend_grad():
+                return lt.trace_image(self.passes(scene, sensor, seed, spp, params), self.estimator)
+
+        def replay(self, trace: lt.Trace, gradient: Any, params: Any) -> None:
+            """Add the gradient of the objective with dL/dI `gradient` (H, W, C) to the parameters."""
+            with dr.suspend_grad():
+                adjoint = trace.film.adjoint(gradient)
+                for samples, state in zip(trace.samples, trace.states(self.estimator), strict=True):
+                    lt.replay(samples, self.estimator, state, adjoint)
+                    if len(trace.samples) > 1:
+                        _evaluate_gradients(params)
+
+        def render_backward(self, scene: Any, params: Any, grad_in: Any, sensor: Any = 0, seed: Any = 0,
+                            spp: int = 0) -> None:  # fmt: skip
+            sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
+            params = _parameters(scene, params)
+            with dr.suspend_grad():
+                trace = lt.Trace(self.passes(scene, sensor, seed, spp, params))
+            self.replay(trace, grad_in, params)
+
+        def render_forward(self, scene: Any, params: Any, sensor: Any = 0, seed: Any = 0, spp: int = 0) -> Any:
+            sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
+            params = _parameters(scene, params)
+            with dr.suspend_grad():
+                film = Film(sensor)
+                block = film.block()
+                for samples in self.passes(scene, sensor, seed, spp, params):
+                    lt.splat_tangents(samples, block)
+                return film.develop_tangent(block)
+
+    class WalkAdIntegrator(LightIntegrator):
+        """The same walk under naive AD: for comparisons at equal seeds."""
+
+        def attached_image(self, scene: Any, sensor: Any, seed: Any, spp: int, params: Any) -> Any:
+            """The image with its whole graph."""
+            film = Film(sensor)
+            block = film.block()
+            for samples in self.passes(scene, sensor, seed, spp, params):
+                lt.splat_attached(samples, block)
+            return film.develop(block)
+
+        def render_backward(self, scene: Any, params: Any, grad_in: Any, sensor: Any = 0, seed: Any = 0,
+                            spp: int = 0) -> None:  # fmt: skip
+            sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
+            with dr.resume_grad():
+                image = self.attached_image(scene, sensor, seed, spp, _parameters(scene, params))
+                dr.backward_from(image * grad_in)
+
+        def render_forward(self, scene: Any, params: Any, sensor: Any = 0, seed: Any = 0, spp: int = 0) -> Any:
+            sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
+            with dr.resume_grad():
+                image = self.attached_image(scene, sensor, seed, spp, _parameters(scene, params))
+                return dr.forward_to(image)
+
+    return ReslrbIntegrator, WalkAdIntegrator
+
+
+def _parameters(scene: Any, params: Any) -> Any:
+    """Parameters to look for derivatives in: the user's, or all of the scene's."""
+    return params if isinstance(params, mi.SceneParameters) else mi.traverse(scene)
+
+
+def _evaluate_gradients(params: Any) -> None:
+    """Run what has been recorded for the gradients, so that passes do not pile up."""
+    with dr.resume_grad():
+        dr.eval([dr.grad(params[key]) for key in params.keys() if dr.grad_enabled(params[key])])

@@ -1,0 +1,64 @@
+"""Which parameters of a scene are being differentiated, and what that asks of a walk."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from reslrb_cli.errors import UnsupportedScene
+
+
+@dataclass(frozen=True)
+class Differentiated:
+    """Whether any parameter of a BSDF, or of an emitter, tracks derivatives; and whether any is exactly zero."""
+
+    bsdfs: bool
+    emission: bool
+    zeros: bool
+
+
+def differentiated(params: Any) -> Differentiated:
+    """Look through `mi.SceneParameters` for parameters with derivatives enabled.
+
+    Raises UnsupportedScene where one of them moves the geometry or the sensor: detached light tracing has no derivative
+    for that, and would silently leave it at zero.
+    """
+    bsdfs = emission = zeros = False
+    with dr.resume_grad():  # where gradients are suspended, nothing says that it tracks them
+        attached = {key: params[key] for key in params.keys() if dr.grad_enabled(params[key])}
+    for key, value in attached.items():
+        owner = _owner(params, key)
+        if isinstance(owner, mi.BSDF):
+            bsdfs = True
+        elif isinstance(owner, mi.Emitter):
+            emission = True
+        else:
+            raise UnsupportedScene(
+                f"{key}: detached light tracing has derivatives of BSDFs and emission only, not of "
+                f"{type(owner).__name__ if owner is not None else 'this'} parameters, which move the geometry or the sensor"
+            )
+        zeros = zeros or _has_singular(key, value)
+    return Differentiated(bsdfs, emission, zeros)
+
+
+def _owner(params: Any, key: str) -> Any:
+    """The BSDF or emitter that a parameter belongs to (a texture belongs to what it is plugged into), or its node."""
+    node = params.properties[key][2]
+    while node is not None:
+        if isinstance(node, (mi.BSDF, mi.Emitter, mi.Shape, mi.Sensor)):
+            return node
+        parent = params.hierarchy.get(node)
+        node = parent[0] if parent else None
+    return None
+
+
+def _has_singular(key: str, value: Any) -> bool:
+    """Whether a factor of this parameter is exactly zero somewhere: at 0, or at 1 where 1 - x is a factor too."""
+    flat = dr.detach(value.array if dr.is_tensor_v(value) else dr.ravel(value))
+    singular = flat == 0
+    if {"opacity", "weight"} & set(key.split(".")):
+        singular |= flat == 1
+    return bool(dr.any(singular))

@@ -1,0 +1,207 @@
+"""The samples of one light-traced image, and what is done with them: image pass, replay, forward mode, naive AD."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from reslrb_cli.estimators import Estimator
+from reslrb_cli.estimators.base import PathAdjoint, adjoint_of_factor
+from reslrb_cli.integrators.hooks import AttachedSplat, Splat, TangentSplat
+from reslrb_cli.transport.emission import sample_emission
+from reslrb_cli.transport.plan import Plan
+from reslrb_cli.transport.splat import AdjointImage, Film
+from reslrb_cli.transport.visible import PrimaryRay, differentiate_visible_radiance, primary_ray, visible_radiance
+from reslrb_cli.transport.walk import Hooks, walk
+
+SELECTION_STREAM = 0x5E1EC7  # keeps the hooks' numbers apart from the sampler's
+VISIBLE_STREAM = 0xD1EC7
+
+
+@dataclass
+class Samples:
+    """The samples of one pass: which random numbers, how many light paths. `seed` is an opaque UInt32."""
+
+    scene: Any
+    sensor: Any
+    plan: Plan
+    film: Film
+    seed: Any
+    spp: int
+    width: int
+    scale: float  # brings a sum over light paths to an image
+    fraction: float  # of all samples of that image, these are so many
+
+    def sampler(self) -> Any:
+        """A sampler at the beginning of these samples' stream."""
+        sampler = self.sensor.sampler().clone()
+        sampler.set_sample_count(self.spp)
+        sampler.set_samples_per_wavefront(self.spp)
+        sampler.seed(self.seed, self.width)
+        return sampler
+
+    def stream(self, name: int) -> Any:
+        """Random numbers beside the sampler's own."""
+        return mi.PCG32(self.width, mi.UInt64(self.seed) + (name << 32))
+
+    def primary_ray(self) -> PrimaryRay:
+        """Rays for C_0, from a stream of their own: the light paths are those of `ptracer` with or without them."""
+        return primary_ray(self.plan, self.sensor, _NumberStream(self.stream(VISIBLE_STREAM)), self.width)
+
+
+class _NumberStream:
+    """The two methods of a Mitsuba sampler that emission asks for, over a bare generator."""
+
+    def __init__(self, generator: Any) -> None:
+        self.generator = generator
+
+    def next_1d(self) -> Any:
+        return self.generator.next_float32()
+
+    def next_2d(self) -> Any:
+        return mi.Point2f(self.generator.next_float32(), self.generator.next_float32())
+
+
+def make_samples(plan: Plan, scene: Any, sensor: Any, seed: Any, spp: int, total_spp: int) -> Samples:
+    """`spp` of `total_spp` samples per pixel; the film's full size counts, not the crop's, as for `ptracer`.
+
+    Raises ValueError where one pass would hold more than 2^32 - 1 paths.
+    """
+    film = Film(sensor)
+    width = spp * int(dr.prod(sensor.film().size()))
+    if width > 0xFFFFFFFF:
+        raise ValueError(
+            f"one pass of {spp} samples per pixel is {width} paths, more than 2^32 - 1: set samples_per_pass"
+        )
+    scale = float(dr.prod(film.size)) / (float(dr.prod(sensor.film().size())) * total_spp)
+    return Samples(scene, sensor, plan, film, mi.UInt32(seed), spp, width, scale, spp / total_spp)
+
+
+def passes(plan: Plan, scene: Any, sensor: Any, seed: Any, spp: int, spp_per_pass: int | None) -> list[Samples]:
+    """All samples of an image, in passes of `spp_per_pass` samples per pixel, which must divide `spp`.
+
+    The first pass has the seed itself, so that it traces what `ptracer` does.
+    """
+    size = spp if spp_per_pass is None else min(spp_per_pass, spp)
+    if spp % size:
+        raise ValueError(f"the sample count ({spp}) must be a multiple of samples_per_pass ({size})")
+    # Opaque: a seed that reached the kernel as a literal would compile a new one each step.
+    seeds = [mi.UInt32(seed)] + [mi.sample_tea_32(mi.UInt32(seed), mi.UInt32(p))[0] for p in range(1, spp // size)]
+    dr.make_opaque(seeds)
+    return [make_samples(plan, scene, sensor, s, size, spp) for s in seeds]
+
+
+def trace(samples: Samples, hooks: Hooks, active: Any = True) -> Any:
+    """Run the walk over these samples; the hooks' final state."""
+    selection = samples.stream(SELECTION_STREAM) if hooks.numbers else None
+    return walk(samples.plan, samples.scene, samples.sensor, samples.sampler(), hooks, active, selection)
+
+
+def splat_visible_emission(samples: Samples, block: Any, loop_mode: str = "symbolic") -> None:
+    """Add C_0 to the block."""
+    if samples.plan.visible_emission:
+        primary = samples.primary_ray()
+        radiance = visible_radiance(samples.plan, samples.scene, primary, loop_mode)
+        samples.film.put(block, primary.u, radiance * primary.weight * samples.fraction, primary.active)
+
+
+def splat_image(samples: Samples, block: Any) -> None:
+    """Add the samples' contributions to the block; keep nothing."""
+    splat_visible_emission(samples, block)
+    trace(samples, Splat(samples, block))
+
+
+def splat_and_keep(samples: Samples, estimator: Estimator, block: Any) -> Any:
+    """Add the samples' contributions to the block (None: no image) and return what the estimator keeps of each path.
+
+    One kernel: the state is scheduled together with the block, which would otherwise trace everything twice.
+    """
+    hooks = estimator.image_hooks(samples.plan, samples.scene, samples.film, block, samples.scale)
+    if block is not None:
+        splat_visible_emission(samples, block)
+    state = trace(samples, hooks)
+    if block is not None:
+        estimator.finish_image(samples.film, block, state)
+        dr.schedule(block.tensor())
+    dr.eval(state)
+    return state
+
+
+@dataclass
+class Trace:
+    """Samples that have been traced: their image, and what is kept of their paths if they fit in one pass.
+
+    Several passes keep nothing, which would grow with the number of passes: each is traced again before its replay.
+    """
+
+    samples: list[Samples]
+    image: Any = None
+    state: Any = None
+
+    @property
+    def film(self) -> Film:
+        return self.samples[0].film
+
+    def states(self, estimator: Estimator) -> Iterator[Any]:
+        """What is kept of each pass, in turn."""
+        for samples in self.samples:
+            yield self.state if self.state is not None else splat_and_keep(samples, estimator, None)
+
+
+def trace_image(samples: list[Samples], estimator: Estimator) -> Trace:
+    """Trace all passes: the image, and what the estimator keeps of each path."""
+    film = samples[0].film
+    block = film.block()
+    if len(samples) == 1:
+        trace = Trace(samples, state=splat_and_keep(samples[0], estimator, block))
+    else:
+        trace = Trace(samples)
+        for part in samples:
+            splat_image(part, block)
+            dr.eval(block.tensor())
+    trace.image = film.develop(block)
+    dr.eval(trace.image)
+    return trace
+
+
+def replay(samples: Samples, estimator: Estimator, state: Any, image: AdjointImage) -> None:
+    """Add the derivatives of the objective, whose derivative with respect to the film is `image`, to the parameters."""
+    plan = samples.plan
+    adjoint = estimator.adjoint(state, image)
+    if plan.visible_emission and (plan.differentiate_emission or plan.needs.has_null):
+        primary = samples.primary_ray()
+        delta = image.lookup(primary.u, primary.active) * primary.weight * samples.fraction
+        differentiate_visible_radiance(plan, samples.scene, primary, delta)
+    if plan.differentiate_emission:
+        with dr.resume_grad(), dr.isolate_grad():
+            E = sample_emission(plan, samples.scene, samples.sensor, samples.sampler()).weight
+            weight = adjoint_of_factor(adjoint, mi.Int32(0), E, 1)
+            dr.backward_from(dr.select(adjoint.active, dr.dot(weight, E), 0))
+    if plan.differentiate_bsdfs:
+        hooks = estimator.replay_hooks(plan, samples.scene, state, adjoint)
+        trace(samples, hooks, adjoint.active)
+
+
+def splat_tangents(samples: Samples, block: Any) -> None:
+    """Add the forward-mode derivative of the samples' contributions to the block, exactly and in one traversal."""
+    plan, dE = samples.plan, mi.Spectrum(0)
+    with dr.resume_grad():
+        if plan.differentiate_emission:
+            E = sample_emission(plan, samples.scene, samples.sensor, samples.sampler()).weight
+            dE = dr.detach(dr.forward_to(E))
+        if plan.visible_emission:
+            primary = samples.primary_ray()
+            tangent = dr.detach(dr.forward_to(visible_radiance(plan, samples.scene, primary)))
+            samples.film.put(block, primary.u, tangent * primary.weight * samples.fraction, primary.active)
+    trace(samples, TangentSplat(samples, block, dE))
+
+
+def splat_attached(samples: Samples, block: Any) -> None:
+    """Add the contributions with derivatives attached to the block: naive AD, its memory proportional to depth."""
+    with dr.resume_grad():
+        splat_visible_emission(samples, block, "evaluated")
+        trace(samples, AttachedSplat(samples, block))

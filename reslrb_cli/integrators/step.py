@@ -1,0 +1,136 @@
+"""A step: image, loss, and the gradient of every parameter, by whichever integrator, with delta from either choice of
+samples.
+
+    correlated     one set of samples for image and gradient; what naive AD of one render does
+    independent    the gradient's samples have a seed of their own; what `mi.render` does
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import drjit as dr
+import mitsuba as mi
+
+from reslrb_cli.integrators.adapter import register
+
+Adjoint = Literal["correlated", "independent"]
+Objective = Callable[[Any], Any]
+
+
+@dataclass
+class StepResult:
+    """What a step yields besides gradients: the image (H, W, C) and the loss (width 1), both detached."""
+
+    image: Any
+    loss: Any
+
+
+def make_integrator(type: str, **options: Any) -> Any:
+    """An integrator by its plugin's name and options: `reslrb`, `walk_ad`, or a stock one such as `ptracer`, `prb`."""
+    register()
+    return mi.load_dict({"type": type, **options})
+
+
+def render_image(integrator: Any, scene: Any, sensor: Any, seed: int, spp: int) -> Any:
+    """The image (H, W, C) without derivatives."""
+    with dr.suspend_grad():
+        return integrator.render(scene, _sensor(scene, sensor), dr.opaque(mi.UInt32, seed), spp)
+
+
+def gradient_step(
+    integrator: Any,
+    scene: Any,
+    sensor: Any,
+    objective: Objective,
+    *,
+    seed: int,
+    spp: int,
+    adjoint: Adjoint = "correlated",
+    params: Any = None,
+    on_image: Callable[[], None] | None = None,
+) -> StepResult:
+    """Render, evaluate `objective(image)`, and add its gradient to every parameter of the scene that tracks one.
+
+    `objective` maps the image, a tensor (H, W, C) that tracks derivatives, to a scalar; `sensor` is one of the scene's
+    or its index; `params` are the scene's parameters where the caller has them at hand (`mi.traverse` otherwise).
+    `on_image` is called once the image and the loss are evaluated, where a step has such a moment.
+    """
+    sensor = _sensor(scene, sensor)
+    params = params if params is not None else mi.traverse(scene)
+    image_seed = mi.UInt32(seed)
+    dr.make_opaque(image_seed)
+    if hasattr(integrator, "trace"):  # reslrb
+        return _replayed(integrator, scene, sensor, objective, image_seed, spp, adjoint, params, on_image)
+    replays = not isinstance(integrator, mi.AdjointIntegrator) and not hasattr(integrator, "attached_image")
+    if replays or adjoint == "independent":
+        gradient_seed = image_seed if adjoint == "correlated" else second_seed(image_seed)
+        with dr.suspend_grad():
+            image = integrator.render(scene, sensor, image_seed, spp)
+        loss, gradient = _derivative(objective, image, on_image)
+        # Isolated, so that another view's propagation finds the edges above the scene's parameters intact.
+        with _naive_ad(integrator), dr.isolate_grad():
+            integrator.render_backward(scene, params, gradient, sensor, gradient_seed, spp)
+        return StepResult(image, loss)
+    with _naive_ad(integrator), dr.isolate_grad():  # as above
+        if hasattr(integrator, "attached_image"):
+            image = integrator.attached_image(scene, sensor, image_seed, spp, params)
+        else:
+            image = integrator.render(scene, sensor, image_seed, spp, develop=True, evaluate=False)
+        loss = objective(image)
+        dr.backward_from(loss)
+    return StepResult(dr.detach(image), dr.detach(loss))
+
+
+def _replayed(integrator: Any, scene: Any, sensor: Any, objective: Objective, seed: Any, spp: int, adjoint: Adjoint,
+              params: Any, on_image: Callable[[], None] | None) -> StepResult:  # fmt: skip
+    if adjoint == "independent":
+        with dr.suspend_grad():
+            image = integrator.render(scene, sensor, seed, spp)
+        loss, gradient = _derivative(objective, image, on_image)
+        gradient_seed = second_seed(seed)
+        integrator.render_backward(scene, params, gradient, sensor, gradient_seed, spp)
+        return StepResult(image, loss)
+    trace = integrator.trace(scene, sensor, seed, spp, params)
+    loss, gradient = _derivative(objective, trace.image, on_image)
+    integrator.replay(trace, gradient, params)
+    return StepResult(trace.image, loss)
+
+
+def _derivative(objective: Objective, image: Any, on_image: Callable[[], None] | None) -> tuple[Any, Any]:
+    """Loss and dL/dI, evaluated in one go."""
+    with dr.resume_grad(), dr.isolate_grad():
+        attached = type(image)(image)
+        dr.enable_grad(attached)
+        loss = objective(attached)
+        dr.backward_from(loss)
+        gradient = dr.grad(attached)
+    loss = dr.detach(loss)
+    dr.eval(loss, gradient)
+    if on_image is not None:
+        on_image()
+    return loss, gradient
+
+
+def second_seed(seed: Any) -> Any:
+    """The seed of the gradient's own samples."""
+    result = mi.sample_tea_32(seed, mi.UInt32(1))[0]
+    dr.make_opaque(result)
+    return result
+
+
+@contextmanager
+def _naive_ad(integrator: Any) -> Iterator[None]:
+    """Stock light tracing is differentiable in evaluated loops alone."""
+    if isinstance(integrator, mi.AdjointIntegrator):
+        with dr.scoped_set_flag(dr.JitFlag.SymbolicLoops, False):
+            yield
+    else:
+        yield
+
+
+def _sensor(scene: Any, sensor: Any) -> Any:
+    return scene.sensors()[sensor] if isinstance(sensor, int) else sensor

@@ -1,0 +1,67 @@
+"""Where light paths start: rays from the emitters."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from reslrb_cli.transport.plan import Plan
+
+
+@dataclass
+class Emission:
+    """A ray that leaves an emitter. `weight` is E of the design notes: radiance over the density of the ray, (C,).
+
+    `weight` tracks derivatives of emission where they are enabled; the density does not.
+    """
+
+    ray: Any
+    weight: Any
+
+
+def sample_time(sensor: Any, sampler: Any) -> Any:
+    """A time within the shutter interval; draws a number only where the shutter is open for some time."""
+    time = mi.Float(sensor.shutter_open())
+    if sensor.shutter_open_time() > 0:
+        time += sampler.next_1d() * sensor.shutter_open_time()
+    return time
+
+
+def sample_emission(plan: Plan, scene: Any, sensor: Any, sampler: Any) -> Emission:
+    """Sample a ray from a random emitter of the scene. Draws as many numbers, in the same order, as `ptracer`."""
+    time = sample_time(sensor, sampler)
+    wavelength_sample, sample_2, sample_3 = sampler.next_1d(), sampler.next_2d(), sampler.next_2d()
+    environment = scene.environment() if plan.environment_map else None
+    if environment is None:
+        ray, weight, _ = scene.sample_emitter_ray(time, wavelength_sample, sample_2, sample_3, True)
+        return Emission(dr.detach(ray), weight)
+
+    index, index_weight, reused = scene.sample_emitter(wavelength_sample, True)
+    is_environment = index == plan.needs.environment
+    ray, weight = _environment_ray(scene, environment, time, sample_2, sample_3)
+    if len(plan.needs.emitters) > 1:
+        emitter = dr.gather(mi.EmitterPtr, scene.emitters_dr(), index)
+        ray_2, weight_2 = emitter.sample_ray(time, reused, sample_2, sample_3, ~is_environment)
+        ray = dr.select(is_environment, ray, ray_2)
+        weight = dr.select(is_environment, weight, weight_2)
+    return Emission(dr.detach(ray), weight * dr.detach(index_weight))
+
+
+def _environment_ray(scene: Any, environment: Any, time: Any, disk: Any, direction: Any) -> tuple[Any, Any]:
+    """A ray from an environment map, on a disk perpendicular to it that covers the scene's bounding sphere.
+
+    Stock `envmap.sample_ray` places the disk in the map's local frame, which is wrong where `to_world` rotates it.
+    """
+    sphere = scene.bbox().bounding_sphere()
+    radius = sphere.radius * (1 + 1e-4)
+    reference = dr.zeros(mi.Interaction3f)
+    reference.p, reference.time = mi.Point3f(sphere.center), time
+    ds, weight = environment.sample_direction(reference, direction, True)
+    d = -dr.detach(ds.d)
+    offset = mi.warp.square_to_uniform_disk_concentric(disk)
+    perpendicular = mi.Frame3f(d).to_world(mi.Vector3f(offset.x, offset.y, 0))
+    ray = mi.Ray3f(sphere.center + (perpendicular - d) * radius, d, time, [])
+    return ray, weight * (dr.pi * radius**2)

@@ -1,0 +1,73 @@
+"""Products of path factors whose zeros are counted, so that the derivative at a zero factor is not lost.
+
+The contribution of a path is a product of factors, f_0 f_1 ... f_k, per channel. Its derivative with respect to f_j is
+the product of all others. Dividing the whole by f_j loses it where f_j = 0, so the product of the nonzero factors is
+carried beside the index of the zero one:
+
+    one zero factor, f_j:  d(f_0 ... f_k) = (product of the others) df_j       nothing for any other factor
+    two or more:           d(f_0 ... f_k) = 0
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+NO_ZERO = -1  # no factor of this channel is zero
+MANY_ZEROS = -2  # two or more are: value and derivatives vanish
+
+
+@dataclass
+class Product:
+    """A product of factors, one value per channel; part of the loop state.
+
+    `nonzero` is the product of all factors (untracked), or of those that are not zero (tracked). `zero` holds, per
+    channel, the index of the zero factor, NO_ZERO or MANY_ZEROS; it is empty where zeros are not tracked. `attached` is
+    the plain product with derivatives, for naive AD only; otherwise it is empty.
+    """
+
+    nonzero: Any
+    zero: list[Any] = field(default_factory=list)
+    attached: list[Any] = field(default_factory=list)
+
+    @staticmethod
+    def one(track_zeros: bool, attached: bool = False) -> Product:
+        """The empty product."""
+        zero = [mi.Int32(NO_ZERO) for _ in range(len(mi.Spectrum(0)))] if track_zeros else []
+        return Product(mi.Spectrum(1), zero, [mi.Spectrum(1)] if attached else [])
+
+    def times(self, factor: Any, index: Any) -> Product:
+        """The product with one more factor, (C,) per lane, that stands at position `index` of the path."""
+        attached = [self.attached[0] * factor] if self.attached else []
+        factor = dr.detach(factor)
+        if not self.zero:
+            return Product(self.nonzero * factor, [], attached)
+        nonzero = self.nonzero * dr.select(factor == 0, 1, factor)
+        first = [dr.select(z == NO_ZERO, mi.Int32(index), MANY_ZEROS) for z in self.zero]
+        zero = [dr.select(factor[c] == 0, first[c], z) for c, z in enumerate(self.zero)]
+        return Product(nonzero, zero, attached)
+
+    def scaled(self, scale: Any) -> Product:
+        """The product times a positive number that no parameter reaches, such as a roulette weight."""
+        return Product(self.nonzero * scale, self.zero, [self.attached[0] * scale] if self.attached else [])
+
+    def value(self) -> Any:
+        """The contribution itself: zero in every channel that has a zero factor. Attached under naive AD."""
+        return self.attached[0] if self.attached else self._where([z == NO_ZERO for z in self.zero])
+
+    def differentiable(self) -> Any:
+        """Product of the nonzero factors in every channel whose value or derivative can be nonzero; else zero."""
+        return self._where([z != MANY_ZEROS for z in self.zero])
+
+    def alive(self) -> Any:
+        """Whether any channel's value or derivative can be nonzero."""
+        return dr.any(self.differentiable() != 0)
+
+    def _where(self, keep: list[Any]) -> Any:
+        result = mi.Spectrum(self.nonzero)
+        for c, mask in enumerate(keep):
+            result[c] = dr.select(mask, result[c], 0)
+        return result

@@ -1,0 +1,108 @@
+"""Splatting onto the film through its reconstruction filter, and the exact adjoint of that: looking up dL/dI at a splat.
+
+splat:   I_p += filter_p(u) C        filter_p(u): weight of pixel p for film position u, summing to 1 over pixels
+lookup:  delta = sum_p filter_p(u) dL/dI_p
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+N_COLOR = 3  # a film's block holds R, G, B, perhaps alpha, and a weight that light tracing leaves at 0
+
+
+class Film:
+    """The film of one sensor as light tracing uses it: image blocks to splat into, adjoint images to look up."""
+
+    def __init__(self, sensor: Any) -> None:
+        self.film = sensor.film()
+        self.film.prepare([])
+        self.size = self.film.crop_size()
+        self.offset = self.film.crop_offset()
+
+    def block(self) -> Any:
+        """An empty image block that covers the crop window; filter weights are normalised per splat."""
+        block = self.film.create_block(normalize=True, borders=False)
+        block.set_offset(self.offset)
+        block.set_coalesce(False)  # splats of neighbouring lanes land anywhere
+        return block
+
+    def put(self, block: Any, u: Any, value: Any, active: Any) -> None:
+        """Add `value` (C,) at film position `u` (pixels, relative to the crop window) through the filter."""
+        color = [value[c % len(value)] for c in range(N_COLOR)]  # a mono variant fills all three
+        block.put(u + mi.Vector2f(self.offset), color + [mi.Float(0)] * (block.channel_count() - N_COLOR), active)
+
+    def develop(self, block: Any) -> Any:
+        """The image (H, W, channels) in the film's own pixel format; differentiable with respect to the block."""
+        self.film.prepare([])
+        if block.channel_count() == len("RGBAW"):
+            # Light tracing has no notion of coverage: every pixel is opaque.
+            alpha = dr.arange(mi.UInt32, dr.prod(self.size)) * block.channel_count() + N_COLOR
+            dr.scatter(block.tensor().array, mi.Float(1), alpha)
+        self.film.put_block(block)
+        return self.film.develop()
+
+    def develop_tangent(self, block: Any) -> Any:
+        """Derivative of the image from that of the block: `develop` is linear but for the opaque alpha channel."""
+        self.film.prepare([])
+        self.film.put_block(block)
+        return self.film.develop()
+
+    def adjoint(self, image_gradient: Any) -> AdjointImage:
+        """dL/d(block) from dL/d(developed image): what `AdjointImage` looks up."""
+        with dr.resume_grad():
+            block = self.block()
+            tensor = block.tensor()
+            dr.enable_grad(tensor)
+            image = self.develop(block)
+            dr.backward_from(image * dr.detach(image_gradient))
+            gradient = dr.grad(tensor)
+        return AdjointImage(self, mi.Float(gradient.array), block.channel_count())
+
+
+class AdjointImage:
+    """dL/dI on the film's pixels, looked up through the pixel filter at film positions.
+
+    `image` is a flat array, H * W * `channels` values, in the order of the film's block.
+    """
+
+    def __init__(self, film: Film, image: Any, channels: int) -> None:
+        self.image, self.channels, self.film = image, channels, film
+        self.filter = film.film.rfilter()
+
+    def lookup(self, u: Any, active: Any) -> Any:
+        """delta (C,) at film position `u` (pixels, relative to the crop window)."""
+        if self.filter.is_box_filter():
+            pixel = mi.Point2u(mi.Point2i(dr.floor(u)))
+            inside = active & (pixel.x < self.film.size.x) & (pixel.y < self.film.size.y)
+            return self._pixel(pixel, inside)
+        return self._filtered(u, active)
+
+    def _pixel(self, pixel: Any, active: Any) -> Any:
+        index = dr.fma(pixel.y, mi.UInt32(self.film.size.x), pixel.x)
+        if self.channels == len("RGBW"):
+            color = dr.gather(mi.Vector4f, self.image, index, active)  # one packet
+        else:
+            color = [dr.gather(mi.Float, self.image, index * self.channels + c, active) for c in range(N_COLOR)]
+        color = [color[c] for c in range(N_COLOR)]
+        return mi.Spectrum(*color) if len(mi.Spectrum(0)) == N_COLOR else mi.Spectrum(sum(color))
+
+    def _filtered(self, u: Any, active: Any) -> Any:
+        # The same taps and the same normalisation, off-film taps included, as ImageBlock.put(normalize=True).
+        radius = self.filter.radius()
+        taps = int(dr.ceil(2 * radius))
+        center = u - 0.5
+        first = mi.Point2i(dr.ceil(center - radius))
+        weights_x = [self.filter.eval(mi.Float(first.x + i) - center.x) for i in range(taps)]
+        weights_y = [self.filter.eval(mi.Float(first.y + i) - center.y) for i in range(taps)]
+        total = sum(weights_x) * sum(weights_y)
+        delta = mi.Spectrum(0)
+        for y in range(taps):
+            for x in range(taps):
+                pixel = mi.Point2u(mi.Point2i(first.x + x, first.y + y))
+                inside = active & (pixel.x < self.film.size.x) & (pixel.y < self.film.size.y)
+                delta += self._pixel(pixel, inside) * (weights_x[x] * weights_y[y])
+        return delta * dr.select(total != 0, dr.rcp(total), 0)

@@ -1,0 +1,100 @@
+"""Emitters that the sensor sees directly: C_0, one primary ray per light path, a sample of its own.
+
+Lanes are spread evenly over the pixels, so that a constant background is free of noise; connecting random points of the
+emitters to the sensor, as `ptracer` does, is the noisier the larger the emitter.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from reslrb_cli.transport.emission import sample_time
+from reslrb_cli.transport.plan import Plan
+
+
+@dataclass
+class PrimaryRay:
+    """A ray through film position `u` (pixels, relative to the crop window); `weight` (C,) is its sensor importance
+    times what brings a sum over lanes to the mean over each pixel's samples."""
+
+    ray: Any
+    u: Any
+    weight: Any
+    active: Any
+
+
+def primary_ray(plan: Plan, sensor: Any, sampler: Any, width: int) -> PrimaryRay:
+    """Sample `width` rays, as many in each pixel of the crop window, or one more."""
+    size = sensor.film().crop_size()
+    n_pixels = int(size[0] * size[1])
+    lane = dr.arange(mi.UInt32, width)
+    pixel = lane % n_pixels
+    per_pixel = mi.Float(width // n_pixels + dr.select(pixel < width % n_pixels, mi.UInt32(1), 0))
+    time = sample_time(sensor, sampler)
+    u = mi.Point2f(pixel % int(size[0]), pixel // int(size[0])) + sampler.next_2d()
+    aperture = sampler.next_2d() if plan.needs.thin_lens else mi.Point2f(0.5)
+    ray, weight = sensor.sample_ray(time, 0.5, u / mi.Vector2f(size), aperture, True)
+    return PrimaryRay(ray, u, weight * dr.rcp(dr.maximum(per_pixel, 1)), per_pixel > 0)
+
+
+@dataclass
+class _Look:
+    """State of a primary ray on its way through null surfaces."""
+
+    active: Any
+    ray: Any
+    transmittance: Any
+    radiance: Any
+    crossings: Any
+
+
+def visible_radiance(plan: Plan, scene: Any, primary: PrimaryRay, loop_mode: str = "symbolic") -> Any:
+    """Radiance (C,) that arrives along the primary ray, through null surfaces where the scene has any.
+
+    Carries derivatives where they are enabled: in forward mode, and, with `loop_mode` evaluated, for naive AD.
+    """
+    return _look(plan, scene, primary, None, loop_mode)
+
+
+def differentiate_visible_radiance(plan: Plan, scene: Any, primary: PrimaryRay, adjoint: Any) -> None:
+    """Add the derivatives of the radiance along the primary rays, times `adjoint` (C,), to the parameters.
+
+    Transmission is divided out of the radiance behind it, which a first look measures.
+    """
+    masks = plan.differentiate_bsdfs and plan.needs.has_null
+    total = visible_radiance(plan, scene, primary) if masks else mi.Spectrum(0)
+
+    def differentiate(state: _Look, Le: Any, radiance: Any, transmission: Any) -> None:
+        weight = dr.select(state.active, adjoint * state.transmittance, 0)
+        objective = weight * Le if plan.differentiate_emission else mi.Spectrum(0)
+        if masks:
+            behind = dr.select(transmission != 0, (total - radiance) / dr.detach(transmission), 0)
+            objective += dr.select(state.active, adjoint * behind, 0) * transmission
+        dr.backward_from(objective)
+
+    with dr.resume_grad():
+        _look(plan, scene, primary, differentiate, "symbolic")
+
+
+def _look(plan: Plan, scene: Any, primary: PrimaryRay, on_surface: Callable[..., None] | None, mode: str) -> Any:
+    def look(state: _Look) -> tuple[_Look]:
+        si = scene.ray_intersect(state.ray, state.active)
+        Le = si.emitter(scene).eval(si, state.active)
+        hit = state.active & si.is_valid()
+        transmission = si.bsdf().eval_null_transmission(si, hit) if plan.needs.has_null else mi.Spectrum(0)
+        if on_surface is not None:  # derivatives are taken here and now, none stays in the state
+            on_surface(state, Le, state.radiance + dr.detach(Le) * state.transmittance, transmission)
+            Le, transmission = dr.detach(Le), dr.detach(transmission)
+        radiance = state.radiance + Le * state.transmittance
+        through = hit & dr.any(transmission != 0) & (state.crossings + 2 <= plan.max_depth)
+        ray = dr.detach(si.spawn_ray(state.ray.d))
+        return (_Look(through, ray, state.transmittance * transmission, radiance, state.crossings + 1),)
+
+    state = _Look(mi.Bool(primary.active), primary.ray, mi.Spectrum(1), mi.Spectrum(0), mi.UInt32(0))
+    (state,) = dr.while_loop((state,), lambda state: state.active, look, label="primary ray", mode=mode)
+    return state.radiance

@@ -1,0 +1,144 @@
+"""The one light-path loop. It samples emission, connects, scatters, and calls hooks; what is done with the connections
+is theirs to say, and no estimator or integrator repeats the loop.
+
+Random numbers are drawn in the order of Mitsuba's `ptracer`, so that both trace the same paths from the same seed. Those
+that hooks need for a selection come from a stream of their own: a replay that selects nothing stays in step.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from reslrb_cli.transport.connection import Connection, connect
+from reslrb_cli.transport.emission import sample_emission
+from reslrb_cli.transport.factors import Product
+from reslrb_cli.transport.plan import Plan
+from reslrb_cli.transport.scattering import Scattering, attached_factor, scatter
+
+ROULETTE_LIMIT = 0.95  # the largest probability of going on, as in `ptracer`
+
+
+@dataclass
+class Path:
+    """Loop state of one light path."""
+
+    active: Any  # active lanes
+    depth: Any  # index of the current vertex; the first after the emitter is 1
+    ray: Any  # the ray that reaches it
+    pi: Any  # where it does
+    product: Product  # E s_1 ... s_{depth-1}, roulette weights included
+    eta: Any  # accumulated relative index of refraction, for roulette alone
+
+
+@dataclass
+class Vertex:
+    """The current vertex as hooks see it; `product` does not include the vertex's own scattering."""
+
+    si: Any
+    bsdf: Any
+    ray: Any
+    depth: Any
+    product: Product
+    active: Any
+
+
+class Hooks:
+    """What an estimator does along a walk. All are pure: state in, state out; none draws a random number.
+
+    `numbers` says how many random numbers `connection` wants at each vertex. A walk whose hooks are `replaying` follows
+    a path that is known to get as far as `goes_on` asks, so that neither its throughput nor its roulette is computed.
+    Hooks that are `attached` keep derivatives in the loop state, which is then evaluated vertex by vertex (naive AD).
+    """
+
+    numbers: int = 0
+    replaying: bool = False
+    attached: bool = False
+
+    def start(self, product: Product) -> Any:
+        """State before the first vertex, any PyTree; `product` is E."""
+        return []
+
+    def connection(self, state: Any, vertex: Vertex, connection: Connection, numbers: list[Any]) -> Any:
+        """Called at each vertex with the geometry of its connection to the sensor."""
+        return state
+
+    def goes_on(self, state: Any, vertex: Vertex) -> Any:
+        """Lanes that scatter on from this vertex, as far as the hooks care."""
+        return mi.Bool(True)
+
+    def scattering(self, state: Any, vertex: Vertex, connection: Connection, scattering: Scattering) -> Any:
+        """Called at each vertex with the sampled scattering event, also in lanes that `goes_on` ended."""
+        return state
+
+
+def walk(
+    plan: Plan, scene: Any, sensor: Any, sampler: Any, hooks: Hooks, active: Any = True, selection: Any = None
+) -> Any:
+    """Trace one light path per lane of `sampler` and return the final state of `hooks`.
+
+    `selection` is the random stream of the hooks (`mi.PCG32`), needed where `hooks.numbers` is not 0.
+    """
+    emission = sample_emission(plan, scene, sensor, sampler)
+    product, active = Product.one(plan.track_zeros, hooks.attached), mi.Bool(active)
+    if not hooks.replaying:
+        product = product.times(emission.weight, mi.Int32(0))
+        active &= product.alive()
+    state = hooks.start(product)
+    active &= 1 < plan.max_depth
+    pi = scene.ray_intersect_preliminary(emission.ray, coherent=False, active=active)
+    path = Path(active & pi.is_valid(), mi.UInt32(1), emission.ray, pi, product, mi.Float(1))
+
+    def next_vertex(path: Path, active: Any, si: Any, scattering: Scattering, product: Product, eta: Any) -> Path:
+        ray = dr.detach(si.spawn_ray(scattering.d))
+        pi = scene.ray_intersect_preliminary(ray, coherent=False, active=active)
+        return Path(active & pi.is_valid(), path.depth + 1, ray, pi, product, eta)
+
+    def body(path: Path, state: Any, sampler: Any, selection: Any) -> tuple[Path, Any, Any, Any]:
+        si = path.pi.compute_surface_interaction(path.ray, mi.RayFlags.All, path.active)
+        vertex = Vertex(si, si.bsdf(), path.ray, path.depth, path.product, path.active)
+
+        # ---- Connect to the sensor ----
+        connection = connect(plan, sensor, si, path.ray, sampler.next_2d(path.active), path.active)
+        numbers = [selection.next_float32() for _ in range(hooks.numbers)]
+        state = hooks.connection(state, vertex, connection, numbers)
+
+        # ---- Scatter ----
+        sample_2, sample_1 = sampler.next_2d(path.active), sampler.next_1d(path.active)
+        active = path.active & (path.depth + 1 < plan.max_depth) & hooks.goes_on(state, vertex)
+        scattering = scatter(plan, si, vertex.bsdf, path.ray, sample_1, sample_2, active)
+        state = hooks.scattering(state, vertex, connection, scattering)
+        if hooks.replaying:
+            sampler.next_1d(active)  # roulette's
+            return next_vertex(path, active, si, scattering, path.product, path.eta), state, sampler, selection
+        weight = scattering.weight
+        if hooks.attached:
+            f = attached_factor(plan, si, vertex.bsdf, scattering.wo, scattering, scattering.active)
+            weight = dr.replace_grad(weight, f * (scattering.correction / scattering.pdf))
+        product = path.product.times(weight, path.depth)
+        eta = path.eta * scattering.eta
+        active = scattering.active & product.alive()
+
+        # ---- Russian roulette ----
+        number = sampler.next_1d(active)
+        if plan.roulette:
+            throughput = dr.max(dr.abs(product.differentiable()))
+            q = dr.minimum(throughput * dr.square(eta), ROULETTE_LIMIT)
+            playing = path.depth + 1 > plan.rr_depth
+            active &= ~playing | (number < q)
+            product = product.scaled(dr.select(playing, dr.rcp(q), 1))
+
+        return next_vertex(path, active, si, scattering, product, eta), state, sampler, selection
+
+    _, state, _, _ = dr.while_loop(
+        state=(path, state, sampler, selection),
+        cond=lambda path, state, sampler, selection: path.active,
+        body=body,
+        labels=("path", "state", "sampler", "selection"),
+        label="light path",
+        mode="evaluated" if hooks.attached else "symbolic",
+    )
+    return state
