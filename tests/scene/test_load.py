@@ -1,0 +1,99 @@
+"""Scene files: what loads, and one located line for what does not."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from reslrb_cli.errors import ConfigError
+from reslrb_cli.scene import load_scene
+
+pytestmark = pytest.mark.usefixtures("llvm")
+
+LIT_SPHERE = (
+    '<scene version="3.0.0">\n<sensor type="perspective"/>\n<emitter type="constant"/>\n'
+    '<shape type="sphere" id="ball"><float name="radius" value="$radius"/></shape>\n</scene>'
+)
+
+
+def load(folder: Path, text: str, **options: object):
+    file = folder / "scene.xml"
+    file.write_text(text)
+    return load_scene(file, options)
+
+
+def test_options_are_passed_on(tmp_path):
+    import mitsuba as mi
+
+    scene = load(tmp_path, LIT_SPHERE, radius=2.5)
+    assert mi.traverse(scene)["ball.to_world"].matrix.numpy()[0, 0, 0] == pytest.approx(2.5)
+
+
+def test_old_versions_load(tmp_path):
+    text = LIT_SPHERE.replace("3.0.0", "0.5.0").replace(
+        '<sensor type="perspective"/>',
+        '<sensor type="perspective"><transform name="toWorld"><lookat origin="0,0,4" target="0,0,0" up="0,1,0"/>'
+        "</transform></sensor>",
+    )
+    scene = load(tmp_path, text, radius=1)
+    assert len(scene.shapes()) == 1
+
+
+def test_files_are_found_beside_the_scene(tmp_path, monkeypatch):
+    import mitsuba as mi
+    import numpy as np
+
+    (tmp_path / "sub").mkdir()
+    mi.Bitmap(np.full((2, 2, 3), 0.5, np.float32)).write(str(tmp_path / "sub" / "t.exr"))
+    text = LIT_SPHERE.replace("</shape>", '<bsdf type="diffuse"><texture type="bitmap" name="reflectance">'
+                              '<string name="filename" value="t.exr"/></texture></bsdf></shape>')  # fmt: skip
+    monkeypatch.chdir(tmp_path)
+    load(tmp_path / "sub", text, radius=1)
+
+
+@pytest.mark.parametrize(
+    ("text", "options", "where", "what"),
+    [
+        ("<scene version='3.0.0'>\n<shape type='sphere'>\n</scene>", {}, ":3", "not valid XML"),
+        ("", {}, ":1", "not valid XML"),
+        (LIT_SPHERE, {}, ":4", "$radius: has no value and no default; set scene.options.radius"),
+        (
+            LIT_SPHERE,
+            {"radius": 1, "height": 2},
+            "",
+            "$height: is set in scene.options, but the scene file does not use",
+        ),
+        (LIT_SPHERE, {"radius": "wide"}, ":4", 'could not parse floating point value "wide"'),
+        (LIT_SPHERE.replace("sphere", "spere"), {"radius": 1}, ":4", 'Plugin "spere" not found'),
+        (LIT_SPHERE.replace('"radius"', '"radios"'), {"radius": 1}, ":4", 'float "radios"'),
+        (LIT_SPHERE.replace("constant", "envmap"), {"radius": 1}, ":3", "filename"),
+        (LIT_SPHERE.replace('<emitter type="constant"/>', ""), {"radius": 1}, "", "has no emitters"),
+        ('<scene version="3.0.0"><emitter type="constant"/></scene>', {}, "", "is empty"),
+        ('<scene version="3.0.0"/>', {}, "", "is empty"),
+        ('<shape version="3.0.0" type="sphere"/>', {}, "", "single object"),
+    ],
+)
+def test_errors_are_located(tmp_path, text, options, where, what):
+    with pytest.raises(ConfigError) as error:
+        load(tmp_path, text, **options)
+    line = str(error.value)
+    assert line.startswith(f"{tmp_path / 'scene.xml'}{where}: ")
+    assert what in line
+    assert "\n" not in line
+    assert ".cpp" not in line
+
+
+def test_missing_file(tmp_path):
+    with pytest.raises(ConfigError, match="cannot be read: No such file"):
+        load_scene(tmp_path / "none.xml")
+
+
+def test_folder(tmp_path):
+    with pytest.raises(ConfigError, match="is a folder"):
+        load_scene(tmp_path)
+
+
+def test_no_sensor_is_refused(tmp_path):
+    with pytest.raises(ConfigError, match="no sensor"):
+        load(tmp_path, LIT_SPHERE.replace('<sensor type="perspective"/>', ""), radius=1)

@@ -1,0 +1,210 @@
+"""Selecting parameters: what they start from, and what is refused, located in the configuration."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from reslrb_cli.config import ImageFile, ParameterSpec
+from reslrb_cli.errors import ConfigError
+from reslrb_cli.scene import list_parameters, select_parameters
+
+TEXTURE = "floor.reflectance.data"
+LAMP = "lamp.intensity.value"
+
+
+def select(scene, *specs: dict):
+    return select_parameters(scene, [ParameterSpec(**spec) for spec in specs], "c.yaml")
+
+
+def write(path, array):
+    import mitsuba as mi
+
+    mi.Bitmap(np.ascontiguousarray(array)).write(str(path))
+    return ImageFile(file=path)
+
+
+def envmap(height=4, width=8):
+    import mitsuba as mi
+
+    pixels = np.arange(height * width * 3, dtype=np.float32).reshape(height, width, 3)
+    return {"type": "envmap", "bitmap": mi.Bitmap(pixels)}
+
+
+def test_scene_value_is_kept(make_scene):
+    selection = select(make_scene(), {"key": TEXTURE, "bounds": [0.1, 0.9]})
+    assert selection.keys == [TEXTURE]
+    assert selection.spec(TEXTURE).bounds == (0.1, 0.9)
+    assert selection.array(TEXTURE)[0, 0, 0] == pytest.approx(0.1)
+
+
+def test_numbers_and_colours(make_scene):
+    selection = select(make_scene(), {"key": TEXTURE, "initial": [0.1, 0.2, 0.3]}, {"key": LAMP, "initial": 2.0})
+    assert selection.array(TEXTURE).shape == (4, 6, 3)
+    assert np.allclose(selection.array(TEXTURE), [0.1, 0.2, 0.3])
+    assert np.allclose(selection.array(LAMP), 2)
+    assert np.allclose(select(make_scene(), {"key": LAMP, "initial": [3, 2, 1]}).array(LAMP), [3, 2, 1])
+
+
+def test_values_reach_the_scene(make_scene):
+    import mitsuba as mi
+
+    dark, bright = make_scene(), make_scene()
+    select(dark, {"key": TEXTURE, "initial": 0.0})
+    select(bright, {"key": TEXTURE, "initial": 0.8})
+    assert np.max(mi.render(dark, spp=1, integrator=mi.load_dict({"type": "direct"}))) == 0
+    assert np.max(mi.render(bright, spp=1, integrator=mi.load_dict({"type": "direct"}))) > 0
+
+
+def test_resolution_resamples(make_scene):
+    ramp = np.tile(np.linspace(0, 1, 6, dtype=np.float32)[None, :, None], (4, 1, 3))
+    scene = make_scene()
+    import mitsuba as mi
+
+    params = mi.traverse(scene)
+    params[TEXTURE] = mi.TensorXf(ramp)
+    params.update()
+    finer = select(scene, {"key": TEXTURE, "resolution": [12, 8]}).array(TEXTURE)
+    assert finer.shape == (8, 12, 3)
+    assert np.all(np.diff(finer[0, :, 0]) >= 0)
+    assert finer.mean() == pytest.approx(0.5, abs=1e-3)
+
+
+def test_file_fills_a_texture(make_scene, tmp_path):
+    values = np.linspace(0, 1, 4 * 6 * 3, dtype=np.float32).reshape(4, 6, 3)
+    selection = select(make_scene(), {"key": TEXTURE, "initial": write(tmp_path / "t.exr", values)})
+    assert np.array_equal(selection.array(TEXTURE), values)
+
+
+def test_globs_take_what_can_be_recovered(make_scene):
+    selection = select(make_scene(), {"key": "floor.*"})  # not `to_uv`
+    assert selection.keys == [TEXTURE]
+
+
+def test_environment_map_has_no_halo(make_scene):
+    scene = make_scene(sky=envmap())
+    selection = select(scene, {"key": "sky.data"})
+    assert selection.params["sky.data"].shape == (4, 10, 3)
+    assert selection.array("sky.data").shape == (4, 8, 3)
+    finer = select(scene, {"key": "sky.data", "resolution": [16, 8]})
+    tensor = np.array(finer.params["sky.data"])
+    assert tensor.shape == (8, 18, 3)
+    assert np.array_equal(tensor[:, 0], tensor[:, -2])
+    assert np.array_equal(tensor[:, -1], tensor[:, 1])
+
+
+def test_mesh_attributes(make_scene):
+    import mitsuba as mi
+
+    mesh = mi.load_dict({"type": "cube", "bsdf": {"type": "diffuse"}})
+    mesh.add_attribute("vertex_color", 3, np.zeros(3 * mesh.vertex_count(), np.float32))
+    scene = make_scene(box=mesh)
+    key = next(info.key for info in list_parameters(mi.traverse(scene)) if info.kind == "attribute")
+    selection = select(scene, {"key": key, "initial": [1, 2, 3]})
+    assert np.array_equal(selection.array(key)[:6], [1, 2, 3, 1, 2, 3])
+
+
+def test_bounds_hold_for_the_nearest_float(make_scene):
+    select(make_scene(), {"key": TEXTURE, "initial": 0.1, "bounds": [0, 0.1]})
+
+
+@pytest.mark.parametrize(
+    ("specs", "where", "what"),
+    [
+        ([{"key": "flor.reflectance.data"}], "key", f"matches no parameter of the scene; did you mean `{TEXTURE}`"),
+        ([{"key": "zzz*"}], "key", "matches no parameter"),
+        ([{"key": "plane.to_world"}], "key", "moves geometry"),
+        ([{"key": "camera.x_fov"}], "key", "belongs to the sensor"),
+        ([{"key": "camera.film.size"}], "key", "belongs to the film"),
+        ([{"key": "lamp.position"}], "key", "moves the light"),
+        ([{"key": "lamp.sampling_weight"}], "key", "is not differentiable"),
+        ([{"key": "floor.reflectance.to_uv"}], "key", "is not differentiable"),
+        ([{"key": "plane.*"}], "key", "matches nothing that can be recovered"),
+        ([{"key": "allow_thread_reordering"}], "key", "no property of a material or a light"),
+        ([{"key": TEXTURE, "initial": [0.1, 0.2]}], "initial", "has 2 numbers"),
+        ([{"key": LAMP, "initial": [1.0]}], "initial", "takes 3 numbers"),
+        ([{"key": LAMP, "resolution": [4, 4]}], "resolution", "is no texture"),
+        ([{"key": TEXTURE, "resolution": [1, 4]}], "resolution", "at least [2, 2]"),
+        (
+            [{"key": TEXTURE, "bounds": [0.5, 1]}],
+            "bounds",
+            "exclude the initial value of `floor.reflectance.data`, 0.1",
+        ),
+        ([{"key": LAMP, "bounds": [0, 2.5]}], "bounds", "lamp.intensity.value`, 3 at entry 2"),
+        ([{"key": LAMP, "initial": ImageFile(file="/none.exr")}], "initial", "is no texture; give a number"),
+        ([{"key": TEXTURE, "initial": ImageFile(file="/none.exr")}], "initial.file", "/none.exr: cannot be read"),
+    ],
+)
+def test_refused(make_scene, specs, where, what):
+    with pytest.raises(ConfigError) as error:
+        select(make_scene(), *specs)
+    assert error.value.key == f"parameters[0].{where}"
+    assert what in str(error.value)
+
+
+def test_overlapping_specs(make_scene):
+    with pytest.raises(ConfigError) as error:
+        select(make_scene(), {"key": "floor.*"}, {"key": TEXTURE})
+    assert str(error.value) == f"c.yaml: parameters[1].key: `{TEXTURE}` is matched by parameters[0] already"
+
+
+@pytest.mark.parametrize(
+    ("array", "what"),
+    [
+        (np.full((3, 3, 3), 0.5, np.float32), "is 3x3, the texture 6x4; give `resolution"),
+        (np.full((4, 6, 3), np.nan, np.float32), "pixel (0, 0), channel R, is nan"),
+        (np.full((4, 6, 3), -1.0, np.float32), "is -1: negative"),
+        (np.full((4, 6, 5), 0.5, np.float32), "has 5 channels"),
+    ],
+)
+def test_refused_files(make_scene, tmp_path, array, what):
+    with pytest.raises(ConfigError) as error:
+        select(make_scene(), {"key": TEXTURE, "initial": write(tmp_path / "t.exr", array)})
+    assert error.value.key == "parameters[0].initial.file"
+    assert what in str(error.value)
+
+
+def test_colour_for_a_grey_texture(make_scene, tmp_path):
+    import mitsuba as mi
+
+    grey = {"type": "bitmap", "raw": True, "data": mi.TensorXf(np.full((4, 6, 1), 0.5, np.float32))}
+    scene = make_scene(floor={"type": "diffuse", "reflectance": grey})
+    colour = np.tile(np.float32([0.1, 0.2, 0.3]), (4, 6, 1))
+    with pytest.raises(ConfigError, match="is coloured, but"):
+        select(scene, {"key": TEXTURE, "initial": write(tmp_path / "t.exr", colour)})
+    flat = np.full((4, 6, 3), 0.25, np.float32)
+    assert select(scene, {"key": TEXTURE, "initial": write(tmp_path / "t.exr", flat)}).array(TEXTURE).max() == 0.25
+
+
+def test_nan_in_the_scene_itself(make_scene):
+    import mitsuba as mi
+
+    values = np.full((4, 6, 3), 0.5, np.float32)
+    values[2, 1, 0] = np.nan
+    texture = {"type": "bitmap", "raw": True, "data": mi.TensorXf(values)}
+    scene = make_scene(floor={"type": "diffuse", "reflectance": texture})
+    with pytest.raises(ConfigError, match=r"holds nan at texel \(1, 2\), channel 0"):
+        select(scene, {"key": TEXTURE})
+
+
+@pytest.mark.parametrize(("type_", "bits"), [(np.uint8, 8), (np.float16, 16)])
+def test_textures_with_few_bits(make_scene, type_, bits):
+    import mitsuba as mi
+
+    texture = {"type": "bitmap", "raw": True, "bitmap": mi.Bitmap(np.ones((4, 6, 3), type_))}
+    scene = make_scene(floor={"type": "diffuse", "reflectance": texture})
+    with pytest.raises(ConfigError, match=f'stored with {bits} bits.*name="format" value="variant"'):
+        select(scene, {"key": TEXTURE})
+
+
+def test_what_shapes_a_beam_is_refused(make_scene):
+    scene = make_scene(lamp={"type": "spot"})
+    for name in ("cutoff_angle", "beam_width"):
+        with pytest.raises(ConfigError, match="shapes the beam"):
+            select(scene, {"key": f"lamp.{name}"})
+
+
+def test_index_of_refraction(make_scene):
+    scene = make_scene(glass={"type": "dielectric"}, ball={"type": "sphere", "bsdf": {"type": "ref", "id": "glass"}})
+    with pytest.raises(ConfigError, match=r"`glass.eta` is not differentiable \(SmoothDielectric\)"):
+        select(scene, {"key": "glass.eta"})

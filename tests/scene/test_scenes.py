@@ -1,0 +1,113 @@
+"""The scenes in `scenes/`: their assets are what the script makes, and they look as their comments say."""
+
+from __future__ import annotations
+
+import importlib.util
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from reslrb_cli.config import load
+from reslrb_cli.scene import check_supported, load_scene, look, scene_needs, select_parameters, visible_texels
+
+ROOT = Path(__file__).resolve().parents[2]
+NAMES = ("cornell_floor", "grey_room", "caustic_slab", "furnace")
+
+pytestmark = pytest.mark.usefixtures("llvm")
+
+
+def make_scenes():
+    spec = importlib.util.spec_from_file_location("make_scenes", ROOT / "scripts" / "make_scenes.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def small(name: str):
+    return load_scene(ROOT / "scenes" / name / "scene.xml", {"resx": 32, "resy": 32, "spp": 4})
+
+
+def test_images_are_what_the_script_makes():
+    import mitsuba as mi
+
+    for name, expected in make_scenes().images().items():
+        found = np.array(mi.Bitmap(str(ROOT / "scenes" / name)))
+        assert found.shape == expected.shape, name
+        assert np.allclose(found, expected, atol=1 / 256 if "sky" in name else 1 / 4096, rtol=1e-5), name
+
+
+def test_mesh_is_what_the_script_makes():
+    import mitsuba as mi
+
+    positions, normals, faces = make_scenes().slab()
+    mesh = mi.load_dict({"type": "ply", "filename": str(ROOT / "scenes" / "caustic_slab" / "slab.ply")})
+    assert np.allclose(np.array(mesh.vertex_positions_buffer()).reshape(-1, 3), positions, atol=2e-6)
+    assert np.allclose(np.array(mesh.vertex_normals_buffer()).reshape(-1, 3), normals, atol=2e-6)
+    assert np.array_equal(np.array(mesh.faces_buffer()).reshape(-1, 3), faces)
+    assert (normals[:, 1] < 0).all()
+
+
+def test_floor_has_detail_at_the_scale_of_its_texels():
+    floor = make_scenes().images()["cornell_floor/floor.exr"]
+    assert floor.shape == (64, 64, 3)
+    assert 0.05 <= floor.min()
+    assert floor.max() <= 0.95
+    between_neighbours = np.abs(np.diff(floor, axis=1)).mean()
+    assert between_neighbours > 0.4 * np.abs(floor - floor.mean((0, 1))).mean()
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_mitsuba_alone_loads_and_renders_it(name):
+    import mitsuba as mi
+
+    scene = mi.load_file(str(ROOT / "scenes" / name / "scene.xml"), resx=32, resy=32, spp=4)
+    image = np.array(mi.render(scene))
+    assert image.shape == (32, 32, 3)
+    assert np.isfinite(image).all()
+    assert image.mean() > 0.05
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_config_fits_the_scene(name):
+    config = load(ROOT / "configs" / f"{name}.yaml", [])
+    scene = load_scene(config.scene.file, config.scene.options)
+    check_supported(scene, scene.sensors()[0], config.integrator.hide_emitters)
+    assert select_parameters(scene, config.parameters, config.source).keys
+
+
+def test_cornell_floor_is_well_seen():
+    scene = load_scene(ROOT / "scenes" / "cornell_floor" / "scene.xml")
+    mask = visible_texels(scene, scene.sensors(), "floor.reflectance.data")
+    assert mask.mean() > 0.7  # a ninth of the floor is under the boxes
+    assert look(scene, scene.sensors()[0]).nothing < 0.1
+
+
+def test_grey_room_is_lit_by_a_turned_sky_alone():
+    import mitsuba as mi
+
+    scene = small("grey_room")
+    needs = scene_needs(scene, scene.sensors()[0])
+    assert needs.emitters == ("EnvironmentMapEmitter",)
+    axes = np.array(mi.traverse(scene)["sky.to_world"].matrix).reshape(4, 4)[:3, :3]
+    assert (np.abs(axes) > 0.2).sum() >= 6  # turned about two axes
+    assert 0.02 < look(scene, scene.sensors()[0]).nothing < 0.3  # the windows
+
+
+def test_caustic_is_not_seen_through_the_glass():
+    scene = small("caustic_slab")
+    assert look(scene, scene.sensors()[0]).smooth == 1
+    needs = scene_needs(scene, scene.sensors()[0])
+    assert needs.has_delta_lobes
+    assert needs.has_shading_normals
+
+
+def test_furnace_is_exact():
+    import mitsuba as mi
+
+    rho, emitted, depth = np.array([0.5, 0.7, 0.3]), np.array([1.0, 0.6, 1.4]), 6
+    image = np.array(mi.render(small("furnace"), spp=64, integrator=mi.load_dict({
+        "type": "path", "max_depth": depth, "rr_depth": 100})))  # fmt: skip
+    expected = emitted * sum(rho**k for k in range(depth))
+    assert np.allclose(image, expected, rtol=0.02)
+    assert np.allclose(image.mean((0, 1)), expected, rtol=1e-3)
