@@ -24,7 +24,7 @@ class Estimator(ABC):
 
     @abstractmethod
     def image_hooks(self, plan: Plan, scene: Any, film: Film, block: Any, scale: float) -> Hooks:
-        """Hooks of the image pass: splat `scale` times each C_i into `block` (None: no image), keep what a replay needs."""
+        """Hooks of the image pass: keep what a replay needs, and splat `scale` C_i into `block` (None: no image)."""
 
     def finish_image(self, film: Film, block: Any, state: Any) -> None:
         """Splat what the final state of the image pass holds, where the image is made of that."""

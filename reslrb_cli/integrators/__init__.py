@@ -1,4 +1,4 @@
-"""Integrators behind one interface: our light tracers as Mitsuba plugins, the stock baselines, and the gradient step."""
+"""Integrators behind one interface: our light tracers as Mitsuba plugins, stock baselines, and the gradient step."""
 
 from reslrb_cli.integrators.adapter import register
 from reslrb_cli.integrators.step import StepResult, gradient_step, make_integrator, render_image

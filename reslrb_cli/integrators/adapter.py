@@ -7,7 +7,6 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from reslrb_cli.errors import UnsupportedScene
 from reslrb_cli.estimators import ESTIMATORS
 from reslrb_cli.integrators import light_tracer as lt
 from reslrb_cli.integrators.differentiated import differentiated
@@ -182,4 +181,4 @@ def _parameters(scene: Any, params: Any) -> Any:
 def _evaluate_gradients(params: Any) -> None:
     """Run what has been recorded for the gradients, so that passes do not pile up."""
     with dr.resume_grad():
-        dr.eval([dr.grad(params[key]) for key in params.keys() if dr.grad_enabled(params[key])])
+        dr.eval([dr.grad(value) for _, value in params.items() if dr.grad_enabled(value)])

@@ -28,7 +28,7 @@ def differentiated(params: Any) -> Differentiated:
     """
     bsdfs = emission = zeros = False
     with dr.resume_grad():  # where gradients are suspended, nothing says that it tracks them
-        attached = {key: params[key] for key in params.keys() if dr.grad_enabled(params[key])}
+        attached = {key: value for key, value in params.items() if dr.grad_enabled(value)}
     for key, value in attached.items():
         owner = _owner(params, key)
         if isinstance(owner, mi.BSDF):
@@ -37,8 +37,8 @@ def differentiated(params: Any) -> Differentiated:
             emission = True
         else:
             raise UnsupportedScene(
-                f"{key}: detached light tracing has derivatives of BSDFs and emission only, not of "
-                f"{type(owner).__name__ if owner is not None else 'this'} parameters, which move the geometry or the sensor"
+                f"{key}: detached light tracing has derivatives of BSDFs and emission only, not of what moves the "
+                "geometry or the sensor"
             )
         zeros = zeros or _has_singular(key, value)
     return Differentiated(bsdfs, emission, zeros)

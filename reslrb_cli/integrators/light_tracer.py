@@ -10,7 +10,7 @@ import drjit as dr
 import mitsuba as mi
 
 from reslrb_cli.estimators import Estimator
-from reslrb_cli.estimators.base import PathAdjoint, adjoint_of_factor
+from reslrb_cli.estimators.base import adjoint_of_factor
 from reslrb_cli.integrators.hooks import AttachedSplat, Splat, TangentSplat
 from reslrb_cli.transport.emission import sample_emission
 from reslrb_cli.transport.plan import Plan
@@ -20,6 +20,7 @@ from reslrb_cli.transport.walk import Hooks, walk
 
 SELECTION_STREAM = 0x5E1EC7  # keeps the hooks' numbers apart from the sampler's
 VISIBLE_STREAM = 0xD1EC7
+PASS_STREAM = 0x9A55E5
 
 
 @dataclass
@@ -74,9 +75,7 @@ def make_samples(plan: Plan, scene: Any, sensor: Any, seed: Any, spp: int, total
     film = Film(sensor)
     width = spp * int(dr.prod(sensor.film().size()))
     if width > 0xFFFFFFFF:
-        raise ValueError(
-            f"one pass of {spp} samples per pixel is {width} paths, more than 2^32 - 1: set samples_per_pass"
-        )
+        raise ValueError(f"{width} paths in one pass are more than 2^32 - 1: set samples_per_pass below {spp}")
     scale = float(dr.prod(film.size)) / (float(dr.prod(sensor.film().size())) * total_spp)
     return Samples(scene, sensor, plan, film, mi.UInt32(seed), spp, width, scale, spp / total_spp)
 
@@ -90,7 +89,8 @@ def passes(plan: Plan, scene: Any, sensor: Any, seed: Any, spp: int, spp_per_pas
     if spp % size:
         raise ValueError(f"the sample count ({spp}) must be a multiple of samples_per_pass ({size})")
     # Opaque: a seed that reached the kernel as a literal would compile a new one each step.
-    seeds = [mi.UInt32(seed)] + [mi.sample_tea_32(mi.UInt32(seed), mi.UInt32(p))[0] for p in range(1, spp // size)]
+    others = [mi.sample_tea_32(mi.UInt32(seed), mi.UInt32(PASS_STREAM + p))[0] for p in range(1, spp // size)]
+    seeds = [mi.UInt32(seed), *others]
     dr.make_opaque(seeds)
     return [make_samples(plan, scene, sensor, s, size, spp) for s in seeds]
 

@@ -1,4 +1,4 @@
-"""Splatting onto the film through its reconstruction filter, and the exact adjoint of that: looking up dL/dI at a splat.
+"""Splatting onto the film through its reconstruction filter, and its exact adjoint: looking up dL/dI at a splat.
 
 splat:   I_p += filter_p(u) C        filter_p(u): weight of pixel p for film position u, summing to 1 over pixels
 lookup:  delta = sum_p filter_p(u) dL/dI_p

@@ -1,8 +1,8 @@
 """The one light-path loop. It samples emission, connects, scatters, and calls hooks; what is done with the connections
 is theirs to say, and no estimator or integrator repeats the loop.
 
-Random numbers are drawn in the order of Mitsuba's `ptracer`, so that both trace the same paths from the same seed. Those
-that hooks need for a selection come from a stream of their own: a replay that selects nothing stays in step.
+Random numbers are drawn in the order of Mitsuba's `ptracer`, so that both trace the same paths from the same seed.
+Those that hooks need for a selection come from a stream of their own: a replay that selects nothing stays in step.
 """
 
 from __future__ import annotations
@@ -88,7 +88,7 @@ def walk(
         product = product.times(emission.weight, mi.Int32(0))
         active &= product.alive()
     state = hooks.start(product)
-    active &= 1 < plan.max_depth
+    active &= plan.max_depth > 1
     pi = scene.ray_intersect_preliminary(emission.ray, coherent=False, active=active)
     path = Path(active & pi.is_valid(), mi.UInt32(1), emission.ray, pi, product, mi.Float(1))
 
