@@ -12,15 +12,15 @@ import mitsuba as mi
 from ..errors import UnsupportedScene
 from .catalog import ParameterInfo, list_parameters
 from .graph import SceneGraph
-from .needs import SENSORS, SceneNeeds, View, check_supported, look, scene_needs
+from .needs import SceneNeeds, View, check_supported, look, scene_needs, unsupported_part
 
 
 @dataclass(frozen=True)
 class SensorSummary:
     """One sensor: its film in pixels (`crop` is offset and size), what it sees, and what light tracing needs for it.
 
-    `obstacle` is the reason why light tracing cannot render for it, or None. `view` is None for a sensor of an unknown
-    kind.
+    `obstacle` is the reason why light tracing cannot render for it, or None. `view` is None where the reason lies
+    in the scene's parts and not in what the sensor sees.
     """
 
     index: int
@@ -90,7 +90,7 @@ def _sensor(scene: Any, index: int, hide_emitters: bool) -> SensorSummary:
         filter=film.rfilter().class_name(),
         channels=int(film.base_channels_count()),
         needs=scene_needs(scene, sensor),
-        view=look(scene, sensor) if sensor.class_name() in SENSORS else None,
+        view=look(scene, sensor) if unsupported_part(scene, sensor) is None else None,
         obstacle=obstacle,
     )
 

@@ -77,24 +77,36 @@ def scene_needs(scene: Any, sensor: Any) -> SceneNeeds:
 
 def check_supported(scene: Any, sensor: Any, hide_emitters: bool = False) -> None:
     """Raise UnsupportedScene, with the reason, where light tracing cannot render `scene` for `sensor`."""
-    name = sensor.id() or "of the scene"
-    for shape in SceneGraph.of(scene).shapes():
-        if shape.is_medium_transition():
-            raise UnsupportedScene(f"shape {shape.id()} bounds a participating medium; media are not supported")
-    if sensor.get_medium() is not None:
-        raise UnsupportedScene(f"sensor {name} stands in a participating medium; media are not supported")
-    if sensor.class_name() not in SENSORS:
-        raise UnsupportedScene(
-            f"sensor {name} is a {sensor.class_name()}; light paths can connect to `perspective` and `thinlens` sensors"
-        )
-    if sensor.film().class_name() != "HDRFilm":
-        raise UnsupportedScene(f"sensor {name} has a {sensor.film().class_name()}; only `hdrfilm` is supported")
-    view = look(scene, sensor)
+    obstacle = unsupported_part(scene, sensor)
+    if obstacle is not None:
+        raise UnsupportedScene(obstacle)
+    view, name = look(scene, sensor), sensor.id()
     if view.specular > 0 and view.smooth == 0 and (hide_emitters or view.emission == 0):
         raise UnsupportedScene(
             f"only smooth specular surfaces (glass, mirrors) face sensor {name}: light paths cannot connect to it from "
             "them; let it see a rough surface, or take integrator.type: prb"
         )
+
+
+def unsupported_part(scene: Any, sensor: Any) -> str | None:
+    """What in the scene no light path can deal with, found without tracing a ray; None where there is nothing."""
+    name = sensor.id()
+    for shape in SceneGraph.of(scene).shapes():
+        if shape.is_medium_transition():
+            return f"shape {shape.id()} bounds a participating medium; media are not supported"
+    for emitter in scene.emitters():
+        if emitter.class_name() == "TimedSunskyEmitter":
+            return (
+                f"emitter {emitter.id()} is a `timed_sunsky`, which evaluates arrays while it is traced: Mitsuba 3.9 "
+                "cannot render it in a kernel; take a `sunsky`"
+            )
+    if sensor.get_medium() is not None:
+        return f"sensor {name} stands in a participating medium; media are not supported"
+    if sensor.class_name() not in SENSORS:
+        return f"sensor {name} is a {sensor.class_name()}; light paths connect to `perspective` and `thinlens` sensors"
+    if sensor.film().class_name() != "HDRFilm":
+        return f"sensor {name} has a {sensor.film().class_name()}; only `hdrfilm` is supported"
+    return None
 
 
 def look(scene: Any, sensor: Any, resolution: int = 128) -> View:

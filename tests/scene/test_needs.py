@@ -17,8 +17,8 @@ def test_plain_scene(make_scene):
     assert needs.emitters == ("PointLight",)
     assert needs.environment is None
     assert needs.has_smooth
-    assert not (needs.has_delta_lobes or needs.has_null or needs.has_shading_normals or needs.has_visible_emitters)
-    assert not (needs.thin_lens or needs.moving_shutter)
+    absent = ("has_delta_lobes", "has_null", "has_shading_normals", "has_visible_emitters", "thin_lens")
+    assert [name for name in (*absent, "moving_shutter") if getattr(needs, name)] == []
     check_supported(scene, scene.sensors()[0])
 
 
@@ -84,8 +84,9 @@ def test_mask_in_front_is_looked_through(make_scene):
 @pytest.mark.parametrize(
     ("changes", "hide_emitters", "reason"),
     [
-        ({"camera": {"type": "orthographic"}}, False, "OrthographicCamera; light paths can connect to"),
+        ({"camera": {"type": "orthographic"}}, False, "OrthographicCamera; light paths connect to"),
         ({"camera": {"type": "distant", "film": {"type": "hdrfilm", "width": 1, "height": 1}}}, False, "DistantSensor"),
+        ({"sky": {"type": "timed_sunsky"}}, False, "is a `timed_sunsky`"),
         ({"plane": {"type": "rectangle", "bsdf": GLASS}}, False, "only smooth specular surfaces"),
         (
             {"plane": {"type": "rectangle", "bsdf": {"type": "conductor"}}, "sky": {"type": "constant"}},
