@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import os
 import platform
 import re
-import shutil
-import subprocess
 import sys
 from dataclasses import dataclass
 from importlib import metadata
-from pathlib import Path
 
 from reslrb_cli.backend import llvm
+from reslrb_cli.backend.device import device_name
 from reslrb_cli.backend.probe import Probe, probe
 from reslrb_cli.backend.variant import missing_cuda, package_version
 from reslrb_cli.errors import BackendError
@@ -67,30 +64,14 @@ def _required() -> list[str]:
 def _cuda() -> Backend:
     missing = missing_cuda()
     trial = Probe(missing) if missing else probe("cuda_ad_rgb")
-    return Backend("cuda_ad_rgb", missing, "" if missing else _gpu_name(), "", trial)
+    return Backend("cuda_ad_rgb", missing, "" if missing else device_name("cuda_ad_rgb"), "", trial)
 
 
 def _llvm() -> Backend:
-    device = f"{_cpu_name()}, {os.cpu_count()} threads"
+    device = device_name("llvm_ad_rgb")
     try:
         library = llvm.require()
     except BackendError as error:
         return Backend("llvm_ad_rgb", str(error), device, "", Probe(str(error)))
     trial = probe("llvm_ad_rgb")
     return Backend("llvm_ad_rgb", trial.failure, device, f"libLLVM {library.version}, {library.path}", trial)
-
-
-def _gpu_name() -> str:
-    command = shutil.which("nvidia-smi")
-    if command is None:
-        return "NVIDIA GPU"
-    query = [command, "--query-gpu=name,driver_version", "--format=csv,noheader"]
-    return subprocess.run(query, capture_output=True, text=True, check=False).stdout.strip().replace("\n", "; ")
-
-
-def _cpu_name() -> str:
-    try:
-        found = re.search(r"^model name\s*:\s*(.+)$", Path("/proc/cpuinfo").read_text(), re.MULTILINE)
-    except OSError:
-        found = None
-    return found[1] if found else platform.machine()

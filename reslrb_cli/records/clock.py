@@ -17,8 +17,8 @@ MIB = 2.0**20
 class StepTimes:
     """Times of one step in milliseconds; filled in when the step has ended.
 
-    `wall_ms` is what a user waits; `kernel_ms` the execution of kernels and `codegen_ms` their generation and compilation,
-    both from `dr.kernel_history`; `compiled` the number of kernels that the in-memory cache did not have.
+    `wall_ms` is what a user waits; `kernel_ms` the execution of kernels and `codegen_ms` their generation and
+    compilation, both from `dr.kernel_history`; `compiled` the number of kernels that the in-memory cache lacked.
     """
 
     wall_ms: float = 0.0

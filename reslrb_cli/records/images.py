@@ -14,17 +14,20 @@ def write_image(stem: Path, image: np.ndarray[Any, Any]) -> None:
 
     `stem` is appended to rather than given a new suffix: keys of parameters have dots of their own.
     """
-    bitmap = mi.Bitmap(np.ascontiguousarray(image, dtype=np.float32))
-    bitmap.write(f"{stem}.exr")
-    write_png(stem, image)
+    write_file(Path(f"{stem}.exr"), image, linear=True)
+    write_file(Path(f"{stem}.png"), image, linear=False)
 
 
-def write_png(stem: Path, image: np.ndarray[Any, Any]) -> None:
-    """Write an (H, W, C) image of linear values as `<stem>.png` in 8-bit sRGB, clipped to [0, 1].
+def write_file(path: Path, image: np.ndarray[Any, Any], linear: bool) -> None:
+    """Write an (H, W, C) image of linear values in the format that the suffix of `path` names.
 
-    Of four channels or more, and of two, only the first are shown: three and one.
+    `linear` writes it as it is; else it becomes 8-bit sRGB, clipped to [0, 1], and of four channels or more, and of
+    two, only the first are shown: three and one.
     """
+    if linear:
+        mi.Bitmap(np.ascontiguousarray(image, dtype=np.float32)).write(str(path))
+        return
     channels = 3 if image.shape[2] >= 3 else 1
     shown = np.clip(np.nan_to_num(image[:, :, :channels], nan=0.0), 0.0, 1.0).astype(np.float32)
     bitmap = mi.Bitmap(np.ascontiguousarray(shown))
-    bitmap.convert(component_format=mi.Struct.Type.UInt8, srgb_gamma=True).write(f"{stem}.png")
+    bitmap.convert(component_format=mi.Struct.Type.UInt8, srgb_gamma=True).write(str(path))

@@ -12,11 +12,12 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
+from reslrb_cli import __version__
 from reslrb_cli.records.atomic import write_atomically
 
 FILE_NAME = "manifest.json"
 PROGRAM = "reslrb"
-PACKAGES = ("reslrb", "mitsuba", "drjit", "numpy")
+PACKAGES = ("mitsuba", "drjit", "numpy")
 
 
 class Status(str, enum.Enum):
@@ -34,8 +35,8 @@ def now() -> str:
 
 
 def versions() -> dict[str, str]:
-    """Versions of Python and of the packages that decide about a result."""
-    found = {"python": platform.python_version()}
+    """Versions of Python and of the packages that a result depends on."""
+    found = {"reslrb": __version__, "python": platform.python_version()}
     for name in PACKAGES:
         try:
             found[name] = metadata.version(name)

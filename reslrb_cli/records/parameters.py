@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import mitsuba as mi
 import numpy as np
 
 from reslrb_cli.records.atomic import write_atomically
@@ -28,6 +29,7 @@ def write_parameters(folder: Path, values: Mapping[str, Array]) -> None:
     and `<key>.png` to look at; the shape of every parameter, and the values of those that are no textures, in
     `parameters.json`; everything in `parameters.npz`.
     """
+    folder.mkdir(exist_ok=True)
     summary: dict[str, Any] = {}
     for key, value in values.items():
         entry: dict[str, Any] = {"shape": list(value.shape)}
@@ -37,9 +39,10 @@ def write_parameters(folder: Path, values: Mapping[str, Array]) -> None:
         elif value.size <= 64:
             entry["value"] = value.tolist()
         summary[key] = entry
+    arrays: dict[str, Any] = dict(values)
     text = json.dumps(summary, indent=2)
     write_atomically(folder / "parameters.json", lambda file: file.write(text.encode() + b"\n"))
-    write_atomically(folder / "parameters.npz", lambda file: np.savez(file, **dict(values)))
+    write_atomically(folder / "parameters.npz", lambda file: np.savez(file, **arrays))
 
 
 def write_mask(folder: Path, key: str, mask: Array) -> None:
@@ -50,6 +53,4 @@ def write_mask(folder: Path, key: str, mask: Array) -> None:
     stem = file_stem(key) + ".mask"
     write_atomically(folder / f"{stem}.npy", lambda file: np.save(file, mask))
     if mask.ndim == 2:
-        import mitsuba as mi
-
         mi.Bitmap(np.ascontiguousarray(mask[:, :, None] * np.uint8(255))).write(str(folder / f"{stem}.png"))

@@ -48,9 +48,9 @@ class RunFolder:
     def create(cls, source: object, output: Path, name: str, force: bool, config: str, manifest: Manifest) -> RunFolder:
         """Make `<output>/<name>/` with its configuration, manifest and empty subfolders.
 
-        Where the name is taken, `<name>-2/` and so on. With `force` the run of that name is replaced: of its folder only
-        what a run writes is removed, and a folder that is no run's is refused. The folder appears under its name
-        only once it is whole.
+        Where the name is taken, `<name>-2/` and so on. With `force` the run of that name is replaced: of its folder
+        only what a run writes is removed, and a folder that is no run's is refused. The folder appears under its
+        name only once it is whole.
         """
         try:
             output.mkdir(parents=True, exist_ok=True)

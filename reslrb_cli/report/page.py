@@ -35,7 +35,7 @@ def write_report(folder: Path) -> Path:
         "<h2>Convergence</h2>",
         draw_curves(read_metrics(folder)) or "<p>No iteration was completed.</p>",
         _gallery("Images", folder / "images", sorted((folder / "images").glob("*.png"), key=_image_order)),
-        _gallery("Parameters", folder / "parameters", sorted((folder / "parameters").glob("*.png"))),
+        _gallery("Parameters", folder / "parameters", _parameter_images(folder / "parameters")),
         "<h2>Run</h2>",
         _table(_flat(manifest)),
         "<h2>Configuration</h2>",
@@ -72,10 +72,17 @@ def _image_order(path: Path) -> tuple[int, str]:
     return {"initial": 0, "final": 2, "target": 3}.get(kind, 1), path.stem
 
 
+def _parameter_images(folder: Path) -> list[Path]:
+    """Of each texture the initial value, the final one, the true one where it is known, and the mask."""
+    stems = sorted(path.stem for path in folder.glob("*.png") if not path.stem.endswith(".mask"))
+    names = (name for stem in stems for name in (f"initial/{stem}", stem, f"true/{stem}", f"{stem}.mask"))
+    return [path for name in names if (path := folder / f"{name}.png").exists()]
+
+
 def _gallery(title: str, folder: Path, paths: list[Path]) -> str:
     figures = "".join(
         f'<figure><img src="data:image/png;base64,{base64.b64encode(path.read_bytes()).decode()}" alt="">'
-        f"<figcaption>{html.escape(path.stem)}</figcaption></figure>"
+        f"<figcaption>{html.escape(str(path.relative_to(folder).with_suffix('')))}</figcaption></figure>"
         for path in paths
     )
     return f"<h2>{title}</h2>{figures}" if figures else ""

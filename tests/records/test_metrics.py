@@ -5,7 +5,8 @@ from __future__ import annotations
 import json
 import math
 
-from reslrb_cli.records import MetricsWriter, Record, read_metrics, save_checkpoint
+from reslrb_cli.records.checkpoint import save_checkpoint
+from reslrb_cli.records.metrics import MetricsWriter, Record, read_metrics
 
 KEYS = [
     "iteration", "loss", "step_ms", "primal_ms", "adjoint_ms", "codegen_ms", "elapsed_s", "peak_mib", "spp", "lr",

@@ -8,7 +8,8 @@ import os
 import pytest
 
 from reslrb_cli.errors import ConfigError
-from reslrb_cli.records import Manifest, RunFolder, Status, check_output
+from reslrb_cli.records.manifest import Manifest, Status
+from reslrb_cli.records.run_folder import RunFolder, check_output
 
 
 def make_manifest(**changes):

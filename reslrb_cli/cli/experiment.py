@@ -1,0 +1,38 @@
+"""What the commands about one experiment share: their arguments, and the way from a file to a variant."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import click
+
+from reslrb_cli.config import Config, load
+
+logger = logging.getLogger(__name__)
+
+
+def experiment_arguments(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Add CONFIG (`config_file`) and `--set` (`overrides`) to a command."""
+    function = click.option(
+        "--set",
+        "overrides",
+        multiple=True,
+        metavar="KEY=VALUE",
+        help="Override a setting, e.g. --set run.spp=32; the value is YAML. May be repeated.",
+    )(function)
+    return click.argument("config_file", metavar="CONFIG", type=click.Path(path_type=Path))(function)
+
+
+def read_config(config_file: Path, overrides: tuple[str, ...]) -> Config:
+    """Load and check the configuration. Raises ConfigError."""
+    return load(config_file, list(overrides))
+
+
+def start_variant(config: Config) -> str:
+    """Set the Mitsuba variant that `config` asks for; return its name. Raises BackendError."""
+    from reslrb_cli.backend.variant import set_variant
+
+    return set_variant(config.variant)

@@ -1,0 +1,51 @@
+"""`reslrb optimize`: from a configuration to recovered parameters."""
+
+from __future__ import annotations
+
+import logging
+import os
+from pathlib import Path
+
+import click
+
+from reslrb_cli.cli.experiment import experiment_arguments, read_config, start_variant
+from reslrb_cli.config import dump
+from reslrb_cli.errors import ExitCode
+from reslrb_cli.records.manifest import Manifest, Status
+from reslrb_cli.records.run_folder import RunFolder, check_output
+
+
+@click.command("optimize")
+@experiment_arguments
+@click.option("--force", is_flag=True, help="Replace the run folder of that name instead of making a numbered one.")
+@click.option("--quiet", is_flag=True, help="Print the last line only.")
+def command(config_file: Path, overrides: tuple[str, ...], force: bool, quiet: bool) -> int:
+    """Recover the parameters that CONFIG names from its target images.
+
+    Writes a run folder; the last line says where it is. Ctrl-C ends the run after the current iteration, with its
+    folder complete; a second one ends it at once.
+    """
+    if quiet:
+        logging.getLogger("reslrb_cli").setLevel(logging.WARNING)
+    config = read_config(config_file, overrides)
+    check_output(config_file, config.run.output, config.run.folder_name, force)
+    variant = start_variant(config)
+
+    from reslrb_cli.backend.device import device_name
+    from reslrb_cli.cli.interrupts import Interrupts
+    from reslrb_cli.cli.progress import Progress, describe
+    from reslrb_cli.cli.recording import Recording
+    from reslrb_cli.optimization import assemble, find_reached
+
+    say = logging.getLogger(__name__).info
+    problem = assemble(config, say)
+    find_reached(problem, say)
+    manifest = Manifest(variant=variant, device=device_name(variant), seed=config.run.seed, config=str(config_file))
+    folder = RunFolder.create(config_file, config.run.output, config.run.folder_name, force, dump(config), manifest)
+    recording = Recording(problem, folder, manifest)
+    with Interrupts() as interrupts, Progress(config.run.iterations, quiet) as progress:
+        status = recording.run(progress.show, lambda: interrupts.requested)
+    outcome = f", {describe(recording.last)}" if recording.last else ""
+    report = os.path.relpath(folder.path / "report.html")
+    click.echo(f"{status.value} after {recording.done} iterations{outcome}; look at {report}")
+    return ExitCode.DONE if status is Status.FINISHED else ExitCode.INTERRUPTED

@@ -1,0 +1,122 @@
+"""Runs an optimisation and writes its run folder."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from reslrb_cli.optimization import Problem, optimize
+from reslrb_cli.records.checkpoint import save_checkpoint
+from reslrb_cli.records.images import write_image
+from reslrb_cli.records.manifest import Manifest, Status
+from reslrb_cli.records.metrics import MetricsWriter, Record
+from reslrb_cli.records.parameters import write_mask, write_parameters
+from reslrb_cli.records.run_folder import RunFolder
+from reslrb_cli.report import write_report
+
+#: Samples per pixel of saved images, at least.
+IMAGE_SPP = 64
+#: Seconds between two checkpoints.
+CHECKPOINT_SECONDS = 30.0
+
+
+@dataclass
+class Recording:
+    """One run being recorded: `records_done` counts finished iterations, `last` is the newest record."""
+
+    problem: Problem
+    folder: RunFolder
+    manifest: Manifest
+    first: Record | None = None
+    last: Record | None = None
+    errors: dict[str, dict[str, float]] = field(default_factory=dict)
+
+    @property
+    def done(self) -> int:
+        """The number of finished iterations."""
+        return 0 if self.last is None else self.last.iteration + 1
+
+    def run(self, show: Callable[[Record], None], stop: Callable[[], bool]) -> Status:
+        """Iterate until the end or until `stop()`, and complete the folder; return how it ended.
+
+        Whatever ends the run, its folder holds the parameters, a checkpoint, the report and a final status; the
+        final images are missing only where the run failed or was interrupted again while they were rendered.
+        """
+        status, error = Status.FAILED, None
+        try:
+            self._begin()
+            self._iterate(show, stop)
+            interrupted = self.done < self.problem.config.run.iterations
+            self._write_images("final")
+            status = Status.INTERRUPTED if interrupted else Status.FINISHED
+        except KeyboardInterrupt:
+            status = Status.INTERRUPTED
+        except BaseException as failure:
+            error = " ".join(str(failure).split()) or type(failure).__name__
+            raise
+        finally:
+            self._end(status, error)
+        return status
+
+    def _begin(self) -> None:
+        problem, parameters = self.problem, self.folder.parameters
+        for sensor, target in zip(problem.sensors, problem.targets, strict=True):
+            write_image(self.folder.images / self._image_name("target", sensor), np.array(target))
+        self._write_images("initial")
+        write_parameters(parameters / "initial", problem.values())
+        if problem.truth:
+            write_parameters(parameters / "true", problem.truth)
+        for key, mask in problem.masks.items():
+            write_mask(parameters, key, mask)
+        self.errors = {key: {"initial": value} for key, value in problem.parameter_errors().items()}
+
+    def _iterate(self, show: Callable[[Record], None], stop: Callable[[], bool]) -> None:
+        every, saved = self.problem.config.run.images_every, time.monotonic()
+        if stop():
+            return
+        with MetricsWriter(self.folder.path) as metrics:
+            for record in optimize(self.problem):
+                self.first, self.last = self.first or record, record
+                metrics.write(record)
+                show(record)
+                if stop():
+                    return
+                if every and self.done % every == 0 and self.done < self.problem.config.run.iterations:
+                    self._write_images(f"iteration-{self.done:06d}")
+                if time.monotonic() - saved > CHECKPOINT_SECONDS:
+                    self._save_checkpoint()
+                    saved = time.monotonic()
+
+    def _end(self, status: Status, error: str | None) -> None:
+        for key, value in self.problem.parameter_errors().items():
+            self.errors.setdefault(key, {})["final"] = value
+        self.manifest.results = {
+            "iterations": self.done,
+            "loss": self.last and _json_number(self.last.loss),
+            "elapsed_s": self.last and self.last.elapsed_s,
+            "parameter_rmse": self.errors,
+        }
+        write_parameters(self.folder.parameters, self.problem.values())
+        self._save_checkpoint()
+        self.manifest.end(self.folder.path, status, error)
+        write_report(self.folder.path)
+
+    def _save_checkpoint(self) -> None:
+        save_checkpoint(self.folder.checkpoint, self.done, self.problem.values(), self.problem.optimizer.state())
+
+    def _write_images(self, name: str) -> None:
+        spp = max(self.problem.config.run.spp, IMAGE_SPP)
+        for sensor in self.problem.sensors:
+            image = self.problem.render(sensor, spp, self.done, "saved image")
+            write_image(self.folder.images / self._image_name(name, sensor), image)
+
+    def _image_name(self, name: str, sensor: int) -> str:
+        return name if len(self.problem.sensors) == 1 else f"{name}-{sensor}"
+
+
+def _json_number(value: float) -> Any:
+    return value if np.isfinite(value) else None

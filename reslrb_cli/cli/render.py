@@ -1,0 +1,74 @@
+"""`reslrb render`: one image of an experiment's scene."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import click
+
+from reslrb_cli.cli.experiment import experiment_arguments, read_config, start_variant
+from reslrb_cli.errors import ConfigError
+
+#: Formats that hold linear values; the others of `FORMATS` are written in 8-bit sRGB.
+FLOAT_FORMATS = (".exr", ".hdr", ".pfm")
+FORMATS = (*FLOAT_FORMATS, ".png", ".jpg", ".jpeg", ".bmp")
+
+
+@click.command("render")
+@experiment_arguments
+@click.option(
+    "-o",
+    "--output",
+    required=True,
+    type=click.Path(path_type=Path),
+    help="Image file to write; EXR, HDR and PFM are linear, PNG, JPG and BMP 8-bit sRGB.",
+)
+@click.option("--spp", type=click.IntRange(min=1), help="Samples per pixel; default: run.spp.")
+@click.option("--sensor", type=click.IntRange(min=0), help="Index of the sensor; default: the experiment's first.")
+@click.option(
+    "--initial/--scene",
+    "initial",
+    default=True,
+    help="Give the parameters their initial values (default), or take the scene as it stands.",
+)
+def command(
+    config_file: Path, overrides: tuple[str, ...], output: Path, spp: int | None, sensor: int | None, initial: bool
+) -> None:
+    """Render the scene of CONFIG with its integrator."""
+    check_image_path(output)
+    config = read_config(config_file, overrides)
+    start_variant(config)
+
+    from reslrb_cli.optimization.problem import load_for_rendering
+    from reslrb_cli.optimization.rendering import render_in_passes
+    from reslrb_cli.records.images import write_file
+
+    if sensor is not None:
+        config = config.model_copy(update={"scene": config.scene.model_copy(update={"sensors": [sensor]})})
+    scene, sensors, integrator, multiple = load_for_rendering(config, initial)
+    if spp is not None and multiple is not None and spp % min(multiple, spp):
+        raise ConfigError("--spp", "", f"{spp} is not a multiple of integrator.samples_per_pass, which is {multiple}")
+    samples = spp or config.run.spp
+    image = render_in_passes(integrator, scene, sensors[0], samples, config.run.seed, 0, "render", multiple)
+    try:
+        write_file(output, image, linear=output.suffix.lower() in FLOAT_FORMATS)
+    except (OSError, RuntimeError) as error:
+        raise ConfigError("--output", "", f"cannot write {output}: {error}") from None
+    click.echo(f"{output}: {image.shape[1]}x{image.shape[0]}, {samples} spp")
+
+
+def check_image_path(path: Path) -> None:
+    """Raise ConfigError where no image can be written at `path`: an unknown format, or no place to write it to."""
+    if path.suffix.lower() not in FORMATS:
+        raise ConfigError("--output", "", f"{path} has no known image format; end it in {', '.join(FORMATS)}")
+    if path.is_dir() or not path.absolute().parent.is_dir():
+        raise ConfigError("--output", "", f"{path} is a folder, or in a folder that does not exist")
+    existed = path.exists()
+    try:
+        with path.open("ab"):
+            pass
+    except OSError as error:
+        raise ConfigError("--output", "", f"cannot write {path}: {error.strerror}") from None
+    if not existed:
+        os.unlink(path)

@@ -1,0 +1,123 @@
+"""The optimisation loop: it yields records and opens no file."""
+
+from __future__ import annotations
+
+import functools
+import time
+from collections.abc import Iterator
+from typing import Any
+
+import drjit as dr
+
+from reslrb_cli.integrators import gradient_step
+from reslrb_cli.optimization.constraints import NonFiniteWatch, count_nonfinite, finite_square_norm
+from reslrb_cli.optimization.problem import Problem
+from reslrb_cli.optimization.schedules import learning_rate_factor
+from reslrb_cli.records.clock import StepClock, peak_mib, reset_peak
+from reslrb_cli.records.metrics import Record
+from reslrb_cli.seeds import seed
+
+
+def optimize(problem: Problem) -> Iterator[Record]:
+    """Run the iterations of `problem`, one record each; the parameters are updated when a record is yielded.
+
+    An iteration is a step (image, loss and gradient of every sensor; the loss is the mean over the sensors) and an
+    update. A parameter whose gradient is not finite is not updated in that iteration; where the loss is not
+    finite, none is. Raises NonFinite where that goes on (see `NonFiniteWatch`).
+    """
+    config = problem.config
+    clock, watch = StepClock(), NonFiniteWatch()
+    reset_peak()
+    for iteration in range(config.run.iterations):
+        rmse = problem.parameter_rmse()
+        with clock.step() as times:
+            split = Split()
+            loss, squares, counts = gradient(problem, iteration, split)
+            dr.eval(loss, squares, counts)
+        factor = learning_rate_factor(
+            config.optimizer.schedule, iteration, config.run.iterations, config.optimizer.final_fraction
+        )
+        with clock.counted():
+            value = float(loss[0])
+            bad = {key: int(count[0]) for key, count in counts.items() if count[0]}
+            lossless = not dr.isfinite(value)
+            overflowed = problem.optimizer.step(factor, skip=problem.optimizer.keys() if lossless else list(bad))
+            problem.apply()
+        nonfinite = int(lossless) + sum(bad.values()) + sum(overflowed.values())
+        yield Record(
+            iteration=iteration,
+            loss=value,
+            step_ms=times.wall_ms,
+            primal_ms=split.primal_ms,
+            adjoint_ms=None if split.primal_ms is None else times.wall_ms - split.primal_ms,
+            codegen_ms=times.codegen_ms,
+            elapsed_s=clock.elapsed_s,
+            peak_mib=peak_mib(dr.backend_v(loss)),
+            spp=config.run.spp,
+            lr=config.optimizer.learning_rate * factor,
+            grad_norm=float(sum(float(square[0]) for square in squares.values()) ** 0.5),
+            nonfinite=nonfinite,
+            parameter_rmse=rmse,
+        )
+        watch.see(iteration, nonfinite, "the loss" if lossless else ", ".join({**bad, **overflowed}))
+
+
+class Split:
+    """Tells the time of a step up to its image and loss, where the integrator has a moment in which both are there."""
+
+    def __init__(self) -> None:
+        self.primal_ms: float | None = 0.0
+        self._start: float | None = None
+
+    def start(self) -> None:
+        """A view begins."""
+        if self._start is not None:  # the view before never came to `image`
+            self.primal_ms = None
+        self._start = time.perf_counter()
+
+    def image(self) -> None:
+        """Its image and loss are evaluated, or launched."""
+        dr.sync_thread()
+        if self.primal_ms is not None and self._start is not None:
+            self.primal_ms += 1e3 * (time.perf_counter() - self._start)
+        self._start = None
+
+    def end(self) -> None:
+        """No view is left."""
+        if self._start is not None:
+            self.primal_ms = None
+
+
+def gradient(problem: Problem, iteration: int, split: Split) -> tuple[Any, dict[str, Any], dict[str, Any]]:
+    """Accumulate the gradient of the loss into the parameters.
+
+    `split` is told of each view's parts. Returns width-1 arrays: the loss, and for each parameter the gradient's sum
+    of squares (of its finite entries) and the number of entries that are not finite.
+    """
+    run, optimizer = problem.config.run, problem.optimizer
+    views = len(problem.sensors)
+
+    def view_loss(target: Any, image: Any) -> Any:
+        return problem.compare(image, target) / views
+
+    total: Any = 0.0
+    for sensor, target in zip(problem.sensors, problem.targets, strict=True):
+        split.start()
+        step = gradient_step(
+            problem.integrator,
+            problem.scene,
+            sensor,
+            functools.partial(view_loss, target),
+            seed=seed(run.seed, iteration, sensor, "image"),
+            spp=run.spp,
+            adjoint=run.adjoint,
+            params=problem.selection.params,
+            on_image=split.image,
+        )
+        # One view's kernels are not to wait for the next one's: memory would grow with the number of views.
+        gradients = {key: optimizer.gradient(key) for key in optimizer.keys()}  # noqa: SIM118 (not a mapping)
+        dr.eval(step.loss, gradients)
+        total = total + step.loss
+    split.end()
+    squares = {key: finite_square_norm(value) for key, value in gradients.items()}
+    return total, squares, {key: count_nonfinite(value) for key, value in gradients.items()}

@@ -1,0 +1,117 @@
+"""Optimisers: Dr.Jit's, one for each parameter, behind one interface.
+
+One optimiser for each parameter rather than one for all, so that a parameter whose gradient is not finite can sit an
+iteration out with its moments and its count of steps as they were.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Mapping
+from typing import Any
+
+import drjit as dr
+import drjit.opt as dropt
+import numpy as np
+
+from reslrb_cli.optimization.constraints import clamp, count_nonfinite
+
+
+def adam(learning_rate: float, beta_1: float = 0.9, beta_2: float = 0.999, epsilon: float = 1e-8) -> Any:
+    """Adam (Kingma and Ba 2015): m, v running means of g and g²; p -= lr · √(1-β₂ᵗ)/(1-β₁ᵗ) · m / (√v + ε)."""
+    return dropt.Adam(lr=learning_rate, beta_1=beta_1, beta_2=beta_2, epsilon=epsilon)
+
+
+def adamw(
+    learning_rate: float,
+    beta_1: float = 0.9,
+    beta_2: float = 0.999,
+    epsilon: float = 1e-8,
+    weight_decay: float = 0.01,
+) -> Any:
+    """Adam with decoupled weight decay (Loshchilov and Hutter 2019): p -= lr · weight_decay · p besides."""
+    return dropt.AdamW(lr=learning_rate, beta_1=beta_1, beta_2=beta_2, epsilon=epsilon, weight_decay=weight_decay)
+
+
+def rmsprop(learning_rate: float, decay: float = 0.99, epsilon: float = 1e-8) -> Any:
+    """RMSProp (Hinton 2012): v the running mean of g²; p -= lr · g / (√v + ε)."""
+    return dropt.RMSProp(lr=learning_rate, alpha=decay, epsilon=epsilon)
+
+
+def sgd(learning_rate: float, momentum: float = 0.0) -> Any:
+    """Gradient descent: v = momentum · v + g; p -= lr · v."""
+    return dropt.SGD(lr=learning_rate, momentum=momentum)
+
+
+OPTIMIZERS: dict[str, Callable[..., Any]] = {"adam": adam, "adamw": adamw, "rmsprop": rmsprop, "sgd": sgd}
+
+
+class Optimizer:
+    """Holds the parameters and updates them; values it hands out receive gradients.
+
+    `rates` and `bounds` are per key: a rate of None is `learning_rate`, bounds of None are none. Raises KeyError for
+    an unknown `type`.
+    """
+
+    def __init__(
+        self,
+        type: str,
+        learning_rate: float,
+        options: Mapping[str, float],
+        values: Mapping[str, Any],
+        rates: Mapping[str, float | None],
+        bounds: Mapping[str, tuple[float, float] | None],
+    ) -> None:
+        self._rates = {key: float(rates[key] or learning_rate) for key in values}
+        self._bounds = {key: bounds[key] for key in values}
+        self._own = {key: OPTIMIZERS[type](self._rates[key], **options) for key in values}
+        for key, value in values.items():
+            self._own[key][key] = value
+
+    def keys(self) -> list[str]:
+        """The keys of the parameters."""
+        return list(self._own)
+
+    def __getitem__(self, key: str) -> Any:
+        """The value of a parameter, gradients enabled."""
+        return self._own[key][key]
+
+    def gradient(self, key: str) -> Any:
+        """The gradient that has been accumulated into `self[key]`."""
+        return dr.grad(self[key])
+
+    def clear_gradient(self, key: str) -> None:
+        """Forget the gradient accumulated into `self[key]`."""
+        dr.clear_grad(self[key])
+
+    def step(self, factor: float, skip: Collection[str] = ()) -> dict[str, int]:
+        """Update all parameters but those in `skip`, with learning rates times `factor`, and clamp them.
+
+        Returns the number of non-finite entries that the update made, by key, where there were any: even a finite
+        gradient can, by overflow. Such a parameter keeps its old value and state.
+        """
+        # Dr.Jit makes the rate opaque, so that one that changes compiles no new kernel.
+        moved, before, counts = [key for key in self._own if key not in skip], {}, {}
+        for key in moved:
+            own = self._own[key]
+            before[key] = own.state[key]
+            own.set_learning_rate(self._rates[key] * factor)
+            own.step(eval=False)
+            own[key] = clamp(dr.detach(own[key]), self._bounds[key])
+            counts[key] = count_nonfinite(own[key])
+        dr.eval(counts)
+        overflowed = {key: int(count[0]) for key, count in counts.items() if count[0]}
+        for key in overflowed:
+            self._own[key].state[key] = before[key]
+        for key in (*skip, *overflowed):
+            self.clear_gradient(key)
+        return overflowed
+
+    def state(self) -> dict[str, np.ndarray[Any, Any]]:
+        """What the optimiser keeps for each parameter beside its value, as `<key>/<index>` (in Dr.Jit's order)."""
+        arrays = {}
+        for key, own in self._own.items():
+            extra = own.state[key][3]
+            for index, entry in enumerate(extra if isinstance(extra, tuple) else (extra,)):
+                if entry is not None:
+                    arrays[f"{key}/{index}"] = np.array(entry)
+        return arrays

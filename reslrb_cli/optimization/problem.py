@@ -1,0 +1,225 @@
+"""An optimisation problem: everything that a config names, loaded and checked."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from reslrb_cli.config import Config, ParameterSpec
+from reslrb_cli.errors import ConfigError
+from reslrb_cli.integrators import make_integrator
+from reslrb_cli.optimization.losses import Loss, make_loss
+from reslrb_cli.optimization.optimizers import Optimizer
+from reslrb_cli.optimization.rendering import render_in_passes
+from reslrb_cli.scene import Selection, check_supported, load_scene, read_image, select_parameters
+
+Array = np.ndarray[Any, Any]
+
+#: Types of integrators that trace from the light, and so cannot render every scene.
+LIGHT_TRACERS = ("reslrb", "ptracer", "walk_ad")
+#: Weights of linear sRGB in luminance, as Mitsuba has them.
+LUMINANCE = np.array([0.212671, 0.715160, 0.072169], dtype=np.float32)
+
+
+@dataclass
+class Problem:
+    """What `optimize` works on.
+
+    `targets` are (H, W, C) tensors, one for each entry of `sensors`, without alpha. `truth` holds the
+    true value of every parameter for which it is known, and `masks` the entries of those that light and sensor reach
+    (boolean; (H, W) for textures, else of the parameter's shape).
+    """
+
+    config: Config
+    scene: Any
+    sensors: list[int]
+    selection: Selection
+    integrator: Any
+    loss: Loss
+    optimizer: Optimizer
+    targets: list[Any] = field(default_factory=list)
+    truth: dict[str, Array] = field(default_factory=dict)
+    masks: dict[str, Array] = field(default_factory=dict)
+
+    def apply(self) -> None:
+        """Hand the optimiser's values to the scene."""
+        for key in self.selection.keys:
+            self.selection.params[key] = self.optimizer[key]
+        self.selection.params.update()
+
+    def compare(self, image: Any, target: Any) -> Any:
+        """The loss of an (H, W, C) image, attached; alpha is left out."""
+        colors = target.shape[2]
+        return self.loss(image if image.shape[2] == colors else image[:, :, :colors], target)
+
+    def values(self) -> dict[str, Array]:
+        """The parameters' current values."""
+        return {key: self.selection.array(key) for key in self.selection.keys}
+
+    def render(self, sensor: int, spp: int, iteration: int, purpose: str) -> Array:
+        """Render the scene as it stands with the experiment's integrator; (H, W, C) float32."""
+        config = self.config
+        return render_in_passes(
+            self.integrator, self.scene, sensor, spp, config.run.seed, iteration, purpose, samples_per_pass(config)
+        )
+
+    def parameter_errors(self) -> dict[str, float]:
+        """The root mean square error of each parameter whose true value is known, over the entries in its mask."""
+        errors = {}
+        for key, truth in self.truth.items():
+            squares = np.square(self.selection.array(key).astype(np.float64) - truth)[self.masks[key]]
+            if squares.size:
+                errors[key] = float(np.sqrt(squares.mean()))
+        return errors
+
+    def parameter_rmse(self) -> float | None:
+        """The same over the entries of all these parameters together; None where no true value is known."""
+        errors, entries = self.parameter_errors(), {}
+        for key in errors:
+            entries[key] = int(self.masks[key].sum()) * self.truth[key].size // self.masks[key].size
+        count = sum(entries.values())
+        return float(np.sqrt(sum(entries[key] * errors[key] ** 2 for key in errors) / count)) if count else None
+
+
+def samples_per_pass(config: Config) -> int | None:
+    """The integrator's own bound on the samples of a pass."""
+    value = config.integrator.options().get("samples_per_pass")
+    return None if value is None else int(value)
+
+
+def assemble(config: Config, say: Callable[[str], None] = lambda line: None) -> Problem:
+    """Load and check what `config` names, and make the targets; a variant must be set.
+
+    Everything that can be checked is, before anything is rendered. `say` is told what takes long. Raises ConfigError
+    and UnsupportedScene.
+    """
+    problem = assemble_scene(config)
+    render = config.target.render
+    if render is None:
+        problem.targets = [
+            _target(problem, read_target(config, problem, index), sensor)
+            for index, sensor in enumerate(problem.sensors)
+        ]
+        return problem
+    true_scene = load_scene(config.scene.file, config.scene.options)
+    true_values = set_true_values(config, true_scene)
+    for key in problem.selection.keys:
+        value = true_values.array(key)
+        if value.shape == problem.selection.array(key).shape:
+            problem.truth[key] = value
+        else:
+            say(f"{key} has another resolution than its true value: no parameter RMSE")
+    chosen = render.integrator or config.integrator
+    _check_supported(config, chosen.type, chosen.hide_emitters, true_scene, problem.sensors)
+    integrator = make_integrator(chosen.type, **chosen.options())
+    multiple = chosen.options().get("samples_per_pass")
+    for sensor in problem.sensors:
+        say(f"rendering the target of sensor {sensor}: {render.spp} spp")
+        image = render_in_passes(integrator, true_scene, sensor, render.spp, render.seed, 0, "target", multiple)
+        problem.targets.append(_target(problem, image, sensor))
+    return problem
+
+
+def load_for_rendering(config: Config, initial: bool) -> tuple[Any, list[int], Any, int | None]:
+    """Load the scene (with the parameters' initial values, if `initial`), and make the integrator.
+
+    Returns both, between them the indices of the sensors in use, and the integrator's `samples_per_pass`.
+    """
+    if initial:
+        problem = assemble_scene(config)
+        return problem.scene, problem.sensors, problem.integrator, samples_per_pass(config)
+    scene = load_scene(config.scene.file, config.scene.options)
+    sensors = choose_sensors(config, scene)
+    _check_supported(config, config.integrator.type, config.integrator.hide_emitters, scene, sensors)
+    integrator = make_integrator(config.integrator.type, **config.integrator.options())
+    return scene, sensors, integrator, samples_per_pass(config)
+
+
+def assemble_scene(config: Config) -> Problem:
+    """Load and check what `config` names, targets left out."""
+    scene = load_scene(config.scene.file, config.scene.options)
+    sensors = choose_sensors(config, scene)
+    _check_supported(config, config.integrator.type, config.integrator.hide_emitters, scene, sensors)
+    selection = select_parameters(scene, config.parameters, config.source)
+    specs = {key: selection.spec(key) for key in selection.keys}
+    optimizer = Optimizer(
+        config.optimizer.type,
+        config.optimizer.learning_rate,
+        config.optimizer.own_options(),
+        values={key: selection.params[key] for key in selection.keys},
+        rates={key: spec.learning_rate for key, spec in specs.items()},
+        bounds={key: spec.bounds for key, spec in specs.items()},
+    )
+    problem = Problem(
+        config=config,
+        scene=scene,
+        sensors=sensors,
+        selection=selection,
+        integrator=make_integrator(config.integrator.type, **config.integrator.options()),
+        loss=make_loss(config.loss.type, **config.loss.options()),
+        optimizer=optimizer,
+    )
+    problem.apply()
+    return problem
+
+
+def choose_sensors(config: Config, scene: Any) -> list[int]:
+    """Return the indices of the sensors that `scene.sensors` names. Raises ConfigError for one that is not there."""
+    count = len(scene.sensors())
+    if config.scene.sensors == "all":
+        return list(range(count))
+    for place, sensor in enumerate(config.scene.sensors):
+        if sensor >= count:
+            has = "one sensor, index 0" if count == 1 else f"{count} sensors, indices 0 to {count - 1}"
+            raise ConfigError(config.source, f"scene.sensors[{place}]", f"is {sensor}, but the scene has {has}")
+    return list(config.scene.sensors)
+
+
+def set_true_values(config: Config, scene: Any) -> Selection:
+    """Set the values of `target.render.parameters` in `scene`; return them, selected.
+
+    They are checked like initial values are; an error is located in the target.
+    """
+    render = config.target.render
+    assert render is not None, "called for rendered targets only"
+    specs = [ParameterSpec(key=key, initial=value) for key, value in render.parameters.items()]
+    try:
+        return select_parameters(scene, specs, config.source)
+    except ConfigError as error:
+        index = int(error.key.removeprefix("parameters[").partition("]")[0])
+        raise ConfigError(config.source, f"target.render.parameters.{specs[index].key}", error.message) from None
+
+
+def read_target(config: Config, problem: Problem, index: int) -> Array:
+    """Read the target image of the `index`-th sensor that is used. Raises ConfigError."""
+    files = config.target.file
+    assert files is not None, "called for target files only"
+    key = "target.file" if len(files) == 1 else f"target.file[{index}]"
+    if len(files) != len(problem.sensors):
+        raise ConfigError(config.source, "target.file", f"names {len(files)} images for {len(problem.sensors)} sensors")
+    width, height = problem.scene.sensors()[problem.sensors[index]].film().crop_size()
+    try:
+        return read_image(files[index], config.target.color_space, (int(width), int(height)))
+    except ConfigError as error:
+        raise ConfigError(config.source, key, error.message) from None
+
+
+def _target(problem: Problem, image: Array, sensor: int) -> Any:
+    """`image` as a tensor with as many channels as the film of `sensor` has without its alpha."""
+    colors = 1 if int(problem.scene.sensors()[sensor].film().base_channels_count()) <= 2 else 3
+    if colors == 1 and image.shape[2] >= 3:
+        image = image[:, :, :3] @ LUMINANCE[:, None]
+    target = mi.TensorXf(np.ascontiguousarray(image[:, :, :colors], dtype=np.float32))
+    dr.make_opaque(target)
+    return target
+
+
+def _check_supported(config: Config, type: str, hide_emitters: bool, scene: Any, sensors: list[int]) -> None:
+    if type in LIGHT_TRACERS:
+        for sensor in sensors:
+            check_supported(scene, scene.sensors()[sensor], hide_emitters)

@@ -1,0 +1,74 @@
+"""Which entries of a parameter the images tell something about."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import drjit as dr
+import numpy as np
+
+from reslrb_cli.integrators import gradient_step
+from reslrb_cli.optimization.problem import Problem, samples_per_pass
+from reslrb_cli.optimization.rendering import passes
+from reslrb_cli.scene import visible_texels
+from reslrb_cli.seeds import seed
+
+Array = np.ndarray[Any, Any]
+
+#: Paths in one pass of the gradient; naive AD keeps every vertex of each of them.
+PATHS_PER_PASS = 2**18
+
+
+def find_reached(problem: Problem, say: Callable[[str], None] = lambda line: None) -> None:
+    """Fill `problem.masks` for the parameters whose true value is known.
+
+    An entry counts as reached where light reaches it (the gradient of the mean image with respect to it, over
+    `run.reach_spp` samples per pixel, is not 0 in some channel) and, for a texel, where some sensor also sees its
+    centre: a texel that only lights others is held by interreflection alone.
+    """
+    if not problem.truth:
+        return
+    say(f"finding what light and sensor reach: {problem.config.run.reach_spp} spp")
+    sensitive = sensitivity(problem)
+    for key in problem.truth:
+        mask: Array = sensitive[key]
+        if mask.ndim == 3:
+            sensors = [problem.scene.sensors()[index] for index in problem.sensors]
+            mask = np.any(mask, axis=2) & visible_texels(problem.scene, sensors, key)
+        problem.masks[key] = mask
+
+
+def sensitivity(problem: Problem) -> dict[str, Array]:
+    """For each parameter whether the mean image depends on an entry, boolean, of the parameter's shape."""
+    run, optimizer = problem.config.run, problem.optimizer
+    found: dict[str, Array] = {}
+    for sensor in problem.sensors:
+        width, height = problem.scene.sensors()[sensor].film().crop_size()
+        pixels = int(width) * int(height)
+        multiple = samples_per_pass(problem.config)
+        spp = -(-run.reach_spp // multiple) * multiple if multiple else run.reach_spp
+        for number, part in enumerate(passes(spp, pixels, multiple, PATHS_PER_PASS)):
+            gradient_step(
+                problem.integrator,
+                problem.scene,
+                sensor,
+                lambda image: dr.mean(image, axis=None),
+                seed=seed(run.seed, 0, sensor, f"reach, pass {number}"),
+                spp=part,
+                adjoint="correlated",
+                params=problem.selection.params,
+            )
+            for key in optimizer.keys():  # noqa: SIM118 (not a mapping)
+                nonzero = np.array(optimizer.gradient(key) != 0.0)
+                optimizer.clear_gradient(key)
+                found[key] = found[key] | nonzero if key in found else nonzero
+    return {key: _like(problem.selection.array(key), value) for key, value in found.items()}
+
+
+def _like(array: Array, mask: Array) -> Array:
+    """`mask` in the shape of `array`, without the halo columns that an environment map's tensor has."""
+    if array.ndim == 3 and mask.ndim == 3:
+        halo = (mask.shape[1] - array.shape[1]) // 2
+        mask = mask[:, halo : halo + array.shape[1]]
+    return mask.reshape(array.shape)

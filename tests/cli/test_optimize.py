@@ -1,0 +1,281 @@
+"""`reslrb optimize`, `render` and `inspect` on a scene of three surfaces, from the command line to the run folder."""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from reslrb_cli.cli import main
+
+SCENE = """<scene version="3.0.0">
+    <sensor type="perspective" id="camera">
+        <float name="fov" value="50"/>
+        <transform name="to_world"><lookat origin="0, 0, 4" target="0, 0, 0" up="0, 1, 0"/></transform>
+        <film type="hdrfilm" id="film">
+            <integer name="width" value="16"/> <integer name="height" value="16"/>
+            <string name="pixel_format" value="rgb"/> <rfilter type="box"/>
+        </film>
+    </sensor>
+    <sensor type="perspective" id="second">
+        <float name="fov" value="50"/>
+        <transform name="to_world"><lookat origin="1, 0, 4" target="0, 0, 0" up="0, 1, 0"/></transform>
+        <film type="hdrfilm" id="second_film">
+            <integer name="width" value="12"/> <integer name="height" value="8"/>
+            <string name="pixel_format" value="rgb"/> <rfilter type="box"/>
+        </film>
+    </sensor>
+    <bsdf type="diffuse" id="poster">
+        <texture type="bitmap" name="reflectance">
+            <string name="filename" value="poster.exr"/> <boolean name="raw" value="true"/>
+            <string name="format" value="variant"/> <string name="filter_type" value="nearest"/>
+        </texture>
+    </bsdf>
+    <bsdf type="diffuse" id="wall"><rgb name="reflectance" value="0.5, 0.4, 0.3"/></bsdf>
+    <shape type="rectangle" id="poster_shape"><ref id="poster"/></shape>
+    <shape type="rectangle" id="wall_shape">
+        <transform name="to_world"><scale value="4"/><translate z="-1"/></transform> <ref id="wall"/>
+    </shape>
+    <shape type="rectangle" id="lamp">
+        <transform name="to_world"><rotate x="1" angle="180"/><translate x="0" y="0" z="5"/></transform>
+        <emitter type="area" id="light"><rgb name="radiance" value="8, 8, 8"/></emitter>
+    </shape>
+</scene>
+"""
+
+CONFIG = """
+variant: llvm_ad_rgb
+scene: {file: scene.xml}
+target: {render: {spp: 512}}
+parameters:
+  - {key: poster.reflectance.data, initial: 0.5, bounds: [0, 1]}
+integrator: {type: ptracer, max_depth: 3}
+optimizer: {learning_rate: 0.05}
+run: {iterations: 25, spp: 16, reach_spp: 32}
+"""
+
+FOLDER = [
+    "checkpoint", "config.yaml", "images", "manifest.json", "metrics.jsonl", "parameters", "report.html",
+]  # fmt: skip
+KEY = "poster.reflectance.data"
+
+
+@pytest.fixture
+def experiment(llvm, tmp_path, monkeypatch):
+    """A folder with a scene and a configuration, and the working directory in it; returns the texture, (4, 4, 3)."""
+    import mitsuba as mi
+
+    texture = np.random.default_rng(2).uniform(0.1, 0.9, (4, 4, 3)).astype(np.float32)
+    mi.Bitmap(texture).write(str(tmp_path / "poster.exr"))
+    (tmp_path / "scene.xml").write_text(SCENE)
+    (tmp_path / "box.yaml").write_text(CONFIG)
+    monkeypatch.chdir(tmp_path)
+    yield texture
+    # The command line keeps its handler, which holds this test's standard error.
+    logger = logging.getLogger("reslrb_cli")
+    logger.handlers.clear()
+    logger.setLevel(logging.NOTSET)
+
+
+def reslrb(capsys, *args):
+    """Run the command line in this process; return exit code, standard output and standard error."""
+    with pytest.raises(SystemExit) as end:
+        main.main([str(arg) for arg in args])
+    out, err = capsys.readouterr()
+    return int(end.value.code or 0), out, err
+
+
+def read_manifest(folder):
+    return json.loads((Path(folder) / "manifest.json").read_text())
+
+
+def read_metrics(folder):
+    return [json.loads(line) for line in (Path(folder) / "metrics.jsonl").read_text().splitlines()]
+
+
+def names(folder):
+    return sorted(path.name for path in Path(folder).iterdir())
+
+
+@pytest.mark.parametrize("type", ["ptracer", "reslrb", "prb"])
+def test_a_texture_is_recovered(experiment, capsys, type):
+    import mitsuba as mi
+
+    sets = ["--set", f"integrator.type={type}", "--set", "run.iterations=40", "--set", "optimizer.schedule=cosine"]
+    sets += ["--set", "run.adjoint=independent"]  # at 16 spp the noise of `correlated` would bias the albedo
+    code, out, err = reslrb(capsys, "optimize", "box.yaml", *sets)
+    assert code == 0, err
+    last = out.splitlines()[-1]
+    assert "runs/box/report.html" in last
+    assert "Traceback" not in err
+
+    assert names("runs/box") == FOLDER
+    records = read_metrics("runs/box")
+    assert [record["iteration"] for record in records] == list(range(40))
+    manifest = read_manifest("runs/box")
+    assert (manifest["status"], manifest["variant"], manifest["seed"]) == ("finished", "llvm_ad_rgb", 0)
+    errors = manifest["results"]["parameter_rmse"][KEY]
+    assert errors["initial"] == pytest.approx(records[0]["parameter_rmse"])
+    assert errors["final"] < 0.4 * errors["initial"]
+
+    mask = np.load(f"runs/box/parameters/{KEY}.mask.npy")
+    assert mask.shape == (4, 4)
+    assert mask.all()
+    recovered = np.array(mi.Bitmap(f"runs/box/parameters/{KEY}.exr"))
+    rmse = np.sqrt(np.mean((recovered - experiment)[mask] ** 2))
+    assert rmse == pytest.approx(errors["final"], rel=1e-4)
+    assert {"initial.exr", "initial.png", "final.exr", "final.png", "target.exr", "target.png"} == set(
+        names("runs/box/images")
+    )
+    assert np.array(mi.Bitmap("runs/box/images/final.exr")).shape == (16, 16, 3)
+
+
+def test_what_a_run_saves_agrees_with_itself(experiment, capsys):
+    assert reslrb(capsys, "optimize", "box.yaml", "--set", "run.iterations=3", "--set", "run.images_every=2")[0] == 0
+    assert "iteration-000002.exr" in names("runs/box/images")
+    with np.load("runs/box/checkpoint/state.npz") as state, np.load("runs/box/parameters/parameters.npz") as values:
+        np.testing.assert_array_equal(state[f"parameter/{KEY}"], values[KEY])
+        assert int(state["iteration"]) == 3
+    page = Path("runs/box/report.html").read_text()
+    for text in ("<svg", "data:image/png;base64", "finished", "target", "llvm_ad_rgb"):
+        assert text in page
+    # the configuration as resolved can be run again, from anywhere
+    again = reslrb(capsys, "optimize", "runs/box/config.yaml", "--set", "run.iterations=1", "--quiet")
+    assert again[0] == 0
+    assert read_metrics("runs/box-2")[0]["loss"] == read_metrics("runs/box")[0]["loss"]
+
+
+def test_runs_can_be_repeated_and_get_numbers(experiment, capsys):
+    for _ in range(2):
+        assert reslrb(capsys, "optimize", "box.yaml", "--set", "run.iterations=2", "--quiet")[0] == 0
+    assert names("runs") == ["box", "box-2"]
+    losses = [[record["loss"] for record in read_metrics(f"runs/{name}")] for name in names("runs")]
+    np.testing.assert_allclose(losses[0], losses[1], rtol=1e-5)
+    assert reslrb(capsys, "optimize", "box.yaml", "--set", "run.iterations=1", "--force", "--quiet")[0] == 0
+    assert names("runs") == ["box", "box-2"]
+    assert len(read_metrics("runs/box")) == 1
+
+
+def test_several_sensors_share_the_parameters(experiment, capsys):
+    sets = ["--set", "scene.sensors=all", "--set", "run.iterations=3"]
+    assert reslrb(capsys, "optimize", "box.yaml", *sets)[0] == 0
+    assert {"final-0.exr", "final-1.exr", "target-1.exr"} <= set(names("runs/box/images"))
+
+
+def test_a_target_file_gives_no_parameter_error(experiment, capsys):
+    assert reslrb(capsys, "render", "box.yaml", "--scene", "-o", "target.exr", "--spp", 64)[0] == 0
+    Path("file.yaml").write_text(CONFIG.replace("{render: {spp: 512}}", "{file: target.exr}"))
+    assert reslrb(capsys, "optimize", "file.yaml", "--set", "run.iterations=2")[0] == 0
+    records = read_metrics("runs/file")
+    assert records[0]["parameter_rmse"] is None
+    assert read_manifest("runs/file")["results"]["parameter_rmse"] == {}
+
+
+def test_later_iterations_compile_nothing(experiment):
+    from reslrb_cli.config import load
+    from reslrb_cli.optimization import assemble, loop
+    from reslrb_cli.records.clock import StepClock
+
+    problem = assemble(load("box.yaml", ["run.iterations=1", "integrator.type=reslrb"]))
+    misses, clock = [], StepClock()
+    for iteration in range(4):
+        with clock.step() as times:
+            loop.gradient(problem, iteration, loop.Split())
+            problem.optimizer.step(0.9**iteration)
+            problem.apply()
+        misses.append(times.compiled)
+    assert misses[2:] == [0, 0]
+
+
+BAD = [
+    ("run.output=blocked", "run.output"),
+    ("run.output=blocked/deeper", "run.output"),
+    ("scene.file=missing.xml", "missing.xml"),
+    ("scene.sensors=[7]", "scene.sensors[0]"),
+    ("parameters[0].key=poster.reflectance.dta", "parameters[0].key"),
+    ("parameters[0].key=poster_shape.to_world", "parameters[0].key"),
+    ("parameters[0].initial=[0.1, 0.2]", "parameters[0].initial"),
+    ("parameters[0].bounds=[0.6, 1]", "parameters[0].initial"),
+    ("target={file: missing.exr}", "target.file"),
+    ("target={file: scene.xml}", "target.file"),
+    ("target={file: poster.exr}", "target.file"),
+    ("target.render.parameters={nothing.value: 1}", "target.render.parameters.nothing.value"),
+    ("run.spp=0", "run.spp"),
+    ("run.itrations=3", "run.itrations"),
+]
+
+
+@pytest.mark.parametrize(("setting", "where"), BAD)
+def test_bad_input_is_one_located_line_and_no_run_folder(experiment, capsys, setting, where):
+    Path("blocked").write_text("a file, not a folder")
+    code, out, err = reslrb(capsys, "optimize", "box.yaml", "--set", setting, "--quiet")
+    lines = [line for line in err.splitlines() if not line.startswith("variant ")]
+    assert code == 2
+    assert len(lines) == 1, err
+    assert where in lines[0]
+    assert out == ""
+    assert not Path("runs").exists()
+    assert Path("blocked").is_file()
+
+
+def test_a_render_is_written_and_bad_outputs_are_refused(experiment, capsys):
+    import mitsuba as mi
+
+    code, out, _ = reslrb(capsys, "render", "box.yaml", "-o", "small.png", "--sensor", 1, "--spp", 8)
+    assert code == 0
+    assert "small.png: 12x8" in out
+    assert np.array(mi.Bitmap("small.png")).dtype == np.uint8
+    for output in ("image.tiff3", "nowhere/image.exr", "."):
+        code, _, err = reslrb(capsys, "render", "box.yaml", "-o", output)
+        assert (code, len(err.splitlines())) == (2, 1)
+    assert reslrb(capsys, "render", "box.yaml", "-o", "x.exr", "--sensor", 9)[0] == 2
+    assert not Path("x.exr").exists()
+
+
+def test_inspect_tells_what_can_be_recovered(experiment, capsys):
+    code, out, _ = reslrb(capsys, "inspect", "box.yaml")
+    assert code == 0
+    assert any(KEY in line and "can be recovered" in line for line in out.splitlines())
+    assert any("poster_shape.to_world" in line and "moves geometry" in line for line in out.splitlines())
+    code, out, _ = reslrb(capsys, "inspect", "box.yaml", "--json")
+    parameters = {entry["key"]: entry for entry in json.loads(out)["parameters"]}
+    assert parameters[KEY]["obstacle"] is None
+    assert parameters[KEY]["shape"] == [4, 4, 3]
+
+
+@pytest.mark.skipif(os.name != "posix", reason="sends SIGINT")
+def test_ctrl_c_leaves_a_complete_run_folder(experiment):
+    command = [sys.executable, "-c", "from reslrb_cli.cli import main; main()", "optimize", "box.yaml"]
+    package = str(Path(__file__).resolve().parents[2])
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([package, os.environ.get("PYTHONPATH", "")])}
+    run = subprocess.Popen(
+        [*command, "--set", "run.iterations=100000"],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment,
+    )  # fmt: skip
+    metrics = Path("runs/box/metrics.jsonl")
+    deadline = time.monotonic() + 60
+    while not (metrics.exists() and metrics.read_text().count("\n") > 2):
+        assert time.monotonic() < deadline
+        assert run.poll() is None, run.communicate()
+        time.sleep(0.05)
+    run.send_signal(signal.SIGINT)
+    out, err = run.communicate(timeout=60)
+    assert run.returncode == 130, err
+    assert "Traceback" not in err
+    assert "runs/box/report.html" in out.splitlines()[-1]
+    assert names("runs/box") == FOLDER
+    manifest, records = read_manifest("runs/box"), read_metrics("runs/box")
+    assert manifest["status"] == "interrupted"
+    assert manifest["results"]["iterations"] == len(records)
+    assert {"initial.exr", "final.exr", "target.exr"} <= set(names("runs/box/images"))
+    assert {f"{KEY}.exr", "parameters.json", "parameters.npz"} <= set(names("runs/box/parameters"))
+    with np.load("runs/box/checkpoint/state.npz") as state:
+        assert int(state["iteration"]) == len(records)

@@ -1,0 +1,159 @@
+"""Optimisers against their published formulas; clamping, rates, parameters that sit out."""
+
+from __future__ import annotations
+
+import itertools
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from reslrb_cli.optimization.optimizers import OPTIMIZERS, Optimizer
+from reslrb_cli.optimization.schedules import SCHEDULES, learning_rate_factor
+from reslrb_cli.records.clock import StepClock
+
+RATE = 0.05
+START = np.array([0.9, -0.4, 0.2, 1.5])
+TARGET = np.array([0.1, 0.3, 0.8, -0.7])
+
+
+def adam(p, g, s, t, beta_1=0.9, beta_2=0.999, epsilon=1e-8, rate=RATE, weight_decay=0.0):
+    s["m"] = beta_1 * s.get("m", 0) + (1 - beta_1) * g
+    s["v"] = beta_2 * s.get("v", 0) + (1 - beta_2) * g**2
+    step = rate * np.sqrt(1 - beta_2**t) / (1 - beta_1**t)  # Section 2 of the paper: epsilon is not corrected for bias
+    return p - step * s["m"] / (np.sqrt(s["v"]) + epsilon) - rate * weight_decay * p
+
+
+def rmsprop(p, g, s, t, decay=0.99, epsilon=1e-8, rate=RATE):
+    s["v"] = decay * s.get("v", 0) + (1 - decay) * g**2
+    return p - rate * g / (np.sqrt(s["v"]) + epsilon)
+
+
+def sgd(p, g, s, t, momentum=0.0, rate=RATE):
+    s["v"] = momentum * s.get("v", 0) + g
+    return p - rate * s["v"]
+
+
+CASES = [
+    ("adam", {}, adam),
+    ("adam", {"beta_1": 0.5, "beta_2": 0.9, "epsilon": 1e-2}, adam),
+    ("adamw", {"weight_decay": 0.1}, adam),
+    ("rmsprop", {}, rmsprop),
+    ("rmsprop", {"decay": 0.8, "epsilon": 1e-2}, rmsprop),
+    ("sgd", {}, sgd),
+    ("sgd", {"momentum": 0.9}, sgd),
+]
+
+
+def make(type="sgd", value=START, options=None, rate=None, bounds=None):
+    value = mi.TensorXf(np.array(value, dtype=np.float32))
+    return Optimizer(type, RATE, options or {}, {"p": value}, {"p": rate}, {"p": bounds})
+
+
+def descend(optimizer, gradient=lambda p: 2 * (p - TARGET)):
+    """Put the gradient of |p - TARGET|² (or `gradient`, from NumPy) into the optimiser."""
+    value = optimizer["p"]
+    wanted = mi.TensorXf(np.array(gradient(np.array(value)), dtype=np.float32))
+    dr.backward(dr.sum(value * wanted, axis=None))
+    return np.array(optimizer.gradient("p"))
+
+
+def test_every_optimiser_has_a_reference():
+    assert {case[0] for case in CASES} == set(OPTIMIZERS)
+
+
+@pytest.mark.parametrize(("type", "options", "reference"), CASES)
+def test_updates_follow_the_formula(type, options, reference):
+    optimizer, expected, state = make(type, options=options), START.copy(), {}
+    for step in range(1, 31):
+        descend(optimizer)
+        optimizer.step(1.0)
+        expected = reference(expected, 2 * (expected - TARGET), state, step, **options)
+        np.testing.assert_allclose(np.array(optimizer["p"]), expected, rtol=2e-3, atol=2e-3)
+
+
+def test_a_parameter_has_its_own_rate_and_the_schedule_scales_it():
+    optimizer = make(rate=0.5)
+    descend(optimizer, lambda p: np.ones_like(p))
+    optimizer.step(0.1)
+    np.testing.assert_allclose(np.array(optimizer["p"]), START - 0.5 * 0.1, rtol=1e-5)
+
+
+@pytest.mark.parametrize("bounds", [(0.0, 1.0), (-np.inf, 0.5), (0.25, np.inf)])
+def test_values_are_clamped_after_the_update(bounds):
+    optimizer = make(value=[0.3, 0.4], bounds=bounds)
+    for gradient in (-100.0, 200.0):
+        descend(optimizer, lambda p, gradient=gradient: np.full_like(p, gradient))
+        optimizer.step(1.0)
+        low, high = np.array(optimizer["p"]).min(), np.array(optimizer["p"]).max()
+        assert bounds[0] <= low
+        assert high <= bounds[1]
+        assert (high == bounds[1]) if gradient < 0 and np.isfinite(bounds[1]) else True
+        assert (low == bounds[0]) if gradient > 0 and np.isfinite(bounds[0]) else True
+
+
+@pytest.mark.parametrize("type", OPTIMIZERS)
+def test_a_parameter_that_sits_out_keeps_value_and_state(type):
+    one, other = make(type), make(type)
+    for step in range(6):
+        descend(one)
+        one.step(1.0)
+        if step == 3:
+            descend(other, lambda p: np.full_like(p, np.nan))
+            assert other.step(1.0, skip=["p"]) == {}
+        descend(other)
+        other.step(1.0)
+    np.testing.assert_array_equal(np.array(one["p"]), np.array(other["p"]))
+
+
+def test_an_update_that_overflows_is_taken_back():
+    optimizer = make(value=[1.0, 1.0])
+    descend(optimizer, lambda p: np.array([3e38, 1.0]))
+    assert optimizer.step(1e10) == {"p": 1}
+    np.testing.assert_array_equal(np.array(optimizer["p"]), [1.0, 1.0])
+    descend(optimizer, lambda p: np.ones_like(p))
+    optimizer.step(1.0)
+    np.testing.assert_allclose(np.array(optimizer["p"]), 1.0 - RATE, rtol=1e-6)
+
+
+@pytest.mark.parametrize("type", OPTIMIZERS)
+@pytest.mark.parametrize("kind", ["texture", "colour", "number"])
+def test_a_rate_that_changes_compiles_nothing(type, kind):
+    value = {
+        "texture": lambda: dr.full(mi.TensorXf, 0.5, (4, 4, 3)),
+        "colour": lambda: mi.Color3f(0.5, 0.4, 0.3),
+        "number": lambda: mi.Float(0.5),
+    }[kind]()
+    optimizer, clock = Optimizer(type, RATE, {}, {"p": value}, {"p": None}, {"p": (0.0, 1.0)}), StepClock()
+    compiled = []
+    for step in range(4):
+        with clock.step() as times:
+            dr.backward(dr.sum(dr.square(optimizer["p"] - 0.9), axis=None))
+            dr.eval(optimizer.gradient("p"))
+            optimizer.step(0.9**step)
+        compiled.append(times.compiled)
+    assert compiled[2:] == [0, 0]
+
+
+def test_the_state_holds_the_moments():
+    optimizer = make("adam")
+    descend(optimizer)
+    optimizer.step(1.0)
+    state = optimizer.state()
+    assert set(state) == {"p/0", "p/1", "p/2"}
+    np.testing.assert_allclose(state["p/1"], 0.1 * 2 * (START - TARGET), rtol=1e-5, atol=1e-7)
+
+
+@pytest.mark.parametrize("schedule", SCHEDULES)
+def test_schedules_run_from_one_to_the_final_fraction(schedule):
+    factors = [learning_rate_factor(schedule, i, 11, 0.1) for i in range(11)]
+    assert factors[0] == pytest.approx(1.0)
+    assert factors[-1] == pytest.approx(1.0 if schedule == "constant" else 0.1)
+    assert all(a >= b for a, b in itertools.pairwise(factors))
+    assert learning_rate_factor(schedule, 0, 1, 0.1) == pytest.approx(1.0)
+
+
+def test_schedules_at_half_time():
+    assert learning_rate_factor("cosine", 5, 11, 0.1) == pytest.approx(0.55)
+    assert learning_rate_factor("exponential", 5, 11, 0.01) == pytest.approx(0.1)
