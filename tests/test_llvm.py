@@ -160,6 +160,10 @@ def test_prepare_leaves_the_users_choice_alone(machine: Machine, monkeypatch: py
     [
         ("libz3.so.4: cannot open shared object file: No such file or directory", "libz3.so.4"),
         ("ImportError: libatomic.so.1: cannot open shared object file: No such file", "libatomic.so.1"),
+        (
+            "raise ImportError('libz3.so.4: cannot open shared object file')\nlibm.so.6: cannot open shared object",
+            "libm.so.6",
+        ),
         ("dlopen(...): Library not loaded: @rpath/libz3.4.dylib\n  Referenced from: ...", "libz3.4.dylib"),
         ("/nope/libLLVM.so: cannot open shared object file: No such file or directory", None),
         ("/lib/libLLVM.so: undefined symbol: x", None),

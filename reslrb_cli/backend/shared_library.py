@@ -13,7 +13,7 @@ from pathlib import Path
 
 # glibc: "libz3.so.4: cannot open shared object file: ...", macOS: "Library not loaded: @rpath/libz3.dylib"
 _MISSING = re.compile(
-    r"(?:^|\s)(?P<so>[^\s/:]+\.so[^\s:]*): cannot open shared object|Library not loaded: (?P<dylib>\S+)"
+    r"(?:^|\s)(?P<so>[\w.+-]+\.so[\w.]*): cannot open shared object|Library not loaded: (?P<dylib>\S+)"
 )
 
 
