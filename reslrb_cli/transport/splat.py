@@ -55,11 +55,11 @@ class Film:
         """dL/d(block) from dL/d(developed image): what `AdjointImage` looks up."""
         with dr.resume_grad():
             block = self.block()
-            tensor = block.tensor()
-            dr.enable_grad(tensor)
+            dr.enable_grad(block.tensor())
+            before = type(block.tensor())(block.tensor())  # `develop` overwrites an alpha channel
             image = self.develop(block)
             dr.backward_from(image * dr.detach(image_gradient))
-            gradient = dr.grad(tensor)
+            gradient = dr.grad(before)
         return AdjointImage(self, mi.Float(gradient.array), block.channel_count())
 
 
