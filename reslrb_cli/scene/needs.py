@@ -35,6 +35,7 @@ class SceneNeeds:
     has_delta_lobes: bool
     has_null: bool
     has_shading_normals: bool
+    has_perturbed_normals: bool
     moving_shutter: bool
     thin_lens: bool
 
@@ -70,6 +71,7 @@ def scene_needs(scene: Any, sensor: Any) -> SceneNeeds:
         has_delta_lobes=flags & int(mi.BSDFFlags.Delta) != 0,
         has_null=flags & int(mi.BSDFFlags.Null) != 0,
         has_shading_normals=any(_has_shading_normals(shape) for shape in graph.shapes()),
+        has_perturbed_normals=any(bsdf.class_name() in ("BumpMap", "NormalMap") for bsdf in graph.of_type(mi.BSDF)),
         moving_shutter=float(sensor.shutter_open_time()) > 0,
         thin_lens=bool(sensor.needs_aperture_sample()),
     )
