@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,41 +16,64 @@ from reslrb_cli.transport.splat import AdjointImage, Film
 from reslrb_cli.transport.walk import Hooks
 
 
-class Estimator(ABC):
-    """One way to estimate the gradient of a path's contributions in constant memory.
+@dataclass
+class Pass:
+    """One set of samples as an estimator sees it.
 
-    The image pass runs `image_hooks`, whose final state is all that is kept of each path; once dL/dI is known,
-    `replay_hooks` runs over the same paths and adds the derivatives.
+    `scale` brings a sum over paths to an image. `block` is the image to splat into, or None. `adjoint` is dL/dI, or
+    None while it is not known. `walk(hooks, active)` traces the same paths each time it is called and returns the
+    hooks' final state; `emission()` is E (C,) of each path, with derivatives.
+    """
+
+    plan: Plan
+    scene: Any
+    film: Film
+    scale: float
+    block: Any
+    adjoint: AdjointImage | None
+    walk: Callable[..., Any]
+    emission: Callable[[], Any]
+
+    def splat(self, u: Any, value: Any, active: Any) -> None:
+        """Add `value` (C,) to the image, where there is one."""
+        if self.block is not None:
+            self.film.put(self.block, u, value, active)
+
+
+class Estimator(ABC):
+    """One way to estimate the gradient of a path's contributions without keeping the path.
+
+    `forward` splats the image and returns what is kept of each path; `backward` adds the derivatives, once dL/dI is
+    known. Where it is known from the start (`Pass.adjoint` in `forward`), an estimator may do better with that.
     """
 
     @abstractmethod
-    def image_hooks(self, plan: Plan, scene: Any, film: Film, block: Any, scale: float) -> Hooks:
-        """Hooks of the image pass: keep what a replay needs, and splat `scale` C_i into `block` (None: no image)."""
-
-    def finish_image(self, film: Film, block: Any, state: Any) -> None:
-        """Splat what the final state of the image pass holds, where the image is made of that."""
-        return
+    def forward(self, p: Pass) -> Any:
+        """Splat the image and return the state to keep, a PyTree of arrays, one entry per path; not evaluated here."""
 
     @abstractmethod
-    def adjoint(self, state: Any, image: AdjointImage) -> PathAdjoint:
-        """What the kept state and dL/dI say of each path."""
+    def backward(self, p: Pass, state: Any) -> None:
+        """Add the derivatives to the parameters' gradients; `p.adjoint` is known, `p.block` is not used."""
 
-    @abstractmethod
-    def replay_hooks(self, plan: Plan, scene: Any, state: Any, adjoint: PathAdjoint) -> Hooks:
-        """Hooks of the replay, from the image pass's final state."""
+
+def differentiate_emission(p: Pass, weight: Callable[[Any], Any]) -> None:
+    """Add the derivative of E, (C,), times `weight(E)`, where the plan differentiates emission at all."""
+    if p.plan.differentiate_emission:
+        with dr.resume_grad(), dr.isolate_grad():
+            E = p.emission()
+            dr.backward_from(dr.dot(weight(dr.detach(E)), E))
 
 
 @dataclass
 class PathAdjoint:
-    """Sensitivity of the objective to one path as a whole.
+    """Sensitivity of the objective to one connection of a path.
 
-    `value` is (C,): delta times the product of the nonzero factors, estimator weight included; `product` says which
-    factor is zero, if any; `active` in which lanes there is anything to replay.
+    `value` is (C,): delta times the product of the nonzero factors, the estimator's weight included, and 0 in lanes
+    without one; `product` says which factor is zero, if any.
     """
 
     value: Any
     product: Product
-    active: Any
 
 
 def adjoint_of_factor(adjoint: PathAdjoint, index: Any, f: Any, rest: Any) -> Any:
@@ -66,3 +90,10 @@ def adjoint_of_factor(adjoint: PathAdjoint, index: Any, f: Any, rest: Any) -> An
         at_zero = dr.select(zero == mi.Int32(index), adjoint.value[c] * rest[c], 0)
         result[c] = dr.select((zero == NO_ZERO) & (f[c] != 0), adjoint.value[c] / f[c], at_zero)
     return result
+
+
+class VertexHooks(Hooks):
+    """Hooks of one pass of an estimator."""
+
+    def __init__(self, p: Pass) -> None:
+        self.p = p

@@ -1,11 +1,12 @@
-"""ResLRB: keep one connection of each path by weighted reservoir sampling, then replay the path up to it.
+"""ResLRB: keep few connections of each path by weighted reservoir sampling, then replay the path up to the last.
 
-    keep candidate i with probability w_i / W,  W = sum_i w_i,  w_i = luminance(C_i)
-    dS ~ (W / w_I) delta_I [ C_I dE/E + sum_{j<I} C_I ds_j/s_j + C_I dc_I/c_I ]
+    slot k keeps candidate i with probability w_i / W,   W = sum_i w_i
+    dS ~ 1/m sum_k (W / w_I) delta_I [ C_I dE/E + sum_{j<I} C_I ds_j/s_j + C_I dc_I/c_I ],   I = I_k
 
-Source: the ResLRB paper, Sections 2.2 to 2.4; reservoir: Chao 1982. Each bracket term needs the graph of one vertex
-alone. With zero factors the weight is that of the nonzero ones, so that a connection whose value is zero and whose
-derivative is not can be kept.
+Source: the ResLRB paper, Sections 2.2 to 2.4, for m = 1 and w = luminance(C); its conclusion names m > 1, here m
+independent slots that one replay serves. Reservoir sampling: Chao 1982. Where delta is known before the paths are
+traced, w = sum_c |delta_c C_c| leaves less variance. With zero factors the weight is that of the nonzero ones, so that
+a connection whose value is zero and whose derivative is not can be kept.
 """
 
 from __future__ import annotations
@@ -16,117 +17,181 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from reslrb_cli.estimators.base import Estimator, PathAdjoint, adjoint_of_factor
-from reslrb_cli.transport.connection import Connection, connection_factor
+from reslrb_cli.estimators.base import (
+    Estimator,
+    Pass,
+    PathAdjoint,
+    VertexHooks,
+    adjoint_of_factor,
+    differentiate_emission,
+)
+from reslrb_cli.transport.connection import Connection
 from reslrb_cli.transport.factors import MANY_ZEROS, NO_ZERO, Product
-from reslrb_cli.transport.plan import Plan
-from reslrb_cli.transport.scattering import Scattering, attached_factor
-from reslrb_cli.transport.splat import AdjointImage, Film
+from reslrb_cli.transport.scattering import Scattering, attached_factor, attached_factors
 from reslrb_cli.transport.transmittance import transmittance
-from reslrb_cli.transport.walk import Hooks, Vertex
+from reslrb_cli.transport.walk import Vertex
 
 
 @dataclass
-class ReservoirState:
-    """What is kept of a path, 32 bytes (and 12 more where zero factors are tracked)."""
+class Slot:
+    """One kept connection, 28 bytes (and 12 more where zero factors are tracked)."""
 
-    W: Any  # sum of all candidates' weights
-    w: Any  # weight of the kept one
+    w: Any  # its selection weight
     I: Any  # its vertex; 0: none  # noqa: E741
     C: Product  # its contribution
     u: Any  # its film position
 
 
+@dataclass
+class ReservoirState:
+    """What is kept of a path."""
+
+    W: Any  # sum of all candidates' weights
+    slots: list[Slot]
+
+
 def luminance(value: Any) -> Any:
-    """Selection weight of a contribution (C,); channels may not be negative."""
+    """Selection weight of a contribution (C,) that does not need delta."""
     return mi.luminance(mi.Color3f(value)) if len(value) == 3 else mi.Float(value[0])
 
 
-class ReservoirSelection(Hooks):
-    """Image pass: splat, and keep one connection."""
+class ReservoirSelection(VertexHooks):
+    """Image pass: splat, and keep connections."""
 
-    numbers = 1
-
-    def __init__(self, plan: Plan, scene: Any, film: Film, block: Any, scale: float) -> None:
-        self.plan, self.scene, self.film, self.block, self.scale = plan, scene, film, block, scale
+    def __init__(self, p: Pass, capacity: int, weight: str, splat: bool) -> None:
+        super().__init__(p)
+        self.numbers, self.weight, self.splat = capacity, weight, splat
 
     def start(self, product: Product) -> ReservoirState:
-        nothing = Product(mi.Spectrum(0), [mi.Int32(MANY_ZEROS) for _ in product.zero])
-        return ReservoirState(mi.Float(0), mi.Float(0), mi.UInt32(0), nothing, mi.Point2f(0))
+        def empty() -> Slot:
+            nothing = Product(mi.Spectrum(0), [mi.Int32(MANY_ZEROS) for _ in product.zero])
+            return Slot(mi.Float(0), mi.UInt32(0), nothing, mi.Point2f(0))
+
+        return ReservoirState(mi.Float(0), [empty() for _ in range(self.numbers)])
 
     def connection(
         self, state: ReservoirState, vertex: Vertex, connection: Connection, numbers: list[Any]
     ) -> ReservoirState:
-        c, active = connection_factor(self.plan, self.scene, vertex, connection)
-        C = vertex.product.times(c, vertex.depth).scaled(self.scale)
-        if self.block is not None:
-            self.film.put(self.block, connection.u, C.value(), active)
-        w = dr.select(active, luminance(C.differentiable()), 0)
+        C = vertex.product.times(connection.c, vertex.depth).scaled(self.p.scale)
+        if self.splat:
+            self.p.splat(connection.u, C.value(), connection.active)
+        if self.weight == "luminance":
+            w = luminance(C.differentiable())
+        else:
+            delta = self.p.adjoint.lookup(connection.u, connection.active)
+            w = dr.sum(dr.abs(delta * C.differentiable()))
+        w = dr.select(connection.active, w, 0)
         W = state.W + w
-        keep = (w > 0) & (numbers[0] * W < w)
-        kept = ReservoirState(W, w, vertex.depth, C, connection.u)
-        return dr.select(keep, kept, ReservoirState(W, state.w, state.I, state.C, state.u))
+        this = Slot(w, vertex.depth, C, connection.u)
+        slots = [
+            dr.select((w > 0) & (number * W < w), this, slot) for number, slot in zip(numbers, state.slots, strict=True)
+        ]
+        return ReservoirState(W, slots)
 
 
-class ReservoirReplay(Hooks):
-    """Replay up to the kept connection, and differentiate one factor a vertex: s_j on the way, c_I at its end."""
+class ReservoirReplay(VertexHooks):
+    """Replay up to the last kept connection, and differentiate s_j on the way and c_I at each kept one."""
 
     replaying = True
+    connects = False
 
-    def __init__(self, plan: Plan, scene: Any, kept: ReservoirState, adjoint: PathAdjoint) -> None:
-        self.plan, self.scene, self.kept, self.adjoint = plan, scene, kept, adjoint
+    def __init__(self, p: Pass, slots: list[Slot], adjoints: list[PathAdjoint]) -> None:
+        super().__init__(p)
+        self.kept = list(zip(slots, adjoints, strict=True))
+        self.last = slots[0].I
+        for slot in slots[1:]:
+            self.last = dr.maximum(self.last, slot.I)
 
     def goes_on(self, state: Any, vertex: Vertex) -> Any:
-        return vertex.depth < self.kept.I
+        return vertex.depth < self.last
 
     def scattering(self, state: Any, vertex: Vertex, connection: Connection, scattering: Scattering) -> Any:
-        at_end = vertex.depth == self.kept.I
-        active = vertex.active & (at_end | scattering.active)
-        rest = dr.select(at_end, connection.weight, mi.Spectrum(scattering.correction / scattering.pdf))
-        if self.plan.needs.has_null:
-            rest = dr.select(at_end, rest * self._transmittance(vertex, connection, vertex.active & at_end), rest)
-        # One evaluation serves both kinds of factor, since a vertex has either.
-        wo = dr.select(at_end, connection.wo, scattering.wo)
-        scattering.is_delta &= ~at_end
-        scattering.is_null &= ~at_end
+        plan, si, bsdf, depth = self.p.plan, vertex.si, vertex.bsdf, vertex.depth
+        connected = self._any(lambda slot: slot.I == depth) & vertex.active
+        rest_c = connection.weight
+        if plan.needs.has_null:
+            rest_c = rest_c * self._transmittance(vertex, connection, connected)
+        rest_s = mi.Spectrum(scattering.correction / scattering.pdf)
         with dr.resume_grad():
-            f = attached_factor(self.plan, vertex.si, vertex.bsdf, wo, scattering, active)
-            weight = adjoint_of_factor(self.adjoint, vertex.depth, f, rest)
-            dr.backward_from(dr.select(active, weight * f, 0))
+            if len(self.kept) == 1:
+                # A vertex has either kind of factor, and one evaluation serves both.
+                [(_, adjoint)] = self.kept
+                scattering.is_delta &= ~connected
+                scattering.is_null &= ~connected
+                scattering.wo = dr.select(connected, connection.wo, scattering.wo)
+                active = connected | scattering.active
+                f = attached_factor(plan, si, bsdf, scattering, active)
+                weight = adjoint_of_factor(adjoint, depth, f, dr.select(connected, rest_c, rest_s))
+                dr.backward_from(dr.select(active, weight * f, 0))
+            else:
+                f_c, f_s = attached_factors(plan, si, bsdf, connection.wo, connected, scattering, scattering.active)
+                weight_c = self._sum(lambda slot: slot.I == depth, depth, f_c, rest_c)
+                weight_s = self._sum(lambda slot: slot.I > depth, depth, f_s, rest_s)
+                objective = dr.select(connected, weight_c * f_c, 0) + dr.select(scattering.active, weight_s * f_s, 0)
+                dr.backward_from(objective)
         return state
 
+    def _any(self, which: Any) -> Any:
+        masks = [which(slot) for slot, _ in self.kept]
+        result = masks[0]
+        for mask in masks[1:]:
+            result |= mask
+        return result
+
+    def _sum(self, which: Any, index: Any, f: Any, rest: Any) -> Any:
+        """Sum of the adjoints of one factor over the slots that `which` picks."""
+        total = mi.Spectrum(0)
+        for slot, adjoint in self.kept:
+            total += dr.select(which(slot), adjoint_of_factor(adjoint, index, f, rest), 0)
+        return total
+
     def _transmittance(self, vertex: Vertex, connection: Connection, active: Any) -> Any:
-        """Transmittance of masks between the kept vertex and the sensor; adds its derivative."""
+        """Transmittance of masks between a kept vertex and the sensor; adds its derivative."""
 
         def differentiate(transmission: Any, hit: Any) -> None:
             # A segment with a transmission of zero is no candidate, so no index can match.
-            weight = adjoint_of_factor(self.adjoint, mi.Int32(NO_ZERO), transmission, 0)
+            weight = self._sum(lambda slot: slot.I == vertex.depth, mi.Int32(NO_ZERO), transmission, 0)
             dr.backward_from(dr.select(hit, weight * transmission, 0))
 
         with dr.resume_grad():
-            limit = self.plan.max_depth - vertex.depth - 1
-            return transmittance(self.scene, vertex.si, connection.target, limit, active, differentiate).value
+            limit = self.p.plan.max_depth - vertex.depth - 1
+            return transmittance(self.p.scene, vertex.si, connection.target, limit, active, differentiate).value
 
 
 class Reservoir(Estimator):
-    """The paper's estimator: capacity 1, weight luminance, detached."""
+    """Reservoir of `capacity` slots with selection weight `luminance` or `adjoint`.
 
-    def __init__(self, image: str = "all") -> None:
-        self.image = image
+    `image` says which connections the image shows: `all`, or the `retained` ones alone, weighted by W / (m w_I).
+    """
 
-    def image_hooks(self, plan: Plan, scene: Any, film: Film, block: Any, scale: float) -> Hooks:
-        return ReservoirSelection(plan, scene, film, block if self.image == "all" else None, scale)
+    def __init__(self, capacity: int = 1, weight: str = "luminance", image: str = "all") -> None:
+        self.capacity, self.weight, self.image = capacity, weight, image
 
-    def finish_image(self, film: Film, block: Any, state: ReservoirState) -> None:
+    def forward(self, p: Pass) -> ReservoirState:
+        if self.weight == "adjoint" and p.adjoint is None:
+            raise ValueError('weight "adjoint" needs dL/dI before the paths are traced, which correlated samples lack')
+        state: ReservoirState = p.walk(ReservoirSelection(p, self.capacity, self.weight, self.image == "all"))
         if self.image == "retained":
-            value = state.C.value() * dr.select(state.w > 0, state.W / state.w, 0)
-            film.put(block, state.u, value, state.I > 0)
+            for slot in state.slots:
+                p.splat(slot.u, slot.C.value() * self._unselected(state, slot), slot.I > 0)
+        return state
 
-    def adjoint(self, state: ReservoirState, image: AdjointImage) -> PathAdjoint:
-        active = state.I > 0
-        delta = image.lookup(state.u, active)
-        value = delta * state.C.nonzero * dr.select(active, state.W / state.w, 0)
-        return PathAdjoint(value, state.C, active)
+    def backward(self, p: Pass, state: ReservoirState) -> None:
+        adjoints = [self._adjoint(p, state, slot) for slot in state.slots]
 
-    def replay_hooks(self, plan: Plan, scene: Any, state: ReservoirState, adjoint: PathAdjoint) -> Hooks:
-        return ReservoirReplay(plan, scene, state, adjoint)
+        def emission_weight(E: Any) -> Any:
+            weights = [adjoint_of_factor(adjoint, mi.Int32(0), E, 1) for adjoint in adjoints]
+            return sum(weights[1:], weights[0])
+
+        differentiate_emission(p, emission_weight)
+        if p.plan.differentiate_bsdfs:
+            p.walk(ReservoirReplay(p, state.slots, adjoints), state.W > 0)
+
+    def _unselected(self, state: ReservoirState, slot: Slot) -> Any:
+        """1 over the probability of the selection, shared among the slots."""
+        return dr.select(slot.I > 0, state.W / (self.capacity * slot.w), 0)
+
+    def _adjoint(self, p: Pass, state: ReservoirState, slot: Slot) -> PathAdjoint:
+        assert p.adjoint is not None
+        delta = p.adjoint.lookup(slot.u, slot.I > 0)
+        return PathAdjoint(delta * slot.C.nonzero * self._unselected(state, slot), slot.C)

@@ -112,7 +112,7 @@ def _make_classes() -> tuple[Any, Any]:
                 raise ValueError(f'"estimator" must be one of {", ".join(ESTIMATORS)}, not "{name}"')
             if image not in ("all", "retained"):
                 raise ValueError(f'"image" must be all or retained, not "{image}"')
-            self.estimator = ESTIMATORS[name](image)
+            self.estimator = ESTIMATORS[name](image=image)
 
         def trace(self, scene: Any, sensor: Any, seed: Any, spp: int, params: Any) -> lt.Trace:
             """The image, and what a replay of the same samples needs; both evaluated."""
@@ -123,7 +123,7 @@ def _make_classes() -> tuple[Any, Any]:
             """Add the gradient of the objective with dL/dI `gradient` (H, W, C) to the parameters."""
             with dr.suspend_grad():
                 adjoint = trace.film.adjoint(gradient)
-                for samples, state in zip(trace.samples, trace.states(self.estimator), strict=True):
+                for samples, state in zip(trace.samples, trace.states(self.estimator, adjoint), strict=True):
                     lt.replay(samples, self.estimator, state, adjoint)
                     if len(trace.samples) > 1:
                         _evaluate_gradients(params)

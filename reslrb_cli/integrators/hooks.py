@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any
 import drjit as dr
 import mitsuba as mi
 
-from reslrb_cli.transport.connection import Connection, connection_factor
+from reslrb_cli.transport.connection import Connection, passage
 from reslrb_cli.transport.factors import Product
-from reslrb_cli.transport.scattering import Scattering, attached_factor
+from reslrb_cli.transport.scattering import Scattering, attached_factors
 from reslrb_cli.transport.walk import Hooks, Vertex
 
 if TYPE_CHECKING:
@@ -25,9 +25,8 @@ class Splat(Hooks):
 
     def connection(self, state: Any, vertex: Vertex, connection: Connection, numbers: list[Any]) -> Any:
         s = self.samples
-        c, active = connection_factor(s.plan, s.scene, vertex, connection)
-        C = vertex.product.times(c, vertex.depth).scaled(s.scale)
-        s.film.put(self.block, connection.u, C.value(), active)
+        C = vertex.product.times(connection.c, vertex.depth).scaled(s.scale)
+        s.film.put(self.block, connection.u, C.value(), connection.active)
         return state
 
 
@@ -51,28 +50,22 @@ class TangentSplat(Hooks):
     zero factors need no care.
     """
 
+    connects = False  # it evaluates them itself, with their derivatives
+
     def __init__(self, samples: Samples, block: Any, dE: Any) -> None:
         self.samples, self.block, self.dE = samples, block, dE
 
     def start(self, product: Product) -> Tangent:
         return Tangent(mi.Spectrum(self.dE))
 
-    def connection(self, state: Tangent, vertex: Vertex, connection: Connection, numbers: list[Any]) -> Tangent:
-        s = self.samples
-        with dr.resume_grad():
-            c, active = connection_factor(s.plan, s.scene, vertex, connection)
-            dc = dr.detach(dr.forward_to(c)) if s.plan.differentiate_bsdfs else mi.Spectrum(0)
-        dC = state.d_product * dr.detach(c) + vertex.product.value() * dc
-        s.film.put(self.block, connection.u, dC * s.scale, active)
-        return state
-
     def scattering(self, state: Tangent, vertex: Vertex, connection: Connection, scattering: Scattering) -> Tangent:
-        s, d_product = self.samples, state.d_product * scattering.weight
-        if s.plan.differentiate_bsdfs:
-            active = scattering.active
-            with dr.resume_grad():
-                f = attached_factor(s.plan, vertex.si, vertex.bsdf, scattering.wo, scattering, active)
-                df = dr.detach(dr.forward_to(f))
-            ds = dr.select(active, df * (scattering.correction / scattering.pdf), 0)
-            d_product += vertex.product.value() * ds
-        return Tangent(d_product)
+        s, P, scattered = self.samples, vertex.product.value(), scattering.active
+        with dr.resume_grad(when=s.plan.differentiate_bsdfs):
+            seen, transmittance = passage(s.plan, s.scene, vertex.si, vertex.depth, connection)
+            factors = (vertex.si, vertex.bsdf, connection.wo, seen, scattering, scattered)
+            f_c, f_s = attached_factors(s.plan, *factors)
+            c = f_c * transmittance * connection.weight
+            dc, df = dr.detach(dr.forward_to((c, f_s))) if s.plan.differentiate_bsdfs else (0, 0)
+        s.film.put(self.block, connection.u, (state.d_product * dr.detach(c) + P * dc) * s.scale, seen)
+        ds = dr.select(scattered, df * (scattering.correction / scattering.pdf), 0)
+        return Tangent(state.d_product * scattering.weight + P * ds)

@@ -10,7 +10,7 @@ import drjit as dr
 import mitsuba as mi
 
 from reslrb_cli.estimators import Estimator
-from reslrb_cli.estimators.base import adjoint_of_factor
+from reslrb_cli.estimators.base import Pass
 from reslrb_cli.integrators.hooks import AttachedSplat, Splat, TangentSplat
 from reslrb_cli.transport.emission import sample_emission
 from reslrb_cli.transport.plan import Plan
@@ -48,6 +48,17 @@ class Samples:
     def stream(self, name: int) -> Any:
         """Random numbers beside the sampler's own."""
         return mi.PCG32(self.width, mi.UInt64(self.seed) + (name << 32))
+
+    def context(self, block: Any, adjoint: AdjointImage | None) -> Pass:
+        """These samples as an estimator sees them."""
+
+        def walk(hooks: Hooks, active: Any = True) -> Any:
+            return trace(self, hooks, active)
+
+        def emission() -> Any:
+            return sample_emission(self.plan, self.scene, self.sensor, self.sampler()).weight
+
+        return Pass(self.plan, self.scene, self.film, self.scale, block, adjoint, walk, emission)
 
     def primary_ray(self) -> PrimaryRay:
         """Rays for C_0, from a stream of their own: the light paths are those of `ptracer` with or without them."""
@@ -115,17 +126,15 @@ def splat_image(samples: Samples, block: Any) -> None:
     trace(samples, Splat(samples, block))
 
 
-def splat_and_keep(samples: Samples, estimator: Estimator, block: Any) -> Any:
-    """Add the samples' contributions to the block (None: no image) and return what the estimator keeps of each path.
+def keep(samples: Samples, estimator: Estimator, block: Any, adjoint: AdjointImage | None = None) -> Any:
+    """Trace the samples: add their contributions to the block (None: no image), and return what is kept of each path.
 
-    One kernel: the state is scheduled together with the block, which would otherwise trace everything twice.
+    One kernel: all that it yields is evaluated together, since what came later would trace everything again.
     """
-    hooks = estimator.image_hooks(samples.plan, samples.scene, samples.film, block, samples.scale)
     if block is not None:
         splat_visible_emission(samples, block)
-    state = trace(samples, hooks)
+    state = estimator.forward(samples.context(block, adjoint))
     if block is not None:
-        estimator.finish_image(samples.film, block, state)
         dr.schedule(block.tensor())
     dr.eval(state)
     return state
@@ -146,10 +155,10 @@ class Trace:
     def film(self) -> Film:
         return self.samples[0].film
 
-    def states(self, estimator: Estimator) -> Iterator[Any]:
-        """What is kept of each pass, in turn."""
+    def states(self, estimator: Estimator, adjoint: AdjointImage) -> Iterator[Any]:
+        """What is kept of each pass, in turn; passes that are traced only now know dL/dI from the start."""
         for samples in self.samples:
-            yield self.state if self.state is not None else splat_and_keep(samples, estimator, None)
+            yield self.state if self.state is not None else keep(samples, estimator, None, adjoint)
 
 
 def trace_image(samples: list[Samples], estimator: Estimator) -> Trace:
@@ -157,7 +166,7 @@ def trace_image(samples: list[Samples], estimator: Estimator) -> Trace:
     film = samples[0].film
     block = film.block()
     if len(samples) == 1:
-        trace = Trace(samples, state=splat_and_keep(samples[0], estimator, block))
+        trace = Trace(samples, state=keep(samples[0], estimator, block))
     else:
         trace = Trace(samples)
         for part in samples:
@@ -168,22 +177,14 @@ def trace_image(samples: list[Samples], estimator: Estimator) -> Trace:
     return trace
 
 
-def replay(samples: Samples, estimator: Estimator, state: Any, image: AdjointImage) -> None:
-    """Add the derivatives of the objective, whose derivative with respect to the film is `image`, to the parameters."""
+def replay(samples: Samples, estimator: Estimator, state: Any, adjoint: AdjointImage) -> None:
+    """Add the derivatives of the objective, whose derivative with respect to the film is `adjoint`."""
     plan = samples.plan
-    adjoint = estimator.adjoint(state, image)
     if plan.visible_emission and (plan.differentiate_emission or plan.needs.has_null):
         primary = samples.primary_ray()
-        delta = image.lookup(primary.u, primary.active) * primary.weight * samples.fraction
+        delta = adjoint.lookup(primary.u, primary.active) * primary.weight * samples.fraction
         differentiate_visible_radiance(plan, samples.scene, primary, delta)
-    if plan.differentiate_emission:
-        with dr.resume_grad(), dr.isolate_grad():
-            E = sample_emission(plan, samples.scene, samples.sensor, samples.sampler()).weight
-            weight = adjoint_of_factor(adjoint, mi.Int32(0), E, 1)
-            dr.backward_from(dr.select(adjoint.active, dr.dot(weight, E), 0))
-    if plan.differentiate_bsdfs:
-        hooks = estimator.replay_hooks(plan, samples.scene, state, adjoint)
-        trace(samples, hooks, adjoint.active)
+    estimator.backward(samples.context(None, adjoint), state)
 
 
 def splat_tangents(samples: Samples, block: Any) -> None:

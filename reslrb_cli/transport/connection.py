@@ -9,7 +9,7 @@ import drjit as dr
 import mitsuba as mi
 
 from reslrb_cli.transport.plan import Plan
-from reslrb_cli.transport.scattering import attached_factor, shading_correction
+from reslrb_cli.transport.scattering import shading_correction
 from reslrb_cli.transport.transmittance import transmittance
 
 
@@ -18,7 +18,8 @@ class Connection:
     """The geometry of one connection, before the BSDF is evaluated and before visibility is known.
 
     `weight` is everything of c_i but the BSDF and the transmittance: sensor importance, geometry, Veach's correction,
-    (C,). `u` is the film position in pixels relative to the crop window, `target` the point on the aperture.
+    (C,). `u` is the film position in pixels relative to the crop window, `target` the point on the aperture. A walk
+    that evaluates connections sets `c` to c_i (C,) as a whole, and `active` to where the sensor is seen.
     """
 
     weight: Any
@@ -26,6 +27,7 @@ class Connection:
     target: Any
     wo: Any
     active: Any
+    c: Any = None
 
 
 def connect(plan: Plan, sensor: Any, si: Any, ray: Any, sample: Any, active: Any) -> Connection:
@@ -38,16 +40,30 @@ def connect(plan: Plan, sensor: Any, si: Any, ray: Any, sample: Any, active: Any
         return Connection(importance * correction, ds.uv, ds.p, wo, active & valid & (ds.pdf > 0))
 
 
-def connection_factor(plan: Plan, scene: Any, vertex: Any, connection: Connection) -> tuple[Any, Any]:
-    """c_i (C,), with derivatives where they are enabled, and where the sensor is seen: traces the shadow ray.
+@dataclass
+class Seen:
+    """What an earlier walk saw of the sensor: `visible`, in the lanes that are `known` (None: in all)."""
 
-    In a scene without surfaces that light passes straight through, no transmittance is computed.
+    visible: Any
+    known: Any = None
+
+
+def passage(
+    plan: Plan, scene: Any, si: Any, depth: Any, connection: Connection, seen: Seen | None = None
+) -> tuple[Any, Any]:
+    """Where the sensor is seen, and the transmittance (C,) of masks on the way: traces the shadow ray.
+
+    No ray is traced in lanes in which `seen` knows the answer. In a scene without surfaces that light passes straight
+    through, no transmittance is computed; in one that has them, `seen` is no help.
     """
-    si, active = vertex.si, connection.active
+    active, one = connection.active, mi.Spectrum(1)
     if plan.needs.has_null:
-        through = transmittance(scene, si, connection.target, plan.max_depth - vertex.depth - 1, active)
-        active, passed = through.reached, through.value
-    else:
-        active, passed = active & ~scene.ray_test(si.spawn_ray_to(connection.target), active), mi.Spectrum(1)
-    f = attached_factor(plan, si, vertex.bsdf, connection.wo, None, active)
-    return f * passed * connection.weight, active
+        through = transmittance(scene, si, connection.target, plan.max_depth - depth - 1, active)
+        return through.reached, through.value
+    if seen is None:
+        return active & ~scene.ray_test(si.spawn_ray_to(connection.target), active), one
+    if seen.known is None:
+        return active & seen.visible, one
+    unknown = active & ~seen.known
+    traced = unknown & ~scene.ray_test(si.spawn_ray_to(connection.target), unknown)
+    return traced | (active & seen.known & seen.visible), one

@@ -9,8 +9,8 @@ Sampling is detached: directions and densities do not depend on the parameters. 
 
 has a derivative.
 
-Bump and normal maps perturb the shading frame inside of the BSDF, where Veach's correction cannot see it. In scenes that
-have them a smooth lobe is evaluated as a path from the camera would, with its two directions exchanged,
+Bump and normal maps perturb the shading frame inside of the BSDF, where Veach's correction cannot see it. In scenes
+that have them a smooth lobe is evaluated as a path from the camera would, with its two directions exchanged,
 
     f = bsdf(wo -> wi) * cos_p wi * |n . wo| / |n . wi|        n: geometric normal, p: perturbed one
 
@@ -66,37 +66,59 @@ def shading_correction(plan: Plan, si: Any, wi_world: Any, wo_world: Any, wo: An
     return dr.select(valid, dr.abs((cos_i * wo_dot_n) / (cos_o * wi_dot_n)), 0), valid
 
 
-def scatter(plan: Plan, si: Any, bsdf: Any, ray: Any, sample_1: Any, sample_2: Any, active: Any) -> Scattering:
-    """Sample the next direction. Detached; `attached_factor` has the derivative."""
+def scatter(
+    plan: Plan, si: Any, bsdf: Any, ray: Any, sample_1: Any, sample_2: Any, active: Any,
+    connection_wo: Any = None, connected: Any = None,
+) -> tuple[Scattering, Any]:  # fmt: skip
+    """Sample the next direction; where `connection_wo` is given, also evaluate f (C,) towards it in `connected` lanes.
+
+    Detached; `attached_factors` has the derivatives. Both queries share one indirect call, and in it what they have in
+    common (looking up textures, mostly).
+    """
+    context = importance_context()
+
+    def both(self: Any, si: Any, wo: Any, sample_1: Any, sample_2: Any, connected: Any, active: Any, any_: Any) -> Any:
+        bs, weight = self.sample(context, si, sample_1, sample_2, active)
+        return evaluate(plan, si, self, wo, connected), bs.wo, bs.pdf, bs.eta, bs.sampled_type, weight
+
     with dr.suspend_grad():
-        bs, weight = bsdf.sample(importance_context(), si, sample_1, sample_2, active)
-        d = si.to_world(bs.wo)
-        correction, valid = shading_correction(plan, si, -ray.d, d, bs.wo)
+        if connection_wo is None:
+            bs, weight = bsdf.sample(context, si, sample_1, sample_2, active)
+            f_connection, wo, pdf, eta, lobe = None, bs.wo, bs.pdf, bs.eta, bs.sampled_type
+        else:
+            # The last argument is taken for the mask of the call as a whole.
+            f_connection, wo, pdf, eta, lobe, weight = dr.dispatch(
+                bsdf, both, si, connection_wo, sample_1, sample_2, connected, active, active | connected
+            )
+        d = si.to_world(wo)
+        correction, valid = shading_correction(plan, si, -ray.d, d, wo)
+        is_delta = mi.has_flag(lobe, mi.BSDFFlags.Delta) if plan.needs.has_delta_lobes else mi.Bool(False)
+        is_null = mi.has_flag(lobe, mi.BSDFFlags.Null) if plan.needs.has_null else mi.Bool(False)
         if plan.needs.has_perturbed_normals:
-            delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
-            singular = delta | mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
-            correction = dr.select(delta, correction * _delta_correction(si.wi, bs), correction)
-            f = evaluate(plan, si, bsdf, bs.wo, active & ~singular)
-            weight = dr.select(singular, weight, dr.select(bs.pdf > 0, f / bs.pdf, 0))
-        return Scattering(
+            correction = dr.select(is_delta, correction * _delta_correction(si.wi, wo, eta), correction)
+            singular = is_delta | is_null
+            f = evaluate(plan, si, bsdf, wo, active & ~singular)
+            weight = dr.select(singular, weight, dr.select(pdf > 0, f / pdf, 0))
+        scattering = Scattering(
             weight=weight * correction,
-            wo=bs.wo,
+            wo=wo,
             d=d,
-            pdf=bs.pdf,
-            eta=bs.eta,
+            pdf=pdf,
+            eta=eta,
             correction=correction,
-            is_delta=mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta) if plan.needs.has_delta_lobes else mi.Bool(False),
-            is_null=mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null) if plan.needs.has_null else mi.Bool(False),
+            is_delta=is_delta,
+            is_null=is_null,
             sample_1=sample_1,
             sample_2=sample_2,
-            active=active & valid & (bs.pdf > 0),
+            active=active & valid & (pdf > 0),
         )
+        return scattering, f_connection
 
 
-def _delta_correction(wi: Any, bs: Any) -> Any:
+def _delta_correction(wi: Any, wo: Any, eta: Any) -> Any:
     """cos_p wi / cos_p wo of a mirror or refraction, whose normal p is along wi + eta wo."""
-    h = dr.fma(bs.eta, bs.wo, wi)
-    return dr.abs(dr.dot(h, wi) / dr.dot(h, bs.wo))
+    h = dr.fma(eta, wo, wi)
+    return dr.abs(dr.dot(h, wi) / dr.dot(h, wo))
 
 
 def evaluate(plan: Plan, si: Any, bsdf: Any, wo: Any, active: Any) -> Any:
@@ -108,15 +130,33 @@ def evaluate(plan: Plan, si: Any, bsdf: Any, wo: Any, active: Any) -> Any:
     return bsdf.eval(mi.BSDFContext(mi.TransportMode.Radiance), exchanged, si.wi, active)
 
 
-def attached_factor(plan: Plan, si: Any, bsdf: Any, wo: Any, scattering: Scattering | None, active: Any) -> Any:
-    """f (C,) with derivatives: towards `wo`, or, where `scattering` chose a delta lobe or passed through, of that.
+def attached_factor(plan: Plan, si: Any, bsdf: Any, scattering: Scattering, active: Any) -> Any:
+    """f (C,) with derivatives, of the event that `scattering` is.
 
     Call under `dr.resume_grad()`. What the scene has no lobes for is not compiled.
     """
-    if scattering is None or not (plan.needs.has_delta_lobes or plan.needs.has_null):
-        return evaluate(plan, si, bsdf, wo, active)
-    singular = scattering.is_delta | scattering.is_null
-    f = evaluate(plan, si, bsdf, wo, active & ~singular)
+    f = evaluate(plan, si, bsdf, scattering.wo, active & ~(scattering.is_delta | scattering.is_null))
+    return _singular_factor(plan, si, bsdf, scattering, active, f)
+
+
+def attached_factors(
+    plan: Plan, si: Any, bsdf: Any, connection_wo: Any, connected: Any, scattering: Scattering, scattered: Any
+) -> tuple[Any, Any]:
+    """f (C,) towards the sensor and f along the path, both with derivatives, from one indirect call.
+
+    Call under `dr.resume_grad()`.
+    """
+
+    def both(self: Any, si: Any, wo_c: Any, wo_s: Any, connected: Any, smooth: Any, any_: Any) -> Any:
+        return evaluate(plan, si, self, wo_c, connected), evaluate(plan, si, self, wo_s, smooth)
+
+    smooth = scattered & ~(scattering.is_delta | scattering.is_null)
+    f_c, f_s = dr.dispatch(bsdf, both, si, connection_wo, scattering.wo, connected, smooth, connected | scattered)
+    return f_c, _singular_factor(plan, si, bsdf, scattering, scattered, f_s)
+
+
+def _singular_factor(plan: Plan, si: Any, bsdf: Any, scattering: Scattering, active: Any, f: Any) -> Any:
+    """`f`, replaced where a delta lobe was sampled or light passed straight through."""
     if plan.needs.has_delta_lobes:
         delta = active & scattering.is_delta
         bs, weight = bsdf.sample(importance_context(), si, scattering.sample_1, scattering.sample_2, delta)

@@ -13,11 +13,11 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from reslrb_cli.transport.connection import Connection, connect
+from reslrb_cli.transport.connection import Connection, Seen, connect, passage
 from reslrb_cli.transport.emission import sample_emission
 from reslrb_cli.transport.factors import Product
 from reslrb_cli.transport.plan import Plan
-from reslrb_cli.transport.scattering import Scattering, attached_factor, scatter
+from reslrb_cli.transport.scattering import Scattering, attached_factor, evaluate, scatter
 
 ROULETTE_LIMIT = 0.95  # the largest probability of going on, as in `ptracer`
 
@@ -49,12 +49,14 @@ class Vertex:
 class Hooks:
     """What an estimator does along a walk. All are pure: state in, state out; none draws a random number.
 
-    `numbers` says how many random numbers `connection` wants at each vertex. A walk whose hooks are `replaying` follows
+    `numbers` says how many random numbers `connection` wants at each vertex; without `connects` no connection is
+    evaluated, and `connection` is not called. A walk whose hooks are `replaying` follows
     a path that is known to get as far as `goes_on` asks, so that neither its throughput nor its roulette is computed.
     Hooks that are `attached` keep derivatives in the loop state, which is then evaluated vertex by vertex (naive AD).
     """
 
     numbers: int = 0
+    connects: bool = True
     replaying: bool = False
     attached: bool = False
 
@@ -62,8 +64,12 @@ class Hooks:
         """State before the first vertex, any PyTree; `product` is E."""
         return []
 
+    def seen(self, vertex: Vertex) -> Seen | None:
+        """What is known of the sensor's visibility from this vertex."""
+        return None
+
     def connection(self, state: Any, vertex: Vertex, connection: Connection, numbers: list[Any]) -> Any:
-        """Called at each vertex with the geometry of its connection to the sensor."""
+        """Called at each vertex with its connection to the sensor."""
         return state
 
     def goes_on(self, state: Any, vertex: Vertex) -> Any:
@@ -103,20 +109,27 @@ def walk(
 
         # ---- Connect to the sensor ----
         connection = connect(plan, sensor, si, path.ray, sampler.next_2d(path.active), path.active)
-        numbers = [selection.next_float32() for _ in range(hooks.numbers)]
-        state = hooks.connection(state, vertex, connection, numbers)
+        if hooks.connects:
+            connection.active, transmittance = passage(plan, scene, si, path.depth, connection, hooks.seen(vertex))
 
-        # ---- Scatter ----
+        # ---- Scatter, and evaluate the connection in the same call ----
         sample_2, sample_1 = sampler.next_2d(path.active), sampler.next_1d(path.active)
         active = path.active & (path.depth + 1 < plan.max_depth) & hooks.goes_on(state, vertex)
-        scattering = scatter(plan, si, vertex.bsdf, path.ray, sample_1, sample_2, active)
+        query = (connection.wo, connection.active) if hooks.connects and not hooks.attached else (None, None)
+        scattering, f_c = scatter(plan, si, vertex.bsdf, path.ray, sample_1, sample_2, active, *query)
+        if hooks.connects:
+            if hooks.attached:
+                f_c = evaluate(plan, si, vertex.bsdf, connection.wo, connection.active)
+            connection.c = f_c * transmittance * connection.weight
+            numbers = [selection.next_float32() for _ in range(hooks.numbers)]
+            state = hooks.connection(state, vertex, connection, numbers)
         state = hooks.scattering(state, vertex, connection, scattering)
         if hooks.replaying:
             sampler.next_1d(active)  # roulette's
             return next_vertex(path, active, si, scattering, path.product, path.eta), state, sampler, selection
         weight = scattering.weight
         if hooks.attached:
-            f = attached_factor(plan, si, vertex.bsdf, scattering.wo, scattering, scattering.active)
+            f = attached_factor(plan, si, vertex.bsdf, scattering, scattering.active)
             weight = dr.replace_grad(weight, f * (scattering.correction / scattering.pdf))
         product = path.product.times(weight, path.depth)
         eta = path.eta * scattering.eta
