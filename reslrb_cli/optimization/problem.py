@@ -51,6 +51,13 @@ class Problem:
         for key in self.selection.keys:
             self.selection.params[key] = self.optimizer[key]
         self.selection.params.update()
+        # A texture pads its storage when it is first looked up, and unpads it when it is read. Left to the step, either
+        # would cut its kernels in two, and differently in the first step and the second.
+        for key in self.selection.keys:
+            node = self.selection.params.properties[key][2]
+            if isinstance(node, mi.Texture):
+                node.eval(dr.zeros(mi.SurfaceInteraction3f))
+        dr.eval([self.selection.params[key] for key in self.selection.keys])
 
     def compare(self, image: Any, target: Any) -> Any:
         """The loss of an (H, W, C) image, attached; alpha is left out."""

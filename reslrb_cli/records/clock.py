@@ -18,13 +18,14 @@ class StepTimes:
     """Times of one step in milliseconds; filled in when the step has ended.
 
     `wall_ms` is what a user waits; `kernel_ms` the execution of kernels and `codegen_ms` their generation and
-    compilation, both from `dr.kernel_history`; `compiled` the number of kernels that the in-memory cache lacked.
+    compilation, both from `dr.kernel_history`; `new_kernels` the number of kernels that no earlier step of the same
+    clock has launched (`cache_hit` does not tell: a kernel from the disk cache is a hit).
     """
 
     wall_ms: float = 0.0
     kernel_ms: float = 0.0
     codegen_ms: float = 0.0
-    compiled: int = 0
+    new_kernels: int = 0
 
 
 class StepClock:
@@ -32,6 +33,7 @@ class StepClock:
 
     def __init__(self) -> None:
         self.elapsed_s = 0.0
+        self._known: set[Any] = set()
 
     @contextmanager
     def step(self) -> Iterator[StepTimes]:
@@ -46,7 +48,10 @@ class StepClock:
                 dr.sync_thread()
                 times.wall_ms = 1e3 * (time.perf_counter() - start)
             history = dr.kernel_history()
-        times.kernel_ms, times.codegen_ms, times.compiled = summarise(history)
+        times.kernel_ms, times.codegen_ms = summarise(history)
+        launched = {entry["hash"] for entry in history if entry["type"] == dr.KernelType.JIT}
+        times.new_kernels = len(launched - self._known)
+        self._known |= launched
 
     @contextmanager
     def counted(self) -> Iterator[None]:
@@ -57,15 +62,14 @@ class StepClock:
         self.elapsed_s += time.perf_counter() - start
 
 
-def summarise(history: list[dict[str, Any]]) -> tuple[float, float, int]:
-    """Sum a kernel history: milliseconds of execution, of code generation and compilation, and cache misses.
+def summarise(history: list[dict[str, Any]]) -> tuple[float, float]:
+    """Sum a kernel history: milliseconds of execution, and of code generation and compilation.
 
     Copies and reductions count as execution: they are kernels of the step like any other.
     """
     execution = sum(entry.get("execution_time", 0.0) for entry in history)
     codegen = sum(entry.get("codegen_time", 0.0) + entry.get("backend_time", 0.0) for entry in history)
-    compiled = sum(1 for entry in history if not entry.get("cache_hit", True))
-    return float(execution), float(codegen), compiled
+    return float(execution), float(codegen)
 
 
 def reset_peak() -> None:

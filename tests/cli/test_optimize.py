@@ -150,7 +150,8 @@ def test_what_a_run_saves_agrees_with_itself(experiment, capsys):
     # the configuration as resolved can be run again, from anywhere
     again = reslrb(capsys, "optimize", "runs/box/config.yaml", "--set", "run.iterations=1", "--quiet")
     assert again[0] == 0
-    assert read_metrics("runs/box-2")[0]["loss"] == read_metrics("runs/box")[0]["loss"]
+    first, repeated = (read_metrics(folder)[0]["loss"] for folder in ("runs/box", "runs/box-2"))
+    assert first == pytest.approx(repeated, rel=1e-5)  # threads add up in any order
 
 
 def test_runs_can_be_repeated_and_get_numbers(experiment, capsys):
@@ -180,6 +181,8 @@ def test_a_target_file_gives_no_parameter_error(experiment, capsys):
 
 
 def test_later_iterations_compile_nothing(experiment):
+    import drjit as dr
+
     from reslrb_cli.config import load
     from reslrb_cli.optimization import assemble, loop
     from reslrb_cli.records.clock import StepClock
@@ -187,12 +190,13 @@ def test_later_iterations_compile_nothing(experiment):
     problem = assemble(load("box.yaml", ["run.iterations=1", "integrator.type=reslrb"]))
     misses, clock = [], StepClock()
     for iteration in range(4):
-        with clock.step() as times:
-            loop.gradient(problem, iteration, loop.Split())
+        with clock.step() as step:
+            dr.eval(loop.gradient(problem, iteration, loop.Split()))
+        with clock.step() as update:
             problem.optimizer.step(0.9**iteration)
             problem.apply()
-        misses.append(times.compiled)
-    assert misses[2:] == [0, 0]
+        misses.append((step.new_kernels, update.new_kernels))
+    assert misses[1:] == [(0, 0)] * 3
 
 
 BAD = [
