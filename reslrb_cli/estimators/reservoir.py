@@ -17,7 +17,7 @@ import drjit as dr
 import mitsuba as mi
 
 from reslrb_cli.estimators.base import Estimator, PathAdjoint, adjoint_of_factor
-from reslrb_cli.transport.connection import Connection, connection_factor
+from reslrb_cli.transport.connection import Connection, connection_factor, stand_in
 from reslrb_cli.transport.factors import MANY_ZEROS, NO_ZERO, Product
 from reslrb_cli.transport.plan import Plan
 from reslrb_cli.transport.scattering import Scattering, attached_factor
@@ -58,7 +58,7 @@ class ReservoirSelection(Hooks):
         self, state: ReservoirState, vertex: Vertex, connection: Connection, numbers: list[Any]
     ) -> ReservoirState:
         c, active = connection_factor(self.plan, self.scene, vertex, connection)
-        C = vertex.product.times(c, vertex.depth).scaled(self.scale)
+        C = vertex.product.times(c, vertex.depth, stand_in(connection)[1]).scaled(self.scale)
         if self.block is not None:
             self.film.put(self.block, connection.u, C.value(), active)
         w = dr.select(active, luminance(C.differentiable()), 0)
@@ -82,9 +82,10 @@ class ReservoirReplay(Hooks):
     def scattering(self, state: Any, vertex: Vertex, connection: Connection, scattering: Scattering) -> Any:
         at_end = vertex.depth == self.kept.I
         active = vertex.active & (at_end | scattering.active)
-        rest = dr.select(at_end, connection.weight, mi.Spectrum(scattering.correction / scattering.pdf))
+        rest = dr.select(at_end, dr.rcp(stand_in(connection)[0]), scattering.correction / scattering.pdf)
         if self.plan.needs.has_null:
-            rest = dr.select(at_end, rest * self._transmittance(vertex, connection, vertex.active & at_end), rest)
+            passed = self._transmittance(vertex, connection, vertex.active & at_end)
+            rest = dr.select(at_end, rest * passed, mi.Spectrum(rest))
         # One evaluation serves both kinds of factor, since a vertex has either.
         wo = dr.select(at_end, connection.wo, scattering.wo)
         scattering.is_delta &= ~at_end

@@ -25,7 +25,8 @@ class Splat(Hooks):
 
     def connection(self, state: Any, vertex: Vertex, connection: Connection, numbers: list[Any]) -> Any:
         s = self.samples
-        c, active = connection_factor(s.plan, s.scene, vertex, connection)
+        mode = "evaluated" if self.attached else "symbolic"
+        c, active = connection_factor(s.plan, s.scene, vertex, connection, mode)
         C = vertex.product.times(c, vertex.depth).scaled(s.scale)
         s.film.put(self.block, connection.u, C.value(), active)
         return state

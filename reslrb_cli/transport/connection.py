@@ -38,16 +38,26 @@ def connect(plan: Plan, sensor: Any, si: Any, ray: Any, sample: Any, active: Any
         return Connection(importance * correction, ds.uv, ds.p, wo, active & valid & (ds.pdf > 0))
 
 
-def connection_factor(plan: Plan, scene: Any, vertex: Any, connection: Connection) -> tuple[Any, Any]:
+def connection_factor(
+    plan: Plan, scene: Any, vertex: Any, connection: Connection, loop_mode: str = "symbolic"
+) -> tuple[Any, Any]:
     """c_i (C,), with derivatives where they are enabled, and where the sensor is seen: traces the shadow ray.
 
-    In a scene without surfaces that light passes straight through, no transmittance is computed.
+    In a scene without surfaces that light passes straight through, no transmittance is computed. `loop_mode` is that of
+    its loop: naive AD needs it evaluated.
     """
     si, active = vertex.si, connection.active
     if plan.needs.has_null:
-        through = transmittance(scene, si, connection.target, plan.max_depth - vertex.depth - 1, active)
+        limit = plan.max_depth - vertex.depth - 1
+        through = transmittance(scene, si, connection.target, limit, active, loop_mode=loop_mode)
         active, passed = through.reached, through.value
     else:
         active, passed = active & ~scene.ray_test(si.spawn_ray_to(connection.target), active), mi.Spectrum(1)
     f = attached_factor(plan, si, vertex.bsdf, connection.wo, None, active)
     return f * passed * connection.weight, active
+
+
+def stand_in(connection: Connection) -> tuple[Any, Any]:
+    """What stands for bsdf * cos, and for c_i (C,), where they are zero (`Product.times`): those of a white surface."""
+    f = dr.maximum(dr.abs(mi.Frame3f.cos_theta(connection.wo)), 1e-3) * dr.inv_pi
+    return f, connection.weight * f

@@ -9,8 +9,8 @@ Sampling is detached: directions and densities do not depend on the parameters. 
 
 has a derivative.
 
-Bump and normal maps perturb the shading frame inside of the BSDF, where Veach's correction cannot see it. In scenes that
-have them a smooth lobe is evaluated as a path from the camera would, with its two directions exchanged,
+Bump and normal maps perturb the shading frame inside of the BSDF, where Veach's correction cannot see it. In scenes
+that have them a smooth lobe is evaluated as a path from the camera would, with its two directions exchanged,
 
     f = bsdf(wo -> wi) * cos_p wi * |n . wo| / |n . wi|        n: geometric normal, p: perturbed one
 
