@@ -25,7 +25,7 @@ from reslrb_cli.estimators.base import (
     adjoint_of_factor,
     differentiate_emission,
 )
-from reslrb_cli.transport.connection import Connection
+from reslrb_cli.transport.connection import Connection, stand_in
 from reslrb_cli.transport.factors import MANY_ZEROS, NO_ZERO, Product
 from reslrb_cli.transport.scattering import Scattering, attached_factor, attached_factors
 from reslrb_cli.transport.transmittance import transmittance
@@ -72,7 +72,7 @@ class ReservoirSelection(VertexHooks):
     def connection(
         self, state: ReservoirState, vertex: Vertex, connection: Connection, numbers: list[Any]
     ) -> ReservoirState:
-        C = vertex.product.times(connection.c, vertex.depth).scaled(self.p.scale)
+        C = vertex.product.times(connection.c, vertex.depth, stand_in(connection)[1]).scaled(self.p.scale)
         if self.splat:
             self.p.splat(connection.u, C.value(), connection.active)
         if self.weight == "luminance":
@@ -108,7 +108,7 @@ class ReservoirReplay(VertexHooks):
     def scattering(self, state: Any, vertex: Vertex, connection: Connection, scattering: Scattering) -> Any:
         plan, si, bsdf, depth = self.p.plan, vertex.si, vertex.bsdf, vertex.depth
         connected = self._any(lambda slot: slot.I == depth) & vertex.active
-        rest_c = connection.weight
+        rest_c = mi.Spectrum(dr.rcp(stand_in(connection)[0]))
         if plan.needs.has_null:
             rest_c = rest_c * self._transmittance(vertex, connection, connected)
         rest_s = mi.Spectrum(scattering.correction / scattering.pdf)

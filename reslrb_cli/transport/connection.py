@@ -48,17 +48,31 @@ class Seen:
     known: Any = None
 
 
+def stand_in(connection: Connection) -> tuple[Any, Any]:
+    """What stands for bsdf * cos, and for c_i (C,), where they are zero (`Product.times`): those of a white surface."""
+    f = dr.maximum(dr.abs(mi.Frame3f.cos_theta(connection.wo)), 1e-3) * dr.inv_pi
+    return f, connection.weight * f
+
+
 def passage(
-    plan: Plan, scene: Any, si: Any, depth: Any, connection: Connection, seen: Seen | None = None
+    plan: Plan,
+    scene: Any,
+    si: Any,
+    depth: Any,
+    connection: Connection,
+    seen: Seen | None = None,
+    loop_mode: str = "symbolic",
 ) -> tuple[Any, Any]:
     """Where the sensor is seen, and the transmittance (C,) of masks on the way: traces the shadow ray.
 
     No ray is traced in lanes in which `seen` knows the answer. In a scene without surfaces that light passes straight
-    through, no transmittance is computed; in one that has them, `seen` is no help.
+    through, no transmittance is computed; in one that has them, `seen` is no help. `loop_mode` is that of its loop:
+    naive AD needs it evaluated.
     """
     active, one = connection.active, mi.Spectrum(1)
     if plan.needs.has_null:
-        through = transmittance(scene, si, connection.target, plan.max_depth - depth - 1, active)
+        limit = plan.max_depth - depth - 1
+        through = transmittance(scene, si, connection.target, limit, active, loop_mode=loop_mode)
         return through.reached, through.value
     if seen is None:
         return active & ~scene.ray_test(si.spawn_ray_to(connection.target), active), one

@@ -24,9 +24,9 @@ MANY_ZEROS = -2  # two or more are: value and derivatives vanish
 class Product:
     """A product of factors, one value per channel; part of the loop state.
 
-    `nonzero` is the product of all factors (untracked), or of those that are not zero (tracked). `zero` holds, per
-    channel, the index of the zero factor, NO_ZERO or MANY_ZEROS; it is empty where zeros are not tracked. `attached` is
-    the plain product with derivatives, for naive AD only; otherwise it is empty.
+    `nonzero` is the product of all factors (untracked), or of those that are not zero, with stand-ins for the others
+    (tracked). `zero` holds, per channel, the index of the zero factor, NO_ZERO or MANY_ZEROS; it is empty where zeros
+    are not tracked. `attached` is the plain product with derivatives, for naive AD only; otherwise it is empty.
     """
 
     nonzero: Any
@@ -39,13 +39,17 @@ class Product:
         zero = [mi.Int32(NO_ZERO) for _ in range(len(mi.Spectrum(0)))] if track_zeros else []
         return Product(mi.Spectrum(1), zero, [mi.Spectrum(1)] if attached else [])
 
-    def times(self, factor: Any, index: Any) -> Product:
-        """The product with one more factor, (C,) per lane, that stands at position `index` of the path."""
+    def times(self, factor: Any, index: Any, stand_in: Any = 1) -> Product:
+        """The product with one more factor, (C,) per lane, that stands at position `index` of the path.
+
+        `stand_in` takes its place in `nonzero` where it is zero: a positive number of the size of its derivative, so
+        that weights made of the product can be compared with those of paths without zeros.
+        """
         attached = [self.attached[0] * factor] if self.attached else []
         factor = dr.detach(factor)
         if not self.zero:
             return Product(self.nonzero * factor, [], attached)
-        nonzero = self.nonzero * dr.select(factor == 0, 1, factor)
+        nonzero = self.nonzero * dr.select(factor == 0, stand_in, factor)
         first = [dr.select(z == NO_ZERO, mi.Int32(index), MANY_ZEROS) for z in self.zero]
         zero = [dr.select(factor[c] == 0, first[c], z) for c, z in enumerate(self.zero)]
         return Product(nonzero, zero, attached)

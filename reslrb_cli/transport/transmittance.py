@@ -30,6 +30,7 @@ def transmittance(
     limit: Any,
     active: Any,
     on_crossing: Callable[[Any, Any], None] | None = None,
+    loop_mode: str = "symbolic",
 ) -> Passage:
     """Follow the segment from the interaction `start` to the point `target` through at most `limit` null surfaces.
 
@@ -59,5 +60,6 @@ def transmittance(
         cond=lambda passage, ray: passage.active,
         body=body,
         label="null surfaces",
+        mode=loop_mode,
     )
     return passage

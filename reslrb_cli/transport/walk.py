@@ -88,6 +88,7 @@ def walk(
 
     `selection` is the random stream of the hooks (`mi.PCG32`), needed where `hooks.numbers` is not 0.
     """
+    loop_mode = "evaluated" if hooks.attached else "symbolic"
     emission = sample_emission(plan, scene, sensor, sampler)
     product, active = Product.one(plan.track_zeros, hooks.attached), mi.Bool(active)
     if not hooks.replaying:
@@ -110,7 +111,8 @@ def walk(
         # ---- Connect to the sensor ----
         connection = connect(plan, sensor, si, path.ray, sampler.next_2d(path.active), path.active)
         if hooks.connects:
-            connection.active, transmittance = passage(plan, scene, si, path.depth, connection, hooks.seen(vertex))
+            shadow = passage(plan, scene, si, path.depth, connection, hooks.seen(vertex), loop_mode)
+            connection.active, transmittance = shadow
 
         # ---- Scatter, and evaluate the connection in the same call ----
         sample_2, sample_1 = sampler.next_2d(path.active), sampler.next_1d(path.active)
@@ -152,6 +154,6 @@ def walk(
         body=body,
         labels=("path", "state", "sampler", "selection"),
         label="light path",
-        mode="evaluated" if hooks.attached else "symbolic",
+        mode=loop_mode,
     )
     return state
