@@ -5,14 +5,16 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import drjit as dr
 import mitsuba as mi
 
+from reslrb_cli.transport.connection import Connection
 from reslrb_cli.transport.factors import NO_ZERO, Product
 from reslrb_cli.transport.plan import Plan
 from reslrb_cli.transport.splat import AdjointImage, Film
+from reslrb_cli.transport.transmittance import transmittance
 from reslrb_cli.transport.walk import Hooks
 
 
@@ -27,6 +29,7 @@ class Pass:
 
     plan: Plan
     scene: Any
+    sensor: Any
     film: Film
     scale: float
     block: Any
@@ -45,7 +48,12 @@ class Estimator(ABC):
 
     `forward` splats the image and returns what is kept of each path; `backward` adds the derivatives, once dL/dI is
     known. Where it is known from the start (`Pass.adjoint` in `forward`), an estimator may do better with that.
+
+    OPTIONS names the options of the plugin that this estimator has, with their defaults; its constructor takes them and
+    raises ValueError where one is wrong.
     """
+
+    OPTIONS: ClassVar[dict[str, Any]] = {}
 
     @abstractmethod
     def forward(self, p: Pass) -> Any:
@@ -92,8 +100,37 @@ def adjoint_of_factor(adjoint: PathAdjoint, index: Any, f: Any, rest: Any) -> An
     return result
 
 
+def differentiate_passage(
+    p: Pass, si: Any, depth: Any, connection: Connection, active: Any, adjoint: Callable[[Any], Any]
+) -> Any:
+    """Transmittance (C,) of the masks between a vertex and the sensor; adds its derivative.
+
+    `adjoint(transmission)` is d(objective)/d(transmission) of one of them. One with a transmission of zero ends the
+    segment, so that none of them is ever the zero factor of a product.
+    """
+
+    def differentiate(transmission: Any, hit: Any) -> None:
+        dr.backward_from(dr.select(hit, adjoint(dr.detach(transmission)) * transmission, 0))
+
+    with dr.resume_grad():
+        limit = p.plan.max_depth - depth - 1
+        return transmittance(p.scene, si, connection.target, limit, active, differentiate).value
+
+
 class VertexHooks(Hooks):
     """Hooks of one pass of an estimator."""
 
     def __init__(self, p: Pass) -> None:
         self.p = p
+
+
+def one_of(name: str, value: str, allowed: tuple[str, ...]) -> None:
+    """Raise ValueError where an option has none of the values it may have."""
+    if value not in allowed:
+        raise ValueError(f'"{name}" must be one of {", ".join(allowed)}, not "{value}"')
+
+
+def at_least_one(name: str, value: int) -> None:
+    """Raise ValueError where an option that counts something is less than 1."""
+    if value < 1:
+        raise ValueError(f'"{name}" must be at least 1, not {value}')

@@ -12,7 +12,7 @@ a connection whose value is zero and whose derivative is not can be kept.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import drjit as dr
 import mitsuba as mi
@@ -23,12 +23,14 @@ from reslrb_cli.estimators.base import (
     PathAdjoint,
     VertexHooks,
     adjoint_of_factor,
+    at_least_one,
     differentiate_emission,
+    differentiate_passage,
+    one_of,
 )
 from reslrb_cli.transport.connection import Connection, stand_in
 from reslrb_cli.transport.factors import MANY_ZEROS, NO_ZERO, Product
 from reslrb_cli.transport.scattering import Scattering, attached_factor, attached_factors
-from reslrb_cli.transport.transmittance import transmittance
 from reslrb_cli.transport.walk import Vertex
 
 
@@ -110,7 +112,11 @@ class ReservoirReplay(VertexHooks):
         connected = self._any(lambda slot: slot.I == depth) & vertex.active
         rest_c = mi.Spectrum(dr.rcp(stand_in(connection)[0]))
         if plan.needs.has_null:
-            rest_c = rest_c * self._transmittance(vertex, connection, connected)
+
+            def adjoint_of(transmission: Any) -> Any:
+                return self._sum(lambda slot: slot.I == depth, mi.Int32(NO_ZERO), transmission, 0)
+
+            rest_c *= differentiate_passage(self.p, si, depth, connection, connected, adjoint_of)
         rest_s = mi.Spectrum(scattering.correction / scattering.pdf)
         with dr.resume_grad():
             if len(self.kept) == 1:
@@ -145,18 +151,6 @@ class ReservoirReplay(VertexHooks):
             total += dr.select(which(slot), adjoint_of_factor(adjoint, index, f, rest), 0)
         return total
 
-    def _transmittance(self, vertex: Vertex, connection: Connection, active: Any) -> Any:
-        """Transmittance of masks between a kept vertex and the sensor; adds its derivative."""
-
-        def differentiate(transmission: Any, hit: Any) -> None:
-            # A segment with a transmission of zero is no candidate, so no index can match.
-            weight = self._sum(lambda slot: slot.I == vertex.depth, mi.Int32(NO_ZERO), transmission, 0)
-            dr.backward_from(dr.select(hit, weight * transmission, 0))
-
-        with dr.resume_grad():
-            limit = self.p.plan.max_depth - vertex.depth - 1
-            return transmittance(self.p.scene, vertex.si, connection.target, limit, active, differentiate).value
-
 
 class Reservoir(Estimator):
     """Reservoir of `capacity` slots with selection weight `luminance` or `adjoint`.
@@ -164,7 +158,12 @@ class Reservoir(Estimator):
     `image` says which connections the image shows: `all`, or the `retained` ones alone, weighted by W / (m w_I).
     """
 
+    OPTIONS: ClassVar[dict[str, Any]] = {"capacity": 1, "weight": "luminance", "image": "all"}
+
     def __init__(self, capacity: int = 1, weight: str = "luminance", image: str = "all") -> None:
+        one_of("weight", weight, ("luminance", "adjoint"))
+        one_of("image", image, ("all", "retained"))
+        at_least_one("capacity", capacity)
         self.capacity, self.weight, self.image = capacity, weight, image
 
     def forward(self, p: Pass) -> ReservoirState:

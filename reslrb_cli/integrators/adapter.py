@@ -107,12 +107,12 @@ def _make_classes() -> tuple[Any, Any]:
 
         def __init__(self, props: Any) -> None:
             super().__init__(props)
-            name, image = props.get("estimator", "reservoir"), props.get("image", "all")
+            name = props.get("estimator", "reservoir")
             if name not in ESTIMATORS:
                 raise ValueError(f'"estimator" must be one of {", ".join(ESTIMATORS)}, not "{name}"')
-            if image not in ("all", "retained"):
-                raise ValueError(f'"image" must be all or retained, not "{image}"')
-            self.estimator = ESTIMATORS[name](image=image)
+            # An option that the estimator does not know stays unread, which Mitsuba reports as an error.
+            kind = ESTIMATORS[name]
+            self.estimator = kind(**{key: props.get(key, default) for key, default in kind.OPTIONS.items()})
 
         def trace(self, scene: Any, sensor: Any, seed: Any, spp: int, params: Any) -> lt.Trace:
             """The image, and what a replay of the same samples needs; both evaluated."""
@@ -123,10 +123,13 @@ def _make_classes() -> tuple[Any, Any]:
             """Add the gradient of the objective with dL/dI `gradient` (H, W, C) to the parameters."""
             with dr.suspend_grad():
                 adjoint = trace.film.adjoint(gradient)
-                for samples, state in zip(trace.samples, trace.states(self.estimator, adjoint), strict=True):
-                    lt.replay(samples, self.estimator, state, adjoint)
-                    if len(trace.samples) > 1:
-                        _evaluate_gradients(params)
+                # Isolated: on their way to the parameters gradients are evaluated, and with them all that they hang on,
+                # which is to be one kernel. They set out once, at the end.
+                with dr.isolate_grad():
+                    for samples, state in zip(trace.samples, trace.states(self.estimator, adjoint), strict=True):
+                        lt.replay(samples, self.estimator, state, adjoint)
+                        if len(trace.samples) > 1:
+                            dr.eval()  # passes are not to pile up
 
         def render_backward(self, scene: Any, params: Any, grad_in: Any, sensor: Any = 0, seed: Any = 0,
                             spp: int = 0) -> None:  # fmt: skip
@@ -176,9 +179,3 @@ def _make_classes() -> tuple[Any, Any]:
 def _parameters(scene: Any, params: Any) -> Any:
     """Parameters to look for derivatives in: the user's, or all of the scene's."""
     return params if isinstance(params, mi.SceneParameters) else mi.traverse(scene)
-
-
-def _evaluate_gradients(params: Any) -> None:
-    """Run what has been recorded for the gradients, so that passes do not pile up."""
-    with dr.resume_grad():
-        dr.eval([dr.grad(value) for _, value in params.items() if dr.grad_enabled(value)])

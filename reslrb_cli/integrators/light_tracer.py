@@ -58,7 +58,7 @@ class Samples:
         def emission() -> Any:
             return sample_emission(self.plan, self.scene, self.sensor, self.sampler()).weight
 
-        return Pass(self.plan, self.scene, self.film, self.scale, block, adjoint, walk, emission)
+        return Pass(self.plan, self.scene, self.sensor, self.film, self.scale, block, adjoint, walk, emission)
 
     def primary_ray(self) -> PrimaryRay:
         """Rays for C_0, from a stream of their own: the light paths are those of `ptracer` with or without them."""

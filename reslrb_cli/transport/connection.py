@@ -27,6 +27,7 @@ class Connection:
     target: Any
     wo: Any
     active: Any
+    sample: Any  # of the aperture
     c: Any = None
 
 
@@ -37,7 +38,7 @@ def connect(plan: Plan, sensor: Any, si: Any, ray: Any, sample: Any, active: Any
         # From the vertex itself, where `ptracer` takes the shadow ray's direction, which starts a little off it.
         wo = si.to_local(ds.d)
         correction, valid = shading_correction(plan, si, -ray.d, ds.d, wo)
-        return Connection(importance * correction, ds.uv, ds.p, wo, active & valid & (ds.pdf > 0))
+        return Connection(importance * correction, ds.uv, ds.p, wo, active & valid & (ds.pdf > 0), sample)
 
 
 @dataclass

@@ -38,6 +38,7 @@ class Path:
 class Vertex:
     """The current vertex as hooks see it; `product` does not include the vertex's own scattering."""
 
+    pi: Any
     si: Any
     bsdf: Any
     ray: Any
@@ -106,7 +107,7 @@ def walk(
 
     def body(path: Path, state: Any, sampler: Any, selection: Any) -> tuple[Path, Any, Any, Any]:
         si = path.pi.compute_surface_interaction(path.ray, mi.RayFlags.All, path.active)
-        vertex = Vertex(si, si.bsdf(), path.ray, path.depth, path.product, path.active)
+        vertex = Vertex(path.pi, si, si.bsdf(), path.ray, path.depth, path.product, path.active)
 
         # ---- Connect to the sensor ----
         connection = connect(plan, sensor, si, path.ray, sampler.next_2d(path.active), path.active)

@@ -1,0 +1,189 @@
+"""Every connection of a path, at no extra variance: the image pass keeps a sum, the replay takes it apart again.
+
+    S_0 = sum_i delta_i C_i,   S_j = S_{j-1} - delta_j C_j
+    dS  = S_0 dE/E + sum_j [ S_j ds_j/s_j + delta_j C_j dc_j/c_j ]
+
+Source: the ResLRB paper's conclusion, second extension. The sum needs delta: where dL/dI is known only after the image,
+a walk that traces no shadow rays sums first. One bit per vertex remembers which connections were visible; vertices
+beyond the last bit trace their shadow rays again, so that memory is constant.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from reslrb_cli.estimators.base import (
+    Estimator,
+    Pass,
+    PathAdjoint,
+    VertexHooks,
+    adjoint_of_factor,
+    differentiate_emission,
+    differentiate_passage,
+)
+from reslrb_cli.estimators.sums import AdjointSum
+from reslrb_cli.transport.connection import Connection, Seen, passage, stand_in
+from reslrb_cli.transport.factors import NO_ZERO, Product
+from reslrb_cli.transport.scattering import Scattering, attached_factors
+from reslrb_cli.transport.walk import Vertex
+
+WORDS = 2  # of visibility bits, 32 vertices each
+
+
+@dataclass
+class Visibility:
+    """Which connections of a path were visible: one bit for each of 32 * WORDS vertices, and the last of all."""
+
+    words: list[Any]
+    last: Any  # the last vertex with a visible connection; 0: none
+
+    @staticmethod
+    def none(plan_depth: int) -> Visibility:
+        """No vertex seen yet, with as many words as paths of that many vertices can fill."""
+        return Visibility([mi.UInt32(0) for _ in range(min(WORDS, -(-plan_depth // 32)))], mi.UInt32(0))
+
+    def with_vertex(self, depth: Any, visible: Any) -> Visibility:
+        """Remember whether the connection from vertex `depth` is visible."""
+        index = depth - 1
+        bit = mi.UInt32(1) << (index & 31)
+        words = [word | dr.select(visible & ((index >> 5) == k), bit, 0) for k, word in enumerate(self.words)]
+        return Visibility(words, dr.select(visible, depth, self.last))
+
+    def seen(self, depth: Any, vertices: int) -> Seen:
+        """What is known at vertex `depth`, of paths that have at most so many vertices."""
+        index = depth - 1
+        visible = mi.Bool(False)
+        for k, word in enumerate(self.words):
+            visible |= ((index >> 5) == k) & (((word >> (index & 31)) & 1) != 0)
+        enough = vertices <= 32 * len(self.words)
+        return Seen(visible, None if enough else index < 32 * len(self.words))
+
+
+@dataclass
+class GatherState:
+    """What is kept of a path: visibility, and S_0 where delta is known already (else nothing)."""
+
+    visibility: Visibility
+    S: list[AdjointSum]
+
+
+class Gathering(VertexHooks):
+    """Image pass: splat, remember visibility, and sum where delta is known."""
+
+    def start(self, product: Product) -> GatherState:
+        S = [] if self.p.adjoint is None else [AdjointSum.zero(self.p.plan.track_zeros)]
+        return GatherState(Visibility.none(vertices(self.p)), S)
+
+    def connection(self, state: GatherState, vertex: Vertex, connection: Connection, numbers: list[Any]) -> GatherState:
+        C = contribution(self.p, vertex, connection)
+        self.p.splat(connection.u, C.value(), connection.active)
+        visibility = state.visibility.with_vertex(vertex.depth, connection.active)
+        return GatherState(visibility, [plus(self.p, S, vertex, connection, C) for S in state.S])
+
+
+class Summing(VertexHooks):
+    """Sum delta_i C_i along the same paths again, without shadow rays."""
+
+    def __init__(self, p: Pass, visibility: Visibility) -> None:
+        super().__init__(p)
+        self.visibility = visibility
+
+    def start(self, product: Product) -> AdjointSum:
+        return AdjointSum.zero(self.p.plan.track_zeros)
+
+    def seen(self, vertex: Vertex) -> Seen:
+        return self.visibility.seen(vertex.depth, vertices(self.p))
+
+    def goes_on(self, state: AdjointSum, vertex: Vertex) -> Any:
+        return vertex.depth < self.visibility.last
+
+    def connection(self, state: AdjointSum, vertex: Vertex, connection: Connection, numbers: list[Any]) -> Any:
+        return plus(self.p, state, vertex, connection, contribution(self.p, vertex, connection))
+
+
+class Taking(VertexHooks):
+    """Replay: take each contribution off the sum again, and differentiate both factors of each vertex.
+
+    `S` sums the connections of the vertices from `first` on; what comes before them is left alone.
+    """
+
+    connects = False  # it evaluates connections itself, with their derivatives
+
+    def __init__(self, p: Pass, visibility: Visibility, S: AdjointSum, first: int = 1) -> None:
+        super().__init__(p)
+        self.visibility, self.S, self.first = visibility, S, first
+
+    def start(self, product: Product) -> AdjointSum:
+        return self.S
+
+    def goes_on(self, state: AdjointSum, vertex: Vertex) -> Any:
+        return vertex.depth < self.visibility.last
+
+    def scattering(self, state: AdjointSum, vertex: Vertex, connection: Connection, scattering: Scattering) -> Any:
+        p, plan = self.p, self.p.plan
+        seen = self.visibility.seen(vertex.depth, vertices(p))
+        scattered = scattering.active
+        if self.first > 1:
+            # Not in place: the walk goes on with the same masks.
+            connection.active = connection.active & (vertex.depth >= self.first)
+            scattered = scattered & (vertex.depth >= self.first)
+        connection.active, transmittance = passage(plan, p.scene, vertex.si, vertex.depth, connection, seen)
+        with dr.resume_grad():
+            f_c, f_s = attached_factors(
+                plan, vertex.si, vertex.bsdf, connection.wo, connection.active, scattering, scattered
+            )
+            connection.c = dr.detach(f_c) * transmittance * connection.weight
+            C = contribution(p, vertex, connection)
+            delta = p.adjoint.lookup(connection.u, connection.active)
+            S = state.minus(delta, C, vertex.depth, connection.active)
+            own = PathAdjoint(delta * C.nonzero, C)
+            if plan.needs.has_null:
+                # Once more through the masks: their derivative needs the contribution, which needs their transmission.
+                differentiate_passage(
+                    p, vertex.si, vertex.depth, connection, connection.active,
+                    lambda t: adjoint_of_factor(own, mi.Int32(NO_ZERO), t, 0),
+                )  # fmt: skip
+            weight_c = adjoint_of_factor(own, vertex.depth, f_c, dr.rcp(stand_in(connection)[0]) * transmittance)
+            weight_s = S.adjoint_of_factor(f_s, vertex.product, scattering.correction / scattering.pdf)
+            objective = dr.select(connection.active, weight_c * f_c, 0)
+            dr.backward_from(objective + dr.select(scattered, weight_s * f_s, 0))
+        return S
+
+
+def vertices(p: Pass) -> int:
+    """The most vertices that a path of this pass can have."""
+    return max(p.plan.max_depth - 1, 0)
+
+
+def contribution(p: Pass, vertex: Vertex, connection: Connection) -> Product:
+    """C_i of an evaluated connection."""
+    return vertex.product.times(connection.c, vertex.depth, stand_in(connection)[1]).scaled(p.scale)
+
+
+def plus(p: Pass, S: AdjointSum, vertex: Vertex, connection: Connection, C: Product) -> AdjointSum:
+    """S + delta C."""
+    assert p.adjoint is not None
+    return S.plus(p.adjoint.lookup(connection.u, connection.active), C, vertex.depth, connection.active)
+
+
+class Gather(Estimator):
+    """Exact: as many derivatives as naive AD of the same paths."""
+
+    def forward(self, p: Pass) -> GatherState:
+        state: GatherState = p.walk(Gathering(p))
+        return state
+
+    def backward(self, p: Pass, state: GatherState) -> None:
+        active = state.visibility.last > 0
+        if state.S:
+            [S] = state.S
+        else:
+            S = p.walk(Summing(p, state.visibility), active)
+            dr.eval(S)  # the emission and the replay both read it
+        differentiate_emission(p, S.adjoint_of_emission)
+        if p.plan.differentiate_bsdfs:
+            p.walk(Taking(p, state.visibility, S), active)
