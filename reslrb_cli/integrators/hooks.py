@@ -10,7 +10,8 @@ import mitsuba as mi
 
 from reslrb_cli.transport.connection import Connection, passage
 from reslrb_cli.transport.factors import Product
-from reslrb_cli.transport.scattering import Scattering, attached_factors
+from reslrb_cli.transport.scattering import Scattering, attached_factor, evaluate
+from reslrb_cli.transport.transmittance import forward_derivatives, transmittance
 from reslrb_cli.transport.walk import Hooks, Vertex
 
 if TYPE_CHECKING:
@@ -60,12 +61,21 @@ class TangentSplat(Hooks):
 
     def scattering(self, state: Tangent, vertex: Vertex, connection: Connection, scattering: Scattering) -> Tangent:
         s, P, scattered = self.samples, vertex.product.value(), scattering.active
+        if s.plan.needs.has_null:
+            limit = s.plan.max_depth - vertex.depth - 1
+            through = transmittance(s.scene, vertex.si, connection.target, limit, connection.active, tangents=True)
+            seen, passed, d_passed = through.reached, through.value, through.tangent[0]
+        else:
+            (seen, passed), d_passed = passage(s.plan, s.scene, vertex.si, vertex.depth, connection), mi.Spectrum(0)
         with dr.resume_grad(when=s.plan.differentiate_bsdfs):
-            seen, transmittance = passage(s.plan, s.scene, vertex.si, vertex.depth, connection)
-            factors = (vertex.si, vertex.bsdf, connection.wo, seen, scattering, scattered)
-            f_c, f_s = attached_factors(s.plan, *factors)
-            c = f_c * transmittance * connection.weight
-            dc, df = dr.detach(dr.forward_to((c, f_s))) if s.plan.differentiate_bsdfs else (0, 0)
-        s.film.put(self.block, connection.u, (state.d_product * dr.detach(c) + P * dc) * s.scale, seen)
+            # Two indirect calls: Dr.Jit cannot forward-propagate through one of our own (`attached_factors`) that reads
+            # several parameters.
+            f_c = evaluate(s.plan, vertex.si, vertex.bsdf, connection.wo, seen)
+            f_s = attached_factor(s.plan, vertex.si, vertex.bsdf, scattering, scattered)
+            df_c, df = forward_derivatives(f_c, f_s)
+            f_c = dr.detach(f_c)
+        c = f_c * passed * connection.weight
+        dc = (df_c * passed + f_c * d_passed) * connection.weight
+        s.film.put(self.block, connection.u, (state.d_product * c + P * dc) * s.scale, seen)
         ds = dr.select(scattered, df * (scattering.correction / scattering.pdf), 0)
         return Tangent(state.d_product * scattering.weight + P * ds)

@@ -15,7 +15,14 @@ from reslrb_cli.integrators.hooks import AttachedSplat, Splat, TangentSplat
 from reslrb_cli.transport.emission import sample_emission
 from reslrb_cli.transport.plan import Plan
 from reslrb_cli.transport.splat import AdjointImage, Film
-from reslrb_cli.transport.visible import PrimaryRay, differentiate_visible_radiance, primary_ray, visible_radiance
+from reslrb_cli.transport.transmittance import forward_derivatives
+from reslrb_cli.transport.visible import (
+    PrimaryRay,
+    differentiate_visible_radiance,
+    primary_ray,
+    visible_radiance,
+    visible_tangent,
+)
 from reslrb_cli.transport.walk import Hooks, walk
 
 SELECTION_STREAM = 0x5E1EC7  # keeps the hooks' numbers apart from the sampler's
@@ -193,10 +200,12 @@ def splat_tangents(samples: Samples, block: Any) -> None:
     with dr.resume_grad():
         if plan.differentiate_emission:
             E = sample_emission(plan, samples.scene, samples.sensor, samples.sampler()).weight
-            dE = dr.detach(dr.forward_to(E))
-        if plan.visible_emission:
+            [dE] = forward_derivatives(E)
+        if plan.visible_emission and (
+            plan.differentiate_emission or (plan.differentiate_bsdfs and plan.needs.has_null)
+        ):
             primary = samples.primary_ray()
-            tangent = dr.detach(dr.forward_to(visible_radiance(plan, samples.scene, primary)))
+            tangent = visible_tangent(plan, samples.scene, primary)
             samples.film.put(block, primary.u, tangent * primary.weight * samples.fraction, primary.active)
     trace(samples, TangentSplat(samples, block, dE))
 

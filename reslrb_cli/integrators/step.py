@@ -30,9 +30,12 @@ class StepResult:
 
 
 def make_integrator(type: str, **options: Any) -> Any:
-    """An integrator by its plugin's name and options: `reslrb`, `walk_ad`, or a stock one such as `ptracer`, `prb`."""
+    """An integrator by its plugin's name and options: `reslrb`, `walk_ad`, or a stock one such as `ptracer`, `prb`.
+
+    An option that is None is left out: Mitsuba's parser would end the process.
+    """
     register()
-    return mi.load_dict({"type": type, **options})
+    return mi.load_dict({"type": type} | {name: value for name, value in options.items() if value is not None})
 
 
 def render_image(integrator: Any, scene: Any, sensor: Any, seed: int, spp: int) -> Any:

@@ -92,8 +92,9 @@ def scatter(
             )
         d = si.to_world(wo)
         correction, valid = shading_correction(plan, si, -ray.d, d, wo)
-        is_delta = mi.has_flag(lobe, mi.BSDFFlags.Delta) if plan.needs.has_delta_lobes else mi.Bool(False)
         is_null = mi.has_flag(lobe, mi.BSDFFlags.Null) if plan.needs.has_null else mi.Bool(False)
+        # BSDFFlags.Delta holds Null too.
+        is_delta = mi.has_flag(lobe, mi.BSDFFlags.Delta) & ~is_null if plan.needs.has_delta_lobes else mi.Bool(False)
         if plan.needs.has_perturbed_normals:
             correction = dr.select(is_delta, correction * _delta_correction(si.wi, wo, eta), correction)
             singular = is_delta | is_null

@@ -3,24 +3,38 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
 
+def forward_derivatives(*values: Any) -> list[Any]:
+    """Derivatives of `values` along the parameters' tangents; zero for those that depend on none of them.
+
+    In one propagation: a second one would meet the edges of the first. It leaves the parameters' own tangents standing,
+    for the next vertex.
+    """
+    attached = [value for value in values if dr.grad_enabled(value)]
+    if attached:
+        dr.forward_to(attached, flags=dr.ADFlag.ClearEdges | dr.ADFlag.ClearInterior)
+    return [dr.detach(dr.grad(value)) if dr.grad_enabled(value) else dr.zeros(type(value)) for value in values]
+
+
 @dataclass
 class Passage:
     """State of a ray on its way through null surfaces; loop state.
 
-    `value` is the product of the transmissions so far, (C,); `reached` becomes true where nothing is left in the way.
+    `value` is the product of the transmissions so far, (C,), `tangent` its derivative (empty unless asked for);
+    `reached` becomes true where nothing is left in the way.
     """
 
     active: Any
     value: Any
     crossings: Any
     reached: Any
+    tangent: list[Any] = field(default_factory=list)
 
 
 def transmittance(
@@ -31,30 +45,42 @@ def transmittance(
     active: Any,
     on_crossing: Callable[[Any, Any], None] | None = None,
     loop_mode: str = "symbolic",
+    tangents: bool = False,
 ) -> Passage:
     """Follow the segment from the interaction `start` to the point `target` through at most `limit` null surfaces.
 
     Each crossing counts as a vertex, as it does for `path`. `on_crossing(transmission, active)` is called at each one
     with its transmission (C,), attached where gradients are enabled, to take its derivative there and then.
+    With `tangents`, the derivative along the parameters' tangents is carried along (forward mode); call it where
+    gradients are suspended then, since the loop itself must not track any.
     """
 
     def body(passage: Passage, ray: Any) -> tuple[Passage, Any]:
         si = scene.ray_intersect(ray, passage.active)
         hit = passage.active & si.is_valid()
-        transmission = si.bsdf().eval_null_transmission(si, hit)
+        with dr.resume_grad(when=tangents):
+            transmission = si.bsdf().eval_null_transmission(si, hit)
+            if tangents:
+                [d_transmission], transmission = forward_derivatives(transmission), dr.detach(transmission)
         if on_crossing is not None:
             on_crossing(transmission, hit)
             transmission = dr.detach(transmission)
+        tangent = passage.tangent
+        if tangents:
+            tangent = [dr.select(hit, tangent[0] * transmission + passage.value * d_transmission, tangent[0])]
         blocked = hit & (dr.all(transmission == 0) | (passage.crossings >= limit))
         state = Passage(
             active=hit & ~blocked,
             value=dr.select(hit, passage.value * transmission, passage.value),
             crossings=passage.crossings + dr.select(hit, mi.UInt32(1), 0),
             reached=passage.reached | (passage.active & ~hit),
+            tangent=tangent,
         )
         return state, dr.select(hit, si.spawn_ray_to(target), ray)
 
-    passage = Passage(mi.Bool(active), mi.Spectrum(1), mi.UInt32(0), mi.Bool(False))
+    passage = Passage(
+        mi.Bool(active), mi.Spectrum(1), mi.UInt32(0), mi.Bool(False), [mi.Spectrum(0)] if tangents else []
+    )
     passage, _ = dr.while_loop(
         state=(passage, start.spawn_ray_to(target)),
         cond=lambda passage, ray: passage.active,

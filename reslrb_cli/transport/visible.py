@@ -7,7 +7,7 @@ emitters to the sensor, as `ptracer` does, is the noisier the larger the emitter
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import drjit as dr
@@ -15,6 +15,7 @@ import mitsuba as mi
 
 from reslrb_cli.transport.emission import sample_time
 from reslrb_cli.transport.plan import Plan
+from reslrb_cli.transport.transmittance import forward_derivatives
 
 
 @dataclass
@@ -44,21 +45,29 @@ def primary_ray(plan: Plan, sensor: Any, sampler: Any, width: int) -> PrimaryRay
 
 @dataclass
 class _Look:
-    """State of a primary ray on its way through null surfaces."""
+    """State of a primary ray on its way through null surfaces; `tangents`, in forward mode, are the derivatives of
+    transmittance and radiance."""
 
     active: Any
     ray: Any
     transmittance: Any
     radiance: Any
     crossings: Any
+    tangents: list[Any] = field(default_factory=list)
 
 
 def visible_radiance(plan: Plan, scene: Any, primary: PrimaryRay, loop_mode: str = "symbolic") -> Any:
     """Radiance (C,) that arrives along the primary ray, through null surfaces where the scene has any.
 
-    Carries derivatives where they are enabled: in forward mode, and, with `loop_mode` evaluated, for naive AD.
+    With `loop_mode` evaluated it carries derivatives where they are enabled, for naive AD.
     """
-    return _look(plan, scene, primary, None, loop_mode)
+    return _look(plan, scene, primary, None, loop_mode).radiance
+
+
+def visible_tangent(plan: Plan, scene: Any, primary: PrimaryRay) -> Any:
+    """Derivative (C,) of that radiance along the parameters' tangents (forward mode)."""
+    with dr.suspend_grad():  # the loop itself tracks nothing
+        return _look(plan, scene, primary, None, "symbolic", tangents=True).tangents[1]
 
 
 def differentiate_visible_radiance(plan: Plan, scene: Any, primary: PrimaryRay, adjoint: Any) -> None:
@@ -81,20 +90,36 @@ def differentiate_visible_radiance(plan: Plan, scene: Any, primary: PrimaryRay, 
         _look(plan, scene, primary, differentiate, "symbolic")
 
 
-def _look(plan: Plan, scene: Any, primary: PrimaryRay, on_surface: Callable[..., None] | None, mode: str) -> Any:
+def _look(
+    plan: Plan,
+    scene: Any,
+    primary: PrimaryRay,
+    on_surface: Callable[..., None] | None,
+    mode: str,
+    tangents: bool = False,
+) -> Any:
     def look(state: _Look) -> tuple[_Look]:
         si = scene.ray_intersect(state.ray, state.active)
-        Le = si.emitter(scene).eval(si, state.active)
         hit = state.active & si.is_valid()
-        transmission = si.bsdf().eval_null_transmission(si, hit) if plan.needs.has_null else mi.Spectrum(0)
+        with dr.resume_grad(when=tangents):
+            Le = si.emitter(scene).eval(si, state.active)
+            transmission = si.bsdf().eval_null_transmission(si, hit) if plan.needs.has_null else mi.Spectrum(0)
+            if tangents:
+                d_Le, d_transmission = forward_derivatives(Le, transmission)
+                Le, transmission = dr.detach(Le), dr.detach(transmission)
         if on_surface is not None:  # derivatives are taken here and now, none stays in the state
             on_surface(state, Le, state.radiance + dr.detach(Le) * state.transmittance, transmission)
             Le, transmission = dr.detach(Le), dr.detach(transmission)
+        d_state = state.tangents
+        if tangents:
+            (dT, dL), T = d_state, state.transmittance
+            d_state = [dT * transmission + T * d_transmission, dL + dT * Le + T * d_Le]
         radiance = state.radiance + Le * state.transmittance
         through = hit & dr.any(transmission != 0) & (state.crossings + 2 <= plan.max_depth)
         ray = dr.detach(si.spawn_ray(state.ray.d))
-        return (_Look(through, ray, state.transmittance * transmission, radiance, state.crossings + 1),)
+        return (_Look(through, ray, state.transmittance * transmission, radiance, state.crossings + 1, d_state),)
 
-    state = _Look(mi.Bool(primary.active), primary.ray, mi.Spectrum(1), mi.Spectrum(0), mi.UInt32(0))
+    d_state = [mi.Spectrum(0), mi.Spectrum(0)] if tangents else []
+    state = _Look(mi.Bool(primary.active), primary.ray, mi.Spectrum(1), mi.Spectrum(0), mi.UInt32(0), d_state)
     (state,) = dr.while_loop((state,), lambda state: state.active, look, label="primary ray", mode=mode)
-    return state.radiance
+    return state

@@ -1,0 +1,200 @@
+"""Image: depth, roulette, passes, shading normals, masks, shapes: `reslrb` against `path` and `ptracer`."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from conformance.scenes import (
+    RED,
+    SAME,
+    WHITE,
+    agreement,
+    ball,
+    bitmap,
+    camera,
+    difference_from_ptracer,
+    images,
+    lamp,
+    rectangle,
+    rgb,
+    stage,
+    transform,
+)
+from conformance.stats import compare, renders
+
+from reslrb_cli.integrators import gradient_step, make_integrator
+
+TWO_SIDED = {"type": "twosided", "bsdf": RED}
+
+
+def visible():
+    """A lamp that the camera sees."""
+    return {"lamp": lamp(position=(0, 1.6, -0.8), target=(0, 0.3, 2))}
+
+
+def large():
+    return {"lamp": lamp(side=1.5, radiance=rgb(2, 3, 4))}
+
+
+def leaf(opacity=None, distance: float = 2.0, size: float = 0.5):
+    """A perforated sheet between camera and stage, that also covers a part of the background and of `visible()`."""
+    bsdf = {"type": "mask", "opacity": opacity or bitmap(6, 6, channels=1, low=0), "bsdf": TWO_SIDED}
+    to_world = transform().look_at(origin=[0.2, 1.3, distance], target=[0.4, 1.5, 4], up=[0, 1, 0])
+    return rectangle(bsdf, to_world @ transform().scale(size))
+
+
+@pytest.fixture(scope="module")
+def facets(tmp_path_factory):
+    """A coarse ball, whose smooth normals are up to 20 degrees off its faces: path of a PLY file."""
+    n, m = 5, 9
+    polar, azimuth = np.linspace(0, np.pi, n + 1), np.linspace(0, 2 * np.pi, m, endpoint=False)
+    normals = np.array([[np.sin(t) * np.cos(p), np.cos(t), np.sin(t) * np.sin(p)] for t in polar for p in azimuth])
+    quads = [(i * m + j, i * m + (j + 1) % m, (i + 1) * m + j, (i + 1) * m + (j + 1) % m)
+             for i in range(n) for j in range(m)]  # fmt: skip
+    faces = [(a, b, c) for a, b, c, _ in quads[m:]] + [(b, d, c) for _, b, c, d in quads[:-m]]
+    mesh = mi.Mesh("ball", len(normals), len(faces), has_vertex_normals=True)
+    params = mi.traverse(mesh)
+    params["vertex_positions"] = (0.5 * normals + [0, 0.7, 0]).ravel().astype(np.float32)
+    params["vertex_normals"] = normals.ravel().astype(np.float32)
+    params["faces"] = np.array(faces).ravel().astype(np.uint32)
+    params.update()
+    path = str(tmp_path_factory.mktemp("mesh") / "ball.ply")
+    mesh.write_ply(path)
+    return path
+
+
+MATERIALS = {
+    "diffuse": {"type": "twosided", "bsdf": WHITE},
+    "roughplastic": {"type": "roughplastic", "alpha": 0.2},
+    "roughdielectric": {"type": "roughdielectric", "alpha": 0.3},
+}
+
+
+@pytest.mark.parametrize("name", MATERIALS)
+def test_shading_normals(facets, name):
+    scene = stage(large(), ball={"type": "ply", "filename": facets, "bsdf": MATERIALS[name]})
+    result = agreement(scene)
+    assert result, result
+    assert difference_from_ptracer(scene) < SAME
+
+
+def test_shading_normals_under_a_small_lamp(facets):
+    # Where the correction is far from 1: light and view both graze.
+    light = {"type": "point", "position": [-2.5, 0.9, -0.3], "intensity": rgb(20, 20, 20)}
+    scene = stage({"light": light}, wall=None, ball={"type": "ply", "filename": facets, "bsdf": WHITE})
+    result = agreement(scene, max_depth=2)
+    assert result, result
+
+
+def test_mesh_emitter(facets):
+    # Without smooth normals, of which `path`'s two ways to sample an emitter make different things.
+    emitter = {"type": "area", "radiance": rgb(2, 1, 1)}
+    mesh = {"type": "ply", "filename": facets, "bsdf": WHITE, "face_normals": True, "emitter": emitter}
+    result = agreement(stage({}, ball=mesh))
+    assert result, result
+
+
+@pytest.mark.parametrize("depth", [0, 1, 2, 3, -1])
+def test_max_depth(depth):
+    scene = stage(visible())
+    result = agreement(scene, max_depth=depth, rr_depth=5)
+    assert result, result
+    if depth not in (0, 1):
+        assert difference_from_ptracer(scene, max_depth=depth) < SAME
+
+
+@pytest.mark.parametrize("rr_depth", [1, 2])
+@pytest.mark.parametrize("name", ["diffuse", "roughdielectric"])
+def test_roulette(rr_depth, name):
+    scene = stage(large(), ball=ball(MATERIALS[name]))
+    result = agreement(scene, max_depth=-1, rr_depth=rr_depth)
+    assert result, result
+    assert difference_from_ptracer(scene, max_depth=-1, rr_depth=rr_depth) < SAME
+
+
+def test_mask_before_the_camera():
+    result = agreement(stage(large(), leaf=leaf()))
+    assert result, result
+
+
+@pytest.mark.parametrize("depth", [1, 2, 3, 5])
+def test_mask_between_emitter_and_camera(depth):
+    # Each surface that light passes straight through counts as a vertex.
+    result = agreement(stage(visible(), leaf=leaf()), max_depth=depth)
+    assert result, result
+
+
+@pytest.mark.parametrize("hide_emitters", [False, True])
+def test_masks_before_the_sky(hide_emitters):
+    scene = stage({"sky": {"type": "constant"}}, leaf=leaf(), second=leaf(0.5, distance=2.4, size=0.3))
+    result = agreement(scene, max_depth=4, hide_emitters=hide_emitters)
+    assert result, result
+
+
+def test_opaque_and_absent_masks():
+    scene = stage(large(), leaf=leaf(1.0, size=0.2), second=leaf(0.0, distance=2.4))
+    result = agreement(scene)
+    assert result, result
+
+
+def test_passes_are_unbiased_and_independent():
+    scene = stage(visible())
+    result = agreement(scene, reslrb={"samples_per_pass": 32})
+    assert result, result
+    options = {"max_depth": 5, "rr_depth": 100}
+    in_one = images(scene, "reslrb", range(16), 64, **options).std(0).mean()
+    in_four = images(scene, "reslrb", range(16), 64, samples_per_pass=16, **options).std(0).mean()
+    assert in_four == pytest.approx(in_one, rel=0.1)
+
+
+def test_first_pass_is_what_ptracer_traces():
+    assert difference_from_ptracer(stage(large()), spp=8, reslrb={"samples_per_pass": 8}) < SAME
+
+
+def test_retained_image_is_unbiased():
+    scene = stage(visible())
+    integrator = make_integrator("reslrb", image="retained", max_depth=5, rr_depth=100)
+    ours = renders(lambda seed: gradient_step(integrator, scene, 0, dr.sum, seed=seed, spp=256).image, range(10))
+    result = compare(ours, images(scene, "path", range(1000, 1010), 256, max_depth=5, rr_depth=100))
+    assert result, result
+    # Another estimate of the same image, from the same paths.
+    assert (ours != images(scene, "reslrb", range(10), 256, max_depth=5, rr_depth=100)).any()
+
+
+def test_shapes():
+    things = {
+        "ball": {"type": "cylinder", "p0": [0, 0.2, 0], "p1": [0.3, 1, 0.2], "radius": 0.3, "bsdf": TWO_SIDED},
+        "disk": {"type": "disk", "bsdf": TWO_SIDED, "to_world": transform().translate([-0.8, 0.8, 0.2])
+                 @ transform().rotate([1, 0, 0], -60) @ transform().scale(0.4)},
+        "inside out": ball(TWO_SIDED, (0.9, 0.4, 0.4), 0.3) | {"flip_normals": True},
+        "cube": {"type": "cube", "bsdf": WHITE, "to_world": transform().translate([-0.9, 0.2, 0.8])
+                 @ transform().rotate([0, 1, 0], 30) @ transform().scale(0.2)},
+    }  # fmt: skip
+    result = agreement(stage(large(), **things))
+    assert result, result
+
+
+def test_instances():
+    scene = stage(
+        large(),
+        ball=None,
+        group={"type": "shapegroup", "shape": ball(WHITE, (0, 0, 0), 0.3)},
+        left={"type": "instance", "shapegroup": {"type": "ref", "id": "group"},
+              "to_world": transform().translate([-0.5, 0.6, 0]) @ transform().scale([1, 1.5, 1])},
+        right={"type": "instance", "shapegroup": {"type": "ref", "id": "group"},
+               "to_world": transform().translate([0.5, 0.6, 0])},
+    )  # fmt: skip
+    result = agreement(scene)
+    assert result, result
+
+
+def test_camera_inside_a_closed_room():
+    # No light leaves, so that every path runs to its end.
+    room = {"type": "cube", "flip_normals": True, "bsdf": WHITE,
+            "to_world": transform().translate([0, 2, 1]) @ transform().scale([3, 2.5, 4])}  # fmt: skip
+    scene = stage(visible(), camera(), room=room)
+    result = agreement(scene, max_depth=12, rr_depth=4)
+    assert result, result
+    assert difference_from_ptracer(scene, max_depth=12) < SAME

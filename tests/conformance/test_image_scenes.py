@@ -1,0 +1,103 @@
+"""Image, for the scenes in `scenes/` and a real room: `reslrb` against `path`, `ptracer` and the analytic answer."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from conformance.scenes import SAME, agreement, difference_from_ptracer, images
+from conformance.stats import compare
+from scipy.ndimage import binary_dilation
+
+from reslrb_cli.scene import load_scene
+
+ROOT = Path(__file__).resolve().parents[2]
+#: What judges each scene, and how many samples a pixel it takes. `path` cannot see a caustic of parallel light.
+SCENES = {"cornell_floor": ("path", 256), "grey_room": ("path", 256), "caustic_slab": ("ptracer", 256),
+          "furnace": ("path", 256)}  # fmt: skip
+
+
+def shipped(name: str):
+    return load_scene(ROOT / "scenes" / name / "scene.xml", {"resx": 32, "resy": 32})
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_shipped_scene(name):
+    reference, spp = SCENES[name]
+    result = agreement(shipped(name), reference, spp=spp, max_depth=8, rr_depth=5)
+    assert result, result
+
+
+@pytest.mark.parametrize("name", [name for name in SCENES if name != "grey_room"])  # a turned sky
+def test_shipped_scene_equals_ptracer_at_equal_seeds(name):
+    assert difference_from_ptracer(shipped(name), max_depth=8) < SAME
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", SCENES)
+def test_shipped_scene_with_many_samples(name):
+    reference, spp = SCENES[name]
+    result = agreement(shipped(name), reference, spp=4 * spp, seeds=24, max_depth=16, rr_depth=5)
+    assert result, result
+    assert result.relative_error < 0.002
+
+
+@pytest.mark.parametrize("depth", [1, 2, 6])
+def test_furnace_against_the_analytic_answer(depth):
+    rho, emitted = np.array([0.5, 0.7, 0.3]), np.array([1.0, 0.6, 1.4])
+    expected = emitted * sum(rho**k for k in range(depth))
+    found = images(shipped("furnace"), "reslrb", range(12), 256, max_depth=depth, rr_depth=3)
+    result = compare(found, np.broadcast_to(expected, found.shape))
+    assert result, result
+    assert np.allclose(found.mean((0, 1, 2)), expected, rtol=2e-3)
+
+
+def real_room() -> Path:
+    """The room's file: in the folder that RESLRB_GREY_WHITE_ROOM names, or beside the repository."""
+    folder = Path(os.environ.get("RESLRB_GREY_WHITE_ROOM") or ROOT.parent / "shared" / "scenes" / "grey-white-room")
+    if not (folder / "scene.xml").exists():
+        pytest.skip(
+            f"The Grey & White Room (Wig42, CC BY 3.0) is not in {folder}; set RESLRB_GREY_WHITE_ROOM to its folder"
+        )
+    return folder / "scene.xml"
+
+
+def sees_specular(scene, rays: int = 64) -> np.ndarray:
+    """Pixels (H, W) in which mirrors or glass are seen: light paths cannot connect to the sensor from them."""
+    sensor = scene.sensors()[0]
+    width, height = (int(n) for n in sensor.film().crop_size())
+    pixel = dr.arange(mi.UInt32, width * height * rays) // rays
+    random = mi.PCG32(width * height * rays)
+    u = mi.Point2f(pixel % width + random.next_float32(), pixel // width + random.next_float32())
+    ray, _ = sensor.sample_ray(0, 0.5, u / mi.Vector2f(width, height), mi.Point2f(0.5))
+    lobes = int(mi.BSDFFlags.DeltaReflection | mi.BSDFFlags.DeltaTransmission)
+    active, specular = mi.Bool(True), dr.zeros(mi.Bool, width * height * rays)
+    for _ in range(8):
+        si = scene.ray_intersect(ray, active)
+        flags = si.bsdf().flags()
+        specular |= (
+            active & si.is_valid() & ((flags & lobes) != 0)
+        )
+        active &= si.is_valid() & mi.has_flag(flags, mi.BSDFFlags.Null)
+        ray = si.spawn_ray(ray.d)
+        dr.eval(active, specular, ray)
+    return np.array(specular).reshape(height, width, rays).any(-1)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("hide_emitters", [False, True])
+def test_real_room(hide_emitters):
+    scene = load_scene(real_room(), {"resx": 64, "resy": 36, "max_depth": 8})
+    options = {"max_depth": 8, "rr_depth": 5, "hide_emitters": hide_emitters}
+    ours = images(scene, "reslrb", range(16), 1024, **options)
+    theirs = images(scene, "path", range(1000, 1016), 1024, **options)
+    # Its tent filter reaches into the next pixel, and beyond the film's border.
+    left_out = binary_dilation(sees_specular(scene), np.ones((3, 3)))
+    left_out[[0, -1]] = left_out[:, [0, -1]] = True
+    assert left_out.mean() < 0.2
+    result = compare(ours * ~left_out[..., None], theirs * ~left_out[..., None])
+    assert result, result
