@@ -151,7 +151,8 @@ class ReservoirReplay(VertexHooks):
         def differentiate(transmission: Any, hit: Any) -> None:
             # A segment with a transmission of zero is no candidate, so no index can match.
             weight = self._sum(lambda slot: slot.I == vertex.depth, mi.Int32(NO_ZERO), transmission, 0)
-            dr.backward_from(dr.select(hit, weight * transmission, 0))
+            # Masks may be there and have no parameter that is differentiated.
+            dr.backward_from(dr.select(hit, weight * transmission, 0), flags=dr.ADFlag.Default | dr.ADFlag.AllowNoGrad)
 
         with dr.resume_grad():
             limit = self.p.plan.max_depth - vertex.depth - 1
