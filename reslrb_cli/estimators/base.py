@@ -110,7 +110,9 @@ def differentiate_passage(
     """
 
     def differentiate(transmission: Any, hit: Any) -> None:
-        dr.backward_from(dr.select(hit, adjoint(dr.detach(transmission)) * transmission, 0))
+        objective = dr.select(hit, adjoint(dr.detach(transmission)) * transmission, 0)
+        # Masks may be there and have no parameter that is differentiated.
+        dr.backward_from(objective, flags=dr.ADFlag.Default | dr.ADFlag.AllowNoGrad)
 
     with dr.resume_grad():
         limit = p.plan.max_depth - depth - 1

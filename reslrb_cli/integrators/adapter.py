@@ -64,6 +64,7 @@ def _make_classes() -> tuple[Any, Any]:
             if key not in self._plans:
                 check_supported(scene, sensor, self.hide_emitters)
                 needs = scene_needs(scene, sensor)
+                lt.settle(scene)
                 self._plans[key] = make_plan(needs, self.max_depth, self.rr_depth, self.hide_emitters)
             plan = self._plans[key]
             if params is None:

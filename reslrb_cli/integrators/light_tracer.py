@@ -12,6 +12,7 @@ import mitsuba as mi
 from reslrb_cli.estimators import Estimator
 from reslrb_cli.estimators.base import Pass
 from reslrb_cli.integrators.hooks import AttachedSplat, Splat, TangentSplat
+from reslrb_cli.scene.graph import SceneGraph
 from reslrb_cli.transport.emission import sample_emission
 from reslrb_cli.transport.plan import Plan
 from reslrb_cli.transport.splat import AdjointImage, Film
@@ -83,6 +84,19 @@ class _NumberStream:
 
     def next_2d(self) -> Any:
         return mi.Point2f(self.generator.next_float32(), self.generator.next_float32())
+
+
+def settle(scene: Any) -> None:
+    """Have textures and emitters set up now what they set up when they are first used (padded storage, distributions).
+
+    In the midst of tracing this would cut the first step's kernels in two, and the second would compile them anew.
+    """
+    with dr.suspend_grad():
+        for texture in SceneGraph.of(scene).of_type(mi.Texture):
+            if texture.class_name().startswith("BitmapTexture"):
+                texture.eval(dr.zeros(mi.SurfaceInteraction3f))
+        _, weight, _ = scene.sample_emitter_ray(0, 0.5, mi.Point2f(0.5), mi.Point2f(0.5), True)
+        dr.eval(weight)
 
 
 def make_samples(plan: Plan, scene: Any, sensor: Any, seed: Any, spp: int, total_spp: int) -> Samples:

@@ -84,7 +84,8 @@ def differentiate_visible_radiance(plan: Plan, scene: Any, primary: PrimaryRay, 
         if masks:
             behind = dr.select(transmission != 0, (total - radiance) / dr.detach(transmission), 0)
             objective += dr.select(state.active, adjoint * behind, 0) * transmission
-        dr.backward_from(objective)
+        # Masks may be there and have no parameter that is differentiated.
+        dr.backward_from(objective, flags=dr.ADFlag.Default | dr.ADFlag.AllowNoGrad)
 
     with dr.resume_grad():
         _look(plan, scene, primary, differentiate, "symbolic")
