@@ -167,6 +167,31 @@ FILES: dict[str, tuple[str | bytes, tuple[str, ...]]] = {
         GOOD + "integrator: {type: prb, estimator: reservoir}\n",
         ("x.yaml: integrator.estimator: not an option of prb but of reslrb",),
     ),
+    "option of another estimator": (
+        GOOD + "integrator: {estimator: gather, capacity: 2}\n",
+        ("x.yaml: integrator.capacity: has no effect with estimator `gather`, but with `reservoir`",),
+    ),
+    "estimator's option left at its default": (
+        GOOD + "integrator: {stack_size: 64}\n",
+        ("x.yaml: integrator.stack_size: has no effect with estimator `reservoir`, but with `stack`",),
+    ),
+    "unknown estimator": (
+        GOOD + "integrator: {estimator: gater}\n",
+        ("x.yaml: integrator.estimator: must be one of", "(did you mean gather?)"),
+    ),
+    "capacity": (GOOD + "integrator: {capacity: 0}\n", ("x.yaml: integrator.capacity: must be at least 1",)),
+    "stack size": (
+        GOOD + "integrator: {estimator: stack, stack_size: 0}\n",
+        ("x.yaml: integrator.stack_size: must be at least 1",),
+    ),
+    "weight": (
+        GOOD + "integrator: {weight: adjont}\n",
+        ("x.yaml: integrator.weight: must be luminance or adjoint (did you mean adjoint?)",),
+    ),
+    "weight that is not known yet": (
+        GOOD + "integrator: {weight: adjoint}\n",
+        ("x.yaml: integrator.weight: `adjoint` needs dL/dI before", "run.adjoint: correlated"),
+    ),
     "option of another optimiser": (
         GOOD + "optimizer: {type: sgd, beta_1: 0.5}\n",
         ("x.yaml: optimizer.beta_1: not an option of sgd but of adam, adamw",),
