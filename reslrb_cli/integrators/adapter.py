@@ -56,11 +56,17 @@ def _make_classes() -> tuple[Any, Any]:
             if self.rr_depth <= 0:
                 raise ValueError('"rr_depth" must be greater than zero')
             self._track_zeros = False
-            self._plans: dict[Any, Plan] = {}
+            self._plans: dict[Any, Plan] = {}  # of the sensors of one scene
+            self._scene: Any = None  # its address, and, to keep that from being used again, itself
 
         def plan(self, scene: Any, sensor: Any, params: Any = None) -> Plan:
             """What a walk of this scene needs; refuses what cannot work. `params`: those to look for derivatives in."""
-            key = (scene.ptr, sensor.ptr)
+            if self._scene is None or self._scene[0] != scene.ptr:
+                # The scene's own integrator does not hold the scene: neither would ever be freed.
+                owner = scene.integrator()
+                self._scene = (scene.ptr, None if owner is not None and owner.ptr == self.ptr else scene)
+                self._plans.clear()
+            key = sensor.ptr
             if key not in self._plans:
                 check_supported(scene, sensor, self.hide_emitters)
                 needs = scene_needs(scene, sensor)
