@@ -38,6 +38,7 @@ class SceneNeeds:
     has_perturbed_normals: bool
     moving_shutter: bool
     thin_lens: bool
+    principal_point: bool
 
 
 @dataclass(frozen=True)
@@ -74,6 +75,7 @@ def scene_needs(scene: Any, sensor: Any) -> SceneNeeds:
         has_perturbed_normals=any(bsdf.class_name() in ("BumpMap", "NormalMap") for bsdf in graph.of_type(mi.BSDF)),
         moving_shutter=float(sensor.shutter_open_time()) > 0,
         thin_lens=bool(sensor.needs_aperture_sample()),
+        principal_point=_has_principal_point(sensor),
     )
 
 
@@ -137,6 +139,13 @@ def look(scene: Any, sensor: Any, resolution: int = 128) -> View:
         return float(dr.count(mask)[0]) / count
 
     return View(fraction(smooth), fraction(specular), fraction(~(smooth | specular)), fraction(emission))
+
+
+def _has_principal_point(sensor: Any) -> bool:
+    """Whether the principal point of `sensor` is not the film's centre."""
+    params = mi.traverse(sensor)
+    keys = [f"principal_point_offset_{axis}" for axis in "xy"]
+    return any(np.any(np.array(params[key]) != 0) for key in keys if key in params)
 
 
 def _has_shading_normals(shape: Any) -> bool:
