@@ -128,11 +128,26 @@ class WalkAd(LightTracer):
     type: Literal["walk_ad"] = Field(default="walk_ad", description="The walk of `reslrb`, naively differentiated.")
 
 
+class Trajectory(LightTracer):
+    """The same walk, reversed by Dr.Jit itself: it records each path's loop state in thread-local memory."""
+
+    model_config = _NEEDS_TYPE
+    type: Literal["trajectory"] = Field(default="trajectory", description="The walk of `reslrb`, reversed by Dr.Jit.")
+    max_depth: int = Field(
+        default=8,
+        ge=0,
+        lt=2**31,
+        description="Longest path in segments, as above; the record has room for as many vertices, so that there must "
+        "be a limit.",
+    )
+
+
 AnyIntegrator = Annotated[
     Annotated[Reslrb, Tag("<reslrb>")]
     | Annotated[Ptracer, Tag("<ptracer>")]
     | Annotated[Prb, Tag("<prb>")]
-    | Annotated[WalkAd, Tag("<walk_ad>")],
+    | Annotated[WalkAd, Tag("<walk_ad>")]
+    | Annotated[Trajectory, Tag("<trajectory>")],
     by_type("reslrb"),
 ]
 

@@ -7,6 +7,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from reslrb_cli.errors import UnsupportedScene
 from reslrb_cli.estimators import ESTIMATORS
 from reslrb_cli.integrators import light_tracer as lt
 from reslrb_cli.integrators.differentiated import differentiated
@@ -18,7 +19,7 @@ _registered_with_callback = False
 
 
 def register() -> None:
-    """Make `reslrb` and `walk_ad` known to Mitsuba, in the current variant and in any that is set later."""
+    """Make our integrators known to Mitsuba, in the current variant and in any that is set later."""
     global _registered_with_callback
     if not _registered_with_callback:
         mi.detail.add_variant_callback(_on_variant)
@@ -30,16 +31,15 @@ def register() -> None:
 def _on_variant(old: str | None, new: str) -> None:
     if not new.endswith(("_ad_rgb", "_ad_mono")):
         return
-    reslrb, walk_ad = _make_classes()
-    mi.register_integrator("reslrb", lambda props: reslrb(props))
-    mi.register_integrator("walk_ad", lambda props: walk_ad(props))
+    for name, kind in _make_classes().items():
+        mi.register_integrator(name, lambda props, kind=kind: kind(props))
 
 
-def _make_classes() -> tuple[Any, Any]:
-    """The classes derive from one of the variant's, so they exist once for each variant."""
+def _make_classes() -> dict[str, Any]:
+    """Plugins by name. The classes derive from one of the variant's, so they exist once for each variant."""
 
     class LightIntegrator(mi.CppADIntegrator):  # type: ignore[misc]
-        """What both have in common: `ptracer`'s options, and the image."""
+        """What all have in common: `ptracer`'s options, and the image."""
 
         def __init__(self, props: Any) -> None:
             # Taken before the base class sees it, which has another idea of a pass and warns.
@@ -103,6 +103,16 @@ def _make_classes() -> tuple[Any, Any]:
                     dr.eval(image)
                 return image
 
+        def render_forward(self, scene: Any, params: Any, sensor: Any = 0, seed: Any = 0, spp: int = 0) -> Any:
+            sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
+            params = _parameters(scene, params)
+            with dr.suspend_grad():
+                film = Film(sensor)
+                block = film.block()
+                for samples in self.passes(scene, sensor, seed, spp, params):
+                    lt.splat_tangents(samples, block)
+                return film.develop_tangent(block)
+
         def aov_names(self) -> list[str]:
             return []
 
@@ -138,6 +148,23 @@ def _make_classes() -> tuple[Any, Any]:
                         if len(trace.samples) > 1:
                             dr.eval()  # passes are not to pile up
 
+        def fused(self, scene: Any, sensor: Any, seed: Any, spp: int, gradient: Any, params: Any) -> Any:
+            """The image, and the gradient of the objective with dL/dI `gradient` (H, W, C), known before either.
+
+            One set of samples, traced once for both where the estimator can.
+            """
+            with dr.suspend_grad():
+                parts = self.passes(scene, sensor, seed, spp, params)
+                film = parts[0].film
+                block, adjoint = film.block(), film.adjoint(gradient)
+                with dr.isolate_grad():  # as in `replay`
+                    for samples in parts:
+                        state = lt.keep(samples, self.estimator, block, adjoint)
+                        lt.replay(samples, self.estimator, state, adjoint)
+                        if len(parts) > 1:
+                            dr.eval()
+                return film.develop(block)
+
         def render_backward(self, scene: Any, params: Any, grad_in: Any, sensor: Any = 0, seed: Any = 0,
                             spp: int = 0) -> None:  # fmt: skip
             sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
@@ -145,16 +172,6 @@ def _make_classes() -> tuple[Any, Any]:
             with dr.suspend_grad():
                 trace = lt.Trace(self.passes(scene, sensor, seed, spp, params))
             self.replay(trace, grad_in, params)
-
-        def render_forward(self, scene: Any, params: Any, sensor: Any = 0, seed: Any = 0, spp: int = 0) -> Any:
-            sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
-            params = _parameters(scene, params)
-            with dr.suspend_grad():
-                film = Film(sensor)
-                block = film.block()
-                for samples in self.passes(scene, sensor, seed, spp, params):
-                    lt.splat_tangents(samples, block)
-                return film.develop_tangent(block)
 
     class WalkAdIntegrator(LightIntegrator):
         """The same walk under naive AD: for comparisons at equal seeds."""
@@ -180,7 +197,32 @@ def _make_classes() -> tuple[Any, Any]:
                 image = self.attached_image(scene, sensor, seed, spp, _parameters(scene, params))
                 return dr.forward_to(image)
 
-    return ReslrbIntegrator, WalkAdIntegrator
+    class TrajectoryIntegrator(LightIntegrator):
+        """The same walk in a loop that Dr.Jit itself reverses, from a record of its state in thread-local memory."""
+
+        def __init__(self, props: Any) -> None:
+            super().__init__(props)
+            if self.max_depth == -1:
+                raise ValueError('"max_depth" must be given: it is the size of the record')
+
+        def render_backward(self, scene: Any, params: Any, grad_in: Any, sensor: Any = 0, seed: Any = 0,
+                            spp: int = 0) -> None:  # fmt: skip
+            sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
+            params = _parameters(scene, params)
+            with dr.suspend_grad():
+                parts = self.passes(scene, sensor, seed, spp, params)
+                if parts[0].plan.needs.has_null:
+                    raise UnsupportedScene(
+                        "trajectory: Dr.Jit cannot reverse the loop through masks within that of the path"
+                    )
+                adjoint = parts[0].film.adjoint(grad_in)
+                with dr.isolate_grad():  # as in `replay` above; without it the derivatives of textures are lost
+                    for samples in parts:
+                        lt.reverse_recorded(samples, adjoint)
+                        if len(parts) > 1:
+                            dr.eval()
+
+    return {"reslrb": ReslrbIntegrator, "walk_ad": WalkAdIntegrator, "trajectory": TrajectoryIntegrator}
 
 
 def _parameters(scene: Any, params: Any) -> Any:

@@ -146,7 +146,7 @@ FILES: dict[str, tuple[str | bytes, tuple[str, ...]]] = {
     ),
     "target integrator": (
         changed("{render: {}}", "{render: {integrator: {type: path}}}"),
-        ("x.yaml: target.render.integrator.type: must be one of reslrb, ptracer, prb, walk_ad",),
+        ("x.yaml: target.render.integrator.type: must be one of reslrb, ptracer, prb, walk_ad, trajectory",),
     ),
     "sensor negative": (changed("scene.xml", "a, sensors: [-1]"), ("x.yaml: scene.sensors[0]: must be at least 0",)),
     "sensor twice": (
@@ -160,7 +160,7 @@ FILES: dict[str, tuple[str | bytes, tuple[str, ...]]] = {
     "home of nobody": (changed("scene.xml", "~no-such-user-here/a"), ("x.yaml: scene.file: must be a path",)),
     "unknown integrator": (
         GOOD + "integrator: {type: reslbr}\n",
-        ("x.yaml: integrator.type: must be one of reslrb, ptracer, prb, walk_ad (did you mean reslrb?)",),
+        ("x.yaml: integrator.type: must be one of reslrb, ptracer, prb, walk_ad, trajectory (did you mean reslrb?)",),
     ),
     "type is a list": (GOOD + "integrator: {type: [prb]}\n", ("x.yaml: integrator.type: must be one of",)),
     "option of another integrator": (
@@ -218,6 +218,10 @@ FILES: dict[str, tuple[str | bytes, tuple[str, ...]]] = {
         ("x.yaml: optimizer.learning_rate: must be a finite",),
     ),
     "momentum one": (GOOD + "optimizer: {type: sgd, momentum: 1}\n", ("x.yaml: optimizer.momentum: must be below 1",)),
+    "record without end": (
+        GOOD + "integrator: {type: trajectory, max_depth: -1}\n",
+        ("x.yaml: integrator.max_depth: must be at least 0",),
+    ),
     "depth": (GOOD + "integrator: {max_depth: -2}\n", ("x.yaml: integrator.max_depth: must be at least -1",)),
     "flag is a number": (
         GOOD + "integrator: {hide_emitters: 1}\n",
