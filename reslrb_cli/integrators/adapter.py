@@ -10,6 +10,7 @@ import mitsuba as mi
 from reslrb_cli.estimators import ESTIMATORS
 from reslrb_cli.integrators import light_tracer as lt
 from reslrb_cli.integrators.differentiated import differentiated
+from reslrb_cli.scene.graph import SceneGraph
 from reslrb_cli.scene.needs import check_supported, scene_needs
 from reslrb_cli.transport.plan import Plan, make_plan
 from reslrb_cli.transport.splat import Film
@@ -56,6 +57,8 @@ def _make_classes() -> tuple[Any, Any]:
             if self.rr_depth <= 0:
                 raise ValueError('"rr_depth" must be greater than zero')
             self._track_zeros = False
+            # By address: what is known of scenes, which are kept alive with it.
+            self._scenes: dict[Any, tuple[Any, SceneGraph]] = {}
             self._plans: dict[Any, Plan] = {}
 
         def plan(self, scene: Any, sensor: Any, params: Any = None) -> Plan:
@@ -65,6 +68,7 @@ def _make_classes() -> tuple[Any, Any]:
                 check_supported(scene, sensor, self.hide_emitters)
                 needs = scene_needs(scene, sensor)
                 lt.settle(scene)
+                self._scenes.setdefault(scene.ptr, (scene, SceneGraph.of(scene)))
                 self._plans[key] = make_plan(needs, self.max_depth, self.rr_depth, self.hide_emitters)
             plan = self._plans[key]
             if params is None:
@@ -72,7 +76,12 @@ def _make_classes() -> tuple[Any, Any]:
             which = differentiated(params)
             # Once needed, kept: otherwise kernels would be compiled anew whenever a texel enters or leaves zero.
             self._track_zeros |= which.zeros
-            return plan.differentiating(which.bsdfs, which.emission, self._track_zeros)
+            graph = self._scenes[scene.ptr][1]
+            bsdfs = {bsdf: None for node in which.bsdf_nodes for bsdf in graph.owning_bsdfs(node)}
+            everywhere = len(bsdfs) == len(graph.surface_bsdfs())
+            return plan.differentiating(
+                bool(bsdfs), which.emission, self._track_zeros, () if everywhere else tuple(bsdfs)
+            )
 
         def passes(self, scene: Any, sensor: Any, seed: Any, spp: int, params: Any = None) -> list[lt.Samples]:
             """The samples of one image, and the sensor's own sample count where `spp` is 0."""
