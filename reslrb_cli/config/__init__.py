@@ -15,6 +15,7 @@ from .choices import (
     RelativeL2,
     Reslrb,
     RMSProp,
+    Trajectory,
     WalkAd,
 )
 from .loader import dump, load
@@ -43,6 +44,7 @@ __all__ = [
     "RunConfig",
     "SceneConfig",
     "TargetConfig",
+    "Trajectory",
     "WalkAd",
     "dump",
     "load",

@@ -51,21 +51,60 @@ class LightTracer(Integrator):
     )
 
 
+#: The options of `reslrb` that belong to an estimator, by its name; the others have no use for them.
+ESTIMATOR_OPTIONS: dict[str, tuple[str, ...]] = {
+    "reservoir": ("capacity", "weight", "image"),
+    "gather": (),
+    "stack": ("stack_size",),
+}
+
+
 class Reslrb(LightTracer):
     """Reservoir light replay backpropagation: light tracing whose memory does not depend on path length."""
 
     type: Literal["reslrb"] = Field(
         default="reslrb", description="Light tracing, derivatives by a replay of each path."
     )
-    estimator: Literal["reservoir"] = Field(
+    estimator: Literal["reservoir", "gather", "stack"] = Field(
         default="reservoir",
-        description="How a path's connections enter its gradient. `reservoir`: one connection, kept with "
-        "probability proportional to its luminance.",
+        description="How a path's connections enter its gradient. `reservoir`: few of them, kept at random; `gather`: "
+        "all, by a second traversal; `stack`: all, kept in thread-local memory.",
+    )
+    capacity: Count = Field(
+        default=1, description="Connections that are kept of each path. Only with estimator `reservoir`."
+    )
+    weight: Literal["luminance", "adjoint"] = Field(
+        default="luminance",
+        description="What a connection is kept in proportion to: its `luminance`, or its share in the objective "
+        "(`adjoint`: less variance; not with `run.adjoint: correlated`). Only with estimator `reservoir`.",
     )
     image: Literal["all", "retained"] = Field(
         default="all",
-        description="Which connections the image shows: `all`, or the `retained` one alone, weighted (noisier).",
+        description="Which connections the image shows: `all`, or the `retained` ones alone, weighted (noisier). "
+        "Only with estimator `reservoir`.",
     )
+    stack_size: Count = Field(
+        default=64,
+        description="Vertices of a path that fit into thread-local memory; longer paths are traced a second time. "
+        "Only with estimator `stack`.",
+    )
+
+    @model_validator(mode="after")
+    def _check_options(self) -> Self:
+        for option in sorted(self._foreign() & self.model_fields_set):
+            owners = " or ".join(f"`{name}`" for name, options in ESTIMATOR_OPTIONS.items() if option in options)
+            raise located(option, f"has no effect with estimator `{self.estimator}`, but with {owners}; remove it")
+        return self
+
+    @model_serializer(mode="wrap")
+    def _without_foreign(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        values: dict[str, Any] = handler(self)
+        return {name: value for name, value in values.items() if name not in self._foreign()}
+
+    def _foreign(self) -> set[str]:
+        """The options of the other estimators."""
+        every = {option for options in ESTIMATOR_OPTIONS.values() for option in options}
+        return every - set(ESTIMATOR_OPTIONS[self.estimator])
 
 
 class Ptracer(LightTracer):
@@ -89,11 +128,26 @@ class WalkAd(LightTracer):
     type: Literal["walk_ad"] = Field(default="walk_ad", description="The walk of `reslrb`, naively differentiated.")
 
 
+class Trajectory(LightTracer):
+    """The same walk, reversed by Dr.Jit itself: it records each path's loop state in thread-local memory."""
+
+    model_config = _NEEDS_TYPE
+    type: Literal["trajectory"] = Field(default="trajectory", description="The walk of `reslrb`, reversed by Dr.Jit.")
+    max_depth: int = Field(
+        default=8,
+        ge=0,
+        lt=2**31,
+        description="Longest path in segments, as above; the record has room for as many vertices, so that there must "
+        "be a limit.",
+    )
+
+
 AnyIntegrator = Annotated[
     Annotated[Reslrb, Tag("<reslrb>")]
     | Annotated[Ptracer, Tag("<ptracer>")]
     | Annotated[Prb, Tag("<prb>")]
-    | Annotated[WalkAd, Tag("<walk_ad>")],
+    | Annotated[WalkAd, Tag("<walk_ad>")]
+    | Annotated[Trajectory, Tag("<trajectory>")],
     by_type("reslrb"),
 ]
 

@@ -268,6 +268,12 @@ class Config(Section):
             if key in keys[:i]:
                 raise located(f"parameters[{i}].key", f"`{key}` stands in parameters[{keys.index(key)}] already")
         _check_passes(self.integrator, self.run.spp, "integrator", "run.spp")
+        if self.run.adjoint == "correlated" and self.integrator.options().get("weight") == "adjoint":
+            raise located(
+                "integrator.weight",
+                "`adjoint` needs dL/dI before the paths are traced, which run.adjoint: correlated does not have; "
+                "set that to independent, or the weight to luminance",
+            )
         if self.target.render is not None:
             own = self.target.render.integrator
             key = "integrator" if own is None else "target.render.integrator"

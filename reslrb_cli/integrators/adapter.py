@@ -7,6 +7,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from reslrb_cli.errors import UnsupportedScene
 from reslrb_cli.estimators import ESTIMATORS
 from reslrb_cli.integrators import light_tracer as lt
 from reslrb_cli.integrators.differentiated import differentiated
@@ -19,7 +20,7 @@ _registered_with_callback = False
 
 
 def register() -> None:
-    """Make `reslrb` and `walk_ad` known to Mitsuba, in the current variant and in any that is set later."""
+    """Make our integrators known to Mitsuba, in the current variant and in any that is set later."""
     global _registered_with_callback
     if not _registered_with_callback:
         mi.detail.add_variant_callback(_on_variant)
@@ -31,16 +32,15 @@ def register() -> None:
 def _on_variant(old: str | None, new: str) -> None:
     if not new.endswith(("_ad_rgb", "_ad_mono")):
         return
-    reslrb, walk_ad = _make_classes()
-    mi.register_integrator("reslrb", lambda props: reslrb(props))
-    mi.register_integrator("walk_ad", lambda props: walk_ad(props))
+    for name, kind in _make_classes().items():
+        mi.register_integrator(name, lambda props, kind=kind: kind(props))
 
 
-def _make_classes() -> tuple[Any, Any]:
-    """The classes derive from one of the variant's, so they exist once for each variant."""
+def _make_classes() -> dict[str, Any]:
+    """Plugins by name. The classes derive from one of the variant's, so they exist once for each variant."""
 
     class LightIntegrator(mi.CppADIntegrator):  # type: ignore[misc]
-        """What both have in common: `ptracer`'s options, and the image."""
+        """What all have in common: `ptracer`'s options, and the image."""
 
         def __init__(self, props: Any) -> None:
             # Taken before the base class sees it, which has another idea of a pass and warns.
@@ -57,18 +57,23 @@ def _make_classes() -> tuple[Any, Any]:
             if self.rr_depth <= 0:
                 raise ValueError('"rr_depth" must be greater than zero')
             self._track_zeros = False
-            # By address: what is known of scenes, which are kept alive with it.
-            self._scenes: dict[Any, tuple[Any, SceneGraph]] = {}
-            self._plans: dict[Any, Plan] = {}
+            self._plans: dict[Any, Plan] = {}  # of the sensors of one scene
+            self._scene: Any = None  # its address, and, to keep that from being used again, itself
+            self._owners: dict[Any, list[Any]] = {}  # BSDFs of its surfaces that use a node, and under None all of them
 
         def plan(self, scene: Any, sensor: Any, params: Any = None) -> Plan:
             """What a walk of this scene needs; refuses what cannot work. `params`: those to look for derivatives in."""
-            key = (scene.ptr, sensor.ptr)
+            if self._scene is None or self._scene[0] != scene.ptr:
+                # The scene's own integrator does not hold the scene: neither would ever be freed.
+                owner = scene.integrator()
+                self._scene = (scene.ptr, None if owner is not None and owner.ptr == self.ptr else scene)
+                self._plans.clear()
+                self._owners.clear()
+            key = sensor.ptr
             if key not in self._plans:
                 check_supported(scene, sensor, self.hide_emitters)
                 needs = scene_needs(scene, sensor)
                 lt.settle(scene)
-                self._scenes.setdefault(scene.ptr, (scene, SceneGraph.of(scene)))
                 self._plans[key] = make_plan(needs, self.max_depth, self.rr_depth, self.hide_emitters)
             plan = self._plans[key]
             if params is None:
@@ -76,12 +81,16 @@ def _make_classes() -> tuple[Any, Any]:
             which = differentiated(params)
             # Once needed, kept: otherwise kernels would be compiled anew whenever a texel enters or leaves zero.
             self._track_zeros |= which.zeros
-            graph = self._scenes[scene.ptr][1]
-            bsdfs = {bsdf: None for node in which.bsdf_nodes for bsdf in graph.owning_bsdfs(node)}
-            everywhere = len(bsdfs) == len(graph.surface_bsdfs())
-            return plan.differentiating(
-                bool(bsdfs), which.emission, self._track_zeros, () if everywhere else tuple(bsdfs)
-            )
+            only = self._bsdfs(scene, which.bsdf_nodes)
+            return plan.differentiating(bool(which.bsdf_nodes), which.emission, self._track_zeros, only)
+
+        def _bsdfs(self, scene: Any, nodes: tuple[Any, ...]) -> tuple[Any, ...]:
+            """The surfaces' BSDFs that use any of these nodes; empty where that is all of them."""
+            if any(node not in self._owners for node in nodes):
+                graph = SceneGraph.of(scene)
+                self._owners |= {node: graph.owning_bsdfs(node) for node in nodes} | {None: graph.surface_bsdfs()}
+            used = {bsdf: None for node in nodes for bsdf in self._owners[node]}
+            return () if all(bsdf in used for bsdf in self._owners.get(None, [])) else tuple(used)
 
         def passes(self, scene: Any, sensor: Any, seed: Any, spp: int, params: Any = None) -> list[lt.Samples]:
             """The samples of one image, and the sensor's own sample count where `spp` is 0."""
@@ -105,6 +114,16 @@ def _make_classes() -> tuple[Any, Any]:
                 if evaluate:
                     dr.eval(image)
                 return image
+
+        def render_forward(self, scene: Any, params: Any, sensor: Any = 0, seed: Any = 0, spp: int = 0) -> Any:
+            sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
+            params = _parameters(scene, params)
+            with dr.suspend_grad():
+                film = Film(sensor)
+                block = film.block()
+                for samples in self.passes(scene, sensor, seed, spp, params):
+                    lt.splat_tangents(samples, block)
+                return film.develop_tangent(block)
 
         def aov_names(self) -> list[str]:
             return []
@@ -141,6 +160,23 @@ def _make_classes() -> tuple[Any, Any]:
                         if len(trace.samples) > 1:
                             dr.eval()  # passes are not to pile up
 
+        def fused(self, scene: Any, sensor: Any, seed: Any, spp: int, gradient: Any, params: Any) -> Any:
+            """The image, and the gradient of the objective with dL/dI `gradient` (H, W, C), known before either.
+
+            One set of samples, traced once for both where the estimator can.
+            """
+            with dr.suspend_grad():
+                parts = self.passes(scene, sensor, seed, spp, params)
+                film = parts[0].film
+                block, adjoint = film.block(), film.adjoint(gradient)
+                with dr.isolate_grad():  # as in `replay`
+                    for samples in parts:
+                        state = lt.keep(samples, self.estimator, block, adjoint)
+                        lt.replay(samples, self.estimator, state, adjoint)
+                        if len(parts) > 1:
+                            dr.eval()
+                return film.develop(block)
+
         def render_backward(self, scene: Any, params: Any, grad_in: Any, sensor: Any = 0, seed: Any = 0,
                             spp: int = 0) -> None:  # fmt: skip
             sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
@@ -148,16 +184,6 @@ def _make_classes() -> tuple[Any, Any]:
             with dr.suspend_grad():
                 trace = lt.Trace(self.passes(scene, sensor, seed, spp, params))
             self.replay(trace, grad_in, params)
-
-        def render_forward(self, scene: Any, params: Any, sensor: Any = 0, seed: Any = 0, spp: int = 0) -> Any:
-            sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
-            params = _parameters(scene, params)
-            with dr.suspend_grad():
-                film = Film(sensor)
-                block = film.block()
-                for samples in self.passes(scene, sensor, seed, spp, params):
-                    lt.splat_tangents(samples, block)
-                return film.develop_tangent(block)
 
     class WalkAdIntegrator(LightIntegrator):
         """The same walk under naive AD: for comparisons at equal seeds."""
@@ -183,7 +209,32 @@ def _make_classes() -> tuple[Any, Any]:
                 image = self.attached_image(scene, sensor, seed, spp, _parameters(scene, params))
                 return dr.forward_to(image)
 
-    return ReslrbIntegrator, WalkAdIntegrator
+    class TrajectoryIntegrator(LightIntegrator):
+        """The same walk in a loop that Dr.Jit itself reverses, from a record of its state in thread-local memory."""
+
+        def __init__(self, props: Any) -> None:
+            super().__init__(props)
+            if self.max_depth == -1:
+                raise ValueError('"max_depth" must be given: it is the size of the record')
+
+        def render_backward(self, scene: Any, params: Any, grad_in: Any, sensor: Any = 0, seed: Any = 0,
+                            spp: int = 0) -> None:  # fmt: skip
+            sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
+            params = _parameters(scene, params)
+            with dr.suspend_grad():
+                parts = self.passes(scene, sensor, seed, spp, params)
+                if parts[0].plan.needs.has_null:
+                    raise UnsupportedScene(
+                        "trajectory: Dr.Jit cannot reverse the loop through masks within that of the path"
+                    )
+                adjoint = parts[0].film.adjoint(grad_in)
+                with dr.isolate_grad():  # as in `replay` above; without it the derivatives of textures are lost
+                    for samples in parts:
+                        lt.reverse_recorded(samples, adjoint)
+                        if len(parts) > 1:
+                            dr.eval()
+
+    return {"reslrb": ReslrbIntegrator, "walk_ad": WalkAdIntegrator, "trajectory": TrajectoryIntegrator}
 
 
 def _parameters(scene: Any, params: Any) -> Any:

@@ -11,6 +11,7 @@ import mitsuba as mi
 from reslrb_cli.transport.connection import Connection, passage
 from reslrb_cli.transport.factors import Product
 from reslrb_cli.transport.scattering import Scattering, attached_factor, evaluate
+from reslrb_cli.transport.splat import AdjointImage
 from reslrb_cli.transport.transmittance import forward_derivatives, transmittance
 from reslrb_cli.transport.walk import Hooks, Vertex
 
@@ -35,6 +36,27 @@ class AttachedSplat(Splat):
     """Splat every connection, derivatives attached (walk_ad)."""
 
     attached = True
+
+
+class RecordedObjective(Hooks):
+    """Sum each path's share of the objective, S = sum_i delta_i C_i, derivatives attached (trajectory).
+
+    A splat in a loop that is reversed would have no derivative: side effects are none of the loop's state.
+    """
+
+    attached = True
+
+    def __init__(self, samples: Samples, adjoint: AdjointImage) -> None:
+        self.samples, self.adjoint = samples, adjoint
+        self.max_iterations = max(samples.plan.max_depth - 1, 1)
+
+    def start(self, product: Product) -> Any:
+        return mi.Float(0)
+
+    def connection(self, state: Any, vertex: Vertex, connection: Connection, numbers: list[Any]) -> Any:
+        C = vertex.product.times(connection.c, vertex.depth).scaled(self.samples.scale).value()
+        delta = self.adjoint.lookup(connection.u, connection.active)
+        return state + dr.select(connection.active, dr.dot(delta, C), 0)
 
 
 @dataclass

@@ -11,7 +11,7 @@ import mitsuba as mi
 
 from reslrb_cli.estimators import Estimator
 from reslrb_cli.estimators.base import Pass
-from reslrb_cli.integrators.hooks import AttachedSplat, Splat, TangentSplat
+from reslrb_cli.integrators.hooks import AttachedSplat, RecordedObjective, Splat, TangentSplat
 from reslrb_cli.scene.graph import SceneGraph
 from reslrb_cli.transport.emission import sample_emission
 from reslrb_cli.transport.plan import Plan
@@ -200,12 +200,25 @@ def trace_image(samples: list[Samples], estimator: Estimator) -> Trace:
 
 def replay(samples: Samples, estimator: Estimator, state: Any, adjoint: AdjointImage) -> None:
     """Add the derivatives of the objective, whose derivative with respect to the film is `adjoint`."""
+    differentiate_visible_emission(samples, adjoint)
+    estimator.backward(samples.context(None, adjoint), state)
+
+
+def reverse_recorded(samples: Samples, adjoint: AdjointImage) -> None:
+    """Add the same derivatives by Dr.Jit's own reversal of the walk, which records the loop's state on the way."""
+    differentiate_visible_emission(samples, adjoint)
+    with dr.resume_grad():
+        S = trace(samples, RecordedObjective(samples, adjoint))
+        dr.backward_from(S, flags=dr.ADFlag.Default | dr.ADFlag.AllowNoGrad)
+
+
+def differentiate_visible_emission(samples: Samples, adjoint: AdjointImage) -> None:
+    """Add the derivatives of C_0."""
     plan = samples.plan
     if plan.visible_emission and (plan.differentiate_emission or plan.needs.has_null):
         primary = samples.primary_ray()
         delta = adjoint.lookup(primary.u, primary.active) * primary.weight * samples.fraction
         differentiate_visible_radiance(plan, samples.scene, primary, delta)
-    estimator.backward(samples.context(None, adjoint), state)
 
 
 def splat_tangents(samples: Samples, block: Any) -> None:

@@ -88,6 +88,28 @@ def gradient_step(
     return StepResult(dr.detach(image), dr.detach(loss))
 
 
+def known_step(
+    integrator: Any, scene: Any, sensor: Any, gradient: Any, *, seed: int, spp: int, params: Any = None
+) -> StepResult:
+    """A step whose dL/dI, `gradient` (H, W, C), is known before its image: the loss is the sum of dL/dI times I.
+
+    One set of samples for both; an estimator of `reslrb` that can splats and differentiates in one traversal. The rest
+    is as in `gradient_step`.
+    """
+    gradient = dr.detach(gradient)
+
+    def objective(image: Any) -> Any:
+        return dr.sum((image * gradient).array)
+
+    if not hasattr(integrator, "fused"):
+        return gradient_step(integrator, scene, sensor, objective, seed=seed, spp=spp, params=params)
+    params = params if params is not None else mi.traverse(scene)
+    image_seed = mi.UInt32(seed)
+    dr.make_opaque(image_seed)
+    image = integrator.fused(scene, _sensor(scene, sensor), image_seed, spp, gradient, params)
+    return StepResult(image, objective(image))
+
+
 def _replayed(integrator: Any, scene: Any, sensor: Any, objective: Objective, seed: Any, spp: int, adjoint: Adjoint,
               params: Any, on_image: Callable[[], None] | None) -> StepResult:  # fmt: skip
     if adjoint == "independent":

@@ -21,7 +21,7 @@ from reslrb_cli.scene import Selection, check_supported, load_scene, read_image,
 Array = np.ndarray[Any, Any]
 
 #: Types of integrators that trace from the light, and so cannot render every scene.
-LIGHT_TRACERS = ("reslrb", "ptracer", "walk_ad")
+LIGHT_TRACERS = ("reslrb", "ptracer", "walk_ad", "trajectory")
 #: Weights of linear sRGB in luminance, as Mitsuba has them.
 LUMINANCE = np.array([0.212671, 0.715160, 0.072169], dtype=np.float32)
 

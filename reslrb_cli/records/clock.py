@@ -33,6 +33,8 @@ class StepClock:
 
     def __init__(self) -> None:
         self.elapsed_s = 0.0
+        #: Kernel history of the last step.
+        self.history: list[dict[str, Any]] = []
         self._known: set[Any] = set()
 
     @contextmanager
@@ -47,9 +49,9 @@ class StepClock:
                 yield times
                 dr.sync_thread()
                 times.wall_ms = 1e3 * (time.perf_counter() - start)
-            history = dr.kernel_history()
-        times.kernel_ms, times.codegen_ms = summarise(history)
-        launched = {entry["hash"] for entry in history if entry["type"] == dr.KernelType.JIT}
+            self.history = dr.kernel_history()
+        times.kernel_ms, times.codegen_ms = summarise(self.history)
+        launched = {entry["hash"] for entry in self.history if entry["type"] == dr.KernelType.JIT}
         times.new_kernels = len(launched - self._known)
         self._known |= launched
 

@@ -44,6 +44,7 @@ class SceneNeeds:
     bsdfs_read_geometry: bool
     moving_shutter: bool
     thin_lens: bool
+    principal_point: bool
 
 
 @dataclass(frozen=True)
@@ -81,6 +82,7 @@ def scene_needs(scene: Any, sensor: Any) -> SceneNeeds:
         bsdfs_read_geometry=_read_geometry(graph),
         moving_shutter=float(sensor.shutter_open_time()) > 0,
         thin_lens=bool(sensor.needs_aperture_sample()),
+        principal_point=_has_principal_point(sensor),
     )
 
 
@@ -156,6 +158,13 @@ def _read_geometry(graph: SceneGraph) -> bool:
     textures = [texture for texture in graph.of_type(mi.Texture) if graph.owning_bsdfs(texture)]
     bsdfs = graph.of_type(mi.BSDF)
     return not all(map(plain, textures)) or any(bsdf.class_name() not in _PLAIN_BSDFS for bsdf in bsdfs)
+
+
+def _has_principal_point(sensor: Any) -> bool:
+    """Whether the principal point of `sensor` is not the film's centre."""
+    params = mi.traverse(sensor)
+    keys = [f"principal_point_offset_{axis}" for axis in "xy"]
+    return any(np.any(np.array(params[key]) != 0) for key in keys if key in params)
 
 
 def _has_shading_normals(shape: Any) -> bool:

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import drjit as dr
+import mitsuba as mi
 import numpy as np
 
 from ..errors import ConfigError
@@ -58,6 +59,9 @@ class Slot:
             array = np.concatenate([array[:, -self.halo :], array, array[:, : self.halo]], axis=1)
         array = np.ascontiguousarray(array, dtype=np.float32)
         value = self.type(array) if self.is_tensor or array.ndim else self.type(float(array))
+        # A sum, since NumPy's own memory would be used as it is: kernels depend on its alignment, which is random, so
+        # that a later step, whose values are Dr.Jit's own, would compile them anew.
+        value = self.type(value + dr.opaque(mi.Float, 0))
         dr.make_opaque(value)
         self.params[self.key] = value
 

@@ -37,10 +37,25 @@ def connect(plan: Plan, sensor: Any, si: Any, ray: Any, sample: Any, active: Any
     """Find where the vertex `si` appears on the film. Detached: film positions do not move here."""
     with dr.suspend_grad():
         ds, importance = sensor.sample_direction(si, sample, active)
+        if plan.needs.principal_point:
+            importance = _shifted_importance(sensor, ds)
         # From the vertex itself, where `ptracer` takes the shadow ray's direction, which starts a little off it.
         wo = si.to_local(ds.d)
         correction, valid = shading_correction(plan, si, -ray.d, ds.d, wo)
         return Connection(importance * correction, ds.uv, ds.p, wo, active & valid & (ds.pdf > 0), sample)
+
+
+def _shifted_importance(sensor: Any, ds: Any) -> Any:
+    """Importance and geometry of a pinhole camera whose principal point is not the film's centre.
+
+    Mitsuba's own is zero wherever a film that is not shifted would end.
+    """
+    film = sensor.film()
+    size, crop = film.size(), film.crop_size()
+    half = dr.tan(dr.deg2rad(mi.Float(mi.traverse(sensor)["x_fov"])) / 2)
+    area = 4 * half**2 * (int(size.y) / int(size.x)) * (int(dr.prod(crop)) / int(dr.prod(size)))
+    cos = -dr.dot(ds.d, dr.normalize(ds.n))
+    return mi.Spectrum(dr.select(ds.pdf > 0, dr.rcp(area * cos**3 * ds.dist**2), 0))
 
 
 @dataclass

@@ -164,8 +164,12 @@ def _singular_factor(plan: Plan, si: Any, bsdf: Any, scattering: Scattering, act
     if plan.needs.has_delta_lobes:
         delta = active & scattering.is_delta
         bs, weight = bsdf.sample(importance_context(), si, scattering.sample_1, scattering.sample_2, delta)
-        # A mask's weight carries the derivative of its opacity already, and so does its density.
-        f = dr.select(delta, weight * (dr.detach(bs.pdf) if plan.needs.has_null else bs.pdf), f)
+        pdf = bs.pdf
+        if plan.needs.has_null:
+            # A mask's weight carries the derivative of its opacity already, and so does its density. Other BSDFs divide
+            # by a density that may depend on their parameters (plastic).
+            pdf = dr.select(mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null), dr.detach(pdf), pdf)
+        f = dr.select(delta, weight * pdf, f)
     if plan.needs.has_null:
         null = active & scattering.is_null
         f = dr.select(null, bsdf.eval_null_transmission(si, null), f)

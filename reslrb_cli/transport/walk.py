@@ -7,7 +7,7 @@ Those that hooks need for a selection come from a stream of their own: a replay 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import drjit as dr
@@ -53,13 +53,16 @@ class Hooks:
     `numbers` says how many random numbers `connection` wants at each vertex; without `connects` no connection is
     evaluated, and `connection` is not called. A walk whose hooks are `replaying` follows
     a path that is known to get as far as `goes_on` asks, so that neither its throughput nor its roulette is computed.
-    Hooks that are `attached` keep derivatives in the loop state, which is then evaluated vertex by vertex (naive AD).
+    Hooks that are `attached` keep derivatives in the loop state, which is then evaluated vertex by vertex (naive AD);
+    with `max_iterations` the loop stays symbolic, and Dr.Jit itself reverses it, from a record of the loop state in
+    thread-local memory.
     """
 
     numbers: int = 0
     connects: bool = True
     replaying: bool = False
     attached: bool = False
+    max_iterations: int | None = None
 
     def start(self, product: Product) -> Any:
         """State before the first vertex, any PyTree; `product` is E."""
@@ -93,7 +96,7 @@ def walk(
 
     `selection` is the random stream of the hooks (`mi.PCG32`), needed where `hooks.numbers` is not 0.
     """
-    loop_mode = "evaluated" if hooks.attached else "symbolic"
+    loop_mode = "evaluated" if hooks.attached and hooks.max_iterations is None else "symbolic"
     emission = sample_emission(plan, scene, sensor, sampler)
     product, active = Product.one(plan.track_zeros, hooks.attached), mi.Bool(active)
     if not hooks.replaying:
@@ -155,12 +158,29 @@ def walk(
 
         return next_vertex(path, active, si, scattering, product, eta), state, sampler, selection
 
+    def recorded_body(path: Path, *rest: Any) -> tuple[Any, ...]:
+        path, *rest = body(_with_masks(path), *rest)
+        return _without_masks(path), *rest
+
+    recorded = hooks.max_iterations is not None
     _, state, _, _ = dr.while_loop(
-        state=(path, state, sampler, selection),
-        cond=lambda path, state, sampler, selection: path.active,
-        body=body,
+        state=(_without_masks(path) if recorded else path, state, sampler, selection),
+        cond=lambda path, state, sampler, selection: path.active != 0 if recorded else path.active,
+        body=recorded_body if recorded else body,
         labels=("path", "state", "sampler", "selection"),
         label="light path",
         mode=loop_mode,
+        max_iterations=hooks.max_iterations,
     )
     return state
+
+
+def _without_masks(path: Path) -> Path:
+    """The same for a record of the loop state: masked writes of booleans to thread-local memory end the process."""
+    path.pi.valid = mi.Bool(True)
+    return replace(path, active=dr.select(path.active, mi.UInt32(1), 0))
+
+
+def _with_masks(path: Path) -> Path:
+    path.pi.valid = mi.Bool(True)  # in active lanes
+    return replace(path, active=path.active != 0)

@@ -146,7 +146,7 @@ FILES: dict[str, tuple[str | bytes, tuple[str, ...]]] = {
     ),
     "target integrator": (
         changed("{render: {}}", "{render: {integrator: {type: path}}}"),
-        ("x.yaml: target.render.integrator.type: must be one of reslrb, ptracer, prb, walk_ad",),
+        ("x.yaml: target.render.integrator.type: must be one of reslrb, ptracer, prb, walk_ad, trajectory",),
     ),
     "sensor negative": (changed("scene.xml", "a, sensors: [-1]"), ("x.yaml: scene.sensors[0]: must be at least 0",)),
     "sensor twice": (
@@ -160,12 +160,37 @@ FILES: dict[str, tuple[str | bytes, tuple[str, ...]]] = {
     "home of nobody": (changed("scene.xml", "~no-such-user-here/a"), ("x.yaml: scene.file: must be a path",)),
     "unknown integrator": (
         GOOD + "integrator: {type: reslbr}\n",
-        ("x.yaml: integrator.type: must be one of reslrb, ptracer, prb, walk_ad (did you mean reslrb?)",),
+        ("x.yaml: integrator.type: must be one of reslrb, ptracer, prb, walk_ad, trajectory (did you mean reslrb?)",),
     ),
     "type is a list": (GOOD + "integrator: {type: [prb]}\n", ("x.yaml: integrator.type: must be one of",)),
     "option of another integrator": (
         GOOD + "integrator: {type: prb, estimator: reservoir}\n",
         ("x.yaml: integrator.estimator: not an option of prb but of reslrb",),
+    ),
+    "option of another estimator": (
+        GOOD + "integrator: {estimator: gather, capacity: 2}\n",
+        ("x.yaml: integrator.capacity: has no effect with estimator `gather`, but with `reservoir`",),
+    ),
+    "estimator's option left at its default": (
+        GOOD + "integrator: {stack_size: 64}\n",
+        ("x.yaml: integrator.stack_size: has no effect with estimator `reservoir`, but with `stack`",),
+    ),
+    "unknown estimator": (
+        GOOD + "integrator: {estimator: gater}\n",
+        ("x.yaml: integrator.estimator: must be one of", "(did you mean gather?)"),
+    ),
+    "capacity": (GOOD + "integrator: {capacity: 0}\n", ("x.yaml: integrator.capacity: must be at least 1",)),
+    "stack size": (
+        GOOD + "integrator: {estimator: stack, stack_size: 0}\n",
+        ("x.yaml: integrator.stack_size: must be at least 1",),
+    ),
+    "weight": (
+        GOOD + "integrator: {weight: adjont}\n",
+        ("x.yaml: integrator.weight: must be luminance or adjoint (did you mean adjoint?)",),
+    ),
+    "weight that is not known yet": (
+        GOOD + "integrator: {weight: adjoint}\n",
+        ("x.yaml: integrator.weight: `adjoint` needs dL/dI before", "run.adjoint: correlated"),
     ),
     "option of another optimiser": (
         GOOD + "optimizer: {type: sgd, beta_1: 0.5}\n",
@@ -193,6 +218,10 @@ FILES: dict[str, tuple[str | bytes, tuple[str, ...]]] = {
         ("x.yaml: optimizer.learning_rate: must be a finite",),
     ),
     "momentum one": (GOOD + "optimizer: {type: sgd, momentum: 1}\n", ("x.yaml: optimizer.momentum: must be below 1",)),
+    "record without end": (
+        GOOD + "integrator: {type: trajectory, max_depth: -1}\n",
+        ("x.yaml: integrator.max_depth: must be at least 0",),
+    ),
     "depth": (GOOD + "integrator: {max_depth: -2}\n", ("x.yaml: integrator.max_depth: must be at least -1",)),
     "flag is a number": (
         GOOD + "integrator: {hide_emitters: 1}\n",

@@ -111,8 +111,10 @@ def test_near_clip_cuts_surfaces_away():
     assert result, result
 
 
-def test_principal_point():
-    scene = seen(camera(principal_point_offset_x=0.2, principal_point_offset_y=-0.1))
+@pytest.mark.parametrize("film", [{}, CROP])
+def test_principal_point(film):
+    # `ptracer` clips it to where the film would be without the offset.
+    scene = seen(camera(film=film, principal_point_offset_x=0.2, principal_point_offset_y=-0.1))
     result = agreement(scene)
     assert result, result
 

@@ -1,0 +1,115 @@
+#!/usr/bin/env python3
+"""Make the pictures in `docs/images/`.
+
+    scripts/make_figures.py run RUN_FOLDER OUT.png    from a finished run: target, start, recovered and true texture
+    scripts/make_figures.py scenes OUT.png            render the scenes in `scenes/`
+
+Both need the environment that `scripts/setup` makes: run them with `.venv/bin/python`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.image import imread
+from PIL import Image as Picture
+
+import reslrb_cli  # noqa: F401  # chooses libLLVM, so it comes before Mitsuba
+
+ROOT = Path(__file__).resolve().parent.parent
+PANEL, MARGIN, TITLE = 1.9, 0.06, 0.24  # inches
+DPI = 100
+HEIGHT = 180  # pixels of a scene's picture
+#: Samples per pixel, the longest path, and the exposure of each scene's picture.
+SCENES = {
+    "cornell_floor": (1024, 8, 1.0),
+    "grey_room": (4096, 16, 1.0),
+    "caustic_slab": (1024, 5, 1.0),
+    "furnace": (64, 8, 0.2),
+}
+
+Image = np.ndarray[Any, Any]
+
+
+def main() -> None:
+    """Parse the command line and write one picture."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    kinds = parser.add_subparsers(dest="kind", required=True)
+    run = kinds.add_parser("run", help="strip from a run folder")
+    run.add_argument("folder", type=Path)
+    run.add_argument("out", type=Path)
+    scenes = kinds.add_parser("scenes", help="strip of the shipped scenes")
+    scenes.add_argument("out", type=Path)
+    arguments = parser.parse_args()
+    write_strip(run_panels(arguments.folder) if arguments.kind == "run" else scene_panels(), arguments.out)
+
+
+def run_panels(folder: Path) -> list[tuple[str, Image]]:
+    """Target, initial image, and the first texture of the run: recovered, and true where it is known."""
+    summary = json.loads((folder / "parameters" / "parameters.json").read_text())
+    texture = next((entry["file"] for entry in summary.values() if "file" in entry), None)
+    if texture is None:
+        raise SystemExit(f"{folder}: the run recovered no texture")
+    files = {
+        "target": folder / "images" / "target.png",
+        "start": folder / "images" / "initial.png",
+        "recovered texture": folder / "parameters" / texture,
+        "true texture": folder / "parameters" / "true" / texture,
+    }
+    return [(title, imread(file.with_suffix(".png"))) for title, file in files.items() if file.exists()]
+
+
+def scene_panels() -> list[tuple[str, Image]]:
+    """The scenes in `scenes/`, light-traced by `reslrb`."""
+    from reslrb_cli.backend.variant import set_variant
+    from reslrb_cli.integrators import make_integrator
+    from reslrb_cli.optimization.rendering import render_in_passes
+    from reslrb_cli.scene import load_scene
+
+    set_variant("auto")
+    panels = []
+    for name, (spp, max_depth, exposure) in SCENES.items():
+        width = HEIGHT * 4 // 3 if name == "grey_room" else HEIGHT
+        scene = load_scene(ROOT / "scenes" / name / "scene.xml", {"resx": width, "resy": HEIGHT})
+        integrator = make_integrator("reslrb", max_depth=max_depth)
+        image = render_in_passes(integrator, scene, 0, spp, 0, 0, "figure", None)
+        panels.append((name, encode(image * exposure)))
+    return panels
+
+
+def encode(image: Image) -> Image:
+    """Linear values as sRGB in [0, 1]."""
+    image = np.clip(image[:, :, :3], 0, 1)
+    return np.where(image <= 0.0031308, 12.92 * image, 1.055 * image ** (1 / 2.4) - 0.055)
+
+
+def write_strip(panels: Sequence[tuple[str, Image]], out: Path) -> None:
+    """Write panels of equal height beside each other, a title above each."""
+    widths = [PANEL * image.shape[1] / image.shape[0] for _, image in panels]
+    size = sum(widths) + MARGIN * (len(panels) - 1), PANEL + TITLE
+    figure = Figure(figsize=size, dpi=DPI, facecolor="white")
+    left = 0.0
+    for (title, image), width in zip(panels, widths, strict=True):
+        axes = figure.add_axes((left / size[0], 0, width / size[0], PANEL / size[1]))
+        fine = image.shape[0] >= PANEL * DPI  # shrink with a filter, enlarge texel by texel
+        axes.imshow(image, interpolation="antialiased" if fine else "nearest", aspect="auto")
+        axes.set_axis_off()
+        axes.set_title(title, fontsize=8, pad=3)
+        left += width + MARGIN
+    out.parent.mkdir(parents=True, exist_ok=True)
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    # 256 colours: noise compresses badly, and the repository is to stay small.
+    Picture.fromarray(np.asarray(canvas.buffer_rgba())[:, :, :3].copy()).quantize(256).save(out, optimize=True)
+    print(f"{out}: {out.stat().st_size / 1000:.0f} kB")
+
+
+if __name__ == "__main__":
+    main()

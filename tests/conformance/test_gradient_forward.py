@@ -1,0 +1,82 @@
+"""Naive AD of our walk, forward mode, and the reservoir, each against the others at equal seeds."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from conformance.gradient_cases import CASES
+from conformance.gradients import Case, integrator, relative, seeds
+from conformance.stats import compare
+
+pytestmark = pytest.mark.usefixtures("llvm")
+
+BY_NAME = {case.name: case for case in CASES}
+
+#: Where stock `ptracer` is right and traces the same paths: not masks, rotated environment maps, bump and normal maps,
+#: nor where its directions move with a parameter.
+SAME_PATHS = ("texture", "gaussian", "crop", "rgba", "thin_lens", "twosided", "mirror", "glass", "area", "area_texture",
+              "point", "spot", "projector", "directional", "directionalarea", "constant")  # fmt: skip
+
+
+@pytest.mark.parametrize("name", SAME_PATHS)
+def test_walk_ad_is_ptracer(name: str):
+    case = BY_NAME[name]
+    scene = Case(case.scene(), case.keys)
+    options = case.both | {"hide_emitters": True}
+    ours = scene.gradient(integrator("walk_ad", **options), 3, 64)
+    assert relative(ours, scene.gradient(integrator("ptracer", **options), 3, 64)) < 1e-4
+
+
+def forward(scene: Case, integrator: Any, seed: int, spp: int) -> np.ndarray:
+    """The image's derivative along the first of the random directions of the parameters."""
+    import drjit as dr
+    import mitsuba as mi
+
+    direction, at, leaves = scene.directions(1)[0], 0, {}
+    for key in scene.keys:
+        leaves[key] = type(scene.params[key])(dr.detach(scene.params[key]))
+        dr.enable_grad(leaves[key])
+        scene.params[key] = type(leaves[key])(leaves[key])
+    scene.params.update()
+    for key, leaf in leaves.items():
+        size = len(scene.initial[key])
+        dr.set_grad(leaf, scene.shaped(key, direction[at : at + size]))
+        dr.enqueue(dr.ADMode.Forward, leaf)
+        at += size
+    dr.traverse(dr.ADMode.Forward, dr.ADFlag.ClearEdges)
+    image = mi.render(scene.scene, scene.params, integrator=integrator, seed=seed, seed_grad=seed + 1, spp=spp)
+    result = np.array(dr.forward_to(image), dtype=np.float64)[:, :, :3]  # derivative of alpha: none
+    for key in scene.keys:
+        scene.params[key] = dr.detach(leaves[key])
+    scene.params.update()
+    return result
+
+
+@pytest.mark.parametrize("name", [case.name for case in CASES if case.name not in ("texture_prb", "retained")])
+def test_forward_mode_is_walk_ad(name: str):
+    case = BY_NAME[name]
+    scene = Case(case.scene(), case.keys)
+    tangent = forward(scene, integrator("reslrb", **case.both), 3, 32)
+    naive = forward(scene, integrator("walk_ad", **case.both), 3, 32)
+    assert np.abs(naive).max() > 0
+    assert relative(tangent, naive) < 1e-5
+    # The adjoint of the same derivative: <weights, J v> = <J^T weights, v>, at the seed that forward mode had.
+    gradient = scene.gradient(integrator("walk_ad", **case.both), 4, 32)
+    assert np.sum(naive * np.array(scene.weights)) == pytest.approx(gradient @ scene.directions(1)[0], rel=1e-3)
+
+
+@pytest.mark.parametrize("name", ["texture", "roulette", "glass", "blend", "visible_lamp"])
+def test_forward_against_backward(name: str):
+    """<weights, J v> against <J^T weights, v>, where J^T is the reservoir's."""
+    case = BY_NAME[name]
+    scene = Case(case.scene(), case.keys)
+    ours = integrator("reslrb", **case.both | case.options)
+    direction = np.abs(scene.directions(1)[0])
+    scene.directions = lambda count: direction[None]  # one sign, so that the product is not lost in its noise
+    tangents = np.array([np.sum(forward(scene, ours, s, case.spp) * np.array(scene.weights)) for s in seeds(16)])
+    gradients = scene.gradients(ours, seeds(16, 1), case.spp) @ direction
+    result = compare(tangents[:, None], gradients[:, None], block=None)
+    assert result
+    assert result.relative_error < 0.03

@@ -1,0 +1,128 @@
+"""The second step compiles nothing: no seed, parameter value or adjoint image reaches a kernel as a literal."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from conformance.gradient_cases import CASES
+from conformance.gradients import Case, integrator
+
+from reslrb_cli.scene import load_scene
+
+pytestmark = pytest.mark.usefixtures("llvm")
+
+ROOT = Path(__file__).resolve().parents[2]
+
+#: The shipped scenes and what is optimised in them.
+SHIPPED = {
+    "cornell_floor": ("floor.reflectance.data",),
+    "grey_room": ("painting.reflectance.data", "sky.data"),
+    "caustic_slab": ("receiver.reflectance.data",),
+    "furnace": None,
+}
+
+
+class Kernels:
+    """The kernels that were launched, told apart by their hash: `cache_hit` is also set for those found on the disk."""
+
+    def __init__(self) -> None:
+        self.known: set[str] = set()
+
+    def new(self, step: Callable[[], Any]) -> list[dict]:
+        """The kernels of `step` that no earlier one launched."""
+        import drjit as dr
+
+        dr.kernel_history_clear()
+        with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+            step()
+            dr.sync_thread()
+            history = dr.kernel_history((dr.KernelType.JIT,))
+        assert history, "no kernel was launched"
+        found = [kernel for kernel in history if kernel["hash"] not in self.known]
+        self.known |= {kernel["hash"] for kernel in found}
+        return found
+
+
+def steps_compile_nothing(scene: Case, step: Callable[[int], Any]) -> None:
+    """Steps 2 to 4, each with another seed and, from step 3, other parameter values."""
+    kernels = Kernels()
+    scene.set(scene.initial)
+    kernels.new(lambda: step(1))
+    for seed in (2, 3, 4):
+        if seed > 2:
+            shift = 1 - 0.02 * seed
+            scene.set({key: value * shift for key, value in scene.initial.items()})
+        found = kernels.new(lambda: step(seed))  # noqa: B023
+        assert not found, f"step {seed} compiled kernels of {[k['operation_count'] for k in found]} operations"
+
+
+@pytest.mark.parametrize("adjoint", ["correlated", "independent"])
+@pytest.mark.parametrize("name", [case.name for case in CASES])
+def test_second_step_compiles_nothing(name: str, adjoint: str):
+    case = next(case for case in CASES if case.name == name)
+    scene = Case(case.scene(), case.keys)
+    ours = integrator("reslrb", **case.both | case.options)
+
+    def loss(image: Any) -> Any:  # dL/dI changes with the image
+        import drjit as dr
+
+        return dr.sum(dr.square(image[:, :, :3] - scene.weights), axis=None)
+
+    steps_compile_nothing(scene, lambda seed: scene.gradient(ours, seed, 16, loss, adjoint=adjoint))
+
+
+@pytest.mark.parametrize("adjoint", ["correlated", "independent"])
+@pytest.mark.parametrize("name", SHIPPED)
+def test_second_step_compiles_nothing_on_shipped_scenes(name: str, adjoint: str):
+    import drjit as dr
+    import mitsuba as mi
+
+    loaded = load_scene(ROOT / "scenes" / name / "scene.xml", {"resx": 16, "resy": 16, "spp": 4})
+    found = list(mi.traverse(loaded).keys())
+    keys = SHIPPED[name] or [key for key in found if "reflectance" in key or "radiance" in key][:2]
+    assert set(keys) <= set(found), found
+    scene = Case.of(loaded, keys)
+    ours = integrator("reslrb", 6, 3)
+
+    def step(seed: int) -> None:
+        def loss(image: Any) -> Any:
+            return dr.mean(dr.square(image - 0.5), axis=None)
+
+        scene.gradient(ours, seed, 4, loss, adjoint=adjoint)
+
+    steps_compile_nothing(scene, step)
+
+
+def test_zero_texels_come_and_go():
+    """A texel that reaches zero asks for other kernels once, and for none when it leaves zero."""
+    case = next(case for case in CASES if case.name == "texture")
+    scene = Case(case.scene(), case.keys)
+    ours = integrator("reslrb")
+    initial = dict(scene.initial)
+    zero = {key: np.where(np.arange(value.size) == 0, 0.0, value) for key, value in initial.items()}
+
+    def step(seed: int, values: dict[str, np.ndarray]) -> None:
+        scene.set(values)
+        scene.gradient(ours, seed, 16)
+
+    kernels = Kernels()
+    kernels.new(lambda: step(1, initial))
+    assert kernels.new(lambda: step(2, zero)), "zeros are not tracked"
+    assert not kernels.new(lambda: step(3, zero))
+    assert not kernels.new(lambda: step(4, initial))
+    assert not kernels.new(lambda: step(5, zero))
+
+
+def test_image_seeds_compile_nothing():
+    from conformance.gradients import render_image
+
+    case = next(case for case in CASES if case.name == "texture")
+    scene = Case(case.scene(), case.keys)
+    ours = integrator("reslrb")
+    kernels = Kernels()
+    kernels.new(lambda: np.array(render_image(ours, scene.scene, 0, 1, 16)))
+    assert not kernels.new(lambda: np.array(render_image(ours, scene.scene, 0, 2, 16)))

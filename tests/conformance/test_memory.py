@@ -1,0 +1,64 @@
+"""Peak memory of a gradient step: flat in depth for the reservoir, linear for naive AD."""
+
+from __future__ import annotations
+
+import gc
+
+import pytest
+from conformance.gradients import Case, diffuse, integrator, room, texture
+
+pytestmark = pytest.mark.usefixtures("llvm")
+
+FLOOR = "floor.brdf_0.reflectance.data"
+SPP = 256
+
+
+@pytest.fixture(scope="module")
+def case(llvm: str) -> Case:
+    """Bright walls all around, so that paths do reach the depth limit."""
+    bright = {"type": "twosided", "bsdf": diffuse(0.95, 0.95, 0.95)}
+    floor = {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": texture(8, 8, 0.8, 0.95)}}
+    cave = {"type": "sphere", "radius": 8.0, "flip_normals": True, "bsdf": diffuse(0.95, 0.95, 0.95)}
+    return Case(room(floor=floor, wall=bright, side=bright, cave=cave), (FLOOR,))
+
+
+def peak(case: Case, name: str, max_depth: int, **step: str) -> int:
+    """Most bytes that the allocator gave out at any time of a second step, above what stood before it."""
+    import drjit as dr
+
+    # rr_depth beyond any depth: no roulette
+    tracer = integrator(name, max_depth, 1000)
+    case.gradient(tracer, 1, SPP, **step)
+    gc.collect()
+    dr.sync_thread()
+    dr.flush_malloc_cache()
+    dr.detail.malloc_clear_statistics()
+    before = dr.detail.malloc_watermark(dr.JitBackend.LLVM)
+    case.gradient(tracer, 2, SPP, **step)
+    dr.sync_thread()
+    return dr.detail.malloc_watermark(dr.JitBackend.LLVM) - before
+
+
+@pytest.mark.parametrize("adjoint", ["correlated", "independent"])
+def test_reservoir_is_flat(case: Case, adjoint: str):
+    peaks = {depth: peak(case, "reslrb", depth, adjoint=adjoint) for depth in (2, 4, 16, 64, 256)}
+    print(adjoint, peaks)
+    assert peaks[2] > 1 << 20, "the watermark sees nothing"
+    assert max(peaks.values()) <= 1.02 * min(peaks.values()), peaks
+
+
+def test_naive_ad_grows(case: Case):
+    ours = {depth: peak(case, "reslrb", depth) for depth in (4, 16)}
+    for name in ("ptracer", "walk_ad"):
+        peaks = {depth: peak(case, name, depth) for depth in (4, 16)}
+        print(name, peaks, "reslrb", ours)
+        assert peaks[16] > 2.5 * peaks[4], name
+        assert ours[16] < 0.25 * peaks[16], name
+
+
+@pytest.mark.long
+def test_naive_ad_grows_linearly(case: Case):
+    peaks = {depth: peak(case, "ptracer", depth) for depth in (4, 8, 16, 32)}
+    print(peaks)
+    slopes = [(peaks[2 * depth] - peaks[depth]) / depth for depth in (4, 8, 16)]
+    assert max(slopes) < 1.5 * min(slopes)

@@ -1,0 +1,309 @@
+"""reslrb as a Mitsuba plugin and through our own step, as a script would use it; every option changes something."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from conformance.gradient_cases import FLOOR, _mask, _textured
+from conformance.gradients import Case, camera, integrator, lamp, relative, render_image, rgb, room, seeds
+from conformance.stats import compare
+
+from reslrb_cli.errors import UnsupportedScene
+
+pytestmark = pytest.mark.usefixtures("llvm")
+
+SCRIPT = """
+import reslrb_cli
+import mitsuba as mi
+if {before}:
+    reslrb_cli.register()
+mi.set_variant("llvm_ad_rgb")
+if not {before}:
+    reslrb_cli.register()
+import drjit as dr
+scene = mi.load_dict(mi.cornell_box() | {{"integrator": {{"type": "reslrb", "max_depth": 3}}}}, optimize=False)
+params = mi.traverse(scene)
+key = "white.reflectance.value"
+dr.enable_grad(params[key])
+params.update()
+dr.backward(dr.mean(mi.render(scene, params, spp=1), axis=None))
+print("gradient", dr.grad(params[key]).numpy().min() > 0)
+for variant in ("llvm_ad_mono", "llvm_ad_rgb"):
+    mi.set_variant(variant)
+    print(mi.load_dict({{"type": "reslrb", "max_depth": 3}}).max_depth)
+"""
+
+
+@pytest.mark.parametrize("before", [True, False])
+def test_register_before_and_after_the_variant(before: bool):
+    run = subprocess.run([sys.executable, "-c", SCRIPT.format(before=before)], capture_output=True, text=True,
+                         cwd=Path(__file__).resolve().parents[2], timeout=120)  # fmt: skip
+    assert run.returncode == 0, run.stderr
+    assert run.stdout.split() == ["gradient", "True", "3", "3"]
+
+
+@pytest.fixture(scope="module")
+def case(llvm: str) -> Case:
+    """The textured room."""
+    return Case(_textured(), (FLOOR,))
+
+
+@pytest.fixture(scope="module")
+def shown(llvm: str) -> Case:
+    """The textured room with an emitter in view."""
+    sign = lamp(radiance=rgb(0.5, 0.6, 0.7)) | {"to_world": _facing()}
+    return Case(_textured(sign=sign), (FLOOR,))
+
+
+def _facing() -> Any:
+    from conformance.gradients import transform
+
+    return transform(translate=[0.2, -0.1, 1.2], rotate=([0, 1, 0], 15), scale=0.4)
+
+
+def test_defaults_are_ptracers():
+    ours, stock = integrator("reslrb", max_depth=-1, rr_depth=5), str(integrator("ptracer", max_depth=-1, rr_depth=5))
+    import mitsuba as mi
+
+    default = mi.load_dict({"type": "reslrb"})
+    assert (default.max_depth, default.rr_depth, default.hide_emitters) == (ours.max_depth, ours.rr_depth, False)
+    assert default.samples_per_pass is None
+    assert f"max_depth = {default.max_depth}" in stock.replace("4294967295", "-1")
+    assert f"rr_depth = {default.rr_depth}" in str(mi.load_dict({"type": "ptracer"}))
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"max_depth": -2},
+        {"rr_depth": 0},
+        {"samples_per_pass": 0},
+        {"estimator": "rezervoir"},
+        {"image": "some"},
+        {"max_dpth": 3},
+        {"max_depth": "deep"},
+    ],
+    ids=str,
+)
+def test_wrong_options_raise(options: dict[str, Any]):
+    import mitsuba as mi
+
+    with pytest.raises((ValueError, RuntimeError, TypeError)):
+        mi.load_dict({"type": "reslrb", **options})
+
+
+@pytest.mark.parametrize("name", ["estimator", "image"])
+def test_walk_ad_knows_no_estimators(name: str):
+    import mitsuba as mi
+
+    with pytest.raises(RuntimeError):
+        mi.load_dict({"type": "walk_ad", name: "all"})
+
+
+def test_samples_that_passes_do_not_divide_raise(case: Case):
+    with pytest.raises(ValueError, match="multiple"):
+        render_image(integrator("reslrb", samples_per_pass=3), case.scene, 0, 1, 16)
+
+
+def test_mi_render_backward_through_a_latent_variable(case: Case):
+    """Parameters that are a function of something else: gradients arrive there, and are those of our own step."""
+    import drjit as dr
+    import mitsuba as mi
+
+    ours, key, steps = integrator("reslrb"), FLOOR, []
+    for seed in seeds(12):
+        latent = mi.Float(0.8)
+        dr.enable_grad(latent)
+        case.params[key] = mi.TensorXf(case.initial[key].reshape(case.params[key].shape)) * latent
+        case.params.update()
+        image = mi.render(case.scene, case.params, integrator=ours, seed=seed, spp=64)
+        dr.backward(case.objective(image))
+        steps.append(float(dr.grad(latent)[0]))
+    case.set(case.initial)
+    case.set({key: 0.8 * case.initial[key]})
+    direct = case.gradients(ours, seeds(12, 1), 64) @ case.initial[key]
+    case.set(case.initial)
+    assert np.mean(steps) > 0
+    assert compare(np.array(steps)[:, None], direct[:, None], block=None)
+
+
+def test_mi_render_adds_to_gradients_that_are_there(case: Case):
+    import drjit as dr
+    import mitsuba as mi
+
+    ours, leaf = integrator("reslrb"), mi.TensorXf(case.params[FLOOR])
+    dr.enable_grad(leaf)
+    sums = []
+    for seed in (1, 2):
+        case.params[FLOOR] = mi.TensorXf(leaf)
+        case.params.update()
+        dr.backward(case.objective(mi.render(case.scene, case.params, integrator=ours, seed=seed, spp=16)))
+        sums.append(np.array(dr.grad(leaf)))
+    case.set(case.initial)
+    assert (sums[1] > sums[0]).mean() > 0.9
+
+
+def test_several_sensors_accumulate(llvm: str):
+    """Two views of one scene: gradients add up, and each is that of a scene with that view alone."""
+    import drjit as dr
+    import mitsuba as mi
+
+    from reslrb_cli.integrators import gradient_step
+
+    other = camera() | {
+        "to_world": mi.ScalarTransform4f().look_at(origin=[0.2, 1.2, 4], target=[0, 0, 0], up=[0, 1, 0])
+    }
+    both, second = Case(_textured(other=other), (FLOOR,)), Case(_textured(camera=other), (FLOOR,))
+    ours = integrator("reslrb")
+    leaf = mi.TensorXf(dr.detach(both.params[FLOOR]))
+    dr.enable_grad(leaf)
+    both.params[FLOOR] = mi.TensorXf(leaf)
+    both.params.update()
+    for sensor in (0, 1):
+        gradient_step(ours, both.scene, sensor, both.objective, seed=5 + sensor, spp=32)
+    total = np.array(dr.grad(leaf)).ravel()
+    both.set(both.initial)
+    first_alone, second_alone = both.gradient(ours, 5, 32), second.gradient(ours, 6, 32)
+    assert relative(total, first_alone + second_alone) < 1e-5
+
+
+def test_one_latent_for_several_sensors(llvm: str):
+    """A view's propagation may not take the edges above the parameters from the next one."""
+    import drjit as dr
+    import mitsuba as mi
+
+    from reslrb_cli.integrators import gradient_step
+
+    scene = Case(_textured(other=camera()), (FLOOR,))
+    for name in ("reslrb", "walk_ad", "ptracer", "prb"):
+        tracer, sums = integrator(name), []
+        latent = mi.Float(1)
+        dr.enable_grad(latent)
+        scene.params[FLOOR] = mi.TensorXf(scene.initial[FLOOR].reshape(scene.params[FLOOR].shape)) * latent
+        scene.params.update()
+        for sensor in (0, 1):
+            gradient_step(tracer, scene.scene, sensor, scene.objective, seed=5, spp=16, params=scene.params)
+            sums.append(np.array(dr.grad(scene.params[FLOOR])).sum())
+        dr.enqueue(dr.ADMode.Backward, scene.params[FLOOR])
+        dr.traverse(dr.ADMode.Backward)
+        assert sums[1] == pytest.approx(2 * sums[0], rel=1e-4), name
+        assert float(dr.grad(latent)[0]) > 0, name
+        scene.set(scene.initial)
+
+
+@pytest.mark.parametrize("key", ["floor_shape.to_world", "lamp.to_world"])
+@pytest.mark.parametrize("name", ["reslrb", "walk_ad"])
+def test_geometry_is_refused(name: str, key: str):
+    import drjit as dr
+
+    from reslrb_cli.integrators import gradient_step
+
+    case = Case(_textured(), (FLOOR,))
+    dr.enable_grad(case.params[key])
+    case.params.update()
+    with pytest.raises(UnsupportedScene, match=key):
+        gradient_step(integrator(name), case.scene, 0, case.objective, seed=1, spp=4)
+
+
+def test_correlated_and_independent(case: Case):
+    """Equal in expectation for a linear objective; a nonlinear one shows which samples delta comes from."""
+    import drjit as dr
+
+    ours = integrator("reslrb")
+
+    def square(image: Any) -> Any:
+        return dr.sum(dr.square(image[:, :, :3]), axis=None)
+
+    def total(adjoint: str, objective: Any, spp: int, block: int) -> np.ndarray:
+        steps = [case.gradient(ours, seed, spp, objective, adjoint=adjoint) for seed in seeds(16, block)]
+        return np.stack(steps).sum(1, keepdims=True)
+
+    assert compare(total("correlated", None, 64, 0), total("independent", None, 64, 1), block=None)
+    correlated, independent = total("correlated", square, 4, 0), total("independent", square, 4, 0)
+    assert correlated.mean() > 1.1 * independent.mean()  # a pixel's noise is correlated with its own derivative
+
+
+def test_the_same_seed_gives_the_same_step(case: Case):
+    ours = integrator("reslrb")
+    first, again, other = (case.gradient(ours, seed, 16) for seed in (3, 3, 4))
+    assert relative(first, again) < 1e-5
+    assert relative(first, other) > 0.01
+
+
+def test_step_returns_image_and_loss(case: Case):
+    import drjit as dr
+
+    from reslrb_cli import step
+
+    for adjoint in ("correlated", "independent"):
+        result = step(integrator("reslrb"), case.scene, 0, case.objective, seed=9, spp=16, adjoint=adjoint)
+        image = np.array(result.image)
+        assert image.shape == (16, 16, 3)
+        assert np.array(result.loss) == pytest.approx(np.sum(image * np.array(case.weights)), rel=1e-5)
+        assert not dr.grad_enabled(result.image)
+        assert np.allclose(image, np.array(render_image(integrator("reslrb"), case.scene, 0, 9, 16)), rtol=1e-4)
+
+
+def test_max_depth(case: Case):
+    """0: nothing; 1: directly visible emission alone; more: more light, and derivatives."""
+    totals = [case.value(integrator("reslrb", depth), 1, 64) for depth in (0, 1, 2, 3, 6)]
+    assert totals[:2] == [0, 0]
+    assert all(low < high for low, high in pairwise(totals[1:]))
+    for depth in (0, 1):
+        assert not case.gradient(integrator("reslrb", depth), 1, 16).any()
+
+
+def test_hide_emitters(shown: Case):
+    images = [np.array(render_image(integrator("reslrb", hide_emitters=hide), shown.scene, 0, 1, 64))
+              for hide in (False, True)]  # fmt: skip
+    lit = np.abs(images[0] - images[1]).sum(-1) > 0.1
+    assert 0.02 < lit.mean() < 0.5
+
+
+def test_rr_depth_ends_paths(case: Case):
+    early, late = (case.gradients(integrator("reslrb", 8, rr), seeds(8), 16) for rr in (1, 1000))
+    assert relative(early, late) > 0.01
+
+
+def test_samples_per_pass(case: Case):
+    whole, parts = integrator("reslrb"), integrator("reslrb", samples_per_pass=16)
+    one, several = (np.array(render_image(tracer, case.scene, 0, 1, 64)) for tracer in (whole, parts))
+    assert relative(one, several) > 1e-3  # other samples,
+    assert one.mean() == pytest.approx(several.mean(), rel=0.05)  # as many of them
+    only = np.array(render_image(integrator("reslrb", samples_per_pass=64), case.scene, 0, 1, 64))
+    assert relative(one, only) < 1e-5
+
+
+def test_retained_image_has_the_same_expectation(case: Case):
+    every, retained = (integrator("reslrb", image=image) for image in ("all", "retained"))
+    from reslrb_cli.integrators import gradient_step
+
+    def images(tracer: Any, block: int) -> np.ndarray:
+        steps = [gradient_step(tracer, case.scene, 0, case.objective, seed=s, spp=64) for s in seeds(16, block)]
+        return np.stack([np.array(step.image, np.float64) for step in steps])
+
+    a, b = images(every, 0), images(retained, 1)
+    assert compare(a, b, block=8)
+    assert b.std(0).mean() > 1.05 * a.std(0).mean()
+
+
+def test_a_plan_is_not_taken_from_another_scene(llvm: str):
+    """Scenes come and go, and their addresses are used again: what one needs may not be read off another."""
+    import gc
+
+    tracer, plain = integrator("reslrb"), room()
+    for _ in range(6):
+        scene = Case(plain, ("wall.brdf_0.reflectance.value",))
+        assert not tracer.plan(scene.scene, scene.scene.sensors()[0]).needs.has_null
+        del scene
+        gc.collect()
+        masked = Case(_mask(0.5), ("wall.brdf_0.reflectance.value",))
+        assert tracer.plan(masked.scene, masked.scene.sensors()[0]).needs.has_null
+        del masked
+        gc.collect()
