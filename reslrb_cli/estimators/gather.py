@@ -26,7 +26,7 @@ from reslrb_cli.estimators.base import (
     differentiate_passage,
 )
 from reslrb_cli.estimators.sums import AdjointSum
-from reslrb_cli.transport.connection import Connection, Seen, passage, stand_in
+from reslrb_cli.transport.connection import Connection, Seen, stand_in
 from reslrb_cli.transport.factors import NO_ZERO, Product
 from reslrb_cli.transport.scattering import Scattering, attached_factors
 from reslrb_cli.transport.walk import Vertex
@@ -111,8 +111,6 @@ class Taking(VertexHooks):
     `S` sums the connections of the vertices from `first` on; what comes before them is left alone.
     """
 
-    connects = False  # it evaluates connections itself, with their derivatives
-
     def __init__(self, p: Pass, visibility: Visibility, S: AdjointSum, first: int = 1) -> None:
         super().__init__(p)
         self.visibility, self.S, self.first = visibility, S, first
@@ -120,37 +118,36 @@ class Taking(VertexHooks):
     def start(self, product: Product) -> AdjointSum:
         return self.S
 
+    def seen(self, vertex: Vertex) -> Seen:
+        return self.visibility.seen(vertex.depth, vertices(self.p))
+
     def goes_on(self, state: AdjointSum, vertex: Vertex) -> Any:
         return vertex.depth < self.visibility.last
 
     def scattering(self, state: AdjointSum, vertex: Vertex, connection: Connection, scattering: Scattering) -> Any:
-        p, plan = self.p, self.p.plan
-        seen = self.visibility.seen(vertex.depth, vertices(p))
-        scattered = scattering.active
+        p, plan, connected = self.p, self.p.plan, connection.active
+        useful = plan.differentiates(vertex.bsdf)
         if self.first > 1:
             # Not in place: the walk goes on with the same masks.
-            connection.active = connection.active & (vertex.depth >= self.first)
-            scattered = scattered & (vertex.depth >= self.first)
-        connection.active, transmittance = passage(plan, p.scene, vertex.si, vertex.depth, connection, seen)
+            connected = connected & (vertex.depth >= self.first)
+            useful = useful & (vertex.depth >= self.first)
+        C = contribution(p, vertex, connection)
+        delta = p.adjoint.lookup(connection.u, connected)
+        S = state.minus(delta, C, vertex.depth, connected)
+        own = PathAdjoint(delta * C.nonzero, C)
+        rest_c = mi.Spectrum(dr.rcp(stand_in(connection)[0]))
+        if plan.needs.has_null:
+
+            def adjoint_of(transmission: Any) -> Any:
+                return adjoint_of_factor(own, mi.Int32(NO_ZERO), transmission, 0)
+
+            rest_c *= differentiate_passage(p, vertex.si, vertex.depth, connection, connected, adjoint_of)
+        weight_c = adjoint_of_factor(own, vertex.depth, connection.f, rest_c)
+        weight_s = S.adjoint_of_factor(scattering.f, vertex.product, scattering.correction / scattering.pdf)
+        connected, scattered = connected & useful, scattering.active & useful
         with dr.resume_grad():
-            f_c, f_s = attached_factors(
-                plan, vertex.si, vertex.bsdf, connection.wo, connection.active, scattering, scattered
-            )
-            connection.c = dr.detach(f_c) * transmittance * connection.weight
-            C = contribution(p, vertex, connection)
-            delta = p.adjoint.lookup(connection.u, connection.active)
-            S = state.minus(delta, C, vertex.depth, connection.active)
-            own = PathAdjoint(delta * C.nonzero, C)
-            if plan.needs.has_null:
-                # Once more through the masks: their derivative needs the contribution, which needs their transmission.
-                differentiate_passage(
-                    p, vertex.si, vertex.depth, connection, connection.active,
-                    lambda t: adjoint_of_factor(own, mi.Int32(NO_ZERO), t, 0),
-                )  # fmt: skip
-            weight_c = adjoint_of_factor(own, vertex.depth, f_c, dr.rcp(stand_in(connection)[0]) * transmittance)
-            weight_s = S.adjoint_of_factor(f_s, vertex.product, scattering.correction / scattering.pdf)
-            objective = dr.select(connection.active, weight_c * f_c, 0)
-            dr.backward_from(objective + dr.select(scattered, weight_s * f_s, 0))
+            f_c, f_s = attached_factors(plan, vertex.si, vertex.bsdf, connection.wo, connected, scattering, scattered)
+            dr.backward_from(dr.select(connected, weight_c * f_c, 0) + dr.select(scattered, weight_s * f_s, 0))
         return S
 
 

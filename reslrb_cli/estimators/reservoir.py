@@ -109,7 +109,7 @@ class ReservoirReplay(VertexHooks):
 
     def scattering(self, state: Any, vertex: Vertex, connection: Connection, scattering: Scattering) -> Any:
         plan, si, bsdf, depth = self.p.plan, vertex.si, vertex.bsdf, vertex.depth
-        connected = self._any(lambda slot: slot.I == depth) & vertex.active
+        connected = self.wants(vertex)
         rest_c = mi.Spectrum(dr.rcp(stand_in(connection)[0]))
         if plan.needs.has_null:
 
@@ -118,6 +118,8 @@ class ReservoirReplay(VertexHooks):
 
             rest_c *= differentiate_passage(self.p, si, depth, connection, connected, adjoint_of)
         rest_s = mi.Spectrum(scattering.correction / scattering.pdf)
+        useful = plan.differentiates(bsdf)
+        connected, scattered = connected & useful, scattering.active & useful
         with dr.resume_grad():
             if len(self.kept) == 1:
                 # A vertex has either kind of factor, and one evaluation serves both.
@@ -125,17 +127,19 @@ class ReservoirReplay(VertexHooks):
                 scattering.is_delta &= ~connected
                 scattering.is_null &= ~connected
                 scattering.wo = dr.select(connected, connection.wo, scattering.wo)
-                active = connected | scattering.active
-                f = attached_factor(plan, si, bsdf, scattering, active)
+                active, f = connected | scattered, dr.select(connected, connection.f, scattering.f)
                 weight = adjoint_of_factor(adjoint, depth, f, dr.select(connected, rest_c, rest_s))
-                dr.backward_from(dr.select(active, weight * f, 0))
+                attached = attached_factor(plan, si, bsdf, scattering, active)
+                dr.backward_from(dr.select(active, weight * attached, 0))
             else:
-                f_c, f_s = attached_factors(plan, si, bsdf, connection.wo, connected, scattering, scattering.active)
-                weight_c = self._sum(lambda slot: slot.I == depth, depth, f_c, rest_c)
-                weight_s = self._sum(lambda slot: slot.I > depth, depth, f_s, rest_s)
-                objective = dr.select(connected, weight_c * f_c, 0) + dr.select(scattering.active, weight_s * f_s, 0)
-                dr.backward_from(objective)
+                weight_c = self._sum(lambda slot: slot.I == depth, depth, connection.f, rest_c)
+                weight_s = self._sum(lambda slot: slot.I > depth, depth, scattering.f, rest_s)
+                f_c, f_s = attached_factors(plan, si, bsdf, connection.wo, connected, scattering, scattered)
+                dr.backward_from(dr.select(connected, weight_c * f_c, 0) + dr.select(scattered, weight_s * f_s, 0))
         return state
+
+    def wants(self, vertex: Vertex) -> Any:
+        return self._any(lambda slot: slot.I == vertex.depth) & vertex.active
 
     def _any(self, which: Any) -> Any:
         masks = [which(slot) for slot, _ in self.kept]

@@ -11,6 +11,7 @@ from reslrb_cli.errors import UnsupportedScene
 from reslrb_cli.estimators import ESTIMATORS
 from reslrb_cli.integrators import light_tracer as lt
 from reslrb_cli.integrators.differentiated import differentiated
+from reslrb_cli.scene.graph import SceneGraph
 from reslrb_cli.scene.needs import check_supported, scene_needs
 from reslrb_cli.transport.plan import Plan, make_plan
 from reslrb_cli.transport.splat import Film
@@ -58,6 +59,7 @@ def _make_classes() -> dict[str, Any]:
             self._track_zeros = False
             self._plans: dict[Any, Plan] = {}  # of the sensors of one scene
             self._scene: Any = None  # its address, and, to keep that from being used again, itself
+            self._owners: dict[Any, list[Any]] = {}  # BSDFs of its surfaces that use a node, and under None all of them
 
         def plan(self, scene: Any, sensor: Any, params: Any = None) -> Plan:
             """What a walk of this scene needs; refuses what cannot work. `params`: those to look for derivatives in."""
@@ -66,6 +68,7 @@ def _make_classes() -> dict[str, Any]:
                 owner = scene.integrator()
                 self._scene = (scene.ptr, None if owner is not None and owner.ptr == self.ptr else scene)
                 self._plans.clear()
+                self._owners.clear()
             key = sensor.ptr
             if key not in self._plans:
                 check_supported(scene, sensor, self.hide_emitters)
@@ -78,7 +81,16 @@ def _make_classes() -> dict[str, Any]:
             which = differentiated(params)
             # Once needed, kept: otherwise kernels would be compiled anew whenever a texel enters or leaves zero.
             self._track_zeros |= which.zeros
-            return plan.differentiating(which.bsdfs, which.emission, self._track_zeros)
+            only = self._bsdfs(scene, which.bsdf_nodes)
+            return plan.differentiating(bool(which.bsdf_nodes), which.emission, self._track_zeros, only)
+
+        def _bsdfs(self, scene: Any, nodes: tuple[Any, ...]) -> tuple[Any, ...]:
+            """The surfaces' BSDFs that use any of these nodes; empty where that is all of them."""
+            if any(node not in self._owners for node in nodes):
+                graph = SceneGraph.of(scene)
+                self._owners |= {node: graph.owning_bsdfs(node) for node in nodes} | {None: graph.surface_bsdfs()}
+            used = {bsdf: None for node in nodes for bsdf in self._owners[node]}
+            return () if all(bsdf in used for bsdf in self._owners.get(None, [])) else tuple(used)
 
         def passes(self, scene: Any, sensor: Any, seed: Any, spp: int, params: Any = None) -> list[lt.Samples]:
             """The samples of one image, and the sensor's own sample count where `spp` is 0."""

@@ -13,9 +13,10 @@ from reslrb_cli.errors import UnsupportedScene
 
 @dataclass(frozen=True)
 class Differentiated:
-    """Whether any parameter of a BSDF, or of an emitter, tracks derivatives; and whether any is exactly zero."""
+    """What tracks derivatives: the nodes of BSDFs (textures, nested BSDFs) that have such parameters, whether emission
+    does, and whether any of the parameters is exactly zero."""
 
-    bsdfs: bool
+    bsdf_nodes: tuple[Any, ...]
     emission: bool
     zeros: bool
 
@@ -26,13 +27,14 @@ def differentiated(params: Any) -> Differentiated:
     Raises UnsupportedScene where one of them moves the geometry or the sensor: detached light tracing has no derivative
     for that, and would silently leave it at zero.
     """
-    bsdfs = emission = zeros = False
+    nodes: dict[Any, None] = {}
+    emission = zeros = False
     with dr.resume_grad():  # where gradients are suspended, nothing says that it tracks them
         attached = {key: value for key, value in params.items() if dr.grad_enabled(value)}
     for key, value in attached.items():
         owner = _owner(params, key)
         if isinstance(owner, mi.BSDF):
-            bsdfs = True
+            nodes[params.properties[key][2]] = None
         elif isinstance(owner, mi.Emitter):
             emission = True
         else:
@@ -41,7 +43,7 @@ def differentiated(params: Any) -> Differentiated:
                 "geometry or the sensor"
             )
         zeros = zeros or _has_singular(key, value)
-    return Differentiated(bsdfs, emission, zeros)
+    return Differentiated(tuple(nodes), emission, zeros)
 
 
 def _owner(params: Any, key: str) -> Any:

@@ -16,6 +16,11 @@ from .graph import SceneGraph
 SENSORS = ("PerspectiveCamera", "ThinLensCamera")
 #: Shapes whose shading normal is their geometric one.
 _PLAIN_SHAPES = ("Rectangle", "Disk", "Sphere", "Cylinder")
+#: BSDFs that read nothing of a surface but its texture coordinates and local directions.
+_PLAIN_BSDFS = (
+    *("SmoothDiffuse", "SmoothConductor", "RoughConductor", "SmoothDielectric", "RoughDielectric", "ThinDielectric"),
+    *("SmoothPlastic", "RoughPlastic", "Principled", "PrincipledThin", "BlendBSDF", "MaskBSDF", "TwoSidedBRDF", "Null"),
+)
 #: How many see-through surfaces a primary ray is followed through.
 _CROSSINGS = 32
 
@@ -36,6 +41,7 @@ class SceneNeeds:
     has_null: bool
     has_shading_normals: bool
     has_perturbed_normals: bool
+    bsdfs_read_geometry: bool
     moving_shutter: bool
     thin_lens: bool
     principal_point: bool
@@ -73,6 +79,7 @@ def scene_needs(scene: Any, sensor: Any) -> SceneNeeds:
         has_null=flags & int(mi.BSDFFlags.Null) != 0,
         has_shading_normals=any(_has_shading_normals(shape) for shape in graph.shapes()),
         has_perturbed_normals=any(bsdf.class_name() in ("BumpMap", "NormalMap") for bsdf in graph.of_type(mi.BSDF)),
+        bsdfs_read_geometry=_read_geometry(graph),
         moving_shutter=float(sensor.shutter_open_time()) > 0,
         thin_lens=bool(sensor.needs_aperture_sample()),
         principal_point=_has_principal_point(sensor),
@@ -139,6 +146,18 @@ def look(scene: Any, sensor: Any, resolution: int = 128) -> View:
         return float(dr.count(mask)[0]) / count
 
     return View(fraction(smooth), fraction(specular), fraction(~(smooth | specular)), fraction(emission))
+
+
+def _read_geometry(graph: SceneGraph) -> bool:
+    """Whether any BSDF, or texture of one, may read more of a surface than texture coordinates and local directions."""
+
+    def plain(texture: Any) -> bool:
+        name = texture.class_name()
+        return name.startswith("BitmapTexture") or name.endswith("Spectrum") or name == "Checkerboard"
+
+    textures = [texture for texture in graph.of_type(mi.Texture) if graph.owning_bsdfs(texture)]
+    bsdfs = graph.of_type(mi.BSDF)
+    return not all(map(plain, textures)) or any(bsdf.class_name() not in _PLAIN_BSDFS for bsdf in bsdfs)
 
 
 def _has_principal_point(sensor: Any) -> bool:

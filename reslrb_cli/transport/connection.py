@@ -19,7 +19,8 @@ class Connection:
 
     `weight` is everything of c_i but the BSDF and the transmittance: sensor importance, geometry, Veach's correction,
     (C,). `u` is the film position in pixels relative to the crop window, `target` the point on the aperture. A walk
-    that evaluates connections sets `c` to c_i (C,) as a whole, and `active` to where the sensor is seen.
+    that evaluates connections sets `f` (C,) to bsdf * cos, `c` to c_i (C,) as a whole, and `active` to where the sensor
+    is seen.
     """
 
     weight: Any
@@ -28,6 +29,7 @@ class Connection:
     wo: Any
     active: Any
     sample: Any  # of the aperture
+    f: Any = None
     c: Any = None
 
 

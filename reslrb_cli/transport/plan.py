@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
+
+import mitsuba as mi
 
 from reslrb_cli.scene.needs import SceneNeeds
 
@@ -23,6 +26,8 @@ class Plan:
     track_zeros: bool = False
     differentiate_bsdfs: bool = False
     differentiate_emission: bool = False
+    # The BSDFs of surfaces that are differentiated, where not all of them are.
+    only_bsdfs: tuple[Any, ...] = ()
 
     @property
     def roulette(self) -> bool:
@@ -42,9 +47,24 @@ class Plan:
             and self.needs.emitters[self.needs.environment] == "EnvironmentMapEmitter"
         )
 
-    def differentiating(self, bsdfs: bool, emission: bool, track_zeros: bool) -> Plan:
+    def differentiates(self, bsdf: Any) -> Any:
+        """Lanes in which the BSDF (a pointer) has anything to differentiate."""
+        if not self.only_bsdfs:
+            return mi.Bool(self.differentiate_bsdfs)
+        result = bsdf == mi.BSDFPtr(self.only_bsdfs[0])
+        for other in self.only_bsdfs[1:]:
+            result |= bsdf == mi.BSDFPtr(other)
+        return result
+
+    def differentiating(self, bsdfs: bool, emission: bool, track_zeros: bool, only_bsdfs: tuple[Any, ...] = ()) -> Plan:
         """The same plan for a step that differentiates these; `track_zeros`: some of their factors may be zero."""
-        return replace(self, differentiate_bsdfs=bsdfs, differentiate_emission=emission, track_zeros=track_zeros)
+        return replace(
+            self,
+            differentiate_bsdfs=bsdfs,
+            differentiate_emission=emission,
+            track_zeros=track_zeros,
+            only_bsdfs=only_bsdfs,
+        )
 
 
 def make_plan(needs: SceneNeeds, max_depth: int, rr_depth: int, hide_emitters: bool) -> Plan:

@@ -35,9 +35,11 @@ def importance_context() -> Any:
 
 @dataclass
 class Scattering:
-    """What happened at a vertex. `weight` is s_j (C,), with Veach's correction; `wo` is local, `d` in world space."""
+    """What happened at a vertex. `weight` is s_j (C,), with Veach's correction; `f` (C,) is what of it has derivatives,
+    weight = f correction / pdf; `wo` is local, `d` in world space."""
 
     weight: Any
+    f: Any
     wo: Any
     d: Any
     pdf: Any
@@ -68,9 +70,9 @@ def shading_correction(plan: Plan, si: Any, wi_world: Any, wo_world: Any, wo: An
 
 def scatter(
     plan: Plan, si: Any, bsdf: Any, ray: Any, sample_1: Any, sample_2: Any, active: Any,
-    connection_wo: Any = None, connected: Any = None,
+    connection_wo: Any, connected: Any,
 ) -> tuple[Scattering, Any]:  # fmt: skip
-    """Sample the next direction; where `connection_wo` is given, also evaluate f (C,) towards it in `connected` lanes.
+    """Sample the next direction, and evaluate f (C,) towards `connection_wo` in `connected` lanes (None: in no lane).
 
     Detached; `attached_factors` has the derivatives. Both queries share one indirect call, and in it what they have in
     common (looking up textures, mostly).
@@ -82,7 +84,7 @@ def scatter(
         return evaluate(plan, si, self, wo, connected), bs.wo, bs.pdf, bs.eta, bs.sampled_type, weight
 
     with dr.suspend_grad():
-        if connection_wo is None:
+        if connected is None:
             bs, weight = bsdf.sample(context, si, sample_1, sample_2, active)
             f_connection, wo, pdf, eta, lobe = None, bs.wo, bs.pdf, bs.eta, bs.sampled_type
         else:
@@ -102,6 +104,7 @@ def scatter(
             weight = dr.select(singular, weight, dr.select(pdf > 0, f / pdf, 0))
         scattering = Scattering(
             weight=weight * correction,
+            f=weight * pdf,
             wo=wo,
             d=d,
             pdf=pdf,

@@ -72,6 +72,10 @@ class Hooks:
         """What is known of the sensor's visibility from this vertex."""
         return None
 
+    def wants(self, vertex: Vertex) -> Any:
+        """Without `connects`: lanes in which bsdf * cos towards the sensor is evaluated all the same; None: in none."""
+        return None
+
     def connection(self, state: Any, vertex: Vertex, connection: Connection, numbers: list[Any]) -> Any:
         """Called at each vertex with its connection to the sensor."""
         return state
@@ -121,12 +125,14 @@ def walk(
         # ---- Scatter, and evaluate the connection in the same call ----
         sample_2, sample_1 = sampler.next_2d(path.active), sampler.next_1d(path.active)
         active = path.active & (path.depth + 1 < plan.max_depth) & hooks.goes_on(state, vertex)
-        query = (connection.wo, connection.active) if hooks.connects and not hooks.attached else (None, None)
-        scattering, f_c = scatter(plan, si, vertex.bsdf, path.ray, sample_1, sample_2, active, *query)
+        wanted = None if hooks.attached else connection.active if hooks.connects else hooks.wants(vertex)
+        scattering, connection.f = scatter(
+            plan, si, vertex.bsdf, path.ray, sample_1, sample_2, active, connection.wo, wanted
+        )
         if hooks.connects:
             if hooks.attached:
-                f_c = evaluate(plan, si, vertex.bsdf, connection.wo, connection.active)
-            connection.c = f_c * transmittance * connection.weight
+                connection.f = evaluate(plan, si, vertex.bsdf, connection.wo, connection.active)
+            connection.c = connection.f * transmittance * connection.weight
             numbers = [selection.next_float32() for _ in range(hooks.numbers)]
             state = hooks.connection(state, vertex, connection, numbers)
         state = hooks.scattering(state, vertex, connection, scattering)

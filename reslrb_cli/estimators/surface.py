@@ -1,0 +1,73 @@
+"""A surface interaction in few words: what an estimator keeps of a vertex whose BSDF it will evaluate again."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from reslrb_cli.transport.plan import Plan
+from reslrb_cli.transport.walk import Vertex
+
+
+@dataclass
+class SurfacePoint:
+    """What of a vertex its BSDF reads, as plain numbers (pointers are their indices).
+
+    Where BSDFs read texture coordinates and directions alone, these are `[uv, wi, bsdf]`; otherwise what the shape
+    needs to find the interaction again: `[t, prim_uv, prim_index, shape, instance, o, d]`.
+    """
+
+    numbers: list[Any]
+
+    @staticmethod
+    def of(plan: Plan, vertex: Vertex) -> SurfacePoint:
+        """That of a walk's current vertex."""
+        if not plan.needs.bsdfs_read_geometry:
+            return SurfacePoint([vertex.si.uv, vertex.si.wi, _index(vertex.bsdf)])
+        pi, ray = vertex.pi, vertex.ray
+        pointers = [_index(pi.shape), _index(pi.instance)]
+        return SurfacePoint([pi.t, pi.prim_uv, pi.prim_index, *pointers, ray.o, ray.d])
+
+    @staticmethod
+    def blank(plan: Plan) -> SurfacePoint:
+        """One of zeros, of the same form."""
+        if not plan.needs.bsdfs_read_geometry:
+            return SurfacePoint([mi.Point2f(0), mi.Vector3f(0), mi.UInt32(0)])
+        indices = [mi.UInt32(0), mi.UInt32(0), mi.UInt32(0)]
+        return SurfacePoint([mi.Float(0), mi.Point2f(0), *indices, mi.Point3f(0), mi.Vector3f(0)])
+
+    def interaction(self, plan: Plan, active: Any = True) -> tuple[Any, Any]:
+        """The surface interaction, as far as BSDFs read it, and the BSDF."""
+        if not plan.needs.bsdfs_read_geometry:
+            si = dr.zeros(mi.SurfaceInteraction3f)
+            si.uv, si.wi, bsdf = self.numbers
+            si.t = mi.Float(0)  # valid
+            return si, dr.reinterpret_array(mi.BSDFPtr, bsdf)
+        pi = dr.zeros(mi.PreliminaryIntersection3f)
+        pi.valid = mi.Bool(True)  # not kept: a masked write of booleans to thread-local memory ends the process
+        pi.t, pi.prim_uv, pi.prim_index, shape, instance, o, d = self.numbers
+        pi.shape = dr.reinterpret_array(mi.ShapePtr, shape)
+        pi.instance = dr.reinterpret_array(mi.ShapePtr, instance)
+        si = pi.compute_surface_interaction(mi.Ray3f(o, d), mi.RayFlags.All, active)
+        return si, si.bsdf()
+
+
+def _index(pointer: Any) -> Any:
+    return dr.reinterpret_array(mi.UInt32, pointer)
+
+
+def lobe(plan: Plan, scattering: Any) -> list[Any]:
+    """Which lobe was sampled (1: delta, 2: null), with which numbers; nothing in scenes that have smooth ones alone."""
+    if not (plan.needs.has_delta_lobes or plan.needs.has_null):
+        return []
+    kind = dr.select(scattering.is_delta, mi.UInt32(1), 0) + dr.select(scattering.is_null, mi.UInt32(2), 0)
+    return [kind, scattering.sample_1, scattering.sample_2]
+
+
+def blank_lobe(plan: Plan) -> list[Any]:
+    """Zeros of the same form."""
+    singular = plan.needs.has_delta_lobes or plan.needs.has_null
+    return [mi.UInt32(0), mi.Float(0), mi.Point2f(0)] if singular else []
