@@ -147,7 +147,7 @@ def _conditions(config: Config, sweep: Sweep) -> str:
     roulette = "no roulette" if rr_depth > max(sweep.depths) else f"roulette from depth {rr_depth}"
     delta = "dL/dI known before" if sweep.objective == "fixed" else f"l2, adjoint {config.run.adjoint}"
     limit = "" if sweep.memory_limit is None else f", {sweep.memory_limit / 2**30:.2f} GiB each"
-    return f"{config.source}, {config.run.spp} spp, {roulette}, {delta}, over {sweep.baseline.label}{limit}"
+    return f"{config.source}, {config.run.spp} spp, {roulette}, {delta}, ratios over {sweep.baseline.label}{limit}"
 
 
 def _exit_code(results: list[Result]) -> ExitCode:

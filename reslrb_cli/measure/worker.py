@@ -11,7 +11,7 @@ import os
 import sys
 from typing import IO, Any
 
-from reslrb_cli.errors import BackendError, ConfigError, is_out_of_memory
+from reslrb_cli.errors import BackendError, ConfigError, is_out_of_memory, mentions_memory
 
 
 def main() -> int:
@@ -19,8 +19,7 @@ def main() -> int:
     answers = os.fdopen(os.dup(sys.stdout.fileno()), "w", encoding="utf-8")
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
     try:
-        _limit(first := json.loads(sys.stdin.readline()))
-        _serve(first, sys.stdin, answers)
+        _serve(json.loads(sys.stdin.readline()), sys.stdin, answers)
     except Exception as error:
         _answer(answers, _failure(error))
         return 1
@@ -40,6 +39,8 @@ def _serve(first: dict[str, Any], questions: IO[str], answers: IO[str]) -> None:
     from reslrb_cli.config import loads
     from reslrb_cli.measure.stepper import Stepper
 
+    # Only now: a library that finds no room looks like one that is not there.
+    _limit(first["memory_limit"])
     stepper = Stepper(loads(first["config"], first["source"]), first["objective"])
     _answer(answers, {"width": stepper.size[0], "height": stepper.size[1]})
     for line in questions:
@@ -47,20 +48,22 @@ def _serve(first: dict[str, Any], questions: IO[str], answers: IO[str]) -> None:
         _answer(answers, stepper.step(question["round"], question["cold"], question["release"]))
 
 
-def _limit(first: dict[str, Any]) -> None:
-    if first["memory_limit"] is not None:
+def _limit(memory_limit: int | None) -> None:
+    """Bound the address space, what is in use already included."""
+    if memory_limit is not None:
         import resource
 
         _, most = resource.getrlimit(resource.RLIMIT_AS)
-        limit = first["memory_limit"] if most == resource.RLIM_INFINITY else min(first["memory_limit"], most)
+        limit = memory_limit if most == resource.RLIM_INFINITY else min(memory_limit, most)
         resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
 
 
 def _failure(error: Exception) -> dict[str, Any]:
     words = " ".join(str(error).split())
-    refused = isinstance(error, ConfigError | BackendError)
+    memory = is_out_of_memory(error) or mentions_memory(words)  # also as the reason of another error
+    refused = isinstance(error, ConfigError | BackendError) and not memory
     return {
-        "failure": "refused" if refused else "out_of_memory" if is_out_of_memory(error) else "failed",
+        "failure": "refused" if refused else "out_of_memory" if memory else "failed",
         "reason": words if refused else f"{type(error).__name__}: {words}"[:400],
         "exit_code": int(getattr(error, "exit_code", 1)),
     }

@@ -14,7 +14,7 @@ _MARKERS = "osD^vPX*<>"
 def plot_bench(series: Sequence[tuple[str, Sequence[BenchRecord]]], path: Path, title: str) -> None:
     """Write a PNG with one curve for each (label, records); bars span from the least to the greatest step time.
 
-    Where a case ran out of memory or failed, a cross stands at the top of the diagram at that depth.
+    Where a case ran out of memory or failed, a cross stands above the diagram of memory at that depth.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -31,23 +31,25 @@ def plot_bench(series: Sequence[tuple[str, Sequence[BenchRecord]]], path: Path, 
         time_axis.errorbar(depths, [s.median for s in steps], yerr=errors, label=label, capsize=2, **style)
         memory_axis.plot(depths, [max(record.peak_mib or 0, 1e-3) for record in done], label=label, **style)
         _mark_ends(memory_axis, [r.max_depth for r in records if r.status is not BenchStatus.OK], style["color"], k)
+    finished = any(record.status is BenchStatus.OK for _, records in series for record in records)
     ends = {record.status for _, records in series for record in records} - {BenchStatus.OK}
     words = {BenchStatus.OUT_OF_MEMORY: "out of memory", BenchStatus.FAILED: "failed"}
     for axis, label in ((time_axis, "time of a step (ms)"), (memory_axis, "peak memory (MiB)")):
-        axis.set(xscale="log", yscale="log", xlabel="path depth", ylabel=label)
+        axis.set(yscale="log" if finished else "linear", xlabel="path depth", ylabel=label)
         axis.set_xscale("log", base=2)
         axis.set_xticks(sorted({record.max_depth for _, records in series for record in records}))
         axis.xaxis.set_major_formatter("{x:.0f}")
         axis.grid(True, which="both", alpha=0.25)
     if ends:
         crosses = " or ".join(words[end] for end in sorted(ends))
-        memory_axis.set_title(f"×: {crosses}", fontsize="small", loc="right")
+        memory_axis.set_title(f"×: {crosses}", fontsize="small", loc="left")
     time_axis.legend(fontsize="small")
     figure.suptitle(title, fontsize="medium")
     figure.savefig(path, format="png", dpi=150)
 
 
 def _mark_ends(axis: Any, depths: list[int], color: Any, row: int) -> None:
-    """Crosses in rows below the top, so that those of several cases do not cover each other."""
+    """Crosses above the diagram, a little apart where several cases ended at one depth."""
     for depth in depths:
-        axis.plot([depth], [0.97 - 0.04 * row], "x", color=color, markersize=8, transform=axis.get_xaxis_transform())
+        place = axis.get_xaxis_transform()
+        axis.plot([depth * 2 ** (0.06 * row)], [1.025], "x", color=color, markersize=8, transform=place, clip_on=False)
