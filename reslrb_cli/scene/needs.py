@@ -41,7 +41,7 @@ class SceneNeeds:
     has_null: bool
     has_shading_normals: bool
     has_perturbed_normals: bool
-    bsdfs_read_geometry: bool
+    bsdfs_read_geometry: bool  # or masks do, which light passes on its way to the sensor
     moving_shutter: bool
     thin_lens: bool
     principal_point: bool
@@ -79,7 +79,7 @@ def scene_needs(scene: Any, sensor: Any) -> SceneNeeds:
         has_null=flags & int(mi.BSDFFlags.Null) != 0,
         has_shading_normals=any(_has_shading_normals(shape) for shape in graph.shapes()),
         has_perturbed_normals=any(bsdf.class_name() in ("BumpMap", "NormalMap") for bsdf in graph.of_type(mi.BSDF)),
-        bsdfs_read_geometry=_read_geometry(graph),
+        bsdfs_read_geometry=_read_geometry(graph) or flags & int(mi.BSDFFlags.Null) != 0,
         moving_shutter=float(sensor.shutter_open_time()) > 0,
         thin_lens=bool(sensor.needs_aperture_sample()),
         principal_point=_has_principal_point(sensor),
