@@ -100,7 +100,7 @@ def images(scene: Any, integrator: str, seeds: range, spp: int, sensor: int = 0,
     return np.stack([np.array(render_image(renderer, scene, sensor, s, spp), np.float64) for s in seeds])
 
 
-def agreement(scene: Any, reference: str = "path", *, spp: int = 256, seeds: int = 10, border: int = 0,
+def agreement(scene: Any, reference: str = "path", *, spp: int = 256, seeds: int = 8, border: int = 0,
               reslrb: dict[str, Any] | None = None, **options: Any) -> Agreement:  # fmt: skip
     """`reslrb`'s image against `reference`'s, from independent seeds.
 
