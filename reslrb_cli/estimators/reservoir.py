@@ -171,7 +171,10 @@ class Reservoir(Estimator):
         one_of("weight", weight, ("luminance", "adjoint"))
         one_of("image", image, ("all", "retained"))
         at_least_one("capacity", capacity)
+        if image == "retained" and weight == "adjoint":
+            raise ValueError('image "retained" needs weight "luminance": an image is made before dL/dI is known')
         self.capacity, self.weight, self.image = capacity, weight, image
+        self.splats_all = image == "all"
 
     def forward(self, p: Pass) -> ReservoirState:
         state: ReservoirState = p.walk(ReservoirSelection(p, self.capacity, self.weight, self.image == "all"))

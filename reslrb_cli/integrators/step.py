@@ -1,4 +1,4 @@
-"""A step: image, loss, and the gradient of every parameter, by whichever integrator, with delta from a choice of samples.
+"""A step: image, loss, and the gradient of every parameter, by any integrator, with delta from a choice of samples.
 
 correlated     one set of samples for image and gradient; what naive AD of one render does
 independent    the gradient's samples have a seed of their own; what `mi.render` does
