@@ -55,6 +55,7 @@ class LightTracer(Integrator):
 ESTIMATOR_OPTIONS: dict[str, tuple[str, ...]] = {
     "reservoir": ("capacity", "weight", "image"),
     "gather": (),
+    "event": ("capacity", "weight"),
     "stack": ("stack_size",),
 }
 
@@ -65,18 +66,22 @@ class Reslrb(LightTracer):
     type: Literal["reslrb"] = Field(
         default="reslrb", description="Light tracing, derivatives by a replay of each path."
     )
-    estimator: Literal["reservoir", "gather", "stack"] = Field(
+    estimator: Literal["reservoir", "gather", "event", "stack"] = Field(
         default="reservoir",
         description="How a path's connections enter its gradient. `reservoir`: few of them, kept at random; `gather`: "
-        "all, by a second traversal; `stack`: all, kept in thread-local memory.",
+        "all, by a second traversal; `event`: few scattering events, kept at random; `stack`: all, kept in "
+        "thread-local memory.",
     )
     capacity: Count = Field(
-        default=1, description="Connections that are kept of each path. Only with estimator `reservoir`."
+        default=1,
+        description="How many connections, or events, are kept of each path. Only with estimators `reservoir` "
+        "and `event`.",
     )
     weight: Literal["luminance", "adjoint"] = Field(
         default="luminance",
         description="What a connection is kept in proportion to: its `luminance`, or its share in the objective "
-        "(`adjoint`: less variance; not with `run.adjoint: correlated`). Only with estimator `reservoir`.",
+        "(`adjoint`: less variance; not with `run.adjoint: correlated`). Only with estimators `reservoir` and "
+        "`event`.",
     )
     image: Literal["all", "retained"] = Field(
         default="all",
@@ -91,6 +96,8 @@ class Reslrb(LightTracer):
 
     @model_validator(mode="after")
     def _check_options(self) -> Self:
+        if self.image == "retained" and self.weight == "adjoint":
+            raise located("weight", "`adjoint` does not go with image: retained, which is made before dL/dI is known")
         for option in sorted(self._foreign() & self.model_fields_set):
             owners = " or ".join(f"`{name}`" for name, options in ESTIMATOR_OPTIONS.items() if option in options)
             raise located(option, f"has no effect with estimator `{self.estimator}`, but with {owners}; remove it")

@@ -203,10 +203,19 @@ class RunConfig(Section):
     iterations: Count = Field(default=200, description="Optimisation steps.")
     spp: Count = Field(default=16, description="Samples per pixel and step.")
     seed: Seed = Field(default=0, description="Seed of the run; every other seed is made from it.")
-    adjoint: Literal["correlated", "independent"] = Field(
+    adjoint: Literal["correlated", "independent", "batched"] = Field(
         default="correlated",
         description="Samples that the adjoint image comes from: those of the gradient (`correlated`: "
-        "cheapest, biased by noise under a nonlinear loss) or a second set (`independent`: unbiased for l2).",
+        "cheapest, biased by noise under a nonlinear loss), a second set (`independent`: unbiased for l2), or the "
+        "batches before the one that is differentiated (`batched`: unbiased for l2, from half the paths).",
+    )
+    batches: Annotated[int, Field(ge=2)] = Field(
+        default=4, description="Batches of a step's samples; must divide `spp`. Only with `adjoint: batched`."
+    )
+    first_batch: Literal["image", "again"] = Field(
+        default="image",
+        description="What the first batch is for: an `image` alone, or to be traced `again` for its gradient, with the "
+        "adjoint image of all others. Only with `adjoint: batched`.",
     )
     images_every: Annotated[int, Field(ge=0)] = Field(
         default=0, description="Iterations between two saved images; 0: only the initial and the final one."
@@ -219,6 +228,20 @@ class RunConfig(Section):
         if not _folder_name(value):
             raise wrong("must hold a letter or a digit")
         return value
+
+    @model_serializer(mode="wrap")
+    def _without_unused(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        values: dict[str, Any] = handler(self)
+        if self.adjoint != "batched":
+            del values["batches"], values["first_batch"]
+        return values
+
+    def step_options(self) -> dict[str, Any]:
+        """What a gradient step is told of its samples."""
+        options: dict[str, Any] = {"spp": self.spp, "adjoint": self.adjoint}
+        if self.adjoint == "batched":
+            options |= {"batches": self.batches, "first_batch": self.first_batch}
+        return options
 
     @property
     def folder_name(self) -> str:
@@ -268,11 +291,16 @@ class Config(Section):
             if key in keys[:i]:
                 raise located(f"parameters[{i}].key", f"`{key}` stands in parameters[{keys.index(key)}] already")
         _check_passes(self.integrator, self.run.spp, "integrator", "run.spp")
+        for option in sorted({"batches", "first_batch"} & self.run.model_fields_set):
+            if self.run.adjoint != "batched":
+                raise located(f"run.{option}", f"has no effect with run.adjoint: {self.run.adjoint}, but with batched")
+        if self.run.adjoint == "batched" and self.run.spp % self.run.batches:
+            raise located("run.batches", f"{self.run.batches} does not divide run.spp, which is {self.run.spp}")
         if self.run.adjoint == "correlated" and self.integrator.options().get("weight") == "adjoint":
             raise located(
                 "integrator.weight",
                 "`adjoint` needs dL/dI before the paths are traced, which run.adjoint: correlated does not have; "
-                "set that to independent, or the weight to luminance",
+                "set that to independent or batched, or the weight to luminance",
             )
         if self.target.render is not None:
             own = self.target.render.integrator

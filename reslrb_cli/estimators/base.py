@@ -54,6 +54,7 @@ class Estimator(ABC):
     """
 
     OPTIONS: ClassVar[dict[str, Any]] = {}
+    splats_all: bool = True  # the image shows every connection, so that an image alone needs no estimator
 
     @abstractmethod
     def forward(self, p: Pass) -> Any:

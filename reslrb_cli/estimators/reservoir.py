@@ -52,9 +52,17 @@ class ReservoirState:
     slots: list[Slot]
 
 
-def luminance(value: Any) -> Any:
-    """Selection weight of a contribution (C,) that does not need delta."""
-    return mi.luminance(mi.Color3f(value)) if len(value) == 3 else mi.Float(value[0])
+def selection_weight(p: Pass, weight: str, connection: Connection, C: Product) -> Any:
+    """w of a connection: `luminance` of C, or `adjoint`, sum_c |delta_c C_c|.
+
+    Raises ValueError where the latter is asked for and delta is not known.
+    """
+    value = C.differentiable()
+    if weight == "luminance":
+        return mi.luminance(mi.Color3f(value)) if len(value) == 3 else mi.Float(value[0])
+    if p.adjoint is None:
+        raise ValueError('weight "adjoint" needs dL/dI before the paths are traced, which correlated samples lack')
+    return dr.sum(dr.abs(p.adjoint.lookup(connection.u, connection.active) * value))
 
 
 class ReservoirSelection(VertexHooks):
@@ -77,12 +85,7 @@ class ReservoirSelection(VertexHooks):
         C = vertex.product.times(connection.c, vertex.depth, stand_in(connection)[1]).scaled(self.p.scale)
         if self.splat:
             self.p.splat(connection.u, C.value(), connection.active)
-        if self.weight == "luminance":
-            w = luminance(C.differentiable())
-        else:
-            delta = self.p.adjoint.lookup(connection.u, connection.active)
-            w = dr.sum(dr.abs(delta * C.differentiable()))
-        w = dr.select(connection.active, w, 0)
+        w = dr.select(connection.active, selection_weight(self.p, self.weight, connection, C), 0)
         W = state.W + w
         this = Slot(w, vertex.depth, C, connection.u)
         slots = [
@@ -168,11 +171,12 @@ class Reservoir(Estimator):
         one_of("weight", weight, ("luminance", "adjoint"))
         one_of("image", image, ("all", "retained"))
         at_least_one("capacity", capacity)
+        if image == "retained" and weight == "adjoint":
+            raise ValueError('image "retained" needs weight "luminance": an image is made before dL/dI is known')
         self.capacity, self.weight, self.image = capacity, weight, image
+        self.splats_all = image == "all"
 
     def forward(self, p: Pass) -> ReservoirState:
-        if self.weight == "adjoint" and p.adjoint is None:
-            raise ValueError('weight "adjoint" needs dL/dI before the paths are traced, which correlated samples lack')
         state: ReservoirState = p.walk(ReservoirSelection(p, self.capacity, self.weight, self.image == "all"))
         if self.image == "retained":
             for slot in state.slots:

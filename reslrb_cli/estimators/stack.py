@@ -29,7 +29,7 @@ from reslrb_cli.estimators.base import (
 )
 from reslrb_cli.estimators.gather import Gather, GatherState, Taking, Visibility, contribution, vertices
 from reslrb_cli.estimators.sums import AdjointSum, PlainSum
-from reslrb_cli.estimators.surface import SurfacePoint, blank_lobe, lobe
+from reslrb_cli.estimators.surface import SurfacePoint, blank_lobe, event, lobe
 from reslrb_cli.transport.connection import Connection, Seen, stand_in
 from reslrb_cli.transport.factors import NO_ZERO, Product
 from reslrb_cli.transport.plan import Plan
@@ -169,8 +169,8 @@ def walk_back(p: Pass, pushed: Pushed) -> AdjointSum:
         weight_s = A.adjoint_of_factor(frame.f_s, Product.one(plan.track_zeros), rest_s)
         connected, scattered = dr.any(frame.weight_c != 0), dr.any(weight_s != 0)
         with dr.resume_grad():
-            event = _event(frame)
-            f_c, f_s = attached_factors(plan, si, bsdf, frame.wo_c, connected, event, scattered)
+            sampled = event(frame.wo_s, frame.lobe)
+            f_c, f_s = attached_factors(plan, si, bsdf, frame.wo_c, connected, sampled, scattered)
             dr.backward_from(dr.select(connected, frame.weight_c * f_c, 0) + dr.select(scattered, weight_s * f_s, 0))
         behind_zero = [A.behind_zero[0] + frame.zeros[1], A.behind_zero[1]] if frame.zeros else []
         return height - 1, PlainSum(A.value + frame.own, A.rest, behind_zero), stack
@@ -186,15 +186,6 @@ def walk_back(p: Pass, pushed: Pushed) -> AdjointSum:
         label="walk back",
     )
     return A
-
-
-def _event(frame: Frame) -> Scattering:
-    """The sampled event of a frame, as far as its factor needs it."""
-    kind, sample_1, sample_2 = frame.lobe or [mi.UInt32(0), None, None]
-    return Scattering(
-        weight=None, f=None, wo=frame.wo_s, d=None, pdf=None, eta=None, correction=None,
-        is_delta=kind == 1, is_null=kind == 2, sample_1=sample_1, sample_2=sample_2, active=None,
-    )  # fmt: skip
 
 
 class Stack(Gather):

@@ -9,6 +9,7 @@ import drjit as dr
 import mitsuba as mi
 
 from reslrb_cli.transport.plan import Plan
+from reslrb_cli.transport.scattering import Scattering
 from reslrb_cli.transport.walk import Vertex
 
 
@@ -39,6 +40,10 @@ class SurfacePoint:
         indices = [mi.UInt32(0), mi.UInt32(0), mi.UInt32(0)]
         return SurfacePoint([mi.Float(0), mi.Point2f(0), *indices, mi.Point3f(0), mi.Vector3f(0)])
 
+    def ray(self) -> Any:
+        """The ray that reached the vertex; kept in scenes in which BSDFs read geometry."""
+        return mi.Ray3f(*self.numbers[-2:])
+
     def interaction(self, plan: Plan, active: Any = True) -> tuple[Any, Any]:
         """The surface interaction, as far as BSDFs read it, and the BSDF."""
         if not plan.needs.bsdfs_read_geometry:
@@ -53,6 +58,15 @@ class SurfacePoint:
         pi.instance = dr.reinterpret_array(mi.ShapePtr, instance)
         si = pi.compute_surface_interaction(mi.Ray3f(o, d), mi.RayFlags.All, active)
         return si, si.bsdf()
+
+
+def event(wo: Any, lobe: list[Any]) -> Scattering:
+    """A sampled event that was kept as its direction and `lobe`, as far as its factor needs it."""
+    kind, sample_1, sample_2 = lobe or [mi.UInt32(0), None, None]
+    return Scattering(
+        weight=None, f=None, wo=wo, d=None, pdf=None, eta=None, correction=None,
+        is_delta=kind == 1, is_null=kind == 2, sample_1=sample_1, sample_2=sample_2, active=None,
+    )  # fmt: skip
 
 
 def _index(pointer: Any) -> Any:

@@ -8,7 +8,7 @@ import drjit as dr
 import mitsuba as mi
 
 from reslrb_cli.errors import UnsupportedScene
-from reslrb_cli.estimators import ESTIMATORS
+from reslrb_cli.estimators import ESTIMATORS, Estimator
 from reslrb_cli.integrators import light_tracer as lt
 from reslrb_cli.integrators.differentiated import differentiated
 from reslrb_cli.scene.graph import SceneGraph
@@ -56,6 +56,7 @@ def _make_classes() -> dict[str, Any]:
             self.rr_depth = props.get("rr_depth", 5)
             if self.rr_depth <= 0:
                 raise ValueError('"rr_depth" must be greater than zero')
+            self.estimator: Estimator | None = None
             self._track_zeros = False
             self._plans: dict[Any, Plan] = {}  # of the sensors of one scene
             self._scene: Any = None  # its address, and, to keep that from being used again, itself
@@ -107,7 +108,7 @@ def _make_classes() -> dict[str, Any]:
                 film = Film(sensor)
                 block = film.block()
                 for samples in self.passes(scene, sensor, seed, spp):
-                    lt.splat_image(samples, block)
+                    lt.image_alone(samples, self.estimator, block)
                     if self.samples_per_pass is not None:
                         dr.eval(block.tensor())
                 image = film.develop(block)

@@ -147,6 +147,14 @@ def splat_image(samples: Samples, block: Any) -> None:
     trace(samples, Splat(samples, block))
 
 
+def image_alone(samples: Samples, estimator: Estimator | None, block: Any) -> None:
+    """Add the samples' image to the block, as the estimator makes it where it makes one of its own."""
+    if estimator is None or estimator.splats_all:
+        splat_image(samples, block)
+    else:
+        keep(samples, estimator, block)
+
+
 def keep(samples: Samples, estimator: Estimator, block: Any, adjoint: AdjointImage | None = None) -> Any:
     """Trace the samples: add their contributions to the block (None: no image), and return what is kept of each path.
 
@@ -191,7 +199,7 @@ def trace_image(samples: list[Samples], estimator: Estimator) -> Trace:
     else:
         trace = Trace(samples)
         for part in samples:
-            splat_image(part, block)
+            image_alone(part, estimator, block)
             dr.eval(block.tensor())
     trace.image = film.develop(block)
     dr.eval(trace.image)

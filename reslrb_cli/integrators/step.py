@@ -1,8 +1,8 @@
-"""A step: image, loss, and the gradient of every parameter, by whichever integrator, with delta from either choice of
-samples.
+"""A step: image, loss, and the gradient of every parameter, by any integrator, with delta from a choice of samples.
 
-    correlated     one set of samples for image and gradient; what naive AD of one render does
-    independent    the gradient's samples have a seed of their own; what `mi.render` does
+correlated     one set of samples for image and gradient; what naive AD of one render does
+independent    the gradient's samples have a seed of their own; what `mi.render` does
+batched        the samples in batches, each with delta from the image of those before it (`_batched`)
 """
 
 from __future__ import annotations
@@ -17,8 +17,12 @@ import mitsuba as mi
 
 from reslrb_cli.integrators.adapter import register
 
-Adjoint = Literal["correlated", "independent"]
+Adjoint = Literal["correlated", "independent", "batched"]
+FirstBatch = Literal["image", "again"]
 Objective = Callable[[Any], Any]
+
+
+BATCH_STREAM = 0xBA7C4E5  # keeps the batches' seeds apart from those of passes and of the second samples
 
 
 @dataclass
@@ -55,15 +59,20 @@ def gradient_step(
     adjoint: Adjoint = "correlated",
     params: Any = None,
     on_image: Callable[[], None] | None = None,
+    batches: int = 4,
+    first_batch: FirstBatch = "image",
 ) -> StepResult:
     """Render, evaluate `objective(image)`, and add its gradient to every parameter of the scene that tracks one.
 
     `objective` maps the image, a tensor (H, W, C) that tracks derivatives, to a scalar; `sensor` is one of the scene's
     or its index; `params` are the scene's parameters where the caller has them at hand (`mi.traverse` otherwise).
-    `on_image` is called once the image and the loss are evaluated, where a step has such a moment.
+    `on_image` is called once the image and the loss are evaluated, where a step has such a moment. `batches` and
+    `first_batch` belong to `adjoint="batched"`, whose loss is that of all samples' image.
     """
     sensor = _sensor(scene, sensor)
     params = params if params is not None else mi.traverse(scene)
+    if adjoint == "batched":
+        return _batched(integrator, scene, sensor, objective, seed, spp, params, batches, first_batch)
     image_seed = mi.UInt32(seed)
     dr.make_opaque(image_seed)
     if hasattr(integrator, "trace"):  # reslrb
@@ -123,6 +132,35 @@ def _replayed(integrator: Any, scene: Any, sensor: Any, objective: Objective, se
     loss, gradient = _derivative(objective, trace.image, on_image)
     integrator.replay(trace, gradient, params)
     return StepResult(trace.image, loss)
+
+
+def _batched(integrator: Any, scene: Any, sensor: Any, objective: Objective, seed: Any, spp: int, params: Any,
+             batches: int, first_batch: FirstBatch) -> StepResult:  # fmt: skip
+    """A step in batches (design of Deng et al. 2022's dual buffer): batch b takes delta from the image of those before.
+
+    No path sees a delta that it helped to make, so that the gradient of an L2 loss is unbiased, as with `independent`,
+    from half the paths. The first batch gives an image alone, or is traced `again` with the delta of all others.
+    """
+    if batches < 2 or spp % batches:
+        raise ValueError(f"the samples per pixel ({spp}) must be a multiple of the batches ({batches}), at least 2")
+    size = spp // batches
+    seeds = [mi.sample_tea_32(mi.UInt32(seed), mi.UInt32(BATCH_STREAM + b))[0] for b in range(batches)]
+    dr.make_opaque(seeds)
+    share = 1 / (batches if first_batch == "again" else batches - 1)
+    with dr.suspend_grad():
+        first = integrator.render(scene, sensor, seeds[0], size)
+    image = first
+    for b in range(1, batches):
+        _, gradient = _derivative(objective, image, None)
+        step = known_step(integrator, scene, sensor, gradient * share, seed=seeds[b], spp=size, params=params)
+        image = image + (step.image - image) / (b + 1)
+        dr.eval(image)
+    if first_batch == "again":
+        others = (image * batches - first) / (batches - 1)
+        _, gradient = _derivative(objective, others, None)
+        with _naive_ad(integrator), dr.isolate_grad():
+            integrator.render_backward(scene, params, gradient * share, sensor, seeds[0], size)
+    return StepResult(image, dr.detach(objective(image)))
 
 
 def _derivative(objective: Objective, image: Any, on_image: Callable[[], None] | None) -> tuple[Any, Any]:

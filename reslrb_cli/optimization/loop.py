@@ -109,8 +109,7 @@ def gradient(problem: Problem, iteration: int, split: Split) -> tuple[Any, dict[
             sensor,
             functools.partial(view_loss, target),
             seed=seed(run.seed, iteration, sensor, "image"),
-            spp=run.spp,
-            adjoint=run.adjoint,
+            **run.step_options(),
             params=problem.selection.params,
             on_image=split.image,
         )

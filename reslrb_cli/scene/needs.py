@@ -41,7 +41,7 @@ class SceneNeeds:
     has_null: bool
     has_shading_normals: bool
     has_perturbed_normals: bool
-    bsdfs_read_geometry: bool
+    bsdfs_read_geometry: bool  # or masks do, which light passes on its way to the sensor
     moving_shutter: bool
     thin_lens: bool
     principal_point: bool
@@ -69,17 +69,18 @@ def scene_needs(scene: Any, sensor: Any) -> SceneNeeds:
     for bsdf in graph.surface_bsdfs():
         flags |= int(bsdf.flags())
     emitters, environment = list(scene.emitters()), scene.environment()
+    delta = int(mi.BSDFFlags.Delta) & ~int(mi.BSDFFlags.Null)  # `Delta` holds it too
     pointlike = int(mi.EmitterFlags.Delta)
     return SceneNeeds(
         emitters=tuple(emitter.class_name() for emitter in emitters),
         environment=None if environment is None else emitters.index(environment),
         has_visible_emitters=any(int(emitter.flags()) & pointlike == 0 for emitter in emitters),
         has_smooth=flags & int(mi.BSDFFlags.Smooth) != 0,
-        has_delta_lobes=flags & int(mi.BSDFFlags.Delta) != 0,
+        has_delta_lobes=flags & delta != 0,
         has_null=flags & int(mi.BSDFFlags.Null) != 0,
         has_shading_normals=any(_has_shading_normals(shape) for shape in graph.shapes()),
         has_perturbed_normals=any(bsdf.class_name() in ("BumpMap", "NormalMap") for bsdf in graph.of_type(mi.BSDF)),
-        bsdfs_read_geometry=_read_geometry(graph),
+        bsdfs_read_geometry=_read_geometry(graph) or flags & int(mi.BSDFFlags.Null) != 0,
         moving_shutter=float(sensor.shutter_open_time()) > 0,
         thin_lens=bool(sensor.needs_aperture_sample()),
         principal_point=_has_principal_point(sensor),

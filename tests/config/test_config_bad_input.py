@@ -238,7 +238,20 @@ FILES: dict[str, tuple[str | bytes, tuple[str, ...]]] = {
     "spp a fraction": (GOOD + "run: {spp: 1.5}\n", ("x.yaml: run.spp: must be an integer, not 1.5",)),
     "spp zero": (GOOD + "run: {spp: 0}\n", ("x.yaml: run.spp: must be at least 1",)),
     "seed beyond 32 bits": (GOOD + "run: {seed: 4294967296}\n", ("x.yaml: run.seed: must be below 4294967296",)),
-    "adjoint": (GOOD + "run: {adjoint: correlate}\n", ("x.yaml: run.adjoint: must be correlated or independent",)),
+    "batches that do not divide": (
+        GOOD + "run: {adjoint: batched, spp: 6, batches: 4}\n",
+        ("x.yaml: run.batches: 4 does not divide run.spp, which is 6",),
+    ),
+    "one batch": (GOOD + "run: {adjoint: batched, batches: 1}\n", ("x.yaml: run.batches: must be",)),
+    "batches of nothing": (
+        GOOD + "run: {batches: 2}\n",
+        ("x.yaml: run.batches: has no effect with run.adjoint: correlated",),
+    ),
+    "retained before dL/dI": (
+        GOOD + "integrator: {weight: adjoint, image: retained}\nrun: {adjoint: independent}\n",
+        ("x.yaml: integrator.weight: `adjoint` does not go with image: retained",),
+    ),
+    "adjoint": (GOOD + "run: {adjoint: correlate}\n", ("x.yaml: run.adjoint: must be one of correlated, independent, batched",)),
     "name without letters": (GOOD + "run: {name: '..'}\n", ("x.yaml: run.name: must hold a letter or a digit",)),
     "variant": (GOOD + "variant: scalar_rgb\n", ("x.yaml: variant: must be one of auto, llvm_ad_rgb",)),
 }

@@ -1,0 +1,213 @@
+"""Keep single scattering events of each path, chosen by two nested reservoirs, and differentiate those: no replay.
+
+A path's gradient is a double sum, over the connections i, and over what each of them went through: emission, the
+scattering events j < i, and the connection's own BSDF (j = i). The inner reservoir keeps one of these, with weight
+q_j = 1, or 0 where there is nothing to differentiate; the outer keeps a connection with weight w_i Q_i,
+Q_i = sum_j q_j.
+
+    the pair (i, j) is kept with probability w_i q_j / W,   W = sum_i w_i Q_i
+    dS ~ 1/m sum_slots W / (w_i q_j) delta_i C_i df_j/f_j
+
+Reservoir sampling: Chao 1982. What is kept of an event is enough to evaluate its BSDF again, about 80 bytes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import drjit as dr
+import mitsuba as mi
+
+from reslrb_cli.estimators.base import (
+    Estimator,
+    Pass,
+    PathAdjoint,
+    VertexHooks,
+    adjoint_of_factor,
+    at_least_one,
+    differentiate_emission,
+    differentiate_passage,
+    one_of,
+)
+from reslrb_cli.estimators.gather import contribution
+from reslrb_cli.estimators.reservoir import selection_weight
+from reslrb_cli.estimators.surface import SurfacePoint, blank_lobe, event, lobe
+from reslrb_cli.transport.connection import Connection, connect, stand_in
+from reslrb_cli.transport.factors import MANY_ZEROS, NO_ZERO, Product
+from reslrb_cli.transport.plan import Plan
+from reslrb_cli.transport.scattering import Scattering, attached_factor
+from reslrb_cli.transport.walk import Vertex
+
+
+@dataclass
+class Event:
+    """One factor of a path: f towards local direction `wo`; `index` is its vertex, 0 for emission.
+
+    `rest` times f is the factor as a whole, but for the transmittance of masks. `own` holds whether the event is a
+    connection's own, and the sample of the aperture, where masks may stand between it and the sensor.
+    """
+
+    index: Any
+    point: SurfacePoint
+    wo: Any
+    f: Any
+    rest: Any
+    lobe: list[Any]
+    own: list[Any]
+
+    @staticmethod
+    def emission(plan: Plan) -> Event:
+        """The event before the first vertex."""
+        own = [mi.Bool(False), mi.Point2f(0)] if plan.needs.has_null else []
+        point = SurfacePoint.blank(plan)
+        return Event(mi.UInt32(0), point, mi.Vector3f(0), mi.Spectrum(0), mi.Float(0), blank_lobe(plan), own)
+
+
+@dataclass
+class Slot:
+    """One kept pair of a connection and an event."""
+
+    w: Any  # selection weight of the connection; 0: nothing kept
+    C: Product
+    u: Any
+    event: Event
+
+
+@dataclass
+class EventState:
+    """Loop state: Q, W, and for each slot the prefix's event, and the kept pair."""
+
+    Q: Any
+    W: Any
+    prefix: list[Event]
+    slots: list[Slot]
+    numbers: list[Any]  # for the choice of the prefix's event after this vertex
+
+
+@dataclass
+class Kept:
+    """What is kept of a path."""
+
+    W: Any
+    slots: list[Slot]
+
+
+class EventSelection(VertexHooks):
+    """Image pass: splat, and keep events."""
+
+    def __init__(self, p: Pass, capacity: int, weight: str) -> None:
+        super().__init__(p)
+        self.numbers, self.capacity, self.weight = 3 * capacity, capacity, weight
+
+    def start(self, product: Product) -> EventState:
+        plan, slots = self.p.plan, []
+        for _ in range(self.capacity):
+            nothing = Product(mi.Spectrum(0), [mi.Int32(MANY_ZEROS) for _ in product.zero])
+            slots.append(Slot(mi.Float(0), nothing, mi.Point2f(0), Event.emission(plan)))
+        prefix = [Event.emission(plan) for _ in slots]
+        Q = mi.Float(1 if plan.differentiate_emission else 0)
+        return EventState(Q, mi.Float(0), prefix, slots, [mi.Float(0) for _ in slots])
+
+    def connection(self, state: EventState, vertex: Vertex, connection: Connection, numbers: list[Any]) -> EventState:
+        p, plan = self.p, self.p.plan
+        C = contribution(p, vertex, connection)
+        p.splat(connection.u, C.value(), connection.active)
+        w = dr.select(connection.active, selection_weight(p, self.weight, connection, C), 0)
+        q = dr.select(plan.differentiates(vertex.bsdf), mi.Float(1), 0)
+        if plan.needs.has_null:
+            q = mi.Float(1)  # the masks between vertex and sensor may have something to differentiate
+        Q = state.Q + q
+        W = dr.fma(w, Q, state.W)
+        this = Event(
+            index=mi.UInt32(vertex.depth),
+            point=SurfacePoint.of(plan, vertex),
+            wo=connection.wo,
+            f=connection.f,
+            rest=dr.rcp(stand_in(connection)[0]),
+            lobe=blank_lobe(plan),
+            own=[mi.Bool(True), connection.sample] if plan.needs.has_null else [],
+        )
+        slots = []
+        for k, slot in enumerate(state.slots):
+            own = numbers[3 * k] * Q < q
+            pair = Slot(w, C, connection.u, dr.select(own, this, state.prefix[k]))
+            keep = (w * Q > 0) & (numbers[3 * k + 1] * W < w * Q)
+            slots.append(dr.select(keep, pair, slot))
+        return EventState(state.Q, W, state.prefix, slots, numbers[2::3])
+
+    def scattering(
+        self, state: EventState, vertex: Vertex, connection: Connection, scattering: Scattering
+    ) -> EventState:
+        plan = self.p.plan
+        q = dr.select(plan.differentiates(vertex.bsdf), mi.Float(1), 0)
+        Q = state.Q + q
+        this = Event(
+            index=mi.UInt32(vertex.depth),
+            point=SurfacePoint.of(plan, vertex),
+            wo=scattering.wo,
+            f=scattering.f,
+            rest=scattering.correction / scattering.pdf,
+            lobe=lobe(plan, scattering),
+            own=[mi.Bool(False), mi.Point2f(0)] if plan.needs.has_null else [],
+        )
+        prefix = [
+            dr.select(number * Q < q, this, event) for number, event in zip(state.numbers, state.prefix, strict=True)
+        ]
+        return EventState(Q, state.W, prefix, state.slots, state.numbers)
+
+
+class EventEstimator(Estimator):
+    """`capacity` independent pairs of a connection and an event, with selection weight `luminance` or `adjoint`."""
+
+    OPTIONS: ClassVar[dict[str, Any]] = {"capacity": 1, "weight": "luminance"}
+
+    def __init__(self, capacity: int = 1, weight: str = "luminance") -> None:
+        at_least_one("capacity", capacity)
+        one_of("weight", weight, ("luminance", "adjoint"))
+        self.capacity, self.weight = capacity, weight
+
+    def forward(self, p: Pass) -> Kept:
+        state: EventState = p.walk(EventSelection(p, self.capacity, self.weight))
+        return Kept(state.W, state.slots)
+
+    def backward(self, p: Pass, state: Kept) -> None:
+        assert p.adjoint is not None
+        adjoints = []
+        for slot in state.slots:
+            delta = p.adjoint.lookup(slot.u, slot.w > 0)
+            unselected = dr.select(slot.w > 0, state.W / (self.capacity * slot.w), 0)
+            adjoints.append(PathAdjoint(delta * slot.C.nonzero * unselected, slot.C))
+
+        def emission_weight(E: Any) -> Any:
+            total = mi.Spectrum(0)
+            for slot, adjoint in zip(state.slots, adjoints, strict=True):
+                total += dr.select(slot.event.index == 0, adjoint_of_factor(adjoint, mi.Int32(0), E, 1), 0)
+            return total
+
+        differentiate_emission(p, emission_weight)
+        if p.plan.differentiate_bsdfs:
+            for slot, adjoint in zip(state.slots, adjoints, strict=True):
+                _differentiate(p, slot, adjoint)
+
+
+def _differentiate(p: Pass, slot: Slot, adjoint: PathAdjoint) -> None:
+    """Add the derivative of one slot's event."""
+    plan, kept = p.plan, slot.event
+    active = (slot.w > 0) & (kept.index > 0)
+    si, bsdf = kept.point.interaction(plan, active)
+    rest = mi.Spectrum(kept.rest)
+    if plan.needs.has_null:
+        own, sample = kept.own
+        connection = connect(plan, p.sensor, si, kept.point.ray(), sample, active & own)
+
+        def adjoint_of(transmission: Any) -> Any:
+            return adjoint_of_factor(adjoint, mi.Int32(NO_ZERO), transmission, 0)
+
+        passed = differentiate_passage(p, si, kept.index, connection, active & own, adjoint_of)
+        rest = dr.select(own, rest * passed, rest)
+    weight = adjoint_of_factor(adjoint, kept.index, kept.f, rest)
+    active &= plan.differentiates(bsdf)
+    with dr.resume_grad():
+        f = attached_factor(plan, si, bsdf, event(kept.wo, kept.lobe), active)
+        dr.backward_from(dr.select(active, dr.dot(weight, f), 0))
