@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from reslrb_cli.measure.bench import Result, Sweep
 
 #: What is compared where the user names nothing.
-INTEGRATORS = "ptracer,reslrb:reservoir,reslrb:gather,reslrb:stack,trajectory"
+INTEGRATORS = "ptracer,reslrb:reservoir,reslrb:event,reslrb:gather,reslrb:stack,trajectory"
 _UNITS = {"": 1, "k": 10**3, "M": 10**6, "G": 10**9, "Ki": 2**10, "Mi": 2**20, "Gi": 2**30}
 
 
@@ -39,7 +39,8 @@ class Size(click.ParamType):
 @click.option("--max-depth", type=click.IntRange(min=2), default=32, show_default=True,
               help="Greatest path depth; measured are 2, 4, 8, ... and this one.")  # fmt: skip
 @click.option("--integrators", default=INTEGRATORS, show_default=True, metavar="LIST",
-              help="What to compare: TYPE[:ESTIMATOR][(OPTION=VALUE,...)], separated by commas.")  # fmt: skip
+              help="What to compare: TYPE[:ESTIMATOR][(OPTION=VALUE,...)], separated by commas; OPTION is one of the "
+                   "integrator's, or adjoint.")  # fmt: skip
 @click.option("--baseline", metavar="NAME",
               help="Entry of that list that times are divided by; default: ptracer, or else the first.")  # fmt: skip
 @click.option("--objective", type=click.Choice(["fixed", "l2"]), default="fixed", show_default=True,

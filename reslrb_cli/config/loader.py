@@ -49,14 +49,16 @@ def loads(text: str, path: Path | str, overrides: Sequence[str] = ()) -> Config:
     raise ConfigError(blame, found[0].key, found[0].message + more)
 
 
-def with_integrator(config: Config, values: dict[str, Any], blame: str, adjoint: str | None = None) -> Config:
-    """The same experiment with the integrator that `values` describe, and another `run.adjoint` where one is given.
+def with_integrator(config: Config, values: dict[str, Any], blame: str, adjoint: dict[str, Any]) -> Config:
+    """The same experiment with the integrator that `values` describe, and other settings of `run.adjoint`.
 
-    Raises ConfigError that names `blame`.
+    `adjoint` holds `adjoint` and what goes with it, or nothing, and all stays as it is. Raises ConfigError that names
+    `blame`.
     """
     data = _plain(config.model_dump(exclude_none=True)) | {"integrator": values}
-    if adjoint is not None:
-        data["run"]["adjoint"] = adjoint
+    if "adjoint" in adjoint:
+        data["run"] = {key: value for key, value in data["run"].items() if key not in ("batches", "first_batch")}
+    data["run"] |= adjoint
     changed, found = _validate(data, config.source)
     if changed is None:
         raise ConfigError(blame, found[0].key, found[0].message)

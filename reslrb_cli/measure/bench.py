@@ -48,8 +48,7 @@ class Sweep:
 
     def at(self, case: Case, depth: int) -> Config:
         """The experiment of one case. Raises ConfigError."""
-        # dL/dI that is fixed is known, whatever the run would make of it.
-        return case.at(self.config, depth, "independent" if self.objective == "fixed" else None)
+        return case.at(self.config, depth, known=self.objective == "fixed")
 
     def check(self) -> None:
         """Raise ConfigError where an integrator of the list cannot be."""

@@ -14,6 +14,8 @@ from reslrb_cli.errors import ConfigError
 
 #: Options that a case takes over from the configuration's integrator, where it knows them.
 SHARED = ("rr_depth", "hide_emitters", "samples_per_pass")
+#: Options of a case that are those of `run`, for itself alone.
+ADJOINT = ("adjoint", "batches", "first_batch")
 _TYPES = {str(kind.model_fields["type"].default): kind for kind in (Reslrb, Ptracer, Prb, WalkAd, Trajectory)}
 _ESTIMATOR_OPTIONS = {option for options in ESTIMATOR_OPTIONS.values() for option in options} - {"capacity"}
 _OPTION = "--integrators"
@@ -28,12 +30,21 @@ class Case:
     type: str
     options: dict[str, Any]
 
-    def at(self, config: Config, max_depth: int, adjoint: str | None = None) -> Config:
-        """The experiment with this integrator at this depth. Raises ConfigError where the integrator cannot be."""
+    def at(self, config: Config, max_depth: int, known: bool) -> Config:
+        """The experiment with this integrator at this depth. Raises ConfigError where the integrator cannot be.
+
+        `known`: dL/dI is, before the image, so that `run.adjoint` has no part in it.
+        """
+        blame = f"{_OPTION} {self.label}"
+        adjoint = {name: value for name, value in self.options.items() if name in ADJOINT}
+        if known and adjoint:
+            raise ConfigError(blame, next(iter(adjoint)), "has no effect where dL/dI is known; take --objective l2")
+        if known:
+            adjoint = {"adjoint": "independent"}  # which goes with any weight
         shared, own = config.integrator.options(), _TYPES[self.type].model_fields if self.type in _TYPES else {}
-        known = {name: shared[name] for name in SHARED if name in shared and name in own}
-        values = {"type": self.type, **known, **self.options, "max_depth": max_depth}
-        return with_integrator(config, values, f"{_OPTION} {self.label}", adjoint)
+        values = {"type": self.type} | {name: shared[name] for name in SHARED if name in shared and name in own}
+        values |= {name: value for name, value in self.options.items() if name not in ADJOINT}
+        return with_integrator(config, values | {"max_depth": max_depth}, blame, adjoint)
 
     @property
     def estimator(self) -> str | None:
@@ -44,7 +55,7 @@ class Case:
         other = [
             f"{option}={value}"
             for option, value in self.options.items()
-            if option in _ESTIMATOR_OPTIONS and value != Reslrb.model_fields[option].default
+            if option in ADJOINT or (option in _ESTIMATOR_OPTIONS and value != Reslrb.model_fields[option].default)
         ]
         return f"{name}({','.join(other)})" if other else name
 
@@ -92,7 +103,7 @@ def choose_baseline(cases: Sequence[Case], name: str | None) -> Case:
     Raises ConfigError where none has the label.
     """
     for case in cases:
-        if case.label == (name or "ptracer"):
+        if case.label == name or (name is None and case.type == "ptracer"):
             return case
     if name is not None:
         labels = ", ".join(case.label for case in cases)

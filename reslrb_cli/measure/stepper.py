@@ -45,7 +45,7 @@ class Stepper:
         if cold:
             reset_peak()
         with self.clock.step() as times:
-            result = self._take(seed(run.seed, round, self.sensor, "image"), run.spp, run.adjoint)
+            result = self._take(seed(run.seed, round, self.sensor, "image"))
             dr.eval(result.image, result.loss, [problem.optimizer.gradient(key) for key in problem.selection.keys])
         answer = {"step_ms": times.wall_ms, "kernel_ms": times.kernel_ms, "new_kernels": times.new_kernels}
         if cold:
@@ -56,16 +56,16 @@ class Stepper:
             dr.flush_malloc_cache()
         return answer
 
-    def _take(self, seed: int, spp: int, adjoint: Any) -> Any:
-        problem = self.problem
-        common = {"seed": seed, "spp": spp, "params": problem.selection.params}
+    def _take(self, seed: int) -> Any:
+        problem, run = self.problem, self.problem.config.run
+        common = {"seed": seed, "params": problem.selection.params}
         if self.known:
-            return known_step(problem.integrator, problem.scene, self.sensor, self.image, **common)
+            return known_step(problem.integrator, problem.scene, self.sensor, self.image, spp=run.spp, **common)
 
         def loss(image: Any) -> Any:
             return dr.mean(dr.square(image - self.image).array)
 
-        return gradient_step(problem.integrator, problem.scene, self.sensor, loss, adjoint=adjoint, **common)
+        return gradient_step(problem.integrator, problem.scene, self.sensor, loss, **run.step_options(), **common)
 
 
 def _noise(width: int, height: int, channels: int) -> Any:

@@ -38,8 +38,8 @@ class Spread:
 class BenchRecord:
     """Cost of a step of one integrator at one depth.
 
-    `estimator` is None where the integrator has none; options of an estimator that are neither its defaults nor
-    `capacity` stand behind its name, `reservoir(weight=adjoint)`. `step_ms` is wall time, `kernel_ms` what kernels
+    `estimator` is None where the integrator has none; what makes it another than by default, but for `capacity`, stands
+    behind its name, `reservoir(weight=adjoint)`. `step_ms` is wall time, `kernel_ms` what kernels
     took of it, both of warm steps; `cold_ms` is the wall time of the first step in a new process with an empty kernel
     cache. `peak_mib` is the most that the allocator held in that step, the scene included. `scratch_bytes` is
     thread-local memory of a path. What was not measured is None: everything, where `status` is not ok.

@@ -187,10 +187,20 @@ def test_options_of_cases() -> None:
     cases = parse_cases("reslrb:reservoir(capacity=4, weight=adjoint), ptracer(rr_depth=3),prb,reslrb")
     config = loads(CONFIG, "x.yaml")
     assert [case.estimator for case in cases] == ["reservoir(weight=adjoint)", None, None, "reservoir"]
-    options = [case.at(config, 9, "independent").integrator.options() for case in cases]
+    options = [case.at(config, 9, known=True).integrator.options() for case in cases]
     assert (options[0]["capacity"], options[0]["samples_per_pass"], options[0]["max_depth"]) == (4, 2, 9)
     assert [option["rr_depth"] for option in options] == [7, 3, 7, 7]
     assert "samples_per_pass" not in options[2]
+
+
+def test_cases_may_have_an_adjoint_of_their_own() -> None:
+    case, other, third = parse_cases("reslrb:stack(adjoint=batched,batches=2),ptracer(adjoint=correlated),prb")
+    config = loads(CONFIG, "x.yaml", ["run.adjoint=batched"])
+    runs = [c.at(config, 9, known=False).run for c in (case, other, third)]
+    assert [run.adjoint for run in runs] == ["batched", "correlated", "batched"]
+    assert [run.batches for run in runs] == [2, 4, 4]
+    assert case.estimator == "stack(adjoint=batched,batches=2)"
+    assert case.at(loads(CONFIG, "x.yaml"), 9, known=False).run.batches == 2
 
 
 @pytest.mark.parametrize(
@@ -203,6 +213,7 @@ def test_options_of_cases() -> None:
         ("path", "--integrators path: integrator.type: must be one of"),
         ("reslrb:gather(capacity=2)", "integrator.capacity: has no effect with estimator `gather`"),
         ("ptracer(capacity=2)", "integrator.capacity: not an option of ptracer but of reslrb"),
+        ("ptracer(adjoint=batched)", "adjoint: has no effect where dL/dI is known"),
         ("ptracer(samples_per_pass=3)", "integrator.samples_per_pass: 3 does not divide run.spp"),
     ],
 )
