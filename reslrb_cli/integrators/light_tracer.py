@@ -223,7 +223,7 @@ def reverse_recorded(samples: Samples, adjoint: AdjointImage) -> None:
 def differentiate_visible_emission(samples: Samples, adjoint: AdjointImage) -> None:
     """Add the derivatives of C_0."""
     plan = samples.plan
-    if plan.visible_emission and (plan.differentiate_emission or plan.needs.has_null):
+    if plan.visible_emission and (plan.differentiate_emission or plan.differentiate_null):
         primary = samples.primary_ray()
         delta = adjoint.lookup(primary.u, primary.active) * primary.weight * samples.fraction
         differentiate_visible_radiance(plan, samples.scene, primary, delta)
@@ -236,9 +236,7 @@ def splat_tangents(samples: Samples, block: Any) -> None:
         if plan.differentiate_emission:
             E = sample_emission(plan, samples.scene, samples.sensor, samples.sampler()).weight
             [dE] = forward_derivatives(E)
-        if plan.visible_emission and (
-            plan.differentiate_emission or (plan.differentiate_bsdfs and plan.needs.has_null)
-        ):
+        if plan.visible_emission and (plan.differentiate_emission or plan.differentiate_null):
             primary = samples.primary_ray()
             tangent = visible_tangent(plan, samples.scene, primary)
             samples.film.put(block, primary.u, tangent * primary.weight * samples.fraction, primary.active)

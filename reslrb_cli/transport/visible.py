@@ -75,7 +75,7 @@ def differentiate_visible_radiance(plan: Plan, scene: Any, primary: PrimaryRay, 
 
     Transmission is divided out of the radiance behind it, which a first look measures.
     """
-    masks = plan.differentiate_bsdfs and plan.needs.has_null
+    masks = plan.differentiate_null
     total = visible_radiance(plan, scene, primary) if masks else mi.Spectrum(0)
 
     def differentiate(state: _Look, Le: Any, radiance: Any, transmission: Any) -> None:
