@@ -212,6 +212,31 @@ def replay(samples: Samples, estimator: Estimator, state: Any, adjoint: AdjointI
     estimator.backward(samples.context(None, adjoint), state)
 
 
+def replay_all(trace: Trace, estimator: Estimator, gradient: Any) -> None:
+    """Add the gradient of the objective with dL/dI `gradient` (H, W, C) to the parameters."""
+    adjoint = trace.film.adjoint(gradient)
+    # Isolated: on their way to the parameters gradients are evaluated, and with them all that they hang on, which is to
+    # be one kernel. They set out once, at the end.
+    with dr.isolate_grad():
+        for samples, state in zip(trace.samples, trace.states(estimator, adjoint), strict=True):
+            replay(samples, estimator, state, adjoint)
+            if len(trace.samples) > 1:
+                dr.eval()  # passes are not to pile up
+
+
+def fused(samples: list[Samples], estimator: Estimator, gradient: Any) -> Any:
+    """The image, and the same gradient, where dL/dI is known before either."""
+    film = samples[0].film
+    block, adjoint = film.block(), film.adjoint(gradient)
+    with dr.isolate_grad():  # as above
+        for part in samples:
+            state = keep(part, estimator, block, adjoint)
+            replay(part, estimator, state, adjoint)
+            if len(samples) > 1:
+                dr.eval()
+    return film.develop(block)
+
+
 def reverse_recorded(samples: Samples, adjoint: AdjointImage) -> None:
     """Add the same derivatives by Dr.Jit's own reversal of the walk, which records the loop's state on the way."""
     differentiate_visible_emission(samples, adjoint)

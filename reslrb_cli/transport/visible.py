@@ -36,7 +36,7 @@ def primary_ray(plan: Plan, sensor: Any, sampler: Any, width: int) -> PrimaryRay
     lane = dr.arange(mi.UInt32, width)
     pixel = lane % n_pixels
     per_pixel = mi.Float(width // n_pixels + dr.select(pixel < width % n_pixels, mi.UInt32(1), 0))
-    time = sample_time(sensor, sampler)
+    time = sample_time(plan, sensor, sampler)
     u = mi.Point2f(pixel % int(size[0]), pixel // int(size[0])) + sampler.next_2d()
     aperture = sampler.next_2d() if plan.needs.thin_lens else mi.Point2f(0.5)
     ray, weight = sensor.sample_ray(time, 0.5, u / mi.Vector2f(size), aperture, True)
