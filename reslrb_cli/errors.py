@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import enum
+import errno
 
 
 class ExitCode(enum.IntEnum):
@@ -59,3 +60,23 @@ class NonFinite(ReslrbError):
     """A value that must be finite is not; raised before it reaches a parameter."""
 
     exit_code = ExitCode.NON_FINITE
+
+
+#: What backends, the C++ library, the loader and NumPy write where memory is out.
+_MEMORY_WORDS = (
+    "out of memory", "bad alloc", "cannot allocate memory", "could not allocate", "unable to allocate",
+    "failed to map segment",
+)  # fmt: skip
+
+
+def mentions_memory(text: str) -> bool:
+    """Whether a message, known by its text alone, says that an allocation failed."""
+    text = text.lower().replace("_", " ")
+    return any(words in text for words in _MEMORY_WORDS)
+
+
+def is_out_of_memory(error: BaseException) -> bool:
+    """Whether an exception, ours or a backend's, says that an allocation failed."""
+    if isinstance(error, MemoryError | OutOfMemory) or (isinstance(error, OSError) and error.errno == errno.ENOMEM):
+        return True
+    return isinstance(error, RuntimeError | ImportError) and mentions_memory(str(error))

@@ -31,3 +31,22 @@ def cpu_name() -> str:
     except OSError:
         found = None
     return found[1] if found else platform.machine()
+
+
+def memory_bytes(variant: str) -> int:
+    """The memory that `variant` can use: the GPU's, or the machine's as far as this process may have it."""
+    if variant.startswith("cuda"):
+        return _gpu_memory()
+    total = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    try:
+        return min(total, int(Path("/sys/fs/cgroup/memory.max").read_text()))
+    except (OSError, ValueError):  # no control groups, or `max`: no limit
+        return total
+
+
+def _gpu_memory() -> int:
+    command = shutil.which("nvidia-smi")
+    query = [] if command is None else [command, "--query-gpu=memory.total", "--format=csv,noheader,nounits"]
+    output = subprocess.run(query, capture_output=True, text=True, check=False).stdout if query else ""
+    sizes = [int(line) for line in output.split() if line.isdigit()]
+    return min(sizes, default=2**20) * 2**20  # unknown: more than any has, so that it never counts as scarce

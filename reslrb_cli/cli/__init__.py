@@ -17,7 +17,7 @@ from typing import Any
 import click
 
 from reslrb_cli import __version__
-from reslrb_cli.errors import ExitCode, ReslrbError
+from reslrb_cli.errors import ExitCode, ReslrbError, is_out_of_memory
 
 # What `reslrb --help` says of each command, so that it need not load them; in the order of a user's work.
 _SUMMARIES = {
@@ -86,18 +86,12 @@ def _tell(error: BaseException) -> tuple[str, int] | None:
         context = getattr(error, "ctx", None)
         where = context.command_path if context else "reslrb"
         return f"{where}: {' '.join(error.format_message().split())} See `{where} --help`.", ExitCode.USAGE
-    if isinstance(error, MemoryError) or _is_out_of_memory(error):
+    if is_out_of_memory(error):
         advice = "lower run.spp or the size of the film, or set integrator.samples_per_pass"
         return f"out of memory ({_one_line(error) or 'host'}); {advice}", ExitCode.OUT_OF_MEMORY
     if isinstance(error, OSError) and error.filename is not None:
         return f"{error.filename}: {error.strerror}", ExitCode.USAGE
     return None
-
-
-def _is_out_of_memory(error: BaseException) -> bool:
-    """Whether a backend's exception, known by its text alone, says that an allocation failed."""
-    text = str(error).lower().replace("_", " ")
-    return isinstance(error, RuntimeError) and ("out of memory" in text or "bad alloc" in text)
 
 
 def _one_line(error: BaseException) -> str:

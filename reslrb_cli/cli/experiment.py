@@ -16,6 +16,15 @@ logger = logging.getLogger(__name__)
 
 def experiment_arguments(function: Callable[..., Any]) -> Callable[..., Any]:
     """Add CONFIG (`config_file`) and `--set` (`overrides`) to a command."""
+    return _arguments(function, required=True)
+
+
+def optional_experiment_arguments(function: Callable[..., Any]) -> Callable[..., Any]:
+    """The same for a command that has a scene of its own: `config_file` is None where CONFIG is left out."""
+    return _arguments(function, required=False)
+
+
+def _arguments(function: Callable[..., Any], required: bool) -> Callable[..., Any]:
     function = click.option(
         "--set",
         "overrides",
@@ -23,7 +32,8 @@ def experiment_arguments(function: Callable[..., Any]) -> Callable[..., Any]:
         metavar="KEY=VALUE",
         help="Override a setting, e.g. --set run.spp=32; the value is YAML. May be repeated.",
     )(function)
-    return click.argument("config_file", metavar="CONFIG", type=click.Path(path_type=Path))(function)
+    metavar = "CONFIG" if required else "[CONFIG]"
+    return click.argument("config_file", metavar=metavar, required=required, type=click.Path(path_type=Path))(function)
 
 
 def read_config(config_file: Path, overrides: tuple[str, ...]) -> Config:

@@ -18,7 +18,7 @@ from .choices import (
     Trajectory,
     WalkAd,
 )
-from .loader import dump, load
+from .loader import dump, load, loads, with_integrator
 from .schema import ColorSpace, Config, ImageFile, ParameterSpec, Rendering, RunConfig, SceneConfig, TargetConfig
 
 __all__ = [
@@ -48,4 +48,6 @@ __all__ = [
     "WalkAd",
     "dump",
     "load",
+    "loads",
+    "with_integrator",
 ]

@@ -20,9 +20,14 @@ def load(path: Path | str, overrides: Sequence[str] = ()) -> Config:
 
     Raises ConfigError, located by the file (or the override that is at fault) and the key.
     """
+    return loads(_read(Path(path), str(path)), path, overrides)
+
+
+def loads(text: str, path: Path | str, overrides: Sequence[str] = ()) -> Config:
+    """The same from the text of a file; `path` names it, and paths in it are relative to where that is."""
     source = str(path)
-    parsed = [parse_override(text) for text in overrides]
-    data = parse(_read(Path(path), source), source)
+    parsed = [parse_override(override) for override in overrides]
+    data = parse(text, source)
     if data is None and not parsed:
         raise ConfigError(source, "", "is empty; it needs at least scene, target and parameters")
     if not isinstance(data, dict) and data is not None:
@@ -42,6 +47,22 @@ def load(path: Path | str, overrides: Sequence[str] = ()) -> Config:
             break
     more = f" (and {len(found) - 1} more)" if len(found) > 1 else ""
     raise ConfigError(blame, found[0].key, found[0].message + more)
+
+
+def with_integrator(config: Config, values: dict[str, Any], blame: str, adjoint: dict[str, Any]) -> Config:
+    """The same experiment with the integrator that `values` describe, and other settings of `run.adjoint`.
+
+    `adjoint` holds `adjoint` and what goes with it, or nothing, and all stays as it is. Raises ConfigError that names
+    `blame`.
+    """
+    data = _plain(config.model_dump(exclude_none=True)) | {"integrator": values}
+    if "adjoint" in adjoint:
+        data["run"] = {key: value for key, value in data["run"].items() if key not in ("batches", "first_batch")}
+    data["run"] |= adjoint
+    changed, found = _validate(data, config.source)
+    if changed is None:
+        raise ConfigError(blame, found[0].key, found[0].message)
+    return changed
 
 
 def dump(config: Config) -> str:

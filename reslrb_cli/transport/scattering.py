@@ -27,6 +27,8 @@ import mitsuba as mi
 
 from reslrb_cli.transport.plan import Plan
 
+DEFENSIVE = 0.2  # share of samples that a perturbed BSDF does not draw itself
+
 
 def importance_context() -> Any:
     """BSDF queries of a path that carries importance towards the sensor, so that eta^2 is not applied twice."""
@@ -84,6 +86,9 @@ def scatter(
         return evaluate(plan, si, self, wo, connected), bs.wo, bs.pdf, bs.eta, bs.sampled_type, weight
 
     with dr.suspend_grad():
+        if plan.needs.has_perturbed_normals:
+            defensive = sample_1 < DEFENSIVE
+            sample_1 = dr.select(defensive, sample_1 / DEFENSIVE, (sample_1 - DEFENSIVE) / (1 - DEFENSIVE))
         if connected is None:
             bs, weight = bsdf.sample(context, si, sample_1, sample_2, active)
             f_connection, wo, pdf, eta, lobe = None, bs.wo, bs.pdf, bs.eta, bs.sampled_type
@@ -92,6 +97,8 @@ def scatter(
             f_connection, wo, pdf, eta, lobe, weight = dr.dispatch(
                 bsdf, both, si, connection_wo, sample_1, sample_2, connected, active, active | connected
             )
+        if plan.needs.has_perturbed_normals:
+            wo, pdf, eta, lobe = _mixed(si, bsdf, sample_2, defensive, active, wo, pdf, eta, lobe)
         d = si.to_world(wo)
         correction, valid = shading_correction(plan, si, -ray.d, d, wo)
         is_null = mi.has_flag(lobe, mi.BSDFFlags.Null) if plan.needs.has_null else mi.Bool(False)
@@ -101,7 +108,7 @@ def scatter(
             correction = dr.select(is_delta, correction * _delta_correction(si.wi, wo, eta), correction)
             singular = is_delta | is_null
             f = evaluate(plan, si, bsdf, wo, active & ~singular)
-            weight = dr.select(singular, weight, dr.select(pdf > 0, f / pdf, 0))
+            weight = dr.select(singular, weight / (1 - DEFENSIVE), dr.select(pdf > 0, f / pdf, 0))
         scattering = Scattering(
             weight=weight * correction,
             f=weight * pdf,
@@ -117,6 +124,26 @@ def scatter(
             active=active & valid & (pdf > 0),
         )
         return scattering, f_connection
+
+
+def _mixed(
+    si: Any, bsdf: Any, sample_2: Any, defensive: Any, active: Any, wo: Any, pdf: Any, eta: Any, lobe: Any
+) -> tuple[Any, Any, Any, Any]:
+    """A BSDF's sample, replaced by one of the cosine-weighted hemisphere in `defensive` lanes; the mixture's density.
+
+    A BSDF with a perturbed normal samples around the normal as it is turned to wi, and its exchanged evaluation turns
+    it to wo: there are directions in which the latter is not zero and that the former never samples.
+    """
+    hemisphere = mi.warp.square_to_cosine_hemisphere(sample_2)
+    hemisphere.z = dr.mulsign(hemisphere.z, mi.Frame3f.cos_theta(si.wi))
+    singular = mi.has_flag(lobe, mi.BSDFFlags.Delta) & ~defensive  # holds Null too
+    wo = dr.select(defensive, hemisphere, wo)
+    same_side = mi.Frame3f.cos_theta(wo) * mi.Frame3f.cos_theta(si.wi) > 0
+    other = dr.select(same_side, dr.abs(mi.Frame3f.cos_theta(wo)) * dr.inv_pi, 0)
+    own = dr.select(defensive, bsdf.pdf(importance_context(), si, wo, active & defensive), pdf)
+    pdf = (1 - DEFENSIVE) * own + dr.select(singular, 0, DEFENSIVE * other)
+    eta = dr.select(defensive, 1, eta)
+    return wo, pdf, eta, dr.select(defensive, mi.UInt32(int(mi.BSDFFlags.GlossyReflection)), lobe)
 
 
 def _delta_correction(wi: Any, wo: Any, eta: Any) -> Any:

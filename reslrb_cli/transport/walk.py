@@ -159,8 +159,8 @@ def walk(
         return next_vertex(path, active, si, scattering, product, eta), state, sampler, selection
 
     def recorded_body(path: Path, *rest: Any) -> tuple[Any, ...]:
-        path, *rest = body(_with_masks(path), *rest)
-        return _without_masks(path), *rest
+        path, *changed = body(_with_masks(path), *rest)
+        return _without_masks(path), *changed
 
     recorded = hooks.max_iterations is not None
     _, state, _, _ = dr.while_loop(

@@ -146,7 +146,7 @@ CASES = [
     GradientCase("roughdielectric",
                  lambda: room(ball=_ball({"type": "roughdielectric", "alpha": 0.3,
                                           "specular_transmittance": rgb(0.9, 0.7, 0.5)})),
-                 ("ball.bsdf.specular_transmittance.value", "ball.bsdf.alpha.value"), "prb", spp=256,
+                 ("ball.bsdf.specular_transmittance.value", "ball.bsdf.alpha.value"), "prb", spp=512,
                  both={"max_depth": 5}),
     GradientCase("bumped_mirror",
                  lambda: floor({"type": "bumpmap", "scale": 1.0, "bsdf": {
@@ -159,7 +159,7 @@ CASES = [
                   "floor.brdf_0.reflectance.value"), "fd"),
     GradientCase("mask_not_differentiated", lambda: _mask(0.4), ("floor.brdf_0.reflectance.value",), "prb"),
     GradientCase("mask_texture_in_view", lambda: _mask(_tiles(channels=1), **_IN_VIEW),
-                 ("veil.bsdf.opacity.data",), "fd"),
+                 ("veil.bsdf.opacity.data",), "fd", spp=128),
     GradientCase("plastic_beside_mask",
                  lambda: _mask(0.4) | {"floor": {"type": "plastic", "diffuse_reflectance": rgb(0.3, 0.6, 0.5),
                                                  "specular_reflectance": rgb(0.9, 0.8, 0.7)}},

@@ -20,7 +20,7 @@ def agreement(case: GradientCase, count: int) -> Agreement:
     ours = scene.gradients(integrator("reslrb", **case.both | case.options), seeds(count), case.spp)
     if case.reference == "fd":
         image = integrator("reslrb", **case.both)
-        directions = scene.directions(4)
+        directions = scene.directions(max(2, count // 16))
         ours = ours @ directions.T
         reference = np.array([
             [scene.difference(image, direction, seed, case.spp, case.step, case.sides) for direction in directions]

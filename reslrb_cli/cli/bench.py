@@ -1,0 +1,174 @@
+"""`reslrb bench`: time and memory of gradient steps against path depth."""
+
+from __future__ import annotations
+
+import logging
+import os
+import re
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from reslrb_cli.cli.experiment import optional_experiment_arguments
+from reslrb_cli.errors import ConfigError, ExitCode
+
+if TYPE_CHECKING:
+    from reslrb_cli.config import Config
+    from reslrb_cli.measure.bench import Result, Sweep
+
+#: What is compared where the user names nothing.
+INTEGRATORS = "ptracer,reslrb:reservoir,reslrb:event,reslrb:gather,reslrb:stack,trajectory"
+_UNITS = {"": 1, "k": 10**3, "M": 10**6, "G": 10**9, "Ki": 2**10, "Mi": 2**20, "Gi": 2**30}
+
+
+class Size(click.ParamType):
+    """A number of bytes such as `2GiB`."""
+
+    name = "size"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> int:
+        match = re.fullmatch(r"(\d+(?:\.\d+)?)\s*(|k|M|G|Ki|Mi|Gi)B?", str(value).strip())
+        if match is None:
+            self.fail(f"`{value}` is no size; write it as in 2GiB or 500MB", param, ctx)
+        return int(float(match[1]) * _UNITS[match[2]])
+
+
+@click.command("bench")
+@optional_experiment_arguments
+@click.option("--max-depth", type=click.IntRange(min=2), default=32, show_default=True,
+              help="Greatest path depth; measured are 2, 4, 8, ... and this one.")  # fmt: skip
+@click.option("--integrators", default=INTEGRATORS, show_default=True, metavar="LIST",
+              help="What to compare: TYPE[:ESTIMATOR][(OPTION=VALUE,...)], separated by commas; OPTION is one of the "
+                   "integrator's, or adjoint.")  # fmt: skip
+@click.option("--baseline", metavar="NAME",
+              help="Entry of that list that times are divided by; default: ptracer, or else the first.")  # fmt: skip
+@click.option("--objective", type=click.Choice(["fixed", "l2"]), default="fixed", show_default=True,
+              help="fixed: dL/dI is given before the image; l2: it comes from the image, by run.adjoint.")  # fmt: skip
+@click.option("--memory-limit", type=Size(),
+              help="Address space of each process, e.g. 2GiB (CPU only); default: the machine's memory.")  # fmt: skip
+@click.option("--budget", type=click.FloatRange(min=0), default=240.0, show_default=True, metavar="SECONDS",
+              help="Time for the whole; what it does not suffice for is still measured three times.")  # fmt: skip
+@click.option("--json", "json_file", type=click.Path(path_type=Path, dir_okay=False),
+              help="Write one object a line, as results come.")  # fmt: skip
+@click.option("--plot", "plot_file", type=click.Path(path_type=Path, dir_okay=False),
+              help="PNG of time and memory against depth; default: beside the JSON file.")  # fmt: skip
+def command(
+    config_file: Path | None,
+    overrides: tuple[str, ...],
+    max_depth: int,
+    integrators: str,
+    baseline: str | None,
+    objective: str,
+    memory_limit: int | None,
+    budget: float,
+    json_file: Path | None,
+    plot_file: Path | None,
+) -> int:
+    """Measure time and peak memory of gradient steps against path depth.
+
+    A step is image, loss and gradient of every parameter of CONFIG, seen through its first sensor. Without CONFIG the
+    scene is a Cornell box (--set scene.options.size=64, run.spp=4, ...). Each integrator runs in processes of its own;
+    one that runs out of memory is recorded as out_of_memory, and the rest goes on. Ctrl-C keeps what is done.
+    """
+    from reslrb_cli.backend.device import device_name, memory_bytes
+    from reslrb_cli.backend.variant import choose
+    from reslrb_cli.config import load, loads
+    from reslrb_cli.measure import cornell_box
+    from reslrb_cli.measure.bench import Sweep
+    from reslrb_cli.measure.cases import choose_baseline, depths, parse_cases
+
+    if config_file is None:
+        config = loads(cornell_box.CONFIG, cornell_box.SOURCE, overrides)
+    else:
+        config = load(config_file, overrides)
+    cases = parse_cases(integrators)
+    if json_file is not None and plot_file is None:
+        plot_file = json_file.with_suffix(".png")
+    for option, path in (("--json", json_file), ("--plot", plot_file)):
+        _check_writable(option, path)
+    variant, _ = choose(config.variant)
+    if variant.startswith("cuda") and memory_limit is not None:
+        raise ConfigError("--memory-limit", "", f"bounds address space, which says nothing of {variant}'s memory")
+    memory = memory_bytes(variant)
+    sweep = Sweep(
+        config=config,
+        variant=variant,
+        cases=cases,
+        baseline=choose_baseline(cases, baseline),
+        depths=depths(max_depth),
+        objective=objective,
+        memory_limit=memory_limit or (None if variant.startswith("cuda") else memory),
+        memory=memory,
+        budget_s=budget,
+    )
+    sweep.check()
+    click.echo(f"{device_name(variant)}, {variant}")
+    click.echo(_conditions(config, sweep))
+    results, interrupted = _run(sweep, json_file)
+    if plot_file is not None and results:
+        from reslrb_cli.report.bench_plot import plot_bench
+
+        series = [(case.label, [r.record for r in results if r.case == case]) for case in cases]
+        plot_bench(series, plot_file, f"{device_name(variant)}\n{_conditions(config, sweep)}")
+        click.echo(f"look at {os.path.relpath(plot_file)}")
+    return ExitCode.INTERRUPTED if interrupted else _exit_code(results)
+
+
+def _run(sweep: Sweep, json_file: Path | None) -> tuple[list[Result], bool]:
+    """Measure, print and write; returns all results, and whether the user interrupted."""
+    from contextlib import ExitStack
+
+    from reslrb_cli.cli.interrupts import Interrupts
+    from reslrb_cli.measure.bench import bench
+    from reslrb_cli.records.bench import BenchWriter
+    from reslrb_cli.report.bench_table import table_head, table_line
+
+    labels, results, notes = [case.label for case in sweep.cases], [], []
+    with ExitStack() as stack:
+        writer = None if json_file is None else stack.enter_context(BenchWriter(json_file))
+        interrupts = stack.enter_context(Interrupts())
+        click.echo(table_head(labels))
+        for rows in bench(sweep, lambda: interrupts.requested, logging.getLogger(__name__).info):
+            for row in rows:
+                if writer is not None:
+                    writer.write(row.record)
+                click.echo(table_line(row.case.label, row.record, row.step_ratio, row.kernel_ratio, labels))
+                if row.reason:
+                    notes.append(f"depth {row.record.max_depth}, {row.case.label}: {row.reason}")
+            results += rows
+        for note in notes:
+            click.echo(note)
+        return results, interrupts.requested
+
+
+def _conditions(config: Config, sweep: Sweep) -> str:
+    """What was measured, in one line."""
+    rr_depth = config.integrator.rr_depth
+    roulette = "no roulette" if rr_depth > max(sweep.depths) else f"roulette from depth {rr_depth}"
+    delta = "dL/dI known before" if sweep.objective == "fixed" else f"l2, adjoint {config.run.adjoint}"
+    limit = "" if sweep.memory_limit is None else f", {sweep.memory_limit / 2**30:.2f} GiB each"
+    return f"{config.source}, {config.run.spp} spp, {roulette}, {delta}, ratios over {sweep.baseline.label}{limit}"
+
+
+def _exit_code(results: list[Result]) -> ExitCode:
+    """A sweep in which something could be measured is done; else what kept it from that decides."""
+    from reslrb_cli.records.bench import BenchStatus
+
+    states = {result.record.status for result in results}
+    if BenchStatus.OK in states:
+        return ExitCode.DONE
+    return ExitCode.OUT_OF_MEMORY if states == {BenchStatus.OUT_OF_MEMORY} else ExitCode.CHECK_FAILED
+
+
+def _check_writable(option: str, path: Path | None) -> None:
+    if path is None:
+        return
+    existed = path.exists()
+    try:
+        with path.open("ab"):
+            pass
+    except OSError as error:
+        raise ConfigError(option, "", f"cannot write {path}: {error.strerror}") from None
+    if not existed:
+        path.unlink()

@@ -1,0 +1,1 @@
+"""Measurements: what a step costs. They yield records, and draw nothing."""

@@ -1,0 +1,247 @@
+"""Time and memory of a step against path depth, for several integrators side by side.
+
+At each depth every case has a process of its own, and all live at once. They load the scene, take a cold step each,
+then as many as it takes until no new kernel comes (stock integrators need a few), and then steps in rounds, one each in
+turn, so that a drift of the machine hits all alike; only one computes at a time. Ratios are taken within a round, whose
+steps also share a seed. The order turns from round to round.
+
+A case that runs out of memory is tried again at greater depths: what is recorded was seen, and a failure costs no more
+time than it takes to fill the memory once.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from reslrb_cli.config import Config, dump
+from reslrb_cli.measure.cases import Case
+from reslrb_cli.measure.processes import Ended, Process, Stopped
+from reslrb_cli.records.bench import BenchRecord, BenchStatus, Spread
+
+MIN_ROUNDS = 3
+MAX_ROUNDS = 25
+#: Steps after the cold one until no new kernel comes, at most.
+MAX_WARM_UPS = 4
+#: Where the cases of a depth together hold more than this share of the memory, each releases its own after a step.
+MEMORY_SHARE = 0.7
+MIB = 2**20
+#: How much longer the beginning of the next depth takes, until it is known: compiling, which few cases do more of.
+FIRST_GROWTH = 1.3
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """What is measured. `memory_limit` is of each process, None: none; `memory` is what the machine has, in bytes."""
+
+    config: Config
+    variant: str
+    cases: Sequence[Case]
+    baseline: Case
+    depths: Sequence[int]
+    objective: str
+    memory_limit: int | None
+    memory: int
+    budget_s: float
+
+    def at(self, case: Case, depth: int) -> Config:
+        """The experiment of one case. Raises ConfigError."""
+        return case.at(self.config, depth, known=self.objective == "fixed")
+
+    def check(self) -> None:
+        """Raise ConfigError where an integrator of the list cannot be."""
+        for case in self.cases:
+            self.at(case, self.depths[0])
+
+
+@dataclass(frozen=True)
+class Result:
+    """A record, what it is compared with, and what the record has no room for.
+
+    `kernel_ratio` and `step_ratio` are times over those of the baseline, round by round; None where either has none.
+    """
+
+    case: Case
+    record: BenchRecord
+    kernel_ratio: Spread | None
+    step_ratio: Spread | None
+    reason: str
+
+
+@dataclass
+class _Run:
+    """One case at one depth, under way."""
+
+    case: Case
+    config: Config
+    process: Any
+    size: tuple[int, int] | None = None
+    cold: dict[str, Any] | None = None
+    steps: dict[int, dict[str, Any]] = field(default_factory=dict)  # by round
+    end: Ended | None = None
+
+    def ask(self, round: int, cold: bool, release: bool, stop: Callable[[], bool]) -> dict[str, Any] | None:
+        """One step; None where the process ended over it."""
+        self.process.ask({"round": round, "cold": cold, "release": release})
+        return self.answer(stop)
+
+    def answer(self, stop: Callable[[], bool]) -> dict[str, Any] | None:
+        try:
+            result: dict[str, Any] = self.process.answer(stop)
+            return result
+        except Ended as end:
+            self.end = end
+            self.process.close()  # what it held is for the others
+            return None
+
+
+def bench(
+    sweep: Sweep,
+    stop: Callable[[], bool],
+    say: Callable[[str], None],
+    start: Callable[[dict[str, Any]], Any] = Process,
+) -> Iterator[list[Result]]:
+    """Measure depth by depth; yield the results of each. Ends early, with what is done, once `stop()`.
+
+    Where the budget is spent, each depth still gets MIN_ROUNDS rounds. Raises Refused where no case can begin.
+    """
+    pace = Pace(sweep.budget_s, len(sweep.depths))
+    for depth in sweep.depths:
+        pace.begin_depth()
+        runs = [_begin(sweep, case, depth, start) for case in sweep.cases]
+        try:
+            _measure(sweep, runs, depth, pace, stop, say)
+            stopped = False
+        except Stopped:
+            stopped = True
+        finally:
+            for run in runs:
+                run.process.close()
+        done = [run for run in runs if run.end is not None or run.steps]
+        yield [_result(run, depth, sweep, runs) for run in done]
+        if stopped:
+            return
+
+
+class Pace:
+    """Divides the time among depths: more rounds where they are cheap, never fewer than MIN_ROUNDS."""
+
+    def __init__(self, budget_s: float, depths: int, now: Callable[[], float] = time.monotonic) -> None:
+        self._now, self._end, self._left = now, now() + budget_s, depths
+        self._start = self._rounds_start = now()
+        self._growth, self._before = FIRST_GROWTH, 0.0
+
+    def begin_depth(self) -> None:
+        """A depth begins."""
+        self._start, self._left = self._now(), self._left - 1
+
+    def begin_rounds(self) -> None:
+        """Its processes are warm."""
+        self._rounds_start = self._now()
+        begin_s = self._rounds_start - self._start
+        if self._before:
+            self._growth = min(max(begin_s / self._before, 1.0), 2.0)
+        self._before = begin_s
+
+    def another(self, done: int) -> bool:
+        """Whether there is time for another round after `done` of them."""
+        if done < MIN_ROUNDS:
+            return True
+        if done >= MAX_ROUNDS:
+            return False
+        now = self._now()
+        round_s, begin_s = (now - self._rounds_start) / done, self._rounds_start - self._start
+        # The depths to come, with their minimum: beginnings grow as they did, and steps take twice as long each time.
+        ahead = sum(self._growth**k * begin_s + 2**k * MIN_ROUNDS * round_s for k in range(1, self._left + 1))
+        spare = (self._end - now - ahead) / (self._left + 1)
+        return spare > round_s
+
+
+def _begin(sweep: Sweep, case: Case, depth: int, start: Callable[[dict[str, Any]], Any]) -> _Run:
+    config = sweep.at(case, depth)
+    first = {
+        "config": dump(config),
+        "source": str(config.source),
+        "variant": sweep.variant,
+        "objective": sweep.objective,
+        "memory_limit": sweep.memory_limit,
+    }
+    return _Run(case, config, start(first))
+
+
+def _measure(
+    sweep: Sweep, runs: list[_Run], depth: int, pace: Pace, stop: Callable[[], bool], say: Callable[[str], None]
+) -> None:
+    def alive() -> list[_Run]:
+        return [run for run in runs if run.end is None]
+
+    for run in runs:
+        answer = run.answer(stop)
+        if answer is not None:
+            run.size = (answer["width"], answer["height"])
+    for run in alive():
+        run.cold = run.ask(0, True, False, stop)
+        for _ in range(MAX_WARM_UPS):
+            answer = run.ask(0, False, _tight(sweep, runs), stop) if run.end is None else None
+            if answer is None or not answer["new_kernels"]:
+                break
+    tight = _tight(sweep, runs)
+    if tight:
+        say(f"depth {depth}: together the cases need more than the memory; each releases its own after a step")
+    pace.begin_rounds()
+    done = 0
+    while alive() and pace.another(done):
+        turn = alive()
+        for run in turn[done % len(turn) :] + turn[: done % len(turn)]:
+            answer = run.ask(done + 1, False, tight, stop)
+            if answer is not None:
+                run.steps[done] = answer
+        done += 1
+
+
+def _tight(sweep: Sweep, runs: list[_Run]) -> bool:
+    held = sum(run.cold["peak_mib"] for run in runs if run.cold is not None and run.end is None) * MIB
+    return held > MEMORY_SHARE * sweep.memory
+
+
+def _result(run: _Run, depth: int, sweep: Sweep, runs: list[_Run]) -> Result:
+    options, ok = run.config.integrator.options(), run.end is None
+    baseline = next(other for other in runs if other.case == sweep.baseline)
+    width, height = next((other.size for other in runs if other.size is not None), (None, None))
+    record = BenchRecord(
+        integrator=run.case.type,
+        estimator=run.case.estimator,
+        capacity=options.get("capacity"),
+        max_depth=depth,
+        rr_depth=options["rr_depth"],
+        spp=run.config.run.spp,
+        width=width,
+        height=height,
+        status=BenchStatus.OK if run.end is None else run.end.status,
+        step_ms=Spread.of([step["step_ms"] for step in run.steps.values()]) if ok else None,
+        kernel_ms=Spread.of([step["kernel_ms"] for step in run.steps.values()]) if ok else None,
+        cold_ms=run.cold["step_ms"] if ok and run.cold else None,
+        peak_mib=run.cold["peak_mib"] if ok and run.cold else None,
+        scratch_bytes=run.cold["scratch_bytes"] if ok and run.cold else None,
+        repeats=len(run.steps) if ok else 0,
+    )
+    comparable = ok and baseline.end is None
+    return Result(
+        run.case,
+        record,
+        _ratio(run, baseline, "kernel_ms") if comparable else None,
+        _ratio(run, baseline, "step_ms") if comparable else None,
+        "" if run.end is None else run.end.reason,
+    )
+
+
+def _ratio(run: _Run, baseline: _Run, key: str) -> Spread | None:
+    """Ratios of the rounds that both have; None where there is none."""
+    rounds = [
+        run.steps[round][key] / baseline.steps[round][key]
+        for round in run.steps
+        if baseline.steps.get(round, {}).get(key)
+    ]
+    return Spread.of(rounds) if rounds else None

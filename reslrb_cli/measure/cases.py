@@ -1,0 +1,117 @@
+"""What a bench compares: a list such as `ptracer,reslrb:reservoir(capacity=4)`, and the depths."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from reslrb_cli.config import Config, Prb, Ptracer, Reslrb, Trajectory, WalkAd, with_integrator
+from reslrb_cli.config.choices import ESTIMATOR_OPTIONS
+from reslrb_cli.config.text import parse
+from reslrb_cli.errors import ConfigError
+
+#: Options that a case takes over from the configuration's integrator, where it knows them.
+SHARED = ("rr_depth", "hide_emitters", "samples_per_pass")
+#: Options of a case that are those of `run`, for itself alone.
+ADJOINT = ("adjoint", "batches", "first_batch")
+_TYPES = {str(kind.model_fields["type"].default): kind for kind in (Reslrb, Ptracer, Prb, WalkAd, Trajectory)}
+_ESTIMATOR_OPTIONS = {option for options in ESTIMATOR_OPTIONS.values() for option in options} - {"capacity"}
+_OPTION = "--integrators"
+_ITEM = re.compile(r"(?P<type>\w+)(?::(?P<estimator>\w+))?(?:\((?P<options>.*)\))?")
+
+
+@dataclass(frozen=True)
+class Case:
+    """One integrator with its options, at no depth yet; `label` is how the user wrote it."""
+
+    label: str
+    type: str
+    options: dict[str, Any]
+
+    def at(self, config: Config, max_depth: int, known: bool) -> Config:
+        """The experiment with this integrator at this depth. Raises ConfigError where the integrator cannot be.
+
+        `known`: dL/dI is, before the image, so that `run.adjoint` has no part in it.
+        """
+        blame = f"{_OPTION} {self.label}"
+        adjoint = {name: value for name, value in self.options.items() if name in ADJOINT}
+        if known and adjoint:
+            raise ConfigError(blame, next(iter(adjoint)), "has no effect where dL/dI is known; take --objective l2")
+        if known:
+            adjoint = {"adjoint": "independent"}  # which goes with any weight
+        shared, own = config.integrator.options(), _TYPES[self.type].model_fields if self.type in _TYPES else {}
+        values = {"type": self.type} | {name: shared[name] for name in SHARED if name in shared and name in own}
+        values |= {name: value for name, value in self.options.items() if name not in ADJOINT}
+        return with_integrator(config, values | {"max_depth": max_depth}, blame, adjoint)
+
+    @property
+    def estimator(self) -> str | None:
+        """Name of the estimator, with the options that make it another than the default one, but for `capacity`."""
+        if self.type != "reslrb":
+            return None
+        name = str(self.options.get("estimator", Reslrb.model_fields["estimator"].default))
+        other = [
+            f"{option}={value}"
+            for option, value in self.options.items()
+            if option in ADJOINT or (option in _ESTIMATOR_OPTIONS and value != Reslrb.model_fields[option].default)
+        ]
+        return f"{name}({','.join(other)})" if other else name
+
+
+def parse_cases(text: str) -> list[Case]:
+    """The cases in a list. Raises ConfigError where one is not written as it must be, or stands there twice.
+
+    What an option means is not looked at here, but in `Case.at`.
+    """
+    cases: list[Case] = []
+    for item in _split(text):
+        match = _ITEM.fullmatch(item)
+        if match is None:
+            raise ConfigError(_OPTION, "", f"`{item}` is no integrator; write TYPE[:ESTIMATOR][(OPTION=VALUE,...)]")
+        options = {} if match["estimator"] is None else {"estimator": match["estimator"]}
+        for pair in _split(match["options"] or "") if match["options"] else []:
+            name, equals, value = pair.partition("=")
+            if not equals or not name.strip():
+                raise ConfigError(_OPTION, item, f"`{pair}` must be OPTION=VALUE")
+            if name.strip() == "max_depth":
+                raise ConfigError(_OPTION, item, "max_depth is what is varied; --max-depth says how far")
+            options[name.strip()] = parse(value, f"{_OPTION} {item}", name_line=False)
+        case = Case(item, match["type"], options)
+        if case.label in [other.label for other in cases]:
+            raise ConfigError(_OPTION, "", f"`{item}` is named twice")
+        cases.append(case)
+    return cases
+
+
+def _split(text: str) -> list[str]:
+    """The parts between commas that stand in no parentheses."""
+    parts, depth = [""], 0
+    for character in text:
+        depth += {"(": 1, ")": -1}.get(character, 0)
+        if character == "," and depth == 0:
+            parts.append("")
+        else:
+            parts[-1] += character
+    return [part.strip() for part in parts]
+
+
+def choose_baseline(cases: Sequence[Case], name: str | None) -> Case:
+    """The case that the others are compared with: that of this label, else `ptracer` where it is there, or the first.
+
+    Raises ConfigError where none has the label.
+    """
+    for case in cases:
+        if case.label == name or (name is None and case.type == "ptracer"):
+            return case
+    if name is not None:
+        labels = ", ".join(case.label for case in cases)
+        raise ConfigError("--baseline", "", f"`{name}` is none of {labels}")
+    return cases[0]
+
+
+def depths(max_depth: int) -> list[int]:
+    """2, 4, 8, ... up to `max_depth`, which comes last."""
+    powers = [2**k for k in range(1, max_depth.bit_length()) if 2**k < max_depth]
+    return [*powers, max_depth]

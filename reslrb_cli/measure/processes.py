@@ -1,0 +1,134 @@
+"""Each case in a process of its own, so that the end of one is seen, and said, and is not the end of the sweep."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import re
+import selectors
+import signal
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from reslrb_cli.errors import ReslrbError, mentions_memory
+from reslrb_cli.records.bench import BenchStatus
+
+POLL_SECONDS = 0.05
+#: A process that crashes with as much of its limit in use is taken to have died of it.
+CLOSE_TO_LIMIT = 0.75
+#: Signals by which a program ends when it goes on after an allocation that failed.
+_CRASHES = (signal.SIGSEGV, signal.SIGABRT, signal.SIGBUS)
+
+
+class Ended(Exception):
+    """A process ended before it answered; `status` and `reason` say how."""
+
+    def __init__(self, status: BenchStatus, reason: str) -> None:
+        super().__init__(reason)
+        self.status, self.reason = status, reason
+
+
+class Stopped(Exception):
+    """The user wants to stop."""
+
+
+class Refused(ReslrbError):
+    """A process could not begin, for a reason that holds for all of them."""
+
+    def __init__(self, line: str, exit_code: int) -> None:
+        super().__init__(line)
+        self.exit_code = exit_code  # type: ignore[assignment]
+
+
+class Process:
+    """One worker. `first` is its first message; `memory_limit` (bytes, or None) is in it too."""
+
+    def __init__(self, first: dict[str, Any], command: list[str] | None = None) -> None:
+        self.limit: int | None = first["memory_limit"]
+        self.peak_bytes = 0  # of address space
+        self._folder = tempfile.TemporaryDirectory(prefix="reslrb-bench-", ignore_cleanup_errors=True)
+        self._words = Path(self._folder.name) / "stderr"
+        self._buffer = b""
+        with self._words.open("wb") as words:
+            self._process = subprocess.Popen(
+                command or [sys.executable, "-m", "reslrb_cli.measure.worker"],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=words,
+                start_new_session=True,  # Ctrl-C is for us
+            )
+        self.ask(first | {"cache": self._folder.name})
+
+    def ask(self, question: dict[str, Any]) -> None:
+        """Send a message; an end of the process shows when the answer is waited for."""
+        assert self._process.stdin is not None
+        with contextlib.suppress(BrokenPipeError):
+            self._process.stdin.write(json.dumps(question).encode() + b"\n")
+            self._process.stdin.flush()
+
+    def answer(self, stop: Callable[[], bool]) -> dict[str, Any]:
+        """Wait for the next answer. Raises Ended, Stopped once `stop()`, and Refused."""
+        assert self._process.stdout is not None
+        with selectors.DefaultSelector() as selector:
+            selector.register(self._process.stdout, selectors.EVENT_READ)
+            while b"\n" not in self._buffer:
+                if stop():
+                    raise Stopped
+                self._look_at_memory()
+                if selector.select(POLL_SECONDS):
+                    chunk = os.read(self._process.stdout.fileno(), 1 << 16)
+                    if not chunk:
+                        raise Ended(*self._end())
+                    self._buffer += chunk
+        line, _, self._buffer = self._buffer.partition(b"\n")
+        answer: dict[str, Any] = json.loads(line)
+        if answer.get("failure") == "refused":
+            raise Refused(answer["reason"], answer["exit_code"])
+        if "failure" in answer:
+            raise Ended(BenchStatus(answer["failure"]), answer["reason"])
+        return answer
+
+    def close(self) -> None:
+        """End the process and remove what it leaves."""
+        self._process.kill()
+        self._process.wait()
+        for stream in (self._process.stdin, self._process.stdout):
+            assert stream is not None
+            with contextlib.suppress(BrokenPipeError):
+                stream.close()
+        self._folder.cleanup()
+
+    def _look_at_memory(self) -> None:
+        try:
+            text = Path(f"/proc/{self._process.pid}/status").read_text()
+        except OSError:
+            return
+        found = re.search(r"^VmPeak:\s+(\d+) kB", text, re.MULTILINE)
+        if found:
+            self.peak_bytes = max(self.peak_bytes, 1024 * int(found[1]))
+
+    def _end(self) -> tuple[BenchStatus, str]:
+        code = self._process.wait()
+        with self._words.open("rb") as file:
+            file.seek(max(0, self._words.stat().st_size - (1 << 20)))
+            text = file.read().decode(errors="replace")
+        words = last_words(text)
+        name = signal.Signals(-code).name if code < 0 else f"exit code {code}"
+        reason = f"ended by {name}" + (f": {words}" if words else "")
+        close = self.limit is not None and self.peak_bytes >= CLOSE_TO_LIMIT * self.limit
+        if close:
+            reason += f" ({self.peak_bytes >> 20} of {self.limit >> 20} MiB in use)"  # type: ignore[operator]
+        memory = code == -signal.SIGKILL or mentions_memory(text) or (close and -code in _CRASHES)
+        return (BenchStatus.OUT_OF_MEMORY if memory else BenchStatus.FAILED), reason
+
+
+def last_words(text: str) -> str:
+    """The line of a process's standard error that says most: Dr.Jit's `>>>` line, or the last one."""
+    lines = [line.strip() for line in text.splitlines() if line.strip()]
+    marked = [line for line in lines if line.startswith(">>>")]
+    return (marked[-1].lstrip("> ") if marked else lines[-1] if lines else "")[:300]

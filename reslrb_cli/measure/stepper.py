@@ -1,0 +1,78 @@
+"""Steps of one experiment, measured one by one."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from reslrb_cli.config import Config
+from reslrb_cli.integrators import gradient_step, known_step
+from reslrb_cli.measure import cornell_box
+from reslrb_cli.measure.scratch import scratch_bytes
+from reslrb_cli.optimization.problem import assemble_scene
+from reslrb_cli.records.clock import StepClock, peak_mib, reset_peak
+from reslrb_cli.seeds import seed
+
+
+class Stepper:
+    """Takes steps of an experiment through its first sensor; the parameters keep their initial values.
+
+    `objective` is `fixed`, sum(G * I) with a fixed image G, known before the image I, or `l2`, the mean of (I - G)^2
+    with `run.adjoint`. G is noise: what it shows costs nothing.
+    """
+
+    def __init__(self, config: Config, objective: str) -> None:
+        built_in = config.scene.file == cornell_box.FILE
+        scene = cornell_box.build(config.scene.options) if built_in else None
+        self.problem = assemble_scene(config, scene)
+        self.sensor = self.problem.sensors[0]
+        self.known = objective == "fixed"
+        film = self.problem.scene.sensors()[self.sensor].film()
+        width, height = film.crop_size()
+        self.size = (int(width), int(height))
+        self.image = _noise(*self.size, int(film.base_channels_count()))
+        self.clock = StepClock()
+
+    def step(self, round: int, cold: bool, release: bool) -> dict[str, Any]:
+        """Take one step; `cold` ones also measure memory, `release` gives the allocator's cache back afterwards."""
+        problem, run = self.problem, self.problem.config.run
+        problem.apply()
+        for key in problem.selection.keys:
+            dr.clear_grad(problem.optimizer[key])
+        if cold:
+            reset_peak()
+        with self.clock.step() as times:
+            result = self._take(seed(run.seed, round, self.sensor, "image"))
+            dr.eval(result.image, result.loss, [problem.optimizer.gradient(key) for key in problem.selection.keys])
+        answer = {"step_ms": times.wall_ms, "kernel_ms": times.kernel_ms, "new_kernels": times.new_kernels}
+        if cold:
+            answer["peak_mib"] = peak_mib(dr.backend_v(mi.Float))
+            answer["scratch_bytes"] = scratch_bytes(self.clock.history)
+        self.clock.history = []
+        if release:
+            dr.flush_malloc_cache()
+        return answer
+
+    def _take(self, seed: int) -> Any:
+        problem, run = self.problem, self.problem.config.run
+        common = {"seed": seed, "params": problem.selection.params}
+        if self.known:
+            return known_step(problem.integrator, problem.scene, self.sensor, self.image, spp=run.spp, **common)
+
+        def loss(image: Any) -> Any:
+            return dr.mean(dr.square(image - self.image).array)
+
+        return gradient_step(problem.integrator, problem.scene, self.sensor, loss, **run.step_options(), **common)
+
+
+def _noise(width: int, height: int, channels: int) -> Any:
+    """An image (H, W, C) of positive noise; nothing in an alpha channel."""
+    values = np.random.default_rng(1).uniform(0.5, 1.5, (height, width, channels)).astype(np.float32)
+    if channels in (2, 4):
+        values[:, :, -1] = 0
+    image = mi.TensorXf(values)
+    dr.make_opaque(image)
+    return image

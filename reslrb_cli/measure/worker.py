@@ -1,0 +1,80 @@
+"""The process of one case: `python -m reslrb_cli.measure.worker`, started and told what to do by `processes.py`.
+
+It reads one JSON object a line from standard input and answers each with one on standard output. The first describes
+the case; each other one asks for a step. What else is printed goes to standard error.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+from typing import IO, Any
+
+from reslrb_cli.errors import BackendError, ConfigError, is_out_of_memory, mentions_memory
+
+
+def main() -> int:
+    """Answer until standard input ends, or until something fails: the last answer then says what."""
+    answers = os.fdopen(os.dup(sys.stdout.fileno()), "w", encoding="utf-8")
+    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
+    try:
+        _serve(json.loads(sys.stdin.readline()), sys.stdin, answers)
+    except Exception as error:
+        _answer(answers, _failure(error))
+        return 1
+    return 0
+
+
+def _serve(first: dict[str, Any], questions: IO[str], answers: IO[str]) -> None:
+    os.environ |= {
+        "HOME": first["cache"],  # where Dr.Jit keeps compiled kernels: a cold step is to find none
+        "OPTIX_CACHE_PATH": first["cache"],
+        "CUDA_CACHE_DISABLE": "1",
+    }
+    from reslrb_cli.backend.variant import set_variant
+
+    set_variant(first["variant"])
+
+    from reslrb_cli.config import loads
+    from reslrb_cli.measure.stepper import Stepper
+
+    # Only now: a library that finds no room looks like one that is not there.
+    _limit(first["memory_limit"])
+    stepper = Stepper(loads(first["config"], first["source"]), first["objective"])
+    _answer(answers, {"width": stepper.size[0], "height": stepper.size[1]})
+    for line in questions:
+        question = json.loads(line)
+        _answer(answers, stepper.step(question["round"], question["cold"], question["release"]))
+
+
+def _limit(memory_limit: int | None) -> None:
+    """Bound the address space, what is in use already included."""
+    if memory_limit is not None:
+        import resource
+
+        _, most = resource.getrlimit(resource.RLIMIT_AS)
+        limit = memory_limit if most == resource.RLIM_INFINITY else min(memory_limit, most)
+        resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
+
+
+def _failure(error: Exception) -> dict[str, Any]:
+    words = " ".join(str(error).split())
+    memory = is_out_of_memory(error) or mentions_memory(words)  # also as the reason of another error
+    refused = isinstance(error, ConfigError | BackendError) and not memory
+    return {
+        "failure": "refused" if refused else "out_of_memory" if memory else "failed",
+        "reason": words if refused else f"{type(error).__name__}: {words}"[:400],
+        "exit_code": int(getattr(error, "exit_code", 1)),
+    }
+
+
+def _answer(answers: IO[str], message: dict[str, Any]) -> None:
+    answers.write(json.dumps(message) + "\n")
+    answers.flush()
+
+
+if __name__ == "__main__":
+    code = main()
+    sys.stderr.flush()
+    os._exit(code)  # what is left to tidy up may take long, or fail where memory is out

@@ -1,0 +1,91 @@
+"""`reslrb bench --json FILE`: one object a line, one line a case and depth."""
+
+from __future__ import annotations
+
+import enum
+import json
+import statistics
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+
+class BenchStatus(str, enum.Enum):
+    """How a case ended."""
+
+    OK = "ok"
+    OUT_OF_MEMORY = "out_of_memory"
+    FAILED = "failed"
+
+
+@dataclass(frozen=True)
+class Spread:
+    """Median, least and greatest of repeated measurements."""
+
+    median: float
+    min: float
+    max: float
+
+    @classmethod
+    def of(cls, values: Sequence[float]) -> Spread:
+        """The spread of at least one value."""
+        return cls(statistics.median(values), min(values), max(values))
+
+
+@dataclass(frozen=True)
+class BenchRecord:
+    """Cost of a step of one integrator at one depth.
+
+    `estimator` is None where the integrator has none; what makes it another than by default, but for `capacity`, stands
+    behind its name, `reservoir(weight=adjoint)`. `step_ms` is wall time, `kernel_ms` what kernels
+    took of it, both of warm steps; `cold_ms` is the wall time of the first step in a new process with an empty kernel
+    cache. `peak_mib` is the most that the allocator held in that step, the scene included. `scratch_bytes` is
+    thread-local memory of a path. What was not measured is None: everything, where `status` is not ok.
+    """
+
+    integrator: str
+    estimator: str | None
+    capacity: int | None
+    max_depth: int
+    rr_depth: int
+    spp: int
+    width: int | None
+    height: int | None
+    status: BenchStatus
+    step_ms: Spread | None
+    kernel_ms: Spread | None
+    cold_ms: float | None
+    peak_mib: float | None
+    scratch_bytes: int | None
+    repeats: int
+
+    def to_json(self) -> str:
+        """The record as one line of JSON."""
+        return json.dumps(asdict(self), allow_nan=False)
+
+
+class BenchWriter:
+    """Writes records to a file of their own; each line is on disk once `write` returns."""
+
+    def __init__(self, path: Path) -> None:
+        self._file = path.open("w", encoding="utf-8")
+
+    def write(self, record: BenchRecord) -> None:
+        """Append one record."""
+        self._file.write(record.to_json() + "\n")
+        self._file.flush()
+
+    def __enter__(self) -> BenchWriter:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._file.close()
+
+
+def read_bench(path: Path) -> list[dict[str, Any]]:
+    """The objects in a file that `BenchWriter` wrote."""
+    return [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]

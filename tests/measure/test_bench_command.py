@@ -1,0 +1,154 @@
+"""`reslrb bench` from the command line, on a scene of 16x16 pixels."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from reslrb_cli.cli import main
+
+pytestmark = pytest.mark.usefixtures("llvm")
+
+KEYS = ["integrator", "estimator", "capacity", "max_depth", "rr_depth", "spp", "width", "height", "status", "step_ms",
+        "kernel_ms", "cold_ms", "peak_mib", "scratch_bytes", "repeats"]  # fmt: skip
+SMALL = ["--set", "scene.options.size=16", "--set", "run.spp=1", "--budget", "0"]
+
+
+def call(*args: str) -> int:
+    with pytest.raises(SystemExit) as ended:
+        main(["bench", *args], prog_name="reslrb")
+    return int(ended.value.code or 0)
+
+
+def read(path: Path) -> list[dict]:
+    return [json.loads(line) for line in path.read_text().splitlines()]
+
+
+def test_two_depths(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = tmp_path / "bench.json"
+    names = "ptracer,reslrb:stack,reslrb:reservoir(capacity=2)"
+    assert call(*SMALL, "--max-depth", "4", "--integrators", names, "--json", str(file)) == 0
+    rows = read(file)
+    assert [list(row) for row in rows] == [KEYS] * 6
+    assert [(row["integrator"], row["estimator"], row["capacity"], row["max_depth"]) for row in rows] == [
+        entry
+        for depth in (2, 4)
+        for entry in (
+            ("ptracer", None, None, depth),
+            ("reslrb", "stack", None, depth),
+            ("reslrb", "reservoir", 2, depth),
+        )
+    ]
+    for row in rows:
+        assert (row["status"], row["spp"], row["width"], row["height"], row["repeats"]) == ("ok", 1, 16, 16, 3)
+        for key in ("step_ms", "kernel_ms"):
+            assert 0 < row[key]["min"] <= row[key]["median"] <= row[key]["max"]
+        assert row["step_ms"]["median"] > row["kernel_ms"]["median"]
+        assert row["cold_ms"] > row["step_ms"]["median"]
+        assert row["peak_mib"] > 0
+    assert [row["scratch_bytes"] > 0 for row in rows] == [False, True, False] * 2
+    assert rows[4]["scratch_bytes"] == 3 * rows[1]["scratch_bytes"]  # three vertices in place of one
+    assert (tmp_path / "bench.png").read_bytes().startswith(b"\x89PNG")
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split()[:2] for line in lines[3:9]] == [
+        [str(depth), name] for depth in (2, 4) for name in names.split(",")
+    ]
+
+
+def test_l2(tmp_path: Path) -> None:
+    file = tmp_path / "bench.json"
+    names = "reslrb:stack,trajectory,prb"
+    args = ["--max-depth", "2", "--integrators", names, "--objective", "l2", "--json", str(file)]
+    assert call(*SMALL, *args, "--plot", str(tmp_path / "other.png")) == 0
+    assert [row["status"] for row in read(file)] == ["ok"] * 3
+    assert (tmp_path / "other.png").exists()
+    assert not (tmp_path / "bench.png").exists()
+
+
+def test_no_memory(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = tmp_path / "bench.json"
+    args = ["--max-depth", "4", "--integrators", "ptracer", "--memory-limit", "100MiB", "--json", str(file)]
+    assert call(*SMALL, *args) == 4
+    rows = read(file)
+    assert [list(row) for row in rows] == [KEYS] * 2
+    assert [row["status"] for row in rows] == ["out_of_memory"] * 2
+    assert rows[0]["step_ms"] is None
+    assert "depth 2, ptracer: " in capsys.readouterr().out
+
+
+def test_a_case_that_fails_says_why(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = tmp_path / "bench.json"
+    (tmp_path / "scene.xml").write_text(MASKED)
+    (tmp_path / "x.yaml").write_text(
+        "scene: {file: scene.xml}\ntarget: {render: {}}\nparameters: [{key: veil.opacity.value}]\n"
+    )
+    args = ["--max-depth", "2", "--integrators", "reslrb:gather,trajectory", "--json", str(file)]
+    assert call(str(tmp_path / "x.yaml"), *args, "--set", "run.spp=1", "--budget", "0") == 0
+    assert [row["status"] for row in read(file)] == ["ok", "failed"]
+    assert "depth 2, trajectory: UnsupportedScene: trajectory: Dr.Jit cannot reverse" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("limit", ["200MiB", "420MiB"])
+def test_what_ends_at_a_low_limit_ended_for_want_of_memory(limit: str, tmp_path: Path) -> None:
+    file = tmp_path / "bench.json"
+    args = ["--max-depth", "2", "--integrators", "reslrb:stack", "--memory-limit", limit, "--json", str(file)]
+    assert call(*SMALL, *args) in (0, 4)  # how much a process needs depends on the number of cores
+    assert read(file)[0]["status"] in ("ok", "out_of_memory")
+
+
+@pytest.mark.parametrize(
+    ("args", "line"),
+    [
+        (["none.yaml"], "none.yaml: no such file"),
+        (["--set", "scene.options.colour=3", "--max-depth", "2"], "scene.options.colour: the options are"),
+        (["--memory-limit", "much"], "`much` is no size"),
+        (["--max-depth", "1"], "--max-depth"),
+        (["--integrators", "pt"], "--integrators pt: integrator.type"),
+        (["--baseline", "prb"], "--baseline: `prb` is none of"),
+        (["--json", "no/such/folder.json"], "--json: cannot write"),
+    ],
+)
+def test_wrong_calls_are_one_located_line(args: list[str], line: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert call(*args) == 2
+    [error] = capsys.readouterr().err.strip().splitlines()
+    assert line in error
+
+
+def test_ctrl_c_keeps_what_is_done(tmp_path: Path) -> None:
+    file = tmp_path / "bench.json"
+    command = [sys.executable, "-c", "from reslrb_cli.cli import main; main()", "bench", *SMALL, "--max-depth", "1024"]
+    process = subprocess.Popen(
+        [*command, "--integrators", "reslrb:stack", "--json", str(file)],
+        stdout=subprocess.PIPE, text=True, env=os.environ | {"PYTHONUNBUFFERED": "1"},
+    )  # fmt: skip
+    end = time.monotonic() + 60
+    while not (file.exists() and file.read_text().count("\n") >= 1) and time.monotonic() < end:
+        time.sleep(0.05)
+    process.send_signal(signal.SIGINT)
+    output, _ = process.communicate(timeout=30)
+    assert process.returncode == 130
+    rows = read(file)
+    assert rows
+    assert [list(row) for row in rows] == [KEYS] * len(rows)
+    assert (tmp_path / "bench.png").exists()
+    assert "look at" in output
+
+
+MASKED = """<scene version="3.0.0">
+    <sensor type="perspective">
+        <transform name="to_world"><lookat origin="0, 0, 4" target="0, 0, 0" up="0, 1, 0"/></transform>
+        <film type="hdrfilm"><integer name="width" value="8"/> <integer name="height" value="8"/>
+            <rfilter type="box"/></film>
+    </sensor>
+    <bsdf type="mask" id="veil"><float name="opacity" value="0.5"/> <bsdf type="diffuse"/></bsdf>
+    <shape type="rectangle"><ref id="veil"/></shape>
+    <emitter type="point"><point name="position" x="0" y="1" z="3"/></emitter>
+</scene>
+"""

@@ -1,0 +1,229 @@
+"""The order of a sweep, and what becomes of cases that end: with processes that only pretend."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from reslrb_cli.config import loads
+from reslrb_cli.errors import ConfigError
+from reslrb_cli.measure.bench import MAX_ROUNDS, MIN_ROUNDS, Pace, Result, Sweep, bench
+from reslrb_cli.measure.cases import choose_baseline, depths, parse_cases
+from reslrb_cli.measure.processes import Ended, Stopped
+from reslrb_cli.records.bench import BenchStatus, Spread
+
+CONFIG = """\
+scene: {file: scene.xml}
+target: {render: {}}
+parameters: [{key: a}]
+integrator: {rr_depth: 7, samples_per_pass: 2}
+run: {spp: 4}
+"""
+LIST = "ptracer,reslrb:stack,walk_ad"
+
+
+class Pretended:
+    """A process that writes down what it is asked, and ends at the question that `ends` gives for (type, depth)."""
+
+    log: list[tuple[int, str, Any]] = []  # noqa: RUF012 (shared by all, as the machine is)
+    ends: dict[tuple[str, int], int] = {}  # noqa: RUF012
+    alive = 0
+
+    def __init__(self, first: dict[str, Any]) -> None:
+        config = loads(first["config"], "x.yaml")
+        self.type, self.depth = config.integrator.type, config.integrator.max_depth
+        self.asked, self.closed = 0, False
+        self.question: dict[str, Any] | None = None
+        Pretended.alive += 1
+
+    def ask(self, question: dict[str, Any]) -> None:
+        self.asked, self.question = self.asked + 1, question
+        Pretended.log.append((self.depth, self.type, question["round"]))
+
+    def answer(self, stop: Callable[[], bool]) -> dict[str, Any]:
+        if stop():
+            raise Stopped
+        if self.ends.get((self.type, self.depth)) == self.asked:
+            raise Ended(BenchStatus.OUT_OF_MEMORY, "ended by SIGSEGV")
+        if self.question is None:
+            return {"width": 6, "height": 5}
+        ms = float(self.depth * (1 + self.question["round"]) * {"ptracer": 4, "reslrb": 2, "walk_ad": 5}[self.type])
+        answer = {"step_ms": ms, "kernel_ms": ms / 2, "new_kernels": 2 if self.asked < 3 else 0}
+        return answer | ({"peak_mib": 1.5, "scratch_bytes": 60} if self.question["cold"] else {})
+
+    def close(self) -> None:
+        Pretended.alive -= not self.closed
+        self.closed = True
+
+
+@pytest.fixture(autouse=True)
+def _clean() -> None:
+    Pretended.log, Pretended.ends, Pretended.alive = [], {}, 0
+
+
+def sweep(list_of: str = LIST, baseline: str | None = None, **changes: Any) -> Sweep:
+    cases = parse_cases(list_of)
+    values: dict[str, Any] = {
+        "config": loads(CONFIG, Path("x.yaml")), "variant": "llvm_ad_rgb", "cases": cases,
+        "baseline": choose_baseline(cases, baseline), "depths": [2, 4], "objective": "fixed", "memory_limit": None,
+        "memory": 2**40, "budget_s": 0.0,
+    }  # fmt: skip
+    return Sweep(**(values | changes))
+
+
+def run(what: Sweep, stop: Callable[[], bool] = lambda: False) -> list[Result]:
+    said: list[str] = []
+    rows = [row for depth in bench(what, stop, said.append, Pretended) for row in depth]
+    assert Pretended.alive == 0
+    return rows
+
+
+def test_steps_are_interleaved_and_the_order_turns() -> None:
+    run(sweep(depths=[2]))
+    types = ["ptracer", "reslrb", "walk_ad"]
+    warm = [(2, name, 0) for name in types for _ in range(3)]  # one cold step, two until no kernel is new
+    rounds = [(2, types[(r + k) % 3], r + 1) for r in range(MIN_ROUNDS) for k in range(3)]
+    assert Pretended.log == warm + rounds
+
+
+def test_records() -> None:
+    rows = run(sweep())
+    assert [(row.record.integrator, row.record.max_depth) for row in rows] == [
+        (name, depth) for depth in (2, 4) for name in ("ptracer", "reslrb", "walk_ad")
+    ]
+    stack = rows[1].record
+    assert (stack.estimator, stack.capacity, stack.rr_depth, stack.spp) == ("stack", None, 7, 4)
+    assert (stack.width, stack.height, stack.status, stack.repeats) == (6, 5, BenchStatus.OK, MIN_ROUNDS)
+    assert stack.step_ms == Spread(12.0, 8.0, 16.0)
+    assert stack.kernel_ms == Spread(6.0, 4.0, 8.0)
+    assert (stack.cold_ms, stack.peak_mib, stack.scratch_bytes) == (4.0, 1.5, 60)
+    assert rows[1].step_ratio == rows[1].kernel_ratio == Spread(0.5, 0.5, 0.5)  # in pairs, as all get slower
+    assert rows[0].step_ratio == Spread(1.0, 1.0, 1.0)
+
+
+@pytest.mark.parametrize("question", [0, 1, 2, 5], ids=["loading", "cold", "warming up", "in a round"])
+def test_a_case_that_ends_is_recorded_and_the_rest_goes_on(question: int) -> None:
+    Pretended.ends = {("walk_ad", 2): question}
+    rows = run(sweep())
+    ended = rows[2].record
+    assert (ended.status, ended.repeats, ended.width) == (BenchStatus.OUT_OF_MEMORY, 0, 6)
+    measured = (ended.step_ms, ended.kernel_ms, ended.cold_ms, ended.peak_mib, ended.scratch_bytes)
+    assert measured == (None,) * 5
+    assert (rows[2].reason, rows[2].step_ratio) == ("ended by SIGSEGV", None)
+    assert [row.record.repeats for row in rows] == [3, 3, 0, 3, 3, 3]
+    assert rows[5].record.status is BenchStatus.OK  # it is tried again at the next depth
+
+
+def test_without_a_baseline_there_are_no_ratios() -> None:
+    Pretended.ends = {("ptracer", 2): 1}
+    rows = run(sweep())
+    assert [row.step_ratio is None for row in rows] == [True, True, True, False, False, False]
+
+
+def test_another_baseline() -> None:
+    rows = run(sweep(baseline="reslrb:stack", depths=[2]))
+    assert [row.step_ratio and row.step_ratio.median for row in rows] == [2.0, 1.0, 2.5]
+
+
+def test_all_may_end() -> None:
+    Pretended.ends = {(name, 2): 1 for name in ("ptracer", "reslrb", "walk_ad")}
+    assert {row.record.status for row in run(sweep(depths=[2]))} == {BenchStatus.OUT_OF_MEMORY}
+
+
+@pytest.mark.parametrize(("after", "kept"), [(5, []), (14, [1, 1, 1]), (13, [1, 1]), (33, [3, 3, 3, 1])])
+def test_a_stop_keeps_what_is_done(after: int, kept: list[int]) -> None:
+    answers = iter(range(1000))
+    rows = run(sweep(), stop=lambda: next(answers) > after)
+    assert [row.record.repeats for row in rows] == kept
+    assert all(row.record.status is BenchStatus.OK for row in rows)
+
+
+def test_cases_that_need_the_memory_of_each_other_release_it() -> None:
+    asked: list[bool] = []
+
+    class Noting(Pretended):
+        def ask(self, question: dict[str, Any]) -> None:
+            asked.append(question["release"])
+            super().ask(question)
+
+    said: list[str] = []
+    list(bench(sweep(depths=[2], memory=5 * 2**20), lambda: False, said.append, Noting))
+    assert asked[-1]
+    assert "memory" in said[0]
+
+
+def test_pace_divides_the_budget() -> None:
+    now = [0.0]
+    pace = Pace(100.0, 3, now=lambda: now[0])
+
+    def rounds(begin_s: float, round_s: float) -> int:
+        pace.begin_depth()
+        now[0] += begin_s
+        pace.begin_rounds()
+        done = 0
+        while pace.another(done):
+            now[0] += round_s
+            done += 1
+        return done
+
+    assert MIN_ROUNDS < rounds(2.0, 3.0) < MAX_ROUNDS
+    assert MIN_ROUNDS < rounds(2.0, 4.0) < MAX_ROUNDS
+    assert now[0] < 100.0 - 8.0 * MIN_ROUNDS
+    assert rounds(1.0, 50.0) == MIN_ROUNDS
+    cheap = Pace(1e6, 1, now=lambda: 0.0)
+    assert [cheap.another(done) for done in (MAX_ROUNDS - 1, MAX_ROUNDS)] == [True, False]
+
+
+def test_depths() -> None:
+    assert depths(2) == [2]
+    assert depths(16) == [2, 4, 8, 16]
+    assert depths(20) == [2, 4, 8, 16, 20]
+
+
+def test_options_of_cases() -> None:
+    cases = parse_cases("reslrb:reservoir(capacity=4, weight=adjoint), ptracer(rr_depth=3),prb,reslrb")
+    config = loads(CONFIG, "x.yaml")
+    assert [case.estimator for case in cases] == ["reservoir(weight=adjoint)", None, None, "reservoir"]
+    options = [case.at(config, 9, known=True).integrator.options() for case in cases]
+    assert (options[0]["capacity"], options[0]["samples_per_pass"], options[0]["max_depth"]) == (4, 2, 9)
+    assert [option["rr_depth"] for option in options] == [7, 3, 7, 7]
+    assert "samples_per_pass" not in options[2]
+
+
+def test_cases_may_have_an_adjoint_of_their_own() -> None:
+    case, other, third = parse_cases("reslrb:stack(adjoint=batched,batches=2),ptracer(adjoint=correlated),prb")
+    config = loads(CONFIG, "x.yaml", ["run.adjoint=batched"])
+    runs = [c.at(config, 9, known=False).run for c in (case, other, third)]
+    assert [run.adjoint for run in runs] == ["batched", "correlated", "batched"]
+    assert [run.batches for run in runs] == [2, 4, 4]
+    assert case.estimator == "stack(adjoint=batched,batches=2)"
+    assert case.at(loads(CONFIG, "x.yaml"), 9, known=False).run.batches == 2
+
+
+@pytest.mark.parametrize(
+    ("text", "line"),
+    [
+        ("ptracer,", "`` is no integrator"),
+        ("ptracer,ptracer", "`ptracer` is named twice"),
+        ("reslrb:stack(3)", "`3` must be OPTION=VALUE"),
+        ("reslrb(max_depth=3)", "max_depth is what is varied"),
+        ("path", "--integrators path: integrator.type: must be one of"),
+        ("reslrb:gather(capacity=2)", "integrator.capacity: has no effect with estimator `gather`"),
+        ("ptracer(capacity=2)", "integrator.capacity: not an option of ptracer but of reslrb"),
+        ("ptracer(adjoint=batched)", "adjoint: has no effect where dL/dI is known"),
+        ("ptracer(samples_per_pass=3)", "integrator.samples_per_pass: 3 does not divide run.spp"),
+    ],
+)
+def test_wrong_lists_are_located(text: str, line: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        sweep(text).check()
+    assert str(caught.value).startswith("--integrators")
+    assert line in str(caught.value)
+
+
+def test_an_unknown_baseline_is_located() -> None:
+    with pytest.raises(ConfigError, match=r"--baseline: `prb` is none of ptracer, reslrb:stack"):
+        sweep(baseline="prb")
