@@ -251,7 +251,10 @@ FILES: dict[str, tuple[str | bytes, tuple[str, ...]]] = {
         GOOD + "integrator: {weight: adjoint, image: retained}\nrun: {adjoint: independent}\n",
         ("x.yaml: integrator.weight: `adjoint` does not go with image: retained",),
     ),
-    "adjoint": (GOOD + "run: {adjoint: correlate}\n", ("x.yaml: run.adjoint: must be one of correlated, independent, batched",)),
+    "adjoint": (
+        GOOD + "run: {adjoint: correlate}\n",
+        ("x.yaml: run.adjoint: must be one of correlated, independent, batched",),
+    ),
     "name without letters": (GOOD + "run: {name: '..'}\n", ("x.yaml: run.name: must hold a letter or a digit",)),
     "variant": (GOOD + "variant: scalar_rgb\n", ("x.yaml: variant: must be one of auto, llvm_ad_rgb",)),
 }
