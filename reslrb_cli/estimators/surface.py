@@ -77,7 +77,7 @@ def _index(pointer: Any) -> Any:
 
 
 def lobe(plan: Plan, scattering: Any) -> list[Any]:
-    """Which lobe was sampled (1: delta, 2: null), with which numbers; nothing where only smooth ones have derivatives."""
+    """Which lobe was sampled (1: delta, 2: null), with which numbers; nothing where just smooth ones matter."""
     if not (plan.differentiate_delta or plan.differentiate_null):
         return []
     kind = dr.select(scattering.is_delta, mi.UInt32(1), 0) + dr.select(scattering.is_null, mi.UInt32(2), 0)

@@ -34,8 +34,8 @@ def _needs(member: str, **along: Any) -> Callable[[Plan], Plan]:
     """Toggle one of the scene's needs; `along` are members of the plan that go with it when it is left out."""
 
     def toggle(plan: Plan) -> Plan:
-        value = not getattr(plan.needs, member)
-        return replace(plan, needs=replace(plan.needs, **{member: value}), **({} if value else along))
+        change: dict[str, Any] = {member: not getattr(plan.needs, member)}
+        return replace(plan, needs=replace(plan.needs, **change), **({} if change[member] else along))
 
     return toggle
 
