@@ -79,7 +79,7 @@ def scene_needs(scene: Any, sensor: Any) -> SceneNeeds:
         has_smooth=flags & int(mi.BSDFFlags.Smooth) != 0,
         has_delta_lobes=flags & delta != 0,
         has_null=flags & int(mi.BSDFFlags.Null) != 0,
-        has_instances=any(shape.class_name() == "Instance" for shape in graph.shapes()),
+        has_instances=any(shape.class_name() == "Instance" for shape in graph.of_type(mi.Shape)),
         has_shading_normals=any(_has_shading_normals(shape) for shape in graph.shapes()),
         has_perturbed_normals=any(bsdf.class_name() in ("BumpMap", "NormalMap") for bsdf in graph.of_type(mi.BSDF)),
         bsdfs_read_geometry=_read_geometry(graph),
