@@ -184,3 +184,6 @@ class Gather(Estimator):
         differentiate_emission(p, S.adjoint_of_emission)
         if p.plan.differentiate_bsdfs:
             p.walk(Taking(p, state.visibility, S), active)
+
+    def kept(self, plan: Plan) -> Any:
+        return GatherState(Visibility.none(max(plan.max_depth - 1, 0)), [AdjointSum.zero(plan.track_zeros)])

@@ -138,6 +138,11 @@ def _make_classes() -> dict[str, Any]:
         def __init__(self, props: Any) -> None:
             super().__init__(props)
             name = props.get("estimator", "reservoir")
+            if name == "auto":
+                raise ValueError(
+                    '"estimator" auto needs an experiment to measure on (`reslrb optimize`); as a plugin, name one of '
+                    + ", ".join(ESTIMATORS)
+                )
             if name not in ESTIMATORS:
                 raise ValueError(f'"estimator" must be one of {", ".join(ESTIMATORS)}, not "{name}"')
             # An option that the estimator does not know stays unread, which Mitsuba reports as an error.

@@ -42,8 +42,8 @@ class Samples:
     seed: Any
     spp: int
     width: int
-    scale: float  # brings a sum over light paths to an image
-    fraction: float  # of all samples of that image, these are so many
+    scale: Any  # brings a sum over light paths to an image
+    fraction: Any  # of all samples of that image, these are so many
 
     def sampler(self) -> Any:
         """A sampler at the beginning of these samples' stream."""
@@ -108,8 +108,9 @@ def make_samples(plan: Plan, scene: Any, sensor: Any, seed: Any, spp: int, total
     width = spp * int(dr.prod(sensor.film().size()))
     if width > 0xFFFFFFFF:
         raise ValueError(f"{width} paths in one pass are more than 2^32 - 1: set samples_per_pass below {spp}")
-    scale = float(dr.prod(film.size)) / (float(dr.prod(sensor.film().size())) * total_spp)
-    return Samples(scene, sensor, plan, film, mi.UInt32(seed), spp, width, scale, spp / total_spp)
+    # Opaque: as a literal it would give every sample count kernels of its own.
+    scale = dr.opaque(mi.Float, float(dr.prod(film.size)) / (float(dr.prod(sensor.film().size())) * total_spp))
+    return Samples(scene, sensor, plan, film, mi.UInt32(seed), spp, width, scale, dr.opaque(mi.Float, spp / total_spp))
 
 
 def passes(plan: Plan, scene: Any, sensor: Any, seed: Any, spp: int, spp_per_pass: int | None) -> list[Samples]:
