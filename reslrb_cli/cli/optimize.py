@@ -42,8 +42,8 @@ def command(config_file: Path, overrides: tuple[str, ...], force: bool, quiet: b
     problem = assemble(config, say, PilotCache())
     find_reached(problem, say)
     manifest = Manifest(variant=variant, device=device_name(variant), seed=config.run.seed, config=str(config_file))
-    manifest.pilot = problem.pilot and problem.pilot.to_json()
-    manifest.memory = problem.memory and problem.memory.to_json()
+    manifest.pilot = None if problem.pilot is None else problem.pilot.to_json()
+    manifest.memory = None if problem.memory is None else problem.memory.to_json()
     folder = RunFolder.create(config_file, config.run.output, config.run.folder_name, force, dump(config), manifest)
     recording = Recording(problem, folder, manifest)
     with Interrupts() as interrupts, Progress(config.run.iterations, quiet) as progress:

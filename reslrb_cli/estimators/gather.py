@@ -28,6 +28,7 @@ from reslrb_cli.estimators.base import (
 from reslrb_cli.estimators.sums import AdjointSum
 from reslrb_cli.transport.connection import Connection, Seen, stand_in
 from reslrb_cli.transport.factors import NO_ZERO, Product
+from reslrb_cli.transport.plan import Plan
 from reslrb_cli.transport.scattering import Scattering, attached_factors
 from reslrb_cli.transport.walk import Vertex
 

@@ -161,8 +161,10 @@ def _make_classes() -> dict[str, Any]:
                 # Isolated: on their way to the parameters gradients are evaluated, and with them all that they hang on,
                 # which is to be one kernel. They set out once, at the end.
                 with dr.isolate_grad():
-                    for samples, state in zip(trace.samples, trace.states(self.estimator, adjoint), strict=True):
+                    for samples in trace.samples:
+                        state = trace.state_of(samples, self.estimator, adjoint)
                         lt.replay(samples, self.estimator, state, adjoint)
+                        del state  # before the next pass makes its own
                         if len(trace.samples) > 1:
                             dr.eval()  # passes are not to pile up
 
@@ -179,6 +181,7 @@ def _make_classes() -> dict[str, Any]:
                     for samples in parts:
                         state = lt.keep(samples, self.estimator, block, adjoint)
                         lt.replay(samples, self.estimator, state, adjoint)
+                        del state  # before the next pass makes its own
                         if len(parts) > 1:
                             dr.eval()
                 return film.develop(block)

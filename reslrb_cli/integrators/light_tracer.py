@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -185,10 +184,9 @@ class Trace:
     def film(self) -> Film:
         return self.samples[0].film
 
-    def states(self, estimator: Estimator, adjoint: AdjointImage) -> Iterator[Any]:
-        """What is kept of each pass, in turn; passes that are traced only now know dL/dI from the start."""
-        for samples in self.samples:
-            yield self.state if self.state is not None else keep(samples, estimator, None, adjoint)
+    def state_of(self, samples: Samples, estimator: Estimator, adjoint: AdjointImage) -> Any:
+        """What is kept of one of the passes; one that is traced only now knows dL/dI from the start."""
+        return self.state if self.state is not None else keep(samples, estimator, None, adjoint)
 
 
 def trace_image(samples: list[Samples], estimator: Estimator) -> Trace:

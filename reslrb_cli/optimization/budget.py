@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from reslrb_cli.optimization.problem import Problem
 
 #: Images of the film's size that a step has at once: block, image, loss's temporaries, gradient, adjoint.
-FILM_IMAGES = 10
+FILM_IMAGES = 6
 #: Copies of a parameter: gradients, the optimiser's moments, their next values.
 PARAMETER_COPIES = 8
 
@@ -41,21 +41,21 @@ class Estimate:
 class MemoryPlan:
     """How a budget is kept: the samples of a pass, what is expected, and, after the first iterations, what was used."""
 
-    budget: int
+    budget_bytes: int
     samples_per_pass: int
     passes: int
-    expected: Estimate
+    expected_bytes: Estimate
     peak_mib: float | None = None
     exceeded: bool = False
 
     def check(self, peak: float) -> str | None:
         """Take note of the allocator's peak in MiB; the warning, the first time that it is above the budget."""
         self.peak_mib = peak
-        used, before = peak * MIB + self.expected.scratch, self.exceeded
-        self.exceeded = used > self.budget
+        used, before = peak * MIB + self.expected_bytes.scratch, self.exceeded
+        self.exceeded = used > self.budget_bytes
         if not self.exceeded or before:
             return None
-        return f"run.memory_budget: {used / MIB:.1f} MiB were used, more than the {self.budget / MIB:.1f} MiB allowed"
+        return f"run.memory_budget: {used / MIB:.1f} MiB were used, more than the {self.budget_bytes / MIB:.1f} MiB allowed"
 
     def to_json(self) -> dict[str, Any]:
         """For the manifest."""
@@ -76,8 +76,8 @@ def estimate(problem: Problem, integrator: Any, samples: int, fixed: int) -> Est
         plan = integrator.plan(problem.scene, sensor, problem.selection.params)
         width = samples * int(dr.prod(sensor.film().size()))
         paths = max(paths, sum(_allocated(size * width) for size in entry_bytes(integrator.estimator.kept(plan))))
-        pixels = int(dr.prod(sensor.film().crop_size())) * 5  # channels, at most
-        images = max(images, FILM_IMAGES * _allocated(4 * pixels) + _replicas(pixels))
+        block = int(dr.prod(sensor.film().crop_size())) * (sensor.film().base_channels_count() + 1)
+        images = max(images, FILM_IMAGES * _allocated(4 * block), 2 * _allocated(4 * block) + _replicas(block))
         scratch = max(scratch, integrator.estimator.scratch_bytes(plan))
     for key in problem.selection.keys:
         size = int(dr.prod(dr.shape(problem.selection.params[key])))

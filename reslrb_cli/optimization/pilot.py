@@ -6,7 +6,7 @@ Variance is that of the gradient at equal samples, summed over the parameters, e
 square; time is that of a step's kernels. Equal seeds give all candidates equal paths, and given the paths an estimator
 that selects has the exact one's gradient as its expectation, so that
 
-    Var = Var_exact + E |g - g_exact|^2        and with m independent slots   Var_m = Var_exact + (Var_1 - Var_exact) / m
+    Var = Var_exact + E |g - g_exact|^2,   with m independent slots   Var_m = Var_exact + (Var_1 - Var_exact) / m,
 
 which few seeds estimate well, and which tells what a candidate can reach at best before its kernels are compiled.
 """

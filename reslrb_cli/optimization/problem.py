@@ -114,9 +114,7 @@ def make_configured(integrator: Integrator) -> Any:
     return make_integrator(integrator.type, **integrator.options())
 
 
-def assemble(
-    config: Config, say: Callable[[str], None] = lambda line: None, cache: Cache | None = None
-) -> Problem:
+def assemble(config: Config, say: Callable[[str], None] = lambda line: None, cache: Cache | None = None) -> Problem:
     """Load and check what `config` names, make the targets, and settle the integrator; a variant must be set.
 
     Everything that can be checked is, before anything is rendered. `say` is told what takes long, `cache` holds what
