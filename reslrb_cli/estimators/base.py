@@ -37,6 +37,11 @@ class Pass:
     walk: Callable[..., Any]
     emission: Callable[[], Any]
 
+    def delta(self, u: Any, active: Any) -> Any:
+        """The adjoint (C,) at film position `u`; dL/dI is known."""
+        assert self.adjoint is not None
+        return self.adjoint.lookup(u, active)
+
     def splat(self, u: Any, value: Any, active: Any) -> None:
         """Add `value` (C,) to the image, where there is one."""
         if self.block is not None:

@@ -179,10 +179,9 @@ class EventEstimator(Estimator):
         return Kept(mi.Float(0), [Slot.empty(plan) for _ in range(self.capacity)])
 
     def backward(self, p: Pass, state: Kept) -> None:
-        assert p.adjoint is not None
         adjoints = []
         for slot in state.slots:
-            delta = p.adjoint.lookup(slot.u, slot.w > 0)
+            delta = p.delta(slot.u, slot.w > 0)
             unselected = dr.select(slot.w > 0, state.W / (self.capacity * slot.w), 0)
             adjoints.append(PathAdjoint(delta * slot.C.nonzero * unselected, slot.C))
 

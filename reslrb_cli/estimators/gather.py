@@ -133,7 +133,7 @@ class Taking(VertexHooks):
             connected = connected & (vertex.depth >= self.first)
             useful = useful & (vertex.depth >= self.first)
         C = contribution(p, vertex, connection)
-        delta = p.adjoint.lookup(connection.u, connected)
+        delta = p.delta(connection.u, connected)
         S = state.minus(delta, C, vertex.depth, connected)
         own = PathAdjoint(delta * C.nonzero, C)
         rest_c = mi.Spectrum(dr.rcp(stand_in(connection)[0]))
@@ -164,8 +164,7 @@ def contribution(p: Pass, vertex: Vertex, connection: Connection) -> Product:
 
 def plus(p: Pass, S: AdjointSum, vertex: Vertex, connection: Connection, C: Product) -> AdjointSum:
     """S + delta C."""
-    assert p.adjoint is not None
-    return S.plus(p.adjoint.lookup(connection.u, connection.active), C, vertex.depth, connection.active)
+    return S.plus(p.delta(connection.u, connection.active), C, vertex.depth, connection.active)
 
 
 class Gather(Estimator):

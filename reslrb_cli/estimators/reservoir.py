@@ -73,7 +73,7 @@ def selection_weight(p: Pass, weight: str, connection: Connection, C: Product) -
         return mi.luminance(mi.Color3f(value)) if len(value) == 3 else mi.Float(value[0])
     if p.adjoint is None:
         raise ValueError('weight "adjoint" needs dL/dI before the paths are traced, which correlated samples lack')
-    return dr.sum(dr.abs(p.adjoint.lookup(connection.u, connection.active) * value))
+    return dr.sum(dr.abs(p.delta(connection.u, connection.active) * value))
 
 
 class ReservoirSelection(VertexHooks):
@@ -209,6 +209,5 @@ class Reservoir(Estimator):
         return dr.select(slot.I > 0, state.W / (self.capacity * slot.w), 0)
 
     def _adjoint(self, p: Pass, state: ReservoirState, slot: Slot) -> PathAdjoint:
-        assert p.adjoint is not None
-        delta = p.adjoint.lookup(slot.u, slot.I > 0)
+        delta = p.delta(slot.u, slot.I > 0)
         return PathAdjoint(delta * slot.C.nonzero * self._unselected(state, slot), slot.C)

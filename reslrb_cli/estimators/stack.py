@@ -19,6 +19,7 @@ import drjit as dr
 import mitsuba as mi
 
 from reslrb_cli.estimators.base import (
+    Estimator,
     Pass,
     PathAdjoint,
     VertexHooks,
@@ -74,8 +75,9 @@ class Frame:
         """The frame of the same form that has these members."""
         values = iter(members)
         point = SurfacePoint([next(values) for _ in self.point.numbers])
-        plain = [next(values) for _ in range(5)]
-        return Frame(point, *plain, [next(values) for _ in self.zeros], list(values))
+        wo_c, wo_s, weight_c, f_s, own = (next(values) for _ in range(5))
+        zeros = [next(values) for _ in self.zeros]
+        return Frame(point, wo_c, wo_s, weight_c, f_s, own, zeros, list(values))
 
 
 @dataclass
@@ -125,7 +127,7 @@ class Pushing(VertexHooks):
         p, plan, depth, connected = self.p, self.p.plan, vertex.depth, connection.active
         C = contribution(p, vertex, connection)
         p.splat(connection.u, C.value(), connected)
-        delta = p.adjoint.lookup(connection.u, connected)
+        delta = p.delta(connection.u, connected)
         own = PathAdjoint(dr.select(connected, delta * C.nonzero, 0), C)
         rest_c = mi.Spectrum(dr.rcp(stand_in(connection)[0]))
         if plan.needs.has_null:
@@ -189,25 +191,25 @@ def walk_back(p: Pass, pushed: Pushed) -> AdjointSum:
     return A
 
 
-class Stack(Gather):
+class Stack(Estimator):
     """Exact, like `gather`, without tracing the paths a second time."""
 
     OPTIONS: ClassVar[dict[str, Any]] = {"stack_size": STACK_SIZE}
 
     def __init__(self, stack_size: int = STACK_SIZE) -> None:
         at_least_one("stack_size", stack_size)
-        self.stack_size = stack_size
+        self.stack_size, self.gather = stack_size, Gather()
 
     def forward(self, p: Pass) -> GatherState | StackState:
         if p.adjoint is None or not p.plan.differentiate_bsdfs:
-            return super().forward(p)
+            return self.gather.forward(p)
         return self._sweep(p, None)
 
     def backward(self, p: Pass, state: GatherState | StackState) -> None:
-        if not p.plan.differentiate_bsdfs:
-            super().backward(p, state)
-            return
         if isinstance(state, GatherState):
+            if not p.plan.differentiate_bsdfs:
+                self.gather.backward(p, state)
+                return
             state = self._sweep(p, state.visibility)
             dr.eval(state)
         differentiate_emission(p, state.S.adjoint_of_emission)

@@ -54,7 +54,7 @@ class AdjointSum:
         for c, zero in enumerate(C.zero):
             # A connection whose own factor is the zero one has a derivative there, and none in the prefix.
             term[c] = dr.select((zero >= 0) & (zero != mi.Int32(index)), term[c], 0)
-        return type(self)(value, rest, list(self._add(*self.behind_zero, term)))
+        return type(self)(value, rest, list(self._add(self.behind_zero[0], self.behind_zero[1], term)))
 
     def alive(self) -> Any:
         """Whether any channel of the sum can have a derivative."""

@@ -39,7 +39,7 @@ def _on_variant(old: str | None, new: str) -> None:
 def _make_classes() -> dict[str, Any]:
     """Plugins by name. The classes derive from one of the variant's, so they exist once for each variant."""
 
-    class LightIntegrator(mi.CppADIntegrator):  # type: ignore[misc]
+    class LightIntegrator(mi.CppADIntegrator):
         """What all have in common: `ptracer`'s options, and the image."""
 
         def __init__(self, props: Any) -> None:
@@ -56,7 +56,6 @@ def _make_classes() -> dict[str, Any]:
             self.rr_depth = props.get("rr_depth", 5)
             if self.rr_depth <= 0:
                 raise ValueError('"rr_depth" must be greater than zero')
-            self.estimator: Estimator | None = None
             self._track_zeros = False
             self._plans: dict[Any, Plan] = {}  # of the sensors of one scene
             self._scene: Any = None  # its address, and, to keep that from being used again, itself
@@ -89,7 +88,8 @@ def _make_classes() -> dict[str, Any]:
             """The surfaces' BSDFs that use any of these nodes; empty where that is all of them."""
             if any(node not in self._owners for node in nodes):
                 graph = SceneGraph.of(scene)
-                self._owners |= {node: graph.owning_bsdfs(node) for node in nodes} | {None: graph.surface_bsdfs()}
+                owners = {n: [n.bsdf()] if isinstance(n, mi.Shape) else graph.owning_bsdfs(n) for n in nodes}
+                self._owners |= owners | {None: graph.surface_bsdfs()}
             used = {bsdf: None for node in nodes for bsdf in self._owners[node]}
             return () if all(bsdf in used for bsdf in self._owners.get(None, [])) else tuple(used)
 
@@ -108,7 +108,7 @@ def _make_classes() -> dict[str, Any]:
                 film = Film(sensor)
                 block = film.block()
                 for samples in self.passes(scene, sensor, seed, spp):
-                    lt.image_alone(samples, self.estimator, block)
+                    lt.image_alone(samples, self.image_estimator(), block)
                     if self.samples_per_pass is not None:
                         dr.eval(block.tensor())
                 image = film.develop(block)
@@ -125,6 +125,10 @@ def _make_classes() -> dict[str, Any]:
                 for samples in self.passes(scene, sensor, seed, spp, params):
                     lt.splat_tangents(samples, block)
                 return film.develop_tangent(block)
+
+        def image_estimator(self) -> Estimator | None:
+            """The estimator that makes images of its own; None where they show every connection."""
+            return None
 
         def aov_names(self) -> list[str]:
             return []
@@ -148,6 +152,9 @@ def _make_classes() -> dict[str, Any]:
             # An option that the estimator does not know stays unread, which Mitsuba reports as an error.
             kind = ESTIMATORS[name]
             self.estimator = kind(**{key: props.get(key, default) for key, default in kind.OPTIONS.items()})
+
+        def image_estimator(self) -> Estimator | None:
+            return None if self.estimator.splats_all else self.estimator
 
         def trace(self, scene: Any, sensor: Any, seed: Any, spp: int, params: Any) -> lt.Trace:
             """The image, and what a replay of the same samples needs; both evaluated."""

@@ -6,15 +6,18 @@ from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
-import mitsuba as mi
 
 from reslrb_cli.errors import UnsupportedScene
+from reslrb_cli.scene.catalog import parameter_kind
 
 
 @dataclass(frozen=True)
 class Differentiated:
-    """What tracks derivatives: the nodes of BSDFs (textures, nested BSDFs) that have such parameters, whether emission
-    does, and whether any of the parameters is exactly zero."""
+    """What tracks derivatives.
+
+    `bsdf_nodes` are the nodes of BSDFs that have such parameters: textures, nested BSDFs, and meshes whose attributes
+    textures read. `emission` says whether emission does, `zeros` whether any of the parameters is exactly zero.
+    """
 
     bsdf_nodes: tuple[Any, ...]
     emission: bool
@@ -32,10 +35,10 @@ def differentiated(params: Any) -> Differentiated:
     with dr.resume_grad():  # where gradients are suspended, nothing says that it tracks them
         attached = {key: value for key, value in params.items() if dr.grad_enabled(value)}
     for key, value in attached.items():
-        owner = _owner(params, key)
-        if isinstance(owner, mi.BSDF):
+        kind = parameter_kind(params, key)
+        if kind in ("bsdf", "attribute"):
             nodes[params.properties[key][2]] = None
-        elif isinstance(owner, mi.Emitter):
+        elif kind == "emitter":
             emission = True
         else:
             raise UnsupportedScene(
@@ -44,17 +47,6 @@ def differentiated(params: Any) -> Differentiated:
             )
         zeros = zeros or _has_singular(key, value)
     return Differentiated(tuple(nodes), emission, zeros)
-
-
-def _owner(params: Any, key: str) -> Any:
-    """The BSDF or emitter that a parameter belongs to (a texture belongs to what it is plugged into), or its node."""
-    node = params.properties[key][2]
-    while node is not None:
-        if isinstance(node, (mi.BSDF, mi.Emitter, mi.Shape, mi.Sensor)):
-            return node
-        parent = params.hierarchy.get(node)
-        node = parent[0] if parent else None
-    return None
 
 
 def _has_singular(key: str, value: Any) -> bool:

@@ -148,8 +148,8 @@ def splat_image(samples: Samples, block: Any) -> None:
 
 
 def image_alone(samples: Samples, estimator: Estimator | None, block: Any) -> None:
-    """Add the samples' image to the block, as the estimator makes it where it makes one of its own."""
-    if estimator is None or estimator.splats_all:
+    """Add the samples' image to the block, as the estimator makes it where it makes one of its own (else None)."""
+    if estimator is None:
         splat_image(samples, block)
     else:
         keep(samples, estimator, block)
@@ -198,7 +198,7 @@ def trace_image(samples: list[Samples], estimator: Estimator) -> Trace:
     else:
         trace = Trace(samples)
         for part in samples:
-            image_alone(part, estimator, block)
+            image_alone(part, None if estimator.splats_all else estimator, block)
             dr.eval(block.tensor())
     trace.image = film.develop(block)
     dr.eval(trace.image)

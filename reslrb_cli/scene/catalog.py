@@ -45,7 +45,7 @@ def describe(params: Any, key: str) -> ParameterInfo:
     """Describe one entry of a `mi.traverse` result."""
     value, node, flags = _value(params, key), params.properties[key][2], int(params.flags(key))
     differentiable = flags & (int(mi.ParamFlags.NonDifferentiable) | int(mi.ParamFlags.ReadOnly)) == 0
-    kind = _kind(params, key, node)
+    kind = parameter_kind(params, key)
     return ParameterInfo(
         key=key,
         kind=kind,
@@ -71,7 +71,9 @@ def _value(params: Any, key: str) -> Any:
     return value if value_type is None else params.get_property(value, value_type, node)
 
 
-def _kind(params: Any, key: str, node: Any) -> str:
+def parameter_kind(params: Any, key: str) -> str:
+    """What an entry of a `mi.traverse` result belongs to (`ParameterInfo.kind`)."""
+    node = params.properties[key][2]
     kinds = {
         "bsdf": mi.BSDF,
         "emitter": mi.Emitter,

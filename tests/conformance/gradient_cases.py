@@ -82,6 +82,28 @@ def _environment() -> dict:
                                 "to_world": transform(rotate=([1, 0.3, 0.2], 50))})  # fmt: skip
 
 
+def _vertex_colors() -> dict:
+    import mitsuba as mi
+
+    sheet = mi.Mesh("sheet", 4, 2, has_vertex_texcoords=False, props=_mesh_properties())
+    params = mi.traverse(sheet)
+    params["vertex_positions"] = [-0.8, -0.6, -0.5, 0.6, -0.6, -0.5, 0.6, -0.5, 0.6, -0.8, -0.4, 0.5]
+    params["faces"] = [0, 2, 1, 0, 3, 2]
+    params.update()
+    sheet.add_attribute("vertex_color", 3, [0.8, 0.3, 0.2, 0.2, 0.7, 0.4, 0.5, 0.5, 0.9, 0.6, 0.8, 0.3])
+    return room(sheet=sheet)
+
+
+def _mesh_properties() -> Any:
+    import mitsuba as mi
+
+    properties = mi.Properties()
+    bsdf = mi.load_dict({"type": "twosided", "bsdf": {
+        "type": "diffuse", "reflectance": {"type": "mesh_attribute", "name": "vertex_color"}}})  # fmt: skip
+    properties["mesh_bsdf"] = bsdf
+    return properties
+
+
 FLOOR = "floor.brdf_0.reflectance.data"
 
 
@@ -153,6 +175,7 @@ CASES = [
                                     "type": "conductor", "specular_reflectance": rgb(0.9, 0.7, 0.5)},
                                 "arbitrary": bitmap(np.random.default_rng(5).uniform(0, 0.1, (4, 4, 1)), "bilinear")}),
                  ("floor.nested_bsdf.specular_reflectance.value",), "fd", spp=128),
+    GradientCase("mesh_attribute", _vertex_colors, ("sheet.vertex_color",), "ptracer"),
     # ---- Masks ----
     GradientCase("mask", lambda: _mask(0.4),
                  ("veil.bsdf.opacity.value", "veil.bsdf.nested_bsdf.brdf_0.reflectance.value",
