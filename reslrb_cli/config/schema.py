@@ -221,8 +221,8 @@ class RunConfig(Section):
     memory_budget: Memory | None = Field(
         default=None,
         description="Memory that the iterations may take, with what stands before them: a number of MiB, or text such "
-        "as 512 MiB or 2GiB. The samples of a step are split into passes that fit. null: no limit. Only with integrator "
-        "`reslrb`.",
+        "as 512 MiB or 2GiB. The samples of a step are split into passes that fit. null: no limit. Only with "
+        "integrator `reslrb`.",
     )
     images_every: Annotated[int, Field(ge=0)] = Field(
         default=0, description="Iterations between two saved images; 0: only the initial and the final one."

@@ -220,7 +220,7 @@ class Stack(Estimator):
     def kept(self, plan: Plan) -> Any:
         # Visibility is there from an image pass that did not know delta; the sweep's own state comes beside it.
         S = AdjointSum.zero(plan.track_zeros)
-        return [super().kept(plan).visibility, StackState(S, S, mi.UInt32(0))]
+        return [Visibility.none(max(plan.max_depth - 1, 0)), StackState(S, S, mi.UInt32(0))]
 
     def scratch_bytes(self, plan: Plan) -> int:
         if not plan.differentiate_bsdfs:

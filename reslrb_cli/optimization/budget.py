@@ -23,7 +23,7 @@ PARAMETER_COPIES = 8
 
 @dataclass(frozen=True)
 class Estimate:
-    """Bytes that a step is expected to take: what stands before it (`fixed`), its images and parameters (`images`),
+    """Bytes that a step is expected to take: what stands before it, with the targets (`fixed`), its images and parameters (`images`),
     thread-local memory (`scratch`), and what is kept of the paths of one pass (`paths`)."""
 
     fixed: int
@@ -55,7 +55,8 @@ class MemoryPlan:
         self.exceeded = used > self.budget_bytes
         if not self.exceeded or before:
             return None
-        return f"run.memory_budget: {used / MIB:.1f} MiB were used, more than the {self.budget_bytes / MIB:.1f} MiB allowed"
+        allowed = f"{self.budget_bytes / MIB:.1f} MiB"
+        return f"run.memory_budget: {used / MIB:.1f} MiB were used, more than the {allowed} that it allows"
 
     def to_json(self) -> dict[str, Any]:
         """For the manifest."""
@@ -69,8 +70,9 @@ def standing() -> int:
 
 
 def estimate(problem: Problem, integrator: Any, samples: int, fixed: int) -> Estimate:
-    """What a step takes whose passes have `samples` samples per pixel; `fixed` is what stands before it."""
-    paths = images = scratch = 0
+    """What a step takes whose passes have `samples` samples per pixel; `fixed` is what stands
+    before it, but for the targets."""
+    paths = images = targets = scratch = 0
     for index in problem.sensors:
         sensor = problem.scene.sensors()[index]
         plan = integrator.plan(problem.scene, sensor, problem.selection.params)
@@ -78,11 +80,12 @@ def estimate(problem: Problem, integrator: Any, samples: int, fixed: int) -> Est
         paths = max(paths, sum(_allocated(size * width) for size in entry_bytes(integrator.estimator.kept(plan))))
         block = int(dr.prod(sensor.film().crop_size())) * (sensor.film().base_channels_count() + 1)
         images = max(images, FILM_IMAGES * _allocated(4 * block), 2 * _allocated(4 * block) + _replicas(block))
+        targets += _allocated(4 * block)
         scratch = max(scratch, integrator.estimator.scratch_bytes(plan))
     for key in problem.selection.keys:
         size = int(dr.prod(dr.shape(problem.selection.params[key])))
         images += PARAMETER_COPIES * _allocated(4 * size) + _replicas(size)
-    return Estimate(fixed, images, scratch * resident_paths(), paths)
+    return Estimate(fixed + targets, images, scratch * resident_paths(), paths)
 
 
 def choose_samples(problem: Problem, integrator: Any, samples: int, budget: int, fixed: int) -> tuple[int, Estimate]:

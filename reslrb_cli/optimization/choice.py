@@ -39,7 +39,7 @@ class Cache(Protocol):
 
 
 @dataclass
-class _Option:
+class Option:
     """A candidate, ready to run; `memory` where there is a budget."""
 
     options: dict[str, Any]
@@ -47,23 +47,27 @@ class _Option:
     memory: MemoryPlan | None
 
 
-def settle_integrator(problem: Problem, say: Say, cache: Cache | None = None) -> None:
-    """Replace `problem.integrator` by the one that the run will use, where that is left to measurement.
+def find_options(problem: Problem) -> list[Option]:
+    """What the run may use in place of `problem.integrator`, where that is left to measurement; else nothing.
 
-    Raises ConfigError where no estimator keeps the memory budget.
+    Needs no targets. Raises ConfigError where no estimator keeps the memory budget.
     """
     config = problem.config
     if not isinstance(config.integrator, Reslrb):
+        return []
+    if config.integrator.estimator == "auto":
+        return _fitting(problem, config.integrator, candidates(config))
+    return [] if config.run.memory_budget is None else _fitting(problem, config.integrator, [{}])
+
+
+def settle_integrator(problem: Problem, options: list[Option], say: Say, cache: Cache | None = None) -> None:
+    """Replace `problem.integrator` by the best of the options, where there are any; of several a pilot finds it."""
+    if not options:
         return
-    auto = config.integrator.estimator == "auto"
-    if not auto and config.run.memory_budget is None:
-        return
-    choices = candidates(config) if auto else [{}]
-    fitting = _fitting(problem, config.integrator, choices)
-    chosen = fitting[0]
-    if auto:
-        problem.pilot = _outcome(problem, fitting, say, cache)
-        chosen = next(option for option in fitting if option.options == problem.pilot.chosen)
+    chosen = options[0]
+    if chosen.options:
+        problem.pilot = _outcome(problem, options, say, cache)
+        chosen = next(option for option in options if option.options == problem.pilot.chosen)
         say(problem.pilot.line())
     problem.integrator, problem.memory = chosen.integrator, chosen.memory
     if chosen.memory is not None:
@@ -82,7 +86,7 @@ def candidates(config: Config) -> list[dict[str, Any]]:
 # --- memory -----------------------------------------------------------------------------------------------------------
 
 
-def _fitting(problem: Problem, integrator: Reslrb, choices: list[dict[str, Any]]) -> list[_Option]:
+def _fitting(problem: Problem, integrator: Reslrb, choices: list[dict[str, Any]]) -> list[Option]:
     """The candidates that keep the budget, each with the samples of its passes."""
     run, budget, least, options = problem.config.run, problem.config.run.budget_bytes, [], []
     fixed = 0 if budget is None else standing()
@@ -90,7 +94,7 @@ def _fitting(problem: Problem, integrator: Reslrb, choices: list[dict[str, Any]]
         own = integrator.chosen(**choice).options() if choice else integrator.options()
         made = make_integrator("reslrb", **own)
         if budget is None:
-            options.append(_Option(choice, made, None))
+            options.append(Option(choice, made, None))
             continue
         samples = run.spp // run.batches if run.adjoint == "batched" else run.spp
         size, expected = choose_samples(problem, made, samples, budget, fixed)
@@ -99,7 +103,7 @@ def _fitting(problem: Problem, integrator: Reslrb, choices: list[dict[str, Any]]
             continue
         if size < samples:
             made.samples_per_pass = size
-        options.append(_Option(choice, made, MemoryPlan(budget, size, samples // size, expected)))
+        options.append(Option(choice, made, MemoryPlan(budget, size, samples // size, expected)))
     if not options:
         mib = -(-min(least) // MIB)
         reason = f"one sample per pixel takes about {mib:.0f} MiB; allow at least {mib:.0f} MiB"
@@ -110,7 +114,7 @@ def _fitting(problem: Problem, integrator: Reslrb, choices: list[dict[str, Any]]
 # --- pilot ------------------------------------------------------------------------------------------------------------
 
 
-def _outcome(problem: Problem, options: list[_Option], say: Say, cache: Cache | None) -> Outcome:
+def _outcome(problem: Problem, options: list[Option], say: Say, cache: Cache | None) -> Outcome:
     """The cached outcome of an earlier pilot, or that of a new one."""
     key = key_of(_situation(problem)) if cache is not None else ""
     if cache is not None:
@@ -128,7 +132,7 @@ def _outcome(problem: Problem, options: list[_Option], say: Say, cache: Cache | 
     return outcome
 
 
-def _run_pilot(problem: Problem, options: list[_Option]) -> Outcome:
+def _run_pilot(problem: Problem, options: list[Option]) -> Outcome:
     run = problem.config.run
     batches = run.batches if run.adjoint == "batched" else 1
     integrators = {}
@@ -153,7 +157,7 @@ def _run_pilot(problem: Problem, options: list[_Option]) -> Outcome:
     return Pilot(made, step, run.spp, unit).run()
 
 
-def _candidate(option: _Option) -> Candidate:
+def _candidate(option: Option) -> Candidate:
     """As the pilot sees it: with two passes where the run has more, which take as many traversals."""
     options = option.options
     parent = None
@@ -184,7 +188,8 @@ def _step(problem: Problem, integrator: Any, clock: StepClock, round: int, spp: 
         gradient = np.array(problem.optimizer.gradient(key), dtype=np.float32)
         gradients[key] = np.nan_to_num(gradient, nan=0.0, posinf=0.0, neginf=0.0).ravel()
         problem.optimizer.clear_gradient(key)
-    return Measured(gradients, times.kernel_ms, 1e3 * (time.perf_counter() - start))
+    wall_ms = 1e3 * (time.perf_counter() - start)
+    return Measured(gradients, times.kernel_ms, wall_ms - times.codegen_ms, times.codegen_ms)
 
 
 def _situation(problem: Problem) -> dict[str, Any]:

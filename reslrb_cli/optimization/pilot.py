@@ -53,11 +53,13 @@ class Candidate:
 
 @dataclass
 class Measured:
-    """One step: the gradients by parameter, and its times; `wall_ms` is all that the caller waits."""
+    """One step: the gradients by parameter, and its times; `wall_ms` is all that the caller waits but for `compile_ms`,
+    in which kernels were generated and compiled."""
 
     gradients: Gradients
     kernel_ms: float
     wall_ms: float
+    compile_ms: float = 0.0
 
 
 @dataclass
@@ -149,16 +151,12 @@ class Pilot:
         self._choose_size(alive[0])
         for round in range(MOST_ROUNDS):
             for entry in alive:
-                if round < 2 or self._affords(entry):
+                if round == 0 or self._affords(entry):
                     self._measure(entry)
             alive = self._contenders(alive)
             if round == 1:
-                for entry in self._promising():
-                    for _ in range(2):
-                        self._measure(entry)
-                    alive.append(entry)
-                alive = self._contenders(alive)
-            if (round >= 1 and len(alive) == 1) or not all(self._affords(entry) for entry in alive):
+                alive = self._contenders(alive + self._promising())
+            if round >= 1 and (len(alive) == 1 or not any(self._affords(entry) for entry in alive)):
                 break
         return self._outcome()
 
@@ -166,13 +164,18 @@ class Pilot:
 
     def _warm_up(self, candidate: Candidate) -> _Entry:
         """Compile the kernels of a candidate."""
-        self._compile_ms += self._step(candidate, 0, self._unit).wall_ms
+        first = self._step(candidate, 0, self._unit)
+        self._compile_ms += first.wall_ms + first.compile_ms
         entry = _Entry(candidate)
         self._entries.append(entry)
         return entry
 
     def _measure(self, entry: _Entry) -> None:
         measured = self._step(entry.candidate, len(entry.kernel), self._pilot_spp)
+        if measured.compile_ms > measured.wall_ms:  # a first step after all, whose times say nothing
+            self._compile_ms += measured.wall_ms + measured.compile_ms
+            measured = self._step(entry.candidate, len(entry.kernel), self._pilot_spp)
+        self._compile_ms += measured.compile_ms
         self._spent_ms += measured.wall_ms
         entry.kernel.append(measured.kernel_ms)
         entry.wall.append(measured.wall_ms)
@@ -246,18 +249,27 @@ class Pilot:
         return kept
 
     def _promising(self) -> list[_Entry]:
-        """The variants that could be the best, by what is known of those they vary; warmed up."""
+        """Measure the variants that could be the best, by what is known of those they vary."""
         best = max(self._efficiency(entry) for entry in self._entries)
         labels = {entry.candidate.label: entry for entry in self._entries}
         found = []
         for candidate in self._candidates:
             if candidate.parent is None:
                 continue
-            bound = self._bound(candidate, labels.get(candidate.parent))
+            parent = labels.get(candidate.parent)
+            bound = self._bound(candidate, parent)
             if bound * TIMING_NOISE < best:
                 self._notes[candidate.label] = f"not measured: at most {bound / best:.2f} of the best's efficiency"
+            elif not self._affords(parent or self._entries[0]):
+                self._notes[candidate.label] = (
+                    f"not measured: no more than {100 * SHARE:.0f} % of the run is to be spent"
+                )
             else:
-                found.append(self._warm_up(candidate))
+                entry = self._warm_up(candidate)
+                self._measure(entry)
+                if self._affords(entry):
+                    self._measure(entry)
+                found.append(entry)
         return found
 
     def _bound(self, candidate: Candidate, parent: _Entry | None) -> float:

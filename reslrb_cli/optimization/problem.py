@@ -14,7 +14,7 @@ from reslrb_cli.config import Config, Integrator, ParameterSpec, Reslrb
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.integrators import make_integrator
 from reslrb_cli.optimization.budget import MemoryPlan
-from reslrb_cli.optimization.choice import Cache, settle_integrator
+from reslrb_cli.optimization.choice import Cache, find_options, settle_integrator
 from reslrb_cli.optimization.losses import Loss, make_loss
 from reslrb_cli.optimization.optimizers import Optimizer
 from reslrb_cli.optimization.pilot import Outcome
@@ -120,20 +120,22 @@ def assemble(config: Config, say: Callable[[str], None] = lambda line: None, cac
     Everything that can be checked is, before anything is rendered. `say` is told what takes long, `cache` holds what
     earlier pilots learned (None: nothing is kept). Raises ConfigError and UnsupportedScene.
     """
-    problem = _with_targets(config, say)
-    settle_integrator(problem, say, cache)
+    problem = assemble_scene(config)
+    options = find_options(problem)
+    _make_targets(problem, say)
+    settle_integrator(problem, options, say, cache)
     return problem
 
 
-def _with_targets(config: Config, say: Callable[[str], None]) -> Problem:
-    problem = assemble_scene(config)
+def _make_targets(problem: Problem, say: Callable[[str], None]) -> None:
+    config = problem.config
     render = config.target.render
     if render is None:
         problem.targets = [
             _target(problem, read_target(config, problem, index), sensor)
             for index, sensor in enumerate(problem.sensors)
         ]
-        return problem
+        return
     true_scene = load_scene(config.scene.file, config.scene.options)
     true_values = set_true_values(config, true_scene)
     for key in problem.selection.keys:
@@ -150,7 +152,6 @@ def _with_targets(config: Config, say: Callable[[str], None]) -> Problem:
         say(f"rendering the target of sensor {sensor}: {render.spp} spp")
         image = render_in_passes(integrator, true_scene, sensor, render.spp, render.seed, 0, "target", multiple)
         problem.targets.append(_target(problem, image, sensor))
-    return problem
 
 
 def load_for_rendering(config: Config, initial: bool) -> tuple[Any, list[int], Any, int | None]:

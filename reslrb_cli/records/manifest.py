@@ -50,8 +50,8 @@ class Manifest:
     """Provenance and outcome of one run.
 
     `pilot` is the table by which an estimator was chosen, `memory` how a memory budget is kept, None where that was not
-    asked for. `results` holds what the run found (`iterations`, `parameter_rmse` per key, ...); `error` is the line that
-    the user saw where the run failed.
+    asked for. `results` holds what the run found (`iterations`, `parameter_rmse` per key, ...); `error` is the line
+    that the user saw where the run failed.
     """
 
     variant: str
