@@ -172,9 +172,9 @@ class Case:
 
         return dr.sum(image[:, :, :3] * self.weights, axis=None)
 
-    def gradient(self, integrator: Any, seed: int, spp: int, objective: Callable | None = None, **step: Any
-                 ) -> np.ndarray:  # fmt: skip
-        """The gradient of all parameters in a row, by one step."""
+    def gradient(self, integrator: Any, seed: int, spp: int, objective: Callable | None = None,
+                 step: Callable = gradient_step, **options: Any) -> np.ndarray:  # fmt: skip
+        """The gradient of all parameters in a row, by one step; `options` are the step's."""
         import drjit as dr
 
         # Leaves of our own: `update` may put something derived in their place (an environment map pads its columns).
@@ -184,7 +184,7 @@ class Case:
             self.params[key] = type(leaf)(leaf)
         self.settle()
         objective = objective or self.objective
-        gradient_step(integrator, self.scene, 0, objective, seed=seed, spp=spp, params=self.params, **step)
+        step(integrator, self.scene, 0, objective, seed=seed, spp=spp, params=self.params, **options)
         result = [np.array(dr.grad(leaf), dtype=np.float64).ravel() for leaf in leaves.values()]
         for key in self.keys:
             self.params[key] = dr.detach(leaves[key])
