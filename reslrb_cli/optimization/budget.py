@@ -23,8 +23,8 @@ PARAMETER_COPIES = 8
 
 @dataclass(frozen=True)
 class Estimate:
-    """Bytes that a step is expected to take: what stands before it, with the targets (`fixed`), its images and parameters (`images`),
-    thread-local memory (`scratch`), and what is kept of the paths of one pass (`paths`)."""
+    """Bytes that a step is expected to take: what stands before it, with the targets (`fixed`), its images and
+    parameters (`images`), thread-local memory (`scratch`), and what is kept of the paths of one pass (`paths`)."""
 
     fixed: int
     images: int
@@ -70,8 +70,10 @@ def standing() -> int:
 
 
 def estimate(problem: Problem, integrator: Any, samples: int, fixed: int) -> Estimate:
-    """What a step takes whose passes have `samples` samples per pixel; `fixed` is what stands
-    before it, but for the targets."""
+    """What a step takes whose passes have `samples` samples per pixel; `fixed` stands before it.
+
+    The targets, which may not be there yet, are not part of `fixed`, but of the result's.
+    """
     paths = images = targets = scratch = 0
     for index in problem.sensors:
         sensor = problem.scene.sensors()[index]

@@ -25,13 +25,11 @@ def experiment(llvm, tmp_path, monkeypatch):
     (tmp_path / "scene.xml").write_text(SCENE)
     (tmp_path / "box.yaml").write_text(AUTO)
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("RESLRB_CACHE", str(tmp_path / "cache"))
     logging.getLogger("reslrb_cli").setLevel(logging.INFO)
 
 
 def optimize(capsys, *settings: str) -> tuple[int, str]:
     capsys.readouterr()
-    logging.getLogger("reslrb_cli").handlers.clear()  # theirs is the standard error of another test
     sets = [text for setting in settings for text in ("--set", setting)]
     with pytest.raises(SystemExit) as end:
         main(["optimize", "box.yaml", *sets, "--force"])
