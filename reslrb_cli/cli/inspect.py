@@ -10,19 +10,24 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from reslrb_cli.cli.experiment import experiment_arguments, read_config, start_variant
+from reslrb_cli.errors import ConfigError, UnsupportedScene
 
 if TYPE_CHECKING:
+    from reslrb_cli.config import Config
+    from reslrb_cli.integrators.plan_report import PlanReport
     from reslrb_cli.scene import ParameterInfo, SceneSummary, SensorSummary
 
 
 @click.command("inspect")
 @experiment_arguments
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object instead of lines.")
-def command(config_file: Path, overrides: tuple[str, ...], as_json: bool) -> None:
-    """List the parameters of the scene of CONFIG with their flags, and what the scene contains.
+@click.option("--no-counts", is_flag=True, help="Do not compile kernels to count their operations (takes seconds).")
+def command(config_file: Path, overrides: tuple[str, ...], as_json: bool, no_counts: bool) -> None:
+    """List the parameters of the scene of CONFIG with their flags, what the scene contains, and the plan of a step.
 
     A parameter that says "can be recovered" may stand in `parameters` of the configuration; of the others the reason
-    is given.
+    is given. The plan says which features the scene and the parameters call for and which are left out, with the number
+    of operations that the kernels of a step have with and without each of them.
     """
     config = read_config(config_file, overrides)
     start_variant(config)
@@ -31,8 +36,10 @@ def command(config_file: Path, overrides: tuple[str, ...], as_json: bool) -> Non
 
     scene = load_scene(config.scene.file, config.scene.options)
     summary = summarise(scene, config.integrator.hide_emitters)
+    plan = make_plan_report(config, scene, counts=not no_counts)
     if as_json:
-        click.echo(json.dumps(dataclasses.asdict(summary), indent=2))
+        report = {"obstacle": plan} if isinstance(plan, str) else dataclasses.asdict(plan)
+        click.echo(json.dumps(dataclasses.asdict(summary) | {"plan": report}, indent=2))
         return
     click.echo(f"scene {config.scene.file}")
     for line in scene_lines(summary):
@@ -41,11 +48,62 @@ def command(config_file: Path, overrides: tuple[str, ...], as_json: bool) -> Non
         click.echo(f"sensor {sensor.index} ({sensor.id})")
         for line in sensor_lines(sensor):
             click.echo(f"  {line}")
+    click.echo("plan")
+    for line in [f"none: {plan}"] if isinstance(plan, str) else plan_lines(plan):
+        click.echo(f"  {line}")
     click.echo("parameters")
     for line in parameter_lines(summary.parameters):
         click.echo(f"  {line}")
     if summary.unnamed:
         click.echo("  keys that begin with object_ change from run to run: give those objects an id in the scene file")
+
+
+def make_plan_report(config: Config, scene: Any, counts: bool) -> PlanReport | str:
+    """The plan of a step for the first sensor that is used, or why there is none. Sets initial values in `scene`."""
+    from reslrb_cli.integrators import make_integrator
+    from reslrb_cli.integrators.plan_report import report_plan
+    from reslrb_cli.optimization.problem import choose_sensors
+    from reslrb_cli.scene import select_parameters
+
+    if config.integrator.type != "reslrb":
+        return f"integrator.type is {config.integrator.type}; `reslrb` alone plans its kernels"
+    options = config.integrator.options()
+    if options.get("estimator") == "auto":
+        options["estimator"] = "stack"  # `auto` is chosen by a run
+    known = config.run.adjoint == "batched" or options.get("weight") == "adjoint"
+    try:
+        [sensor, *_] = choose_sensors(config, scene)
+        selection = select_parameters(scene, config.parameters, config.source)
+        integrator = make_integrator("reslrb", **options)
+        return report_plan(
+            integrator, scene, scene.sensors()[sensor], selection.params, selection.keys, known=known, counts=counts
+        )
+    except (ConfigError, UnsupportedScene) as error:
+        return str(error)
+
+
+def plan_lines(report: PlanReport) -> list[str]:
+    """The plan as a table: what is needed first."""
+    lines = []
+    if report.kernels is not None:
+        each = " + ".join(map(str, report.kernels))
+        lines.append(f"estimator {report.estimator}, kernels of {each} operations")
+    rows = [
+        (
+            "needed" if row.needed else "left out",
+            row.feature,
+            "" if row.operations_with is None else str(row.operations_with),
+            "" if row.operations_without is None else str(row.operations_without),
+            row.reason + (f" ({row.note})" if row.note else ""),
+        )
+        for row in sorted(report.rows, key=lambda row: not row.needed)
+    ]
+    table = [("", "", "with", "without", "")] * (report.kernels is not None) + rows
+    widths = [max(len(row[column]) for row in table) for column in range(4)]
+    for a, b, c, d, reason in table:
+        counts = f"  {c.rjust(widths[2])}  {d.rjust(widths[3])}" if report.kernels is not None else ""
+        lines.append(f"{a.ljust(widths[0])}  {b.ljust(widths[1])}{counts}  {reason}".rstrip())
+    return lines
 
 
 def scene_lines(summary: SceneSummary) -> list[str]:

@@ -135,17 +135,21 @@ def differentiate_passage(
     """Transmittance (C,) of the masks between a vertex and the sensor; adds its derivative.
 
     `adjoint(transmission)` is d(objective)/d(transmission) of one of them. One with a transmission of zero ends the
-    segment, so that none of them is ever the zero factor of a product.
+    segment, so that none of them is ever the zero factor of a product. Only beside a zero factor is the transmittance
+    of use; where there is none, and no derivative either, nothing is traced.
     """
+    if not p.plan.passage_in_gradient:
+        return mi.Spectrum(1)
 
     def differentiate(transmission: Any, hit: Any) -> None:
         objective = dr.select(hit, adjoint(dr.detach(transmission)) * transmission, 0)
         # Masks may be there and have no parameter that is differentiated.
         dr.backward_from(objective, flags=dr.ADFlag.Default | dr.ADFlag.AllowNoGrad)
 
-    with dr.resume_grad():
+    with dr.resume_grad(when=p.plan.differentiate_null):
         limit = p.plan.max_depth - depth - 1
-        return transmittance(p.scene, si, connection.target, limit, active, differentiate).value
+        on_crossing = differentiate if p.plan.differentiate_null else None
+        return transmittance(p.scene, si, connection.target, limit, active, on_crossing).value
 
 
 class VertexHooks(Hooks):

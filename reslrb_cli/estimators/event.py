@@ -59,7 +59,7 @@ class Event:
     @staticmethod
     def emission(plan: Plan) -> Event:
         """The event before the first vertex."""
-        own = [mi.Bool(False), mi.Point2f(0)] if plan.needs.has_null else []
+        own = [mi.Bool(False), mi.Point2f(0)] if plan.passage_in_gradient else []
         point = SurfacePoint.blank(plan)
         return Event(mi.UInt32(0), point, mi.Vector3f(0), mi.Spectrum(0), mi.Float(0), blank_lobe(plan), own)
 
@@ -119,7 +119,7 @@ class EventSelection(VertexHooks):
         p.splat(connection.u, C.value(), connection.active)
         w = dr.select(connection.active, selection_weight(p, self.weight, connection, C), 0)
         q = dr.select(plan.differentiates(vertex.bsdf), mi.Float(1), 0)
-        if plan.needs.has_null:
+        if plan.differentiate_null:
             q = mi.Float(1)  # the masks between vertex and sensor may have something to differentiate
         Q = state.Q + q
         W = dr.fma(w, Q, state.W)
@@ -130,12 +130,14 @@ class EventSelection(VertexHooks):
             f=connection.f,
             rest=dr.rcp(stand_in(connection)[0]),
             lobe=blank_lobe(plan),
-            own=[mi.Bool(True), connection.sample] if plan.needs.has_null else [],
+            own=[mi.Bool(True), connection.sample] if plan.passage_in_gradient else [],
         )
         slots = []
         for k, slot in enumerate(state.slots):
-            own = numbers[3 * k] * Q < q
-            pair = Slot(w, C, connection.u, dr.select(own, this, state.prefix[k]))
+            event = state.prefix[k]
+            if plan.differentiate_bsdfs:  # else emission is the one event
+                event = dr.select(numbers[3 * k] * Q < q, this, event)
+            pair = Slot(w, C, connection.u, event)
             keep = (w * Q > 0) & (numbers[3 * k + 1] * W < w * Q)
             slots.append(dr.select(keep, pair, slot))
         return EventState(state.Q, W, state.prefix, slots, numbers[2::3])
@@ -144,6 +146,8 @@ class EventSelection(VertexHooks):
         self, state: EventState, vertex: Vertex, connection: Connection, scattering: Scattering
     ) -> EventState:
         plan = self.p.plan
+        if not plan.differentiate_bsdfs:
+            return state
         q = dr.select(plan.differentiates(vertex.bsdf), mi.Float(1), 0)
         Q = state.Q + q
         this = Event(
@@ -153,7 +157,7 @@ class EventSelection(VertexHooks):
             f=scattering.f,
             rest=scattering.correction / scattering.pdf,
             lobe=lobe(plan, scattering),
-            own=[mi.Bool(False), mi.Point2f(0)] if plan.needs.has_null else [],
+            own=[mi.Bool(False), mi.Point2f(0)] if plan.passage_in_gradient else [],
         )
         prefix = [
             dr.select(number * Q < q, this, event) for number, event in zip(state.numbers, state.prefix, strict=True)
@@ -203,7 +207,7 @@ def _differentiate(p: Pass, slot: Slot, adjoint: PathAdjoint) -> None:
     active = (slot.w > 0) & (kept.index > 0)
     si, bsdf = kept.point.interaction(plan, active)
     rest = mi.Spectrum(kept.rest)
-    if plan.needs.has_null:
+    if plan.passage_in_gradient:
         own, sample = kept.own
         connection = connect(plan, p.sensor, si, kept.point.ray(), sample, active & own)
 

@@ -76,8 +76,11 @@ class Gathering(VertexHooks):
     """Image pass: splat, remember visibility, and sum where delta is known."""
 
     def start(self, product: Product) -> GatherState:
-        S = [] if self.p.adjoint is None else [AdjointSum.zero(self.p.plan.track_zeros)]
-        return GatherState(Visibility.none(vertices(self.p)), S)
+        p = self.p
+        S = [] if p.adjoint is None else [AdjointSum.zero(p.plan.track_zeros)]
+        # The sum is all that derivatives of emission need.
+        traced_again = p.adjoint is None or p.plan.differentiate_bsdfs
+        return GatherState(Visibility.none(vertices(p) if traced_again else 0), S)
 
     def connection(self, state: GatherState, vertex: Vertex, connection: Connection, numbers: list[Any]) -> GatherState:
         C = contribution(self.p, vertex, connection)

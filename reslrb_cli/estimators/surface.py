@@ -17,7 +17,8 @@ from reslrb_cli.transport.walk import Vertex
 class SurfacePoint:
     """What of a vertex its BSDF reads, as plain numbers (pointers are their indices).
 
-    Where BSDFs read texture coordinates and directions alone, these are `[uv, wi, bsdf]`; otherwise what the shape
+    Where BSDFs read texture coordinates and directions alone, these are `[uv, wi, bsdf]`, without `bsdf`
+    where just one is differentiated; otherwise what the shape
     needs to find the interaction again: `[t, prim_uv, prim_index, shape, instance, o, d]`.
     """
 
@@ -26,8 +27,9 @@ class SurfacePoint:
     @staticmethod
     def of(plan: Plan, vertex: Vertex) -> SurfacePoint:
         """That of a walk's current vertex."""
-        if not plan.needs.bsdfs_read_geometry:
-            return SurfacePoint([vertex.si.uv, vertex.si.wi, _index(vertex.bsdf)])
+        if not plan.keep_geometry:
+            pointer = [] if plan.sole_bsdf is not None else [_index(vertex.bsdf)]
+            return SurfacePoint([vertex.si.uv, vertex.si.wi, *pointer])
         pi, ray = vertex.pi, vertex.ray
         pointers = [_index(pi.shape), _index(pi.instance)]
         return SurfacePoint([pi.t, pi.prim_uv, pi.prim_index, *pointers, ray.o, ray.d])
@@ -35,8 +37,9 @@ class SurfacePoint:
     @staticmethod
     def blank(plan: Plan) -> SurfacePoint:
         """One of zeros, of the same form."""
-        if not plan.needs.bsdfs_read_geometry:
-            return SurfacePoint([mi.Point2f(0), mi.Vector3f(0), mi.UInt32(0)])
+        if not plan.keep_geometry:
+            pointer = [] if plan.sole_bsdf is not None else [mi.UInt32(0)]
+            return SurfacePoint([mi.Point2f(0), mi.Vector3f(0), *pointer])
         indices = [mi.UInt32(0), mi.UInt32(0), mi.UInt32(0)]
         return SurfacePoint([mi.Float(0), mi.Point2f(0), *indices, mi.Point3f(0), mi.Vector3f(0)])
 
@@ -46,11 +49,11 @@ class SurfacePoint:
 
     def interaction(self, plan: Plan, active: Any = True) -> tuple[Any, Any]:
         """The surface interaction, as far as BSDFs read it, and the BSDF."""
-        if not plan.needs.bsdfs_read_geometry:
+        if not plan.keep_geometry:
             si = dr.zeros(mi.SurfaceInteraction3f)
-            si.uv, si.wi, bsdf = self.numbers
+            si.uv, si.wi, *pointer = self.numbers
             si.t = mi.Float(0)  # valid
-            return si, dr.reinterpret_array(mi.BSDFPtr, bsdf)
+            return si, dr.reinterpret_array(mi.BSDFPtr, pointer[0]) if pointer else plan.sole_bsdf
         pi = dr.zeros(mi.PreliminaryIntersection3f)
         pi.valid = mi.Bool(True)  # not kept: a masked write of booleans to thread-local memory ends the process
         pi.t, pi.prim_uv, pi.prim_index, shape, instance, o, d = self.numbers
@@ -74,8 +77,8 @@ def _index(pointer: Any) -> Any:
 
 
 def lobe(plan: Plan, scattering: Any) -> list[Any]:
-    """Which lobe was sampled (1: delta, 2: null), with which numbers; nothing in scenes that have smooth ones alone."""
-    if not (plan.needs.has_delta_lobes or plan.needs.has_null):
+    """Which lobe was sampled (1: delta, 2: null), with which numbers; nothing where just smooth ones matter."""
+    if not (plan.differentiate_delta or plan.differentiate_null):
         return []
     kind = dr.select(scattering.is_delta, mi.UInt32(1), 0) + dr.select(scattering.is_null, mi.UInt32(2), 0)
     return [kind, scattering.sample_1, scattering.sample_2]
@@ -83,5 +86,5 @@ def lobe(plan: Plan, scattering: Any) -> list[Any]:
 
 def blank_lobe(plan: Plan) -> list[Any]:
     """Zeros of the same form."""
-    singular = plan.needs.has_delta_lobes or plan.needs.has_null
+    singular = plan.differentiate_delta or plan.differentiate_null
     return [mi.UInt32(0), mi.Float(0), mi.Point2f(0)] if singular else []

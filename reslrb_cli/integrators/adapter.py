@@ -164,16 +164,7 @@ def _make_classes() -> dict[str, Any]:
         def replay(self, trace: lt.Trace, gradient: Any, params: Any) -> None:
             """Add the gradient of the objective with dL/dI `gradient` (H, W, C) to the parameters."""
             with dr.suspend_grad():
-                adjoint = trace.film.adjoint(gradient)
-                # Isolated: on their way to the parameters gradients are evaluated, and with them all that they hang on,
-                # which is to be one kernel. They set out once, at the end.
-                with dr.isolate_grad():
-                    for samples in trace.samples:
-                        state = trace.state_of(samples, self.estimator, adjoint)
-                        lt.replay(samples, self.estimator, state, adjoint)
-                        del state  # before the next pass makes its own
-                        if len(trace.samples) > 1:
-                            dr.eval()  # passes are not to pile up
+                lt.replay_all(trace, self.estimator, gradient)
 
         def fused(self, scene: Any, sensor: Any, seed: Any, spp: int, gradient: Any, params: Any) -> Any:
             """The image, and the gradient of the objective with dL/dI `gradient` (H, W, C), known before either.
@@ -181,17 +172,7 @@ def _make_classes() -> dict[str, Any]:
             One set of samples, traced once for both where the estimator can.
             """
             with dr.suspend_grad():
-                parts = self.passes(scene, sensor, seed, spp, params)
-                film = parts[0].film
-                block, adjoint = film.block(), film.adjoint(gradient)
-                with dr.isolate_grad():  # as in `replay`
-                    for samples in parts:
-                        state = lt.keep(samples, self.estimator, block, adjoint)
-                        lt.replay(samples, self.estimator, state, adjoint)
-                        del state  # before the next pass makes its own
-                        if len(parts) > 1:
-                            dr.eval()
-                return film.develop(block)
+                return lt.fused(self.passes(scene, sensor, seed, spp, params), self.estimator, gradient)
 
         def render_backward(self, scene: Any, params: Any, grad_in: Any, sensor: Any = 0, seed: Any = 0,
                             spp: int = 0) -> None:  # fmt: skip
@@ -244,7 +225,7 @@ def _make_classes() -> dict[str, Any]:
                         "trajectory: Dr.Jit cannot reverse the loop through masks within that of the path"
                     )
                 adjoint = parts[0].film.adjoint(grad_in)
-                with dr.isolate_grad():  # as in `replay` above; without it the derivatives of textures are lost
+                with dr.isolate_grad():  # as in `replay_all`; without it the derivatives of textures are lost
                     for samples in parts:
                         lt.reverse_recorded(samples, adjoint)
                         if len(parts) > 1:

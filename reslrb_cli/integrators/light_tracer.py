@@ -211,6 +211,34 @@ def replay(samples: Samples, estimator: Estimator, state: Any, adjoint: AdjointI
     estimator.backward(samples.context(None, adjoint), state)
 
 
+def replay_all(trace: Trace, estimator: Estimator, gradient: Any) -> None:
+    """Add the gradient of the objective with dL/dI `gradient` (H, W, C) to the parameters."""
+    adjoint = trace.film.adjoint(gradient)
+    # Isolated: on their way to the parameters gradients are evaluated, and with them all that they hang on, which is to
+    # be one kernel. They set out once, at the end.
+    with dr.isolate_grad():
+        for samples in trace.samples:
+            state = trace.state_of(samples, estimator, adjoint)
+            replay(samples, estimator, state, adjoint)
+            del state  # before the next pass makes its own
+            if len(trace.samples) > 1:
+                dr.eval()  # passes are not to pile up
+
+
+def fused(samples: list[Samples], estimator: Estimator, gradient: Any) -> Any:
+    """The image, and the same gradient, where dL/dI is known before either."""
+    film = samples[0].film
+    block, adjoint = film.block(), film.adjoint(gradient)
+    with dr.isolate_grad():  # as above
+        for part in samples:
+            state = keep(part, estimator, block, adjoint)
+            replay(part, estimator, state, adjoint)
+            del state  # before the next pass makes its own
+            if len(samples) > 1:
+                dr.eval()
+    return film.develop(block)
+
+
 def reverse_recorded(samples: Samples, adjoint: AdjointImage) -> None:
     """Add the same derivatives by Dr.Jit's own reversal of the walk, which records the loop's state on the way."""
     differentiate_visible_emission(samples, adjoint)
@@ -222,7 +250,7 @@ def reverse_recorded(samples: Samples, adjoint: AdjointImage) -> None:
 def differentiate_visible_emission(samples: Samples, adjoint: AdjointImage) -> None:
     """Add the derivatives of C_0."""
     plan = samples.plan
-    if plan.visible_emission and (plan.differentiate_emission or plan.needs.has_null):
+    if plan.visible_emission and (plan.differentiate_emission or plan.differentiate_null):
         primary = samples.primary_ray()
         delta = adjoint.lookup(primary.u, primary.active) * primary.weight * samples.fraction
         differentiate_visible_radiance(plan, samples.scene, primary, delta)
@@ -235,9 +263,7 @@ def splat_tangents(samples: Samples, block: Any) -> None:
         if plan.differentiate_emission:
             E = sample_emission(plan, samples.scene, samples.sensor, samples.sampler()).weight
             [dE] = forward_derivatives(E)
-        if plan.visible_emission and (
-            plan.differentiate_emission or (plan.differentiate_bsdfs and plan.needs.has_null)
-        ):
+        if plan.visible_emission and (plan.differentiate_emission or plan.differentiate_null):
             primary = samples.primary_ray()
             tangent = visible_tangent(plan, samples.scene, primary)
             samples.film.put(block, primary.u, tangent * primary.weight * samples.fraction, primary.active)

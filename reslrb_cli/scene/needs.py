@@ -39,9 +39,10 @@ class SceneNeeds:
     has_smooth: bool
     has_delta_lobes: bool
     has_null: bool
+    has_instances: bool
     has_shading_normals: bool
     has_perturbed_normals: bool
-    bsdfs_read_geometry: bool  # or masks do, which light passes on its way to the sensor
+    bsdfs_read_geometry: bool
     moving_shutter: bool
     thin_lens: bool
     principal_point: bool
@@ -78,9 +79,10 @@ def scene_needs(scene: Any, sensor: Any) -> SceneNeeds:
         has_smooth=flags & int(mi.BSDFFlags.Smooth) != 0,
         has_delta_lobes=flags & delta != 0,
         has_null=flags & int(mi.BSDFFlags.Null) != 0,
+        has_instances=any(shape.class_name() == "Instance" for shape in graph.of_type(mi.Shape)),
         has_shading_normals=any(_has_shading_normals(shape) for shape in graph.shapes()),
         has_perturbed_normals=any(bsdf.class_name() in ("BumpMap", "NormalMap") for bsdf in graph.of_type(mi.BSDF)),
-        bsdfs_read_geometry=_read_geometry(graph) or flags & int(mi.BSDFFlags.Null) != 0,
+        bsdfs_read_geometry=_read_geometry(graph),
         moving_shutter=float(sensor.shutter_open_time()) > 0,
         thin_lens=bool(sensor.needs_aperture_sample()),
         principal_point=_has_principal_point(sensor),

@@ -22,17 +22,17 @@ class Emission:
     weight: Any
 
 
-def sample_time(sensor: Any, sampler: Any) -> Any:
+def sample_time(plan: Plan, sensor: Any, sampler: Any) -> Any:
     """A time within the shutter interval; draws a number only where the shutter is open for some time."""
     time = mi.Float(sensor.shutter_open())
-    if sensor.shutter_open_time() > 0:
+    if plan.needs.moving_shutter:
         time += sampler.next_1d() * sensor.shutter_open_time()
     return time
 
 
 def sample_emission(plan: Plan, scene: Any, sensor: Any, sampler: Any) -> Emission:
     """Sample a ray from a random emitter of the scene. Draws as many numbers, in the same order, as `ptracer`."""
-    time = sample_time(sensor, sampler)
+    time = sample_time(plan, sensor, sampler)
     wavelength_sample, sample_2, sample_3 = sampler.next_1d(), sampler.next_2d(), sampler.next_2d()
     environment = scene.environment() if plan.environment_map else None
     if environment is None:

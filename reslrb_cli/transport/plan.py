@@ -28,6 +28,9 @@ class Plan:
     differentiate_emission: bool = False
     # The BSDFs of surfaces that are differentiated, where not all of them are.
     only_bsdfs: tuple[Any, ...] = ()
+    # Whether any of those that are differentiated has delta lobes, or lets light pass straight through.
+    differentiate_delta: bool = False
+    differentiate_null: bool = False
 
     @property
     def roulette(self) -> bool:
@@ -47,6 +50,22 @@ class Plan:
             and self.needs.emitters[self.needs.environment] == "EnvironmentMapEmitter"
         )
 
+    @property
+    def passage_in_gradient(self) -> bool:
+        """Whether a gradient asks for the masks between a vertex and the sensor: their derivative, or, beside a zero
+        factor, their transmittance."""
+        return self.needs.has_null and (self.differentiate_null or self.track_zeros)
+
+    @property
+    def keep_geometry(self) -> bool:
+        """Whether a vertex that is kept has to be found again on its surface."""
+        return self.needs.bsdfs_read_geometry or self.passage_in_gradient
+
+    @property
+    def sole_bsdf(self) -> Any:
+        """The one BSDF that is differentiated (a pointer), where there is just one; otherwise None."""
+        return mi.BSDFPtr(self.only_bsdfs[0]) if len(self.only_bsdfs) == 1 else None
+
     def differentiates(self, bsdf: Any) -> Any:
         """Lanes in which the BSDF (a pointer) has anything to differentiate."""
         if not self.only_bsdfs:
@@ -58,12 +77,19 @@ class Plan:
 
     def differentiating(self, bsdfs: bool, emission: bool, track_zeros: bool, only_bsdfs: tuple[Any, ...] = ()) -> Plan:
         """The same plan for a step that differentiates these; `track_zeros`: some of their factors may be zero."""
+        delta, null = self.needs.has_delta_lobes, self.needs.has_null
+        if only_bsdfs:
+            flags = [int(bsdf.flags()) for bsdf in only_bsdfs]
+            delta = any(flag & (int(mi.BSDFFlags.Delta) & ~int(mi.BSDFFlags.Null)) for flag in flags)
+            null = any(flag & int(mi.BSDFFlags.Null) for flag in flags)
         return replace(
             self,
             differentiate_bsdfs=bsdfs,
             differentiate_emission=emission,
             track_zeros=track_zeros,
             only_bsdfs=only_bsdfs,
+            differentiate_delta=bsdfs and delta,
+            differentiate_null=bsdfs and null,
         )
 
 

@@ -187,17 +187,17 @@ def attached_factors(
 
 
 def _singular_factor(plan: Plan, si: Any, bsdf: Any, scattering: Scattering, active: Any, f: Any) -> Any:
-    """`f`, replaced where a delta lobe was sampled or light passed straight through."""
-    if plan.needs.has_delta_lobes:
+    """`f`, replaced where a delta lobe was sampled or light passed straight through, where that has derivatives."""
+    if plan.differentiate_delta:
         delta = active & scattering.is_delta
         bs, weight = bsdf.sample(importance_context(), si, scattering.sample_1, scattering.sample_2, delta)
         pdf = bs.pdf
-        if plan.needs.has_null:
+        if plan.differentiate_null:
             # A mask's weight carries the derivative of its opacity already, and so does its density. Other BSDFs divide
             # by a density that may depend on their parameters (plastic).
             pdf = dr.select(mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null), dr.detach(pdf), pdf)
         f = dr.select(delta, weight * pdf, f)
-    if plan.needs.has_null:
+    if plan.differentiate_null:
         null = active & scattering.is_null
         f = dr.select(null, bsdf.eval_null_transmission(si, null), f)
     return f

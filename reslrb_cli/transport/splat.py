@@ -60,6 +60,7 @@ class Film:
             image = self.develop(block)
             dr.backward_from(image * dr.detach(image_gradient))
             gradient = dr.grad(before)
+        dr.eval(gradient)  # not in the midst of tracing, where it would cut a kernel in two
         return AdjointImage(self, mi.Float(gradient.array), block.channel_count())
 
 

@@ -37,7 +37,7 @@ def primary_ray(plan: Plan, sensor: Any, sampler: Any, width: int) -> PrimaryRay
     pixel = lane % n_pixels
     count = dr.opaque(mi.UInt32, width)  # as a literal it would give every sample count a kernel of its own
     per_pixel = mi.Float(count // n_pixels + dr.select(pixel < count % n_pixels, mi.UInt32(1), 0))
-    time = sample_time(sensor, sampler)
+    time = sample_time(plan, sensor, sampler)
     u = mi.Point2f(pixel % int(size[0]), pixel // int(size[0])) + sampler.next_2d()
     aperture = sampler.next_2d() if plan.needs.thin_lens else mi.Point2f(0.5)
     ray, weight = sensor.sample_ray(time, 0.5, u / mi.Vector2f(size), aperture, True)
@@ -76,7 +76,7 @@ def differentiate_visible_radiance(plan: Plan, scene: Any, primary: PrimaryRay, 
 
     Transmission is divided out of the radiance behind it, which a first look measures.
     """
-    masks = plan.differentiate_bsdfs and plan.needs.has_null
+    masks = plan.differentiate_null
     total = visible_radiance(plan, scene, primary) if masks else mi.Spectrum(0)
 
     def differentiate(state: _Look, Le: Any, radiance: Any, transmission: Any) -> None:

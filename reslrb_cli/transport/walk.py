@@ -96,6 +96,15 @@ def walk(
 
     `selection` is the random stream of the hooks (`mi.PCG32`), needed where `hooks.numbers` is not 0.
     """
+
+    def intersect(ray: Any, active: Any) -> tuple[Any, Any]:
+        pi = scene.ray_intersect_preliminary(ray, coherent=False, active=active)
+        active = active & pi.is_valid()
+        pi.valid = mi.Bool(True)  # in active lanes
+        if not plan.needs.has_instances:
+            pi.instance = dr.zeros(mi.ShapePtr)
+        return pi, active
+
     loop_mode = "evaluated" if hooks.attached and hooks.max_iterations is None else "symbolic"
     emission = sample_emission(plan, scene, sensor, sampler)
     product, active = Product.one(plan.track_zeros, hooks.attached), mi.Bool(active)
@@ -104,13 +113,13 @@ def walk(
         active &= product.alive()
     state = hooks.start(product)
     active &= plan.max_depth > 1
-    pi = scene.ray_intersect_preliminary(emission.ray, coherent=False, active=active)
-    path = Path(active & pi.is_valid(), mi.UInt32(1), emission.ray, pi, product, mi.Float(1))
+    pi, active = intersect(emission.ray, active)
+    path = Path(active, mi.UInt32(1), emission.ray, pi, product, mi.Float(1))
 
     def next_vertex(path: Path, active: Any, si: Any, scattering: Scattering, product: Product, eta: Any) -> Path:
         ray = dr.detach(si.spawn_ray(scattering.d))
-        pi = scene.ray_intersect_preliminary(ray, coherent=False, active=active)
-        return Path(active & pi.is_valid(), path.depth + 1, ray, pi, product, eta)
+        pi, active = intersect(ray, active)
+        return Path(active, path.depth + 1, ray, pi, product, eta)
 
     def body(path: Path, state: Any, sampler: Any, selection: Any) -> tuple[Path, Any, Any, Any]:
         si = path.pi.compute_surface_interaction(path.ray, mi.RayFlags.All, path.active)

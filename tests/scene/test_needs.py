@@ -18,7 +18,7 @@ def test_plain_scene(make_scene):
     assert needs.environment is None
     assert needs.has_smooth
     absent = ("has_delta_lobes", "has_null", "has_shading_normals", "has_visible_emitters", "thin_lens")
-    assert [name for name in (*absent, "moving_shutter") if getattr(needs, name)] == []
+    assert [name for name in (*absent, "moving_shutter", "has_instances") if getattr(needs, name)] == []
     check_supported(scene, scene.sensors()[0])
 
 
@@ -57,7 +57,9 @@ def test_nested_bsdfs_and_groups_are_seen(make_scene, tmp_path):
     mi.load_dict({"type": "cube"}).write_ply(str(tmp_path / "cube.ply"))
     group = {"type": "shapegroup", "cube": {"type": "ply", "filename": str(tmp_path / "cube.ply"), "bsdf": GLASS}}
     scene = make_scene(group=group, copy={"type": "instance", "group": {"type": "ref", "id": "group"}})
-    assert scene_needs(scene, scene.sensors()[0]).has_delta_lobes
+    needs = scene_needs(scene, scene.sensors()[0])
+    assert needs.has_delta_lobes
+    assert needs.has_instances
     assert summarise(scene).shapes == {"Rectangle": 1, "PLYMesh": 1}
 
 

@@ -1,0 +1,141 @@
+"""What a plan is made of, feature by feature: whether the scene and its parameters call for it, and the same plan with
+the feature the other way round, for a comparison of kernels."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+from reslrb_cli.transport.plan import UNBOUNDED, Plan
+
+#: Kinds of parameters that features come with.
+EMITTERS, BSDFS = "emitter", "bsdf"
+
+
+@dataclass(frozen=True)
+class Feature:
+    """One feature of a plan.
+
+    `needed(plan)` says whether it is part of it; `present` and `absent` say why. `toggle(plan)` is the plan without it,
+    or with it, or the reason why there is no such plan; None: the step has it once all `parameters` of that kind are
+    differentiated.
+    """
+
+    name: str
+    needed: Callable[[Plan], bool]
+    present: str
+    absent: str
+    toggle: Callable[[Plan], Plan | str | None]
+    parameters: str | None = None
+
+
+def _needs(member: str, **along: Any) -> Callable[[Plan], Plan]:
+    """Toggle one of the scene's needs; `along` are members of the plan that go with it when it is left out."""
+
+    def toggle(plan: Plan) -> Plan:
+        change: dict[str, Any] = {member: not getattr(plan.needs, member)}
+        return replace(plan, needs=replace(plan.needs, **change), **({} if change[member] else along))
+
+    return toggle
+
+
+def _visible(plan: Plan) -> Plan | str:
+    if plan.visible_emission:
+        return replace(plan, hide_emitters=True)
+    if plan.max_depth == 0:
+        return "paths have no edge"
+    return replace(plan, hide_emitters=False, needs=replace(plan.needs, has_visible_emitters=True))
+
+
+def _roulette(plan: Plan) -> Plan | str:
+    if plan.roulette:
+        return replace(plan, rr_depth=UNBOUNDED)
+    return replace(plan, rr_depth=1) if plan.max_depth > 2 else "paths are too short for it"
+
+
+def _environment(plan: Plan) -> Plan | str:
+    if plan.environment_map:
+        return replace(plan, needs=replace(plan.needs, environment=None))
+    return "there is no environment map to place rays of"
+
+
+def _zeros(plan: Plan) -> Plan | str:
+    if not (plan.differentiate_bsdfs or plan.differentiate_emission):
+        return "nothing is differentiated"
+    return replace(plan, track_zeros=not plan.track_zeros)
+
+
+def _delta(plan: Plan) -> Plan | str:
+    if not (plan.needs.has_delta_lobes and plan.differentiate_bsdfs):
+        return "there are no delta lobes, or no BSDF is differentiated"
+    return replace(plan, differentiate_delta=not plan.differentiate_delta)
+
+
+def _null(plan: Plan) -> Plan | str:
+    if not (plan.needs.has_null and plan.differentiate_bsdfs):
+        return "there are no such surfaces, or no BSDF is differentiated"
+    return replace(plan, differentiate_null=not plan.differentiate_null)
+
+
+def _several(plan: Plan) -> Plan | str:
+    return "follows from the number of emitters, in Mitsuba itself"
+
+
+def _emission(plan: Plan) -> Plan | None:
+    return replace(plan, differentiate_emission=False) if plan.differentiate_emission else None
+
+
+def _bsdfs(plan: Plan) -> Plan | None:
+    if plan.differentiate_bsdfs:
+        return plan.differentiating(False, plan.differentiate_emission, plan.track_zeros)
+    return None
+
+
+def _all_bsdfs(plan: Plan) -> str | None:
+    if not plan.differentiate_bsdfs:
+        return "no BSDF is differentiated"
+    return None if plan.only_bsdfs else "all are asked for"
+
+
+FEATURES = (
+    Feature("visible emitters", lambda p: p.visible_emission, "an emitter may be seen directly",
+            "hidden, or points and directions alone", _visible),
+    Feature("several emitters", lambda p: len(p.needs.emitters) > 1, "one is drawn for each path",
+            "the only one is sampled", _several),
+    Feature("environment map", lambda p: p.environment_map, "its rays are placed by the walk",
+            "none emits", _environment),
+    Feature("roulette", lambda p: p.roulette, "rr_depth is below max_depth", "max_depth ends paths first", _roulette),
+    Feature("shading-normal correction", lambda p: p.needs.has_shading_normals,
+            "shapes have interpolated normals", "all normals are geometric", _needs("has_shading_normals")),
+    Feature("bump and normal maps", lambda p: p.needs.has_perturbed_normals,
+            "smooth lobes are evaluated with exchanged directions", "no BSDF perturbs normals",
+            _needs("has_perturbed_normals")),
+    Feature("delta lobes", lambda p: p.needs.has_delta_lobes, "mirrors or clear glass", "no BSDF has any",
+            _needs("has_delta_lobes", differentiate_delta=False)),
+    Feature("null surfaces", lambda p: p.needs.has_null, "shadow rays pass through masks",
+            "every surface stops a shadow ray", _needs("has_null", differentiate_null=False)),
+    Feature("instances", lambda p: p.needs.has_instances, "shapes are instanced", "no shape is instanced",
+            _needs("has_instances")),
+    Feature("lens sampling", lambda p: p.needs.thin_lens, "the aperture has a size", "the sensor is a pinhole",
+            _needs("thin_lens")),
+    Feature("time sampling", lambda p: p.needs.moving_shutter, "the shutter is open for some time",
+            "the shutter opens for an instant", _needs("moving_shutter")),
+    Feature("shifted principal point", lambda p: p.needs.principal_point, "the film is off the axis",
+            "the film is on the axis", _needs("principal_point")),
+    Feature("derivatives of emission", lambda p: p.differentiate_emission, "parameters of emitters",
+            "no parameter of an emitter", _emission, EMITTERS),
+    Feature("derivatives of BSDFs", lambda p: p.differentiate_bsdfs, "parameters of BSDFs",
+            "no parameter of a BSDF: no path is replayed", _bsdfs, BSDFS),
+    Feature("derivatives of all BSDFs", lambda p: p.differentiate_bsdfs and not p.only_bsdfs,
+            "each has a parameter", "others have no parameter", _all_bsdfs, BSDFS),
+    Feature("derivatives of delta lobes", lambda p: p.differentiate_delta, "a BSDF with parameters has such lobes",
+            "no BSDF with parameters has any", _delta),
+    Feature("derivatives of null surfaces", lambda p: p.differentiate_null, "a BSDF with parameters is see-through",
+            "no BSDF with parameters is", _null),
+    Feature("zero-factor bookkeeping", lambda p: p.track_zeros, "a parameter is exactly zero somewhere",
+            "no parameter is exactly zero", _zeros),
+    Feature("geometry read by BSDFs", lambda p: p.needs.bsdfs_read_geometry,
+            "kept vertices are found again on their surface", "texture coordinates and directions are enough",
+            _needs("bsdfs_read_geometry")),
+)  # fmt: skip
