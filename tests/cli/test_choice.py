@@ -196,3 +196,64 @@ def test_a_budget_that_nothing_can_keep_is_one_located_line(experiment, capsys):
         assert lines[0].startswith("box.yaml: run.memory_budget: ")
         assert "allow at least 1 MiB" in lines[0]
         assert not Path("runs").exists()
+
+
+@pytest.mark.parametrize("adjoint", ["correlated", "independent", "batched"])
+def test_peak_memory_is_flat_in_samples_under_a_budget(experiment, adjoint):
+    from reslrb_cli.config import load
+    from reslrb_cli.optimization import assemble, optimize
+
+    peaks = {}
+    for spp in (256, 1024, 4096):
+        settings = [f"run.spp={spp}", f"run.adjoint={adjoint}", "run.memory_budget=1.5", "target.render.spp=4"]
+        problem = assemble(load("box.yaml", [*settings, "integrator={max_depth: 4, estimator: event}"]))
+        problem.truth.clear()
+        peaks[spp] = max(record.peak_mib for record in optimize(problem))
+        assert problem.memory is not None
+        assert problem.memory.passes >= spp // 256 // (4 if adjoint == "batched" else 1)
+    print(adjoint, peaks)
+    assert max(peaks.values()) < 1.5
+    assert peaks[4096] <= 1.02 * peaks[1024], peaks
+
+
+@pytest.mark.parametrize("estimator", ["reservoir", "gather", "event", "stack"])
+@pytest.mark.parametrize("zeros", [False, True])
+def test_what_is_kept_of_a_path_is_what_is_counted(experiment, monkeypatch, estimator, zeros):
+    from reslrb_cli.config import load
+    from reslrb_cli.estimators.base import entry_bytes
+    from reslrb_cli.integrators import light_tracer
+    from reslrb_cli.optimization import assemble, loop
+
+    states, keep = [], light_tracer.keep
+
+    def spy(*args):
+        states.append(keep(*args))
+        return states[-1]
+
+    monkeypatch.setattr(light_tracer, "keep", spy)
+    value = 0.0 if zeros else 0.5
+    settings = [f"integrator={{max_depth: 4, estimator: {estimator}}}", f"parameters[0].initial={value}"]
+    for adjoint in ("correlated", "independent"):
+        problem = assemble(load("box.yaml", [*settings, f"run.adjoint={adjoint}"]))
+        loop.gradient(problem, 0, loop.Split())
+        sensor = problem.scene.sensors()[0]
+        plan = problem.integrator.plan(problem.scene, sensor, problem.selection.params)
+        counted, kept = problem.integrator.estimator.bytes_per_path(plan), sum(entry_bytes(states.pop()))
+        assert plan.track_zeros == zeros
+        assert kept == counted if estimator in ("reservoir", "event") else kept <= counted <= kept + 128
+        assert (problem.integrator.estimator.scratch_bytes(plan) > 0) == (estimator == "stack")
+
+
+@pytest.mark.parametrize("estimator", ["reservoir", "gather", "event", "stack"])
+def test_all_sample_counts_have_the_same_kernels(experiment, estimator):
+    """The pilot's would otherwise be compiled for nothing."""
+    from reslrb_cli.config import load
+    from reslrb_cli.optimization import assemble, choice
+    from reslrb_cli.records.clock import StepClock
+
+    problem = assemble(load("box.yaml", [f"integrator={{max_depth: 4, estimator: {estimator}}}"]))
+    clock, launched = StepClock(), []
+    for spp in (3, 8, 16):
+        choice._step(problem, problem.integrator, clock, 0, spp)
+        launched.append({entry["hash"] for entry in clock.history if "hash" in entry})
+    assert launched[1] | launched[2] <= launched[0]
