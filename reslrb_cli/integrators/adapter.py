@@ -110,7 +110,7 @@ def _make_classes() -> dict[str, Any]:
                 for samples in self.passes(scene, sensor, seed, spp):
                     lt.image_alone(samples, self.image_estimator(), block)
                     if self.samples_per_pass is not None:
-                        dr.eval(block.tensor())
+                        lt.finish_pass(block.tensor())
                 image = film.develop(block)
                 if evaluate:
                     dr.eval(image)
@@ -229,7 +229,7 @@ def _make_classes() -> dict[str, Any]:
                     for samples in parts:
                         lt.reverse_recorded(samples, adjoint)
                         if len(parts) > 1:
-                            dr.eval()
+                            lt.finish_pass()
 
     return {"reslrb": ReslrbIntegrator, "walk_ad": WalkAdIntegrator, "trajectory": TrajectoryIntegrator}
 

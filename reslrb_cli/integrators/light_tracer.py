@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import drjit as dr
@@ -107,7 +107,7 @@ def make_samples(plan: Plan, scene: Any, sensor: Any, seed: Any, spp: int, total
     width = spp * int(dr.prod(sensor.film().size()))
     if width > 0xFFFFFFFF:
         raise ValueError(f"{width} paths in one pass are more than 2^32 - 1: set samples_per_pass below {spp}")
-    # Opaque: as a literal it would give every sample count kernels of its own.
+    # Opaque: as literals they would give every sample count kernels of its own.
     scale = dr.opaque(mi.Float, float(dr.prod(film.size)) / (float(dr.prod(sensor.film().size())) * total_spp))
     return Samples(scene, sensor, plan, film, mi.UInt32(seed), spp, width, scale, dr.opaque(mi.Float, spp / total_spp))
 
@@ -124,7 +124,14 @@ def passes(plan: Plan, scene: Any, sensor: Any, seed: Any, spp: int, spp_per_pas
     others = [mi.sample_tea_32(mi.UInt32(seed), mi.UInt32(PASS_STREAM + p))[0] for p in range(1, spp // size)]
     seeds = [mi.UInt32(seed), *others]
     dr.make_opaque(seeds)
-    return [make_samples(plan, scene, sensor, s, size, spp) for s in seeds]
+    first = make_samples(plan, scene, sensor, seeds[0], size, spp)
+    return [replace(first, seed=s) for s in seeds]
+
+
+def finish_pass(*results: Any) -> None:
+    """Evaluate what a pass yields, and wait for it: memory of passes that are still queued would pile up."""
+    dr.eval(*results)
+    dr.sync_thread()
 
 
 def trace(samples: Samples, hooks: Hooks, active: Any = True) -> Any:
@@ -199,7 +206,7 @@ def trace_image(samples: list[Samples], estimator: Estimator) -> Trace:
         trace = Trace(samples)
         for part in samples:
             image_alone(part, None if estimator.splats_all else estimator, block)
-            dr.eval(block.tensor())
+            finish_pass(block.tensor())
     trace.image = film.develop(block)
     dr.eval(trace.image)
     return trace
@@ -222,7 +229,7 @@ def replay_all(trace: Trace, estimator: Estimator, gradient: Any) -> None:
             replay(samples, estimator, state, adjoint)
             del state  # before the next pass makes its own
             if len(trace.samples) > 1:
-                dr.eval()  # passes are not to pile up
+                finish_pass()
 
 
 def fused(samples: list[Samples], estimator: Estimator, gradient: Any) -> Any:
@@ -235,7 +242,7 @@ def fused(samples: list[Samples], estimator: Estimator, gradient: Any) -> Any:
             replay(part, estimator, state, adjoint)
             del state  # before the next pass makes its own
             if len(samples) > 1:
-                dr.eval()
+                finish_pass()
     return film.develop(block)
 
 

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from reslrb_cli.optimization.problem import Problem
 
 #: Images of the film's size that a step has at once: block, image, loss's temporaries, gradient, adjoint.
-FILM_IMAGES = 6
+FILM_IMAGES = 8
 #: Copies of a parameter: gradients, the optimiser's moments, their next values.
 PARAMETER_COPIES = 8
 
