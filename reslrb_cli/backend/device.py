@@ -9,6 +9,9 @@ import shutil
 import subprocess
 from pathlib import Path
 
+#: Lanes of a vector on the CPU, at most (AVX-512); resident threads of a large GPU, where the driver does not tell.
+LLVM_LANES, LARGE_GPU = 16, 132 * 2048
+
 
 def device_name(variant: str) -> str:
     """The device that the Mitsuba variant `variant` runs on."""
@@ -50,3 +53,24 @@ def _gpu_memory() -> int:
     output = subprocess.run(query, capture_output=True, text=True, check=False).stdout if query else ""
     sizes = [int(line) for line in output.split() if line.isdigit()]
     return min(sizes, default=2**20) * 2**20  # unknown: more than any has, so that it never counts as scarce
+
+
+def resident_paths() -> int:
+    """How many lanes of a kernel the current device runs at a time, each with thread-local memory of its own."""
+    import drjit as dr
+    import mitsuba as mi
+
+    if not mi.variant().startswith("cuda"):
+        return (dr.thread_count() + 1) * LLVM_LANES
+    import ctypes
+
+    try:
+        driver, count = ctypes.CDLL("nvcuda.dll" if os.name == "nt" else "libcuda.so.1"), []
+        for attribute in (16, 39):  # multiprocessors, and the most threads on each
+            value = ctypes.c_int()
+            if driver.cuDeviceGetAttribute(ctypes.byref(value), attribute, 0):
+                return LARGE_GPU
+            count.append(value.value)
+    except (OSError, AttributeError):
+        return LARGE_GPU
+    return count[0] * count[1]

@@ -87,7 +87,7 @@ def _tell(error: BaseException) -> tuple[str, int] | None:
         where = context.command_path if context else "reslrb"
         return f"{where}: {' '.join(error.format_message().split())} See `{where} --help`.", ExitCode.USAGE
     if is_out_of_memory(error):
-        advice = "lower run.spp or the size of the film, or set integrator.samples_per_pass"
+        advice = "lower run.spp or the size of the film, or set run.memory_budget or integrator.samples_per_pass"
         return f"out of memory ({_one_line(error) or 'host'}); {advice}", ExitCode.OUT_OF_MEMORY
     if isinstance(error, OSError) and error.filename is not None:
         return f"{error.filename}: {error.strerror}", ExitCode.USAGE

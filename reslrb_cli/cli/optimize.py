@@ -36,11 +36,14 @@ def command(config_file: Path, overrides: tuple[str, ...], force: bool, quiet: b
     from reslrb_cli.cli.progress import Progress, describe
     from reslrb_cli.cli.recording import Recording
     from reslrb_cli.optimization import assemble, find_reached
+    from reslrb_cli.records.pilot_cache import PilotCache
 
     say = logging.getLogger(__name__).info
-    problem = assemble(config, say)
+    problem = assemble(config, say, PilotCache())
     find_reached(problem, say)
     manifest = Manifest(variant=variant, device=device_name(variant), seed=config.run.seed, config=str(config_file))
+    manifest.pilot = None if problem.pilot is None else problem.pilot.to_json()
+    manifest.memory = None if problem.memory is None else problem.memory.to_json()
     folder = RunFolder.create(config_file, config.run.output, config.run.folder_name, force, dump(config), manifest)
     recording = Recording(problem, folder, manifest)
     with Interrupts() as interrupts, Progress(config.run.iterations, quiet) as progress:

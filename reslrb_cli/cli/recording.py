@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -17,6 +18,8 @@ from reslrb_cli.records.metrics import MetricsWriter, Record
 from reslrb_cli.records.parameters import write_mask, write_parameters
 from reslrb_cli.records.run_folder import RunFolder
 from reslrb_cli.report import write_report
+
+logger = logging.getLogger(__name__)
 
 #: Samples per pixel of saved images, at least.
 IMAGE_SPP = 64
@@ -83,6 +86,7 @@ class Recording:
                 self.first, self.last = self.first or record, record
                 metrics.write(record)
                 show(record)
+                self._check_memory(record)
                 if stop():
                     return
                 if every and self.done % every == 0 and self.done < self.problem.config.run.iterations:
@@ -90,6 +94,14 @@ class Recording:
                 if time.monotonic() - saved > CHECKPOINT_SECONDS:
                     self._save_checkpoint()
                     saved = time.monotonic()
+
+    def _check_memory(self, record: Record) -> None:
+        memory = self.problem.memory
+        if memory is not None:
+            warning = memory.check(record.peak_mib)
+            if warning is not None:
+                logger.warning(warning)
+            self.manifest.memory = memory.to_json()
 
     def _end(self, status: Status, error: str | None) -> None:
         for key, value in self.problem.parameter_errors().items():
@@ -109,7 +121,8 @@ class Recording:
         save_checkpoint(self.folder.checkpoint, self.done, self.problem.values(), self.problem.optimizer.state())
 
     def _write_images(self, name: str) -> None:
-        spp = max(self.problem.config.run.spp, IMAGE_SPP)
+        own = self.problem.config.run.spp
+        spp = own * max(-(-IMAGE_SPP // own), 1)  # a multiple, which passes that divide a step divide as well
         for sensor in self.problem.sensors:
             image = self.problem.render(sensor, spp, self.done, "saved image")
             write_image(self.folder.images / self._image_name(name, sensor), image)

@@ -25,6 +25,7 @@ from typing_extensions import Self
 
 from .base import ConfigPath, Count, Positive, Section, Seed, WorkPath, by_kind, located, wrong
 from .choices import L2, Adam, AnyIntegrator, AnyLoss, AnyOptimizer, Integrator, Reslrb
+from .sizes import Memory, memory_bytes
 
 ColorSpace = Literal["auto", "linear", "srgb"]
 _COLOR_SPACE = "How values are encoded: `linear`, `srgb`, or `auto` (8-bit files srgb, float files linear)."
@@ -217,6 +218,12 @@ class RunConfig(Section):
         description="What the first batch is for: an `image` alone, or to be traced `again` for its gradient, with the "
         "adjoint image of all others. Only with `adjoint: batched`.",
     )
+    memory_budget: Memory | None = Field(
+        default=None,
+        description="Memory that the iterations may take, with what stands before them: a number of MiB, or text such "
+        "as 512 MiB or 2GiB. The samples of a step are split into passes that fit. null: no limit. Only with "
+        "integrator `reslrb`.",
+    )
     images_every: Annotated[int, Field(ge=0)] = Field(
         default=0, description="Iterations between two saved images; 0: only the initial and the final one."
     )
@@ -242,6 +249,11 @@ class RunConfig(Section):
         if self.adjoint == "batched":
             options |= {"batches": self.batches, "first_batch": self.first_batch}
         return options
+
+    @property
+    def budget_bytes(self) -> int | None:
+        """`memory_budget` in bytes."""
+        return None if self.memory_budget is None else memory_bytes(self.memory_budget)
 
     @property
     def folder_name(self) -> str:
@@ -302,6 +314,13 @@ class Config(Section):
                 "`adjoint` needs dL/dI before the paths are traced, which run.adjoint: correlated does not have; "
                 "set that to independent or batched, or the weight to luminance",
             )
+        if self.run.memory_budget is not None:
+            if not isinstance(self.integrator, Reslrb):
+                raise located(
+                    "run.memory_budget", f"goes with integrator `reslrb` alone, not with `{self.integrator.type}`"
+                )
+            if self.integrator.samples_per_pass is not None:
+                raise located("integrator.samples_per_pass", "is chosen by run.memory_budget; remove one of the two")
         if self.target.render is not None:
             own = self.target.render.integrator
             key = "integrator" if own is None else "target.render.integrator"

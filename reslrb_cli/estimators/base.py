@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, is_dataclass
 from typing import Any, ClassVar
 
 import drjit as dr
@@ -31,7 +31,7 @@ class Pass:
     scene: Any
     sensor: Any
     film: Film
-    scale: float
+    scale: Any
     block: Any
     adjoint: AdjointImage | None
     walk: Callable[..., Any]
@@ -68,6 +68,29 @@ class Estimator(ABC):
     @abstractmethod
     def backward(self, p: Pass, state: Any) -> None:
         """Add the derivatives to the parameters' gradients; `p.adjoint` is known, `p.block` is not used."""
+
+    @abstractmethod
+    def kept(self, plan: Plan) -> Any:
+        """All that memory holds of a path at once, a PyTree of the same form; only the types of its leaves count."""
+
+    def bytes_per_path(self, plan: Plan) -> int:
+        """Bytes that memory holds of each path."""
+        return sum(entry_bytes(self.kept(plan)))
+
+    def scratch_bytes(self, plan: Plan) -> int:
+        """Thread-local bytes of each path that is being traced, which the allocator does not see."""
+        return 0
+
+
+def entry_bytes(tree: Any) -> list[int]:
+    """Bytes of one entry of each array in a PyTree."""
+    if is_dataclass(tree):
+        parts: Any = [getattr(tree, field.name) for field in fields(tree)]
+    elif isinstance(tree, (list, tuple)) or dr.depth_v(tree) > 1:
+        parts = tree
+    else:
+        return [dr.itemsize_v(tree)]
+    return [size for part in parts for size in entry_bytes(part)]
 
 
 def differentiate_emission(p: Pass, weight: Callable[[Any], Any]) -> None:

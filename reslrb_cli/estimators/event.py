@@ -73,6 +73,12 @@ class Slot:
     u: Any
     event: Event
 
+    @staticmethod
+    def empty(plan: Plan) -> Slot:
+        """Nothing kept yet."""
+        zero = [mi.Int32(MANY_ZEROS) for _ in Product.one(plan.track_zeros).zero]
+        return Slot(mi.Float(0), Product(mi.Spectrum(0), zero), mi.Point2f(0), Event.emission(plan))
+
 
 @dataclass
 class EventState:
@@ -101,10 +107,8 @@ class EventSelection(VertexHooks):
         self.numbers, self.capacity, self.weight = 3 * capacity, capacity, weight
 
     def start(self, product: Product) -> EventState:
-        plan, slots = self.p.plan, []
-        for _ in range(self.capacity):
-            nothing = Product(mi.Spectrum(0), [mi.Int32(MANY_ZEROS) for _ in product.zero])
-            slots.append(Slot(mi.Float(0), nothing, mi.Point2f(0), Event.emission(plan)))
+        plan = self.p.plan
+        slots = [Slot.empty(plan) for _ in range(self.capacity)]
         prefix = [Event.emission(plan) for _ in slots]
         Q = mi.Float(1 if plan.differentiate_emission else 0)
         return EventState(Q, mi.Float(0), prefix, slots, [mi.Float(0) for _ in slots])
@@ -174,6 +178,9 @@ class EventEstimator(Estimator):
     def forward(self, p: Pass) -> Kept:
         state: EventState = p.walk(EventSelection(p, self.capacity, self.weight))
         return Kept(state.W, state.slots)
+
+    def kept(self, plan: Plan) -> Kept:
+        return Kept(mi.Float(0), [Slot.empty(plan) for _ in range(self.capacity)])
 
     def backward(self, p: Pass, state: Kept) -> None:
         adjoints = []

@@ -28,6 +28,7 @@ from reslrb_cli.estimators.base import (
 from reslrb_cli.estimators.sums import AdjointSum
 from reslrb_cli.transport.connection import Connection, Seen, stand_in
 from reslrb_cli.transport.factors import NO_ZERO, Product
+from reslrb_cli.transport.plan import Plan
 from reslrb_cli.transport.scattering import Scattering, attached_factors
 from reslrb_cli.transport.walk import Vertex
 
@@ -186,3 +187,6 @@ class Gather(Estimator):
         differentiate_emission(p, S.adjoint_of_emission)
         if p.plan.differentiate_bsdfs:
             p.walk(Taking(p, state.visibility, S), active)
+
+    def kept(self, plan: Plan) -> Any:
+        return GatherState(Visibility.none(max(plan.max_depth - 1, 0)), [AdjointSum.zero(plan.track_zeros)])

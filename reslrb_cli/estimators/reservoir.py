@@ -30,6 +30,7 @@ from reslrb_cli.estimators.base import (
 )
 from reslrb_cli.transport.connection import Connection, stand_in
 from reslrb_cli.transport.factors import MANY_ZEROS, NO_ZERO, Product
+from reslrb_cli.transport.plan import Plan
 from reslrb_cli.transport.scattering import Scattering, attached_factor, attached_factors
 from reslrb_cli.transport.walk import Vertex
 
@@ -50,6 +51,16 @@ class ReservoirState:
 
     W: Any  # sum of all candidates' weights
     slots: list[Slot]
+
+    @staticmethod
+    def empty(capacity: int, zeros: int) -> ReservoirState:
+        """Nothing kept yet; `zeros` is the number of channels whose zero factors are tracked."""
+
+        def slot() -> Slot:
+            nothing = Product(mi.Spectrum(0), [mi.Int32(MANY_ZEROS) for _ in range(zeros)])
+            return Slot(mi.Float(0), mi.UInt32(0), nothing, mi.Point2f(0))
+
+        return ReservoirState(mi.Float(0), [slot() for _ in range(capacity)])
 
 
 def selection_weight(p: Pass, weight: str, connection: Connection, C: Product) -> Any:
@@ -73,11 +84,7 @@ class ReservoirSelection(VertexHooks):
         self.numbers, self.weight, self.splat = capacity, weight, splat
 
     def start(self, product: Product) -> ReservoirState:
-        def empty() -> Slot:
-            nothing = Product(mi.Spectrum(0), [mi.Int32(MANY_ZEROS) for _ in product.zero])
-            return Slot(mi.Float(0), mi.UInt32(0), nothing, mi.Point2f(0))
-
-        return ReservoirState(mi.Float(0), [empty() for _ in range(self.numbers)])
+        return ReservoirState.empty(self.numbers, len(product.zero))
 
     def connection(
         self, state: ReservoirState, vertex: Vertex, connection: Connection, numbers: list[Any]
@@ -193,6 +200,9 @@ class Reservoir(Estimator):
         differentiate_emission(p, emission_weight)
         if p.plan.differentiate_bsdfs:
             p.walk(ReservoirReplay(p, state.slots, adjoints), state.W > 0)
+
+    def kept(self, plan: Plan) -> ReservoirState:
+        return ReservoirState.empty(self.capacity, len(Product.one(plan.track_zeros).zero))
 
     def _unselected(self, state: ReservoirState, slot: Slot) -> Any:
         """1 over the probability of the selection, shared among the slots."""

@@ -27,6 +27,7 @@ from reslrb_cli.estimators.base import (
     at_least_one,
     differentiate_emission,
     differentiate_passage,
+    entry_bytes,
 )
 from reslrb_cli.estimators.gather import Gather, GatherState, Taking, Visibility, contribution, vertices
 from reslrb_cli.estimators.sums import AdjointSum, PlainSum
@@ -215,6 +216,16 @@ class Stack(Estimator):
         if vertices(p) > self.stack_size:
             beyond = Visibility([], state.last)
             p.walk(Taking(p, beyond, state.tail, first=self.stack_size + 1), state.last > self.stack_size)
+
+    def kept(self, plan: Plan) -> Any:
+        # Visibility is there from an image pass that did not know delta; the sweep's own state comes beside it.
+        S = AdjointSum.zero(plan.track_zeros)
+        return [Visibility.none(max(plan.max_depth - 1, 0)), StackState(S, S, mi.UInt32(0))]
+
+    def scratch_bytes(self, plan: Plan) -> int:
+        if not plan.differentiate_bsdfs:
+            return 0
+        return sum(entry_bytes(Frame.blank(plan).members())) * min(self.stack_size, max(plan.max_depth - 1, 0))
 
     def _sweep(self, p: Pass, visibility: Visibility | None) -> StackState:
         active = True if visibility is None else visibility.last > 0

@@ -110,7 +110,7 @@ def _make_classes() -> dict[str, Any]:
                 for samples in self.passes(scene, sensor, seed, spp):
                     lt.image_alone(samples, self.image_estimator(), block)
                     if self.samples_per_pass is not None:
-                        dr.eval(block.tensor())
+                        lt.finish_pass(block.tensor())
                 image = film.develop(block)
                 if evaluate:
                     dr.eval(image)
@@ -142,6 +142,11 @@ def _make_classes() -> dict[str, Any]:
         def __init__(self, props: Any) -> None:
             super().__init__(props)
             name = props.get("estimator", "reservoir")
+            if name == "auto":
+                raise ValueError(
+                    '"estimator" auto needs an experiment to measure on (`reslrb optimize`); as a plugin, name one of '
+                    + ", ".join(ESTIMATORS)
+                )
             if name not in ESTIMATORS:
                 raise ValueError(f'"estimator" must be one of {", ".join(ESTIMATORS)}, not "{name}"')
             # An option that the estimator does not know stays unread, which Mitsuba reports as an error.
@@ -224,7 +229,7 @@ def _make_classes() -> dict[str, Any]:
                     for samples in parts:
                         lt.reverse_recorded(samples, adjoint)
                         if len(parts) > 1:
-                            dr.eval()
+                            lt.finish_pass()
 
     return {"reslrb": ReslrbIntegrator, "walk_ad": WalkAdIntegrator, "trajectory": TrajectoryIntegrator}
 

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import drjit as dr
@@ -42,8 +41,8 @@ class Samples:
     seed: Any
     spp: int
     width: int
-    scale: float  # brings a sum over light paths to an image
-    fraction: float  # of all samples of that image, these are so many
+    scale: Any  # brings a sum over light paths to an image
+    fraction: Any  # of all samples of that image, these are so many
 
     def sampler(self) -> Any:
         """A sampler at the beginning of these samples' stream."""
@@ -108,8 +107,9 @@ def make_samples(plan: Plan, scene: Any, sensor: Any, seed: Any, spp: int, total
     width = spp * int(dr.prod(sensor.film().size()))
     if width > 0xFFFFFFFF:
         raise ValueError(f"{width} paths in one pass are more than 2^32 - 1: set samples_per_pass below {spp}")
-    scale = float(dr.prod(film.size)) / (float(dr.prod(sensor.film().size())) * total_spp)
-    return Samples(scene, sensor, plan, film, mi.UInt32(seed), spp, width, scale, spp / total_spp)
+    # Opaque: as literals they would give every sample count kernels of its own.
+    scale = dr.opaque(mi.Float, float(dr.prod(film.size)) / (float(dr.prod(sensor.film().size())) * total_spp))
+    return Samples(scene, sensor, plan, film, mi.UInt32(seed), spp, width, scale, dr.opaque(mi.Float, spp / total_spp))
 
 
 def passes(plan: Plan, scene: Any, sensor: Any, seed: Any, spp: int, spp_per_pass: int | None) -> list[Samples]:
@@ -124,7 +124,14 @@ def passes(plan: Plan, scene: Any, sensor: Any, seed: Any, spp: int, spp_per_pas
     others = [mi.sample_tea_32(mi.UInt32(seed), mi.UInt32(PASS_STREAM + p))[0] for p in range(1, spp // size)]
     seeds = [mi.UInt32(seed), *others]
     dr.make_opaque(seeds)
-    return [make_samples(plan, scene, sensor, s, size, spp) for s in seeds]
+    first = make_samples(plan, scene, sensor, seeds[0], size, spp)
+    return [replace(first, seed=s) for s in seeds]
+
+
+def finish_pass(*results: Any) -> None:
+    """Evaluate what a pass yields, and wait for it: memory of passes that are still queued would pile up."""
+    dr.eval(*results)
+    dr.sync_thread()
 
 
 def trace(samples: Samples, hooks: Hooks, active: Any = True) -> Any:
@@ -184,10 +191,9 @@ class Trace:
     def film(self) -> Film:
         return self.samples[0].film
 
-    def states(self, estimator: Estimator, adjoint: AdjointImage) -> Iterator[Any]:
-        """What is kept of each pass, in turn; passes that are traced only now know dL/dI from the start."""
-        for samples in self.samples:
-            yield self.state if self.state is not None else keep(samples, estimator, None, adjoint)
+    def state_of(self, samples: Samples, estimator: Estimator, adjoint: AdjointImage) -> Any:
+        """What is kept of one of the passes; one that is traced only now knows dL/dI from the start."""
+        return self.state if self.state is not None else keep(samples, estimator, None, adjoint)
 
 
 def trace_image(samples: list[Samples], estimator: Estimator) -> Trace:
@@ -200,7 +206,7 @@ def trace_image(samples: list[Samples], estimator: Estimator) -> Trace:
         trace = Trace(samples)
         for part in samples:
             image_alone(part, None if estimator.splats_all else estimator, block)
-            dr.eval(block.tensor())
+            finish_pass(block.tensor())
     trace.image = film.develop(block)
     dr.eval(trace.image)
     return trace
@@ -218,10 +224,12 @@ def replay_all(trace: Trace, estimator: Estimator, gradient: Any) -> None:
     # Isolated: on their way to the parameters gradients are evaluated, and with them all that they hang on, which is to
     # be one kernel. They set out once, at the end.
     with dr.isolate_grad():
-        for samples, state in zip(trace.samples, trace.states(estimator, adjoint), strict=True):
+        for samples in trace.samples:
+            state = trace.state_of(samples, estimator, adjoint)
             replay(samples, estimator, state, adjoint)
+            del state  # before the next pass makes its own
             if len(trace.samples) > 1:
-                dr.eval()  # passes are not to pile up
+                finish_pass()
 
 
 def fused(samples: list[Samples], estimator: Estimator, gradient: Any) -> Any:
@@ -232,8 +240,9 @@ def fused(samples: list[Samples], estimator: Estimator, gradient: Any) -> Any:
         for part in samples:
             state = keep(part, estimator, block, adjoint)
             replay(part, estimator, state, adjoint)
+            del state  # before the next pass makes its own
             if len(samples) > 1:
-                dr.eval()
+                finish_pass()
     return film.develop(block)
 
 

@@ -14,6 +14,8 @@ from reslrb_cli.errors import ConfigError
 
 #: Options that a case takes over from the configuration's integrator, where it knows them.
 SHARED = ("rr_depth", "hide_emitters", "samples_per_pass")
+#: The estimator of a case that names none, as that of the plugin.
+PLUGIN_ESTIMATOR = "reservoir"
 #: Options of a case that are those of `run`, for itself alone.
 ADJOINT = ("adjoint", "batches", "first_batch")
 _TYPES = {str(kind.model_fields["type"].default): kind for kind in (Reslrb, Ptracer, Prb, WalkAd, Trajectory)}
@@ -44,6 +46,8 @@ class Case:
         shared, own = config.integrator.options(), _TYPES[self.type].model_fields if self.type in _TYPES else {}
         values = {"type": self.type} | {name: shared[name] for name in SHARED if name in shared and name in own}
         values |= {name: value for name, value in self.options.items() if name not in ADJOINT}
+        if self.type == "reslrb" and values.setdefault("estimator", PLUGIN_ESTIMATOR) == "auto":
+            raise ConfigError(blame, "estimator", "`auto` measures which to take; name those to compare")
         return with_integrator(config, values | {"max_depth": max_depth}, blame, adjoint)
 
     @property
@@ -51,7 +55,7 @@ class Case:
         """Name of the estimator, with the options that make it another than the default one, but for `capacity`."""
         if self.type != "reslrb":
             return None
-        name = str(self.options.get("estimator", Reslrb.model_fields["estimator"].default))
+        name = str(self.options.get("estimator", PLUGIN_ESTIMATOR))
         other = [
             f"{option}={value}"
             for option, value in self.options.items()

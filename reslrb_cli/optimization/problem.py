@@ -10,11 +10,14 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from reslrb_cli.config import Config, ParameterSpec
+from reslrb_cli.config import Config, Integrator, ParameterSpec, Reslrb
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.integrators import make_integrator
+from reslrb_cli.optimization.budget import MemoryPlan
+from reslrb_cli.optimization.choice import Cache, find_options, settle_integrator
 from reslrb_cli.optimization.losses import Loss, make_loss
 from reslrb_cli.optimization.optimizers import Optimizer
+from reslrb_cli.optimization.pilot import Outcome
 from reslrb_cli.optimization.rendering import render_in_passes
 from reslrb_cli.scene import Selection, check_supported, load_scene, read_image, select_parameters
 
@@ -45,6 +48,11 @@ class Problem:
     targets: list[Any] = field(default_factory=list)
     truth: dict[str, Array] = field(default_factory=dict)
     masks: dict[str, Array] = field(default_factory=dict)
+    #: The integrator's own bound on the samples of a pass.
+    samples_per_pass: int | None = None
+    #: What was measured and planned before the first iteration, where it was.
+    pilot: Outcome | None = None
+    memory: MemoryPlan | None = None
 
     def apply(self) -> None:
         """Hand the optimiser's values to the scene."""
@@ -72,7 +80,7 @@ class Problem:
         """Render the scene as it stands with the experiment's integrator; (H, W, C) float32."""
         config = self.config
         return render_in_passes(
-            self.integrator, self.scene, sensor, spp, config.run.seed, iteration, purpose, samples_per_pass(config)
+            self.integrator, self.scene, sensor, spp, config.run.seed, iteration, purpose, self.samples_per_pass
         )
 
     def parameter_errors(self) -> dict[str, float]:
@@ -99,20 +107,35 @@ def samples_per_pass(config: Config) -> int | None:
     return None if value is None else int(value)
 
 
-def assemble(config: Config, say: Callable[[str], None] = lambda line: None) -> Problem:
-    """Load and check what `config` names, and make the targets; a variant must be set.
+def make_configured(integrator: Integrator) -> Any:
+    """The integrator that a configuration describes; all estimators have the same image, so for `auto` any will do."""
+    if isinstance(integrator, Reslrb) and integrator.estimator == "auto":
+        integrator = integrator.chosen(estimator="reservoir")
+    return make_integrator(integrator.type, **integrator.options())
 
-    Everything that can be checked is, before anything is rendered. `say` is told what takes long. Raises ConfigError
-    and UnsupportedScene.
+
+def assemble(config: Config, say: Callable[[str], None] = lambda line: None, cache: Cache | None = None) -> Problem:
+    """Load and check what `config` names, make the targets, and settle the integrator; a variant must be set.
+
+    Everything that can be checked is, before anything is rendered. `say` is told what takes long, `cache` holds what
+    earlier pilots learned (None: nothing is kept). Raises ConfigError and UnsupportedScene.
     """
     problem = assemble_scene(config)
+    options = find_options(problem)
+    _make_targets(problem, say)
+    settle_integrator(problem, options, say, cache)
+    return problem
+
+
+def _make_targets(problem: Problem, say: Callable[[str], None]) -> None:
+    config = problem.config
     render = config.target.render
     if render is None:
         problem.targets = [
             _target(problem, read_target(config, problem, index), sensor)
             for index, sensor in enumerate(problem.sensors)
         ]
-        return problem
+        return
     true_scene = load_scene(config.scene.file, config.scene.options)
     true_values = set_true_values(config, true_scene)
     for key in problem.selection.keys:
@@ -123,13 +146,12 @@ def assemble(config: Config, say: Callable[[str], None] = lambda line: None) -> 
             say(f"{key} has another resolution than its true value: no parameter RMSE")
     chosen = render.integrator or config.integrator
     _check_supported(config, chosen.type, chosen.hide_emitters, true_scene, problem.sensors)
-    integrator = make_integrator(chosen.type, **chosen.options())
+    integrator = make_configured(chosen)
     multiple = chosen.options().get("samples_per_pass")
     for sensor in problem.sensors:
         say(f"rendering the target of sensor {sensor}: {render.spp} spp")
         image = render_in_passes(integrator, true_scene, sensor, render.spp, render.seed, 0, "target", multiple)
         problem.targets.append(_target(problem, image, sensor))
-    return problem
 
 
 def load_for_rendering(config: Config, initial: bool) -> tuple[Any, list[int], Any, int | None]:
@@ -143,7 +165,7 @@ def load_for_rendering(config: Config, initial: bool) -> tuple[Any, list[int], A
     scene = load_scene(config.scene.file, config.scene.options)
     sensors = choose_sensors(config, scene)
     _check_supported(config, config.integrator.type, config.integrator.hide_emitters, scene, sensors)
-    integrator = make_integrator(config.integrator.type, **config.integrator.options())
+    integrator = make_configured(config.integrator)
     return scene, sensors, integrator, samples_per_pass(config)
 
 
@@ -167,9 +189,10 @@ def assemble_scene(config: Config, scene: Any = None) -> Problem:
         scene=scene,
         sensors=sensors,
         selection=selection,
-        integrator=make_integrator(config.integrator.type, **config.integrator.options()),
+        integrator=make_configured(config.integrator),
         loss=make_loss(config.loss.type, **config.loss.options()),
         optimizer=optimizer,
+        samples_per_pass=samples_per_pass(config),
     )
     problem.apply()
     return problem

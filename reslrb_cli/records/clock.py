@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -78,8 +79,9 @@ def reset_peak() -> None:
     """Start a new memory peak from what is alive now.
 
     The allocator's statistics count blocks that it holds back for reuse as allocated: without the flush a peak
-    would include whatever ran before.
+    would include whatever ran before; and scenes that are done with die by the garbage collector alone.
     """
+    gc.collect()
     dr.sync_thread()
     dr.flush_malloc_cache()
     dr.sync_thread()

@@ -49,8 +49,9 @@ def versions() -> dict[str, str]:
 class Manifest:
     """Provenance and outcome of one run.
 
-    `results` holds what the run found (`iterations`, `parameter_rmse` per key, ...); `error` is the line that the user
-    saw where the run failed.
+    `pilot` is the table by which an estimator was chosen, `memory` how a memory budget is kept, None where that was not
+    asked for. `results` holds what the run found (`iterations`, `parameter_rmse` per key, ...); `error` is the line
+    that the user saw where the run failed.
     """
 
     variant: str
@@ -64,6 +65,8 @@ class Manifest:
     started: str = field(default_factory=now)
     ended: str | None = None
     error: str | None = None
+    pilot: dict[str, Any] | None = None
+    memory: dict[str, Any] | None = None
     results: dict[str, Any] = field(default_factory=dict)
 
     def write(self, folder: Path) -> None:

@@ -35,7 +35,8 @@ def primary_ray(plan: Plan, sensor: Any, sampler: Any, width: int) -> PrimaryRay
     n_pixels = int(size[0] * size[1])
     lane = dr.arange(mi.UInt32, width)
     pixel = lane % n_pixels
-    per_pixel = mi.Float(width // n_pixels + dr.select(pixel < width % n_pixels, mi.UInt32(1), 0))
+    count = dr.opaque(mi.UInt32, width)  # as a literal it would give every sample count a kernel of its own
+    per_pixel = mi.Float(count // n_pixels + dr.select(pixel < count % n_pixels, mi.UInt32(1), 0))
     time = sample_time(plan, sensor, sampler)
     u = mi.Point2f(pixel % int(size[0]), pixel // int(size[0])) + sampler.next_2d()
     aperture = sampler.next_2d() if plan.needs.thin_lens else mi.Point2f(0.5)

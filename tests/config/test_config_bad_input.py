@@ -173,7 +173,7 @@ FILES: dict[str, tuple[str | bytes, tuple[str, ...]]] = {
     ),
     "estimator's option left at its default": (
         GOOD + "integrator: {stack_size: 64}\n",
-        ("x.yaml: integrator.stack_size: has no effect with estimator `reservoir`, but with `stack`",),
+        ("x.yaml: integrator.stack_size: has no effect with estimator `auto`, but with `stack`",),
     ),
     "unknown estimator": (
         GOOD + "integrator: {estimator: gater}\n",
@@ -189,8 +189,21 @@ FILES: dict[str, tuple[str | bytes, tuple[str, ...]]] = {
         ("x.yaml: integrator.weight: must be luminance or adjoint (did you mean adjoint?)",),
     ),
     "weight that is not known yet": (
-        GOOD + "integrator: {weight: adjoint}\n",
+        GOOD + "integrator: {estimator: reservoir, weight: adjoint}\n",
         ("x.yaml: integrator.weight: `adjoint` needs dL/dI before", "run.adjoint: correlated"),
+    ),
+    "memory budget in no unit": (
+        GOOD + "run: {memory_budget: 2 floppies}\n",
+        ("x.yaml: run.memory_budget: must be a number of MiB, or text such as 512 MiB or 2GiB",),
+    ),
+    "memory budget of nothing": (GOOD + "run: {memory_budget: 0}\n", ("x.yaml: run.memory_budget: must be a number",)),
+    "memory budget of a baseline": (
+        GOOD + "integrator: {type: ptracer}\nrun: {memory_budget: 64}\n",
+        ("x.yaml: run.memory_budget: goes with integrator `reslrb` alone, not with `ptracer`",),
+    ),
+    "memory budget and passes": (
+        GOOD + "integrator: {samples_per_pass: 4}\nrun: {memory_budget: 64}\n",
+        ("x.yaml: integrator.samples_per_pass: is chosen by run.memory_budget",),
     ),
     "option of another optimiser": (
         GOOD + "optimizer: {type: sgd, beta_1: 0.5}\n",

@@ -56,8 +56,7 @@ def test_defaults(tmp_path: Path) -> None:
     assert config.parameters[0].initial == "scene"
     assert isinstance(config.integrator, Reslrb)
     assert config.integrator.options() == {
-        "max_depth": 8, "rr_depth": 5, "hide_emitters": False, "estimator": "reservoir",
-        "capacity": 1, "weight": "luminance", "image": "all",
+        "max_depth": 8, "rr_depth": 5, "hide_emitters": False, "estimator": "auto",
     }  # fmt: skip
     assert config.loss.type == "l2"
     assert config.loss.options() == {}
@@ -110,7 +109,7 @@ def test_paths_do_not_depend_on_the_working_directory(tmp_path: Path, monkeypatc
         (FULL, ("integrator={type: prb}", "loss={type: l1}", "optimizer={type: rmsprop}", "run.name='null'")),
         (GOOD, ("integrator={estimator: stack, stack_size: 8}",)),
         (GOOD, ("integrator={estimator: gather}",)),
-        (GOOD, ("integrator={capacity: 4, weight: adjoint}", "run.adjoint=independent")),
+        (GOOD, ("integrator={estimator: event, capacity: 4, weight: adjoint}", "run.adjoint=independent")),
         (GOOD, ("target.render={parameters: {a.b: 1e-3, c: {file: x.exr}}, integrator: {type: ptracer}}",)),
     ],
 )

@@ -1,0 +1,212 @@
+"""The integrator of a run, settled before its first iteration: the estimator by a pilot, the passes by a budget."""
+
+from __future__ import annotations
+
+import hashlib
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from reslrb_cli.backend.device import device_name
+from reslrb_cli.config import Config, Reslrb
+from reslrb_cli.errors import ConfigError
+from reslrb_cli.integrators import gradient_step, make_integrator
+from reslrb_cli.optimization.budget import MemoryPlan, choose_samples, standing
+from reslrb_cli.optimization.pilot import Candidate, Measured, Outcome, Pilot
+from reslrb_cli.records.clock import MIB, StepClock
+from reslrb_cli.records.manifest import versions
+from reslrb_cli.records.pilot_cache import key_of
+from reslrb_cli.seeds import seed
+
+if TYPE_CHECKING:
+    from reslrb_cli.optimization.problem import Problem
+
+Say = Callable[[str], None]
+
+
+class Cache(Protocol):
+    """Where pilots' outcomes are kept."""
+
+    def get(self, key: str) -> dict[str, Any] | None: ...
+
+    def put(self, key: str, entry: dict[str, Any]) -> None: ...
+
+
+@dataclass
+class Option:
+    """A candidate, ready to run; `memory` where there is a budget."""
+
+    options: dict[str, Any]
+    integrator: Any
+    memory: MemoryPlan | None
+
+
+def find_options(problem: Problem) -> list[Option]:
+    """What the run may use in place of `problem.integrator`, where that is left to measurement; else nothing.
+
+    Needs no targets. Raises ConfigError where no estimator keeps the memory budget.
+    """
+    config = problem.config
+    if not isinstance(config.integrator, Reslrb):
+        return []
+    if config.integrator.estimator == "auto":
+        return _fitting(problem, config.integrator, candidates(config))
+    return [] if config.run.memory_budget is None else _fitting(problem, config.integrator, [{}])
+
+
+def settle_integrator(problem: Problem, options: list[Option], say: Say, cache: Cache | None = None) -> None:
+    """Replace `problem.integrator` by the best of the options, where there are any; of several a pilot finds it."""
+    if not options:
+        return
+    chosen = options[0]
+    if chosen.options:
+        problem.pilot = _outcome(problem, options, say, cache)
+        chosen = next(option for option in options if option.options == problem.pilot.chosen)
+        say(problem.pilot.line())
+    problem.integrator, problem.memory = chosen.integrator, chosen.memory
+    if chosen.memory is not None:
+        problem.samples_per_pass = chosen.memory.samples_per_pass
+
+
+def candidates(config: Config) -> list[dict[str, Any]]:
+    """Options of all estimators that apply, those first that others are judged by."""
+    found: list[dict[str, Any]] = [{"estimator": "stack"}, {"estimator": "gather"}]
+    found += [{"estimator": name, "capacity": m} for m in (1, 4) for name in ("reservoir", "event")]
+    if config.run.adjoint != "correlated":
+        found += [{"estimator": "reservoir", "capacity": m, "weight": "adjoint"} for m in (1, 4)]
+    return found
+
+
+# --- memory -----------------------------------------------------------------------------------------------------------
+
+
+def _fitting(problem: Problem, integrator: Reslrb, choices: list[dict[str, Any]]) -> list[Option]:
+    """The candidates that keep the budget, each with the samples of its passes."""
+    run, budget, least, options = problem.config.run, problem.config.run.budget_bytes, [], []
+    fixed = 0 if budget is None else standing()
+    for choice in choices:
+        own = integrator.chosen(**choice).options() if choice else integrator.options()
+        made = make_integrator("reslrb", **own)
+        if budget is None:
+            options.append(Option(choice, made, None))
+            continue
+        samples = run.spp // run.batches if run.adjoint == "batched" else run.spp
+        size, expected = choose_samples(problem, made, samples, budget, fixed)
+        if size == 0:
+            least.append(expected.total)
+            continue
+        if size < samples:
+            made.samples_per_pass = size
+        options.append(Option(choice, made, MemoryPlan(budget, size, samples // size, expected)))
+    if not options:
+        mib = -(-min(least) // MIB)
+        reason = f"one sample per pixel takes about {mib:.0f} MiB; allow at least {mib:.0f} MiB"
+        raise ConfigError(problem.config.source, "run.memory_budget", reason)
+    return options
+
+
+# --- pilot ------------------------------------------------------------------------------------------------------------
+
+
+def _outcome(problem: Problem, options: list[Option], say: Say, cache: Cache | None) -> Outcome:
+    """The cached outcome of an earlier pilot, or that of a new one."""
+    key = key_of(_situation(problem)) if cache is not None else ""
+    if cache is not None:
+        try:
+            outcome = Outcome.from_json(cache.get(key) or {})
+            outcome.cached = True
+            if any(option.options == outcome.chosen for option in options):
+                return outcome
+        except (TypeError, KeyError):
+            pass  # nothing there, or nothing that this version wrote
+    say("estimator auto: measuring")
+    outcome = _run_pilot(problem, options)
+    if cache is not None:
+        cache.put(key, outcome.to_json())
+    return outcome
+
+
+def _run_pilot(problem: Problem, options: list[Option]) -> Outcome:
+    run = problem.config.run
+    batches = run.batches if run.adjoint == "batched" else 1
+    integrators = {}
+    made = [_candidate(option) for option in options]
+    for candidate, option in zip(made, options, strict=True):
+        integrators[candidate.label] = option.integrator
+    clock = StepClock()
+
+    def step(candidate: Candidate, round: int, spp: int) -> Measured:
+        integrator = integrators[candidate.label]
+        samples = integrator.samples_per_pass
+        if candidate.passes > 1:
+            integrator.samples_per_pass = spp // (batches * candidate.passes)
+        try:
+            return _step(problem, integrator, clock, round, spp)
+        finally:
+            integrator.samples_per_pass = samples
+
+    unit = batches * max(candidate.passes for candidate in made)
+    if problem.samples_per_pass is not None:  # the user's own passes
+        unit = batches * min(problem.samples_per_pass, run.spp // batches)
+    return Pilot(made, step, run.spp, unit).run()
+
+
+def _candidate(option: Option) -> Candidate:
+    """As the pilot sees it: with two passes where the run has more, which take as many traversals."""
+    options = option.options
+    parent = None
+    if options.get("capacity", 1) > 1 or "weight" in options:
+        parent = Candidate({"estimator": options["estimator"], "capacity": 1}, exact=False).label
+    several = option.memory is not None and option.memory.passes > 1
+    return Candidate(options, options["estimator"] in ("stack", "gather"), 2 if several else 1, parent)
+
+
+def _step(problem: Problem, integrator: Any, clock: StepClock, round: int, spp: int) -> Measured:
+    """One step of all views, with seeds of the pilot's own; leaves neither gradient nor change behind."""
+    start = time.perf_counter()
+    run, keys = problem.config.run, problem.selection.keys
+    problem.apply()
+    with clock.step() as times:
+        for sensor, target in zip(problem.sensors, problem.targets, strict=True):
+
+            def loss(image: Any, target: Any = target) -> Any:
+                return problem.compare(image, target) / len(problem.sensors)
+
+            step = gradient_step(
+                integrator, problem.scene, sensor, loss, seed=seed(run.seed, round, sensor, "pilot"),
+                **{**run.step_options(), "spp": spp}, params=problem.selection.params,
+            )  # fmt: skip
+            dr.eval(step.loss, [problem.optimizer.gradient(key) for key in keys])
+    gradients = {}
+    for key in keys:
+        gradient = np.array(problem.optimizer.gradient(key), dtype=np.float32)
+        gradients[key] = np.nan_to_num(gradient, nan=0.0, posinf=0.0, neginf=0.0).ravel()
+        problem.optimizer.clear_gradient(key)
+    wall_ms = 1e3 * (time.perf_counter() - start)
+    # Kernels are compiled side by side: their times can add up to more than was waited for.
+    return Measured(gradients, times.kernel_ms, max(wall_ms - times.codegen_ms, times.kernel_ms), times.codegen_ms)
+
+
+def _situation(problem: Problem) -> dict[str, Any]:
+    """All that the choice depends on, as plain values."""
+    config = problem.config
+    dump = config.model_dump(mode="json")
+    run = {key: dump["run"].get(key) for key in ("spp", "adjoint", "batches", "first_batch", "memory_budget")}
+    return {
+        "scene": hashlib.blake2b(Path(config.scene.file).read_bytes()).hexdigest(),
+        "options": dump["scene"]["options"],
+        "sensors": problem.sensors,
+        "parameters": {key: list(problem.selection.array(key).shape) for key in problem.selection.keys},
+        "integrator": dump["integrator"],
+        "loss": dump["loss"],
+        "run": run,
+        "versions": versions(),
+        "variant": mi.variant(),
+        "device": device_name(mi.variant()),
+    }

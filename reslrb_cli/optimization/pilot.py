@@ -1,0 +1,315 @@
+"""Which estimator is the most efficient here: a short pilot measures each, and leaves out what cannot win.
+
+    efficiency = 1 / (variance * time)
+
+Variance is that of the gradient at equal samples, summed over the parameters, each divided by its own gradient's mean
+square; time is that of a step's kernels. Equal seeds give all candidates equal paths, and given the paths an estimator
+that selects has the exact one's gradient as its expectation, so that
+
+    Var = Var_exact + E |g - g_exact|^2,   with m independent slots   Var_m = Var_exact + (Var_1 - Var_exact) / m,
+
+which few seeds estimate well, and which tells what a candidate can reach at best before its kernels are compiled.
+"""
+
+from __future__ import annotations
+
+import math
+import statistics
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+import numpy as np
+
+#: Share of a run of so many iterations that the pilot may cost, compilation apart.
+SHARE, ITERATIONS = 0.05, 200
+#: Steps that the pilot plans for, the most first: the first that its share suffices for.
+PLANNED_STEPS = (24, 18, 12, 9)
+#: A candidate is dropped once the best is so many times as efficient, after at least so many rounds.
+DROPPED = ((2, 1.5), (4, 1.25))
+MOST_ROUNDS = 12
+#: Relative error of a single time that must not decide anything.
+TIMING_NOISE = 1.1
+
+Gradients = dict[str, "np.ndarray[Any, Any]"]
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """An estimator and its options. `exact`: it uses every connection. `passes` are those of
+    a step in the pilot; other passes are other paths. `parent`: the label of the candidate that it varies."""
+
+    options: dict[str, Any]
+    exact: bool
+    passes: int = 1
+    parent: str | None = None
+
+    @property
+    def label(self) -> str:
+        """The estimator in words."""
+        name, *rest = (str(value) if key == "estimator" else f"{key} {value}" for key, value in self.options.items())
+        return ", ".join([name, *rest])
+
+
+@dataclass
+class Measured:
+    """One step: the gradients by parameter, and its times; `wall_ms` is all that the caller waits but for `compile_ms`,
+    in which kernels were generated and compiled."""
+
+    gradients: Gradients
+    kernel_ms: float
+    wall_ms: float
+    compile_ms: float = 0.0
+
+
+@dataclass
+class Row:
+    """One line of the pilot's table. `rounds` is 0 where `note` says why a candidate was not measured."""
+
+    estimator: str
+    options: dict[str, Any]
+    rounds: int
+    kernel_ms: float | None = None
+    variance: float | None = None
+    efficiency: float | None = None
+    note: str = ""
+
+
+@dataclass
+class Outcome:
+    """What a pilot found: `chosen` are the options of its best candidate, `advantage` its efficiency over the next's.
+
+    `share` is what the measurement cost of 200 iterations of that candidate; `compile_s` are the first steps.
+    """
+
+    chosen: dict[str, Any]
+    label: str
+    rows: list[Row]
+    spp: int = 0
+    advantage: float | None = None
+    next_label: str | None = None
+    measure_s: float = 0.0
+    compile_s: float = 0.0
+    share: float = 0.0
+    cached: bool = False
+
+    def to_json(self) -> dict[str, Any]:
+        """As a mapping for JSON."""
+        return asdict(self)
+
+    @staticmethod
+    def from_json(data: dict[str, Any]) -> Outcome:
+        """The same again. Raises TypeError or KeyError where `data` is nothing that `to_json` made."""
+        return Outcome(**{**data, "rows": [Row(**row) for row in data["rows"]]})
+
+    def line(self) -> str:
+        """What the user is told."""
+        over = ""
+        if self.advantage is not None:
+            over = f", {self.advantage:.2f} times as efficient as the next, {self.next_label}"
+        cost = f"measured in {self.measure_s:.1f} s, {100 * self.share:.1f} % of {ITERATIONS} iterations, and "
+        cost += f"{self.compile_s:.1f} s of first steps"
+        return f"estimator {self.label}{over} ({'as an earlier run measured' if self.cached else cost})"
+
+
+@dataclass
+class _Entry:
+    """What is known of one candidate."""
+
+    candidate: Candidate
+    kernel: list[float] = field(default_factory=list)
+    wall: list[float] = field(default_factory=list)
+    gradients: list[Gradients] = field(default_factory=list)
+
+    @property
+    def time(self) -> float:
+        return statistics.median(self.kernel)
+
+    @property
+    def overhead(self) -> float:
+        return max(statistics.median(self.wall) - self.time, 0.0)
+
+
+class Pilot:
+    """One pilot. `step(candidate, round, spp)` takes a step; equal rounds have equal seeds.
+
+    `spp` are those of the run, of which the pilot uses a multiple of `unit`.
+    """
+
+    def __init__(
+        self, candidates: Sequence[Candidate], step: Callable[[Candidate, int, int], Measured], spp: int, unit: int = 1
+    ) -> None:
+        self._candidates, self._step = list(candidates), step
+        self._spp, self._unit, self._pilot_spp = spp, unit, unit
+        self._entries: list[_Entry] = []
+        self._notes: dict[str, str] = {}
+        self._spent_ms = self._compile_ms = 0.0
+
+    def run(self) -> Outcome:
+        """Measure, and choose."""
+        alive = [self._warm_up(c) for c in self._candidates if c.parent is None]
+        self._choose_size(alive[0])
+        for round in range(MOST_ROUNDS):
+            for entry in alive:
+                if round == 0 or self._affords(entry):
+                    self._measure(entry)
+            alive = self._contenders(alive)
+            if round == 1:
+                alive = self._contenders(alive + self._promising())
+            if round >= 1 and (len(alive) == 1 or not any(self._affords(entry) for entry in alive)):
+                break
+        return self._outcome()
+
+    # --- measuring ----------------------------------------------------------------------------------------------------
+
+    def _warm_up(self, candidate: Candidate) -> _Entry:
+        """Compile the kernels of a candidate."""
+        first = self._step(candidate, 0, self._unit)
+        self._compile_ms += first.wall_ms + first.compile_ms
+        entry = _Entry(candidate)
+        self._entries.append(entry)
+        return entry
+
+    def _measure(self, entry: _Entry) -> None:
+        measured = self._step(entry.candidate, len(entry.kernel), self._pilot_spp)
+        if measured.compile_ms > measured.wall_ms:  # a first step after all, whose times say nothing
+            self._compile_ms += measured.wall_ms + measured.compile_ms
+            measured = self._step(entry.candidate, len(entry.kernel), self._pilot_spp)
+        self._compile_ms += measured.compile_ms
+        self._spent_ms += measured.wall_ms
+        entry.kernel.append(measured.kernel_ms)
+        entry.wall.append(measured.wall_ms)
+        entry.gradients.append(measured.gradients)
+
+    def _choose_size(self, entry: _Entry) -> None:
+        """Choose the samples per pixel so that the planned steps fit into the pilot's share, by a step of the first."""
+        first = self._step(entry.candidate, 0, self._unit)
+        self._spent_ms += first.wall_ms
+        overhead, slope = max(first.wall_ms - first.kernel_ms, 0.0), max(first.kernel_ms, 1e-6) / self._unit
+        budget = SHARE * ITERATIONS * (overhead + slope * self._spp) - first.wall_ms
+        for steps in PLANNED_STEPS:
+            fits = int((budget / steps - overhead) / slope) // self._unit * self._unit
+            if fits >= self._unit:
+                break
+        self._pilot_spp = max(min(fits, self._spp // self._unit * self._unit), self._unit)
+
+    def _run_ms(self) -> float:
+        """Time of a run of ITERATIONS by the fastest candidate so far."""
+        scale = self._spp / self._pilot_spp
+        return ITERATIONS * min(entry.overhead + entry.time * scale for entry in self._entries if entry.kernel)
+
+    def _affords(self, entry: _Entry) -> bool:
+        return self._spent_ms + statistics.median(entry.wall) <= SHARE * self._run_ms()
+
+    # --- judging ------------------------------------------------------------------------------------------------------
+
+    def _references(self, passes: int) -> list[Gradients]:
+        """The exact gradient of each round on the same paths."""
+        exact = [e.gradients for e in self._entries if e.candidate.exact and e.candidate.passes == passes]
+        return max(exact, key=len, default=[])
+
+    def _scales(self) -> dict[str, float]:
+        """Mean square norm of each parameter's gradient."""
+        every = [g for e in self._entries if e.candidate.exact for g in e.gradients]
+        every = every or [g for e in self._entries for g in e.gradients]
+        return {key: float(np.mean([_square(g[key]) for g in every])) for key in every[0]}
+
+    def _variance(self, entry: _Entry) -> float:
+        scales = {key: scale for key, scale in self._scales().items() if scale > 0}
+        references = self._references(entry.candidate.passes)
+        total = 0.0
+        for key, scale in scales.items():
+            own = [g[key] for g in entry.gradients]
+            exact = [g[key] for g in references]
+            total += _sample_variance(exact if len(exact) > 1 else own) / scale
+            if exact and not entry.candidate.exact:
+                pairs = list(zip(own, exact, strict=False))
+                total += sum(_square(a - b) for a, b in pairs) / (len(pairs) * scale)
+        return max(total, 1e-12)  # a furnace has none at all
+
+    def _efficiency(self, entry: _Entry) -> float:
+        return 1 / (self._variance(entry) * max(entry.time, 1e-6))
+
+    def _contenders(self, alive: list[_Entry]) -> list[_Entry]:
+        """Those that may still turn out to be the best."""
+        best = max(alive, key=self._efficiency)
+        kept = []
+        for entry in alive:
+            rounds = min(len(entry.kernel), len(best.kernel))
+            limit = min((factor for least, factor in DROPPED if rounds >= least), default=math.inf)
+            slower = any(
+                other.candidate.exact
+                and other.candidate.passes == entry.candidate.passes
+                and other.time * TIMING_NOISE < entry.time
+                for other in alive
+            )
+            # No estimator has less variance than an exact one of the same paths.
+            if entry is best or not (slower or self._efficiency(entry) * limit < self._efficiency(best)):
+                kept.append(entry)
+        return kept
+
+    def _promising(self) -> list[_Entry]:
+        """Measure the variants that could be the best, by what is known of those they vary."""
+        best = max(self._efficiency(entry) for entry in self._entries)
+        labels = {entry.candidate.label: entry for entry in self._entries}
+        found = []
+        for candidate in self._candidates:
+            if candidate.parent is None:
+                continue
+            parent = labels.get(candidate.parent)
+            bound = self._bound(candidate, parent)
+            if bound * TIMING_NOISE < best:
+                self._notes[candidate.label] = f"not measured: at most {bound / best:.2f} of the best's efficiency"
+            elif not self._affords(parent or self._entries[0]):
+                self._notes[candidate.label] = (
+                    f"not measured: no more than {100 * SHARE:.0f} % of the run is to be spent"
+                )
+            else:
+                entry = self._warm_up(candidate)
+                self._measure(entry)
+                if self._affords(entry):
+                    self._measure(entry)
+                found.append(entry)
+        return found
+
+    def _bound(self, candidate: Candidate, parent: _Entry | None) -> float:
+        """The greatest efficiency that a variant can have: it is no faster than its parent."""
+        if parent is None or not self._references(candidate.passes) or candidate.passes != parent.candidate.passes:
+            return math.inf
+        exact = next(e for e in self._entries if e.candidate.exact and e.candidate.passes == candidate.passes)
+        least = self._variance(exact)
+        if candidate.options.get("weight") != "adjoint":
+            least += (self._variance(parent) - least) / candidate.options["capacity"]
+        return 1 / (least * max(parent.time, 1e-6))
+
+    def _outcome(self) -> Outcome:
+        ranked = sorted(self._entries, key=self._efficiency, reverse=True)
+        best = ranked[0]
+        measured = {entry.candidate.label: entry for entry in self._entries}
+        rows = []
+        for candidate in self._candidates:
+            entry = measured.get(candidate.label)
+            options = {key: value for key, value in candidate.options.items() if key != "estimator"}
+            row = Row(candidate.options["estimator"], options, 0, note=self._notes.get(candidate.label, ""))
+            if entry is not None:
+                row.rounds, row.kernel_ms = len(entry.kernel), entry.time
+                row.variance, row.efficiency = self._variance(entry), self._efficiency(entry)
+            rows.append(row)
+        outcome = Outcome(best.candidate.options, best.candidate.label, rows, self._pilot_spp)
+        if len(ranked) > 1:
+            outcome.advantage = self._efficiency(best) / self._efficiency(ranked[1])
+            outcome.next_label = ranked[1].candidate.label
+        outcome.measure_s, outcome.compile_s = self._spent_ms / 1e3, self._compile_ms / 1e3
+        outcome.share = self._spent_ms / self._run_ms()
+        return outcome
+
+
+def _square(values: np.ndarray[Any, Any]) -> float:
+    return float(np.sum(np.square(values, dtype=np.float64)))
+
+
+def _sample_variance(values: list[np.ndarray[Any, Any]]) -> float:
+    """Sum over the entries; the mean square where there is one sample only."""
+    if len(values) < 2:
+        return _square(values[0])
+    return float(np.sum(np.var(np.array(values, dtype=np.float64), axis=0, ddof=1)))

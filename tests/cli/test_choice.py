@@ -1,0 +1,259 @@
+"""`estimator: auto` and `memory_budget` in whole runs of a small scene, from the command line to the manifest."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+
+import numpy as np
+import pytest
+from cli.test_optimize import CONFIG, KEY, SCENE
+
+from reslrb_cli.cli import main
+from reslrb_cli.records.manifest import read_manifest
+from reslrb_cli.records.metrics import read_metrics
+
+AUTO = CONFIG.replace("{type: ptracer, max_depth: 3}", "{max_depth: 4}").replace("iterations: 25", "iterations: 2")
+
+
+@pytest.fixture
+def experiment(llvm, tmp_path, monkeypatch):
+    """A folder with a scene and a configuration, the working directory in it, and a cache of its own."""
+    import mitsuba as mi
+
+    mi.Bitmap(np.full((4, 4, 3), 0.6, dtype=np.float32)).write(str(tmp_path / "poster.exr"))
+    (tmp_path / "scene.xml").write_text(SCENE)
+    (tmp_path / "box.yaml").write_text(AUTO)
+    monkeypatch.chdir(tmp_path)
+    logging.getLogger("reslrb_cli").setLevel(logging.INFO)
+
+
+def optimize(capsys, *settings: str) -> tuple[int, str]:
+    capsys.readouterr()
+    sets = [text for setting in settings for text in ("--set", setting)]
+    with pytest.raises(SystemExit) as end:
+        main(["optimize", "box.yaml", *sets, "--force"])
+    return int(end.value.code or 0), capsys.readouterr().err
+
+
+def wide(*settings: str) -> list[str]:
+    """At 32x32: memory is that of paths."""
+    text = Path("scene.xml").read_text()
+    Path("scene.xml").write_text(text.replace('name="width" value="16"', 'name="width" value="32"').replace(
+        'name="height" value="16"', 'name="height" value="32"'))  # fmt: skip
+    return ["target.render.spp=16", *settings]
+
+
+def test_auto_measures_once_and_remembers(experiment, capsys):
+    code, err = optimize(capsys)
+    assert code == 0, err
+    lines = [line for line in err.splitlines() if line.startswith("estimator ") and "measuring" not in line]
+    assert len(lines) == 1, err
+    pilot = read_manifest(Path("runs/box"))["pilot"]
+    assert not pilot["cached"]
+    assert lines[0].startswith(f"estimator {pilot['label']}")
+    assert {row["estimator"] for row in pilot["rows"]} == {"stack", "gather", "reservoir", "event"}
+    measured = [row for row in pilot["rows"] if row["rounds"]]
+    best = max(measured, key=lambda row: row["efficiency"])
+    assert pilot["chosen"] == {"estimator": best["estimator"], **best["options"]}
+    for row in measured:
+        assert row["efficiency"] == pytest.approx(1 / (row["variance"] * row["kernel_ms"]))
+    assert all(row["note"].startswith("not measured") for row in pilot["rows"] if not row["rounds"])
+    assert "estimator: auto" in Path("runs/box/config.yaml").read_text()
+    first = [record["loss"] for record in read_metrics(Path("runs/box"))]
+
+    code, err = optimize(capsys)
+    assert code == 0, err
+    again = read_manifest(Path("runs/box"))["pilot"]
+    assert again == {**pilot, "cached": True}
+    assert "as an earlier run measured" in err
+    assert "measuring" not in err
+    # The pilot changed neither parameters nor random numbers.
+    np.testing.assert_allclose([record["loss"] for record in read_metrics(Path("runs/box"))], first, rtol=1e-4)
+
+    assert "measuring" in optimize(capsys, "run.spp=8")[1]  # another situation
+
+
+def test_the_pilot_leaves_the_run_as_it_was(experiment):
+    import drjit as dr
+
+    from reslrb_cli.config import load
+    from reslrb_cli.optimization import assemble, loop
+
+    def first_step(*settings):
+        problem = assemble(load("box.yaml", settings))
+        assert not np.any(np.array(problem.optimizer.gradient(KEY)))
+        value = problem.selection.array(KEY).copy()
+        loss, _, _ = loop.gradient(problem, 0, loop.Split())
+        dr.eval(loss)
+        return value, float(loss[0]), np.array(problem.optimizer.gradient(KEY)), problem.pilot
+
+    value, loss, _, pilot = first_step()
+    assert pilot is not None
+    chosen = ", ".join(f"{key}: {entry}" for key, entry in pilot.chosen.items())
+    named = first_step(f"integrator={{max_depth: 4, {chosen}}}")
+    assert named[3] is None
+    np.testing.assert_array_equal(value, named[0])
+    assert loss == pytest.approx(named[1], rel=1e-5)
+
+
+def test_the_pilot_has_seeds_of_its_own(experiment, monkeypatch):
+    from reslrb_cli.config import load
+    from reslrb_cli.optimization import choice
+    from reslrb_cli.optimization.problem import assemble_scene
+
+    drawn = []
+
+    def spy(run_seed, iteration, view, purpose):
+        drawn.append((run_seed, iteration, view, purpose))
+        return len(drawn)
+
+    monkeypatch.setattr(choice, "seed", spy)
+    monkeypatch.setattr(choice, "gradient_step", lambda *args, **options: pytest.fail("stop", pytrace=False))
+    problem = assemble_scene(load("box.yaml", ["run.seed=7"]))
+    problem.targets = [None]
+    from reslrb_cli.records.clock import StepClock
+
+    for round in (0, 1, 0):
+        with pytest.raises(pytest.fail.Exception):
+            choice._step(problem, problem.integrator, StepClock(), round, 4)
+    assert drawn == [(7, 0, 0, "pilot"), (7, 1, 0, "pilot"), (7, 0, 0, "pilot")]
+
+
+@pytest.mark.parametrize("adjoint", ["independent", "batched"])
+def test_candidates_know_delta_where_it_is_known(experiment, adjoint):
+    from reslrb_cli.config import load
+    from reslrb_cli.optimization.choice import candidates
+
+    assert not any("weight" in options for options in candidates(load("box.yaml")))
+    options = candidates(load("box.yaml", [f"run.adjoint={adjoint}"]))
+    assert [entry["capacity"] for entry in options if entry.get("weight") == "adjoint"] == [1, 4]
+
+
+def test_auto_works_with_batches_and_several_views(experiment, capsys):
+    code, err = optimize(capsys, "run.adjoint=batched", "scene.sensors=all", "run.spp=8", "run.iterations=1")
+    assert code == 0, err
+    assert read_manifest(Path("runs/box"))["pilot"]["spp"] in (4, 8)
+
+
+def test_auto_is_no_option_of_the_plugin(llvm):
+    from reslrb_cli.integrators import make_integrator
+
+    with pytest.raises(Exception, match="name one of reservoir"):
+        make_integrator("reslrb", estimator="auto")
+
+
+@pytest.mark.parametrize("adjoint", ["correlated", "independent", "batched"])
+@pytest.mark.parametrize("estimator", ["reservoir", "event"])
+def test_a_memory_budget_is_kept(experiment, capsys, estimator, adjoint):
+    settings = wide(f"integrator={{max_depth: 4, estimator: {estimator}}}", "run.spp=256", f"run.adjoint={adjoint}")
+    peaks, losses = [], []
+    limit = 1.5 if adjoint == "batched" else 3
+    for budget in ("null", limit):
+        code, err = optimize(capsys, *settings, f"run.memory_budget={budget}")
+        assert code == 0, err
+        records = read_metrics(Path("runs/box"))
+        peaks.append(max(record["peak_mib"] for record in records))
+        losses.append(records[0]["loss"])
+        assert "were used" not in err, read_manifest(Path("runs/box"))["memory"]
+    assert peaks[0] > limit > peaks[1], peaks
+    assert losses[1] == pytest.approx(losses[0], rel=0.05)
+    memory = read_manifest(Path("runs/box"))["memory"]
+    assert memory["passes"] * memory["samples_per_pass"] == (64 if adjoint == "batched" else 256)
+    assert memory["peak_mib"] == peaks[1]
+    assert not memory["exceeded"]
+    assert sum(memory["expected_bytes"].values()) <= memory["budget_bytes"] == limit * 2**20
+    # expected from the start, and used: within a factor
+    assert peaks[1] / 2 < sum(memory["expected_bytes"].values()) / 2**20 < 2 * peaks[1]
+
+
+def test_auto_under_a_budget(experiment, capsys):
+    code, err = optimize(capsys, *wide("run.spp=64", "run.memory_budget=2", "run.iterations=1"))
+    assert code == 0, err
+    manifest = read_manifest(Path("runs/box"))
+    assert manifest["memory"]["passes"] >= 1
+    assert manifest["memory"]["peak_mib"] < 2
+    assert manifest["pilot"]["chosen"]["estimator"] in ("stack", "gather", "reservoir", "event")
+
+
+def test_a_budget_that_is_exceeded_is_a_warning(experiment, capsys, monkeypatch):
+    from reslrb_cli.optimization import budget
+
+    monkeypatch.setattr(budget, "_allocated", lambda size: 0)
+    settings = wide("integrator={max_depth: 4, estimator: event}", "run.spp=256", "run.memory_budget=3")
+    code, err = optimize(capsys, *settings)
+    assert code == 0, err
+    assert len([line for line in err.splitlines() if line.startswith("run.memory_budget: ")]) == 1
+    assert read_manifest(Path("runs/box"))["memory"]["exceeded"]
+
+
+def test_a_budget_that_nothing_can_keep_is_one_located_line(experiment, capsys):
+    for integrator in ("{max_depth: 4}", "{max_depth: 4, estimator: stack}"):
+        code, err = optimize(capsys, f"integrator={integrator}", "run.memory_budget=20 kB")
+        lines = [line for line in err.splitlines() if not line.startswith("variant ")]
+        assert code == 2
+        assert len(lines) == 1, err
+        assert lines[0].startswith("box.yaml: run.memory_budget: ")
+        assert "allow at least 1 MiB" in lines[0]
+        assert not Path("runs").exists()
+
+
+@pytest.mark.parametrize("adjoint", ["correlated", "independent", "batched"])
+def test_peak_memory_is_flat_in_samples_under_a_budget(experiment, adjoint):
+    from reslrb_cli.config import load
+    from reslrb_cli.optimization import assemble, optimize
+
+    peaks = {}
+    for spp in (256, 1024, 4096):
+        settings = [f"run.spp={spp}", f"run.adjoint={adjoint}", "run.memory_budget=1.5", "target.render.spp=4"]
+        problem = assemble(load("box.yaml", [*settings, "integrator={max_depth: 4, estimator: event}"]))
+        problem.truth.clear()
+        peaks[spp] = max(record.peak_mib for record in optimize(problem))
+        assert problem.memory is not None
+        assert problem.memory.passes >= spp // 256 // (4 if adjoint == "batched" else 1)
+    print(adjoint, peaks)
+    assert max(peaks.values()) < 1.5
+    assert peaks[4096] <= 1.02 * peaks[1024], peaks
+
+
+@pytest.mark.parametrize("estimator", ["reservoir", "gather", "event", "stack"])
+@pytest.mark.parametrize("zeros", [False, True])
+def test_what_is_kept_of_a_path_is_what_is_counted(experiment, monkeypatch, estimator, zeros):
+    from reslrb_cli.config import load
+    from reslrb_cli.estimators.base import entry_bytes
+    from reslrb_cli.integrators import light_tracer
+    from reslrb_cli.optimization import assemble, loop
+
+    states, keep = [], light_tracer.keep
+
+    def spy(*args):
+        states.append(keep(*args))
+        return states[-1]
+
+    monkeypatch.setattr(light_tracer, "keep", spy)
+    value = 0.0 if zeros else 0.5
+    settings = [f"integrator={{max_depth: 4, estimator: {estimator}}}", f"parameters[0].initial={value}"]
+    for adjoint in ("correlated", "independent"):
+        problem = assemble(load("box.yaml", [*settings, f"run.adjoint={adjoint}"]))
+        loop.gradient(problem, 0, loop.Split())
+        sensor = problem.scene.sensors()[0]
+        plan = problem.integrator.plan(problem.scene, sensor, problem.selection.params)
+        counted, kept = problem.integrator.estimator.bytes_per_path(plan), sum(entry_bytes(states.pop()))
+        assert plan.track_zeros == zeros
+        assert kept == counted if estimator in ("reservoir", "event") else kept <= counted <= kept + 128
+        assert (problem.integrator.estimator.scratch_bytes(plan) > 0) == (estimator == "stack")
+
+
+@pytest.mark.parametrize("estimator", ["reservoir", "gather", "event", "stack"])
+def test_all_sample_counts_have_the_same_kernels(experiment, estimator):
+    """The pilot's would otherwise be compiled for nothing."""
+    from reslrb_cli.config import load
+    from reslrb_cli.optimization import assemble, choice
+    from reslrb_cli.records.clock import StepClock
+
+    problem = assemble(load("box.yaml", [f"integrator={{max_depth: 4, estimator: {estimator}}}"]))
+    clock, launched = StepClock(), []
+    for spp in (3, 8, 16):
+        choice._step(problem, problem.integrator, clock, 0, spp)
+        launched.append({entry["hash"] for entry in clock.history if "hash" in entry})
+    assert launched[1] | launched[2] <= launched[0]

@@ -1,0 +1,129 @@
+"""The pilot on fabricated candidates: which it picks, what it measures, and what it leaves out."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from reslrb_cli.optimization.pilot import ITERATIONS, SHARE, Candidate, Measured, Outcome, Pilot
+
+STACK, GATHER = Candidate({"estimator": "stack"}, True), Candidate({"estimator": "gather"}, True)
+RESERVOIR = Candidate({"estimator": "reservoir", "capacity": 1}, False)
+RESERVOIR_4 = Candidate({"estimator": "reservoir", "capacity": 4}, False, parent=RESERVOIR.label)
+EVENT = Candidate({"estimator": "event", "capacity": 1}, False)
+ADJOINT = Candidate({"estimator": "event", "capacity": 1, "weight": "adjoint"}, False, parent=EVENT.label)
+ALL = [STACK, GATHER, RESERVOIR, EVENT, RESERVOIR_4, ADJOINT]
+
+
+class World:
+    """Steps whose times and variances are given: `times` in ms for each sample, `selection` over the exact variance.
+
+    The parameter `large` has a thousandfold gradient, and no estimator adds variance to it.
+    """
+
+    def __init__(self, times: dict[str, float], selection: dict[str, float], overhead: float = 1.0) -> None:
+        self.times, self.selection, self.overhead = times, selection, overhead
+        self.calls: list[tuple[str, int, int]] = []
+
+    def step(self, candidate: Candidate, round: int, spp: int) -> Measured:
+        name = candidate.label
+        self.calls.append((name, round, spp))
+        paths = np.random.default_rng(round)
+        small = 1 + paths.normal(size=400) / np.sqrt(spp)
+        large = 1000 * (1 + 0.01 * paths.normal(size=4) / np.sqrt(spp))
+        choice = np.random.default_rng([round, *name.encode()])
+        small = small + choice.normal(size=400) * np.sqrt(self.selection.get(name, 0) / spp)
+        kernel = self.times[name] * spp
+        return Measured({"small": small, "large": large}, kernel, kernel + self.overhead)
+
+    def run(self, candidates=ALL, spp: int = 64) -> Outcome:
+        return Pilot(candidates, self.step, spp).run()
+
+
+def times(**changed: float) -> dict[str, float]:
+    result = {candidate.label: 10.0 for candidate in ALL}
+    return {**result, **{name.replace("_", " "): value for name, value in changed.items()}}
+
+
+TABLES = {
+    "exact is best": ({}, {"reservoir, capacity 1": 1.0, "event, capacity 1": 2.0}, "stack"),
+    "gather is faster": ({"gather": 6.0}, {"reservoir, capacity 1": 1.0, "event, capacity 1": 2.0}, "gather"),
+    "cheap selection": (
+        {"event, capacity 1": 3.0, "event, capacity 1, weight adjoint": 6.0},
+        {"reservoir, capacity 1": 1.0, "event, capacity 1": 0.5, "event, capacity 1, weight adjoint": 0.4},
+        "event, capacity 1",
+    ),
+    "more slots": (
+        {"reservoir, capacity 1": 5.0, "reservoir, capacity 4": 5.5},
+        {"reservoir, capacity 1": 4.0, "reservoir, capacity 4": 0.2, "event, capacity 1": 9.0},
+        "reservoir, capacity 4",
+    ),
+    "a better weight": (
+        {"event, capacity 1": 5.0, "event, capacity 1, weight adjoint": 5.0},
+        {"reservoir, capacity 1": 4.0, "event, capacity 1": 3.0, "event, capacity 1, weight adjoint": 0.3},
+        "event, capacity 1, weight adjoint",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("table", TABLES)
+def test_the_most_efficient_is_picked(table: str) -> None:
+    changed, selection, best = TABLES[table]
+    outcome = World({**times(), **changed}, selection).run()
+    assert outcome.label == best
+    assert outcome.advantage is not None
+    assert outcome.advantage >= 1
+    assert [row.estimator for row in outcome.rows] == [candidate.options["estimator"] for candidate in ALL]
+    assert outcome.line().startswith(f"estimator {best}, ")
+
+
+def test_what_cannot_win_is_not_measured() -> None:
+    slow = {candidate.label: 12.0 for candidate in (RESERVOIR, EVENT)}
+    world = World({**times(), **slow}, {RESERVOIR.label: 1.0, EVENT.label: 2.0})
+    outcome = world.run()
+    assert not {name for name, _, _ in world.calls} & {RESERVOIR_4.label, ADJOINT.label}
+    for row in outcome.rows[4:]:
+        assert row.rounds == 0
+        assert row.efficiency is None
+        assert row.note.startswith("not measured: at most")
+    assert [row.rounds for row in outcome.rows[2:4]] == [1, 1]  # no faster than what is exact
+
+
+def test_variances_do_not_depend_on_units() -> None:
+    """The parameter with the large values would hide what selection adds to the other."""
+    outcome = World(times(), {RESERVOIR.label: 1.0, EVENT.label: 1.0}).run()
+    stack, _, reservoir = outcome.rows[:3]
+    assert reservoir.variance == pytest.approx(2 * stack.variance, rel=0.2)
+
+
+@pytest.mark.parametrize("spp", [1, 4, 16, 1024])
+@pytest.mark.parametrize("overhead", [0.0, 1.0, 1000.0])
+def test_its_share_is_kept(spp: int, overhead: float) -> None:
+    world = World(times(), {RESERVOIR.label: 0.1, EVENT.label: 0.1}, overhead)
+    outcome = world.run(spp=spp)
+    measured = sum(row.rounds for row in outcome.rows)
+    assert measured >= 4
+    assert outcome.spp <= spp
+    assert outcome.share <= SHARE * 1.001
+    assert outcome.share == pytest.approx(1e3 * outcome.measure_s / (ITERATIONS * (overhead + 10.0 * spp)), rel=1e-6)
+
+
+def test_equal_rounds_are_measured_with_equal_seeds_from_the_first() -> None:
+    world = World({**times(), RESERVOIR.label: 8.0}, {RESERVOIR.label: 0.1, EVENT.label: 0.1})
+    world.run()
+    for name in {name for name, _, _ in world.calls}:
+        rounds = [round for other, round, _ in world.calls if other == name]
+        assert rounds[0] == 0  # the first step, which compiles
+        assert sorted(set(rounds)) == list(range(max(rounds) + 1))
+
+
+def test_no_noise_at_all_is_no_division_by_zero() -> None:
+    def step(candidate: Candidate, round: int, spp: int) -> Measured:
+        return Measured({"a": np.zeros(3)}, 1.0 if candidate is GATHER else 2.0, 3.0)
+
+    assert Pilot(ALL, step, 16).run().label == "gather"
+
+
+def test_an_outcome_survives_json() -> None:
+    outcome = World(times(), {RESERVOIR.label: 1.0, EVENT.label: 1.0}).run()
+    assert Outcome.from_json(outcome.to_json()) == outcome
