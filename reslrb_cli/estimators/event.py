@@ -27,41 +27,16 @@ from reslrb_cli.estimators.base import (
     adjoint_of_factor,
     at_least_one,
     differentiate_emission,
-    differentiate_passage,
     one_of,
 )
+from reslrb_cli.estimators.events import Event, differentiate_event
 from reslrb_cli.estimators.gather import contribution
 from reslrb_cli.estimators.reservoir import selection_weight
-from reslrb_cli.estimators.surface import SurfacePoint, blank_lobe, event, lobe
-from reslrb_cli.transport.connection import Connection, connect, stand_in
-from reslrb_cli.transport.factors import MANY_ZEROS, NO_ZERO, Product
+from reslrb_cli.transport.connection import Connection
+from reslrb_cli.transport.factors import MANY_ZEROS, Product
 from reslrb_cli.transport.plan import Plan
-from reslrb_cli.transport.scattering import Scattering, attached_factor
+from reslrb_cli.transport.scattering import Scattering
 from reslrb_cli.transport.walk import Vertex
-
-
-@dataclass
-class Event:
-    """One factor of a path: f towards local direction `wo`; `index` is its vertex, 0 for emission.
-
-    `rest` times f is the factor as a whole, but for the transmittance of masks. `own` holds whether the event is a
-    connection's own, and the sample of the aperture, where masks may stand between it and the sensor.
-    """
-
-    index: Any
-    point: SurfacePoint
-    wo: Any
-    f: Any
-    rest: Any
-    lobe: list[Any]
-    own: list[Any]
-
-    @staticmethod
-    def emission(plan: Plan) -> Event:
-        """The event before the first vertex."""
-        own = [mi.Bool(False), mi.Point2f(0)] if plan.passage_in_gradient else []
-        point = SurfacePoint.blank(plan)
-        return Event(mi.UInt32(0), point, mi.Vector3f(0), mi.Spectrum(0), mi.Float(0), blank_lobe(plan), own)
 
 
 @dataclass
@@ -123,15 +98,7 @@ class EventSelection(VertexHooks):
             q = mi.Float(1)  # the masks between vertex and sensor may have something to differentiate
         Q = state.Q + q
         W = dr.fma(w, Q, state.W)
-        this = Event(
-            index=mi.UInt32(vertex.depth),
-            point=SurfacePoint.of(plan, vertex),
-            wo=connection.wo,
-            f=connection.f,
-            rest=dr.rcp(stand_in(connection)[0]),
-            lobe=blank_lobe(plan),
-            own=[mi.Bool(True), connection.sample] if plan.passage_in_gradient else [],
-        )
+        this = Event.of_connection(plan, vertex, connection)
         slots = []
         for k, slot in enumerate(state.slots):
             event = state.prefix[k]
@@ -150,15 +117,7 @@ class EventSelection(VertexHooks):
             return state
         q = dr.select(plan.differentiates(vertex.bsdf), mi.Float(1), 0)
         Q = state.Q + q
-        this = Event(
-            index=mi.UInt32(vertex.depth),
-            point=SurfacePoint.of(plan, vertex),
-            wo=scattering.wo,
-            f=scattering.f,
-            rest=scattering.correction / scattering.pdf,
-            lobe=lobe(plan, scattering),
-            own=[mi.Bool(False), mi.Point2f(0)] if plan.passage_in_gradient else [],
-        )
+        this = Event.of_scattering(plan, vertex, scattering)
         prefix = [
             dr.select(number * Q < q, this, event) for number, event in zip(state.numbers, state.prefix, strict=True)
         ]
@@ -198,26 +157,4 @@ class EventEstimator(Estimator):
         differentiate_emission(p, emission_weight)
         if p.plan.differentiate_bsdfs:
             for slot, adjoint in zip(state.slots, adjoints, strict=True):
-                _differentiate(p, slot, adjoint)
-
-
-def _differentiate(p: Pass, slot: Slot, adjoint: PathAdjoint) -> None:
-    """Add the derivative of one slot's event."""
-    plan, kept = p.plan, slot.event
-    active = (slot.w > 0) & (kept.index > 0)
-    si, bsdf = kept.point.interaction(plan, active)
-    rest = mi.Spectrum(kept.rest)
-    if plan.passage_in_gradient:
-        own, sample = kept.own
-        connection = connect(plan, p.sensor, si, kept.point.ray(), sample, active & own)
-
-        def adjoint_of(transmission: Any) -> Any:
-            return adjoint_of_factor(adjoint, mi.Int32(NO_ZERO), transmission, 0)
-
-        passed = differentiate_passage(p, si, kept.index, connection, active & own, adjoint_of)
-        rest = dr.select(own, rest * passed, rest)
-    weight = adjoint_of_factor(adjoint, kept.index, kept.f, rest)
-    active &= plan.differentiates(bsdf)
-    with dr.resume_grad():
-        f = attached_factor(plan, si, bsdf, event(kept.wo, kept.lobe), active)
-        dr.backward_from(dr.select(active, dr.dot(weight, f), 0))
+                differentiate_event(p, slot.event, adjoint, slot.w > 0)

@@ -1,4 +1,4 @@
-"""ResLRB: keep few connections of each path by weighted reservoir sampling, then replay the path up to the last.
+"""ResLRB: keep few connections of each path by weighted reservoir sampling, then replay the path towards them.
 
     slot k keeps candidate i with probability w_i / W,   W = sum_i w_i
     dS ~ 1/m sum_k (W / w_I) delta_I [ C_I dE/E + sum_{j<I} C_I ds_j/s_j + C_I dc_I/c_I ],   I = I_k
@@ -6,7 +6,8 @@
 Source: the ResLRB paper, Sections 2.2 to 2.4, for m = 1 and w = luminance(C); its conclusion names m > 1, here m
 independent slots that one replay serves. Reservoir sampling: Chao 1982. Where delta is known before the paths are
 traced, w = sum_c |delta_c C_c| leaves less variance. With zero factors the weight is that of the nonzero ones, so that
-a connection whose value is zero and whose derivative is not can be kept.
+a connection whose value is zero and whose derivative is not can be kept. Of the kept connection the surface point is
+kept as well: c_I is differentiated without a replay, which has to reach x_{I-1} only.
 """
 
 from __future__ import annotations
@@ -25,24 +26,28 @@ from reslrb_cli.estimators.base import (
     adjoint_of_factor,
     at_least_one,
     differentiate_emission,
-    differentiate_passage,
     one_of,
 )
+from reslrb_cli.estimators.events import Event, differentiate_event
 from reslrb_cli.transport.connection import Connection, stand_in
-from reslrb_cli.transport.factors import MANY_ZEROS, NO_ZERO, Product
+from reslrb_cli.transport.factors import MANY_ZEROS, Product
 from reslrb_cli.transport.plan import Plan
-from reslrb_cli.transport.scattering import Scattering, attached_factor, attached_factors
+from reslrb_cli.transport.scattering import Scattering, attached_factor
 from reslrb_cli.transport.walk import Vertex
 
 
 @dataclass
 class Slot:
-    """One kept connection, 28 bytes (and 12 more where zero factors are tracked)."""
+    """One kept connection, 28 bytes (and 12 more where zero factors are tracked).
+
+    Where BSDFs are differentiated, `event` holds c_I, about 50 bytes, so that the replay ends a vertex earlier.
+    """
 
     w: Any  # its selection weight
     I: Any  # its vertex; 0: none  # noqa: E741
     C: Product  # its contribution
     u: Any  # its film position
+    event: list[Event]
 
 
 @dataclass
@@ -53,12 +58,13 @@ class ReservoirState:
     slots: list[Slot]
 
     @staticmethod
-    def empty(capacity: int, zeros: int) -> ReservoirState:
-        """Nothing kept yet; `zeros` is the number of channels whose zero factors are tracked."""
+    def empty(plan: Plan, capacity: int) -> ReservoirState:
+        """Nothing kept yet."""
 
         def slot() -> Slot:
-            nothing = Product(mi.Spectrum(0), [mi.Int32(MANY_ZEROS) for _ in range(zeros)])
-            return Slot(mi.Float(0), mi.UInt32(0), nothing, mi.Point2f(0))
+            nothing = Product(mi.Spectrum(0), [mi.Int32(MANY_ZEROS) for _ in Product.one(plan.track_zeros).zero])
+            event = [Event.emission(plan)] if plan.differentiate_bsdfs else []
+            return Slot(mi.Float(0), mi.UInt32(0), nothing, mi.Point2f(0), event)
 
         return ReservoirState(mi.Float(0), [slot() for _ in range(capacity)])
 
@@ -84,7 +90,7 @@ class ReservoirSelection(VertexHooks):
         self.numbers, self.weight, self.splat = capacity, weight, splat
 
     def start(self, product: Product) -> ReservoirState:
-        return ReservoirState.empty(self.numbers, len(product.zero))
+        return ReservoirState.empty(self.p.plan, self.numbers)
 
     def connection(
         self, state: ReservoirState, vertex: Vertex, connection: Connection, numbers: list[Any]
@@ -94,7 +100,9 @@ class ReservoirSelection(VertexHooks):
             self.p.splat(connection.u, C.value(), connection.active)
         w = dr.select(connection.active, selection_weight(self.p, self.weight, connection, C), 0)
         W = state.W + w
-        this = Slot(w, vertex.depth, C, connection.u)
+        plan = self.p.plan
+        event = [Event.of_connection(plan, vertex, connection)] if plan.differentiate_bsdfs else []
+        this = Slot(w, vertex.depth, C, connection.u, event)
         slots = [
             dr.select((w > 0) & (number * W < w), this, slot) for number, slot in zip(numbers, state.slots, strict=True)
         ]
@@ -102,7 +110,7 @@ class ReservoirSelection(VertexHooks):
 
 
 class ReservoirReplay(VertexHooks):
-    """Replay up to the last kept connection, and differentiate s_j on the way and c_I at each kept one."""
+    """Replay up to the vertex before the last kept connection, and differentiate s_j on the way."""
 
     replaying = True
     connects = False
@@ -117,53 +125,19 @@ class ReservoirReplay(VertexHooks):
     def goes_on(self, state: Any, vertex: Vertex) -> Any:
         return vertex.depth < self.last
 
+    def is_followed(self, state: Any, vertex: Vertex) -> Any:
+        return vertex.depth + 1 < self.last
+
     def scattering(self, state: Any, vertex: Vertex, connection: Connection, scattering: Scattering) -> Any:
-        plan, si, bsdf, depth = self.p.plan, vertex.si, vertex.bsdf, vertex.depth
-        connected = self.wants(vertex)
-        rest_c = mi.Spectrum(dr.rcp(stand_in(connection)[0]))
-        if plan.needs.has_null:
-
-            def adjoint_of(transmission: Any) -> Any:
-                return self._sum(lambda slot: slot.I == depth, mi.Int32(NO_ZERO), transmission, 0)
-
-            rest_c *= differentiate_passage(self.p, si, depth, connection, connected, adjoint_of)
-        rest_s = mi.Spectrum(scattering.correction / scattering.pdf)
-        useful = plan.differentiates(bsdf)
-        connected, scattered = connected & useful, scattering.active & useful
-        with dr.resume_grad():
-            if len(self.kept) == 1:
-                # A vertex has either kind of factor, and one evaluation serves both.
-                [(_, adjoint)] = self.kept
-                scattering.is_delta &= ~connected
-                scattering.is_null &= ~connected
-                scattering.wo = dr.select(connected, connection.wo, scattering.wo)
-                active, f = connected | scattered, dr.select(connected, connection.f, scattering.f)
-                weight = adjoint_of_factor(adjoint, depth, f, dr.select(connected, rest_c, rest_s))
-                attached = attached_factor(plan, si, bsdf, scattering, active)
-                dr.backward_from(dr.select(active, weight * attached, 0))
-            else:
-                weight_c = self._sum(lambda slot: slot.I == depth, depth, connection.f, rest_c)
-                weight_s = self._sum(lambda slot: slot.I > depth, depth, scattering.f, rest_s)
-                f_c, f_s = attached_factors(plan, si, bsdf, connection.wo, connected, scattering, scattered)
-                dr.backward_from(dr.select(connected, weight_c * f_c, 0) + dr.select(scattered, weight_s * f_s, 0))
-        return state
-
-    def wants(self, vertex: Vertex) -> Any:
-        return self._any(lambda slot: slot.I == vertex.depth) & vertex.active
-
-    def _any(self, which: Any) -> Any:
-        masks = [which(slot) for slot, _ in self.kept]
-        result = masks[0]
-        for mask in masks[1:]:
-            result |= mask
-        return result
-
-    def _sum(self, which: Any, index: Any, f: Any, rest: Any) -> Any:
-        """Sum of the adjoints of one factor over the slots that `which` picks."""
-        total = mi.Spectrum(0)
+        plan, bsdf, depth = self.p.plan, vertex.bsdf, vertex.depth
+        active = scattering.active & plan.differentiates(bsdf)
+        rest, weight = mi.Spectrum(scattering.correction / scattering.pdf), mi.Spectrum(0)
         for slot, adjoint in self.kept:
-            total += dr.select(which(slot), adjoint_of_factor(adjoint, index, f, rest), 0)
-        return total
+            weight += dr.select(slot.I > depth, adjoint_of_factor(adjoint, depth, scattering.f, rest), 0)
+        with dr.resume_grad():
+            f = attached_factor(plan, vertex.si, bsdf, scattering, active)
+            dr.backward_from(dr.select(active, weight * f, 0))
+        return state
 
 
 class Reservoir(Estimator):
@@ -199,10 +173,13 @@ class Reservoir(Estimator):
 
         differentiate_emission(p, emission_weight)
         if p.plan.differentiate_bsdfs:
-            p.walk(ReservoirReplay(p, state.slots, adjoints), state.W > 0)
+            for slot, adjoint in zip(state.slots, adjoints, strict=True):
+                differentiate_event(p, slot.event[0], adjoint, slot.I > 0)
+            replay = ReservoirReplay(p, state.slots, adjoints)
+            p.walk(replay, replay.last > 1)
 
     def kept(self, plan: Plan) -> ReservoirState:
-        return ReservoirState.empty(self.capacity, len(Product.one(plan.track_zeros).zero))
+        return ReservoirState.empty(plan, self.capacity)
 
     def _unselected(self, state: ReservoirState, slot: Slot) -> Any:
         """1 over the probability of the selection, shared among the slots."""

@@ -84,6 +84,10 @@ class Hooks:
         """Lanes that scatter on from this vertex, as far as the hooks care."""
         return mi.Bool(True)
 
+    def is_followed(self, state: Any, vertex: Vertex) -> Any:
+        """In a replay: lanes that `goes_on` let scatter, and whose next vertex is wanted as well."""
+        return mi.Bool(True)
+
     def scattering(self, state: Any, vertex: Vertex, connection: Connection, scattering: Scattering) -> Any:
         """Called at each vertex with the sampled scattering event, also in lanes that `goes_on` ended."""
         return state
@@ -147,6 +151,7 @@ def walk(
         state = hooks.scattering(state, vertex, connection, scattering)
         if hooks.replaying:
             sampler.next_1d(active)  # roulette's
+            active &= hooks.is_followed(state, vertex)
             return next_vertex(path, active, si, scattering, path.product, path.eta), state, sampler, selection
         weight = scattering.weight
         if hooks.attached:
