@@ -11,7 +11,7 @@ import mitsuba as mi
 import numpy as np
 
 from reslrb_cli.config import Config, Integrator, ParameterSpec, Reslrb
-from reslrb_cli.errors import ConfigError
+from reslrb_cli.errors import ConfigError, UnsupportedScene
 from reslrb_cli.integrators import make_integrator
 from reslrb_cli.optimization.budget import MemoryPlan
 from reslrb_cli.optimization.choice import Cache, find_options, settle_integrator
@@ -19,7 +19,7 @@ from reslrb_cli.optimization.losses import Loss, make_loss
 from reslrb_cli.optimization.optimizers import Optimizer
 from reslrb_cli.optimization.pilot import Outcome
 from reslrb_cli.optimization.rendering import render_in_passes
-from reslrb_cli.scene import Selection, check_supported, load_scene, read_image, select_parameters
+from reslrb_cli.scene import Selection, check_camera_paths, check_supported, load_scene, read_image, select_parameters
 
 Array = np.ndarray[Any, Any]
 
@@ -250,6 +250,11 @@ def _target(problem: Problem, image: Array, sensor: int) -> Any:
 
 
 def _check_supported(config: Config, type: str, hide_emitters: bool, scene: Any, sensors: list[int]) -> None:
-    if type in LIGHT_TRACERS:
-        for sensor in sensors:
-            check_supported(scene, scene.sensors()[sensor], hide_emitters)
+    try:
+        if type in LIGHT_TRACERS:
+            for sensor in sensors:
+                check_supported(scene, scene.sensors()[sensor], hide_emitters)
+        elif type == "prb":
+            check_camera_paths(scene)
+    except UnsupportedScene as error:
+        raise ConfigError(config.source, "scene.file", str(error)) from error

@@ -4,7 +4,7 @@ from .catalog import ParameterInfo, list_parameters
 from .graph import SceneGraph
 from .inspect import SceneSummary, SensorSummary, summarise
 from .load import load_scene
-from .needs import SceneNeeds, View, check_supported, look, scene_needs
+from .needs import SceneNeeds, View, check_camera_paths, check_supported, look, scene_needs
 from .parameters import Selection, select_parameters
 from .reach import visible_texels
 from .target import read_image
@@ -17,6 +17,7 @@ __all__ = [
     "Selection",
     "SensorSummary",
     "View",
+    "check_camera_paths",
     "check_supported",
     "list_parameters",
     "load_scene",

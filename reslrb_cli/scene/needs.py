@@ -102,6 +102,16 @@ def check_supported(scene: Any, sensor: Any, hide_emitters: bool = False) -> Non
         )
 
 
+def check_camera_paths(scene: Any) -> None:
+    """Raise UnsupportedScene, with the reason, where `prb` cannot render `scene`."""
+    for emitter in scene.emitters():
+        if emitter.class_name() == "DirectionalArea":
+            raise UnsupportedScene(
+                f"emitter {emitter.id()} is a `directionalarea`, which camera paths cannot find and `prb` cannot "
+                "evaluate; take integrator.type: reslrb or ptracer"
+            )
+
+
 def unsupported_part(scene: Any, sensor: Any) -> str | None:
     """What in the scene no light path can deal with, found without tracing a ray; None where there is nothing."""
     name = sensor.id()

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from reslrb_cli.errors import UnsupportedScene
-from reslrb_cli.scene import check_supported, look, scene_needs, summarise
+from reslrb_cli.scene import check_camera_paths, check_supported, look, scene_needs, summarise
 
 GLASS = {"type": "dielectric"}
 
@@ -144,3 +144,10 @@ def test_fractions_are_of_the_crop_window(make_scene):
     scene = make_scene(camera={"type": "perspective", "fov": 60, "to_world": to_world, "film": film})
     assert look(scene, scene.sensors()[0]).smooth == 1
     assert np.isclose(look(make_scene(), make_scene().sensors()[0]).smooth, 0.45, atol=0.15)
+
+
+def test_light_that_camera_paths_cannot_find_is_refused_for_prb(make_scene):
+    check_camera_paths(make_scene())
+    scene = make_scene(lamp={"type": "rectangle", "emitter": {"type": "directionalarea"}})
+    with pytest.raises(UnsupportedScene, match="`prb` cannot evaluate"):
+        check_camera_paths(scene)
