@@ -15,7 +15,7 @@ from reslrb_cli.records.clock import MIB, peak_mib, reset_peak
 if TYPE_CHECKING:
     from reslrb_cli.optimization.problem import Problem
 
-#: Images of the film's size that a step, of batches too, has at once: block, image, the loss's parts, gradient, adjoint.
+#: Images of the film's size that a step has at once: block, image, loss's parts, gradient, adjoint; a batch's too.
 FILM_IMAGES = 12
 #: Copies of a parameter: gradients, the optimiser's moments, their next values.
 PARAMETER_COPIES = 8
