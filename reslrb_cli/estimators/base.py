@@ -10,12 +10,12 @@ from typing import Any, ClassVar
 import drjit as dr
 import mitsuba as mi
 
-from reslrb_cli.transport.connection import Connection
+from reslrb_cli.transport.connection import Connection, stand_in
 from reslrb_cli.transport.factors import NO_ZERO, Product
 from reslrb_cli.transport.plan import Plan
 from reslrb_cli.transport.splat import AdjointImage, Film
 from reslrb_cli.transport.transmittance import transmittance
-from reslrb_cli.transport.walk import Hooks
+from reslrb_cli.transport.walk import Hooks, Vertex
 
 
 @dataclass
@@ -150,6 +150,11 @@ def differentiate_passage(
         limit = p.plan.max_depth - depth - 1
         on_crossing = differentiate if p.plan.differentiate_null else None
         return transmittance(p.scene, si, connection.target, limit, active, on_crossing).value
+
+
+def contribution(p: Pass, vertex: Vertex, connection: Connection) -> Product:
+    """C_i of an evaluated connection."""
+    return vertex.product.times(connection.c, vertex.depth, stand_in(connection)[1]).scaled(p.scale)
 
 
 class VertexHooks(Hooks):

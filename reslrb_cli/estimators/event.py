@@ -22,18 +22,17 @@ import mitsuba as mi
 from reslrb_cli.estimators.base import (
     Estimator,
     Pass,
-    PathAdjoint,
     VertexHooks,
     adjoint_of_factor,
     at_least_one,
+    contribution,
     differentiate_emission,
     one_of,
 )
 from reslrb_cli.estimators.events import Event, differentiate_event
-from reslrb_cli.estimators.gather import contribution
-from reslrb_cli.estimators.reservoir import selection_weight
+from reslrb_cli.estimators.reservoir import selection_weight, slot_adjoint
 from reslrb_cli.transport.connection import Connection
-from reslrb_cli.transport.factors import MANY_ZEROS, Product
+from reslrb_cli.transport.factors import Product
 from reslrb_cli.transport.plan import Plan
 from reslrb_cli.transport.scattering import Scattering
 from reslrb_cli.transport.walk import Vertex
@@ -51,8 +50,7 @@ class Slot:
     @staticmethod
     def empty(plan: Plan) -> Slot:
         """Nothing kept yet."""
-        zero = [mi.Int32(MANY_ZEROS) for _ in Product.one(plan.track_zeros).zero]
-        return Slot(mi.Float(0), Product(mi.Spectrum(0), zero), mi.Point2f(0), Event.emission(plan))
+        return Slot(mi.Float(0), Product.none(plan.track_zeros), mi.Point2f(0), Event.emission(plan))
 
 
 @dataclass
@@ -142,11 +140,7 @@ class EventEstimator(Estimator):
         return Kept(mi.Float(0), [Slot.empty(plan) for _ in range(self.capacity)])
 
     def backward(self, p: Pass, state: Kept) -> None:
-        adjoints = []
-        for slot in state.slots:
-            delta = p.delta(slot.u, slot.w > 0)
-            unselected = dr.select(slot.w > 0, state.W / (self.capacity * slot.w), 0)
-            adjoints.append(PathAdjoint(delta * slot.C.nonzero * unselected, slot.C))
+        adjoints = [slot_adjoint(p, state.W, slot, self.capacity) for slot in state.slots]
 
         def emission_weight(E: Any) -> Any:
             total = mi.Spectrum(0)

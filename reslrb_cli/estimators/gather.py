@@ -22,6 +22,7 @@ from reslrb_cli.estimators.base import (
     PathAdjoint,
     VertexHooks,
     adjoint_of_factor,
+    contribution,
     differentiate_emission,
     differentiate_passage,
 )
@@ -158,11 +159,6 @@ class Taking(VertexHooks):
 def vertices(p: Pass) -> int:
     """The most vertices that a path of this pass can have."""
     return max(p.plan.max_depth - 1, 0)
-
-
-def contribution(p: Pass, vertex: Vertex, connection: Connection) -> Product:
-    """C_i of an evaluated connection."""
-    return vertex.product.times(connection.c, vertex.depth, stand_in(connection)[1]).scaled(p.scale)
 
 
 def plus(p: Pass, S: AdjointSum, vertex: Vertex, connection: Connection, C: Product) -> AdjointSum:

@@ -25,12 +25,13 @@ from reslrb_cli.estimators.base import (
     VertexHooks,
     adjoint_of_factor,
     at_least_one,
+    contribution,
     differentiate_emission,
     one_of,
 )
 from reslrb_cli.estimators.events import Event, differentiate_event
-from reslrb_cli.transport.connection import Connection, stand_in
-from reslrb_cli.transport.factors import MANY_ZEROS, Product
+from reslrb_cli.transport.connection import Connection
+from reslrb_cli.transport.factors import Product
 from reslrb_cli.transport.plan import Plan
 from reslrb_cli.transport.scattering import Scattering, attached_factor
 from reslrb_cli.transport.walk import Vertex
@@ -62,9 +63,8 @@ class ReservoirState:
         """Nothing kept yet."""
 
         def slot() -> Slot:
-            nothing = Product(mi.Spectrum(0), [mi.Int32(MANY_ZEROS) for _ in Product.one(plan.track_zeros).zero])
             event = [Event.emission(plan)] if plan.differentiate_bsdfs else []
-            return Slot(mi.Float(0), mi.UInt32(0), nothing, mi.Point2f(0), event)
+            return Slot(mi.Float(0), mi.UInt32(0), Product.none(plan.track_zeros), mi.Point2f(0), event)
 
         return ReservoirState(mi.Float(0), [slot() for _ in range(capacity)])
 
@@ -82,6 +82,17 @@ def selection_weight(p: Pass, weight: str, connection: Connection, C: Product) -
     return dr.sum(dr.abs(p.delta(connection.u, connection.active) * value))
 
 
+def unselected(W: Any, slot: Any, capacity: int) -> Any:
+    """W / (m w): 1 over the probability of a slot's selection, shared among the slots; 0 where it holds nothing."""
+    return dr.select(slot.w > 0, W / (capacity * slot.w), 0)
+
+
+def slot_adjoint(p: Pass, W: Any, slot: Any, capacity: int) -> PathAdjoint:
+    """Sensitivity of the objective to what a slot holds (`w`, `C`, `u`), standing for all that it was chosen from."""
+    delta = p.delta(slot.u, slot.w > 0)
+    return PathAdjoint(delta * slot.C.nonzero * unselected(W, slot, capacity), slot.C)
+
+
 class ReservoirSelection(VertexHooks):
     """Image pass: splat, and keep connections."""
 
@@ -95,7 +106,7 @@ class ReservoirSelection(VertexHooks):
     def connection(
         self, state: ReservoirState, vertex: Vertex, connection: Connection, numbers: list[Any]
     ) -> ReservoirState:
-        C = vertex.product.times(connection.c, vertex.depth, stand_in(connection)[1]).scaled(self.p.scale)
+        C = contribution(self.p, vertex, connection)
         if self.splat:
             self.p.splat(connection.u, C.value(), connection.active)
         w = dr.select(connection.active, selection_weight(self.p, self.weight, connection, C), 0)
@@ -161,11 +172,11 @@ class Reservoir(Estimator):
         state: ReservoirState = p.walk(ReservoirSelection(p, self.capacity, self.weight, self.image == "all"))
         if self.image == "retained":
             for slot in state.slots:
-                p.splat(slot.u, slot.C.value() * self._unselected(state, slot), slot.I > 0)
+                p.splat(slot.u, slot.C.value() * unselected(state.W, slot, self.capacity), slot.I > 0)
         return state
 
     def backward(self, p: Pass, state: ReservoirState) -> None:
-        adjoints = [self._adjoint(p, state, slot) for slot in state.slots]
+        adjoints = [slot_adjoint(p, state.W, slot, self.capacity) for slot in state.slots]
 
         def emission_weight(E: Any) -> Any:
             weights = [adjoint_of_factor(adjoint, mi.Int32(0), E, 1) for adjoint in adjoints]
@@ -180,11 +191,3 @@ class Reservoir(Estimator):
 
     def kept(self, plan: Plan) -> ReservoirState:
         return ReservoirState.empty(plan, self.capacity)
-
-    def _unselected(self, state: ReservoirState, slot: Slot) -> Any:
-        """1 over the probability of the selection, shared among the slots."""
-        return dr.select(slot.I > 0, state.W / (self.capacity * slot.w), 0)
-
-    def _adjoint(self, p: Pass, state: ReservoirState, slot: Slot) -> PathAdjoint:
-        delta = p.delta(slot.u, slot.I > 0)
-        return PathAdjoint(delta * slot.C.nonzero * self._unselected(state, slot), slot.C)

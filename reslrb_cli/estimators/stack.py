@@ -25,11 +25,12 @@ from reslrb_cli.estimators.base import (
     VertexHooks,
     adjoint_of_factor,
     at_least_one,
+    contribution,
     differentiate_emission,
     differentiate_passage,
     entry_bytes,
 )
-from reslrb_cli.estimators.gather import Gather, GatherState, Taking, Visibility, contribution, vertices
+from reslrb_cli.estimators.gather import Gather, GatherState, Taking, Visibility, vertices
 from reslrb_cli.estimators.sums import AdjointSum, PlainSum
 from reslrb_cli.estimators.surface import SurfacePoint, blank_lobe, event, lobe
 from reslrb_cli.transport.connection import Connection, Seen, stand_in

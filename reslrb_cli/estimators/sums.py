@@ -42,10 +42,6 @@ class AdjointSum:
         """The sum without delta C of a connection that is in it."""
         return self._shifted(dr.select(active, -delta, 0), C, index)
 
-    def plus_product(self, value: Any, zero: list[Any], index: Any) -> AdjointSum:
-        """The sum with one more connection, given as delta times the product of its nonzero factors."""
-        return self._shifted(mi.Spectrum(1), Product(value, zero), index)
-
     def _shifted(self, delta: Any, C: Product, index: Any) -> AdjointSum:
         value, rest = self._add(self.value, self.rest, delta * C.value())
         if not self.behind_zero:
@@ -55,11 +51,6 @@ class AdjointSum:
             # A connection whose own factor is the zero one has a derivative there, and none in the prefix.
             term[c] = dr.select((zero >= 0) & (zero != mi.Int32(index)), term[c], 0)
         return type(self)(value, rest, list(self._add(self.behind_zero[0], self.behind_zero[1], term)))
-
-    def alive(self) -> Any:
-        """Whether any channel of the sum can have a derivative."""
-        result = dr.any(self.value != 0)
-        return result | dr.any(self.behind_zero[0] != 0) if self.behind_zero else result
 
     def adjoint_of_factor(self, f: Any, prefix: Product, rest: Any) -> Any:
         """d(sum)/df (C,), for a factor `f * rest` of the path with this prefix, before all connections in the sum."""

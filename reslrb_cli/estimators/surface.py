@@ -17,9 +17,9 @@ from reslrb_cli.transport.walk import Vertex
 class SurfacePoint:
     """What of a vertex its BSDF reads, as plain numbers (pointers are their indices).
 
-    Where BSDFs read texture coordinates and directions alone, these are `[uv, wi, bsdf]`, without `bsdf`
-    where just one is differentiated; otherwise what the shape
-    needs to find the interaction again: `[t, prim_uv, prim_index, shape, instance, o, d]`.
+    Where BSDFs read texture coordinates and directions alone, these are `[uv, wi, bsdf]`, without `bsdf` where just one
+    is differentiated; otherwise what the shape needs to find the interaction again: `[t, prim_uv, prim_index, shape,
+    instance, o, d]`.
     """
 
     numbers: list[Any]

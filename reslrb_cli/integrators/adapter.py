@@ -103,7 +103,7 @@ def _make_classes() -> dict[str, Any]:
                    evaluate: bool = True) -> Any:  # fmt: skip
             if not develop:
                 raise ValueError("develop=True must be specified when invoking AD integrators")
-            sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
+            sensor = resolve_sensor(scene, sensor)
             with dr.suspend_grad():
                 film = Film(sensor)
                 block = film.block()
@@ -117,7 +117,7 @@ def _make_classes() -> dict[str, Any]:
                 return image
 
         def render_forward(self, scene: Any, params: Any, sensor: Any = 0, seed: Any = 0, spp: int = 0) -> Any:
-            sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
+            sensor = resolve_sensor(scene, sensor)
             params = _parameters(scene, params)
             with dr.suspend_grad():
                 film = Film(sensor)
@@ -176,7 +176,7 @@ def _make_classes() -> dict[str, Any]:
 
         def render_backward(self, scene: Any, params: Any, grad_in: Any, sensor: Any = 0, seed: Any = 0,
                             spp: int = 0) -> None:  # fmt: skip
-            sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
+            sensor = resolve_sensor(scene, sensor)
             params = _parameters(scene, params)
             with dr.suspend_grad():
                 trace = lt.Trace(self.passes(scene, sensor, seed, spp, params))
@@ -195,13 +195,13 @@ def _make_classes() -> dict[str, Any]:
 
         def render_backward(self, scene: Any, params: Any, grad_in: Any, sensor: Any = 0, seed: Any = 0,
                             spp: int = 0) -> None:  # fmt: skip
-            sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
+            sensor = resolve_sensor(scene, sensor)
             with dr.resume_grad():
                 image = self.attached_image(scene, sensor, seed, spp, _parameters(scene, params))
                 dr.backward_from(image * grad_in)
 
         def render_forward(self, scene: Any, params: Any, sensor: Any = 0, seed: Any = 0, spp: int = 0) -> Any:
-            sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
+            sensor = resolve_sensor(scene, sensor)
             with dr.resume_grad():
                 image = self.attached_image(scene, sensor, seed, spp, _parameters(scene, params))
                 return dr.forward_to(image)
@@ -216,7 +216,7 @@ def _make_classes() -> dict[str, Any]:
 
         def render_backward(self, scene: Any, params: Any, grad_in: Any, sensor: Any = 0, seed: Any = 0,
                             spp: int = 0) -> None:  # fmt: skip
-            sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
+            sensor = resolve_sensor(scene, sensor)
             params = _parameters(scene, params)
             with dr.suspend_grad():
                 parts = self.passes(scene, sensor, seed, spp, params)
@@ -232,6 +232,11 @@ def _make_classes() -> dict[str, Any]:
                             lt.finish_pass()
 
     return {"reslrb": ReslrbIntegrator, "walk_ad": WalkAdIntegrator, "trajectory": TrajectoryIntegrator}
+
+
+def resolve_sensor(scene: Any, sensor: Any) -> Any:
+    """A sensor of the scene, given as itself or as its index."""
+    return scene.sensors()[sensor] if isinstance(sensor, int) else sensor
 
 
 def _parameters(scene: Any, params: Any) -> Any:

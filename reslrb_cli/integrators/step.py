@@ -15,7 +15,7 @@ from typing import Any, Literal
 import drjit as dr
 import mitsuba as mi
 
-from reslrb_cli.integrators.adapter import register
+from reslrb_cli.integrators.adapter import register, resolve_sensor
 
 Adjoint = Literal["correlated", "independent", "batched"]
 FirstBatch = Literal["image", "again"]
@@ -45,7 +45,7 @@ def make_integrator(type: str, **options: Any) -> Any:
 def render_image(integrator: Any, scene: Any, sensor: Any, seed: int, spp: int) -> Any:
     """The image (H, W, C) without derivatives."""
     with dr.suspend_grad():
-        return integrator.render(scene, _sensor(scene, sensor), dr.opaque(mi.UInt32, seed), spp)
+        return integrator.render(scene, resolve_sensor(scene, sensor), dr.opaque(mi.UInt32, seed), spp)
 
 
 def gradient_step(
@@ -69,7 +69,7 @@ def gradient_step(
     `on_image` is called once the image and the loss are evaluated, where a step has such a moment. `batches` and
     `first_batch` belong to `adjoint="batched"`, whose loss is that of all samples' image.
     """
-    sensor = _sensor(scene, sensor)
+    sensor = resolve_sensor(scene, sensor)
     params = params if params is not None else mi.traverse(scene)
     if adjoint == "batched":
         return _batched(integrator, scene, sensor, objective, seed, spp, params, batches, first_batch)
@@ -115,7 +115,7 @@ def known_step(
     params = params if params is not None else mi.traverse(scene)
     image_seed = mi.UInt32(seed)
     dr.make_opaque(image_seed)
-    image = integrator.fused(scene, _sensor(scene, sensor), image_seed, spp, gradient, params)
+    image = integrator.fused(scene, resolve_sensor(scene, sensor), image_seed, spp, gradient, params)
     return StepResult(image, objective(image))
 
 
@@ -193,7 +193,3 @@ def _naive_ad(integrator: Any) -> Iterator[None]:
             yield
     else:
         yield
-
-
-def _sensor(scene: Any, sensor: Any) -> Any:
-    return scene.sensors()[sensor] if isinstance(sensor, int) else sensor

@@ -39,6 +39,11 @@ class Product:
         zero = [mi.Int32(NO_ZERO) for _ in range(len(mi.Spectrum(0)))] if track_zeros else []
         return Product(mi.Spectrum(1), zero, [mi.Spectrum(1)] if attached else [])
 
+    @staticmethod
+    def none(track_zeros: bool) -> Product:
+        """The product of a connection that is not there: neither its value nor its derivative is anything."""
+        return Product(mi.Spectrum(0), [mi.Int32(MANY_ZEROS) for _ in Product.one(track_zeros).zero])
+
     def times(self, factor: Any, index: Any, stand_in: Any = 1) -> Product:
         """The product with one more factor, (C,) per lane, that stands at position `index` of the path.
 

@@ -51,8 +51,8 @@ class Hooks:
     """What an estimator does along a walk. All are pure: state in, state out; none draws a random number.
 
     `numbers` says how many random numbers `connection` wants at each vertex; without `connects` no connection is
-    evaluated, and `connection` is not called. A walk whose hooks are `replaying` follows
-    a path that is known to get as far as `goes_on` asks, so that neither its throughput nor its roulette is computed.
+    evaluated, and `connection` is not called. A walk whose hooks are `replaying` follows a path that is known to get as
+    far as `goes_on` asks, so that neither its throughput nor its roulette is computed.
     Hooks that are `attached` keep derivatives in the loop state, which is then evaluated vertex by vertex (naive AD);
     with `max_iterations` the loop stays symbolic, and Dr.Jit itself reverses it, from a record of the loop state in
     thread-local memory.
@@ -70,10 +70,6 @@ class Hooks:
 
     def seen(self, vertex: Vertex) -> Seen | None:
         """What is known of the sensor's visibility from this vertex."""
-        return None
-
-    def wants(self, vertex: Vertex) -> Any:
-        """Without `connects`: lanes in which bsdf * cos towards the sensor is evaluated all the same; None: in none."""
         return None
 
     def connection(self, state: Any, vertex: Vertex, connection: Connection, numbers: list[Any]) -> Any:
@@ -138,7 +134,7 @@ def walk(
         # ---- Scatter, and evaluate the connection in the same call ----
         sample_2, sample_1 = sampler.next_2d(path.active), sampler.next_1d(path.active)
         active = path.active & (path.depth + 1 < plan.max_depth) & hooks.goes_on(state, vertex)
-        wanted = None if hooks.attached else connection.active if hooks.connects else hooks.wants(vertex)
+        wanted = connection.active if hooks.connects and not hooks.attached else None
         scattering, connection.f = scatter(
             plan, si, vertex.bsdf, path.ray, sample_1, sample_2, active, connection.wo, wanted
         )
