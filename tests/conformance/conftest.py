@@ -1,4 +1,4 @@
-"""The conformance tests run in one variant; scenes are in scenes.py and gradient_cases.py, statistics in stats.py."""
+"""The conformance tests run in one variant; scenes are in scenes.py and gradient_cases.py."""
 
 from __future__ import annotations
 

@@ -12,7 +12,8 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from conformance.gradients import bitmap, camera, diffuse, lamp, rgb, room, texture, transform
+
+from reslrb_cli.measure.small_scenes import bitmap, camera, diffuse, lamp, rgb, room, texture, transform
 
 
 @dataclass(frozen=True)

@@ -10,9 +10,9 @@ from typing import Any
 
 import mitsuba as mi
 import numpy as np
-from conformance.stats import Agreement, compare
 
 from reslrb_cli.integrators import make_integrator, render_image
+from reslrb_cli.measure.statistics import Agreement, compare
 
 #: Largest relative difference between images of the same random numbers.
 SAME = 3e-4

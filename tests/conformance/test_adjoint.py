@@ -9,10 +9,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from conformance.gradient_cases import FLOOR, floor
-from conformance.gradients import Case, integrator, seeds, texture
-from conformance.stats import Agreement, compare
 
 from reslrb_cli.integrators import known_step, render_image
+from reslrb_cli.measure.gradients import Case, integrator, seeds
+from reslrb_cli.measure.small_scenes import texture
+from reslrb_cli.measure.statistics import Agreement, compare
 
 pytestmark = pytest.mark.usefixtures("llvm")
 

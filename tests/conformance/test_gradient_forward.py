@@ -7,8 +7,9 @@ from typing import Any
 import numpy as np
 import pytest
 from conformance.gradient_cases import CASES
-from conformance.gradients import Case, integrator, relative, seeds
-from conformance.stats import compare
+
+from reslrb_cli.measure.gradients import Case, integrator, relative, seeds
+from reslrb_cli.measure.statistics import compare
 
 pytestmark = pytest.mark.usefixtures("llvm")
 

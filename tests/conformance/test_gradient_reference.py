@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from conformance.gradient_cases import CASES, GradientCase
-from conformance.gradients import Case, integrator, seeds
-from conformance.stats import Agreement, compare
+
+from reslrb_cli.measure.gradients import Case, integrator, seeds
+from reslrb_cli.measure.statistics import Agreement, compare
 
 pytestmark = pytest.mark.usefixtures("llvm")
 

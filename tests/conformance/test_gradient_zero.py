@@ -12,8 +12,10 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 from conformance.gradient_cases import _IN_VIEW, FLOOR, _mask, floor
-from conformance.gradients import Case, bitmap, diffuse, integrator, lamp, relative, rgb, room, seeds
-from conformance.stats import compare
+
+from reslrb_cli.measure.gradients import Case, integrator, relative, seeds
+from reslrb_cli.measure.small_scenes import bitmap, diffuse, lamp, rgb, room
+from reslrb_cli.measure.statistics import compare
 
 pytestmark = pytest.mark.usefixtures("llvm")
 

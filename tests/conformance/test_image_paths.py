@@ -22,9 +22,9 @@ from conformance.scenes import (
     stage,
     transform,
 )
-from conformance.stats import compare, renders
 
 from reslrb_cli.integrators import gradient_step, make_integrator
+from reslrb_cli.measure.statistics import compare, renders
 
 TWO_SIDED = {"type": "twosided", "bsdf": RED}
 

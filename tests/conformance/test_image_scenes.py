@@ -10,9 +10,9 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from conformance.scenes import SAME, agreement, difference_from_ptracer, images
-from conformance.stats import compare
 from scipy.ndimage import binary_dilation
 
+from reslrb_cli.measure.statistics import compare
 from reslrb_cli.scene import load_scene
 
 ROOT = Path(__file__).resolve().parents[2]

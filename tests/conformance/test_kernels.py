@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 from conformance.gradient_cases import CASES
-from conformance.gradients import Case, integrator
 
+from reslrb_cli.measure.gradients import Case, integrator
 from reslrb_cli.scene import load_scene
 
 pytestmark = pytest.mark.usefixtures("llvm")
@@ -138,7 +138,7 @@ def test_zero_texels_come_and_go():
 
 
 def test_image_seeds_compile_nothing():
-    from conformance.gradients import render_image
+    from reslrb_cli.integrators import render_image
 
     case = next(case for case in CASES if case.name == "texture")
     scene = Case(case.scene(), case.keys)

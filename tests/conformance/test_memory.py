@@ -5,7 +5,9 @@ from __future__ import annotations
 import gc
 
 import pytest
-from conformance.gradients import Case, diffuse, integrator, room, texture
+
+from reslrb_cli.measure.gradients import Case, integrator
+from reslrb_cli.measure.small_scenes import diffuse, room, texture
 
 pytestmark = pytest.mark.usefixtures("llvm")
 

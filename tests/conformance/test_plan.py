@@ -11,11 +11,12 @@ from typing import Any
 import numpy as np
 import pytest
 from conformance.gradient_cases import FLOOR
-from conformance.gradients import Case, camera, diffuse, integrator, rgb, room, texture, transform
 
 from reslrb_cli.integrators import known_step
 from reslrb_cli.integrators.features import FEATURES
 from reslrb_cli.integrators.plan_report import attached, count, report_plan
+from reslrb_cli.measure.gradients import Case, integrator
+from reslrb_cli.measure.small_scenes import camera, diffuse, rgb, room, texture, transform
 
 pytestmark = pytest.mark.usefixtures("llvm")
 

@@ -11,10 +11,12 @@ from typing import Any
 import numpy as np
 import pytest
 from conformance.gradient_cases import FLOOR, _mask, _textured
-from conformance.gradients import Case, camera, integrator, lamp, relative, render_image, rgb, room, seeds
-from conformance.stats import compare
 
 from reslrb_cli.errors import UnsupportedScene
+from reslrb_cli.integrators import render_image
+from reslrb_cli.measure.gradients import Case, integrator, relative, seeds
+from reslrb_cli.measure.small_scenes import camera, lamp, rgb, room
+from reslrb_cli.measure.statistics import compare
 
 pytestmark = pytest.mark.usefixtures("llvm")
 
@@ -62,7 +64,7 @@ def shown(llvm: str) -> Case:
 
 
 def _facing() -> Any:
-    from conformance.gradients import transform
+    from reslrb_cli.measure.small_scenes import transform
 
     return transform(translate=[0.2, -0.1, 1.2], rotate=([0, 1, 0], 15), scale=0.4)
 

@@ -7,10 +7,11 @@ from typing import Any
 
 import pytest
 from conformance.gradient_cases import CASES
-from conformance.gradients import Case, integrator, room
 
 from reslrb_cli.estimators.reservoir import ReservoirSelection
 from reslrb_cli.integrators import light_tracer
+from reslrb_cli.measure.gradients import Case, integrator
+from reslrb_cli.measure.small_scenes import room
 from reslrb_cli.transport.walk import Hooks
 
 pytestmark = pytest.mark.usefixtures("llvm")
@@ -109,7 +110,7 @@ def test_replay_meets_the_same_vertices(name: str):
 
 def test_no_light_no_replay():
     """A scene whose light reaches nothing keeps nothing, and its gradient is zero."""
-    from conformance.gradients import rgb, transform
+    from reslrb_cli.measure.small_scenes import rgb, transform
 
     lamp = room()["lamp"] | {"to_world": transform(translate=[0, 5, 0], rotate=([1, 0, 0], -90))}
     case = Case(room(lamp=lamp | {"emitter": {"type": "area", "radiance": rgb(1, 1, 1)}}),

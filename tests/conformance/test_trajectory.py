@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from conformance.gradient_cases import CASES, GradientCase
-from conformance.gradients import Case, integrator, relative
 
 from reslrb_cli.errors import UnsupportedScene
 from reslrb_cli.integrators import gradient_step, known_step, make_integrator
+from reslrb_cli.measure.gradients import Case, integrator, relative
 
 pytestmark = pytest.mark.usefixtures("llvm")
 

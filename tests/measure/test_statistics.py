@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from conformance.stats import blocks, combined_z_rms, compare, sidak, z_rms_limit, z_scores
+
+from reslrb_cli.measure.statistics import blocks, combined_z_rms, compare, sidak, z_rms_limit, z_scores
 
 
 def noise(seed: int, shape=(12, 32, 32, 3), mean: float = 1.0) -> np.ndarray:
