@@ -81,6 +81,25 @@ def z_scores(a: np.ndarray, b: np.ndarray, rounding: float = 1e-5) -> np.ndarray
         # The rounding floor counts as known exactly.
         spread = var_a**2 / (len(a) - 1) + var_b**2 / (len(b) - 1)
         freedom = np.where(spread > 0, (var_a + var_b + floor) ** 2 / spread, np.inf)
+    return _normal_scores(t, freedom)
+
+
+def paired_z_scores(difference: np.ndarray, floor: Any = 0.0, bias: Any = 0.0) -> np.ndarray:
+    """Standard normal scores of mean(difference) along axis 0 against zero, for each of the other entries.
+
+    For estimates at equal seeds, whose noise is in part the same: `difference` is (N, ...). `floor`, what rounding may
+    cause, is added to the standard error; `bias`, such as truncation, is taken off what the means differ by.
+    """
+    mean, var, floor = difference.mean(0), difference.var(0, ddof=1) / len(difference), np.square(floor)
+    mean = np.sign(mean) * np.maximum(np.abs(mean) - bias, 0.0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        t = np.where(mean == 0, 0.0, mean / np.sqrt(var + floor))
+        freedom = np.where(var > 0, (1 + floor / var) ** 2 * (len(difference) - 1), np.inf)
+    return _normal_scores(t, freedom)
+
+
+def _normal_scores(t: np.ndarray, freedom: np.ndarray) -> np.ndarray:
+    """The standard normal z of the same probability as Student's t."""
     z = -np.sign(t) * stats.norm.ppf(stats.t.sf(np.abs(t), np.minimum(freedom, 1e6)))
     # Beyond what doubles resolve: as bad as t says.
     return np.where(np.isfinite(z), z, t)
@@ -127,6 +146,6 @@ def combined_z_rms(z: np.ndarray) -> float:
     return float(np.sqrt(np.mean(np.square(z))))
 
 
-def z_rms_limit(count: int, alpha: float = ALPHA) -> float:
+def z_rms_limit(count: float, alpha: float = ALPHA) -> float:
     """What the root mean square of `count` independent normal deviates exceeds with probability `alpha`."""
     return float(np.sqrt(stats.chi2.isf(alpha, count) / count))

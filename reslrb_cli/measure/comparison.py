@@ -1,0 +1,217 @@
+"""Whether gradients agree with a reference: over many seeds by z scores, or at equal seeds by relative L2.
+
+Samples are (N, P): N seeds, P entries. Where both sides have the same seeds the test is on their differences, which is
+valid whatever noise they share, and the sharper the more they share:
+
+    t_k = mean_k(a - b) / sqrt(var_k(a - b) / N + floor_k^2)         to z, the normal deviate of the same probability
+
+Two criteria must hold, as in `statistics.compare`. The largest |z| stays under Sidak's threshold for all entries of
+all rows of a table, and the root mean square of a row's z under that of nu normal deviates, nu the row's effective
+number of independent entries (Satterthwaite, with the mean squared correlation r^2 of its entries' samples, chance
+taken off):
+
+    nu = E / (1 + (E - 1) r^2)
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy import stats
+
+from reslrb_cli.measure.entries import entries
+from reslrb_cli.measure.statistics import ALPHA, combined_z_rms, paired_z_scores, sidak, z_rms_limit, z_scores
+from reslrb_cli.records.gradcheck import Verdict
+
+#: Probability with which a deviation of the size `detectable` is seen.
+POWER = 0.9
+#: Relative error that single precision alone may cause in a sum over many samples, added to the standard error.
+ROUNDING = 1e-4
+#: Where a deviation by this fraction of the gradient could not have been seen, nothing is said.
+RESOLUTION = 0.5
+#: Tails are too heavy for z scores where the mean kurtosis of the entries' samples lies above this fraction of the way
+#: from that of normal deviates to the greatest that N samples can have, which is that of one outlier.
+TAIL = 0.5
+#: Fewer seeds than these say nothing of tails.
+TAIL_SEEDS = 8
+
+
+@dataclass(frozen=True)
+class Family:
+    """The comparisons that are corrected for together: `rows` of a table, with `entries` in all."""
+
+    rows: int = 1
+    entries: int = 1
+    alpha: float = ALPHA
+
+    @property
+    def z_max_limit(self) -> float:
+        """What the largest |z| of the table exceeds with probability `alpha` if all is right."""
+        return sidak(self.entries, self.alpha)
+
+    def z_rms_limit(self, independent: float) -> float:
+        """What the root mean square of a row's z exceeds; in any row of the table with probability `alpha`."""
+        return z_rms_limit(independent, float(-np.expm1(np.log1p(-self.alpha) / self.rows)))
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """The figures of a `GradcheckRecord`, under its names, and `z` of each entry (E,)."""
+
+    verdict: Verdict
+    z: np.ndarray | None
+    relative_l2: float | None = None
+    relative_l2_limit: float | None = None
+    z_rms: float | None = None
+    z_rms_limit: float | None = None
+    z_max: float | None = None
+    z_max_limit: float | None = None
+    cosine: float | None = None
+    variance_ratio: float | None = None
+    detectable: float | None = None
+    message: str = ""
+
+    @property
+    def figures(self) -> dict[str, Any]:
+        """What a record takes over."""
+        return {name: value for name, value in vars(self).items() if name != "z"}
+
+
+def compare_expectations(
+    ours: np.ndarray,
+    reference: np.ndarray,
+    family: Family,
+    *,
+    shape: tuple[int, ...] | None = None,
+    paired: bool = True,
+    bias: Any = 0.0,
+    rounding: float = ROUNDING,
+) -> Comparison:
+    """Compare the means of (N, P) samples with those of a reference.
+
+    `reference` is (N, P) at the same seeds if `paired`, else (M, P) at others, or (P,): exact values. `shape` is that
+    of the parameter: with it, z scores are of `entries`, not of each of the P. By `bias` the reference may be wrong
+    itself, in its units (a number, or one for each entry; not of other seeds): only what goes beyond counts.
+    `rounding` is relative to the entries, and added to the standard error.
+    """
+    problem = _problem(ours, reference)
+    if problem is not None:
+        return problem
+    exact = reference.ndim == 1
+    a, b = (side if shape is None else entries(np.atleast_2d(side), shape) for side in (ours, np.atleast_2d(reference)))
+    mean, expected = a.mean(0), b.mean(0)
+    floor = rounding * np.maximum(np.abs(mean), np.abs(expected))
+    if exact or paired:
+        difference = a - b
+        z = paired_z_scores(difference, floor, bias)
+        noise, sides = difference.var(0, ddof=1) / len(a), [difference]
+    else:
+        z = z_scores(a, b, rounding)
+        noise, sides = a.var(0, ddof=1) / len(a) + b.var(0, ddof=1) / len(b), [a, b]
+    standard_error = np.sqrt(noise + floor**2)
+    independent = min(effective_entries(side) for side in sides)
+    z_max, z_rms = float(np.abs(z).max()), combined_z_rms(z)
+    rms_limit = family.z_rms_limit(independent)
+    detectable = _detectable(standard_error, bias, expected, family)
+    heavy = any(tail_weight(side[:, noise > floor**2]) > TAIL for side in sides)
+    our_mean, its_mean = ours.mean(0), np.atleast_2d(reference).mean(0)
+    verdict, message = Verdict.HOLDS, ""
+    if heavy:
+        verdict, message = Verdict.HEAVY_TAILED, "single seeds carry the variance: more samples per pixel, or seeds"
+    elif z_max >= family.z_max_limit or z_rms >= rms_limit:
+        verdict = Verdict.FAILS
+    elif detectable > RESOLUTION:
+        verdict, message = Verdict.UNRESOLVED, f"a deviation by {detectable:.0%} could hide in the noise: more seeds"
+    return Comparison(
+        verdict,
+        z,
+        relative_l2=_ratio(np.linalg.norm(our_mean - its_mean), np.linalg.norm(its_mean)),
+        z_rms=z_rms,
+        z_rms_limit=rms_limit,
+        z_max=z_max,
+        z_max_limit=family.z_max_limit,
+        cosine=cosine(our_mean, its_mean),
+        variance_ratio=None if exact else variance_ratio(ours, reference),
+        detectable=detectable,
+        message=message,
+    )
+
+
+def compare_equal_seeds(ours: np.ndarray, reference: np.ndarray, limit: float = ROUNDING) -> Comparison:
+    """Compare (N, P) samples with those of a reference at the same seeds, by relative L2 over all of them together."""
+    problem = _problem(ours, reference)
+    if problem is not None:
+        return problem
+    distance = float(np.linalg.norm(ours - reference) / np.linalg.norm(reference)) if reference.any() else np.inf
+    return Comparison(
+        Verdict.HOLDS if distance < limit else Verdict.FAILS,
+        None,
+        relative_l2=distance,
+        relative_l2_limit=limit,
+        cosine=cosine(ours.mean(0), reference.mean(0)),
+        variance_ratio=variance_ratio(ours, reference) if len(ours) > 1 else None,
+        detectable=limit,
+    )
+
+
+def cosine(a: np.ndarray, b: np.ndarray) -> float | None:
+    """Cosine of the angle between two vectors; None where one is zero or has one entry."""
+    return _ratio(float(a @ b), float(np.linalg.norm(a) * np.linalg.norm(b))) if a.size > 1 else None
+
+
+def variance_ratio(ours: np.ndarray, reference: np.ndarray) -> float | None:
+    """Summed variance of (N, P) samples over that of the reference's; None where that has none."""
+    return _ratio(ours.var(0, ddof=1).sum(), reference.var(0, ddof=1).sum())
+
+
+def effective_entries(samples: np.ndarray) -> float:
+    """How many independent entries the correlated ones of (N, E) samples are worth: between 1 and E."""
+    count, entries = samples.shape
+    deviation = samples - samples.mean(0)
+    size = np.linalg.norm(deviation, axis=0)
+    unit = deviation[:, size > 0] / size[size > 0]
+    moving = unit.shape[1]
+    if moving < 2 or count < 3:
+        return float(entries)
+    squares = (np.square(unit.T @ unit).sum() - moving) / (moving * (moving - 1))
+    chance = 1 / (count - 1)
+    correlation = max(0.0, (squares - chance) / (1 - chance))
+    return max(1.0, entries / (1 + (moving - 1) * correlation))
+
+
+def tail_weight(samples: np.ndarray) -> float:
+    """How much of the variance of (N, E) samples single ones carry: 0 as of normal deviates, 1 one sample alone."""
+    count = len(samples)
+    squares = np.square(samples - samples.mean(0))
+    squares = squares[:, squares.sum(0) > 0]
+    if squares.shape[1] == 0 or count < TAIL_SEEDS:
+        return 0.0
+    kurtosis = float((count * np.square(squares).sum(0) / squares.sum(0) ** 2).mean())
+    normal, greatest = 3 * (count - 1) / (count + 1), count - 2 + 1 / (count - 1)
+    return (kurtosis - normal) / (greatest - normal)
+
+
+def _detectable(standard_error: np.ndarray, bias: Any, expected: np.ndarray, family: Family) -> float:
+    """The least factor, less 1, on the whole gradient that would have been seen in its clearest entry."""
+    seen = np.abs(expected) > 0
+    if not seen.any():
+        return np.inf
+    needed = (family.z_max_limit + float(stats.norm.ppf(POWER))) * standard_error + bias
+    return float((needed[seen] / np.abs(expected[seen])).min())
+
+
+def _problem(ours: np.ndarray, reference: np.ndarray) -> Comparison | None:
+    """What keeps samples from being compared at all."""
+    for name, samples in (("gradient", ours), ("reference", reference)):
+        bad = int(np.count_nonzero(~np.isfinite(samples)))
+        if bad:
+            return Comparison(Verdict.FAILS, None, message=f"the {name} has {bad} entries that are not finite")
+    if not ours.any() and not reference.any():
+        return Comparison(Verdict.UNREACHED, None, message="gradient and reference are zero: no light path sees it")
+    return None
+
+
+def _ratio(numerator: Any, denominator: Any) -> float | None:
+    return float(numerator / denominator) if denominator > 0 else None

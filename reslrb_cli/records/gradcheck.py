@@ -1,0 +1,119 @@
+"""`reslrb gradcheck --json FILE`: one object a line, one line for each comparison of a gradient with a reference."""
+
+from __future__ import annotations
+
+import enum
+import json
+import math
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+
+class Reference(str, enum.Enum):
+    """What a gradient is compared with."""
+
+    PTRACER = "ptracer"
+    WALK_AD = "walk_ad"
+    PATH = "path"
+    PRB = "prb"
+    FINITE_DIFFERENCE = "finite_difference"
+    ANALYTIC = "analytic"
+
+
+class Kind(str, enum.Enum):
+    """How it is compared.
+
+    `equal_seeds`: by relative L2, where both compute the same numbers but for rounding. `expectation`: by z scores over
+    many seeds. `forward_backward`: by the dot product <w, J v> = <J^T w, v>, over many seeds too. `image`: not the
+    gradient but the image it belongs to, over many seeds.
+    """
+
+    EQUAL_SEEDS = "equal_seeds"
+    EXPECTATION = "expectation"
+    FORWARD_BACKWARD = "forward_backward"
+    IMAGE = "image"
+
+
+class Verdict(str, enum.Enum):
+    """What came of it. All but `holds` and `fails` leave the question open, and `message` says why.
+
+    `heavy_tailed`: single seeds carry the variance, so that z scores prove nothing. `unresolved`: noise hides
+    deviations as large as the gradient itself. `unreached`: gradient and reference are exactly zero.
+    `no_reference`: nothing here counts as one.
+    """
+
+    HOLDS = "holds"
+    FAILS = "fails"
+    HEAVY_TAILED = "heavy_tailed"
+    UNRESOLVED = "unresolved"
+    UNREACHED = "unreached"
+    NO_REFERENCE = "no_reference"
+
+
+@dataclass(frozen=True)
+class GradcheckRecord:
+    """One comparison: the gradient of a parameter by an integrator, against a reference.
+
+    `case` names the scene: the configuration, or a case of a suite. `parameter` is None where all are compared
+    together, or the image; `estimator` where the integrator has none. `seeds` is how many gradients each side has.
+    `relative_l2` is the distance from the reference over its norm: at equal seeds of the samples, else of the
+    means. `z_rms` and `z_max` are in standard errors; each has its limit, corrected for the number of comparisons.
+    `cosine` is that of the angle between the means, `variance_ratio` the variance over that of the reference.
+    `detectable` is the least deviation, as a fraction of the reference, that would have been seen. `message` says what
+    the figures do not. What does not apply is None.
+    """
+
+    case: str
+    parameter: str | None
+    integrator: str
+    estimator: str | None
+    reference: Reference
+    kind: Kind
+    seeds: int
+    verdict: Verdict
+    relative_l2: float | None = None
+    relative_l2_limit: float | None = None
+    z_rms: float | None = None
+    z_rms_limit: float | None = None
+    z_max: float | None = None
+    z_max_limit: float | None = None
+    cosine: float | None = None
+    variance_ratio: float | None = None
+    detectable: float | None = None
+    message: str = ""
+
+    @property
+    def holds(self) -> bool | None:
+        """True or False where the comparison decides; None where it does not."""
+        return {Verdict.HOLDS: True, Verdict.FAILS: False}.get(self.verdict)
+
+    def to_json(self) -> str:
+        """The record as one line of JSON; figures that are not finite become null."""
+        values = {key: _finite(value) for key, value in asdict(self).items()}
+        return json.dumps(values | {"holds": self.holds}, allow_nan=False)
+
+
+def _finite(value: Any) -> Any:
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+class GradcheckWriter:
+    """Writes records to a file of their own; each line is on disk once `write` returns."""
+
+    def __init__(self, path: Path) -> None:
+        self._file = path.open("w", encoding="utf-8")
+
+    def write(self, record: GradcheckRecord) -> None:
+        """Append one record."""
+        self._file.write(record.to_json() + "\n")
+        self._file.flush()
+
+    def __enter__(self) -> GradcheckWriter:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._file.close()

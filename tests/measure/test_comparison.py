@@ -1,0 +1,170 @@
+"""Whether two gradients agree: what is equal holds, what is not fails, and what cannot be told is not called a pass."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from reslrb_cli.measure.comparison import (
+    Family,
+    compare_equal_seeds,
+    compare_expectations,
+    effective_entries,
+    tail_weight,
+)
+from reslrb_cli.measure.entries import entries, entry_count
+from reslrb_cli.records.gradcheck import GradcheckRecord, GradcheckWriter, Kind, Reference, Verdict
+from reslrb_cli.report.gradcheck_table import Table, failure_line, markdown_table
+
+FAMILY = Family(rows=20, entries=400, alpha=1e-4)
+TRUTH = np.linspace(-2, 3, 24)
+
+
+def noisy(seed: int, count: int = 16, size: float = 0.2, truth: np.ndarray = TRUTH) -> np.ndarray:
+    return truth + size * np.random.default_rng(seed).normal(size=(count, len(truth)))
+
+
+@pytest.mark.parametrize("paired", [True, False])
+def test_equal_expectations_hold(paired: bool):
+    results = [compare_expectations(noisy(k), noisy(k + 100), FAMILY, paired=paired) for k in range(50)]
+    assert {result.verdict for result in results} == {Verdict.HOLDS}
+    assert np.mean([result.z_rms for result in results]) == pytest.approx(1, abs=0.05)
+    assert results[0].cosine == pytest.approx(1, abs=0.01)
+    assert np.mean([result.variance_ratio for result in results]) == pytest.approx(1, abs=0.1)
+
+
+@pytest.mark.parametrize("paired", [True, False])
+def test_a_deviation_of_the_size_that_is_called_detectable_is_seen(paired: bool):
+    seen = []
+    for k in range(100):
+        reference = noisy(k + 100)
+        size = compare_expectations(noisy(k), reference, FAMILY, paired=paired).detectable
+        seen.append(compare_expectations(noisy(k) + size * TRUTH, reference, FAMILY, paired=paired).verdict)
+    assert seen.count(Verdict.FAILS) >= 85  # 90 are expected, and more by z rms
+
+
+def test_shared_noise_sharpens_a_paired_comparison():
+    reference = noisy(1)
+    close = reference + 1e-3 * np.random.default_rng(2).normal(size=reference.shape)
+    assert compare_expectations(close, reference, FAMILY).detectable < 0.01
+    assert compare_expectations(close * 1.01, reference, FAMILY).verdict is Verdict.FAILS
+    assert compare_expectations(close * 1.01, reference, FAMILY, paired=False).verdict is Verdict.HOLDS
+
+
+def test_exact_values_and_what_they_may_be_wrong_by():
+    assert compare_expectations(noisy(1), TRUTH, FAMILY).verdict is Verdict.HOLDS
+    assert compare_expectations(noisy(1), TRUTH + 0.5, FAMILY).verdict is Verdict.FAILS
+    assert compare_expectations(noisy(1), TRUTH + 0.5, FAMILY, bias=0.5).verdict is Verdict.HOLDS
+    assert compare_expectations(noisy(1), TRUTH + 1.0, FAMILY, bias=0.5).verdict is Verdict.FAILS
+
+
+def test_what_noise_hides_is_unresolved():
+    result = compare_expectations(noisy(1, size=20), noisy(2, size=20), FAMILY)
+    assert result.verdict is Verdict.UNRESOLVED
+    assert result.detectable > 0.5
+
+
+def test_a_single_seed_that_carries_the_variance_is_no_pass():
+    ours = noisy(1)
+    ours[3] += 100
+    assert compare_expectations(ours, noisy(2), FAMILY).verdict is Verdict.HEAVY_TAILED
+    assert tail_weight(ours) > 0.9
+    assert abs(tail_weight(noisy(3, 30))) < 0.1
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_what_is_not_finite_fails(value: float):
+    ours = noisy(1)
+    ours[2, 3] = value
+    for result in (compare_expectations(ours, noisy(2), FAMILY), compare_equal_seeds(ours, noisy(2))):
+        assert result.verdict is Verdict.FAILS
+        assert result.message == "the gradient has 1 entries that are not finite"
+
+
+def test_a_gradient_that_is_zero_on_one_side_fails():
+    zero = np.zeros((16, 24))
+    assert compare_expectations(zero, noisy(1), FAMILY).verdict is Verdict.FAILS
+    assert compare_expectations(noisy(1), zero, FAMILY).verdict is Verdict.FAILS
+    assert compare_equal_seeds(noisy(1), zero).verdict is Verdict.FAILS
+    assert compare_expectations(zero, zero, FAMILY).verdict is Verdict.UNREACHED
+
+
+def test_equal_seeds_are_compared_by_relative_l2():
+    ours = noisy(1)
+    assert compare_equal_seeds(ours * (1 + 1e-5), ours).verdict is Verdict.HOLDS
+    result = compare_equal_seeds(ours * (1 + 1e-3), ours)
+    assert (result.verdict, result.relative_l2) == (Verdict.FAILS, pytest.approx(1e-3))
+
+
+def test_effective_entries():
+    noise = np.random.default_rng(0).normal(size=(40, 90))
+    assert effective_entries(noise) > 60
+    assert effective_entries(np.repeat(noise[:, :30], 3, axis=1)) == pytest.approx(30, rel=0.3)
+    assert effective_entries(np.repeat(noise[:, :1], 90, axis=1)) == pytest.approx(1, rel=0.01)
+
+
+def test_limits_grow_with_the_table():
+    assert Family(1, 1, 0.05).z_max_limit == pytest.approx(1.96, abs=0.01)
+    assert Family(50, 1000).z_max_limit > Family(1, 10).z_max_limit
+    assert Family(50, 1000).z_rms_limit(10) > Family(1, 10).z_rms_limit(10)
+
+
+def test_entries_of_a_texture_see_blocks_single_texels_and_the_sum():
+    shape, rng = (20, 30, 3), np.random.default_rng(0)
+    gradient = rng.normal(size=(2, 20 * 30 * 3))
+    values = entries(gradient, shape)
+    assert values.shape == (2, entry_count(shape)) == (2, 8 * 8 * 3 + 16 + 1)
+    assert values[:, -1] == pytest.approx(gradient.sum(1))
+    assert values[:, : 8 * 8 * 3].sum(1) == pytest.approx(gradient.sum(1))
+    grid = gradient.reshape(2, 20, 30, 3)
+    assert values[1, 0] == pytest.approx(grid[1, :2, :3, 0].sum())
+    # Two texels of one tile change places: sums are the same, projections are not.
+    swapped = grid.copy()
+    swapped[:, 0, 0], swapped[:, 0, 1] = grid[:, 0, 1], grid[:, 0, 0]
+    other = entries(swapped.reshape(2, -1), shape)
+    assert other[:, : 8 * 8 * 3] == pytest.approx(values[:, : 8 * 8 * 3])
+    assert np.abs(other - values)[:, 8 * 8 * 3 : -1].max() > 0.1
+
+
+@pytest.mark.parametrize(
+    ("shape", "count"), [((), 1), ((3,), 4), ((4, 4, 3), 49), ((1, 500, 1), 8 + 17), ((1000,), 64 + 17)]
+)
+def test_entry_count(shape: tuple[int, ...], count: int):
+    assert entry_count(shape) == count
+
+
+def record(**changes) -> GradcheckRecord:
+    values = {"case": "a.yaml", "parameter": "floor.data", "integrator": "reslrb", "estimator": "stack",
+              "reference": Reference.PTRACER, "kind": Kind.EXPECTATION, "seeds": 16, "verdict": Verdict.FAILS,
+              "relative_l2": 0.0312, "z_rms": 3.2, "z_rms_limit": 1.5, "z_max": 9.1, "z_max_limit": 5.2,
+              "detectable": 0.02}  # fmt: skip
+    return GradcheckRecord(**values | changes)
+
+
+def test_records_are_written_one_a_line(tmp_path):
+    with GradcheckWriter(tmp_path / "a.jsonl") as writer:
+        writer.write(record())
+        writer.write(record(verdict=Verdict.UNRESOLVED, relative_l2=float("inf"), parameter=None))
+    first, second = map(json.loads, (tmp_path / "a.jsonl").read_text().splitlines())
+    assert {"case", "parameter", "integrator", "estimator", "reference", "seeds", "relative_l2", "z_rms", "z_max",
+            "cosine", "variance_ratio", "holds"} <= set(first)  # fmt: skip
+    assert (first["reference"], first["verdict"], first["holds"]) == ("ptracer", "fails", False)
+    assert (second["holds"], second["relative_l2"], second["parameter"]) == (None, None, None)
+
+
+def test_table_and_the_line_of_a_failure():
+    table = Table(["floor.data"], ["reslrb:stack"], ["ptracer"])
+    assert table.head().split() == ["parameter", "integrator", "reference", "seeds", "rel.", "L2", "z", "rms", "max",
+                                    "|z|", "cosine", "variance", "detectable", "verdict"]  # fmt: skip
+    assert table.line(record()).split() == ["floor.data", "reslrb:stack", "ptracer", "16", "3.1e-02", "3.20", ">",
+                                            "1.50", "9.1", ">", "5.2", "2.0%", "fails"]  # fmt: skip
+    assert failure_line(record()) == (
+        "a.yaml: floor.data: reslrb:stack against ptracer: z rms 3.2, limit 1.5; max |z| 9.1, limit 5.2; "
+        "the means differ by 3.12%"
+    )
+    lines = markdown_table([record(), record(verdict=Verdict.HOLDS)], cases=True).splitlines()
+    assert lines[0].startswith("| case | parameter | integrator |")
+    assert lines[2].startswith("| a.yaml | floor.data | reslrb:stack | ptracer | 16 | 3.1e-02 |")
+    assert [line.replace(r"\|", "").count("|") for line in lines] == [13] * 4
