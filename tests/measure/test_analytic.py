@@ -1,0 +1,118 @@
+"""Scenes with known images: the formulas against themselves, Mitsuba's integrators, and our gradients."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from reslrb_cli.integrators import render_image
+from reslrb_cli.measure.analytic import beam_through_slab, fresnel, furnace, plane_points, point_through_surface
+from reslrb_cli.measure.analytic_scenes import (
+    KnownScene,
+    furnace_scene,
+    plane_scene,
+    refraction_scene,
+    slab_scene,
+)
+from reslrb_cli.measure.gradients import Case, integrator, seeds
+from reslrb_cli.measure.statistics import compare, renders
+
+SCENES = {
+    "furnace": (lambda: furnace_scene((0.5, 0.8, 0.9), (1, 2, 0.5), 16, 8), 64, "path"),
+    "plane": (plane_scene, 256, "path"),
+    "refraction": (refraction_scene, 256, "ptracer"),
+    "slab": (slab_scene, 512, "ptracer"),
+    "slab_head_on": (lambda: slab_scene(degrees=0, max_depth=4), 256, "ptracer"),
+}
+
+
+def twice(exact: np.ndarray) -> np.ndarray:
+    """A sample of two without noise."""
+    return np.stack([exact, exact])
+
+
+# ---- The formulas themselves ----
+
+
+def test_furnace_goes_to_its_limit():
+    limit = furnace(0.9, 2.0, -1, 1)
+    deep = furnace(0.9, 2.0, 1024, 1)
+    assert limit.image[0, 0] == pytest.approx([20.0] * 3)
+    assert limit.derivatives["albedo"][0, 0] == pytest.approx([200.0] * 3)
+    for name in ("albedo", "emission"):
+        assert deep.derivatives[name] == pytest.approx(limit.derivatives[name], rel=1e-12)
+
+
+def test_white_furnace_counts_its_bounces():
+    known = furnace(1.0, 0.5, 1024, 1)
+    assert known.image[0, 0, 0] == pytest.approx(512)
+    assert known.derivatives["albedo"][0, 0, 0] == pytest.approx(0.5 * 1023 * 1024 / 2)
+    with pytest.raises(ValueError, match="without bound"):
+        furnace(1.0, 0.5, -1, 1)
+
+
+def test_black_furnace_reflects_once_to_first_order():
+    known = furnace(0.0, 3.0, 8, 1)
+    assert known.image[0, 0, 0] == 3
+    assert known.derivatives["albedo"][0, 0, 0] == 3
+
+
+def test_fresnel():
+    assert fresnel(np.array(0.0), 1.5) == pytest.approx(0.04)
+    assert fresnel(np.array(0.7), 1.0) == pytest.approx(0)
+    brewster = np.arctan(1.5)  # one polarisation alone is reflected
+    assert fresnel(np.array(brewster), 1.5) == pytest.approx(np.sin(2 * brewster - np.pi / 2) ** 2 / 2)
+    assert fresnel(np.array(np.pi / 2), 1.5) == pytest.approx(1)
+
+
+def test_a_medium_of_index_one_is_not_there():
+    through = point_through_surface(0.5, 2.0, 1.0, 1.0, (0.3, 1.6, -0.2), 1.0, 0.9, 60, 4)
+    points, weights = plane_points(0.9, 60, 4)
+    to_light = np.array([0.3, 1.6, -0.2]) - points
+    irradiance = (2.0 * to_light[..., 1] / np.linalg.norm(to_light, axis=-1) ** 3) @ weights
+    assert through.image[..., 0] == pytest.approx(irradiance * 0.5 / np.pi, rel=1e-9)
+
+
+@pytest.mark.parametrize("name", ["albedo", "radiance", "transmittance", "reflectance"])
+def test_slab_derivatives(name: str):
+    values = {"albedo": 0.5, "radiance": 2.0, "transmittance": 0.8, "reflectance": 0.7}
+
+    def image(step: float) -> float:
+        changed = values | {name: values[name] + step}
+        known = beam_through_slab(**changed, ior=2.0, angle=0.9, max_depth=12, size=1)
+        return float(known.image[0, 0, 0])
+
+    exact = beam_through_slab(**values, ior=2.0, angle=0.9, max_depth=12, size=1).derivatives[name][0, 0, 0]
+    assert exact == pytest.approx((image(1e-5) - image(-1e-5)) / 2e-5, rel=1e-6)
+
+
+# ---- Renderers ----
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_images(name: str, llvm: str):
+    make, spp, stock = SCENES[name]
+    known: KnownScene = make()
+    case = Case(known.scene(), known.keys.values())
+    for kind in ("reslrb", stock):
+        tracer = integrator(kind, known.max_depth)
+        images = renders(lambda seed, tracer=tracer: render_image(tracer, case.scene, 0, seed, spp), seeds(8))
+        result = compare(images, twice(known.known.image), block=4)
+        print(name, kind, result)
+        assert result, kind
+        assert result.relative_error < 0.02
+
+
+@pytest.mark.parametrize("estimator", ["reservoir", "gather"])
+@pytest.mark.parametrize("name", SCENES)
+def test_gradients(name: str, estimator: str, llvm: str):
+    make, spp, _ = SCENES[name]
+    known: KnownScene = make()
+    case = Case(known.scene(), known.keys.values())
+    ours = case.gradients(integrator("reslrb", known.max_depth, estimator=estimator), seeds(12), spp)
+    exact = known.gradient(case.weights)
+    result = compare(ours, twice(exact), block=None)
+    print(name, estimator, result)
+    assert result
+    error = np.linalg.norm(ours.std(0)) / np.sqrt(12) / np.linalg.norm(exact)
+    assert error < 0.05, "too noisy to see a fault"
