@@ -101,3 +101,6 @@ class TangentSplat(Hooks):
         s.film.put(self.block, connection.u, (state.d_product * c + P * dc) * s.scale, seen)
         ds = dr.select(scattered, df * (scattering.correction / scattering.pdf), 0)
         return Tangent(state.d_product * scattering.weight + P * ds)
+
+    def survived(self, state: Tangent, weight: Any) -> Tangent:
+        return Tangent(state.d_product * weight)

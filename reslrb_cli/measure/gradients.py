@@ -1,4 +1,4 @@
-"""Gradients of a scene over many seeds, and finite differences.
+"""Gradients of a scene over many seeds, derivatives in forward mode, and finite differences.
 
 An objective is sum(image * weights) with fixed random weights, so dL/dI is the same for every estimator. A gradient is
 one flat vector over all parameters of a case.
@@ -19,21 +19,38 @@ class Case:
     """A scene, its parameters, and a linear objective."""
 
     @classmethod
-    def of(cls, loaded: Any, keys: Iterable[str]) -> Case:
-        """A case of a scene that is loaded already."""
-        return cls(loaded, keys)
+    def of(cls, loaded: Any, keys: Iterable[str], sensor: int = 0) -> Case:
+        """A case of a scene that is loaded already, seen through one of its sensors."""
+        return cls(loaded, keys, sensor=sensor)
 
-    def __init__(self, scene: Any, keys: Iterable[str], seed: int = 7) -> None:
+    def __init__(self, scene: Any, keys: Iterable[str], seed: int = 7, sensor: int = 0) -> None:
         import mitsuba as mi
 
         self.scene = load(scene) if isinstance(scene, dict) else scene
+        self.sensor = sensor
         self.params = mi.traverse(self.scene)
         self.keys = list(keys)
         self.initial = {key: self.flat(key) for key in self.keys}
-        # mean 1, so that entries do not cancel; random, so that a wrong film position shows
-        size = self.scene.sensors()[0].film().crop_size()
-        shape = (int(size[1]), int(size[0]), 3)
-        self.weights = mi.TensorXf(np.random.default_rng(seed).uniform(0.2, 1.8, shape).astype(np.float32))
+        film = self.scene.sensors()[sensor].film()
+        width, height = film.crop_size()
+        self.channels = int(film.base_channels_count())
+        shape = (int(height), int(width), 1 if self.channels <= 2 else 3)
+        # Mean 1, so that entries do not cancel; random, so that a wrong film position shows.
+        self.weigh(np.random.default_rng(seed).uniform(0.2, 1.8, shape))
+
+    def weigh(self, weights: np.ndarray) -> None:
+        """Set the weights of the objective, (H, W, C) without alpha: dL/dI."""
+        import mitsuba as mi
+
+        self.weights = mi.TensorXf(np.ascontiguousarray(weights, np.float32))
+
+    @property
+    def adjoint(self) -> Any:
+        """dL/dI, (H, W, C) with as many channels as the film has: none of its alpha counts."""
+        import mitsuba as mi
+
+        weights = np.array(self.weights)
+        return mi.TensorXf(np.pad(weights, ((0, 0), (0, 0), (0, self.channels - weights.shape[2]))))
 
     def flat(self, key: str) -> np.ndarray:
         """The parameter's values in a row; colours that are stored by channel come channel by channel."""
@@ -75,7 +92,7 @@ class Case:
         """sum(image * weights) over the colour channels."""
         import drjit as dr
 
-        return dr.sum(image[:, :, :3] * self.weights, axis=None)
+        return dr.sum(image[:, :, : self.weights.shape[2]] * self.weights, axis=None)
 
     def gradient(self, integrator: Any, seed: int, spp: int, objective: Callable | None = None,
                  step: Callable = gradient_step, **options: Any) -> np.ndarray:  # fmt: skip
@@ -89,7 +106,7 @@ class Case:
             self.params[key] = type(leaf)(leaf)
         self.settle()
         objective = objective or self.objective
-        step(integrator, self.scene, 0, objective, seed=seed, spp=spp, params=self.params, **options)
+        step(integrator, self.scene, self.sensor, objective, seed=seed, spp=spp, params=self.params, **options)
         result = [np.array(dr.grad(leaf), dtype=np.float64).ravel() for leaf in leaves.values()]
         for key in self.keys:
             self.params[key] = dr.detach(leaves[key])
@@ -102,8 +119,51 @@ class Case:
 
     def value(self, integrator: Any, seed: int, spp: int) -> float:
         """The objective."""
-        image = render_image(integrator, self.scene, 0, seed, spp)
-        return float(np.sum(np.array(image, np.float64)[:, :, :3] * np.array(self.weights)))
+        return self.weighted(self.image(integrator, seed, spp))
+
+    def image(self, integrator: Any, seed: int, spp: int) -> np.ndarray:
+        """The image, (H, W, C) float64, without alpha."""
+        image = np.array(render_image(integrator, self.scene, self.sensor, seed, spp), np.float64)
+        return image[:, :, : self.weights.shape[2]]
+
+    def weighted(self, image: np.ndarray) -> float:
+        """The objective of an image, or its derivative where `image` is one."""
+        return float(np.sum(image[:, :, : self.weights.shape[2]] * np.array(self.weights)))
+
+    def along(self, direction: np.ndarray, tangent: Callable[[], Any]) -> np.ndarray:
+        """What `tangent()` returns, an image, while the parameters carry the tangent `direction` (P,); float64.
+
+        For forward mode: `tangent` is to render the derivative of the image along that direction.
+        """
+        import drjit as dr
+
+        leaves, at = {}, 0
+        for key in self.keys:
+            leaves[key] = type(self.params[key])(dr.detach(self.params[key]))
+            dr.enable_grad(leaves[key])
+            self.params[key] = type(leaves[key])(leaves[key])
+        self.params.update()
+        for key, leaf in leaves.items():
+            size = len(self.initial[key])
+            dr.set_grad(leaf, self.shaped(key, direction[at : at + size]))
+            dr.enqueue(dr.ADMode.Forward, leaf)
+            at += size
+        dr.traverse(dr.ADMode.Forward, dr.ADFlag.ClearEdges)
+        image = np.array(tangent(), dtype=np.float64)
+        for key in self.keys:
+            self.params[key] = dr.detach(leaves[key])
+        self.settle()
+        return image
+
+    def tangent(self, integrator: Any, direction: np.ndarray, seed: int, spp: int) -> float:
+        """The objective's derivative along `direction` (P,) in forward mode."""
+        import drjit as dr
+        import mitsuba as mi
+
+        sensor, opaque = self.scene.sensors()[self.sensor], dr.opaque(mi.UInt32, seed)
+        return self.weighted(
+            self.along(direction, lambda: integrator.render_forward(self.scene, self.params, sensor, opaque, spp))
+        )
 
     def directions(self, count: int, seed: int = 3) -> np.ndarray:
         """Random directions in the space of parameters, (count, P): entries of size 0.5 to 1, either sign."""

@@ -12,7 +12,7 @@ from typing import Any
 
 
 class Reference(str, enum.Enum):
-    """What a gradient is compared with."""
+    """What a gradient is compared with; `forward_mode` by the dot product <w, J v> = <J^T w, v>."""
 
     PTRACER = "ptracer"
     WALK_AD = "walk_ad"
@@ -20,19 +20,18 @@ class Reference(str, enum.Enum):
     PRB = "prb"
     FINITE_DIFFERENCE = "finite_difference"
     ANALYTIC = "analytic"
+    FORWARD_MODE = "forward_mode"
 
 
 class Kind(str, enum.Enum):
     """How it is compared.
 
     `equal_seeds`: by relative L2, where both compute the same numbers but for rounding. `expectation`: by z scores over
-    many seeds. `forward_backward`: by the dot product <w, J v> = <J^T w, v>, over many seeds too. `image`: not the
-    gradient but the image it belongs to, over many seeds.
+    many seeds. `image`: so too, but not the gradient, the image it belongs to.
     """
 
     EQUAL_SEEDS = "equal_seeds"
     EXPECTATION = "expectation"
-    FORWARD_BACKWARD = "forward_backward"
     IMAGE = "image"
 
 

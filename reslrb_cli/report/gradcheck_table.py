@@ -10,14 +10,14 @@ HEAD = ("parameter", "integrator", "reference", "seeds", "rel. L2", "z rms", "ma
         "detectable", "verdict")  # fmt: skip
 #: The first three columns are text; 0 is as wide as what stands in it.
 _WIDTHS = (0, 0, 0, 5, 17, 11, 11, 8, 8, 10, 0)
-_REFERENCES = {Reference.FINITE_DIFFERENCE: "differences"}
-_KINDS = {Kind.EQUAL_SEEDS: ", equal seeds", Kind.FORWARD_BACKWARD: ", forward mode", Kind.IMAGE: ", image"}
+_REFERENCES = {Reference.FINITE_DIFFERENCE: "differences", Reference.FORWARD_MODE: "forward mode"}
+_KINDS = {Kind.EQUAL_SEEDS: ", equal seeds"}
 
 
 def cells(record: GradcheckRecord) -> tuple[str, ...]:
     """What stands in the columns of HEAD; limits follow the figures that have one."""
     return (
-        record.parameter or ("all" if record.kind is not Kind.IMAGE else "image"),
+        parameter_name(record),
         integrator_name(record),
         reference_name(record),
         str(record.seeds),
@@ -30,6 +30,11 @@ def cells(record: GradcheckRecord) -> tuple[str, ...]:
         else f"{record.detectable:.0e}",
         record.verdict.value.replace("_", "-"),
     )  # fmt: skip
+
+
+def parameter_name(record: GradcheckRecord) -> str:
+    """The parameter; `image` or `all` where there is none."""
+    return record.parameter or ("image" if record.kind is Kind.IMAGE else "all")
 
 
 def integrator_name(record: GradcheckRecord) -> str:
@@ -55,9 +60,8 @@ def failure_line(record: GradcheckRecord) -> str:
     if record.relative_l2 is not None and record.relative_l2_limit is None:
         parts.append(f"the means differ by {record.relative_l2:.2%}")
     parts += [record.message] if record.message else []
-    what = record.parameter or cells(record)[0]
-    against = reference_name(record)
-    return f"{record.case}: {what}: {integrator_name(record)} against {against}: {'; '.join(parts)}"
+    what = f"{parameter_name(record)}: {integrator_name(record)} against {reference_name(record)}"
+    return f"{record.case}: {what}: {'; '.join(parts)}"
 
 
 class Table:

@@ -88,6 +88,10 @@ class Hooks:
         """Called at each vertex with the sampled scattering event, also in lanes that `goes_on` ended."""
         return state
 
+    def survived(self, state: Any, weight: Any) -> Any:
+        """Called with the weight that roulette has just given the path's product, 1 where it was not played."""
+        return state
+
 
 def walk(
     plan: Plan, scene: Any, sensor: Any, sampler: Any, hooks: Hooks, active: Any = True, selection: Any = None
@@ -164,7 +168,8 @@ def walk(
             q = dr.minimum(throughput * dr.square(eta), ROULETTE_LIMIT)
             playing = path.depth + 1 > plan.rr_depth
             active &= ~playing | (number < q)
-            product = product.scaled(dr.select(playing, dr.rcp(q), 1))
+            roulette_weight = dr.select(playing, dr.rcp(q), 1)
+            product, state = product.scaled(roulette_weight), hooks.survived(state, roulette_weight)
 
         return next_vertex(path, active, si, scattering, product, eta), state, sampler, selection
 

@@ -31,40 +31,27 @@ def test_walk_ad_is_ptracer(name: str):
 
 
 def forward(scene: Case, integrator: Any, seed: int, spp: int) -> np.ndarray:
-    """The image's derivative along the first of the random directions of the parameters."""
+    """The image's derivative along the first of the random directions of the parameters, as Mitsuba's users get it."""
     import drjit as dr
     import mitsuba as mi
 
-    direction, at, leaves = scene.directions(1)[0], 0, {}
-    for key in scene.keys:
-        leaves[key] = type(scene.params[key])(dr.detach(scene.params[key]))
-        dr.enable_grad(leaves[key])
-        scene.params[key] = type(leaves[key])(leaves[key])
-    scene.params.update()
-    for key, leaf in leaves.items():
-        size = len(scene.initial[key])
-        dr.set_grad(leaf, scene.shaped(key, direction[at : at + size]))
-        dr.enqueue(dr.ADMode.Forward, leaf)
-        at += size
-    dr.traverse(dr.ADMode.Forward, dr.ADFlag.ClearEdges)
-    image = mi.render(scene.scene, scene.params, integrator=integrator, seed=seed, seed_grad=seed + 1, spp=spp)
-    result = np.array(dr.forward_to(image), dtype=np.float64)[:, :, :3]  # derivative of alpha: none
-    for key in scene.keys:
-        scene.params[key] = dr.detach(leaves[key])
-    scene.params.update()
-    return result
+    def tangent() -> Any:
+        image = mi.render(scene.scene, scene.params, integrator=integrator, seed=seed, seed_grad=seed + 1, spp=spp)
+        return dr.forward_to(image)
+
+    return scene.along(scene.directions(1)[0], tangent)[:, :, :3]  # derivative of alpha: none
 
 
 @pytest.mark.parametrize("name", [case.name for case in CASES if case.name not in ("texture_prb", "retained")])
 def test_forward_mode_is_walk_ad(name: str):
     case = BY_NAME[name]
-    scene = Case(case.scene(), case.keys)
-    tangent = forward(scene, integrator("reslrb", **case.both), 3, 32)
-    naive = forward(scene, integrator("walk_ad", **case.both), 3, 32)
+    scene, options = Case(case.scene(), case.keys), case.both | case.options
+    tangent = forward(scene, integrator("reslrb", **options), 3, 32)
+    naive = forward(scene, integrator("walk_ad", **options), 3, 32)
     assert np.abs(naive).max() > 0
     assert relative(tangent, naive) < 1e-5
     # The adjoint of the same derivative: <weights, J v> = <J^T weights, v>, at the seed that forward mode had.
-    gradient = scene.gradient(integrator("walk_ad", **case.both), 4, 32)
+    gradient = scene.gradient(integrator("walk_ad", **options), 4, 32)
     assert np.sum(naive * np.array(scene.weights)) == pytest.approx(gradient @ scene.directions(1)[0], rel=1e-3)
 
 
