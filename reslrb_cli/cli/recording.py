@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from reslrb_cli.optimization import Problem, optimize
+from reslrb_cli.optimization.scaling import Sensitivity
 from reslrb_cli.records.checkpoint import save_checkpoint
 from reslrb_cli.records.images import write_image
 from reslrb_cli.records.manifest import Manifest, Status
@@ -83,6 +84,8 @@ class Recording:
             return
         with MetricsWriter(self.folder.path) as metrics:
             for record in optimize(self.problem):
+                if self.first is None and self.problem.sensitivities is not None:
+                    self._note_scaling(self.problem.sensitivities)
                 self.first, self.last = self.first or record, record
                 metrics.write(record)
                 show(record)
@@ -94,6 +97,14 @@ class Recording:
                 if time.monotonic() - saved > CHECKPOINT_SECONDS:
                     self._save_checkpoint()
                     saved = time.monotonic()
+
+    def _note_scaling(self, measured: list[Sensitivity]) -> None:
+        self.manifest.scaling = [row.to_json() for row in measured]
+        for row in measured:
+            if row.length is None:
+                logger.warning(f"scale auto: {row.key} has no effect on the image where it starts; it is not scaled")
+            else:
+                logger.info(f"scale auto: {row.key} moves in steps of {row.length:.3g} times the learning rate")
 
     def _check_memory(self, record: Record) -> None:
         memory = self.problem.memory

@@ -225,7 +225,16 @@ class Optimizer(Choice):
 
     type: str
     learning_rate: Positive = Field(
-        default=0.02, description="Step size at the first iteration, in the parameter's units."
+        default=0.02,
+        description="Step size at the first iteration, in the parameter's units; in those of its `transform`, where it "
+        "has one; with `scale: auto`, as a share of the measured length.",
+    )
+    scale: Literal["none", "auto"] = Field(
+        default="none",
+        description="`auto`: before the first iteration, measure for each parameter the length by which it would have "
+        "to change to make up the image where it has an effect, and how large its gradient is, and let the optimizer "
+        "move each in units of its own: one learning rate serves parameters that differ by orders of magnitude, and "
+        "`epsilon` does not matter. Learning rates are then shares of that length: 0.02 is 2 % a step.",
     )
     schedule: Literal["constant", "cosine", "exponential"] = Field(
         default="constant", description="How the learning rate runs from its first value to its last."

@@ -158,8 +158,15 @@ class ParameterSpec(Section):
         description="[low, high], in the parameter's units; values are clamped to them after each step. "
         "`-.inf` and `.inf` leave a side open.",
     )
+    transform: Literal["none", "sigmoid", "log", "softplus"] = Field(
+        default="none",
+        description="What the optimizer moves in place of the value x: `sigmoid`: the logit of x between its `bounds`, "
+        "which it never reaches; `log`: log(x), for positive values known to an order of magnitude at best; "
+        "`softplus`: log(exp(x) - 1), for positive values; as `log` well below 1, as `none` well above. Learning "
+        "rates are in units of that variable.",
+    )
     learning_rate: Positive | None = Field(
-        default=None, description="Step size of this parameter; null: the optimizer's."
+        default=None, description="Step size of this parameter, in the optimizer's units; null: the optimizer's."
     )
     resolution: Annotated[tuple[Count, Count], Field(strict=False)] | None = Field(
         default=None, description="[width, height] in texels to which a texture is resampled before the start."
@@ -171,6 +178,16 @@ class ParameterSpec(Section):
         if value is not None and not value[0] < value[1]:
             raise wrong(f"must be [low, high] with low < high, not [{value[0]:g}, {value[1]:g}]")
         return value
+
+    @model_validator(mode="after")
+    def _check_transform(self) -> Self:
+        low, high = self.bounds or (-math.inf, math.inf)
+        if self.transform == "sigmoid" and not (math.isfinite(low) and math.isfinite(high)):
+            has = "has none" if self.bounds is None else f"has [{low:g}, {high:g}]"
+            raise located("transform", f"sigmoid maps to finite `bounds`, [low, high]; this parameter {has}")
+        if self.transform in ("log", "softplus") and high <= 0:
+            raise located("bounds", f"leave no positive value, and transform: {self.transform} yields nothing else")
+        return self
 
     @model_validator(mode="after")
     def _check_initial(self) -> Self:

@@ -9,20 +9,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
-import drjit as dr
 import mitsuba as mi
-import numpy as np
 
 from reslrb_cli.backend.device import device_name
 from reslrb_cli.config import Config, Reslrb
 from reslrb_cli.errors import ConfigError
-from reslrb_cli.integrators import gradient_step, make_integrator
+from reslrb_cli.integrators import make_integrator
 from reslrb_cli.optimization.budget import MemoryPlan, choose_samples, standing
 from reslrb_cli.optimization.pilot import Candidate, Measured, Outcome, Pilot
+from reslrb_cli.optimization.samples import sample_gradient, take_gradient
 from reslrb_cli.records.clock import MIB, StepClock
 from reslrb_cli.records.manifest import versions
 from reslrb_cli.records.pilot_cache import key_of
-from reslrb_cli.seeds import seed
 
 if TYPE_CHECKING:
     from reslrb_cli.optimization.problem import Problem
@@ -170,24 +168,10 @@ def _candidate(option: Option) -> Candidate:
 def _step(problem: Problem, integrator: Any, clock: StepClock, round: int, spp: int) -> Measured:
     """One step of all views, with seeds of the pilot's own; leaves neither gradient nor change behind."""
     start = time.perf_counter()
-    run, keys = problem.config.run, problem.selection.keys
     problem.apply()
     with clock.step() as times:
-        for sensor, target in zip(problem.sensors, problem.targets, strict=True):
-
-            def loss(image: Any, target: Any = target) -> Any:
-                return problem.compare(image, target) / len(problem.sensors)
-
-            step = gradient_step(
-                integrator, problem.scene, sensor, loss, seed=seed(run.seed, round, sensor, "pilot"),
-                **{**run.step_options(), "spp": spp}, params=problem.selection.params,
-            )  # fmt: skip
-            dr.eval(step.loss, [problem.optimizer.gradient(key) for key in keys])
-    gradients = {}
-    for key in keys:
-        gradient = np.array(problem.optimizer.gradient(key), dtype=np.float32)
-        gradients[key] = np.nan_to_num(gradient, nan=0.0, posinf=0.0, neginf=0.0).ravel()
-        problem.optimizer.clear_gradient(key)
+        sample_gradient(problem, integrator, round, "pilot", spp)
+    gradients = take_gradient(problem)
     wall_ms = 1e3 * (time.perf_counter() - start)
     # Kernels are compiled side by side: their times can add up to more than was waited for.
     return Measured(gradients, times.kernel_ms, max(wall_ms - times.codegen_ms, times.kernel_ms), times.codegen_ms)

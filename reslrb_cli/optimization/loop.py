@@ -12,6 +12,7 @@ import drjit as dr
 from reslrb_cli.integrators import gradient_step
 from reslrb_cli.optimization.constraints import NonFiniteWatch, count_nonfinite, finite_square_norm
 from reslrb_cli.optimization.problem import Problem
+from reslrb_cli.optimization.scaling import rescale
 from reslrb_cli.optimization.schedules import learning_rate_factor
 from reslrb_cli.records.clock import StepClock, peak_mib, reset_peak
 from reslrb_cli.records.metrics import Record
@@ -23,11 +24,15 @@ def optimize(problem: Problem) -> Iterator[Record]:
 
     An iteration is a step (image, loss and gradient of every sensor; the loss is the mean over the sensors) and an
     update. A parameter whose gradient is not finite is not updated in that iteration; where the loss is not
-    finite, none is. Raises NonFinite where that goes on (see `NonFiniteWatch`).
+    finite, none is. Raises NonFinite where that goes on (see `NonFiniteWatch`). `optimizer.scale: auto` measures
+    before the first iteration, and `elapsed_s` counts that.
     """
     config = problem.config
     clock, watch = StepClock(), NonFiniteWatch()
     reset_peak()
+    if config.optimizer.scale == "auto":
+        with clock.counted():
+            problem.sensitivities = rescale(problem)
     for iteration in range(config.run.iterations):
         rmse = problem.parameter_rmse()
         with clock.step() as times:

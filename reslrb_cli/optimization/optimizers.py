@@ -14,6 +14,7 @@ import drjit.opt as dropt
 import numpy as np
 
 from reslrb_cli.optimization.constraints import clamp, count_nonfinite
+from reslrb_cli.optimization.transforms import Transform, Variable
 
 
 def adam(learning_rate: float, beta_1: float = 0.9, beta_2: float = 0.999, epsilon: float = 1e-8) -> Any:
@@ -48,8 +49,9 @@ OPTIMIZERS: dict[str, Callable[..., Any]] = {"adam": adam, "adamw": adamw, "rmsp
 class Optimizer:
     """Holds the parameters and updates them; values it hands out receive gradients.
 
-    `rates` and `bounds` are per key: a rate of None is `learning_rate`, bounds of None are none. Raises KeyError for
-    an unknown `type`.
+    `rates`, `bounds` and `transforms` are per key: a rate of None is `learning_rate`, bounds of None are none, and so
+    is a transform that is left out. What it hands out, and the gradients that it takes, are the scene's; a parameter
+    with a `Variable` is moved by way of that. Raises KeyError for an unknown `type`.
     """
 
     def __init__(
@@ -60,12 +62,19 @@ class Optimizer:
         values: Mapping[str, Any],
         rates: Mapping[str, float | None],
         bounds: Mapping[str, tuple[float, float] | None],
+        transforms: Mapping[str, Transform | None] | None = None,
     ) -> None:
         self._rates = {key: float(rates[key] or learning_rate) for key in values}
         self._bounds = {key: bounds[key] for key in values}
         self._own = {key: OPTIMIZERS[type](self._rates[key], **options) for key in values}
+        self._variables: dict[str, Variable] = {}
+        #: The scene's values of the parameters that have a variable.
+        self._scene: dict[str, Any] = {}
         for key, value in values.items():
             self._own[key][key] = value
+            transform = (transforms or {}).get(key)
+            if transform is not None:
+                self.set_variable(key, Variable(transform, bounds[key]))
 
     def keys(self) -> list[str]:
         """The keys of the parameters."""
@@ -73,7 +82,17 @@ class Optimizer:
 
     def __getitem__(self, key: str) -> Any:
         """The value of a parameter, gradients enabled."""
-        return self._own[key][key]
+        return self._scene[key] if key in self._scene else self._own[key][key]
+
+    def variable(self, key: str) -> Variable:
+        """How a parameter is moved."""
+        return self._variables.get(key) or Variable(None, self._bounds[key])
+
+    def set_variable(self, key: str, variable: Variable) -> None:
+        """Move a parameter by way of `variable` from now on; to be called before the first step."""
+        value = dr.detach(self[key])
+        self._variables[key], self._scene[key] = variable, _leaf(value)
+        self._own[key][key] = variable.from_scene(value)
 
     def gradient(self, key: str) -> Any:
         """The gradient that has been accumulated into `self[key]`."""
@@ -93,25 +112,53 @@ class Optimizer:
         moved, before, counts = [key for key in self._own if key not in skip], {}, {}
         for key in moved:
             own = self._own[key]
-            before[key] = own.state[key]
+            before[key] = own.state[key], self[key]
             own.set_learning_rate(self._rates[key] * factor)
-            own.step(eval=False)
-            own[key] = clamp(dr.detach(own[key]), self._bounds[key])
-            counts[key] = count_nonfinite(own[key])
+            if key in self._variables:
+                self._step_variable(key)
+            else:
+                own.step(eval=False)
+                own[key] = clamp(dr.detach(own[key]), self._bounds[key])
+            counts[key] = count_nonfinite(self[key])
         dr.eval(counts)
         overflowed = {key: int(count[0]) for key, count in counts.items() if count[0]}
         for key in overflowed:
-            self._own[key].state[key] = before[key]
+            self._own[key].state[key], value = before[key]
+            dr.clear_grad(self._own[key][key])
+            if key in self._variables:
+                self._scene[key] = value
         for key in (*skip, *overflowed):
             self.clear_gradient(key)
         return overflowed
 
+    def _step_variable(self, key: str) -> None:
+        own, variable = self._own[key], self._variables[key]
+        gradient = variable.chain(dr.detach(own[key]), self.gradient(key))
+        dr.set_grad(own[key], gradient)
+        own.step(eval=False)
+        own[key] = variable.clamp(dr.detach(own[key]))
+        self._scene[key] = _leaf(variable.to_scene(dr.detach(own[key])))
+
     def state(self) -> dict[str, np.ndarray[Any, Any]]:
-        """What the optimiser keeps for each parameter beside its value, as `<key>/<index>` (in Dr.Jit's order)."""
+        """What the optimiser keeps for each parameter beside its value, as `<key>/<index>` (in Dr.Jit's order).
+
+        `<key>/variable` is what it moves in place of the value, `<key>/length` its unit (`Variable`), where it does.
+        """
         arrays = {}
+        for key, variable in self._variables.items():
+            arrays[f"{key}/variable"] = np.array(self._own[key][key])
+            arrays[f"{key}/length"] = np.array(variable.length)
         for key, own in self._own.items():
             extra = own.state[key][3]
             for index, entry in enumerate(extra if isinstance(extra, tuple) else (extra,)):
                 if entry is not None:
                     arrays[f"{key}/{index}"] = np.array(entry)
         return arrays
+
+
+def _leaf(value: Any) -> Any:
+    """A copy that receives gradients."""
+    copy = type(value)(value)
+    dr.make_opaque(copy)
+    dr.enable_grad(copy)
+    return copy

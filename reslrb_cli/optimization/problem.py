@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -19,6 +19,8 @@ from reslrb_cli.optimization.losses import Loss, make_loss
 from reslrb_cli.optimization.optimizers import Optimizer
 from reslrb_cli.optimization.pilot import Outcome
 from reslrb_cli.optimization.rendering import render_in_passes
+from reslrb_cli.optimization.scaling import Sensitivity
+from reslrb_cli.optimization.transforms import make_transform
 from reslrb_cli.scene import Selection, check_camera_paths, check_supported, load_scene, read_image, select_parameters
 
 Array = np.ndarray[Any, Any]
@@ -53,11 +55,12 @@ class Problem:
     #: What was measured and planned before the first iteration, where it was.
     pilot: Outcome | None = None
     memory: MemoryPlan | None = None
+    sensitivities: list[Sensitivity] | None = None
 
-    def apply(self) -> None:
-        """Hand the optimiser's values to the scene."""
+    def apply(self, others: Mapping[str, Any] | None = None) -> None:
+        """Hand the optimiser's values to the scene, or, of the keys in `others`, those."""
         for key in self.selection.keys:
-            self.selection.params[key] = self.optimizer[key]
+            self.selection.params[key] = others[key] if others and key in others else self.optimizer[key]
         self.selection.params.update()
         # A texture pads its storage when it is first looked up, and unpads it when it is read. Left to the step, either
         # would cut its kernels in two, and differently in the first step and the second.
@@ -183,6 +186,7 @@ def assemble_scene(config: Config, scene: Any = None) -> Problem:
         values={key: selection.params[key] for key in selection.keys},
         rates={key: spec.learning_rate for key, spec in specs.items()},
         bounds={key: spec.bounds for key, spec in specs.items()},
+        transforms={key: make_transform(spec.transform, spec.bounds) for key, spec in specs.items()},
     )
     problem = Problem(
         config=config,

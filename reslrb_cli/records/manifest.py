@@ -49,9 +49,9 @@ def versions() -> dict[str, str]:
 class Manifest:
     """Provenance and outcome of one run.
 
-    `pilot` is the table by which an estimator was chosen, `memory` how a memory budget is kept, None where that was not
-    asked for. `results` holds what the run found (`iterations`, `parameter_rmse` per key, ...); `error` is the line
-    that the user saw where the run failed.
+    `pilot` is the table by which an estimator was chosen, `memory` how a memory budget is kept, `scaling` what was
+    measured of each parameter for `scale: auto`; each is None where that was not asked for. `results` holds what the
+    run found (`iterations`, `parameter_rmse` per key, ...); `error` is the line that the user saw where the run failed.
     """
 
     variant: str
@@ -67,6 +67,7 @@ class Manifest:
     error: str | None = None
     pilot: dict[str, Any] | None = None
     memory: dict[str, Any] | None = None
+    scaling: list[dict[str, Any]] | None = None
     results: dict[str, Any] = field(default_factory=dict)
 
     def write(self, folder: Path) -> None:

@@ -14,7 +14,7 @@ import numpy as np
 from ..config import ParameterSpec
 from ..errors import ConfigError
 from .catalog import describe, list_parameters
-from .values import Place, Slot, check_bounds, initial_array
+from .values import Place, Slot, check_bounds, check_transform, initial_array
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,8 @@ def select_parameters(scene: Any, specs: Sequence[ParameterSpec], source: object
 
     A glob selects what it matches and can be recovered. `source` names the configuration in errors. Raises ConfigError
     where a key matches nothing, or nothing that can be recovered, or what another spec has already; where an initial
-    value does not fit, is not finite, or lies outside of the bounds; and where a resolution is given for no texture.
+    value does not fit, is not finite, or lies outside of the bounds or of what the transform yields; and where a
+    resolution is given for no texture.
     """
     params = mi.traverse(scene)
     chosen: dict[str, ParameterSpec] = {}
@@ -67,6 +68,7 @@ def select_parameters(scene: Any, specs: Sequence[ParameterSpec], source: object
         value = initial_array(slot, spec.initial, spec.resolution, place)
         if spec.bounds is not None:
             check_bounds(slot, value, spec.bounds, place)
+        check_transform(slot, value, spec, place)
         if spec.initial != "scene" or spec.resolution is not None:
             slot.set(value)
     params.update()

@@ -9,6 +9,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..config import ParameterSpec
 from ..errors import ConfigError
 from .target import read_image
 
@@ -100,6 +101,22 @@ def check_bounds(slot: Slot, array: Array, bounds: tuple[float, float], place: P
         value = float(array[outside].flat[0])
         where = _entry(array, outside)
         raise place.fail("bounds", f"exclude the initial value of `{slot.key}`, {value:g}{where}")
+
+
+def check_transform(slot: Slot, array: Array, spec: ParameterSpec, place: Place) -> None:
+    """Raise ConfigError at `place` where an entry of `array` is not among the values that the transform yields."""
+    if spec.transform == "none":
+        return
+    low, high = (0.0, np.inf) if spec.transform != "sigmoid" else spec.bounds or (-np.inf, np.inf)
+    outside = (array <= np.float32(low)) | (array >= np.float32(high))
+    if outside.any():
+        yields = (
+            f"values between its bounds, {low:g} and {high:g}" if spec.transform == "sigmoid" else "positive values"
+        )
+        value = f"{float(array[outside].flat[0]):g}{_entry(array, outside)}"
+        raise place.fail(
+            "initial", f"`{slot.key}` begins at {value}; transform: {spec.transform} yields {yields} alone"
+        )
 
 
 def resample(array: Array, resolution: tuple[int, int]) -> Array:

@@ -99,7 +99,7 @@ def test_the_pilot_leaves_the_run_as_it_was(experiment):
 
 def test_the_pilot_has_seeds_of_its_own(experiment, monkeypatch):
     from reslrb_cli.config import load
-    from reslrb_cli.optimization import choice
+    from reslrb_cli.optimization import choice, samples
     from reslrb_cli.optimization.problem import assemble_scene
 
     drawn = []
@@ -108,8 +108,8 @@ def test_the_pilot_has_seeds_of_its_own(experiment, monkeypatch):
         drawn.append((run_seed, iteration, view, purpose))
         return len(drawn)
 
-    monkeypatch.setattr(choice, "seed", spy)
-    monkeypatch.setattr(choice, "gradient_step", lambda *args, **options: pytest.fail("stop", pytrace=False))
+    monkeypatch.setattr(samples, "seed", spy)
+    monkeypatch.setattr(samples, "gradient_step", lambda *args, **options: pytest.fail("stop", pytrace=False))
     problem = assemble_scene(load("box.yaml", ["run.seed=7"]))
     problem.targets = [None]
     from reslrb_cli.records.clock import StepClock

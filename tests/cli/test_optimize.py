@@ -138,6 +138,28 @@ def test_a_texture_is_recovered(experiment, capsys, type):
     assert np.array(mi.Bitmap("runs/box/images/final.exr")).shape == (16, 16, 3)
 
 
+@pytest.mark.parametrize("transform", ["sigmoid", "log", "softplus"])
+def test_a_texture_is_recovered_by_way_of_a_transform(experiment, capsys, transform):
+    sets = ["run.iterations=40", "run.adjoint=independent", "optimizer={scale: auto, learning_rate: 0.1}"]
+    sets += [f"parameters[0].transform={transform}", "integrator={type: reslrb, max_depth: 3, estimator: stack}"]
+    code, _, err = reslrb(capsys, "optimize", "box.yaml", *(word for each in sets for word in ("--set", each)))
+    assert code == 0, err
+    assert f"scale auto: {KEY} moves in steps of" in err
+    manifest, records = read_manifest("runs/box"), read_metrics("runs/box")
+    errors = manifest["results"]["parameter_rmse"][KEY]
+    assert errors["initial"] == pytest.approx(np.sqrt(np.mean((experiment - 0.5) ** 2)), rel=1e-5)
+    assert errors["final"] < 0.4 * errors["initial"]
+    [scaling] = manifest["scaling"]
+    assert (scaling["key"], scaling["value"]) == (KEY, 0.5)
+    # what was measured first counts
+    assert records[0]["elapsed_s"] > 1e-3 * records[0]["step_ms"] * 2
+    # everything that is written is in the scene's units
+    with np.load("runs/box/checkpoint/state.npz") as state, np.load("runs/box/parameters/parameters.npz") as values:
+        np.testing.assert_array_equal(state[f"parameter/{KEY}"], values[KEY])
+        assert np.sqrt(np.mean((values[KEY] - experiment) ** 2)) == pytest.approx(errors["final"], rel=1e-4)
+        assert f"optimizer/{KEY}/variable" in state
+
+
 def test_what_a_run_saves_agrees_with_itself(experiment, capsys):
     assert reslrb(capsys, "optimize", "box.yaml", "--set", "run.iterations=3", "--set", "run.images_every=2")[0] == 0
     assert "iteration-000002.exr" in names("runs/box/images")

@@ -99,6 +99,23 @@ FILES: dict[str, tuple[str | bytes, tuple[str, ...]]] = {
         changed(PARAMETER, "{key: a, bounds: [0, inf]}"),
         ("x.yaml: parameters[0].bounds[1]: must be a number", "'inf'"),
     ),
+    "unknown transform": (
+        changed(PARAMETER, "{key: a, transform: logarithm}"),
+        ("x.yaml: parameters[0].transform: must be one of", "log"),
+    ),
+    "sigmoid without bounds": (
+        changed(PARAMETER, "{key: a, transform: sigmoid}"),
+        ("x.yaml: parameters[0].transform: sigmoid maps to finite `bounds`", "has none"),
+    ),
+    "sigmoid with an open side": (
+        changed(PARAMETER, "{key: a, transform: sigmoid, bounds: [0, .inf]}"),
+        ("x.yaml: parameters[0].transform: sigmoid maps to finite `bounds`", "has [0, inf]"),
+    ),
+    "log of nothing positive": (
+        changed(PARAMETER, "{key: a, transform: log, bounds: [-1, 0]}"),
+        ("x.yaml: parameters[0].bounds: leave no positive value", "log"),
+    ),
+    "unknown scale": (GOOD + "optimizer: {scale: 1e6}\n", ("x.yaml: optimizer.scale: must be", "auto")),
     "bounds exclude the initial value": (
         changed(PARAMETER, "{key: a, bounds: [0, 1], initial: [0.5, 1.5, 0.5]}"),
         ("x.yaml: parameters[0].initial: 1.5 is outside of the bounds [0, 1]",),

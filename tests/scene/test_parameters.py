@@ -131,6 +131,17 @@ def test_bounds_hold_for_the_nearest_float(make_scene):
             "exclude the initial value of `floor.reflectance.data`, 0.1",
         ),
         ([{"key": LAMP, "bounds": [0, 2.5]}], "bounds", "lamp.intensity.value`, 3 at entry 2"),
+        (
+            [{"key": LAMP, "initial": [1, 0, 1], "transform": "log"}],
+            "initial",
+            "0 at entry 1; transform: log yields pos",
+        ),
+        ([{"key": LAMP, "initial": -2.0, "transform": "softplus"}], "initial", "begins at -2 at entry 0"),
+        (
+            [{"key": LAMP, "bounds": [0, 3], "transform": "sigmoid"}],
+            "initial",
+            "begins at 3 at entry 2; transform: sigmoid yields values between its bounds, 0 and 3 alone",
+        ),
         ([{"key": LAMP, "initial": ImageFile(file="/none.exr")}], "initial", "is no texture; give a number"),
         ([{"key": TEXTURE, "initial": ImageFile(file="/none.exr")}], "initial.file", "/none.exr: cannot be read"),
     ],

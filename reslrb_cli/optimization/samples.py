@@ -1,0 +1,44 @@
+"""Gradient samples: steps that measure, and leave the parameters as they are."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import drjit as dr
+import numpy as np
+
+from reslrb_cli.integrators import gradient_step
+from reslrb_cli.seeds import seed
+
+if TYPE_CHECKING:
+    from reslrb_cli.optimization.problem import Problem
+
+
+def sample_gradient(problem: Problem, integrator: Any, round: int, purpose: str, spp: int) -> dict[str, Any]:
+    """One step of all views, evaluated, with the seeds of `round` and `purpose`.
+
+    Returns the gradient of each parameter as it is accumulated in `problem.optimizer`; `take_gradient` has to follow.
+    """
+    run = problem.config.run
+    for sensor, target in zip(problem.sensors, problem.targets, strict=True):
+
+        def loss(image: Any, target: Any = target) -> Any:
+            return problem.compare(image, target) / len(problem.sensors)
+
+        step = gradient_step(
+            integrator, problem.scene, sensor, loss, seed=seed(run.seed, round, sensor, purpose),
+            **{**run.step_options(), "spp": spp}, params=problem.selection.params,
+        )  # fmt: skip
+        gradients = {key: problem.optimizer.gradient(key) for key in problem.selection.keys}
+        dr.eval(step.loss, gradients)
+    return gradients
+
+
+def take_gradient(problem: Problem) -> dict[str, np.ndarray[Any, Any]]:
+    """The gradients that have been accumulated, each in a row, 0 where they are not finite; they are cleared."""
+    taken = {}
+    for key in problem.selection.keys:
+        gradient = np.array(problem.optimizer.gradient(key), dtype=np.float32)
+        taken[key] = np.nan_to_num(gradient, nan=0.0, posinf=0.0, neginf=0.0).ravel()
+        problem.optimizer.clear_gradient(key)
+    return taken

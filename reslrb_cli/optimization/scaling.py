@@ -1,0 +1,184 @@
+"""How sensitive image and loss are to each parameter, from samples; and units that make up for it (`scale: auto`).
+
+Let g be the mean of some gradient samples, and z = -sign(g), the direction of Adam's first step, in one parameter x
+alone, all its entries at once. With I(x) the image at common random numbers and T the target,
+
+    D = I(x + h z) - I(x)
+    change = |D| / (h |M|),   length = h sum |D| M / sum D²,   M = max(|I|, |T|)
+
+`change` is the relative change of the image per unit of the parameter. `length` is how far the parameter would have to
+go to make up what image or target hold, by least squares over those pixels that it changes at all: for a light alone in
+its scene its own intensity, for a wall its own albedo, whatever share of the picture they have. h is chosen so that the
+image changes by about 3 %, so that neither rounding nor curvature decides.
+
+Step lengths from `length` make all parameters equally fast for one learning rate, and dividing by the root mean square
+of g keeps an absolute epsilon, as Adam has it, out of the matter.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Any
+
+import drjit as dr
+import numpy as np
+
+from reslrb_cli.integrators import render_image
+from reslrb_cli.optimization.samples import sample_gradient, take_gradient
+from reslrb_cli.optimization.transforms import Bounds, Transform, Variable
+from reslrb_cli.seeds import seed
+
+if TYPE_CHECKING:
+    from reslrb_cli.optimization.problem import Problem
+
+Array = np.ndarray[Any, Any]
+
+#: Gradient samples that a run takes.
+SAMPLES = 4
+#: The part of the image that a change of h replaces: aimed at, and good enough.
+AIM, LEAST, MOST = 0.03, 0.003, 0.3
+#: Renderings for each parameter, at most, until h is found.
+TRIALS = 8
+_PURPOSE = "conditioning"
+
+
+@dataclass(frozen=True)
+class Sensitivity:
+    """What was measured of one parameter of `entries` numbers, in the scene's units.
+
+    `value`, `gradient` and `noise` are root mean squares over the entries: of the values, of the mean gradient over the
+    samples, of the standard deviation of one sample (one step's gradient). `change` is relative, per unit; it and
+    `length` are None where no change of the image was seen.
+    """
+
+    key: str
+    entries: int
+    value: float
+    gradient: float
+    noise: float
+    change: float | None
+    length: float | None
+
+    def to_json(self) -> dict[str, Any]:
+        """As a mapping for JSON."""
+        return asdict(self)
+
+
+def rescale(problem: Problem) -> list[Sensitivity]:
+    """Measure, and let the optimiser move each parameter in units of what was found; return that.
+
+    A parameter without an effect on the image stays as it is.
+    """
+    measured, optimizer = measure_sensitivities(problem, SAMPLES), problem.optimizer
+    for row in measured:
+        if row.length is None or row.gradient == 0:
+            continue
+        variable, value = optimizer.variable(row.key), dr.detach(optimizer[row.key])
+        length = own_length(variable.transform, variable.bounds, value, row.length)
+        # Of the mean gradient's size in every entry, by which the gain is judged.
+        unit = Variable(variable.transform, variable.bounds, length)
+        slope = np.array(unit.chain(unit.from_scene(value), type(value)(row.gradient)), dtype=np.float64)
+        unit.gain = 1 / _rms(slope)
+        optimizer.set_variable(row.key, unit)
+    problem.apply()
+    return measured
+
+
+def own_length(transform: Transform | None, bounds: Bounds, value: Any, length: float) -> float:
+    """What `length`, of the scene's `value`, is in the optimiser's variable: a mean over the entries."""
+    if transform is None:
+        return length
+    low, high = bounds or (-math.inf, math.inf)
+    if math.isfinite(low) and math.isfinite(high):  # half way to the farther bound, at most
+        room = dr.select(value < 0.5 * (low + high), high - value, low - value)
+        moved = value + dr.clip(room, -2 * length, 2 * length) / 2
+    else:
+        moved = value + length
+    distance = np.array(dr.abs(transform.inverse(moved) - transform.inverse(value)), dtype=np.float64)
+    return float(distance.mean())
+
+
+def measure_sensitivities(problem: Problem, samples: int) -> list[Sensitivity]:
+    """Measure every parameter of `problem` where it stands, by `samples` gradients and a few images, each with the
+    run's samples per pixel."""
+    problem.apply()
+    rows: dict[str, list[Array]] = {key: [] for key in problem.selection.keys}
+    total: dict[str, Any] = {}
+    for round in range(samples):
+        for key, gradient in sample_gradient(
+            problem, problem.integrator, round, _PURPOSE, problem.config.run.spp
+        ).items():
+            finite = dr.select(dr.isfinite(gradient), gradient, 0)
+            total[key] = finite if round == 0 else total[key] + finite
+        for key, row in take_gradient(problem).items():
+            rows[key].append(row.astype(np.float64))
+    base = _images(problem)
+    targets = [np.array(target, dtype=np.float64) for target in problem.targets]
+    reference = [np.maximum(np.abs(a), np.abs(b)) for a, b in zip(base, targets, strict=True)]
+    found = []
+    for key, gradients in rows.items():
+        value = problem.selection.array(key)
+        change, length = _probe(problem, key, _downhill(total[key]), base, reference)
+        found.append(
+            Sensitivity(
+                key=key,
+                entries=value.size,
+                value=_rms(value),
+                gradient=_rms(np.mean(gradients, axis=0)),
+                noise=_rms(np.std(gradients, axis=0, ddof=1)) if samples > 1 else math.nan,
+                change=change,
+                length=length,
+            )
+        )
+    problem.apply()
+    return found
+
+
+def _probe(
+    problem: Problem, key: str, direction: Any, base: Sequence[Array], reference: Sequence[Array]
+) -> tuple[float | None, float | None]:
+    """`change` and `length` of one parameter, along `direction`; None where the image does not change."""
+    value = dr.detach(problem.optimizer[key])
+    low, high = problem.selection.spec(key).bounds or (-math.inf, math.inf)
+    # 1 % of the parameter, whatever its unit; of its range where it is 0; a guess where it has none.
+    step = 0.01 * (_rms(np.array(value)) or (high - low if math.isfinite(high - low) else 1.0))
+    best: tuple[float | None, float | None] = (None, None)
+    for _ in range(TRIALS):
+        step = min(step, 0.5 * (high - low))
+        moved = value + direction * step
+        moved = dr.select((moved < low) | (moved > high), value - direction * step, moved)
+        dr.make_opaque(moved)
+        problem.apply({key: moved})
+        difference = [a - b for a, b in zip(_images(problem), base, strict=True)]
+        squares = sum(float(np.square(d).sum()) for d in difference)
+        shared = sum(float((np.abs(d) * r).sum()) for d, r in zip(difference, reference, strict=True))
+        if not (0 < squares < math.inf and 0 < shared < math.inf):
+            step *= 1e3 if squares == 0 else 1e-3
+            continue
+        share = squares / shared
+        norm = math.sqrt(sum(float(np.square(r).sum()) for r in reference))
+        best = math.sqrt(squares) / (step * norm), min(step / share, high - low)
+        if LEAST <= share <= MOST or (share < LEAST and step == 0.5 * (high - low)):
+            break
+        step *= AIM / share
+    return best
+
+
+def _downhill(gradient: Any) -> Any:
+    """-1, 0 or 1 in each entry."""
+    return dr.select(gradient == 0, 0, -dr.sign(gradient))
+
+
+def _images(problem: Problem) -> list[Array]:
+    """Every view as the scene stands, without alpha, always from the same seeds."""
+    run, images = problem.config.run, []
+    for sensor, target in zip(problem.sensors, problem.targets, strict=True):
+        image = render_image(problem.integrator, problem.scene, sensor, seed(run.seed, 0, sensor, _PURPOSE), run.spp)
+        images.append(np.array(image, dtype=np.float64)[:, :, : target.shape[2]])
+    return images
+
+
+def _rms(values: Array) -> float:
+    return float(np.sqrt(np.mean(np.square(values, dtype=np.float64))))

@@ -1,0 +1,125 @@
+"""Measured sensitivities, the units made of them, and what they do for a stiff problem."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from reslrb_cli.config import load
+from reslrb_cli.optimization import assemble, find_reached, optimize
+from reslrb_cli.optimization.optimizers import Optimizer
+from reslrb_cli.optimization.scaling import measure_sensitivities, own_length
+from reslrb_cli.optimization.transforms import Variable, make_transform
+
+CONFIG = Path(__file__).resolve().parents[2] / "configs" / "stiff" / "lamp.yaml"
+TINY = ["scene.options={resx: 12, resy: 12}", "integrator.max_depth=2", "run.spp=32", "run.reach_spp=16",
+        "target.render.integrator.max_depth=2", "target.render.spp=256"]  # fmt: skip
+FLOOR, LAMP = "floor.reflectance.value", "lamp.intensity.value"
+
+
+def measured(*sets, samples=4):
+    return {row.key: row for row in measure_sensitivities(assemble(load(CONFIG, [*TINY, *sets])), samples)}
+
+
+def relative_errors(problem):
+    truth = problem.truth
+    return [np.linalg.norm(problem.selection.array(key) - truth[key]) / np.linalg.norm(truth[key]) for key in truth]
+
+
+def test_a_planted_ratio_is_found():
+    """A lamp in units of a millionth, over the same picture: its sensitivity falls by a million, the floor's stays."""
+    before = measured()
+    after = measured("parameters[1].initial=3e12", f"target.render.parameters.{LAMP}=[1.2e13, 1.0e13, 0.6e13]")
+    assert before[LAMP].change / after[LAMP].change == pytest.approx(1e6, rel=1e-3)
+    assert after[LAMP].length / before[LAMP].length == pytest.approx(1e6, rel=1e-3)
+    # the loss goes with the square of the image
+    assert after[LAMP].gradient / before[LAMP].gradient == pytest.approx(1e6, rel=1e-3)
+    assert after[FLOOR].gradient / before[FLOOR].gradient == pytest.approx(1e12, rel=1e-3)
+    assert after[FLOOR].change == pytest.approx(before[FLOOR].change, rel=1e-3)
+    assert after[FLOOR].length == pytest.approx(before[FLOOR].length, rel=1e-3)
+
+
+def test_a_lamp_alone_has_its_own_intensity_as_its_length():
+    found = measured("parameters[1].initial=1e7", f"target.render.parameters.{LAMP}=1e7",
+                     f"target.render.parameters.{FLOOR}=0.5", "run.spp=512")  # fmt: skip
+    assert found[LAMP].length == pytest.approx(1e7, rel=0.05)
+    assert found[LAMP].change == pytest.approx(1e-7, rel=0.05)
+    assert (found[LAMP].entries, found[LAMP].value) == (3, 1e7)
+    # direct light is proportional to the albedo of what it falls on, in a part of the picture
+    assert found[FLOOR].length == pytest.approx(0.5, rel=0.05)
+    assert found[FLOOR].change < 1 / 0.5
+
+
+def test_noise_is_that_of_one_step():
+    few, many = measured(samples=16), measured("run.spp=512", samples=16)
+    for key in (FLOOR, LAMP):
+        assert few[key].noise / many[key].noise == pytest.approx(4, rel=0.5)
+
+
+def test_measuring_leaves_everything_as_it_was():
+    problem = assemble(load(CONFIG, TINY))
+    before = problem.values()
+    measure_sensitivities(problem, 2)
+    for key, value in before.items():
+        np.testing.assert_array_equal(problem.selection.array(key), value)
+        assert not np.array(problem.optimizer.gradient(key)).any()
+
+
+def test_what_has_no_effect_is_not_scaled():
+    """At depth 1 nothing but emitters is seen, and a point has no size."""
+    problem = assemble(load(CONFIG, [*TINY, "integrator={estimator: gather, max_depth: 1}", "run.iterations=1"]))
+    problem.truth.clear()
+    list(optimize(problem))
+    for row in problem.sensitivities:
+        assert (row.change, row.length, row.gradient) == (None, None, 0.0)
+        assert problem.optimizer.variable(row.key).length == 1.0
+
+
+def test_own_lengths():
+    value = mi.Color3f(0.5, 1.0, 4.0)
+    assert own_length(None, None, value, 3.0) == 3.0
+    assert own_length(make_transform("log", None), None, value, 3.0) == pytest.approx(
+        np.mean(np.log1p(3 / np.array([0.5, 1, 4]))), rel=1e-5
+    )
+    sigmoid = make_transform("sigmoid", (0.0, 1.0))
+    for x, length, moved in ((0.5, 0.1, 0.6), (0.2, 5.0, 0.6), (0.9, 5.0, 0.45), (0.9, 0.1, 0.8)):
+        expected = abs(np.log(moved / (1 - moved)) - np.log(x / (1 - x)))
+        assert own_length(sigmoid, (0.0, 1.0), mi.Float(x), length) == pytest.approx(expected, rel=1e-4)
+
+
+@pytest.mark.parametrize("type", ["adam", "adamw", "rmsprop", "sgd"])
+def test_in_units_of_its_own_no_scale_is_left(type):
+    """The same problem in units of 1e6 and 1, and its loss times 1e-12: equal steps, weight decay and epsilon too."""
+
+    def descend(unit, loss):
+        optimizer = Optimizer(type, 0.02, {}, {"p": mi.TensorXf(np.array([0.3, 0.7], np.float32) * unit)},
+                              {"p": None}, {"p": None})  # fmt: skip
+        optimizer.set_variable("p", Variable(None, None, unit, gain=1 / (loss / unit) / unit))
+        for _ in range(20):
+            dr.backward(dr.sum(dr.square(optimizer["p"] / unit - 0.9) * loss, axis=None))
+            optimizer.step(1.0)
+        return np.array(optimizer["p"]) / unit
+
+    expected = descend(1.0, 1.0)
+    assert (np.abs(expected - 0.9) < np.abs(np.array([0.3, 0.7]) - 0.9)).all()
+    np.testing.assert_allclose(descend(1e6, 1.0), expected, rtol=1e-4)
+    np.testing.assert_allclose(descend(1.0, 1e-12), expected, rtol=1e-4)
+
+
+def test_a_stiff_problem_is_solved_with_one_learning_rate():
+    """An albedo with an intensity of 1e7: a tenth of the error of plain Adam at its best learning rate."""
+
+    def error(*sets):
+        problem = assemble(load(CONFIG, [*TINY, "run.iterations=100", "run.spp=16", "run.adjoint=independent", *sets]))
+        find_reached(problem)
+        records = list(optimize(problem))
+        assert len(records) == 100
+        return np.sqrt(np.mean(np.square(relative_errors(problem))))
+
+    plain = [error("optimizer.scale=none", f"optimizer.learning_rate={rate:g}")
+             for rate in (0.003, 0.03, 0.3, 30, 3e3, 3e5, 3e6)]  # fmt: skip
+    assert error("optimizer.learning_rate=0.1") < 0.1 * min(plain)
