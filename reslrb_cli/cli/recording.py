@@ -18,6 +18,7 @@ from reslrb_cli.records.manifest import Manifest, Status
 from reslrb_cli.records.metrics import MetricsWriter, Record
 from reslrb_cli.records.parameters import write_mask, write_parameters
 from reslrb_cli.records.run_folder import RunFolder
+from reslrb_cli.records.tally import NonFiniteTally
 from reslrb_cli.report import write_report
 
 logger = logging.getLogger(__name__)
@@ -38,6 +39,7 @@ class Recording:
     first: Record | None = None
     last: Record | None = None
     errors: dict[str, dict[str, float]] = field(default_factory=dict)
+    nonfinite: NonFiniteTally = field(default_factory=NonFiniteTally)
 
     @property
     def done(self) -> int:
@@ -88,6 +90,7 @@ class Recording:
                     self._note_scaling(self.problem.sensitivities)
                 self.first, self.last = self.first or record, record
                 metrics.write(record)
+                self.nonfinite.add(record)
                 show(record)
                 self._check_memory(record)
                 if stop():
@@ -122,6 +125,7 @@ class Recording:
             "loss": self.last and _json_number(self.last.loss),
             "elapsed_s": self.last and self.last.elapsed_s,
             "parameter_rmse": self.errors,
+            "nonfinite": self.nonfinite.to_json(),
         }
         write_parameters(self.folder.parameters, self.problem.values())
         self._save_checkpoint()

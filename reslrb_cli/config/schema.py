@@ -241,6 +241,13 @@ class RunConfig(Section):
         "as 512 MiB or 2GiB. The samples of a step are split into passes that fit. null: no limit. Only with "
         "integrator `reslrb`.",
     )
+    on_nonfinite: Literal["stop", "skip", "zero"] = Field(
+        default="skip",
+        description="What to do where a loss, its derivative, or a gradient is not finite. `stop`: end the run (exit "
+        "code 5); `skip`: leave the parameter as it is in this iteration, or all of them; `zero`: take such entries of "
+        "a gradient or of the loss's derivative for 0, and go on. No such value ever reaches a parameter; a run that "
+        "comes to a standstill for 10 iterations ends.",
+    )
     images_every: Annotated[int, Field(ge=0)] = Field(
         default=0, description="Iterations between two saved images; 0: only the initial and the final one."
     )

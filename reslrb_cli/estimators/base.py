@@ -11,7 +11,7 @@ import drjit as dr
 import mitsuba as mi
 
 from reslrb_cli.transport.connection import Connection, stand_in
-from reslrb_cli.transport.factors import NO_ZERO, Product
+from reslrb_cli.transport.factors import NO_ZERO, Product, showing
 from reslrb_cli.transport.plan import Plan
 from reslrb_cli.transport.splat import AdjointImage, Film
 from reslrb_cli.transport.transmittance import transmittance
@@ -119,14 +119,14 @@ def adjoint_of_factor(adjoint: PathAdjoint, index: Any, f: Any, rest: Any) -> An
     A factor that is not zero gets adjoint / f where no factor is zero; one that is, adjoint * rest where it is the only
     one.
     """
-    f, zeros = dr.detach(f), adjoint.product.zero
+    f, value, zeros = dr.detach(f), adjoint.value, adjoint.product.zero
     if not zeros:
-        return dr.select(f != 0, adjoint.value / f, 0)
+        return dr.select(f != 0, showing(value / f), 0)
     result, rest = mi.Spectrum(0), mi.Spectrum(rest)
     for c, zero in enumerate(zeros):
-        at_zero = dr.select(zero == mi.Int32(index), adjoint.value[c] * rest[c], 0)
-        result[c] = dr.select((zero == NO_ZERO) & (f[c] != 0), adjoint.value[c] / f[c], at_zero)
-    return result
+        at_zero = dr.select(zero == mi.Int32(index), value[c] * rest[c], 0)
+        result[c] = dr.select((zero == NO_ZERO) & (f[c] != 0), value[c] / f[c], at_zero)
+    return showing(result)
 
 
 def differentiate_passage(

@@ -30,7 +30,7 @@ from reslrb_cli.estimators.base import (
     one_of,
 )
 from reslrb_cli.estimators.events import Event, differentiate_event
-from reslrb_cli.estimators.reservoir import selection_weight, slot_adjoint
+from reslrb_cli.estimators.reservoir import is_taken, selection_weight, slot_adjoint
 from reslrb_cli.transport.connection import Connection
 from reslrb_cli.transport.factors import Product
 from reslrb_cli.transport.plan import Plan
@@ -103,8 +103,7 @@ class EventSelection(VertexHooks):
             if plan.differentiate_bsdfs:  # else emission is the one event
                 event = dr.select(numbers[3 * k] * Q < q, this, event)
             pair = Slot(w, C, connection.u, event)
-            keep = (w * Q > 0) & (numbers[3 * k + 1] * W < w * Q)
-            slots.append(dr.select(keep, pair, slot))
+            slots.append(dr.select(is_taken(numbers[3 * k + 1], w * Q, W), pair, slot))
         return EventState(state.Q, W, state.prefix, slots, numbers[2::3])
 
     def scattering(
@@ -151,4 +150,4 @@ class EventEstimator(Estimator):
         differentiate_emission(p, emission_weight)
         if p.plan.differentiate_bsdfs:
             for slot, adjoint in zip(state.slots, adjoints, strict=True):
-                differentiate_event(p, slot.event, adjoint, slot.w > 0)
+                differentiate_event(p, slot.event, adjoint, slot.w != 0)

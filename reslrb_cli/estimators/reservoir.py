@@ -82,14 +82,22 @@ def selection_weight(p: Pass, weight: str, connection: Connection, C: Product) -
     return dr.sum(dr.abs(p.delta(connection.u, connection.active) * value))
 
 
+def is_taken(number: Any, w: Any, W: Any) -> Any:
+    """Whether a candidate of weight `w` takes the slot, `W` being the sum up to it: with probability w / W.
+
+    A weight that is not finite is always taken, and so is all that follows: what is wrong must not be lost.
+    """
+    return (w != 0) & ((number * W < w) | ~dr.isfinite(W))
+
+
 def unselected(W: Any, slot: Any, capacity: int) -> Any:
     """W / (m w): 1 over the probability of a slot's selection, shared among the slots; 0 where it holds nothing."""
-    return dr.select(slot.w > 0, W / (capacity * slot.w), 0)
+    return dr.select(slot.w != 0, W / (capacity * slot.w), 0)
 
 
 def slot_adjoint(p: Pass, W: Any, slot: Any, capacity: int) -> PathAdjoint:
     """Sensitivity of the objective to what a slot holds (`w`, `C`, `u`), standing for all that it was chosen from."""
-    delta = p.delta(slot.u, slot.w > 0)
+    delta = p.delta(slot.u, slot.w != 0)
     return PathAdjoint(delta * slot.C.nonzero * unselected(W, slot, capacity), slot.C)
 
 
@@ -115,7 +123,7 @@ class ReservoirSelection(VertexHooks):
         event = [Event.of_connection(plan, vertex, connection)] if plan.differentiate_bsdfs else []
         this = Slot(w, vertex.depth, C, connection.u, event)
         slots = [
-            dr.select((w > 0) & (number * W < w), this, slot) for number, slot in zip(numbers, state.slots, strict=True)
+            dr.select(is_taken(number, w, W), this, slot) for number, slot in zip(numbers, state.slots, strict=True)
         ]
         return ReservoirState(W, slots)
 

@@ -13,7 +13,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from reslrb_cli.transport.factors import NO_ZERO, Product
+from reslrb_cli.transport.factors import NO_ZERO, Product, showing
 
 
 @dataclass
@@ -60,7 +60,7 @@ class AdjointSum:
             behind = (self.behind_zero[0] + self.behind_zero[1]) * rest
             for c, zero in enumerate(prefix.zero):
                 result[c] = dr.select((f[c] == 0) & (zero == NO_ZERO), behind[c], result[c])
-        return result
+        return showing(result)
 
     def adjoint_of_emission(self, E: Any) -> Any:
         """d(sum)/dE (C,)."""

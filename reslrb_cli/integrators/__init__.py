@@ -1,6 +1,16 @@
 """Integrators behind one interface: our light tracers as Mitsuba plugins, stock baselines, and the gradient step."""
 
 from reslrb_cli.integrators.adapter import register
+from reslrb_cli.integrators.refusal import Refused, first_channels
 from reslrb_cli.integrators.step import StepResult, gradient_step, known_step, make_integrator, render_image
 
-__all__ = ["StepResult", "gradient_step", "known_step", "make_integrator", "register", "render_image"]
+__all__ = [
+    "Refused",
+    "StepResult",
+    "first_channels",
+    "gradient_step",
+    "known_step",
+    "make_integrator",
+    "register",
+    "render_image",
+]

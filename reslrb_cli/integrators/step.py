@@ -9,13 +9,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import drjit as dr
 import mitsuba as mi
 
 from reslrb_cli.integrators.adapter import register, resolve_sensor
+from reslrb_cli.integrators.refusal import Refused
 
 Adjoint = Literal["correlated", "independent", "batched"]
 FirstBatch = Literal["image", "again"]
@@ -27,10 +28,14 @@ BATCH_STREAM = 0xBA7C4E5  # keeps the batches' seeds apart from those of passes 
 
 @dataclass
 class StepResult:
-    """What a step yields besides gradients: the image (H, W, C) and the loss (width 1), both detached."""
+    """What a step yields besides gradients: the image (H, W, C) and the loss (width 1), both detached.
+
+    Entries of dL/dI that are not finite count as 0; `refused` says how many there were, and where the first.
+    """
 
     image: Any
     loss: Any
+    refused: Refused = field(default_factory=Refused)
 
 
 def make_integrator(type: str, **options: Any) -> Any:
@@ -73,28 +78,31 @@ def gradient_step(
     params = params if params is not None else mi.traverse(scene)
     if adjoint == "batched":
         return _batched(integrator, scene, sensor, objective, seed, spp, params, batches, first_batch)
-    image_seed = mi.UInt32(seed)
+    image_seed, refused = mi.UInt32(seed), Refused()
     dr.make_opaque(image_seed)
-    if hasattr(integrator, "trace"):  # reslrb
-        return _replayed(integrator, scene, sensor, objective, image_seed, spp, adjoint, params, on_image)
+    if hasattr(integrator, "trace") and adjoint == "correlated":  # reslrb
+        trace = integrator.trace(scene, sensor, image_seed, spp, params)
+        loss, gradient = _derivative(objective, trace.image, refused, on_image)
+        integrator.replay(trace, gradient, params)
+        return StepResult(trace.image, loss, refused)
     replays = not isinstance(integrator, mi.AdjointIntegrator) and not hasattr(integrator, "attached_image")
     if replays or adjoint == "independent":
         gradient_seed = image_seed if adjoint == "correlated" else second_seed(image_seed)
         with dr.suspend_grad():
             image = integrator.render(scene, sensor, image_seed, spp)
-        loss, gradient = _derivative(objective, image, on_image)
+        loss, gradient = _derivative(objective, image, refused, on_image)
         # Isolated, so that another view's propagation finds the edges above the scene's parameters intact.
         with _naive_ad(integrator), dr.isolate_grad():
             integrator.render_backward(scene, params, gradient, sensor, gradient_seed, spp)
-        return StepResult(image, loss)
+        return StepResult(image, loss, refused)
     with _naive_ad(integrator), dr.isolate_grad():  # as above
         if hasattr(integrator, "attached_image"):
             image = integrator.attached_image(scene, sensor, image_seed, spp, params)
         else:
             image = integrator.render(scene, sensor, image_seed, spp, develop=True, evaluate=False)
-        loss = objective(image)
-        dr.backward_from(loss)
-    return StepResult(dr.detach(image), dr.detach(loss))
+        loss, gradient = _derivative(objective, dr.detach(image), refused)
+        dr.backward_from(image * gradient)
+    return StepResult(dr.detach(image), loss, refused)
 
 
 def known_step(
@@ -105,33 +113,20 @@ def known_step(
     One set of samples for both; an estimator of `reslrb` that can splats and differentiates in one traversal. The rest
     is as in `gradient_step`.
     """
-    gradient = dr.detach(gradient)
+    refused = Refused()
+    gradient = refused.take(dr.detach(gradient))
 
     def objective(image: Any) -> Any:
         return dr.sum((image * gradient).array)
 
     if not hasattr(integrator, "fused"):
-        return gradient_step(integrator, scene, sensor, objective, seed=seed, spp=spp, params=params)
+        step = gradient_step(integrator, scene, sensor, objective, seed=seed, spp=spp, params=params)
+        return StepResult(step.image, step.loss, refused)
     params = params if params is not None else mi.traverse(scene)
     image_seed = mi.UInt32(seed)
     dr.make_opaque(image_seed)
     image = integrator.fused(scene, resolve_sensor(scene, sensor), image_seed, spp, gradient, params)
-    return StepResult(image, objective(image))
-
-
-def _replayed(integrator: Any, scene: Any, sensor: Any, objective: Objective, seed: Any, spp: int, adjoint: Adjoint,
-              params: Any, on_image: Callable[[], None] | None) -> StepResult:  # fmt: skip
-    if adjoint == "independent":
-        with dr.suspend_grad():
-            image = integrator.render(scene, sensor, seed, spp)
-        loss, gradient = _derivative(objective, image, on_image)
-        gradient_seed = second_seed(seed)
-        integrator.render_backward(scene, params, gradient, sensor, gradient_seed, spp)
-        return StepResult(image, loss)
-    trace = integrator.trace(scene, sensor, seed, spp, params)
-    loss, gradient = _derivative(objective, trace.image, on_image)
-    integrator.replay(trace, gradient, params)
-    return StepResult(trace.image, loss)
+    return StepResult(image, objective(image), refused)
 
 
 def _batched(integrator: Any, scene: Any, sensor: Any, objective: Objective, seed: Any, spp: int, params: Any,
@@ -149,30 +144,32 @@ def _batched(integrator: Any, scene: Any, sensor: Any, objective: Objective, see
     share = 1 / (batches if first_batch == "again" else batches - 1)
     with dr.suspend_grad():
         first = integrator.render(scene, sensor, seeds[0], size)
-    image = first
+    image, refused = first, Refused()
     for b in range(1, batches):
-        _, gradient = _derivative(objective, image, None)
+        _, gradient = _derivative(objective, image, refused)
         step = known_step(integrator, scene, sensor, gradient * share, seed=seeds[b], spp=size, params=params)
         image = image + (step.image - image) / (b + 1)
         dr.eval(image)
     if first_batch == "again":
         others = (image * batches - first) / (batches - 1)
-        _, gradient = _derivative(objective, others, None)
+        _, gradient = _derivative(objective, others, refused)
         with _naive_ad(integrator), dr.isolate_grad():
             integrator.render_backward(scene, params, gradient * share, sensor, seeds[0], size)
-    return StepResult(image, dr.detach(objective(image)))
+    return StepResult(image, dr.detach(objective(image)), refused)
 
 
-def _derivative(objective: Objective, image: Any, on_image: Callable[[], None] | None) -> tuple[Any, Any]:
-    """Loss and dL/dI, evaluated in one go."""
+def _derivative(
+    objective: Objective, image: Any, refused: Refused, on_image: Callable[[], None] | None = None
+) -> tuple[Any, Any]:
+    """Loss and dL/dI, evaluated in one go; what of the latter is not finite is refused."""
     with dr.resume_grad(), dr.isolate_grad():
         attached = type(image)(image)
         dr.enable_grad(attached)
         loss = objective(attached)
         dr.backward_from(loss)
         gradient = dr.grad(attached)
-    loss = dr.detach(loss)
-    dr.eval(loss, gradient)
+    loss, gradient = dr.detach(loss), refused.take(dr.detach(gradient))
+    dr.eval(loss, gradient, refused)
     if on_image is not None:
         on_image()
     return loss, gradient

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from reslrb_cli.integrators import gradient_step, make_integrator, render_image
+from reslrb_cli.integrators import first_channels, gradient_step, make_integrator, render_image
 from reslrb_cli.measure.small_scenes import load
 
 
@@ -92,7 +92,7 @@ class Case:
         """sum(image * weights) over the colour channels."""
         import drjit as dr
 
-        return dr.sum(image[:, :, : self.weights.shape[2]] * self.weights, axis=None)
+        return dr.sum(first_channels(image, self.weights.shape[2]) * self.weights, axis=None)
 
     def gradient(self, integrator: Any, seed: int, spp: int, objective: Callable | None = None,
                  step: Callable = gradient_step, **options: Any) -> np.ndarray:  # fmt: skip

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import functools
+import math
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import drjit as dr
 
-from reslrb_cli.integrators import gradient_step
-from reslrb_cli.optimization.constraints import NonFiniteWatch, count_nonfinite, finite_square_norm
+from reslrb_cli.integrators import Refused, gradient_step
+from reslrb_cli.optimization.constraints import count_nonfinite, finite_square_norm
+from reslrb_cli.optimization.nonfinite import Findings, NonFinitePolicy, RefusedAt, zero_nonfinite
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.scaling import rescale
 from reslrb_cli.optimization.schedules import learning_rate_factor
@@ -19,16 +21,16 @@ from reslrb_cli.records.metrics import Record
 from reslrb_cli.seeds import seed
 
 
-def optimize(problem: Problem) -> Iterator[Record]:
+def optimize(problem: Problem, on_nonfinite: Callable[[Findings], None] = lambda found: None) -> Iterator[Record]:
     """Run the iterations of `problem`, one record each; the parameters are updated when a record is yielded.
 
     An iteration is a step (image, loss and gradient of every sensor; the loss is the mean over the sensors) and an
-    update. A parameter whose gradient is not finite is not updated in that iteration; where the loss is not
-    finite, none is. Raises NonFinite where that goes on (see `NonFiniteWatch`). `optimizer.scale: auto` measures
-    before the first iteration, and `elapsed_s` counts that.
+    update. What is not finite reaches no parameter; what happens instead, and when NonFinite is raised, is in
+    `NonFinitePolicy`. `on_nonfinite` is told of it before the update, while the scene is as it was in the step.
+    `optimizer.scale: auto` measures before the first iteration, and `elapsed_s` counts that.
     """
     config = problem.config
-    clock, watch = StepClock(), NonFiniteWatch()
+    clock, policy = StepClock(), NonFinitePolicy(config.run.on_nonfinite)
     reset_peak()
     if config.optimizer.scale == "auto":
         with clock.counted():
@@ -37,18 +39,21 @@ def optimize(problem: Problem) -> Iterator[Record]:
         rmse = problem.parameter_rmse()
         with clock.step() as times:
             split = Split()
-            loss, squares, counts = gradient(problem, iteration, split)
+            loss, squares, counts, refused = gradient(problem, iteration, split)
             dr.eval(loss, squares, counts)
         factor = learning_rate_factor(
             config.optimizer.schedule, iteration, config.run.iterations, config.optimizer.final_fraction
         )
         with clock.counted():
             value = float(loss[0])
-            bad = {key: int(count[0]) for key, count in counts.items() if count[0]}
-            lossless = not dr.isfinite(value)
-            overflowed = problem.optimizer.step(factor, skip=problem.optimizer.keys() if lossless else list(bad))
+            found = _findings(problem, iteration, value, counts, refused)
+            if found:
+                on_nonfinite(found)
+            held = policy.held(found, problem.optimizer.keys())
+            for key in found.gradients if policy.kind == "zero" else ():
+                zero_nonfinite(problem.optimizer[key])
+            found.updates = problem.optimizer.step(factor, skip=held)
             problem.apply()
-        nonfinite = int(lossless) + sum(bad.values()) + sum(overflowed.values())
         yield Record(
             iteration=iteration,
             loss=value,
@@ -61,10 +66,22 @@ def optimize(problem: Problem) -> Iterator[Record]:
             spp=config.run.spp,
             lr=config.optimizer.learning_rate * factor,
             grad_norm=float(sum(float(square[0]) for square in squares.values()) ** 0.5),
-            nonfinite=nonfinite,
+            nonfinite=found.total,
             parameter_rmse=rmse,
+            nonfinite_by_parameter=found.by_parameter,
         )
-        watch.see(iteration, nonfinite, "the loss" if lossless else ", ".join({**bad, **overflowed}))
+        policy.see(found, held)
+
+
+def _findings(problem: Problem, iteration: int, loss: float, counts: dict[str, Any], refused: list[Any]) -> Findings:
+    """What of a step was not finite; `refused` are the steps' counts, one a view."""
+    found = Findings(iteration, loss=not math.isfinite(loss))
+    found.gradients = {key: int(count[0]) for key, count in counts.items() if count[0]}
+    found.lost = [key for key, bad in found.gradients.items() if bad == dr.prod(dr.shape(problem.optimizer[key]))]
+    for sensor, view in zip(problem.sensors, refused, strict=True):
+        if view.count[0]:
+            found.refused[sensor] = RefusedAt(int(view.count[0]), view.entry())
+    return found
 
 
 class Split:
@@ -93,11 +110,14 @@ class Split:
             self.primal_ms = None
 
 
-def gradient(problem: Problem, iteration: int, split: Split) -> tuple[Any, dict[str, Any], dict[str, Any]]:
+def gradient(
+    problem: Problem, iteration: int, split: Split
+) -> tuple[Any, dict[str, Any], dict[str, Any], list[Refused]]:
     """Accumulate the gradient of the loss into the parameters.
 
-    `split` is told of each view's parts. Returns width-1 arrays: the loss, and for each parameter the gradient's sum
-    of squares (of its finite entries) and the number of entries that are not finite.
+    `split` is told of each view's parts. Returns width-1 arrays: the loss, for each parameter the gradient's sum
+    of squares (of its finite entries) and the number of entries that are not finite, and for each view what was
+    refused.
     """
     run, optimizer = problem.config.run, problem.optimizer
     views = len(problem.sensors)
@@ -106,6 +126,7 @@ def gradient(problem: Problem, iteration: int, split: Split) -> tuple[Any, dict[
         return problem.compare(image, target) / views
 
     total: Any = 0.0
+    refused = []
     for sensor, target in zip(problem.sensors, problem.targets, strict=True):
         split.start()
         step = gradient_step(
@@ -122,6 +143,7 @@ def gradient(problem: Problem, iteration: int, split: Split) -> tuple[Any, dict[
         gradients = {key: optimizer.gradient(key) for key in optimizer.keys()}  # noqa: SIM118 (not a mapping)
         dr.eval(step.loss, gradients)
         total = total + step.loss
+        refused.append(step.refused)
     split.end()
     squares = {key: finite_square_norm(value) for key, value in gradients.items()}
-    return total, squares, {key: count_nonfinite(value) for key, value in gradients.items()}
+    return total, squares, {key: count_nonfinite(value) for key, value in gradients.items()}, refused

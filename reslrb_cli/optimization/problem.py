@@ -12,7 +12,7 @@ import numpy as np
 
 from reslrb_cli.config import Config, Integrator, ParameterSpec, Reslrb
 from reslrb_cli.errors import ConfigError, UnsupportedScene
-from reslrb_cli.integrators import make_integrator
+from reslrb_cli.integrators import first_channels, make_integrator
 from reslrb_cli.optimization.budget import MemoryPlan
 from reslrb_cli.optimization.choice import Cache, find_options, settle_integrator
 from reslrb_cli.optimization.losses import Loss, make_loss
@@ -72,8 +72,7 @@ class Problem:
 
     def compare(self, image: Any, target: Any) -> Any:
         """The loss of an (H, W, C) image, attached; alpha is left out."""
-        colors = target.shape[2]
-        return self.loss(image if image.shape[2] == colors else image[:, :, :colors], target)
+        return self.loss(first_channels(image, target.shape[2]), target)
 
     def values(self) -> dict[str, Array]:
         """The parameters' current values."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -20,7 +20,8 @@ class Record:
     left out), `codegen_ms` the part of it in which kernels were generated and compiled. `primal_ms` and `adjoint_ms`
     are None where one kernel does both. `elapsed_s` is the time since the start in steps and updates; files and
     the reading of `parameter_rmse` are not in it. `peak_mib` is the allocator's high-water mark since the start.
-    `nonfinite` counts the entries of loss and gradient that were not finite; `grad_norm` leaves them out.
+    `nonfinite` counts the entries of loss, of its derivative by the image and of gradients that were not finite;
+    `grad_norm` leaves them out. `nonfinite_by_parameter` holds those of gradients and updates, of parameters with any.
     `parameter_rmse` is taken over the entries that light and sensor reach, None where the true value is not known.
     """
 
@@ -37,6 +38,7 @@ class Record:
     grad_norm: float
     nonfinite: int
     parameter_rmse: float | None
+    nonfinite_by_parameter: dict[str, int] = field(default_factory=dict)
 
     def to_json(self) -> str:
         """The record as one line of JSON, non-finite numbers as null (JSON has none)."""

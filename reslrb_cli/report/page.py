@@ -53,13 +53,23 @@ def write_report(folder: Path) -> Path:
 def _summary(manifest: Mapping[str, Any]) -> str:
     error = f": {html.escape(manifest['error'])}" if manifest.get("error") else ""
     line = f"<p>Status: <b>{html.escape(str(manifest.get('status', 'unknown')))}</b>{error}</p>"
-    errors = manifest.get("results", {}).get("parameter_rmse", {})
+    results = manifest.get("results", {})
+    line += _not_finite(results.get("nonfinite", {}))
+    errors = results.get("parameter_rmse", {})
     rows = "".join(
         f"<tr><td>{html.escape(key)}</td><td>{_number(entry['initial'])}</td><td>{_number(entry['final'])}</td></tr>"
         for key, entry in errors.items()
     )
     head = "<tr><th>parameter</th><th>initial RMSE</th><th>final RMSE</th></tr>"
     return line + (f"<table>{head}{rows}</table>" if rows else "")
+
+
+def _not_finite(tally: Mapping[str, Any]) -> str:
+    if not tally.get("iterations"):
+        return ""
+    rows = "".join(f"<li>{html.escape(key)}: {count}</li>" for key, count in tally["by_parameter"].items())
+    text = f"{tally['values']} values were not finite, in {tally['iterations']} iterations; none reached a parameter."
+    return f"<p>{text}</p><ul>{rows}</ul>"
 
 
 def _number(value: float | None) -> str:

@@ -20,6 +20,15 @@ NO_ZERO = -1  # no factor of this channel is zero
 MANY_ZEROS = -2  # two or more are: value and derivatives vanish
 
 
+def showing(value: Any) -> Any:
+    """`value`, with infinity in place of NaN where the backend's atomic sums would drop that.
+
+    On a CPU they pass over a NaN unless it shares its address with other numbers of the same packet (Dr.Jit 1.5): it
+    would vanish from images and gradients, which are then finite, and wrong.
+    """
+    return dr.select(dr.isnan(value), dr.inf, value) if dr.backend_v(value) == dr.JitBackend.LLVM else value
+
+
 @dataclass
 class Product:
     """A product of factors, one value per channel; part of the loop state.

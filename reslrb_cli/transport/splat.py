@@ -11,6 +11,8 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from reslrb_cli.transport.factors import showing
+
 N_COLOR = 3  # a film's block holds R, G, B, perhaps alpha, and a weight that light tracing leaves at 0
 
 
@@ -33,6 +35,8 @@ class Film:
     def put(self, block: Any, u: Any, value: Any, active: Any) -> None:
         """Add `value` (C,) at film position `u` (pixels, relative to the crop window) through the filter."""
         color = [value[c % len(value)] for c in range(N_COLOR)]  # a mono variant fills all three
+        if block.channel_count() != len("RGBW"):
+            color = [showing(c) for c in color]  # they are added up one by one, not as a packet
         block.put(u + mi.Vector2f(self.offset), color + [mi.Float(0)] * (block.channel_count() - N_COLOR), active)
 
     def develop(self, block: Any) -> Any:

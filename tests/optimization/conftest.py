@@ -1,10 +1,45 @@
-"""The variant of these tests."""
+"""The variant of these tests, and a step that needs no scene."""
 
 from __future__ import annotations
 
+import types
+
+import drjit as dr
 import pytest
+
+from reslrb_cli.integrators import Refused
+from reslrb_cli.optimization import loop
 
 
 @pytest.fixture(autouse=True)
 def _variant(llvm):
     """LLVM: these tests are about arithmetic, not about a device."""
+
+
+@pytest.fixture
+def steps(monkeypatch, request):
+    """Replaces the gradient step by one whose image is the mean of the parameters; returns its calls.
+
+    `steps.spoil(call, key)` says what to multiply into a gradient, `steps.derivative(call)` which dL/dI is refused
+    where it is not finite.
+    """
+    calls = []
+    state = types.SimpleNamespace(calls=calls, problem=None, has_image=False, spoil=lambda call, key: 1.0)
+    state.derivative = lambda call: dr.zeros(dr.llvm.ad.TensorXf, (2, 2, 3))
+
+    def gradient_step(integrator, scene, sensor, objective, *, seed, spp, adjoint, params, on_image):
+        number = len(calls)
+        calls.append(types.SimpleNamespace(sensor=sensor, seed=seed, spp=spp, adjoint=adjoint))
+        factors = {key: state.spoil(number, key) for key in params}
+        image = sum((dr.replace_grad(dr.detach(value), value * factors[key]) for key, value in params.items()), 0.0)
+        image = image / len(params)
+        loss = objective(image)
+        if state.has_image:
+            on_image()
+        dr.backward(loss)
+        refused = Refused()
+        refused.take(state.derivative(number))
+        return types.SimpleNamespace(image=dr.detach(image), loss=dr.detach(loss), refused=refused)
+
+    monkeypatch.setattr(loop, "gradient_step", gradient_step)
+    return state

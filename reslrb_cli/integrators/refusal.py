@@ -1,0 +1,65 @@
+"""Derivatives of a loss that are not finite: refused, which is to say taken for 0, and counted.
+
+One NaN in dL/dI would make a gradient NaN wherever a path of that pixel passes, and some estimators would lose it on
+the way. Both are done in the kernel that computes dL/dI, and nobody waits for the count but who reads it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+NONE = 0xFFFFFFFF
+
+
+def _count() -> Any:
+    return dr.zeros(mi.UInt32, 1)
+
+
+def _first() -> Any:
+    return dr.full(mi.UInt32, NONE, 1)
+
+
+@dataclass
+class Refused:
+    """Entries of dL/dI that were not finite: how many, and the first one's flat index, of width 1; the shape of dL/dI,
+    (H, W, C)."""
+
+    count: Any = field(default_factory=_count)
+    first: Any = field(default_factory=_first)
+    shape: tuple[int, ...] = (0, 0, 0)
+
+    def take(self, gradient: Any) -> Any:
+        """dL/dI with 0 for what is not finite, which is added to the count; neither is evaluated here."""
+        self.shape, flat = gradient.shape, gradient.array
+        bad = ~dr.isfinite(flat)
+        # Atomics of the lanes that are not finite alone: none where nothing is wrong.
+        dr.scatter_reduce(dr.ReduceOp.Add, self.count, mi.UInt32(1), mi.UInt32(0), bad, dr.ReduceMode.Direct)
+        index = dr.arange(mi.UInt32, dr.width(flat))
+        dr.scatter_reduce(dr.ReduceOp.Min, self.first, index, mi.UInt32(0), bad, dr.ReduceMode.Direct)
+        return type(gradient)(dr.select(bad, 0, flat), gradient.shape)
+
+    def entry(self) -> tuple[int, int, int] | None:
+        """Pixel (x, y) and channel of the first of them; None where there is none. Waits for the step."""
+        index = int(self.first[0])
+        if index == NONE:
+            return None
+        _, width, channels = self.shape
+        return index // channels % width, index // channels // width, index % channels
+
+
+def first_channels(image: Any, count: int) -> Any:
+    """`image[:, :, :count]`, whose derivative keeps a NaN.
+
+    That of a slice adds up with atomics, which drop it on a CPU (`transport.factors.showing`).
+    """
+    height, width, channels = image.shape
+    if channels == count:
+        return image
+    lane = dr.arange(mi.UInt32, height * width * count)
+    index = lane // count * channels + lane % count
+    flat = dr.gather(type(image.array), image.array, index, True, dr.ReduceMode.Permute)
+    return type(image)(flat, (height, width, count))
