@@ -4,17 +4,19 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
 from reslrb_cli.cli.experiment import experiment_arguments, read_config, start_variant
-from reslrb_cli.errors import ConfigError, UnsupportedScene
+from reslrb_cli.errors import ConfigError, ExitCode, UnsupportedScene
 
 if TYPE_CHECKING:
     from reslrb_cli.config import Config
     from reslrb_cli.integrators.plan_report import PlanReport
+    from reslrb_cli.records.offender import Offender
     from reslrb_cli.scene import ParameterInfo, SceneSummary, SensorSummary
 
 
@@ -22,7 +24,14 @@ if TYPE_CHECKING:
 @experiment_arguments
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object instead of lines.")
 @click.option("--no-counts", is_flag=True, help="Do not compile kernels to count their operations (takes seconds).")
-def command(config_file: Path, overrides: tuple[str, ...], as_json: bool, no_counts: bool) -> None:
+@click.option(
+    "--nonfinite",
+    is_flag=True,
+    help="Say where the run whose folder CONFIG lies in first met a value that is not finite: trace that step again.",
+)
+def command(
+    config_file: Path, overrides: tuple[str, ...], as_json: bool, no_counts: bool, nonfinite: bool
+) -> int | None:
     """List the parameters of the scene of CONFIG with their flags, what the scene contains, and the plan of a step.
 
     A parameter that says "can be recovered" may stand in `parameters` of the configuration; of the others the reason
@@ -31,6 +40,8 @@ def command(config_file: Path, overrides: tuple[str, ...], as_json: bool, no_cou
     """
     config = read_config(config_file, overrides)
     start_variant(config)
+    if nonfinite:
+        return show_offenders(config, as_json)
 
     from reslrb_cli.scene import load_scene, summarise
 
@@ -40,7 +51,7 @@ def command(config_file: Path, overrides: tuple[str, ...], as_json: bool, no_cou
     if as_json:
         report = {"obstacle": plan} if isinstance(plan, str) else dataclasses.asdict(plan)
         click.echo(json.dumps(dataclasses.asdict(summary) | {"plan": report}, indent=2))
-        return
+        return None
     click.echo(f"scene {config.scene.file}")
     for line in scene_lines(summary):
         click.echo(f"  {line}")
@@ -56,6 +67,52 @@ def command(config_file: Path, overrides: tuple[str, ...], as_json: bool, no_cou
         click.echo(f"  {line}")
     if summary.unnamed:
         click.echo("  keys that begin with object_ change from run to run: give those objects an id in the scene file")
+    return None
+
+
+def show_offenders(config: Config, as_json: bool) -> int:
+    """Print where the run of `config` first met a value that is not finite; exit code 1 where it does not again."""
+    from reslrb_cli.cli.replaying import load_replay
+    from reslrb_cli.measure.offender import find_offenders
+
+    replay = load_replay(config)
+    found = find_offenders(replay.problem, replay.iteration)
+    if as_json:
+        report = {"iteration": replay.iteration, "offenders": [dataclasses.asdict(entry) for entry in found]}
+        click.echo(json.dumps(_named(report), indent=2, allow_nan=False))
+    else:
+        lines = [line for entry in found for line in offender_lines(entry, replay.iteration)]
+        for line in lines or [f"iteration {replay.iteration}: all is finite this time"]:
+            click.echo(line)
+    return ExitCode.DONE if found else ExitCode.CHECK_FAILED
+
+
+def offender_lines(offender: Offender, iteration: int) -> list[str]:
+    """One view's offender, in lines."""
+    place = "" if offender.pixel is None else f", pixel {offender.pixel}"
+    value = f": {_numbers(offender.value)}" if offender.value else ""
+    lines = [f"iteration {iteration}, sensor {offender.sensor}{place}", f"  {offender.quantity}{value}"]
+    at = offender.where
+    if at is not None:
+        on = "" if at.surface is None else f", on {at.surface}"
+        lines.append(f"  path {at.path} of {at.paths}, samples of {at.samples}, sampler seed {at.seed}")
+        lines.append(f"  vertex {at.vertex}, at {_numbers(list(at.position))}{on}")
+    if offender.image is not None and offender.target is not None:
+        lines.append(f"  image {_numbers(offender.image)}, target {_numbers(offender.target)}")
+    return lines
+
+
+def _named(value: Any) -> Any:
+    """The same with numbers that are not finite as text, "nan", "inf" and "-inf": JSON has none."""
+    if isinstance(value, dict):
+        return {key: _named(entry) for key, entry in value.items()}
+    if isinstance(value, list | tuple):
+        return [_named(entry) for entry in value]
+    return str(value) if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _numbers(values: list[float]) -> str:
+    return f"({', '.join(f'{value:.6g}' for value in values)})"
 
 
 def make_plan_report(config: Config, scene: Any, counts: bool) -> PlanReport | str:

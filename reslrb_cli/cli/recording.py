@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import logging
+import os
+import shlex
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -10,9 +12,11 @@ from typing import Any
 
 import numpy as np
 
+from reslrb_cli.errors import NonFinite
 from reslrb_cli.optimization import Problem, optimize
+from reslrb_cli.optimization.nonfinite import Findings
 from reslrb_cli.optimization.scaling import Sensitivity
-from reslrb_cli.records.checkpoint import save_checkpoint
+from reslrb_cli.records.checkpoint import save_checkpoint, save_nonfinite
 from reslrb_cli.records.images import write_image
 from reslrb_cli.records.manifest import Manifest, Status
 from reslrb_cli.records.metrics import MetricsWriter, Record
@@ -40,6 +44,7 @@ class Recording:
     last: Record | None = None
     errors: dict[str, dict[str, float]] = field(default_factory=dict)
     nonfinite: NonFiniteTally = field(default_factory=NonFiniteTally)
+    _saved_nonfinite: bool = False
 
     @property
     def done(self) -> int:
@@ -61,6 +66,9 @@ class Recording:
             status = Status.INTERRUPTED if interrupted else Status.FINISHED
         except KeyboardInterrupt:
             status = Status.INTERRUPTED
+        except NonFinite as failure:
+            error = f"{failure}; where: {self._inspection()}" if self._saved_nonfinite else str(failure)
+            raise NonFinite(error) from None
         except BaseException as failure:
             error = " ".join(str(failure).split()) or type(failure).__name__
             raise
@@ -85,7 +93,7 @@ class Recording:
         if stop():
             return
         with MetricsWriter(self.folder.path) as metrics:
-            for record in optimize(self.problem):
+            for record in optimize(self.problem, self._on_nonfinite):
                 if self.first is None and self.problem.sensitivities is not None:
                     self._note_scaling(self.problem.sensitivities)
                 self.first, self.last = self.first or record, record
@@ -108,6 +116,18 @@ class Recording:
                 logger.warning(f"scale auto: {row.key} has no effect on the image where it starts; it is not scaled")
             else:
                 logger.info(f"scale auto: {row.key} moves in steps of {row.length:.3g} times the learning rate")
+
+    def _on_nonfinite(self, found: Findings) -> None:
+        """Keep the parameters of the first step that met a value that is not finite, and say how to look into it."""
+        if self._saved_nonfinite:
+            return
+        save_nonfinite(self.folder.checkpoint, found.iteration, self.problem.values())
+        self._saved_nonfinite = True
+        if self.problem.config.run.on_nonfinite != "stop":  # which says so when it ends
+            logger.warning(f"{found}; where: {self._inspection()}")
+
+    def _inspection(self) -> str:
+        return f"reslrb inspect {shlex.quote(os.path.relpath(self.folder.path / 'config.yaml'))} --nonfinite"
 
     def _check_memory(self, record: Record) -> None:
         memory = self.problem.memory

@@ -2,7 +2,14 @@
 
 from reslrb_cli.integrators.adapter import register
 from reslrb_cli.integrators.refusal import Refused, first_channels
-from reslrb_cli.integrators.step import StepResult, gradient_step, known_step, make_integrator, render_image
+from reslrb_cli.integrators.step import (
+    StepResult,
+    gradient_step,
+    known_step,
+    make_integrator,
+    render_image,
+    sample_sets,
+)
 
 __all__ = [
     "Refused",
@@ -13,4 +20,5 @@ __all__ = [
     "make_integrator",
     "register",
     "render_image",
+    "sample_sets",
 ]

@@ -139,8 +139,7 @@ def _batched(integrator: Any, scene: Any, sensor: Any, objective: Objective, see
     if batches < 2 or spp % batches:
         raise ValueError(f"the samples per pixel ({spp}) must be a multiple of the batches ({batches}), at least 2")
     size = spp // batches
-    seeds = [mi.sample_tea_32(mi.UInt32(seed), mi.UInt32(BATCH_STREAM + b))[0] for b in range(batches)]
-    dr.make_opaque(seeds)
+    seeds = batch_seeds(seed, batches)
     share = 1 / (batches if first_batch == "again" else batches - 1)
     with dr.suspend_grad():
         first = integrator.render(scene, sensor, seeds[0], size)
@@ -173,6 +172,25 @@ def _derivative(
     if on_image is not None:
         on_image()
     return loss, gradient
+
+
+def sample_sets(seed: int, options: dict[str, Any]) -> list[tuple[str, Any, int]]:
+    """The sets of samples of a step with these options (`RunConfig.step_options`): name, seed, samples per pixel."""
+    spp, adjoint = options["spp"], options["adjoint"]
+    if adjoint == "batched":
+        seeds = batch_seeds(seed, options["batches"])
+        return [(f"batch {b + 1}", batch, spp // len(seeds)) for b, batch in enumerate(seeds)]
+    first = dr.opaque(mi.UInt32, seed)
+    if adjoint == "correlated":
+        return [("image and gradient", first, spp)]
+    return [("image", first, spp), ("gradient", second_seed(first), spp)]
+
+
+def batch_seeds(seed: int, batches: int) -> list[Any]:
+    """The seed of each batch."""
+    seeds = [mi.sample_tea_32(mi.UInt32(seed), mi.UInt32(BATCH_STREAM + b))[0] for b in range(batches)]
+    dr.make_opaque(seeds)
+    return seeds
 
 
 def second_seed(seed: Any) -> Any:

@@ -171,12 +171,16 @@ def load_for_rendering(config: Config, initial: bool) -> tuple[Any, list[int], A
     return scene, sensors, integrator, samples_per_pass(config)
 
 
-def assemble_scene(config: Config, scene: Any = None) -> Problem:
-    """Load and check what `config` names, targets left out; `scene` is used in place of `scene.file`."""
+def assemble_scene(config: Config, scene: Any = None, values: Mapping[str, Array] | None = None) -> Problem:
+    """Load and check what `config` names, targets left out.
+
+    `scene` is used in place of `scene.file`, `values` in place of the parameters' initial ones.
+    """
     scene = load_scene(config.scene.file, config.scene.options) if scene is None else scene
     sensors = choose_sensors(config, scene)
     _check_supported(config, config.integrator.type, config.integrator.hide_emitters, scene, sensors)
     selection = select_parameters(scene, config.parameters, config.source)
+    selection.set_arrays(values or {})
     specs = {key: selection.spec(key) for key in selection.keys}
     optimizer = Optimizer(
         config.optimizer.type,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from typing import Any
@@ -43,6 +43,12 @@ class Selection:
         An environment map comes without the halo columns that its tensor has.
         """
         return Slot(self.params, key).get()
+
+    def set_arrays(self, values: Mapping[str, np.ndarray[Any, Any]]) -> None:
+        """Set parameters in the scene, from arrays as `array` returns them."""
+        for key, value in values.items():
+            Slot(self.params, key).set(value)
+        self.params.update()
 
 
 def select_parameters(scene: Any, specs: Sequence[ParameterSpec], source: object) -> Selection:

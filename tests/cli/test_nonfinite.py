@@ -1,0 +1,254 @@
+"""Planted faults: what a run does about them, and whether the command that it prints finds them."""
+
+from __future__ import annotations
+
+import json
+import logging
+import re
+import shlex
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from reslrb_cli.cli import main
+from reslrb_cli.optimization import losses
+
+SCENE = """<scene version="3.0.0">
+    <default name="format" value="rgb"/> <default name="power" value="8"/> <default name="wall" value="wall.exr"/>
+    <sensor type="perspective" id="camera">
+        <float name="fov" value="50"/>
+        <transform name="to_world"><lookat origin="0, 0, 4" target="0, 0, 0" up="0, 1, 0"/></transform>
+        <film type="hdrfilm" id="film">
+            <integer name="width" value="8"/> <integer name="height" value="8"/>
+            <string name="pixel_format" value="$format"/> <rfilter type="box"/>
+        </film>
+    </sensor>
+    <bsdf type="diffuse" id="poster">REFLECTANCE</bsdf>
+    <bsdf type="diffuse" id="wall">
+        <texture type="bitmap" name="reflectance">
+            <string name="filename" value="$wall"/> <boolean name="raw" value="true"/>
+            <string name="format" value="variant"/> <string name="filter_type" value="nearest"/>
+        </texture>
+    </bsdf>
+    <shape type="rectangle" id="poster_shape"><transform name="to_world"><translate z="0"/></transform>
+        <ref id="poster"/></shape>
+    <shape type="rectangle" id="wall_shape">
+        <transform name="to_world"><scale value="4"/><translate z="-1"/></transform> <ref id="wall"/>
+    </shape>
+    <shape type="rectangle" id="lamp">
+        <transform name="to_world"><rotate x="1" angle="180"/><translate x="0" y="0" z="5"/></transform>
+        <emitter type="area" id="light"><rgb name="radiance" value="$power, $power, $power"/></emitter>
+    </shape>
+</scene>
+"""
+PLAIN = '<rgb name="reflectance" value="0.6, 0.5, 0.4"/>'
+
+CONFIG = """
+variant: llvm_ad_rgb
+scene: {file: scene.xml}
+target: {file: target.exr}
+parameters: [{key: poster.reflectance.value, initial: 0.5, bounds: [0, 1]}]
+integrator: {type: reslrb, max_depth: 4, estimator: stack}
+optimizer: {learning_rate: 0.01}
+run: {iterations: 3, spp: 16, seed: 5}
+"""
+KEY = "poster.reflectance.value"
+
+
+@pytest.fixture
+def experiment(llvm, tmp_path, monkeypatch):
+    """A folder with a scene, textures, a target and a configuration, and the working directory in it."""
+    import mitsuba as mi
+
+    wall = np.full((8, 8, 3), 0.5, np.float32)
+    mi.Bitmap(wall).write(str(tmp_path / "wall.exr"))
+    wall[4, 1, 1] = np.nan
+    mi.Bitmap(wall).write(str(tmp_path / "spoilt.exr"))
+    mi.Bitmap(np.full((8, 8, 3), 0.2, np.float32)).write(str(tmp_path / "target.exr"))
+    (tmp_path / "scene.xml").write_text(SCENE.replace("REFLECTANCE", PLAIN))
+    (tmp_path / "config.yaml").write_text(CONFIG)
+    monkeypatch.chdir(tmp_path)
+    yield tmp_path
+    logging.getLogger("reslrb_cli").handlers.clear()
+
+
+def reslrb(capsys, *args):
+    """Run the command line in this process; return exit code, standard output and standard error."""
+    with pytest.raises(SystemExit) as end:
+        main.main([str(arg) for arg in args])
+    out, err = capsys.readouterr()
+    return int(end.value.code or 0), out, err
+
+
+def optimize(capsys, *sets, code=5):
+    """A run that ends with this code; its standard output and error."""
+    arguments = [argument for setting in sets for argument in ("--set", setting)]
+    found, out, err = reslrb(capsys, "optimize", "config.yaml", *arguments)
+    assert found == code, err
+    assert "Traceback" not in err
+    return out, err
+
+
+def inspect(capsys, err):
+    """What the command that stands in `err` finds, as JSON."""
+    [command] = set(re.findall(r"where: (reslrb inspect .* --nonfinite)", err))
+    program, *arguments = shlex.split(command)
+    assert program == "reslrb"
+    code, out, _ = reslrb(capsys, *arguments)
+    assert code == 0
+    code, as_json, _ = reslrb(capsys, *arguments, "--json")
+    assert code == 0
+    report = json.loads(as_json)
+    assert out.startswith(f"iteration {report['iteration']}, sensor 0, pixel")
+    return report["iteration"], report["offenders"], out
+
+
+def manifest(folder="runs/config"):
+    return json.loads((Path(folder) / "manifest.json").read_text())
+
+
+STOP = "run.on_nonfinite=stop"
+
+
+@pytest.mark.parametrize("film", ["rgb", "rgba"])
+def test_a_texel_that_is_not_a_number(experiment, capsys, film):
+    _, err = optimize(capsys, STOP, f"scene.options={{wall: spoilt.exr, format: {film}}}")
+    assert "not finite in iteration 0" in err.splitlines()[-1]
+    iteration, [offender], text = inspect(capsys, err)
+    assert iteration == 0
+    assert offender["value"][1] == "nan"
+    assert all(isinstance(value, float) for value in offender["value"][::2])
+    at = offender["where"]
+    assert at["surface"] == "wall_shape"
+    assert offender["quantity"].startswith(("scattering weight", "connection factor"))
+    x, y, z = at["position"]  # on a wall of [-4, 4]^2 at z = -1, of whose 8x8 texels (1, 4) is spoilt
+    assert (int(x + 4), int(y + 4)) == (1, 4)
+    assert z == pytest.approx(-1)
+    assert f"path {at['path']} of 1024" in text
+
+
+def test_a_light_that_overflows(experiment, capsys):
+    _, err = optimize(capsys, STOP, "scene.options={power: 3e38}")
+    _, [offender], _ = inspect(capsys, err)
+    assert offender["quantity"] == "emission E"
+    assert (offender["value"], offender["where"]["vertex"]) == (["inf"] * 3, 0)
+
+
+def test_a_sum_that_overflows(experiment, capsys):
+    _, err = optimize(capsys, STOP, "scene.options={power: 2e36}")
+    _, [offender], _ = inspect(capsys, err)
+    assert "finite" in offender["quantity"]
+    assert min(offender["value"]) > 1e30
+
+
+def test_a_derivative_that_is_not_finite(experiment, capsys):
+    """A reflectance of 0.5 + sqrt(x) at x = 0."""
+    _register_root()
+    Path("scene.xml").write_text(SCENE.replace("REFLECTANCE", '<texture type="root" name="reflectance"/>'))
+    _, err = optimize(capsys, STOP, "parameters=[{key: poster.reflectance.x, initial: 0.0, bounds: [0, 1]}]")
+    assert "the gradient of poster.reflectance.x in 1 entry" in err
+    _, [offender], _ = inspect(capsys, err)
+    assert offender["quantity"].startswith("derivative of the")
+    assert offender["where"]["surface"] == "poster_shape"
+
+
+def _register_root():
+    import drjit as dr
+    import mitsuba as mi
+
+    class Root(mi.Texture):
+        def __init__(self, props):
+            super().__init__(props)
+            self.x = mi.Float(0)
+
+        def eval(self, si, active=True):
+            return mi.Color3f(0.5 + dr.sqrt(self.x))
+
+        def traverse(self, callback):
+            callback.put("x", self.x, mi.ParamFlags.Differentiable)
+
+        def parameters_changed(self, keys):
+            pass
+
+        def mean(self):
+            return mi.Float(0.5)
+
+    mi.register_texture("root", Root)
+
+
+def root_of_pixel(image, target):
+    """A loss whose value is finite and whose derivative is not, in one entry."""
+    import drjit as dr
+
+    index = (3 * 8 + 5) * 3 + 1
+    entry = dr.gather(type(image.array), image.array, index, True, dr.ReduceMode.Permute)
+    return losses.l2(image, target) + dr.sum(dr.sqrt(entry - dr.detach(entry)))
+
+
+@pytest.mark.parametrize("kind", ["stop", "skip", "zero"])
+def test_a_loss_whose_derivative_is_not_finite(experiment, capsys, monkeypatch, kind):
+    monkeypatch.setitem(losses.LOSSES, "l2", root_of_pixel)
+    _, err = optimize(capsys, f"run.on_nonfinite={kind}", code=5 if kind == "stop" else 0)
+    assert "dL/dI in 1 entry, the first at pixel (5, 3), channel 1, of sensor 0" in err
+    _, [offender], text = inspect(capsys, err)
+    assert (offender["pixel"], offender["where"]) == ([5, 3], None)
+    assert offender["quantity"].endswith("dL/dI, channel 1")
+    assert offender["target"] == pytest.approx([0.2] * 3)
+    assert "target (0.2, 0.2, 0.2)" in text
+    moved = np.load("runs/config/parameters/parameters.npz")[KEY] != 0.5
+    assert moved.all() if kind == "zero" else not moved.any()
+
+
+def test_what_was_done_is_kept(experiment, capsys, monkeypatch):
+    """A fault in the second iteration: the run folder is whole, and the parameters are those of then."""
+    calls = []
+
+    def sometimes(image, target):
+        calls.append(1)
+        return root_of_pixel(image, target) if len(calls) == 2 else losses.l2(image, target)
+
+    monkeypatch.setitem(losses.LOSSES, "l2", sometimes)
+    out, err = optimize(capsys, STOP)
+    folder = Path("runs/config")
+    result = manifest()
+    assert (result["status"], result["results"]["iterations"]) == ("failed", 2)
+    assert result["error"] == err.splitlines()[-1]
+    assert result["results"]["nonfinite"] == {"iterations": 1, "values": 1, "by_parameter": {}}
+    records = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
+    assert [record["nonfinite"] for record in records] == [0, 1]
+    with np.load(folder / "checkpoint/nonfinite.npz") as saved, np.load(folder / "parameters/parameters.npz") as last:
+        assert int(saved["iteration"]) == 1
+        np.testing.assert_array_equal(saved[f"parameter/{KEY}"], last[KEY])
+        assert (last[KEY] != 0.5).all()
+    assert "1 values were not finite" in (folder / "report.html").read_text()
+    calls.clear()
+    monkeypatch.setitem(losses.LOSSES, "l2", losses.l2)
+    code, out, _ = reslrb(capsys, "inspect", "runs/config/config.yaml", "--nonfinite")
+    assert (code, out) == (1, "iteration 1: all is finite this time\n")
+
+
+def test_the_last_line_counts(experiment, capsys, monkeypatch):
+    monkeypatch.setitem(losses.LOSSES, "l2", root_of_pixel)
+    out, err = optimize(capsys, "run.on_nonfinite=zero", code=0)
+    assert "3 values not finite in 3 iterations" in out.splitlines()[-1]
+    assert err.count("--nonfinite") == 1, "the first says where to look"
+
+
+@pytest.mark.parametrize("adjoint", ["independent", "batched"])
+def test_each_set_of_samples_is_looked_at(experiment, capsys, adjoint):
+    _, err = optimize(
+        capsys, STOP, "scene.options={wall: spoilt.exr}", f"run.adjoint={adjoint}", "run.memory_budget=64"
+    )
+    _, [offender], _ = inspect(capsys, err)
+    assert offender["where"]["samples"] in ("image", "gradient", "batch 1", "batch 2", "batch 3", "batch 4")
+
+
+def test_there_must_be_something_to_show(experiment, capsys):
+    code, _, err = reslrb(capsys, "inspect", "config.yaml", "--nonfinite")
+    assert (code, len(err.splitlines())) == (2, 2)
+    assert "is not in a run folder" in err
+    optimize(capsys, code=0)
+    code, _, err = reslrb(capsys, "inspect", "runs/config/config.yaml", "--nonfinite")
+    assert code == 2
+    assert "met no value that was not finite" in err
