@@ -49,7 +49,7 @@ def command(config_file: Path, overrides: tuple[str, ...], force: bool, quiet: b
     with Interrupts() as interrupts, Progress(config.run.iterations, quiet) as progress:
         status = recording.run(progress.show, lambda: interrupts.requested)
     outcome = f", {describe(recording.last)}" if recording.last else ""
-    outcome += f", {recording.nonfinite}" if recording.nonfinite.iterations else ""
+    outcome += "".join(f", {tally}" for tally in (recording.nonfinite, recording.clamped) if tally.iterations)
     report = os.path.relpath(folder.path / "report.html")
     click.echo(f"{status.value} after {recording.done} iterations{outcome}; look at {report}")
     return ExitCode.DONE if status is Status.FINISHED else ExitCode.INTERRUPTED

@@ -22,7 +22,7 @@ from reslrb_cli.records.manifest import Manifest, Status
 from reslrb_cli.records.metrics import MetricsWriter, Record
 from reslrb_cli.records.parameters import write_mask, write_parameters
 from reslrb_cli.records.run_folder import RunFolder
-from reslrb_cli.records.tally import NonFiniteTally
+from reslrb_cli.records.tally import ClampTally, NonFiniteTally
 from reslrb_cli.report import write_report
 
 logger = logging.getLogger(__name__)
@@ -44,6 +44,7 @@ class Recording:
     last: Record | None = None
     errors: dict[str, dict[str, float]] = field(default_factory=dict)
     nonfinite: NonFiniteTally = field(default_factory=NonFiniteTally)
+    clamped: ClampTally = field(default_factory=ClampTally)
     _saved_nonfinite: bool = False
 
     @property
@@ -99,6 +100,7 @@ class Recording:
                 self.first, self.last = self.first or record, record
                 metrics.write(record)
                 self.nonfinite.add(record)
+                self.clamped.add(record)
                 show(record)
                 self._check_memory(record)
                 if stop():
@@ -146,6 +148,7 @@ class Recording:
             "elapsed_s": self.last and self.last.elapsed_s,
             "parameter_rmse": self.errors,
             "nonfinite": self.nonfinite.to_json(),
+            "clamped": self.clamped.to_json(),
         }
         write_parameters(self.folder.parameters, self.problem.values())
         self._save_checkpoint()

@@ -246,6 +246,13 @@ class Optimizer(Choice):
         description="Last learning rate over the first; only with a schedule other than `constant`.",
     )
 
+    clamp_gradient: Annotated[float, Field(ge=1)] | None = Field(
+        default=None,
+        description="Clamp each entry of a gradient at so many times its usual size: the larger of the running means "
+        "of its own absolute value and of those of all entries of the parameter. Takes the noise of rare bright paths, "
+        "and is biased by what it takes, which the run reports. null: no clamp.",
+    )
+
     @model_validator(mode="after")
     def _check_schedule(self) -> Self:
         if self.schedule == "constant" and "final_fraction" in self.model_fields_set:

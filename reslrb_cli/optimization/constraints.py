@@ -12,13 +12,17 @@ def clamp(value: Any, bounds: tuple[float, float] | None) -> Any:
     return value if bounds is None else dr.clip(value, bounds[0], bounds[1])
 
 
+def flat(value: Any) -> Any:
+    """All entries of a tensor or a (nested) array in a row."""
+    return value.array if dr.is_tensor_v(value) else dr.ravel(value)
+
+
 def count_nonfinite(value: Any) -> Any:
     """The number of NaN and infinite entries of a tensor or a (nested) array, as a width-1 array."""
-    flat = value.array if dr.is_tensor_v(value) else dr.ravel(value)
-    return dr.count(~dr.isfinite(flat))
+    return dr.count(~dr.isfinite(flat(value)))
 
 
 def finite_square_norm(value: Any) -> Any:
     """The sum of squares of the finite entries, as a width-1 array."""
-    flat = value.array if dr.is_tensor_v(value) else dr.ravel(value)
-    return dr.sum(dr.select(dr.isfinite(flat), dr.square(flat), 0.0))
+    entries = flat(value)
+    return dr.sum(dr.select(dr.isfinite(entries), dr.square(entries), 0.0))

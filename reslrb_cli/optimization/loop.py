@@ -11,6 +11,7 @@ from typing import Any
 import drjit as dr
 
 from reslrb_cli.integrators import Refused, gradient_step
+from reslrb_cli.optimization.clamping import GradientClamp
 from reslrb_cli.optimization.constraints import count_nonfinite, finite_square_norm
 from reslrb_cli.optimization.nonfinite import Findings, NonFinitePolicy, RefusedAt, zero_nonfinite
 from reslrb_cli.optimization.problem import Problem
@@ -31,6 +32,8 @@ def optimize(problem: Problem, on_nonfinite: Callable[[Findings], None] = lambda
     """
     config = problem.config
     clock, policy = StepClock(), NonFinitePolicy(config.run.on_nonfinite)
+    limit = config.optimizer.clamp_gradient
+    clamp = None if limit is None else GradientClamp(limit)
     reset_peak()
     if config.optimizer.scale == "auto":
         with clock.counted():
@@ -52,6 +55,8 @@ def optimize(problem: Problem, on_nonfinite: Callable[[Findings], None] = lambda
             held = policy.held(found, problem.optimizer.keys())
             for key in found.gradients if policy.kind == "zero" else ():
                 zero_nonfinite(problem.optimizer[key])
+            moved = [key for key in problem.optimizer.keys() if key not in held]  # noqa: SIM118 (not a mapping)
+            clamped = None if clamp is None else clamp.apply({key: problem.optimizer[key] for key in moved})
             found.updates = problem.optimizer.step(factor, skip=held)
             problem.apply()
         yield Record(
@@ -69,6 +74,7 @@ def optimize(problem: Problem, on_nonfinite: Callable[[Findings], None] = lambda
             nonfinite=found.total,
             parameter_rmse=rmse,
             nonfinite_by_parameter=found.by_parameter,
+            clamped=clamped,
         )
         policy.see(found, held)
 

@@ -13,6 +13,17 @@ FILE_NAME = "metrics.jsonl"
 
 
 @dataclass(frozen=True)
+class Clamped:
+    """What a clamp did to the gradients of an iteration: how many entries it changed; by parameter, the share that it
+    took of the gradient (the sum of absolute values), and the bias that this made of the iterations so far: the share
+    that it took of their sum."""
+
+    entries: int
+    share: dict[str, float]
+    bias: dict[str, float]
+
+
+@dataclass(frozen=True)
 class Record:
     """What one iteration was: its step, and the parameters before its update.
 
@@ -22,6 +33,7 @@ class Record:
     the reading of `parameter_rmse` are not in it. `peak_mib` is the allocator's high-water mark since the start.
     `nonfinite` counts the entries of loss, of its derivative by the image and of gradients that were not finite;
     `grad_norm` leaves them out. `nonfinite_by_parameter` holds those of gradients and updates, of parameters with any.
+    `clamped` is None where gradients are not clamped; `grad_norm` is that before.
     `parameter_rmse` is taken over the entries that light and sensor reach, None where the true value is not known.
     """
 
@@ -39,14 +51,17 @@ class Record:
     nonfinite: int
     parameter_rmse: float | None
     nonfinite_by_parameter: dict[str, int] = field(default_factory=dict)
+    clamped: Clamped | None = None
 
     def to_json(self) -> str:
         """The record as one line of JSON, non-finite numbers as null (JSON has none)."""
-        values = {
-            key: None if isinstance(value, float) and not math.isfinite(value) else value
-            for key, value in asdict(self).items()
-        }
-        return json.dumps(values, allow_nan=False)
+        return json.dumps(_finite(asdict(self)), allow_nan=False)
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _finite(entry) for key, entry in value.items()}
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 class MetricsWriter:

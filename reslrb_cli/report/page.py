@@ -54,7 +54,7 @@ def _summary(manifest: Mapping[str, Any]) -> str:
     error = f": {html.escape(manifest['error'])}" if manifest.get("error") else ""
     line = f"<p>Status: <b>{html.escape(str(manifest.get('status', 'unknown')))}</b>{error}</p>"
     results = manifest.get("results", {})
-    line += _not_finite(results.get("nonfinite", {}))
+    line += _not_finite(results.get("nonfinite", {})) + _clamped(results.get("clamped", {}))
     errors = results.get("parameter_rmse", {})
     rows = "".join(
         f"<tr><td>{html.escape(key)}</td><td>{_number(entry['initial'])}</td><td>{_number(entry['final'])}</td></tr>"
@@ -70,6 +70,14 @@ def _not_finite(tally: Mapping[str, Any]) -> str:
     rows = "".join(f"<li>{html.escape(key)}: {count}</li>" for key, count in tally["by_parameter"].items())
     text = f"{tally['values']} values were not finite, in {tally['iterations']} iterations; none reached a parameter."
     return f"<p>{text}</p><ul>{rows}</ul>"
+
+
+def _clamped(tally: Mapping[str, Any]) -> str:
+    if not tally.get("iterations"):
+        return ""
+    rows = "".join(f"<li>{html.escape(key)}: {_number(bias)}</li>" for key, bias in tally["bias"].items())
+    text = f"{tally['entries']} entries of gradients were clamped, in {tally['iterations']} iterations."
+    return f"<p>{text} Bias, as the share of the gradient that this took over the run:</p><ul>{rows}</ul>"
 
 
 def _number(value: float | None) -> str:

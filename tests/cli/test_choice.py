@@ -84,7 +84,7 @@ def test_the_pilot_leaves_the_run_as_it_was(experiment):
         problem = assemble(load("box.yaml", settings))
         assert not np.any(np.array(problem.optimizer.gradient(KEY)))
         value = problem.selection.array(KEY).copy()
-        loss, _, _ = loop.gradient(problem, 0, loop.Split())
+        loss, *_ = loop.gradient(problem, 0, loop.Split())
         dr.eval(loss)
         return value, float(loss[0]), np.array(problem.optimizer.gradient(KEY)), problem.pilot
 

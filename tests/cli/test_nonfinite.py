@@ -252,3 +252,17 @@ def test_there_must_be_something_to_show(experiment, capsys):
     code, _, err = reslrb(capsys, "inspect", "runs/config/config.yaml", "--nonfinite")
     assert code == 2
     assert "met no value that was not finite" in err
+
+
+def test_a_clamp_reports_its_bias(experiment, capsys):
+    """At 1 sample per pixel gradients scatter: with k = 1 the clamp acts."""
+    sets = ("optimizer.clamp_gradient=1", "run.spp=1", "run.iterations=6")
+    out, _ = optimize(capsys, *sets, code=0)
+    tally = manifest()["results"]["clamped"]
+    assert tally["entries"] > 0
+    assert 0 < tally["bias"][KEY] < 1
+    line = f"{tally['entries']} entries of gradients clamped in {tally['iterations']} iterations: a bias of"
+    assert line in out.splitlines()[-1]
+    assert f"{tally['entries']} entries of gradients were clamped" in Path("runs/config/report.html").read_text()
+    records = [json.loads(text) for text in Path("runs/config/metrics.jsonl").read_text().splitlines()]
+    assert sum(record["clamped"]["entries"] for record in records) == tally["entries"]

@@ -10,7 +10,7 @@ from reslrb_cli.records.metrics import MetricsWriter, Record, read_metrics
 
 KEYS = [
     "iteration", "loss", "step_ms", "primal_ms", "adjoint_ms", "codegen_ms", "elapsed_s", "peak_mib", "spp", "lr",
-    "grad_norm", "nonfinite", "parameter_rmse", "nonfinite_by_parameter",
+    "grad_norm", "nonfinite", "parameter_rmse", "nonfinite_by_parameter", "clamped",
 ]  # fmt: skip
 
 
