@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import logging
 import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,8 +17,12 @@ from reslrb_cli.errors import ConfigError, ExitCode, UnsupportedScene
 if TYPE_CHECKING:
     from reslrb_cli.config import Config
     from reslrb_cli.integrators.plan_report import PlanReport
+    from reslrb_cli.measure.conditioning import Conditioning
     from reslrb_cli.records.offender import Offender
     from reslrb_cli.scene import ParameterInfo, SceneSummary, SensorSummary
+
+#: Gradients that `--conditioning` takes.
+SAMPLES = 8
 
 
 @click.command("inspect")
@@ -29,15 +34,36 @@ if TYPE_CHECKING:
     is_flag=True,
     help="Say where the run whose folder CONFIG lies in first met a value that is not finite: trace that step again.",
 )
+@click.option(
+    "--conditioning", is_flag=True, help="Measure how sensitive image and loss are to each parameter (renders)."
+)
+@click.option(
+    "--samples",
+    type=click.IntRange(min=2),
+    help=f"Gradients that --conditioning takes, each of run.spp samples per pixel.  [default: {SAMPLES}]",
+)
 def command(
-    config_file: Path, overrides: tuple[str, ...], as_json: bool, no_counts: bool, nonfinite: bool
+    config_file: Path,
+    overrides: tuple[str, ...],
+    as_json: bool,
+    no_counts: bool,
+    nonfinite: bool,
+    conditioning: bool,
+    samples: int | None,
 ) -> int | None:
     """List the parameters of the scene of CONFIG with their flags, what the scene contains, and the plan of a step.
 
     A parameter that says "can be recovered" may stand in `parameters` of the configuration; of the others the reason
     is given. The plan says which features the scene and the parameters call for and which are left out, with the number
     of operations that the kernels of a step have with and without each of them.
+
+    --conditioning says how far apart the parameters' sensitivities lie, where they start: of each the root mean square
+    of its values, its gradient and the noise of one step's gradient, the relative change of the image and the curvature
+    of the loss per unit of the parameter, and the length by which it would have to change to make up the image where it
+    has an effect. `optimizer.scale: auto` makes up for what it shows.
     """
+    if samples is not None and not conditioning:
+        raise click.UsageError("--samples has no effect without --conditioning")
     config = read_config(config_file, overrides)
     start_variant(config)
     if nonfinite:
@@ -48,9 +74,11 @@ def command(
     scene = load_scene(config.scene.file, config.scene.options)
     summary = summarise(scene, config.integrator.hide_emitters)
     plan = make_plan_report(config, scene, counts=not no_counts)
+    measured = measure(config_file, overrides, config, samples or SAMPLES) if conditioning else None
     if as_json:
         report = {"obstacle": plan} if isinstance(plan, str) else dataclasses.asdict(plan)
-        click.echo(json.dumps(dataclasses.asdict(summary) | {"plan": report}, indent=2))
+        extra = {} if measured is None else {"conditioning": measured.to_json()}
+        click.echo(json.dumps(dataclasses.asdict(summary) | {"plan": report} | extra, indent=2))
         return None
     click.echo(f"scene {config.scene.file}")
     for line in scene_lines(summary):
@@ -67,6 +95,12 @@ def command(
         click.echo(f"  {line}")
     if summary.unnamed:
         click.echo("  keys that begin with object_ change from run to run: give those objects an id in the scene file")
+    if measured is not None:
+        from reslrb_cli.report.conditioning_table import conditioning_lines
+
+        click.echo(f"conditioning ({measured.samples} gradients of {measured.spp} spp, seed {measured.seed})")
+        for line in conditioning_lines(measured):
+            click.echo(f"  {line}")
     return None
 
 
@@ -113,6 +147,16 @@ def _named(value: Any) -> Any:
 
 def _numbers(values: list[float]) -> str:
     return f"({', '.join(f'{value:.6g}' for value in values)})"
+
+
+def measure(config_file: Path, overrides: tuple[str, ...], config: Config, samples: int) -> Conditioning:
+    """The conditioning of the experiment; an estimator that is to be measured first makes no difference to it."""
+    from reslrb_cli.measure.conditioning import measure_conditioning
+    from reslrb_cli.optimization import assemble
+
+    if config.integrator.options().get("estimator") == "auto":
+        config = read_config(config_file, (*overrides, "integrator.estimator=stack"))
+    return measure_conditioning(assemble(config, logging.getLogger(__name__).info), samples)
 
 
 def make_plan_report(config: Config, scene: Any, counts: bool) -> PlanReport | str:

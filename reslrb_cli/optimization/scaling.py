@@ -5,11 +5,13 @@ alone, all its entries at once. With I(x) the image at common random numbers and
 
     D = I(x + h z) - I(x)
     change = |D| / (h |M|),   length = h sum |D| M / sum D²,   M = max(|I|, |T|)
+    curvature = (L(I + D) - 2 L(I) + L(I - D)) / h²,           L the loss of an image
 
-`change` is the relative change of the image per unit of the parameter. `length` is how far the parameter would have to
-go to make up what image or target hold, by least squares over those pixels that it changes at all: for a light alone in
-its scene its own intensity, for a wall its own albedo, whatever share of the picture they have. h is chosen so that the
-image changes by about 3 %, so that neither rounding nor curvature decides.
+`change` is the relative change of the image per unit of the parameter, `curvature` the Gauss-Newton one (with D scaled
+up to what single precision resolves). `length` is how far the parameter would have to go to make up what image or
+target hold, by least squares over those pixels that it changes at all: for a light alone in its scene its own
+intensity, for a wall its own albedo, whatever share of the picture they have. h is chosen so that the image changes by
+about 3 %, so that neither rounding nor curvature decides.
 
 Step lengths from `length` make all parameters equally fast for one learning rate, and dividing by the root mean square
 of g keeps an absolute epsilon, as Adam has it, out of the matter.
@@ -19,10 +21,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import drjit as dr
+import mitsuba as mi
 import numpy as np
 
 from reslrb_cli.integrators import render_image
@@ -49,8 +52,8 @@ class Sensitivity:
     """What was measured of one parameter of `entries` numbers, in the scene's units.
 
     `value`, `gradient` and `noise` are root mean squares over the entries: of the values, of the mean gradient over the
-    samples, of the standard deviation of one sample (one step's gradient). `change` is relative, per unit; it and
-    `length` are None where no change of the image was seen.
+    samples, of the standard deviation of one sample (one step's gradient). `change` is relative, per unit; it,
+    `curvature` (loss per unit²) and `length` are None where no change of the image was seen.
     """
 
     key: str
@@ -58,8 +61,9 @@ class Sensitivity:
     value: float
     gradient: float
     noise: float
-    change: float | None
-    length: float | None
+    change: float | None = None
+    curvature: float | None = None
+    length: float | None = None
 
     def to_json(self) -> dict[str, Any]:
         """As a mapping for JSON."""
@@ -101,8 +105,8 @@ def own_length(transform: Transform | None, bounds: Bounds, value: Any, length: 
 
 
 def measure_sensitivities(problem: Problem, samples: int) -> list[Sensitivity]:
-    """Measure every parameter of `problem` where it stands, by `samples` gradients and a few images, each with the
-    run's samples per pixel."""
+    """Measure every parameter of `problem` where it stands, by `samples` gradients, at least 2, and a few images, each
+    with the run's samples per pixel."""
     problem.apply()
     rows: dict[str, list[Array]] = {key: [] for key in problem.selection.keys}
     total: dict[str, Any] = {}
@@ -112,39 +116,36 @@ def measure_sensitivities(problem: Problem, samples: int) -> list[Sensitivity]:
         ).items():
             finite = dr.select(dr.isfinite(gradient), gradient, 0)
             total[key] = finite if round == 0 else total[key] + finite
-        for key, row in take_gradient(problem).items():
-            rows[key].append(row.astype(np.float64))
+        for key, gradient in take_gradient(problem).items():
+            rows[key].append(gradient.astype(np.float64))
     base = _images(problem)
     targets = [np.array(target, dtype=np.float64) for target in problem.targets]
     reference = [np.maximum(np.abs(a), np.abs(b)) for a, b in zip(base, targets, strict=True)]
     found = []
     for key, gradients in rows.items():
         value = problem.selection.array(key)
-        change, length = _probe(problem, key, _downhill(total[key]), base, reference)
-        found.append(
-            Sensitivity(
-                key=key,
-                entries=value.size,
-                value=_rms(value),
-                gradient=_rms(np.mean(gradients, axis=0)),
-                noise=_rms(np.std(gradients, axis=0, ddof=1)) if samples > 1 else math.nan,
-                change=change,
-                length=length,
-            )
+        row = Sensitivity(
+            key=key,
+            entries=value.size,
+            value=_rms(value),
+            gradient=_rms(np.mean(gradients, axis=0)),
+            noise=_rms(np.std(gradients, axis=0, ddof=1)),
         )
+        found.append(_probe(problem, row, _downhill(total[key]), base, reference))
     problem.apply()
     return found
 
 
 def _probe(
-    problem: Problem, key: str, direction: Any, base: Sequence[Array], reference: Sequence[Array]
-) -> tuple[float | None, float | None]:
-    """`change` and `length` of one parameter, along `direction`; None where the image does not change."""
+    problem: Problem, row: Sensitivity, direction: Any, base: Sequence[Array], reference: Sequence[Array]
+) -> Sensitivity:
+    """`row` with what the image tells, along `direction`, where it does."""
+    key = row.key
     value = dr.detach(problem.optimizer[key])
     low, high = problem.selection.spec(key).bounds or (-math.inf, math.inf)
     # 1 % of the parameter, whatever its unit; of its range where it is 0; a guess where it has none.
     step = 0.01 * (_rms(np.array(value)) or (high - low if math.isfinite(high - low) else 1.0))
-    best: tuple[float | None, float | None] = (None, None)
+    norm = math.sqrt(sum(float(np.square(r).sum()) for r in reference))
     for _ in range(TRIALS):
         step = min(step, 0.5 * (high - low))
         moved = value + direction * step
@@ -158,12 +159,26 @@ def _probe(
             step *= 1e3 if squares == 0 else 1e-3
             continue
         share = squares / shared
-        norm = math.sqrt(sum(float(np.square(r).sum()) for r in reference))
-        best = math.sqrt(squares) / (step * norm), min(step / share, high - low)
+        row = replace(
+            row,
+            change=math.sqrt(squares) / (step * norm),
+            curvature=_second_difference(problem, base, difference, MOST / share) * (share / (MOST * step)) ** 2,
+            length=min(step / share, high - low),
+        )
         if LEAST <= share <= MOST or (share < LEAST and step == 0.5 * (high - low)):
             break
         step *= AIM / share
-    return best
+    return row
+
+
+def _second_difference(problem: Problem, base: Sequence[Array], difference: Sequence[Array], factor: float) -> float:
+    """L(I + D) - 2 L(I) + L(I - D), the mean over the views, D `factor` times the difference."""
+    total = 0.0
+    for image, change, target in zip(base, difference, problem.targets, strict=True):
+        for side, weight in ((1, 1), (0, -2), (-1, 1)):
+            at = mi.TensorXf((image + side * factor * change).astype(np.float32))
+            total += weight * float(problem.compare(at, target)[0]) / len(base)
+    return total
 
 
 def _downhill(gradient: Any) -> Any:

@@ -1,0 +1,47 @@
+"""How far apart the sensitivities of an experiment's parameters lie, where they start."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from reslrb_cli.optimization import Problem
+from reslrb_cli.optimization.scaling import Sensitivity, measure_sensitivities
+
+#: What a spread is taken of.
+QUANTITIES = ("gradient", "change", "curvature", "length")
+
+
+@dataclass(frozen=True)
+class Conditioning:
+    """What was measured of each parameter, from `samples` gradients of `spp` samples per pixel, of the run's `seed`."""
+
+    rows: list[Sensitivity]
+    samples: int
+    spp: int
+    seed: int
+
+    def spread(self, quantity: str) -> float | None:
+        """The largest value of one of QUANTITIES over its smallest, of those above 0; None of fewer than two.
+
+        That of `curvature` is the condition number of the Gauss-Newton matrix's diagonal, by parameters.
+        """
+        values = [getattr(row, quantity) for row in self.rows]
+        positive = [value for value in values if value is not None and value > 0]
+        return max(positive) / min(positive) if len(positive) > 1 else None
+
+    def to_json(self) -> dict[str, Any]:
+        """As a mapping for JSON."""
+        return {
+            "samples": self.samples,
+            "spp": self.spp,
+            "seed": self.seed,
+            "parameters": [row.to_json() for row in self.rows],
+            "spread": {quantity: self.spread(quantity) for quantity in QUANTITIES},
+        }
+
+
+def measure_conditioning(problem: Problem, samples: int) -> Conditioning:
+    """Measure every parameter of `problem`, which has its targets, where it stands; at least 2 `samples`."""
+    run = problem.config.run
+    return Conditioning(measure_sensitivities(problem, samples), samples, run.spp, run.seed)
