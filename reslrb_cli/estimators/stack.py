@@ -109,7 +109,7 @@ class Pushing(VertexHooks):
 
     def __init__(self, p: Pass, visibility: Visibility | None, stack_size: int) -> None:
         super().__init__(p)
-        self.visibility, self.size = visibility, min(stack_size, vertices(p))
+        self.visibility, self.size = visibility, min(stack_size, max(vertices(p), 1))
         self.bounded = vertices(p) > self.size
 
     def start(self, product: Product) -> Pushed:

@@ -114,19 +114,23 @@ def known_step(
     is as in `gradient_step`.
     """
     refused = Refused()
-    gradient = refused.take(dr.detach(gradient))
+    step = _known(integrator, scene, sensor, refused.take(dr.detach(gradient)), seed, spp, params)
+    return StepResult(step.image, step.loss, refused)
+
+
+def _known(integrator: Any, scene: Any, sensor: Any, gradient: Any, seed: Any, spp: int, params: Any) -> StepResult:
+    """The same with a dL/dI that is finite."""
 
     def objective(image: Any) -> Any:
         return dr.sum((image * gradient).array)
 
     if not hasattr(integrator, "fused"):
-        step = gradient_step(integrator, scene, sensor, objective, seed=seed, spp=spp, params=params)
-        return StepResult(step.image, step.loss, refused)
+        return gradient_step(integrator, scene, sensor, objective, seed=seed, spp=spp, params=params)
     params = params if params is not None else mi.traverse(scene)
     image_seed = mi.UInt32(seed)
     dr.make_opaque(image_seed)
     image = integrator.fused(scene, resolve_sensor(scene, sensor), image_seed, spp, gradient, params)
-    return StepResult(image, objective(image), refused)
+    return StepResult(image, objective(image))
 
 
 def _batched(integrator: Any, scene: Any, sensor: Any, objective: Objective, seed: Any, spp: int, params: Any,
@@ -146,7 +150,7 @@ def _batched(integrator: Any, scene: Any, sensor: Any, objective: Objective, see
     image, refused = first, Refused()
     for b in range(1, batches):
         _, gradient = _derivative(objective, image, refused)
-        step = known_step(integrator, scene, sensor, gradient * share, seed=seeds[b], spp=size, params=params)
+        step = _known(integrator, scene, sensor, gradient * share, seeds[b], size, params)
         image = image + (step.image - image) / (b + 1)
         dr.eval(image)
     if first_batch == "again":

@@ -6,6 +6,7 @@ direction in which all entries of the parameters grow alike: what is not finite 
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
@@ -22,8 +23,12 @@ from reslrb_cli.transport.emission import Emission, sample_emission
 from reslrb_cli.transport.transmittance import forward_derivatives
 from reslrb_cli.transport.visible import visible_radiance, visible_tangent
 
+Array = np.ndarray[Any, Any]
+
 SUM = "sum of contributions, each of which is finite; the largest"
 LOSS = "derivative of the loss, dL/dI"
+IMAGE = "image (of this integrator no paths are looked at)"
+GRADIENT = "gradient (of this integrator no paths are looked at) of"
 
 
 def find_offenders(problem: Problem, iteration: int) -> list[Offender]:
@@ -39,6 +44,7 @@ def find_offenders(problem: Problem, iteration: int) -> list[Offender]:
 def _of_view(problem: Problem, iteration: int, sensor: int, target: Any) -> Offender | None:
     run = problem.config.run
     step_seed, largest = seed(run.seed, iteration, sensor, "image"), None
+    step = _take_step(problem, sensor, target, step_seed)
     if problem.config.integrator.type in LIGHT_TRACERS:
         tracer = _tracer(problem)
         _set_tangents(problem)
@@ -48,12 +54,12 @@ def _of_view(problem: Problem, iteration: int, sensor: int, target: Any) -> Offe
             )
             for number, samples in enumerate(parts):
                 label = name if len(parts) == 1 else f"{name}, pass {number + 1}"
-                offender, peak = _of_samples(samples, sensor, label)
+                offender, peak = _of_samples(samples, sensor, label, step.pixel)
                 if offender is not None:
                     return offender
                 largest = max((largest, peak), key=lambda entry: -1.0 if entry is None else max(map(abs, entry.value)))
         problem.apply()
-    return _of_step(problem, sensor, target, step_seed, largest)
+    return _of_step(step, sensor, target, largest)
 
 
 def _tracer(problem: Problem) -> Any:
@@ -79,8 +85,10 @@ def _set_tangents(problem: Problem) -> None:
 # --- paths ------------------------------------------------------------------------------------------------------------
 
 
-def _of_samples(samples: Samples, sensor: int, label: str) -> tuple[Offender | None, Offender | None]:
-    """The offender of the first path that has one, and the largest contribution of them all."""
+def _of_samples(
+    samples: Samples, sensor: int, label: str, pixel: tuple[int, int] | None
+) -> tuple[Offender | None, Offender | None]:
+    """The offender of the first path that has one, one to `pixel` where there is any, and the largest contribution."""
     plan = samples.plan
     with dr.suspend_grad():
         with dr.resume_grad():
@@ -94,8 +102,15 @@ def _of_samples(samples: Samples, sensor: int, label: str) -> tuple[Offender | N
     peak = _offender(samples, sensor, label, state.largest, state.largest_u, lane) if size[lane] > 0 else None
     lanes = np.flatnonzero(np.array(state.found.kind))
     if lanes.size:
-        return _offender(samples, sensor, label, state.found, state.u, int(lanes[0])), peak
+        return _offender(samples, sensor, label, state.found, state.u, _first(lanes, state.u, pixel)), peak
     return _of_visible_emission(samples, sensor, label), peak
+
+
+def _first(lanes: Array, u: Any, pixel: tuple[int, int] | None) -> int:
+    """The first of these lanes, of those that land in `pixel` if any do."""
+    x, y = (np.floor(np.array(component))[lanes] for component in u)
+    there = lanes[(x == pixel[0]) & (y == pixel[1])] if pixel is not None else lanes[:0]
+    return int(there[0] if there.size else lanes[0])
 
 
 def _of_visible_emission(samples: Samples, sensor: int, label: str) -> Offender | None:
@@ -153,21 +168,52 @@ def _shape_name(scene: Any, index: int) -> str | None:
 # --- the step itself --------------------------------------------------------------------------------------------------
 
 
-def _of_step(problem: Problem, sensor: int, target: Any, step_seed: int, largest: Offender | None) -> Offender | None:
-    """What is left where no path has anything: sums that overflow, and the loss."""
-    run = problem.config.run
+@dataclass
+class Step:
+    """Image (H, W, C) and gradients of a step, and the first entry (x, y, channel) of dL/dI that was refused."""
+
+    image: Array
+    gradients: dict[str, Array]
+    refused: tuple[int, int, int] | None
+
+    @property
+    def pixel(self) -> tuple[int, int] | None:
+        """The pixel of that entry."""
+        return None if self.refused is None else self.refused[:2]
+
+
+def _take_step(problem: Problem, sensor: int, target: Any, step_seed: int) -> Step:
+    """The view's step, as the run took it; leaves no gradient behind."""
+    optimizer, keys = problem.optimizer, problem.selection.keys
     step = gradient_step(
         problem.integrator, problem.scene, sensor, lambda image: problem.compare(image, target) / len(problem.sensors),
-        seed=step_seed, **run.step_options(), params=problem.selection.params,
+        seed=step_seed, **problem.config.run.step_options(), params=problem.selection.params,
     )  # fmt: skip
-    gradients = [np.array(problem.optimizer.gradient(key)) for key in problem.selection.keys]
-    for key in problem.selection.keys:
-        problem.optimizer.clear_gradient(key)
-    image, entry = np.array(step.image), step.refused.entry()
-    if entry is not None and np.isfinite(image[entry[1], entry[0]]).all():
-        x, y, channel = entry
-        here, wanted = (np.array(array)[y, x].tolist() for array in (image, target))
-        return Offender(sensor, (x, y), f"{LOSS}, channel {channel}", [], None, here, wanted)
-    if largest is not None and not all(np.isfinite(array).all() for array in [image, *gradients]):
+    gradients = {key: np.array(optimizer.gradient(key)) for key in keys}
+    for key in keys:
+        optimizer.clear_gradient(key)
+    return Step(np.array(step.image), gradients, step.refused.entry())
+
+
+def _of_step(step: Step, sensor: int, target: Any, largest: Offender | None) -> Offender | None:
+    """What is left where no path has anything: sums that overflow, and the loss."""
+    image = step.image
+    if step.refused is not None:
+        x, y, channel = step.refused
+        if np.isfinite(image[y, x]).all():
+            here, wanted = (np.array(array)[y, x].tolist() for array in (image, target))
+            return Offender(sensor, (x, y), f"{LOSS}, channel {channel}", [], None, here, wanted)
+    if all(np.isfinite(array).all() for array in [image, *step.gradients.values()]):
+        return None
+    if largest is not None:
         return Offender(sensor, largest.pixel, SUM, largest.value, largest.where)
-    return None
+    return _without_paths(sensor, image, np.array(target), step.gradients)
+
+
+def _without_paths(sensor: int, image: Array, target: Array, gradients: dict[str, Array]) -> Offender:
+    """What there is to say where paths were not looked at: the pixel, or else the parameter."""
+    if not np.isfinite(image).all():
+        y, x, _ = (int(index) for index in np.argwhere(~np.isfinite(image))[0])
+        return Offender(sensor, (x, y), IMAGE, image[y, x].tolist(), None, image[y, x].tolist(), target[y, x].tolist())
+    [key, *_] = [key for key, gradient in gradients.items() if not np.isfinite(gradient).all()]
+    return Offender(sensor, None, f"{GRADIENT} {key}", [], None)

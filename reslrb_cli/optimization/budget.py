@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 FILM_IMAGES = 12
 #: Copies of a parameter: gradients, the optimiser's moments, their next values.
 PARAMETER_COPIES = 8
+#: And those of a clamp: what is usual, the sums over the iterations, and their next values.
+CLAMP_COPIES = 7
 
 
 @dataclass(frozen=True)
@@ -84,9 +86,10 @@ def estimate(problem: Problem, integrator: Any, samples: int, fixed: int) -> Est
         images = max(images, FILM_IMAGES * _allocated(4 * block), 2 * _allocated(4 * block) + _replicas(block))
         targets += _allocated(4 * block)
         scratch = max(scratch, integrator.estimator.scratch_bytes(plan))
+    copies = PARAMETER_COPIES + (0 if problem.config.optimizer.clamp_gradient is None else CLAMP_COPIES)
     for key in problem.selection.keys:
         size = int(dr.prod(dr.shape(problem.selection.params[key])))
-        images += PARAMETER_COPIES * _allocated(4 * size) + _replicas(size)
+        images += copies * _allocated(4 * size) + _replicas(size)
     return Estimate(fixed + targets, images, scratch * resident_paths(), paths)
 
 

@@ -119,6 +119,7 @@ def test_a_texel_that_is_not_a_number(experiment, capsys, film):
     assert iteration == 0
     assert offender["value"][1] == "nan"
     assert all(isinstance(value, float) for value in offender["value"][::2])
+    assert f"the first at pixel ({', '.join(map(str, offender['pixel']))})" in err
     at = offender["where"]
     assert at["surface"] == "wall_shape"
     assert offender["quantity"].startswith(("scattering weight", "connection factor"))
@@ -266,3 +267,37 @@ def test_a_clamp_reports_its_bias(experiment, capsys):
     assert f"{tally['entries']} entries of gradients were clamped" in Path("runs/config/report.html").read_text()
     records = [json.loads(text) for text in Path("runs/config/metrics.jsonl").read_text().splitlines()]
     assert sum(record["clamped"]["entries"] for record in records) == tally["entries"]
+
+
+def test_paths_from_the_sensor_are_not_looked_at(experiment, capsys):
+    prb = "integrator={type: prb, max_depth: 4}"
+    _, err = optimize(capsys, STOP, "scene.options={wall: spoilt.exr}", prb)
+    _, [offender], _ = inspect(capsys, err)
+    assert offender["quantity"].startswith("image")
+    assert offender["image"][1] in ("nan", "inf")
+    assert offender["where"] is None
+
+
+def test_emitters_that_are_seen_are_looked_at(experiment, capsys):
+    """The lamp, turned towards the camera beside the poster, at a depth of 1: there are no light paths at all."""
+    at_camera = SCENE.replace('<rotate x="1" angle="180"/><translate x="0" y="0" z="5"/>', '<scale value="0.1"/>')
+    Path("scene.xml").write_text(
+        at_camera.replace("REFLECTANCE", PLAIN).replace('<translate z="0"/>', '<translate z="-0.5"/>')
+    )
+    sets = ("scene.options={power: 3.4028236e38}", "integrator.max_depth=1")
+    _, err = optimize(capsys, STOP, *sets)
+    _, [offender], _ = inspect(capsys, err)
+    assert offender["quantity"] == "emission E towards the sensor"
+    assert offender["where"]["surface"] == "lamp"
+
+
+@pytest.mark.parametrize(
+    "integrator", ["walk_ad", "ptracer", "reslrb, estimator: reservoir", "reslrb, estimator: event"]
+)
+def test_other_integrators_have_the_same_paths(experiment, capsys, integrator):
+    found = []
+    for type in (integrator, "reslrb, estimator: gather"):
+        chosen = f"integrator={{type: {type}, max_depth: 4}}"
+        _, err = optimize(capsys, STOP, "scene.options={wall: spoilt.exr}", chosen, "run.name=" + type[:4])
+        found.append(inspect(capsys, err)[:2])
+    assert found[0] == found[1]

@@ -76,3 +76,11 @@ def test_random_estimators_agree_over_many_seeds(case: GradientCase):
     count = 200 if case.name in FEW else 40
     agree(case, count, RANDOM, "correlated")
     agree(case, count, BY_ADJOINT, "independent")
+
+
+@pytest.mark.parametrize("name", ["reservoir", "gather", "event", "stack"])
+@pytest.mark.parametrize("max_depth", [0, 1])
+def test_without_light_paths_the_gradient_is_zero(name: str, max_depth: int):
+    case = next(case for case in CASES if case.name == "texture")
+    scene = Case(case.scene(), case.keys)
+    assert not scene.gradient(integrator("reslrb", estimator=name, max_depth=max_depth), 3, 4).any()
