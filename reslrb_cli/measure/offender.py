@@ -6,22 +6,19 @@ direction in which all entries of the parameters grow alike: what is not finite 
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
-import mitsuba as mi
 import numpy as np
 
 from reslrb_cli.integrators import gradient_step, make_integrator, sample_sets
-from reslrb_cli.integrators.light_tracer import Samples, trace
-from reslrb_cli.measure.offender_walk import QUANTITIES, SearchHooks, Suspect, is_bad
+from reslrb_cli.integrators.light_tracer import Samples
+from reslrb_cli.measure.offender_paths import search_paths
 from reslrb_cli.optimization.problem import LIGHT_TRACERS, Problem
-from reslrb_cli.records.offender import Offender, PathVertex
+from reslrb_cli.records.offender import Offender
 from reslrb_cli.seeds import seed
-from reslrb_cli.transport.emission import Emission, sample_emission
-from reslrb_cli.transport.transmittance import forward_derivatives
-from reslrb_cli.transport.visible import visible_radiance, visible_tangent
 
 Array = np.ndarray[Any, Any]
 
@@ -42,31 +39,30 @@ def find_offenders(problem: Problem, iteration: int) -> list[Offender]:
 
 
 def _of_view(problem: Problem, iteration: int, sensor: int, target: Any) -> Offender | None:
-    run = problem.config.run
-    step_seed, largest = seed(run.seed, iteration, sensor, "image"), None
+    step_seed = seed(problem.config.run.seed, iteration, sensor, "image")
     step = _take_step(problem, sensor, target, step_seed)
-    if problem.config.integrator.type in LIGHT_TRACERS:
-        tracer = _tracer(problem)
-        _set_tangents(problem)
-        for name, samples_seed, spp in sample_sets(step_seed, run.step_options()):
-            parts = tracer.passes(
-                problem.scene, problem.scene.sensors()[sensor], samples_seed, spp, problem.selection.params
-            )
-            for number, samples in enumerate(parts):
-                label = name if len(parts) == 1 else f"{name}, pass {number + 1}"
-                offender, peak = _of_samples(samples, sensor, label, step.pixel)
-                if offender is not None:
-                    return offender
-                largest = max((largest, peak), key=lambda entry: -1.0 if entry is None else max(map(abs, entry.value)))
-        problem.apply()
-    return _of_step(step, sensor, target, largest)
+    if problem.config.integrator.type not in LIGHT_TRACERS:
+        return _of_step(step, sensor, target, None)
+    _set_tangents(problem)
+    found = [search_paths(*part, step.pixel) for part in _parts(problem, sensor, step_seed)]
+    problem.apply()
+    offenders = sorted((part for part in found if part.offender is not None), key=lambda part: not part.there)
+    if offenders:
+        return offenders[0].offender
+    largest = [part.largest for part in found if part.largest is not None]
+    return _of_step(step, sensor, target, max(largest, key=lambda entry: max(map(abs, entry.value)), default=None))
 
 
-def _tracer(problem: Problem) -> Any:
-    """An integrator that traces the same light paths as that of the run."""
+def _parts(problem: Problem, sensor: int, step_seed: int) -> Iterator[tuple[Samples, int, str]]:
+    """The samples of a step, pass by pass, with the sensor's index and a name; light paths are those of the run."""
     options = problem.config.integrator.options()
     shared = {name: options[name] for name in ("max_depth", "rr_depth", "hide_emitters")}
-    return make_integrator("reslrb", estimator="gather", samples_per_pass=problem.samples_per_pass, **shared)
+    tracer = make_integrator("reslrb", estimator="gather", samples_per_pass=problem.samples_per_pass, **shared)
+    scene, params = problem.scene, problem.selection.params
+    for name, samples_seed, spp in sample_sets(step_seed, problem.config.run.step_options()):
+        passes = tracer.passes(scene, scene.sensors()[sensor], samples_seed, spp, params)
+        for number, samples in enumerate(passes):
+            yield samples, sensor, name if len(passes) == 1 else f"{name}, pass {number + 1}"
 
 
 def _set_tangents(problem: Problem) -> None:
@@ -80,92 +76,6 @@ def _set_tangents(problem: Problem) -> None:
     for key in keys:
         dr.enqueue(dr.ADMode.Forward, problem.optimizer[key])
     dr.traverse(dr.ADMode.Forward, dr.ADFlag.ClearEdges)
-
-
-# --- paths ------------------------------------------------------------------------------------------------------------
-
-
-def _of_samples(
-    samples: Samples, sensor: int, label: str, pixel: tuple[int, int] | None
-) -> tuple[Offender | None, Offender | None]:
-    """The offender of the first path that has one, one to `pixel` where there is any, and the largest contribution."""
-    plan = samples.plan
-    with dr.suspend_grad():
-        with dr.resume_grad():
-            E = sample_emission(plan, samples.scene, samples.sensor, samples.sampler())
-            [dE] = forward_derivatives(E.weight) if plan.differentiate_emission else [mi.Spectrum(0)]
-        hooks = SearchHooks(samples, Emission(E.ray, dr.detach(E.weight)), dE)
-        state = trace(samples, hooks)
-        dr.eval(state)
-    size = np.array(dr.max(dr.abs(state.largest.value)))
-    lane = int(np.argmax(np.where(np.isfinite(size), size, 0)))
-    peak = _offender(samples, sensor, label, state.largest, state.largest_u, lane) if size[lane] > 0 else None
-    lanes = np.flatnonzero(np.array(state.found.kind))
-    if lanes.size:
-        return _offender(samples, sensor, label, state.found, state.u, _first(lanes, state.u, pixel)), peak
-    return _of_visible_emission(samples, sensor, label), peak
-
-
-def _first(lanes: Array, u: Any, pixel: tuple[int, int] | None) -> int:
-    """The first of these lanes, of those that land in `pixel` if any do."""
-    x, y = (np.floor(np.array(component))[lanes] for component in u)
-    there = lanes[(x == pixel[0]) & (y == pixel[1])] if pixel is not None else lanes[:0]
-    return int(there[0] if there.size else lanes[0])
-
-
-def _of_visible_emission(samples: Samples, sensor: int, label: str) -> Offender | None:
-    plan = samples.plan
-    if not plan.visible_emission:
-        return None
-    with dr.suspend_grad():
-        primary = samples.primary_ray()
-        radiance = visible_radiance(plan, samples.scene, primary)
-        tangent = mi.Spectrum(0)
-        if plan.differentiate_emission or plan.differentiate_null:
-            tangent = visible_tangent(plan, samples.scene, primary)
-        si = samples.scene.ray_intersect(primary.ray, primary.active)
-        p = dr.select(si.is_valid(), si.p, primary.ray.o)
-        for name, value in (("emission E towards the sensor", radiance), ("derivative of emission, dE", tangent)):
-            lanes = np.flatnonzero(np.array(primary.active & is_bad(value) & dr.mask_t(primary.u.x)(True)))
-            if lanes.size:
-                shape = dr.reinterpret_array(mi.UInt32, si.shape)
-                suspect = Suspect(mi.UInt32(0), mi.UInt32(0), p, shape, mi.Spectrum(value))
-                return _offender(samples, sensor, label, suspect, primary.u, int(lanes[0]), name)
-    return None
-
-
-def _offender(
-    samples: Samples, sensor: int, label: str, suspect: Suspect, u: Any, lane: int, quantity: str | None = None
-) -> Offender:
-    def numbers(value: Any) -> list[float]:
-        return [float(np.array(channel).ravel()[lane % dr.width(channel)]) for channel in value]
-
-    def number(value: Any) -> int:
-        return int(np.array(value).ravel()[lane % dr.width(value)])
-
-    x, y = numbers(u)
-    position = tuple(numbers(suspect.p))
-    where = PathVertex(
-        label,
-        int(samples.seed[0]),
-        lane,
-        samples.width,
-        number(suspect.vertex),
-        position,  # type: ignore[arg-type]
-        _shape_name(samples.scene, number(suspect.shape)),
-    )
-    pixel = (int(np.floor(x)), int(np.floor(y)))
-    return Offender(sensor, pixel, quantity or QUANTITIES[number(suspect.kind)], numbers(suspect.value), where)
-
-
-def _shape_name(scene: Any, index: int) -> str | None:
-    for shape in scene.shapes():
-        if int(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))[0]) == index:
-            return str(shape.id())
-    return None
-
-
-# --- the step itself --------------------------------------------------------------------------------------------------
 
 
 @dataclass

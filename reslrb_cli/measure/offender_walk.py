@@ -12,6 +12,7 @@ from reslrb_cli.integrators.light_tracer import Samples
 from reslrb_cli.transport.connection import Connection
 from reslrb_cli.transport.factors import Product
 from reslrb_cli.transport.scattering import Scattering, attached_factor, evaluate
+from reslrb_cli.transport.splat import Film
 from reslrb_cli.transport.transmittance import forward_derivatives
 from reslrb_cli.transport.walk import Hooks, Vertex
 
@@ -56,17 +57,27 @@ def is_bad(value: Any) -> Any:
     return ~dr.all(dr.isfinite(value))
 
 
+def reaches(film: Film, u: Any, pixel: tuple[int, int] | None) -> Any:
+    """Lanes whose film position `u` is within the filter's reach of `pixel`."""
+    if pixel is None:
+        return mi.Bool(False)
+    centre = mi.Point2f(pixel[0] + 0.5, pixel[1] + 0.5)
+    return dr.all(dr.abs(u - centre) <= film.film.rfilter().radius())
+
+
 @dataclass
 class Search:
     """Loop state.
 
     `first` is the first suspect of the path so far, and `found` the one that was first when a connection took it to
-    film position `u`; `largest` is the largest contribution (its `value`), which lands at `largest_u`.
+    film position `u`: the first such connection, or, where there is one, the first whose pixel is the wanted one
+    (`there`). `largest` is the largest contribution (its `value`), which lands at `largest_u`.
     """
 
     first: Suspect
     found: Suspect
     u: Any
+    there: Any
     largest: Suspect
     largest_u: Any
 
@@ -75,16 +86,16 @@ class SearchHooks(Hooks):
     """Looks at every factor that a connection passes on, at its derivative along the parameters' tangents, and at the
     product of them all."""
 
-    def __init__(self, samples: Samples, emission: Any, derivative: Any) -> None:
-        """`emission` is a ray of each path, with E; `derivative` is dE (C,)."""
-        self.samples, self.emission, self.derivative = samples, emission, derivative
+    def __init__(self, samples: Samples, emission: Any, derivative: Any, pixel: tuple[int, int] | None) -> None:
+        """`emission` is a ray of each path, with E; `derivative` is dE (C,); `pixel` the one that is wanted, if any."""
+        self.samples, self.emission, self.derivative, self.pixel = samples, emission, derivative, pixel
 
     def start(self, product: Product) -> Search:
         first = Suspect.none()
         for kind, value in ((_E, dr.detach(self.emission.weight)), (_DE, self.derivative)):
             here = Suspect(mi.UInt32(kind), mi.UInt32(0), self.emission.ray.o, mi.UInt32(0), mi.Spectrum(value))
             first = first.otherwise(here, mi.Bool(True))
-        return Search(first, Suspect.none(), mi.Point2f(0), Suspect.none(), mi.Point2f(0))
+        return Search(first, Suspect.none(), mi.Point2f(0), mi.Bool(False), Suspect.none(), mi.Point2f(0))
 
     def scattering(self, state: Search, vertex: Vertex, connection: Connection, scattering: Scattering) -> Search:
         plan, seen, scattered = self.samples.plan, connection.active, scattering.active
@@ -101,7 +112,8 @@ class SearchHooks(Hooks):
         C = vertex.product.times(connection.c, vertex.depth).scaled(self.samples.scale).value()
         found = state.first.otherwise(here(_C, connection.c), seen).otherwise(here(_DC, df_c), seen & useful)
         found = found.otherwise(here(_CONTRIBUTION, C), seen)
-        new = seen & (state.found.kind == 0) & (found.kind != 0)
+        there = reaches(self.samples.film, connection.u, self.pixel)
+        new = seen & (found.kind != 0) & ((state.found.kind == 0) | (there & ~state.there))
         larger = seen & (dr.max(dr.abs(C)) > dr.max(dr.abs(state.largest.value)))
 
         first = state.first.otherwise(here(_S, scattering.weight), scattered)
@@ -112,6 +124,7 @@ class SearchHooks(Hooks):
             first,
             dr.select(new, found, state.found),
             dr.select(new, connection.u, state.u),
+            state.there | (new & there),
             dr.select(larger, here(_CONTRIBUTION, C), state.largest),
             dr.select(larger, connection.u, state.largest_u),
         )

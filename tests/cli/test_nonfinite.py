@@ -301,3 +301,14 @@ def test_other_integrators_have_the_same_paths(experiment, capsys, integrator):
         _, err = optimize(capsys, STOP, "scene.options={wall: spoilt.exr}", chosen, "run.name=" + type[:4])
         found.append(inspect(capsys, err)[:2])
     assert found[0] == found[1]
+
+
+def test_passes_that_a_budget_made_are_replayed(experiment, capsys):
+    sets = (STOP, "scene.options={wall: spoilt.exr}", "run.spp=1024", "integrator.estimator=reservoir")
+    _, err = optimize(capsys, *sets, "run.memory_budget=1e-3", code=2)
+    least = int(re.search(r"allow at least (\d+) MiB", err)[1])
+    _, err = optimize(capsys, *sets, f"run.memory_budget={least}")
+    assert manifest()["memory"]["passes"] > 1
+    _, [offender], _ = inspect(capsys, err)
+    assert f"the first at pixel ({', '.join(map(str, offender['pixel']))})" in err
+    assert ", pass " in offender["where"]["samples"]
