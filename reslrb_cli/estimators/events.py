@@ -21,15 +21,16 @@ from reslrb_cli.transport.walk import Vertex
 class Event:
     """One factor of a path: f towards local direction `wo`; `index` is its vertex, 0 for emission.
 
-    `rest` times f is the factor as a whole, but for the transmittance of masks. `own` holds whether the event is a
-    connection's own, and the sample of the aperture, where masks may stand between it and the sensor.
+    `rest` times f is the factor as a whole, but for the transmittance of masks; it is kept where zero factors are
+    tracked, beside which alone it is of use. `own` holds whether the event is a connection's own, and the sample of the
+    aperture, where masks may stand between it and the sensor.
     """
 
     index: Any
     point: SurfacePoint
     wo: Any
     f: Any
-    rest: Any
+    rest: list[Any]
     lobe: list[Any]
     own: list[Any]
 
@@ -38,7 +39,8 @@ class Event:
         """The event before the first vertex."""
         own = [mi.Bool(False), mi.Point2f(0)] if plan.passage_in_gradient else []
         point = SurfacePoint.blank(plan)
-        return Event(mi.UInt32(0), point, mi.Vector3f(0), mi.Spectrum(0), mi.Float(0), blank_lobe(plan), own)
+        rest = [mi.Float(0)] if plan.track_zeros else []
+        return Event(mi.UInt32(0), point, mi.Vector3f(0), mi.Spectrum(0), rest, blank_lobe(plan), own)
 
     @staticmethod
     def of_connection(plan: Plan, vertex: Vertex, connection: Connection) -> Event:
@@ -49,7 +51,7 @@ class Event:
             point=SurfacePoint.of(plan, vertex),
             wo=connection.wo,
             f=connection.f,
-            rest=dr.rcp(stand_in(connection)[0]),
+            rest=[dr.rcp(stand_in(connection)[0])] if plan.track_zeros else [],
             lobe=blank_lobe(plan),
             own=[mi.Bool(True), connection.sample] if plan.passage_in_gradient else [],
         )
@@ -62,7 +64,7 @@ class Event:
             point=SurfacePoint.of(plan, vertex),
             wo=scattering.wo,
             f=scattering.f,
-            rest=scattering.correction / scattering.pdf,
+            rest=[scattering.correction / scattering.pdf] if plan.track_zeros else [],
             lobe=lobe(plan, scattering),
             own=[mi.Bool(False), mi.Point2f(0)] if plan.passage_in_gradient else [],
         )
@@ -72,7 +74,7 @@ def differentiate_event(p: Pass, kept: Event, adjoint: PathAdjoint, active: Any)
     """Add the derivative of an event, of a connection with this adjoint, in `active` lanes that hold one."""
     plan, active = p.plan, active & (kept.index > 0)
     si, bsdf = kept.point.interaction(plan, active)
-    rest = mi.Spectrum(kept.rest)
+    rest = mi.Spectrum(kept.rest[0] if kept.rest else 0)
     if plan.passage_in_gradient:
         own, sample = kept.own
         connection = connect(plan, p.sensor, si, kept.point.ray(), sample, active & own)

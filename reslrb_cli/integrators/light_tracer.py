@@ -238,11 +238,12 @@ def fused(samples: list[Samples], estimator: Estimator, gradient: Any) -> Any:
     block, adjoint = film.block(), film.adjoint(gradient)
     with dr.isolate_grad():  # as above
         for part in samples:
-            state = keep(part, estimator, block, adjoint)
+            splat_visible_emission(part, block)
+            state = estimator.forward(part.context(block, adjoint))
             replay(part, estimator, state, adjoint)
-            del state  # before the next pass makes its own
+            dr.schedule(block.tensor())  # with the gradients: what came later would trace everything again
             if len(samples) > 1:
-                finish_pass()
+                finish_pass(block.tensor())
     return film.develop(block)
 
 

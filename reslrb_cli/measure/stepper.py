@@ -13,7 +13,7 @@ from reslrb_cli.integrators import gradient_step, known_step
 from reslrb_cli.measure import cornell_box
 from reslrb_cli.measure.scratch import scratch_bytes
 from reslrb_cli.optimization.problem import assemble_scene
-from reslrb_cli.records.clock import StepClock, peak_mib, reset_peak
+from reslrb_cli.records.clock import StepClock, StepTimes, peak_mib, reset_peak
 from reslrb_cli.seeds import seed
 
 
@@ -37,17 +37,19 @@ class Stepper:
         self.clock = StepClock()
 
     def step(self, round: int, cold: bool, release: bool) -> dict[str, Any]:
-        """Take one step; `cold` ones also measure memory, `release` gives the allocator's cache back afterwards."""
-        problem, run = self.problem, self.problem.config.run
-        problem.apply()
-        for key in problem.selection.keys:
-            dr.clear_grad(problem.optimizer[key])
+        """Take one step and measure it, `cold` ones also their memory; others are taken twice, and the second counts.
+
+        `release` gives the allocator's cache back afterwards.
+        """
+        new_kernels = 0
         if cold:
             reset_peak()
-        with self.clock.step() as times:
-            result = self._take(seed(run.seed, round, self.sensor, "image"))
-            dr.eval(result.image, result.loss, [problem.optimizer.gradient(key) for key in problem.selection.keys])
-        answer = {"step_ms": times.wall_ms, "kernel_ms": times.kernel_ms, "new_kernels": times.new_kernels}
+        else:
+            # What other processes did since the last step, to caches above all, is to cost this one nothing.
+            new_kernels = self._timed(round).new_kernels
+        times = self._timed(round)
+        new_kernels += times.new_kernels
+        answer = {"step_ms": times.wall_ms, "kernel_ms": times.kernel_ms, "new_kernels": new_kernels}
         if cold:
             answer["peak_mib"] = peak_mib(dr.backend_v(mi.Float))
             answer["scratch_bytes"] = scratch_bytes(self.clock.history)
@@ -55,6 +57,16 @@ class Stepper:
         if release:
             dr.flush_malloc_cache()
         return answer
+
+    def _timed(self, round: int) -> StepTimes:
+        problem = self.problem
+        problem.apply()
+        for key in problem.selection.keys:
+            dr.clear_grad(problem.optimizer[key])
+        with self.clock.step() as times:
+            result = self._take(seed(problem.config.run.seed, round, self.sensor, "image"))
+            dr.eval(result.image, result.loss, [problem.optimizer.gradient(key) for key in problem.selection.keys])
+        return times
 
     def _take(self, seed: int) -> Any:
         problem, run = self.problem, self.problem.config.run
