@@ -97,6 +97,11 @@ class Reslrb(LightTracer):
         description="Vertices of a path that fit into thread-local memory; longer paths are traced a second time. "
         "Only with estimator `stack`.",
     )
+    freeze: bool = Field(
+        default=True,
+        description="Record what a step launches and launch that again, so that its Python runs once, not in every "
+        "iteration. Not with passes.",
+    )
 
     @model_validator(mode="after")
     def _check_options(self) -> Self:

@@ -11,6 +11,7 @@ from reslrb_cli.errors import UnsupportedScene
 from reslrb_cli.estimators import ESTIMATORS, Estimator
 from reslrb_cli.integrators import light_tracer as lt
 from reslrb_cli.integrators.differentiated import differentiated
+from reslrb_cli.integrators.freezing import Recordings
 from reslrb_cli.scene.graph import SceneGraph
 from reslrb_cli.scene.needs import check_supported, scene_needs
 from reslrb_cli.transport.plan import Plan, make_plan
@@ -56,8 +57,10 @@ def _make_classes() -> dict[str, Any]:
             self.rr_depth = props.get("rr_depth", 5)
             if self.rr_depth <= 0:
                 raise ValueError('"rr_depth" must be greater than zero')
+            self.freeze = False
             self._track_zeros = False
             self._plans: dict[Any, Plan] = {}  # of the sensors of one scene
+            self.recordings = Recordings()  # the same scene's
             self._scene: Any = None  # its address, and, to keep that from being used again, itself
             self._owners: dict[Any, list[Any]] = {}  # BSDFs of its surfaces that use a node, and under None all of them
 
@@ -69,6 +72,7 @@ def _make_classes() -> dict[str, Any]:
                 self._scene = (scene.ptr, None if owner is not None and owner.ptr == self.ptr else scene)
                 self._plans.clear()
                 self._owners.clear()
+                self.recordings.clear()
             key = sensor.ptr
             if key not in self._plans:
                 check_supported(scene, sensor, self.hide_emitters)
@@ -103,18 +107,19 @@ def _make_classes() -> dict[str, Any]:
                    evaluate: bool = True) -> Any:  # fmt: skip
             if not develop:
                 raise ValueError("develop=True must be specified when invoking AD integrators")
-            sensor = resolve_sensor(scene, sensor)
+            sensor, estimator = resolve_sensor(scene, sensor), self.image_estimator()
+
+            def image(samples: lt.Samples) -> Any:
+                return lt.image_of([samples], estimator)
+
             with dr.suspend_grad():
-                film = Film(sensor)
-                block = film.block()
-                for samples in self.passes(scene, sensor, seed, spp):
-                    lt.image_alone(samples, self.image_estimator(), block)
-                    if self.samples_per_pass is not None:
-                        lt.finish_pass(block.tensor())
-                image = film.develop(block)
+                parts = self.passes(scene, sensor, seed, spp)
+                if evaluate and self._freezes(parts):
+                    return self.recordings.call("image", parts[0], image)
+                result = lt.image_of(parts, estimator)
                 if evaluate:
-                    dr.eval(image)
-                return image
+                    dr.eval(result)
+                return result
 
         def render_forward(self, scene: Any, params: Any, sensor: Any = 0, seed: Any = 0, spp: int = 0) -> Any:
             sensor = resolve_sensor(scene, sensor)
@@ -125,6 +130,10 @@ def _make_classes() -> dict[str, Any]:
                 for samples in self.passes(scene, sensor, seed, spp, params):
                     lt.splat_tangents(samples, block)
                 return film.develop_tangent(block)
+
+        def _freezes(self, parts: list[lt.Samples]) -> bool:
+            """Whether these samples are traced from a recording; several passes are large, and gain little by it."""
+            return self.freeze and len(parts) == 1
 
         def image_estimator(self) -> Estimator | None:
             """The estimator that makes images of its own; None where they show every connection."""
@@ -151,6 +160,7 @@ def _make_classes() -> dict[str, Any]:
                 raise ValueError(f'"estimator" must be one of {", ".join(ESTIMATORS)}, not "{name}"')
             # An option that the estimator does not know stays unread, which Mitsuba reports as an error.
             kind = ESTIMATORS[name]
+            self.freeze = props.get("freeze", False)
             self.estimator = kind(**{key: props.get(key, default) for key, default in kind.OPTIONS.items()})
 
         def image_estimator(self) -> Estimator | None:
@@ -158,21 +168,48 @@ def _make_classes() -> dict[str, Any]:
 
         def trace(self, scene: Any, sensor: Any, seed: Any, spp: int, params: Any) -> lt.Trace:
             """The image, and what a replay of the same samples needs; both evaluated."""
+            estimator = self.estimator
+
+            def trace(samples: lt.Samples) -> tuple[Any, Any]:
+                result = lt.trace_image([samples], estimator)
+                return result.image, result.state
+
             with dr.suspend_grad():
-                return lt.trace_image(self.passes(scene, sensor, seed, spp, params), self.estimator)
+                parts = self.passes(scene, sensor, seed, spp, params)
+                if not self._freezes(parts):
+                    return lt.trace_image(parts, estimator)
+                return lt.Trace(parts, *self.recordings.call("trace", parts[0], trace))
 
         def replay(self, trace: lt.Trace, gradient: Any, params: Any) -> None:
             """Add the gradient of the objective with dL/dI `gradient` (H, W, C) to the parameters."""
+            estimator = self.estimator
+
+            def replay(samples: lt.Samples, gradient: Any, *state: Any) -> None:
+                lt.replay_all(lt.Trace([samples], None, *state), estimator, gradient)
+
             with dr.suspend_grad():
-                lt.replay_all(trace, self.estimator, gradient)
+                if not self._freezes(trace.samples):
+                    lt.replay_all(trace, estimator, gradient)
+                elif trace.state is None:
+                    self.recordings.call("trace and replay", trace.samples[0], replay, gradient)
+                else:
+                    self.recordings.call("replay", trace.samples[0], replay, gradient, trace.state)
 
         def fused(self, scene: Any, sensor: Any, seed: Any, spp: int, gradient: Any, params: Any) -> Any:
             """The image, and the gradient of the objective with dL/dI `gradient` (H, W, C), known before either.
 
             One set of samples, traced once for both where the estimator can.
             """
+            estimator = self.estimator
+
+            def fused(samples: lt.Samples, gradient: Any) -> Any:
+                return lt.fused([samples], estimator, gradient)
+
             with dr.suspend_grad():
-                return lt.fused(self.passes(scene, sensor, seed, spp, params), self.estimator, gradient)
+                parts = self.passes(scene, sensor, seed, spp, params)
+                if not self._freezes(parts):
+                    return lt.fused(parts, estimator, gradient)
+                return self.recordings.call("fused", parts[0], fused, gradient)
 
         def render_backward(self, scene: Any, params: Any, grad_in: Any, sensor: Any = 0, seed: Any = 0,
                             spp: int = 0) -> None:  # fmt: skip

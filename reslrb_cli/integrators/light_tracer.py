@@ -154,12 +154,18 @@ def splat_image(samples: Samples, block: Any) -> None:
     trace(samples, Splat(samples, block))
 
 
-def image_alone(samples: Samples, estimator: Estimator | None, block: Any) -> None:
-    """Add the samples' image to the block, as the estimator makes it where it makes one of its own (else None)."""
-    if estimator is None:
-        splat_image(samples, block)
-    else:
-        keep(samples, estimator, block)
+def image_of(samples: list[Samples], estimator: Estimator | None) -> Any:
+    """The image of all passes, as the estimator makes it where it makes one of its own (else None); nothing is kept."""
+    film = samples[0].film
+    block = film.block()
+    for part in samples:
+        if estimator is None:
+            splat_image(part, block)
+        else:
+            keep(part, estimator, block)
+        if len(samples) > 1:
+            finish_pass(block.tensor())
+    return film.develop(block)
 
 
 def keep(samples: Samples, estimator: Estimator, block: Any, adjoint: AdjointImage | None = None) -> Any:
@@ -198,16 +204,13 @@ class Trace:
 
 def trace_image(samples: list[Samples], estimator: Estimator) -> Trace:
     """Trace all passes: the image, and what the estimator keeps of each path."""
-    film = samples[0].film
-    block = film.block()
+    trace = Trace(samples)
     if len(samples) == 1:
-        trace = Trace(samples, state=keep(samples[0], estimator, block))
+        block = trace.film.block()
+        trace.state = keep(samples[0], estimator, block)
+        trace.image = trace.film.develop(block)
     else:
-        trace = Trace(samples)
-        for part in samples:
-            image_alone(part, None if estimator.splats_all else estimator, block)
-            finish_pass(block.tensor())
-    trace.image = film.develop(block)
+        trace.image = image_of(samples, None if estimator.splats_all else estimator)
     dr.eval(trace.image)
     return trace
 

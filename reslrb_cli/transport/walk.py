@@ -158,7 +158,7 @@ def walk(
             f = attached_factor(plan, si, vertex.bsdf, scattering, scattering.active)
             weight = dr.replace_grad(weight, f * (scattering.correction / scattering.pdf))
         product = path.product.times(weight, path.depth)
-        eta = path.eta * scattering.eta if plan.roulette else path.eta
+        eta = path.eta * scattering.eta
         active = scattering.active & product.alive()
 
         # ---- Russian roulette ----

@@ -1,0 +1,118 @@
+"""What a step launches, recorded once and launched again: no Python between a seed and its gradient (`dr.freeze`).
+
+Tracing a step takes milliseconds, however small the image. A recording is made for each kind of call; Dr.Jit makes
+another by itself where inputs change in more than their values.
+"""
+
+from __future__ import annotations
+
+import gc
+import logging
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import drjit as dr
+
+from reslrb_cli.errors import UnsupportedScene, is_out_of_memory
+from reslrb_cli.integrators.light_tracer import Samples
+from reslrb_cli.transport.splat import Film
+
+#: Recordings of one kind of call that are kept, for inputs that change in more than their values.
+KEPT = 4
+#: A call that is recorded more often than that gains nothing by it; Dr.Jit then warns.
+WARN_AFTER = 10
+
+
+class Recordings:
+    """Calls on the samples of one scene, by kind and plan."""
+
+    def __init__(self) -> None:
+        self._functions: dict[Any, Any] = {}  # None where Dr.Jit cannot record the call
+
+    def clear(self) -> None:
+        """Forget all of them, for a new scene."""
+        self._functions.clear()
+
+    def call(self, kind: str, samples: Samples, function: Callable[..., Any], *inputs: Any) -> Any:
+        """`function(samples, *inputs)`, from a recording where there is one; its results are evaluated.
+
+        `function` depends on nothing but its inputs and, of what is no Dr.Jit array, on `kind`; the derivatives that it
+        adds to parameters are proportional to the first of `inputs`. A call that cannot be recorded is made as it is:
+        scenes that live beside this one, for example, take part in its indirect calls, and are none of its inputs.
+        Raises UnsupportedScene where a recording is there, and no longer fits.
+        """
+        s = samples
+        key = (kind, s.plan, s.spp, s.width, tuple(s.film.size))
+        plain = _on_samples(samples, function)
+        common = (s.scene, s.sensor, s.seed, s.scale, s.fraction)
+        if key not in self._functions:
+            self._functions[key] = _record(kind, plain, common, inputs)
+        recorded = self._functions[key]
+        if recorded is None:
+            return plain(*common, *inputs)
+        try:
+            with _without_garbage_collection():
+                return recorded(*common, *inputs)
+        except RuntimeError as error:
+            if is_out_of_memory(error):
+                raise
+            reason = str(error.__cause__ or error).splitlines()[0]
+            raise UnsupportedScene(
+                f"freeze: a recorded step no longer fits, as when another scene was loaded since ({reason}); "
+                "set integrator.freeze to false"
+            ) from error
+
+    def counts(self) -> dict[str, int]:
+        """How often each kind of call was recorded."""
+        counts: dict[str, int] = {}
+        for (kind, *_), function in self._functions.items():
+            if function is not None:
+                counts[kind] = counts.get(kind, 0) + function.n_recordings
+        return counts
+
+
+def _record(kind: str, plain: Callable[..., Any], common: tuple[Any, ...], inputs: tuple[Any, ...]) -> Any:
+    """A recording, or None where there cannot be one.
+
+    Dr.Jit finds that out after all has been computed and derivatives were added. So it is tried with a first input of
+    zeros, which adds none.
+    """
+    recorded = dr.freeze(plain, limit=KEPT, warn_after=WARN_AFTER)
+    if inputs:
+        zeros = dr.zeros(type(inputs[0]), inputs[0].shape)
+        dr.make_opaque(zeros)
+        inputs = (zeros, *inputs[1:])
+    gc.collect()  # scenes that are done with
+    try:
+        with _without_garbage_collection():
+            recorded(*common, *inputs)
+    except RuntimeError as error:
+        if is_out_of_memory(error):
+            raise
+        logging.getLogger(__name__).debug("not recorded (%s): %s", kind, error.__cause__ or error)
+        return None
+    return recorded
+
+
+@contextmanager
+def _without_garbage_collection() -> Iterator[None]:
+    """A scene that is freed in the midst of a recording ends the process."""
+    collects = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if collects:
+            gc.enable()
+
+
+def _on_samples(samples: Samples, function: Callable[..., Any]) -> Callable[..., Any]:
+    """`function` with everything that a recording has to see as an argument of its own."""
+    # Only these: arrays would be constants of the recording, and a scene would never be freed.
+    plan, spp, width = samples.plan, samples.spp, samples.width
+
+    def on_samples(scene: Any, sensor: Any, seed: Any, scale: Any, fraction: Any, *inputs: Any) -> Any:
+        return function(Samples(scene, sensor, plan, Film(sensor), seed, spp, width, scale, fraction), *inputs)
+
+    return on_samples

@@ -1,0 +1,101 @@
+"""Steps from a recording (`freeze`) are the steps themselves: same image and gradient, also after parameters change."""
+
+from __future__ import annotations
+
+import gc
+
+import numpy as np
+import pytest
+from conformance.gradient_cases import CASES, GradientCase
+
+from reslrb_cli.errors import UnsupportedScene
+from reslrb_cli.measure.gradients import Case, integrator, relative
+
+pytestmark = pytest.mark.usefixtures("llvm")
+
+BY_NAME = {case.name: case for case in CASES}
+#: Mitsuba's thin lens keeps an array that a recording does not see.
+NOT_RECORDED = ("thin_lens",)
+ESTIMATORS = ("reservoir", "event", "gather", "stack")
+#: What is recorded, by the way in which a step comes by dL/dI.
+KINDS = {
+    "correlated": {"trace", "replay"},
+    "independent": {"image", "trace and replay"},
+    "batched": {"image", "fused"},
+}
+
+
+def gradients(case: GradientCase, adjoint: str, **options: object) -> tuple[list[np.ndarray], list[dict[str, int]]]:
+    """Gradients of four steps, between which seed and parameters change, and recordings after each."""
+    scene = Case(case.scene(), case.keys)
+    own = {key: value for key, value in case.options.items() if key not in ("image", "samples_per_pass")}
+    chosen = integrator("reslrb", **{**case.both, **own, **options})
+    found, counts = [], []
+    for step in range(4):
+        factor = 1 - 0.1 * step
+        scene.set({key: value * factor for key, value in scene.initial.items()})
+        found.append(scene.gradient(chosen, 5 + step, 8, adjoint=adjoint))
+        counts.append(chosen.recordings.counts())
+    return found, counts
+
+
+@pytest.mark.parametrize("case", [case for case in CASES if case.name not in NOT_RECORDED], ids=lambda case: case.name)
+def test_a_recorded_step_is_the_step(case: GradientCase) -> None:
+    for number, estimator in enumerate(ESTIMATORS):
+        adjoint = list(KINDS)[(number + len(case.name)) % len(KINDS)]
+        expected, none = gradients(case, adjoint, estimator=estimator, freeze=False)
+        gc.collect()  # the scene: none but its own may be alive
+        found, counts = gradients(case, adjoint, estimator=estimator, freeze=True)
+        for step, (a, b) in enumerate(zip(found, expected, strict=True)):
+            assert relative(a, b) < 1e-5, f"{estimator}, {adjoint}, step {step}"
+        # The last steps come from recordings, or else nothing was tested.
+        assert none[-1] == {}
+        assert set(counts[-1]) == KINDS[adjoint], f"{estimator}, {adjoint}"
+        assert counts[-1] == counts[-2], f"{estimator}, {adjoint}"
+
+
+@pytest.mark.parametrize("adjoint", KINDS)
+def test_what_cannot_be_recorded_is_computed_all_the_same(adjoint: str) -> None:
+    case = BY_NAME["thin_lens"]
+    for estimator in ESTIMATORS:
+        expected, _ = gradients(case, adjoint, estimator=estimator, freeze=False)
+        found, counts = gradients(case, adjoint, estimator=estimator, freeze=True)
+        for a, b in zip(found, expected, strict=True):
+            assert relative(a, b) < 1e-5, estimator
+        assert not KINDS[adjoint] & set(counts[-1]) & {"trace", "image", "fused"}, estimator
+
+
+def test_a_recording_that_no_longer_fits_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Stale:
+        """Works when it is tried, and not later."""
+
+        def __init__(self, function: object, **options: object) -> None:
+            self.n_recordings = 0
+
+        def __call__(self, *inputs: object) -> None:
+            self.n_recordings += 1
+            if self.n_recordings > 1:
+                raise RuntimeError("the inputs are others")
+
+    monkeypatch.setattr("drjit.freeze", Stale)
+    case = BY_NAME["texture"]
+    with pytest.raises(UnsupportedScene, match=r"the inputs are others.*integrator\.freeze"):
+        Case(case.scene(), case.keys).gradient(integrator("reslrb", freeze=True), 3, 8)
+
+
+def test_another_scene_is_another_recording() -> None:
+    case = BY_NAME["texture"]
+    chosen = integrator("reslrb", estimator="stack", freeze=True)
+    plain = integrator("reslrb", estimator="stack", freeze=False)
+    for change in ({}, {"side": None, "side_shape": None}, {}):
+        kept = {key: value for key, value in (case.scene() | change).items() if value is not None}
+        scene = Case(kept, case.keys)
+        assert relative(scene.gradient(chosen, 3, 8), scene.gradient(plain, 3, 8)) < 1e-5
+
+
+def test_other_sample_counts_are_other_recordings() -> None:
+    case = BY_NAME["texture"]
+    scene, chosen = Case(case.scene(), case.keys), integrator("reslrb", estimator="event", freeze=True)
+    plain = integrator("reslrb", estimator="event", freeze=False)
+    for spp in (4, 16, 4):
+        assert relative(scene.gradient(chosen, 3, spp), scene.gradient(plain, 3, spp)) < 1e-5
