@@ -20,6 +20,8 @@ from reslrb_cli.transport.splat import Film
 
 #: Recordings of one kind of call that are kept, for inputs that change in more than their values.
 KEPT = 4
+#: Calls after which a recording is in use, at most: Dr.Jit makes some twice before it trusts them.
+TRIALS = 4
 #: A call that is recorded more often than that gains nothing by it; Dr.Jit then warns.
 WARN_AFTER = 10
 
@@ -76,7 +78,7 @@ def _record(kind: str, plain: Callable[..., Any], common: tuple[Any, ...], input
     """A recording, or None where there cannot be one.
 
     Dr.Jit finds that out after all has been computed and derivatives were added. So it is tried with a first input of
-    zeros, which adds none.
+    zeros, which adds none, and until it is in use: what follows a step then has the same kernels from the first one on.
     """
     recorded = dr.freeze(plain, limit=KEPT, warn_after=WARN_AFTER)
     if inputs:
@@ -86,7 +88,10 @@ def _record(kind: str, plain: Callable[..., Any], common: tuple[Any, ...], input
     gc.collect()  # scenes that are done with
     try:
         with _without_garbage_collection():
-            recorded(*common, *inputs)
+            for done in range(TRIALS):
+                recorded(*common, *inputs)
+                if recorded.n_recordings <= done:
+                    break
     except RuntimeError as error:
         if is_out_of_memory(error):
             raise

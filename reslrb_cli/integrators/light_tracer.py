@@ -162,24 +162,18 @@ def image_of(samples: list[Samples], estimator: Estimator | None) -> Any:
         if estimator is None:
             splat_image(part, block)
         else:
-            keep(part, estimator, block)
+            forward(part, estimator, block)
         if len(samples) > 1:
             finish_pass(block.tensor())
     return film.develop(block)
 
 
-def keep(samples: Samples, estimator: Estimator, block: Any, adjoint: AdjointImage | None = None) -> Any:
-    """Trace the samples: add their contributions to the block (None: no image), and return what is kept of each path.
-
-    One kernel: all that it yields is evaluated together, since what came later would trace everything again.
-    """
+def forward(samples: Samples, estimator: Estimator, block: Any, adjoint: AdjointImage | None = None) -> Any:
+    """Trace the samples: add their contributions to the block (None: no image). What is kept of each path is returned,
+    and not evaluated."""
     if block is not None:
         splat_visible_emission(samples, block)
-    state = estimator.forward(samples.context(block, adjoint))
-    if block is not None:
-        dr.schedule(block.tensor())
-    dr.eval(state)
-    return state
+    return estimator.forward(samples.context(block, adjoint))
 
 
 @dataclass
@@ -197,17 +191,16 @@ class Trace:
     def film(self) -> Film:
         return self.samples[0].film
 
-    def state_of(self, samples: Samples, estimator: Estimator, adjoint: AdjointImage) -> Any:
-        """What is kept of one of the passes; one that is traced only now knows dL/dI from the start."""
-        return self.state if self.state is not None else keep(samples, estimator, None, adjoint)
-
 
 def trace_image(samples: list[Samples], estimator: Estimator) -> Trace:
     """Trace all passes: the image, and what the estimator keeps of each path."""
     trace = Trace(samples)
     if len(samples) == 1:
         block = trace.film.block()
-        trace.state = keep(samples[0], estimator, block)
+        trace.state = forward(samples[0], estimator, block)
+        # One kernel: all that it yields is evaluated together, since what came later would trace everything again.
+        dr.schedule(block.tensor())
+        dr.eval(trace.state)
         trace.image = trace.film.develop(block)
     else:
         trace.image = image_of(samples, None if estimator.splats_all else estimator)
@@ -224,30 +217,35 @@ def replay(samples: Samples, estimator: Estimator, state: Any, adjoint: AdjointI
 def replay_all(trace: Trace, estimator: Estimator, gradient: Any) -> None:
     """Add the gradient of the objective with dL/dI `gradient` (H, W, C) to the parameters."""
     adjoint = trace.film.adjoint(gradient)
+    if trace.state is None:
+        differentiate_passes(trace.samples, estimator, None, adjoint)
+        return
     # Isolated: on their way to the parameters gradients are evaluated, and with them all that they hang on, which is to
     # be one kernel. They set out once, at the end.
     with dr.isolate_grad():
-        for samples in trace.samples:
-            state = trace.state_of(samples, estimator, adjoint)
-            replay(samples, estimator, state, adjoint)
-            del state  # before the next pass makes its own
-            if len(trace.samples) > 1:
-                finish_pass()
+        replay(trace.samples[0], estimator, trace.state, adjoint)
 
 
 def fused(samples: list[Samples], estimator: Estimator, gradient: Any) -> Any:
     """The image, and the same gradient, where dL/dI is known before either."""
     film = samples[0].film
-    block, adjoint = film.block(), film.adjoint(gradient)
+    block = film.block()
+    differentiate_passes(samples, estimator, block, film.adjoint(gradient))
+    return film.develop(block)
+
+
+def differentiate_passes(samples: list[Samples], estimator: Estimator, block: Any, adjoint: AdjointImage) -> None:
+    """Trace samples whose dL/dI is known and add their derivatives, and to the block (None: none) their contributions.
+
+    What is kept of a path goes from one to the other within the kernel, and takes no memory.
+    """
     with dr.isolate_grad():  # as above
         for part in samples:
-            splat_visible_emission(part, block)
-            state = estimator.forward(part.context(block, adjoint))
-            replay(part, estimator, state, adjoint)
-            dr.schedule(block.tensor())  # with the gradients: what came later would trace everything again
+            replay(part, estimator, forward(part, estimator, block, adjoint), adjoint)
+            image = [] if block is None else [block.tensor()]
+            dr.schedule(image)
             if len(samples) > 1:
-                finish_pass(block.tensor())
-    return film.develop(block)
+                finish_pass(image)
 
 
 def reverse_recorded(samples: Samples, adjoint: AdjointImage) -> None:

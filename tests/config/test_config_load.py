@@ -56,7 +56,7 @@ def test_defaults(tmp_path: Path) -> None:
     assert config.parameters[0].initial == "scene"
     assert isinstance(config.integrator, Reslrb)
     assert config.integrator.options() == {
-        "max_depth": 8, "rr_depth": 5, "hide_emitters": False, "estimator": "auto",
+        "max_depth": 8, "rr_depth": 5, "hide_emitters": False, "estimator": "auto", "freeze": True,
     }  # fmt: skip
     assert config.loss.type == "l2"
     assert config.loss.options() == {}

@@ -67,14 +67,14 @@ def test_what_cannot_be_recorded_is_computed_all_the_same(adjoint: str) -> None:
 
 def test_a_recording_that_no_longer_fits_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
     class Stale:
-        """Works when it is tried, and not later."""
+        """Works while it is tried, twice, and not later."""
 
         def __init__(self, function: object, **options: object) -> None:
-            self.n_recordings = 0
+            self.n_recordings, self.calls = 1, 0
 
         def __call__(self, *inputs: object) -> None:
-            self.n_recordings += 1
-            if self.n_recordings > 1:
+            self.calls += 1
+            if self.calls > 2:
                 raise RuntimeError("the inputs are others")
 
     monkeypatch.setattr("drjit.freeze", Stale)

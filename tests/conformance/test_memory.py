@@ -24,12 +24,12 @@ def case(llvm: str) -> Case:
     return Case(room(floor=floor, wall=bright, side=bright, cave=cave), (FLOOR,))
 
 
-def peak(case: Case, name: str, max_depth: int, **step: str) -> int:
+def peak(case: Case, name: str, max_depth: int, estimator: str | None = None, **step: str) -> int:
     """Most bytes that the allocator gave out at any time of a second step, above what stood before it."""
     import drjit as dr
 
     # rr_depth beyond any depth: no roulette
-    tracer = integrator(name, max_depth, 1000)
+    tracer = integrator(name, max_depth, 1000, **({"estimator": estimator} if estimator else {}))
     case.gradient(tracer, 1, SPP, **step)
     gc.collect()
     dr.sync_thread()
@@ -41,12 +41,21 @@ def peak(case: Case, name: str, max_depth: int, **step: str) -> int:
     return dr.detail.malloc_watermark(dr.JitBackend.LLVM) - before
 
 
-@pytest.mark.parametrize("adjoint", ["correlated", "independent"])
-def test_reservoir_is_flat(case: Case, adjoint: str):
-    peaks = {depth: peak(case, "reslrb", depth, adjoint=adjoint) for depth in (2, 4, 16, 64, 256)}
-    print(adjoint, peaks)
+def test_reservoir_is_flat(case: Case):
+    peaks = {depth: peak(case, "reslrb", depth) for depth in (2, 4, 16, 64, 256)}
+    print(peaks)
     assert peaks[2] > 1 << 20, "the watermark sees nothing"
     assert max(peaks.values()) <= 1.02 * min(peaks.values()), peaks
+
+
+@pytest.mark.parametrize("estimator", ["reservoir", "event", "gather", "stack"])
+def test_nothing_is_kept_of_paths_whose_adjoint_is_known_before(case: Case, estimator: str):
+    peaks = {depth: peak(case, "reslrb", depth, estimator, adjoint="independent") for depth in (2, 4, 40, 80, 256)}
+    print(estimator, peaks)
+    assert max(peaks.values()) < SPP * case.weights.shape[0] * case.weights.shape[1]  # a byte a path
+    # What does not fit on the stack is traced again, and its gradient is another copy of the texture's.
+    for depths in ((2, 4, 40), (80, 256)) if estimator == "stack" else (tuple(peaks),):
+        assert max(peaks[depth] for depth in depths) <= 1.02 * min(peaks[depth] for depth in depths), peaks
 
 
 def test_naive_ad_grows(case: Case):
