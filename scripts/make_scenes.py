@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import OpenEXR
+from PIL import Image as Picture
 
 SCENES = Path(__file__).resolve().parent.parent / "scenes"
 
@@ -25,6 +26,7 @@ def main(arguments: list[str]) -> None:
     folder = Path(arguments[0]) if arguments else SCENES
     for name, image in images().items():
         write_exr(folder / name, image)
+    Picture.fromarray(mottled_wall(736, 1472)).save(folder / "stiff" / "wall.png", optimize=True)
     write_ply(folder / "caustic_slab" / "slab.ply", *slab())
 
 
@@ -115,6 +117,13 @@ def paper(size: int) -> Image:
     square = np.maximum(abs(x), abs(y))
     color[(square > size * 0.44) & (square < size * 0.47)] = (0.62, 0.22, 0.14)
     return quantise(color)
+
+
+def mottled_wall(width: int, height: int) -> np.ndarray:
+    """Soft waves of grey, (H, W) uint8, linear: no detail finer than a pixel of the picture shows."""
+    y, x = (np.mgrid[0:height, 0:width] + 0.5) / height
+    value = 0.45 + 0.17 * np.sin(3 * np.pi * x + 1) + 0.17 * np.cos(4 * np.pi * y + 0.5)
+    return np.round(255 * quantise(value)).astype(np.uint8)
 
 
 def sky(height: int) -> Image:

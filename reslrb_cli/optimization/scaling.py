@@ -14,7 +14,7 @@ intensity, for a wall its own albedo, whatever share of the picture they have. h
 about 3 %, so that neither rounding nor curvature decides.
 
 Step lengths from `length` make all parameters equally fast for one learning rate, and dividing by the root mean square
-of g keeps an absolute epsilon, as Adam has it, out of the matter.
+of a sample keeps an absolute epsilon, as Adam has it, out of the matter.
 """
 
 from __future__ import annotations
@@ -51,9 +51,9 @@ _PURPOSE = "conditioning"
 class Sensitivity:
     """What was measured of one parameter of `entries` numbers, in the scene's units.
 
-    `value`, `gradient` and `noise` are root mean squares over the entries: of the values, of the mean gradient over the
-    samples, of the standard deviation of one sample (one step's gradient). `change` is relative, per unit; it,
-    `curvature` (loss per unit²) and `length` are None where no change of the image was seen.
+    `value`, `gradient` and `noise` are root mean squares over the entries: of the values, of the gradient (0 where the
+    samples do not tell it from noise), of the standard deviation of one sample (one step's gradient). `change` is
+    relative, per unit; it, `curvature` (loss per unit²) and `length` are None where no change of the image was seen.
     """
 
     key: str
@@ -77,13 +77,13 @@ def rescale(problem: Problem) -> list[Sensitivity]:
     """
     measured, optimizer = measure_sensitivities(problem, SAMPLES), problem.optimizer
     for row in measured:
-        if row.length is None or row.gradient == 0:
+        size = math.hypot(row.gradient, row.noise)  # of what one step hands the optimiser
+        if row.length is None or size == 0:
             continue
         variable, value = optimizer.variable(row.key), dr.detach(optimizer[row.key])
         length = own_length(variable.transform, variable.bounds, value, row.length)
-        # Of the mean gradient's size in every entry, by which the gain is judged.
         unit = Variable(variable.transform, variable.bounds, length)
-        slope = np.array(unit.chain(unit.from_scene(value), type(value)(row.gradient)), dtype=np.float64)
+        slope = np.array(unit.chain(unit.from_scene(value), type(value)(size)), dtype=np.float64)
         unit.gain = 1 / _rms(slope)
         optimizer.set_variable(row.key, unit)
     problem.apply()
@@ -124,13 +124,9 @@ def measure_sensitivities(problem: Problem, samples: int) -> list[Sensitivity]:
     found = []
     for key, gradients in rows.items():
         value = problem.selection.array(key)
-        row = Sensitivity(
-            key=key,
-            entries=value.size,
-            value=_rms(value),
-            gradient=_rms(np.mean(gradients, axis=0)),
-            noise=_rms(np.std(gradients, axis=0, ddof=1)),
-        )
+        noise = _rms(np.std(gradients, axis=0, ddof=1))
+        square = _rms(np.mean(gradients, axis=0)) ** 2 - noise**2 / samples  # less what the noise adds to it
+        row = Sensitivity(key, value.size, _rms(value), math.sqrt(max(square, 0.0)), noise)
         found.append(_probe(problem, row, _downhill(total[key]), base, reference))
     problem.apply()
     return found

@@ -12,7 +12,7 @@ import pytest
 from reslrb_cli.config import load
 from reslrb_cli.optimization import assemble, find_reached, optimize
 from reslrb_cli.optimization.optimizers import Optimizer
-from reslrb_cli.optimization.scaling import measure_sensitivities, own_length
+from reslrb_cli.optimization.scaling import measure_sensitivities, own_length, rescale
 from reslrb_cli.optimization.transforms import Variable, make_transform
 
 CONFIG = Path(__file__).resolve().parents[2] / "configs" / "stiff" / "lamp.yaml"
@@ -123,3 +123,16 @@ def test_a_stiff_problem_is_solved_with_one_learning_rate():
     plain = [error("optimizer.scale=none", f"optimizer.learning_rate={rate:g}")
              for rate in (0.003, 0.03, 0.3, 30, 3e3, 3e5, 3e6)]  # fmt: skip
     assert error("optimizer.learning_rate=0.1") < 0.1 * min(plain)
+
+
+@pytest.mark.parametrize("transforms", [("none", "none"), ("sigmoid", "log"), ("softplus", "softplus")])
+def test_the_optimiser_gets_gradients_of_order_one(transforms):
+    sets = [f"parameters[{i}].transform={name}" for i, name in enumerate(transforms)]
+    problem = assemble(load(CONFIG, [*TINY, *sets]))
+    for row in rescale(problem):
+        variable, value = problem.optimizer.variable(row.key), dr.detach(problem.optimizer[row.key])
+        handed = variable.chain(variable.from_scene(value), type(value)(np.hypot(row.gradient, row.noise)))
+        assert np.sqrt(np.mean(np.square(np.array(handed)))) == pytest.approx(1, rel=1e-4)
+        if variable.transform is None:
+            assert variable.length == row.length
+        np.testing.assert_allclose(problem.selection.array(row.key), row.value, rtol=1e-6)

@@ -37,6 +37,14 @@ def test_images_are_what_the_script_makes():
         assert np.allclose(found, expected, atol=1 / 256 if "sky" in name else 1 / 4096, rtol=1e-5), name
 
 
+def test_the_stiff_wall_is_what_the_script_makes():
+    import mitsuba as mi
+
+    found = np.array(mi.Bitmap(str(ROOT / "scenes" / "stiff" / "wall.png")))
+    assert found.size > 10**6
+    assert np.abs(np.squeeze(found).astype(int) - make_scenes().mottled_wall(736, 1472)).max() <= 1
+
+
 def test_mesh_is_what_the_script_makes():
     import mitsuba as mi
 
