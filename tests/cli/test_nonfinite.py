@@ -243,6 +243,7 @@ def test_each_set_of_samples_is_looked_at(experiment, capsys, adjoint):
     )
     _, [offender], _ = inspect(capsys, err)
     assert offender["where"]["samples"] in ("image", "gradient", "batch 1", "batch 2", "batch 3", "batch 4")
+    assert f"the first at pixel ({', '.join(map(str, offender['pixel']))})" in err
 
 
 def test_there_must_be_something_to_show(experiment, capsys):

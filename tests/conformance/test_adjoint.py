@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from conformance.gradient_cases import FLOOR, floor
 
-from reslrb_cli.integrators import known_step, render_image
+from reslrb_cli.integrators import gradient_step, known_step, render_image, sample_sets
 from reslrb_cli.measure.gradients import Case, integrator, seeds
 from reslrb_cli.measure.small_scenes import texture
 from reslrb_cli.measure.statistics import Agreement, compare
@@ -104,3 +104,20 @@ def test_batches_serve_the_baselines(case: Case, reference: tuple, name: str):
 def test_batches_that_do_not_divide_are_refused(case: Case, reference: tuple, batches: int):
     with pytest.raises(ValueError, match="multiple of the batches"):
         case.gradient(integrator("reslrb"), 1, SPP, l2(reference[0]), adjoint="batched", batches=batches)
+
+
+@pytest.mark.parametrize("name", ["correlated", "independent", "four batches"])
+def test_sample_sets_are_those_of_a_step(case: Case, name: str):
+    tracer, results = integrator("reslrb", estimator="stack"), []
+
+    def step(*args, **options):
+        results.append(gradient_step(*args, **options))
+
+    gradient = case.gradient(tracer, 3, SPP, step=step, **ADJOINTS[name])
+    sets = [(int(seed[0]), spp) for _, seed, spp in sample_sets(3, {"spp": SPP, "batches": 4, **ADJOINTS[name]})]
+    images = [np.array(render_image(tracer, case.scene, 0, seed, spp)) for seed, spp in sets]
+    expected = np.mean(images, axis=0) if name == "four batches" else images[0]
+    np.testing.assert_allclose(np.array(results[0].image), expected, rtol=1e-4, atol=1e-5)
+    # the objective is linear, so that dL/dI is the same for all samples; the first batch gives an image alone
+    own = [case.gradient(tracer, seed, spp) for seed, spp in (sets[1:] or sets)]
+    np.testing.assert_allclose(gradient, np.mean(own, axis=0), rtol=1e-3, atol=1e-5 * np.abs(gradient).max())

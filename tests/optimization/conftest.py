@@ -21,10 +21,11 @@ def steps(monkeypatch, request):
     """Replaces the gradient step by one whose image is the mean of the parameters; returns its calls.
 
     `steps.spoil(call, key)` says what to multiply into a gradient, `steps.derivative(call)` which dL/dI is refused
-    where it is not finite.
+    where it is not finite, and `steps.loss(call)` what to add to the loss.
     """
     calls = []
     state = types.SimpleNamespace(calls=calls, problem=None, has_image=False, spoil=lambda call, key: 1.0)
+    state.loss = lambda call: 0.0
     state.derivative = lambda call: dr.zeros(dr.llvm.ad.TensorXf, (2, 2, 3))
 
     def gradient_step(integrator, scene, sensor, objective, *, seed, spp, adjoint, params, on_image):
@@ -39,7 +40,7 @@ def steps(monkeypatch, request):
         dr.backward(loss)
         refused = Refused()
         refused.take(state.derivative(number))
-        return types.SimpleNamespace(image=dr.detach(image), loss=dr.detach(loss), refused=refused)
+        return types.SimpleNamespace(image=dr.detach(image), loss=dr.detach(loss) + state.loss(number), refused=refused)
 
     monkeypatch.setattr(loop, "gradient_step", gradient_step)
     return state

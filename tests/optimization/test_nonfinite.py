@@ -176,3 +176,12 @@ def test_an_update_that_overflows_is_counted_and_taken_back(tmp_path, steps):
     records, values, _ = run(problem)
     assert [record.nonfinite_by_parameter for record in records] == [{"albedo": 12}] * 2
     assert values["albedo"] == [0.5, 0.5]
+
+
+@pytest.mark.parametrize("kind", ["skip", "zero"])
+def test_after_a_loss_nothing_moves_even_if_its_gradient_is_finite(tmp_path, steps, kind):
+    problem = make_problem(tmp_path, sets=[f"run.on_nonfinite={kind}", "run.iterations=3"])
+    steps.loss = lambda call: np.inf if call == 1 else 0.0
+    records, values, _ = run(problem)
+    assert [record.nonfinite for record in records] == [0, 1, 0]
+    assert values["albedo"][0] == values["albedo"][1] != values["albedo"][2]
