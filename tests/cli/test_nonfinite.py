@@ -154,9 +154,23 @@ def test_a_derivative_that_is_not_finite(experiment, capsys):
     assert offender["where"]["surface"] == "poster_shape"
 
 
-def _register_root():
+def test_the_replay_has_the_parameters_of_then(experiment, capsys):
+    """A reflectance that is not a number once x has moved by more than 0.015, in iteration 2."""
+    import drjit as dr
+
+    _register_root(lambda x: dr.select(dr.abs(x - 0.5) > 0.015, dr.nan, x))
+    Path("scene.xml").write_text(SCENE.replace("REFLECTANCE", '<texture type="root" name="reflectance"/>'))
+    _, err = optimize(capsys, STOP, "parameters=[{key: poster.reflectance.x, initial: 0.5, bounds: [0, 1]}]")
+    iteration, [offender], _ = inspect(capsys, err)
+    assert iteration == 2
+    assert offender["where"]["surface"] == "poster_shape"
+
+
+def _register_root(function=None):
     import drjit as dr
     import mitsuba as mi
+
+    function = function or (lambda x: 0.5 + dr.sqrt(x))
 
     class Root(mi.Texture):
         def __init__(self, props):
@@ -164,7 +178,7 @@ def _register_root():
             self.x = mi.Float(0)
 
         def eval(self, si, active=True):
-            return mi.Color3f(0.5 + dr.sqrt(self.x))
+            return mi.Color3f(function(self.x))
 
         def traverse(self, callback):
             callback.put("x", self.x, mi.ParamFlags.Differentiable)
@@ -313,3 +327,4 @@ def test_passes_that_a_budget_made_are_replayed(experiment, capsys):
     _, [offender], _ = inspect(capsys, err)
     assert f"the first at pixel ({', '.join(map(str, offender['pixel']))})" in err
     assert ", pass " in offender["where"]["samples"]
+    assert offender["quantity"] == "scattering weight s"
