@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from reslrb_cli.cli.experiment import optional_experiment_arguments
+from reslrb_cli.cli.experiment import check_writable, optional_experiment_arguments
 from reslrb_cli.errors import ConfigError, ExitCode
 
 if TYPE_CHECKING:
@@ -86,7 +86,7 @@ def command(
     if json_file is not None and plot_file is None:
         plot_file = json_file.with_suffix(".png")
     for option, path in (("--json", json_file), ("--plot", plot_file)):
-        _check_writable(option, path)
+        check_writable(option, path)
     variant, _ = choose(config.variant)
     if variant.startswith("cuda") and memory_limit is not None:
         raise ConfigError("--memory-limit", "", f"bounds address space, which says nothing of {variant}'s memory")
@@ -159,16 +159,3 @@ def _exit_code(results: list[Result]) -> ExitCode:
     if BenchStatus.OK in states:
         return ExitCode.DONE
     return ExitCode.OUT_OF_MEMORY if states == {BenchStatus.OUT_OF_MEMORY} else ExitCode.CHECK_FAILED
-
-
-def _check_writable(option: str, path: Path | None) -> None:
-    if path is None:
-        return
-    existed = path.exists()
-    try:
-        with path.open("ab"):
-            pass
-    except OSError as error:
-        raise ConfigError(option, "", f"cannot write {path}: {error.strerror}") from None
-    if not existed:
-        path.unlink()

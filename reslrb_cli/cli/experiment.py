@@ -10,6 +10,7 @@ from typing import Any
 import click
 
 from reslrb_cli.config import Config, load
+from reslrb_cli.errors import ConfigError
 
 logger = logging.getLogger(__name__)
 
@@ -46,3 +47,17 @@ def start_variant(config: Config) -> str:
     from reslrb_cli.backend.variant import set_variant
 
     return set_variant(config.variant)
+
+
+def check_writable(option: str, path: Path | None) -> None:
+    """Raise ConfigError, located by the option, where the file `path` cannot be written; it is left as it was."""
+    if path is None:
+        return
+    existed = path.exists()
+    try:
+        with path.open("ab"):
+            pass
+    except OSError as error:
+        raise ConfigError(option, "", f"cannot write {path}: {error.strerror}") from None
+    if not existed:
+        path.unlink()

@@ -1,4 +1,4 @@
-"""What a bench compares: a list such as `ptracer,reslrb:reservoir(capacity=4)`, and the depths."""
+"""What a measurement compares: a list such as `ptracer,reslrb:reservoir(capacity=4)`, and the depths of a bench."""
 
 from __future__ import annotations
 
@@ -26,18 +26,19 @@ _ITEM = re.compile(r"(?P<type>\w+)(?::(?P<estimator>\w+))?(?:\((?P<options>.*)\)
 
 @dataclass(frozen=True)
 class Case:
-    """One integrator with its options, at no depth yet; `label` is how the user wrote it."""
+    """One integrator with its options, at no depth yet; `label` is how the user wrote it, `source` where."""
 
     label: str
     type: str
     options: dict[str, Any]
+    source: str = _OPTION
 
     def at(self, config: Config, max_depth: int, known: bool) -> Config:
         """The experiment with this integrator at this depth. Raises ConfigError where the integrator cannot be.
 
         `known`: dL/dI is, before the image, so that `run.adjoint` has no part in it.
         """
-        blame = f"{_OPTION} {self.label}"
+        blame = f"{self.source} {self.label}"
         adjoint = {name: value for name, value in self.options.items() if name in ADJOINT}
         if known and adjoint:
             raise ConfigError(blame, next(iter(adjoint)), "has no effect where dL/dI is known; take --objective l2")
@@ -69,22 +70,48 @@ def parse_cases(text: str) -> list[Case]:
 
     What an option means is not looked at here, but in `Case.at`.
     """
+    return _parse(_split(text), _OPTION, "", "integrator; write TYPE[:ESTIMATOR][(OPTION=VALUE,...)]")
+
+
+def parse_estimators(text: str) -> list[Case]:
+    """The cases in a list of estimators of `reslrb`, such as `stack,reservoir(capacity=4)`; raises as `parse_cases`."""
+    return _parse(_split(text), "--estimators", "reslrb:", "estimator; write ESTIMATOR[(OPTION=VALUE,...)]")
+
+
+def all_estimators(config: Config) -> list[Case]:
+    """Every estimator of `reslrb`; that of the configuration has the options that stand there."""
+    cases, own = [], config.integrator
+    for name in ESTIMATOR_OPTIONS:
+        if name != "auto":
+            mine = isinstance(own, Reslrb) and own.estimator == name
+            names = [option for option in ESTIMATOR_OPTIONS[name] if mine and option in own.model_fields_set]
+            options = {option: getattr(own, option) for option in names}
+            text = ",".join(f"{option}={value}" for option, value in options.items())
+            label = f"reslrb:{name}({text})" if text else f"reslrb:{name}"
+            cases.append(Case(label, "reslrb", {"estimator": name} | options))
+    return cases
+
+
+def _parse(items: list[str], source: str, prefix: str, wanted: str) -> list[Case]:
     cases: list[Case] = []
-    for item in _split(text):
-        match = _ITEM.fullmatch(item)
-        if match is None:
-            raise ConfigError(_OPTION, "", f"`{item}` is no integrator; write TYPE[:ESTIMATOR][(OPTION=VALUE,...)]")
+    for item in items:
+        match = _ITEM.fullmatch(prefix + item)
+        if match is None or (prefix and not match["estimator"]):
+            raise ConfigError(source, "", f"`{item}` is no {wanted}")
         options = {} if match["estimator"] is None else {"estimator": match["estimator"]}
         for pair in _split(match["options"] or "") if match["options"] else []:
             name, equals, value = pair.partition("=")
             if not equals or not name.strip():
-                raise ConfigError(_OPTION, item, f"`{pair}` must be OPTION=VALUE")
-            if name.strip() == "max_depth":
-                raise ConfigError(_OPTION, item, "max_depth is what is varied; --max-depth says how far")
-            options[name.strip()] = parse(value, f"{_OPTION} {item}", name_line=False)
-        case = Case(item, match["type"], options)
+                raise ConfigError(source, item, f"`{pair}` must be OPTION=VALUE")
+            if name.strip() == "max_depth" and not prefix:
+                raise ConfigError(source, item, "max_depth is what is varied; --max-depth says how far")
+            if name.strip() in ("max_depth", *ADJOINT) and prefix:
+                section = "run" if name.strip() in ADJOINT else "integrator"
+                raise ConfigError(source, item, f"all share one {name.strip()}; take --set {section}.{pair}")
+            options[name.strip()] = parse(value, f"{source} {item}", name_line=False)
+        case = Case(prefix + item, match["type"], options, source)
         if case.label in [other.label for other in cases]:
-            raise ConfigError(_OPTION, "", f"`{item}` is named twice")
+            raise ConfigError(source, "", f"`{item}` is named twice")
         cases.append(case)
     return cases
 

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 from scipy import stats
 
-from reslrb_cli.measure.entries import entries
+from reslrb_cli.measure.entries import divisions, overall, parts
 from reslrb_cli.measure.statistics import ALPHA, combined_z_rms, paired_z_scores, sidak, z_rms_limit, z_scores
 from reslrb_cli.records.gradcheck import Verdict
 
@@ -29,11 +29,16 @@ from reslrb_cli.records.gradcheck import Verdict
 POWER = 0.9
 #: Relative error that single precision alone may cause in a sum over many samples, added to the standard error.
 ROUNDING = 1e-4
-#: Where a deviation by this fraction of the gradient could not have been seen, nothing is said.
-RESOLUTION = 0.5
+#: Where not even a deviation by this fraction of the gradient would have been seen, as of one that is missing, nothing
+#: is said.
+RESOLUTION = 1.0
 #: Tails are too heavy for z scores where the mean kurtosis of the entries' samples lies above this fraction of the way
 #: from that of normal deviates to the greatest that N samples can have, which is that of one outlier.
 TAIL = 0.5
+#: A parameter is divided no finer than its tiles have tails lighter than this: z of skewed samples is too large.
+TILE_TAIL = 0.12
+#: Tails of noise below so many times what rounding may cause do not matter.
+NOISY = 10
 #: Fewer seeds than these say nothing of tails.
 TAIL_SEEDS = 8
 
@@ -92,18 +97,19 @@ def compare_expectations(
     """Compare the means of (N, P) samples with those of a reference.
 
     `reference` is (N, P) at the same seeds if `paired`, else (M, P) at others, or (P,): exact values. `shape` is that
-    of the parameter: with it, z scores are of `entries`, not of each of the P. By `bias` the reference may be wrong
-    itself, in its units (a number, or one for each entry; not of other seeds): only what goes beyond counts.
+    of the parameter: with it, z scores are of its parts (`entries`), not of each of the P. By `bias` the reference may
+    be wrong itself, in its units (a number, or one for each entry; not of other seeds): only what goes beyond counts.
     `rounding` is relative to the entries, and added to the standard error.
     """
     problem = _problem(ours, reference)
     if problem is not None:
         return problem
     exact = reference.ndim == 1
-    a, b = (side if shape is None else entries(np.atleast_2d(side), shape) for side in (ours, np.atleast_2d(reference)))
+    joined = exact or paired
+    a, b = _entries(ours, np.atleast_2d(reference), shape, joined, rounding)
     mean, expected = a.mean(0), b.mean(0)
     floor = rounding * np.maximum(np.abs(mean), np.abs(expected))
-    if exact or paired:
+    if joined:
         difference = a - b
         z = paired_z_scores(difference, floor, bias)
         noise, sides = difference.var(0, ddof=1) / len(a), [difference]
@@ -115,7 +121,7 @@ def compare_expectations(
     z_max, z_rms = float(np.abs(z).max()), combined_z_rms(z)
     rms_limit = family.z_rms_limit(independent)
     detectable = _detectable(standard_error, bias, expected, family)
-    heavy = any(tail_weight(side[:, noise > floor**2]) > TAIL for side in sides)
+    heavy = any(tail_weight(side[:, noise > (NOISY * floor) ** 2]) > TAIL for side in sides)
     our_mean, its_mean = ours.mean(0), np.atleast_2d(reference).mean(0)
     verdict, message = Verdict.HOLDS, ""
     if heavy:
@@ -191,6 +197,23 @@ def tail_weight(samples: np.ndarray) -> float:
     kurtosis = float((count * np.square(squares).sum(0) / squares.sum(0) ** 2).mean())
     normal, greatest = 3 * (count - 1) / (count + 1), count - 2 + 1 / (count - 1)
     return (kurtosis - normal) / (greatest - normal)
+
+
+def _entries(
+    ours: np.ndarray, reference: np.ndarray, shape: tuple[int, ...] | None, joined: bool, rounding: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Both sides in the finest division of the parameter whose samples are near enough to normal, (N, E) each."""
+    if shape is None:
+        return ours, reference
+    for tiles in divisions(shape):
+        a, b = parts(ours, shape, tiles), parts(reference, shape, tiles)
+        sides = [a - b] if joined else [a, b]
+        floor = rounding * np.maximum(np.abs(a.mean(0)), np.abs(b.mean(0)))
+        noisy = sum(side.var(0, ddof=1) / len(side) for side in sides) > floor**2
+        if all(tail_weight(side[:, noisy]) <= TILE_TAIL for side in sides):
+            break
+    whole = overall(ours), overall(reference)
+    return np.concatenate([a, whole[0]], 1), np.concatenate([b, whole[1]], 1)
 
 
 def _detectable(standard_error: np.ndarray, bias: Any, expected: np.ndarray, family: Family) -> float:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 
-from reslrb_cli.records.gradcheck import GradcheckRecord, Kind, Reference
+from reslrb_cli.records.gradcheck import GradcheckRecord, Kind, Reference, Verdict
 
 HEAD = ("parameter", "integrator", "reference", "seeds", "rel. L2", "z rms", "max |z|", "cosine", "variance",
         "detectable", "verdict")  # fmt: skip
@@ -64,12 +64,28 @@ def failure_line(record: GradcheckRecord) -> str:
     return f"{record.case}: {what}: {'; '.join(parts)}"
 
 
-class Table:
-    """Lines of a table whose first columns are as wide as the texts that are known to come."""
+def summary_lines(records: Sequence[GradcheckRecord]) -> list[str]:
+    """What it comes to: how many comparisons hold, what failed and by how much, and what was left open, and why."""
+    count = {verdict: sum(record.verdict is verdict for record in records) for verdict in Verdict}
+    open_ = [record for record in records if record.holds is None]
+    line = f"{count[Verdict.HOLDS]} of {len(records)} comparisons hold, {count[Verdict.FAILS]} fail"
+    lines = [line + (f", {len(open_)} leave the question open" if open_ else "")]
+    reasons: dict[tuple[str, str], list[GradcheckRecord]] = {}
+    for record in open_:
+        reasons.setdefault((parameter_name(record), record.message), []).append(record)
+    for (what, message), group in reasons.items():
+        pairs = dict.fromkeys(f"{integrator_name(r)} against {reference_name(r)}" for r in group)
+        which = "" if group[0].verdict is Verdict.NO_REFERENCE else f"{', '.join(pairs)}: "
+        lines.append(f"open: {what}: {which}{message}")
+    return lines + [f"FAILS: {failure_line(record)}" for record in records if record.verdict is Verdict.FAILS]
 
-    def __init__(self, parameters: Iterable[str], integrators: Iterable[str], references: Iterable[str]) -> None:
-        texts = zip((parameters, integrators, references), HEAD[:3], strict=True)
-        self._widths = [max(map(len, (head, *column))) for column, head in texts]
+
+class Table:
+    """Lines of a table of these records; its columns of text are as wide as theirs."""
+
+    def __init__(self, records: Iterable[GradcheckRecord]) -> None:
+        columns = zip(*(cells(record)[:3] for record in records), strict=True)
+        self._widths = [max(map(len, (head, *column))) for head, column in zip(HEAD, columns, strict=False)]
 
     def head(self) -> str:
         """The first line."""

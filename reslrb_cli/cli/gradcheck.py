@@ -1,0 +1,138 @@
+"""`reslrb gradcheck`: whether the gradients of a scene can be trusted."""
+
+from __future__ import annotations
+
+import logging
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from reslrb_cli.cli.experiment import check_writable, optional_experiment_arguments
+from reslrb_cli.errors import ConfigError, ExitCode
+
+if TYPE_CHECKING:
+    from reslrb_cli.measure.gradcheck import Gradcheck, Result
+    from reslrb_cli.records.gradcheck import GradcheckRecord
+
+logger = logging.getLogger(__name__)
+
+
+@click.command("gradcheck")
+@optional_experiment_arguments
+@click.option("--estimators", metavar="LIST",
+              help="What to check: ESTIMATOR[(OPTION=VALUE,...)], separated by commas. Default: all four, with the "
+                   "options of CONFIG.")  # fmt: skip
+@click.option("--budget", type=click.FloatRange(min=0), default=45.0, show_default=True, metavar="SECONDS",
+              help="Time for the whole; it decides how many seeds there are, eight at least.")  # fmt: skip
+@click.option("--seeds", type=click.IntRange(min=3), metavar="N", help="Number of seeds, whatever time they take.")
+@click.option("--spp", type=click.IntRange(min=1),
+              help="Samples per pixel of one gradient. Default: 65536 light paths, no more than run.spp.")  # fmt: skip
+@click.option("--json", "json_file", type=click.Path(path_type=Path, dir_okay=False),
+              help="Write one object a line, one for each comparison.")  # fmt: skip
+@click.option("--markdown", "markdown_file", type=click.Path(path_type=Path, dir_okay=False),
+              help="Write the table as Markdown.")  # fmt: skip
+@click.option("--images", "folder", type=click.Path(path_type=Path, file_okay=False),
+              help="Write PNG maps of the gradients of textures, their references and z into this folder.")  # fmt: skip
+def command(
+    config_file: Path | None,
+    overrides: tuple[str, ...],
+    estimators: str | None,
+    budget: float,
+    seeds: int | None,
+    spp: int | None,
+    json_file: Path | None,
+    markdown_file: Path | None,
+    folder: Path | None,
+) -> int:
+    """Compare the gradients of every parameter of CONFIG with references, at its initial values.
+
+    Each estimator is compared with naive AD of the same paths (walk_ad), with a stock integrator where one counts as a
+    reference (ptracer, else prb), with finite differences, with forward mode, and with the exact value where the scene
+    is known to have one. Without CONFIG the scene is a Cornell box (--set scene.options.size=64, ...). The exit code is
+    1 where a comparison fails; the last lines say which, and by how much. docs/gradcheck.md explains the columns.
+    """
+    from reslrb_cli.backend.device import device_name
+    from reslrb_cli.backend.variant import set_variant
+    from reslrb_cli.config import load, loads
+    from reslrb_cli.measure import cornell_box
+    from reslrb_cli.measure.cases import all_estimators, parse_estimators
+    from reslrb_cli.measure.gradcheck import Gradcheck
+    from reslrb_cli.measure.participants import Settings
+
+    if config_file is None:
+        config = loads(cornell_box.CONFIG, cornell_box.SOURCE, overrides)
+    else:
+        config = load(config_file, overrides)
+    listed = all_estimators(config) if estimators is None else parse_estimators(estimators)
+    check_writable("--json", json_file)
+    check_writable("--markdown", markdown_file)
+    _check_folder(folder)
+    settings = Settings(config, listed, budget, seeds, spp)
+    settings.configs()  # before anything is loaded
+    variant = set_variant(config.variant)
+    check = Gradcheck(settings)
+    click.echo(f"{device_name(variant)}, {variant}")
+    click.echo(check.conditions())
+    records, interrupted = _run(check, json_file, folder)
+    _finish(records, markdown_file)
+    if interrupted:
+        return ExitCode.INTERRUPTED
+    return ExitCode.CHECK_FAILED if any(record.holds is False for record in records) else ExitCode.DONE
+
+
+def _run(check: Gradcheck, json_file: Path | None, folder: Path | None) -> tuple[list[GradcheckRecord], bool]:
+    """Measure, print and write; returns all records, and whether the user interrupted."""
+    from contextlib import ExitStack
+
+    from reslrb_cli.cli.interrupts import Interrupts
+    from reslrb_cli.records.gradcheck import GradcheckWriter
+    from reslrb_cli.report.gradcheck_table import Table
+
+    records: list[GradcheckRecord] = []
+    table: Table | None = None
+    with ExitStack() as stack:
+        writer = None if json_file is None else stack.enter_context(GradcheckWriter(json_file))
+        interrupts = stack.enter_context(Interrupts())
+        results = list(check.run(lambda: interrupts.requested, logger.info))
+        for result in results:
+            if table is None:
+                table = Table([other.record for other in results])
+                click.echo(table.head())
+            if writer is not None:
+                writer.write(result.record)
+            click.echo(table.line(result.record))
+            records.append(result.record)
+            _draw(result, folder)
+    if folder is not None and any(result.maps is not None for result in results):
+        click.echo(f"look at {os.path.relpath(folder)}")
+    return records, interrupts.requested
+
+
+def _draw(result: Result, folder: Path | None) -> None:
+    if folder is None or result.maps is None:
+        return
+    from reslrb_cli.report.gradcheck_maps import plot_maps
+
+    folder.mkdir(parents=True, exist_ok=True)
+    plot_maps(result.record, result.maps.gradient, result.maps.reference, result.maps.z, folder)
+
+
+def _finish(records: list[GradcheckRecord], markdown_file: Path | None) -> None:
+    """Print what it comes to, and write the Markdown table."""
+    from reslrb_cli.report.gradcheck_table import markdown_table, summary_lines
+
+    for line in summary_lines(records) if records else ["interrupted before there were enough seeds to compare"]:
+        click.echo(line)
+    if markdown_file is not None:
+        markdown_file.write_text(markdown_table(records), encoding="utf-8")
+
+
+def _check_folder(folder: Path | None) -> None:
+    """Raise ConfigError where maps could not be written."""
+    if folder is None:
+        return
+    above = next(path for path in (folder, *folder.absolute().parents) if os.path.lexists(path))
+    if not above.is_dir() or not os.access(above, os.W_OK):
+        raise ConfigError("--images", "", f"cannot write into {above}")

@@ -1,0 +1,189 @@
+"""Whether the gradients of an experiment can be trusted: each estimator against everything that counts as a reference.
+
+The objective is sum(G * I) with a fixed random image G, some of it negative, so that every integrator estimates the
+same gradient; the configuration's loss would have each add a bias of its own, which the noise of its image makes. Every
+seed gives one gradient of each integrator, finite differences, and forward derivatives along the same directions; all
+comparisons are of estimates at equal seeds. What is cheap goes on to more seeds while the budget lasts: the estimators
+and the stock reference, whose comparisons are the noisiest.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from reslrb_cli.measure.comparison import ROUNDING, Comparison, Family, compare_equal_seeds, compare_expectations
+from reslrb_cli.measure.entries import entry_count
+from reslrb_cli.measure.participants import Settings
+from reslrb_cli.measure.sampling import Sampling
+from reslrb_cli.measure.statistics import paired_z_scores
+from reslrb_cli.records.gradcheck import GradcheckRecord, Kind, Reference, Verdict
+
+#: Estimators that agree with naive AD to rounding at equal seeds.
+EXACT = ("gather", "stack")
+#: What a stock integrator on the same paths differs by from this one, relative to the entries: whether a point is
+#: visible is another matter of rounding to each.
+STOCK_ROUNDING = 1e-3
+#: References that know the gradient along a few directions alone.
+ALONG_DIRECTIONS = (Reference.FINITE_DIFFERENCE, Reference.FORWARD_MODE)
+
+
+@dataclass(frozen=True)
+class Maps:
+    """Of a texture: mean gradient and reference (H, W, C), and z (H, W) of the sums over channels."""
+
+    gradient: np.ndarray
+    reference: np.ndarray
+    z: np.ndarray
+
+
+@dataclass(frozen=True)
+class Result:
+    """A record; `maps` where the parameter is a texture and the reference has all its texels."""
+
+    record: GradcheckRecord
+    maps: Maps | None = None
+
+
+@dataclass(frozen=True)
+class Row:
+    """One comparison to be made: of the parameter `key` (None: the image) by the integrator `label`."""
+
+    key: str | None
+    label: str
+    reference: Reference
+    kind: Kind
+
+
+class Gradcheck:
+    """A check of one experiment; `participants` have its scene."""
+
+    def __init__(self, settings: Settings, now: Callable[[], float] = time.monotonic) -> None:
+        self.settings, self._sampling = settings, Sampling(settings, now)
+        self.participants = self._sampling.participants
+
+    @cached_property
+    def rows(self) -> list[Row]:
+        """What is compared, in the order of the table."""
+        parts = self.participants
+        found = [] if parts.image is None else [Row(None, "reslrb", parts.image, Kind.IMAGE)]
+        for key in parts.case.keys:
+            for listed in self.settings.integrators:
+                kind = Kind.EQUAL_SEEDS if listed.options["estimator"] in EXACT else Kind.EXPECTATION
+                found.append(Row(key, listed.label, Reference.WALK_AD, kind))
+                stock = parts.stock[key]
+                references = [] if stock is None else [stock]
+                references += [Reference.ANALYTIC] if key in parts.exact else []
+                references += [Reference.FINITE_DIFFERENCE, Reference.FORWARD_MODE]
+                found += [Row(key, listed.label, reference, Kind.EXPECTATION) for reference in references]
+        return found
+
+    def conditions(self) -> str:
+        """What is measured, in one line."""
+        parts, integrator = self.participants, self.settings.config.integrator
+        width, height = parts.film
+        plays = not 0 <= integrator.max_depth <= integrator.rr_depth
+        roulette = f"roulette from depth {integrator.rr_depth}" if plays else "no roulette"
+        return (
+            f"{self.settings.config.source}, film {width}x{height}, {parts.spp} spp "
+            f"({width * height * parts.spp} light paths a seed), max_depth {integrator.max_depth}, {roulette}"
+        )
+
+    def run(self, stop: Callable[[], bool], say: Callable[[str], None]) -> Iterator[Result]:
+        """Measure, then yield the result of each row; ends with fewer seeds, or none, once `stop()`."""
+        self._sampling.run(stop, say)
+        if not self._sampling.enough:
+            return
+        family = self._family()
+        for row in self.rows:
+            yield self._result(row, family)
+        yield from self._without_reference()
+
+    # --- comparing ----------------------------------------------------------------------------------------------------
+
+    def _family(self) -> Family:
+        rows = [row for row in self.rows if row.kind is not Kind.EQUAL_SEEDS]
+        return Family(len(rows), sum(self._entries(row) for row in rows))
+
+    def _entries(self, row: Row) -> int:
+        parts = self.participants
+        if row.key is None:
+            return entry_count(tuple(parts.case.weights.shape))
+        if row.reference in ALONG_DIRECTIONS:
+            return len(parts.directions[row.key])
+        if row.reference is Reference.ANALYTIC:
+            return len(parts.exact[row.key])
+        return entry_count(parts.shape(row.key))
+
+    def _result(self, row: Row, family: Family) -> Result:
+        parts = self.participants
+        if row.key is None:
+            ours, reference = self._sampling.of("image", "walk_ad"), self._sampling.of("image", row.reference.value)
+            shape = tuple(parts.case.weights.shape)
+            figures = compare_expectations(ours, reference, family, shape=shape, rounding=STOCK_ROUNDING)
+            return Result(self._record(row, figures, len(ours)))
+        ours = self._sampling.of("gradient", row.label)[:, parts.slices()[row.key]]
+        if row.reference in ALONG_DIRECTIONS:
+            return self._along(row, ours, family)
+        shape = parts.shape(row.key)
+        if row.reference is Reference.ANALYTIC:
+            return Result(self._record(row, compare_expectations(ours, parts.exact[row.key], family), len(ours)))
+        reference = self._sampling.of("gradient", row.reference.value)[:, parts.slices()[row.key]]
+        ours = ours[: len(reference)]
+        if row.kind is Kind.EQUAL_SEEDS:
+            figures = compare_equal_seeds(ours, reference)
+        else:
+            rounding = ROUNDING if row.reference is Reference.WALK_AD else STOCK_ROUNDING
+            figures = compare_expectations(ours, reference, family, shape=shape, rounding=rounding)
+        return Result(self._record(row, figures, len(ours)), _maps(ours, reference, shape))
+
+    def _along(self, row: Row, ours: np.ndarray, family: Family) -> Result:
+        """Against derivatives along a few directions."""
+        assert row.key is not None
+        chosen, place = self.participants.directions[row.key], self.participants.slices()[row.key]
+        projected = ours @ np.array([direction.vector[place] for direction in chosen]).T
+        if row.reference is Reference.FINITE_DIFFERENCE:
+            reference, bias = self._sampling.of("differences", row.key), np.array([d.truncation for d in chosen])
+        else:
+            reference, bias = self._sampling.of("tangents", row.key), np.zeros(len(chosen))
+        figures = compare_expectations(projected[: len(reference)], reference, family, bias=bias)
+        return Result(self._record(row, figures, len(reference)))
+
+    def _record(self, row: Row, figures: Comparison, seeds: int) -> GradcheckRecord:
+        kind, _, estimator = row.label.partition(":")
+        return GradcheckRecord(
+            case=str(self.settings.config.source),
+            parameter=row.key,
+            integrator=kind,
+            estimator=estimator or None,
+            reference=row.reference,
+            kind=row.kind,
+            seeds=seeds,
+            **figures.figures,
+        )
+
+    def _without_reference(self) -> Iterator[Result]:
+        """Say so where no stock integrator counts."""
+        parts = self.participants
+        missing = [
+            (Row(key, "reslrb", Reference.PTRACER, Kind.EXPECTATION), parts.why[key])
+            for key in parts.case.keys
+            if parts.stock[key] is None
+        ]
+        if parts.image is None:
+            missing.append((Row(None, "reslrb", Reference.PATH, Kind.IMAGE), parts.why_no_image))
+        for row, why in missing:
+            yield Result(self._record(row, Comparison(Verdict.NO_REFERENCE, None, message=why), 0))
+
+
+def _maps(ours: np.ndarray, reference: np.ndarray, shape: tuple[int, ...]) -> Maps | None:
+    if len(shape) != 3:
+        return None
+    grids = [side.reshape(len(side), *shape) for side in (ours, reference)]
+    sums = [grid.sum(-1) for grid in grids]
+    floor = ROUNDING * np.maximum(*(np.abs(side.mean(0)) for side in sums))
+    return Maps(grids[0].mean(0), grids[1].mean(0), paired_z_scores(sums[0] - sums[1], floor))

@@ -1,0 +1,178 @@
+"""An experiment whose gradients are to be checked: its scene, the integrators that take part, and one seed of each."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from reslrb_cli.config import Config
+from reslrb_cli.integrators import known_step, make_integrator
+from reslrb_cli.measure import cornell_box
+from reslrb_cli.measure.cases import Case as Listed
+from reslrb_cli.measure.differences import Direction, choose_step, directions, natural_bounds
+from reslrb_cli.measure.film import shrink
+from reslrb_cli.measure.gradients import Case, seeds
+from reslrb_cli.measure.known import known_gradient
+from reslrb_cli.measure.references import Situation, interior, path_image, prb_gradient, ptracer_gradient, ptracer_image
+from reslrb_cli.optimization.problem import assemble_scene
+from reslrb_cli.records.gradcheck import Reference
+from reslrb_cli.scene.catalog import parameter_kind, value_shape
+
+#: Light paths of one gradient, as near as whole samples per pixel come.
+PATHS = 2**16
+#: Directions of finite differences and of forward mode for each parameter.
+DIRECTIONS = 2
+#: A depth at which roulette never begins.
+NEVER = 1_000_000
+#: Seeds that the step of finite differences is chosen with.
+PILOT_SEEDS = 2
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What is checked. `seeds` and `spp` are None where they are to be chosen."""
+
+    config: Config
+    integrators: Sequence[Listed]
+    budget_s: float
+    seeds: int | None = None
+    spp: int | None = None
+
+    @property
+    def known(self) -> bool:
+        """Whether dL/dI is known before the image, as in the steps of the experiment."""
+        return self.config.run.adjoint != "correlated"
+
+    def configs(self) -> dict[str, Config]:
+        """The experiment with each integrator, by its label. Raises ConfigError where one cannot be."""
+        depth = self.config.integrator.max_depth
+        return {case.label: case.at(self.config, depth, self.known) for case in self.integrators}
+
+
+class Participants:
+    """The scene, loaded, and every integrator by its label; a variant must be set.
+
+    `stock` holds the stock reference of each parameter's gradient, or None, and `why` the reasons for what is not one;
+    `image` is the reference of the image, and `exact` holds gradients that are known in closed form. Raises ConfigError
+    and UnsupportedScene.
+    """
+
+    def __init__(self, settings: Settings) -> None:
+        config, configs, self.known = settings.config, settings.configs(), settings.known
+        first = next(iter(configs.values()))
+        built_in = config.scene.file == cornell_box.FILE
+        problem = assemble_scene(first, cornell_box.build(config.scene.options) if built_in else None)
+        scene, sensor = problem.scene, problem.sensors[0]
+        shrink(scene, sensor, PATHS)
+        self.case = Case.of(scene, problem.selection.keys, sensor)
+        self.sensor = scene.sensors()[sensor]
+        self.film: tuple[int, int] = (self.case.weights.shape[1], self.case.weights.shape[0])
+        self.spp = settings.spp or _samples(self.film, config.run.spp, problem.samples_per_pass)
+        options = first.integrator.options()
+        shared = {name: options[name] for name in ("max_depth", "rr_depth", "hide_emitters")}
+        self.integrators = {
+            label: make_integrator(made.integrator.type, **made.integrator.options()) for label, made in configs.items()
+        }
+        self.integrators |= {
+            "walk_ad": make_integrator("walk_ad", **shared, samples_per_pass=options.get("samples_per_pass")),
+            "ptracer": make_integrator("ptracer", **shared | {"rr_depth": NEVER}),
+            "prb": make_integrator("prb", **shared),
+            "path": make_integrator("path", **shared),
+        }
+        hidden = config.integrator.hide_emitters
+        depth = config.integrator.max_depth
+        self._situation = Situation.of(scene, self.sensor, self.case.params, depth, hidden)
+        self._choose_references()
+        self._weigh()
+        self.directions = self._directions(problem.selection)
+        weights = np.array(self.case.weights, np.float64)
+        known = {key: known_gradient(self._situation, self.sensor, key, weights) for key in self.case.keys}
+        self.exact = {key: value for key, value in known.items() if value is not None}
+
+    def _choose_references(self) -> None:
+        at = self._situation
+        self.stock: dict[str, Reference | None] = {}
+        self.why: dict[str, str] = {}
+        for key in self.case.keys:
+            reasons = {Reference.PTRACER: ptracer_gradient(at, key), Reference.PRB: prb_gradient(at, key)}
+            self.stock[key], self.why[key] = _first(reasons)
+        reasons = {Reference.PTRACER: ptracer_image(at), Reference.PATH: path_image(at)}
+        self.image, self.why_no_image = _first(reasons)
+
+    def _weigh(self) -> None:
+        """Random weights of mean 1, so that entries do not cancel, a sixth negative; 0 where the border lacks light."""
+        shape = tuple(self.case.weights.shape)
+        weights = np.random.default_rng(7).uniform(-0.5, 2.5, shape)
+        if {*self.stock.values(), self.image} & {Reference.PRB, Reference.PATH}:
+            weights *= interior(shape, self.sensor)[:, :, None]
+        self.case.weigh(weights)
+
+    def _directions(self, selection: Any) -> dict[str, list[Direction]]:
+        found = {}
+        for key in self.case.keys:
+            bounds = selection.spec(key).bounds
+            if bounds is None or not np.all(np.isfinite(bounds)):
+                bounds = natural_bounds(parameter_kind(self.case.params, key), self.case.initial[key])
+            found[key] = directions(self.case, key, bounds, DIRECTIONS)
+        return found
+
+    def shape(self, key: str) -> tuple[int, ...]:
+        """Shape of a parameter."""
+        return value_shape(self.case.params[key])
+
+    def slices(self) -> dict[str, slice]:
+        """Where each parameter stands in a gradient."""
+        found, at = {}, 0
+        for key, values in self.case.initial.items():
+            found[key] = slice(at, at + len(values))
+            at += len(values)
+        return found
+
+    def choose_steps(self, key: str) -> None:
+        """Choose the steps of the finite differences of a parameter."""
+        walk, pilot = self.integrators["walk_ad"], seeds(PILOT_SEEDS, 9)
+        self.directions[key] = [choose_step(self.case, walk, d, pilot, self.spp) for d in self.directions[key]]
+
+    # --- one seed -----------------------------------------------------------------------------------------------------
+
+    def gradient(self, label: str, seed: int) -> np.ndarray:
+        """The gradient of all parameters in a row, by a step such as the experiment takes."""
+        integrator = self.integrators[label]
+        if not self.known:
+            return self.case.gradient(integrator, seed, self.spp)
+        adjoint = self.case.adjoint
+
+        def step(integrator: Any, scene: Any, sensor: Any, _objective: Any, **options: Any) -> Any:
+            return known_step(integrator, scene, sensor, adjoint, **options)
+
+        return self.case.gradient(integrator, seed, self.spp, step=step)
+
+    def differences(self, key: str, seed: int) -> list[float]:
+        """Finite differences of the image's objective along the directions of a parameter."""
+        walk = self.integrators["walk_ad"]
+        return [direction.difference(self.case, walk, seed, self.spp) for direction in self.directions[key]]
+
+    def tangents(self, label: str, key: str, seed: int) -> list[float]:
+        """Forward derivatives along the same directions."""
+        integrator = self.integrators[label]
+        return [self.case.tangent(integrator, d.vector, seed, self.spp) for d in self.directions[key]]
+
+    def picture(self, label: str, seed: int) -> np.ndarray:
+        """The image in a row."""
+        return self.case.image(self.integrators[label], seed, self.spp).ravel()
+
+
+def _samples(film: tuple[int, int], most: int, multiple: int | None) -> int:
+    """Samples per pixel of one gradient: as many paths as PATHS, no more than in a step of the run."""
+    spp = max(min(PATHS // (film[0] * film[1]), most), 1)
+    return spp if multiple is None else max(spp // multiple, 1) * multiple
+
+
+def _first(reasons: dict[Reference, str | None]) -> tuple[Reference | None, str]:
+    """The first that counts, and why those before it do not."""
+    refused = {name: reason for name, reason in reasons.items() if reason is not None}
+    chosen = next((name for name in reasons if name not in refused), None)
+    return chosen, "; ".join(f"not {name.value}: {reason}" for name, reason in refused.items())

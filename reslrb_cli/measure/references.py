@@ -1,0 +1,150 @@
+"""Which stock integrators count as references: of images `ptracer` and `path`, of gradients `ptracer` and `prb`.
+
+Each function returns why it does not count, or None where it does. docs/method.md, Baselines, has the reasons.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+
+from reslrb_cli.errors import UnsupportedScene
+from reslrb_cli.scene import SceneGraph, SceneNeeds, View, check_camera_paths, look, scene_needs
+from reslrb_cli.scene.catalog import parameter_kind
+
+#: Longest paths that naive AD is asked to keep.
+DEEPEST = 64
+#: BSDFs whose sampling does not depend on their parameters, but for a roughness.
+_FIXED_SAMPLING = ("SmoothDiffuse", "TwoSidedBRDF", "SmoothConductor", "RoughConductor", "SmoothDielectric")
+_ROUGHNESS = ("alpha", "alpha_u", "alpha_v")
+
+
+@dataclass(frozen=True)
+class Situation:
+    """What decides: a scene as one sensor sees it, the paths' greatest depth, and whether emitters are hidden."""
+
+    scene: Any
+    params: Any
+    graph: SceneGraph
+    needs: SceneNeeds
+    view: View
+    max_depth: int
+    hide_emitters: bool
+
+    @classmethod
+    def of(cls, scene: Any, sensor: Any, params: Any, max_depth: int, hide_emitters: bool) -> Situation:
+        """The situation of a loaded scene, whose `mi.traverse` is `params`."""
+        graph = SceneGraph.of(scene)
+        return cls(scene, params, graph, scene_needs(scene, sensor), look(scene, sensor), max_depth, hide_emitters)
+
+
+def ptracer_image(at: Situation) -> str | None:
+    """Of the image, by stock light tracing without roulette."""
+    if any(_is_turned(emitter) for emitter in at.scene.emitters()):
+        return "it emits wrongly from a turned environment map"
+    if at.needs.has_null:
+        return "it does not connect through masks"
+    if at.needs.has_perturbed_normals:
+        return "it does not treat bump and normal maps as this code does"
+    if not 0 <= at.max_depth <= DEEPEST:
+        return f"without roulette its paths are to end at depth {DEEPEST} or before"
+    return None
+
+
+def path_image(at: Situation) -> str | None:
+    """Of the image, by paths from the sensor."""
+    try:
+        check_camera_paths(at.scene)
+    except UnsupportedScene:
+        return "camera paths cannot find a `directionalarea` emitter"
+    pointlike = any(int(emitter.flags()) & int(mi.EmitterFlags.Delta) for emitter in at.scene.emitters())
+    if pointlike and (at.needs.has_delta_lobes or at.needs.has_null):
+        return "camera paths cannot find point or parallel lights through glass, mirrors or masks"
+    if at.view.specular > 0:
+        return "the sensor sees glass or mirrors, where light paths cannot connect"
+    if at.hide_emitters and at.view.emission > 0:
+        return "it looks through hidden emitters, which stop light paths"
+    return None
+
+
+def ptracer_gradient(at: Situation, key: str) -> str | None:
+    """Of the gradient with respect to the parameter `key`, by stock light tracing under naive AD."""
+    reason = ptracer_image(at)
+    if reason is not None:
+        return reason
+    if _all_zero_somewhere(at.params[key]):
+        return "it stops paths whose throughput is 0"
+    if parameter_kind(at.params, key) == "emitter":
+        return None if key.endswith(".value") else "it differentiates how a textured emitter is sampled"
+    if key.split(".")[-2 if key.endswith((".value", ".data")) else -1] in _ROUGHNESS:
+        return "it differentiates how roughness is sampled"
+    others = {bsdf.class_name() for bsdf in _bsdfs(at, key)} - set(_FIXED_SAMPLING)
+    return f"it differentiates how a {sorted(others)[0]} is sampled" if others else None
+
+
+def prb_gradient(at: Situation, key: str) -> str | None:
+    """Of the gradient with respect to the parameter `key`, by path replay backpropagation from the sensor."""
+    reason = path_image(at)
+    if reason is not None:
+        return reason
+    if np.any(np.array(at.params[key]) == 0):
+        return "it loses derivatives where a channel is exactly 0"
+    if parameter_kind(at.params, key) != "emitter" and any(
+        int(bsdf.flags()) & int(mi.BSDFFlags.Delta) for bsdf in _bsdfs(at, key)
+    ):
+        return "it does not differentiate delta lobes and masks"
+    return None
+
+
+def _bsdfs(at: Situation, key: str) -> list[Any]:
+    """The BSDFs that a parameter belongs to, nested ones and those around them."""
+    node = at.params.properties[key][2]
+    if isinstance(node, mi.Shape):  # an attribute, which some texture of its BSDF reads
+        return _below(at.graph, node.bsdf())
+    found: dict[Any, None] = {}
+    waiting = [node]
+    while waiting:
+        current = waiting.pop()
+        if isinstance(current, mi.BSDF):
+            found[current] = None
+        waiting += [p for p in at.graph.parents.get(current, []) if isinstance(p, (mi.BSDF, mi.Texture))]
+    return list(found)
+
+
+def _below(graph: SceneGraph, bsdf: Any) -> list[Any]:
+    """A BSDF and those nested in it."""
+    found = [bsdf]
+    for item in graph.of_type(mi.BSDF):
+        if any(parent in found for parent in graph.parents[item]) and item not in found:
+            found.append(item)
+    return found
+
+
+def _is_turned(emitter: Any) -> bool:
+    """Whether this is an environment map with a transformation other than the identity."""
+    if emitter.class_name() != "EnvironmentMapEmitter":
+        return False
+    matrix = np.array(mi.traverse(emitter)["to_world"].matrix, np.float64).reshape(4, 4)
+    return not np.allclose(matrix[:3, :3], np.eye(3))
+
+
+def _all_zero_somewhere(value: Any) -> bool:
+    """Whether a texel, or a colour, is 0 in all channels."""
+    array = np.array(value)
+    texels = array.reshape(-1, array.shape[-1]) if array.ndim == 3 else array.reshape(1, -1)
+    return bool(np.any(np.all(texels == 0, axis=1)))
+
+
+def interior(shape: tuple[int, ...], sensor: Any) -> np.ndarray:
+    """Where light tracing loses nothing by the film's border: boolean (H, W), for a sensor whose film is so large.
+
+    Samples just outside of the film are lost, so that pixels within the filter's radius of its border lack what they
+    would have added; paths from the sensor lose none.
+    """
+    margin = int(np.ceil(float(sensor.film().rfilter().radius()) - 0.5))
+    inside = np.zeros(shape[:2], dtype=bool)
+    inside[margin : shape[0] - margin, margin : shape[1] - margin] = True
+    return inside

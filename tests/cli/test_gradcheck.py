@@ -1,0 +1,117 @@
+"""`reslrb gradcheck` from the command line, on a scene of 24x24 pixels."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from reslrb_cli.cli import main
+
+pytestmark = pytest.mark.usefixtures("llvm")
+
+SMALL = [
+    argument
+    for setting in ("scene.options.size=24", "scene.options.texture=4", "run.spp=4", "integrator.max_depth=3")
+    for argument in ("--set", setting)
+]
+KEYS = ["case", "parameter", "integrator", "estimator", "reference", "kind", "seeds", "verdict", "relative_l2",
+        "relative_l2_limit", "z_rms", "z_rms_limit", "z_max", "z_max_limit", "cosine", "variance_ratio", "detectable",
+        "message", "holds"]  # fmt: skip
+
+
+def call(*args: str) -> int:
+    with pytest.raises(SystemExit) as ended:
+        main(["gradcheck", *args], prog_name="reslrb")
+    return int(ended.value.code or 0)
+
+
+def read(path: Path) -> list[dict]:
+    return [json.loads(line) for line in path.read_text().splitlines()]
+
+
+def test_a_table_and_its_files(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    json_file, markdown, maps = tmp_path / "a.jsonl", tmp_path / "a.md", tmp_path / "maps" / "here"
+    files = ["--json", str(json_file), "--markdown", str(markdown), "--images", str(maps)]
+    assert call(*SMALL, "--seeds", "8", "--estimators", "stack,event(capacity=2)", *files) == 0
+    rows = read(json_file)
+    assert [list(row) for row in rows] == [KEYS] * 9
+    assert [(row["parameter"], row["estimator"], row["reference"], row["kind"]) for row in rows] == [
+        (None, None, "ptracer", "image"),
+        *(
+            ("white.reflectance.data", estimator, reference, "expectation" if estimator != "stack" else kind)
+            for estimator in ("stack", "event(capacity=2)")
+            for reference, kind in (
+                ("walk_ad", "equal_seeds"),
+                ("ptracer", "expectation"),
+                ("finite_difference", "expectation"),
+                ("forward_mode", "expectation"),
+            )
+        ),
+    ]
+    assert all(row["holds"] is True and row["seeds"] == 8 for row in rows)
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[1] == "the built-in Cornell box, film 24x24, 4 spp (2304 light paths a seed), max_depth 3, no roulette"
+    assert lines[2].split()[:3] == ["parameter", "integrator", "reference"]
+    assert lines[-1] == "9 of 9 comparisons hold, 0 fail"
+    assert len(markdown.read_text().splitlines()) == 11
+    assert sorted(path.name for path in maps.iterdir()) == [
+        f"white.reflectance.data-reslrb-{estimator}-{reference}.png"
+        for estimator in ("event_capacity=2", "stack")
+        for reference in ("ptracer", "walk_ad")
+    ]
+
+
+def test_what_fails_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from reslrb_cli.estimators import stack
+
+    right = stack.adjoint_of_factor
+    monkeypatch.setattr(stack, "adjoint_of_factor", lambda *arguments: right(*arguments) * 1.5)
+    json_file = tmp_path / "a.jsonl"
+    assert call(*SMALL, "--seeds", "8", "--estimators", "stack,gather", "--json", str(json_file)) == 1
+    assert {row["estimator"] for row in read(json_file) if row["holds"] is False} == {"stack"}
+    lines = [line for line in capsys.readouterr().out.splitlines() if line.startswith("FAILS: ")]
+    assert len(lines) == 4
+    where = "FAILS: the built-in Cornell box: white.reflectance.data: reslrb:stack against walk_ad, equal seeds: "
+    assert re.fullmatch(where + r"relative L2 0\.\d+, limit 0\.0001", lines[0])
+
+
+@pytest.mark.parametrize(
+    ("args", "line"),
+    [
+        (["--estimators", "stak"], "--estimators reslrb:stak: integrator.estimator: must be one of"),
+        (["--estimators", "stack("], "--estimators: `stack(` is no estimator"),
+        (["--set", "run.sp=3"], "did you mean `spp`?"),
+        (["--seeds", "2"], "--seeds"),
+        (["--json", "/nowhere/a.jsonl"], "--json: cannot write /nowhere/a.jsonl"),
+        (["--images", f"{__file__}/here"], f"--images: cannot write into {__file__}"),
+        (["nothing.yaml"], "nothing.yaml: no such file"),
+    ],
+)
+def test_wrong_calls_are_one_located_line(args: list[str], line: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert call(*args) == 2
+    [error] = capsys.readouterr().err.strip().splitlines()
+    assert line in error
+
+
+def test_ctrl_c_prints_what_is_done() -> None:
+    command = [sys.executable, "-c", "from reslrb_cli.cli import main; main()", "gradcheck", *SMALL, "--seeds", "4000"]
+    process = subprocess.Popen(
+        [*command, "--estimators", "stack"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=os.environ
+    )
+    assert process.stderr is not None
+    for line in process.stderr:
+        if line.startswith("seed 16 "):
+            break
+    process.send_signal(signal.SIGINT)
+    output, _ = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert "of 5 comparisons hold" in output

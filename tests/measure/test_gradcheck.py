@@ -1,0 +1,206 @@
+"""Gradcheck on a small Cornell box: it holds as the code stands, and what is broken on purpose is found and named."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from conformance.gradient_cases import CASES
+
+from reslrb_cli.config import loads
+from reslrb_cli.errors import ConfigError
+from reslrb_cli.integrators import hooks
+from reslrb_cli.measure import cornell_box
+from reslrb_cli.measure.cases import all_estimators, parse_estimators
+from reslrb_cli.measure.differences import choose_step, directions, natural_bounds
+from reslrb_cli.measure.gradcheck import Gradcheck, Result
+from reslrb_cli.measure.gradients import Case, integrator
+from reslrb_cli.measure.participants import Settings
+from reslrb_cli.measure.references import Situation, interior, path_image, prb_gradient, ptracer_gradient, ptracer_image
+from reslrb_cli.measure.small_scenes import camera, diffuse, rgb, room
+from reslrb_cli.records.gradcheck import Kind, Reference, Verdict
+
+pytestmark = pytest.mark.usefixtures("llvm")
+
+SMALL = ["scene.options.size=32", "scene.options.texture=4", "run.spp=8", "integrator.max_depth=4"]
+
+
+def check(*overrides: str, estimators: str = "reservoir,event,gather,stack", seeds: int = 8) -> list[Result]:
+    config = loads(cornell_box.CONFIG, cornell_box.SOURCE, [*SMALL, *overrides])
+    made = Gradcheck(Settings(config, parse_estimators(estimators), 0, seeds))
+    return list(made.run(lambda: False, lambda line: None))
+
+
+def failures(results: list[Result]) -> set[tuple[str | None, str]]:
+    found = [result.record for result in results if result.record.verdict is not Verdict.HOLDS]
+    return {(record.estimator, record.reference.value) for record in found}
+
+
+def test_it_holds():
+    results = check("integrator.rr_depth=2")
+    assert failures(results) == set()
+    records = [result.record for result in results]
+    assert [record.kind for record in records].count(Kind.IMAGE) == 1
+    for name in ("reservoir", "event", "gather", "stack"):
+        of = {record.reference: record for record in records if record.estimator == name}
+        assert list(of) == [Reference.WALK_AD, Reference.PTRACER, Reference.FINITE_DIFFERENCE, Reference.FORWARD_MODE]
+        exact = name in ("gather", "stack")
+        assert (of[Reference.WALK_AD].kind is Kind.EQUAL_SEEDS) is exact
+        assert of[Reference.WALK_AD].relative_l2 < (1e-5 if exact else 0.5)
+        assert of[Reference.FINITE_DIFFERENCE].relative_l2 < (1e-3 if exact else 0.5)
+        assert all(record.seeds == 8 and record.detectable < 0.5 for record in of.values())
+        assert all(record.cosine > 0.9 for record in of.values())
+        assert 0.8 < of[Reference.PTRACER].variance_ratio < 3
+    maps = [result.maps for result in results if result.maps is not None]
+    assert len(maps) == 8
+    assert maps[0].gradient.shape == maps[0].reference.shape == (4, 4, 3)
+    assert maps[0].z.shape == (4, 4)
+
+
+def test_a_selection_weight_that_is_wrong(monkeypatch: pytest.MonkeyPatch):
+    """The reservoir alone is wrong, by a fifth: all references of it say so, and none of the others'."""
+    from reslrb_cli.estimators import reservoir
+
+    right = reservoir.slot_adjoint
+    monkeypatch.setattr(reservoir, "slot_adjoint", lambda p, W, *rest: right(p, W * 1.2, *rest))
+    found = failures(check(estimators="reservoir,stack", seeds=16))
+    assert found == {("reservoir", name) for name in ("walk_ad", "ptracer", "finite_difference", "forward_mode")}
+
+
+def test_a_derivative_that_is_wrong_by_little(monkeypatch: pytest.MonkeyPatch):
+    from reslrb_cli.estimators import stack
+
+    right = stack.adjoint_of_factor
+    monkeypatch.setattr(stack, "adjoint_of_factor", lambda *arguments: right(*arguments) * 1.001)
+    found = failures(check(estimators="stack,gather"))
+    assert found == {("stack", name) for name in ("walk_ad", "finite_difference", "forward_mode")}
+
+
+def test_forward_mode_without_the_weight_of_roulette(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(hooks.TangentSplat, "survived", lambda self, state, weight: state)
+    assert failures(check("integrator.rr_depth=1", estimators="stack")) == {("stack", "forward_mode")}
+
+
+def test_a_fault_of_the_walk_is_none_of_its_own_references(monkeypatch: pytest.MonkeyPatch):
+    """Connections that are a third too strong: image and stock reference differ, naive AD and differences do not."""
+    from reslrb_cli.transport import walk
+
+    right = walk.connect
+
+    def connect(*arguments):
+        connection = right(*arguments)
+        connection.weight = connection.weight * 1.3
+        return connection
+
+    monkeypatch.setattr(walk, "connect", connect)
+    assert failures(check(estimators="stack")) == {(None, "ptracer"), ("stack", "ptracer")}
+
+
+def test_budget_decides_how_many_seeds():
+    config = loads(cornell_box.CONFIG, cornell_box.SOURCE, SMALL)
+    time = iter(range(10_000))
+    made = Gradcheck(Settings(config, parse_estimators("stack"), 30), now=lambda: next(time))
+    records = [result.record for result in made.run(lambda: False, lambda line: None)]
+    counts = {record.reference: record.seeds for record in records}
+    assert counts[Reference.WALK_AD] == counts[Reference.FINITE_DIFFERENCE] == 8
+    assert 8 < counts[Reference.PTRACER] < 20
+
+
+def test_what_is_interrupted_is_compared_with_what_is_done():
+    config = loads(cornell_box.CONFIG, cornell_box.SOURCE, SMALL)
+    asked = iter(range(10_000))
+    made = Gradcheck(Settings(config, parse_estimators("stack"), 0, 8))
+    records = [result.record for result in made.run(lambda: next(asked) > 40, lambda line: None)]
+    assert {record.seeds for record in records} == {5}
+    assert list(made.run(lambda: True, lambda line: None)) != []
+    fresh = Gradcheck(Settings(config, parse_estimators("stack"), 0, 8))
+    assert list(fresh.run(lambda: True, lambda line: None)) == []
+
+
+def test_estimators_have_the_options_of_the_configuration():
+    config = loads(cornell_box.CONFIG, cornell_box.SOURCE, ["integrator.estimator=reservoir", "integrator.capacity=4"])
+    assert [case.label for case in all_estimators(config)] == [
+        "reslrb:reservoir(capacity=4)", "reslrb:gather", "reslrb:event", "reslrb:stack"
+    ]  # fmt: skip
+    assert [case.options for case in parse_estimators("event(capacity=2)")] == [{"estimator": "event", "capacity": 2}]
+    for text, message in (
+        ("", "is no estimator"),
+        ("stack,stack", "named twice"),
+        ("stack(max_depth=3)", "--set integrator.max_depth=3"),
+        ("stack(adjoint=independent)", "--set run.adjoint=independent"),
+    ):
+        with pytest.raises(ConfigError, match=message):
+            parse_estimators(text)
+
+
+# ---- What counts as a reference ----
+
+
+@pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
+def test_references_are_those_of_the_conformance_tests(case):
+    """The rules allow what each case was judged by, and refuse both stock integrators where differences alone were."""
+    scene = Case(case.scene(), case.keys)
+    at = Situation.of(scene.scene, scene.scene.sensors()[0], scene.params, case.both.get("max_depth", 4), False)
+    reasons = {"ptracer": ptracer_gradient, "prb": prb_gradient}
+    for key in case.keys:
+        if case.reference == "fd":
+            assert ptracer_gradient(at, key) is not None
+            assert prb_gradient(at, key) is not None or key.startswith("floor.brdf")
+        else:
+            assert reasons[case.reference](at, key) is None
+
+
+def test_references_refuse_what_they_cannot_do():
+    scene = Case(room(floor={"type": "twosided", "bsdf": diffuse(0, 0, 0)}), ["floor.brdf_0.reflectance.value"])
+    [key], sensor = scene.keys, scene.scene.sensors()[0]
+
+    def at(depth: int = 4, hidden: bool = False) -> Situation:
+        return Situation.of(scene.scene, sensor, scene.params, depth, hidden)
+
+    assert "throughput is 0" in ptracer_gradient(at(), key)
+    assert "exactly 0" in prb_gradient(at(), key)
+    assert ptracer_image(at()) is path_image(at()) is None
+    assert "without roulette" in ptracer_image(at(-1))
+    lit = Case(room(lamp=None, light={"type": "point", "position": [0.5, 0.9, 0.8], "intensity": rgb(1, 2, 3)},
+                    ball={"type": "sphere", "radius": 0.2, "bsdf": {"type": "dielectric"}}), [])  # fmt: skip
+    assert "point or parallel lights" in path_image(
+        Situation.of(lit.scene, lit.scene.sensors()[0], lit.params, 4, False)
+    )
+
+
+def test_a_wide_filter_has_no_weights_along_the_border():
+    sensor = Case(room(camera=camera("gaussian")), []).scene.sensors()[0]
+    inside = interior((16, 16, 3), sensor)
+    assert inside[2:-2, 2:-2].all()
+    assert inside.sum() == 12 * 12
+    assert interior((16, 16, 3), Case(room(), []).scene.sensors()[0]).all()
+
+
+# ---- Finite differences ----
+
+
+def test_a_step_has_the_truncation_error_that_it_says():
+    """The image is a cubic in the albedo, whose differences are wrong by h^2 times the third derivative."""
+    key = "side.brdf_0.reflectance.value"
+    scene, walk = Case(room(), [key]), integrator("walk_ad", 4)
+    [first, second] = directions(scene, key, (0.0, 1.0), 2)
+    assert first.sides == "both"
+    assert (first.vector > 0).all()
+    for direction in (first, second):
+        chosen = choose_step(scene, walk, direction, (1, 2, 3), 64)
+        for seed in (7, 8):
+            exact = scene.gradient(walk, seed, 64) @ chosen.vector
+            error = abs(chosen.difference(scene, walk, seed, 64) - exact)
+            assert error < 10 * chosen.truncation + 1e-4 * abs(exact)
+            assert chosen.truncation < 1e-3 * abs(exact)
+
+
+def test_directions_stay_within_the_bounds():
+    key = "floor.brdf_0.reflectance.value"
+    scene = Case(room(floor={"type": "twosided", "bsdf": diffuse(0, 0.5, 1)}), [key])
+    for direction in directions(scene, key, (0.0, 1.0), 2):
+        assert direction.sides == "up"
+        assert direction.vector[0] > 0 > direction.vector[2]
+    assert natural_bounds("bsdf", np.array([0.2, 1.0])) == (0, 1)
+    assert natural_bounds("bsdf", np.array([1.5])) == (0, np.inf)
+    assert natural_bounds("emitter", np.array([0.2])) == (0, np.inf)
+    assert natural_bounds("bsdf", np.array([-1.5])) == (-np.inf, np.inf)
