@@ -28,6 +28,8 @@ MAX_WARM_UPS = 4
 #: Where the cases of a depth together hold more than this share of the memory, each releases its own after a step.
 MEMORY_SHARE = 0.7
 MIB = 2**20
+#: What is measured of every step.
+TIMES = ("step_ms", "kernel_ms", "codegen_ms", "tracing_ms")
 #: How much longer the beginning of the next depth takes, until it is known: compiling, which few cases do more of.
 FIRST_GROWTH = 1.3
 
@@ -220,9 +222,9 @@ def _result(run: _Run, depth: int, sweep: Sweep, runs: list[_Run]) -> Result:
         width=width,
         height=height,
         status=BenchStatus.OK if run.end is None else run.end.status,
-        step_ms=Spread.of([step["step_ms"] for step in run.steps.values()]) if ok else None,
-        kernel_ms=Spread.of([step["kernel_ms"] for step in run.steps.values()]) if ok else None,
+        **{name: Spread.of([step[name] for step in run.steps.values()]) if ok else None for name in TIMES},
         cold_ms=run.cold["step_ms"] if ok and run.cold else None,
+        cold_codegen_ms=run.cold["codegen_ms"] if ok and run.cold else None,
         peak_mib=run.cold["peak_mib"] if ok and run.cold else None,
         scratch_bytes=run.cold["scratch_bytes"] if ok and run.cold else None,
         repeats=len(run.steps) if ok else 0,

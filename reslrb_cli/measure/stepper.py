@@ -49,7 +49,13 @@ class Stepper:
             new_kernels = self._timed(round).new_kernels
         times = self._timed(round)
         new_kernels += times.new_kernels
-        answer = {"step_ms": times.wall_ms, "kernel_ms": times.kernel_ms, "new_kernels": new_kernels}
+        answer = {
+            "step_ms": times.wall_ms,
+            "kernel_ms": times.kernel_ms,
+            "codegen_ms": times.codegen_ms,
+            "tracing_ms": max(times.wall_ms - times.kernel_ms - times.codegen_ms, 0.0),
+            "new_kernels": new_kernels,
+        }
         if cold:
             answer["peak_mib"] = peak_mib(dr.backend_v(mi.Float))
             answer["scratch_bytes"] = scratch_bytes(self.clock.history)

@@ -39,10 +39,12 @@ class BenchRecord:
     """Cost of a step of one integrator at one depth.
 
     `estimator` is None where the integrator has none; what makes it another than by default, but for `capacity`, stands
-    behind its name, `reservoir(weight=adjoint)`. `step_ms` is wall time, `kernel_ms` what kernels
-    took of it, both of warm steps; `cold_ms` is the wall time of the first step in a new process with an empty kernel
-    cache. `peak_mib` is the most that the allocator held in that step, the scene included. `scratch_bytes` is
-    thread-local memory of a path. What was not measured is None: everything, where `status` is not ok.
+    behind its name, `reservoir(weight=adjoint)`. `step_ms` is wall time, `kernel_ms` what kernels took of it,
+    `codegen_ms` their generation (and the look into the cache of kernels), `tracing_ms` the rest: Python and what it
+    calls; all of warm steps. `cold_ms` is the wall time of the first step in a new process with an empty kernel cache,
+    `cold_codegen_ms` its part in which kernels were generated and compiled. `peak_mib` is the most that the allocator
+    held in that step, the scene included. `scratch_bytes` is thread-local memory of a path. What was not measured is
+    None: everything, where `status` is not ok.
     """
 
     integrator: str
@@ -56,7 +58,10 @@ class BenchRecord:
     status: BenchStatus
     step_ms: Spread | None
     kernel_ms: Spread | None
+    codegen_ms: Spread | None
+    tracing_ms: Spread | None
     cold_ms: float | None
+    cold_codegen_ms: float | None
     peak_mib: float | None
     scratch_bytes: int | None
     repeats: int

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 from reslrb_cli.records.bench import BenchRecord, Spread
 
-_HEAD = ("depth", "", "step ms", "over baseline", "kernel ms", "over baseline", "cold ms", "peak MiB", "scratch B", "n")
-_WIDTHS = (5, 0, 9, 19, 9, 19, 8, 9, 9, 3)
+_HEAD = (
+    "depth", "", "step ms", "over baseline", "kernel ms", "over baseline", "codegen", "tracing", "cold ms", "peak MiB",
+    "scratch B", "n",
+)  # fmt: skip
+_WIDTHS = (5, 0, 9, 19, 9, 19, 7, 7, 8, 9, 9, 3)
 
 
 def table_head(labels: list[str]) -> str:
@@ -31,12 +34,18 @@ def table_line(
         _ratio(step_ratio),
         f"{record.kernel_ms.median:.1f}",
         _ratio(kernel_ratio),
+        _milliseconds(record.codegen_ms),
+        _milliseconds(record.tracing_ms),
         f"{record.cold_ms or 0:.0f}",
         f"{record.peak_mib or 0:.1f}",
         str(record.scratch_bytes),
         str(record.repeats),
     )
     return _line(cells, width)
+
+
+def _milliseconds(time: Spread | None) -> str:
+    return "" if time is None else f"{time.median:.1f}"
 
 
 def _ratio(ratio: Spread | None) -> str:

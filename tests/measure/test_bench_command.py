@@ -17,7 +17,8 @@ from reslrb_cli.cli import main
 pytestmark = pytest.mark.usefixtures("llvm")
 
 KEYS = ["integrator", "estimator", "capacity", "max_depth", "rr_depth", "spp", "width", "height", "status", "step_ms",
-        "kernel_ms", "cold_ms", "peak_mib", "scratch_bytes", "repeats"]  # fmt: skip
+        "kernel_ms", "codegen_ms", "tracing_ms", "cold_ms", "cold_codegen_ms", "peak_mib", "scratch_bytes",
+        "repeats"]  # fmt: skip
 SMALL = ["--set", "scene.options.size=16", "--set", "run.spp=1", "--budget", "0"]
 
 
@@ -52,6 +53,10 @@ def test_two_depths(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
             assert 0 < row[key]["min"] <= row[key]["median"] <= row[key]["max"]
         assert row["step_ms"]["median"] > row["kernel_ms"]["median"]
         assert row["cold_ms"] > row["step_ms"]["median"]
+        assert row["cold_ms"] > row["cold_codegen_ms"] > row["codegen_ms"]["median"] >= 0
+        parts = [row[key]["median"] for key in ("kernel_ms", "codegen_ms", "tracing_ms")]
+        assert sum(parts) == pytest.approx(row["step_ms"]["median"], rel=0.5)
+        assert row["tracing_ms"]["min"] > 0
         assert row["peak_mib"] > 0
     assert [row["scratch_bytes"] > 0 for row in rows] == [False, True, False] * 2
     assert rows[4]["scratch_bytes"] == 3 * rows[1]["scratch_bytes"]  # three vertices in place of one

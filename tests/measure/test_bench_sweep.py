@@ -51,7 +51,8 @@ class Pretended:
         if self.question is None:
             return {"width": 6, "height": 5}
         ms = float(self.depth * (1 + self.question["round"]) * {"ptracer": 4, "reslrb": 2, "walk_ad": 5}[self.type])
-        answer = {"step_ms": ms, "kernel_ms": ms / 2, "new_kernels": 2 if self.asked < 3 else 0}
+        parts = {"kernel_ms": ms / 2, "codegen_ms": ms / 8, "tracing_ms": 3 * ms / 8}
+        answer = {"step_ms": ms, **parts, "new_kernels": 2 if self.asked < 3 else 0}
         return answer | ({"peak_mib": 1.5, "scratch_bytes": 60} if self.question["cold"] else {})
 
     def close(self) -> None:
@@ -99,6 +100,8 @@ def test_records() -> None:
     assert (stack.width, stack.height, stack.status, stack.repeats) == (6, 5, BenchStatus.OK, MIN_ROUNDS)
     assert stack.step_ms == Spread(12.0, 8.0, 16.0)
     assert stack.kernel_ms == Spread(6.0, 4.0, 8.0)
+    assert (stack.codegen_ms, stack.tracing_ms) == (Spread(1.5, 1.0, 2.0), Spread(4.5, 3.0, 6.0))
+    assert stack.cold_codegen_ms == 0.5
     assert (stack.cold_ms, stack.peak_mib, stack.scratch_bytes) == (4.0, 1.5, 60)
     assert rows[1].step_ratio == rows[1].kernel_ratio == Spread(0.5, 0.5, 0.5)  # in pairs, as all get slower
     assert rows[0].step_ratio == Spread(1.0, 1.0, 1.0)
