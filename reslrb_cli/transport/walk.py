@@ -129,13 +129,8 @@ def walk(
         si = path.pi.compute_surface_interaction(path.ray, mi.RayFlags.All, path.active)
         vertex = Vertex(path.pi, si, si.bsdf(), path.ray, path.depth, path.product, path.active)
 
-        # ---- Connect to the sensor ----
+        # ---- Connect to the sensor, scatter, and evaluate both in one call ----
         connection = connect(plan, sensor, si, path.ray, sampler.next_2d(path.active), path.active)
-        if hooks.connects:
-            shadow = passage(plan, scene, si, path.depth, connection, hooks.seen(vertex), loop_mode)
-            connection.active, transmittance = shadow
-
-        # ---- Scatter, and evaluate the connection in the same call ----
         sample_2, sample_1 = sampler.next_2d(path.active), sampler.next_1d(path.active)
         active = path.active & (path.depth + 1 < plan.max_depth) & hooks.goes_on(state, vertex)
         wanted = connection.active if hooks.connects and not hooks.attached else None
@@ -143,6 +138,11 @@ def walk(
             plan, si, vertex.bsdf, path.ray, sample_1, sample_2, active, connection.wo, wanted
         )
         if hooks.connects:
+            if not (hooks.attached or plan.track_zeros):
+                # No shadow ray where neither light nor its derivative would arrive.
+                connection.active = connection.active & dr.any(connection.f != 0)
+            shadow = passage(plan, scene, si, path.depth, connection, hooks.seen(vertex), loop_mode)
+            connection.active, transmittance = shadow
             if hooks.attached:
                 connection.f = evaluate(plan, si, vertex.bsdf, connection.wo, connection.active)
             connection.c = connection.f * transmittance * connection.weight
