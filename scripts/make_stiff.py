@@ -28,13 +28,13 @@ from reslrb_cli.optimization import Problem, assemble, assemble_scene, find_reac
 ROOT = Path(__file__).resolve().parent.parent
 TITLES = {"lamp": "albedo and intensity", "plate": "roughness and radiance", "wall": "a million texels and one number"}
 #: Exponents of the learning rates: half decades around all that the parameters' own units suggest.
-GRIDS = {"lamp": (-3, 8), "plate": (-3, 8), "wall": (-3, 4)}
+GRIDS = {"lamp": (-3, 9), "plate": (-3, 9), "wall": (-3, 4)}
 #: What else a user of plain Adam could try, and the learning rates that might suit it.
 _FALLING = ("plain, rate falling by 8 decades", "optimizer.final_fraction=1e-8", (1e3, 1e4, 1e5, 1e6, 1e7))
 OTHERS: dict[str, tuple[str, str, tuple[float, ...]]] = {
     "lamp": _FALLING,
     "plate": _FALLING,
-    "wall": ("plain, epsilon 1e-20", "optimizer.epsilon=1e-20", (0.01, 0.03, 0.1)),
+    "wall": ("plain, epsilon 1e-16", "optimizer.epsilon=1e-16", (0.01, 0.03, 0.1)),
 }
 #: Texels of the wall that a pixel is wide.
 BLOCK = 23
@@ -126,14 +126,16 @@ def compare(name: str) -> dict[str, Any]:
     rates = [10 ** (first + half / 2) for half in range(2 * (last - first) + 1)]
     grid = [experiment.run(f"{rate:.1e}", *experiment.plain, f"optimizer.learning_rate={rate!r}") for rate in rates]
     auto = experiment.run("scale: auto")
-    bare = experiment.run("scale: auto, no transforms", *(s for s in experiment.plain if "transform" in s))
+    transformed = any(spec.transform != "none" for spec in experiment.model.config.parameters)
+    without = [setting for setting in experiment.plain if "transform" in setting]
+    bare = [experiment.run("scale: auto, no transforms", *without)] if transformed else []
     label, setting, suited = OTHERS[name]
     runs = [experiment.run(label, *experiment.plain, f"optimizer.learning_rate={r!r}", setting) for r in suited]
     tried = min(runs, key=lambda curve: curve.points[-1][2])
     best = min(grid, key=lambda curve: curve.points[-1][2])
     best.label = f"plain, rate {best.label}"
     print(f"\n{name}: {TITLES[name]}; error at the start {auto.points[0][2]:.3f}")
-    for curve in (best, tried, bare, auto):
+    for curve in (best, tried, *bare, auto):
         time = min(curve.end, auto.end)
         each = ", ".join(f"{part:.4f}" for part in curve.errors)
         print(
@@ -156,7 +158,7 @@ def draw(results: list[dict[str, Any]], out: Path) -> None:
         lines = [(curve, "0.8", "-", 0.7, None) for curve in result["grid"]]
         lines += [(result["tried"], "tab:green", ":", 1.5, result["tried"].label)]
         lines += [(result["best"], "tab:red", "-", 1.8, result["best"].label)]
-        lines += [(result["bare"], "tab:blue", "--", 1.3, "scale: auto, no transforms")]
+        lines += [(curve, "tab:blue", "--", 1.3, curve.label) for curve in result["bare"]]
         lines += [(result["auto"], "tab:blue", "-", 1.8, "scale: auto")]
         for row, what in enumerate((0, 1)):
             axis = axes[row][column]

@@ -54,6 +54,13 @@ def test_a_lamp_alone_has_its_own_intensity_as_its_length():
     assert found[FLOOR].change < 1 / 0.5
 
 
+@pytest.mark.parametrize("start", [1e6, 4e7])
+def test_a_length_reaches_to_the_brighter_of_image_and_target(start):
+    found = measured(f"parameters[1].initial={start:g}", f"target.render.parameters.{LAMP}=1e7",
+                     f"target.render.parameters.{FLOOR}=0.5", "run.spp=512")  # fmt: skip
+    assert found[LAMP].length == pytest.approx(max(start, 1e7), rel=0.05)
+
+
 def test_noise_is_that_of_one_step():
     few, many = measured(samples=16), measured("run.spp=512", samples=16)
     for key in (FLOOR, LAMP):
