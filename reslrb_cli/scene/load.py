@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import re
 from collections.abc import Mapping
 from pathlib import Path
@@ -10,6 +11,9 @@ from typing import Any
 import mitsuba as mi
 
 from ..errors import ConfigError
+from .extent import lost_light
+
+logger = logging.getLogger(__name__)
 
 #: "[parser.cpp:482] " and "[PluginManager] ": where in Mitsuba's sources a message comes from.
 _ORIGIN = re.compile(r"\[[\w.]+(:\d+)?\]\s*")
@@ -23,7 +27,7 @@ def load_scene(file: Path, options: Mapping[str, Any] | None = None) -> Any:
 
     `options` are the values of the file's `$name` variables. Shapes are not merged, so that all parameters keep their
     names. Returns a `mi.Scene`. Raises ConfigError, located in the scene file, where it is missing or wrong, has
-    nothing in it, or no light.
+    nothing in it, or no light. Warns, in the log, of one that is too far from the origin, or too small.
     """
     file = Path(file)
     try:
@@ -46,6 +50,9 @@ def load_scene(file: Path, options: Mapping[str, Any] | None = None) -> Any:
         raise ConfigError(file, "", "the scene has no emitters: no light path can start")
     if len(scene.sensors()) == 0:
         raise ConfigError(file, "", "the scene has no sensor")
+    loss = lost_light(scene)
+    if loss is not None:
+        logger.warning("%s: %s", file, loss)
     return scene
 
 

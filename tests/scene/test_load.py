@@ -97,3 +97,33 @@ def test_folder(tmp_path):
 def test_no_sensor_is_refused(tmp_path):
     with pytest.raises(ConfigError, match="no sensor"):
         load(tmp_path, LIT_SPHERE.replace('<sensor type="perspective"/>', ""), radius=1)
+
+
+ROOM = (
+    '<scene version="3.0.0"><sensor type="perspective"/><emitter type="constant"/>'
+    '<shape type="cube"><transform name="to_world"><scale value="$scale"/><translate x="$x"/></transform></shape>'
+    "</scene>"
+)
+
+
+@pytest.mark.parametrize(
+    ("scale", "x", "advice"),
+    [
+        (1, 0, None),
+        (1, 100, None),
+        (1, 1000, "move it to the origin"),
+        (1e4, 0, None),
+        (1e-2, 0, None),
+        (1e-4, 0, "scale it to about 1"),
+    ],
+)
+def test_light_that_ray_offsets_lose_is_warned_of(tmp_path, caplog, scale: float, x: float, advice: str | None):
+    load(tmp_path, ROOM, scale=scale, x=x)
+    if advice is None:
+        assert not caplog.records
+    else:
+        [record] = caplog.records
+        message = record.getMessage()
+        assert message.startswith(f"{tmp_path}/scene.xml: the scene ")
+        assert advice in message
+        assert "\n" not in message
