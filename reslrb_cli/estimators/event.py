@@ -32,7 +32,7 @@ from reslrb_cli.estimators.base import (
     one_of,
 )
 from reslrb_cli.estimators.events import Event, differentiate_event
-from reslrb_cli.estimators.reservoir import is_taken, selection_weight, slot_adjoint
+from reslrb_cli.estimators.reservoir import defended, is_taken, selection_weight, slot_adjoint
 from reslrb_cli.transport.connection import Connection
 from reslrb_cli.transport.factors import Product
 from reslrb_cli.transport.plan import Plan
@@ -97,6 +97,7 @@ class EventSelection(VertexHooks):
         if plan.differentiate_null:
             q = mi.Float(1)  # the masks between vertex and sensor may have something to differentiate
         Q = state.Q + q
+        w = defended(w, state.W / dr.maximum(Q, 1))  # 1: the least Q that is not 0
         W = dr.fma(w, Q, state.W)
         this = Event.of_connection(plan, vertex, connection)
         slots = []
@@ -104,7 +105,7 @@ class EventSelection(VertexHooks):
             event = state.prefix[k]
             if plan.differentiate_bsdfs:  # else emission is the one event
                 event = dr.select(numbers[2 * k] * Q < q, this, event)
-            pair = Slot(w, C, connection.u, event)
+            pair = Slot(w, C.stored(), connection.u, event)
             slots.append(dr.select(is_taken(numbers[2 * k + 1], w * Q, W), pair, slot))
         return EventState(state.Q, W, state.prefix, slots, numbers[::2])
 

@@ -6,8 +6,9 @@
 Source: the ResLRB paper, Sections 2.2 to 2.4, for m = 1 and w = luminance(C); its conclusion names m > 1, here m
 independent slots that one replay serves. Reservoir sampling: Chao 1982. Where delta is known before the paths are
 traced, w = sum_c |delta_c C_c| leaves less variance. With zero factors the weight is that of the nonzero ones, so that
-a connection whose value is zero and whose derivative is not can be kept. Of the kept connection the surface point is
-kept as well: c_I is differentiated without a replay, which has to reach x_{I-1} only.
+a connection whose value is zero and whose derivative is not can be kept; and no weight is below SHARE of those before
+it. Of the kept connection the surface point is kept as well: c_I is differentiated without a replay, which has to reach
+x_{I-1} only.
 """
 
 from __future__ import annotations
@@ -35,6 +36,8 @@ from reslrb_cli.transport.factors import Product
 from reslrb_cli.transport.plan import Plan
 from reslrb_cli.transport.scattering import Scattering, attached_factor
 from reslrb_cli.transport.walk import Vertex
+
+SHARE = 0.01  # the least share of a candidate in the weights up to it
 
 
 @dataclass
@@ -74,7 +77,7 @@ def selection_weight(p: Pass, weight: str, connection: Connection, C: Product) -
 
     Raises ValueError where the latter is asked for and delta is not known.
     """
-    value = C.differentiable()
+    value = C.weight()
     if weight == "luminance":
         return mi.luminance(mi.Color3f(value)) if len(value) == 3 else mi.Float(value[0])
     if p.adjoint is None:
@@ -88,6 +91,17 @@ def is_taken(number: Any, w: Any, W: Any) -> Any:
     A weight that is not finite is always taken, and so is all that follows: what is wrong must not be lost.
     """
     return (w != 0) & ((number * W < w) | ~dr.isfinite(W))
+
+
+def defended(w: Any, W: Any) -> Any:
+    """A candidate's weight, raised to SHARE of all before it, W, unless it is 0.
+
+    What comes after a heavy connection may be all that some parameter has: it is chosen with a probability of SHARE at
+    least, where its own weight may be a millionth. What comes before needs no such care, since its parameters have a
+    part in the heavy one too.
+    """
+    least = SHARE * W
+    return dr.select((w != 0) & (w < least), least, w)  # a comparison: what is not a number stays
 
 
 def unselected(W: Any, slot: Any, capacity: int) -> Any:
@@ -117,11 +131,11 @@ class ReservoirSelection(VertexHooks):
         C = contribution(self.p, vertex, connection)
         if self.splat:
             self.p.splat(connection.u, C.value(), connection.active)
-        w = dr.select(connection.active, selection_weight(self.p, self.weight, connection, C), 0)
+        w = defended(dr.select(connection.active, selection_weight(self.p, self.weight, connection, C), 0), state.W)
         W = state.W + w
         plan = self.p.plan
         event = [Event.of_connection(plan, vertex, connection)] if plan.differentiate_bsdfs else []
-        this = Slot(w, vertex.depth, C, connection.u, event)
+        this = Slot(w, vertex.depth, C.stored(), connection.u, event)
         slots = [
             dr.select(is_taken(number, w, W), this, slot) for number, slot in zip(numbers, state.slots, strict=True)
         ]

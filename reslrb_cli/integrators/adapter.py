@@ -125,10 +125,10 @@ def _make_classes() -> dict[str, Any]:
             sensor = resolve_sensor(scene, sensor)
             params = _parameters(scene, params)
             with dr.suspend_grad():
-                film = Film(sensor)
+                samples = self.passes(scene, sensor, seed, spp, params)
+                film = samples[0].film
                 block = film.block()
-                for samples in self.passes(scene, sensor, seed, spp, params):
-                    lt.splat_tangents(samples, block)
+                lt.in_passes(samples, lt.splat_tangents, block)
                 return film.develop_tangent(block)
 
         def _freezes(self, parts: list[lt.Samples]) -> bool:
@@ -189,7 +189,7 @@ def _make_classes() -> dict[str, Any]:
 
             with dr.suspend_grad():
                 if not self._freezes(trace.samples):
-                    lt.replay_all(trace, estimator, gradient)
+                    lt.replay_all(trace, estimator, gradient, params)
                 elif trace.state is None:
                     self.recordings.call("trace and replay", trace.samples[0], replay, gradient)
                 else:
@@ -208,7 +208,7 @@ def _make_classes() -> dict[str, Any]:
             with dr.suspend_grad():
                 parts = self.passes(scene, sensor, seed, spp, params)
                 if not self._freezes(parts):
-                    return lt.fused(parts, estimator, gradient)
+                    return lt.fused(parts, estimator, gradient, params)
                 return self.recordings.call("fused", parts[0], fused, gradient)
 
         def render_backward(self, scene: Any, params: Any, grad_in: Any, sensor: Any = 0, seed: Any = 0,
@@ -262,11 +262,12 @@ def _make_classes() -> dict[str, Any]:
                         "trajectory: Dr.Jit cannot reverse the loop through masks within that of the path"
                     )
                 adjoint = parts[0].film.adjoint(grad_in)
-                with dr.isolate_grad():  # as in `replay_all`; without it the derivatives of textures are lost
-                    for samples in parts:
-                        lt.reverse_recorded(samples, adjoint)
-                        if len(parts) > 1:
-                            lt.finish_pass()
+
+                def differentiate(part: lt.Samples, block: None) -> None:
+                    with dr.isolate_grad():  # as in `replay_all`; without it the derivatives of textures are lost
+                        lt.reverse_recorded(part, adjoint)
+
+                lt.in_passes(parts, differentiate, None, params)
 
     return {"reslrb": ReslrbIntegrator, "walk_ad": WalkAdIntegrator, "trajectory": TrajectoryIntegrator}
 

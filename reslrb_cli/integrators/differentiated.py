@@ -10,13 +10,19 @@ import drjit as dr
 from reslrb_cli.errors import UnsupportedScene
 from reslrb_cli.scene.catalog import parameter_kind
 
+#: Where a parameter of a BSDF is this small, paths are followed and chosen in spite of it.
+NEARLY_ZERO = 1e-2
+#: What is a factor of a BSDF's value, where a roughness, say, is none.
+FACTORS = ("reflectance", "transmittance", "base_color", "opacity", "weight")
+
 
 @dataclass(frozen=True)
 class Differentiated:
     """What tracks derivatives.
 
     `bsdf_nodes` are the nodes of BSDFs that have such parameters: textures, nested BSDFs, and meshes whose attributes
-    textures read. `emission` says whether emission does, `zeros` whether any of the parameters is exactly zero.
+    textures read. `emission` says whether emission does, `zeros` whether any of the parameters is zero, or, of
+    those of BSDFs, nearly so.
     """
 
     bsdf_nodes: tuple[Any, ...]
@@ -45,14 +51,15 @@ def differentiated(params: Any) -> Differentiated:
                 f"{key}: detached light tracing has derivatives of BSDFs and emission only, not of what moves the "
                 "geometry or the sensor"
             )
-        zeros = zeros or _has_singular(key, value)
+        dims = kind == "attribute" or (kind == "bsdf" and any(name in key for name in FACTORS))
+        zeros = zeros or _has_singular(key, value, NEARLY_ZERO if dims else 0)
     return Differentiated(tuple(nodes), emission, zeros)
 
 
-def _has_singular(key: str, value: Any) -> bool:
-    """Whether a factor of this parameter is exactly zero somewhere: at 0, or at 1 where 1 - x is a factor too."""
+def _has_singular(key: str, value: Any, least: float) -> bool:
+    """Whether a factor of this parameter is `least` or less somewhere: near 0, or at 1 where 1 - x is a factor too."""
     flat = dr.detach(value.array if dr.is_tensor_v(value) else dr.ravel(value))
-    singular = flat == 0
+    singular = flat <= least
     if {"opacity", "weight"} & set(key.split(".")):
         singular |= flat == 1
     return bool(dr.any(singular))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -28,6 +29,9 @@ from reslrb_cli.transport.walk import Hooks, walk
 SELECTION_STREAM = 0x5E1EC7  # keeps the hooks' numbers apart from the sampler's
 VISIBLE_STREAM = 0xD1EC7
 PASS_STREAM = 0x9A55E5
+#: Samples per pixel of one pass. In single precision a sum loses terms below a 2^24th of it, and thousands of such
+#: passes can be added to one another.
+LARGEST_PASS = 1 << 18
 
 
 @dataclass
@@ -53,8 +57,14 @@ class Samples:
         return sampler
 
     def stream(self, name: int) -> Any:
-        """Random numbers beside the sampler's own."""
-        return mi.PCG32(self.width, mi.UInt64(self.seed) + (name << 32))
+        """Random numbers beside the sampler's own.
+
+        Hashed for each lane, as Mitsuba's samplers do: generators that differ in their sequence's number alone begin
+        with numbers that are evenly spread over the lanes, and off their mean alike for all seeds.
+        """
+        seed = mi.sample_tea_32(self.seed, mi.UInt32(name))[0]
+        state, sequence = mi.sample_tea_32(seed, dr.arange(mi.UInt32, self.width))
+        return mi.PCG32(1, mi.UInt64(state), mi.UInt64(sequence))
 
     def context(self, block: Any, adjoint: AdjointImage | None) -> Pass:
         """These samples as an estimator sees them."""
@@ -113,19 +123,73 @@ def make_samples(plan: Plan, scene: Any, sensor: Any, seed: Any, spp: int, total
 
 
 def passes(plan: Plan, scene: Any, sensor: Any, seed: Any, spp: int, spp_per_pass: int | None) -> list[Samples]:
-    """All samples of an image, in passes of `spp_per_pass` samples per pixel, which must divide `spp`.
+    """All samples of an image, in passes of `spp_per_pass` samples per pixel, which must divide `spp`, or less.
 
     The first pass has the seed itself, so that it traces what `ptracer` does.
     """
-    size = spp if spp_per_pass is None else min(spp_per_pass, spp)
-    if spp % size:
-        raise ValueError(f"the sample count ({spp}) must be a multiple of samples_per_pass ({size})")
+    unit = spp if spp_per_pass is None else min(spp_per_pass, spp)
+    if spp % unit:
+        raise ValueError(f"the sample count ({spp}) must be a multiple of samples_per_pass ({unit})")
+    sizes = _parts(unit) * (spp // unit)
     # Opaque: a seed that reached the kernel as a literal would compile a new one each step.
-    others = [mi.sample_tea_32(mi.UInt32(seed), mi.UInt32(PASS_STREAM + p))[0] for p in range(1, spp // size)]
+    others = [mi.sample_tea_32(mi.UInt32(seed), mi.UInt32(PASS_STREAM + p))[0] for p in range(1, len(sizes))]
     seeds = [mi.UInt32(seed), *others]
     dr.make_opaque(seeds)
-    first = make_samples(plan, scene, sensor, seeds[0], size, spp)
-    return [replace(first, seed=s) for s in seeds]
+    made = {size: make_samples(plan, scene, sensor, seeds[0], size, spp) for size in set(sizes)}
+    return [replace(made[size], seed=s) for size, s in zip(sizes, seeds, strict=True)]
+
+
+def _parts(spp: int) -> list[int]:
+    """The fewest parts of at most LARGEST_PASS samples, of sizes that differ by 1 at most."""
+    count = -(-spp // LARGEST_PASS)
+    return [spp // count + (part < spp % count) for part in range(count)]
+
+
+def in_passes(samples: list[Samples], work: Callable[[Samples, Any], None], block: Any, params: Any = None) -> None:
+    """Call `work(part, block)` for each pass. It splats into the block (None: nothing), and differentiates `params`
+    (None: nothing).
+
+    Of several passes each has a block and gradients of its own, which are added up here: single precision would lose
+    the terms of the last pass in the sum of all others.
+    """
+    if len(samples) == 1:
+        work(samples[0], block)
+        return
+    sums = None if params is None else GradientSum(params)
+    for part in samples:
+        own = None if block is None else part.film.block()
+        work(part, own)
+        if own is not None:
+            block.put_block(own)
+        finish_pass([] if block is None else block.tensor())
+        if sums is not None:
+            sums.take()
+    if sums is not None:
+        sums.put()
+
+
+class GradientSum:
+    """Sums the parameters' gradients over passes, apart from where each pass adds its own."""
+
+    def __init__(self, params: Any) -> None:
+        with dr.resume_grad():  # where gradients are suspended, nothing says that it tracks them
+            self.values = [value for _, value in params.items() if dr.grad_enabled(value)]
+        self.totals: list[Any] = []
+
+    def take(self) -> None:
+        """Take what has been added to the gradients since the last time."""
+        with dr.resume_grad():
+            found = [dr.detach(dr.grad(value)) for value in self.values]
+            self.totals = [a + b for a, b in zip(self.totals, found, strict=True)] if self.totals else found
+            for value in self.values:
+                dr.clear_grad(value)
+        finish_pass(self.totals)
+
+    def put(self) -> None:
+        """Give the sums to the parameters."""
+        with dr.resume_grad():
+            for value, total in zip(self.values, self.totals, strict=True):
+                dr.accum_grad(value, total)
 
 
 def finish_pass(*results: Any) -> None:
@@ -158,13 +222,14 @@ def image_of(samples: list[Samples], estimator: Estimator | None) -> Any:
     """The image of all passes, as the estimator makes it where it makes one of its own (else None); nothing is kept."""
     film = samples[0].film
     block = film.block()
-    for part in samples:
+
+    def splat(part: Samples, own: Any) -> None:
         if estimator is None:
-            splat_image(part, block)
+            splat_image(part, own)
         else:
-            forward(part, estimator, block)
-        if len(samples) > 1:
-            finish_pass(block.tensor())
+            forward(part, estimator, own)
+
+    in_passes(samples, splat, block)
     return film.develop(block)
 
 
@@ -214,11 +279,11 @@ def replay(samples: Samples, estimator: Estimator, state: Any, adjoint: AdjointI
     estimator.backward(samples.context(None, adjoint), state)
 
 
-def replay_all(trace: Trace, estimator: Estimator, gradient: Any) -> None:
-    """Add the gradient of the objective with dL/dI `gradient` (H, W, C) to the parameters."""
+def replay_all(trace: Trace, estimator: Estimator, gradient: Any, params: Any = None) -> None:
+    """Add the gradient of the objective with dL/dI `gradient` (H, W, C) to `params`, which one pass need not know."""
     adjoint = trace.film.adjoint(gradient)
     if trace.state is None:
-        differentiate_passes(trace.samples, estimator, None, adjoint)
+        differentiate_passes(trace.samples, estimator, None, adjoint, params)
         return
     # Isolated: on their way to the parameters gradients are evaluated, and with them all that they hang on, which is to
     # be one kernel. They set out once, at the end.
@@ -226,26 +291,31 @@ def replay_all(trace: Trace, estimator: Estimator, gradient: Any) -> None:
         replay(trace.samples[0], estimator, trace.state, adjoint)
 
 
-def fused(samples: list[Samples], estimator: Estimator, gradient: Any) -> Any:
+def fused(samples: list[Samples], estimator: Estimator, gradient: Any, params: Any = None) -> Any:
     """The image, and the same gradient, where dL/dI is known before either."""
     film = samples[0].film
     block = film.block()
-    differentiate_passes(samples, estimator, block, film.adjoint(gradient))
+    differentiate_passes(samples, estimator, block, film.adjoint(gradient), params)
     return film.develop(block)
 
 
-def differentiate_passes(samples: list[Samples], estimator: Estimator, block: Any, adjoint: AdjointImage) -> None:
+def differentiate_passes(
+    samples: list[Samples], estimator: Estimator, block: Any, adjoint: AdjointImage, params: Any
+) -> None:
     """Trace samples whose dL/dI is known and add their derivatives, and to the block (None: none) their contributions.
 
     What is kept of a path goes from one to the other within the kernel, and takes no memory.
     """
-    with dr.isolate_grad():  # as above
-        for part in samples:
-            replay(part, estimator, forward(part, estimator, block, adjoint), adjoint)
-            image = [] if block is None else [block.tensor()]
+
+    def differentiate(part: Samples, own: Any) -> None:
+        with dr.isolate_grad():  # as above
+            replay(part, estimator, forward(part, estimator, own, adjoint), adjoint)
+            image = [] if own is None else [own.tensor()]
             dr.schedule(image)
             if len(samples) > 1:
                 finish_pass(image)
+
+    in_passes(samples, differentiate, block, params)
 
 
 def reverse_recorded(samples: Samples, adjoint: AdjointImage) -> None:

@@ -6,11 +6,14 @@ carried beside the index of the zero one:
 
     one zero factor, f_j:  d(f_0 ... f_k) = (product of the others) df_j       nothing for any other factor
     two or more:           d(f_0 ... f_k) = 0
+
+Nor must a factor of a millionth keep a path from being followed, or a connection from being chosen, for which its
+derivative is as large as any. Roulette and selection go by `weight`, in which no factor is below DIM.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import drjit as dr
@@ -18,6 +21,7 @@ import mitsuba as mi
 
 NO_ZERO = -1  # no factor of this channel is zero
 MANY_ZEROS = -2  # two or more are: value and derivatives vanish
+DIM = 0.1  # the least that a factor counts in a weight, as a fraction of its stand-in
 
 
 def showing(value: Any) -> Any:
@@ -36,17 +40,19 @@ class Product:
     `nonzero` is the product of all factors (untracked), or of those that are not zero, with stand-ins for the others
     (tracked). `zero` holds, per channel, the index of the zero factor, NO_ZERO or MANY_ZEROS; it is empty where zeros
     are not tracked. `attached` is the plain product with derivatives, for naive AD only; otherwise it is empty.
+    `raised` is the product of the factors, each at least DIM of its stand-in; it is empty where zeros are not tracked.
     """
 
     nonzero: Any
     zero: list[Any] = field(default_factory=list)
     attached: list[Any] = field(default_factory=list)
+    raised: list[Any] = field(default_factory=list)
 
     @staticmethod
     def one(track_zeros: bool, attached: bool = False) -> Product:
         """The empty product."""
         zero = [mi.Int32(NO_ZERO) for _ in range(len(mi.Spectrum(0)))] if track_zeros else []
-        return Product(mi.Spectrum(1), zero, [mi.Spectrum(1)] if attached else [])
+        return Product(mi.Spectrum(1), zero, [mi.Spectrum(1)] if attached else [], [mi.Spectrum(1)] if zero else [])
 
     @staticmethod
     def none(track_zeros: bool) -> Product:
@@ -56,8 +62,7 @@ class Product:
     def times(self, factor: Any, index: Any, stand_in: Any = 1) -> Product:
         """The product with one more factor, (C,) per lane, that stands at position `index` of the path.
 
-        `stand_in` takes its place in `nonzero` where it is zero: a positive number of the size of its derivative, so
-        that weights made of the product can be compared with those of paths without zeros.
+        `stand_in` takes its place in `nonzero` where it is zero: a positive number of the size of its derivative.
         """
         attached = [self.attached[0] * factor] if self.attached else []
         factor = dr.detach(factor)
@@ -66,26 +71,37 @@ class Product:
         nonzero = self.nonzero * dr.select(factor == 0, stand_in, factor)
         first = [dr.select(z == NO_ZERO, mi.Int32(index), MANY_ZEROS) for z in self.zero]
         zero = [dr.select(factor[c] == 0, first[c], z) for c, z in enumerate(self.zero)]
-        return Product(nonzero, zero, attached)
+        raised = [r * dr.maximum(dr.abs(factor), mi.Spectrum(DIM * stand_in)) for r in self.raised]
+        return Product(nonzero, zero, attached, raised)
 
     def scaled(self, scale: Any) -> Product:
         """The product times a positive number that no parameter reaches, such as a roulette weight."""
-        return Product(self.nonzero * scale, self.zero, [self.attached[0] * scale] if self.attached else [])
+        attached, raised = ([value * scale for value in values] for values in (self.attached, self.raised))
+        return Product(self.nonzero * scale, self.zero, attached, raised)
+
+    def stored(self) -> Product:
+        """The product without what is of no more use once it has been chosen."""
+        return replace(self, raised=[])
 
     def value(self) -> Any:
         """The contribution itself: zero in every channel that has a zero factor. Attached under naive AD."""
-        return self.attached[0] if self.attached else self._where([z == NO_ZERO for z in self.zero])
+        return self.attached[0] if self.attached else self._where(self.nonzero, [z == NO_ZERO for z in self.zero])
 
     def differentiable(self) -> Any:
         """Product of the nonzero factors in every channel whose value or derivative can be nonzero; else zero."""
-        return self._where([z != MANY_ZEROS for z in self.zero])
+        return self._where(self.nonzero, [z != MANY_ZEROS for z in self.zero])
+
+    def weight(self) -> Any:
+        """How much there may be to differentiate behind this product, (C,): what roulette and selection go by."""
+        return self._where(self.raised[0] if self.raised else self.nonzero, [z != MANY_ZEROS for z in self.zero])
 
     def alive(self) -> Any:
         """Whether any channel's value or derivative can be nonzero."""
         return dr.any(self.differentiable() != 0)
 
-    def _where(self, keep: list[Any]) -> Any:
-        result = mi.Spectrum(self.nonzero)
+    @staticmethod
+    def _where(values: Any, keep: list[Any]) -> Any:
+        result = mi.Spectrum(values)
         for c, mask in enumerate(keep):
             result[c] = dr.select(mask, result[c], 0)
         return result

@@ -20,6 +20,7 @@ from reslrb_cli.transport.plan import Plan
 from reslrb_cli.transport.scattering import Scattering, attached_factor, evaluate, scatter
 
 ROULETTE_LIMIT = 0.95  # the largest probability of going on, as in `ptracer`
+DIMMEST = 1e-30  # the least emission that roulette knows, well above what single precision rounds to zero
 
 
 @dataclass
@@ -31,7 +32,7 @@ class Path:
     ray: Any  # the ray that reaches it
     pi: Any  # where it does
     product: Product  # E s_1 ... s_{depth-1}, roulette weights included
-    eta: Any  # accumulated relative index of refraction, for roulette alone
+    eta: Any  # accumulated relative index of refraction, for roulette alone; begins larger where emission is dim
 
 
 @dataclass
@@ -111,14 +112,17 @@ def walk(
 
     loop_mode = "evaluated" if hooks.attached and hooks.max_iterations is None else "symbolic"
     emission = sample_emission(plan, scene, sensor, sampler)
-    product, active = Product.one(plan.track_zeros, hooks.attached), mi.Bool(active)
+    product, active, eta = Product.one(plan.track_zeros, hooks.attached), mi.Bool(active), mi.Float(1)
     if not hooks.replaying:
         product = product.times(emission.weight, mi.Int32(0))
         active &= product.alive()
+        if plan.roulette:
+            # Relative to emission where that is dim: else light of small lamps, or in large units, would end at once.
+            eta = dr.rsqrt(dr.clip(dr.max(product.weight()), DIMMEST, 1))
     state = hooks.start(product)
     active &= plan.max_depth > 1
     pi, active = intersect(emission.ray, active)
-    path = Path(active, mi.UInt32(1), emission.ray, pi, product, mi.Float(1))
+    path = Path(active, mi.UInt32(1), emission.ray, pi, product, eta)
 
     def next_vertex(path: Path, active: Any, si: Any, scattering: Scattering, product: Product, eta: Any) -> Path:
         ray = dr.detach(si.spawn_ray(scattering.d))
@@ -164,7 +168,7 @@ def walk(
         # ---- Russian roulette ----
         number = sampler.next_1d(active)
         if plan.roulette:
-            throughput = dr.max(dr.abs(product.differentiable()))
+            throughput = dr.max(dr.abs(product.weight()))
             q = dr.minimum(throughput * dr.square(eta), ROULETTE_LIMIT)
             playing = path.depth + 1 > plan.rr_depth
             active &= ~playing | (number < q)
