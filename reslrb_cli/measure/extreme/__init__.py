@@ -1,0 +1,36 @@
+"""The extreme suite: cases in which gradients of light paths break, each with its reference."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+
+from reslrb_cli.measure.extreme import colours, films, glass, lights, losses, places, roughness
+from reslrb_cli.measure.extreme.case import ExtremeCase
+from reslrb_cli.measure.extreme.runner import run_cases
+from reslrb_cli.records.gradcheck import GradcheckRecord
+
+TOPICS = (colours, lights, places, roughness, films, glass, losses)
+
+
+def registry(cases: Iterable[ExtremeCase]) -> dict[str, ExtremeCase]:
+    """Cases by name. Raises ValueError where two have the same."""
+    found: dict[str, ExtremeCase] = {}
+    for case in cases:
+        if case.name in found:
+            raise ValueError(f"two cases are named {case.name}")
+        found[case.name] = case
+    return found
+
+
+CASES = registry(case for topic in TOPICS for case in topic.CASES)
+
+
+def run_suite(
+    names: Iterable[str] | None = None, estimators: Iterable[str] | None = None, seeds: int | None = None
+) -> Iterator[GradcheckRecord]:
+    """Run the cases of these names (all by default), one record for each comparison.
+
+    Raises KeyError where there is no such case.
+    """
+    chosen = list(CASES.values()) if names is None else [CASES[name] for name in names]
+    return run_cases(chosen, estimators, seeds)

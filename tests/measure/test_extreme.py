@@ -1,0 +1,93 @@
+"""The extreme suite: a part of it by default, all of it with `-m long`; what it found once, it finds again."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+import pytest
+
+from reslrb_cli.measure.extreme import CASES, registry, run_suite
+from reslrb_cli.records.gradcheck import GradcheckRecord
+
+FEW = ("albedo_0", "albedo_1e-6_roulette", "emission_1e-25_roulette", "sun_1e6", "connection_1e8", "no_connection",
+       "furnace", "sums_1e7", "nan_loss", "scaled_1e-2", "index_3", "film_crop", "roughconductor_1e-2")  # fmt: skip
+
+
+@pytest.fixture(autouse=True)
+def _quiet(llvm: str) -> None:
+    import mitsuba as mi
+
+    mi.set_log_level(mi.LogLevel.Error)
+
+
+def failures(records: Iterable[GradcheckRecord]) -> list[str]:
+    """Records that do not hold, one line each."""
+    return [record.to_json() for record in records if record.holds is False]
+
+
+def test_names():
+    assert len(CASES) >= 40
+    with pytest.raises(ValueError, match="two cases are named furnace"):
+        registry([*CASES.values(), CASES["furnace"]])
+    with pytest.raises(KeyError):
+        next(run_suite(["no_such_case"]))
+
+
+@pytest.mark.parametrize("name", FEW)
+def test_case(name: str):
+    records = list(run_suite([name]))
+    assert {record.estimator for record in records} == {"reservoir", "gather", "event", "stack"}
+    assert not failures(records)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", [name for name in CASES if name not in FEW])
+def test_every_case(name: str):
+    assert not failures(run_suite([name]))
+
+
+def lost(case: str, estimator: str) -> list[str]:
+    return failures(run_suite([case], [estimator]))
+
+
+def test_selection_by_contribution_alone_loses_what_follows_a_heavy_one(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("reslrb_cli.estimators.reservoir.SHARE", 0.0)
+    assert lost("connection_1e8", "reservoir")
+    assert lost("connection_1e8", "event")
+
+
+def test_roulette_by_throughput_alone_loses_what_follows_a_dark_surface(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("reslrb_cli.transport.factors.DIM", 1e-30)
+    assert lost("albedo_1e-6_roulette", "stack")
+
+
+def test_roulette_by_power_loses_dim_lamps(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("reslrb_cli.transport.walk.DIMMEST", 1.0)
+    assert lost("emission_1e-25_roulette", "gather")
+
+
+def test_sampling_by_radiance_alone_hardly_sees_the_sky_beside_a_sun(monkeypatch: pytest.MonkeyPatch):
+    def variance() -> float:
+        rows = run_suite(["sun_1e6"], ["stack"])
+        [ratio] = [row.variance_ratio for row in rows if row.parameter == "sky.data" and row.reference == "prb"]
+        assert ratio is not None
+        return ratio
+
+    before = variance()
+    monkeypatch.setattr("reslrb_cli.transport.emission.DEFENSIVE", 1e-9)
+    assert variance() > 100 * before
+
+
+def test_a_replay_leaves_nothing_because_its_sums_are_compensated(monkeypatch: pytest.MonkeyPatch):
+    def left() -> float:
+        [record] = [r for r in run_suite(["furnace"], ["gather"], seeds=2) if "residual" in r.message]
+        assert record.relative_l2 is not None
+        return record.relative_l2
+
+    def add(value: Any, rest: Any, term: Any) -> tuple[Any, Any]:
+        return value + term, rest
+
+    assert left() < 1e-10
+    monkeypatch.setattr("reslrb_cli.estimators.sums.AdjointSum._add", staticmethod(add))
+    assert left() > 1e-8
