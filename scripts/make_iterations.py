@@ -5,9 +5,9 @@
 
 The usual loop renders N samples per pixel for the image and N others for the gradient, with `ptracer` under naive AD;
 ours takes N in all, in batches (`run.adjoint: batched`). The scene is bench's Cornell box, without roulette, the loss
-L2 against a picture of it with another texture. Iterations alternate; ratios are taken in pairs. Each gradient's error is
-its distance from the mean of many independent ones, over the size of that mean, which is the root mean square over all
-iterations; at equal time it goes with the root of the time that an iteration takes. Needs the environment that
+L2 against a picture of it with another texture. Iterations alternate; ratios are taken in pairs. Each gradient's error
+is its distance from the mean of many independent ones, over the size of that mean, which is the root mean square over
+all iterations; at equal time it goes with the root of the time that an iteration takes. Needs the environment that
 `scripts/setup` makes: run it with `.venv/bin/python`, on a machine that does nothing else.
 """
 
