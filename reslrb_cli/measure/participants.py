@@ -16,7 +16,15 @@ from reslrb_cli.measure.differences import Direction, choose_step, directions, n
 from reslrb_cli.measure.film import shrink
 from reslrb_cli.measure.gradients import Case, seeds
 from reslrb_cli.measure.known import known_gradient
-from reslrb_cli.measure.references import Situation, interior, path_image, prb_gradient, ptracer_gradient, ptracer_image
+from reslrb_cli.measure.references import (
+    Situation,
+    ends,
+    interior,
+    path_image,
+    prb_gradient,
+    ptracer_gradient,
+    ptracer_image,
+)
 from reslrb_cli.optimization.problem import assemble_scene
 from reslrb_cli.records.gradcheck import Reference
 from reslrb_cli.scene.catalog import parameter_kind, value_shape
@@ -27,6 +35,8 @@ PATHS = 2**16
 DIRECTIONS = 2
 #: A depth at which roulette never begins.
 NEVER = 1_000_000
+#: The integrator whose images are differenced: ours, without roulette where paths end without.
+DIFFERENCED = "differenced"
 #: Seeds that the step of finite differences is chosen with.
 PILOT_SEEDS = 2
 
@@ -72,18 +82,20 @@ class Participants:
         self.film: tuple[int, int] = (self.case.weights.shape[1], self.case.weights.shape[0])
         self.spp = settings.spp or _samples(self.film, config.run.spp, problem.samples_per_pass)
         options = first.integrator.options()
+        depth = config.integrator.max_depth
         shared = {name: options[name] for name in ("max_depth", "rr_depth", "hide_emitters")}
         self.integrators = {
             label: make_integrator(made.integrator.type, **made.integrator.options()) for label, made in configs.items()
         }
         self.integrators |= {
             "walk_ad": make_integrator("walk_ad", **shared, samples_per_pass=options.get("samples_per_pass")),
+            # With roulette differences are heavy-tailed: now and then a path ends for one of the values alone.
+            DIFFERENCED: make_integrator("walk_ad", **shared | ({"rr_depth": NEVER} if ends(depth) else {})),
             "ptracer": make_integrator("ptracer", **shared | {"rr_depth": NEVER}),
             "prb": make_integrator("prb", **shared),
             "path": make_integrator("path", **shared),
         }
         hidden = config.integrator.hide_emitters
-        depth = config.integrator.max_depth
         self._situation = Situation.of(scene, self.sensor, self.case.params, depth, hidden)
         self._choose_references()
         self._weigh()
@@ -133,8 +145,8 @@ class Participants:
 
     def choose_steps(self, key: str) -> None:
         """Choose the steps of the finite differences of a parameter."""
-        walk, pilot = self.integrators["walk_ad"], seeds(PILOT_SEEDS, 9)
-        self.directions[key] = [choose_step(self.case, walk, d, pilot, self.spp) for d in self.directions[key]]
+        image, pilot = self.integrators[DIFFERENCED], seeds(PILOT_SEEDS, 9)
+        self.directions[key] = [choose_step(self.case, image, d, pilot, self.spp) for d in self.directions[key]]
 
     # --- one seed -----------------------------------------------------------------------------------------------------
 
@@ -152,8 +164,8 @@ class Participants:
 
     def differences(self, key: str, seed: int) -> list[float]:
         """Finite differences of the image's objective along the directions of a parameter."""
-        walk = self.integrators["walk_ad"]
-        return [direction.difference(self.case, walk, seed, self.spp) for direction in self.directions[key]]
+        image = self.integrators[DIFFERENCED]
+        return [direction.difference(self.case, image, seed, self.spp) for direction in self.directions[key]]
 
     def tangents(self, label: str, key: str, seed: int) -> list[float]:
         """Forward derivatives along the same directions."""

@@ -15,7 +15,7 @@ from reslrb_cli.errors import UnsupportedScene
 from reslrb_cli.scene import SceneGraph, SceneNeeds, View, check_camera_paths, look, scene_needs
 from reslrb_cli.scene.catalog import parameter_kind
 
-#: Longest paths that naive AD is asked to keep.
+#: Longest paths that are traced without roulette; naive AD of stock integrators keeps all of them.
 DEEPEST = 64
 #: BSDFs whose sampling does not depend on their parameters, but for a roughness.
 _FIXED_SAMPLING = ("SmoothDiffuse", "TwoSidedBRDF", "SmoothConductor", "RoughConductor", "SmoothDielectric")
@@ -49,9 +49,14 @@ def ptracer_image(at: Situation) -> str | None:
         return "it does not connect through masks"
     if at.needs.has_perturbed_normals:
         return "it does not treat bump and normal maps as this code does"
-    if not 0 <= at.max_depth <= DEEPEST:
+    if not ends(at.max_depth):
         return f"without roulette its paths are to end at depth {DEEPEST} or before"
     return None
+
+
+def ends(max_depth: int) -> bool:
+    """Whether paths are short enough without roulette."""
+    return 0 <= max_depth <= DEEPEST
 
 
 def path_image(at: Situation) -> str | None:
