@@ -32,8 +32,8 @@ def placed(scale: float = 1, offset: Any = (0, 0, 0)) -> dict:
 
 
 def low_view() -> dict:
-    """A camera a fiftieth above the floor, which looks along it."""
-    return room(camera=pinhole([0.9, -0.98, 0.9], [-0.9, -0.99, -0.2], [0, 1, 0], 40))
+    """A camera close above the floor, which looks along it."""
+    return room(camera=pinhole([0.9, -0.95, 0.9], [-0.9, -0.96, -0.2], [0, 1, 0], 25))
 
 
 def turned_panes() -> dict:
