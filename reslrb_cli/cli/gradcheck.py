@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import click
 
 from reslrb_cli.cli.experiment import check_writable, optional_experiment_arguments
+from reslrb_cli.cli.suite import refuse_foreign, run_suite_command
 from reslrb_cli.errors import ConfigError, ExitCode
 
 if TYPE_CHECKING:
@@ -21,6 +22,9 @@ logger = logging.getLogger(__name__)
 
 @click.command("gradcheck")
 @optional_experiment_arguments
+@click.option("--suite", type=click.Choice(["extreme"]),
+              help="Run scenes of its own in place of CONFIG: extreme, those in which gradients break.")  # fmt: skip
+@click.option("--case", "cases", multiple=True, metavar="NAME", help="Run this case of the suite; may be repeated.")
 @click.option("--estimators", metavar="LIST",
               help="What to check: ESTIMATOR[(OPTION=VALUE,...)], separated by commas. Default: all four, with the "
                    "options of CONFIG.")  # fmt: skip
@@ -35,9 +39,13 @@ logger = logging.getLogger(__name__)
               help="Write the table as Markdown.")  # fmt: skip
 @click.option("--images", "folder", type=click.Path(path_type=Path, file_okay=False),
               help="Write PNG maps of the gradients of textures, their references and z into this folder.")  # fmt: skip
+@click.pass_context
 def command(
+    context: click.Context,
     config_file: Path | None,
     overrides: tuple[str, ...],
+    suite: str | None,
+    cases: tuple[str, ...],
     estimators: str | None,
     budget: float,
     seeds: int | None,
@@ -61,13 +69,18 @@ def command(
     from reslrb_cli.measure.gradcheck import Gradcheck
     from reslrb_cli.measure.participants import Settings
 
+    check_writable("--json", json_file)
+    check_writable("--markdown", markdown_file)
+    if suite is not None:
+        refuse_foreign(context)
+        return run_suite_command(cases, estimators, seeds, json_file, markdown_file)
+    if cases:
+        raise ConfigError("--case", "", "names a case of a suite; take --suite extreme with it")
     if config_file is None:
         config = loads(cornell_box.CONFIG, cornell_box.SOURCE, overrides)
     else:
         config = load(config_file, overrides)
     listed = all_estimators(config) if estimators is None else parse_estimators(estimators)
-    check_writable("--json", json_file)
-    check_writable("--markdown", markdown_file)
     _check_folder(folder)
     settings = Settings(config, listed, budget, seeds, spp)
     settings.configs()  # before anything is loaded
