@@ -108,6 +108,22 @@ def test_wrong_calls_are_one_located_line(args: list[str], line: str, capsys: py
     assert line in error
 
 
+def test_a_case_of_the_suite(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    json_file, markdown = tmp_path / "a.jsonl", tmp_path / "a.md"
+    files = ["--json", str(json_file), "--markdown", str(markdown)]
+    assert call("--suite", "extreme", "--case", "furnace", "--estimators", "stack", *files) == 0
+    rows = read(json_file)
+    assert {(row["case"], row["estimator"], row["holds"]) for row in rows} == {("furnace", "stack", True)}
+    assert "analytic" in {row["reference"] for row in rows}
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[1].startswith("furnace ")
+    assert lines[1].endswith("holds")
+    assert lines[-1] == f"{len(rows)} of {len(rows)} comparisons hold, 0 fail"
+    assert "| `furnace` |" in markdown.read_text()
+    assert call("--suite", "extreme", "--case", "furnac") == 2
+    assert "there is no case `furnac`; did you mean furnace?" in capsys.readouterr().err
+
+
 def test_ctrl_c_prints_what_is_done() -> None:
     command = [sys.executable, "-c", "from reslrb_cli.cli import main; main()", "gradcheck", *SMALL, "--seeds", "4000"]
     process = subprocess.Popen(
