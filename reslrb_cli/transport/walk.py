@@ -144,11 +144,13 @@ def walk(
         if hooks.connects:
             if not (hooks.attached or plan.track_zeros):
                 # No shadow ray where neither light nor its derivative would arrive.
-                connection.active = connection.active & dr.any(connection.f != 0)
+                connection.active = connection.active & ~dr.all(connection.f == 0)  # NaN arrives
             shadow = passage(plan, scene, si, path.depth, connection, hooks.seen(vertex), loop_mode)
             connection.active, transmittance = shadow
             if hooks.attached:
                 connection.f = evaluate(plan, si, vertex.bsdf, connection.wo, connection.active)
+            else:
+                connection.f = dr.select(connection.active, connection.f, 0)
             connection.c = connection.f * transmittance * connection.weight
             numbers = [selection.next_float32() for _ in range(hooks.numbers)]
             state = hooks.connection(state, vertex, connection, numbers)

@@ -327,4 +327,4 @@ def test_passes_that_a_budget_made_are_replayed(experiment, capsys):
     _, [offender], _ = inspect(capsys, err)
     assert f"the first at pixel ({', '.join(map(str, offender['pixel']))})" in err
     assert ", pass " in offender["where"]["samples"]
-    assert offender["quantity"] == "scattering weight s"
+    assert offender["quantity"] == "connection factor c"
