@@ -1,0 +1,162 @@
+"""Faults to break the code with, one line each, and the check that is to find it: gradcheck, or a case of the extreme
+suite."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+from reslrb_cli.config import Config, loads
+from reslrb_cli.measure import cornell_box
+from reslrb_cli.measure.cases import parse_estimators
+from reslrb_cli.measure.extreme import run_suite
+from reslrb_cli.measure.gradcheck import Gradcheck
+from reslrb_cli.measure.participants import Settings
+from reslrb_cli.records.gradcheck import GradcheckRecord
+
+Check = Callable[[], Iterable[GradcheckRecord]]
+SMALL = ["scene.options.size=32", "scene.options.texture=4", "run.spp=8", "integrator.max_depth=4"]
+VEILED = f"""\
+scene: {{file: {Path(__file__).with_name("veiled_room.xml")}}}
+target: {{render: {{}}}}
+parameters:
+  - {{key: veil.opacity.value}}
+  - {{key: floor.reflectance.value}}
+integrator: {{max_depth: 4, rr_depth: 1000000}}
+run: {{spp: 64}}
+"""
+
+
+def checked(config: Config, estimators: str, seeds: int) -> list[GradcheckRecord]:
+    """The records of `reslrb gradcheck`."""
+    made = Gradcheck(Settings(config, parse_estimators(estimators), 0, seeds))
+    return [result.record for result in made.run(lambda: False, lambda line: None)]
+
+
+def cornell(*overrides: str, estimators: str, seeds: int = 8) -> Check:
+    """`reslrb gradcheck` on the built-in Cornell box, small."""
+    return lambda: checked(loads(cornell_box.CONFIG, cornell_box.SOURCE, [*SMALL, *overrides]), estimators, seeds)
+
+
+def extreme(case: str, *estimators: str) -> Check:
+    """A case of the extreme suite, with these estimators, or all."""
+    return lambda: run_suite([case], estimators or None)
+
+
+CHECKS: dict[str, Check] = {
+    "cornell": cornell(estimators="gather,stack"),
+    "cornell_reservoir": cornell(estimators="reservoir,stack"),
+    "cornell_event": cornell(estimators="event,stack"),
+    "cornell_roulette": cornell("integrator.rr_depth=1", estimators="stack"),
+    "cornell_capacity_2": cornell(estimators="reservoir(capacity=2),stack", seeds=16),
+    "cornell_stack_of_2": cornell(estimators="stack(stack_size=2)"),
+    "veil": lambda: checked(loads(VEILED, "a room with a veil"), "gather,stack", 8),
+    "black_texels": extreme("albedo_0"),
+    "pure_colours": extreme("pure_colours", "gather", "stack"),
+    "lamp": extreme("one_texel"),
+    "wide_filter": extreme("film_border", "gather", "stack"),
+    "crop": extreme("film_crop", "stack"),
+    "shading_normals": extreme("shading_normals", "stack"),
+    "refraction": extreme("refraction", "stack"),
+    "delta_lobes": extreme("nested_dielectrics", "reservoir", "stack"),
+    "sky": extreme("sun_1e6", "stack"),
+}
+
+
+@dataclass(frozen=True)
+class Fault:
+    """`right`, in the source of the function `where`, becomes `wrong`; `check` then fails in these records at least.
+
+    `fails` are pairs of an estimator and a reference; the estimator is None in an image's record. Estimators that are
+    not in it are free of the fault, and their records hold.
+    """
+
+    name: str
+    check: str
+    where: str
+    right: str
+    wrong: str
+    fails: frozenset[tuple[str | None, str]]
+
+
+def by(estimators: str, *references: str) -> frozenset[tuple[str | None, str]]:
+    """All pairs of these estimators with these references; `image` is none of the estimators."""
+    return frozenset((None if e == "image" else e, r) for e in estimators.split() for r in references)
+
+
+GRADIENT = ("walk_ad", "finite_difference", "forward_mode")  # of an estimator whose walk is right
+WALK = "transport.walk:walk"
+
+FAULTS = [
+    # ---- Light paths: naive AD and differences share the fault, a stock integrator does not ----
+    Fault("cosine_of_connection", "cornell", "transport.scattering:scatter",
+          "return evaluate(plan, si, self, wo, connected), bs.wo",
+          "return evaluate(plan, si, self, wo, connected) / dr.maximum(mi.Frame3f.cos_theta(wo), 1e-3), bs.wo",
+          by("gather stack", "walk_ad", "ptracer", "finite_difference") | by("image", "ptracer")),
+    Fault("roulette_without_weight", "cornell_roulette", WALK,
+          "dr.select(playing, dr.rcp(q), 1)", "dr.select(playing, mi.Float(1), 1)",
+          by("image stack", "ptracer")),
+    Fault("shading_normals_uncorrected", "shading_normals", "transport.scattering:shading_correction",
+          "dr.abs((cos_i * wo_dot_n) / (cos_o * wi_dot_n))", "mi.Float(1)", by("stack", "prb", "path")),
+    Fault("radiance_at_refraction", "refraction", "transport.scattering:importance_context",
+          "TransportMode.Importance", "TransportMode.Radiance", by("stack", "analytic", "ptracer")),
+    Fault("crop_offset_dropped", "crop", "transport.splat:Film.put", "u + mi.Vector2f(self.offset)", "u",
+          by("stack", "ptracer")),
+    Fault("density_of_sky_without_uniform_part", "sky", "transport.emission:_any_direction",
+          "(1 - DEFENSIVE) * own + DEFENSIVE * dr.inv_four_pi", "own", by("stack", "prb")),
+    # ---- Adjoints and derivatives: paths are right, and naive AD of them is a reference ----
+    Fault("adjoint_without_filter", "wide_filter", "transport.splat:AdjointImage.lookup",
+          "self.filter.is_box_filter()", "True", by("gather stack", "walk_ad", "ptracer")),
+    Fault("channels_of_adjoint_swapped", "cornell", "transport.splat:AdjointImage._pixel",
+          "mi.Spectrum(*color)", "mi.Spectrum(*color[::-1])", by("gather stack", "walk_ad", "ptracer")),
+    Fault("emission_not_differentiated", "lamp", "estimators.base:differentiate_emission",
+          "p.plan.differentiate_emission", "False", by("reservoir event gather stack", "walk_ad", "ptracer")),
+    Fault("zero_factor_dropped", "black_texels", "estimators.base:adjoint_of_factor",
+          "at_zero = dr.select(zero == mi.Int32(index), value[c] * rest[c], 0)", "at_zero = mi.Float(0)",
+          by("reservoir event gather stack", "walk_ad", "finite_difference")),
+    Fault("zero_factor_of_prefix_dropped", "black_texels", "estimators.sums:AdjointSum.adjoint_of_factor",
+          "(f[c] == 0) & (zero == NO_ZERO)", "mi.Bool(False)", by("gather stack", "walk_ad")),
+    Fault("second_zero_factor_forgotten", "pure_colours", "transport.factors:Product.times",
+          "dr.select(z == NO_ZERO, mi.Int32(index), MANY_ZEROS)", "mi.Int32(index)",
+          by("gather stack", "walk_ad", "finite_difference")),
+    Fault("stand_in_without_cosine", "black_texels", "transport.connection:stand_in",
+          "connection.weight * f", "connection.weight * dr.inv_pi",
+          by("reservoir event gather stack", "walk_ad", "finite_difference")),
+    Fault("delta_lobe_without_probability", "delta_lobes", "transport.scattering:_singular_factor",
+          "weight * pdf", "weight", by("reservoir stack", "ptracer")),
+    Fault("veil_not_differentiated", "veil", "estimators.base:differentiate_passage",
+          "differentiate if p.plan.differentiate_null else None", "None",
+          by("gather stack", "walk_ad", "forward_mode")),
+    Fault("veil_taken_for_clear_in_adjoint", "veil", "estimators.base:differentiate_passage",
+          "adjoint(dr.detach(transmission)) * transmission", "adjoint(mi.Spectrum(1)) * transmission",
+          by("gather stack", "walk_ad")),
+    # ---- Estimators: the others are right ----
+    Fault("w_of_previous_step", "cornell_reservoir", "estimators.reservoir:ReservoirSelection.connection",
+          "is_taken(number, w, W)", "is_taken(number, w, state.W)", by("reservoir", *GRADIENT, "ptracer")),
+    Fault("replay_one_number_too_many", "delta_lobes", WALK,
+          "sampler.next_1d(active)  # roulette's", "sampler.next_1d(active), sampler.next_1d(active)",
+          by("reservoir", "walk_ad")),
+    Fault("replay_ends_a_vertex_early", "cornell_reservoir", "estimators.reservoir:ReservoirReplay.is_followed",
+          "vertex.depth + 1 < self.last", "vertex.depth + 2 < self.last", by("reservoir", *GRADIENT, "ptracer")),
+    Fault("slots_counted_twice", "cornell_capacity_2", "estimators.reservoir:unselected",
+          "W / (capacity * slot.w)", "W / slot.w", by("reservoir(capacity=2)", *GRADIENT, "ptracer")),
+    Fault("weight_of_prefix", "cornell_event", "estimators.event:EventSelection.scattering",
+          "return EventState(Q, state.W", "return EventState(state.Q, state.W", by("event", *GRADIENT, "ptracer")),
+    Fault("one_visibility_bit_late", "cornell", "estimators.gather:Visibility.seen",
+          "index = depth - 1", "index = depth", by("gather stack", *GRADIENT)),
+    Fault("visibility_inverted", "cornell", "estimators.gather:Visibility.seen",
+          "& 1) != 0", "& 1) == 0", by("gather stack", *GRADIENT)),
+    Fault("stack_without_last_vertex", "cornell", "estimators.stack:walk_back",
+          "(pushed.height,", "(pushed.height - dr.select(pushed.height > 0, mi.UInt32(1), 0),",
+          by("stack", *GRADIENT)),
+    Fault("stack_without_its_tail", "cornell_stack_of_2", "estimators.stack:walk_back",
+          "PlainSum(tail.value + tail.rest,", "PlainSum(mi.Spectrum(0),",
+          by("stack(stack_size=2)", *GRADIENT)),
+    # ---- Forward mode: all estimators share it ----
+    Fault("forward_without_prefix", "cornell", "integrators.hooks:TangentSplat.scattering",
+          "state.d_product * c + P * dc", "P * dc", by("gather stack", "forward_mode")),
+    Fault("forward_without_veil", "veil", "integrators.hooks:TangentSplat.scattering",
+          "(df_c * passed + f_c * d_passed)", "df_c * passed",
+          by("gather stack", "forward_mode")),
+]  # fmt: skip

@@ -1,0 +1,78 @@
+"""The code broken on purpose: gradcheck or the extreme suite finds each of these faults, and says where it is."""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+import textwrap
+from collections.abc import Iterable
+from functools import cache
+from operator import attrgetter
+
+import pytest
+from measure.faults import CHECKS, FAULTS, Fault
+
+from reslrb_cli.records.gradcheck import GradcheckRecord, Verdict
+
+#: Those that take seconds, of the default suite.
+QUICK = ("one_visibility_bit_late", "stack_without_last_vertex", "zero_factor_dropped")
+
+
+@pytest.fixture(autouse=True)
+def _quiet(llvm: str) -> None:
+    import mitsuba as mi
+
+    mi.set_log_level(mi.LogLevel.Error)
+
+
+def test_enough():
+    assert len(FAULTS) >= 12
+    assert {fault.check for fault in FAULTS} == set(CHECKS)
+    assert set(QUICK) <= {fault.name for fault in FAULTS}
+
+
+@pytest.mark.parametrize("fault", FAULTS, ids=lambda fault: fault.name)
+def test_it_fits_the_code(fault: Fault, monkeypatch: pytest.MonkeyPatch):
+    """Also those that the default suite does not run: a change of the code that one gets lost by shows at once."""
+    plant(fault, monkeypatch)
+
+
+@pytest.mark.parametrize("name", [pytest.param(f.name, marks=[] if f.name in QUICK else pytest.mark.long)
+                                  for f in FAULTS])  # fmt: skip
+def test_fault(name: str, monkeypatch: pytest.MonkeyPatch):
+    [fault] = [fault for fault in FAULTS if fault.name == name]
+    assert as_it_stands(fault.check) == set()
+    plant(fault, monkeypatch)
+    found = failures(CHECKS[fault.check]())
+    assert fault.fails <= found
+    # Nothing but what has the fault.
+    assert {name for name, _ in found} == {name for name, _ in fault.fails}
+
+
+@cache
+def as_it_stands(check: str) -> set[tuple[str | None, str]]:
+    """What fails of a check without any fault: once for all faults that it is to find."""
+    return failures(CHECKS[check]())
+
+
+def failures(records: Iterable[GradcheckRecord]) -> set[tuple[str | None, str]]:
+    """Estimator and reference of each record that fails."""
+    return {(r.estimator, r.reference.value) for r in records if r.verdict is Verdict.FAILS}
+
+
+def plant(fault: Fault, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Put a fault into a function, wherever it has been imported to.
+
+    Its source has to hold the line once: a fault that no longer fits the code is an error of this test.
+    """
+    module, _, path = fault.where.partition(":")
+    function = attrgetter(path)(importlib.import_module(f"reslrb_cli.{module}"))
+    function = getattr(function, "__func__", function)
+    source = textwrap.dedent(inspect.getsource(function))
+    assert source.count(fault.right) == 1, f"{fault.where} has no such line any more: {fault.right}"
+    # Annotations name what is imported for type checkers alone.
+    broken_source = "from __future__ import annotations\n" + source.replace(fault.right, fault.wrong)
+    scope = dict(function.__globals__)
+    exec(compile(broken_source, fault.where, "exec", dont_inherit=True), scope)
+    broken = scope[function.__name__]
+    monkeypatch.setattr(function, "__code__", getattr(broken, "__func__", broken).__code__)
