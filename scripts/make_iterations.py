@@ -37,7 +37,7 @@ SERIES: dict[str, tuple[dict[str, Any], str]] = {
     "reservoir, batched": ({"type": "reslrb", "estimator": "reservoir", "freeze": True}, "batched"),
 }
 #: The reference gradient: so many, of so many samples per pixel, with seeds of their own.
-REFERENCES, REFERENCE_SPP = 32, 512
+REFERENCES, REFERENCE_SPP = 16, 256
 
 
 class Iterations:
