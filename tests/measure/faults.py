@@ -61,6 +61,11 @@ CHECKS: dict[str, Check] = {
     "refraction": extreme("refraction", "stack"),
     "delta_lobes": extreme("nested_dielectrics", "reservoir", "stack"),
     "sky": extreme("sun_1e6", "stack"),
+    "furnace": extreme("furnace", "stack"),
+    "black_solid": extreme("shading_normals_albedo_0", "stack"),
+    "behind_mask": extreme("albedo_0_behind_mask", "stack"),
+    "opacity": extreme("opacity_0.4", "stack"),
+    "deep": extreme("white_box_100", "gather"),
 }
 
 
@@ -131,6 +136,15 @@ FAULTS = [
     Fault("veil_taken_for_clear_in_adjoint", "veil", "estimators.base:differentiate_passage",
           "adjoint(dr.detach(transmission)) * transmission", "adjoint(mi.Spectrum(1)) * transmission",
           by("gather stack", "walk_ad")),
+    Fault("visible_emission_not_differentiated", "furnace",
+          "integrators.light_tracer:differentiate_visible_emission", "plan.visible_emission and (", "False and (",
+          by("stack", "walk_ad", "analytic")),
+    Fault("shading_normals_uncorrected_beside_zero", "black_solid", "estimators.stack:Pushing.scattering",
+          "scattering.correction / scattering.pdf", "1 / scattering.pdf", by("stack", "walk_ad")),
+    Fault("mask_forgotten_beside_zero", "behind_mask", "estimators.stack:Pushing.scattering",
+          "rest_c *= differentiate_passage(", "differentiate_passage(", by("stack", "walk_ad", "finite_difference")),
+    Fault("opacity_not_differentiated", "opacity", "estimators.base:differentiate_passage",
+          "differentiate if p.plan.differentiate_null else None", "None", by("stack", "walk_ad", "finite_difference")),
     # ---- Estimators: the others are right ----
     Fault("w_of_previous_step", "cornell_reservoir", "estimators.reservoir:ReservoirSelection.connection",
           "is_taken(number, w, W)", "is_taken(number, w, state.W)", by("reservoir", *GRADIENT, "ptracer")),
@@ -145,6 +159,9 @@ FAULTS = [
           "return EventState(Q, state.W", "return EventState(state.Q, state.W", by("event", *GRADIENT, "ptracer")),
     Fault("one_visibility_bit_late", "cornell", "estimators.gather:Visibility.seen",
           "index = depth - 1", "index = depth", by("gather stack", *GRADIENT)),
+    Fault("beyond_visibility_bits_all_seen", "deep", "transport.connection:passage",
+          "traced = unknown & ~scene.ray_test(si.spawn_ray_to(connection.target), unknown)", "traced = unknown",
+          by("gather", "walk_ad")),
     Fault("visibility_inverted", "cornell", "estimators.gather:Visibility.seen",
           "& 1) != 0", "& 1) == 0", by("gather stack", *GRADIENT)),
     Fault("stack_without_last_vertex", "cornell", "estimators.stack:walk_back",

@@ -8,21 +8,22 @@ import numpy as np
 
 from reslrb_cli.measure.analytic_scenes import camera as pinhole
 from reslrb_cli.measure.analytic_scenes import refraction_scene, slab_scene
-from reslrb_cli.measure.extreme.case import Exact, ExtremeCase, Stock
+from reslrb_cli.measure.extreme.case import Differences, Exact, ExtremeCase, Stock
 from reslrb_cli.measure.small_scenes import bitmap, diffuse, rgb, room, transform
 
 FLOOR = "floor.brdf_0.reflectance.value"
+WALL = "wall.brdf_0.reflectance.value"
 LAMP = "lamp.emitter.radiance.value"
 VEIL = "veil.bsdf.nested_bsdf.brdf_0.reflectance.value"
 OPACITY = "veil.bsdf.opacity.value"
 
 
-def veiled(opacity: Any) -> dict:
-    """A sheet between lamp and floor, in view."""
+def veiled(opacity: Any, **changes: Any) -> dict:
+    """A sheet between lamp and floor, and between camera and wall."""
     bsdf = {"type": "mask", "opacity": opacity, "id": "veil_bsdf",
             "bsdf": {"type": "twosided", "bsdf": diffuse(0.7, 0.6, 0.3)}}  # fmt: skip
     place = transform(translate=[0.1, 0.2, 0.2], rotate=([1, 0, 0], -80), scale=0.5)
-    return room(veil={"type": "rectangle", "to_world": place, "bsdf": bsdf})
+    return room(veil={"type": "rectangle", "to_world": place, "bsdf": bsdf}, **changes)
 
 
 def nested() -> dict:
@@ -88,6 +89,12 @@ CASES = [
     ExtremeCase("opacity_texture_0_and_1", "a mask of opaque and of clear texels",
                 lambda: veiled(bitmap(np.array([[[0.0], [1.0]], [[1.0], [0.0]]]))), (FLOOR, LAMP, VEIL), Stock("prb"),
                 spp=128),
+    ExtremeCase("opacity_0.4", "the opacity of a mask, at a depth at which the image is quadratic in it",
+                lambda: veiled(0.4), (OPACITY,), Differences(0.3), spp=1024, options={"max_depth": 3}, signed=True),
+    ExtremeCase("albedo_0_behind_mask", "a wall that is 0 in one channel behind a mask: what the mask lets pass is "
+                "a factor of a derivative that no contribution shows",
+                lambda: veiled(0.4, wall={"type": "twosided", "bsdf": diffuse(0, 0.7, 0.4)}), (WALL, VEIL),
+                Differences(0.05, "up"), spp=128),
     ExtremeCase("nested_dielectrics", "a ball of glass in a ball of water", nested,
                 ("water.bsdf.specular_transmittance.value", "glass.bsdf.specular_transmittance.value",
                  "floor.bsdf.reflectance.value"), Stock("ptracer"), image="ptracer", spp=512,

@@ -85,6 +85,23 @@ def grey(max_depth: int) -> Any:
     return furnace_scene((0.5, 0.8, 0.9), (1, 2, 0.5), max_depth, 8)
 
 
+def white_box() -> dict:
+    """A closed white box that holds a white cube, behind which the camera does not see."""
+    import mitsuba as mi
+
+    view = mi.ScalarTransform4f().look_at(origin=[0.8, 0.7, 0.8], target=[-0.2, -0.2, -0.2], up=[0, 1, 0])
+    return {
+        "type": "scene",
+        "camera": camera(size=8) | {"to_world": view, "fov": 80},
+        "box": {"type": "cube", "flip_normals": True, "bsdf": diffuse(1, 0.99, 1)},
+        "cube": {"type": "cube", "bsdf": diffuse(1, 1, 0.98),
+                 "to_world": transform(rotate=([1, 2, 3], 40), scale=0.35)},
+        "lamp": lamp(radiance=rgb(3, 4, 5)) | {
+            "to_world": transform(translate=[0.2, 0.99, 0.2], rotate=([1, 0, 0], 90), scale=0.3),
+            "bsdf": diffuse(0.9, 0.9, 0.9)},
+    }  # fmt: skip
+
+
 FURNACE = ("walls.bsdf.reflectance.value", "walls.emitter.radiance.value")
 
 CASES = [
@@ -115,6 +132,9 @@ CASES = [
                 options={"max_depth": -1, "rr_depth": 5}, residual=True),
     ExtremeCase("furnace_1024", "a furnace of albedo 1, 1024 bounces", lambda: white(1024).scene(), FURNACE,
                 Exact(lambda: white(1024)), spp=256, image="", options={"max_depth": 1024}, naive=False, residual=True),
+    ExtremeCase("white_box_100", "a white box with an obstacle, 100 bounces: more than have a bit for visibility",
+                white_box, ("box.bsdf.reflectance.value", "cube.bsdf.reflectance.value"), Stock("ptracer"),
+                image="ptracer", options={"max_depth": 100, "hide_emitters": True}, residual=True),
     ExtremeCase("furnace_black", "a furnace of albedo 0, whose derivative is its first bounce",
                 lambda: furnace_scene((0, 0, 0), (1, 2, 0.5), 8, 8).scene(), FURNACE,
                 Exact(lambda: furnace_scene((0, 0, 0), (1, 2, 0.5), 8, 8)), options={"max_depth": 8}),

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from reslrb_cli.measure.analytic_scenes import camera as pinhole
-from reslrb_cli.measure.extreme.case import ExtremeCase, Stock, Twin
+from reslrb_cli.measure.extreme.case import Differences, ExtremeCase, Stock, Twin
 from reslrb_cli.measure.small_scenes import bitmap, diffuse, rgb, room, transform
 
 FLOOR = "floor.brdf_0.reflectance.value"
@@ -46,12 +46,12 @@ def turned_panes() -> dict:
     return room(first=pane(160, translate=[0.4, -0.2, 0.6]), second=pane(40, translate=[-0.4, -0.3, 0.5]))
 
 
-def octahedron() -> dict:
+def octahedron(*reflectance: float) -> dict:
     """A solid of eight flat faces that is shaded as a sphere."""
     import mitsuba as mi
 
     properties = mi.Properties()
-    properties["mesh_bsdf"] = mi.load_dict(diffuse(0.7, 0.5, 0.8))
+    properties["mesh_bsdf"] = mi.load_dict(diffuse(*reflectance))
     mesh = mi.Mesh("solid", 6, 8, has_vertex_normals=True, props=properties)
     corners = np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]], np.float32)
     faces = [(x, y, z) if (x + y + z) % 2 == 0 else (y, x, z) for x in (0, 1) for y in (2, 3) for z in (4, 5)]
@@ -94,8 +94,11 @@ CASES = [
                 (FLOOR, WALL, LAMP), Stock("ptracer"), spp=128),
     ExtremeCase("back_facing", "sheets that turn their backs on camera and lamp", turned_panes,
                 ("first.bsdf.reflectance.value", "second.bsdf.reflectance.value", FLOOR), Stock("ptracer"), spp=256),
-    ExtremeCase("shading_normals", "eight flat faces shaded as a sphere", octahedron,
+    ExtremeCase("shading_normals", "eight flat faces shaded as a sphere", lambda: octahedron(0.7, 0.5, 0.8),
                 ("solid.bsdf.reflectance.value", FLOOR), Stock("prb"), spp=256),
+    ExtremeCase("shading_normals_albedo_0", "the same in black: the derivative alone shows how its normals are treated",
+                lambda: octahedron(0, 0, 0), ("solid.bsdf.reflectance.value", FLOOR), Differences(0.05, "up"),
+                spp=256),
     ExtremeCase("normal_map", "normals that lean by up to 60 degrees", normal_map,
                 ("floor.nested_bsdf.reflectance.value", WALL), Stock("prb"), spp=512),
 ]  # fmt: skip
