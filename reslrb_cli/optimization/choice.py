@@ -141,13 +141,14 @@ def _run_pilot(problem: Problem, options: list[Option]) -> Outcome:
 
     def step(candidate: Candidate, round: int, spp: int) -> Measured:
         integrator = integrators[candidate.label]
-        samples = integrator.samples_per_pass
+        samples, freeze = integrator.samples_per_pass, integrator.freeze
         if candidate.passes > 1:
             integrator.samples_per_pass = spp // (batches * candidate.passes)
+        integrator.freeze = False  # few steps of each sample count: a recording would cost more than it saves
         try:
             return _step(problem, integrator, clock, round, spp)
         finally:
-            integrator.samples_per_pass = samples
+            integrator.samples_per_pass, integrator.freeze = samples, freeze
 
     unit = batches * max(candidate.passes for candidate in made)
     if problem.samples_per_pass is not None:  # the user's own passes
