@@ -100,7 +100,7 @@ class Reslrb(LightTracer):
     freeze: bool = Field(
         default=True,
         description="Record what a step launches and launch that again, so that its Python runs once, not in every "
-        "iteration. Not with passes.",
+        "iteration. Not with passes, nor with more than 4 million paths, beside which Python does not show.",
     )
 
     @model_validator(mode="after")

@@ -9,6 +9,7 @@ import mitsuba as mi
 
 from reslrb_cli.errors import UnsupportedScene
 from reslrb_cli.estimators import ESTIMATORS, Estimator
+from reslrb_cli.integrators import freezing
 from reslrb_cli.integrators import light_tracer as lt
 from reslrb_cli.integrators.differentiated import differentiated
 from reslrb_cli.integrators.freezing import Recordings
@@ -132,8 +133,8 @@ def _make_classes() -> dict[str, Any]:
                 return film.develop_tangent(block)
 
         def _freezes(self, parts: list[lt.Samples]) -> bool:
-            """Whether these samples are traced from a recording; several passes are large, and gain little by it."""
-            return self.freeze and len(parts) == 1
+            """Whether these samples are traced from a recording; large ones, and so several passes, gain little by it."""
+            return self.freeze and len(parts) == 1 and parts[0].width <= freezing.MOST_PATHS
 
         def image_estimator(self) -> Estimator | None:
             """The estimator that makes images of its own; None where they show every connection."""

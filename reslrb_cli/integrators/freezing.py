@@ -18,6 +18,8 @@ from reslrb_cli.errors import UnsupportedScene, is_out_of_memory
 from reslrb_cli.integrators.light_tracer import Samples
 from reslrb_cli.transport.splat import Film
 
+#: Paths beyond which nothing is recorded: Python does not show beside them, and the trials of a recording would.
+MOST_PATHS = 2**22
 #: Recordings of one kind of call that are kept, for inputs that change in more than their values.
 KEPT = 4
 #: Calls after which a recording is in use, at most: Dr.Jit makes some twice before it trusts them.

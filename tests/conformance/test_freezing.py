@@ -9,6 +9,7 @@ import pytest
 from conformance.gradient_cases import CASES, GradientCase
 
 from reslrb_cli.errors import UnsupportedScene
+from reslrb_cli.integrators import freezing
 from reslrb_cli.measure.gradients import Case, integrator, relative
 
 pytestmark = pytest.mark.usefixtures("llvm")
@@ -99,3 +100,13 @@ def test_other_sample_counts_are_other_recordings() -> None:
     plain = integrator("reslrb", estimator="event", freeze=False)
     for spp in (4, 16, 4):
         assert relative(scene.gradient(chosen, 3, spp), scene.gradient(plain, 3, spp)) < 1e-5
+
+
+def test_large_steps_are_not_recorded(monkeypatch: pytest.MonkeyPatch) -> None:
+    case = BY_NAME["texture"]
+    scene, chosen = Case(case.scene(), case.keys), integrator("reslrb", estimator="event", freeze=True)
+    paths = 8 * scene.weights.shape[0] * scene.weights.shape[1]
+    for most, recorded in ((paths - 1, False), (paths, True)):
+        monkeypatch.setattr(freezing, "MOST_PATHS", most)
+        scene.gradient(chosen, 3, 8)
+        assert bool(chosen.recordings.counts()) == recorded
