@@ -133,7 +133,7 @@ def _make_classes() -> dict[str, Any]:
                 return film.develop_tangent(block)
 
         def _freezes(self, parts: list[lt.Samples]) -> bool:
-            """Whether these samples are traced from a recording; large ones, and so several passes, gain little by it."""
+            """Whether these samples are traced from a recording; large ones, and so several passes, gain little."""
             return self.freeze and len(parts) == 1 and parts[0].width <= freezing.MOST_PATHS
 
         def image_estimator(self) -> Estimator | None:
