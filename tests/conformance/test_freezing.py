@@ -17,6 +17,8 @@ pytestmark = pytest.mark.usefixtures("llvm")
 BY_NAME = {case.name: case for case in CASES}
 #: Mitsuba's thin lens keeps an array that a recording does not see.
 NOT_RECORDED = ("thin_lens",)
+#: One of each kind; the others take minutes in all.
+QUICK = ("texture", "rgba", "roughplastic", "glass", "mask", "area_texture", "envmap", "visible_lamp")
 ESTIMATORS = ("reservoir", "event", "gather", "stack")
 #: What is recorded, by the way in which a step comes by dL/dI.
 KINDS = {
@@ -40,7 +42,11 @@ def gradients(case: GradientCase, adjoint: str, **options: object) -> tuple[list
     return found, counts
 
 
-@pytest.mark.parametrize("case", [case for case in CASES if case.name not in NOT_RECORDED], ids=lambda case: case.name)
+def _quick_or_long(case: GradientCase) -> object:
+    return pytest.param(case, id=case.name, marks=[] if case.name in QUICK else [pytest.mark.long])
+
+
+@pytest.mark.parametrize("case", [_quick_or_long(case) for case in CASES if case.name not in NOT_RECORDED])
 def test_a_recorded_step_is_the_step(case: GradientCase) -> None:
     for number, estimator in enumerate(ESTIMATORS):
         adjoint = list(KINDS)[(number + len(case.name)) % len(KINDS)]
