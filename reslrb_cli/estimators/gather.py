@@ -41,19 +41,19 @@ class Visibility:
     """Which connections of a path were visible: one bit for each of 32 * WORDS vertices, and the last of all."""
 
     words: list[Any]
-    last: Any  # the last vertex with a visible connection; 0: none
+    last: Any  # the last vertex that there is need to visit again, mostly the last with a visible connection; 0: none
 
     @staticmethod
     def none(plan_depth: int) -> Visibility:
         """No vertex seen yet, with as many words as paths of that many vertices can fill."""
         return Visibility([mi.UInt32(0) for _ in range(min(WORDS, -(-plan_depth // 32)))], mi.UInt32(0))
 
-    def with_vertex(self, depth: Any, visible: Any) -> Visibility:
-        """Remember whether the connection from vertex `depth` is visible."""
+    def with_vertex(self, depth: Any, visible: Any, last: Any) -> Visibility:
+        """Remember whether the connection from vertex `depth` is visible; if so, `last` is to be visited."""
         index = depth - 1
         bit = mi.UInt32(1) << (index & 31)
         words = [word | dr.select(visible & ((index >> 5) == k), bit, 0) for k, word in enumerate(self.words)]
-        return Visibility(words, dr.select(visible, depth, self.last))
+        return Visibility(words, dr.select(visible, last, self.last))
 
     def seen(self, depth: Any, vertices: int) -> Seen:
         """What is known at vertex `depth`, of paths that have at most so many vertices."""
@@ -67,10 +67,14 @@ class Visibility:
 
 @dataclass
 class GatherState:
-    """What is kept of a path: visibility, and S_0 where delta is known already (else nothing)."""
+    """What is kept of a path: visibility, and S_0 where delta is known already (else nothing).
+
+    On the way there, where delta is known, `latest` is the latest vertex with anything to differentiate.
+    """
 
     visibility: Visibility
     S: list[AdjointSum]
+    latest: list[Any]
 
 
 class Gathering(VertexHooks):
@@ -78,16 +82,31 @@ class Gathering(VertexHooks):
 
     def start(self, product: Product) -> GatherState:
         p = self.p
-        S = [] if p.adjoint is None else [AdjointSum.zero(p.plan.track_zeros)]
         # The sum is all that derivatives of emission need.
         traced_again = p.adjoint is None or p.plan.differentiate_bsdfs
-        return GatherState(Visibility.none(vertices(p) if traced_again else 0), S)
+        visibility = Visibility.none(vertices(p) if traced_again else 0)
+        if p.adjoint is None:
+            return GatherState(visibility, [], [])
+        return GatherState(visibility, [AdjointSum.zero(p.plan.track_zeros)], [mi.UInt32(0)])
 
     def connection(self, state: GatherState, vertex: Vertex, connection: Connection, numbers: list[Any]) -> GatherState:
-        C = contribution(self.p, vertex, connection)
-        self.p.splat(connection.u, C.value(), connection.active)
-        visibility = state.visibility.with_vertex(vertex.depth, connection.active)
-        return GatherState(visibility, [plus(self.p, S, vertex, connection, C) for S in state.S])
+        p, depth, last = self.p, vertex.depth, vertex.depth
+        C = contribution(p, vertex, connection)
+        p.splat(connection.u, C.value(), connection.active)
+        latest = [latest_concerned(p, vertex, before) for before in state.latest]
+        if latest:
+            last = needed(latest[0], depth)
+        visibility = state.visibility.with_vertex(depth, connection.active, last)
+        return GatherState(visibility, [plus(p, S, vertex, connection, C) for S in state.S], latest)
+
+
+@dataclass
+class Summed:
+    """State of a walk that sums: S_0 so far, `latest` as in GatherState, the last vertex that a replay has to visit."""
+
+    S: AdjointSum
+    latest: Any
+    last: Any
 
 
 class Summing(VertexHooks):
@@ -97,26 +116,29 @@ class Summing(VertexHooks):
         super().__init__(p)
         self.visibility = visibility
 
-    def start(self, product: Product) -> AdjointSum:
-        return AdjointSum.zero(self.p.plan.track_zeros)
+    def start(self, product: Product) -> Summed:
+        return Summed(AdjointSum.zero(self.p.plan.track_zeros), mi.UInt32(0), mi.UInt32(0))
 
     def seen(self, vertex: Vertex) -> Seen:
         return self.visibility.seen(vertex.depth, vertices(self.p))
 
-    def goes_on(self, state: AdjointSum, vertex: Vertex) -> Any:
+    def goes_on(self, state: Summed, vertex: Vertex) -> Any:
         return vertex.depth < self.visibility.last
 
-    def connection(self, state: AdjointSum, vertex: Vertex, connection: Connection, numbers: list[Any]) -> Any:
-        return plus(self.p, state, vertex, connection, contribution(self.p, vertex, connection))
+    def connection(self, state: Summed, vertex: Vertex, connection: Connection, numbers: list[Any]) -> Summed:
+        S = plus(self.p, state.S, vertex, connection, contribution(self.p, vertex, connection))
+        latest = latest_concerned(self.p, vertex, state.latest)
+        last = dr.select(connection.active, needed(latest, vertex.depth), state.last)
+        return Summed(S, latest, last)
 
 
 class Taking(VertexHooks):
     """Replay: take each contribution off the sum again, and differentiate both factors of each vertex.
 
-    `S` sums the connections of the vertices from `first` on; what comes before them is left alone.
+    `S` sums the connections of the vertices from `first` on; what comes before them is left alone. None: of all.
     """
 
-    def __init__(self, p: Pass, visibility: Visibility, S: AdjointSum, first: int = 1) -> None:
+    def __init__(self, p: Pass, visibility: Visibility, S: AdjointSum, first: Any = None) -> None:
         super().__init__(p)
         self.visibility, self.S, self.first = visibility, S, first
 
@@ -132,7 +154,7 @@ class Taking(VertexHooks):
     def scattering(self, state: AdjointSum, vertex: Vertex, connection: Connection, scattering: Scattering) -> Any:
         p, plan, connected = self.p, self.p.plan, connection.active
         useful = plan.differentiates(vertex.bsdf)
-        if self.first > 1:
+        if self.first is not None:
             # Not in place: the walk goes on with the same masks.
             connected = connected & (vertex.depth >= self.first)
             useful = useful & (vertex.depth >= self.first)
@@ -156,6 +178,17 @@ class Taking(VertexHooks):
         return S
 
 
+def latest_concerned(p: Pass, vertex: Vertex, before: Any) -> Any:
+    """The latest vertex with anything to differentiate up to this one, `before` without it; 0: none."""
+    return dr.select(p.plan.concerns(vertex.bsdf), vertex.depth, before)
+
+
+def needed(latest: Any, depth: Any) -> Any:
+    """The last vertex that a replay has to visit for a connection from vertex `depth`: one after the latest with
+    anything to differentiate, whose scattering is then sampled, or that vertex itself; 0: none."""
+    return dr.select(latest > 0, dr.minimum(latest + 1, depth), 0)
+
+
 def vertices(p: Pass) -> int:
     """The most vertices that a path of this pass can have."""
     return max(p.plan.max_depth - 1, 0)
@@ -171,18 +204,20 @@ class Gather(Estimator):
 
     def forward(self, p: Pass) -> GatherState:
         state: GatherState = p.walk(Gathering(p))
-        return state
+        return GatherState(state.visibility, state.S, [])
 
     def backward(self, p: Pass, state: GatherState) -> None:
-        active = state.visibility.last > 0
+        visibility = state.visibility
         if state.S:
             [S] = state.S
         else:
-            S = p.walk(Summing(p, state.visibility), active)
-            dr.eval(S)  # the emission and the replay both read it
+            summed: Summed = p.walk(Summing(p, visibility), visibility.last > 0)
+            S, visibility = summed.S, Visibility(visibility.words, summed.last)
+            dr.eval(S, visibility)  # the emission and the replay both read them
         differentiate_emission(p, S.adjoint_of_emission)
         if p.plan.differentiate_bsdfs:
-            p.walk(Taking(p, state.visibility, S), active)
+            p.walk(Taking(p, visibility, S), visibility.last > 0)
 
     def kept(self, plan: Plan) -> Any:
-        return GatherState(Visibility.none(max(plan.max_depth - 1, 0)), [AdjointSum.zero(plan.track_zeros)])
+        visibility = Visibility.none(max(plan.max_depth - 1, 0))
+        return GatherState(visibility, [AdjointSum.zero(plan.track_zeros)], [mi.UInt32(0)])

@@ -8,12 +8,13 @@ independent slots that one replay serves. Reservoir sampling: Chao 1982. Where d
 traced, w = sum_c |delta_c C_c| leaves less variance. With zero factors the weight is that of the nonzero ones, so that
 a connection whose value is zero and whose derivative is not can be kept; and no weight is below SHARE of those before
 it. Of the kept connection the surface point is kept as well: c_I is differentiated without a replay, which has to reach
-x_{I-1} only.
+x_{I-1} only, or the last vertex before it that has anything to differentiate. A connection whose path has nothing to
+differentiate is no candidate.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import drjit as dr
@@ -48,7 +49,7 @@ class Slot:
     """
 
     w: Any  # its selection weight
-    I: Any  # its vertex; 0: none  # noqa: E741
+    last: Any  # the last vertex before its own with anything to differentiate; 0: none
     C: Product  # its contribution
     u: Any  # its film position
     event: list[Event]
@@ -60,6 +61,7 @@ class ReservoirState:
 
     W: Any  # sum of all candidates' weights
     slots: list[Slot]
+    latest: list[Any]  # on the way: the latest vertex with anything to differentiate; 0: none
 
     @staticmethod
     def empty(plan: Plan, capacity: int) -> ReservoirState:
@@ -69,7 +71,7 @@ class ReservoirState:
             event = [Event.emission(plan)] if plan.differentiate_bsdfs else []
             return Slot(mi.Float(0), mi.UInt32(0), Product.none(plan.track_zeros), mi.Point2f(0), event)
 
-        return ReservoirState(mi.Float(0), [slot() for _ in range(capacity)])
+        return ReservoirState(mi.Float(0), [slot() for _ in range(capacity)], [mi.UInt32(0)])
 
 
 def selection_weight(p: Pass, weight: str, connection: Connection, C: Product) -> Any:
@@ -131,19 +133,27 @@ class ReservoirSelection(VertexHooks):
         C = contribution(self.p, vertex, connection)
         if self.splat:
             self.p.splat(connection.u, C.value(), connection.active)
-        w = defended(dr.select(connection.active, selection_weight(self.p, self.weight, connection, C), 0), state.W)
+        plan, [latest], candidate = self.p.plan, state.latest, connection.active
+        if self.splat and not plan.differentiate_emission:  # else every connection counts
+            candidate = candidate & (plan.concerns(vertex.bsdf) | (latest > 0))
+        w = defended(dr.select(candidate, selection_weight(self.p, self.weight, connection, C), 0), state.W)
         W = state.W + w
-        plan = self.p.plan
         event = [Event.of_connection(plan, vertex, connection)] if plan.differentiate_bsdfs else []
-        this = Slot(w, vertex.depth, C.stored(), connection.u, event)
+        this = Slot(w, latest, C.stored(), connection.u, event)
         slots = [
             dr.select(is_taken(number, w, W), this, slot) for number, slot in zip(numbers, state.slots, strict=True)
         ]
-        return ReservoirState(W, slots)
+        return ReservoirState(W, slots, state.latest)
+
+    def scattering(
+        self, state: ReservoirState, vertex: Vertex, connection: Connection, scattering: Scattering
+    ) -> ReservoirState:
+        latest = dr.select(self.p.plan.differentiates(vertex.bsdf), vertex.depth, state.latest[0])
+        return ReservoirState(state.W, state.slots, [latest])
 
 
 class ReservoirReplay(VertexHooks):
-    """Replay up to the vertex before the last kept connection, and differentiate s_j on the way."""
+    """Replay up to the last vertex that any slot has to differentiate before its own, and differentiate s_j."""
 
     replaying = True
     connects = False
@@ -151,22 +161,22 @@ class ReservoirReplay(VertexHooks):
     def __init__(self, p: Pass, slots: list[Slot], adjoints: list[PathAdjoint]) -> None:
         super().__init__(p)
         self.kept = list(zip(slots, adjoints, strict=True))
-        self.last = slots[0].I
+        self.last = slots[0].last
         for slot in slots[1:]:
-            self.last = dr.maximum(self.last, slot.I)
+            self.last = dr.maximum(self.last, slot.last)
 
     def goes_on(self, state: Any, vertex: Vertex) -> Any:
-        return vertex.depth < self.last
+        return vertex.depth <= self.last
 
     def is_followed(self, state: Any, vertex: Vertex) -> Any:
-        return vertex.depth + 1 < self.last
+        return vertex.depth < self.last
 
     def scattering(self, state: Any, vertex: Vertex, connection: Connection, scattering: Scattering) -> Any:
         plan, bsdf, depth = self.p.plan, vertex.bsdf, vertex.depth
         active = scattering.active & plan.differentiates(bsdf)
         rest, weight = mi.Spectrum(scattering.correction / scattering.pdf), mi.Spectrum(0)
         for slot, adjoint in self.kept:
-            weight += dr.select(slot.I > depth, adjoint_of_factor(adjoint, depth, scattering.f, rest), 0)
+            weight += dr.select(slot.last >= depth, adjoint_of_factor(adjoint, depth, scattering.f, rest), 0)
         with dr.resume_grad():
             f = attached_factor(plan, vertex.si, bsdf, scattering, active)
             dr.backward_from(dr.select(active, weight * f, 0))
@@ -191,10 +201,11 @@ class Reservoir(Estimator):
         self.splats_all = image == "all"
 
     def forward(self, p: Pass) -> ReservoirState:
-        state: ReservoirState = p.walk(ReservoirSelection(p, self.capacity, self.weight, self.image == "all"))
+        selection = ReservoirSelection(p, self.capacity, self.weight, self.image == "all")
+        state: ReservoirState = replace(p.walk(selection), latest=[])
         if self.image == "retained":
             for slot in state.slots:
-                p.splat(slot.u, slot.C.value() * unselected(state.W, slot, self.capacity), slot.I > 0)
+                p.splat(slot.u, slot.C.value() * unselected(state.W, slot, self.capacity), slot.w != 0)
         return state
 
     def backward(self, p: Pass, state: ReservoirState) -> None:
@@ -207,9 +218,9 @@ class Reservoir(Estimator):
         differentiate_emission(p, emission_weight)
         if p.plan.differentiate_bsdfs:
             for slot, adjoint in zip(state.slots, adjoints, strict=True):
-                differentiate_event(p, slot.event[0], adjoint, slot.I > 0)
+                differentiate_event(p, slot.event[0], adjoint, slot.w != 0)
             replay = ReservoirReplay(p, state.slots, adjoints)
-            p.walk(replay, replay.last > 1)
+            p.walk(replay, replay.last > 0)
 
     def kept(self, plan: Plan) -> ReservoirState:
-        return ReservoirState.empty(plan, self.capacity)
+        return replace(ReservoirState.empty(plan, self.capacity), latest=[])

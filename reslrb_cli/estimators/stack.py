@@ -1,13 +1,14 @@
-"""Every connection of a path, at no extra variance and in one traversal: push each vertex, then walk back over them.
+"""Every connection of a path, at no extra variance and in one traversal: push vertices, then walk back over them.
 
 Walking back, the sum over all later connections is at hand when a vertex is reached:
 
     A_k = 0,   A_{j-1} = A_j + delta_j C_j
     dS  = A_0 dE/E + sum_j [ A_j ds_j/s_j + delta_j C_j dc_j/c_j ]
 
-The stack is thread-local memory, about 90 bytes a vertex, of at most `stack_size` vertices. What lies beyond is summed
-on the way, and a second walk takes that sum apart as `gather` does: no vertex is left out. With delta known before the
-paths are traced, image and gradient are one kernel; otherwise they are traced again for it, without shadow rays.
+Only vertices with something to differentiate are pushed, each with the contributions since the last one. The stack is
+thread-local memory, about 90 bytes a vertex, of at most `stack_size` vertices. What lies beyond is summed on the way,
+and a second walk takes that sum apart as `gather` does: no vertex is left out. With delta known before the paths are
+traced, image and gradient are one kernel; otherwise they are traced again for it, without shadow rays.
 """
 
 from __future__ import annotations
@@ -47,7 +48,7 @@ class Frame:
     """One vertex on the stack.
 
     `weight_c` is d(objective)/df of its connection, (C,), 0 where the sensor is not seen; `f_s` is f of its scattering;
-    both are 0 where the BSDF is not differentiated. `own` is delta C, what the vertex adds to A.
+    `own` is what the vertex adds to A: its delta C, and those of the vertices since the one below it on the stack.
     """
 
     point: SurfacePoint
@@ -87,7 +88,9 @@ class Pushed:
 
     stack: list[Any]  # thread-local arrays, one for each member of a frame
     height: Any
-    tail: AdjointSum  # contributions of the vertices that found it full
+    since: AdjointSum  # contributions since the last vertex that was pushed
+    tail: AdjointSum  # contributions from vertex `first` on
+    first: Any  # the first vertex that found the stack full; 0: none
     last: Any  # last vertex with a visible connection; 0: none
 
 
@@ -97,14 +100,15 @@ class StackState:
 
     S: AdjointSum
     tail: AdjointSum
+    first: Any
     last: Any
 
 
 class Pushing(VertexHooks):
-    """The way out: splat, and push each vertex.
+    """The way out: splat, and push vertices.
 
-    Each is pushed, also those without anything to differentiate: writing twice to one place of thread-local memory was
-    seen to lose the second (Dr.Jit 1.5, LLVM), so that the index has to grow at every vertex.
+    No place of thread-local memory can be written twice, be it that the first write is masked out: the second was seen
+    to be lost (Dr.Jit 1.5, LLVM). What is not pushed goes to one more place, which nobody reads.
     """
 
     def __init__(self, p: Pass, visibility: Visibility | None, stack_size: int) -> None:
@@ -114,9 +118,10 @@ class Pushing(VertexHooks):
 
     def start(self, product: Product) -> Pushed:
         plan = self.p.plan
-        stack = [dr.alloc_local(type(member), self.size) for member in Frame.blank(plan).members()]
-        # Two zeros: state variables may not be one object.
-        return Pushed(stack, mi.UInt32(0), AdjointSum.zero(plan.track_zeros), mi.UInt32(0))
+        stack = [dr.alloc_local(type(member), self.size + 1) for member in Frame.blank(plan).members()]
+        since, tail = PlainSum.zero(plan.track_zeros), AdjointSum.zero(plan.track_zeros)
+        # Three zeros: state variables may not be one object.
+        return Pushed(stack, mi.UInt32(0), since, tail, mi.UInt32(0), mi.UInt32(0))
 
     def seen(self, vertex: Vertex) -> Seen | None:
         return None if self.visibility is None else self.visibility.seen(vertex.depth, vertices(self.p))
@@ -138,28 +143,33 @@ class Pushing(VertexHooks):
 
             rest_c *= differentiate_passage(p, vertex.si, depth, connection, connected, adjoint_of)
 
-        useful = plan.differentiates(vertex.bsdf)
-        term = state.tail.zero(plan.track_zeros).plus(delta, C, depth, connected)
+        useful = vertex.active & plan.differentiates(vertex.bsdf)
+        fits, first = useful, state.first
+        if self.bounded:
+            full = state.height >= self.size
+            fits = useful & ~full
+            first = dr.select((first == 0) & useful & full, depth, first)
+        since = state.since.plus(delta, C, depth, connected & (first == 0))
+        tail = state.tail.plus(delta, C, depth, connected & (first != 0)) if self.bounded else state.tail
         zeros = []
         if plan.track_zeros:
-            rest_s = dr.select(useful & scattering.active, scattering.correction / scattering.pdf, 0)
-            zeros = [rest_s, term.behind_zero[0]]
+            rest_s = dr.select(scattering.active, scattering.correction / scattering.pdf, 0)
+            zeros = [rest_s, since.behind_zero[0]]
         frame = Frame(
             point=SurfacePoint.of(plan, vertex),
             wo_c=connection.wo,
             wo_s=scattering.wo,
-            weight_c=dr.select(useful, adjoint_of_factor(own, depth, connection.f, rest_c), 0),
-            f_s=dr.select(useful & scattering.active, scattering.f, 0),
-            own=term.value,
+            weight_c=adjoint_of_factor(own, depth, connection.f, rest_c),
+            f_s=dr.select(scattering.active, scattering.f, 0),
+            own=since.value,
             zeros=zeros,
             lobe=lobe(plan, scattering),
         )
-        fits = vertex.active & (depth <= self.size)
         for array, value in zip(state.stack, frame.members(), strict=True):
-            array.write(value, depth - 1, fits)
-        tail = state.tail.plus(delta, C, depth, connected & ~fits) if self.bounded else state.tail
-        height = dr.select(fits, depth, state.height)
-        return Pushed(state.stack, height, tail, dr.select(connected, depth, state.last))
+            array.write(value, dr.select(fits, state.height, self.size))
+        height = state.height + dr.select(fits, mi.UInt32(1), 0)
+        since = dr.select(fits, PlainSum.zero(plan.track_zeros), since)
+        return Pushed(state.stack, height, since, tail, first, dr.select(connected, depth, state.last))
 
 
 def walk_back(p: Pass, pushed: Pushed) -> AdjointSum:
@@ -179,9 +189,9 @@ def walk_back(p: Pass, pushed: Pushed) -> AdjointSum:
         behind_zero = [A.behind_zero[0] + frame.zeros[1], A.behind_zero[1]] if frame.zeros else []
         return height - 1, PlainSum(A.value + frame.own, A.rest, behind_zero), stack
 
-    tail = pushed.tail
-    behind_zero = [sum(tail.behind_zero), mi.Spectrum(0)] if tail.behind_zero else []
-    A = PlainSum(tail.value + tail.rest, mi.Spectrum(0), behind_zero)
+    since, tail = pushed.since, pushed.tail
+    behind_zero = [sum(tail.behind_zero, since.behind_zero[0]), mi.Spectrum(0)] if tail.behind_zero else []
+    A = PlainSum(tail.value + tail.rest + since.value, mi.Spectrum(0), behind_zero)
     _, A, _ = dr.while_loop(
         state=(pushed.height, A, pushed.stack),
         cond=lambda height, A, stack: height > 0,
@@ -216,19 +226,20 @@ class Stack(Estimator):
         differentiate_emission(p, state.S.adjoint_of_emission)
         if vertices(p) > self.stack_size:
             beyond = Visibility([], state.last)
-            p.walk(Taking(p, beyond, state.tail, first=self.stack_size + 1), state.last > self.stack_size)
+            p.walk(Taking(p, beyond, state.tail, state.first), (state.first > 0) & (state.first <= state.last))
 
     def kept(self, plan: Plan) -> Any:
         # Visibility is there from an image pass that did not know delta; the sweep's own state comes beside it.
         S = AdjointSum.zero(plan.track_zeros)
-        return [Visibility.none(max(plan.max_depth - 1, 0)), StackState(S, S, mi.UInt32(0))]
+        return [Visibility.none(max(plan.max_depth - 1, 0)), StackState(S, S, mi.UInt32(0), mi.UInt32(0))]
 
     def scratch_bytes(self, plan: Plan) -> int:
         if not plan.differentiate_bsdfs:
             return 0
-        return sum(entry_bytes(Frame.blank(plan).members())) * min(self.stack_size, max(plan.max_depth - 1, 0))
+        vertices = min(self.stack_size, max(plan.max_depth - 1, 1))
+        return sum(entry_bytes(Frame.blank(plan).members())) * (vertices + 1)
 
     def _sweep(self, p: Pass, visibility: Visibility | None) -> StackState:
         active = True if visibility is None else visibility.last > 0
         pushed = p.walk(Pushing(p, visibility, self.stack_size), active)
-        return StackState(walk_back(p, pushed), pushed.tail, pushed.last)
+        return StackState(walk_back(p, pushed), pushed.tail, pushed.first, pushed.last)

@@ -75,6 +75,11 @@ class Plan:
             result |= bsdf == mi.BSDFPtr(other)
         return result
 
+    def concerns(self, bsdf: Any) -> Any:
+        """Lanes in which a vertex with this BSDF (a pointer) has anything to differentiate, its connection's passage
+        through masks included."""
+        return mi.Bool(True) if self.differentiate_null else self.differentiates(bsdf)
+
     def differentiating(self, bsdfs: bool, emission: bool, track_zeros: bool, only_bsdfs: tuple[Any, ...] = ()) -> Plan:
         """The same plan for a step that differentiates these; `track_zeros`: some of their factors may be zero."""
         delta, null = self.needs.has_delta_lobes, self.needs.has_null
