@@ -166,7 +166,7 @@ class Pushing(VertexHooks):
             lobe=lobe(plan, scattering),
         )
         for array, value in zip(state.stack, frame.members(), strict=True):
-            array.write(value, dr.select(fits, state.height, self.size))
+            array.write(value, dr.select(fits, state.height, self.size), fits)
         height = state.height + dr.select(fits, mi.UInt32(1), 0)
         since = dr.select(fits, PlainSum.zero(plan.track_zeros), since)
         return Pushed(state.stack, height, since, tail, first, dr.select(connected, depth, state.last))

@@ -54,12 +54,15 @@ def test_two_depths(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
         assert row["step_ms"]["median"] > row["kernel_ms"]["median"]
         assert row["cold_ms"] > row["step_ms"]["median"]
         assert row["cold_ms"] > row["cold_codegen_ms"] > row["codegen_ms"]["median"] >= 0
-        parts = [row[key]["median"] for key in ("kernel_ms", "codegen_ms", "tracing_ms")]
-        assert sum(parts) == pytest.approx(row["step_ms"]["median"], rel=0.5)
+        # Each step is the sum of its parts; medians are not.
+        parts = [row[key] for key in ("kernel_ms", "codegen_ms", "tracing_ms")]
+        assert sum(part["min"] for part in parts) <= 1.001 * row["step_ms"]["min"]
+        assert sum(part["max"] for part in parts) >= 0.999 * row["step_ms"]["max"]
         assert row["tracing_ms"]["min"] > 0
         assert row["peak_mib"] > 0
     assert [row["scratch_bytes"] > 0 for row in rows] == [False, True, False] * 2
-    assert rows[4]["scratch_bytes"] == 3 * rows[1]["scratch_bytes"]  # three vertices in place of one
+    # Three vertices in place of one, and one place for what is not pushed.
+    assert rows[4]["scratch_bytes"] == 2 * rows[1]["scratch_bytes"]
     assert (tmp_path / "bench.png").read_bytes().startswith(b"\x89PNG")
     lines = capsys.readouterr().out.splitlines()
     assert [line.split()[:2] for line in lines[3:9]] == [
