@@ -163,6 +163,17 @@ class VertexHooks(Hooks):
     def __init__(self, p: Pass) -> None:
         self.p = p
 
+    def concerned(self, state: Any) -> Any:
+        """Lanes with anything to differentiate before the current vertex, where emission is not differentiated."""
+        return mi.Bool(True)
+
+    def wants(self, state: Any, vertex: Vertex) -> Any:
+        """Where there is no image to splat into, connections with anything to differentiate."""
+        plan = self.p.plan
+        if self.p.block is not None or plan.differentiate_emission:
+            return mi.Bool(True)
+        return self.concerned(state) | plan.concerns(vertex.bsdf)
+
 
 def one_of(name: str, value: str, allowed: tuple[str, ...]) -> None:
     """Raise ValueError where an option has none of the values it may have."""

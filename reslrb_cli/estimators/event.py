@@ -88,6 +88,9 @@ class EventSelection(VertexHooks):
         Q = mi.Float(1 if plan.differentiate_emission else 0)
         return EventState(Q, mi.Float(0), prefix, slots, [mi.Float(0) for _ in slots])
 
+    def concerned(self, state: EventState) -> Any:
+        return state.Q > 0
+
     def connection(self, state: EventState, vertex: Vertex, connection: Connection, numbers: list[Any]) -> EventState:
         p, plan = self.p, self.p.plan
         C = contribution(p, vertex, connection)

@@ -127,19 +127,22 @@ class ReservoirSelection(VertexHooks):
     def start(self, product: Product) -> ReservoirState:
         return ReservoirState.empty(self.p.plan, self.numbers)
 
+    def concerned(self, state: ReservoirState) -> Any:
+        return state.latest[0] > 0
+
     def connection(
         self, state: ReservoirState, vertex: Vertex, connection: Connection, numbers: list[Any]
     ) -> ReservoirState:
         C = contribution(self.p, vertex, connection)
         if self.splat:
             self.p.splat(connection.u, C.value(), connection.active)
-        plan, [latest], candidate = self.p.plan, state.latest, connection.active
+        plan, candidate = self.p.plan, connection.active
         if self.splat and not plan.differentiate_emission:  # else every connection counts
-            candidate = candidate & (plan.concerns(vertex.bsdf) | (latest > 0))
+            candidate = candidate & (self.concerned(state) | plan.concerns(vertex.bsdf))
         w = defended(dr.select(candidate, selection_weight(self.p, self.weight, connection, C), 0), state.W)
         W = state.W + w
         event = [Event.of_connection(plan, vertex, connection)] if plan.differentiate_bsdfs else []
-        this = Slot(w, latest, C.stored(), connection.u, event)
+        this = Slot(w, state.latest[0], C.stored(), connection.u, event)
         slots = [
             dr.select(is_taken(number, w, W), this, slot) for number, slot in zip(numbers, state.slots, strict=True)
         ]

@@ -123,6 +123,9 @@ class Pushing(VertexHooks):
         # Three zeros: state variables may not be one object.
         return Pushed(stack, mi.UInt32(0), since, tail, mi.UInt32(0), mi.UInt32(0))
 
+    def concerned(self, state: Pushed) -> Any:
+        return state.height > 0
+
     def seen(self, vertex: Vertex) -> Seen | None:
         return None if self.visibility is None else self.visibility.seen(vertex.depth, vertices(self.p))
 

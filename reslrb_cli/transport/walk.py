@@ -73,6 +73,10 @@ class Hooks:
         """What is known of the sensor's visibility from this vertex."""
         return None
 
+    def wants(self, state: Any, vertex: Vertex) -> Any:
+        """Lanes whose connection from this vertex is of use; others trace no shadow ray."""
+        return mi.Bool(True)
+
     def connection(self, state: Any, vertex: Vertex, connection: Connection, numbers: list[Any]) -> Any:
         """Called at each vertex with its connection to the sensor."""
         return state
@@ -134,7 +138,8 @@ def walk(
         vertex = Vertex(path.pi, si, si.bsdf(), path.ray, path.depth, path.product, path.active)
 
         # ---- Connect to the sensor, scatter, and evaluate both in one call ----
-        connection = connect(plan, sensor, si, path.ray, sampler.next_2d(path.active), path.active)
+        connected = path.active & hooks.wants(state, vertex)
+        connection = connect(plan, sensor, si, path.ray, sampler.next_2d(path.active), connected)
         sample_2, sample_1 = sampler.next_2d(path.active), sampler.next_1d(path.active)
         active = path.active & (path.depth + 1 < plan.max_depth) & hooks.goes_on(state, vertex)
         wanted = connection.active if hooks.connects and not hooks.attached else None

@@ -65,7 +65,7 @@ def test_connections_without_anything_to_differentiate_are_no_candidates(scene: 
     case = Case(scene, FLOOR)
 
     def gradients(**options: str) -> np.ndarray:
-        return case.gradients(integrator("reslrb", MAX_DEPTH, **options), seeds(24), SPP, adjoint="independent")
+        return case.gradients(integrator("reslrb", MAX_DEPTH, **options), seeds(24), SPP, adjoint="correlated")
 
     exact = gradients(estimator="gather")
     # What selection adds to the variance. The retained image needs every connection as a candidate.
@@ -74,3 +74,17 @@ def test_connections_without_anything_to_differentiate_are_no_candidates(scene: 
     )
     print(ours / of_all)
     assert ours < 0.7 * of_all
+
+
+def test_without_an_image_the_others_are_not_even_connected(scene: dict, monkeypatch: pytest.MonkeyPatch) -> None:
+    original, shares = stack.walk_back, []
+
+    def noting(p: Any, pushed: stack.Pushed) -> Any:
+        shares.append(float(np.mean(np.array(pushed.last > 0, dtype=float))))
+        return original(p, pushed)
+
+    monkeypatch.setattr(stack, "walk_back", noting)
+    for keys in (FLOOR, ALL):
+        Case(scene, keys).gradient(integrator("reslrb", MAX_DEPTH, estimator="stack"), 1, SPP, adjoint="independent")
+    print(shares)
+    assert 0 < shares[0] < 0.7 * shares[1]

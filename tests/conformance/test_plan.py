@@ -21,8 +21,10 @@ from reslrb_cli.measure.small_scenes import camera, diffuse, rgb, room, texture,
 pytestmark = pytest.mark.usefixtures("llvm")
 
 ESTIMATORS = ("reservoir", "gather", "event", "stack")
-#: Those that draw the same whatever the plan says; `event` draws among what can be differentiated.
+#: Those whose draws follow from few features; `event` draws among what can be differentiated.
 STEADY = ("reservoir", "gather", "stack")
+#: What makes `reservoir` draw among other connections. That both are right is for test_estimators.py.
+CANDIDATES = ("derivatives of null surfaces",)
 WALL = "wall.brdf_0.reflectance.value"
 RADIANCE = "lamp.emitter.radiance.value"
 
@@ -99,7 +101,8 @@ OMISSIONS = [
     ("zero-factor bookkeeping", in_the_dark, (FLOOR,), STEADY),
     ("geometry read by BSDFs", plain, (FLOOR,), ("stack",)),
     ("derivatives of delta lobes", with_glass, (FLOOR,), STEADY),
-    ("derivatives of null surfaces", with_veil, (FLOOR,), STEADY),
+    # `gather` then remembers the last vertex with anything to differentiate, in as many operations.
+    ("derivatives of null surfaces", with_veil, (FLOOR,), ("reservoir", "stack")),
     # Dr.Jit drops these by itself, since nothing reads what they compute.
     ("delta lobes", plain, (FLOOR,), ()),
     ("lens sampling", plain, (FLOOR,), ()),
@@ -111,7 +114,8 @@ OMISSIONS = [
 def test_omission_changes_nothing_and_shrinks(feature, make, keys, shrinks, estimator):
     (operations, image, gradient), (forced, forced_image, forced_gradient) = both_ways(make, keys, feature, estimator)
     assert differs(image, forced_image) < 1e-6
-    assert differs(gradient, forced_gradient) < 1e-6
+    if not (estimator == "reservoir" and feature in CANDIDATES):
+        assert differs(gradient, forced_gradient) < 1e-6
     assert np.abs(gradient).max() > 0
     assert operations < forced if estimator in shrinks else operations <= forced
 
@@ -135,7 +139,7 @@ def test_only_what_is_asked_for_is_differentiated(keys: tuple[str, ...], more: t
         results.append((kernels, image, gradient[: case.initial[keys[0]].size]))
     (kernels, image, gradient), (all_kernels, all_image, all_gradient) = results
     assert differs(image, all_image) < 1e-6
-    if estimator != "event":  # what it draws depends on what can be differentiated
+    if estimator in ("gather", "stack"):  # what the others draw depends on what can be differentiated
         assert differs(gradient, all_gradient) < 1e-6
     assert sum(kernels) < sum(all_kernels)
 
