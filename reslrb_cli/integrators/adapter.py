@@ -258,9 +258,10 @@ def _make_classes() -> dict[str, Any]:
             params = _parameters(scene, params)
             with dr.suspend_grad():
                 parts = self.passes(scene, sensor, seed, spp, params)
-                if parts[0].plan.needs.has_null:
+                if parts[0].plan.differentiate_null:
                     raise UnsupportedScene(
-                        "trajectory: Dr.Jit cannot reverse the loop through masks within that of the path"
+                        "trajectory: Dr.Jit cannot reverse the loop through masks within that of the path; give "
+                        "parameters to other surfaces than masks alone"
                     )
                 adjoint = parts[0].film.adjoint(grad_in)
 

@@ -150,7 +150,8 @@ def walk(
             if not (hooks.attached or plan.track_zeros):
                 # No shadow ray where neither light nor its derivative would arrive.
                 connection.active = connection.active & ~dr.all(connection.f == 0)  # NaN arrives
-            shadow = passage(plan, scene, si, path.depth, connection, hooks.seen(vertex), loop_mode)
+            with dr.suspend_grad(when=not plan.differentiate_null):
+                shadow = passage(plan, scene, si, path.depth, connection, hooks.seen(vertex), loop_mode)
             connection.active, transmittance = shadow
             if hooks.attached:
                 connection.f = evaluate(plan, si, vertex.bsdf, connection.wo, connection.active)

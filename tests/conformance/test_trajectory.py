@@ -9,6 +9,7 @@ from conformance.gradient_cases import CASES, GradientCase
 from reslrb_cli.errors import UnsupportedScene
 from reslrb_cli.integrators import gradient_step, known_step, make_integrator
 from reslrb_cli.measure.gradients import Case, integrator, relative
+from reslrb_cli.measure.small_scenes import diffuse, room, transform
 
 pytestmark = pytest.mark.usefixtures("llvm")
 
@@ -32,7 +33,16 @@ def test_equal_seeds_give_equal_gradients(name: str, adjoint: str) -> None:
     assert relative(found, expected) < 2e-5
 
 
-def test_masks_are_refused() -> None:
+def test_masks_without_parameters_are_passed() -> None:
+    mask = {"type": "mask", "opacity": 0.4, "bsdf": {"type": "twosided", "bsdf": diffuse(0.7, 0.6, 0.3)}}
+    placed = transform(translate=[0.1, 0.2, 0.2], rotate=([1, 0, 0], -80), scale=0.5)
+    case = Case(room(veil={"type": "rectangle", "to_world": placed, "bsdf": mask}), ("floor.brdf_0.reflectance.value",))
+    expected = case.gradient(integrator("walk_ad", 6), 3, 8)
+    assert np.abs(expected).sum() > 0
+    assert relative(case.gradient(integrator("trajectory", 6), 3, 8), expected) < 2e-5
+
+
+def test_masks_with_parameters_are_refused() -> None:
     named = BY_NAME["mask"]
     case = Case(named.scene(), named.keys)
     with pytest.raises(UnsupportedScene, match="masks"):
