@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import pytest
@@ -22,28 +22,43 @@ NAMES = ("texture", "roulette", "thin_lens", "plastic", "blend", "glass", "mirro
          "mask_texture_in_view", "area_texture", "envmap", "two_emitters", "visible_lamp")  # fmt: skip
 
 
+NONE = 0xFFFFFFFF
+
+
 @dataclass
 class Kept:
-    """The reservoir's state, and where its vertex stands."""
+    """The reservoir's state, which of the path's vertices it holds (0: none), and where that stands."""
 
     state: Any
+    I: Any  # noqa: E741
     p: Any
 
 
 class Recording(ReservoirSelection):
-    """The reservoir's image pass, which also keeps the position of the kept vertex."""
+    """The reservoir's image pass among all connections, which also keeps index and position of the kept vertex."""
 
     def start(self, product: Any) -> Kept:
         import mitsuba as mi
 
-        return Kept(super().start(product), mi.Point3f(0))
+        return Kept(super().start(product), mi.UInt32(0), mi.Point3f(0))
+
+    def wants(self, state: Kept, vertex: Any) -> Any:
+        import mitsuba as mi
+
+        return mi.Bool(True)
 
     def connection(self, state: Kept, vertex: Any, connection: Any, numbers: list[Any]) -> Kept:
         import drjit as dr
+        import mitsuba as mi
 
-        before, after = state.state, super().connection(state.state, vertex, connection, numbers)
-        changed = (after.slots[0].I != before.slots[0].I) & (after.slots[0].I == vertex.depth)
-        return Kept(after, dr.select(changed, vertex.si.p, state.p))
+        [slot] = state.state.slots
+        before = replace(state.state, slots=[replace(slot, last=mi.UInt32(NONE))])
+        after = super().connection(before, vertex, connection, numbers)
+        taken = after.slots[0].last != NONE
+        return Kept(after, dr.select(taken, vertex.depth, state.I), dr.select(taken, vertex.si.p, state.p))
+
+    def scattering(self, state: Kept, vertex: Any, connection: Any, scattering: Any) -> Kept:
+        return replace(state, state=super().scattering(state.state, vertex, connection, scattering))
 
 
 class Rewalk(Hooks):
@@ -90,13 +105,13 @@ def test_replay_meets_the_same_vertices(name: str):
         dr.eval(kept)
         slot, active = kept.state.slots[0], kept.state.W > 0
         emission = light_tracer.sample_emission(samples.plan, scene.scene, samples.sensor, samples.sampler()).weight
-        _, C, p, u, I = context.walk(Rewalk(samples, slot, emission), active)  # noqa: E741
+        _, C, p, u, I = context.walk(Rewalk(samples, kept, emission), active)  # noqa: E741
         stored = slot.C.value()
         dr.eval(C, p, u, I, stored)
     where = np.array(active)
     assert where.sum() > 1000
     assert len(np.unique(np.array(I)[where])) > 1, "paths of one length only"
-    assert np.array_equal(np.array(I)[where], np.array(slot.I)[where])
+    assert np.array_equal(np.array(I)[where], np.array(kept.I)[where])
 
     def error(found: Any, expected: Any) -> float:
         found, expected = np.array(found, np.float64).T[where], np.array(expected, np.float64).T[where]
