@@ -17,15 +17,19 @@ from reslrb_cli.records.gradcheck import GradcheckRecord
 
 Check = Callable[[], Iterable[GradcheckRecord]]
 SMALL = ["scene.options.size=32", "scene.options.texture=4", "run.spp=8", "integrator.max_depth=4"]
-VEILED = f"""\
-scene: {{file: {Path(__file__).with_name("veiled_room.xml")}}}
+
+
+def room(name: str, *keys: str) -> Config:
+    """The experiment of finding the parameters of a room that stands beside this file."""
+    parameters = "".join(f"  - {{key: {key}}}\n" for key in keys)
+    text = f"""\
+scene: {{file: {Path(__file__).with_name(name)}}}
 target: {{render: {{}}}}
 parameters:
-  - {{key: veil.opacity.value}}
-  - {{key: floor.reflectance.value}}
-integrator: {{max_depth: 4, rr_depth: 1000000}}
+{parameters}integrator: {{max_depth: 4, rr_depth: 1000000}}
 run: {{spp: 64}}
 """
+    return loads(text, name, [])
 
 
 def checked(config: Config, estimators: str, seeds: int) -> list[GradcheckRecord]:
@@ -51,7 +55,14 @@ CHECKS: dict[str, Check] = {
     "cornell_roulette": cornell("integrator.rr_depth=1", estimators="stack"),
     "cornell_capacity_2": cornell(estimators="reservoir(capacity=2),stack", seeds=16),
     "cornell_stack_of_2": cornell(estimators="stack(stack_size=2)"),
-    "veil": lambda: checked(loads(VEILED, "a room with a veil"), "gather,stack", 8),
+    "veil": lambda: checked(
+        room("veiled_room.xml", "veil.opacity.value", "floor.reflectance.value"), "gather,stack", 8
+    ),
+    "glow": lambda: checked(
+        room("glowing_room.xml", "wall.emitter.radiance.value", "veil.opacity.value"), "event,stack", 16
+    ),
+    "behind_lens": lambda: checked(room("glowing_room.xml", "veil.opacity.value"), "event", 64),
+    "instance": lambda: checked(room("glowing_room.xml", "floor.reflectance.value", "veil.opacity.value"), "stack", 8),
     "black_texels": extreme("albedo_0"),
     "pure_colours": extreme("pure_colours", "gather", "stack"),
     "lamp": extreme("one_texel"),
@@ -145,7 +156,13 @@ FAULTS = [
           "rest_c *= differentiate_passage(", "differentiate_passage(", by("stack", "walk_ad", "finite_difference")),
     Fault("opacity_not_differentiated", "opacity", "estimators.base:differentiate_passage",
           "differentiate if p.plan.differentiate_null else None", "None", by("stack", "walk_ad", "finite_difference")),
+    Fault("instance_forgotten", "instance", "estimators.surface:SurfacePoint.of",
+          "_index(pi.instance)", "mi.UInt32(0)", by("stack", "walk_ad")),
+    Fault("mask_in_view_not_differentiated", "glow", "transport.visible:differentiate_visible_radiance",
+          "adjoint * behind", "mi.Spectrum(0)", by("event stack", "walk_ad", "forward_mode")),
     # ---- Estimators: the others are right ----
+    Fault("another_point_of_the_lens", "behind_lens", "estimators.events:differentiate_event",
+          "kept.point.ray(), sample,", "kept.point.ray(), mi.Point2f(0),", by("event", "walk_ad")),
     Fault("w_of_previous_step", "cornell_reservoir", "estimators.reservoir:ReservoirSelection.connection",
           "is_taken(number, w, W)", "is_taken(number, w, state.W)", by("reservoir", *GRADIENT, "ptracer")),
     Fault("replay_one_number_too_many", "delta_lobes", WALK,
@@ -180,6 +197,8 @@ FAULTS = [
     Fault("sum_ends_a_vertex_early", "cornell", "estimators.gather:needed",
           "dr.minimum(latest + 1, depth)", "latest", by("gather", *GRADIENT)),
     # ---- Forward mode: all estimators share it ----
+    Fault("forward_without_emission", "glow", "integrators.hooks:TangentSplat.start",
+          "mi.Spectrum(self.dE)", "mi.Spectrum(0)", by("event stack", "forward_mode")),
     Fault("forward_without_prefix", "cornell", "integrators.hooks:TangentSplat.scattering",
           "state.d_product * c + P * dc", "P * dc", by("gather stack", "forward_mode")),
     Fault("forward_without_veil", "veil", "integrators.hooks:TangentSplat.scattering",
