@@ -22,6 +22,7 @@ from reslrb_cli.measure.references import (
     interior,
     path_image,
     prb_gradient,
+    prb_image,
     ptracer_gradient,
     ptracer_image,
 )
@@ -111,7 +112,11 @@ class Participants:
         for key in self.case.keys:
             reasons = {Reference.PTRACER: ptracer_gradient(at, key), Reference.PRB: prb_gradient(at, key)}
             self.stock[key], self.why[key] = _first(reasons)
-        reasons = {Reference.PTRACER: ptracer_image(at), Reference.PATH: path_image(at)}
+        reasons = {
+            Reference.PTRACER: ptracer_image(at),
+            Reference.PATH: path_image(at),
+            Reference.PRB: prb_image(at),
+        }
         self.image, self.why_no_image = _first(reasons)
 
     def _weigh(self) -> None:

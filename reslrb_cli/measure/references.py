@@ -1,4 +1,4 @@
-"""Which stock integrators count as references: of images `ptracer` and `path`, of gradients `ptracer` and `prb`.
+"""Which stock integrators count as references: of images `ptracer`, `path` and `prb`, of gradients `ptracer` and `prb`.
 
 Each function returns why it does not count, or None where it does. docs/method.md, Baselines, has the reasons.
 """
@@ -60,6 +60,13 @@ def ends(max_depth: int) -> bool:
 
 
 def path_image(at: Situation) -> str | None:
+    """Of the image, by `path`."""
+    if at.needs.has_null and (at.needs.environment is None or at.hide_emitters):
+        return "it drops what masks reflect where nothing stands behind them"
+    return prb_image(at)
+
+
+def prb_image(at: Situation) -> str | None:
     """Of the image, by paths from the sensor."""
     try:
         check_camera_paths(at.scene)
@@ -92,7 +99,7 @@ def ptracer_gradient(at: Situation, key: str) -> str | None:
 
 def prb_gradient(at: Situation, key: str) -> str | None:
     """Of the gradient with respect to the parameter `key`, by path replay backpropagation from the sensor."""
-    reason = path_image(at)
+    reason = prb_image(at)
     if reason is not None:
         return reason
     if np.any(np.array(at.params[key]) == 0):

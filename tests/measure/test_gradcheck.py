@@ -15,8 +15,16 @@ from reslrb_cli.measure.differences import choose_step, directions, natural_boun
 from reslrb_cli.measure.gradcheck import Gradcheck, Result
 from reslrb_cli.measure.gradients import Case, integrator
 from reslrb_cli.measure.participants import Settings
-from reslrb_cli.measure.references import Situation, interior, path_image, prb_gradient, ptracer_gradient, ptracer_image
-from reslrb_cli.measure.small_scenes import camera, diffuse, rgb, room
+from reslrb_cli.measure.references import (
+    Situation,
+    interior,
+    path_image,
+    prb_gradient,
+    prb_image,
+    ptracer_gradient,
+    ptracer_image,
+)
+from reslrb_cli.measure.small_scenes import camera, diffuse, rgb, room, transform
 from reslrb_cli.records.gradcheck import Kind, Reference, Verdict
 
 pytestmark = pytest.mark.usefixtures("llvm")
@@ -165,6 +173,19 @@ def test_references_refuse_what_they_cannot_do():
     assert "point or parallel lights" in path_image(
         Situation.of(lit.scene, lit.scene.sensors()[0], lit.params, 4, False)
     )
+
+
+def test_path_loses_what_masks_reflect_before_nothing():
+    """A veil of opacity 0.4 and a lamp: the stock `path` shows 0.4 of what it is to show, `prb` and ours all of it."""
+    veil = {"type": "mask", "opacity": 0.4, "bsdf": {"type": "twosided", "bsdf": diffuse(0.7, 0.6, 0.3)}}
+    pane = {"type": "rectangle", "to_world": transform(rotate=([1, 0, 0], -45)), "bsdf": veil}
+    scene = Case(room(floor_shape=None, wall_shape=None, side_shape=None, pane=pane), [])
+    at = Situation.of(scene.scene, scene.scene.sensors()[0], scene.params, 4, False)
+    assert "masks reflect" in path_image(at)
+    assert prb_image(at) is None
+    ours, path, prb = (scene.image(integrator(name, 4), 1, 256).sum() for name in ("reslrb", "path", "prb"))
+    assert abs(prb / ours - 1) < 0.02
+    assert abs(path / ours - 0.4) < 0.02
 
 
 def test_a_wide_filter_has_no_weights_along_the_border():
