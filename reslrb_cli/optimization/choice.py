@@ -124,13 +124,14 @@ def _outcome(problem: Problem, options: list[Option], say: Say, cache: Cache | N
         except (TypeError, KeyError):
             pass  # nothing there, or nothing that this version wrote
     say("estimator auto: measuring")
-    outcome = _run_pilot(problem, options)
+    outcome = run_pilot(problem, options)
     if cache is not None:
         cache.put(key, outcome.to_json())
     return outcome
 
 
-def _run_pilot(problem: Problem, options: list[Option]) -> Outcome:
+def run_pilot(problem: Problem, options: list[Option]) -> Outcome:
+    """Measure the options, and say which is the most efficient."""
     run = problem.config.run
     batches = run.batches if run.adjoint == "batched" else 1
     integrators = {}
@@ -146,7 +147,7 @@ def _run_pilot(problem: Problem, options: list[Option]) -> Outcome:
             integrator.samples_per_pass = spp // (batches * candidate.passes)
         integrator.freeze = False  # few steps of each sample count: a recording would cost more than it saves
         try:
-            return _step(problem, integrator, clock, round, spp)
+            return measured_step(problem, integrator, clock, round, spp)
         finally:
             integrator.samples_per_pass, integrator.freeze = samples, freeze
 
@@ -166,7 +167,7 @@ def _candidate(option: Option) -> Candidate:
     return Candidate(options, options["estimator"] in ("stack", "gather"), 2 if several else 1, parent)
 
 
-def _step(problem: Problem, integrator: Any, clock: StepClock, round: int, spp: int) -> Measured:
+def measured_step(problem: Problem, integrator: Any, clock: StepClock, round: int, spp: int) -> Measured:
     """One step of all views, with seeds of the pilot's own; leaves neither gradient nor change behind."""
     start = time.perf_counter()
     problem.apply()

@@ -116,7 +116,7 @@ def test_the_pilot_has_seeds_of_its_own(experiment, monkeypatch):
 
     for round in (0, 1, 0):
         with pytest.raises(pytest.fail.Exception):
-            choice._step(problem, problem.integrator, StepClock(), round, 4)
+            choice.measured_step(problem, problem.integrator, StepClock(), round, 4)
     assert drawn == [(7, 0, 0, "pilot"), (7, 1, 0, "pilot"), (7, 0, 0, "pilot")]
 
 
@@ -269,6 +269,6 @@ def test_all_sample_counts_have_the_same_kernels(experiment, estimator):
     problem = assemble(load("box.yaml", [f"integrator={{max_depth: 4, estimator: {estimator}}}"]))
     clock, launched = StepClock(), []
     for spp in (3, 8, 16):
-        choice._step(problem, problem.integrator, clock, 0, spp)
+        choice.measured_step(problem, problem.integrator, clock, 0, spp)
         launched.append({entry["hash"] for entry in clock.history if "hash" in entry})
     assert launched[1] | launched[2] <= launched[0]
