@@ -30,8 +30,8 @@ MEMORY_SHARE = 0.7
 MIB = 2**20
 #: What is measured of every step.
 TIMES = ("step_ms", "kernel_ms", "codegen_ms", "tracing_ms")
-#: How much longer the beginning of the next depth takes, until it is known: compiling, which few cases do more of.
-FIRST_GROWTH = 1.3
+#: How much more of the time is for the next depth, whose kernels take longer to compile and to run.
+GROWTH = 1.3
 
 
 @dataclass(frozen=True)
@@ -128,24 +128,24 @@ def bench(
 
 
 class Pace:
-    """Divides the time among depths: more rounds where they are cheap, never fewer than MIN_ROUNDS."""
+    """Divides the time among depths, each of which gets GROWTH times as much as the one before it.
+
+    What a depth leaves is for the others. None gets fewer than MIN_ROUNDS rounds, whatever they cost.
+    """
 
     def __init__(self, budget_s: float, depths: int, now: Callable[[], float] = time.monotonic) -> None:
         self._now, self._end, self._left = now, now() + budget_s, depths
-        self._start = self._rounds_start = now()
-        self._growth, self._before = FIRST_GROWTH, 0.0
+        self._rounds_start = self._depth_end = now()
 
     def begin_depth(self) -> None:
         """A depth begins."""
-        self._start, self._left = self._now(), self._left - 1
+        now = self._now()
+        self._depth_end = now + (self._end - now) / sum(GROWTH**k for k in range(self._left))
+        self._left -= 1
 
     def begin_rounds(self) -> None:
         """Its processes are warm."""
         self._rounds_start = self._now()
-        begin_s = self._rounds_start - self._start
-        if self._before:
-            self._growth = min(max(begin_s / self._before, 1.0), 2.0)
-        self._before = begin_s
 
     def another(self, done: int) -> bool:
         """Whether there is time for another round after `done` of them."""
@@ -154,11 +154,7 @@ class Pace:
         if done >= MAX_ROUNDS:
             return False
         now = self._now()
-        round_s, begin_s = (now - self._rounds_start) / done, self._rounds_start - self._start
-        # The depths to come, with their minimum: beginnings grow as they did, and steps take twice as long each time.
-        ahead = sum(self._growth**k * begin_s + 2**k * MIN_ROUNDS * round_s for k in range(1, self._left + 1))
-        spare = (self._end - now - ahead) / (self._left + 1)
-        return spare > round_s
+        return now + (now - self._rounds_start) / done <= self._depth_end
 
 
 def _begin(sweep: Sweep, case: Case, depth: int, start: Callable[[dict[str, Any]], Any]) -> _Run:
