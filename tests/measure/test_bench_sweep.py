@@ -160,9 +160,9 @@ def test_cases_that_need_the_memory_of_each_other_release_it() -> None:
 
 def test_pace_divides_the_budget() -> None:
     now = [0.0]
-    pace = Pace(100.0, 3, now=lambda: now[0])
+    pace, spent = Pace(100.0, 3, now=lambda: now[0]), Pace(100.0, 1, now=lambda: now[0])
 
-    def rounds(begin_s: float, round_s: float) -> int:
+    def rounds(begin_s: float, round_s: float, pace: Pace = pace) -> int:
         pace.begin_depth()
         now[0] += begin_s
         pace.begin_rounds()
@@ -177,7 +177,7 @@ def test_pace_divides_the_budget() -> None:
     assert rounds(3.0, 4.0) == 7
     assert rounds(1.0, 5.0) == 9
     assert 95.0 < now[0] <= 100.0
-    assert rounds(1.0, 50.0) == MIN_ROUNDS  # the time is spent
+    assert rounds(1.0, 50.0, spent) == MIN_ROUNDS
     cheap = Pace(1e6, 1, now=lambda: 0.0)
     cheap.begin_depth()
     assert [cheap.another(done) for done in (MAX_ROUNDS - 1, MAX_ROUNDS)] == [True, False]
