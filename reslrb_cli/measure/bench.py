@@ -3,8 +3,7 @@
 At each depth every case has a process of its own, and all live at once. They load the scene, take a cold step each,
 then as many as it takes until no new kernel comes (stock integrators need a few), and then steps in rounds, one each in
 turn, so that a drift of the machine hits all alike; only one computes at a time. Ratios are taken within a round, whose
-steps also share a seed. The order turns from round to round. Half of the rounds are of new processes, where there is
-time for those: what one process happens to get, its place in memory above all, changes its times by a few per cent.
+steps also share a seed. The order turns from round to round.
 
 A case that runs out of memory is tried again at greater depths: what is recorded was seen, and a failure costs no more
 time than it takes to fill the memory once.
@@ -12,16 +11,18 @@ time than it takes to fill the memory once.
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 from reslrb_cli.config import Config, dump
 from reslrb_cli.measure.cases import Case
-from reslrb_cli.measure.pace import Pace
 from reslrb_cli.measure.processes import Ended, Process, Stopped
 from reslrb_cli.records.bench import BenchRecord, BenchStatus, Spread
 
+MIN_ROUNDS = 3
+MAX_ROUNDS = 25
 #: Steps after the cold one until no new kernel comes, at most.
 MAX_WARM_UPS = 4
 #: Where the cases of a depth together hold more than this share of the memory, each releases its own after a step.
@@ -29,6 +30,8 @@ MEMORY_SHARE = 0.7
 MIB = 2**20
 #: What is measured of every step.
 TIMES = ("step_ms", "kernel_ms", "codegen_ms", "tracing_ms")
+#: How much more of the time is for the next depth, whose kernels take longer to compile and to run.
+GROWTH = 1.3
 
 
 @dataclass(frozen=True)
@@ -86,13 +89,6 @@ class _Run:
         self.process.ask({"round": round, "cold": cold, "release": release})
         return self.answer(stop)
 
-    def warm_up(self, release: bool, stop: Callable[[], bool]) -> None:
-        """Take steps until no new kernel comes."""
-        for _ in range(MAX_WARM_UPS):
-            answer = self.ask(0, False, release, stop) if self.end is None else None
-            if answer is None or not answer["new_kernels"]:
-                break
-
     def answer(self, stop: Callable[[], bool]) -> dict[str, Any] | None:
         try:
             result: dict[str, Any] = self.process.answer(stop)
@@ -111,7 +107,7 @@ def bench(
 ) -> Iterator[list[Result]]:
     """Measure depth by depth; yield the results of each. Ends early, with what is done, once `stop()`.
 
-    Where the budget is spent, each depth still gets the least number of rounds. Raises Refused where no case can begin.
+    Where the budget is spent, each depth still gets MIN_ROUNDS rounds. Raises Refused where no case can begin.
     """
     pace = Pace(sweep.budget_s, len(sweep.depths))
     for depth in sweep.depths:
@@ -129,6 +125,36 @@ def bench(
         yield [_result(run, depth, sweep, runs) for run in done]
         if stopped:
             return
+
+
+class Pace:
+    """Divides the time among depths, each of which gets GROWTH times as much as the one before it.
+
+    What a depth leaves is for the others. None gets fewer than MIN_ROUNDS rounds, whatever they cost.
+    """
+
+    def __init__(self, budget_s: float, depths: int, now: Callable[[], float] = time.monotonic) -> None:
+        self._now, self._end, self._left = now, now() + budget_s, depths
+        self._rounds_start = self._depth_end = now()
+
+    def begin_depth(self) -> None:
+        """A depth begins."""
+        now = self._now()
+        self._depth_end = now + (self._end - now) / sum(GROWTH**k for k in range(self._left))
+        self._left -= 1
+
+    def begin_rounds(self) -> None:
+        """Its processes are warm."""
+        self._rounds_start = self._now()
+
+    def another(self, done: int) -> bool:
+        """Whether there is time for another round after `done` of them."""
+        if done < MIN_ROUNDS:
+            return True
+        if done >= MAX_ROUNDS:
+            return False
+        now = self._now()
+        return now + (now - self._rounds_start) / done <= self._depth_end
 
 
 def _begin(sweep: Sweep, case: Case, depth: int, start: Callable[[dict[str, Any]], Any]) -> _Run:
@@ -155,30 +181,22 @@ def _measure(
             run.size = (answer["width"], answer["height"])
     for run in alive():
         run.cold = run.ask(0, True, False, stop)
-        run.warm_up(_tight(sweep, runs), stop)
+        for _ in range(MAX_WARM_UPS):
+            answer = run.ask(0, False, _tight(sweep, runs), stop) if run.end is None else None
+            if answer is None or not answer["new_kernels"]:
+                break
     tight = _tight(sweep, runs)
     if tight:
         say(f"depth {depth}: together the cases need more than the memory; each releases its own after a step")
-
-    def rounds(done: int) -> int:
-        while alive() and pace.another(done):
-            turn = alive()
-            for run in turn[done % len(turn) :] + turn[: done % len(turn)]:
-                answer = run.ask(done + 1, False, tight, stop)
-                if answer is not None:
-                    run.steps[done] = answer
-            done += 1
-        return done
-
-    pace.begin_rounds(sum(run.cold["codegen_ms"] for run in alive() if run.cold is not None) / 1e3)
-    done = rounds(0)
-    if alive() and pace.renews(done):
-        for run in alive():
-            run.process.restart()
-            if run.answer(stop) is not None:
-                run.warm_up(tight, stop)
-        pace.begin_rounds_again(done)
-        rounds(done)
+    pace.begin_rounds()
+    done = 0
+    while alive() and pace.another(done):
+        turn = alive()
+        for run in turn[done % len(turn) :] + turn[: done % len(turn)]:
+            answer = run.ask(done + 1, False, tight, stop)
+            if answer is not None:
+                run.steps[done] = answer
+        done += 1
 
 
 def _tight(sweep: Sweep, runs: list[_Run]) -> bool:

@@ -50,19 +50,19 @@ class Process:
 
     def __init__(self, first: dict[str, Any], command: list[str] | None = None) -> None:
         self.limit: int | None = first["memory_limit"]
+        self.peak_bytes = 0  # of address space
         self._folder = tempfile.TemporaryDirectory(prefix="reslrb-bench-", ignore_cleanup_errors=True)
-        self._first = first | {"cache": self._folder.name}
-        self._command = command or [sys.executable, "-m", "reslrb_cli.measure.worker"]
         self._words = Path(self._folder.name) / "stderr"
         self._buffer = b""
-        self._process = self._start()
-        self.ask(self._first)
-
-    def restart(self) -> None:
-        """Go on in a new process, which finds the kernels that this one compiled."""
-        self._end_process()
-        self._process = self._start()
-        self.ask(self._first)
+        with self._words.open("wb") as words:
+            self._process = subprocess.Popen(
+                command or [sys.executable, "-m", "reslrb_cli.measure.worker"],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=words,
+                start_new_session=True,  # Ctrl-C is for us
+            )
+        self.ask(first | {"cache": self._folder.name})
 
     def ask(self, question: dict[str, Any]) -> None:
         """Send a message; an end of the process shows when the answer is waited for."""
@@ -95,27 +95,13 @@ class Process:
 
     def close(self) -> None:
         """End the process and remove what it leaves."""
-        self._end_process()
-        self._folder.cleanup()
-
-    def _start(self) -> subprocess.Popen[bytes]:
-        self.peak_bytes, self._buffer = 0, b""  # the first is of address space
-        with self._words.open("wb") as words:
-            return subprocess.Popen(
-                self._command,
-                stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE,
-                stderr=words,
-                start_new_session=True,  # Ctrl-C is for us
-            )
-
-    def _end_process(self) -> None:
         self._process.kill()
         self._process.wait()
         for stream in (self._process.stdin, self._process.stdout):
             assert stream is not None
             with contextlib.suppress(BrokenPipeError):
                 stream.close()
+        self._folder.cleanup()
 
     def _look_at_memory(self) -> None:
         try:

@@ -69,24 +69,6 @@ def test_waiting_can_be_stopped() -> None:
     process.close()
 
 
-def test_a_new_process_finds_what_the_old_one_left() -> None:
-    script = (
-        "import json, os, sys; cache = json.loads(sys.stdin.readline())['cache']; "
-        "print(json.dumps([os.getpid(), sorted(os.listdir(cache))]), flush=True); "
-        "open(os.path.join(cache, 'kernel'), 'w'); sys.stdin.readline(); print(json.dumps('more'), flush=True)"
-    )
-    process = Process(FIRST, [sys.executable, "-c", script])
-    first, nothing = process.answer(lambda: False)
-    process.ask({})
-    assert process.answer(lambda: False) == "more"
-    process.ask({})  # whose answer, if there is any, the new process must not be taken to have given
-    process.restart()
-    second, kept = process.answer(lambda: False)
-    process.close()
-    assert first != second
-    assert (nothing, kept) == (["stderr"], ["kernel", "stderr"])
-
-
 def test_last_words() -> None:
     assert last_words("") == ""
     assert last_words("a\n\n b \n") == "b"

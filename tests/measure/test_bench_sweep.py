@@ -10,9 +10,8 @@ import pytest
 
 from reslrb_cli.config import loads
 from reslrb_cli.errors import ConfigError
-from reslrb_cli.measure.bench import Result, Sweep, bench
+from reslrb_cli.measure.bench import MAX_ROUNDS, MIN_ROUNDS, Pace, Result, Sweep, bench
 from reslrb_cli.measure.cases import choose_baseline, depths, parse_cases
-from reslrb_cli.measure.pace import MAX_ROUNDS, MIN_ROUNDS, Pace
 from reslrb_cli.measure.processes import Ended, Stopped
 from reslrb_cli.records.bench import BenchStatus, Spread
 
@@ -55,10 +54,6 @@ class Pretended:
         parts = {"kernel_ms": ms / 2, "codegen_ms": ms / 8, "tracing_ms": 3 * ms / 8}
         answer = {"step_ms": ms, **parts, "new_kernels": 2 if self.asked < 3 else 0}
         return answer | ({"peak_mib": 1.5, "scratch_bytes": 60} if self.question["cold"] else {})
-
-    def restart(self) -> None:
-        self.asked, self.question = 0, None
-        Pretended.log.append((self.depth, self.type, "anew"))
 
     def close(self) -> None:
         Pretended.alive -= not self.closed
@@ -167,63 +162,25 @@ def test_pace_divides_the_budget() -> None:
     now = [0.0]
     pace, spent = Pace(100.0, 3, now=lambda: now[0]), Pace(100.0, 1, now=lambda: now[0])
 
-    def rounds(load_s: float, compile_s: float, round_s: float, pace: Pace = pace) -> list[int]:
+    def rounds(begin_s: float, round_s: float, pace: Pace = pace) -> int:
         pace.begin_depth()
-        now[0] += load_s + compile_s
-        pace.begin_rounds(compile_s)
-        done = [0]
-        while pace.another(done[0]):
+        now[0] += begin_s
+        pace.begin_rounds()
+        done = 0
+        while pace.another(done):
             now[0] += round_s
-            done[0] += 1
-        if pace.renews(done[0]):
-            now[0] += load_s
-            pace.begin_rounds_again(done[0])
-            done.append(done[0])
-            while pace.another(done[1]):
-                now[0] += round_s
-                done[1] += 1
+            done += 1
         return done
 
-    # 100 s in shares of 1, 1.3 and 1.69: 25.1 s, less 2 + 1 + 2 for two beginnings leaves 10 for either half;
-    assert rounds(2.0, 1.0, 2.0) == [5, 10]
-    # of the other 75, 32.6 s, the same; and what is left, with too little time for a second beginning.
-    assert rounds(3.0, 2.0, 4.0) == [3, 6]
-    assert rounds(10.0, 2.0, 5.0) == [MIN_ROUNDS]
-    assert now[0] <= 100.0
-    assert rounds(1.0, 0.0, 50.0, spent) == [MIN_ROUNDS]
+    # 100 s in shares of 1, 1.3 and 1.69: 25.1 s; of the other 77, 33.5 s; and what is left.
+    assert rounds(2.0, 3.0) == 7
+    assert rounds(3.0, 4.0) == 7
+    assert rounds(1.0, 5.0) == 9
+    assert 95.0 < now[0] <= 100.0
+    assert rounds(1.0, 50.0, spent) == MIN_ROUNDS
     cheap = Pace(1e6, 1, now=lambda: 0.0)
     cheap.begin_depth()
-    cheap.begin_rounds(0.0)
-    first = (MAX_ROUNDS + 1) // 2
-    assert [cheap.another(done) for done in (first - 1, first)] == [True, False]
-    cheap.begin_rounds_again(first)
     assert [cheap.another(done) for done in (MAX_ROUNDS - 1, MAX_ROUNDS)] == [True, False]
-
-
-def test_half_of_the_rounds_are_of_new_processes() -> None:
-    rows = run(sweep(depths=[2], budget_s=1e6))
-    types, first = ["ptracer", "reslrb", "walk_ad"], (MAX_ROUNDS + 1) // 2
-    anew = [entry for name in types for entry in [(2, name, "anew"), (2, name, 0), (2, name, 0), (2, name, 0)]]
-    begin = 3 * 3 + 3 * first
-    assert Pretended.log[begin : begin + len(anew)] == anew
-    assert [entry[2] for entry in Pretended.log[begin + len(anew) :: 3]] == list(range(first + 1, MAX_ROUNDS + 1))
-    assert [row.record.repeats for row in rows] == [MAX_ROUNDS] * 3
-    assert rows[1].record.cold_ms == 4.0  # of the first process
-
-
-@pytest.mark.parametrize("question", [0, 1, 4], ids=["loading", "warming up", "in a round"])
-def test_a_case_that_ends_in_its_second_process_is_recorded(question: int) -> None:
-    class EndsAnew(Pretended):
-        def restart(self) -> None:
-            super().restart()
-            Pretended.ends = {("walk_ad", 2): question}
-
-    rows = [
-        row for depth in bench(sweep(depths=[2], budget_s=1e6), lambda: False, [].append, EndsAnew) for row in depth
-    ]
-    assert [row.record.status.value for row in rows] == ["ok", "ok", "out_of_memory"]
-    assert [row.record.repeats for row in rows] == [MAX_ROUNDS, MAX_ROUNDS, 0]
-    assert Pretended.alive == 0
 
 
 def test_depths() -> None:
