@@ -22,7 +22,15 @@ import numpy as np
 from scipy import stats
 
 from reslrb_cli.measure.entries import divisions, overall, parts
-from reslrb_cli.measure.statistics import ALPHA, combined_z_rms, paired_z_scores, sidak, z_rms_limit, z_scores
+from reslrb_cli.measure.statistics import (
+    ALPHA,
+    combined_z_rms,
+    effective_entries,
+    paired_z_scores,
+    sidak,
+    z_rms_limit,
+    z_scores,
+)
 from reslrb_cli.records.gradcheck import Verdict
 
 #: Probability with which a deviation of the size `detectable` is seen.
@@ -170,21 +178,6 @@ def cosine(a: np.ndarray, b: np.ndarray) -> float | None:
 def variance_ratio(ours: np.ndarray, reference: np.ndarray) -> float | None:
     """Summed variance of (N, P) samples over that of the reference's; None where that has none."""
     return _ratio(ours.var(0, ddof=1).sum(), reference.var(0, ddof=1).sum())
-
-
-def effective_entries(samples: np.ndarray) -> float:
-    """How many independent entries the correlated ones of (N, E) samples are worth: between 1 and E."""
-    count, entries = samples.shape
-    deviation = samples - samples.mean(0)
-    size = np.linalg.norm(deviation, axis=0)
-    unit = deviation[:, size > 0] / size[size > 0]
-    moving = unit.shape[1]
-    if moving < 2 or count < 3:
-        return float(entries)
-    squares = (np.square(unit.T @ unit).sum() - moving) / (moving * (moving - 1))
-    chance = 1 / (count - 1)
-    correlation = max(0.0, (squares - chance) / (1 - chance))
-    return max(1.0, entries / (1 + (moving - 1) * correlation))
 
 
 def tail_weight(samples: np.ndarray) -> float:

@@ -5,7 +5,8 @@
 t is turned into the standard normal z of the same probability (Welch-Satterthwaite degrees of freedom), so that few
 renders do not look like a bias. Beside the blocks, the mean of the whole image is tested: a bias that is everywhere
 small shows there. Two sides must hold: max |z| under Sidak's threshold for all blocks and channels, and the root mean
-square of z under that of as many normal deviates as there are blocks (channels may be fully correlated).
+square of z under that of as many normal deviates as there are blocks (channels may be fully correlated), or, entry by
+entry, as the correlated entries are worth.
 """
 
 from __future__ import annotations
@@ -124,7 +125,9 @@ def compare(a: np.ndarray, b: np.ndarray, block: int | None = 8, alpha: float = 
     where = "whole" if index == len(z) - 1 else f"block {index}"
     total_a, total_b = parts_a.mean((1, 2)), parts_b.mean((1, 2))
     scale = abs(total_b.mean()) or 1.0
-    count = len(z) - 1
+    count: float = len(z) - 1
+    if block is None:
+        count = min(effective_entries(x.reshape(len(x), -1)) for x in (a, b))
     return Agreement(
         z=z,
         threshold=sidak(z.size, alpha),
@@ -149,3 +152,18 @@ def combined_z_rms(z: np.ndarray) -> float:
 def z_rms_limit(count: float, alpha: float = ALPHA) -> float:
     """What the root mean square of `count` independent normal deviates exceeds with probability `alpha`."""
     return float(np.sqrt(stats.chi2.isf(alpha, count) / count))
+
+
+def effective_entries(samples: np.ndarray) -> float:
+    """How many independent entries the correlated ones of (N, E) samples are worth: between 1 and E."""
+    count, entries = samples.shape
+    deviation = samples - samples.mean(0)
+    size = np.linalg.norm(deviation, axis=0)
+    unit = deviation[:, size > 0] / size[size > 0]
+    moving = unit.shape[1]
+    if moving < 2 or count < 3:
+        return float(entries)
+    squares = (np.square(unit.T @ unit).sum() - moving) / (moving * (moving - 1))
+    chance = 1 / (count - 1)
+    correlation = max(0.0, (squares - chance) / (1 - chance))
+    return max(1.0, entries / (1 + (moving - 1) * correlation))

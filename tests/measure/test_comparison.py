@@ -11,7 +11,6 @@ from reslrb_cli.measure.comparison import (
     Family,
     compare_equal_seeds,
     compare_expectations,
-    effective_entries,
     tail_weight,
 )
 from reslrb_cli.measure.entries import divisions, entry_count, overall, parts
@@ -96,13 +95,6 @@ def test_equal_seeds_are_compared_by_relative_l2():
     assert compare_equal_seeds(ours * (1 + 1e-5), ours).verdict is Verdict.HOLDS
     result = compare_equal_seeds(ours * (1 + 1e-3), ours)
     assert (result.verdict, result.relative_l2) == (Verdict.FAILS, pytest.approx(1e-3))
-
-
-def test_effective_entries():
-    noise = np.random.default_rng(0).normal(size=(40, 90))
-    assert effective_entries(noise) > 60
-    assert effective_entries(np.repeat(noise[:, :30], 3, axis=1)) == pytest.approx(30, rel=0.3)
-    assert effective_entries(np.repeat(noise[:, :1], 90, axis=1)) == pytest.approx(1, rel=0.01)
 
 
 def test_limits_grow_with_the_table():

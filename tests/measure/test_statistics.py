@@ -5,7 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from reslrb_cli.measure.statistics import blocks, combined_z_rms, compare, sidak, z_rms_limit, z_scores
+from reslrb_cli.measure.statistics import (
+    blocks,
+    combined_z_rms,
+    compare,
+    effective_entries,
+    sidak,
+    z_rms_limit,
+    z_scores,
+)
 
 
 def noise(seed: int, shape=(12, 32, 32, 3), mean: float = 1.0) -> np.ndarray:
@@ -65,3 +73,22 @@ def test_thresholds():
     assert sidak(1000) > sidak(10)
     assert z_rms_limit(10000) == pytest.approx(1, abs=0.03)
     assert combined_z_rms(np.array([3.0, -4.0])) == pytest.approx(np.sqrt(12.5))
+
+
+def test_effective_entries():
+    noise = np.random.default_rng(0).normal(size=(40, 90))
+    assert effective_entries(noise) > 60
+    assert effective_entries(np.repeat(noise[:, :30], 3, axis=1)) == pytest.approx(30, rel=0.3)
+    assert effective_entries(np.repeat(noise[:, :1], 90, axis=1)) == pytest.approx(1, rel=0.01)
+
+
+def test_correlated_entries_are_not_counted_each():
+    """Sixty entries that are five: their z rms scatters as that of five, and a bias of one of them still shows."""
+    rng, failed = np.random.default_rng(3), 0
+    for _ in range(200):
+        a, b = (np.repeat(rng.normal(size=(64, 5)), 12, axis=1) for _ in range(2))
+        result = compare(a, b, block=None, alpha=1e-2)
+        assert result.z_rms_threshold > 1.35 * z_rms_limit(60, 1e-2)
+        failed += not result
+        assert not compare(a + np.repeat([0.0, 0, 1.2, 0, 0], 12), b, block=None)
+    assert failed <= 9  # of 200, at 1 % for either criterion: more in one of 60 cases
