@@ -28,6 +28,8 @@ PLANNED_STEPS = (24, 18, 12, 9)
 #: A candidate is dropped once the best is so many times as efficient, after at least so many rounds.
 DROPPED = ((2, 1.5), (4, 1.25))
 MOST_ROUNDS = 12
+#: Share of a step's other costs that kernels may have for nothing.
+FREE = 0.25
 #: Relative error of a single time that must not decide anything.
 TIMING_NOISE = 1.1
 
@@ -144,11 +146,16 @@ class Pilot:
         self._entries: list[_Entry] = []
         self._notes: dict[str, str] = {}
         self._spent_ms = self._compile_ms = 0.0
+        self._first_steps_count = False
 
     def run(self) -> Outcome:
         """Measure, and choose."""
-        alive = [self._warm_up(c) for c in self._candidates if c.parent is None]
+        first, *others = [c for c in self._candidates if c.parent is None]
+        alive = [self._warm_up(first)]
         self._choose_size(alive[0])
+        if self._first_steps_count:
+            self._measure(alive[0])
+        alive += [self._warm_up(candidate) for candidate in others]
         for round in range(MOST_ROUNDS):
             for entry in alive:
                 if round == 0 or self._affords(entry):
@@ -163,18 +170,20 @@ class Pilot:
     # --- measuring ----------------------------------------------------------------------------------------------------
 
     def _warm_up(self, candidate: Candidate) -> _Entry:
-        """Compile the kernels of a candidate."""
-        first = self._step(candidate, 0, self._unit)
+        """Compile the kernels of a candidate, and keep its gradient if that counts."""
+        counts = self._first_steps_count
+        first = self._step(candidate, 0, self._pilot_spp if counts else self._unit)
         self._compile_ms += first.wall_ms + first.compile_ms
-        entry = _Entry(candidate)
+        entry = _Entry(candidate, gradients=[first.gradients] if counts else [])
         self._entries.append(entry)
         return entry
 
     def _measure(self, entry: _Entry) -> None:
-        measured = self._step(entry.candidate, len(entry.kernel), self._pilot_spp)
+        round = len(entry.gradients)
+        measured = self._step(entry.candidate, round, self._pilot_spp)
         if measured.compile_ms > measured.wall_ms:  # a first step after all, whose times say nothing
             self._compile_ms += measured.wall_ms + measured.compile_ms
-            measured = self._step(entry.candidate, len(entry.kernel), self._pilot_spp)
+            measured = self._step(entry.candidate, round, self._pilot_spp)
         self._compile_ms += measured.compile_ms
         self._spent_ms += measured.wall_ms
         entry.kernel.append(measured.kernel_ms)
@@ -182,7 +191,11 @@ class Pilot:
         entry.gradients.append(measured.gradients)
 
     def _choose_size(self, entry: _Entry) -> None:
-        """Choose the samples per pixel so that the planned steps fit into the pilot's share, by a step of the first."""
+        """Choose the samples per pixel so that the planned steps fit into the pilot's share, by a step of the first.
+
+        Where Python takes longer than the kernels, steps are few, and nearly as dear with fewer samples. Then the first
+        steps of the other candidates, which compile their kernels, count as samples of their gradients.
+        """
         first = self._step(entry.candidate, 0, self._unit)
         self._spent_ms += first.wall_ms
         overhead, slope = max(first.wall_ms - first.kernel_ms, 0.0), max(first.kernel_ms, 1e-6) / self._unit
@@ -191,7 +204,9 @@ class Pilot:
             fits = int((budget / steps - overhead) / slope) // self._unit * self._unit
             if fits >= self._unit:
                 break
+        fits = max(fits, int(FREE * overhead / slope) // self._unit * self._unit)
         self._pilot_spp = max(min(fits, self._spp // self._unit * self._unit), self._unit)
+        self._first_steps_count = slope * self._pilot_spp <= overhead
 
     def _run_ms(self) -> float:
         """Time of a run of ITERATIONS by the fastest candidate so far."""

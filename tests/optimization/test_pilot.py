@@ -127,3 +127,19 @@ def test_no_noise_at_all_is_no_division_by_zero() -> None:
 def test_an_outcome_survives_json() -> None:
     outcome = World(times(), {RESERVOIR.label: 1.0, EVENT.label: 1.0}).run()
     assert Outcome.from_json(outcome.to_json()) == outcome
+
+
+def test_few_steps_that_python_makes_dear_are_all_used() -> None:
+    """One parameter, and kernels of no account beside Python: an estimator of half the time and 5 % more variance."""
+    right, steps = 0, []
+    for world in range(100):
+
+        def step(candidate: Candidate, round: int, spp: int, world: int = world) -> Measured:
+            steps.append(candidate)
+            path, choice = (np.random.default_rng([world, round, k]).normal() for k in (0, len(candidate.label)))
+            value = (path + (0.2 * choice if candidate is EVENT else 0)) / np.sqrt(spp)
+            return Measured({"a": np.array([10 + value])}, (0.1 if candidate is EVENT else 0.2) * spp, 10.0 + 0.2 * spp)
+
+        right += Pilot([STACK, EVENT], step, 16).run().chosen == EVENT.options
+    assert right >= 95
+    assert len(steps) < 100 * (SHARE * ITERATIONS + 3)
