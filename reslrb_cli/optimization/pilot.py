@@ -23,6 +23,8 @@ import numpy as np
 
 #: Share of a run of so many iterations that the pilot may cost, compilation apart.
 SHARE, ITERATIONS = 0.05, 200
+#: How much of that it plans for: a step may take longer than those before it, and a later candidate's run less time.
+PLANNED = 0.95 * SHARE
 #: Steps that the pilot plans for, the most first: the first that its share suffices for.
 PLANNED_STEPS = (24, 18, 12, 9)
 #: A candidate is dropped once the best is so many times as efficient, after at least so many rounds.
@@ -199,7 +201,7 @@ class Pilot:
         first = self._step(entry.candidate, 0, self._unit)
         self._spent_ms += first.wall_ms
         overhead, slope = max(first.wall_ms - first.kernel_ms, 0.0), max(first.kernel_ms, 1e-6) / self._unit
-        budget = SHARE * ITERATIONS * (overhead + slope * self._spp) - first.wall_ms
+        budget = PLANNED * ITERATIONS * (overhead + slope * self._spp) - first.wall_ms
         for steps in PLANNED_STEPS:
             fits = int((budget / steps - overhead) / slope) // self._unit * self._unit
             if fits >= self._unit:
@@ -214,7 +216,7 @@ class Pilot:
         return ITERATIONS * min(entry.overhead + entry.time * scale for entry in self._entries if entry.kernel)
 
     def _affords(self, entry: _Entry) -> bool:
-        return self._spent_ms + statistics.median(entry.wall) <= SHARE * self._run_ms()
+        return self._spent_ms + statistics.median(entry.wall) <= PLANNED * self._run_ms()
 
     # --- judging ------------------------------------------------------------------------------------------------------
 
