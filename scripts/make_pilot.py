@@ -23,7 +23,7 @@ from reslrb_cli.backend.variant import set_variant
 from reslrb_cli.config import load
 from reslrb_cli.optimization import assemble
 from reslrb_cli.optimization.choice import Option, find_options, measured_step, run_pilot
-from reslrb_cli.optimization.pilot import Candidate, Gradients
+from reslrb_cli.optimization.pilot import ITERATIONS, Candidate, Gradients, sample_variance, square
 from reslrb_cli.records.clock import StepClock
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -40,9 +40,9 @@ def efficiencies(problem: Any, options: list[Option], seeds: int) -> dict[str, f
     for round in range(seeds + WARM_UPS):
         for option in options:
             option.integrator.freeze = False
+            label = Candidate(option.options, exact=False).label
             step = measured_step(problem, option.integrator, clock, round, spp)
             if round >= WARM_UPS:
-                label = label_of(option.options)
                 times.setdefault(label, []).append(step.kernel_ms)
                 gradients.setdefault(label, []).append(step.gradients)
     found = {
@@ -55,15 +55,10 @@ def variance(own: list[Gradients], exact: list[Gradients]) -> float:
     """Variance of a gradient, in units of the exact one's mean square, summed over the parameters."""
     total = 0.0
     for key in exact[0]:
-        scale = np.mean([np.sum(np.square(g[key], dtype=np.float64)) for g in exact])
+        scale = np.mean([square(g[key]) for g in exact])
         if scale > 0:
-            total += np.var(np.array([g[key] for g in own], np.float64), axis=0, ddof=1).sum() / scale
+            total += sample_variance([g[key] for g in own]) / scale
     return max(float(total), 1e-12)
-
-
-def label_of(options: dict[str, Any]) -> str:
-    """The candidate in words, as the pilot has them."""
-    return Candidate(options, exact=False).label
 
 
 def report(path: Path, seeds: int, pilots: int) -> None:
@@ -75,10 +70,9 @@ def report(path: Path, seeds: int, pilots: int) -> None:
     print(f"{path.stem}: " + ", ".join(f"{label} {value:.2f}" for label, value in ranked), flush=True)
     for _ in range(pilots):
         outcome = run_pilot(problem, options)
-        label = label_of(outcome.chosen)
+        worth, share = found[outcome.label], 100 * outcome.share
         print(
-            f"  pilot: {label}, {found[label]:.2f} of the best; {100 * outcome.share:.1f} % of 200 iterations",
-            flush=True,
+            f"  pilot: {outcome.label}, {worth:.2f} of the best; {share:.1f} % of {ITERATIONS} iterations", flush=True
         )
 
 

@@ -104,6 +104,11 @@ class StackState:
     last: Any
 
 
+def places(plan: Plan, stack_size: int) -> int:
+    """How many vertices a stack has room for: no more than a path can have, and one at least."""
+    return min(stack_size, max(plan.max_depth - 1, 1))
+
+
 class Pushing(VertexHooks):
     """The way out: splat, and push vertices.
 
@@ -113,7 +118,7 @@ class Pushing(VertexHooks):
 
     def __init__(self, p: Pass, visibility: Visibility | None, stack_size: int) -> None:
         super().__init__(p)
-        self.visibility, self.size = visibility, min(stack_size, max(vertices(p), 1))
+        self.visibility, self.size = visibility, places(p.plan, stack_size)
         self.bounded = vertices(p) > self.size
 
     def start(self, product: Product) -> Pushed:
@@ -239,8 +244,7 @@ class Stack(Estimator):
     def scratch_bytes(self, plan: Plan) -> int:
         if not plan.differentiate_bsdfs:
             return 0
-        vertices = min(self.stack_size, max(plan.max_depth - 1, 1))
-        return sum(entry_bytes(Frame.blank(plan).members())) * (vertices + 1)
+        return sum(entry_bytes(Frame.blank(plan).members())) * (places(plan, self.stack_size) + 1)
 
     def _sweep(self, p: Pass, visibility: Visibility | None) -> StackState:
         active = True if visibility is None else visibility.last > 0

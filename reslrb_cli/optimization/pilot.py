@@ -229,7 +229,7 @@ class Pilot:
         """Mean square norm of each parameter's gradient."""
         every = [g for e in self._entries if e.candidate.exact for g in e.gradients]
         every = every or [g for e in self._entries for g in e.gradients]
-        return {key: float(np.mean([_square(g[key]) for g in every])) for key in every[0]}
+        return {key: float(np.mean([square(g[key]) for g in every])) for key in every[0]}
 
     def _variance(self, entry: _Entry) -> float:
         scales = {key: scale for key, scale in self._scales().items() if scale > 0}
@@ -238,10 +238,10 @@ class Pilot:
         for key, scale in scales.items():
             own = [g[key] for g in entry.gradients]
             exact = [g[key] for g in references]
-            total += _sample_variance(exact if len(exact) > 1 else own) / scale
+            total += sample_variance(exact if len(exact) > 1 else own) / scale
             if exact and not entry.candidate.exact:
                 pairs = list(zip(own, exact, strict=False))
-                total += sum(_square(a - b) for a, b in pairs) / (len(pairs) * scale)
+                total += sum(square(a - b) for a, b in pairs) / (len(pairs) * scale)
         return max(total, 1e-12)  # a furnace has none at all
 
     def _efficiency(self, entry: _Entry) -> float:
@@ -321,12 +321,13 @@ class Pilot:
         return outcome
 
 
-def _square(values: np.ndarray[Any, Any]) -> float:
+def square(values: np.ndarray[Any, Any]) -> float:
+    """Sum of the squares of all entries, in double precision."""
     return float(np.sum(np.square(values, dtype=np.float64)))
 
 
-def _sample_variance(values: list[np.ndarray[Any, Any]]) -> float:
+def sample_variance(values: list[np.ndarray[Any, Any]]) -> float:
     """Sum over the entries; the mean square where there is one sample only."""
     if len(values) < 2:
-        return _square(values[0])
+        return square(values[0])
     return float(np.sum(np.var(np.array(values, dtype=np.float64), axis=0, ddof=1)))
