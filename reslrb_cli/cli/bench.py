@@ -146,7 +146,7 @@ def _conditions(config: Config, sweep: Sweep) -> str:
     """What was measured, in one line."""
     rr_depth = config.integrator.rr_depth
     roulette = "no roulette" if rr_depth > max(sweep.depths) else f"roulette from depth {rr_depth}"
-    delta = "dL/dI known before" if sweep.objective == "fixed" else f"l2, adjoint {config.run.adjoint}"
+    delta = "dL/dI known before" if sweep.objective == "fixed" else f"l2, adjoint {config.adjoint}"
     limit = "" if sweep.memory_limit is None else f", {sweep.memory_limit / 2**30:.2f} GiB each"
     return f"{config.source}, {config.run.spp} spp, {roulette}, {delta}, ratios over {sweep.baseline.label}{limit}"
 

@@ -171,7 +171,7 @@ def make_plan_report(config: Config, scene: Any, counts: bool) -> PlanReport | s
     options = config.integrator.options()
     if options.get("estimator") == "auto":
         options["estimator"] = "stack"  # `auto` is chosen by a run
-    known = config.run.adjoint == "batched" or options.get("weight") == "adjoint"
+    known = config.adjoint == "batched" or options.get("weight") == "adjoint"
     try:
         [sensor, *_] = choose_sensors(config, scene)
         selection = select_parameters(scene, config.parameters, config.source)

@@ -221,19 +221,24 @@ class RunConfig(Section):
     iterations: Count = Field(default=200, description="Optimisation steps.")
     spp: Count = Field(default=16, description="Samples per pixel and step.")
     seed: Seed = Field(default=0, description="Seed of the run; every other seed is made from it.")
-    adjoint: Literal["correlated", "independent", "batched"] = Field(
-        default="correlated",
-        description="Samples that the adjoint image comes from: those of the gradient (`correlated`: "
-        "cheapest, biased by noise under a nonlinear loss), a second set (`independent`: unbiased for l2), or the "
-        "batches before the one that is differentiated (`batched`: unbiased for l2, from half the paths).",
+    adjoint: Literal["auto", "correlated", "independent", "batched"] = Field(
+        default="auto",
+        description="Samples that the adjoint image dL/dI comes from: the batches before the one that is "
+        "differentiated (`batched`), a second set (`independent`, twice the paths), or those of the gradient "
+        "(`correlated`). Gradients of `l2` and `relative_l2` are unbiased with the first two; with `correlated` the "
+        "noise that both share pulls parameters, mostly towards darker. `l1` and `log_l2` are biased with any of them, "
+        "since noise in the image does not average out of their derivatives; more samples help. `auto`: `batched` "
+        "where `batches` divides `spp`, else `independent`.",
     )
     batches: Annotated[int, Field(ge=2)] = Field(
-        default=4, description="Batches of a step's samples; must divide `spp`. Only with `adjoint: batched`."
+        default=4,
+        description="Batches of a step's samples; with `adjoint: batched` it must divide `spp`. Not with `correlated` "
+        "and `independent`.",
     )
     first_batch: Literal["image", "again"] = Field(
         default="image",
         description="What the first batch is for: an `image` alone, or to be traced `again` for its gradient, with the "
-        "adjoint image of all others. Only with `adjoint: batched`.",
+        "adjoint image of all others. Not with `correlated` and `independent`.",
     )
     memory_budget: Memory | None = Field(
         default=None,
@@ -263,16 +268,9 @@ class RunConfig(Section):
     @model_serializer(mode="wrap")
     def _without_unused(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
         values: dict[str, Any] = handler(self)
-        if self.adjoint != "batched":
+        if self.adjoint not in ("auto", "batched"):
             del values["batches"], values["first_batch"]
         return values
-
-    def step_options(self) -> dict[str, Any]:
-        """What a gradient step is told of its samples."""
-        options: dict[str, Any] = {"spp": self.spp, "adjoint": self.adjoint}
-        if self.adjoint == "batched":
-            options |= {"batches": self.batches, "first_batch": self.first_batch}
-        return options
 
     @property
     def budget_bytes(self) -> int | None:
@@ -307,6 +305,22 @@ class Config(Section):
     _source: Path = PrivateAttr(default=Path("config.yaml"))
 
     @property
+    def adjoint(self) -> Literal["correlated", "independent", "batched"]:
+        """`run.adjoint`, with `auto` settled: batches where they divide the samples, and the passes divide them."""
+        run = self.run
+        if run.adjoint != "auto":
+            return run.adjoint
+        fits = run.spp % run.batches == 0 and _passes_divide(self.integrator, run.spp // run.batches)
+        return "batched" if fits else "independent"
+
+    def step_options(self) -> dict[str, Any]:
+        """What a gradient step is told of its samples."""
+        options: dict[str, Any] = {"spp": self.run.spp, "adjoint": self.adjoint}
+        if self.adjoint == "batched":
+            options |= {"batches": self.run.batches, "first_batch": self.run.first_batch}
+        return options
+
+    @property
     def source(self) -> Path:
         """The file that this was loaded from, as the user named it."""
         return self._source
@@ -328,15 +342,17 @@ class Config(Section):
                 raise located(f"parameters[{i}].key", f"`{key}` stands in parameters[{keys.index(key)}] already")
         _check_passes(self.integrator, self.run.spp, "integrator", "run.spp")
         for option in sorted({"batches", "first_batch"} & self.run.model_fields_set):
-            if self.run.adjoint != "batched":
+            if self.run.adjoint not in ("auto", "batched"):
                 raise located(f"run.{option}", f"has no effect with run.adjoint: {self.run.adjoint}, but with batched")
-        if self.run.adjoint == "batched" and self.run.spp % self.run.batches:
-            raise located("run.batches", f"{self.run.batches} does not divide run.spp, which is {self.run.spp}")
+        if self.run.adjoint == "batched":
+            if self.run.spp % self.run.batches:
+                raise located("run.batches", f"{self.run.batches} does not divide run.spp, which is {self.run.spp}")
+            _check_passes(self.integrator, self.run.spp // self.run.batches, "integrator", "run.spp / run.batches")
         if self.run.adjoint == "correlated" and self.integrator.options().get("weight") == "adjoint":
             raise located(
                 "integrator.weight",
                 "`adjoint` needs dL/dI before the paths are traced, which run.adjoint: correlated does not have; "
-                "set that to independent or batched, or the weight to luminance",
+                "leave that at auto, or set the weight to luminance",
             )
         if self.run.memory_budget is not None:
             if not isinstance(self.integrator, Reslrb):
@@ -352,7 +368,13 @@ class Config(Section):
         return self
 
 
-def _check_passes(integrator: Integrator, spp: int, key: str, spp_key: str) -> None:
+def _passes_divide(integrator: Integrator, spp: int) -> bool:
+    """Whether `spp` samples per pixel can be split into the integrator's passes."""
     per_pass = getattr(integrator, "samples_per_pass", None)
-    if per_pass is not None and spp % min(per_pass, spp) != 0:
+    return per_pass is None or spp % min(per_pass, spp) == 0
+
+
+def _check_passes(integrator: Integrator, spp: int, key: str, spp_key: str) -> None:
+    if not _passes_divide(integrator, spp):
+        per_pass = getattr(integrator, "samples_per_pass", None)
         raise located(f"{key}.samples_per_pass", f"{per_pass} does not divide {spp_key}, which is {spp}")

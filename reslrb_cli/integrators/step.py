@@ -179,7 +179,7 @@ def _derivative(
 
 
 def sample_sets(seed: int, options: dict[str, Any]) -> list[tuple[str, Any, int]]:
-    """The sets of samples of a step with these options (`RunConfig.step_options`): name, seed, samples per pixel."""
+    """The sets of samples of a step with these options (`Config.step_options`): name, seed, samples per pixel."""
     spp, adjoint = options["spp"], options["adjoint"]
     if adjoint == "batched":
         seeds = batch_seeds(seed, options["batches"])

@@ -59,7 +59,7 @@ def _parts(problem: Problem, sensor: int, step_seed: int) -> Iterator[tuple[Samp
     shared = {name: options[name] for name in ("max_depth", "rr_depth", "hide_emitters")}
     tracer = make_integrator("reslrb", estimator="gather", samples_per_pass=problem.samples_per_pass, **shared)
     scene, params = problem.scene, problem.selection.params
-    for name, samples_seed, spp in sample_sets(step_seed, problem.config.run.step_options()):
+    for name, samples_seed, spp in sample_sets(step_seed, problem.config.step_options()):
         passes = tracer.passes(scene, scene.sensors()[sensor], samples_seed, spp, params)
         for number, samples in enumerate(passes):
             yield samples, sensor, name if len(passes) == 1 else f"{name}, pass {number + 1}"
@@ -97,7 +97,7 @@ def _take_step(problem: Problem, sensor: int, target: Any, step_seed: int) -> St
     optimizer, keys = problem.optimizer, problem.selection.keys
     step = gradient_step(
         problem.integrator, problem.scene, sensor, lambda image: problem.compare(image, target) / len(problem.sensors),
-        seed=step_seed, **problem.config.run.step_options(), params=problem.selection.params,
+        seed=step_seed, **problem.config.step_options(), params=problem.selection.params,
     )  # fmt: skip
     gradients = {key: np.array(optimizer.gradient(key)) for key in keys}
     for key in keys:

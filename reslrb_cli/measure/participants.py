@@ -55,7 +55,7 @@ class Settings:
     @property
     def known(self) -> bool:
         """Whether dL/dI is known before the image, as in the steps of the experiment."""
-        return self.config.run.adjoint != "correlated"
+        return self.config.adjoint != "correlated"
 
     def configs(self) -> dict[str, Config]:
         """The experiment with each integrator, by its label. Raises ConfigError where one cannot be."""

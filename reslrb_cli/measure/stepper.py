@@ -83,7 +83,9 @@ class Stepper:
         def loss(image: Any) -> Any:
             return dr.mean(dr.square(image - self.image).array)
 
-        return gradient_step(problem.integrator, problem.scene, self.sensor, loss, **run.step_options(), **common)
+        return gradient_step(
+            problem.integrator, problem.scene, self.sensor, loss, **problem.config.step_options(), **common
+        )
 
 
 def _noise(width: int, height: int, channels: int) -> Any:

@@ -81,7 +81,7 @@ def estimate(problem: Problem, integrator: Any, samples: int, fixed: int) -> Est
         sensor = problem.scene.sensors()[index]
         plan = integrator.plan(problem.scene, sensor, problem.selection.params)
         width = samples * int(dr.prod(sensor.film().size()))
-        if problem.config.run.adjoint == "correlated" and samples == problem.config.run.spp:
+        if problem.config.adjoint == "correlated" and samples == problem.config.run.spp:
             # Else dL/dI is known before the paths are traced, and nothing of them outlives the kernel.
             paths = max(paths, sum(_allocated(size * width) for size in entry_bytes(integrator.estimator.kept(plan))))
         block = int(dr.prod(sensor.film().crop_size())) * (sensor.film().base_channels_count() + 1)

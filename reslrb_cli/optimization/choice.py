@@ -76,7 +76,7 @@ def candidates(config: Config) -> list[dict[str, Any]]:
     """Options of all estimators that apply, those first that others are judged by."""
     found: list[dict[str, Any]] = [{"estimator": "stack"}, {"estimator": "gather"}]
     found += [{"estimator": name, "capacity": m} for m in (1, 4) for name in ("reservoir", "event")]
-    if config.run.adjoint != "correlated":
+    if config.adjoint != "correlated":
         found += [{"estimator": "reservoir", "capacity": m, "weight": "adjoint"} for m in (1, 4)]
     return found
 
@@ -94,7 +94,7 @@ def _fitting(problem: Problem, integrator: Reslrb, choices: list[dict[str, Any]]
         if budget is None:
             options.append(Option(choice, made, None))
             continue
-        samples = run.spp // run.batches if run.adjoint == "batched" else run.spp
+        samples = run.spp // run.batches if problem.config.adjoint == "batched" else run.spp
         size, expected = choose_samples(problem, made, samples, budget, fixed)
         if size == 0:
             least.append(expected.total)
@@ -133,7 +133,7 @@ def _outcome(problem: Problem, options: list[Option], say: Say, cache: Cache | N
 def run_pilot(problem: Problem, options: list[Option]) -> Outcome:
     """Measure the options, and say which is the most efficient."""
     run = problem.config.run
-    batches = run.batches if run.adjoint == "batched" else 1
+    batches = run.batches if problem.config.adjoint == "batched" else 1
     integrators = {}
     made = [_candidate(option) for option in options]
     for candidate, option in zip(made, options, strict=True):
@@ -183,7 +183,7 @@ def _situation(problem: Problem) -> dict[str, Any]:
     """All that the choice depends on, as plain values."""
     config = problem.config
     dump = config.model_dump(mode="json")
-    run = {key: dump["run"].get(key) for key in ("spp", "adjoint", "batches", "first_batch", "memory_budget")}
+    run = config.step_options() | {"memory_budget": dump["run"]["memory_budget"]}
     return {
         "scene": hashlib.blake2b(Path(config.scene.file).read_bytes()).hexdigest(),
         "options": dump["scene"]["options"],

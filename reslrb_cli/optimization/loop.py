@@ -125,7 +125,7 @@ def gradient(
     of squares (of its finite entries) and the number of entries that are not finite, and for each view what was
     refused.
     """
-    run, optimizer = problem.config.run, problem.optimizer
+    config, optimizer = problem.config, problem.optimizer
     views = len(problem.sensors)
 
     def view_loss(target: Any, image: Any) -> Any:
@@ -140,8 +140,8 @@ def gradient(
             problem.scene,
             sensor,
             functools.partial(view_loss, target),
-            seed=seed(run.seed, iteration, sensor, "image"),
-            **run.step_options(),
+            seed=seed(config.run.seed, iteration, sensor, "image"),
+            **config.step_options(),
             params=problem.selection.params,
             on_image=split.image,
         )

@@ -27,7 +27,7 @@ def sample_gradient(problem: Problem, integrator: Any, round: int, purpose: str,
 
         step = gradient_step(
             integrator, problem.scene, sensor, loss, seed=seed(run.seed, round, sensor, purpose),
-            **{**run.step_options(), "spp": spp}, params=problem.selection.params,
+            **{**problem.config.step_options(), "spp": spp}, params=problem.selection.params,
         )  # fmt: skip
         gradients = {key: problem.optimizer.gradient(key) for key in problem.selection.keys}
         dr.eval(step.loss, gradients)

@@ -120,12 +120,12 @@ def test_the_pilot_has_seeds_of_its_own(experiment, monkeypatch):
     assert drawn == [(7, 0, 0, "pilot"), (7, 1, 0, "pilot"), (7, 0, 0, "pilot")]
 
 
-@pytest.mark.parametrize("adjoint", ["independent", "batched"])
+@pytest.mark.parametrize("adjoint", ["auto", "independent", "batched"])
 def test_candidates_know_delta_where_it_is_known(experiment, adjoint):
     from reslrb_cli.config import load
     from reslrb_cli.optimization.choice import candidates
 
-    assert not any("weight" in options for options in candidates(load("box.yaml")))
+    assert not any("weight" in options for options in candidates(load("box.yaml", ["run.adjoint=correlated"])))
     options = candidates(load("box.yaml", [f"run.adjoint={adjoint}"]))
     assert [entry["capacity"] for entry in options if entry.get("weight") == "adjoint"] == [1, 4]
 
@@ -195,6 +195,7 @@ def test_a_budget_that_is_exceeded_is_a_warning(experiment, capsys, monkeypatch)
 
     monkeypatch.setattr(budget, "_allocated", lambda size: 0)
     settings = wide("integrator={max_depth: 4, estimator: event}", "run.spp=256", "run.memory_budget=3")
+    settings += ("run.adjoint=correlated",)  # else nothing is kept of paths
     code, err = optimize(capsys, *settings)
     assert code == 0, err
     assert len([line for line in err.splitlines() if line.startswith("run.memory_budget: ")]) == 1
@@ -259,16 +260,18 @@ def test_what_is_kept_of_a_path_is_what_is_counted(experiment, monkeypatch, esti
         assert (problem.integrator.estimator.scratch_bytes(plan) > 0) == (estimator == "stack")
 
 
+@pytest.mark.parametrize("adjoint", ["correlated", "batched"])
 @pytest.mark.parametrize("estimator", ["reservoir", "gather", "event", "stack"])
-def test_all_sample_counts_have_the_same_kernels(experiment, estimator):
+def test_all_sample_counts_have_the_same_kernels(experiment, estimator, adjoint):
     """The pilot's would otherwise be compiled for nothing."""
     from reslrb_cli.config import load
     from reslrb_cli.optimization import assemble, choice
     from reslrb_cli.records.clock import StepClock
 
-    problem = assemble(load("box.yaml", [f"integrator={{max_depth: 4, estimator: {estimator}}}"]))
+    settings = [f"integrator={{max_depth: 4, estimator: {estimator}}}", f"run.adjoint={adjoint}"]
+    problem = assemble(load("box.yaml", settings))
     clock, launched = StepClock(), []
-    for spp in (3, 8, 16):
+    for spp in (12, 32, 64):
         choice.measured_step(problem, problem.integrator, clock, 0, spp)
         launched.append({entry["hash"] for entry in clock.history if "hash" in entry})
     assert launched[1] | launched[2] <= launched[0]

@@ -51,7 +51,7 @@ target: {file: target.exr}
 parameters: [{key: poster.reflectance.value, initial: 0.5, bounds: [0, 1]}]
 integrator: {type: reslrb, max_depth: 4, estimator: stack}
 optimizer: {learning_rate: 0.01}
-run: {iterations: 3, spp: 16, seed: 5}
+run: {iterations: 3, spp: 16, seed: 5, adjoint: correlated}
 """
 KEY = "poster.reflectance.value"
 

@@ -206,7 +206,7 @@ FILES: dict[str, tuple[str | bytes, tuple[str, ...]]] = {
         ("x.yaml: integrator.weight: must be luminance or adjoint (did you mean adjoint?)",),
     ),
     "weight that is not known yet": (
-        GOOD + "integrator: {estimator: reservoir, weight: adjoint}\n",
+        GOOD + "integrator: {estimator: reservoir, weight: adjoint}\nrun: {adjoint: correlated}\n",
         ("x.yaml: integrator.weight: `adjoint` needs dL/dI before", "run.adjoint: correlated"),
     ),
     "memory budget in no unit": (
@@ -273,8 +273,12 @@ FILES: dict[str, tuple[str | bytes, tuple[str, ...]]] = {
         ("x.yaml: run.batches: 4 does not divide run.spp, which is 6",),
     ),
     "one batch": (GOOD + "run: {adjoint: batched, batches: 1}\n", ("x.yaml: run.batches: must be",)),
+    "batches that passes do not divide": (
+        GOOD + "integrator: {samples_per_pass: 4}\nrun: {adjoint: batched, spp: 24}\n",
+        ("x.yaml: integrator.samples_per_pass: 4 does not divide run.spp / run.batches, which is 6",),
+    ),
     "batches of nothing": (
-        GOOD + "run: {batches: 2}\n",
+        GOOD + "run: {adjoint: correlated, batches: 2}\n",
         ("x.yaml: run.batches: has no effect with run.adjoint: correlated",),
     ),
     "retained before dL/dI": (
@@ -283,7 +287,7 @@ FILES: dict[str, tuple[str | bytes, tuple[str, ...]]] = {
     ),
     "adjoint": (
         GOOD + "run: {adjoint: correlate}\n",
-        ("x.yaml: run.adjoint: must be one of correlated, independent, batched",),
+        ("x.yaml: run.adjoint: must be one of auto, correlated, independent, batched",),
     ),
     "name without letters": (GOOD + "run: {name: '..'}\n", ("x.yaml: run.name: must hold a letter or a digit",)),
     "variant": (GOOD + "variant: scalar_rgb\n", ("x.yaml: variant: must be one of auto, llvm_ad_rgb",)),

@@ -197,3 +197,23 @@ def test_free_mappings_are_those_of_the_schema() -> None:
 def test_configuration_loads_no_mitsuba() -> None:
     code = "import sys, reslrb_cli.config; sys.exit(any(m in sys.modules for m in ('mitsuba', 'drjit', 'numpy')))"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+@pytest.mark.parametrize(
+    ("sets", "adjoint"),
+    [
+        ([], "batched"),
+        (["run.spp=6"], "independent"),
+        (["run.spp=6", "run.batches=3"], "batched"),
+        (["run.spp=24", "integrator.samples_per_pass=4"], "independent"),  # batches of 6
+        (["run.spp=32", "integrator.samples_per_pass=4"], "batched"),
+        (["run.adjoint=correlated"], "correlated"),
+    ],
+)
+def test_adjoint_auto_takes_batches_where_they_divide_the_samples(
+    tmp_path: Path, sets: list[str], adjoint: str
+) -> None:
+    config = load_text(tmp_path, GOOD, *sets)
+    assert config.adjoint == config.step_options()["adjoint"] == adjoint
+    assert ("batches" in config.step_options()) is (adjoint == "batched")
+    assert load_text(tmp_path, dump(config)) == config
