@@ -6,9 +6,10 @@ from collections.abc import Callable
 from typing import Any
 
 import drjit as dr
+import mitsuba as mi
 import numpy as np
 
-from reslrb_cli.integrators import gradient_step
+from reslrb_cli.integrators import known_step
 from reslrb_cli.optimization.problem import Problem, samples_per_pass
 from reslrb_cli.optimization.rendering import passes
 from reslrb_cli.scene import visible_texels
@@ -23,7 +24,7 @@ PATHS_PER_PASS = 2**18
 def find_reached(problem: Problem, say: Callable[[str], None] = lambda line: None) -> None:
     """Fill `problem.masks` for the parameters whose true value is known.
 
-    An entry counts as reached where light reaches it (the gradient of the mean image with respect to it, over
+    An entry counts as reached where light reaches it (the gradient of the image's sum with respect to it, over
     `run.reach_spp` samples per pixel, is not 0 in some channel) and, for a texel, where some sensor also sees its
     centre: a texel that only lights others is held by interreflection alone.
     """
@@ -44,19 +45,21 @@ def sensitivity(problem: Problem) -> dict[str, Array]:
     run, optimizer = problem.config.run, problem.optimizer
     found: dict[str, Array] = {}
     for sensor in problem.sensors:
-        width, height = problem.scene.sensors()[sensor].film().crop_size()
-        pixels = int(width) * int(height)
+        film = problem.scene.sensors()[sensor].film()
+        width, height = (int(n) for n in film.crop_size())
+        # dL/dI of the mean image: known before any path is traced, which some estimators ask for.
+        ones = dr.ones(mi.TensorXf, (height, width, int(film.base_channels_count())))
+        dr.make_opaque(ones)
         multiple = samples_per_pass(problem.config)
         spp = -(-run.reach_spp // multiple) * multiple if multiple else run.reach_spp
-        for number, part in enumerate(passes(spp, pixels, multiple, PATHS_PER_PASS)):
-            gradient_step(
+        for number, part in enumerate(passes(spp, width * height, multiple, PATHS_PER_PASS)):
+            known_step(
                 problem.integrator,
                 problem.scene,
                 sensor,
-                lambda image: dr.mean(image, axis=None),
+                ones,
                 seed=seed(run.seed, 0, sensor, f"reach, pass {number}"),
                 spp=part,
-                adjoint="correlated",
                 params=problem.selection.params,
             )
             for key in optimizer.keys():  # noqa: SIM118 (not a mapping)

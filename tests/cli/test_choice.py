@@ -181,6 +181,14 @@ def test_paths_take_no_memory_where_the_adjoint_is_known_before(experiment, caps
     assert peaks[1] / 2 < sum(memory["expected_bytes"].values()) / 2**20 < 2 * peaks[1]
 
 
+@pytest.mark.parametrize("estimator", ["reservoir", "event"])
+def test_a_weight_that_needs_the_adjoint_goes_through_a_whole_run(experiment, capsys, estimator):
+    """Whatever is rendered or differentiated besides the steps (what light reaches, saved images) has to know it too."""
+    code, err = optimize(capsys, f"integrator={{max_depth: 4, estimator: {estimator}, weight: adjoint}}")
+    assert code == 0, err
+    assert np.load(f"runs/box/parameters/{KEY}.mask.npy").all()
+
+
 def test_auto_under_a_budget(experiment, capsys):
     code, err = optimize(capsys, *wide("run.spp=64", "run.memory_budget=2", "run.iterations=1"))
     assert code == 0, err
