@@ -183,7 +183,7 @@ def test_paths_take_no_memory_where_the_adjoint_is_known_before(experiment, caps
 
 @pytest.mark.parametrize("estimator", ["reservoir", "event"])
 def test_a_weight_that_needs_the_adjoint_goes_through_a_whole_run(experiment, capsys, estimator):
-    """Whatever is rendered or differentiated besides the steps (what light reaches, saved images) has to know it too."""
+    """What is rendered or differentiated besides the steps (what light reaches, saved images) has to know it too."""
     code, err = optimize(capsys, f"integrator={{max_depth: 4, estimator: {estimator}, weight: adjoint}}")
     assert code == 0, err
     assert np.load(f"runs/box/parameters/{KEY}.mask.npy").all()
