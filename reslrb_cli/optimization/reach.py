@@ -56,7 +56,9 @@ def sensitivity(problem: Problem) -> dict[str, Array]:
                 lambda image: dr.mean(image, axis=None),
                 seed=seed(run.seed, 0, sensor, f"reach, pass {number}"),
                 spp=part,
-                adjoint="correlated",
+                # Not "batched", which would have to divide the samples of every pass; but dL/dI is known before the
+                # paths are traced where the run has it so, since estimators that choose by it have nothing else to go by.
+                adjoint="correlated" if run.adjoint == "correlated" else "independent",
                 params=problem.selection.params,
             )
             for key in optimizer.keys():  # noqa: SIM118 (not a mapping)

@@ -136,6 +136,15 @@ def test_auto_works_with_batches_and_several_views(experiment, capsys):
     assert read_manifest(Path("runs/box"))["pilot"]["spp"] in (4, 8)
 
 
+@pytest.mark.parametrize("adjoint", ["independent", "batched"])
+def test_an_estimator_that_chooses_by_the_adjoint_recovers_what_has_a_truth(experiment, capsys, adjoint):
+    """What light and sensor reach is found by a gradient as well, for which the run's estimator needs dL/dI."""
+    integrator = "integrator={max_depth: 4, estimator: reservoir, weight: adjoint}"
+    code, err = optimize(capsys, integrator, f"run.adjoint={adjoint}", "run.spp=8", "run.iterations=1")
+    assert code == 0, err
+    assert np.load(f"runs/box/parameters/{KEY}.mask.npy").all()
+
+
 def test_auto_is_no_option_of_the_plugin(llvm):
     from reslrb_cli.integrators import make_integrator
 
