@@ -91,7 +91,7 @@ def test_another_resolution_than_the_truths_has_an_error(capsys):
 
 def test_a_loss_that_does_not_fall_is_said_plainly(capsys):
     """A learning rate of nothing: the parameters stay where they are."""
-    sets = ["optimizer.learning_rate=1e-12", "run.iterations=40", "run.spp=8"]
+    sets = ["optimizer.learning_rate=1e-12", "run.iterations=40", "run.spp=32"]
     last, _, results = optimize(capsys, *sets)
     assert results["loss_trend"]["change"] == "flat"
     assert re.search(
@@ -156,7 +156,8 @@ def test_the_error_map_is_that_of_the_final_image(capsys, sensors):
         np.testing.assert_allclose(error, np.abs(final - target), rtol=1e-4, atol=1e-6)
         about = results["error_maps"][f"error{suffix}"]
         assert about["mean"] == pytest.approx(error.mean(), rel=1e-5)
-        assert np.mean(error.mean(axis=2) > about["end"]) <= 0.01
+        beyond = np.sum(error.mean(axis=2) > about["end"])
+        assert beyond <= np.ceil(0.01 * error[:, :, 0].size)
         assert (images / f"error{suffix}.png").exists()
 
 
