@@ -91,7 +91,7 @@ def test_another_resolution_than_the_truths_has_an_error(capsys):
 
 def test_a_loss_that_does_not_fall_is_said_plainly(capsys):
     """A learning rate of nothing: the parameters stay where they are."""
-    sets = ["optimizer.learning_rate=1e-12", "run.iterations=40", "run.spp=32"]
+    sets = ["optimizer.learning_rate=1e-12", "run.iterations=40", "run.spp=512"]
     last, _, results = optimize(capsys, *sets)
     assert results["loss_trend"]["change"] == "flat"
     assert re.search(
