@@ -1,0 +1,188 @@
+"""Mends what other versions of Mitsuba and exporters for them wrote, where it can be said in Mitsuba 3's own way."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+from ...backend.plugins import is_known
+from . import dialects
+from .colours import hexadecimal, linear
+from .element import Element
+from .including import Description
+from .notes import Note
+
+CURRENT_VERSION = "3.0.0"
+TRANSFORMS = frozenset(("translate", "scale", "rotate", "lookat", "matrix"))
+
+
+def mend(description: Description) -> list[Note]:
+    """Bring the elements of a scene to Mitsuba 3's spelling, in place; say what its parser would have refused.
+
+    What Mitsuba itself upgrades, in files of before version 2, is brought over without a word. Materials, lights and
+    shapes keep their meaning or are refused elsewhere; what is left out is what makes no difference to light.
+    """
+    mender = _Mender(description.folders)
+    root = description.root
+    if root.source.version is None:
+        given = root.attributes.get("version")
+        wrong = "the version is missing" if given is None else f"version {given!r} is not three numbers"
+        mender.note(root, wrong, f"taken for {CURRENT_VERSION}")
+    mender.mend(root)
+    root.attributes["version"] = CURRENT_VERSION
+    return mender.notes
+
+
+class _Mender:
+    def __init__(self, folders: list[Path]) -> None:
+        self.folders = folders
+        self.notes: list[Note] = []
+
+    def note(self, element: Element, wrong: str, done: str) -> None:
+        self.notes.append(Note(element, wrong, done))
+
+    def mend(self, element: Element) -> None:
+        """Mend all below `element`, which is mended itself."""
+        kept = []
+        for child in element.children:
+            if child.tag == "integrator":  # the experiment's own takes its place
+                continue
+            if self._element(child) and (not child.is_object or self._plugin(child)):
+                if element.is_object:
+                    self._parameter(child, element)
+                if not self._is_needless_format(child, element):
+                    kept.append(child)
+        element.children[:] = kept
+        if element.is_object:
+            self._repetitions(element)
+            self._texture_scale(element)
+        for child in element.children:
+            self.mend(child)
+
+    # --- elements and plugins -----------------------------------------------------------------------------------------
+
+    def _element(self, element: Element) -> bool:
+        """Mend tag and attributes; False where the element is to be left out."""
+        tag = element.tag
+        if tag == "srgb":
+            element.attributes["value"] = linear(element)
+        if tag in dialects.ELEMENTS:
+            element.tag = dialects.ELEMENTS[tag]
+            self.note(element, f"<{tag}> is unknown to Mitsuba 3", f"read as <{element.tag}>")
+        known = dialects.ATTRIBUTES.get(element.tag)
+        if element.is_object:
+            known = dialects.OBJECT_ATTRIBUTES
+        if known is None:
+            if tag in dialects.LOST_ELEMENTS:
+                raise element.fail("", f"<{tag}> is {dialects.LOST_ELEMENTS[tag]}")
+            self.note(element, f"<{tag}> is unknown to Mitsuba 3", "left out")
+            return False
+        for attribute in [name for name in element.attributes if name not in known]:
+            self.note(element, f"<{tag}> has no attribute `{attribute}` in Mitsuba 3", "left out")
+            del element.attributes[attribute]
+        return True
+
+    def _plugin(self, element: Element) -> bool:
+        """Mend the name of an object's plugin; False where the object is to be left out."""
+        type = element.type
+        if is_known(type):
+            return True
+        other = dialects.PLUGINS.get((element.tag, type), type.lower())
+        if is_known(other):
+            self.note(element, f"there is no {element.tag} `{type}` in Mitsuba 3", f"read as `{other}`")
+            element.attributes["type"] = other
+            return True
+        replacement = dialects.REPLACEABLE.get(element.tag)
+        if replacement is None:
+            return True
+        self.note(element, f"there is no {element.tag} `{type}` in Mitsuba 3", f"left out ({replacement})")
+        return False
+
+    # --- parameters ---------------------------------------------------------------------------------------------------
+
+    def _parameter(self, element: Element, owner: Element) -> None:
+        """Mend the name and the value of a parameter of `owner`."""
+        if owner.tag == "scene" and element.is_object:
+            # A name says nothing here, but of two objects with the same one Mitsuba drops the first.
+            element.attributes.pop("name", None)
+            return
+        self._name(element, owner)
+        value = element.attributes.get("value", "")
+        if element.tag == "spectrum" and "type" not in element.attributes and _is_colour(value):
+            self.note(element, "a <spectrum> of three numbers is unknown to Mitsuba 3", "read as <rgb>")
+            element.tag = "rgb"
+        elif element.tag == "rgb" and value.startswith("#"):
+            element.attributes["value"] = hexadecimal(element)
+            self.note(element, f"a colour cannot be written as {value} in Mitsuba 3", "read as three numbers")
+        elif element.tag == "string":
+            self._text(element, owner, value)
+
+    def _name(self, element: Element, owner: Element) -> None:
+        old, name = element.name, dialects.snake_case(element.name)
+        if owner.type == "diffuse" and name == "diffuse_reflectance":
+            name = "reflectance"
+        is_attribute = owner.tag == "shape" and old.startswith(
+            ("vertex_", "face_")
+        )  # of a mesh; its name is the user's
+        if name == old or is_attribute or any(name == other.name for other in owner.children):
+            return
+        element.attributes["name"] = name
+        if not element.source.is_old:
+            self.note(element, f"`{old}` is spelled as before Mitsuba 2", f"read as `{name}`")
+
+    def _text(self, element: Element, owner: Element, value: str) -> None:
+        other = dialects.VALUES.get((owner.type, element.name), {}).get(value)
+        if (owner.type, element.name) == ("hdrfilm", "pixel_format") and "," in value:
+            other = value.partition(",")[0].strip()  # one for each of several images
+        if element.name == "filename" and "\\" in value and not self._exists(value):
+            other = value.replace("\\", "/") if self._exists(value.replace("\\", "/")) else None
+        if other is not None:
+            element.attributes["value"] = other
+            self.note(element, f"{owner.type} has no {element.name} `{value}` in Mitsuba 3", f"read as `{other}`")
+
+    def _exists(self, file: str) -> bool:
+        return any(os.path.exists(folder / file) for folder in self.folders)
+
+    def _is_needless_format(self, element: Element, owner: Element) -> bool:
+        """Whether `element` asks `hdrfilm` for a format that it does not know: images are written without it."""
+        known = dialects.FORMATS.get(element.name)
+        value = element.attributes.get("value", "")
+        if owner.type != "hdrfilm" or known is None or element.tag != "string" or value.lower() in known:
+            return False
+        self.note(element, f"hdrfilm has no {element.name} `{value}` in Mitsuba 3", "left out")
+        return True
+
+    def _repetitions(self, owner: Element) -> None:
+        """Of parameters that are given more than once keep the last, as Mitsuba 0.6 did."""
+        last: dict[str, Element] = {}
+        for child in owner.children:
+            earlier = last.get(child.name) if child.name else None
+            if earlier is not None and (earlier.is_value or child.is_value):
+                self.note(earlier, f"`{child.name}` is given again in line {child.line}", "left out")
+                owner.children.remove(earlier)
+            last[child.name] = child
+
+    def _texture_scale(self, owner: Element) -> None:
+        """Write `uscale` and its like, which scale and shift texture coordinates, as the transform that they mean."""
+        names = [f"{axis}{what}" for what in ("offset", "scale") for axis in "uv"]
+        given = {child.name: child for child in owner.children if child.tag == "float" and child.name in names}
+        if not given or owner.tag != "texture":
+            return
+        first = next(iter(given.values()))
+        steps = []
+        for what, tag in (("offset", "translate"), ("scale", "scale")):
+            values = {
+                axis: given[name].attributes.get("value", "")
+                for axis, name in (("x", f"u{what}"), ("y", f"v{what}"))
+                if name in given
+            }
+            if values:
+                steps.append(Element(tag, values, first.source, first.line))
+        if not owner.source.is_old:
+            self.note(first, f"`{first.name}` is unknown to Mitsuba 3", "read as `to_uv`")
+        owner.children[:] = [child for child in owner.children if child not in given.values()]
+        owner.children.append(Element("transform", {"name": "to_uv"}, first.source, first.line, steps))
+
+
+def _is_colour(value: str) -> bool:
+    return ":" not in value and len(value.replace(",", " ").split()) == 3
