@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from reslrb_cli.cli.experiment import overrides_option, start_variant
-from reslrb_cli.cli.listing import parameter_lines, plan_lines, scene_lines, sensor_lines
+from reslrb_cli.cli.listing import LISTED_SENSORS, parameter_lines, plan_lines, scene_lines, sensor_lines
 from reslrb_cli.cli.offending import show_offenders, without_nan
 from reslrb_cli.cli.subject import Subject, read_subject
 from reslrb_cli.errors import ConfigError, UnsupportedScene
@@ -95,10 +95,13 @@ def command(
     click.echo(f"scene {config.scene.file}")
     for line in scene_lines(summary):
         click.echo(f"  {line}")
-    for sensor in summary.sensors:
+    sensors = summary.sensors if everything else summary.sensors[:LISTED_SENSORS]
+    for sensor in sensors:
         click.echo(f"sensor {sensor.index} ({sensor.id})")
         for line in sensor_lines(sensor):
             click.echo(f"  {line}")
+    if len(sensors) < len(summary.sensors):
+        click.echo(f"and {len(summary.sensors) - len(sensors)} more sensors; --all lists them")
     if plan is not None:
         click.echo("plan")
         for line in [f"none: {plan}"] if isinstance(plan, str) else plan_lines(plan):

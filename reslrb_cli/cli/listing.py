@@ -11,8 +11,8 @@ if TYPE_CHECKING:
     from reslrb_cli.integrators.plan_report import PlanReport
     from reslrb_cli.scene import ParameterInfo, SceneSummary, SensorSummary
 
-#: Parameters that can be recovered, and keys that one reason names, without `--all`.
-_LISTED, _NAMED = 40, 3
+#: Sensors, parameters that can be recovered, and keys that one reason names, without `--all`.
+LISTED_SENSORS, _LISTED, _NAMED = 3, 30, 3
 
 
 def scene_lines(summary: SceneSummary) -> list[str]:
@@ -87,11 +87,11 @@ def parameter_lines(infos: Sequence[ParameterInfo], wanted: Sequence[str], every
         return [*lines, f"others: {len(others)}", *(f"  {line}" for line in _columns(table))]
     if others:
         lines.append(f"others: {len(others)}; --all lists them")
-        lines += [f"  {line}" for line in _columns(_reasons(others))]
+        lines += [f"  {line}" for line in _reasons(others)]
     return lines
 
 
-def _reasons(others: Sequence[ParameterInfo]) -> list[tuple[str, str]]:
+def _reasons(others: Sequence[ParameterInfo]) -> list[str]:
     """How many there are with each reason; where the reason says what to do, with their keys."""
     groups: dict[str, list[str]] = {}
     for info in others:
@@ -99,11 +99,14 @@ def _reasons(others: Sequence[ParameterInfo]) -> list[tuple[str, str]]:
         reason = str(info.obstacle).partition(" (")[0]
         reason = reason if "; give" in reason else reason.partition(";")[0]
         groups.setdefault(reason, []).append(info.key)
-    rows = []
+    width = len(str(max(map(len, groups.values()))))
+    lines = []
     for reason, keys in sorted(groups.items(), key=lambda group: -len(group[1])):
-        more = f" and {len(keys) - _NAMED} more" if len(keys) > _NAMED else ""
-        rows.append((str(len(keys)), reason + (f": {', '.join(keys[:_NAMED])}{more}" if "; give" in reason else "")))
-    return rows
+        lines.append(f"{len(keys):{width}}  {reason}")
+        if "; give" in reason:
+            more = f" and {len(keys) - _NAMED} more" if len(keys) > _NAMED else ""
+            lines.append(f"{'':{width}}  ({', '.join(keys[:_NAMED])}{more})")
+    return lines
 
 
 def _columns(rows: Sequence[tuple[str, ...]]) -> list[str]:

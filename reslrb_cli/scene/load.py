@@ -31,7 +31,8 @@ def load_scene(file: Path, options: Mapping[str, Any] | None = None, strict: boo
     """
     file = Path(file)
     description = read_description(file, {name: _as_text(value) for name, value in (options or {}).items()})
-    found = [*name_objects(description.root), *mend(description)]
+    root = description.root
+    found = notes.in_order([*name_objects(root), *mend(description)], root)
     if strict:
         notes.refuse(found)
     check(description)
@@ -46,7 +47,9 @@ def load_scene(file: Path, options: Mapping[str, Any] | None = None, strict: boo
         raise ConfigError(file, "", "the scene has no emitters: no light path can start")
     if len(scene.sensors()) == 0:
         raise ConfigError(file, "", "the scene has no sensor")
-    for line in notes.warnings([*found, *unused]):
+    lost = {note.element for note in unused}  # what else was done to them says nothing
+    found = [note for note in found if note.element not in lost]
+    for line in notes.warnings(notes.in_order([*found, *unused], root)):
         _warn(line)
     loss = lost_light(scene)
     if loss is not None:

@@ -12,7 +12,7 @@ import mitsuba as mi
 
 from ...backend.plugins import likely_parameters, looking_in
 from ...errors import ConfigError
-from .element import Element
+from .element import Element, quoted
 from .including import Description
 from .notes import Note
 
@@ -21,6 +21,9 @@ _ORIGIN = re.compile(r"\[[\w.]+(:\d+)?\]\s*")
 #: "At string (line 3, col 7): " and the like, before the message proper.
 _PREAMBLE = re.compile(r"^(At|Error while loading|While loading) .*?\(line \d+, col \d+\):? ?")
 _PLACE = re.compile(r"\(line (\d+), col \d+\)")
+
+#: Parameters of one object for which names that are like theirs are looked for.
+_HINTS = 30
 
 
 def build(description: Description) -> tuple[Any, list[Note]]:
@@ -95,8 +98,10 @@ def _unused(props: mi.Properties, element: Element) -> list[Note]:
             child = unnamed[int(number[1])]
             notes.append(Note(child, f"{element.type} has no use for a <{child.tag}> in Mitsuba 3", "left out"))
         else:
-            near = difflib.get_close_matches(name, likely_parameters(element.type), n=1, cutoff=0.75)
+            likely = likely_parameters(element.type) if len(notes) < _HINTS else []
+            near = difflib.get_close_matches(name, likely, n=1, cutoff=0.75)
             hint = f" (did you mean `{near[0]}`?)" if near else ""
-            wrong = f"{element.type} has no parameter `{name}` in Mitsuba 3{hint}"
-            notes.append(Note(children.get(name, element), wrong, "left out"))
+            child = children.get(name, element)
+            wrong = f"{element.type} has no parameter {quoted(child.written or name)} in Mitsuba 3{hint}"
+            notes.append(Note(child, wrong, "left out"))
     return notes

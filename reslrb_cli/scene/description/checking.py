@@ -12,7 +12,7 @@ import mitsuba as mi
 from ...backend.plugins import is_known, nearest_plugin
 from ...errors import ConfigError
 from . import dialects
-from .element import Element
+from .element import Element, quoted
 from .including import Description
 from .reading import MAX_DEPTH
 
@@ -43,7 +43,7 @@ def _unknown_plugin(root: Element, element: Element) -> ConfigError:
         return element.fail("", f"{tag} `{type}` is a plugin of Mitsuba 0.6 that Mitsuba 3 does not have; {lost}{more}")
     near = nearest_plugin(type, _object_type(tag))
     hint = f"; did you mean `{near}`?" if near else "; only Mitsuba's own plugins are loaded"
-    return element.fail("", f"there is no {tag} {type[:60]!r} in Mitsuba 3{hint}{more}")
+    return element.fail("", f"there is no {tag} {quoted(type)} in Mitsuba 3{hint}{more}")
 
 
 def _object_type(tag: str) -> mi.ObjectType:

@@ -18,6 +18,15 @@ OBJECTS = frozenset(
 #: Elements that are values of parameters; a <spectrum> without a type is one, too.
 VALUES = frozenset(("float", "integer", "boolean", "string", "point", "vector", "rgb", "transform"))
 
+#: Characters of a quotation.
+_QUOTED = 60
+
+
+def quoted(text: str, mark: str = "`") -> str:
+    """What a file says, as it can stand in a message: not too long, and nothing in it that a terminal would obey."""
+    text = text if len(text) <= _QUOTED else text[: _QUOTED - 3] + "..."
+    return f"{mark}{text if text.isprintable() else repr(text)[1:-1]}{mark}"
+
 
 @dataclass(frozen=True)
 class Source:
@@ -34,13 +43,17 @@ class Source:
 
 @dataclass(slots=True, eq=False)
 class Element:
-    """One element, with its attributes and children in their order."""
+    """One element, with its attributes and children in their order.
+
+    `written` is its name as the file has it, where that is another.
+    """
 
     tag: str
     attributes: dict[str, str]
     source: Source
     line: int
     children: list[Element] = field(default_factory=list)
+    written: str = ""
 
     @property
     def place(self) -> str:

@@ -8,12 +8,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from ...errors import ConfigError
-from .element import Element
+from . import reading
+from .element import Element, quoted
 from .reading import MAX_DEPTH, read_document
 from .variables import Variables
 
-#: XML of all files of a scene together, each counted as often as it is included.
-MAX_BYTES = 64 * 2**20
 MAX_INCLUDES = 1000
 #: Includes within one another; that of Mitsuba's parser.
 MAX_INCLUDE_DEPTH = 15
@@ -48,7 +47,7 @@ class _Reader:
     """What the files of one scene share."""
 
     variables: Variables
-    bytes_left: int = MAX_BYTES
+    bytes_left: int = field(default_factory=lambda: reading.MAX_BYTES)
     includes: list[Path] = field(default_factory=list)
     including: list[Path] = field(default_factory=list)
 
@@ -103,7 +102,7 @@ class _Reader:
         here = [include.source.file.absolute().parent, *folders]
         file = _find(_required(include, "filename"), here)
         if not os.path.exists(file):
-            raise include.fail("", f"included file {include.attributes['filename']} not found")
+            raise include.fail("", f"included file {quoted(include.attributes['filename'])} not found")
         root = self.read(file, here, include, depth)
         if root.type == "scene":
             # Parameters of the included <scene> itself, and references right below it, are nobody's: so with Mitsuba.
@@ -130,5 +129,5 @@ def _folder(element: Element, folders: list[Path]) -> Path:
     name = _required(element, "value")
     folder = _find(name, [element.source.file.absolute().parent, *folders])
     if not folder.is_dir():
-        raise element.fail("", f"<path>: folder {name} not found")
+        raise element.fail("", f"<path>: folder {quoted(name)} not found")
     return folder.absolute()

@@ -8,7 +8,7 @@ from pathlib import Path
 from ...backend.plugins import is_known
 from . import dialects
 from .colours import hexadecimal, linear
-from .element import Element
+from .element import Element, quoted
 from .including import Description
 from .notes import Note
 
@@ -26,7 +26,7 @@ def mend(description: Description) -> list[Note]:
     root = description.root
     if root.source.version is None:
         given = root.attributes.get("version")
-        wrong = "the version is missing" if given is None else f"version {given!r} is not three numbers"
+        wrong = "the version is missing" if given is None else f"version {quoted(given)} is not three numbers"
         mender.note(root, wrong, f"taken for {CURRENT_VERSION}")
     mender.mend(root)
     root.attributes["version"] = CURRENT_VERSION
@@ -44,12 +44,13 @@ class _Mender:
     def mend(self, element: Element) -> None:
         """Mend all below `element`, which is mended itself."""
         kept = []
+        names = {child.name for child in element.children}
         for child in element.children:
             if child.tag == "integrator":  # the experiment's own takes its place
                 continue
             if self._element(child) and (not child.is_object or self._plugin(child)):
                 if element.is_object:
-                    self._parameter(child, element)
+                    self._parameter(child, element, names)
                 if not self._is_needless_format(child, element):
                     kept.append(child)
         element.children[:] = kept
@@ -68,17 +69,17 @@ class _Mender:
             element.attributes["value"] = linear(element)
         if tag in dialects.ELEMENTS:
             element.tag = dialects.ELEMENTS[tag]
-            self.note(element, f"<{tag}> is unknown to Mitsuba 3", f"read as <{element.tag}>")
+            self.note(element, f"{quoted(f'<{tag}>')} is unknown to Mitsuba 3", f"read as <{element.tag}>")
         known = dialects.ATTRIBUTES.get(element.tag)
         if element.is_object:
             known = dialects.OBJECT_ATTRIBUTES
         if known is None:
             if tag in dialects.LOST_ELEMENTS:
                 raise element.fail("", f"<{tag}> is {dialects.LOST_ELEMENTS[tag]}")
-            self.note(element, f"<{tag}> is unknown to Mitsuba 3", "left out")
+            self.note(element, f"{quoted(f'<{tag}>')} is unknown to Mitsuba 3", "left out")
             return False
         for attribute in [name for name in element.attributes if name not in known]:
-            self.note(element, f"<{tag}> has no attribute `{attribute}` in Mitsuba 3", "left out")
+            self.note(element, f"<{tag}> has no attribute {quoted(attribute)} in Mitsuba 3", "left out")
             del element.attributes[attribute]
         return True
 
@@ -89,46 +90,46 @@ class _Mender:
             return True
         other = dialects.PLUGINS.get((element.tag, type), type.lower())
         if is_known(other):
-            self.note(element, f"there is no {element.tag} `{type}` in Mitsuba 3", f"read as `{other}`")
+            self.note(element, f"there is no {element.tag} {quoted(type)} in Mitsuba 3", f"read as `{other}`")
             element.attributes["type"] = other
             return True
         replacement = dialects.REPLACEABLE.get(element.tag)
         if replacement is None:
             return True
-        self.note(element, f"there is no {element.tag} `{type}` in Mitsuba 3", f"left out ({replacement})")
+        self.note(element, f"there is no {element.tag} {quoted(type)} in Mitsuba 3", f"left out ({replacement})")
         return False
 
     # --- parameters ---------------------------------------------------------------------------------------------------
 
-    def _parameter(self, element: Element, owner: Element) -> None:
-        """Mend the name and the value of a parameter of `owner`."""
+    def _parameter(self, element: Element, owner: Element, names: set[str]) -> None:
+        """Mend the name and the value of a parameter of `owner`, whose parameters have these `names`."""
         if owner.tag == "scene" and element.is_object:
             # A name says nothing here, but of two objects with the same one Mitsuba drops the first.
             element.attributes.pop("name", None)
             return
-        self._name(element, owner)
+        self._name(element, owner, names)
         value = element.attributes.get("value", "")
         if element.tag == "spectrum" and "type" not in element.attributes and _is_colour(value):
             self.note(element, "a <spectrum> of three numbers is unknown to Mitsuba 3", "read as <rgb>")
             element.tag = "rgb"
         elif element.tag == "rgb" and value.startswith("#"):
             element.attributes["value"] = hexadecimal(element)
-            self.note(element, f"a colour cannot be written as {value} in Mitsuba 3", "read as three numbers")
+            self.note(element, f"a colour cannot be written as {quoted(value)} in Mitsuba 3", "read as three numbers")
         elif element.tag == "string":
             self._text(element, owner, value)
 
-    def _name(self, element: Element, owner: Element) -> None:
+    def _name(self, element: Element, owner: Element, names: set[str]) -> None:
         old, name = element.name, dialects.snake_case(element.name)
         if owner.type == "diffuse" and name == "diffuse_reflectance":
             name = "reflectance"
         is_attribute = owner.tag == "shape" and old.startswith(
             ("vertex_", "face_")
         )  # of a mesh; its name is the user's
-        if name == old or is_attribute or any(name == other.name for other in owner.children):
+        if name == old or is_attribute or name in names:
             return
-        element.attributes["name"] = name
+        element.attributes["name"], element.written = name, old
         if not element.source.is_old:
-            self.note(element, f"`{old}` is spelled as before Mitsuba 2", f"read as `{name}`")
+            self.note(element, f"{quoted(old)} is spelled as before Mitsuba 2", f"read as {quoted(name)}")
 
     def _text(self, element: Element, owner: Element, value: str) -> None:
         other = dialects.VALUES.get((owner.type, element.name), {}).get(value)
@@ -138,7 +139,9 @@ class _Mender:
             other = value.replace("\\", "/") if self._exists(value.replace("\\", "/")) else None
         if other is not None:
             element.attributes["value"] = other
-            self.note(element, f"{owner.type} has no {element.name} `{value}` in Mitsuba 3", f"read as `{other}`")
+            self.note(
+                element, f"{owner.type} has no {element.name} {quoted(value)} in Mitsuba 3", f"read as {quoted(other)}"
+            )
 
     def _exists(self, file: str) -> bool:
         return any(os.path.exists(folder / file) for folder in self.folders)
@@ -149,18 +152,20 @@ class _Mender:
         value = element.attributes.get("value", "")
         if owner.type != "hdrfilm" or known is None or element.tag != "string" or value.lower() in known:
             return False
-        self.note(element, f"hdrfilm has no {element.name} `{value}` in Mitsuba 3", "left out")
+        self.note(element, f"hdrfilm has no {element.name} {quoted(value)} in Mitsuba 3", "left out")
         return True
 
     def _repetitions(self, owner: Element) -> None:
         """Of parameters that are given more than once keep the last, as Mitsuba 0.6 did."""
         last: dict[str, Element] = {}
+        dropped: set[Element] = set()
         for child in owner.children:
             earlier = last.get(child.name) if child.name else None
             if earlier is not None and (earlier.is_value or child.is_value):
-                self.note(earlier, f"`{child.name}` is given again in line {child.line}", "left out")
-                owner.children.remove(earlier)
+                self.note(earlier, f"{quoted(child.name)} is given again in line {child.line}", "left out")
+                dropped.add(earlier)
             last[child.name] = child
+        owner.children[:] = [child for child in owner.children if child not in dropped]
 
     def _texture_scale(self, owner: Element) -> None:
         """Write `uscale` and its like, which scale and shift texture coordinates, as the transform that they mean."""

@@ -7,20 +7,24 @@ from __future__ import annotations
 
 from collections import Counter
 
-from .element import Element
+from .element import Element, quoted
 from .notes import Note
 
 #: Plugins that name what they hold by its place among the others, in every load alike.
 _GROUPS = ("shapegroup", "batch")
+#: How the ids begin that Mitsuba gives to objects without one when it writes a scene; it takes them for none.
+_UNNAMED = "_unnamed_"
+#: Characters of an id that is kept: keys become names of files.
+_LONGEST = 120
 
 
 def name_objects(root: Element) -> list[Note]:
     """Give every object below `root` an id that is there in every load of the same files; say whose ids were changed.
 
     The third `sphere` of the files becomes `Sphere_3`, whether or not the first two have ids. An id that Mitsuba could
-    not use in a key is replaced: one that is empty, or starts with `_unnamed_` (as Mitsuba itself writes), or holds
-    what cannot be printed, or stands at an earlier object already. References follow. Raises ConfigError where a
-    reference is to an id of two objects that differ.
+    not use in a key is replaced: one that is empty, starts with `_unnamed_`, is very long or holds what cannot be
+    printed, or is that of an earlier object. References follow. Raises ConfigError where a reference is to an id of two
+    objects that differ.
     """
     root.attributes.pop("id", None)
     objects = root.objects()[1:]
@@ -32,7 +36,8 @@ def name_objects(root: Element) -> list[Note]:
     notes: list[Note] = []
     numbers: Counter[str] = Counter()
     for element in objects:
-        numbers[element.type] += 1
+        kind = element.type[:1].upper() + element.type[1:]
+        numbers[kind] += 1
         own = element.attributes.get("id", "")
         if own in owners:
             doubled.setdefault(own, []).append(element)
@@ -41,23 +46,29 @@ def name_objects(root: Element) -> list[Note]:
             continue
         elif element in grouped and not own:
             continue
-        name = _free(f"{element.type[:1].upper()}{element.type[1:]}_{numbers[element.type]}", taken)
+        name = _free(f"{kind}_{numbers[kind]}", taken)
         taken.add(name)
         element.attributes["id"] = name
         if own in owners:
-            notes.append(Note(element, f"id {own!r} is that of line {owners[own].line}, too", f"named {name}"))
+            notes.append(Note(element, f"id {quoted(own)} is that of {owners[own].place}, too", f"named {name}"))
         elif own.strip() and own not in renamed:
             renamed[own] = name
-            if not own.isprintable():
-                notes.append(Note(element, f"id {own!r} cannot be printed", f"named {name}"))
+            if not own.startswith(_UNNAMED):
+                notes.append(Note(element, f"id {quoted(own)} cannot stand in a key", f"named {name}"))
+    differing = {own: other for own, others in doubled.items() for other in others if not _same(owners[own], other)}
     for element in root.walk():
-        if element.tag in ("ref", "alias") and "id" in element.attributes:
-            _follow(element, owners, doubled, renamed)
+        own = element.attributes.get("id", "")
+        if element.tag in ("ref", "alias"):
+            if own in differing:
+                places = f"{owners[own].place} and {differing[own].place}"
+                raise element.fail("", f"refers to {quoted(own)}, the id of two objects ({places}); rename one of them")
+            if own in renamed:
+                element.attributes["id"] = renamed[own]
     return notes
 
 
 def _is_usable(own: str) -> bool:
-    return own.strip() != "" and own.isprintable() and not own.startswith("_unnamed_")
+    return own.strip() != "" and own.isprintable() and len(own) <= _LONGEST and not own.startswith(_UNNAMED)
 
 
 def _free(name: str, taken: set[str]) -> str:
@@ -67,17 +78,6 @@ def _free(name: str, taken: set[str]) -> str:
         number += 1
         free = f"{name}_{number}"
     return free
-
-
-def _follow(
-    reference: Element, owners: dict[str, Element], doubled: dict[str, list[Element]], renamed: dict[str, str]
-) -> None:
-    own = reference.attributes["id"]
-    for other in doubled.get(own, []):
-        if not _same(owners[own], other):
-            places = f"{owners[own].place} and {other.place}"
-            raise reference.fail("", f"refers to {own!r}, the id of two objects ({places}); rename one of them")
-    reference.attributes["id"] = renamed.get(own, own)
 
 
 def _same(a: Element, b: Element) -> bool:

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 from ...errors import ConfigError
 from .element import Element
 
-#: Lines that one warning names.
-_LINES = 5
+#: Lines that one warning names, and warnings of one scene.
+_LINES, _WARNINGS = 5, 30
 
 
 @dataclass(frozen=True)
@@ -19,6 +19,15 @@ class Note:
     element: Element
     wrong: str
     done: str
+
+
+def in_order(notes: Iterable[Note], root: Element) -> list[Note]:
+    """The notes in the order of lines, those on the file of `root` first."""
+    return sorted(notes, key=lambda note: (note.element.source != root.source, *_place(note)))
+
+
+def _place(note: Note) -> tuple[str, int]:
+    return str(note.element.source.file), note.element.line
 
 
 def warnings(notes: Sequence[Note]) -> list[str]:
@@ -31,6 +40,12 @@ def warnings(notes: Sequence[Note]) -> list[str]:
         others = list(dict.fromkeys(element.line for element in elements[1:]))
         more = ", ".join(map(str, others[:_LINES])) + (f" and {len(others) - _LINES} more" * (len(others) > _LINES))
         lines.append(f"{elements[0].place}: {wrong}: {done}" + (f" (also in line {more})" if others else ""))
+    if len(lines) > _WARNINGS:
+        rest = len(lines) - _WARNINGS
+        lines = [
+            *lines[:_WARNINGS],
+            f"{notes[0].element.source.file}: {rest} more kinds of things were mended or left out",
+        ]
     return lines
 
 

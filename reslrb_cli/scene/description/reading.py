@@ -11,6 +11,8 @@ from xml.parsers import expat
 from ...errors import ConfigError
 from .element import Element, Source
 
+#: XML of all files of a scene together, each counted as often as it is included.
+MAX_BYTES = 64 * 2**20
 #: Elements within one another. Mitsuba's parser calls itself for each level, until the stack is full.
 MAX_DEPTH = 100
 
@@ -40,7 +42,7 @@ def _read(file: Path, max_bytes: int) -> bytes:
             raise ConfigError(file, "", "is no regular file, and cannot be a Mitsuba scene file (XML)")
         if info.st_size > max_bytes:
             raise ConfigError(
-                file, "", f"has {info.st_size >> 20} MiB; a scene may have {max_bytes >> 20} MiB of XML, with includes"
+                file, "", f"is too large: a scene may have {MAX_BYTES >> 20} MiB of XML, with all that it includes"
             )
         with file.open("rb") as opened:
             return opened.read(max_bytes)
