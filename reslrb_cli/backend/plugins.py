@@ -46,13 +46,12 @@ def _is_registered(name: str) -> bool:
     """Whether Python has registered a plugin of that name for the variant that is set."""
     import mitsuba as mi
 
-    # Mitsuba can be asked only in a way that makes it load a library of that name where it finds one: in the folders of
-    # its resolver, which here has none, and in the working folder.
+    # Mitsuba can be asked only in a way that makes it load a library of that name where it finds one. A new resolver
+    # looks in the working folder alone.
     if re.fullmatch(r"[\w-]+", name) is None or any(Path("plugins").glob(f"{name}.*")):
         return False
-    before, nowhere = mi.file_resolver(), mi.FileResolver()
-    nowhere.clear()
-    mi.set_file_resolver(nowhere)
+    before = mi.file_resolver()
+    mi.set_file_resolver(mi.FileResolver())
     try:
         mi.PluginManager.instance().create_object(mi.Properties(name))
     except Exception as error:

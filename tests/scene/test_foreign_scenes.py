@@ -71,11 +71,12 @@ def test_what_is_loaded_is_what_mitsuba_loads(file):
 
 
 OLD = """<scene version="0.6.0">
-<default name="angle" value="30"/><default name="width" value="8"/>
+<default name="angle" value="30"/><default name="width" value="8"/><default name="w" value="9"/>
+<bsdf type="diffuse" id="costs \\$5"/>
 <include filename="parts/materials.xml"/>
 <sensor type="perspective"><float name="fov" value="$angle"/><string name="fovAxis" value="smaller"/>
 <transform name="toWorld"><lookat origin="0,0,4" target="0,0,0" up="0,1,0"/></transform>
-<film type="hdrfilm"><integer name="width" value="$width"/><integer name="height" value="${$}width"/></film></sensor>
+<film type="hdrfilm"><integer name="width" value="$width"/><integer name="height" value="$width"/></film></sensor>
 <emitter type="constant"/><path value="parts"/>
 <bsdf type="roughplastic" id="floor"><float name="intIOR" value="1.4"/>
 <texture type="bitmap" name="diffuseReflectance"><string name="filename" value="t.exr"/>
@@ -83,14 +84,16 @@ OLD = """<scene version="0.6.0">
 <alias id="shiny" as="mirror"/>
 <shape type="rectangle"><ref id="floor"/></shape><shape type="sphere"><ref name="bsdf" id="mirror"/></shape>
 <shape type="sphere"><boolean name="flipNormals" value="true"/><include filename="bsdf.xml" name="bsdf"/></shape>
-</scene>""".replace("${$}", "$")
+</scene>"""
 
 
 def test_variables_includes_and_folders_are_mitsubas(tmp_path):
     import mitsuba as mi
 
     (tmp_path / "parts").mkdir()
-    mi.Bitmap(np.linspace(0, 1, 48, dtype=np.float32).reshape(4, 4, 3)).write(str(tmp_path / "parts" / "t.exr"))
+    for factor, folder in ((1, "parts"), (0.5, ".")):
+        texels = factor * np.linspace(0, 1, 48, dtype=np.float32).reshape(4, 4, 3)
+        mi.Bitmap(texels).write(str(tmp_path / folder / "t.exr"))
     (tmp_path / "parts" / "materials.xml").write_text(
         '<scene version="2.0.0"><default name="rough" value="0.$digit"/>\n<bsdf type="roughconductor" id="shiny">'
         '<float name="alpha" value="$rough"/><string name="material" value="none"/></bsdf></scene>'

@@ -56,6 +56,11 @@ def growing() -> str:
             2,
             "objects use one another in a circle: a uses b uses a",
         ),
+        (
+            HEAD + "<alias id='a' as='c'/><bsdf type='twosided' id='a'>\n<ref id='c'/></bsdf></scene>",
+            2,
+            "objects use one another in a circle: a uses a",
+        ),
         (entities(), 2, "declares an XML entity"),
         ('<!DOCTYPE s [<!ENTITY e SYSTEM "file:///etc/passwd">]>\n<scene/>', 1, "declares an XML entity"),
         (growing(), 6, "$v3: makes a text of more than 1048576 characters"),
