@@ -72,12 +72,19 @@ def likely_parameters(name: str) -> list[str]:
 
 def nearest_plugin(name: str, type: mi.ObjectType) -> str | None:
     """The plugin of that type whose name is most like `name`, if any is."""
+    near = difflib.get_close_matches(name.lower(), sorted(shipped_plugins()), n=5)
+    return next((candidate for candidate in near if plugin_type(candidate) == type), None)
+
+
+@functools.cache
+def plugin_type(name: str) -> mi.ObjectType:
+    """What a plugin makes; `Unknown` for one that has not been shipped."""
     import mitsuba as mi
 
-    near = difflib.get_close_matches(name.lower(), sorted(shipped_plugins()), n=5)
-    with looking_in([]):  # to learn the type of a plugin, Mitsuba loads it
-        manager = mi.PluginManager.instance()
-        return next((candidate for candidate in near if manager.plugin_type(candidate) == type), None)
+    if name not in shipped_plugins() - _BUILT_IN:
+        return mi.ObjectType.Unknown
+    with looking_in([]):  # Mitsuba loads it to learn that
+        return mi.PluginManager.instance().plugin_type(name)
 
 
 def prefer_own_plugins() -> None:

@@ -99,11 +99,10 @@ def current_value(params: Any, key: str) -> Value | None:
         return None
     if array.dtype.kind not in "buif" or array.size == 0:
         return None
-    array = array.astype(np.float64)
     columns = halo(params.properties[key][2], value)
     array = array[:, columns : array.shape[1] - columns] if columns else array
     numbers = [float(number) for number in array.ravel()] if array.size <= _FEW else None
-    return Value(numbers, float(array.mean()), float(array.min()), float(array.max()))
+    return Value(numbers, float(array.mean(dtype=np.float64)), float(array.min()), float(array.max()))
 
 
 def _value(params: Any, key: str) -> Any:

@@ -129,6 +129,16 @@ def test_keys_are_the_same_from_inspect_to_the_page(folder, name):
     assert all(chosen[0] in page for page in pages[:2])
 
 
+def test_strict_refuses_what_is_mended(folder, capsys):
+    for setting, code in (("false", 0), ("true", 2)):
+        with pytest.raises(SystemExit) as end:
+            main.main(["inspect", "corner.xml", "--set", f"scene.strict={setting}"])
+        assert end.value.code == code
+        said = capsys.readouterr().err.splitlines()[1:]
+        assert said[0].startswith(f"{folder}/corner.xml:3: there is no sampler `halton` in Mitsuba 3")
+        assert len(said) == (1 if code else 5)
+
+
 @pytest.mark.long
 def test_the_other_commands_know_the_names(folder):
     key = "Sphere_2.emitter.radiance.value"

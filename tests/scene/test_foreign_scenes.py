@@ -117,6 +117,12 @@ def test_any_name_is_a_variable(tmp_path, name):
 MENDED = [
     ("head", "<scene>", "the version is missing: taken for 3.0.0"),
     ("head", '<scene version="3">', "version `3` is not three numbers: taken for 3.0.0"),
+    ("head", '<scene version="3.0.0" xmlns="x">', "<scene> has no attribute `xmlns` in Mitsuba 3: left out"),
+    (
+        "light",
+        PARTS["light"].replace("<emitter", '<emitter version="3.0.0"'),
+        "<emitter> has no attribute `version` in Mitsuba 3: left out",
+    ),
     ("pose", PARTS["pose"].replace("lookat", "lookAt"), "`<lookAt>` is unknown to Mitsuba 3: read as <lookat>"),
     ("pose", PARTS["pose"].replace("to_w", "toW"), "`toWorld` is spelled as before Mitsuba 2: read as `to_world`"),
     ("film", PARTS["film"].replace("hdr", "ldr"), "there is no film `ldrfilm` in Mitsuba 3: read as `hdrfilm`"),
@@ -228,6 +234,16 @@ def test_the_scenes_own_integrator_is_not_loaded(tmp_path, caplog):
     file = write(tmp_path, integrator='<integrator type="guided_path"><integrator type="nonsense"/></integrator>')
     assert load_scene(file, strict=True).integrator() is None
     assert not caplog.records
+
+
+def test_references_to_what_is_left_out_are_left_out(tmp_path, caplog):
+    points, own = (
+        '<sampler type="halton" id="points"/>',
+        '<integrator type="x"><sampler type="stratified" id="own"/></integrator>',
+    )
+    load_scene(write(tmp_path, integrator=points + own, sampler='<ref id="points"/>'))
+    load_scene(write(tmp_path, integrator=own, sampler='<ref id="own"/>'))
+    assert len(caplog.records) == 1
 
 
 def test_objects_of_one_name_are_all_there(tmp_path):

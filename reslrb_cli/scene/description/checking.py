@@ -9,13 +9,16 @@ from pathlib import Path
 
 import mitsuba as mi
 
-from ...backend.plugins import is_known, nearest_plugin
+from ...backend.plugins import is_known, nearest_plugin, plugin_type
 from ...errors import ConfigError
 from . import dialects
 from .element import Element, quoted
 from .including import Description
 from .reading import MAX_DEPTH
 
+#: Parameters without which a plugin reads memory that is not its own.
+_NEEDED = {"bitmap": "filename", "normalmap": "normalmap"}
+_VECTORS = ("point", "vector", "translate", "scale", "rotate")
 #: Lines, or objects, that one message names.
 _SHOWN = 5
 
@@ -23,11 +26,41 @@ _SHOWN = 5
 def check(description: Description) -> None:
     """Raise ConfigError, located by file and line, for what must not reach Mitsuba's parser."""
     for element in description.root.walk():
-        if element.is_object and not is_known(element.type):
-            raise _unknown_plugin(description.root, element)
+        if element.is_object:
+            if not is_known(element.type):
+                raise _unknown_plugin(description.root, element)
+            _check_kind(element)
+            _check_needed(element)
+        elif element.tag in _VECTORS:
+            _check_vector(element)
         if element.tag == "string" and element.name == "filename":
             _check_regular(element, description.folders)
     _check_chains(description.root)
+
+
+def _check_kind(element: Element) -> None:
+    """Refuse a plugin that is not what its element says."""
+    type = plugin_type(element.type)
+    if type not in (mi.ObjectType.Unknown, _object_type(element.tag)):
+        raise element.fail("", f"{quoted(element.type)} is no {element.tag}")
+
+
+def _check_needed(element: Element) -> None:
+    """Refuse an object without what Mitsuba takes to be there, and reads memory that is not its own."""
+    name = _NEEDED.get(element.type)
+    if name is not None and not any(child.name == name for child in element.children):
+        raise element.fail("", f"{element.type} needs a parameter `{name}`")
+    if element.type == "blendbsdf" and sum(child.tag in ("bsdf", "ref") for child in element.children) < 2:
+        raise element.fail("", "blendbsdf needs two BSDFs")
+
+
+def _check_vector(element: Element) -> None:
+    """Refuse a vector that is given in two ways, or by a number of numbers; Mitsuba would not say where."""
+    if "value" in element.attributes:
+        if any(axis in element.attributes for axis in "xyz"):
+            raise element.fail("", f"<{element.tag}> can have `value` or x, y and z, not both")
+        if len(element.attributes["value"].replace(",", " ").split()) not in (1, 3):
+            raise element.fail("", f"<{element.tag}> needs one or three numbers in `value`")
 
 
 def _unknown_plugin(root: Element, element: Element) -> ConfigError:

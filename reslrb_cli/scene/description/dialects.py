@@ -28,7 +28,7 @@ ATTRIBUTES = {
     "lookat": ("origin", "target", "up"),
     "matrix": ("value",),
 }
-OBJECT_ATTRIBUTES = ("type", "id", "name", "version")
+OBJECT_ATTRIBUTES = ("type", "id", "name")
 
 #: Plugins by other names, for elements of one kind.
 PLUGINS = {

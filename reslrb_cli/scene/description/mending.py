@@ -28,7 +28,7 @@ def mend(description: Description) -> list[Note]:
         given = root.attributes.get("version")
         wrong = "the version is missing" if given is None else f"version {quoted(given)} is not three numbers"
         mender.note(root, wrong, f"taken for {CURRENT_VERSION}")
-    mender.mend(root)
+    mender.mend_root(root)
     root.attributes["version"] = CURRENT_VERSION
     return mender.notes
 
@@ -37,28 +37,47 @@ class _Mender:
     def __init__(self, folders: list[Path]) -> None:
         self.folders = folders
         self.notes: list[Note] = []
+        self.gone: set[str] = set()
 
     def note(self, element: Element, wrong: str, done: str) -> None:
         self.notes.append(Note(element, wrong, done))
+
+    def mend_root(self, root: Element) -> None:
+        """Mend the whole scene."""
+        root.attributes.pop("version", None)
+        if root.is_object:
+            self._element(root)
+        self.mend(root)
+        # What refers to something that was left out goes with it.
+        for element in root.walk() if self.gone else ():
+            element.children[:] = [
+                child for child in element.children if child.tag != "ref" or child.attributes.get("id") not in self.gone
+            ]
 
     def mend(self, element: Element) -> None:
         """Mend all below `element`, which is mended itself."""
         kept = []
         names = {child.name for child in element.children}
         for child in element.children:
-            if child.tag == "integrator":  # the experiment's own takes its place
-                continue
-            if self._element(child) and (not child.is_object or self._plugin(child)):
+            if self._is_kept(child):
                 if element.is_object:
                     self._parameter(child, element, names)
                 if not self._is_needless_format(child, element):
                     kept.append(child)
+            else:
+                self.gone.update(other.attributes.get("id", "") for other in child.walk() if other.is_object)
         element.children[:] = kept
         if element.is_object:
             self._repetitions(element)
             self._texture_scale(element)
         for child in element.children:
             self.mend(child)
+
+    def _is_kept(self, element: Element) -> bool:
+        """Mend an element and its plugin; False where it is to be left out."""
+        if element.tag == "integrator":  # the experiment's own takes its place
+            return False
+        return self._element(element) and (not element.is_object or self._plugin(element))
 
     # --- elements and plugins -----------------------------------------------------------------------------------------
 
