@@ -223,6 +223,14 @@ def test_one_line_for_one_kind_of_thing(tmp_path, caplog):
     assert record.getMessage() == f"{file}:11: {said}"
 
 
+def test_scaled_texture_coordinates(tmp_path, caplog):
+    texture = '<texture type="checkerboard" name="reflectance"><float name="uscale" value="3"/></texture>'
+    file = write(tmp_path, paint=f'<bsdf type="diffuse" id="paint">{texture}</bsdf>')
+    assert values(load_scene(file))["paint.reflectance.to_uv"].ravel()[[0, 4]].tolist() == [3, 1]
+    [record] = caplog.records
+    assert record.getMessage() == f"{file}:10: `uscale` is unknown to Mitsuba 3: read as `to_uv`"
+
+
 def test_colours_in_hexadecimal(tmp_path):
     file = write(tmp_path, paint=PARTS["paint"].replace("0.5, 0.25, 1", "#80ff00"))
     np.testing.assert_allclose(

@@ -8,19 +8,20 @@ from pathlib import Path
 from ...backend.plugins import is_known
 from . import dialects
 from .colours import hexadecimal, linear
+from .coordinates import transform_coordinates
 from .element import Element, quoted
 from .including import Description
 from .notes import Note
 
 CURRENT_VERSION = "3.0.0"
-TRANSFORMS = frozenset(("translate", "scale", "rotate", "lookat", "matrix"))
 
 
 def mend(description: Description) -> list[Note]:
     """Bring the elements of a scene to Mitsuba 3's spelling, in place; say what its parser would have refused.
 
     What Mitsuba itself upgrades, in files of before version 2, is brought over without a word. Materials, lights and
-    shapes keep their meaning or are refused elsewhere; what is left out is what makes no difference to light.
+    shapes keep their meaning: those that Mitsuba 3 does not have stay as they are, to be refused. Parameters that no
+    plugin asks for show only when the scene is built.
     """
     mender = _Mender(description.folders)
     root = description.root
@@ -69,7 +70,7 @@ class _Mender:
         element.children[:] = kept
         if element.is_object:
             self._repetitions(element)
-            self._texture_scale(element)
+            self._texture_coordinates(element)
         for child in element.children:
             self.mend(child)
 
@@ -141,9 +142,8 @@ class _Mender:
         old, name = element.name, dialects.snake_case(element.name)
         if owner.type == "diffuse" and name == "diffuse_reflectance":
             name = "reflectance"
-        is_attribute = owner.tag == "shape" and old.startswith(
-            ("vertex_", "face_")
-        )  # of a mesh; its name is the user's
+        # An attribute of a mesh has a name of the user's own.
+        is_attribute = owner.tag == "shape" and old.startswith(("vertex_", "face_"))
         if name == old or is_attribute or name in names:
             return
         element.attributes["name"], element.written = name, old
@@ -154,13 +154,13 @@ class _Mender:
         other = dialects.VALUES.get((owner.type, element.name), {}).get(value)
         if (owner.type, element.name) == ("hdrfilm", "pixel_format") and "," in value:
             other = value.partition(",")[0].strip()  # one for each of several images
-        if element.name == "filename" and "\\" in value and not self._exists(value):
-            other = value.replace("\\", "/") if self._exists(value.replace("\\", "/")) else None
+        wrong = f"{owner.type} has no {element.name} {quoted(value)} in Mitsuba 3"
+        slashed = value.replace("\\", "/")
+        if element.name == "filename" and slashed != value and not self._exists(value) and self._exists(slashed):
+            other, wrong = slashed, f"there is no file {quoted(value)}"
         if other is not None:
             element.attributes["value"] = other
-            self.note(
-                element, f"{owner.type} has no {element.name} {quoted(value)} in Mitsuba 3", f"read as {quoted(other)}"
-            )
+            self.note(element, wrong, f"read as {quoted(other)}")
 
     def _exists(self, file: str) -> bool:
         return any(os.path.exists(folder / file) for folder in self.folders)
@@ -186,26 +186,10 @@ class _Mender:
             last[child.name] = child
         owner.children[:] = [child for child in owner.children if child not in dropped]
 
-    def _texture_scale(self, owner: Element) -> None:
-        """Write `uscale` and its like, which scale and shift texture coordinates, as the transform that they mean."""
-        names = [f"{axis}{what}" for what in ("offset", "scale") for axis in "uv"]
-        given = {child.name: child for child in owner.children if child.tag == "float" and child.name in names}
-        if not given or owner.tag != "texture":
-            return
-        first = next(iter(given.values()))
-        steps = []
-        for what, tag in (("offset", "translate"), ("scale", "scale")):
-            values = {
-                axis: given[name].attributes.get("value", "")
-                for axis, name in (("x", f"u{what}"), ("y", f"v{what}"))
-                if name in given
-            }
-            if values:
-                steps.append(Element(tag, values, first.source, first.line))
-        if not owner.source.is_old:
-            self.note(first, f"`{first.name}` is unknown to Mitsuba 3", "read as `to_uv`")
-        owner.children[:] = [child for child in owner.children if child not in given.values()]
-        owner.children.append(Element("transform", {"name": "to_uv"}, first.source, first.line, steps))
+    def _texture_coordinates(self, owner: Element) -> None:
+        replaced = transform_coordinates(owner) if owner.tag == "texture" else None
+        if replaced is not None and not owner.source.is_old:
+            self.note(replaced, f"`{replaced.name}` is unknown to Mitsuba 3", "read as `to_uv`")
 
 
 def _is_colour(value: str) -> bool:
