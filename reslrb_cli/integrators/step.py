@@ -41,10 +41,19 @@ class StepResult:
 def make_integrator(type: str, **options: Any) -> Any:
     """An integrator by its plugin's name and options: `reslrb`, `walk_ad`, or a stock one such as `ptracer`, `prb`.
 
-    An option that is None is left out: Mitsuba's parser would end the process.
+    An option that is None is left out: Mitsuba would end the process. Raises ValueError for one that is unknown.
     """
     register()
-    return mi.load_dict({"type": type} | {name: value for name, value in options.items() if value is not None})
+    properties = mi.Properties(type)
+    for name, value in options.items():
+        if value is not None:
+            properties[name] = value
+    # `mi.load_dict` would look for a library `plugins/prb.so`, and so run one that lies in the working folder: it does
+    # not know of plugins that are written in Python.
+    integrator = mi.PluginManager.instance().create_object(properties)
+    if properties.unqueried():
+        raise ValueError(f"{type} has no option {', '.join(properties.unqueried())}")
+    return integrator
 
 
 def render_image(integrator: Any, scene: Any, sensor: Any, seed: int, spp: int) -> Any:
