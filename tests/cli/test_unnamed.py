@@ -126,7 +126,7 @@ def test_keys_are_the_same_from_inspect_to_the_page(folder, name):
             assert json.loads((run / "parameters" / "true" / "parameters.json").read_text()).keys() == set(chosen)
         pages.append((run / "report.html").read_text())
     assert not any("object_" in page for page in pages)
-    assert all(chosen[0] in page for page in pages[:2])
+    assert all(chosen[0] in page.replace("<wbr>", "") for page in pages)
 
 
 def test_strict_refuses_what_is_mended(folder, capsys):
