@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from reslrb_cli.cli.experiment import check_writable, optional_experiment_arguments
+from reslrb_cli.cli.output import echo
 from reslrb_cli.errors import ConfigError, ExitCode
 
 if TYPE_CHECKING:
@@ -103,15 +104,15 @@ def command(
         budget_s=budget,
     )
     sweep.check()
-    click.echo(f"{device_name(variant)}, {variant}")
-    click.echo(_conditions(config, sweep))
+    echo(f"{device_name(variant)}, {variant}")
+    echo(_conditions(config, sweep))
     results, interrupted = _run(sweep, json_file)
     if plot_file is not None and results:
         from reslrb_cli.report.bench_plot import plot_bench
 
         series = [(case.label, [r.record for r in results if r.case == case]) for case in cases]
         plot_bench(series, plot_file, f"{device_name(variant)}\n{_conditions(config, sweep)}")
-        click.echo(f"look at {os.path.relpath(plot_file)}")
+        echo(f"look at {os.path.relpath(plot_file)}")
     return ExitCode.INTERRUPTED if interrupted else _exit_code(results)
 
 
@@ -128,17 +129,17 @@ def _run(sweep: Sweep, json_file: Path | None) -> tuple[list[Result], bool]:
     with ExitStack() as stack:
         writer = None if json_file is None else stack.enter_context(BenchWriter(json_file))
         interrupts = stack.enter_context(Interrupts())
-        click.echo(table_head(labels))
+        echo(table_head(labels))
         for rows in bench(sweep, lambda: interrupts.requested, logging.getLogger(__name__).info):
             for row in rows:
                 if writer is not None:
                     writer.write(row.record)
-                click.echo(table_line(row.case.label, row.record, row.step_ratio, row.kernel_ratio, labels))
+                echo(table_line(row.case.label, row.record, row.step_ratio, row.kernel_ratio, labels))
                 if row.reason:
                     notes.append(f"depth {row.record.max_depth}, {row.case.label}: {row.reason}")
             results += rows
         for note in notes:
-            click.echo(note)
+            echo(note)
         return results, interrupts.requested
 
 

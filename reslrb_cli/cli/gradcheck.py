@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import click
 
 from reslrb_cli.cli.experiment import check_writable, optional_experiment_arguments
+from reslrb_cli.cli.output import echo
 from reslrb_cli.cli.suite import refuse_foreign, run_suite_command
 from reslrb_cli.errors import ConfigError, ExitCode
 
@@ -86,8 +87,8 @@ def command(
     settings.configs()  # before anything is loaded
     variant = set_variant(config.variant)
     check = Gradcheck(settings)
-    click.echo(f"{device_name(variant)}, {variant}")
-    click.echo(check.conditions())
+    echo(f"{device_name(variant)}, {variant}")
+    echo(check.conditions())
     records, interrupted = _run(check, json_file, folder)
     _finish(records, markdown_file)
     if interrupted:
@@ -112,14 +113,14 @@ def _run(check: Gradcheck, json_file: Path | None, folder: Path | None) -> tuple
         for result in results:
             if table is None:
                 table = Table([other.record for other in results])
-                click.echo(table.head())
+                echo(table.head())
             if writer is not None:
                 writer.write(result.record)
-            click.echo(table.line(result.record))
+            echo(table.line(result.record))
             records.append(result.record)
             _draw(result, folder)
     if folder is not None and any(result.maps is not None for result in results):
-        click.echo(f"look at {os.path.relpath(folder)}")
+        echo(f"look at {os.path.relpath(folder)}")
     return records, interrupts.requested
 
 
@@ -137,7 +138,7 @@ def _finish(records: list[GradcheckRecord], markdown_file: Path | None) -> None:
     from reslrb_cli.report.gradcheck_table import markdown_table, summary_lines
 
     for line in summary_lines(records) if records else ["interrupted before there were enough seeds to compare"]:
-        click.echo(line)
+        echo(line)
     if markdown_file is not None:
         markdown_file.write_text(markdown_table(records), encoding="utf-8")
 

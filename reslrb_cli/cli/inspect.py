@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from reslrb_cli.cli.experiment import experiment_arguments, read_config, start_variant
+from reslrb_cli.cli.output import echo
 from reslrb_cli.errors import ConfigError, ExitCode, UnsupportedScene
 
 if TYPE_CHECKING:
@@ -80,27 +81,27 @@ def command(
         extra = {} if measured is None else {"conditioning": measured.to_json()}
         click.echo(json.dumps(dataclasses.asdict(summary) | {"plan": report} | extra, indent=2))
         return None
-    click.echo(f"scene {config.scene.file}")
+    echo(f"scene {config.scene.file}")
     for line in scene_lines(summary):
-        click.echo(f"  {line}")
+        echo(f"  {line}")
     for sensor in summary.sensors:
-        click.echo(f"sensor {sensor.index} ({sensor.id})")
+        echo(f"sensor {sensor.index} ({sensor.id})")
         for line in sensor_lines(sensor):
-            click.echo(f"  {line}")
-    click.echo("plan")
+            echo(f"  {line}")
+    echo("plan")
     for line in [f"none: {plan}"] if isinstance(plan, str) else plan_lines(plan):
-        click.echo(f"  {line}")
-    click.echo("parameters")
+        echo(f"  {line}")
+    echo("parameters")
     for line in parameter_lines(summary.parameters):
-        click.echo(f"  {line}")
+        echo(f"  {line}")
     if summary.unnamed:
-        click.echo("  keys that begin with object_ change from run to run: give those objects an id in the scene file")
+        echo("  keys that begin with object_ change from run to run: give those objects an id in the scene file")
     if measured is not None:
         from reslrb_cli.report.conditioning_table import conditioning_lines
 
-        click.echo(f"conditioning ({measured.samples} gradients of {measured.spp} spp, seed {measured.seed})")
+        echo(f"conditioning ({measured.samples} gradients of {measured.spp} spp, seed {measured.seed})")
         for line in conditioning_lines(measured):
-            click.echo(f"  {line}")
+            echo(f"  {line}")
     return None
 
 
@@ -117,7 +118,7 @@ def show_offenders(config: Config, as_json: bool) -> int:
     else:
         lines = [line for entry in found for line in offender_lines(entry, replay.iteration)]
         for line in lines or [f"iteration {replay.iteration}: all is finite this time"]:
-            click.echo(line)
+            echo(line)
     return ExitCode.DONE if found else ExitCode.CHECK_FAILED
 
 

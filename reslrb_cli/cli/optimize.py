@@ -9,6 +9,7 @@ from pathlib import Path
 import click
 
 from reslrb_cli.cli.experiment import experiment_arguments, read_config, start_variant
+from reslrb_cli.cli.output import echo
 from reslrb_cli.config import dump
 from reslrb_cli.errors import ExitCode
 from reslrb_cli.records.manifest import Manifest, Status
@@ -51,5 +52,5 @@ def command(config_file: Path, overrides: tuple[str, ...], force: bool, quiet: b
     outcome = f", {describe(recording.last)}" if recording.last else ""
     outcome += "".join(f", {tally}" for tally in (recording.nonfinite, recording.clamped) if tally.iterations)
     report = os.path.relpath(folder.path / "report.html")
-    click.echo(f"{status.value} after {recording.done} iterations{outcome}; look at {report}")
+    echo(f"{status.value} after {recording.done} iterations{outcome}; look at {report}")
     return ExitCode.DONE if status is Status.FINISHED else ExitCode.INTERRUPTED

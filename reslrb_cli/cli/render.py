@@ -8,6 +8,7 @@ from pathlib import Path
 import click
 
 from reslrb_cli.cli.experiment import experiment_arguments, read_config, start_variant
+from reslrb_cli.cli.output import echo
 from reslrb_cli.errors import ConfigError
 
 #: Formats that hold linear values; the others of `FORMATS` are written in 8-bit sRGB.
@@ -55,7 +56,7 @@ def command(
         write_file(output, image, linear=output.suffix.lower() in FLOAT_FORMATS)
     except (OSError, RuntimeError) as error:
         raise ConfigError("--output", "", f"cannot write {output}: {error}") from None
-    click.echo(f"{output}: {image.shape[1]}x{image.shape[0]}, {samples} spp")
+    echo(f"{output}: {image.shape[1]}x{image.shape[0]}, {samples} spp")
 
 
 def check_image_path(path: Path) -> None:

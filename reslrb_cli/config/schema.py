@@ -6,7 +6,6 @@ Units, defaults and meanings stand in the fields' descriptions; `reference.py` w
 from __future__ import annotations
 
 import math
-import re
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -15,7 +14,6 @@ from pydantic import (
     Field,
     PrivateAttr,
     SerializerFunctionWrapHandler,
-    Tag,
     WithJsonSchema,
     field_validator,
     model_serializer,
@@ -23,8 +21,9 @@ from pydantic import (
 )
 from typing_extensions import Self
 
-from .base import ConfigPath, Count, Positive, Section, Seed, WorkPath, by_kind, located, wrong
+from .base import ConfigPath, Count, Positive, Section, Seed, WorkPath, by_kind, located, mark, wrong
 from .choices import L2, Adam, AnyIntegrator, AnyLoss, AnyOptimizer, Integrator, Reslrb
+from .names import check_name, folder_name
 from .sizes import Memory, memory_bytes
 
 ColorSpace = Literal["auto", "linear", "srgb"]
@@ -51,15 +50,15 @@ class ImageFile(Section):
 _Numbers = Annotated[list[float], Field(min_length=1)]
 #: A value for a scene parameter: one number, a list such as [r, g, b], or an image file.
 Value = Annotated[
-    Annotated[float, Tag("<number>")] | Annotated[_Numbers, Tag("<list>")] | Annotated[ImageFile, Tag("<mapping>")],
+    Annotated[float, mark("number")] | Annotated[_Numbers, mark("list")] | Annotated[ImageFile, mark("mapping")],
     by_kind("a number, a list of numbers, or {file: IMAGE}"),
 ]
 #: The same, or "scene": the value that the scene file gives.
 Initial = Annotated[
-    Annotated[float, Tag("<number>")]
-    | Annotated[_Numbers, Tag("<list>")]
-    | Annotated[ImageFile, Tag("<mapping>")]
-    | Annotated[Literal["scene"], Tag("<text>")],
+    Annotated[float, mark("number")]
+    | Annotated[_Numbers, mark("list")]
+    | Annotated[ImageFile, mark("mapping")]
+    | Annotated[Literal["scene"], mark("text")],
     by_kind("a number, a list of numbers, {file: IMAGE}, or `scene`", "scene"),
 ]
 
@@ -72,8 +71,8 @@ class SceneConfig(Section):
         default={}, description="Values of the scene file's `$name` variables."
     )
     sensors: Annotated[
-        Annotated[Annotated[list[Annotated[int, Field(ge=0)]], Field(min_length=1)], Tag("<list>")]
-        | Annotated[Literal["all"], Tag("<text>")],
+        Annotated[Annotated[list[Annotated[int, Field(ge=0)]], Field(min_length=1)], mark("list")]
+        | Annotated[Literal["all"], mark("text")],
         by_kind("a list of sensor indices, or `all`", "all"),
     ] = Field(default=[0], description="Indices of the scene's sensors that are used, or `all`.")
 
@@ -256,9 +255,7 @@ class RunConfig(Section):
     @field_validator("name")
     @classmethod
     def _check_name(cls, value: str) -> str:
-        if not _folder_name(value):
-            raise wrong("must hold a letter or a digit")
-        return value
+        return check_name(value)
 
     @model_serializer(mode="wrap")
     def _without_unused(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
@@ -282,11 +279,7 @@ class RunConfig(Section):
     @property
     def folder_name(self) -> str:
         """The run's name as the name of a folder: what is no letter, digit, `.`, `_`, `+`, `=` becomes `-`."""
-        return _folder_name(self.name)
-
-
-def _folder_name(name: str) -> str:
-    return re.sub(r"[^\w.+=]+", "-", name).strip("-.")
+        return folder_name(self.name)
 
 
 class Config(Section):
@@ -321,11 +314,13 @@ class Config(Section):
     def _check_together(self) -> Self:
         sensors, files = self.scene.sensors, self.target.file
         if files is not None and sensors != "all" and len(files) != len(sensors):
-            raise located("target.file", f"names {len(files)} images for {len(sensors)} sensors; give one for each")
-        keys = [spec.key for spec in self.parameters]
-        for i, key in enumerate(keys):
-            if key in keys[:i]:
-                raise located(f"parameters[{i}].key", f"`{key}` stands in parameters[{keys.index(key)}] already")
+            raise located(
+                "target.file", f"must name one image for each sensor; images: {len(files)}, sensors: {len(sensors)}"
+            )
+        places: dict[str, int] = {}
+        for i, spec in enumerate(self.parameters):
+            if places.setdefault(spec.key, i) < i:
+                raise located(f"parameters[{i}].key", f"`{spec.key}` stands in parameters[{places[spec.key]}] already")
         _check_passes(self.integrator, self.run.spp, "integrator", "run.spp")
         for option in sorted({"batches", "first_batch"} & self.run.model_fields_set):
             if self.run.adjoint != "batched":

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import pytest
@@ -48,16 +49,16 @@ FILES: dict[str, tuple[str | bytes, tuple[str, ...]]] = {
     "two documents": (GOOD + "---\n" + GOOD, ("x.yaml:5: not valid YAML",)),
     "python object": ("scene: !!python/object:os.x {}", ("x.yaml:1: not valid YAML",)),
     "contradicting tag": ("variant: !!bool maybe", ("x.yaml: not valid YAML",)),
-    "deep nesting": ("[" * 20_000, ("x.yaml: nested too deeply",)),
-    "endless integer": ("variant: " + "1" * 6000, ("x.yaml:1: not valid YAML", "too long")),
-    "unhashable key": (GOOD + "? [a]\n: 1\n", ("x.yaml:5: not valid YAML",)),
+    "deep nesting": ("[" * 20_000, ("x.yaml:1: nested too deeply",)),
+    "endless integer": ("variant: " + "1" * 6000, ("x.yaml:1: the integer 1111", "more than 64 bits")),
+    "unhashable key": (GOOD + "? [a]\n: 1\n", ("x.yaml:5: has a key that is a list",)),
     "value that holds itself": (
         changed(f"\n  - {PARAMETER}", " &a [*a]"),
-        ("x.yaml: parameters[0]: must be a mapping",),
+        ("x.yaml:3: an alias", "stands in itself"),
     ),
     "duplicate key": (GOOD + "run: {spp: 1}\nrun: {spp: 2}\n", ("x.yaml:6: run: given twice", "line 5")),
     "duplicate in a list": (changed(PARAMETER, "{key: a, key: b}"), ("x.yaml:4: parameters[0].key: given twice",)),
-    "key is a number": (GOOD + "1: 2\n", ("x.yaml: 1: ", "text")),
+    "key is a number": (GOOD + "1: 2\n", ("x.yaml:5: 1: a key must be text",)),
     "unknown section": (GOOD + "optimiser: {}\n", ("x.yaml: optimiser: unknown key", "`optimizer`")),
     "unknown key": (GOOD + "run: {iteration: 3}\n", ("x.yaml: run.iteration: unknown key", "`iterations`")),
     "unknown key, none near": (GOOD + "run: {xyz: 3}\n", ("x.yaml: run.xyz: unknown key; known here: name, output",)),
@@ -147,7 +148,7 @@ FILES: dict[str, tuple[str | bytes, tuple[str, ...]]] = {
     "target file empty": (changed("{render: {}}", "{file: ''}"), ("x.yaml: target.file: must be a path",)),
     "fewer targets than sensors": (
         changed("{render: {}}", "{file: [a.exr, b.exr]}"),
-        ("x.yaml: target.file: names 2 images for 1 sensors",),
+        ("x.yaml: target.file: must name one image for each sensor; images: 2, sensors: 1",),
     ),
     "colour space of a rendered target": (
         changed("{render: {}}", "{render: {}, color_space: srgb}"),
@@ -285,7 +286,7 @@ FILES: dict[str, tuple[str | bytes, tuple[str, ...]]] = {
         GOOD + "run: {adjoint: correlate}\n",
         ("x.yaml: run.adjoint: must be one of correlated, independent, batched",),
     ),
-    "name without letters": (GOOD + "run: {name: '..'}\n", ("x.yaml: run.name: must hold a letter or a digit",)),
+    "name without letters": (GOOD + "run: {name: '---'}\n", ("x.yaml: run.name: must hold a letter or a digit",)),
     "variant": (GOOD + "variant: scalar_rgb\n", ("x.yaml: variant: must be one of auto, llvm_ad_rgb",)),
 }
 
@@ -357,10 +358,11 @@ def test_folder_in_place_of_a_file(tmp_path: Path) -> None:
 
 
 def test_unreadable_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def refuse(self: Path) -> bytes:
+    def refuse(*_args: object) -> int:
         raise PermissionError(13, "Permission denied")
 
-    monkeypatch.setattr(Path, "read_bytes", refuse)  # root may read what chmod forbids
+    (tmp_path / "x.yaml").write_text(GOOD)
+    monkeypatch.setattr(os, "open", refuse)  # root may read what chmod forbids
     with pytest.raises(ConfigError, match=r"x\.yaml: cannot be read: Permission denied"):
         load(tmp_path / "x.yaml")
 
