@@ -73,8 +73,11 @@ def command(
     one that runs out of memory is recorded as out_of_memory, and the rest goes on. Ctrl-C keeps what is done.
     """
     from reslrb_cli.backend.device import device_name, memory_bytes
+    from reslrb_cli.backend.installation import load_packages
     from reslrb_cli.backend.variant import choose
     from reslrb_cli.config import load, loads
+
+    load_packages()  # before what follows asks for them
     from reslrb_cli.measure import cornell_box
     from reslrb_cli.measure.bench import Sweep
     from reslrb_cli.measure.cases import choose_baseline, depths, parse_cases

@@ -63,8 +63,11 @@ def command(
     1 where a comparison fails; the last lines say which, and by how much. docs/gradcheck.md explains the columns.
     """
     from reslrb_cli.backend.device import device_name
+    from reslrb_cli.backend.installation import load_packages
     from reslrb_cli.backend.variant import set_variant
     from reslrb_cli.config import load, loads
+
+    load_packages()  # before what follows asks for them
     from reslrb_cli.measure import cornell_box
     from reslrb_cli.measure.cases import all_estimators, parse_estimators
     from reslrb_cli.measure.gradcheck import Gradcheck
