@@ -51,7 +51,7 @@ def _load(name: str) -> ModuleType:
 
 def child_environment() -> dict[str, str]:
     """Environment in which a Python process finds the packages that this one does, and none that it does not."""
-    folders = [os.path.abspath(folder) for folder in sys.path]
+    folders = [folder or os.curdir for folder in sys.path]
     return {**os.environ, "PYTHONPATH": os.pathsep.join(folders), "PYTHONSAFEPATH": "1"}
 
 

@@ -86,7 +86,7 @@ def _tell(error: BaseException) -> tuple[str, int] | None:
     if isinstance(error, click.ClickException):
         context = getattr(error, "ctx", None)
         where = context.command_path if context else "reslrb"
-        return f"{where}: {' '.join(error.format_message().split())} See `{where} --help`.", ExitCode.USAGE
+        return f"{where}: {one_line(error.format_message()).rstrip('.')}. See `{where} --help`.", ExitCode.USAGE
     if is_out_of_memory(error):
         advice = "lower run.spp or the size of the film, or set run.memory_budget or integrator.samples_per_pass"
         return f"out of memory ({one_line(error, 200) or 'host'}); {advice}", ExitCode.OUT_OF_MEMORY
@@ -115,3 +115,7 @@ def main() -> None:
         handler.setFormatter(LineFormatter())
         logger.addHandler(handler)
         logger.setLevel(logging.INFO)
+    try:
+        os.getcwd()
+    except OSError as error:  # removed; relative paths start from it, and Mitsuba does not load without
+        raise OSError(error.errno, error.strerror, "the working directory") from None

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from reslrb_cli.cli.experiment import check_writable, optional_experiment_arguments
+from reslrb_cli.cli.experiment import COUNT, check_writable, optional_experiment_arguments
 from reslrb_cli.cli.output import echo
 from reslrb_cli.errors import ConfigError, ExitCode
 
@@ -30,14 +30,15 @@ class Size(click.ParamType):
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> int:
         match = re.fullmatch(r"(\d+(?:\.\d+)?)\s*(|k|M|G|Ki|Mi|Gi)B?", str(value).strip())
-        if match is None:
+        size = 0.0 if match is None else float(match[1]) * _UNITS[match[2]]
+        if not 1 <= size < 2**63:
             self.fail(f"`{value}` is no size; write it as in 2GiB or 500MB", param, ctx)
-        return int(float(match[1]) * _UNITS[match[2]])
+        return int(size)
 
 
 @click.command("bench")
 @optional_experiment_arguments
-@click.option("--max-depth", type=click.IntRange(min=2), default=32, show_default=True,
+@click.option("--max-depth", type=click.IntRange(min=2, max=COUNT.max), default=32, show_default=True,
               help="Greatest path depth; measured are 2, 4, 8, ... and this one.")  # fmt: skip
 @click.option("--integrators", default=INTEGRATORS, show_default=True, metavar="LIST",
               help="What to compare: TYPE[:ESTIMATOR][(OPTION=VALUE,...)], separated by commas; OPTION is one of the "

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from reslrb_cli.cli.experiment import check_writable, optional_experiment_arguments
+from reslrb_cli.cli.experiment import COUNT, check_writable, optional_experiment_arguments
 from reslrb_cli.cli.output import echo
 from reslrb_cli.cli.suite import refuse_foreign, run_suite_command
 from reslrb_cli.errors import ConfigError, ExitCode
@@ -31,8 +31,9 @@ logger = logging.getLogger(__name__)
                    "options of CONFIG.")  # fmt: skip
 @click.option("--budget", type=click.FloatRange(min=0), default=45.0, show_default=True, metavar="SECONDS",
               help="Time for the whole; it decides how many seeds there are, eight at least.")  # fmt: skip
-@click.option("--seeds", type=click.IntRange(min=3), metavar="N", help="Number of seeds, whatever time they take.")
-@click.option("--spp", type=click.IntRange(min=1),
+@click.option("--seeds", type=click.IntRange(min=3, max=COUNT.max), metavar="N",
+              help="Number of seeds, whatever time they take.")  # fmt: skip
+@click.option("--spp", type=COUNT,
               help="Samples per pixel of one gradient. Default: 65536 light paths, no more than run.spp.")  # fmt: skip
 @click.option("--json", "json_file", type=click.Path(path_type=Path, dir_okay=False),
               help="Write one object a line, one for each comparison.")  # fmt: skip

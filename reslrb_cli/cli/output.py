@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import sys
 
 import click
 
@@ -10,8 +11,9 @@ from reslrb_cli.errors import printable
 
 
 def echo(line: object) -> None:
-    """Print one line on standard output, with what is not printable in it escaped."""
-    click.echo(printable(line))
+    """Print one line on standard output; what is not printable in it, or not in the terminal's encoding, as escapes."""
+    encoding = sys.stdout.encoding or "utf-8"
+    click.echo(printable(line).encode(encoding, "backslashreplace").decode(encoding))
 
 
 class LineFormatter(logging.Formatter):

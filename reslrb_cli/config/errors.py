@@ -33,6 +33,7 @@ _EXPECTED = {
     "less_than": "below {lt}",
     "less_than_equal": "at most {le}",
     "string_too_short": "nonempty text",
+    "string_too_long": "text of at most {max_length} characters",
     "literal_error": "{expected}",
 }
 

@@ -95,7 +95,8 @@ def _check_part(at: Any, part: str | int, here: Location, override: Override) ->
         if not isinstance(part, int):
             raise ConfigError(override.label, name, f"is a list; name an entry, such as {name}[0]")
         if part > len(at):
-            raise ConfigError(override.label, name, f"has {len(at)} entries; there is no [{part}]")
+            has = "1 entry" if len(at) == 1 else f"{len(at)} entries"
+            raise ConfigError(override.label, name, f"has {has}; there is no [{part}]")
         return part
     if not isinstance(at, dict):
         raise ConfigError(override.label, name, "is a single value; replace it as a whole")

@@ -23,6 +23,7 @@ from typing_extensions import Self
 
 from .base import ConfigPath, Count, Positive, Section, Seed, WorkPath, by_kind, located, mark, wrong
 from .choices import L2, Adam, AnyIntegrator, AnyLoss, AnyOptimizer, Integrator, Reslrb
+from .limits import KEY_LENGTH, PIXELS
 from .names import check_name, folder_name
 from .sizes import Memory, memory_bytes
 
@@ -98,6 +99,13 @@ class Rendering(Section):
         default=None, description="Integrator of the target; null: that of the run."
     )
 
+    @field_validator("parameters")
+    @classmethod
+    def _check_keys(cls, value: dict[str, Any]) -> dict[str, Any]:
+        if not all(0 < len(key) <= KEY_LENGTH for key in value):
+            raise wrong(f"must have keys that are not empty, and have at most {KEY_LENGTH} characters")
+        return value
+
 
 _PATH = {"type": "string", "format": "path"}
 _Files = Annotated[
@@ -144,6 +152,7 @@ class ParameterSpec(Section):
 
     key: str = Field(
         min_length=1,
+        max_length=KEY_LENGTH,
         description="Key as `mi.traverse` names it (`reslrb inspect` lists them), or a glob such as "
         "`*.reflectance.data`.",
     )
@@ -178,6 +187,13 @@ class ParameterSpec(Section):
             raise wrong(f"must be [low, high] with low < high, not [{value[0]:g}, {value[1]:g}]")
         return value
 
+    @field_validator("resolution")
+    @classmethod
+    def _check_resolution(cls, value: tuple[int, int] | None) -> tuple[int, int] | None:
+        if value is not None and value[0] * value[1] > PIXELS:
+            raise wrong(f"must have at most {PIXELS} texels, not {value[0] * value[1]}")
+        return value
+
     @model_validator(mode="after")
     def _check_transform(self) -> Self:
         low, high = self.bounds or (-math.inf, math.inf)
@@ -209,7 +225,8 @@ class RunConfig(Section):
     name: str = Field(
         default="run",
         min_length=1,
-        description="Name of the run and of its folder; left out: the config file's name without its suffix.",
+        description="Name of the run and of its folder, not a path, of at most 200 bytes; left out: the config file's "
+        "name without its suffix.",
         json_schema_extra=_without_default,
     )
     output: WorkPath = Field(

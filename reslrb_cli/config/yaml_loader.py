@@ -31,7 +31,7 @@ class Loader(yaml.SafeLoader):
     yaml_constructors = {  # noqa: RUF012
         tag: function
         for tag, function in yaml.SafeLoader.yaml_constructors.items()
-        if tag is None or tag.removeprefix(_TAG) in _KEPT
+        if str(tag).removeprefix(_TAG) in _KEPT
     }
 
     def __init__(self, text: str, at: Callable[[int], str]) -> None:
@@ -93,6 +93,11 @@ def _construct_float(loader: Loader, node: yaml.ScalarNode) -> float:
         raise loader.fail(node.start_mark, f"{text} is no number, as its tag !!float has it") from None
 
 
+def _refuse(loader: Loader, node: yaml.Node) -> None:
+    tag = node.tag.replace(_TAG, "!!")
+    raise loader.fail(node.start_mark, f"not valid YAML: the tag {tag} stands for nothing that a configuration holds")
+
+
 Loader.add_implicit_resolver(f"{_TAG}null", re.compile(r"(~|null|Null|NULL)?$"), ["~", "n", "N", ""])
 Loader.add_implicit_resolver(f"{_TAG}bool", re.compile(r"(true|True|TRUE|false|False|FALSE)$"), list("tTfF"))
 Loader.add_implicit_resolver(f"{_TAG}int", INTEGER, DIGITS)
@@ -101,3 +106,4 @@ Loader.add_implicit_resolver(f"{_TAG}merge", re.compile(r"<<$"), ["<"])
 Loader.add_constructor(f"{_TAG}str", _construct_text)
 Loader.add_constructor(f"{_TAG}int", _construct_integer)
 Loader.add_constructor(f"{_TAG}float", _construct_float)
+Loader.add_constructor(None, _refuse)

@@ -14,7 +14,7 @@ from typing import Any
 
 from reslrb_cli import __version__
 from reslrb_cli.config.files import read_file
-from reslrb_cli.errors import ConfigError
+from reslrb_cli.errors import ConfigError, printable
 from reslrb_cli.records.atomic import write_atomically
 
 FILE_NAME = "manifest.json"
@@ -63,7 +63,7 @@ class Manifest:
     seed: int
     config: str
     status: Status = Status.RUNNING
-    command_line: list[str] = field(default_factory=lambda: list(sys.argv))
+    command_line: list[str] = field(default_factory=lambda: [printable(word) for word in sys.argv])
     versions: dict[str, str] = field(default_factory=versions)
     platform: str = field(default_factory=platform.platform)
     started: str = field(default_factory=now)
