@@ -87,7 +87,7 @@ def _read_target(path: Path, problem: Problem, sensor: int) -> Any:
     array = array if array.ndim == 3 else array[:, :, None]
     colors = color_channels(film)
     if array.shape[2] != colors:
-        raise ConfigError(path, "", f"has {array.shape[2]} channels; the film has {colors}")
+        raise ConfigError(path, "", f"must have the film's channels; its own: {array.shape[2]}, the film's: {colors}")
     target = mi.TensorXf(np.ascontiguousarray(array))
     dr.make_opaque(target)
     return target

@@ -1,7 +1,8 @@
 """Image files before they are decoded: how large they say they are, and whether they end where they should.
 
 A file of some kilobytes can say that it is an image of gigabytes, and Mitsuba's reader fills what a JPEG lacks with
-grey, without a word.
+grey. A file that was cut off and then padded is told as well where its format is compressed, but for the last lines of
+an EXR, which has no check sums.
 """
 
 from __future__ import annotations
@@ -62,7 +63,7 @@ def read_bitmap(path: Path, size: Size | None = None) -> mi.Bitmap:
     except Exception as error:
         if is_out_of_memory(error):
             raise
-        raise ConfigError(path, "", f"is damaged or cut off, or not one of {FORMATS}; it cannot be decoded") from None
+        raise ConfigError(path, "", "is damaged or cut off, or of a kind that Mitsuba does not decode") from None
     for line in complaints:
         if line.startswith(("Corrupt JPEG data", "Premature end")):
             raise ConfigError(path, "", f"is damaged or cut off ({line}); copy or save it again")
