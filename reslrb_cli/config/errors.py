@@ -13,7 +13,6 @@ from pydantic import ValidationError
 from pydantic_core import ErrorDetails
 
 from .base import MARK, Section
-from .limits import WORD_LENGTH
 from .schema import Config
 from .text import Location, format_location
 
@@ -150,8 +149,6 @@ def _unknown_key(loc: tuple[int | str, ...]) -> str:
 
 def _nearest(word: str, known: Iterable[str]) -> list[str]:
     """The known word that is most like `word`, if any is."""
-    if len(word) > WORD_LENGTH:
-        return []
     return difflib.get_close_matches(word.lower(), list(known), n=1)
 
 

@@ -9,6 +9,9 @@ from typing import BinaryIO
 
 from ..errors import ConfigError
 
+#: As far as the system has them: never wait, hand down to no child, change no line ends.
+_FLAGS = ("O_NONBLOCK", "O_CLOEXEC", "O_BINARY")
+
 
 def open_file(path: Path, most: int | None = None) -> BinaryIO:
     """Open the file `path` to read it. Raises ConfigError, located in it, where it cannot be.
@@ -18,7 +21,7 @@ def open_file(path: Path, most: int | None = None) -> BinaryIO:
     """
     try:
         _check(path, os.stat(path), most)  # before it is opened: to open some devices does something already
-        descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_CLOEXEC", 0))
+        descriptor = os.open(path, os.O_RDONLY | sum(getattr(os, flag, 0) for flag in _FLAGS))
         try:
             _check(path, os.fstat(descriptor), most)  # it may have been replaced in between
         except BaseException:

@@ -16,8 +16,6 @@ NODES = 20_000
 DEPTH = 20
 #: Characters of a parameter's key or glob. To make a pattern of one takes time that grows with the square of it.
 KEY_LENGTH = 1000
-#: Characters of a word for which the nearest known word is looked up, which takes time that grows with its length.
-WORD_LENGTH = 100
 #: Integers are below this, and above its negative: nothing that a file counts has more than 64 bits.
 INTEGER_END = 2**64
 

@@ -58,14 +58,17 @@ def test_a_run_and_its_errors(experiment, capsys):
         assert "\x1b" not in out + err
 
 
-def test_a_run_whose_configuration_is_called_by_bytes_that_are_not_utf8(experiment, capsys):
+def test_a_run_whose_configuration_is_called_by_bytes_that_are_not_utf8(experiment, capsys, monkeypatch):
     path = experiment.parent / "c\udcff.yaml"
+    monkeypatch.setattr("sys.argv", ["reslrb", "optimize", str(path), ESC])
     path.write_text((experiment / "c.yaml").read_text().replace("file: ", f"file: {experiment}/".replace(ESC, "*")))
     os.rename(experiment, str(experiment).replace(ESC, "*"))
     code, _, err = reslrb(capsys, "optimize", path, "--set", "run.iterations=1")
     assert code == 0, err
     assert Path("runs/c/report.html").exists()
-    assert "c\\udcff.yaml" in json.loads(Path("runs/c/manifest.json").read_text())["config"]
+    manifest = json.loads(Path("runs/c/manifest.json").read_text())
+    assert "c\\udcff.yaml" in manifest["config"]
+    assert manifest["command_line"][2:] == [manifest["config"], "\\x1b[31m"]
 
 
 def test_usage(capsys):
