@@ -103,13 +103,3 @@ def test_the_versions_are_those_of_pyproject() -> None:
         found = re.search(rf'"{name}>=([\d.]+),<([\d.]+)"', text)
         assert found is not None
         assert found.groups() == (".".join(map(str, first)), ".".join(map(str, end)))
-
-
-def test_a_child_looks_where_this_process_does(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / "mitsuba.py").write_text("raise RuntimeError('not this one')")
-    monkeypatch.chdir(tmp_path)
-    script = "import importlib.util; print(importlib.util.find_spec('mitsuba').origin)"
-    done = subprocess.run(
-        [sys.executable, "-c", script], capture_output=True, text=True, check=True, env=installation.child_environment()
-    )
-    assert sys.version_info < (3, 11) or Path(done.stdout.strip()) != tmp_path / "mitsuba.py"

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import importlib
 import importlib.util
-import os
-import sys
 from types import ModuleType
 
 from reslrb_cli.backend.shared_library import missing_library
@@ -47,12 +45,6 @@ def _load(name: str) -> ModuleType:
     if not isinstance(version, str) or not first <= _numbers(version) < end:
         raise BackendError(f"{name} {version} was found at {_place(name)}; {_dotted(first)} is needed: {mend}")
     return package
-
-
-def child_environment() -> dict[str, str]:
-    """Environment in which a Python process finds the packages that this one does, and none that it does not."""
-    folders = [folder or os.curdir for folder in sys.path]
-    return {**os.environ, "PYTHONPATH": os.pathsep.join(folders), "PYTHONSAFEPATH": "1"}
 
 
 def _place(name: str) -> str:

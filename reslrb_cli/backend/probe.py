@@ -11,7 +11,7 @@ import subprocess
 import sys
 from dataclasses import dataclass
 
-from reslrb_cli.backend.installation import MISSING_LIBRARY, child_environment
+from reslrb_cli.backend.installation import MISSING_LIBRARY
 from reslrb_cli.backend.shared_library import missing_library
 
 # A constant that no kernel cache has seen makes the compiler run; `minimum` is what libLLVM 15 and 16 stumble over.
@@ -69,9 +69,7 @@ def probe(variant: str) -> Probe:
     """Runs the trial for `variant`; never raises."""
     command = [sys.executable, "-c", _SCRIPT, variant]
     try:
-        done = subprocess.run(
-            command, capture_output=True, text=True, errors="replace", timeout=300, check=False, env=child_environment()
-        )
+        done = subprocess.run(command, capture_output=True, text=True, errors="replace", timeout=300, check=False)
     except subprocess.TimeoutExpired:
         return Probe("gave no result within 300 s")
     except OSError as error:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import sys
 
 import click
 
@@ -11,9 +10,8 @@ from reslrb_cli.errors import printable
 
 
 def echo(line: object) -> None:
-    """Print one line on standard output; what is not printable in it, or not in the terminal's encoding, as escapes."""
-    encoding = sys.stdout.encoding or "utf-8"
-    click.echo(printable(line).encode(encoding, "backslashreplace").decode(encoding))
+    """Print one line on standard output, with what is not printable in it escaped."""
+    click.echo(printable(line))
 
 
 class LineFormatter(logging.Formatter):

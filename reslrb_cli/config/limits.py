@@ -35,5 +35,3 @@ NAME_BYTES = 200
 PIXELS = 2**27
 #: Bytes of an image's file: that many pixels of four floats, not compressed, and something for the file's head.
 IMAGE_BYTES = 16 * PIXELS + 2**20
-#: Bytes of a scene file (XML), whose meshes and textures lie in files of their own.
-SCENE_BYTES = 2**28

@@ -22,11 +22,7 @@ def load(path: Path | str, overrides: Sequence[str] = ()) -> Config:
 
     Raises ConfigError, located by the file (or the override that is at fault) and the key.
     """
-    try:
-        text = read_file(Path(path), CONFIG_BYTES).decode("utf-8-sig")
-    except UnicodeDecodeError:
-        raise ConfigError(path, "", "is not UTF-8 text; a configuration is a YAML file") from None
-    return loads(text, path, overrides)
+    return loads(read_text(Path(path), str(path)), path, overrides)
 
 
 def loads(text: str, path: Path | str, overrides: Sequence[str] = ()) -> Config:
@@ -99,6 +95,14 @@ def _plain(value: Any) -> Any:
     if isinstance(value, (list, tuple)):
         return [_plain(item) for item in value]
     return str(value) if isinstance(value, Path) else value
+
+
+def read_text(path: Path, source: str) -> str:
+    """The text of a configuration file, which `source` names in errors. Raises ConfigError where it is none."""
+    try:
+        return read_file(path, CONFIG_BYTES).decode("utf-8-sig")
+    except UnicodeDecodeError:
+        raise ConfigError(source, "", "is not UTF-8 text; a configuration is a YAML file") from None
 
 
 def _validate(raw: dict[str, Any], path: Path) -> tuple[Config | None, list[Problem]]:

@@ -15,7 +15,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from reslrb_cli.backend.installation import child_environment
 from reslrb_cli.errors import ReslrbError, mentions_memory
 from reslrb_cli.records.bench import BenchStatus
 
@@ -62,7 +61,6 @@ class Process:
                 stdout=subprocess.PIPE,
                 stderr=words,
                 start_new_session=True,  # Ctrl-C is for us
-                env=child_environment(),
             )
         self.ask(first | {"cache": self._folder.name})
 

@@ -10,8 +10,6 @@ from typing import Any
 
 import mitsuba as mi
 
-from ..config.files import open_file
-from ..config.limits import SCENE_BYTES
 from ..errors import ConfigError
 from .extent import lost_light
 
@@ -32,8 +30,13 @@ def load_scene(file: Path, options: Mapping[str, Any] | None = None) -> Any:
     nothing in it, or no light. Warns, in the log, of one that is too far from the origin, or too small.
     """
     file = Path(file)
-    with open_file(file, SCENE_BYTES):
-        pass
+    try:
+        with file.open("rb"):
+            pass
+    except IsADirectoryError:
+        raise ConfigError(file, "", "is a folder, not a Mitsuba scene file (XML)") from None
+    except OSError as error:
+        raise ConfigError(file, "", f"cannot be read: {error.strerror}") from None
     values = {name: _as_text(value) for name, value in (options or {}).items()}
     try:
         scene = mi.load_file(str(file), optimize=False, **values)

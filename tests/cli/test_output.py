@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 import logging
 import os
@@ -11,8 +10,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from cli.test_nonfinite import CONFIG, SCENE, reslrb
-
-from reslrb_cli.cli.output import echo
 
 ESC = "\x1b[31m"
 
@@ -82,13 +79,6 @@ def test_the_log(capsys):
     reslrb(capsys, "optimize", "none.yaml")
     logging.getLogger("reslrb_cli.x").warning("%s: %s", f"a{ESC}", "b\nc")
     assert capsys.readouterr().err == "a\\x1b[31m: b\\nc\n"
-
-
-def test_letters_that_the_terminal_does_not_have(monkeypatch):
-    raw = io.BytesIO()
-    monkeypatch.setattr("sys.stdout", io.TextIOWrapper(raw, encoding="latin-1"))
-    echo("ü 名")
-    assert raw.getvalue() == b"\xfc \\u540d\n"
 
 
 def test_long_keys_make_files(experiment, capsys):
