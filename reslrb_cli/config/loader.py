@@ -38,11 +38,11 @@ def loads(text: str, path: Path | str, overrides: Sequence[str] = ()) -> Config:
         raise ConfigError(source, "", "is empty; it needs at least scene, target and parameters")
     if not isinstance(data, dict) and data is not None:
         raise ConfigError(source, "", "must hold sections (scene: ...) at its top level, not a list or a single value")
+    if sum(count_values(value, NODES + 1) for value in (data, *(override.value for override in parsed))) > NODES:
+        raise ConfigError(source, "", f"holds more than {NODES} values, together with what --set puts in")
     stages: list[dict[str, Any]] = [data or {}]
     for override in parsed:
         stages.append(apply(stages[-1], override))
-    if count_values(stages[-1], NODES + 1) > NODES:
-        raise ConfigError(source, "", f"holds more than {NODES} values with what --set puts in")
 
     config, found = _validate(stages[-1], Path(path))
     if config is not None:

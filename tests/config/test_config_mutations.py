@@ -29,7 +29,7 @@ def test_mutated_configurations(count: int, tmp_path: Path) -> None:
     for seed in range(count):
         data, overrides = mutations.mutate(random.Random(seed), texts)
         path.write_bytes(data)
-        begin = time.monotonic()
+        begin = time.process_time()  # of this process, so that others on the machine do not count
         try:
             config = load(path, overrides)
         except ConfigError as error:
@@ -42,7 +42,7 @@ def test_mutated_configurations(count: int, tmp_path: Path) -> None:
         else:
             assert loads(dump(config), path) == config, f"seed {seed}"
             loaded += 1
-        slowest = max(slowest, time.monotonic() - begin)
+        slowest = max(slowest, time.process_time() - begin)
         assert slowest < SECONDS, f"seed {seed}"
     assert _memory("VmHWM") - before < MIB
     assert count / 100 < loaded < count / 2  # neither all wrong at the first look, nor hardly any
