@@ -28,7 +28,11 @@ def read_document(file: Path, max_bytes: int) -> tuple[Element, int]:
     Raises ConfigError, located in the file, where it cannot be read, is no regular file or larger than `max_bytes`, is
     not XML, is nested more than MAX_DEPTH levels deep, or declares entities.
     """
-    data = read_file(file, max_bytes)
+    data = read_file(file, MAX_BYTES)
+    if len(data) > max_bytes:
+        raise ConfigError(
+            file, "", f"is too large: a scene may have {MAX_BYTES >> 20} MiB of XML, with all that it includes"
+        )
     text = _COMMENT.sub(lambda comment: "\n" * comment[0].count("\n"), _decode(data))
     return _parse(file, _BARE_AMPERSAND.sub("&amp;", text)), len(data)
 
