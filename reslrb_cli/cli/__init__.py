@@ -17,6 +17,7 @@ from typing import Any
 import click
 
 from reslrb_cli import __version__
+from reslrb_cli.cli.console import LogLines, forgiving_output
 from reslrb_cli.errors import ExitCode, ReslrbError, is_out_of_memory
 
 # What `reslrb --help` says of each command, so that it need not load them; in the order of a user's work.
@@ -63,16 +64,17 @@ class _Main(click.Group):
         if not standalone_mode:
             return super().main(args, prog_name, complete_var, standalone_mode=False, **extra)
         self.debug = os.environ.get("RESLRB_DEBUG", "0") not in ("", "0")
-        try:
-            code = super().main(args, prog_name, complete_var, standalone_mode=False, **extra)
-        except BaseException as error:
-            told = _tell(error)
-            if told is None:
-                raise
-            if self.debug:
-                traceback.print_exc()
-            line, code = told
-            click.echo(line, err=True)
+        with forgiving_output():
+            try:
+                code = super().main(args, prog_name, complete_var, standalone_mode=False, **extra)
+            except BaseException as error:
+                told = _tell(error)
+                if told is None:
+                    raise
+                if self.debug:
+                    traceback.print_exc()
+                line, code = told
+                click.echo(line, err=True)
         sys.exit(code if isinstance(code, int) else ExitCode.DONE)
 
 
@@ -114,7 +116,7 @@ def main() -> None:
     """Recover scene parameters from images of what light paths carry, with Mitsuba 3."""
     logger = logging.getLogger("reslrb_cli")
     if not logger.handlers:
-        handler = logging.StreamHandler()
+        handler = LogLines()
         handler.setFormatter(logging.Formatter("%(message)s"))
         logger.addHandler(handler)
         logger.setLevel(logging.INFO)
