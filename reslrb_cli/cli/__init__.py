@@ -1,4 +1,5 @@
-"""The command line: `main` finds the commands, and is the one place where an error becomes an exit code.
+"""The command line: `main` finds the commands, and is the one place where an error becomes an exit code; `run` is the
+program, which is `main` under signals.
 
 Each command is one module here that holds a click command named `command`; it is loaded when it is called.
 """
@@ -18,7 +19,9 @@ import click
 
 from reslrb_cli import __version__
 from reslrb_cli.cli.console import LogLines, forgiving_output
-from reslrb_cli.errors import ExitCode, ReslrbError, is_out_of_memory
+from reslrb_cli.cli.interrupts import Interrupts
+from reslrb_cli.cli.telling import tell
+from reslrb_cli.errors import ExitCode
 
 # What `reslrb --help` says of each command, so that it need not load them; in the order of a user's work.
 _SUMMARIES = {
@@ -68,7 +71,7 @@ class _Main(click.Group):
             try:
                 code = super().main(args, prog_name, complete_var, standalone_mode=False, **extra)
             except BaseException as error:
-                told = _tell(error)
+                told = tell(error)
                 if told is None:
                     raise
                 if self.debug:
@@ -76,28 +79,6 @@ class _Main(click.Group):
                 line, code = told
                 click.echo(line, err=True)
         sys.exit(code if isinstance(code, int) else ExitCode.DONE)
-
-
-def _tell(error: BaseException) -> tuple[str, int] | None:
-    """The line and the exit code for `error`; None for a fault of ours, whose traceback is wanted."""
-    if isinstance(error, ReslrbError):
-        return str(error), error.exit_code
-    if isinstance(error, click.Abort | KeyboardInterrupt):
-        return "interrupted", ExitCode.INTERRUPTED
-    if isinstance(error, click.ClickException):
-        context = getattr(error, "ctx", None)
-        where = context.command_path if context else "reslrb"
-        return f"{where}: {' '.join(error.format_message().split())} See `{where} --help`.", ExitCode.USAGE
-    if is_out_of_memory(error):
-        advice = "lower run.spp or the size of the film, or set run.memory_budget or integrator.samples_per_pass"
-        return f"out of memory ({_one_line(error) or 'host'}); {advice}", ExitCode.OUT_OF_MEMORY
-    if isinstance(error, OSError) and error.filename is not None:
-        return f"{error.filename}: {error.strerror}", ExitCode.USAGE
-    return None
-
-
-def _one_line(error: BaseException) -> str:
-    return " ".join(str(error).split())[:200]
 
 
 def _set_debug(ctx: click.Context, _parameter: click.Parameter, value: bool) -> None:
@@ -120,3 +101,13 @@ def main() -> None:
         handler.setFormatter(logging.Formatter("%(message)s"))
         logger.addHandler(handler)
         logger.setLevel(logging.INFO)
+
+
+def run() -> None:
+    """The program `reslrb`: a signal ends it at once and in order, unless a command sees to that itself."""
+    interrupts = Interrupts(tolerated=0)
+    with interrupts:
+        try:
+            main(prog_name="reslrb")
+        finally:
+            interrupts.ignore()  # nothing of the work is left

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import os
+import tempfile
 from pathlib import Path
 
 import click
 
 from reslrb_cli.cli.experiment import experiment_arguments, read_config, start_variant
-from reslrb_cli.errors import ConfigError
+from reslrb_cli.errors import ConfigError, is_machine_fault
 
 #: Formats that hold linear values; the others of `FORMATS` are written in 8-bit sRGB.
 FLOAT_FORMATS = (".exr", ".hdr", ".pfm")
-FORMATS = (*FLOAT_FORMATS, ".png", ".jpg", ".jpeg", ".bmp")
+FORMATS = (*FLOAT_FORMATS, ".png", ".jpg", ".jpeg")
 
 
 @click.command("render")
@@ -22,7 +23,7 @@ FORMATS = (*FLOAT_FORMATS, ".png", ".jpg", ".jpeg", ".bmp")
     "--output",
     required=True,
     type=click.Path(path_type=Path),
-    help="Image file to write; EXR, HDR and PFM are linear, PNG, JPG and BMP 8-bit sRGB.",
+    help="Image file to write; EXR, HDR and PFM are linear, PNG and JPG 8-bit sRGB.",
 )
 @click.option("--spp", type=click.IntRange(min=1), help="Samples per pixel; default: run.spp.")
 @click.option("--sensor", type=click.IntRange(min=0), help="Index of the sensor; default: the experiment's first.")
@@ -52,9 +53,11 @@ def command(
     samples = spp or config.run.spp
     image = render_in_passes(integrator, scene, sensors[0], samples, config.run.seed, 0, "render", multiple)
     try:
-        write_file(output, image, linear=output.suffix.lower() in FLOAT_FORMATS)
+        write_file(output.resolve(), image, linear=output.suffix.lower() in FLOAT_FORMATS)
     except (OSError, RuntimeError) as error:
-        raise ConfigError("--output", "", f"cannot write {output}: {error}") from None
+        if is_machine_fault(error):
+            raise
+        raise ConfigError("--output", "", f"cannot write {output}: {getattr(error, 'strerror', error)}") from None
     click.echo(f"{output}: {image.shape[1]}x{image.shape[0]}, {samples} spp")
 
 
@@ -66,7 +69,7 @@ def check_image_path(path: Path) -> None:
         raise ConfigError("--output", "", f"{path} is a folder, or in a folder that does not exist")
     existed = path.exists()
     try:
-        with path.open("ab"):
+        with path.open("ab"), tempfile.TemporaryFile(dir=path.resolve().parent):
             pass
     except OSError as error:
         raise ConfigError("--output", "", f"cannot write {path}: {error.strerror}") from None

@@ -7,6 +7,7 @@ import json
 import os
 import re
 import selectors
+import shutil
 import signal
 import subprocess
 import sys
@@ -102,6 +103,11 @@ class Process:
             with contextlib.suppress(BrokenPipeError):
                 stream.close()
         self._folder.cleanup()
+
+    def abandon(self) -> None:
+        """End the process and remove its folder, from any thread, as this process is about to end."""
+        self._process.kill()
+        shutil.rmtree(self._folder.name, ignore_errors=True)
 
     def _look_at_memory(self) -> None:
         try:
