@@ -177,6 +177,8 @@ class Recording:
 
     def _kept(self) -> str:
         """What of the run a reader will find."""
+        if not self.folder.path.is_dir():
+            return f"{self.folder.path} was removed or moved away"
         if self._saved is None or not self.folder.checkpoint.is_dir():
             return "nothing of the run was kept"
         state = f"the state after {self._saved} of {self.done} iterations" if self._saved else "the initial state"

@@ -20,7 +20,7 @@ __all__ = ["FILE_NAME", "Manifest", "Status", "now", "read_manifest", "versions"
 
 PACKAGES = ("mitsuba", "drjit", "numpy")
 #: Held while a manifest is written; a process that is about to end takes it for good, after so many seconds at most.
-_WRITING, LAST_WAIT_SECONDS = threading.RLock(), 5.0
+_WRITING, LAST_WAIT_SECONDS = threading.Lock(), 5.0
 
 
 def now() -> str:
@@ -71,7 +71,7 @@ class Manifest:
     def write(self, folder: Path) -> None:
         """Write `manifest.json` into `folder`, atomically where the disk has room. Raises OSError."""
         with _WRITING:
-            write_content(folder, {"program": PROGRAM, **asdict(self)})
+            write_content(folder, self._content())
 
     def end(self, folder: Path, status: Status, error: str | None = None) -> None:
         """Set the final status and the time, and write the file. Raises OSError."""
@@ -81,7 +81,11 @@ class Manifest:
     def end_for_good(self, folder: Path, status: Status) -> None:
         """The same in a process that is about to end, by a thread beside the one that works: that writes no more."""
         _WRITING.acquire(timeout=LAST_WAIT_SECONDS)  # and never released
-        self.end(folder, status)
+        self.status, self.error, self.ended = status, None, now()
+        write_content(folder, self._content())
+
+    def _content(self) -> dict[str, Any]:
+        return {"program": PROGRAM, **asdict(self)}
 
 
 def read_manifest(folder: Path) -> dict[str, Any] | None:

@@ -6,10 +6,12 @@ import errno
 import json
 import os
 import sys
+import threading
 from pathlib import Path
 
 import pytest
 
+from reslrb_cli.records import manifest as manifests
 from reslrb_cli.records import manifest_file
 from reslrb_cli.records.lock import FolderLock, Holder
 from reslrb_cli.records.manifest import Manifest, Status, read_manifest
@@ -80,6 +82,21 @@ def test_what_is_no_manifest_of_ours(tmp_path, text):
     (tmp_path / FILE_NAME).write_bytes(text.encode(errors="surrogateescape"))
     assert read_manifest(tmp_path) is None
     assert read_manifest(tmp_path / "nowhere") is None
+
+
+def test_the_last_word_of_a_process_that_ends_at_once_stays(tmp_path, monkeypatch):
+    monkeypatch.setattr(manifests, "_WRITING", threading.Lock())
+    manifest = make_manifest()
+    manifest.write(tmp_path)
+    for work in (
+        lambda: manifest.end_for_good(tmp_path, Status.INTERRUPTED),
+        lambda: manifest.end(tmp_path, Status.FINISHED),  # the thread that works knows nothing of it
+    ):
+        thread = threading.Thread(target=work, daemon=True)
+        thread.start()
+        thread.join(timeout=0.5)
+    assert thread.is_alive()
+    assert stored(tmp_path)["status"] == "interrupted"
 
 
 # --- full disks -------------------------------------------------------------------------------------------------------
