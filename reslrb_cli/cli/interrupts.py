@@ -1,9 +1,9 @@
 """SIGINT, SIGTERM and SIGHUP: the wish to stop, and the end at once.
 
 Nothing is ever raised out of a signal handler. An exception that comes up in the midst of what Mitsuba and Dr.Jit are
-doing ends in a crash, or in an error that names something else: a module that is half imported, a loop that is half
-traced, a recording without its end. So the first signals only leave a mark, which is looked at where it is safe to
-stop; and one too many ends the process where it stands, after what has to be said has been said.
+doing ends in a crash (a module that is half imported), or in an error that names something else (a recording without
+its end). So the first signals only leave a mark, which is looked at where it is safe to stop; and one too many ends the
+process where it stands, after what has to be said has been said.
 
 Python runs its handlers in the main thread, between two of its instructions, and takes two signals that come while a
 kernel runs for one. The signals are therefore counted by a thread of their own, which gets each of them from the

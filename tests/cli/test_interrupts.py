@@ -76,7 +76,7 @@ def test_in_another_thread_nothing_happens():
 
 
 def test_a_signal_in_a_recording_does_not_break_it(llvm):
-    """Raised as an exception there, it ends the recording, or the process."""
+    """Raised as an exception there, it becomes an error that looks like a call that cannot be recorded."""
     import drjit as dr
     import mitsuba as mi
 
