@@ -21,7 +21,7 @@ _PART = re.compile(r"\..+\.\d+\.part")
 FOLDER_PREFIX = ".reslrb-"
 
 #: Files and folders that this process is about to finish.
-_unfinished: set[Path] = set()
+unfinished: set[Path] = set()
 
 
 def write_atomically(path: Path, write: Callable[[IO[bytes]], object], durable: bool = False) -> None:
@@ -30,7 +30,7 @@ def write_atomically(path: Path, write: Callable[[IO[bytes]], object], durable: 
     With `durable` a machine that loses its power does not lose the file either. Raises OSError, which names `path`.
     """
     part = path.with_name(f".{path.name}.{os.getpid()}.part")
-    _unfinished.add(part)
+    unfinished.add(part)
     try:
         with part.open("wb") as file:
             write(file)
@@ -46,24 +46,24 @@ def write_atomically(path: Path, write: Callable[[IO[bytes]], object], durable: 
     finally:
         with contextlib.suppress(OSError):
             part.unlink(missing_ok=True)
-        _unfinished.discard(part)
+        unfinished.discard(part)
 
 
 @contextmanager
 def unfinished_folder(parent: Path) -> Iterator[Path]:
     """A new folder in `parent`, which the block may rename; else it is removed at its end, with all that is in it."""
     path = Path(tempfile.mkdtemp(prefix=FOLDER_PREFIX, dir=parent))
-    _unfinished.add(path)
+    unfinished.add(path)
     try:
         yield path
     finally:
         shutil.rmtree(path, ignore_errors=True)
-        _unfinished.discard(path)
+        unfinished.discard(path)
 
 
 def remove_unfinished() -> None:
     """Remove what this process has not finished; to be called when it is about to end in the midst of it."""
-    for path in list(_unfinished):
+    for path in list(unfinished):
         with contextlib.suppress(OSError):
             if path.is_dir():
                 shutil.rmtree(path, ignore_errors=True)

@@ -6,6 +6,8 @@ import contextlib
 import os
 from pathlib import Path
 
+from reslrb_cli.records.atomic import unfinished
+
 
 class Reserve:
     """A file in `folder` that takes up room until `release`: the end of a run then fits on a disk that is full.
@@ -19,6 +21,7 @@ class Reserve:
 
     def hold(self, size: int) -> None:
         """Take up so many bytes."""
+        unfinished.add(self._path)
         try:
             descriptor = os.open(self._path, os.O_WRONLY | os.O_CREAT, 0o600)
             try:
@@ -32,6 +35,7 @@ class Reserve:
         """Free them."""
         with contextlib.suppress(OSError):
             self._path.unlink(missing_ok=True)
+        unfinished.discard(self._path)
 
 
 def size_of(folder: Path) -> int:

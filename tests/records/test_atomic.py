@@ -94,6 +94,9 @@ def test_a_reserve_takes_up_room_until_it_is_released(tmp_path: Path) -> None:
     reserve.release()
     reserve.release()
     assert names(tmp_path) == []
+    reserve.hold(100_000)  # and its process is ended at once
+    remove_unfinished()
+    assert names(tmp_path) == []
     reserve.hold(100_000)  # and its process is killed
     remove_parts(tmp_path)
     assert names(tmp_path) == []
