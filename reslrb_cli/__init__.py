@@ -6,10 +6,19 @@ will load. `register()` makes the plugins known to Mitsuba, `step(...)` is one g
 
 from __future__ import annotations
 
-import importlib
-from typing import TYPE_CHECKING, Any
+import os
+import signal
+import sys
 
-from reslrb_cli.backend import llvm as _llvm
+_is_program = bool(sys.argv) and os.path.basename(sys.argv[0]) == "reslrb"
+if _is_program and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+    # Until its command line can answer, Ctrl-C ends the program without a traceback: also during the imports below.
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+import importlib  # noqa: E402
+from typing import TYPE_CHECKING, Any  # noqa: E402
+
+from reslrb_cli.backend import llvm as _llvm  # noqa: E402
 
 if TYPE_CHECKING:
     from reslrb_cli.integrators import gradient_step as step

@@ -44,6 +44,7 @@ class ExitCode(enum.IntEnum):
     BACKEND = 3
     OUT_OF_MEMORY = 4
     NON_FINITE = 5
+    MACHINE = 6
     INTERRUPTED = 130
 
 
@@ -95,6 +96,12 @@ class NonFinite(ReslrbError):
     exit_code = ExitCode.NON_FINITE
 
 
+class MachineError(ReslrbError):
+    """The machine failed, whatever the user asked for: a full disk, a folder that has gone, a driver."""
+
+    exit_code = ExitCode.MACHINE
+
+
 #: What backends, the C++ library, the loader and NumPy write where memory is out.
 _MEMORY_WORDS = (
     "out of memory", "bad alloc", "cannot allocate memory", "could not allocate", "unable to allocate",
@@ -113,3 +120,28 @@ def is_out_of_memory(error: BaseException) -> bool:
     if isinstance(error, MemoryError | OutOfMemory) or (isinstance(error, OSError) and error.errno == errno.ENOMEM):
         return True
     return isinstance(error, RuntimeError | ImportError) and mentions_memory(str(error))
+
+
+#: Errors of files that say nothing about what the user chose: no room, a device or a server that does not answer.
+_MACHINE_ERRNOS = {
+    number
+    for name in (
+        "ENOSPC", "EDQUOT", "EFBIG", "EIO", "ENXIO", "ENODEV", "ESTALE", "EREMOTEIO", "ETIMEDOUT", "EHOSTDOWN",
+        "ENOTCONN", "EMFILE", "ENFILE",
+    )
+    if (number := getattr(errno, name, None)) is not None
+}  # fmt: skip
+#: How Dr.Jit's messages about a driver or a compiler begin, and what CUDA and OptiX call their errors.
+_DRIVER_WORDS = (
+    "cuda_check()", "jit_optix_check()", "jit_cuda_compile()", "jit_optix_compile()", "jit_llvm_compile()",
+    "CUDA_ERROR_", "OPTIX_ERROR_",
+)  # fmt: skip
+
+
+def is_machine_fault(error: BaseException) -> bool:
+    """Whether an exception, ours or another's, says that the machine failed; one about memory does not."""
+    if isinstance(error, MachineError):
+        return True
+    if isinstance(error, OSError):
+        return error.errno in _MACHINE_ERRNOS
+    return isinstance(error, RuntimeError) and any(word in str(error) for word in _DRIVER_WORDS)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import subprocess
 import sys
 import time
@@ -10,7 +11,15 @@ import click
 import pytest
 
 from reslrb_cli.cli import _Main, main
-from reslrb_cli.errors import BackendError, ConfigError, ExitCode, NonFinite, OutOfMemory, UnsupportedScene
+from reslrb_cli.errors import (
+    BackendError,
+    ConfigError,
+    ExitCode,
+    MachineError,
+    NonFinite,
+    OutOfMemory,
+    UnsupportedScene,
+)
 
 COMMANDS = main.list_commands(click.Context(main))
 
@@ -53,6 +62,12 @@ failing: list[BaseException] = []
         (RuntimeError("jit_malloc(): out of memory! Could not\nallocate"), 4, "Could not allocate"),
         (RuntimeError("CUDA_ERROR_OUT_OF_MEMORY"), 4, "out of memory"),
         (PermissionError(13, "Permission denied", "runs/x"), 2, "runs/x: Permission denied"),
+        (MachineError("runs/x: the disk is full"), 6, "runs/x: the disk is full"),
+        (OSError(errno.ENOSPC, "No space left on device", "x.json"), 6, "x.json: No space left on device"),
+        (OSError(errno.EIO, "Input/output error"), 6, "Input/output error"),
+        (RuntimeError('cuda_check(): API error 0700 (CUDA_ERROR_ILLEGAL_ADDRESS): "x"\n in a.cpp'), 6, "0700"),
+        (RuntimeError("jit_llvm_compile(): could not add module: x"), 6, "the driver or its compiler failed: jit_llvm"),
+        (RuntimeError("jit_llvm_compile(): could not allocate 5 bytes of memory!"), 4, "out of memory"),
     ],
 )
 def test_exit_codes(capsys: pytest.CaptureFixture[str], error: BaseException, code: int, line: str) -> None:

@@ -1,4 +1,5 @@
-"""The command line: `main` finds the commands, and is the one place where an error becomes an exit code.
+"""The command line: `main` finds the commands, and is the one place where an error becomes an exit code; `run` is the
+program, which is `main` under signals.
 
 Each command is one module here that holds a click command named `command`; it is loaded when it is called.
 """
@@ -17,8 +18,11 @@ from typing import Any
 import click
 
 from reslrb_cli import __version__
+from reslrb_cli.cli.console import LogLines, forgiving_output
+from reslrb_cli.cli.interrupts import Interrupts
 from reslrb_cli.cli.output import LineFormatter
-from reslrb_cli.errors import LINE_LENGTH, ExitCode, ReslrbError, is_out_of_memory, one_line
+from reslrb_cli.cli.telling import tell
+from reslrb_cli.errors import LINE_LENGTH, ExitCode, one_line
 
 # What `reslrb --help` says of each command, so that it need not load them; in the order of a user's work.
 _SUMMARIES = {
@@ -64,35 +68,18 @@ class _Main(click.Group):
         if not standalone_mode:
             return super().main(args, prog_name, complete_var, standalone_mode=False, **extra)
         self.debug = os.environ.get("RESLRB_DEBUG", "0") not in ("", "0")
-        try:
-            code = super().main(args, prog_name, complete_var, standalone_mode=False, **extra)
-        except BaseException as error:
-            told = _tell(error)
-            if told is None:
-                raise
-            if self.debug:
-                traceback.print_exc()
-            line, code = told
-            click.echo(one_line(line, LINE_LENGTH), err=True)
+        with forgiving_output():
+            try:
+                code = super().main(args, prog_name, complete_var, standalone_mode=False, **extra)
+            except BaseException as error:
+                told = tell(error)
+                if told is None:
+                    raise
+                if self.debug:
+                    traceback.print_exc()
+                line, code = told
+                click.echo(one_line(line, LINE_LENGTH), err=True)
         sys.exit(code if isinstance(code, int) else ExitCode.DONE)
-
-
-def _tell(error: BaseException) -> tuple[str, int] | None:
-    """The line and the exit code for `error`; None for a fault of ours, whose traceback is wanted."""
-    if isinstance(error, ReslrbError):
-        return str(error), error.exit_code
-    if isinstance(error, click.Abort | KeyboardInterrupt):
-        return "interrupted", ExitCode.INTERRUPTED
-    if isinstance(error, click.ClickException):
-        context = getattr(error, "ctx", None)
-        where = context.command_path if context else "reslrb"
-        return f"{where}: {one_line(error.format_message()).rstrip('.')}. See `{where} --help`.", ExitCode.USAGE
-    if is_out_of_memory(error):
-        advice = "lower run.spp or the size of the film, or set run.memory_budget or integrator.samples_per_pass"
-        return f"out of memory ({one_line(error, 200) or 'host'}); {advice}", ExitCode.OUT_OF_MEMORY
-    if isinstance(error, OSError) and error.filename is not None:
-        return f"{error.filename}: {error.strerror}", ExitCode.USAGE
-    return None
 
 
 def _set_debug(ctx: click.Context, _parameter: click.Parameter, value: bool) -> None:
@@ -111,7 +98,7 @@ def main() -> None:
     """Recover scene parameters from images of what light paths carry, with Mitsuba 3."""
     logger = logging.getLogger("reslrb_cli")
     if not logger.handlers:
-        handler = logging.StreamHandler()
+        handler = LogLines()
         handler.setFormatter(LineFormatter())
         logger.addHandler(handler)
         logger.setLevel(logging.INFO)
@@ -119,3 +106,13 @@ def main() -> None:
         os.getcwd()
     except OSError as error:  # removed; relative paths start from it, and Mitsuba does not load without
         raise OSError(error.errno, error.strerror, "the working directory") from None
+
+
+def run() -> None:
+    """The program `reslrb`: a signal ends it at once and in order, unless a command sees to that itself."""
+    interrupts = Interrupts(tolerated=0)
+    with interrupts:
+        try:
+            main(prog_name="reslrb")
+        finally:
+            interrupts.ignore()  # nothing of the work is left

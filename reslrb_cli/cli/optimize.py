@@ -15,6 +15,8 @@ from reslrb_cli.errors import ExitCode, printable
 from reslrb_cli.records.manifest import Manifest, Status
 from reslrb_cli.records.run_folder import RunFolder, check_output
 
+NOTICE = "stopping after this iteration; once more, and it ends at once"
+
 
 @click.command("optimize")
 @experiment_arguments
@@ -23,8 +25,8 @@ from reslrb_cli.records.run_folder import RunFolder, check_output
 def command(config_file: Path, overrides: tuple[str, ...], force: bool, quiet: bool) -> int:
     """Recover the parameters that CONFIG names from its target images.
 
-    Writes a run folder; the last line says where it is. Ctrl-C ends the run after the current iteration, with its
-    folder complete; a second one ends it at once.
+    Writes a run folder; the last line says where it is. Ctrl-C, SIGTERM and SIGHUP end the run after the current
+    iteration, with its folder complete; a second signal ends it at once.
     """
     if quiet:
         logging.getLogger("reslrb_cli").setLevel(logging.WARNING)
@@ -49,13 +51,19 @@ def command(config_file: Path, overrides: tuple[str, ...], force: bool, quiet: b
     )
     manifest.pilot = None if problem.pilot is None else problem.pilot.to_json()
     manifest.memory = None if problem.memory is None else problem.memory.to_json()
-    folder = RunFolder.create(config_file, config.run.output, config.run.folder_name, force, dump(config), manifest)
-    recording = Recording(problem, folder, manifest)
-    with Interrupts() as interrupts, Progress(config.run.iterations, quiet, recording.results.meter) as progress:
-        status = recording.run(progress.show, lambda: interrupts.requested)
+    run = config.run
+    with (
+        Interrupts(notice=None if quiet else NOTICE) as interrupts,
+        RunFolder.create(config_file, run.output, run.folder_name, force, dump(config), manifest) as folder,
+    ):
+        recording = Recording(problem, folder, manifest)
+        interrupts.last_act = recording.abandon
+        with Progress(run.iterations, quiet, recording.results.meter) as progress:
+            status = recording.run(progress.show, lambda: interrupts.requested)
     if not quiet:
         for line in parameter_lines(manifest.results, terminal_width()):
             echo(line)
     tallies = [str(tally) for tally in (recording.nonfinite, recording.clamped) if tally.iterations]
-    echo(last_line(status.value, manifest.results, tallies, os.path.relpath(folder.path / "report.html")))
+    page = folder.path if "page" in manifest.missing else folder.path / "report.html"
+    echo(last_line(status.value, manifest.results, tallies, os.path.relpath(page)))
     return ExitCode.DONE if status is Status.FINISHED else ExitCode.INTERRUPTED

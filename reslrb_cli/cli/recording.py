@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from reslrb_cli.cli.ending import Ending
 from reslrb_cli.errors import NonFinite
 from reslrb_cli.optimization import Problem, optimize
 from reslrb_cli.optimization.nonfinite import Findings
@@ -23,6 +24,7 @@ from reslrb_cli.records.images import write_image
 from reslrb_cli.records.manifest import Manifest, Status
 from reslrb_cli.records.metrics import MetricsWriter, Record
 from reslrb_cli.records.parameters import write_mask, write_parameters
+from reslrb_cli.records.reserve import Reserve, size_of
 from reslrb_cli.records.run_folder import RunFolder
 from reslrb_cli.records.tally import ClampTally, NonFiniteTally
 from reslrb_cli.report import write_report
@@ -33,6 +35,8 @@ logger = logging.getLogger(__name__)
 
 #: Seconds between two checkpoints.
 CHECKPOINT_SECONDS = 30.0
+#: What the end of a run writes beside checkpoint and parameters, for which room is kept: a manifest, and lists.
+RESERVE_BYTES = 1 << 16
 
 
 @dataclass
@@ -49,6 +53,8 @@ class Recording:
     nonfinite: NonFiniteTally = field(default_factory=NonFiniteTally)
     clamped: ClampTally = field(default_factory=ClampTally)
     _saved_nonfinite: bool = False
+    #: Iterations that the newest checkpoint contains; None before the first one.
+    _saved: int | None = None
 
     def __post_init__(self) -> None:
         self.results = Results(self.problem)
@@ -61,31 +67,36 @@ class Recording:
     def run(self, show: Callable[[Record], None], stop: Callable[[], bool]) -> Status:
         """Iterate until the end or until `stop()`, and complete the folder; return how it ended.
 
-        Whatever ends the run, its folder holds the parameters, a checkpoint, the report and a final status; the
-        final images are missing only where the run failed or was interrupted again while they were rendered.
+        Whatever ends the run, its folder has a manifest that says so, the parameters, a checkpoint and the report, and
+        final images where it did not fail; what could not be written is noted in the manifest. Raises what the run
+        failed of, a MachineError where the folder could not be written to.
         """
-        status, error = Status.FAILED, None
+        reserve = Reserve(self.folder.checkpoint)
+        status: Status = Status.FAILED
+        failure: BaseException | None = None
         try:
-            self._begin()
+            self._begin(reserve)
             self._iterate(show, stop)
-            interrupted = self.done < self.problem.config.run.iterations
-            self._write_images("final")
-            status = Status.INTERRUPTED if interrupted else Status.FINISHED
+            status = Status.INTERRUPTED if self.done < self.problem.config.run.iterations else Status.FINISHED
         except KeyboardInterrupt:
             status = Status.INTERRUPTED
-        except NonFinite as failure:
-            error = f"{failure}; where: {self._inspection()}" if self._saved_nonfinite else str(failure)
-            raise NonFinite(error) from None
-        except BaseException as failure:
-            error = " ".join(str(failure).split()) or type(failure).__name__
-            raise
-        finally:
-            self._end(status, error)
-        return status
+        except NonFinite as error:
+            failure = NonFinite(f"{error}; where: {self._inspection()}") if self._saved_nonfinite else error
+        except BaseException as error:
+            failure = error
+        reserve.release()
+        return self._end(status, failure)
 
-    def _begin(self) -> None:
+    def abandon(self) -> None:
+        """Note in the manifest that the run was interrupted, in a process that is about to end in the midst of it."""
+        if not self.manifest.results and self.last is not None:
+            self.manifest.results = {"iterations": self.done, "elapsed_s": self.last.elapsed_s}
+        self.manifest.end_for_good(self.folder.path, Status.INTERRUPTED)
+
+    def _begin(self, reserve: Reserve) -> None:
         problem, parameters = self.problem, self.folder.parameters
         self.results.begin()
+        self._save_checkpoint()
         for sensor, target in zip(problem.sensors, problem.targets, strict=True):
             write_image(self.folder.images / self._image_name("target", sensor), np.array(target))
         self._write_images("initial")
@@ -94,6 +105,7 @@ class Recording:
             write_parameters(parameters / "true", problem.truth)
         for key, mask in problem.masks.items():
             write_mask(parameters, key, mask)
+        reserve.hold(size_of(self.folder.checkpoint) + size_of(parameters / "initial") + RESERVE_BYTES)
 
     def _iterate(self, show: Callable[[Record], None], stop: Callable[[], bool]) -> None:
         every, saved = self.problem.config.run.images_every, time.monotonic()
@@ -145,7 +157,23 @@ class Recording:
                 logger.warning(warning)
             self.manifest.memory = memory.to_json()
 
-    def _end(self, status: Status, error: str | None) -> None:
+    def _end(self, status: Status, failure: BaseException | None) -> Status:
+        ending = Ending(self.folder.path, self.manifest, status, failure, self._kept)
+        ending.part("results", self._note_results)
+        ending.begin(["checkpoint", "parameters", "final images"])
+        ending.part("checkpoint", self._save_checkpoint)
+        ending.part("parameters", lambda: write_parameters(self.folder.parameters, self.problem.values()))
+        if failure is None:
+            ending.part("final images", self._write_final_images)
+        else:
+            ending.leave_out("final images", "the run failed")
+        return ending.finish(lambda: write_report(self.folder.path))
+
+    def _write_final_images(self) -> None:
+        self._write_images("final")
+        self._note_results()
+
+    def _note_results(self) -> None:
         self.results.end()
         found = self.results.to_json()
         self.manifest.results = {
@@ -158,13 +186,19 @@ class Recording:
             "nonfinite": self.nonfinite.to_json(),
             "clamped": self.clamped.to_json(),
         }
-        write_parameters(self.folder.parameters, self.problem.values())
-        self._save_checkpoint()
-        self.manifest.end(self.folder.path, status, error)
-        write_report(self.folder.path)
+
+    def _kept(self) -> str:
+        """What of the run a reader will find."""
+        if not self.folder.path.is_dir():
+            return f"{self.folder.path} was removed or moved away"
+        if self._saved is None or not self.folder.checkpoint.is_dir():
+            return "nothing of the run was kept"
+        state = f"the state after {self._saved} of {self.done} iterations" if self._saved else "the initial state"
+        return f"kept: {state}, in {self.folder.checkpoint}"
 
     def _save_checkpoint(self) -> None:
         save_checkpoint(self.folder.checkpoint, self.done, self.problem.values(), self.problem.optimizer.state())
+        self._saved = self.done
 
     def _write_images(self, name: str) -> None:
         spp = saved_spp(self.problem, between=name.startswith("iteration"))

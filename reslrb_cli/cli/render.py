@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import os
+import tempfile
 from pathlib import Path
 
 import click
 
 from reslrb_cli.cli.experiment import COUNT, check_writable, experiment_arguments, read_config, start_variant
 from reslrb_cli.cli.output import echo
-from reslrb_cli.errors import ConfigError
+from reslrb_cli.errors import ConfigError, is_machine_fault
 
 #: Formats that hold linear values; the others of `FORMATS` are written in 8-bit sRGB.
 FLOAT_FORMATS = (".exr", ".hdr", ".pfm")
@@ -53,9 +54,11 @@ def command(
     samples = spp or config.run.spp
     image = render_in_passes(integrator, scene, sensors[0], samples, config.run.seed, 0, "render", multiple)
     try:
-        write_file(output, image, linear=output.suffix.lower() in FLOAT_FORMATS)
+        write_file(output.resolve(), image, linear=output.suffix.lower() in FLOAT_FORMATS)
     except (OSError, RuntimeError) as error:
-        raise ConfigError("--output", "", f"cannot write {output}: {error}") from None
+        if is_machine_fault(error):
+            raise
+        raise ConfigError("--output", "", f"cannot write {output}: {getattr(error, 'strerror', error)}") from None
     echo(f"{output}: {image.shape[1]}x{image.shape[0]}, {samples} spp")
 
 
@@ -67,8 +70,9 @@ def check_image_path(path: Path) -> None:
         raise ConfigError("--output", "", f"{path} is a folder, or in a folder that does not exist")
     if os.path.lexists(path) and not path.is_file():
         raise ConfigError("--output", "", f"{path} is not a regular file")
-    try:
-        str(path.absolute()).encode()
-    except UnicodeEncodeError:
-        raise ConfigError("--output", "", f"{path} is not UTF-8; Mitsuba writes no such file") from None
     check_writable("--output", path)
+    try:  # for the file that takes the place of that one when it is complete
+        with tempfile.TemporaryFile(dir=path.resolve().parent):
+            pass
+    except OSError as error:
+        raise ConfigError("--output", "", f"cannot write {path}: {error.strerror}") from None

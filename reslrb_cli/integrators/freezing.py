@@ -14,7 +14,7 @@ from typing import Any
 
 import drjit as dr
 
-from reslrb_cli.errors import UnsupportedScene, is_out_of_memory
+from reslrb_cli.errors import UnsupportedScene, is_machine_fault, is_out_of_memory
 from reslrb_cli.integrators.light_tracer import Samples
 from reslrb_cli.transport.splat import Film
 
@@ -59,7 +59,7 @@ class Recordings:
             with _without_garbage_collection():
                 return recorded(*common, *inputs)
         except RuntimeError as error:
-            if is_out_of_memory(error):
+            if is_out_of_memory(error) or is_machine_fault(error):
                 raise
             reason = str(error.__cause__ or error).splitlines()[0]
             raise UnsupportedScene(
@@ -95,7 +95,7 @@ def _record(kind: str, plain: Callable[..., Any], common: tuple[Any, ...], input
                 if recorded.n_recordings <= done:
                     break
     except RuntimeError as error:
-        if is_out_of_memory(error):
+        if is_out_of_memory(error) or is_machine_fault(error):
             raise
         logging.getLogger(__name__).debug("not recorded (%s): %s", kind, error.__cause__ or error)
         return None

@@ -7,6 +7,7 @@ import json
 import os
 import re
 import selectors
+import shutil
 import signal
 import subprocess
 import tempfile
@@ -19,6 +20,8 @@ from reslrb_cli.errors import ReslrbError, mentions_memory
 from reslrb_cli.records.bench import BenchStatus
 
 POLL_SECONDS = 0.05
+#: How long the end of a killed process is waited for: it may still be writing into its folder.
+ABANDON_SECONDS = 5.0
 #: A process that crashes with as much of its limit in use is taken to have died of it.
 CLOSE_TO_LIMIT = 0.75
 #: Signals by which a program ends when it goes on after an allocation that failed.
@@ -45,12 +48,27 @@ class Refused(ReslrbError):
         self.exit_code = exit_code  # type: ignore[assignment]
 
 
+#: Those that have not been closed.
+_at_work: list[Process] = []
+
+
+def abandon_all() -> None:
+    """End all processes and remove their folders, in a program that is about to end; from any thread."""
+    for process in list(_at_work):
+        with contextlib.suppress(AttributeError, subprocess.TimeoutExpired):  # AttributeError: it is just being made
+            process._process.kill()
+            process._process.wait(timeout=ABANDON_SECONDS)
+        with contextlib.suppress(AttributeError):
+            shutil.rmtree(process._folder.name, ignore_errors=True)
+
+
 class Process:
     """One worker. `first` is its first message; `memory_limit` (bytes, or None) is in it too."""
 
     def __init__(self, first: dict[str, Any], command: list[str] | None = None) -> None:
         self.limit: int | None = first["memory_limit"]
         self.peak_bytes = 0  # of address space
+        _at_work.append(self)
         self._folder = tempfile.TemporaryDirectory(prefix="reslrb-bench-", ignore_cleanup_errors=True)
         self._words = Path(self._folder.name) / "stderr"
         self._buffer = b""
@@ -102,6 +120,8 @@ class Process:
             with contextlib.suppress(BrokenPipeError):
                 stream.close()
         self._folder.cleanup()
+        if self in _at_work:
+            _at_work.remove(self)
 
     def _look_at_memory(self) -> None:
         try:

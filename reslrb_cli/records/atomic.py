@@ -1,19 +1,90 @@
-"""Files that are either whole or absent."""
+"""Files that are either whole or absent, however the process ends.
+
+What is under way has a name of its own (`.NAME.PID.part`, `.reslrb-*` for folders). A process that fails removes it,
+one that is ended at once does so by `remove_unfinished`, and what a killed process leaves is found by its name.
+"""
 
 from __future__ import annotations
 
+import contextlib
 import os
-from collections.abc import Callable
+import re
+import shutil
+import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import IO
 
+_PART = re.compile(r"\..+\.\d+\.part")
+#: How the names of folders that are not finished begin.
+FOLDER_PREFIX = ".reslrb-"
 
-def write_atomically(path: Path, write: Callable[[IO[bytes]], object]) -> None:
-    """Let `write` fill a neighbour of `path` and rename it into place, so that no reader sees half a file."""
+#: Files and folders that this process is about to finish.
+unfinished: set[Path] = set()
+
+
+def write_atomically(path: Path, write: Callable[[IO[bytes]], object], durable: bool = False) -> None:
+    """Let `write` fill a neighbour of `path` and rename it into place, so that no reader sees half a file.
+
+    With `durable` a machine that loses its power does not lose the file either. Raises OSError, which names `path`.
+    """
     part = path.with_name(f".{path.name}.{os.getpid()}.part")
+    unfinished.add(part)
     try:
         with part.open("wb") as file:
             write(file)
+            if durable:
+                file.flush()
+                os.fsync(file.fileno())
         os.replace(part, path)
+        if durable:
+            _sync_folder(path.parent)
+    except OSError as error:
+        # An error of writing names no file, one of renaming names two.
+        raise OSError(error.errno, error.strerror, str(path)) from error
     finally:
-        part.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):
+            part.unlink(missing_ok=True)
+        unfinished.discard(part)
+
+
+@contextmanager
+def unfinished_folder(parent: Path) -> Iterator[Path]:
+    """A new folder in `parent`, which the block may rename; else it is removed at its end, with all that is in it."""
+    path = Path(tempfile.mkdtemp(prefix=FOLDER_PREFIX, dir=parent))
+    unfinished.add(path)
+    try:
+        yield path
+    finally:
+        shutil.rmtree(path, ignore_errors=True)
+        unfinished.discard(path)
+
+
+def remove_unfinished() -> None:
+    """Remove what this process has not finished; to be called when it is about to end in the midst of it."""
+    for path in list(unfinished):
+        with contextlib.suppress(OSError):
+            if path.is_dir():
+                shutil.rmtree(path, ignore_errors=True)
+            else:
+                path.unlink(missing_ok=True)
+
+
+def remove_parts(folder: Path) -> None:
+    """Remove the files in `folder` and in the folders below it that a process began and never finished."""
+    for parent, _, names in os.walk(folder):  # which follows no links
+        for name in names:
+            if _PART.fullmatch(name):
+                with contextlib.suppress(OSError):
+                    os.unlink(os.path.join(parent, name))
+
+
+def _sync_folder(folder: Path) -> None:
+    """Have a renamed file's name on the disk too, where the system can do that for a folder."""
+    with contextlib.suppress(OSError):
+        descriptor = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)

@@ -27,14 +27,15 @@ def save_checkpoint(
     parameters: Mapping[str, np.ndarray[Any, Any]],
     optimizer: Mapping[str, np.ndarray[Any, Any]],
 ) -> None:
-    """Write the state after `iteration` updates into `folder`, in place of the one before, atomically.
+    """Write the state after `iteration` updates into `folder`, in place of the one before, atomically and durably.
 
-    The archive's entries are `iteration`, `parameter/<key>` and `optimizer/<key>/<name>`.
+    The archive's entries are `iteration`, `parameter/<key>` and `optimizer/<key>/<name>`. Raises OSError, and then the
+    state before is still there.
     """
     arrays: dict[str, Any] = {"iteration": np.array(iteration)}
     arrays |= {f"parameter/{key}": value for key, value in parameters.items()}
     arrays |= {f"optimizer/{key}": value for key, value in optimizer.items()}
-    write_atomically(folder / FILE_NAME, lambda file: np.savez(file, **arrays))
+    write_atomically(folder / FILE_NAME, lambda file: np.savez(file, **arrays), durable=True)
 
 
 def save_nonfinite(folder: Path, iteration: int, parameters: Mapping[str, np.ndarray[Any, Any]]) -> None:

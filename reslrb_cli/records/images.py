@@ -8,6 +8,11 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
+from reslrb_cli.records.atomic import write_atomically
+
+#: Mitsuba's name of the format of each suffix.
+FORMATS = {".exr": "OpenEXR", ".hdr": "RGBE", ".pfm": "PFM", ".png": "PNG", ".jpg": "JPEG", ".jpeg": "JPEG"}
+
 
 def write_image(stem: Path, image: np.ndarray[Any, Any]) -> None:
     """Write an (H, W, C) image of linear values as `<stem>.exr` and `<stem>.png`.
@@ -19,18 +24,28 @@ def write_image(stem: Path, image: np.ndarray[Any, Any]) -> None:
 
 
 def write_file(path: Path, image: np.ndarray[Any, Any], linear: bool) -> None:
-    """Write an (H, W, C) image of linear values in the format that the suffix of `path` names.
+    """Write an (H, W, C) image of linear values in the format that the suffix of `path` names, atomically.
 
     `linear` writes it as it is; else it becomes 8-bit sRGB, clipped to [0, 1], and of four channels or more, and of
-    two, only the first are shown: three and one.
+    two, only the first are shown: three and one. Raises OSError, and RuntimeError for channels that a format lacks.
     """
     if linear:
-        mi.Bitmap(np.ascontiguousarray(image, dtype=np.float32)).write(str(path))
+        write_bitmap(path, mi.Bitmap(np.ascontiguousarray(image, dtype=np.float32)))
         return
     channels = 3 if image.shape[2] >= 3 else 1
     shown = np.clip(np.nan_to_num(image[:, :, :channels], nan=0.0), 0.0, 1.0).astype(np.float32)
     bitmap = mi.Bitmap(np.ascontiguousarray(shown))
-    bitmap.convert(component_format=mi.Struct.Type.UInt8, srgb_gamma=True).write(str(path))
+    write_bitmap(path, bitmap.convert(component_format=mi.Struct.Type.UInt8, srgb_gamma=True))
+
+
+def write_bitmap(path: Path, bitmap: mi.Bitmap) -> None:
+    """Write a bitmap as it is, atomically, in the format that the suffix of `path` names; raises as `write_file`.
+
+    By way of memory: Mitsuba would open the file itself, and leave it empty or cut short where the process ends.
+    """
+    stream = mi.MemoryStream()
+    bitmap.write(stream, getattr(mi.Bitmap.FileFormat, FORMATS[path.suffix.lower()]))
+    write_atomically(path, lambda file: file.write(stream.raw_buffer()))
 
 
 def read_exr(path: Path) -> np.ndarray[Any, Any]:

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import enum
-import json
 import platform
 import sys
+import threading
 from dataclasses import asdict, dataclass, field
 from datetime import datetime, timezone
 from importlib import metadata
@@ -13,24 +12,16 @@ from pathlib import Path
 from typing import Any
 
 from reslrb_cli import __version__
-from reslrb_cli.config.files import read_file
-from reslrb_cli.errors import ConfigError, printable
-from reslrb_cli.records.atomic import write_atomically
+from reslrb_cli.errors import printable
+from reslrb_cli.records.abandoned import is_abandoned, put_right
+from reslrb_cli.records.lock import Holder
+from reslrb_cli.records.manifest_file import FILE_NAME, PROGRAM, Status, read_content, write_content
 
-FILE_NAME = "manifest.json"
-PROGRAM = "reslrb"
-#: Bytes of a manifest; the largest part of one is a pilot's table, of some kB.
-MOST_BYTES = 2**24
+__all__ = ["FILE_NAME", "Manifest", "Status", "now", "read_manifest", "versions"]
+
 PACKAGES = ("mitsuba", "drjit", "numpy")
-
-
-class Status(str, enum.Enum):
-    """How far a run has come."""
-
-    RUNNING = "running"
-    FINISHED = "finished"
-    INTERRUPTED = "interrupted"
-    FAILED = "failed"
+#: Held while a manifest is written; a process that is about to end takes it for good, after so many seconds at most.
+_WRITING, LAST_WAIT_SECONDS = threading.Lock(), 5.0
 
 
 def now() -> str:
@@ -53,10 +44,11 @@ def versions() -> dict[str, str]:
 class Manifest:
     """Provenance and outcome of one run.
 
-    `pilot` is the table by which an estimator was chosen, `memory` how a memory budget is kept, `scaling` what was
-    measured of each parameter for `scale: auto`; each is None where that was not asked for. `results` holds what the
-    run found (`iterations`, values and errors by key, `warnings`, ...); `error` is the line that the user saw where the
-    run failed.
+    `process` is who works in the folder. `pilot` is the table by which an estimator was chosen, `memory` how a memory
+    budget is kept, `scaling` what was measured of each parameter for `scale: auto`; each is None where that was not
+    asked for. `results` holds what the run found (`iterations`, values and errors by key, `warnings`, ...); `error` is
+    the line that the user saw where the run failed. `missing` names the parts of the folder that are not there (not
+    yet, where the process ended among them), and says why.
     """
 
     variant: str
@@ -67,29 +59,41 @@ class Manifest:
     command_line: list[str] = field(default_factory=lambda: [printable(word) for word in sys.argv])
     versions: dict[str, str] = field(default_factory=versions)
     platform: str = field(default_factory=platform.platform)
+    process: Holder = field(default_factory=lambda: Holder.here(locked=False))
     started: str = field(default_factory=now)
     ended: str | None = None
     error: str | None = None
+    missing: dict[str, str] = field(default_factory=dict)
     pilot: dict[str, Any] | None = None
     memory: dict[str, Any] | None = None
     scaling: list[dict[str, Any]] | None = None
     results: dict[str, Any] = field(default_factory=dict)
 
     def write(self, folder: Path) -> None:
-        """Write `manifest.json` into `folder`, atomically."""
-        text = json.dumps({"program": PROGRAM, **asdict(self)}, indent=2, allow_nan=False)
-        write_atomically(folder / FILE_NAME, lambda file: file.write(text.encode() + b"\n"))
+        """Write `manifest.json` into `folder`, atomically where the disk has room. Raises OSError."""
+        with _WRITING:
+            write_content(folder, self._content())
 
     def end(self, folder: Path, status: Status, error: str | None = None) -> None:
-        """Set the final status and the time, and write the file."""
+        """Set the final status and the time, and write the file. Raises OSError."""
         self.status, self.error, self.ended = status, error, now()
         self.write(folder)
 
+    def end_for_good(self, folder: Path, status: Status) -> None:
+        """The same in a process that is about to end, by a thread beside the one that works: that writes no more."""
+        _WRITING.acquire(timeout=LAST_WAIT_SECONDS)  # and never released
+        self.status, self.error, self.ended = status, None, now()
+        write_content(folder, self._content())
+
+    def _content(self) -> dict[str, Any]:
+        return {"program": PROGRAM, **asdict(self)}
+
 
 def read_manifest(folder: Path) -> dict[str, Any] | None:
-    """Return the manifest in `folder`, or None where there is none that `reslrb` wrote."""
-    try:
-        content = json.loads(read_file(folder / FILE_NAME, MOST_BYTES))
-    except (ConfigError, ValueError, RecursionError):
-        return None
-    return content if isinstance(content, dict) and content.get("program") == PROGRAM else None
+    """Return the manifest in `folder`, or None where there is none that `reslrb` wrote.
+
+    One that was left saying `running` by a process that has gone says `interrupted`, on the disk too from then on, if
+    that can be written to.
+    """
+    content = read_content(folder)
+    return put_right(folder, content) if content is not None and is_abandoned(folder, content) else content

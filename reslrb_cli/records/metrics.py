@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import math
+import os
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from types import TracebackType
 from typing import Any
+
+from reslrb_cli.records.atomic import write_atomically
 
 FILE_NAME = "metrics.jsonl"
 
@@ -71,15 +75,30 @@ def finite(value: Any) -> Any:
 
 
 class MetricsWriter:
-    """Appends records to `metrics.jsonl`; each line is on disk once `write` returns."""
+    """Appends records to `metrics.jsonl`; each line is in the file once `write` returns, and whole whatever happens."""
 
     def __init__(self, folder: Path) -> None:
-        self._file = (folder / FILE_NAME).open("a", encoding="utf-8")
+        self._path = folder / FILE_NAME
+        self._descriptor: int | None = None
+        mend(folder)
 
     def write(self, record: Record) -> None:
-        """Append one record."""
-        self._file.write(record.to_json() + "\n")
-        self._file.flush()
+        """Append one record. Raises OSError, with the file as it was, where there is no room or no file any more."""
+        line = record.to_json().encode() + b"\n"
+        if self._descriptor is None:
+            if not self._path.exists():
+                write_atomically(self._path, lambda file: file.write(line))  # it is never seen empty
+                line = b""
+            self._descriptor = os.open(self._path, os.O_WRONLY | os.O_APPEND)
+        state = os.fstat(self._descriptor)
+        if state.st_nlink == 0:
+            raise FileNotFoundError(errno.ENOENT, "has been removed while the run went on", str(self._path))
+        try:
+            while line:
+                line = line[os.write(self._descriptor, line) :]
+        except OSError as error:
+            os.ftruncate(self._descriptor, state.st_size)
+            raise OSError(error.errno, error.strerror, str(self._path)) from error
 
     def __enter__(self) -> MetricsWriter:
         return self
@@ -87,7 +106,20 @@ class MetricsWriter:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._file.close()
+        if self._descriptor is not None:
+            os.close(self._descriptor)
+
+
+def mend(folder: Path) -> None:
+    """Cut off a last line that a process did not come to finish. Raises OSError where that cannot be done."""
+    try:
+        with (folder / FILE_NAME).open("r+b") as file:
+            text = file.read()
+            whole = text.rfind(b"\n") + 1
+            if whole < len(text):
+                file.truncate(whole)
+    except FileNotFoundError:
+        pass
 
 
 def read_metrics(folder: Path) -> list[dict[str, Any]]:

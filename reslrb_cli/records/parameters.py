@@ -12,7 +12,7 @@ import numpy as np
 
 from reslrb_cli.records.atomic import write_atomically
 from reslrb_cli.records.file_names import file_stem
-from reslrb_cli.records.images import write_image
+from reslrb_cli.records.images import write_bitmap, write_image
 
 Array = np.ndarray[Any, Any]
 
@@ -48,4 +48,5 @@ def write_mask(folder: Path, key: str, mask: Array) -> None:
     stem = file_stem(key) + ".mask"
     write_atomically(folder / f"{stem}.npy", lambda file: np.save(file, mask))
     if mask.ndim == 2:
-        mi.Bitmap(np.ascontiguousarray(mask[:, :, None] * np.uint8(255))).write(str(folder / f"{stem}.png"))
+        bitmap = mi.Bitmap(np.ascontiguousarray(mask[:, :, None] * np.uint8(255)))
+        write_bitmap(folder / f"{stem}.png", bitmap)

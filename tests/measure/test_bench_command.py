@@ -129,6 +129,28 @@ def test_wrong_calls_are_one_located_line(args: list[str], line: str, capsys: py
     assert line in error
 
 
+@pytest.mark.skipif(os.name != "posix", reason="sends signals")
+def test_a_second_signal_leaves_neither_processes_nor_files(tmp_path: Path) -> None:
+    folder = tmp_path / "temporary"
+    folder.mkdir()
+    command = [sys.executable, "-c", "from reslrb_cli.cli import run; run()", "bench", *SMALL, "--max-depth", "1024"]
+    process = subprocess.Popen(
+        [*command, "--integrators", "reslrb:stack"],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=os.environ | {"TMPDIR": str(folder)},
+    )  # fmt: skip
+    assert process.stdout is not None
+    for line in process.stdout:
+        if line.split()[:1] == ["2"]:  # the first depth is done, and the processes of the second are at work
+            break
+    while not any(folder.iterdir()):
+        time.sleep(0.01)
+    for number in (signal.SIGTERM, signal.SIGHUP):
+        process.send_signal(number)
+    _, err = process.communicate(timeout=30)
+    assert (process.returncode, "Traceback" in err) == (130, False)
+    assert list(folder.iterdir()) == []
+
+
 def test_ctrl_c_keeps_what_is_done(tmp_path: Path) -> None:
     file = tmp_path / "bench.json"
     command = [sys.executable, "-c", "from reslrb_cli.cli import main; main()", "bench", *SMALL, "--max-depth", "1024"]

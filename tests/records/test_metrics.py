@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import math
+
+import pytest
 
 from reslrb_cli.records.checkpoint import save_checkpoint
 from reslrb_cli.records.metrics import MetricsWriter, Record, read_metrics
@@ -50,8 +53,41 @@ def test_a_torn_last_line_is_left_out(tmp_path):
     assert len(read_metrics(tmp_path)) == 1
 
 
+def test_a_torn_last_line_is_mended_before_another_follows(tmp_path):
+    with MetricsWriter(tmp_path) as writer:
+        writer.write(make_record())
+    with (tmp_path / "metrics.jsonl").open("a") as file:
+        file.write('{"iteration": 1, "lo')
+    with MetricsWriter(tmp_path) as writer:
+        assert (tmp_path / "metrics.jsonl").read_text().endswith("}\n")
+        writer.write(make_record(iteration=1))
+    assert [record["iteration"] for record in read_metrics(tmp_path)] == [0, 1]
+
+
 def test_no_file_is_no_records(tmp_path):
     assert read_metrics(tmp_path) == []
+    with MetricsWriter(tmp_path):
+        assert list(tmp_path.iterdir()) == []  # nor is one ever seen empty
+
+
+def test_a_line_that_does_not_fit_leaves_whole_ones(tmp_path, file_size_limit):
+    line = len(make_record().to_json()) + 1
+    with MetricsWriter(tmp_path) as writer:
+        writer.write(make_record())
+        with file_size_limit(line + 10), pytest.raises(OSError, match=r"metrics\.jsonl") as error:
+            writer.write(make_record())
+        assert error.value.errno == errno.EFBIG
+        assert (tmp_path / "metrics.jsonl").stat().st_size == line
+        writer.write(make_record(iteration=1))
+    assert [record["iteration"] for record in read_metrics(tmp_path)] == [0, 1]
+
+
+def test_a_file_that_was_removed_is_missed(tmp_path):
+    with MetricsWriter(tmp_path) as writer:
+        writer.write(make_record())
+        (tmp_path / "metrics.jsonl").unlink()
+        with pytest.raises(FileNotFoundError, match="removed while the run went on"):
+            writer.write(make_record())
 
 
 def test_a_checkpoint_can_be_read_by_numpy(tmp_path):

@@ -4,14 +4,21 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
 
 import pytest
 
 from reslrb_cli.config.limits import NAME_BYTES
 from reslrb_cli.config.names import check_name
-from reslrb_cli.errors import ConfigError
-from reslrb_cli.records.manifest import Manifest, Status
+from reslrb_cli.errors import ConfigError, MachineError
+from reslrb_cli.records.lock import FolderLock
+from reslrb_cli.records.manifest import Manifest, Status, read_manifest
 from reslrb_cli.records.run_folder import RunFolder, check_output
+
+ROOT = Path(__file__).resolve().parents[2]
 
 
 def make_manifest(**changes):
@@ -19,7 +26,9 @@ def make_manifest(**changes):
 
 
 def create(output, name="run", force=False, **changes):
-    return RunFolder.create("c.yaml", output, name, force, "scene: {}\n", make_manifest(**changes))
+    """A run folder in which nobody works any more."""
+    with RunFolder.create("c.yaml", output, name, force, "scene: {}\n", make_manifest(**changes)) as folder:
+        return folder
 
 
 def names(folder):
@@ -110,8 +119,6 @@ def test_an_output_that_is_a_file_is_refused(tmp_path):
 
 @pytest.mark.skipif(not os.path.isdir("/proc/self"), reason="needs /proc")
 def test_an_unwritable_output_is_refused_for_root_too(tmp_path):
-    from pathlib import Path
-
     with pytest.raises(ConfigError, match=r"run\.output: cannot write to"):
         check_output("c.yaml", Path("/proc/runs"), "run", False)
 
@@ -129,9 +136,136 @@ def test_names_that_leave_the_output_are_refused(tmp_path, name):
 
 def test_a_failed_start_leaves_nothing(tmp_path, monkeypatch):
     monkeypatch.setattr(Manifest, "write", lambda self, folder: (_ for _ in ()).throw(OSError(28, "No space left")))
-    with pytest.raises(ConfigError, match="No space left"):
+    with pytest.raises(MachineError, match="No space left"):
         create(tmp_path / "runs")
     assert names(tmp_path / "runs") == []
+
+
+@pytest.mark.parametrize("name", ["x" * 300, "ü" * 130, "x" * 254, "\ud800"])
+def test_names_that_no_file_can_have_are_refused_at_once(tmp_path, name):
+    with pytest.raises(ConfigError, match=r"^c\.yaml: run\.name: ") as error:
+        check_output("c.yaml", tmp_path, name, False)
+    assert len(str(error.value)) < 200
+    assert names(tmp_path) == []
+
+
+def test_a_full_disk_is_no_fault_of_the_configuration(tmp_path, monkeypatch):
+    def fail(*args, **options):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("pathlib.Path.write_text", fail)
+    with pytest.raises(MachineError, match="No space left on device"):
+        check_output("c.yaml", tmp_path, "run", False)
+    with pytest.raises(MachineError, match="no run folder was made"):
+        create(tmp_path)
+    assert names(tmp_path) == []
+
+
+# --- who works in it --------------------------------------------------------------------------------------------------
+
+
+def test_a_folder_in_use_is_not_replaced(tmp_path):
+    with RunFolder.create("c.yaml", tmp_path, "run", False, "mine: 1\n", make_manifest()) as folder:
+        who = rf"^c\.yaml: run\.name: .*/run is in use by a run \(process {os.getpid()} on .*, since 2.*\)"
+        with pytest.raises(ConfigError, match=who):
+            check_output("c.yaml", tmp_path, "run", True)
+        with pytest.raises(ConfigError, match=who):
+            create(tmp_path, force=True)
+        check_output("c.yaml", tmp_path, "run", False)
+        assert create(tmp_path).path.name == "run-2"
+        assert (folder.path / "config.yaml").read_text() == "mine: 1\n"
+        assert read_manifest(folder.path)["status"] == "running"
+    check_output("c.yaml", tmp_path, "run", True)
+    assert create(tmp_path, force=True).path == folder.path
+
+
+def test_who_replaces_a_folder_holds_it(tmp_path):
+    create(tmp_path)
+    for _ in range(2):
+        with RunFolder.create("c.yaml", tmp_path, "run", True, "", make_manifest()), pytest.raises(ConfigError):
+            create(tmp_path, force=True)
+
+
+def test_without_locks_runs_go_on_as_they_can(tmp_path, monkeypatch):
+    fcntl = pytest.importorskip("fcntl")
+
+    def fail(descriptor, operation):
+        raise OSError(95, "Operation not supported")
+
+    monkeypatch.setattr(fcntl, "flock", fail)
+    for force in (False, True):
+        with RunFolder.create("c.yaml", tmp_path, "run", force, "", make_manifest()) as folder:
+            content = read_manifest(folder.path)
+            assert (content["status"], content["process"]["locked"]) == ("running", False)
+
+
+def test_a_folder_that_a_killed_process_did_not_finish_is_removed_in_time(tmp_path):
+    old, new, locked = (tmp_path / f".reslrb-{name}" for name in ("old", "new", "locked"))
+    for folder in (old, new, locked):
+        (folder / "images").mkdir(parents=True)
+    for folder in (old, locked):
+        os.utime(folder, (1e9, 1e9))
+    with FolderLock(locked):
+        create(tmp_path)
+        assert names(tmp_path) == [".reslrb-locked", ".reslrb-new", "run"]
+
+
+def test_a_replacement_that_fails_halfway_says_so(tmp_path, monkeypatch):
+    create(tmp_path)
+    rmtree = shutil.rmtree
+
+    def fail(path, ignore_errors=False):
+        if not ignore_errors:
+            raise OSError(5, "Input/output error", str(path))
+        rmtree(path, ignore_errors=True)
+
+    monkeypatch.setattr(shutil, "rmtree", fail)
+    with pytest.raises(MachineError, match="Input/output error"):
+        create(tmp_path, force=True, seed=8)
+    content = read_manifest(tmp_path / "run")
+    assert (content["status"], content["seed"]) == ("failed", 8)
+    assert names(tmp_path) == ["run"]
+
+
+CONTEND = """
+import os, sys, time
+from pathlib import Path
+from reslrb_cli.errors import ConfigError
+from reslrb_cli.records.lock import FolderLock
+from reslrb_cli.records.manifest import Manifest, Status, read_manifest
+from reslrb_cli.records.run_folder import RunFolder
+output, count = Path(sys.argv[1]), int(sys.argv[2])
+for number in range(count):
+    mark = f"{os.getpid()}-{number}"
+    manifest = Manifest(variant=mark, device="", seed=number, config="c.yaml")
+    try:
+        with RunFolder.create("c.yaml", output, "run", True, mark, manifest) as folder:
+            for name in ("metrics.jsonl", "images/final.exr", "checkpoint/state.npz", "report.html"):
+                (folder.path / name).write_text(mark)
+                time.sleep(0.06)
+            manifest.end(folder.path, Status.FINISHED)
+            found = {path.read_text() for path in folder.path.rglob("*") if path.is_file() and path.suffix != ".json"}
+            print("mixed" if found != {mark} or mark not in (folder.path / "manifest.json").read_text() else "ran")
+    except ConfigError as error:
+        print("refused" if "is in use by a run" in str(error) else f"wrong: {error}")
+"""
+
+
+@pytest.mark.parametrize("each", [4, pytest.param(40, marks=pytest.mark.long)])
+def test_many_at_once_either_replace_or_are_refused(tmp_path, each):
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    command = [sys.executable, "-c", CONTEND, str(tmp_path), str(each)]
+    runs = [subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment)
+            for _ in range(8)]  # fmt: skip
+    done = [run.communicate() for run in runs]
+    assert [err for _, err in done] == [""] * 8
+    outcomes = [line for out, _ in done for line in out.splitlines()]
+    assert len(outcomes) == 8 * each
+    assert set(outcomes) == {"ran", "refused"}  # who waits for more than a second
+    assert names(tmp_path) == ["run"]
+    [mark] = {path.read_text() for path in (tmp_path / "run").rglob("*") if path.is_file() and path.suffix != ".json"}
+    content = read_manifest(tmp_path / "run")
+    assert (content["status"], content["variant"]) == ("finished", mark)
 
 
 def test_the_end_is_written(tmp_path):

@@ -1,0 +1,163 @@
+"""Who works in a run folder: a lock on the folder, and the name of the process that has it.
+
+The lock is the kernel's (`flock` on the folder itself). It leaves no file, and it ends with its process, whatever ends
+that. Some network file systems have no locks, or none that other machines see: there the process's name decides.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import os
+import platform
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None  # type: ignore[assignment]
+
+#: Who reads a folder, or puts its manifest right, has the lock for an instant: no run is refused over that, and no
+#: other reader takes it for a run.
+WAIT_SECONDS, READER_WAIT_SECONDS = 1.0, 0.25
+_POLL_SECONDS = 0.01
+_HELD = {errno.EWOULDBLOCK, errno.EAGAIN, errno.EACCES}
+
+
+class InUse(Exception):
+    """Another process, or another part of this one, has the lock."""
+
+
+class FolderLock:
+    """The lock on a folder, from its construction until `release` or the end of the process.
+
+    The folder keeps it when it is renamed. Several may have a `shared` one, as long as nobody has it alone. `real` is
+    False where the file system has no locks, and nothing is locked. Raises InUse, and OSError where there is no such
+    folder (a link to one is none).
+    """
+
+    def __init__(self, folder: Path, wait_s: float = WAIT_SECONDS, shared: bool = False) -> None:
+        flags = os.O_RDONLY | getattr(os, "O_DIRECTORY", 0) | getattr(os, "O_NOFOLLOW", 0)
+        self._descriptor: int | None = os.open(folder, flags) if fcntl is not None else None
+        try:
+            self.real = self._take(wait_s, shared)
+        except BaseException:
+            self.release()
+            raise
+
+    def _take(self, wait_s: float, shared: bool) -> bool:
+        if self._descriptor is None:
+            return False
+        kind, end = fcntl.LOCK_SH if shared else fcntl.LOCK_EX, time.monotonic() + wait_s
+        while True:
+            try:
+                fcntl.flock(self._descriptor, kind | fcntl.LOCK_NB)
+            except OSError as error:
+                if error.errno not in _HELD:
+                    return False
+                if time.monotonic() >= end:
+                    raise InUse from None
+                time.sleep(_POLL_SECONDS)
+            else:
+                return True
+
+    def is_of(self, folder: Path) -> bool:
+        """Whether the folder at that path is the one that is locked, which may have been moved or removed since."""
+        if self._descriptor is None:
+            return folder.is_dir()
+        try:
+            return os.path.samestat(os.fstat(self._descriptor), os.lstat(folder))
+        except OSError:
+            return False
+
+    def release(self) -> None:
+        """Let others have it."""
+        if self._descriptor is not None:
+            os.close(self._descriptor)
+            self._descriptor = None
+
+    def __enter__(self) -> FolderLock:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.release()
+
+
+@dataclass(frozen=True)
+class Holder:
+    """A process that works in a run folder, as its manifest names it.
+
+    `boot` tells one start of a machine from the next (None: the system does not say), and so two machines, or two
+    containers on one machine, of which the latter share it. `locked` says whether the process has a lock.
+    """
+
+    host: str
+    pid: int
+    boot: str | None
+    locked: bool
+
+    @staticmethod
+    def here(locked: bool) -> Holder:
+        """This process."""
+        return Holder(platform.node(), os.getpid(), _boot(), locked)
+
+    @staticmethod
+    def from_json(data: Mapping[str, Any] | None) -> Holder | None:
+        """What a manifest says; None where it says nothing."""
+        try:
+            return Holder(**data) if data is not None else None
+        except TypeError:
+            return None
+
+    def is_gone(self, folder: Path) -> bool:
+        """Whether this process, which worked in `folder`, has surely ended.
+
+        Where that cannot be known, as of a process on another machine without common locks, it has not.
+        """
+        if self.locked:
+            try:
+                with FolderLock(folder, READER_WAIT_SECONDS, shared=True) as lock:
+                    if lock.real:
+                        return self._shares_locks(folder)
+            except InUse:
+                return False
+            except OSError:
+                pass  # the folder cannot be opened: no lock to ask
+        return self._is_no_process()
+
+    def _shares_locks(self, folder: Path) -> bool:
+        """Whether a lock of the process would be seen here: not everywhere do machines share locks of network disks."""
+        here = Holder.here(locked=True)
+        same_kernel = self.host == here.host or (self.boot is not None and self.boot == here.boot)
+        # Network file systems have no block device.
+        return same_kernel or os.major(os.stat(folder).st_dev) != 0
+
+    def _is_no_process(self) -> bool:
+        here = Holder.here(locked=False)
+        if self.host != here.host:
+            return False
+        if self.boot != here.boot:
+            return True
+        try:
+            os.kill(self.pid, 0)
+        except ProcessLookupError:
+            return True
+        except OSError:  # it is another user's
+            pass
+        return False
+
+    def __str__(self) -> str:
+        return f"process {self.pid} on {self.host}"
+
+
+def _boot() -> str | None:
+    with contextlib.suppress(OSError):
+        return Path("/proc/sys/kernel/random/boot_id").read_text().strip()
+    return None

@@ -1,0 +1,109 @@
+"""An experiment of 8x8 pixels that takes a second, and what the tests of its endings share."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+from reslrb_cli.records.manifest import read_manifest
+from reslrb_cli.records.manifest_file import read_content
+
+ROOT = Path(__file__).resolve().parents[2]
+KEY = "poster.reflectance.data"
+SCENE = """<scene version="3.0.0">
+    <sensor type="perspective">
+        <float name="fov" value="50"/>
+        <transform name="to_world"><lookat origin="0, 0, 4" target="0, 0, 0" up="0, 1, 0"/></transform>
+        <film type="hdrfilm">
+            <integer name="width" value="8"/> <integer name="height" value="8"/>
+            <string name="pixel_format" value="rgb"/> <rfilter type="box"/>
+        </film>
+    </sensor>
+    <bsdf type="diffuse" id="poster">
+        <texture type="bitmap" name="reflectance">
+            <string name="filename" value="poster.exr"/> <boolean name="raw" value="true"/>
+            <string name="format" value="variant"/> <string name="filter_type" value="nearest"/>
+        </texture>
+    </bsdf>
+    <shape type="rectangle" id="wall"><ref id="poster"/></shape>
+    <shape type="rectangle" id="lamp">
+        <transform name="to_world"><rotate x="1" angle="180"/><translate z="5"/></transform>
+        <emitter type="area"><rgb name="radiance" value="8, 8, 8"/></emitter>
+    </shape>
+</scene>
+"""
+CONFIG = f"""
+variant: llvm_ad_rgb
+scene: {{file: scene.xml}}
+target: {{render: {{spp: 16}}}}
+parameters:
+  - {{key: {KEY}, initial: 0.5, bounds: [0, 1]}}
+integrator: {{type: reslrb, max_depth: 3, estimator: stack}}
+run: {{iterations: 5, spp: 4, reach_spp: 8}}
+"""
+#: What a run folder holds when all went well.
+COMPLETE = {
+    "checkpoint/state.npz", "config.yaml", "manifest.json", "metrics.jsonl", "report.html", "parameters/parameters.npz",
+    "parameters/parameters.json", *(f"images/{name}.{kind}" for name in ("initial", "final", "target")
+    for kind in ("exr", "png")), *(f"parameters/{folder}{KEY}.{kind}" for folder in ("", "initial/", "true/")
+    for kind in ("exr", "png")),
+}  # fmt: skip
+
+
+def write_experiment(folder: Path) -> None:
+    """Put scene, texture and `tiny.yaml` into `folder`; a variant must be set."""
+    import mitsuba as mi
+    import numpy as np
+
+    texture = np.random.default_rng(2).uniform(0.1, 0.9, (4, 4, 3)).astype(np.float32)
+    mi.Bitmap(texture).write(str(folder / "poster.exr"))
+    (folder / "scene.xml").write_text(SCENE)
+    (folder / "tiny.yaml").write_text(CONFIG)
+
+
+def start(folder: Path, *args: str, **options: Any) -> subprocess.Popen[str]:
+    """`reslrb optimize tiny.yaml` in a process of its own, with `folder` as its working directory."""
+    # As the program is started, which is called `reslrb` from its first line on.
+    script = "import sys; sys.argv[0] = 'reslrb'; from reslrb_cli.cli import run; run()"
+    command = [sys.executable, "-c", script, "optimize", "tiny.yaml", *args]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "RESLRB_CACHE": str(folder / "cache")}
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True, **options}
+    return subprocess.Popen(command, cwd=folder, env=environment, **pipes)
+
+
+def files(folder: Path) -> set[str]:
+    """All files in `folder`, relative to it."""
+    return {str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file()}
+
+
+def faults(folder: Path, code: int, err: str) -> list[str]:
+    """What is wrong with a run folder after its process ended with `code` and printed `err`; `[]` where nothing is."""
+    found = ["a traceback"] if "Traceback" in err or "Exception ignored" in err else []
+    found += [] if code in (0, 130, 6, -signal.SIGKILL) or not folder.exists() else [f"exit code {code}"]
+    if not folder.exists():
+        return found
+    stored, read = read_content(folder), read_manifest(folder)
+    if stored is None or read is None:
+        return [*found, "no manifest"]
+    status = read["status"]
+    found += [f"empty: {name}" for name in files(folder) if (folder / name).stat().st_size == 0]
+    found += [f"left: {name}" for name in files(folder) if Path(name).name.startswith(".")]
+    expected = {0: "finished", 130: "interrupted", 6: "failed", -signal.SIGKILL: read_content(folder)["status"]}.get(
+        code
+    )  # type: ignore[index]
+    found += [] if status == expected and status != "running" else [f"{status} after exit code {code}"]
+    found += [] if stored["status"] != "running" or code < 0 else ["left as running"]
+    if (folder / "metrics.jsonl").exists():
+        lines = (folder / "metrics.jsonl").read_text().splitlines(keepends=True)
+        iterations = [json.loads(line)["iteration"] for line in lines]
+        found += [] if iterations == list(range(len(iterations))) and lines[-1].endswith("\n") else ["torn metrics"]
+    absent = {name for name in COMPLETE if not (folder / name).exists()}
+    absent -= {"report.html"} if code == -signal.SIGKILL else set()  # the page is written from what the folder says
+    if status == "finished" and absent and not read["missing"]:
+        found.append(f"absent: {sorted(absent)}")
+    return found

@@ -1,0 +1,72 @@
+"""Images are whole or absent, in every format, and show what they were given."""
+
+from __future__ import annotations
+
+import gc
+import sys
+
+import numpy as np
+import pytest
+
+pytestmark = pytest.mark.usefixtures("llvm")
+
+
+def make_image(channels=3):
+    return np.random.default_rng(3).uniform(0, 1, (40, 30, channels)).astype(np.float32)
+
+
+@pytest.mark.parametrize("suffix", [".exr", ".hdr", ".pfm", ".png", ".jpg", ".jpeg"])
+def test_every_format_can_be_read_back(tmp_path, suffix):
+    import mitsuba as mi
+
+    from reslrb_cli.records.images import FORMATS, write_file
+
+    assert suffix in FORMATS
+    image, linear = make_image(), suffix in (".exr", ".hdr", ".pfm")
+    write_file(tmp_path / f"a.key{suffix}", image, linear)
+    read = mi.Bitmap(str(tmp_path / f"a.key{suffix}"))
+    if not linear:
+        read = read.convert(component_format=mi.Struct.Type.Float32, srgb_gamma=False)
+    off = np.abs(np.array(read)[:, :, :3] - image).mean()
+    assert off < {".exr": 1e-6, ".pfm": 1e-6, ".hdr": 0.01, ".png": 0.01}.get(suffix, 0.2)
+    assert [path.name for path in tmp_path.iterdir()] == [f"a.key{suffix}"]
+
+
+@pytest.mark.parametrize("suffix", [".exr", ".png"])
+def test_an_image_that_does_not_fit_is_not_there(tmp_path, file_size_limit, suffix):
+    from reslrb_cli.records.images import write_file
+
+    path = tmp_path / f"final{suffix}"
+    with file_size_limit(500), pytest.raises(OSError, match=f"final{suffix}"):
+        write_file(path, make_image(), linear=suffix == ".exr")
+    assert list(tmp_path.iterdir()) == []
+    path.write_bytes(b"what was there before")
+    with file_size_limit(500), pytest.raises(OSError, match=f"final{suffix}"):
+        write_file(path, make_image(), linear=suffix == ".exr")
+    assert path.read_bytes() == b"what was there before"
+
+
+def test_parameters_and_masks_are_written_like_that(tmp_path, file_size_limit):
+    from reslrb_cli.records.parameters import write_mask, write_parameters
+
+    with file_size_limit(300), pytest.raises(OSError, match=r"wall\.data\.exr"):
+        write_parameters(tmp_path, {"wall.data": make_image()})
+    mask = np.random.default_rng(3).uniform(size=(64, 64)) > 0.5
+    with file_size_limit(4300), pytest.raises(OSError, match="mask"):
+        write_mask(tmp_path, "wall.data", np.tile(mask, (2, 2)))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_checkpoint_that_does_not_fit_leaves_the_one_before(tmp_path, file_size_limit, monkeypatch):
+    from reslrb_cli.records.checkpoint import save_checkpoint
+
+    said = []  # by archives that are thrown away
+    monkeypatch.setattr(sys, "unraisablehook", said.append)
+    save_checkpoint(tmp_path, 1, {"a": np.zeros(3)}, {})
+    for size in (100, 2000, 9000):  # among the headers, in the first array, in the last one
+        with file_size_limit(size), pytest.raises(OSError, match=r"state\.npz"):
+            save_checkpoint(tmp_path, 2, {"a": np.zeros(999), "b": np.zeros(999)}, {})
+    with np.load(tmp_path / "state.npz") as state:
+        assert int(state["iteration"]) == 1
+    gc.collect()
+    assert said == []

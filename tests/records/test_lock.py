@@ -1,0 +1,140 @@
+"""Locks on run folders: one holder, gone with its process, and what is believed where there are none."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import pytest
+
+from reslrb_cli.records import lock as locks
+from reslrb_cli.records.lock import FolderLock, Holder, InUse
+
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="tells boots apart as Linux does")
+ROOT = Path(__file__).resolve().parents[2]
+
+HOLD = """
+import sys, time
+from pathlib import Path
+from reslrb_cli.records.lock import FolderLock
+lock = FolderLock(Path(sys.argv[1]))
+print("locked", flush=True)
+time.sleep(60)
+"""
+
+
+def test_one_at_a_time(tmp_path: Path) -> None:
+    with FolderLock(tmp_path) as lock:
+        assert lock.real
+        with pytest.raises(InUse):
+            FolderLock(tmp_path, wait_s=0)
+        with pytest.raises(InUse):
+            FolderLock(tmp_path, wait_s=0, shared=True)
+    FolderLock(tmp_path, wait_s=0).release()
+
+
+def test_readers_do_not_disturb_each_other_and_nobody_gives_up_over_one(tmp_path: Path) -> None:
+    reader = FolderLock(tmp_path, wait_s=0, shared=True)
+    FolderLock(tmp_path, wait_s=0, shared=True).release()
+    threading.Timer(0.2, reader.release).start()
+    FolderLock(tmp_path).release()
+
+
+def test_a_killed_process_holds_nothing(tmp_path: Path) -> None:
+    command = [sys.executable, "-c", HOLD, str(tmp_path)]
+    holder = subprocess.Popen(command, stdout=subprocess.PIPE, env={**os.environ, "PYTHONPATH": str(ROOT)})
+    assert holder.stdout is not None
+    assert holder.stdout.readline() == b"locked\n"
+    with pytest.raises(InUse):
+        FolderLock(tmp_path, wait_s=0)
+    holder.send_signal(signal.SIGKILL)
+    holder.communicate()
+    FolderLock(tmp_path, wait_s=0).release()
+
+
+def test_the_lock_goes_with_the_folder(tmp_path: Path) -> None:
+    (tmp_path / "a").mkdir()
+    with FolderLock(tmp_path / "a") as lock:
+        (tmp_path / "a").rename(tmp_path / "b")
+        (tmp_path / "a").mkdir()
+        assert lock.is_of(tmp_path / "b")
+        assert not lock.is_of(tmp_path / "a")
+        assert not lock.is_of(tmp_path / "c")
+        FolderLock(tmp_path / "a", wait_s=0).release()
+        with pytest.raises(InUse):
+            FolderLock(tmp_path / "b", wait_s=0)
+
+
+@pytest.mark.parametrize("kind", ["nothing", "file", "link"])
+def test_only_a_folder_can_be_locked(tmp_path: Path, kind: str) -> None:
+    (tmp_path / "folder").mkdir()
+    if kind == "file":
+        (tmp_path / "x").write_text("")
+    elif kind == "link":
+        (tmp_path / "x").symlink_to("folder")
+    with pytest.raises(OSError):  # noqa: PT011 (which one is the system's affair)
+        FolderLock(tmp_path / "x")
+
+
+def test_a_file_system_without_locks_locks_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(descriptor: int, operation: int) -> None:
+        raise OSError(9, "Bad file descriptor")  # as NFS says of folders
+
+    monkeypatch.setattr(locks.fcntl, "flock", fail)
+    with FolderLock(tmp_path) as first, FolderLock(tmp_path) as second:
+        assert (first.real, second.real) == (False, False)
+
+
+def test_a_system_without_locks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(locks, "fcntl", None)
+    with FolderLock(tmp_path) as lock:
+        assert not lock.real
+        assert lock.is_of(tmp_path)
+    assert not Holder.here(locked=False).is_gone(tmp_path)
+
+
+def ended_pid() -> int:
+    process = subprocess.Popen([sys.executable, "-c", ""])
+    process.wait()
+    return process.pid
+
+
+def test_who_is_gone_where_there_are_locks(tmp_path: Path) -> None:
+    here = Holder.here(locked=True)
+    with FolderLock(tmp_path):
+        for holder in (here, replace(here, pid=ended_pid()), replace(here, boot="earlier")):
+            assert not holder.is_gone(tmp_path)
+    # The number of a process means nothing: this one has it, too.
+    assert here.is_gone(tmp_path)
+    # so it is after a reboot, and in another container of the same machine
+    assert replace(here, boot="earlier").is_gone(tmp_path)
+    assert replace(here, host="elsewhere").is_gone(tmp_path)
+
+
+def test_another_machine_may_have_a_lock_that_is_not_seen_here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    elsewhere = Holder("elsewhere", 1, "its own boot", locked=True)
+    assert elsewhere.is_gone(tmp_path) == (os.major(os.stat(tmp_path).st_dev) != 0)
+    monkeypatch.setattr(os, "major", lambda device: 0)  # as on a network disk
+    assert not elsewhere.is_gone(tmp_path)
+
+
+def test_who_is_gone_where_there_are_none(tmp_path: Path) -> None:
+    here = Holder.here(locked=False)
+    assert not here.is_gone(tmp_path)
+    assert not replace(here, pid=1).is_gone(tmp_path)
+    assert replace(here, pid=ended_pid()).is_gone(tmp_path)
+    assert replace(here, boot="earlier").is_gone(tmp_path)
+    assert not replace(here, host="elsewhere", pid=ended_pid()).is_gone(tmp_path)
+
+
+def test_a_holder_can_be_read_back() -> None:
+    here = Holder.here(locked=True)
+    assert Holder.from_json(asdict(here)) == here
+    assert str(here) == f"process {os.getpid()} on {here.host}"
+    for nothing in (None, {}, {"host": "x"}):
+        assert Holder.from_json(nothing) is None
