@@ -66,7 +66,7 @@ def hit(process: subprocess.Popen[str], number: int, times: int) -> tuple[int, s
     return process.returncode, err
 
 
-@pytest.mark.parametrize("times", [1, 2])
+@pytest.mark.parametrize("times", [1, pytest.param(2, marks=pytest.mark.long)])
 @pytest.mark.parametrize("moment", MOMENTS)
 def test_ctrl_c_at_every_stage(experiment: Path, moment: str, times: int) -> None:
     process = start(experiment, *LONG)
@@ -165,7 +165,7 @@ def mount(place: Path, kib: int) -> None:
         pytest.skip(f"no disk can be mounted here: {done.stderr.strip()}")
 
 
-SIZES = [8, 32, 160]
+SIZES = [8, 160]
 ALL_SIZES = [4, 8, 12, 16, 24, 32, 48, 64, 80, 96, 104, 112, 120, 128, 144, 160, 192, 256, 384, 512, 768, 1024]
 
 
