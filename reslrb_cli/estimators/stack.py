@@ -36,9 +36,9 @@ from reslrb_cli.estimators.sums import AdjointSum, PlainSum
 from reslrb_cli.estimators.surface import SurfacePoint, blank_lobe, event, lobe
 from reslrb_cli.transport.connection import Connection, Seen, stand_in
 from reslrb_cli.transport.factors import NO_ZERO, Product
+from reslrb_cli.transport.hooks import Vertex
 from reslrb_cli.transport.plan import Plan
-from reslrb_cli.transport.scattering import Scattering, attached_factors
-from reslrb_cli.transport.walk import Vertex
+from reslrb_cli.transport.scattering import Scattering, tracked_factors
 
 STACK_SIZE = 64  # vertices
 
@@ -192,7 +192,7 @@ def walk_back(p: Pass, pushed: Pushed) -> AdjointSum:
         connected, scattered = dr.any(frame.weight_c != 0), dr.any(weight_s != 0)
         with dr.resume_grad():
             sampled = event(frame.wo_s, frame.lobe)
-            f_c, f_s = attached_factors(plan, si, bsdf, frame.wo_c, connected, sampled, scattered)
+            f_c, f_s = tracked_factors(plan, si, bsdf, frame.wo_c, connected, sampled, scattered)
             dr.backward_from(dr.select(connected, frame.weight_c * f_c, 0) + dr.select(scattered, weight_s * f_s, 0))
         behind_zero = [A.behind_zero[0] + frame.zeros[1], A.behind_zero[1]] if frame.zeros else []
         return height - 1, PlainSum(A.value + frame.own, A.rest, behind_zero), stack

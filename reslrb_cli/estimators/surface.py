@@ -8,9 +8,9 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from reslrb_cli.transport.hooks import Vertex
 from reslrb_cli.transport.plan import Plan
 from reslrb_cli.transport.scattering import Scattering
-from reslrb_cli.transport.walk import Vertex
 
 
 @dataclass

@@ -15,7 +15,9 @@ from reslrb_cli.integrators.differentiated import differentiated
 from reslrb_cli.integrators.freezing import Recordings
 from reslrb_cli.scene.graph import SceneGraph
 from reslrb_cli.scene.needs import check_supported, scene_needs
+from reslrb_cli.transport.accumulation import in_passes
 from reslrb_cli.transport.plan import Plan, make_plan
+from reslrb_cli.transport.samples import Samples, passes
 from reslrb_cli.transport.splat import Film
 
 _registered_with_callback = False
@@ -98,11 +100,11 @@ def _make_classes() -> dict[str, Any]:
             used = {bsdf: None for node in nodes for bsdf in self._owners[node]}
             return () if all(bsdf in used for bsdf in self._owners.get(None, [])) else tuple(used)
 
-        def passes(self, scene: Any, sensor: Any, seed: Any, spp: int, params: Any = None) -> list[lt.Samples]:
+        def passes(self, scene: Any, sensor: Any, seed: Any, spp: int, params: Any = None) -> list[Samples]:
             """The samples of one image, and the sensor's own sample count where `spp` is 0."""
             spp = spp or sensor.sampler().sample_count()
             plan = self.plan(scene, sensor, params)
-            return lt.passes(plan, scene, sensor, seed, spp, self.samples_per_pass)
+            return passes(plan, scene, sensor, seed, spp, self.samples_per_pass)
 
         def render(self, scene: Any, sensor: Any = 0, seed: Any = 0, spp: int = 0, develop: bool = True,
                    evaluate: bool = True) -> Any:  # fmt: skip
@@ -110,7 +112,7 @@ def _make_classes() -> dict[str, Any]:
                 raise ValueError("develop=True must be specified when invoking AD integrators")
             sensor, estimator = resolve_sensor(scene, sensor), self.image_estimator()
 
-            def image(samples: lt.Samples) -> Any:
+            def image(samples: Samples) -> Any:
                 return lt.image_of([samples], estimator)
 
             with dr.suspend_grad():
@@ -129,10 +131,10 @@ def _make_classes() -> dict[str, Any]:
                 samples = self.passes(scene, sensor, seed, spp, params)
                 film = samples[0].film
                 block = film.block()
-                lt.in_passes(samples, lt.splat_tangents, block)
+                in_passes(samples, lt.splat_tangents, block)
                 return film.develop_tangent(block)
 
-        def _freezes(self, parts: list[lt.Samples]) -> bool:
+        def _freezes(self, parts: list[Samples]) -> bool:
             """Whether these samples are traced from a recording; large ones, and so several passes, gain little."""
             return self.freeze and len(parts) == 1 and parts[0].width <= freezing.MOST_PATHS
 
@@ -171,7 +173,7 @@ def _make_classes() -> dict[str, Any]:
             """The image, and what a replay of the same samples needs; both evaluated."""
             estimator = self.estimator
 
-            def trace(samples: lt.Samples) -> tuple[Any, Any]:
+            def trace(samples: Samples) -> tuple[Any, Any]:
                 result = lt.trace_image([samples], estimator)
                 return result.image, result.state
 
@@ -185,7 +187,7 @@ def _make_classes() -> dict[str, Any]:
             """Add the gradient of the objective with dL/dI `gradient` (H, W, C) to the parameters."""
             estimator = self.estimator
 
-            def replay(samples: lt.Samples, gradient: Any, *state: Any) -> None:
+            def replay(samples: Samples, gradient: Any, *state: Any) -> None:
                 lt.replay_all(lt.Trace([samples], None, *state), estimator, gradient)
 
             with dr.suspend_grad():
@@ -203,7 +205,7 @@ def _make_classes() -> dict[str, Any]:
             """
             estimator = self.estimator
 
-            def fused(samples: lt.Samples, gradient: Any) -> Any:
+            def fused(samples: Samples, gradient: Any) -> Any:
                 return lt.fused([samples], estimator, gradient)
 
             with dr.suspend_grad():
@@ -223,25 +225,25 @@ def _make_classes() -> dict[str, Any]:
     class WalkAdIntegrator(LightIntegrator):
         """The same walk under naive AD: for comparisons at equal seeds."""
 
-        def attached_image(self, scene: Any, sensor: Any, seed: Any, spp: int, params: Any) -> Any:
+        def tracked_image(self, scene: Any, sensor: Any, seed: Any, spp: int, params: Any) -> Any:
             """The image with its whole graph."""
             film = Film(sensor)
             block = film.block()
             for samples in self.passes(scene, sensor, seed, spp, params):
-                lt.splat_attached(samples, block)
+                lt.splat_tracked(samples, block)
             return film.develop(block)
 
         def render_backward(self, scene: Any, params: Any, grad_in: Any, sensor: Any = 0, seed: Any = 0,
                             spp: int = 0) -> None:  # fmt: skip
             sensor = resolve_sensor(scene, sensor)
             with dr.resume_grad():
-                image = self.attached_image(scene, sensor, seed, spp, _parameters(scene, params))
+                image = self.tracked_image(scene, sensor, seed, spp, _parameters(scene, params))
                 dr.backward_from(image * grad_in)
 
         def render_forward(self, scene: Any, params: Any, sensor: Any = 0, seed: Any = 0, spp: int = 0) -> Any:
             sensor = resolve_sensor(scene, sensor)
             with dr.resume_grad():
-                image = self.attached_image(scene, sensor, seed, spp, _parameters(scene, params))
+                image = self.tracked_image(scene, sensor, seed, spp, _parameters(scene, params))
                 return dr.forward_to(image)
 
     class TrajectoryIntegrator(LightIntegrator):
@@ -265,11 +267,11 @@ def _make_classes() -> dict[str, Any]:
                     )
                 adjoint = parts[0].film.adjoint(grad_in)
 
-                def differentiate(part: lt.Samples, block: None) -> None:
+                def differentiate(part: Samples, block: None) -> None:
                     with dr.isolate_grad():  # as in `replay_all`; without it the derivatives of textures are lost
                         lt.reverse_recorded(part, adjoint)
 
-                lt.in_passes(parts, differentiate, None, params)
+                in_passes(parts, differentiate, None, params)
 
     return {"reslrb": ReslrbIntegrator, "walk_ad": WalkAdIntegrator, "trajectory": TrajectoryIntegrator}
 

@@ -39,8 +39,8 @@ def differentiated(params: Any) -> Differentiated:
     nodes: dict[Any, None] = {}
     emission = zeros = False
     with dr.resume_grad():  # where gradients are suspended, nothing says that it tracks them
-        attached = {key: value for key, value in params.items() if dr.grad_enabled(value)}
-    for key, value in attached.items():
+        enabled = {key: value for key, value in params.items() if dr.grad_enabled(value)}
+    for key, value in enabled.items():
         kind = parameter_kind(params, key)
         if kind in ("bsdf", "attribute"):
             nodes[params.properties[key][2]] = None

@@ -15,6 +15,7 @@ from reslrb_cli.integrators import light_tracer as lt
 from reslrb_cli.integrators.features import FEATURES, Feature
 from reslrb_cli.scene.catalog import list_parameters
 from reslrb_cli.transport.plan import Plan
+from reslrb_cli.transport.samples import passes
 
 PATHS = 64  # traced to have kernels compiled
 LARGE = 100  # operations; smaller kernels develop images and prepare textures
@@ -52,7 +53,7 @@ def report_plan(integrator: Any, scene: Any, sensor: Any, params: Any, keys: Ite
     `limit_s` seconds have passed.
     """
     keys, start = list(keys), time.perf_counter()
-    with attached(params, keys):
+    with tracking(params, keys):
         plan = integrator.plan(scene, sensor, params)
         estimator = type(integrator.estimator).__name__.removesuffix("Estimator").lower()
         if not counts:
@@ -77,7 +78,7 @@ def report_plan(integrator: Any, scene: Any, sensor: Any, params: Any, keys: Ite
 def count(integrator: Any, plan: Plan, scene: Any, sensor: Any, known: bool) -> list[int]:
     """Operations of each large kernel of a step by this plan."""
     with dr.suspend_grad():
-        [samples] = lt.passes(plan, scene, sensor, 0, 1, None)
+        [samples] = passes(plan, scene, sensor, 0, 1, None)
         samples = replace(samples, width=PATHS)
         channels = samples.film.film.base_channels_count()
         size = samples.film.size
@@ -97,7 +98,7 @@ def count(integrator: Any, plan: Plan, scene: Any, sensor: Any, known: bool) -> 
 
 
 @contextmanager
-def attached(params: Any, keys: Iterable[str]) -> Iterator[None]:
+def tracking(params: Any, keys: Iterable[str]) -> Iterator[None]:
     """Parameters `keys` of the scene track derivatives, for as long as the context lasts."""
     values = {key: type(params[key])(dr.detach(params[key])) for key in keys}
     for key, value in values.items():
@@ -140,7 +141,7 @@ def _toggled(integrator: Any, feature: Feature, plan: Plan, scene: Any, sensor: 
         if not more:
             return f"no {feature.parameters} has a parameter that can be differentiated"
         keys = [*keys, *more]
-    with attached(params, keys):
+    with tracking(params, keys):
         if toggled is None:
             toggled = replace(integrator.plan(scene, sensor, params), track_zeros=plan.track_zeros)
         return count(integrator, toggled, scene, sensor, known)

@@ -85,7 +85,7 @@ def gradient_step(
         loss, gradient = _derivative(objective, trace.image, refused, on_image)
         integrator.replay(trace, gradient, params)
         return StepResult(trace.image, loss, refused)
-    replays = not isinstance(integrator, mi.AdjointIntegrator) and not hasattr(integrator, "attached_image")
+    replays = not isinstance(integrator, mi.AdjointIntegrator) and not hasattr(integrator, "tracked_image")
     if replays or adjoint == "independent":
         gradient_seed = image_seed if adjoint == "correlated" else second_seed(image_seed)
         with dr.suspend_grad():
@@ -96,8 +96,8 @@ def gradient_step(
             integrator.render_backward(scene, params, gradient, sensor, gradient_seed, spp)
         return StepResult(image, loss, refused)
     with _naive_ad(integrator), dr.isolate_grad():  # as above
-        if hasattr(integrator, "attached_image"):
-            image = integrator.attached_image(scene, sensor, image_seed, spp, params)
+        if hasattr(integrator, "tracked_image"):
+            image = integrator.tracked_image(scene, sensor, image_seed, spp, params)
         else:
             image = integrator.render(scene, sensor, image_seed, spp, develop=True, evaluate=False)
         loss, gradient = _derivative(objective, dr.detach(image), refused)

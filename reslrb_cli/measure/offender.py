@@ -14,11 +14,11 @@ import drjit as dr
 import numpy as np
 
 from reslrb_cli.integrators import gradient_step, make_integrator, sample_sets
-from reslrb_cli.integrators.light_tracer import Samples
 from reslrb_cli.measure.offender_paths import search_paths
 from reslrb_cli.optimization.problem import LIGHT_TRACERS, Problem
 from reslrb_cli.records.offender import Offender
 from reslrb_cli.seeds import seed
+from reslrb_cli.transport.samples import Samples
 
 Array = np.ndarray[Any, Any]
 

@@ -76,7 +76,7 @@ def scatter(
 ) -> tuple[Scattering, Any]:  # fmt: skip
     """Sample the next direction, and evaluate f (C,) towards `connection_wo` in `connected` lanes (None: in no lane).
 
-    Detached; `attached_factors` has the derivatives. Both queries share one indirect call, and in it what they have in
+    Detached; `tracked_factors` has the derivatives. Both queries share one indirect call, and in it what they have in
     common (looking up textures, mostly).
     """
     context = importance_context()
@@ -161,7 +161,7 @@ def evaluate(plan: Plan, si: Any, bsdf: Any, wo: Any, active: Any) -> Any:
     return bsdf.eval(mi.BSDFContext(mi.TransportMode.Radiance), exchanged, si.wi, active)
 
 
-def attached_factor(plan: Plan, si: Any, bsdf: Any, scattering: Scattering, active: Any) -> Any:
+def tracked_factor(plan: Plan, si: Any, bsdf: Any, scattering: Scattering, active: Any) -> Any:
     """f (C,) with derivatives, of the event that `scattering` is.
 
     Call under `dr.resume_grad()`. What the scene has no lobes for is not compiled.
@@ -170,7 +170,7 @@ def attached_factor(plan: Plan, si: Any, bsdf: Any, scattering: Scattering, acti
     return _singular_factor(plan, si, bsdf, scattering, active, f)
 
 
-def attached_factors(
+def tracked_factors(
     plan: Plan, si: Any, bsdf: Any, connection_wo: Any, connected: Any, scattering: Scattering, scattered: Any
 ) -> tuple[Any, Any]:
     """f (C,) towards the sensor and f along the path, both with derivatives, from one indirect call.
