@@ -23,9 +23,13 @@ class Segment:
     """What follows from a vertex. Visibility is not known here: `connection.c` is not set, and `connection.active` says
     where the sensor would be seen if nothing stood in the way."""
 
+    si: mi.SurfaceInteraction3f
     connection: Connection
     scattering: Scattering
-    ray: mi.Ray3f
+
+    def next_ray(self) -> mi.Ray3f:
+        """The ray that leaves in the sampled direction; no derivative goes with it."""
+        return dr.detach(self.si.spawn_ray(self.scattering.d))
 
 
 def find_vertex(
@@ -63,4 +67,4 @@ def segment(
             connection.f = evaluate(plan, si, bsdf, connection.wo, connection.active)
         f = tracked_factor(plan, si, bsdf, scattering, scattering.active)
         scattering.weight = dr.replace_grad(scattering.weight, f * (scattering.correction / scattering.pdf))
-    return Segment(connection, scattering, dr.detach(si.spawn_ray(scattering.d)))
+    return Segment(si, connection, scattering)

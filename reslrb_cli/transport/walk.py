@@ -64,9 +64,9 @@ def walk(samples: Samples, hooks: Hooks, active: mi.Bool | bool = True) -> Any:
         vertex = Vertex(path.pi, si, bsdf, path.ray, path.depth, path.product, path.active)
 
         # ---- Connect to the sensor, and scatter ----
+        numbers = Numbers.draw(sampler, path.active)
         connected = path.active & hooks.wants(state, vertex)
         active = path.active & (path.depth + 1 < plan.max_depth) & hooks.goes_on(state, vertex)
-        numbers = Numbers.draw(sampler, path.active)
         this = segment(
             plan, sensor, path.ray, si, bsdf, numbers, connected, active, hooks.connects, tracked=hooks.tracked
         )
@@ -86,7 +86,7 @@ def walk(samples: Samples, hooks: Hooks, active: mi.Bool | bool = True) -> Any:
         if hooks.replaying:
             sampler.next_1d(active)  # roulette's
             active &= hooks.is_followed(state, vertex)
-            return _next(path, active, this.ray, path.product, path.eta), state, sampler, selection
+            return _next(path, active, this.next_ray(), path.product, path.eta), state, sampler, selection
         product = path.product.times(scattering.weight, path.depth)
         eta = path.eta * scattering.eta
         active = scattering.active & product.alive()
@@ -101,7 +101,7 @@ def walk(samples: Samples, hooks: Hooks, active: mi.Bool | bool = True) -> Any:
             roulette_weight = dr.select(playing, dr.rcp(q), 1)
             product, state = product.scaled(roulette_weight), hooks.survived(state, roulette_weight)
 
-        return _next(path, active, this.ray, product, eta), state, sampler, selection
+        return _next(path, active, this.next_ray(), product, eta), state, sampler, selection
 
     def _next(path: Path, active: mi.Bool, ray: mi.Ray3f, product: Product, eta: mi.Float) -> Path:
         pi, active = intersect(plan, scene, ray, active)
