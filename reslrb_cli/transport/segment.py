@@ -15,7 +15,7 @@ import mitsuba as mi
 from reslrb_cli.transport.connection import Connection, connect
 from reslrb_cli.transport.numbers import Numbers
 from reslrb_cli.transport.plan import Plan
-from reslrb_cli.transport.scattering import Scattering, evaluate, scatter, tracked_factor
+from reslrb_cli.transport.scattering import Scattering, scatter, tracked_factor
 
 
 @dataclass
@@ -54,8 +54,9 @@ def segment(
 ) -> Segment:
     """The segment from the vertex `si`, which `ray` reaches: connected in some lanes, scattered in some.
 
-    Without `evaluates` the BSDF is not evaluated towards the sensor. With `tracked` the factors f carry the derivatives
-    of the scene's parameters, where gradients are enabled; directions, densities and film positions never do.
+    Without `evaluates` the BSDF is not evaluated towards the sensor. With `tracked` the scattering weight carries the
+    derivatives of the scene's parameters, where gradients are enabled, and the connection is left to be evaluated where
+    it turns out to be visible; directions, densities and film positions have no derivatives here.
     """
     connection = connect(plan, sensor, si, ray, numbers.aperture, connected)
     wanted = connection.active if evaluates and not tracked else None
@@ -63,8 +64,6 @@ def segment(
         plan, si, bsdf, ray, numbers.bsdf_1d, numbers.bsdf_2d, scattered, connection.wo, wanted
     )
     if tracked:
-        if evaluates:
-            connection.f = evaluate(plan, si, bsdf, connection.wo, connection.active)
         f = tracked_factor(plan, si, bsdf, scattering, scattering.active)
         scattering.weight = dr.replace_grad(scattering.weight, f * (scattering.correction / scattering.pdf))
     return Segment(si, connection, scattering)

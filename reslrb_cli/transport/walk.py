@@ -20,6 +20,7 @@ from reslrb_cli.transport.hooks import Hooks, Vertex
 from reslrb_cli.transport.numbers import Numbers
 from reslrb_cli.transport.plan import Plan
 from reslrb_cli.transport.samples import SELECTION_STREAM, Samples
+from reslrb_cli.transport.scattering import evaluate
 from reslrb_cli.transport.segment import find_vertex, segment
 
 ROULETTE_LIMIT = 0.95  # the largest probability of going on, as in `ptracer`
@@ -78,7 +79,10 @@ def walk(samples: Samples, hooks: Hooks, active: mi.Bool | bool = True) -> Any:
             with dr.suspend_grad(when=not plan.differentiate_null):
                 shadow = passage(plan, scene, si, path.depth, connection, hooks.seen(vertex), loop_mode)
             connection.active, transmittance = shadow
-            connection.f = dr.select(connection.active, connection.f, 0)
+            if hooks.tracked:
+                connection.f = evaluate(plan, si, bsdf, connection.wo, connection.active)
+            else:
+                connection.f = dr.select(connection.active, connection.f, 0)
             connection.c = connection.f * transmittance * connection.weight
             chosen_by = [selection.next_float32() for _ in range(hooks.numbers)]
             state = hooks.connection(state, vertex, connection, chosen_by)
