@@ -42,7 +42,9 @@ def load_replay(config: Config) -> Replay:
     problem = assemble_scene(_chosen(config, manifest), values=values)
     if manifest.get("memory"):
         problem.samples_per_pass = int(manifest["memory"]["samples_per_pass"])
-        problem.integrator.samples_per_pass = problem.samples_per_pass
+        problem.integrator = problem.integrator.with_options(
+            samples_per_pass=problem.samples_per_pass, freeze=problem.integrator.freeze
+        )
     for sensor in problem.sensors:
         name = "target" if len(problem.sensors) == 1 else f"target-{sensor}"
         problem.targets.append(_read(folder.images / f"{name}.exr", config))

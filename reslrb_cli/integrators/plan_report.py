@@ -13,6 +13,7 @@ import mitsuba as mi
 
 from reslrb_cli.integrators import light_tracer as lt
 from reslrb_cli.integrators.features import FEATURES, Feature
+from reslrb_cli.integrators.reslrb import Reslrb
 from reslrb_cli.scene.catalog import list_parameters
 from reslrb_cli.transport.plan import Plan
 from reslrb_cli.transport.samples import passes
@@ -45,7 +46,7 @@ class PlanReport:
     rows: list[PlanRow]
 
 
-def report_plan(integrator: Any, scene: Any, sensor: Any, params: Any, keys: Iterable[str], *, known: bool,
+def report_plan(integrator: Reslrb, scene: Any, sensor: Any, params: Any, keys: Iterable[str], *, known: bool,
                 counts: bool = True, limit_s: float = 20.0) -> PlanReport:  # fmt: skip
     """What a step of `integrator` (`reslrb`) has to do to differentiate the parameters `keys` of `params`.
 
@@ -75,7 +76,7 @@ def report_plan(integrator: Any, scene: Any, sensor: Any, params: Any, keys: Ite
     return PlanReport(estimator, kernels, rows)
 
 
-def count(integrator: Any, plan: Plan, scene: Any, sensor: Any, known: bool) -> list[int]:
+def count(integrator: Reslrb, plan: Plan, scene: Any, sensor: Any, known: bool) -> list[int]:
     """Operations of each large kernel of a step by this plan."""
     with dr.suspend_grad():
         [samples] = passes(plan, scene, sensor, 0, 1, None)
@@ -129,7 +130,7 @@ def _row(feature: Feature, plan: Plan) -> PlanRow:
     return PlanRow(feature.name, needed, feature.present if needed else feature.absent)
 
 
-def _toggled(integrator: Any, feature: Feature, plan: Plan, scene: Any, sensor: Any, params: Any, keys: list[str],
+def _toggled(integrator: Reslrb, feature: Feature, plan: Plan, scene: Any, sensor: Any, params: Any, keys: list[str],
              known: bool) -> list[int] | str:  # fmt: skip
     """Kernels of the step with the feature the other way round, or the reason why there are none."""
     toggled = feature.toggle(plan)

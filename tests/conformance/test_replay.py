@@ -10,6 +10,7 @@ from conformance.gradient_cases import CASES
 
 from reslrb_cli.estimators.base import Pass
 from reslrb_cli.estimators.reservoir import ReservoirSelection
+from reslrb_cli.integrators import Job
 from reslrb_cli.measure.gradients import Case, integrator
 from reslrb_cli.measure.small_scenes import room
 from reslrb_cli.transport.emission import sample_emission
@@ -100,7 +101,7 @@ def test_replay_meets_the_same_vertices(name: str):
     scene = Case(case.scene(), case.keys)
     ours = integrator("reslrb", **case.both | case.options)
     with dr.suspend_grad():
-        [samples] = ours.passes(scene.scene, scene.scene.sensors()[0], mi.UInt32(5), 64)
+        [samples] = ours.passes(Job(scene.scene, scene.scene.sensors()[0], mi.UInt32(5), 64))
         context = Pass(samples, None, None)
         kept = context.walk(Recording(context, 1, "luminance", False))
         dr.eval(kept)

@@ -1,0 +1,66 @@
+"""What a light tracer finds out about a scene once, and keeps while that scene is traced."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import mitsuba as mi
+
+from reslrb_cli.integrators.differentiated import differentiated
+from reslrb_cli.integrators.freezing import Recordings
+from reslrb_cli.integrators.light_tracer import settle
+from reslrb_cli.scene.graph import SceneGraph
+from reslrb_cli.scene.needs import check_supported, scene_needs
+from reslrb_cli.transport.plan import Plan, make_plan
+
+
+class Preparation:
+    """Plans by sensor, owners of parameters, and recordings of one scene: the last that was asked for."""
+
+    def __init__(self, max_depth: int, rr_depth: int, hide_emitters: bool) -> None:
+        self._depths, self._hide_emitters = (max_depth, rr_depth), hide_emitters
+        self._scene: tuple[int, mi.Scene | None] | None = None  # its address, and, so that it is not used again, itself
+        self._plans: dict[int, Plan] = {}
+        self._owners: dict[Any, list[Any]] = {}  # BSDFs of its surfaces that use a node, and under None all of them
+        self._track_zeros = False
+        self.recordings = Recordings()
+
+    def plan(self, scene: mi.Scene, sensor: mi.Sensor, params: mi.SceneParameters | None = None) -> Plan:
+        """What a walk of this scene needs; `params` are those to look for derivatives in.
+
+        Raises UnsupportedScene for what cannot work.
+        """
+        self._turn_to(scene)
+        if sensor.ptr not in self._plans:
+            check_supported(scene, sensor, self._hide_emitters)
+            needs = scene_needs(scene, sensor)
+            settle(scene)
+            self._plans[sensor.ptr] = make_plan(needs, *self._depths, self._hide_emitters)
+        plan = self._plans[sensor.ptr]
+        if params is None:
+            return plan
+        which = differentiated(params)
+        # Once needed, kept: otherwise kernels would be compiled anew whenever a texel enters or leaves zero.
+        self._track_zeros |= which.zeros
+        only = self._bsdfs(scene, which.bsdf_nodes)
+        return plan.differentiating(bool(which.bsdf_nodes), which.emission, self._track_zeros, only)
+
+    def _turn_to(self, scene: mi.Scene) -> None:
+        """Forget what was found out about another scene."""
+        if self._scene is None or self._scene[0] != scene.ptr:
+            # The scene's own integrator does not hold the scene: neither would ever be freed.
+            tracer = getattr(scene.integrator(), "tracer", None)
+            own = getattr(tracer, "preparation", None) is self
+            self._scene = (scene.ptr, None if own else scene)
+            self._plans.clear()
+            self._owners.clear()
+            self.recordings.clear()
+
+    def _bsdfs(self, scene: mi.Scene, nodes: tuple[Any, ...]) -> tuple[mi.BSDF, ...]:
+        """The surfaces' BSDFs that use any of these nodes; empty where that is all of them."""
+        if any(node not in self._owners for node in nodes):
+            graph = SceneGraph.of(scene)
+            owners = {n: [n.bsdf()] if isinstance(n, mi.Shape) else graph.owning_bsdfs(n) for n in nodes}
+            self._owners |= owners | {None: graph.surface_bsdfs()}
+        used = {bsdf: None for node in nodes for bsdf in self._owners[node]}
+        return () if all(bsdf in used for bsdf in self._owners.get(None, [])) else tuple(used)
