@@ -73,6 +73,7 @@ def _plugin_class() -> Any:
             self.type = type
             self.tracer = make_tracer(type, options)
             self.max_depth, self.rr_depth = self.tracer.max_depth, self.tracer.rr_depth
+            self.samples_per_pass = self.tracer.samples_per_pass
 
         def render(self, scene: mi.Scene, sensor: mi.Sensor | int = 0, seed: Any = 0, spp: int = 0,
                    develop: bool = True, evaluate: bool = True) -> mi.TensorXf:  # fmt: skip

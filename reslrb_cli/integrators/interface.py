@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, TypeAlias
 
 import mitsuba as mi
 
 #: From an image (H, W, C) to dL/dI, of the same shape.
-Derivative = Callable[[mi.TensorXf], mi.TensorXf]
+Derivative: TypeAlias = "Callable[[mi.TensorXf], mi.TensorXf]"  # text: the type is there once a variant is set
 
 
 @dataclass(frozen=True)
