@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 import pytest
 from conformance.gradient_cases import FLOOR, _mask, _textured
+from conformance.scenes import plugin
 
-import reslrb_cli
 from reslrb_cli.errors import UnsupportedScene
 from reslrb_cli.integrators import render_image
 from reslrb_cli.measure.gradients import Case, integrator, relative, seeds
@@ -20,14 +20,6 @@ from reslrb_cli.measure.small_scenes import camera, lamp, rgb, room
 from reslrb_cli.measure.statistics import compare
 
 pytestmark = pytest.mark.usefixtures("llvm")
-
-
-def plugin(name: str, max_depth: int = 4, rr_depth: int = 1000) -> Any:
-    """The same integrator as Mitsuba's users get it."""
-    import mitsuba as mi
-
-    reslrb_cli.register()
-    return mi.load_dict({"type": name, "max_depth": max_depth, "rr_depth": rr_depth})
 
 
 SCRIPT = """
