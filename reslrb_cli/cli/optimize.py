@@ -33,10 +33,12 @@ def command(config_file: Path, overrides: tuple[str, ...], force: bool, quiet: b
 
     from reslrb_cli.backend.device import device_name
     from reslrb_cli.cli.interrupts import Interrupts
-    from reslrb_cli.cli.progress import Progress, describe
+    from reslrb_cli.cli.progress import Progress
     from reslrb_cli.cli.recording import Recording
     from reslrb_cli.optimization import assemble, find_reached
     from reslrb_cli.records.pilot_cache import PilotCache
+    from reslrb_cli.report.run_table import parameter_lines, terminal_width
+    from reslrb_cli.report.verdict import last_line
 
     say = logging.getLogger(__name__).info
     problem = assemble(config, say, PilotCache())
@@ -46,10 +48,11 @@ def command(config_file: Path, overrides: tuple[str, ...], force: bool, quiet: b
     manifest.memory = None if problem.memory is None else problem.memory.to_json()
     folder = RunFolder.create(config_file, config.run.output, config.run.folder_name, force, dump(config), manifest)
     recording = Recording(problem, folder, manifest)
-    with Interrupts() as interrupts, Progress(config.run.iterations, quiet) as progress:
+    with Interrupts() as interrupts, Progress(config.run.iterations, quiet, recording.results.meter) as progress:
         status = recording.run(progress.show, lambda: interrupts.requested)
-    outcome = f", {describe(recording.last)}" if recording.last else ""
-    outcome += "".join(f", {tally}" for tally in (recording.nonfinite, recording.clamped) if tally.iterations)
-    report = os.path.relpath(folder.path / "report.html")
-    click.echo(f"{status.value} after {recording.done} iterations{outcome}; look at {report}")
+    if not quiet:
+        for line in parameter_lines(manifest.results, terminal_width()):
+            click.echo(line)
+    tallies = [str(tally) for tally in (recording.nonfinite, recording.clamped) if tally.iterations]
+    click.echo(last_line(status.value, manifest.results, tallies, os.path.relpath(folder.path / "report.html")))
     return ExitCode.DONE if status is Status.FINISHED else ExitCode.INTERRUPTED

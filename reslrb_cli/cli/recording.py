@@ -15,7 +15,9 @@ import numpy as np
 from reslrb_cli.errors import NonFinite
 from reslrb_cli.optimization import Problem, optimize
 from reslrb_cli.optimization.nonfinite import Findings
-from reslrb_cli.optimization.scaling import Sensitivity
+from reslrb_cli.optimization.rendering import saved_spp
+from reslrb_cli.optimization.results import Results
+from reslrb_cli.optimization.scaling import Scaled, step_line
 from reslrb_cli.records.checkpoint import save_checkpoint, save_nonfinite
 from reslrb_cli.records.images import write_image
 from reslrb_cli.records.manifest import Manifest, Status
@@ -24,11 +26,11 @@ from reslrb_cli.records.parameters import write_mask, write_parameters
 from reslrb_cli.records.run_folder import RunFolder
 from reslrb_cli.records.tally import ClampTally, NonFiniteTally
 from reslrb_cli.report import write_report
+from reslrb_cli.report.error_map import write_error_map
+from reslrb_cli.report.verdict import warnings
 
 logger = logging.getLogger(__name__)
 
-#: Samples per pixel of saved images, at least.
-IMAGE_SPP = 64
 #: Seconds between two checkpoints.
 CHECKPOINT_SECONDS = 30.0
 
@@ -42,10 +44,14 @@ class Recording:
     manifest: Manifest
     first: Record | None = None
     last: Record | None = None
-    errors: dict[str, dict[str, float]] = field(default_factory=dict)
+    results: Results = field(init=False)
+    error_maps: dict[str, Any] = field(default_factory=dict)
     nonfinite: NonFiniteTally = field(default_factory=NonFiniteTally)
     clamped: ClampTally = field(default_factory=ClampTally)
     _saved_nonfinite: bool = False
+
+    def __post_init__(self) -> None:
+        self.results = Results(self.problem)
 
     @property
     def done(self) -> int:
@@ -79,6 +85,7 @@ class Recording:
 
     def _begin(self) -> None:
         problem, parameters = self.problem, self.folder.parameters
+        self.results.begin()
         for sensor, target in zip(problem.sensors, problem.targets, strict=True):
             write_image(self.folder.images / self._image_name("target", sensor), np.array(target))
         self._write_images("initial")
@@ -87,7 +94,6 @@ class Recording:
             write_parameters(parameters / "true", problem.truth)
         for key, mask in problem.masks.items():
             write_mask(parameters, key, mask)
-        self.errors = {key: {"initial": value} for key, value in problem.parameter_errors().items()}
 
     def _iterate(self, show: Callable[[Record], None], stop: Callable[[], bool]) -> None:
         every, saved = self.problem.config.run.images_every, time.monotonic()
@@ -99,6 +105,7 @@ class Recording:
                     self._note_scaling(self.problem.sensitivities)
                 self.first, self.last = self.first or record, record
                 metrics.write(record)
+                self.results.add(record)
                 self.nonfinite.add(record)
                 self.clamped.add(record)
                 show(record)
@@ -111,13 +118,12 @@ class Recording:
                     self._save_checkpoint()
                     saved = time.monotonic()
 
-    def _note_scaling(self, measured: list[Sensitivity]) -> None:
+    def _note_scaling(self, measured: list[Scaled]) -> None:
         self.manifest.scaling = [row.to_json() for row in measured]
         for row in measured:
-            if row.length is None:
-                logger.warning(f"scale auto: {row.key} has no effect on the image where it starts; it is not scaled")
-            else:
-                logger.info(f"scale auto: {row.key} moves in steps of {row.length:.3g} times the learning rate")
+            spec = self.problem.selection.spec(row.key)
+            line = step_line(row, spec.transform, spec.learning_rate or self.problem.config.optimizer.learning_rate)
+            (logger.warning if row.own_length is None else logger.info)(f"scale auto: {line}")
 
     def _on_nonfinite(self, found: Findings) -> None:
         """Keep the parameters of the first step that met a value that is not finite, and say how to look into it."""
@@ -140,13 +146,15 @@ class Recording:
             self.manifest.memory = memory.to_json()
 
     def _end(self, status: Status, error: str | None) -> None:
-        for key, value in self.problem.parameter_errors().items():
-            self.errors.setdefault(key, {})["final"] = value
+        self.results.end()
+        found = self.results.to_json()
         self.manifest.results = {
             "iterations": self.done,
             "loss": self.last and _json_number(self.last.loss),
             "elapsed_s": self.last and self.last.elapsed_s,
-            "parameter_rmse": self.errors,
+            **found,
+            "warnings": warnings(found),
+            "error_maps": self.error_maps,
             "nonfinite": self.nonfinite.to_json(),
             "clamped": self.clamped.to_json(),
         }
@@ -159,11 +167,16 @@ class Recording:
         save_checkpoint(self.folder.checkpoint, self.done, self.problem.values(), self.problem.optimizer.state())
 
     def _write_images(self, name: str) -> None:
-        own = self.problem.config.run.spp
-        spp = own * max(-(-IMAGE_SPP // own), 1)  # a multiple, which passes that divide a step divide as well
-        for sensor in self.problem.sensors:
+        spp = saved_spp(self.problem, between=name.startswith("iteration"))
+        if name == "final":
+            logger.info(f"rendering the final image: {spp} spp")
+        for sensor, target in zip(self.problem.sensors, self.problem.targets, strict=True):
             image = self.problem.render(sensor, spp, self.done, "saved image")
             write_image(self.folder.images / self._image_name(name, sensor), image)
+            self.results.see(name, image, target)
+            if name == "final":
+                error = self._image_name("error", sensor)
+                self.error_maps[error] = write_error_map(self.folder.images / error, image, np.array(target))
 
     def _image_name(self, name: str, sensor: int) -> str:
         return name if len(self.problem.sensors) == 1 else f"{name}-{sensor}"

@@ -256,6 +256,11 @@ class RunConfig(Section):
     images_every: Annotated[int, Field(ge=0)] = Field(
         default=0, description="Iterations between two saved images; 0: only the initial and the final one."
     )
+    final_spp: Count = Field(
+        default=256,
+        description="Samples per pixel of the saved initial and final image, rounded up to whole passes of "
+        "`samples_per_pass`.",
+    )
     reach_spp: Count = Field(default=64, description="Samples for the mask of the texels that light and sensor reach.")
 
     @field_validator("name")

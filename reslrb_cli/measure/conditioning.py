@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from reslrb_cli.optimization import Problem
-from reslrb_cli.optimization.scaling import Sensitivity, measure_sensitivities
+from reslrb_cli.optimization.sensitivity import Sensitivity, measure_sensitivities
 
 #: What a spread is taken of.
 QUANTITIES = ("gradient", "change", "curvature", "length")

@@ -38,8 +38,9 @@ def optimize(problem: Problem, on_nonfinite: Callable[[Findings], None] = lambda
     if config.optimizer.scale == "auto":
         with clock.counted():
             problem.sensitivities = rescale(problem)
+    meter = problem.error_meter()
     for iteration in range(config.run.iterations):
-        rmse = problem.parameter_rmse()
+        errors = meter.errors(problem.selection.array)
         with clock.step() as times:
             split = Split()
             loss, squares, counts, refused = gradient(problem, iteration, split)
@@ -72,7 +73,8 @@ def optimize(problem: Problem, on_nonfinite: Callable[[Findings], None] = lambda
             lr=config.optimizer.learning_rate * factor,
             grad_norm=float(sum(float(square[0]) for square in squares.values()) ** 0.5),
             nonfinite=found.total,
-            parameter_rmse=rmse,
+            parameter_rmse=meter.total(errors),
+            parameter_errors=errors,
             nonfinite_by_parameter=found.by_parameter,
             clamped=clamped,
         )

@@ -15,11 +15,12 @@ from reslrb_cli.errors import ConfigError, UnsupportedScene
 from reslrb_cli.integrators import first_channels, make_integrator
 from reslrb_cli.optimization.budget import MemoryPlan
 from reslrb_cli.optimization.choice import Cache, find_options, settle_integrator
+from reslrb_cli.optimization.errors import ErrorMeter, comparison_grid, quantity
 from reslrb_cli.optimization.losses import Loss, make_loss
 from reslrb_cli.optimization.optimizers import Optimizer
 from reslrb_cli.optimization.pilot import Outcome
 from reslrb_cli.optimization.rendering import render_in_passes
-from reslrb_cli.optimization.scaling import Sensitivity
+from reslrb_cli.optimization.scaling import Scaled
 from reslrb_cli.optimization.transforms import make_transform
 from reslrb_cli.scene import Selection, check_camera_paths, check_supported, load_scene, read_image, select_parameters
 
@@ -36,8 +37,9 @@ class Problem:
     """What `optimize` works on.
 
     `targets` are (H, W, C) tensors, one for each entry of `sensors`, without alpha. `truth` holds the
-    true value of every parameter for which it is known, and `masks` the entries of those that light and sensor reach
-    (boolean; (H, W) for textures, else of the parameter's shape).
+    true value of every parameter for which it is known, textures in the resolution of the scene file, and `masks` the
+    entries of those that light and sensor reach (boolean; (H, W) for textures, else of the parameter's shape).
+    `quantities` are the parameters' (`errors.quantity`).
     """
 
     config: Config
@@ -50,12 +52,13 @@ class Problem:
     targets: list[Any] = field(default_factory=list)
     truth: dict[str, Array] = field(default_factory=dict)
     masks: dict[str, Array] = field(default_factory=dict)
+    quantities: dict[str, str] = field(default_factory=dict)
     #: The integrator's own bound on the samples of a pass.
     samples_per_pass: int | None = None
     #: What was measured and planned before the first iteration, where it was.
     pilot: Outcome | None = None
     memory: MemoryPlan | None = None
-    sensitivities: list[Sensitivity] | None = None
+    sensitivities: list[Scaled] | None = None
 
     def apply(self, others: Mapping[str, Any] | None = None) -> None:
         """Hand the optimiser's values to the scene, or, of the keys in `others`, those."""
@@ -85,22 +88,9 @@ class Problem:
             self.integrator, self.scene, sensor, spp, config.run.seed, iteration, purpose, self.samples_per_pass
         )
 
-    def parameter_errors(self) -> dict[str, float]:
-        """The root mean square error of each parameter whose true value is known, over the entries in its mask."""
-        errors = {}
-        for key, truth in self.truth.items():
-            squares = np.square(self.selection.array(key).astype(np.float64) - truth)[self.masks[key]]
-            if squares.size:
-                errors[key] = float(np.sqrt(squares.mean()))
-        return errors
-
-    def parameter_rmse(self) -> float | None:
-        """The same over the entries of all these parameters together; None where no true value is known."""
-        errors, entries = self.parameter_errors(), {}
-        for key in errors:
-            entries[key] = int(self.masks[key].sum()) * self.truth[key].size // self.masks[key].size
-        count = sum(entries.values())
-        return float(np.sqrt(sum(entries[key] * errors[key] ** 2 for key in errors) / count)) if count else None
+    def error_meter(self) -> ErrorMeter:
+        """What measures the parameters against `truth`, as that and `masks` are now."""
+        return ErrorMeter(self.truth, self.masks, self.quantities)
 
 
 def samples_per_pass(config: Config) -> int | None:
@@ -141,11 +131,10 @@ def _make_targets(problem: Problem, say: Callable[[str], None]) -> None:
     true_scene = load_scene(config.scene.file, config.scene.options)
     true_values = set_true_values(config, true_scene)
     for key in problem.selection.keys:
-        value = true_values.array(key)
-        if value.shape == problem.selection.array(key).shape:
-            problem.truth[key] = value
-        else:
-            say(f"{key} has another resolution than its true value: no parameter RMSE")
+        problem.truth[key] = true_values.array(key)
+        grid = comparison_grid(problem.selection.array(key).shape, problem.truth[key].shape)
+        if grid is not None:
+            say(f"{key} has another resolution than its true value: compared, resampled, at {grid[1]}x{grid[0]}")
     chosen = render.integrator or config.integrator
     _check_supported(config, chosen.type, chosen.hide_emitters, true_scene, problem.sensors)
     integrator = make_configured(chosen)
@@ -200,6 +189,7 @@ def assemble_scene(config: Config, scene: Any = None, values: Mapping[str, Array
         loss=make_loss(config.loss.type, **config.loss.options()),
         optimizer=optimizer,
         samples_per_pass=samples_per_pass(config),
+        quantities={key: quantity(selection.params, key) for key in selection.keys},
     )
     problem.apply()
     return problem

@@ -36,7 +36,7 @@ def find_reached(problem: Problem, say: Callable[[str], None] = lambda line: Non
         mask: Array = sensitive[key]
         if mask.ndim == 3:
             sensors = [problem.scene.sensors()[index] for index in problem.sensors]
-            mask = np.any(mask, axis=2) & visible_texels(problem.scene, sensors, key)
+            mask = np.any(mask, axis=2) & _without_halo(visible_texels(problem.scene, sensors, key), mask.shape[1])
         problem.masks[key] = mask
 
 
@@ -72,6 +72,11 @@ def sensitivity(problem: Problem) -> dict[str, Array]:
 def _like(array: Array, mask: Array) -> Array:
     """`mask` in the shape of `array`, without the halo columns that an environment map's tensor has."""
     if array.ndim == 3 and mask.ndim == 3:
-        halo = (mask.shape[1] - array.shape[1]) // 2
-        mask = mask[:, halo : halo + array.shape[1]]
+        mask = _without_halo(mask, array.shape[1])
     return mask.reshape(array.shape)
+
+
+def _without_halo(mask: Array, width: int) -> Array:
+    """The middle `width` columns of a mask (H, W, ...)."""
+    halo = (mask.shape[1] - width) // 2
+    return mask[:, halo : halo + width]

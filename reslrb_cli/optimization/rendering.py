@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 import numpy as np
@@ -11,8 +11,13 @@ import numpy as np
 from reslrb_cli.integrators import render_image
 from reslrb_cli.seeds import seed
 
+if TYPE_CHECKING:
+    from reslrb_cli.optimization.problem import Problem
+
 #: Paths in one pass. Baselines keep the state of every path in memory; 2**22 of them stay below 2 GB.
 PATHS_PER_PASS = 2**22
+#: Samples per pixel of images that are saved between the first and the last, at least.
+BETWEEN_SPP = 64
 
 
 def passes(spp: int, pixels: int, multiple: int | None, paths_per_pass: int = PATHS_PER_PASS) -> Iterator[int]:
@@ -26,6 +31,17 @@ def passes(spp: int, pixels: int, multiple: int | None, paths_per_pass: int = PA
     while spp > 0:
         yield min(most, spp)
         spp -= most
+
+
+def saved_spp(problem: Problem, between: bool) -> int:
+    """Samples per pixel of the initial and the final image, `run.final_spp` or the next more that passes divide.
+
+    Of images `between`, which only show how far a run is, a multiple of the run's own.
+    """
+    run, unit = problem.config.run, problem.samples_per_pass or 1
+    if between:
+        return run.spp * -(-BETWEEN_SPP // run.spp)  # passes that divide a step divide this as well
+    return run.final_spp if unit >= run.final_spp else unit * -(-run.final_spp // unit)
 
 
 def render_in_passes(

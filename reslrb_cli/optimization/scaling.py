@@ -1,82 +1,55 @@
-"""How sensitive image and loss are to each parameter, from samples; and units that make up for it (`scale: auto`).
+"""Units in which one learning rate serves parameters of any sensitivity (`scale: auto`).
 
-Let g be the mean of some gradient samples, and z = -sign(g), the direction of Adam's first step, in one parameter x
-alone, all its entries at once. With I(x) the image at common random numbers and T the target,
-
-    D = I(x + h z) - I(x)
-    change = |D| / (h |M|),   length = h sum |D| M / sum D²,   M = max(|I|, |T|)
-    curvature = (L(I + D) - 2 L(I) + L(I - D)) / h²,           L the loss of an image
-
-`change` is the relative change of the image per unit of the parameter, `curvature` the Gauss-Newton one (with D scaled
-up to what single precision resolves). `length` is how far the parameter would have to go to make up what image or
-target hold, by least squares over those pixels that it changes at all: for a light alone in its scene its own
-intensity, for a wall its own albedo, whatever share of the picture they have. h is chosen so that the image changes by
-about 3 %, so that neither rounding nor curvature decides.
-
-Step lengths from `length` make all parameters equally fast for one learning rate, and dividing by the root mean square
+Step lengths from `Sensitivity.length` make all parameters equally fast, and dividing gradients by the root mean square
 of a sample keeps an absolute epsilon, as Adam has it, out of the matter.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import drjit as dr
-import mitsuba as mi
 import numpy as np
 
-from reslrb_cli.integrators import render_image
-from reslrb_cli.optimization.samples import sample_gradient, take_gradient
+from reslrb_cli.optimization.sensitivity import Sensitivity, measure_sensitivities, rms
 from reslrb_cli.optimization.transforms import Bounds, Transform, Variable
-from reslrb_cli.seeds import seed
 
 if TYPE_CHECKING:
     from reslrb_cli.optimization.problem import Problem
 
-Array = np.ndarray[Any, Any]
-
 #: Gradient samples that a run takes.
 SAMPLES = 4
-#: The part of the image that a change of h replaces: aimed at, and good enough.
-AIM, LEAST, MOST = 0.03, 0.003, 0.3
-#: Renderings for each parameter, at most, until h is found.
-TRIALS = 8
-_PURPOSE = "conditioning"
+#: What the optimiser moves in place of a parameter x, by transform.
+_MOVED = {
+    "none": "",
+    "log": " in its logarithm",
+    "sigmoid": " in its logit between the bounds",
+    "softplus": " in log(exp(x) - 1)",
+}
 
 
 @dataclass(frozen=True)
-class Sensitivity:
-    """What was measured of one parameter of `entries` numbers, in the scene's units.
+class Scaled(Sensitivity):
+    """What was measured of a parameter, and what was made of it.
 
-    `value`, `gradient` and `noise` are root mean squares over the entries: of the values, of the gradient (0 where the
-    samples do not tell it from noise), of the standard deviation of one sample (one step's gradient). `change` is
-    relative, per unit; it, `curvature` (loss per unit²) and `length` are None where no change of the image was seen.
+    `own_length` is `length` in what the optimiser moves, its variable, and `first_step`, in the scene's units, how far
+    one learning rate of that moves the value where it starts; both are None where the parameter was not scaled.
     """
 
-    key: str
-    entries: int
-    value: float
-    gradient: float
-    noise: float
-    change: float | None = None
-    curvature: float | None = None
-    length: float | None = None
-
-    def to_json(self) -> dict[str, Any]:
-        """As a mapping for JSON."""
-        return asdict(self)
+    own_length: float | None = None
+    first_step: float | None = None
 
 
-def rescale(problem: Problem) -> list[Sensitivity]:
+def rescale(problem: Problem) -> list[Scaled]:
     """Measure, and let the optimiser move each parameter in units of what was found; return that.
 
     A parameter without an effect on the image stays as it is.
     """
-    measured, optimizer = measure_sensitivities(problem, SAMPLES), problem.optimizer
-    for row in measured:
+    optimizer = problem.optimizer
+    measured = [Scaled(**row.to_json()) for row in measure_sensitivities(problem, SAMPLES)]
+    for place, row in enumerate(measured):
         size = math.hypot(row.gradient, row.noise)  # of what one step hands the optimiser
         if row.length is None or size == 0:
             continue
@@ -84,10 +57,19 @@ def rescale(problem: Problem) -> list[Sensitivity]:
         length = own_length(variable.transform, variable.bounds, value, row.length)
         unit = Variable(variable.transform, variable.bounds, length)
         slope = np.array(unit.chain(unit.from_scene(value), type(value)(size)), dtype=np.float64)
-        unit.gain = 1 / _rms(slope)
+        unit.gain = 1 / rms(slope)
         optimizer.set_variable(row.key, unit)
+        rate = problem.selection.spec(row.key).learning_rate or problem.config.optimizer.learning_rate
+        measured[place] = replace(row, own_length=length, first_step=_first_step(unit, value, rate))
     problem.apply()
     return measured
+
+
+def _first_step(unit: Variable, value: Any, rate: float) -> float:
+    """How far a step of `rate` moves the scene's `value`, upwards or downwards, whichever is farther."""
+    v = unit.from_scene(value)
+    up, down = (dr.abs(unit.to_scene(v + side * rate) - value) for side in (1, -1))
+    return rms(np.array(dr.maximum(up, down)))
 
 
 def own_length(transform: Transform | None, bounds: Bounds, value: Any, length: float) -> float:
@@ -104,92 +86,16 @@ def own_length(transform: Transform | None, bounds: Bounds, value: Any, length: 
     return float(distance.mean())
 
 
-def measure_sensitivities(problem: Problem, samples: int) -> list[Sensitivity]:
-    """Measure every parameter of `problem` where it stands, by `samples` gradients, at least 2, and a few images, each
-    with the run's samples per pixel."""
-    problem.apply()
-    rows: dict[str, list[Array]] = {key: [] for key in problem.selection.keys}
-    total: dict[str, Any] = {}
-    for round in range(samples):
-        for key, gradient in sample_gradient(
-            problem, problem.integrator, round, _PURPOSE, problem.config.run.spp
-        ).items():
-            finite = dr.select(dr.isfinite(gradient), gradient, 0)
-            total[key] = finite if round == 0 else total[key] + finite
-        for key, gradient in take_gradient(problem).items():
-            rows[key].append(gradient.astype(np.float64))
-    base = _images(problem)
-    targets = [np.array(target, dtype=np.float64) for target in problem.targets]
-    reference = [np.maximum(np.abs(a), np.abs(b)) for a, b in zip(base, targets, strict=True)]
-    found = []
-    for key, gradients in rows.items():
-        value = problem.selection.array(key)
-        noise = _rms(np.std(gradients, axis=0, ddof=1))
-        square = _rms(np.mean(gradients, axis=0)) ** 2 - noise**2 / samples  # less what the noise adds to it
-        row = Sensitivity(key, value.size, _rms(value), math.sqrt(max(square, 0.0)), noise)
-        found.append(_probe(problem, row, _downhill(total[key]), base, reference))
-    problem.apply()
-    return found
+def step_line(row: Scaled, transform: str, learning_rate: float) -> str:
+    """What the user is told of one parameter; `transform` and `learning_rate` are those of its configuration.
 
-
-def _probe(
-    problem: Problem, row: Sensitivity, direction: Any, base: Sequence[Array], reference: Sequence[Array]
-) -> Sensitivity:
-    """`row` with what the image tells, along `direction`, where it does."""
-    key = row.key
-    value = dr.detach(problem.optimizer[key])
-    low, high = problem.selection.spec(key).bounds or (-math.inf, math.inf)
-    # 1 % of the parameter, whatever its unit; of its range where it is 0; a guess where it has none.
-    step = 0.01 * (_rms(np.array(value)) or (high - low if math.isfinite(high - low) else 1.0))
-    norm = math.sqrt(sum(float(np.square(r).sum()) for r in reference))
-    for _ in range(TRIALS):
-        step = min(step, 0.5 * (high - low))
-        moved = value + direction * step
-        moved = dr.select((moved < low) | (moved > high), value - direction * step, moved)
-        dr.make_opaque(moved)
-        problem.apply({key: moved})
-        difference = [a - b for a, b in zip(_images(problem), base, strict=True)]
-        squares = sum(float(np.square(d).sum()) for d in difference)
-        shared = sum(float((np.abs(d) * r).sum()) for d, r in zip(difference, reference, strict=True))
-        if not (0 < squares < math.inf and 0 < shared < math.inf):
-            step *= 1e3 if squares == 0 else 1e-3
-            continue
-        share = squares / shared
-        row = replace(
-            row,
-            change=math.sqrt(squares) / (step * norm),
-            curvature=_second_difference(problem, base, difference, MOST / share) * (share / (MOST * step)) ** 2,
-            length=min(step / share, high - low),
-        )
-        if LEAST <= share <= MOST or (share < LEAST and step == 0.5 * (high - low)):
-            break
-        step *= AIM / share
-    return row
-
-
-def _second_difference(problem: Problem, base: Sequence[Array], difference: Sequence[Array], factor: float) -> float:
-    """L(I + D) - 2 L(I) + L(I - D), the mean over the views, D `factor` times the difference."""
-    total = 0.0
-    for image, change, target in zip(base, difference, problem.targets, strict=True):
-        for side, weight in ((1, 1), (0, -2), (-1, 1)):
-            at = mi.TensorXf((image + side * factor * change).astype(np.float32))
-            total += weight * float(problem.compare(at, target)[0]) / len(base)
-    return total
-
-
-def _downhill(gradient: Any) -> Any:
-    """-1, 0 or 1 in each entry."""
-    return dr.select(gradient == 0, 0, -dr.sign(gradient))
-
-
-def _images(problem: Problem) -> list[Array]:
-    """Every view as the scene stands, without alpha, always from the same seeds."""
-    run, images = problem.config.run, []
-    for sensor, target in zip(problem.sensors, problem.targets, strict=True):
-        image = render_image(problem.integrator, problem.scene, sensor, seed(run.seed, 0, sensor, _PURPOSE), run.spp)
-        images.append(np.array(image, dtype=np.float64)[:, :, : target.shape[2]])
-    return images
-
-
-def _rms(values: Array) -> float:
-    return float(np.sqrt(np.mean(np.square(values, dtype=np.float64))))
+    A step is in units of what the optimiser moves; what that is of the parameter itself is told for the first one.
+    """
+    if row.own_length is None:
+        lacks = "no effect on the image" if row.length is None else "no gradient"
+        return f"{row.key} has {lacks} where it starts; it is not scaled"
+    first = f"about {row.first_step or 0.0:.3g}"
+    if transform == "log":
+        first = f"a factor of {math.exp(min(row.own_length * learning_rate, 700.0)):.3g}, up or down"
+    steps = f"{row.own_length:.3g} times the learning rate{_MOVED[transform]}"
+    return f"{row.key} moves in steps of {steps}, at first by {first}"

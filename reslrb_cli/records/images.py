@@ -31,3 +31,11 @@ def write_file(path: Path, image: np.ndarray[Any, Any], linear: bool) -> None:
     shown = np.clip(np.nan_to_num(image[:, :, :channels], nan=0.0), 0.0, 1.0).astype(np.float32)
     bitmap = mi.Bitmap(np.ascontiguousarray(shown))
     bitmap.convert(component_format=mi.Struct.Type.UInt8, srgb_gamma=True).write(str(path))
+
+
+def read_exr(path: Path) -> np.ndarray[Any, Any]:
+    """Read an image of linear values that `write_image` wrote; (H, W, C) float32. Raises OSError or RuntimeError."""
+    with path.open("rb"):  # else the exception is Mitsuba's
+        pass
+    array = np.array(mi.Bitmap(str(path)), dtype=np.float32)
+    return array if array.ndim == 3 else array[:, :, None]

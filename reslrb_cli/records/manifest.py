@@ -51,7 +51,8 @@ class Manifest:
 
     `pilot` is the table by which an estimator was chosen, `memory` how a memory budget is kept, `scaling` what was
     measured of each parameter for `scale: auto`; each is None where that was not asked for. `results` holds what the
-    run found (`iterations`, `parameter_rmse` per key, ...); `error` is the line that the user saw where the run failed.
+    run found (`iterations`, values and errors by key, `warnings`, ...); `error` is the line that the user saw where the
+    run failed.
     """
 
     variant: str

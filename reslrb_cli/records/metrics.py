@@ -30,11 +30,13 @@ class Record:
     `step_ms` is the wall time of the step (image, loss and gradient of every sensor, evaluated; the optimiser's update
     left out), `codegen_ms` the part of it in which kernels were generated and compiled. `primal_ms` and `adjoint_ms`
     are None where one kernel does both. `elapsed_s` is the time since the start in steps and updates; files and
-    the reading of `parameter_rmse` are not in it. `peak_mib` is the allocator's high-water mark since the start.
+    the reading of `parameter_errors` are not in it. `peak_mib` is the allocator's high-water mark since the start.
     `nonfinite` counts the entries of loss, of its derivative by the image and of gradients that were not finite;
     `grad_norm` leaves them out. `nonfinite_by_parameter` holds those of gradients and updates, of parameters with any.
     `clamped` is None where gradients are not clamped; `grad_norm` is that before.
-    `parameter_rmse` is taken over the entries that light and sensor reach, None where the true value is not known.
+    `parameter_errors` are root mean square errors by key, each in its parameter's unit, over the entries that light and
+    sensor reach, of the parameters whose true value is known; `parameter_rmse` is that over the entries of all of them,
+    None where they have no common unit, or no true value is known.
     """
 
     iteration: int
@@ -50,17 +52,21 @@ class Record:
     grad_norm: float
     nonfinite: int
     parameter_rmse: float | None
+    parameter_errors: dict[str, float] = field(default_factory=dict)
     nonfinite_by_parameter: dict[str, int] = field(default_factory=dict)
     clamped: Clamped | None = None
 
     def to_json(self) -> str:
         """The record as one line of JSON, non-finite numbers as null (JSON has none)."""
-        return json.dumps(_finite(asdict(self)), allow_nan=False)
+        return json.dumps(finite(asdict(self)), allow_nan=False)
 
 
-def _finite(value: Any) -> Any:
+def finite(value: Any) -> Any:
+    """The same of mappings, lists and numbers, with None for numbers that are not finite: JSON has none."""
     if isinstance(value, dict):
-        return {key: _finite(entry) for key, entry in value.items()}
+        return {key: finite(entry) for key, entry in value.items()}
+    if isinstance(value, list):
+        return [finite(entry) for entry in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 

@@ -17,6 +17,7 @@ from reslrb_cli.records.gradcheck import GradcheckRecord
 
 Check = Callable[[], Iterable[GradcheckRecord]]
 SMALL = ["scene.options.size=32", "scene.options.texture=4", "run.spp=8", "integrator.max_depth=4"]
+SMALL += ["run.adjoint=correlated"]  # what is kept between image and gradient takes part then
 
 
 def room(name: str, *keys: str) -> Config:

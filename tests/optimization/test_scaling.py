@@ -12,7 +12,8 @@ import pytest
 from reslrb_cli.config import load
 from reslrb_cli.optimization import assemble, find_reached, optimize
 from reslrb_cli.optimization.optimizers import Optimizer
-from reslrb_cli.optimization.scaling import measure_sensitivities, own_length, rescale
+from reslrb_cli.optimization.scaling import Scaled, own_length, rescale, step_line
+from reslrb_cli.optimization.sensitivity import measure_sensitivities
 from reslrb_cli.optimization.transforms import Variable, make_transform
 
 CONFIG = Path(__file__).resolve().parents[2] / "configs" / "stiff" / "lamp.yaml"
@@ -143,3 +144,41 @@ def test_the_optimiser_gets_gradients_of_order_one(transforms):
         if variable.transform is None:
             assert variable.length == row.length
         np.testing.assert_allclose(problem.selection.array(row.key), row.value, rtol=1e-6)
+
+
+@pytest.mark.parametrize("transform", ["none", "sigmoid", "log", "softplus"])
+def test_the_first_step_is_what_the_line_says(transform):
+    """Adam's first step is one learning rate in what it moves."""
+    sets = [f"parameters[1].transform={transform}", "parameters[1].bounds=[0, 1e8]", "run.iterations=1"]
+    problem = assemble(load(CONFIG, [*TINY, *sets]))
+    problem.truth.clear()
+    before = problem.selection.array(LAMP)
+    list(optimize(problem))
+    moved = problem.selection.array(LAMP) / before
+    row = next(row for row in problem.sensitivities if row.key == LAMP)
+    rate = problem.config.optimizer.learning_rate
+    line = step_line(row, transform, rate)
+    assert line.startswith(f"{LAMP} moves in steps of {row.own_length:.3g} times the learning rate")
+    if transform == "log":
+        factor = float(line.partition("by a factor of ")[2].partition(",")[0])
+        np.testing.assert_allclose(np.maximum(moved, 1 / moved), factor, rtol=0.01)
+        assert "in its logarithm" in line
+        return
+    step = float(line.rpartition("at first by about ")[2])
+    # the line tells the farther of up and down
+    assert np.all(np.abs(moved - 1) * before <= 1.01 * step)
+    assert np.abs((moved - 1) * before).max() > 0.7 * step
+    assert ("logit between the bounds" in line) == (transform == "sigmoid")
+    assert ("log(exp(x) - 1)" in line) == (transform == "softplus")
+    if transform == "none":
+        assert (row.own_length, step) == (row.length, pytest.approx(rate * row.length, rel=0.01))
+
+
+def test_the_line_of_what_is_not_scaled_says_why():
+    row = Scaled("lamp.intensity.value", 3, 1.0, 0.0, 0.0)
+    assert (
+        step_line(row, "log", 0.1)
+        == "lamp.intensity.value has no effect on the image where it starts; it is not scaled"
+    )
+    row = Scaled("lamp.intensity.value", 3, 1.0, 0.0, 0.0, change=1.0, curvature=1.0, length=1.0)
+    assert "no gradient" in step_line(row, "log", 0.1)

@@ -10,7 +10,8 @@ from reslrb_cli.records.metrics import MetricsWriter, Record, read_metrics
 
 KEYS = [
     "iteration", "loss", "step_ms", "primal_ms", "adjoint_ms", "codegen_ms", "elapsed_s", "peak_mib", "spp", "lr",
-    "grad_norm", "nonfinite", "parameter_rmse", "nonfinite_by_parameter", "clamped",
+    "grad_norm", "nonfinite", "parameter_rmse", "parameter_errors", "nonfinite_by_parameter",
+    "clamped",
 ]  # fmt: skip
 
 
@@ -28,8 +29,9 @@ def test_a_record_has_the_documented_keys_in_order():
 
 
 def test_non_finite_numbers_become_null():
-    line = make_record(loss=math.nan, grad_norm=math.inf, nonfinite=3).to_json()
+    line = make_record(loss=math.nan, grad_norm=math.inf, nonfinite=3, parameter_errors={"a": math.inf}).to_json()
     content = json.loads(line, parse_constant=lambda name: (_ for _ in ()).throw(ValueError(name)))
+    assert content["parameter_errors"] == {"a": None}
     assert (content["loss"], content["grad_norm"], content["nonfinite"]) == (None, None, 3)
 
 

@@ -1,0 +1,116 @@
+"""How far parameters are from their true values: root mean square errors, each in its parameter's unit.
+
+Only what has one unit can be added up: reflectance and roughness have none, but a lamp's intensity is in W/sr, and the
+radiance of an area light in W/(m² sr). Where units differ, errors are compared as shares of the truth instead.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+
+from reslrb_cli.scene.values import resample
+
+Array = np.ndarray[Any, Any]
+
+#: What emitters emit; parameters of the same quantity have the same unit.
+_EMITTED = {
+    "AreaLight": "radiance",
+    "ConstantBackgroundEmitter": "radiance",
+    "DirectionalArea": "radiance",
+    "EnvironmentMapEmitter": "radiance",
+    "PointLight": "intensity",
+    "SpotLight": "intensity",
+    "DirectionalEmitter": "irradiance",
+    "Projector": "irradiance",
+}
+
+
+def quantity(params: Any, key: str) -> str:
+    """The radiometric quantity of a `mi.traverse` entry: `radiance`, `irradiance`, `intensity`, or "", without a unit.
+
+    Without a unit are all parameters of BSDFs, mesh attributes, and factors of emitters (`scale`, a spot's `texture`).
+    """
+    node = own = params.properties[key][2]
+    while node is not None and not isinstance(node, mi.Emitter):
+        node = params.hierarchy[node][0]
+    is_factor = own is node and not key.endswith(".data") and key != "data"
+    if node is None or is_factor or ".texture." in f".{key}":
+        return ""
+    return _EMITTED.get(node.class_name(), "")
+
+
+class ErrorMeter:
+    """Measures parameters against their true values, over the entries that light and sensor reach.
+
+    `truth` and `masks` are those of a `Problem`, `quantities` the parameters' (`quantity`). A texture whose resolution
+    is not the truth's is compared on the finer grid of the two: each is resampled to it bilinearly, as textures are
+    before the start, and a texel of it counts where the parameter's own texel at its centre does. So the error of a
+    coarse texture holds what it cannot show, and that of a fine one its noise.
+    """
+
+    def __init__(
+        self, truth: Mapping[str, Array], masks: Mapping[str, Array], quantities: Mapping[str, str] | None = None
+    ) -> None:
+        self._truth: dict[str, Array] = {}
+        self._masks: dict[str, Array] = {}
+        for key, true in truth.items():
+            mask = masks[key]
+            grid = comparison_grid(mask.shape, true.shape)
+            mask = mask if grid is None else nearest(mask, grid)
+            if mask.any():
+                self._masks[key] = mask
+                self._truth[key] = on_grid(true, grid).astype(np.float64)[mask]
+        #: The root mean square of each truth, over the same entries; a truth of zeros has none.
+        self.scales = {key: scale for key, true in self._truth.items() if (scale := _rms(true)) > 0}
+        self.one_unit = len({(quantities or {}).get(key, "") for key in self._truth}) <= 1
+
+    def errors(self, value: Callable[[str], Array]) -> dict[str, float]:
+        """The root mean square error of each parameter that has a truth; `value` yields its current value."""
+        found = {}
+        for key, true in self._truth.items():
+            mask, array = self._masks[key], value(key)
+            grid = mask.shape if array.ndim == 3 and array.shape[:2] != mask.shape else None
+            found[key] = _rms(on_grid(array, grid).astype(np.float64)[mask] - true)
+        return found
+
+    def total(self, errors: Mapping[str, float]) -> float | None:
+        """The root mean square error over the entries of all parameters; None where units differ, or nothing is known.
+
+        `errors` is what the method of that name returned.
+        """
+        count = sum(self._truth[key].size for key in errors)
+        if not count or not self.one_unit:
+            return None
+        return float(np.sqrt(sum(self._truth[key].size * error**2 for key, error in errors.items()) / count))
+
+    def relative(self, errors: Mapping[str, float]) -> dict[str, float]:
+        """Errors over the root mean square of the truth, where that is not 0."""
+        return {key: error / self.scales[key] for key, error in errors.items() if key in self.scales}
+
+
+def comparison_grid(shape: tuple[int, ...], true_shape: tuple[int, ...]) -> tuple[int, int] | None:
+    """The (height, width) on which a texture and its truth are compared; None where they have the same, or none."""
+    if len(true_shape) != 3 or shape[:2] == true_shape[:2]:
+        return None
+    return max(shape[0], true_shape[0]), max(shape[1], true_shape[1])
+
+
+def on_grid(array: Array, grid: tuple[int, ...] | None) -> Array:
+    """A texture resampled bilinearly to `grid`, (height, width); as it is where that is None."""
+    return array if grid is None or array.shape[:2] == grid else resample(array, (grid[1], grid[0]))
+
+
+def nearest(mask: Array, grid: tuple[int, int]) -> Array:
+    """A mask (H, W) on a finer grid: each cell of that has what the mask has at its centre."""
+    rows, columns = (
+        ((np.arange(size) + 0.5) * own / size).astype(int) for size, own in zip(grid, mask.shape, strict=True)
+    )
+    return mask[rows[:, None], columns]
+
+
+def _rms(values: Array) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))

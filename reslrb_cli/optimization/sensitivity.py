@@ -1,0 +1,156 @@
+"""How sensitive image and loss are to each parameter, from samples.
+
+Let g be the mean of some gradient samples, and z = -sign(g), the direction of Adam's first step, in one parameter x
+alone, all its entries at once. With I(x) the image at common random numbers and T the target,
+
+    D = I(x + h z) - I(x)
+    change = |D| / (h |M|),   length = h sum |D| M / sum D²,   M = max(|I|, |T|)
+    curvature = (L(I + D) - 2 L(I) + L(I - D)) / h²,           L the loss of an image
+
+`change` is the relative change of the image per unit of the parameter, `curvature` the Gauss-Newton one (with D scaled
+up to what single precision resolves). `length` is how far the parameter would have to go to make up what image or
+target hold, by least squares over those pixels that it changes at all: for a light alone in its scene its own
+intensity, for a wall its own albedo, whatever share of the picture they have. h is chosen so that the image changes by
+about 3 %, so that neither rounding nor curvature decides.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from reslrb_cli.integrators import render_image
+from reslrb_cli.optimization.samples import sample_gradient, take_gradient
+from reslrb_cli.seeds import seed
+
+if TYPE_CHECKING:
+    from reslrb_cli.optimization.problem import Problem
+
+Array = np.ndarray[Any, Any]
+
+#: The part of the image that a change of h replaces: aimed at, and good enough.
+AIM, LEAST, MOST = 0.03, 0.003, 0.3
+#: Renderings for each parameter, at most, until h is found.
+TRIALS = 8
+_PURPOSE = "conditioning"
+
+
+@dataclass(frozen=True)
+class Sensitivity:
+    """What was measured of one parameter of `entries` numbers, in the scene's units.
+
+    `value`, `gradient` and `noise` are root mean squares over the entries: of the values, of the gradient (0 where the
+    samples do not tell it from noise), of the standard deviation of one sample (one step's gradient). `change` is
+    relative, per unit; it, `curvature` (loss per unit²) and `length` are None where no change of the image was seen.
+    """
+
+    key: str
+    entries: int
+    value: float
+    gradient: float
+    noise: float
+    change: float | None = None
+    curvature: float | None = None
+    length: float | None = None
+
+    def to_json(self) -> dict[str, Any]:
+        """As a mapping for JSON."""
+        return asdict(self)
+
+
+def measure_sensitivities(problem: Problem, samples: int) -> list[Sensitivity]:
+    """Measure every parameter of `problem` where it stands, by `samples` gradients, at least 2, and a few images, each
+    with the run's samples per pixel."""
+    problem.apply()
+    rows: dict[str, list[Array]] = {key: [] for key in problem.selection.keys}
+    total: dict[str, Any] = {}
+    for round in range(samples):
+        for key, gradient in sample_gradient(
+            problem, problem.integrator, round, _PURPOSE, problem.config.run.spp
+        ).items():
+            finite = dr.select(dr.isfinite(gradient), gradient, 0)
+            total[key] = finite if round == 0 else total[key] + finite
+        for key, gradient in take_gradient(problem).items():
+            rows[key].append(gradient.astype(np.float64))
+    base = _images(problem)
+    targets = [np.array(target, dtype=np.float64) for target in problem.targets]
+    reference = [np.maximum(np.abs(a), np.abs(b)) for a, b in zip(base, targets, strict=True)]
+    found = []
+    for key, gradients in rows.items():
+        value = problem.selection.array(key)
+        noise = rms(np.std(gradients, axis=0, ddof=1))
+        square = rms(np.mean(gradients, axis=0)) ** 2 - noise**2 / samples  # less what the noise adds to it
+        row = Sensitivity(key, value.size, rms(value), math.sqrt(max(square, 0.0)), noise)
+        found.append(_probe(problem, row, _downhill(total[key]), base, reference))
+    problem.apply()
+    return found
+
+
+def _probe(
+    problem: Problem, row: Sensitivity, direction: Any, base: Sequence[Array], reference: Sequence[Array]
+) -> Sensitivity:
+    """`row` with what the image tells, along `direction`, where it does."""
+    key = row.key
+    value = dr.detach(problem.optimizer[key])
+    low, high = problem.selection.spec(key).bounds or (-math.inf, math.inf)
+    # 1 % of the parameter, whatever its unit; of its range where it is 0; a guess where it has none.
+    step = 0.01 * (rms(np.array(value)) or (high - low if math.isfinite(high - low) else 1.0))
+    norm = math.sqrt(sum(float(np.square(r).sum()) for r in reference))
+    for _ in range(TRIALS):
+        step = min(step, 0.5 * (high - low))
+        moved = value + direction * step
+        moved = dr.select((moved < low) | (moved > high), value - direction * step, moved)
+        dr.make_opaque(moved)
+        problem.apply({key: moved})
+        difference = [a - b for a, b in zip(_images(problem), base, strict=True)]
+        squares = sum(float(np.square(d).sum()) for d in difference)
+        shared = sum(float((np.abs(d) * r).sum()) for d, r in zip(difference, reference, strict=True))
+        if not (0 < squares < math.inf and 0 < shared < math.inf):
+            step *= 1e3 if squares == 0 else 1e-3
+            continue
+        share = squares / shared
+        row = replace(
+            row,
+            change=math.sqrt(squares) / (step * norm),
+            curvature=_second_difference(problem, base, difference, MOST / share) * (share / (MOST * step)) ** 2,
+            length=min(step / share, high - low),
+        )
+        if LEAST <= share <= MOST or (share < LEAST and step == 0.5 * (high - low)):
+            break
+        step *= AIM / share
+    return row
+
+
+def _second_difference(problem: Problem, base: Sequence[Array], difference: Sequence[Array], factor: float) -> float:
+    """L(I + D) - 2 L(I) + L(I - D), the mean over the views, D `factor` times the difference."""
+    total = 0.0
+    for image, change, target in zip(base, difference, problem.targets, strict=True):
+        for side, weight in ((1, 1), (0, -2), (-1, 1)):
+            at = mi.TensorXf((image + side * factor * change).astype(np.float32))
+            total += weight * float(problem.compare(at, target)[0]) / len(base)
+    return total
+
+
+def _downhill(gradient: Any) -> Any:
+    """-1, 0 or 1 in each entry."""
+    return dr.select(gradient == 0, 0, -dr.sign(gradient))
+
+
+def _images(problem: Problem) -> list[Array]:
+    """Every view as the scene stands, without alpha, always from the same seeds."""
+    run, images = problem.config.run, []
+    for sensor, target in zip(problem.sensors, problem.targets, strict=True):
+        image = render_image(problem.integrator, problem.scene, sensor, seed(run.seed, 0, sensor, _PURPOSE), run.spp)
+        images.append(np.array(image, dtype=np.float64)[:, :, : target.shape[2]])
+    return images
+
+
+def rms(values: Array) -> float:
+    """The root mean square of all entries."""
+    return float(np.sqrt(np.mean(np.square(values, dtype=np.float64))))

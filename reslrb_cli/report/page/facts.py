@@ -1,0 +1,148 @@
+"""What ran, on what, how long, and what was measured before it, as tables."""
+
+from __future__ import annotations
+
+import shlex
+import statistics
+from collections.abc import Mapping, Sequence
+from datetime import datetime
+from typing import Any
+
+from reslrb_cli.optimization.pilot import Outcome
+from reslrb_cli.report.page.markup import breakable, facts, table, text
+from reslrb_cli.report.words import duration, number
+
+#: Steps that are left out of medians: the first ones compile kernels.
+WARM_UP = 5
+
+
+def run_facts(manifest: Mapping[str, Any], records: Sequence[Mapping[str, Any]]) -> str:
+    """When, on what and how the run was, what it took, and what it came to."""
+    losses = (manifest.get("results") or {}).get("image_loss") or {}
+    versions = ", ".join(f"{name} {version}" for name, version in (manifest.get("versions") or {}).items())
+    spp = f"{records[-1]['spp']} samples per pixel" if records else ""
+    command = manifest.get("command_line") or []
+    return facts(
+        {
+            "started": _moment(manifest.get("started")),
+            "took": _wall(manifest),
+            "iterations": text(", ".join(part for part in (str(len(records)), spp) if part)),
+            "time in iterations": _total(records),
+            "an iteration": _step(records),
+            "loss of the saved images": text(" → ".join(number(loss) for loss in losses.values() if loss is not None)),
+            "peak memory": text(f"{max(record['peak_mib'] for record in records):.4g} MiB") if records else "",
+            "device": text(manifest.get("device") or ""),
+            "variant": text(manifest.get("variant") or ""),
+            "seed": text(manifest.get("seed", "")),
+            "configuration": breakable(manifest.get("config") or ""),
+            "command line": breakable(shlex.join(map(str, command))) if command else "",
+            "versions": text(versions),
+            "platform": text(manifest.get("platform") or ""),
+        }
+    )
+
+
+def _moment(started: Any) -> str:
+    return text(str(started).replace("T", " ").replace("+00:00", " UTC")) if started else ""
+
+
+def _wall(manifest: Mapping[str, Any]) -> str:
+    try:
+        start, end = (datetime.fromisoformat(str(manifest[key])) for key in ("started", "ended"))
+    except (KeyError, ValueError):
+        return ""
+    return text(f"{duration((end - start).total_seconds())}, with its images and files")
+
+
+def _total(records: Sequence[Mapping[str, Any]]) -> str:
+    if not records:
+        return ""
+    codegen = sum(record["codegen_ms"] for record in records) / 1e3
+    return text(f"{duration(records[-1]['elapsed_s'])}, of which {duration(codegen)} to generate and compile kernels")
+
+
+def _step(records: Sequence[Mapping[str, Any]]) -> str:
+    """The median step, without the first ones, and its parts where they are known."""
+    steady = records[WARM_UP:] or records
+    if not steady:
+        return ""
+    words = f"{duration(statistics.median(record['step_ms'] for record in steady) / 1e3)} (median)"
+    parts = [
+        f"{duration(statistics.median(known) / 1e3)} {what}"
+        for name, what in (("primal_ms", "up to image and loss"), ("adjoint_ms", "for the gradient"))
+        if (known := [record[name] for record in steady if record.get(name) is not None])
+    ]
+    return text(f"{words}: {', '.join(parts)}" if parts else words)
+
+
+def pilot_table(pilot: Mapping[str, Any] | None) -> str:
+    """What the pilot measured of each estimator, the most efficient first, and what it chose."""
+    try:
+        outcome = Outcome.from_json(dict(pilot or {}))
+    except (TypeError, KeyError):  # there was none, or another version's
+        return ""
+    rows = sorted(outcome.rows, key=lambda row: -(row.efficiency or 0.0))
+    best = rows[0].efficiency or 1.0 if rows else 1.0
+    cells = []
+    for row in rows:
+        name = ", ".join([row.estimator, *(f"{key} {value}" for key, value in row.options.items())])
+        share = None if row.efficiency is None else row.efficiency / best
+        time = "" if row.kernel_ms is None else duration(row.kernel_ms / 1e3)
+        cells.append([text(name), *map(text, (number(share, 3), number(row.variance, 3), time, row.rounds, row.note))])
+    head = ("estimator", "efficiency over the best", "variance", "kernels", "rounds", "note")
+    return f"<p>{text(outcome.line())}</p>" + table(head, cells)
+
+
+def scaling_table(scaling: Sequence[Mapping[str, Any]] | None) -> str:
+    """What `scale: auto` measured of each parameter."""
+    head = (
+        "parameter",
+        "value",
+        "gradient",
+        "noise of a step",
+        "image change per unit",
+        "curvature",
+        "length",
+        "first step",
+    )
+    names = ("value", "gradient", "noise", "change", "curvature", "length", "first_step")
+    rows = [[breakable(row["key"]), *(text(number(row.get(name), 3)) for name in names)] for row in scaling or ()]
+    return table(head, rows)
+
+
+def memory_table(memory: Mapping[str, Any] | None) -> str:
+    """How the memory budget was kept."""
+    if not memory:
+        return ""
+    expected = sum(memory["expected_bytes"].values())
+    return facts(
+        {
+            "budget": _mib(memory["budget_bytes"]),
+            "passes": text(f"{memory['passes']} of {memory['samples_per_pass']} samples per pixel"),
+            "expected": _mib(expected),
+            "used": text(f"{memory['peak_mib']:.4g} MiB") if memory.get("peak_mib") is not None else "",
+            "kept": "no" if memory.get("exceeded") else "yes",
+        }
+    )
+
+
+def _mib(count: float) -> str:
+    return text(f"{count / 2**20:.4g} MiB")
+
+
+def not_finite(tally: Mapping[str, Any] | None) -> str:
+    """Values that were not finite, by parameter."""
+    if not tally or not tally.get("iterations"):
+        return ""
+    rows = [[breakable(key), text(count)] for key, count in tally["by_parameter"].items()]
+    line = f"{tally['values']} values were not finite, in {tally['iterations']} iterations; none reached a parameter."
+    return f"<p>{text(line)}</p>" + table(("parameter", "values of gradients and updates"), rows)
+
+
+def clamped(tally: Mapping[str, Any] | None) -> str:
+    """Gradients that were clamped, and the bias that this made."""
+    if not tally or not tally.get("iterations"):
+        return ""
+    rows = [[breakable(key), text(number(bias))] for key, bias in tally["bias"].items()]
+    line = f"{tally['entries']} entries of gradients were clamped, in {tally['iterations']} iterations."
+    return f"<p>{text(line)}</p>" + table(("parameter", "bias, as the share of the gradient taken over the run"), rows)

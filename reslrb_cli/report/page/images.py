@@ -1,0 +1,84 @@
+"""The images on the page: start, end, target and error map of every sensor."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from reslrb_cli.report.error_map import color_stops, colored
+from reslrb_cli.report.page.markup import figure, figures, text
+from reslrb_cli.report.page.pictures import Array, embed, exposure_for, exposure_words, fit, load_image, show
+from reslrb_cli.report.words import number
+
+#: Images between the first and the last that are shown of a sensor, at most.
+MOST_BETWEEN = 12
+_OF_A_SENSOR = re.compile(r"(?:initial|final|target)(-\d+)?\.exr")
+
+
+def image_rows(folder: Path, results: Mapping[str, Any]) -> str:
+    """Of every sensor a row: the initial image, the final one, the target, and the error map; `folder` is `images/`.
+
+    A sensor's images have one exposure. What is missing is left out.
+    """
+    suffixes = {match[1] or "" for path in folder.glob("*.exr") if (match := _OF_A_SENSOR.fullmatch(path.name))}
+    return "".join(
+        _row(folder, suffix, results) for suffix in sorted(suffixes, key=lambda suffix: int(suffix[1:] or 0))
+    )
+
+
+def _row(folder: Path, suffix: str, results: Mapping[str, Any]) -> str:
+    names = {"start": "initial", "end": "final", "target": "target"}
+    loaded = {title: load_image(folder / f"{name}{suffix}.exr") for title, name in names.items()}
+    exposure = exposure_for([loaded["target"]])
+    sensor = f" of sensor {suffix[1:]}" if suffix else ""
+    shown = [
+        _figure(image * exposure, f"{title}{sensor}", f"<b>{text(title)}</b>, {image.shape[1]}×{image.shape[0]}")
+        for title, image in loaded.items()
+        if image is not None
+    ]
+    shown.append(_error_figure(folder, suffix, results))
+    title = f"<h3>Sensor {text(suffix[1:])}</h3>" if suffix else ""
+    words = exposure_words(exposure)
+    title += f'<p class="soft small">{text(words)}</p>' if words else ""
+    return title + figures(shown) + _between(folder, suffix, exposure)
+
+
+def _figure(image: Array, alt: str, markup: str) -> str:
+    picture = show(image)
+    return figure(picture.uri, picture.size, alt, markup, picture.smooth)
+
+
+def _error_figure(folder: Path, suffix: str, results: Mapping[str, Any]) -> str:
+    """The map of |I - T|, with its scale; nothing where it, or its scale, is missing."""
+    about = (results.get("error_maps") or {}).get(f"error{suffix}")
+    error = load_image(folder / f"error{suffix}.exr")
+    if about is None or error is None or not about.get("end"):
+        return ""
+    grey = fit(error.astype(np.float64).mean(axis=2, keepdims=True))[:, :, 0]
+    picture = embed(colored(grey / about["end"]), grey.shape)
+    end = text(number(about["end"]))
+    caption = (
+        f"<b>|image − target|</b> at the end, mean {text(number(about['mean'], 3))}"
+        f'<div class="scale" style="background:linear-gradient(to right,{",".join(color_stops(9))})"></div>'
+        f'<div class="ends"><span>0</span><span>{end} or more</span></div>'
+    )
+    return figure(picture.uri, picture.size, f"error map, from 0 to {end}", caption, picture.smooth)
+
+
+def _between(folder: Path, suffix: str, exposure: float) -> str:
+    """Images that were saved on the way, evenly chosen where they are many."""
+    pattern = re.compile(rf"iteration-(\d+){suffix}\.exr")
+    found = sorted((int(match[1]), path) for path in folder.iterdir() if (match := pattern.fullmatch(path.name)))
+    if len(found) > MOST_BETWEEN:
+        found = [found[round(place)] for place in np.linspace(0, len(found) - 1, MOST_BETWEEN)]
+    loaded = [(iteration, load_image(path)) for iteration, path in found]
+    shown = [
+        _figure(image * exposure, f"after {iteration} iterations", f"after {iteration} iterations")
+        for iteration, image in loaded
+        if image is not None
+    ]
+    return f'<p class="soft small">on the way:</p>{figures(shown)}' if shown else ""

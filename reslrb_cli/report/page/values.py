@@ -1,0 +1,167 @@
+"""The parameters on the page: numbers with swatches, textures as pictures, and their errors."""
+
+from __future__ import annotations
+
+import zipfile
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from reslrb_cli.report.page.markup import breakable, figure, figures, table, text
+from reslrb_cli.report.page.pictures import Array, encode, exposure_for, exposure_words, show
+from reslrb_cli.report.run_table import units_differ
+from reslrb_cli.report.words import number
+
+#: Where a run folder has the values of a moment, below `parameters/`.
+MOMENTS = (("start", "initial"), ("end", "final"), ("true", "true"))
+_FOLDERS = {"initial": "initial", "final": "", "true": "true"}
+#: Parameters of three numbers that are no colours to look at.
+_NO_COLORS = ("eta", "k")
+
+
+def parameter_table(results: Mapping[str, Any]) -> str:
+    """Value and error of each parameter at the start and at the end, and the true value where it is known."""
+    parameters = results.get("parameters") or {}
+    has_truth = any(about.get("true") for about in parameters.values())
+    relative = units_differ(results)
+    head = ["parameter", "start", "end"] + ["true"] * has_truth + ["RMSE"] * has_truth
+    head += ["relative error"] * (has_truth and relative)
+    rows = []
+    for key, about in parameters.items():
+        swatches = _swatches(key, about)
+        cells = [_value(about.get(moment), swatches.get(moment, "")) for _, moment in MOMENTS]
+        row = [_name(key, about), *cells[: 2 + has_truth]]
+        if has_truth:
+            row.append(_error(results, "parameter_rmse", key))
+        if has_truth and relative:
+            row.append(_error(results, "relative_error", key))
+        rows.append(row)
+    return table(head, rows, "parameters")
+
+
+def texture_pictures(folder: Path, results: Mapping[str, Any]) -> str:
+    """Each texture at the start and at the end, the true one where it is known, and what of it light and sensor reach.
+
+    `folder` is a run's `parameters/`.
+    """
+    parts = []
+    archives = {moment: _archive(folder / sub / "parameters.npz") for moment, sub in _FOLDERS.items()}
+    for key, about in (results.get("parameters") or {}).items():
+        arrays = {moment: _texture(archive, key) for moment, archive in archives.items()}
+        exposure = _exposure(arrays)
+        shown = [
+            _figure(title, f"{title}: {key}", array, about.get(moment), exposure)
+            for title, moment in MOMENTS
+            if (array := arrays[moment]) is not None
+        ]
+        mask = _mask(folder, key)
+        if shown and mask is not None and not mask.all():
+            share = f"<b>reached</b> by light and sensor (white): {100 * mask.mean():.3g} %"
+            shown.append(_picture(mask[:, :, None].astype(np.float32), f"reached: {key}", share))
+        if shown:
+            words = exposure_words(exposure)
+            parts.append(f"<h3>{breakable(key)}</h3>" + (f'<p class="soft small">{words}</p>' if words else ""))
+            parts.append(figures(shown))
+    return "".join(parts)
+
+
+def _exposure(arrays: Mapping[str, Array | None]) -> float:
+    """What is emitted may be far beyond 1, and has one exposure at all moments: by the truth, where that is known."""
+    true, final = arrays["true"], arrays["final"]
+    known = true if true is not None else final
+    return exposure_for([known]) if known is not None and float(np.nanmax(known)) > 1 else 1.0
+
+
+def _figure(title: str, alt: str, array: Array, about: Mapping[str, Any] | None, exposure: float) -> str:
+    size = f"{array.shape[1]}×{array.shape[0]}"
+    caption = f"<b>{text(title)}</b>, {size}" + (f"<br>{_value(about, '')}" if about else "")
+    return _picture(array * exposure, alt, caption)
+
+
+def _picture(array: Array, alt: str, markup: str) -> str:
+    picture = show(array)
+    return figure(picture.uri, picture.size, alt, markup, picture.smooth)
+
+
+def _name(key: str, about: Mapping[str, Any]) -> str:
+    shape = "×".join(str(size) for size in about.get("shape") or ())
+    notes = [about.get("quantity") or "", shape if len(about.get("shape") or ()) != 1 or shape != "3" else ""]
+    reached = about.get("reached")
+    notes += [f"{100 * reached:.3g} % reached"] if reached is not None and reached < 1 else []
+    line = ", ".join(note for note in notes if note)
+    return breakable(key) + (f'<br><span class="soft small">{text(line)}</span>' if line else "")
+
+
+def _value(about: Mapping[str, Any] | None, swatch: str) -> str:
+    if not about:
+        return ""
+    if "value" in about:
+        values = about["value"] if isinstance(about["value"], list) else [about["value"]]
+        return f"<span>{swatch}{_numbers(values)}</span>"
+    if about["min"] == about["max"]:
+        return f"<span>{swatch}{_number(about['min'])} throughout</span>"
+    ends = " to ".join(_number(about[end]) for end in ("min", "max"))
+    return f'<span>{swatch}mean {_numbers(about["mean"])}<br><span class="soft small">{ends}</span></span>'
+
+
+def _numbers(values: Iterable[float | None]) -> str:
+    return " ".join(_number(value) for value in values)
+
+
+def _number(value: float | None) -> str:
+    return f'<span class="number">{text(number(value, 3))}</span>'
+
+
+def _error(results: Mapping[str, Any], kind: str, key: str) -> str:
+    pair = (results.get(kind) or {}).get(key)
+    if pair is None:
+        return ""
+    words = " → ".join(_number(pair.get(moment)) for moment in ("initial", "final") if pair.get(moment) is not None)
+    worse = key in (results.get("worse") or ())
+    return f'<span class="worse">{words}, worse</span>' if worse else f"<span>{words}</span>"
+
+
+def _swatches(key: str, about: Mapping[str, Any]) -> dict[str, str]:
+    """The colours of a parameter, by moment, all with one exposure: what is emitted, or beyond 1, is at most 1."""
+    colors = {}
+    for _, moment in MOMENTS:
+        found = about.get(moment) or {}
+        values = found.get("mean", found.get("value"))
+        if isinstance(values, list) and len(values) == 3 and None not in values:
+            colors[moment] = np.array(values, dtype=np.float64)
+    parts = key.split(".")
+    if any(part in _NO_COLORS for part in parts[-2:]) or not colors:
+        return {}
+    brightest = max(float(color.max()) for color in colors.values())
+    unit = brightest if brightest > 1 or (about.get("quantity") and brightest > 0) else 1.0
+    shown = {moment: encode(np.clip(color / unit, 0, 1)) for moment, color in colors.items()}
+    return {
+        moment: '<i class="swatch" style="background:rgb({})"></i>'.format(",".join(f"{255 * c:.0f}" for c in color))
+        for moment, color in shown.items()
+    }
+
+
+def _archive(path: Path) -> dict[str, Array]:
+    """The textures in a `parameters.npz`; nothing where it is missing or damaged."""
+    try:
+        with np.load(path) as arrays:
+            return {key: arrays[key] for key in arrays.files}
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
+        return {}
+
+
+def _texture(archive: Mapping[str, Array], key: str) -> Array | None:
+    array = archive.get(key)
+    return array if array is not None and array.ndim == 3 and array.size else None
+
+
+def _mask(folder: Path, key: str) -> Array | None:
+    from reslrb_cli.records.parameters import file_stem
+
+    try:
+        mask: Array = np.load(folder / f"{file_stem(key)}.mask.npy")
+    except (OSError, ValueError, EOFError):
+        return None
+    return mask if mask.ndim == 2 else None

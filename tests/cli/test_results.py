@@ -1,0 +1,190 @@
+"""What a run says of itself at its end: on the terminal, in the manifest and in its images."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from cli.test_optimize import CONFIG, KEY, SCENE, read_manifest, read_metrics, reslrb
+
+LAMP, WALL = "lamp.emitter.radiance.value", "wall.reflectance.value"
+
+
+@pytest.fixture(autouse=True)
+def _experiment(llvm, tmp_path, monkeypatch):
+    """A folder with a scene and a configuration, and the working directory in it."""
+    import mitsuba as mi
+
+    texture = np.random.default_rng(2).uniform(0.1, 0.9, (4, 4, 3)).astype(np.float32)
+    mi.Bitmap(texture).write(str(tmp_path / "poster.exr"))
+    (tmp_path / "scene.xml").write_text(SCENE)
+    (tmp_path / "box.yaml").write_text(CONFIG)
+    monkeypatch.chdir(tmp_path)
+
+
+def optimize(capsys, *settings, options=(), name="box.yaml"):
+    """Run `reslrb optimize`; return its last line, all of standard output, and the manifest's results."""
+    sets = [word for setting in settings for word in ("--set", setting)]
+    code, out, err = reslrb(capsys, "optimize", name, "--force", *options, *sets)
+    assert code == 0, err
+    return out.splitlines()[-1], out, read_manifest(f"runs/{Path(name).stem}")["results"]
+
+
+def read(path):
+    import mitsuba as mi
+
+    return np.array(mi.Bitmap(str(path)), dtype=np.float64)
+
+
+def test_values_and_errors_stand_above_the_last_line(capsys):
+    both = f"parameters=[{{key: {KEY}, initial: 0.5, bounds: [0, 1]}}, {{key: {WALL}, initial: [0.2, 0.3, 0.4]}}]"
+    last, out, results = optimize(capsys, both, "run.iterations=3", "run.adjoint=independent")
+    head, poster, wall, *rest = out.splitlines()
+    assert rest == [last]
+    assert head.split() == ["parameter", "start", "end", "true", "RMSE"]
+    assert poster.startswith(KEY)
+    assert wall.startswith(WALL)
+    assert "0.2 0.3 0.4" in wall
+    assert "0.5 0.4 0.3" in wall
+    columns = [head.index(title) for title in ("start", "end", "true", "RMSE")]
+    assert all(line[column - 1] == " " != line[column] for line in (poster, wall) for column in columns)
+    errors = results["parameter_rmse"]
+    for key, line in ((KEY, poster), (WALL, wall)):
+        assert line.endswith(f"{errors[key]['initial']:.3g} to {errors[key]['final']:.3g}")
+    assert f"parameter RMSE {results['rmse']['initial']:.3g} to {results['rmse']['final']:.3g};" in last
+    about = results["parameters"][KEY]
+    recovered = np.load("runs/box/parameters/parameters.npz")[KEY]
+    assert about["final"]["mean"] == pytest.approx(recovered.mean(axis=(0, 1)).tolist(), rel=1e-5)
+    assert (about["final"]["min"], about["final"]["max"]) == pytest.approx((recovered.min(), recovered.max()))
+    assert results["parameters"][WALL]["true"] == {"value": pytest.approx([0.5, 0.4, 0.3])}
+    assert optimize(capsys, "run.iterations=1", options=["--quiet"])[1].count("\n") == 1
+
+
+def test_units_that_differ_are_told_as_relative_errors(capsys):
+    both = f"parameters=[{{key: {WALL}, initial: 0.2}}, {{key: {LAMP}, initial: 2.0, learning_rate: 0.5}}]"
+    last, out, results = optimize(capsys, both, "run.iterations=3")
+    for record in read_metrics("runs/box"):
+        assert record["parameter_rmse"] is None
+        assert set(record["parameter_errors"]) == {WALL, LAMP}
+    assert results["rmse"] == {"initial": None, "final": None}
+    assert [results["parameters"][key]["quantity"] for key in (WALL, LAMP)] == ["", "radiance"]
+    truth = {WALL: np.sqrt(np.mean(np.square([0.5, 0.4, 0.3]))), LAMP: 8.0}
+    for key, pair in results["relative_error"].items():
+        rmse = results["parameter_rmse"][key]
+        assert pair == {at: pytest.approx(rmse[at] / truth[key], rel=1e-5) for at in ("initial", "final")}
+    assert results["relative_error"][LAMP]["initial"] == pytest.approx(0.75)
+    assert re.search(rf"relative error 0\.75 to \S+ at worst \({LAMP}\);", last), last
+    assert "relative error" in out.splitlines()[0]
+
+
+def test_another_resolution_than_the_truths_has_an_error(capsys):
+    last, _, results = optimize(capsys, "parameters[0].resolution=[8, 8]", "run.iterations=2")
+    records = read_metrics("runs/box")
+    assert all(record["parameter_rmse"] > 0 for record in records)
+    assert results["parameter_rmse"][KEY]["initial"] == pytest.approx(records[0]["parameter_errors"][KEY])
+    assert results["parameters"][KEY]["shape"] == [8, 8, 3]
+    assert "parameter RMSE" in last
+    assert read("runs/box/parameters/true/" + KEY + ".exr").shape == (4, 4, 3)
+
+
+def test_a_loss_that_does_not_fall_is_said_plainly(capsys):
+    """A learning rate of nothing: the parameters stay where they are."""
+    sets = ["optimizer.learning_rate=1e-12", "run.iterations=40", "run.spp=512"]
+    last, _, results = optimize(capsys, *sets)
+    assert results["loss_trend"]["change"] == "flat"
+    assert re.search(
+        r"; the loss (did not fall|fell by no more than its noise) \(0\.\d+ \+- 0\.\d+ at the start, ", last
+    )
+    assert "got worse" not in last
+    assert results["warnings"][0] in last
+    assert "the loss" in Path("runs/box/report.html").read_text().partition("<section>")[0]
+
+
+def test_a_parameter_that_got_worse_is_said_plainly(capsys):
+    """Far too large a learning rate, from close to the truth."""
+    wall = f"parameters=[{{key: {WALL}, initial: 0.42, bounds: [0, 1]}}]"
+    last, out, results = optimize(capsys, wall, "optimizer.learning_rate=30", "run.iterations=30")
+    pair = results["parameter_rmse"][WALL]
+    assert pair["final"] > 2 * pair["initial"]
+    assert f"; {WALL} got worse (RMSE {pair['initial']:.3g} to {pair['final']:.3g})" in last
+    assert results["worse"] == [WALL]
+    assert out.splitlines()[1].endswith(", worse")
+
+
+def test_a_run_that_works_or_is_short_has_nothing_to_complain_of(capsys):
+    last, _, results = optimize(capsys, "run.adjoint=independent", "run.spp=128")
+    assert results["loss_trend"]["change"] == "fell"
+    assert results["warnings"] == []
+    assert last.count(";") == 1
+    last, _, results = optimize(capsys, "optimizer.learning_rate=30", "run.iterations=5")
+    assert (results["loss_trend"], results["warnings"]) == (None, [])
+
+
+def test_a_loss_that_is_nothing_but_noise_is_no_failure(capsys):
+    """The images of the iterations are too noisy to tell, those of more samples are not."""
+    _, _, results = optimize(capsys, "run.adjoint=independent")
+    assert results["loss_trend"]["change"] == "flat"
+    assert results["image_loss"]["final"] < 0.5 * results["image_loss"]["initial"]
+    assert results["warnings"] == []
+
+
+@pytest.mark.parametrize("integrator", ["ptracer", "reslrb, estimator: event, samples_per_pass: 24"])
+def test_initial_and_final_images_have_samples_of_their_own(capsys, integrator, monkeypatch):
+    from reslrb_cli.optimization.problem import Problem
+
+    samples, render = [], Problem.render
+
+    def spy(problem, sensor, spp, iteration, purpose):
+        samples.append(spp)
+        return render(problem, sensor, spp, iteration, purpose)
+
+    monkeypatch.setattr(Problem, "render", spy)
+    sets = [f"integrator={{type: {integrator}, max_depth: 3}}", "run.final_spp=40", "run.spp=24", "run.iterations=3"]
+    optimize(capsys, *sets, "run.images_every=2", "target.render.spp=480")
+    whole = 48 if "samples_per_pass" in integrator else 40
+    assert samples == [whole, 72, whole]
+
+
+@pytest.mark.parametrize("sensors", ["[0]", "all"])
+def test_the_error_map_is_that_of_the_final_image(capsys, sensors):
+    _, _, results = optimize(capsys, f"scene.sensors={sensors}", "run.iterations=1", "run.final_spp=16")
+    images = Path("runs/box/images")
+    for suffix in ("",) if sensors == "[0]" else ("-0", "-1"):
+        error, final, target = (read(images / f"{name}{suffix}.exr") for name in ("error", "final", "target"))
+        np.testing.assert_allclose(error, np.abs(final - target), rtol=1e-4, atol=1e-6)
+        about = results["error_maps"][f"error{suffix}"]
+        assert about["mean"] == pytest.approx(error.mean(), rel=1e-5)
+        beyond = np.sum(error.mean(axis=2) > about["end"])
+        assert beyond <= np.ceil(0.01 * error[:, :, 0].size)
+        assert (images / f"error{suffix}.png").exists()
+
+
+SKY = """<scene version="3.0.0">
+    <sensor type="perspective" id="camera">
+        <transform name="to_world"><lookat origin="0, 0, 4" target="0, 0, 0" up="0, 1, 0"/></transform>
+        <film type="hdrfilm" id="film">
+            <integer name="width" value="12"/> <integer name="height" value="8"/>
+            <string name="pixel_format" value="rgba"/> <rfilter type="box"/>
+        </film>
+    </sensor>
+    <shape type="sphere" id="ball"><bsdf type="roughconductor"/></shape>
+    <emitter type="envmap" id="sky"><string name="filename" value="poster.exr"/></emitter>
+</scene>
+"""
+
+
+def test_an_environment_map_has_an_error_and_a_picture(capsys):
+    """Its tensor has columns that its image has not, and its film an alpha that the target has not."""
+    Path("scene.xml").write_text(SKY)
+    _, out, results = optimize(
+        capsys, "parameters=[{key: sky.data, initial: 3.0}]", "integrator={type: prb}", "run.iterations=2"
+    )
+    assert results["parameters"]["sky.data"]["quantity"] == "radiance"
+    assert results["parameters"]["sky.data"]["shape"] == [4, 4, 3]
+    assert results["parameter_rmse"]["sky.data"]["initial"] > 2
+    assert out.splitlines()[1].startswith("sky.data")
+    assert read("runs/box/images/final.exr").shape == (8, 12, 4)
+    assert read("runs/box/images/error.exr").shape == (8, 12, 3)
+    assert 'alt="true: sky.data"' in Path("runs/box/report.html").read_text()

@@ -1,0 +1,249 @@
+"""What stands on a run's page."""
+
+from __future__ import annotations
+
+import base64
+import html
+import html.parser
+import io
+import re
+
+import numpy as np
+import pytest
+from report.run_folder import FLOOR, LAMP, MEMORY, PILOT, SCALING, make_run
+
+from reslrb_cli.records.manifest import Status
+from reslrb_cli.report.page import render_page, write_report
+
+
+class Page(html.parser.HTMLParser):
+    """The text of a page by section, its tables by section, its elements, and the pictures."""
+
+    VOID = ("meta", "img", "br", "wbr")
+
+    def __init__(self, markup):
+        super().__init__()
+        self.open, self.tags, self.pictures = [], [], []
+        self.sections, self.cells, self.title = {"": ""}, {"": []}, ""
+        self.feed(markup)
+        assert self.open == [], "an element is not closed"
+
+    def handle_starttag(self, tag, attributes):
+        self.tags.append(tag)
+        if tag == "img":
+            self.pictures.append((dict(attributes)["alt"], dict(attributes)["src"]))
+        if tag == "section":
+            self.title = None
+        if tag == "tr":
+            self.cells[self.title or ""].append([])
+        if tag in ("td", "th"):
+            self.cells[self.title or ""][-1].append("")
+        if tag not in self.VOID:
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag, attributes):
+        pass
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        if "style" in self.open:
+            return
+        if self.open and self.open[-1] == "h2":
+            self.title = data
+            self.sections[data], self.cells[data] = "", []
+        self.sections[self.title or ""] += data
+        if "td" in self.open or "th" in self.open:
+            self.cells[self.title or ""][-1][-1] += data
+
+    def row(self, section, first):
+        return next(row for row in self.cells[section] if row and row[0].startswith(first))
+
+
+def page_of(folder):
+    return Page(write_report(folder).read_text(encoding="utf-8"))
+
+
+def pixels(uri):
+    from matplotlib.image import imread
+
+    return imread(io.BytesIO(base64.b64decode(uri.partition(",")[2])))[:, :, :3]
+
+
+def test_values_and_errors_of_every_parameter(tmp_path):
+    page = page_of(make_run(tmp_path / "lamp"))
+    head, *_ = page.cells["Parameters"]
+    assert head == ["parameter", "start", "end", "true", "RMSE", "relative error"]
+    lamp = page.row("Parameters", LAMP)
+    assert lamp[1:4] == ["2 1 0.5", "3.6 1.8 0.9", "4 2 1"]
+    assert lamp[4:] == ["0.5 → 0.1", "0.5 → 0.1"]
+    assert "intensity" in lamp[0]
+    floor = page.row("Parameters", FLOOR)
+    assert "mean" in floor[1]
+    assert "8×8×3" in floor[0]
+    assert "75 % reached" in floor[0]
+    assert f"relative error 0.5 to 0.1 at worst ({FLOOR})" in page.sections[""]
+
+
+def test_without_a_truth_there_are_values_all_the_same(tmp_path):
+    page = page_of(make_run(tmp_path / "lamp", truth=False))
+    assert page.cells["Parameters"][0] == ["parameter", "start", "end"]
+    assert page.row("Parameters", LAMP)[1:] == ["2 1 0.5", "3.6 1.8 0.9"]
+    assert [alt for alt, _ in page.pictures if FLOOR in alt] == [f"start: {FLOOR}", f"end: {FLOOR}"]
+    assert "RMSE" not in page.sections["Parameters"] + page.sections["Convergence"]
+
+
+def test_textures_stand_beside_each_other(tmp_path):
+    page = page_of(make_run(tmp_path / "lamp"))
+    shown = {alt: pixels(uri) for alt, uri in page.pictures if FLOOR in alt}
+    assert list(shown) == [f"{name}: {FLOOR}" for name in ("start", "end", "true", "reached")]
+    assert all(picture.shape == (8, 8, 3) for picture in shown.values())
+    assert not np.any(shown[f"reached: {FLOOR}"][:2])
+    assert np.all(shown[f"reached: {FLOOR}"][2:] == 1)
+    linear = np.load(tmp_path / "lamp" / "parameters" / "true" / "parameters.npz")[FLOOR]
+    expected = np.where(linear > 0.0031308, 1.055 * linear ** (1 / 2.4) - 0.055, 12.92 * linear)
+    np.testing.assert_allclose(shown[f"true: {FLOOR}"], expected, atol=0.01)
+
+
+@pytest.mark.parametrize("sensors", [1, 3])
+def test_every_sensor_has_its_images_and_error_map(tmp_path, sensors):
+    page = page_of(make_run(tmp_path / "lamp", sensors=sensors))
+    alts = [alt for alt, _ in page.pictures if FLOOR not in alt]
+    assert len(alts) == 4 * sensors
+    assert sum("error map" in alt for alt in alts) == sensors
+    assert page.sections["Images"].count("or more") == sensors
+    assert ("Sensor 2" in page.sections["Images"]) == (sensors == 3)
+
+
+def test_the_colours_of_an_error_map_end_where_it_says(tmp_path):
+    folder = make_run(tmp_path / "lamp")
+    page = page_of(folder)
+    [(alt, uri)] = [(alt, uri) for alt, uri in page.pictures if "error map" in alt]
+    end = float(re.search(r"to (\S+)$", alt)[1])
+    from matplotlib import colormaps
+
+    from reslrb_cli.records.images import read_exr
+
+    error = read_exr(folder / "images" / "error.exr").mean(axis=2)
+    assert np.mean(error > end) <= 0.01
+    assert error.max() > 0.5 * end
+    np.testing.assert_allclose(pixels(uri), colormaps["inferno"](np.minimum(error / end, 1))[:, :, :3], atol=0.01)
+    from matplotlib.image import imread
+
+    np.testing.assert_allclose(imread(folder / "images" / "error.png")[:, :, :3], pixels(uri), atol=0.01)
+    assert f"{end:g} or more" in page.sections["Images"]
+
+
+def test_dark_scenes_are_shown_brighter_and_say_so(tmp_path):
+    from reslrb_cli.records.images import read_exr, write_image
+
+    folder = make_run(tmp_path / "lamp")
+    before = {alt: pixels(uri) for alt, uri in page_of(folder).pictures}
+    for name in ("initial", "final", "target"):
+        write_image(folder / "images" / name, read_exr(folder / "images" / f"{name}.exr") * np.float32(1e-6))
+    page = page_of(folder)
+    assert re.search(r"shown \S+ times brighter", page.sections["Images"])
+    after = {alt: pixels(uri) for alt, uri in page.pictures}
+    assert np.abs(after["target"].mean() - before["target"].mean()) < 0.1
+    assert after["start"].mean() < 0.8 * after["target"].mean()
+
+
+def test_swatches_have_the_colours_of_the_values(tmp_path):
+    """One exposure for all moments of a lamp, in sRGB; none for what is no colour."""
+    markup = render_page(make_run(tmp_path / "lamp", keys=(FLOOR, LAMP, "plate.eta.value")))
+    swatches = [
+        tuple(map(int, found.split(","))) for found in re.findall(r'"swatch" style="background:rgb\((.*?)\)"', markup)
+    ]
+    lamp = swatches[3:]
+    assert len(lamp) == 3
+    assert lamp[2] == (255, 188, 137)  # 4, 2, 1 over 4, encoded
+    assert lamp[0] == (188, 137, 99)
+
+
+def test_pilot_scaling_memory_and_run_are_tables(tmp_path):
+    page = page_of(make_run(tmp_path / "lamp", pilot=PILOT, memory=MEMORY, scaling=SCALING))
+    best, second, last = page.cells["Choice of the estimator"][1:]
+    assert best[:4] == ["event, capacity 4", "1", "0.5", "10 ms"]
+    assert second[:2] == ["stack", "0.8"]
+    assert last[-1].startswith("not measured")
+    assert "1.25 times as efficient" in page.sections["Choice of the estimator"]
+    assert page.row("Scale of the parameters", LAMP)[1] == "3e+06"
+    assert page.row("Memory budget", "budget")[1] == "1024 MiB"
+    assert page.row("Run", "an iteration")[1] == "90 ms (median): 40 ms up to image and loss, 50 ms for the gradient"
+    assert page.row("Run", "device")[1] == "a machine"
+    everything = "".join(page.sections.values())
+    assert "{'" not in everything
+    assert "None" not in everything
+
+
+def test_what_went_wrong_stands_first(tmp_path):
+    trend = {"start": {"mean": 0.0131, "error": 0.0004}, "end": {"mean": 0.0133, "error": 0.0004}, "change": "flat"}
+    page = page_of(make_run(tmp_path / "lamp", results={"loss_trend": trend, "worse": [LAMP]}))
+    assert "the loss did not fall (0.0131 ± 0.0004 at the start, 0.0133 ± 0.0004 at the end)" in page.sections[""]
+    assert f"{LAMP} got worse (RMSE 0.5 to 0.1)" in page.sections[""]
+    assert page.row("Parameters", LAMP)[4].endswith("worse")
+    failed = page_of(make_run(tmp_path / "failed", status=Status.FAILED, error="no light: <b>"))
+    assert "no light: <b>" in failed.sections[""]
+    assert "b" not in failed.tags[:20]
+
+
+EVIL = '<script>alert("1")</script>.a & b.value'
+
+
+def test_names_stay_text(tmp_path):
+    folder = make_run(tmp_path / "<img src=x onerror=alert(1)>", keys=(EVIL, "\x1b[31m</pre>\u202e.value"))
+    (folder / "config.yaml").write_text("name: </pre><script>alert(1)</script>\n")
+    markup = render_page(folder)
+    page = Page(markup)
+    assert "script" not in page.tags
+    assert page.tags.count("img") == len(page.pictures) == 8
+    assert page.row("Parameters", EVIL)
+    assert "\x1b" not in markup
+    assert "\u202e" not in markup
+    assert "<script>alert(1)</script>" in page.sections["Configuration"]
+
+
+def test_nothing_is_loaded(tmp_path):
+    markup = render_page(make_run(tmp_path / "lamp"))
+    assert re.findall(r'(?:src|href)="(?!data:|#)[^"]*"', markup) == []
+    assert "url(http" not in markup
+    assert "default-src 'none'" in html.unescape(markup)
+    assert '<meta name="viewport" content="width=device-width, initial-scale=1">' in markup
+
+
+def test_a_folder_with_hardly_anything_in_it_has_a_page(tmp_path):
+    empty = tmp_path / "empty"
+    empty.mkdir()
+    assert "No iteration was completed" in page_of(empty).sections["Convergence"]
+    damaged = make_run(tmp_path / "damaged")
+    for path in [*damaged.glob("images/*.exr"), *damaged.glob("parameters/**/*.np[yz]")]:
+        path.write_bytes(path.read_bytes()[:-40] if path.stat().st_size > 100 else b"")
+    (damaged / "images" / "final.exr").write_bytes(b"")
+    (damaged / "images" / "target.exr").unlink()
+    page = page_of(damaged)
+    assert page.row("Parameters", LAMP)[1] == "2 1 0.5"
+    assert "end" not in [alt for alt, _ in page.pictures]
+
+
+def test_what_is_there_is_shown_without_what_is_missing(tmp_path):
+    folder = make_run(tmp_path / "interrupted")
+    for name in ("final", "target", "error"):
+        (folder / "images" / f"{name}.exr").unlink()
+    assert [alt for alt, _ in page_of(folder).pictures if FLOOR not in alt] == ["start"]
+
+
+def test_a_page_of_a_long_run_with_large_pictures_is_small(tmp_path):
+    folder = make_run(tmp_path / "long", iterations=5000, size=(900, 1400))
+    page = write_report(folder)
+    assert page.stat().st_size < 6e6
+    parsed = Page(page.read_text())
+    assert max(pixels(uri).shape[1] for _, uri in parsed.pictures) <= 640
+    assert "Each point is the mean of 9 iterations" in parsed.sections["Convergence"]
+
+
+def test_many_parameters_have_their_worst_drawn(tmp_path):
+    keys = tuple(f"part{number}.reflectance.value" for number in range(12))
+    page = page_of(make_run(tmp_path / "many", keys=keys))
+    assert len(page.cells["Parameters"]) == 13
+    assert "4 more are not drawn" in page.sections["Convergence"]

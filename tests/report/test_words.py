@@ -1,0 +1,135 @@
+"""Numbers, times, keys and results in words."""
+
+from __future__ import annotations
+
+import re
+
+import pytest
+
+from reslrb_cli.report.run_table import parameter_lines
+from reslrb_cli.report.verdict import last_line, warnings
+from reslrb_cli.report.words import count, duration, number, printable, shorten, with_error
+
+
+@pytest.mark.parametrize(
+    ("value", "error", "text"),
+    [
+        (0.013123, 0.00041, "0.0131 +- 0.0004"),
+        (0.1296, 0.0612, "0.13 +- 0.06"),
+        (123.4, 12.0, "123 +- 12"),
+        (1.234e-7, 3.2e-9, "(1.23 +- 0.03)e-07"),
+        (2.5e6, 1.2e5, "(2.5 +- 0.1)e+06"),
+        (0.5, 0.0, "0.5"),
+        (0.0, 0.02, "0.00 +- 0.02"),
+        (1.0, float("nan"), "1"),
+    ],
+)
+def test_a_value_with_its_error(value, error, text):
+    assert with_error(value, error) == text
+
+
+@pytest.mark.parametrize(
+    ("seconds", "text"),
+    [
+        (0.0123, "12.3 ms"),
+        (0, "0 ms"),
+        (4.56, "4.56 s"),
+        (59.97, "1 min 0 s"),
+        (200, "3 min 20 s"),
+        (7500, "2 h 5 min"),
+    ],
+)
+def test_times(seconds, text):
+    assert duration(seconds) == text
+
+
+def test_numbers():
+    assert (number(None), number(0.123456), number(1e6), number(0.5, 3)) == ("", "0.1235", "1e+06", "0.5")
+
+
+def test_one_of_a_thing_is_singular():
+    assert [count(amount, "iteration") for amount in (0, 1, 2)] == ["0 iterations", "1 iteration", "2 iterations"]
+
+
+def test_keys_lose_their_middle():
+    assert shorten("floor.reflectance.data", 40) == "floor.reflectance.data"
+    short = shorten("a_very_long_name.brdf_0.reflectance.data", 20)
+    assert (len(short), short[:8], short[-8:]) == (20, "a_very_l", "nce.data")
+    assert all(len(shorten("abcdefghij", width)) == min(width, 10) for width in range(1, 15))
+    assert printable("a\x1b[31m\u202eb\ud800é") == "a\\x1b[31m\\u202eb\\ud800é"
+
+
+def results(**changes):
+    values = {"initial": {"value": [0.5, 0.5, 0.5]}, "final": {"value": [0.123456, 0.2, 0.3]}, "true": None}
+    return {
+        "iterations": 30, "loss": 0.5, "rmse": {"initial": None, "final": None}, "parameter_rmse": {},
+        "relative_error": {}, "parameters": {"wall.reflectance.value": values}, "loss_trend": None, "worse": [],
+    } | changes  # fmt: skip
+
+
+def test_without_a_truth_the_table_has_values_alone():
+    assert parameter_lines(results(), 80) == [
+        "parameter               start        end",
+        "wall.reflectance.value  0.5 0.5 0.5  0.123 0.2 0.3",
+    ]
+
+
+@pytest.mark.parametrize("width", [40, 60, 80, 100, 160])
+def test_no_line_is_wider_than_the_terminal_and_no_number_is_cut(width):
+    key = "a_very_long_name_of_a_wall_that_goes_on_and_on.brdf_0.reflectance.data"
+    texture = {"mean": [0.123, 0.456, 0.789], "min": -0.00123, "max": 1.23e5}
+    about = {"initial": texture, "final": texture, "true": texture}
+    pair = {key: {"initial": 0.123, "final": 0.456}}
+    found = results(parameters={key: about}, parameter_rmse=pair, relative_error=pair, worse=[key])
+    lines = parameter_lines(found, width)
+    assert max(map(len, lines)) <= width
+    words = " ".join(" ".join(lines).split())
+    assert len(re.findall(r"0\.123 0\.456 0\.789 \(-0\.00123 to 1\.23e\+05\)", words)) == 3
+    assert re.search(r"0\.123 to 0\.456, worse", words)
+
+
+def test_many_parameters_are_a_few_lines():
+    values = {"initial": {"value": 0.5}, "final": {"value": 0.1}}
+    found = results(parameters={f"part{number}.alpha.value": values for number in range(40)})
+    lines = parameter_lines(found, 80)
+    assert len(lines) == 14
+    assert lines[-1] == "and 28 more parameters, on the page"
+
+
+def test_a_run_that_ended_before_it_began_has_no_table():
+    assert parameter_lines({}, 80) == []
+    assert parameter_lines(results(parameters={"a": {"initial": None}}), 80) == []
+
+
+def test_the_last_line():
+    assert last_line("finished", results(loss=None), [], "runs/a/report.html") == (
+        "finished after 30 iterations; look at runs/a/report.html"
+    )
+    line = last_line("interrupted", results(rmse={"initial": 0.3, "final": 0.05}), ["2 values not finite"], "r.html")
+    assert line == (
+        "interrupted after 30 iterations, loss 0.5, parameter RMSE 0.3 to 0.05, 2 values not finite; look at r.html"
+    )
+
+
+def trend(change, start=0.0131, end=0.0133):
+    return {"start": {"mean": start, "error": 0.0004}, "end": {"mean": end, "error": 0.0004}, "change": change}
+
+
+def test_what_is_said_of_the_loss():
+    assert warnings(results(loss_trend=trend("fell"))) == warnings(results(loss_trend=trend("unclear"))) == []
+    flat = "the loss did not fall (0.0131 +- 0.0004 at the start, 0.0133 +- 0.0004 at the end)"
+    assert warnings(results(loss_trend=trend("flat"))) == [flat]
+    assert warnings(results(loss_trend=trend("rose"))) == [flat.replace("did not fall", "rose")]
+    lower = warnings(results(loss_trend=trend("flat", end=0.0129)))[0]
+    assert lower.startswith("the loss fell by no more than its noise (")
+    images = {"initial": 0.01, "final": 0.008}
+    assert warnings(results(loss_trend=trend("flat"), image_loss=images)) == []
+    assert warnings(results(loss_trend=trend("flat"), image_loss={"initial": 0.01, "final": None})) == [flat]
+
+
+def test_the_worst_are_named():
+    pairs = {f"part{n}": {"initial": 0.1, "final": 0.1 + 0.1 * n} for n in range(1, 7)}
+    lines = warnings(results(worse=list(pairs), parameter_rmse=pairs))
+    assert lines[0] == "part6 got worse (RMSE 0.1 to 0.7)"
+    assert lines[-1] == "and so did 3 more parameters"
+    assert len(lines) == 4
