@@ -11,7 +11,7 @@ import drjit as dr
 import mitsuba as mi
 
 from reslrb_cli.transport.connection import Connection, stand_in
-from reslrb_cli.transport.emission import sample_emission
+from reslrb_cli.transport.emission import Emission, sample_emission
 from reslrb_cli.transport.factors import NO_ZERO, Product, showing
 from reslrb_cli.transport.hooks import Hooks, Vertex
 from reslrb_cli.transport.plan import Plan
@@ -46,10 +46,10 @@ class Pass:
         """Trace the paths, the same ones each time; the hooks' final state."""
         return walk(self.samples, hooks, active)
 
-    def emission(self) -> mi.Spectrum:
-        """E (C,) of each path, with derivatives."""
+    def emission(self) -> Emission:
+        """The rays that leave the emitters, and E (C,) of each path, with derivatives."""
         s = self.samples
-        return sample_emission(s.plan, s.scene, s.sensor, s.sampler()).weight
+        return sample_emission(s.plan, s.scene, s.sensor, s.sampler())
 
     def delta(self, u: mi.Point2f, active: mi.Bool) -> mi.Spectrum:
         """The adjoint (C,) at film position `u`; dL/dI is known."""
@@ -73,6 +73,8 @@ class Estimator(ABC):
     """
 
     OPTIONS: ClassVar[dict[str, Any]] = {}
+    exact: ClassVar[bool] = False  # every connection of a path counts, as under naive AD of the same paths
+    attaches: ClassVar[bool] = False  # it has derivatives of what moves light
     splats_all: bool = True  # the image shows every connection, so that an image alone needs no estimator
 
     @abstractmethod
@@ -111,7 +113,7 @@ def differentiate_emission(p: Pass, weight: Callable[[Any], Any]) -> None:
     """Add the derivative of E, (C,), times `weight(E)`, where the plan differentiates emission at all."""
     if p.plan.differentiate_emission:
         with dr.resume_grad(), dr.isolate_grad():
-            E = p.emission()
+            E = p.emission().weight
             dr.backward_from(dr.dot(weight(dr.detach(E)), E))
 
 

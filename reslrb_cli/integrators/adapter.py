@@ -100,7 +100,7 @@ def _plugin_class() -> Any:
 
 def _take_options(type: str, props: mi.Properties) -> dict[str, Any]:
     """The options that an integrator of this type has. What stays unread Mitsuba reports as an error."""
-    names = list(LightTracer.OPTIONS)
+    names = list(WalkAd.OPTIONS if type == "walk_ad" else LightTracer.OPTIONS)
     if type == "reslrb":
         kind = ESTIMATORS.get(props.get("estimator", Reslrb.OPTIONS["estimator"]))
         names = [*Reslrb.OPTIONS, *(kind.OPTIONS if kind is not None else ())]

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Mapping
+from typing import Any, ClassVar
 
 import drjit as dr
 import mitsuba as mi
@@ -10,6 +11,7 @@ import mitsuba as mi
 from reslrb_cli.errors import UnsupportedScene
 from reslrb_cli.integrators import light_tracer as lt
 from reslrb_cli.integrators.interface import Derivative, Job
+from reslrb_cli.integrators.preparation import Motion
 from reslrb_cli.integrators.tracer import Reversed
 from reslrb_cli.transport.accumulation import in_passes
 from reslrb_cli.transport.samples import Samples
@@ -18,7 +20,16 @@ from reslrb_cli.transport.samples import Samples
 class WalkAd(Reversed):
     """The same walk under naive AD: for comparisons at equal seeds."""
 
+    OPTIONS: ClassVar[Mapping[str, Any]] = {
+        **Reversed.OPTIONS,
+        "attached": False,
+        "filter_normalization": "attached",
+    }
     image_apart = False
+
+    def __init__(self, attached: bool = False, filter_normalization: str = "attached", **common: Any) -> None:
+        """`attached`: rays and film positions have their derivatives too."""
+        super().__init__(motion=Motion(attached, filter_normalization), **common)
 
     def graph(self, job: Job) -> mi.TensorXf:
         """The image (H, W, C) with its whole graph; to be called where gradients are enabled."""
@@ -48,7 +59,7 @@ class Trajectory(Reversed):
     """The same walk in a loop that Dr.Jit itself reverses, from a record of its state in thread-local memory."""
 
     def __init__(self, max_depth: int = -1, **common: Any) -> None:
-        super().__init__(max_depth, **common)
+        super().__init__(max_depth, motion=Motion(attached=False), **common)
         if max_depth == -1:
             raise ValueError('"max_depth" must be given: it is the size of the record')
 

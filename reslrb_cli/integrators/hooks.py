@@ -10,30 +10,22 @@ import mitsuba as mi
 
 from reslrb_cli.transport.connection import Connection, passage
 from reslrb_cli.transport.factors import Product
-from reslrb_cli.transport.hooks import Hooks, Vertex
+from reslrb_cli.transport.hooks import Hooks, Splat, Vertex
 from reslrb_cli.transport.samples import Samples
 from reslrb_cli.transport.scattering import Scattering, evaluate, tracked_factor
 from reslrb_cli.transport.splat import AdjointImage
 from reslrb_cli.transport.transmittance import forward_derivatives, transmittance
 
 
-class Splat(Hooks):
-    """Splat every connection."""
-
-    def __init__(self, samples: Samples, block: Any) -> None:
-        self.samples, self.block = samples, block
-
-    def connection(self, state: Any, vertex: Vertex, connection: Connection, numbers: list[Any]) -> Any:
-        s = self.samples
-        C = vertex.product.times(connection.c, vertex.depth).scaled(s.scale)
-        s.film.put(self.block, connection.u, C.value(), connection.active)
-        return state
-
-
 class TrackedSplat(Splat):
-    """Splat every connection, derivatives tracked (walk_ad)."""
+    """Splat every connection, derivatives of its factors tracked, and those of rays and film positions if `attached`
+    (walk_ad)."""
 
     tracked = True
+
+    def __init__(self, samples: Samples, block: mi.ImageBlock, attached: bool) -> None:
+        super().__init__(samples, block)
+        self.attached = attached
 
 
 class RecordedObjective(Hooks):

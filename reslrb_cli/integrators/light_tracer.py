@@ -10,10 +10,11 @@ import mitsuba as mi
 
 from reslrb_cli.estimators import Estimator
 from reslrb_cli.estimators.base import Pass
-from reslrb_cli.integrators.hooks import RecordedObjective, Splat, TangentSplat, TrackedSplat
+from reslrb_cli.integrators.hooks import RecordedObjective, TangentSplat, TrackedSplat
 from reslrb_cli.scene.graph import SceneGraph
 from reslrb_cli.transport.accumulation import finish_pass, in_passes
 from reslrb_cli.transport.emission import sample_emission
+from reslrb_cli.transport.hooks import Splat
 from reslrb_cli.transport.samples import Samples
 from reslrb_cli.transport.splat import AdjointImage, Film
 from reslrb_cli.transport.transmittance import forward_derivatives
@@ -183,4 +184,4 @@ def splat_tracked(samples: Samples, block: Any) -> None:
     """Add the contributions with derivatives tracked to the block: naive AD, its memory proportional to depth."""
     with dr.resume_grad():
         splat_visible_emission(samples, block, "evaluated")
-        walk(samples, TrackedSplat(samples, block))
+        walk(samples, TrackedSplat(samples, block, samples.plan.attached))

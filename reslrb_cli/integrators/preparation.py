@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
 from typing import Any
 
 import mitsuba as mi
 
-from reslrb_cli.integrators.differentiated import differentiated
+from reslrb_cli.errors import UnsupportedScene
+from reslrb_cli.integrators.differentiated import Differentiated, differentiated
 from reslrb_cli.integrators.freezing import Recordings
 from reslrb_cli.integrators.light_tracer import settle
 from reslrb_cli.scene.graph import SceneGraph
@@ -14,11 +16,53 @@ from reslrb_cli.scene.needs import check_supported, scene_needs
 from reslrb_cli.transport.plan import Plan, make_plan
 
 
+@dataclass(frozen=True)
+class Motion:
+    """How derivatives of what moves light are taken.
+
+    `attached` is `auto` (where a parameter moves anything), or says so; `filter_normalization` is `attached` or
+    `detached`. Raises ValueError for anything else.
+    """
+
+    attached: bool | str = "auto"
+    filter_normalization: str = "attached"
+
+    def __post_init__(self) -> None:
+        if self.attached not in (True, False, "auto"):
+            raise ValueError('"attached" must be auto, true or false')
+        if self.filter_normalization not in ("attached", "detached"):
+            raise ValueError('"filter_normalization" must be attached or detached')
+
+
+def attach(plan: Plan, which: Differentiated, motion: Motion, sensor: mi.Sensor) -> Plan:
+    """The plan with attached derivatives, where they are asked for. Raises UnsupportedScene where there are none."""
+    if motion.attached is False and which.moves:
+        raise UnsupportedScene(
+            "attached: false leaves out the derivatives of parameters that move light; leave it at auto"
+        )
+    if not (which.moves or (motion.attached is True and (which.bsdf_nodes or which.emission))):
+        return plan
+    if plan.needs.has_null:
+        raise UnsupportedScene("attached derivatives do not go through masks and other surfaces with null lobes")
+    if sensor.film().rfilter().is_box_filter():
+        raise UnsupportedScene(
+            f"sensor {sensor.id()} has a box filter, whose splats do not change while they move inside of a pixel; "
+            "take a smooth one, such as gaussian, for derivatives of what moves light"
+        )
+    return replace(
+        plan,
+        attached=True,
+        moving_shapes=which.shapes,
+        moving_emission=which.emitters,
+        attached_normalization=motion.filter_normalization == "attached",
+    )
+
+
 class Preparation:
     """Plans by sensor, owners of parameters, and recordings of one scene: the last that was asked for."""
 
-    def __init__(self, max_depth: int, rr_depth: int, hide_emitters: bool) -> None:
-        self._depths, self._hide_emitters = (max_depth, rr_depth), hide_emitters
+    def __init__(self, max_depth: int, rr_depth: int, hide_emitters: bool, motion: Motion) -> None:
+        self._depths, self._hide_emitters, self._motion = (max_depth, rr_depth), hide_emitters, motion
         self._scene: tuple[int, mi.Scene | None] | None = None  # its address, and, so that it is not used again, itself
         self._plans: dict[int, Plan] = {}
         self._owners: dict[Any, list[Any]] = {}  # BSDFs of its surfaces that use a node, and under None all of them
@@ -43,7 +87,8 @@ class Preparation:
         # Once needed, kept: otherwise kernels would be compiled anew whenever a texel enters or leaves zero.
         self._track_zeros |= which.zeros
         only = self._bsdfs(scene, which.bsdf_nodes)
-        return plan.differentiating(bool(which.bsdf_nodes), which.emission, self._track_zeros, only)
+        plan = plan.differentiating(bool(which.bsdf_nodes), which.emission, self._track_zeros, only)
+        return attach(plan, which, self._motion, sensor)
 
     def _turn_to(self, scene: mi.Scene) -> None:
         """Forget what was found out about another scene."""

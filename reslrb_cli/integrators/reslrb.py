@@ -8,24 +8,39 @@ from typing import Any, ClassVar
 import drjit as dr
 import mitsuba as mi
 
+from reslrb_cli.errors import UnsupportedScene
 from reslrb_cli.estimators import ESTIMATORS, Estimator
 from reslrb_cli.integrators import light_tracer as lt
 from reslrb_cli.integrators.interface import Derivative, Job
+from reslrb_cli.integrators.preparation import Motion
 from reslrb_cli.integrators.tracer import LightTracer
+from reslrb_cli.transport.plan import Plan
 from reslrb_cli.transport.samples import Samples
 
 
 class Reslrb(LightTracer):
     """Derivatives by a replay of each path; the options beside OPTIONS are those of the estimator."""
 
-    OPTIONS: ClassVar[Mapping[str, Any]] = {**LightTracer.OPTIONS, "estimator": "reservoir", "freeze": False}
+    OPTIONS: ClassVar[Mapping[str, Any]] = {
+        **LightTracer.OPTIONS,
+        "estimator": "reservoir",
+        "freeze": False,
+        "attached": "auto",
+        "filter_normalization": "attached",
+    }
 
     def __init__(self, estimator: Estimator, **common: Any) -> None:
         super().__init__(**common)
         self.estimator = estimator
 
     @classmethod
-    def of(cls, estimator: str = "reservoir", **options: Any) -> Reslrb:
+    def of(
+        cls,
+        estimator: str = "reservoir",
+        attached: bool | str = "auto",
+        filter_normalization: str = "attached",
+        **options: Any,
+    ) -> Reslrb:
         """From the estimator's name and all options. Raises ValueError where one is wrong."""
         if estimator == "auto":
             raise ValueError(
@@ -36,7 +51,18 @@ class Reslrb(LightTracer):
             raise ValueError(f'"estimator" must be one of {", ".join(ESTIMATORS)}, not "{estimator}"')
         kind = ESTIMATORS[estimator]
         own = {name: options.pop(name) for name in kind.OPTIONS if name in options}
-        return cls(kind(**own), **options)
+        return cls(kind(**own), motion=Motion(attached, filter_normalization), **options)
+
+    def plan(self, scene: mi.Scene, sensor: mi.Sensor, params: mi.SceneParameters | None = None) -> Plan:
+        plan = super().plan(scene, sensor, params)
+        if plan.attached and not self.estimator.attaches:
+            able = ", ".join(name for name, kind in ESTIMATORS.items() if kind.attaches)
+            name = next(name for name, kind in ESTIMATORS.items() if isinstance(self.estimator, kind))
+            raise UnsupportedScene(
+                f"estimator {name} has no derivatives of what moves light, which a replay would have to chain through "
+                f"every vertex; take {able}"
+            )
+        return plan
 
     def image_estimator(self) -> Estimator | None:
         return None if self.estimator.splats_all else self.estimator

@@ -13,11 +13,12 @@ import drjit as dr
 import mitsuba as mi
 from typing_extensions import Self
 
+from reslrb_cli.errors import UnsupportedScene
 from reslrb_cli.estimators import Estimator
 from reslrb_cli.integrators import freezing
 from reslrb_cli.integrators import light_tracer as lt
 from reslrb_cli.integrators.interface import Derivative, Job
-from reslrb_cli.integrators.preparation import Preparation
+from reslrb_cli.integrators.preparation import Motion, Preparation
 from reslrb_cli.transport.accumulation import in_passes
 from reslrb_cli.transport.plan import Plan
 from reslrb_cli.transport.samples import Samples, passes
@@ -41,10 +42,11 @@ class LightTracer:
         hide_emitters: bool = False,
         samples_per_pass: int | None = None,
         freeze: bool = False,
+        motion: Motion | None = None,
     ) -> None:
         """Raises ValueError, which names the option, where one has a value that it cannot have.
 
-        `freeze` says whether launches are recorded (`freezing.py`).
+        `freeze` says whether launches are recorded (`freezing.py`), `motion` how derivatives of what moves are taken.
         """
         if max_depth < -1:
             raise ValueError('"max_depth" must be -1 (no limit) or a value >= 0')
@@ -54,7 +56,7 @@ class LightTracer:
             raise ValueError('"samples_per_pass" must be greater than zero')
         self.max_depth, self.rr_depth, self.hide_emitters = max_depth, rr_depth, hide_emitters
         self.samples_per_pass, self.freeze = samples_per_pass, freeze
-        self.preparation = Preparation(max_depth, rr_depth, hide_emitters)
+        self.preparation = Preparation(max_depth, rr_depth, hide_emitters, motion or Motion())
 
     def with_options(self, *, samples_per_pass: int | None, freeze: bool) -> Self:
         """The same with other passes, or without recordings; both share what they find out about a scene."""
@@ -99,6 +101,8 @@ class LightTracer:
         """The derivative (H, W, C) of the image along the tangents of the job's parameters (forward mode)."""
         with dr.suspend_grad():
             parts = self.passes(job)
+            if parts[0].plan.attached:
+                raise UnsupportedScene("forward mode has no derivatives of what moves light; take reverse mode")
             film = parts[0].film
             block = film.block()
             in_passes(parts, lt.splat_tangents, block)

@@ -9,6 +9,7 @@ import mitsuba as mi
 
 from reslrb_cli.transport.connection import Connection, Seen
 from reslrb_cli.transport.factors import Product
+from reslrb_cli.transport.samples import Samples
 from reslrb_cli.transport.scattering import Scattering
 
 
@@ -33,13 +34,14 @@ class Hooks:
     far as `goes_on` asks, so that neither its throughput nor its roulette is computed.
     Hooks that are `tracked` keep derivatives of the factors in the loop state, which is then evaluated vertex by vertex
     (naive AD); with `max_iterations` the loop stays symbolic, and Dr.Jit itself reverses it, from a record of the loop
-    state in thread-local memory.
+    state in thread-local memory. Where they are `attached` too, so are the rays.
     """
 
     numbers: int = 0
     connects: bool = True
     replaying: bool = False
     tracked: bool = False
+    attached: bool = False
     max_iterations: int | None = None
 
     def start(self, product: Product) -> Any:
@@ -72,4 +74,18 @@ class Hooks:
 
     def survived(self, state: Any, weight: mi.Float) -> Any:
         """Called with the weight that roulette has just given the path's product, 1 where it was not played."""
+        return state
+
+
+class Splat(Hooks):
+    """Splat every connection, and keep nothing."""
+
+    def __init__(self, samples: Samples, block: mi.ImageBlock) -> None:
+        self.samples, self.block = samples, block
+
+    def connection(self, state: Any, vertex: Vertex, connection: Connection, numbers: list[mi.Float]) -> Any:
+        s = self.samples
+        C = vertex.product.times(connection.c, vertex.depth).scaled(s.scale)
+        normalization = self.attached and s.plan.attached_normalization
+        s.film.put(self.block, connection.u, C.value(), connection.active, normalization)
         return state

@@ -27,9 +27,10 @@ class Segment:
     connection: Connection
     scattering: Scattering
 
-    def next_ray(self) -> mi.Ray3f:
-        """The ray that leaves in the sampled direction; no derivative goes with it."""
-        return dr.detach(self.si.spawn_ray(self.scattering.d))
+    def next_ray(self, attached: bool = False) -> mi.Ray3f:
+        """The ray that leaves in the sampled direction; its derivatives go with it if `attached`."""
+        ray = self.si.spawn_ray(self.scattering.d)
+        return ray if attached else dr.detach(ray)
 
 
 def find_vertex(
@@ -51,19 +52,21 @@ def segment(
     scattered: mi.Bool,
     evaluates: bool = True,
     tracked: bool = False,
+    attached: bool = False,
 ) -> Segment:
     """The segment from the vertex `si`, which `ray` reaches: connected in some lanes, scattered in some.
 
     Without `evaluates` the BSDF is not evaluated towards the sensor. With `tracked` the scattering weight carries the
     derivatives of the scene's parameters, where gradients are enabled, and the connection is left to be evaluated where
-    it turns out to be visible; directions, densities and film positions have no derivatives here.
+    it turns out to be visible; directions, densities and film positions have no derivatives then. With `attached` they
+    have, and so has everything else.
     """
-    connection = connect(plan, sensor, si, ray, numbers.aperture, connected)
+    connection = connect(plan, sensor, si, ray, numbers.aperture, connected, attached)
     wanted = connection.active if evaluates and not tracked else None
     scattering, connection.f = scatter(
-        plan, si, bsdf, ray, numbers.bsdf_1d, numbers.bsdf_2d, scattered, connection.wo, wanted
+        plan, si, bsdf, ray, numbers.bsdf_1d, numbers.bsdf_2d, scattered, connection.wo, wanted, attached
     )
-    if tracked:
+    if tracked and not attached:
         f = tracked_factor(plan, si, bsdf, scattering, scattering.active)
         scattering.weight = dr.replace_grad(scattering.weight, f * (scattering.correction / scattering.pdf))
     return Segment(si, connection, scattering)

@@ -69,7 +69,7 @@ def walk(samples: Samples, hooks: Hooks, active: mi.Bool | bool = True) -> Any:
         connected = path.active & hooks.wants(state, vertex)
         active = path.active & (path.depth + 1 < plan.max_depth) & hooks.goes_on(state, vertex)
         this = segment(
-            plan, sensor, path.ray, si, bsdf, numbers, connected, active, hooks.connects, tracked=hooks.tracked
+            plan, sensor, path.ray, si, bsdf, numbers, connected, active, hooks.connects, hooks.tracked, hooks.attached
         )
         connection, scattering = this.connection, this.scattering
         if hooks.connects:
@@ -90,9 +90,9 @@ def walk(samples: Samples, hooks: Hooks, active: mi.Bool | bool = True) -> Any:
         if hooks.replaying:
             sampler.next_1d(active)  # roulette's
             active &= hooks.is_followed(state, vertex)
-            return _next(path, active, this.next_ray(), path.product, path.eta), state, sampler, selection
+            return _next(path, active, this.next_ray(hooks.attached), path.product, path.eta), state, sampler, selection
         product = path.product.times(scattering.weight, path.depth)
-        eta = path.eta * scattering.eta
+        eta = path.eta * dr.detach(scattering.eta)
         active = scattering.active & product.alive()
 
         # ---- Russian roulette ----
@@ -105,7 +105,7 @@ def walk(samples: Samples, hooks: Hooks, active: mi.Bool | bool = True) -> Any:
             roulette_weight = dr.select(playing, dr.rcp(q), 1)
             product, state = product.scaled(roulette_weight), hooks.survived(state, roulette_weight)
 
-        return _next(path, active, this.next_ray(), product, eta), state, sampler, selection
+        return _next(path, active, this.next_ray(hooks.attached), product, eta), state, sampler, selection
 
     def _next(path: Path, active: mi.Bool, ray: mi.Ray3f, product: Product, eta: mi.Float) -> Path:
         pi, active = intersect(plan, scene, ray, active)
