@@ -8,9 +8,9 @@ from __future__ import annotations
 import functools
 import json
 import subprocess
-import sys
 from dataclasses import dataclass
 
+from reslrb_cli.backend.python import python_command
 from reslrb_cli.backend.shared_library import missing_library
 
 MISSING_LIBRARY = "run scripts/setup, or install the package that holds it"
@@ -21,8 +21,10 @@ import json, sys, time
 import reslrb_cli
 import drjit as dr
 import mitsuba as mi
+from reslrb_cli.backend.plugins import prefer_own_plugins
 
 mi.set_variant(sys.argv[1])
+prefer_own_plugins()
 salt = (time.time_ns() & 0xFFFFFF) * 1e-6
 
 def timed(work):
@@ -65,7 +67,7 @@ class Probe:
 @functools.cache
 def probe(variant: str) -> Probe:
     """Runs the trial for `variant`; never raises."""
-    command = [sys.executable, "-c", _SCRIPT, variant]
+    command = [*python_command(_SCRIPT), variant]
     try:
         done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
     except subprocess.TimeoutExpired:

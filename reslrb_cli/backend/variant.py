@@ -8,6 +8,7 @@ import os
 from importlib import metadata
 
 from reslrb_cli.backend import llvm
+from reslrb_cli.backend.plugins import prefer_own_plugins
 from reslrb_cli.backend.probe import MISSING_LIBRARY, probe
 from reslrb_cli.backend.shared_library import missing_library
 from reslrb_cli.errors import BackendError
@@ -39,6 +40,7 @@ def set_variant(name: str = "auto") -> str:
         mi.set_variant(chosen)
     except ImportError as error:
         raise BackendError(f"variant {chosen} does not start: {error}") from error
+    prefer_own_plugins()
     logger.info("variant %s%s%s", chosen, f" (libLLVM {library.version})" if library else "", why)
     return chosen
 

@@ -25,16 +25,21 @@ def optional_experiment_arguments(function: Callable[..., Any]) -> Callable[...,
     return _arguments(function, required=False)
 
 
-def _arguments(function: Callable[..., Any], required: bool) -> Callable[..., Any]:
-    function = click.option(
+def overrides_option(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Add `--set` (`overrides`) to a command."""
+    return click.option(
         "--set",
         "overrides",
         multiple=True,
         metavar="KEY=VALUE",
         help="Override a setting, e.g. --set run.spp=32; the value is YAML. May be repeated.",
     )(function)
+
+
+def _arguments(function: Callable[..., Any], required: bool) -> Callable[..., Any]:
     metavar = "CONFIG" if required else "[CONFIG]"
-    return click.argument("config_file", metavar=metavar, required=required, type=click.Path(path_type=Path))(function)
+    argument = click.argument("config_file", metavar=metavar, required=required, type=click.Path(path_type=Path))
+    return argument(overrides_option(function))
 
 
 def read_config(config_file: Path, overrides: tuple[str, ...]) -> Config:

@@ -20,7 +20,7 @@ def load(path: Path | str, overrides: Sequence[str] = ()) -> Config:
 
     Raises ConfigError, located by the file (or the override that is at fault) and the key.
     """
-    return loads(_read(Path(path), str(path)), path, overrides)
+    return loads(read_text(Path(path), str(path)), path, overrides)
 
 
 def loads(text: str, path: Path | str, overrides: Sequence[str] = ()) -> Config:
@@ -78,7 +78,8 @@ def _plain(value: Any) -> Any:
     return str(value) if isinstance(value, Path) else value
 
 
-def _read(path: Path, source: str) -> str:
+def read_text(path: Path, source: str) -> str:
+    """The text of a configuration file, which `source` names in errors. Raises ConfigError where it is none."""
     try:
         return path.read_bytes().decode("utf-8-sig")
     except UnicodeDecodeError:

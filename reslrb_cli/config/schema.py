@@ -71,6 +71,11 @@ class SceneConfig(Section):
     options: dict[str, Annotated[bool | int | float | str, BeforeValidator(_scalar)]] = Field(
         default={}, description="Values of the scene file's `$name` variables."
     )
+    strict: bool = Field(
+        default=False,
+        description="Refuse a scene file in which anything has to be mended or left out before Mitsuba 3 can load it, "
+        "in place of warning of it.",
+    )
     sensors: Annotated[
         Annotated[Annotated[list[Annotated[int, Field(ge=0)]], Field(min_length=1)], Tag("<list>")]
         | Annotated[Literal["all"], Tag("<text>")],
@@ -90,7 +95,7 @@ class Rendering(Section):
 
     parameters: dict[str, Value] = Field(
         default={},
-        description="True values by `mi.traverse` key: a number, a list of numbers, or an image "
+        description="True values by key, as in `parameters`: a number, a list of numbers, or an image "
         "file. Empty: the scene as it stands.",
     )
     spp: Count = Field(default=1024, description="Samples per pixel of the target.")
@@ -145,8 +150,8 @@ class ParameterSpec(Section):
 
     key: str = Field(
         min_length=1,
-        description="Key as `mi.traverse` names it (`reslrb inspect` lists them), or a glob such as "
-        "`*.reflectance.data`.",
+        description="Key as `reslrb inspect` lists it: the names of `mi.traverse`, in which an object without an id "
+        "goes by its kind and number in the scene file, such as `Sphere_3`. Or a glob such as `*.reflectance.data`.",
     )
     initial: Initial = Field(
         default="scene",

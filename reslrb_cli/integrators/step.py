@@ -41,12 +41,20 @@ class StepResult:
 def make_integrator(type: str, **options: Any) -> StepIntegrator:
     """An integrator by its plugin's name and options: `reslrb`, `walk_ad`, or a stock one such as `ptracer`, `prb`.
 
-    An option that is None is left out: Mitsuba's parser would end the process.
+    An option that is None is left out: Mitsuba would end the process. Raises ValueError for one that is unknown.
     """
     given = {name: value for name, value in options.items() if value is not None}
     if type in TRACERS:
         return make_tracer(type, given)
-    return interface_of(mi.load_dict({"type": type} | given))
+    properties = mi.Properties(type)
+    for name, value in given.items():
+        properties[name] = value
+    # `mi.load_dict` would look for a library `plugins/prb.so`, and so run one that lies in the working folder: it does
+    # not know of plugins that are written in Python.
+    integrator = mi.PluginManager.instance().create_object(properties)
+    if properties.unqueried():
+        raise ValueError(f"{type} has no option {', '.join(properties.unqueried())}")
+    return interface_of(integrator)
 
 
 def render_image(integrator: StepIntegrator, scene: mi.Scene, sensor: mi.Sensor | int, seed: int, spp: int

@@ -9,12 +9,12 @@ import re
 import selectors
 import signal
 import subprocess
-import sys
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from reslrb_cli.backend.python import python_command
 from reslrb_cli.errors import ReslrbError, mentions_memory
 from reslrb_cli.records.bench import BenchStatus
 
@@ -56,7 +56,7 @@ class Process:
         self._buffer = b""
         with self._words.open("wb") as words:
             self._process = subprocess.Popen(
-                command or [sys.executable, "-m", "reslrb_cli.measure.worker"],
+                command or python_command("from reslrb_cli.measure.worker import run\nrun()"),
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=words,

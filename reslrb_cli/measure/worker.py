@@ -1,4 +1,4 @@
-"""The process of one case: `python -m reslrb_cli.measure.worker`, started and told what to do by `processes.py`.
+"""The process of one case: `run`, in a Python of its own, started and told what to do by `processes.py`.
 
 It reads one JSON object a line from standard input and answers each with one on standard output. The first describes
 the case; each other one asks for a step. What else is printed goes to standard error.
@@ -74,7 +74,8 @@ def _answer(answers: IO[str], message: dict[str, Any]) -> None:
     answers.flush()
 
 
-if __name__ == "__main__":
+def run() -> None:
+    """Answer, and end the process."""
     code = main()
     sys.stderr.flush()
     os._exit(code)  # what is left to tidy up may take long, or fail where memory is out

@@ -128,7 +128,7 @@ def _make_targets(problem: Problem, say: Callable[[str], None]) -> None:
             for index, sensor in enumerate(problem.sensors)
         ]
         return
-    true_scene = load_scene(config.scene.file, config.scene.options)
+    true_scene = load_configured(config)
     true_values = set_true_values(config, true_scene)
     for key in problem.selection.keys:
         problem.truth[key] = true_values.array(key)
@@ -145,6 +145,11 @@ def _make_targets(problem: Problem, say: Callable[[str], None]) -> None:
         problem.targets.append(_target(problem, image, sensor))
 
 
+def load_configured(config: Config) -> mi.Scene:
+    """Load the scene that `config` names. Raises ConfigError."""
+    return load_scene(config.scene.file, config.scene.options, config.scene.strict)
+
+
 def load_for_rendering(config: Config, initial: bool) -> tuple[Any, list[int], Any, int | None]:
     """Load the scene (with the parameters' initial values, if `initial`), and make the integrator.
 
@@ -153,7 +158,7 @@ def load_for_rendering(config: Config, initial: bool) -> tuple[Any, list[int], A
     if initial:
         problem = assemble_scene(config)
         return problem.scene, problem.sensors, problem.integrator, samples_per_pass(config)
-    scene = load_scene(config.scene.file, config.scene.options)
+    scene = load_configured(config)
     sensors = choose_sensors(config, scene)
     _check_supported(config, config.integrator.type, config.integrator.hide_emitters, scene, sensors)
     integrator = make_configured(config.integrator)
@@ -165,7 +170,7 @@ def assemble_scene(config: Config, scene: Any = None, values: Mapping[str, Array
 
     `scene` is used in place of `scene.file`, `values` in place of the parameters' initial ones.
     """
-    scene = load_scene(config.scene.file, config.scene.options) if scene is None else scene
+    scene = load_configured(config) if scene is None else scene
     sensors = choose_sensors(config, scene)
     _check_supported(config, config.integrator.type, config.integrator.hide_emitters, scene, sensors)
     selection = select_parameters(scene, config.parameters, config.source)

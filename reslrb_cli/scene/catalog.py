@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 #: Emitter parameters that Mitsuba flags as differentiable, but that change where light goes and not how much it is.
 _BEAM_SHAPES = {
@@ -18,13 +19,27 @@ _BEAM_SHAPES = {
 _MESH_GEOMETRY = ("vertex_positions", "vertex_normals", "vertex_texcoords", "vertex_count", "face_count", "faces")
 
 
+#: Numbers that are written out one by one; of more, their mean and range.
+_FEW = 4
+
+
+@dataclass(frozen=True)
+class Value:
+    """The current value of a parameter: its `numbers`, if they are few, and their `mean`, least and greatest."""
+
+    numbers: list[float] | None
+    mean: float
+    low: float
+    high: float
+
+
 @dataclass(frozen=True)
 class ParameterInfo:
     """One entry of `mi.traverse`.
 
     `kind` is what it belongs to: `bsdf`, `emitter`, `attribute` (of a mesh, such as `vertex_color`), `shape`, `sensor`,
     `film`, `medium`, `integrator` or `scene`. `type` and `shape` describe the value: (height, width, channels) for
-    textures. `obstacle` says why it cannot be recovered; None where it can.
+    textures. `obstacle` says why it cannot be recovered; None where it can. `value` is None for what is no number.
     """
 
     key: str
@@ -34,11 +49,13 @@ class ParameterInfo:
     differentiable: bool
     discontinuous: bool
     obstacle: str | None
+    value: Value | None = None
 
 
-def list_parameters(params: Any) -> list[ParameterInfo]:
-    """Describe every entry of a `mi.traverse` result, in its order."""
-    return [describe(params, key) for key in params.properties]
+def list_parameters(params: Any, values: bool = False) -> list[ParameterInfo]:
+    """Describe every entry of a `mi.traverse` result, in its order; their `values` too, if they are asked for."""
+    infos = [describe(params, key) for key in params.properties]
+    return [replace(info, value=current_value(params, info.key)) for info in infos] if values else infos
 
 
 def describe(params: Any, key: str) -> ParameterInfo:
@@ -50,19 +67,42 @@ def describe(params: Any, key: str) -> ParameterInfo:
         key=key,
         kind=kind,
         type=type(value).__name__,
-        shape=value_shape(value),
+        shape=value_shape(value, halo(node, value)),
         differentiable=differentiable,
         discontinuous=flags & int(mi.ParamFlags.Discontinuous) != 0,
         obstacle=_obstacle(kind, key.rpartition(".")[2], value, differentiable, node),
     )
 
 
-def value_shape(value: Any) -> tuple[int, ...]:
-    """Shape of a parameter as a NumPy array; () for one number."""
+def halo(node: Any, value: Any) -> int:
+    """How many columns Mitsuba adds at either side of a texture, copies of the opposite ones: one to an `envmap`."""
+    is_texture = dr.is_tensor_v(value) and len(value.shape) == 3
+    return 1 if is_texture and node.class_name() == "EnvironmentMapEmitter" else 0
+
+
+def value_shape(value: Any, halo: int = 0) -> tuple[int, ...]:
+    """Shape of a parameter as a NumPy array, without its `halo`; () for one number."""
     if not dr.is_array_v(value):
         return ()
     shape = tuple(int(n) for n in dr.shape(value))
+    if halo:
+        return (shape[0], shape[1] - 2 * halo, *shape[2:])
     return shape if dr.is_tensor_v(value) or shape[-1:] != (1,) else shape[:-1]
+
+
+def current_value(params: Any, key: str) -> Value | None:
+    """The value of one entry of a `mi.traverse` result; None for what is no number."""
+    value = _value(params, key)
+    try:
+        array = np.asarray(value.matrix if "AffineTransform" in type(value).__name__ else value)
+    except (RuntimeError, TypeError):
+        return None
+    if array.dtype.kind not in "buif" or array.size == 0:
+        return None
+    columns = halo(params.properties[key][2], value)
+    array = array[:, columns : array.shape[1] - columns] if columns else array
+    numbers = [float(number) for number in array.ravel()] if array.size <= _FEW else None
+    return Value(numbers, float(array.mean(dtype=np.float64)), float(array.min()), float(array.max()))
 
 
 def _value(params: Any, key: str) -> Any:

@@ -47,11 +47,6 @@ class SceneSummary:
     sensors: list[SensorSummary]
     parameters: list[ParameterInfo]
 
-    @property
-    def unnamed(self) -> bool:
-        """Whether some keys stem from objects without an id: these change from one run to the next."""
-        return any(info.key.startswith("object_") for info in self.parameters)
-
 
 def summarise(scene: Any, hide_emitters: bool = False, sensors: Sequence[int] | None = None) -> SceneSummary:
     """Look `scene` over; `sensors` are the indices of those to describe, None for all."""
@@ -64,7 +59,7 @@ def summarise(scene: Any, hide_emitters: bool = False, sensors: Sequence[int] | 
         shapes=_count(shapes),
         triangles=sum(int(shape.face_count()) for shape in shapes if shape.is_mesh()),
         sensors=[_sensor(scene, index, hide_emitters) for index in indices],
-        parameters=list_parameters(mi.traverse(scene)),
+        parameters=list_parameters(mi.traverse(scene), values=True),
     )
 
 

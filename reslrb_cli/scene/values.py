@@ -11,12 +11,10 @@ import numpy as np
 
 from ..config import ParameterSpec
 from ..errors import ConfigError
+from .catalog import halo
 from .target import read_image
 
 Array = np.ndarray[Any, Any]
-
-#: Columns that `envmap` adds at either side of its image, copies of the opposite ones.
-_HALO = 1
 
 
 class Place:
@@ -42,7 +40,7 @@ class Slot:
         self.type = type(value)
         self.is_tensor = bool(dr.is_tensor_v(value))
         self.is_texture = self.is_tensor and len(value.shape) == 3
-        self.halo = _HALO if node.class_name() == "EnvironmentMapEmitter" and self.is_texture else 0
+        self.halo = halo(node, value)
         #: How many numbers a list has that fills the parameter.
         self.channels = _channels(node, key, value, self.is_tensor)
 

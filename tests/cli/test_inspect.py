@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 from click.testing import CliRunner
 
@@ -58,6 +59,182 @@ def test_without_a_plan_the_reason_is_given():
     assert "ptracer" in line
     [line] = plan_lines(inspect("--set", "parameters=[{key: no.such.key}]"))
     assert "parameters[0].key" in line
+
+
+SCENE = """<scene version="3.0.0">
+<default name="power" value="5"/>
+<sensor type="perspective">
+<film type="hdrfilm"><integer name="width" value="16"/><integer name="height" value="12"/></film>
+<transform name="to_world"><lookat origin="0, 0, 6" target="0, 0, 0" up="0, 1, 0"/></transform></sensor>
+<bsdf type="diffuse" id="wall"><texture type="bitmap" name="reflectance"><string name="filename" value="8bit.png"/>
+</texture></bsdf>
+<bsdf type="diffuse" id="floor"><texture type="bitmap" name="reflectance"><string name="filename" value="floor.exr"/>
+<boolean name="raw" value="true"/></texture></bsdf>
+<shape type="rectangle"><ref id="wall"/></shape>
+<shape type="rectangle"><ref id="floor"/></shape>
+<shape type="sphere"><emitter type="area"><rgb name="radiance" value="$power, 2, 0.25"/></emitter></shape>
+<shape type="sphere"><bsdf type="roughconductor"><float name="alpha" value="0.2"/></bsdf></shape>
+<emitter type="envmap"><string name="filename" value="sky.exr"/></emitter>
+</scene>
+"""
+
+
+@pytest.fixture
+def scene(tmp_path, monkeypatch):
+    """A scene file without ids at its shapes and lights, in the working directory."""
+    import mitsuba as mi
+
+    mi.Bitmap(np.full((4, 4, 3), 99, np.uint8)).write(str(tmp_path / "8bit.png"))
+    mi.Bitmap(np.linspace(0, 1, 4 * 6 * 3, dtype=np.float32).reshape(4, 6, 3)).write(str(tmp_path / "floor.exr"))
+    mi.Bitmap(np.ones((4, 8, 3), np.float32)).write(str(tmp_path / "sky.exr"))
+    (tmp_path / "scene.xml").write_text(SCENE)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path / "scene.xml"
+
+
+def lines_of(*arguments: str) -> list[str]:
+    """What the command prints, line by line, blanks apart."""
+    result = CliRunner().invoke(main, ["inspect", *arguments])
+    assert result.exit_code == 0, result.output
+    return [" ".join(line.split()) for line in result.stdout.splitlines()]
+
+
+def test_a_scene_file_by_itself(scene):
+    found = lines_of("scene.xml", "--set", "scene.options.power=7")
+    start = found.index("parameters") + 1
+    assert found[start : start + 9] == [
+        "can be recovered: 8",
+        "floor.reflectance.data 6x4 texels of 3, mean 0.5, 0 to 1",
+        "Sphere_1.bsdf.reflectance.value 0",
+        "Sphere_1.emitter.radiance.value [7, 2, 0.25]",
+        "Sphere_2.bsdf.alpha.value 0.2",
+        "Sphere_2.bsdf.eta.value 0",
+        "Sphere_2.bsdf.k.value 1",
+        "Envmap_1.scale 1",
+        "Envmap_1.data 8x4 texels of 3, mean 1, 1 to 1",
+    ]
+    others = found[start + 9 : -1]
+    assert others[0] == "others: 26; --all lists them"
+    assert "8 moves geometry" in others
+    at = others.index(
+        "1 is stored with 8 bits a channel, too few to follow a gradient; give the texture in the scene file "
+        '<string name="format" value="variant"/>'
+    )
+    assert others[at + 1] == "(wall.reflectance.data)"
+    assert sum(int(line.split()[0]) for line in others[1:] if line[0] != "(") == 26
+    assert found[-1].startswith("next: write `scene: {file: scene.xml}`, `target: {file: IMAGE}` and `parameters: ")
+    assert "plan" not in found
+
+
+def test_everything_with_all(scene):
+    short, full = lines_of("scene.xml"), lines_of("scene.xml", "--all")
+    assert len(short) < 40 < len(full)
+    assert (
+        "Rectangle_2.to_world AffineTransform4f differentiable, discontinuous moves geometry; only BSDF and emission "
+        + ("parameters have derivatives so far")
+        in full
+    )
+
+
+def test_a_long_list_is_cut(scene):
+    scene.write_text(SCENE.replace("</scene>", '<shape type="sphere"/>' * 60 + "</scene>"))
+    short = lines_of("scene.xml")
+    assert "can be recovered: 68" in short
+    assert "and 38 more; --all lists them" in short
+    assert len(short) < 55
+    assert "Sphere_62.bsdf.reflectance.value 0.5" in lines_of("scene.xml", "--all")
+
+
+def test_everything_as_json(scene):
+    result = CliRunner().invoke(main, ["inspect", "scene.xml", "--json"])
+    assert result.exit_code == 0, result.output
+    report = json.loads(result.stdout)
+    assert (report["plan"], report["run"]) == (None, None)
+    parameters = {entry["key"]: entry for entry in report["parameters"]}
+    assert len(parameters) == 34
+    assert parameters["Sphere_1.emitter.radiance.value"]["value"] == {
+        "numbers": [5, 2, 0.25], "mean": pytest.approx(29 / 12), "low": 0.25, "high": 5,
+    }  # fmt: skip
+    assert parameters["Envmap_1.data"]["shape"] == [4, 8, 3]
+    assert parameters["Envmap_1.data"]["value"]["numbers"] is None
+    assert parameters["wall.reflectance.data"]["obstacle"].startswith("is stored with 8 bits")
+
+
+@pytest.mark.parametrize(
+    ("text", "next_step"),
+    [
+        ("", 'add `target: {file: IMAGE}` and `parameters: [{key: "floor.reflectance.data"}]` to c.yaml'),
+        ("target: {file: photo.exr}", 'add `parameters: [{key: "floor.reflectance.data"}]` to c.yaml'),
+        ("parameters: [{key: Sphere_1.*}]", "add `target: {file: IMAGE}` to c.yaml"),
+        ("parameters:\ntarget:\nrun: {iterations: 3}", "add `target: {file: IMAGE}` and `parameters: "),
+        ("parameters: [{key: Sphere_1.*}]\ntarget: {render: {}}", "`reslrb optimize c.yaml` runs it"),
+    ],
+)
+def test_a_configuration_need_not_be_complete(scene, text, next_step):
+    Path("c.yaml").write_text(f"scene: {{file: scene.xml}}\n{text}\n")
+    found = lines_of("c.yaml", "--no-counts")
+    assert found[-1].startswith(f"next: {next_step}")
+    has_parameters = "Sphere_1.*" in text
+    assert ("plan" in found) is has_parameters
+    assert ("* Sphere_1.emitter.radiance.value [5, 2, 0.25]" in found) is has_parameters
+    assert ("can be recovered: 8 (* in `parameters`)" in found) is has_parameters
+
+
+def test_sections_can_be_given_on_the_command_line(scene):
+    Path("c.yaml").write_text("scene: {file: scene.xml}")
+    found = lines_of(
+        "c.yaml", "--no-counts", "--set", "parameters=[{key: Envmap_1.scale}]", "--set", "target.file=x.exr"
+    )
+    assert "* Envmap_1.scale 1" in found
+    assert found[-1] == "next: `reslrb optimize c.yaml` runs it"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["none.xml"], "none.xml: cannot be read: No such file or directory"),
+        (["none.yaml"], "none.yaml: no such file"),
+        (["."], ".: is a folder without a run"),
+        (
+            ["scene.xml", "--set", "scene.options.nothing=1"],
+            "$nothing: is set in scene.options, but the scene file does",
+        ),
+        (["scene.xml", "--set", "scene.filee=1"], "--set scene.filee=1: scene.filee: unknown key"),
+        (["scene.xml", "--conditioning"], "scene.xml: target: missing; --conditioning measures a complete experiment"),
+        (["empty.yaml"], "empty.yaml: is empty; it needs at least scene"),
+        (["run.yaml"], "run.yaml: scene: missing; it has no default"),
+    ],
+)
+def test_what_is_given_wrong(scene, capsys, arguments, said):
+    Path("empty.yaml").write_text("")
+    Path("run.yaml").write_text("run: {spp: 4}")
+    with pytest.raises(SystemExit) as end:
+        main.main(["inspect", *arguments])
+    assert end.value.code == 2
+    assert said in capsys.readouterr().err.splitlines()[-1]
+
+
+def test_a_run_folder_says_how_far_it_came(scene):
+    Path("c.yaml").write_text(
+        "scene: {file: scene.xml}\ntarget: {render: {spp: 4}}\nparameters: [{key: Sphere_1.emitter.radiance.value}]\n"
+        "integrator: {type: ptracer, max_depth: 2}\nrun: {iterations: 2, spp: 1, reach_spp: 1}\n"
+    )
+    done = CliRunner().invoke(main, ["optimize", "c.yaml", "--quiet"])
+    assert done.exit_code == 0, done.output
+    for path in ("runs/c", "runs/c/config.yaml"):
+        found = lines_of(path)
+        assert found[0] == f"run {path}: finished, 2 iterations"
+        assert "* Sphere_1.emitter.radiance.value [5, 2, 0.25]" in found
+        assert found[-1] == "next: `reslrb optimize runs/c/config.yaml` runs it again"
+
+
+def test_keys_that_match_nothing_are_answered_with_lasting_names(scene, capsys):
+    Path("c.yaml").write_text(
+        "scene: {file: scene.xml}\ntarget: {render: {}}\nparameters: [{key: Sphere_3.emitter.radiance}]"
+    )
+    with pytest.raises(SystemExit):
+        main.main(["optimize", "c.yaml"])
+    assert "did you mean `Sphere_1.emitter.radiance.value`" in capsys.readouterr().err
 
 
 STIFF = Path(__file__).resolve().parents[2] / "configs" / "stiff" / "lamp.yaml"

@@ -301,7 +301,8 @@ def test_a_render_is_written_and_bad_outputs_are_refused(experiment, capsys):
 def test_inspect_tells_what_can_be_recovered(experiment, capsys):
     code, out, _ = reslrb(capsys, "inspect", "box.yaml")
     assert code == 0
-    assert any(KEY in line and "can be recovered" in line for line in out.splitlines())
+    assert any(line.split()[:4] == ["*", KEY, "4x4", "texels"] for line in out.splitlines())
+    code, out, _ = reslrb(capsys, "inspect", "box.yaml", "--all", "--no-counts")
     assert any("poster_shape.to_world" in line and "moves geometry" in line for line in out.splitlines())
     code, out, _ = reslrb(capsys, "inspect", "box.yaml", "--json")
     parameters = {entry["key"]: entry for entry in json.loads(out)["parameters"]}

@@ -110,6 +110,15 @@ def test_walk_ad_knows_no_estimators(name: str):
         mi.load_dict({"type": "walk_ad", name: "all"})
 
 
+def test_an_option_that_an_integrator_does_not_have_is_refused():
+    from reslrb_cli.integrators import make_integrator
+
+    for type in ("reslrb", "ptracer", "prb"):
+        with pytest.raises(ValueError, match=f"{type} has no option colour"):
+            make_integrator(type, colour=3)
+        assert make_integrator(type, max_depth=3, rr_depth=None).class_name()
+
+
 def test_samples_that_passes_do_not_divide_raise(case: Case):
     with pytest.raises(ValueError, match="multiple"):
         render_image(integrator("reslrb", samples_per_pass=3), case.scene, 0, 1, 16)

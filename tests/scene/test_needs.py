@@ -118,7 +118,6 @@ def test_summary(make_scene):
     assert summary.emitters == {"PointLight": 1}
     assert summary.bsdfs == {"SmoothDiffuse": 1}
     assert summary.triangles == 2
-    assert not summary.unnamed
     sensor = summary.sensors[0]
     assert (sensor.type, sensor.size, sensor.filter, sensor.channels) == ("PerspectiveCamera", (16, 12), "BoxFilter", 3)
     assert sensor.obstacle is None

@@ -1,0 +1,10 @@
+"""What a scene's files say, before Mitsuba makes objects of it: read, named, mended, checked, and built."""
+
+from .building import build
+from .checking import check
+from .including import Description, read_description
+from .mending import mend
+from .naming import name_objects
+from .notes import Note
+
+__all__ = ["Description", "Note", "build", "check", "mend", "name_objects", "read_description"]

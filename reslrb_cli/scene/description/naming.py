@@ -1,0 +1,89 @@
+"""Lasting names for objects without an id: their kind, and their number among all of that kind.
+
+Mitsuba names an object without an id by its address in memory, which differs each time that the scene is loaded.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+
+from .element import Element, quoted
+from .notes import Note
+
+#: Plugins that name what they hold by its place among the others, in every load alike.
+_GROUPS = ("shapegroup", "batch")
+#: How the ids begin that Mitsuba gives to objects without one when it writes a scene; it takes them for none.
+_UNNAMED = "_unnamed_"
+#: Characters of an id that is kept: keys become names of files.
+_LONGEST = 120
+
+
+def name_objects(root: Element) -> list[Note]:
+    """Give every object below `root` an id that is there in every load of the same files; say whose ids were changed.
+
+    The third `sphere` of the files becomes `Sphere_3`, whether or not the first two have ids. An id that Mitsuba could
+    not use in a key is replaced: one that is empty, starts with `_unnamed_`, is very long or holds what cannot be
+    printed, or is that of an earlier object. References follow. Raises ConfigError where a reference is to an id of two
+    objects that differ.
+    """
+    root.attributes.pop("id", None)
+    objects = root.objects()[1:]
+    grouped = {child for element in objects if element.type in _GROUPS for child in element.children}
+    taken = {element.attributes[key] for element in root.walk() for key in ("id", "as") if key in element.attributes}
+    owners: dict[str, Element] = {}
+    renamed: dict[str, str] = {}
+    doubled: dict[str, list[Element]] = {}
+    notes: list[Note] = []
+    numbers: Counter[str] = Counter()
+    for element in objects:
+        kind = element.type[:1].upper() + element.type[1:]
+        numbers[kind] += 1
+        own = element.attributes.get("id", "")
+        if own in owners:
+            doubled.setdefault(own, []).append(element)
+        elif _is_usable(own):
+            owners[own] = element
+            continue
+        elif element in grouped and not own:
+            continue
+        name = _free(f"{kind}_{numbers[kind]}", taken)
+        taken.add(name)
+        element.attributes["id"] = name
+        if own in owners:
+            notes.append(Note(element, f"id {quoted(own)} is that of {owners[own].place}, too", f"named {name}"))
+        elif own.strip() and own not in renamed:
+            renamed[own] = name
+            if not own.startswith(_UNNAMED):
+                notes.append(Note(element, f"id {quoted(own)} cannot stand in a key", f"named {name}"))
+    differing = {own: other for own, others in doubled.items() for other in others if not _same(owners[own], other)}
+    for element in root.walk():
+        own = element.attributes.get("id", "")
+        if element.tag in ("ref", "alias"):
+            if own in differing:
+                places = f"{owners[own].place} and {differing[own].place}"
+                raise element.fail("", f"refers to {quoted(own)}, the id of two objects ({places}); rename one of them")
+            if own in renamed:
+                element.attributes["id"] = renamed[own]
+    return notes
+
+
+def _is_usable(own: str) -> bool:
+    return own.strip() != "" and own.isprintable() and len(own) <= _LONGEST and not own.startswith(_UNNAMED)
+
+
+def _free(name: str, taken: set[str]) -> str:
+    """`name`, or the first of name_2, name_3 ... that no object has for its id."""
+    number, free = 1, name
+    while free in taken:
+        number += 1
+        free = f"{name}_{number}"
+    return free
+
+
+def _same(a: Element, b: Element) -> bool:
+    """Whether two elements, their ids aside, say the same."""
+    own = [{key: value for key, value in element.attributes.items() if key != "id"} for element in (a, b)]
+    return (
+        (a.tag, own[0], len(a.children)) == (b.tag, own[1], len(b.children))
+        and all(_same(x, y) for x, y in zip(a.children, b.children, strict=True))
+    )  # fmt: skip

@@ -1,0 +1,304 @@
+"""Scenes of other versions and exporters: what is mended, what is left out, what is said of it, and what is refused."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from reslrb_cli.errors import ConfigError
+from reslrb_cli.scene import load_scene
+
+pytestmark = pytest.mark.usefixtures("llvm")
+
+ROOT = Path(__file__).resolve().parents[2]
+SHIPPED = sorted((ROOT / "scenes").rglob("*.xml"))
+#: A scene in which one thing can be exchanged for another; each stands in a line of its own.
+PARTS = {
+    "head": '<scene version="3.0.0">',
+    "integrator": '<integrator type="path"/>',
+    "sensor": '<sensor type="perspective">',
+    "pose": '<transform name="to_world"><lookat origin="1, 2, 4" target="0, 0, 0" up="0, 1, 0"/></transform>',
+    "sampler": '<sampler type="independent"/>',
+    "film": '<film type="hdrfilm"><rfilter type="box"/>',
+    "format": '<integer name="width" value="20"/><integer name="height" value="10"/>',
+    "end": "</film></sensor>",
+    "light": '<emitter type="constant"><rgb name="radiance" value="0.5, 0.25, 1"/></emitter>',
+    "paint": '<bsdf type="diffuse" id="paint"><rgb name="reflectance" value="0.5, 0.25, 1"/></bsdf>',
+    "shape": '<shape type="sphere"><float name="radius" value="2"/><ref id="paint"/></shape>',
+    "tail": "</scene>",
+}
+LINES = {name: number for number, name in enumerate(PARTS, start=1)}
+
+
+def write(folder: Path, **changes: str) -> Path:
+    file = folder / "scene.xml"
+    file.write_text("\n".join((PARTS | changes).values()))
+    return file
+
+
+def values(scene: Any) -> dict[str, Any]:
+    """Every number of a scene by its key."""
+    import mitsuba as mi
+
+    return {
+        key: np.array(value.matrix if "AffineTransform" in type(value).__name__ else value)
+        for key, value in mi.traverse(scene).items()
+    }
+
+
+def assert_same(found: dict[str, Any], expected: dict[str, Any]) -> None:
+    """The same numbers in the same order, under the same keys but for what Mitsuba names by its address."""
+    assert len(found) == len(expected)
+    for (key, value), (other, reference) in zip(found.items(), expected.items(), strict=True):
+        parts = slice(1 if other.startswith("object_") else 0, None)
+        assert key.split(".")[parts] == other.split(".")[parts]
+        np.testing.assert_array_equal(value, reference, err_msg=key)
+
+
+@pytest.mark.parametrize("file", SHIPPED, ids=lambda file: str(file.relative_to(ROOT / "scenes")))
+def test_what_is_loaded_is_what_mitsuba_loads(file):
+    import mitsuba as mi
+
+    size = {"resx": 24, "resy": 24} if 'name="resx"' in file.read_text() else {}
+    stock, ours = mi.load_file(str(file), optimize=False, **size), load_scene(file, size, strict=True)
+    assert_same(values(ours), values(stock))
+    integrator = mi.load_dict({"type": "path", "max_depth": 4})
+    images = [np.array(mi.render(scene, integrator=integrator, spp=2, seed=1)) for scene in (stock, ours)]
+    np.testing.assert_allclose(*images, rtol=1e-4, atol=1e-6)
+
+
+OLD = """<scene version="0.6.0">
+<default name="angle" value="30"/><default name="width" value="8"/><default name="w" value="9"/>
+<bsdf type="diffuse" id="costs \\$5"/>
+<include filename="parts/materials.xml"/>
+<sensor type="perspective"><float name="fov" value="$angle"/><string name="fovAxis" value="smaller"/>
+<transform name="toWorld"><lookat origin="0,0,4" target="0,0,0" up="0,1,0"/></transform>
+<film type="hdrfilm"><integer name="width" value="$width"/><integer name="height" value="$width"/></film></sensor>
+<emitter type="constant"/><path value="parts"/>
+<bsdf type="roughplastic" id="floor"><float name="intIOR" value="1.4"/>
+<texture type="bitmap" name="diffuseReflectance"><string name="filename" value="t.exr"/>
+<float name="uscale" value="2"/><float name="voffset" value="0.5"/></texture></bsdf>
+<alias id="shiny" as="mirror"/>
+<shape type="rectangle"><ref id="floor"/></shape><shape type="sphere"><ref name="bsdf" id="mirror"/></shape>
+<shape type="sphere"><boolean name="flipNormals" value="true"/><include filename="bsdf.xml" name="bsdf"/></shape>
+</scene>"""
+
+
+def test_variables_includes_and_folders_are_mitsubas(tmp_path):
+    import mitsuba as mi
+
+    (tmp_path / "parts").mkdir()
+    for factor, folder in ((1, "parts"), (0.5, ".")):
+        texels = factor * np.linspace(0, 1, 48, dtype=np.float32).reshape(4, 4, 3)
+        mi.Bitmap(texels).write(str(tmp_path / folder / "t.exr"))
+    (tmp_path / "parts" / "materials.xml").write_text(
+        '<scene version="2.0.0"><default name="rough" value="0.$digit"/>\n<bsdf type="roughconductor" id="shiny">'
+        '<float name="alpha" value="$rough"/><string name="material" value="none"/></bsdf></scene>'
+    )
+    (tmp_path / "bsdf.xml").write_text('<bsdf version="0.5.0" type="plastic"><float name="intIOR" value="1.3"/></bsdf>')
+    file = tmp_path / "scene.xml"
+    file.write_text(OLD)
+    options = {"angle": "45", "digit": "25"}
+    assert_same(
+        values(load_scene(file, options, strict=True)), values(mi.load_file(str(file), optimize=False, **options))
+    )
+
+
+@pytest.mark.parametrize("name", ["path", "parallel", "optimize", "file", "strict", "options", "self", "kwargs"])
+def test_any_name_is_a_variable(tmp_path, name):
+    file = write(tmp_path, shape=f'<shape type="sphere"><float name="radius" value="${name}"/></shape>')
+    assert values(load_scene(file, {name: 3}))["Sphere_1.to_world"][0, 0, 0] == 3
+
+
+# part of the scene, what stands there instead, and what is said of it, after file and line
+MENDED = [
+    ("head", "<scene>", "the version is missing: taken for 3.0.0"),
+    ("head", '<scene version="3">', "version `3` is not three numbers: taken for 3.0.0"),
+    ("head", '<scene version="3.0.0" xmlns="x">', "<scene> has no attribute `xmlns` in Mitsuba 3: left out"),
+    (
+        "light",
+        PARTS["light"].replace("<emitter", '<emitter version="3.0.0"'),
+        "<emitter> has no attribute `version` in Mitsuba 3: left out",
+    ),
+    ("pose", PARTS["pose"].replace("lookat", "lookAt"), "`<lookAt>` is unknown to Mitsuba 3: read as <lookat>"),
+    ("pose", PARTS["pose"].replace("to_w", "toW"), "`toWorld` is spelled as before Mitsuba 2: read as `to_world`"),
+    ("film", PARTS["film"].replace("hdr", "ldr"), "there is no film `ldrfilm` in Mitsuba 3: read as `hdrfilm`"),
+    (
+        "film",
+        PARTS["film"] + '<float name="exposure" value="2"/>',
+        "hdrfilm has no parameter `exposure` in Mitsuba 3: left out",
+    ),
+    (
+        "format",
+        PARTS["format"] + '<string name="file_format" value="png"/>',
+        "hdrfilm has no file_format `png` in Mitsuba 3: left out",
+    ),
+    (
+        "format",
+        PARTS["format"] + '<string name="pixel_format" value="rgb, luminance"/>',
+        "hdrfilm has no pixel_format `rgb, luminance` in Mitsuba 3: read as `rgb`",
+    ),
+    (
+        "format",
+        '<integer name="width" value="99"/>' + PARTS["format"],
+        "`width` is given again in line 7: left out",
+    ),
+    (
+        "sampler",
+        '<sampler type="sobol"/>',
+        "there is no sampler `sobol` in Mitsuba 3: left out (an `independent` one takes its place)",
+    ),
+    ("shape", PARTS["shape"].replace("sphere", "Sphere"), "there is no shape `Sphere` in Mitsuba 3: read as `sphere`"),
+    (
+        "shape",
+        PARTS["shape"].replace("<ref", '<float name="radios" value="3"/><ref'),
+        "sphere has no parameter `radios` in Mitsuba 3 (did you mean `radius`?): left out",
+    ),
+    (
+        "shape",
+        PARTS["shape"].replace("<ref", '<sampler type="independent"/><ref'),
+        "sphere has no use for a <sampler> in Mitsuba 3: left out",
+    ),
+    ("shape", PARTS["shape"] + "<comment>mine</comment>", "`<comment>` is unknown to Mitsuba 3: left out"),
+    (
+        "light",
+        PARTS["light"].replace('value="0.5', 'intent="illuminant" value="0.5'),
+        "<rgb> has no attribute `intent` in Mitsuba 3: left out",
+    ),
+    (
+        "light",
+        PARTS["light"].replace("<rgb", "<spectrum"),
+        "a <spectrum> of three numbers is unknown to Mitsuba 3: read as <rgb>",
+    ),
+    (
+        "paint",
+        PARTS["paint"].replace("reflectance", "diffuseReflectance"),
+        "`diffuseReflectance` is spelled as before Mitsuba 2: read as `reflectance`",
+    ),
+    (
+        "paint",
+        PARTS["paint"].replace("<rgb", "<srgb").replace("0.5, 0.25, 1", "0.735356983, 0.537098729, 1"),
+        "`<srgb>` is unknown to Mitsuba 3: read as <rgb>",
+    ),
+]
+
+
+@pytest.mark.parametrize(("part", "text", "said"), MENDED, ids=[said.partition(":")[0][:40] for _, _, said in MENDED])
+def test_what_is_mended_is_said_with_its_line(tmp_path, caplog, part, text, said):
+    expected = values(load_scene(write(tmp_path)))
+    assert not caplog.records
+    file = write(tmp_path, **{part: text})
+    before = file.read_bytes()
+    found = values(load_scene(file))
+    assert [record.getMessage() for record in caplog.records] == [f"{file}:{LINES[part]}: {said}"]
+    assert list(found) == list(expected)
+    for key, value in expected.items():
+        np.testing.assert_allclose(found[key], value, atol=1e-6, err_msg=key)
+    with pytest.raises(ConfigError) as error:
+        load_scene(file, strict=True)
+    wrong, _, done = said.rpartition(": ")
+    assert str(error.value) == f"{file}:{LINES[part]}: {wrong}; with scene.strict: false it would be {done}"
+    assert file.read_bytes() == before
+
+
+def test_what_is_left_out_is_named_as_the_file_has_it(tmp_path, caplog):
+    file = write(tmp_path, film=PARTS["film"] + '<boolean name="highQualityEdges" value="true"/>')
+    load_scene(file)
+    [record] = caplog.records
+    assert record.getMessage() == f"{file}:6: hdrfilm has no parameter `highQualityEdges` in Mitsuba 3: left out"
+    with pytest.raises(ConfigError, match=f"{file}:6: `highQualityEdges` is spelled as before Mitsuba 2; with"):
+        load_scene(file, strict=True)
+
+
+def test_one_line_for_one_kind_of_thing(tmp_path, caplog):
+    shape = PARTS["shape"].replace("<ref", '<float name="weight" value="3"/><ref')
+    file = write(tmp_path, shape="\n".join([shape] * 9))
+    load_scene(file)
+    load_scene(file)  # as for a target that is rendered
+    [record] = caplog.records
+    said = "sphere has no parameter `weight` in Mitsuba 3: left out (also in line 12, 13, 14, 15, 16 and 3 more)"
+    assert record.getMessage() == f"{file}:11: {said}"
+
+
+def test_scaled_texture_coordinates(tmp_path, caplog):
+    texture = '<texture type="checkerboard" name="reflectance"><float name="uscale" value="3"/></texture>'
+    file = write(tmp_path, paint=f'<bsdf type="diffuse" id="paint">{texture}</bsdf>')
+    assert values(load_scene(file))["paint.reflectance.to_uv"].ravel()[[0, 4]].tolist() == [3, 1]
+    [record] = caplog.records
+    assert record.getMessage() == f"{file}:10: `uscale` is unknown to Mitsuba 3: read as `to_uv`"
+
+
+def test_colours_in_hexadecimal(tmp_path):
+    file = write(tmp_path, paint=PARTS["paint"].replace("0.5, 0.25, 1", "#80ff00"))
+    np.testing.assert_allclose(
+        values(load_scene(file))["paint.reflectance.value"].ravel(), [128 / 255, 1, 0], atol=1e-6
+    )
+
+
+def test_the_scenes_own_integrator_is_not_loaded(tmp_path, caplog):
+    file = write(tmp_path, integrator='<integrator type="guided_path"><integrator type="nonsense"/></integrator>')
+    assert load_scene(file, strict=True).integrator() is None
+    assert not caplog.records
+
+
+def test_references_to_what_is_left_out_are_left_out(tmp_path, caplog):
+    points, own = (
+        '<sampler type="halton" id="points"/>',
+        '<integrator type="x"><sampler type="stratified" id="own"/></integrator>',
+    )
+    load_scene(write(tmp_path, integrator=points + own, sampler='<ref id="points"/>'))
+    load_scene(write(tmp_path, integrator=own, sampler='<ref id="own"/>'))
+    assert len(caplog.records) == 1
+
+
+def test_objects_of_one_name_are_all_there(tmp_path):
+    # Mitsuba drops the first: a name is that of a parameter
+    shape = PARTS["shape"].replace("<shape", '<shape name="mesh"')
+    assert len(load_scene(write(tmp_path, shape=shape + shape)).shapes()) == 2
+
+
+def test_files_are_found_where_backslashes_part_folders(tmp_path, caplog):
+    import mitsuba as mi
+
+    (tmp_path / "textures").mkdir()
+    mi.Bitmap(np.full((2, 2, 3), 0.5, np.float32)).write(str(tmp_path / "textures" / "t.exr"))
+    texture = '<texture type="bitmap" name="reflectance"><string name="filename" value="textures\\t.exr"/></texture>'
+    load_scene(write(tmp_path, paint=f'<bsdf type="diffuse" id="paint">{texture}</bsdf>'))
+    assert "read as `textures/t.exr`" in caplog.text
+
+
+@pytest.mark.parametrize("text", ["<!-- - -- what a -- rule -->", "<!-- \n -->", "Tom & Jerry", "<!DOCTYPE scene>"])
+def test_what_mitsubas_parser_lets_pass(tmp_path, text):
+    head = text + PARTS["head"] if "DOCTYPE" in text else PARTS["head"] + text
+    load_scene(write(tmp_path, head=head), strict=True)
+
+
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16", "latin-1"])
+def test_encodings(tmp_path, encoding):
+    file = tmp_path / "scene.xml"
+    file.write_bytes("\n".join((PARTS | {"shape": PARTS["shape"] + "<!-- Ä -->"}).values()).encode(encoding))
+    assert "Sphere_1.to_world" in values(load_scene(file))
+
+
+@pytest.mark.parametrize(
+    ("part", "text", "said"),
+    [
+        ("paint", '<bsdf type="phong" id="paint"/>', "bsdf `phong` is a plugin of Mitsuba 0.6 that Mitsuba 3 does not"),
+        ("shape", '<camera type="perspective"/>', "<camera> is an element of Mitsuba before 0.4"),
+        ("shape", '<shape type="spere"/>', "there is no shape `spere` in Mitsuba 3; did you mean `sphere`?"),
+        ("shape", '<shape type="blender"/>', "there is no shape `blender` in Mitsuba 3"),
+        ("shape", "<shape/>", "<shape> has no type"),
+        ("paint", PARTS["paint"].replace("0.5, 0.25, 1", "#12345"), "must be a colour such as #80ff00, not `#12345`"),
+        ("light", '<include filename="none.xml"/>', "included file `none.xml` not found"),
+        ("light", '<path value="none"/>', "<path>: folder `none` not found"),
+    ],
+)
+def test_what_cannot_be_mended_is_refused(tmp_path, part, text, said):
+    file = write(tmp_path, **{part: text})
+    with pytest.raises(ConfigError) as error:
+        load_scene(file)
+    assert str(error.value).startswith(f"{file}:{LINES[part]}: ")
+    assert said in str(error.value)

@@ -1,0 +1,134 @@
+"""Scene files that would take the process down, never end, or fill the memory: one located line, at once."""
+
+from __future__ import annotations
+
+import os
+import time
+from pathlib import Path
+
+import pytest
+
+from reslrb_cli.errors import ConfigError
+from reslrb_cli.scene import load_scene
+from reslrb_cli.scene.description import reading
+
+pytestmark = pytest.mark.usefixtures("llvm")
+
+HEAD = '<scene version="3.0.0"><sensor type="perspective"/><emitter type="constant"/><shape type="sphere"/>\n'
+TEXTURE = (
+    '<bsdf type="diffuse">\n<texture type="bitmap" name="reflectance"><string name="filename" value="{}"/></texture>'
+    "</bsdf>"
+)
+#: Two objects that use each other, each in a line of its own.
+CIRCLE = "<bsdf type='twosided' id='a'><ref id='b'/></bsdf>\n<bsdf type='twosided' id='b'><ref id='a'/></bsdf></scene>"
+
+
+def write(folder: Path, text: str, name: str = "scene.xml") -> Path:
+    (folder / name).write_text(text)
+    return folder / name
+
+
+def chain(length: int) -> str:
+    bsdfs = ["<bsdf type='diffuse' id='b0'/>"]
+    bsdfs += [f"<bsdf type='twosided' id='b{i}'><ref id='b{i - 1}'/></bsdf>" for i in range(1, length)]
+    return HEAD + "\n".join(bsdfs) + "</scene>"
+
+
+def entities() -> str:
+    nested = "".join(f'<!ENTITY e{i} "{f"&e{i - 1};" * 10}">' for i in range(1, 10))
+    return f'<!DOCTYPE scene [\n<!ENTITY e0 "aaaaaaaaaa">{nested}]>\n{HEAD}&e9;</scene>'
+
+
+def growing() -> str:
+    defaults = "\n".join(f'<default name="v{i}" value="{f"$v{i - 1}" * 10}"/>' for i in range(1, 30))
+    return f'{HEAD}<default name="v0" value="{"x" * 100}"/>\n{defaults}</scene>'
+
+
+@pytest.mark.parametrize(
+    ("text", "line", "said"),
+    [
+        (HEAD + "<shape type='sphere'>\n" * 20000 + "</shape>" * 20000, 101, "nested more than 100 levels deep"),
+        (HEAD + "<bsdf type='twosided'>\n" * 20000 + "</bsdf>" * 20000, 101, "nested more than 100 levels deep"),
+        (HEAD + "<shape type='sphere'>" * 20000, 2, "nested more than 100 levels deep"),
+        (chain(20000), 102, "objects use one another in a chain of more than 100"),
+        (
+            HEAD + CIRCLE,
+            2,
+            "objects use one another in a circle: a uses b uses a",
+        ),
+        (
+            HEAD + "<alias id='a' as='c'/><bsdf type='twosided' id='a'>\n<ref id='c'/></bsdf></scene>",
+            2,
+            "objects use one another in a circle: a uses a",
+        ),
+        (entities(), 2, "declares an XML entity"),
+        ('<!DOCTYPE s [<!ENTITY e SYSTEM "file:///etc/passwd">]>\n<scene/>', 1, "declares an XML entity"),
+        (growing(), 6, "$v3: makes a text of more than 1048576 characters"),
+        (HEAD + '\n<include filename="scene.xml"/></scene>', 3, "files are included more than 15 levels deep"),
+        (HEAD + TEXTURE.format("pipe") + "</scene>", 3, "pipe is no regular file"),
+        (HEAD + TEXTURE.format("/dev/zero") + "</scene>", 3, "/dev/zero is no regular file"),
+        (HEAD + '<include filename="pipe"/></scene>', 2, "pipe, which is no regular file"),
+    ],
+)  # fmt: skip
+def test_refused_at_once(tmp_path, text, line, said):
+    os.mkfifo(tmp_path / "pipe")
+    file = write(tmp_path, text)
+    start = time.monotonic()
+    with pytest.raises(ConfigError) as error:
+        load_scene(file)
+    assert time.monotonic() - start < 60
+    assert str(error.value).startswith(f"{file}:{line}: ")
+    assert said in str(error.value)
+    assert len(str(error.value)) < 400
+
+
+@pytest.mark.parametrize(
+    ("objects", "said"),
+    [
+        (
+            '<bsdf type="diffuse"><texture type="bitmap" name="reflectance"/></bsdf>',
+            "bitmap needs a parameter `filename`",
+        ),
+        ('<bsdf type="normalmap"><bsdf type="diffuse"/></bsdf>', "normalmap needs a parameter `normalmap`"),
+        ('<bsdf type="blendbsdf"><bsdf type="diffuse"/></bsdf>', "blendbsdf needs two BSDFs"),
+        ('<bsdf type="diffuse"><texture type="blendbsdf" name="reflectance"/></bsdf>', "`blendbsdf` is no texture"),
+        ('<shape type="perspective"/>', "`perspective` is no shape"),
+        ('<shape type="sphere"><point name="center" value="1, 2"/></shape>', "<point> needs one or three numbers"),
+        (
+            '<shape type="sphere"><transform name="to_world"><scale value="2" x="1"/></transform></shape>',
+            "<scale> can have `value` or x, y and z, not both",
+        ),
+    ],
+)
+def test_what_mitsuba_would_crash_on_or_not_locate(tmp_path, objects, said):
+    file = write(tmp_path, HEAD + objects + "</scene>")
+    with pytest.raises(ConfigError) as error:
+        load_scene(file)
+    assert str(error.value).startswith(f"{file}:2: {said}")
+
+
+def test_what_is_no_regular_file(tmp_path):
+    os.mkfifo(tmp_path / "pipe.xml")
+    for file in (tmp_path / "pipe.xml", Path("/dev/zero")):
+        with pytest.raises(ConfigError, match=f"{file}: is no regular file"):
+            load_scene(file)
+
+
+def test_files_are_bounded_together(tmp_path, monkeypatch):
+    monkeypatch.setattr(reading, "MAX_BYTES", 3000)
+    write(tmp_path, f'<scene version="3.0.0"><!-- {"x" * 1000} --></scene>', "part.xml")
+    file = write(tmp_path, HEAD + '<include filename="part.xml"/>\n' * 9 + "</scene>")
+    with pytest.raises(ConfigError, match=f"{file}:4: includes {tmp_path}/part.xml, which is too large: a scene"):
+        load_scene(file)
+    monkeypatch.setattr(reading, "MAX_BYTES", 10)
+    with pytest.raises(ConfigError, match=f"{file}: is too large: a scene may have"):
+        load_scene(file)
+
+
+def test_includes_are_counted(tmp_path):
+    write(tmp_path, '<scene version="3.0.0"/>', "0.xml")
+    for level in range(1, 6):
+        includes = f'<include filename="{level - 1}.xml"/>' * 10
+        write(tmp_path, f'<scene version="3.0.0">{includes}</scene>', f"{level}.xml")
+    with pytest.raises(ConfigError, match=r"/1\.xml:1: more than 1000 files are included"):
+        load_scene(tmp_path / "5.xml")
