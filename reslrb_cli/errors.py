@@ -5,6 +5,35 @@ from __future__ import annotations
 import enum
 import errno
 
+#: Characters of a message, and of the file or key that it names: a few lines of a terminal. What a message quotes may
+#: be as long as a file; of longer text the two ends are shown.
+MESSAGE_LENGTH = 600
+PLACE_LENGTH = 300
+LINE_LENGTH = MESSAGE_LENGTH + 2 * PLACE_LENGTH
+
+
+def printable(text: object) -> str:
+    """`text` with every character that a terminal or a page would obey, and not show, as an escape such as `\\x1b`.
+
+    These are control characters (a file's name may hold them, and with them commands to the terminal), marks that turn
+    the direction of writing, line breaks, and halves of surrogate pairs, by which Python holds bytes that are no UTF-8.
+    Letters of every script stay.
+    """
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in str(text))
+
+
+def one_line(text: object, most: int = MESSAGE_LENGTH) -> str:
+    """`text` as one printable line of at most `most` characters; of a longer one both ends, with `...` between."""
+    line = " ".join(_shorten(str(text), 8 * most).split())  # first, so that a long text takes no time
+    return _shorten(printable(_shorten(line, most)), most)
+
+
+def _shorten(text: str, most: int) -> str:
+    if len(text) <= most:
+        return text
+    end = (most - 3) // 3
+    return f"{text[: most - 3 - end]}...{text[len(text) - end :]}"
+
 
 class ExitCode(enum.IntEnum):
     """Process exit codes, as documented in the README."""
@@ -23,6 +52,9 @@ class ReslrbError(Exception):
 
     exit_code: ExitCode = ExitCode.USAGE
 
+    def __init__(self, message: str = "") -> None:
+        super().__init__(one_line(message, LINE_LENGTH))
+
 
 class ConfigError(ReslrbError):
     """Wrong configuration or input, located by file and key.
@@ -34,7 +66,8 @@ class ConfigError(ReslrbError):
     exit_code = ExitCode.USAGE
 
     def __init__(self, source: object, key: str, message: str) -> None:
-        self.source, self.key, self.message = str(source), key, " ".join(message.split())
+        self.source, self.key = one_line(source, PLACE_LENGTH), one_line(key, PLACE_LENGTH)
+        self.message = one_line(message)
         super().__init__(": ".join(part for part in (self.source, self.key, self.message) if part))
 
 

@@ -10,19 +10,18 @@ import json
 import subprocess
 from dataclasses import dataclass
 
+from reslrb_cli.backend.installation import MISSING_LIBRARY
 from reslrb_cli.backend.python import python_command
 from reslrb_cli.backend.shared_library import missing_library
-
-MISSING_LIBRARY = "run scripts/setup, or install the package that holds it"
 
 # A constant that no kernel cache has seen makes the compiler run; `minimum` is what libLLVM 15 and 16 stumble over.
 _SCRIPT = """
 import json, sys, time
 import reslrb_cli
-import drjit as dr
-import mitsuba as mi
+from reslrb_cli.backend.installation import load_packages
 from reslrb_cli.backend.plugins import prefer_own_plugins
 
+dr, mi = load_packages()
 mi.set_variant(sys.argv[1])
 prefer_own_plugins()
 salt = (time.time_ns() & 0xFFFFFF) * 1e-6
@@ -49,6 +48,9 @@ assert abs(t[0] - 2) < 1e-4, f"a ray met the unit sphere at {t[0]} instead of 2"
 print(json.dumps({"compile_ms": compile_ms, "run_ms": run_ms, "ray_ms": ray_ms}))
 """
 
+#: What stands before the line of an error of ours in a traceback.
+_OURS = "reslrb_cli.errors.BackendError: "
+
 
 @dataclass(frozen=True)
 class Probe:
@@ -69,15 +71,20 @@ def probe(variant: str) -> Probe:
     """Runs the trial for `variant`; never raises."""
     command = [*python_command(_SCRIPT), variant]
     try:
-        done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
+        done = subprocess.run(command, capture_output=True, text=True, errors="replace", timeout=300, check=False)
     except subprocess.TimeoutExpired:
         return Probe("gave no result within 300 s")
+    except OSError as error:
+        return Probe(f"could not be tried ({error})")
     if done.returncode == 0:
-        return Probe(**json.loads(done.stdout.splitlines()[-1]))
+        try:
+            return Probe(**json.loads(done.stdout.splitlines()[-1]))
+        except (ValueError, TypeError, IndexError):
+            return Probe("ended without a result")
     missing = missing_library(done.stderr)
     if missing:
         return Probe(f"Mitsuba needs {missing}, which is missing; {MISSING_LIBRARY}")
     said = [line.strip() for line in done.stderr.splitlines() if line.strip()]
     if done.returncode < 0:
         return Probe(f"ended by signal {-done.returncode}: {said[0] if said else 'no message'}")
-    return Probe(said[-1] if said else f"ended with code {done.returncode}")
+    return Probe(said[-1].removeprefix(_OURS) if said else f"ended with code {done.returncode}")

@@ -8,9 +8,9 @@ import os
 from importlib import metadata
 
 from reslrb_cli.backend import llvm
+from reslrb_cli.backend.installation import load_packages
 from reslrb_cli.backend.plugins import prefer_own_plugins
-from reslrb_cli.backend.probe import MISSING_LIBRARY, probe
-from reslrb_cli.backend.shared_library import missing_library
+from reslrb_cli.backend.probe import probe
 from reslrb_cli.errors import BackendError
 
 logger = logging.getLogger(__name__)
@@ -25,20 +25,14 @@ def set_variant(name: str = "auto") -> str:
     if chosen.startswith("cuda") and name != "auto":
         require_cuda(chosen)
     library = llvm.require() if chosen.startswith("llvm") else None
-    try:
-        import drjit as dr
-        import mitsuba as mi
-    except (ImportError, NameError) as error:  # a NameError in Dr.Jit's own handler covers the ImportError
-        cause = error.__context__ or error
-        mend = MISSING_LIBRARY if missing_library(str(cause)) else "install it with `pip install mitsuba`"
-        raise BackendError(f"Mitsuba cannot be loaded ({cause}); {mend}") from error
+    dr, mi = load_packages()
     if chosen not in mi.variants():
         raise BackendError(f"this Mitsuba has no variant {chosen}; it has {', '.join(mi.variants())}")
     if library is not None:
         _check_loaded_llvm(dr)
     try:
         mi.set_variant(chosen)
-    except ImportError as error:
+    except (ImportError, AttributeError, RuntimeError) as error:
         raise BackendError(f"variant {chosen} does not start: {error}") from error
     prefer_own_plugins()
     logger.info("variant %s%s%s", chosen, f" (libLLVM {library.version})" if library else "", why)

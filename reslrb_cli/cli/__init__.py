@@ -17,7 +17,8 @@ from typing import Any
 import click
 
 from reslrb_cli import __version__
-from reslrb_cli.errors import ExitCode, ReslrbError, is_out_of_memory
+from reslrb_cli.cli.output import LineFormatter
+from reslrb_cli.errors import LINE_LENGTH, ExitCode, ReslrbError, is_out_of_memory, one_line
 
 # What `reslrb --help` says of each command, so that it need not load them; in the order of a user's work.
 _SUMMARIES = {
@@ -72,7 +73,7 @@ class _Main(click.Group):
             if self.debug:
                 traceback.print_exc()
             line, code = told
-            click.echo(line, err=True)
+            click.echo(one_line(line, LINE_LENGTH), err=True)
         sys.exit(code if isinstance(code, int) else ExitCode.DONE)
 
 
@@ -85,17 +86,13 @@ def _tell(error: BaseException) -> tuple[str, int] | None:
     if isinstance(error, click.ClickException):
         context = getattr(error, "ctx", None)
         where = context.command_path if context else "reslrb"
-        return f"{where}: {' '.join(error.format_message().split())} See `{where} --help`.", ExitCode.USAGE
+        return f"{where}: {one_line(error.format_message()).rstrip('.')}. See `{where} --help`.", ExitCode.USAGE
     if is_out_of_memory(error):
         advice = "lower run.spp or the size of the film, or set run.memory_budget or integrator.samples_per_pass"
-        return f"out of memory ({_one_line(error) or 'host'}); {advice}", ExitCode.OUT_OF_MEMORY
+        return f"out of memory ({one_line(error, 200) or 'host'}); {advice}", ExitCode.OUT_OF_MEMORY
     if isinstance(error, OSError) and error.filename is not None:
         return f"{error.filename}: {error.strerror}", ExitCode.USAGE
     return None
-
-
-def _one_line(error: BaseException) -> str:
-    return " ".join(str(error).split())[:200]
 
 
 def _set_debug(ctx: click.Context, _parameter: click.Parameter, value: bool) -> None:
@@ -115,6 +112,10 @@ def main() -> None:
     logger = logging.getLogger("reslrb_cli")
     if not logger.handlers:
         handler = logging.StreamHandler()
-        handler.setFormatter(logging.Formatter("%(message)s"))
+        handler.setFormatter(LineFormatter())
         logger.addHandler(handler)
         logger.setLevel(logging.INFO)
+    try:
+        os.getcwd()
+    except OSError as error:  # removed; relative paths start from it, and Mitsuba does not load without
+        raise OSError(error.errno, error.strerror, "the working directory") from None

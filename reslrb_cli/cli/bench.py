@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from reslrb_cli.cli.experiment import check_writable, optional_experiment_arguments
+from reslrb_cli.cli.experiment import COUNT, check_writable, optional_experiment_arguments
+from reslrb_cli.cli.output import echo
 from reslrb_cli.errors import ConfigError, ExitCode
 
 if TYPE_CHECKING:
@@ -29,14 +30,15 @@ class Size(click.ParamType):
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> int:
         match = re.fullmatch(r"(\d+(?:\.\d+)?)\s*(|k|M|G|Ki|Mi|Gi)B?", str(value).strip())
-        if match is None:
+        size = 0.0 if match is None else float(match[1]) * _UNITS[match[2]]
+        if not 1 <= size < 2**63:
             self.fail(f"`{value}` is no size; write it as in 2GiB or 500MB", param, ctx)
-        return int(float(match[1]) * _UNITS[match[2]])
+        return int(size)
 
 
 @click.command("bench")
 @optional_experiment_arguments
-@click.option("--max-depth", type=click.IntRange(min=2), default=32, show_default=True,
+@click.option("--max-depth", type=click.IntRange(min=2, max=COUNT.max), default=32, show_default=True,
               help="Greatest path depth; measured are 2, 4, 8, ... and this one.")  # fmt: skip
 @click.option("--integrators", default=INTEGRATORS, show_default=True, metavar="LIST",
               help="What to compare: TYPE[:ESTIMATOR][(OPTION=VALUE,...)], separated by commas; OPTION is one of the "
@@ -72,8 +74,11 @@ def command(
     one that runs out of memory is recorded as out_of_memory, and the rest goes on. Ctrl-C keeps what is done.
     """
     from reslrb_cli.backend.device import device_name, memory_bytes
+    from reslrb_cli.backend.installation import load_packages
     from reslrb_cli.backend.variant import choose
     from reslrb_cli.config import load, loads
+
+    load_packages()  # before what follows asks for them
     from reslrb_cli.measure import cornell_box
     from reslrb_cli.measure.bench import Sweep
     from reslrb_cli.measure.cases import choose_baseline, depths, parse_cases
@@ -103,15 +108,15 @@ def command(
         budget_s=budget,
     )
     sweep.check()
-    click.echo(f"{device_name(variant)}, {variant}")
-    click.echo(_conditions(config, sweep))
+    echo(f"{device_name(variant)}, {variant}")
+    echo(_conditions(config, sweep))
     results, interrupted = _run(sweep, json_file)
     if plot_file is not None and results:
         from reslrb_cli.report.bench_plot import plot_bench
 
         series = [(case.label, [r.record for r in results if r.case == case]) for case in cases]
         plot_bench(series, plot_file, f"{device_name(variant)}\n{_conditions(config, sweep)}")
-        click.echo(f"look at {os.path.relpath(plot_file)}")
+        echo(f"look at {os.path.relpath(plot_file)}")
     return ExitCode.INTERRUPTED if interrupted else _exit_code(results)
 
 
@@ -128,17 +133,17 @@ def _run(sweep: Sweep, json_file: Path | None) -> tuple[list[Result], bool]:
     with ExitStack() as stack:
         writer = None if json_file is None else stack.enter_context(BenchWriter(json_file))
         interrupts = stack.enter_context(Interrupts())
-        click.echo(table_head(labels))
+        echo(table_head(labels))
         for rows in bench(sweep, lambda: interrupts.requested, logging.getLogger(__name__).info):
             for row in rows:
                 if writer is not None:
                     writer.write(row.record)
-                click.echo(table_line(row.case.label, row.record, row.step_ratio, row.kernel_ratio, labels))
+                echo(table_line(row.case.label, row.record, row.step_ratio, row.kernel_ratio, labels))
                 if row.reason:
                     notes.append(f"depth {row.record.max_depth}, {row.case.label}: {row.reason}")
             results += rows
         for note in notes:
-            click.echo(note)
+            echo(note)
         return results, interrupts.requested
 
 

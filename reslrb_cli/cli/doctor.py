@@ -8,6 +8,7 @@ import json
 import click
 
 from reslrb_cli.backend.doctor import Backend, Report, examine
+from reslrb_cli.cli.output import echo
 from reslrb_cli.errors import BackendError
 
 
@@ -23,7 +24,7 @@ def command(as_json: bool) -> None:
         click.echo(json.dumps(dataclasses.asdict(report), indent=2))
     else:
         for name, value in _lines(report):
-            click.echo(f"{name:14} {value}")
+            echo(f"{name:14} {value}")
     missing = [name for name, version in report.packages.items() if version is None and name != "reslrb"]
     if missing:
         raise BackendError(f"missing packages; install them with `pip install {' '.join(missing)}`")

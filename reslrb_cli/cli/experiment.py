@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import logging
+import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -13,6 +15,9 @@ from reslrb_cli.config import Config, load
 from reslrb_cli.errors import ConfigError
 
 logger = logging.getLogger(__name__)
+
+#: Type of an option that counts something: samples, depths, seeds. As in a configuration, 31 bits.
+COUNT = click.IntRange(min=1, max=2**31 - 1)
 
 
 def experiment_arguments(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -58,11 +63,13 @@ def check_writable(option: str, path: Path | None) -> None:
     """Raise ConfigError, located by the option, where the file `path` cannot be written; it is left as it was."""
     if path is None:
         return
-    existed = path.exists()
-    try:
-        with path.open("ab"):
-            pass
-    except OSError as error:
-        raise ConfigError(option, "", f"cannot write {path}: {error.strerror}") from None
+    existed = os.path.lexists(path)
+    try:  # without waiting: a pipe that nobody reads from would make wait for ever
+        os.close(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND | getattr(os, "O_NONBLOCK", 0), 0o666))
+    except (OSError, ValueError) as error:
+        reason = "nobody reads from that pipe" if getattr(error, "errno", None) == errno.ENXIO else None
+        raise ConfigError(
+            option, "", f"cannot write {path}: {reason or getattr(error, 'strerror', None) or error}"
+        ) from None
     if not existed:
         path.unlink()

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING
 
 import click
 
-from reslrb_cli.cli.experiment import check_writable, optional_experiment_arguments
+from reslrb_cli.cli.experiment import COUNT, check_writable, optional_experiment_arguments
+from reslrb_cli.cli.output import echo
 from reslrb_cli.cli.suite import refuse_foreign, run_suite_command
 from reslrb_cli.errors import ConfigError, ExitCode
 
@@ -30,8 +31,9 @@ logger = logging.getLogger(__name__)
                    "options of CONFIG.")  # fmt: skip
 @click.option("--budget", type=click.FloatRange(min=0), default=45.0, show_default=True, metavar="SECONDS",
               help="Time for the whole; it decides how many seeds there are, eight at least.")  # fmt: skip
-@click.option("--seeds", type=click.IntRange(min=3), metavar="N", help="Number of seeds, whatever time they take.")
-@click.option("--spp", type=click.IntRange(min=1),
+@click.option("--seeds", type=click.IntRange(min=3, max=COUNT.max), metavar="N",
+              help="Number of seeds, whatever time they take.")  # fmt: skip
+@click.option("--spp", type=COUNT,
               help="Samples per pixel of one gradient. Default: 65536 light paths, no more than run.spp.")  # fmt: skip
 @click.option("--json", "json_file", type=click.Path(path_type=Path, dir_okay=False),
               help="Write one object a line, one for each comparison.")  # fmt: skip
@@ -62,8 +64,11 @@ def command(
     1 where a comparison fails; the last lines say which, and by how much. docs/gradcheck.md explains the columns.
     """
     from reslrb_cli.backend.device import device_name
+    from reslrb_cli.backend.installation import load_packages
     from reslrb_cli.backend.variant import set_variant
     from reslrb_cli.config import load, loads
+
+    load_packages()  # before what follows asks for them
     from reslrb_cli.measure import cornell_box
     from reslrb_cli.measure.cases import all_estimators, parse_estimators
     from reslrb_cli.measure.gradcheck import Gradcheck
@@ -86,8 +91,8 @@ def command(
     settings.configs()  # before anything is loaded
     variant = set_variant(config.variant)
     check = Gradcheck(settings)
-    click.echo(f"{device_name(variant)}, {variant}")
-    click.echo(check.conditions())
+    echo(f"{device_name(variant)}, {variant}")
+    echo(check.conditions())
     records, interrupted = _run(check, json_file, folder)
     _finish(records, markdown_file)
     if interrupted:
@@ -112,14 +117,14 @@ def _run(check: Gradcheck, json_file: Path | None, folder: Path | None) -> tuple
         for result in results:
             if table is None:
                 table = Table([other.record for other in results])
-                click.echo(table.head())
+                echo(table.head())
             if writer is not None:
                 writer.write(result.record)
-            click.echo(table.line(result.record))
+            echo(table.line(result.record))
             records.append(result.record)
             _draw(result, folder)
     if folder is not None and any(result.maps is not None for result in results):
-        click.echo(f"look at {os.path.relpath(folder)}")
+        echo(f"look at {os.path.relpath(folder)}")
     return records, interrupts.requested
 
 
@@ -137,7 +142,7 @@ def _finish(records: list[GradcheckRecord], markdown_file: Path | None) -> None:
     from reslrb_cli.report.gradcheck_table import markdown_table, summary_lines
 
     for line in summary_lines(records) if records else ["interrupted before there were enough seeds to compare"]:
-        click.echo(line)
+        echo(line)
     if markdown_file is not None:
         markdown_file.write_text(markdown_table(records), encoding="utf-8")
 

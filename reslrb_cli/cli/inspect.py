@@ -13,6 +13,7 @@ import click
 from reslrb_cli.cli.experiment import overrides_option, start_variant
 from reslrb_cli.cli.listing import LISTED_SENSORS, parameter_lines, plan_lines, scene_lines, sensor_lines
 from reslrb_cli.cli.offending import show_offenders, without_nan
+from reslrb_cli.cli.output import echo
 from reslrb_cli.cli.subject import Subject, read_subject
 from reslrb_cli.errors import ConfigError, UnsupportedScene
 
@@ -91,33 +92,33 @@ def command(
         click.echo(json.dumps(without_nan(everything_known), indent=2, allow_nan=False))
         return None
     if subject.run is not None:
-        click.echo(run_line(subject))
-    click.echo(f"scene {config.scene.file}")
+        echo(run_line(subject))
+    echo(f"scene {config.scene.file}")
     for line in scene_lines(summary):
-        click.echo(f"  {line}")
+        echo(f"  {line}")
     sensors = summary.sensors if everything else summary.sensors[:LISTED_SENSORS]
     for sensor in sensors:
-        click.echo(f"sensor {sensor.index} ({sensor.id})")
+        echo(f"sensor {sensor.index} ({sensor.id})")
         for line in sensor_lines(sensor):
-            click.echo(f"  {line}")
+            echo(f"  {line}")
     if len(sensors) < len(summary.sensors):
-        click.echo(f"and {len(summary.sensors) - len(sensors)} more sensors; --all lists them")
+        echo(f"and {len(summary.sensors) - len(sensors)} more sensors; --all lists them")
     if plan is not None:
-        click.echo("plan")
+        echo("plan")
         for line in [f"none: {plan}"] if isinstance(plan, str) else plan_lines(plan):
-            click.echo(f"  {line}")
-    click.echo("parameters")
+            echo(f"  {line}")
+    echo("parameters")
     wanted = [] if "parameters" in subject.missing else [spec.key for spec in config.parameters]
     for line in parameter_lines(summary.parameters, wanted, everything):
-        click.echo(f"  {line}")
+        echo(f"  {line}")
     if measured is not None:
         from reslrb_cli.report.conditioning_table import conditioning_lines
 
-        click.echo(f"conditioning ({measured.samples} gradients of {measured.spp} spp, seed {measured.seed})")
+        echo(f"conditioning ({measured.samples} gradients of {measured.spp} spp, seed {measured.seed})")
         for line in conditioning_lines(measured):
-            click.echo(f"  {line}")
+            echo(f"  {line}")
     else:
-        click.echo(f"next: {next_step(subject, summary)}")
+        echo(f"next: {next_step(subject, summary)}")
     return None
 
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from reslrb_cli.cli.output import echo
 from reslrb_cli.errors import ExitCode
 
 if TYPE_CHECKING:
@@ -29,7 +30,7 @@ def show_offenders(config: Config, as_json: bool) -> int:
     else:
         lines = [line for entry in found for line in offender_lines(entry, replay.iteration)]
         for line in lines or [f"iteration {replay.iteration}: all is finite this time"]:
-            click.echo(line)
+            echo(line)
     return ExitCode.DONE if found else ExitCode.CHECK_FAILED
 
 

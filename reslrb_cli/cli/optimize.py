@@ -9,8 +9,9 @@ from pathlib import Path
 import click
 
 from reslrb_cli.cli.experiment import experiment_arguments, read_config, start_variant
+from reslrb_cli.cli.output import echo
 from reslrb_cli.config import dump
-from reslrb_cli.errors import ExitCode
+from reslrb_cli.errors import ExitCode, printable
 from reslrb_cli.records.manifest import Manifest, Status
 from reslrb_cli.records.run_folder import RunFolder, check_output
 
@@ -43,7 +44,9 @@ def command(config_file: Path, overrides: tuple[str, ...], force: bool, quiet: b
     say = logging.getLogger(__name__).info
     problem = assemble(config, say, PilotCache())
     find_reached(problem, say)
-    manifest = Manifest(variant=variant, device=device_name(variant), seed=config.run.seed, config=str(config_file))
+    manifest = Manifest(
+        variant=variant, device=device_name(variant), seed=config.run.seed, config=printable(config_file)
+    )
     manifest.pilot = None if problem.pilot is None else problem.pilot.to_json()
     manifest.memory = None if problem.memory is None else problem.memory.to_json()
     folder = RunFolder.create(config_file, config.run.output, config.run.folder_name, force, dump(config), manifest)
@@ -52,7 +55,7 @@ def command(config_file: Path, overrides: tuple[str, ...], force: bool, quiet: b
         status = recording.run(progress.show, lambda: interrupts.requested)
     if not quiet:
         for line in parameter_lines(manifest.results, terminal_width()):
-            click.echo(line)
+            echo(line)
     tallies = [str(tally) for tally in (recording.nonfinite, recording.clamped) if tally.iterations]
-    click.echo(last_line(status.value, manifest.results, tallies, os.path.relpath(folder.path / "report.html")))
+    echo(last_line(status.value, manifest.results, tallies, os.path.relpath(folder.path / "report.html")))
     return ExitCode.DONE if status is Status.FINISHED else ExitCode.INTERRUPTED

@@ -7,12 +7,13 @@ from pathlib import Path
 
 import click
 
-from reslrb_cli.cli.experiment import experiment_arguments, read_config, start_variant
+from reslrb_cli.cli.experiment import COUNT, check_writable, experiment_arguments, read_config, start_variant
+from reslrb_cli.cli.output import echo
 from reslrb_cli.errors import ConfigError
 
 #: Formats that hold linear values; the others of `FORMATS` are written in 8-bit sRGB.
 FLOAT_FORMATS = (".exr", ".hdr", ".pfm")
-FORMATS = (*FLOAT_FORMATS, ".png", ".jpg", ".jpeg", ".bmp")
+FORMATS = (*FLOAT_FORMATS, ".png", ".jpg", ".jpeg")
 
 
 @click.command("render")
@@ -22,9 +23,9 @@ FORMATS = (*FLOAT_FORMATS, ".png", ".jpg", ".jpeg", ".bmp")
     "--output",
     required=True,
     type=click.Path(path_type=Path),
-    help="Image file to write; EXR, HDR and PFM are linear, PNG, JPG and BMP 8-bit sRGB.",
+    help="Image file to write; EXR, HDR and PFM are linear, PNG and JPG 8-bit sRGB.",
 )
-@click.option("--spp", type=click.IntRange(min=1), help="Samples per pixel; default: run.spp.")
+@click.option("--spp", type=COUNT, help="Samples per pixel; default: run.spp.")
 @click.option("--sensor", type=click.IntRange(min=0), help="Index of the sensor; default: the experiment's first.")
 @click.option(
     "--initial/--scene",
@@ -36,8 +37,8 @@ def command(
     config_file: Path, overrides: tuple[str, ...], output: Path, spp: int | None, sensor: int | None, initial: bool
 ) -> None:
     """Render the scene of CONFIG with its integrator."""
-    check_image_path(output)
     config = read_config(config_file, overrides)
+    check_image_path(output)
     start_variant(config)
 
     from reslrb_cli.optimization.problem import load_for_rendering
@@ -55,7 +56,7 @@ def command(
         write_file(output, image, linear=output.suffix.lower() in FLOAT_FORMATS)
     except (OSError, RuntimeError) as error:
         raise ConfigError("--output", "", f"cannot write {output}: {error}") from None
-    click.echo(f"{output}: {image.shape[1]}x{image.shape[0]}, {samples} spp")
+    echo(f"{output}: {image.shape[1]}x{image.shape[0]}, {samples} spp")
 
 
 def check_image_path(path: Path) -> None:
@@ -64,11 +65,10 @@ def check_image_path(path: Path) -> None:
         raise ConfigError("--output", "", f"{path} has no known image format; end it in {', '.join(FORMATS)}")
     if path.is_dir() or not path.absolute().parent.is_dir():
         raise ConfigError("--output", "", f"{path} is a folder, or in a folder that does not exist")
-    existed = path.exists()
+    if os.path.lexists(path) and not path.is_file():
+        raise ConfigError("--output", "", f"{path} is not a regular file")
     try:
-        with path.open("ab"):
-            pass
-    except OSError as error:
-        raise ConfigError("--output", "", f"cannot write {path}: {error.strerror}") from None
-    if not existed:
-        os.unlink(path)
+        str(path.absolute()).encode()
+    except UnicodeEncodeError:
+        raise ConfigError("--output", "", f"{path} is not UTF-8; Mitsuba writes no such file") from None
+    check_writable("--output", path)

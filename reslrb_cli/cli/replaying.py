@@ -10,12 +10,14 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from reslrb_cli.config import Config, Reslrb
+from reslrb_cli.config import Config, Reslrb, with_integrator
 from reslrb_cli.errors import ConfigError
-from reslrb_cli.optimization.problem import Problem, assemble_scene
-from reslrb_cli.records.checkpoint import load_nonfinite
+from reslrb_cli.optimization.problem import Problem, assemble_scene, color_channels
+from reslrb_cli.records.checkpoint import NONFINITE_FILE_NAME, load_nonfinite
+from reslrb_cli.records.manifest import FILE_NAME as MANIFEST
 from reslrb_cli.records.manifest import read_manifest
 from reslrb_cli.records.run_folder import RunFolder
+from reslrb_cli.scene.image_file import read_bitmap
 
 OPTION = "--nonfinite"
 
@@ -29,7 +31,10 @@ class Replay:
 
 
 def load_replay(config: Config) -> Replay:
-    """The replay of the run in whose folder `config` lies. Raises ConfigError where there is none."""
+    """The replay of the run in whose folder `config` lies. Raises ConfigError where there is none.
+
+    What lies in the folder may be damaged, or of another run: whatever is read is checked against the configuration.
+    """
     path = config.source.parent
     manifest = read_manifest(path)
     if manifest is None:
@@ -39,29 +44,52 @@ def load_replay(config: Config) -> Replay:
     if saved is None:
         raise ConfigError(config.source, OPTION, "this run met no value that was not finite")
     iteration, values = saved
-    problem = assemble_scene(_chosen(config, manifest), values=values)
+    archive, written = folder.checkpoint / NONFINITE_FILE_NAME, path / MANIFEST
+    if not 0 <= iteration < config.run.iterations:
+        raise ConfigError(archive, "iteration", f"is {iteration}; the run has {config.run.iterations} iterations")
+    config = _chosen(config, manifest, written)
+    try:
+        problem = assemble_scene(config, values=values)
+    except ValueError as error:
+        raise ConfigError(archive, "", f"does not fit to {config.source}: {error}") from None
     if manifest.get("memory"):
-        problem.samples_per_pass = int(manifest["memory"]["samples_per_pass"])
+        problem.samples_per_pass = _samples_per_pass(manifest["memory"], written)
         problem.integrator = problem.integrator.with_options(
             samples_per_pass=problem.samples_per_pass, freeze=problem.integrator.freeze
         )
     for sensor in problem.sensors:
         name = "target" if len(problem.sensors) == 1 else f"target-{sensor}"
-        problem.targets.append(_read(folder.images / f"{name}.exr", config))
+        problem.targets.append(_read_target(folder.images / f"{name}.exr", problem, sensor))
     return Replay(problem, iteration)
 
 
-def _chosen(config: Config, manifest: dict[str, Any]) -> Config:
-    """The configuration with the estimator that the run's pilot chose."""
+def _chosen(config: Config, manifest: dict[str, Any], path: Path) -> Config:
+    """The configuration with the estimator that the run's pilot chose, by the manifest at `path`."""
     if not manifest.get("pilot") or not isinstance(config.integrator, Reslrb):
         return config
-    return config.model_copy(update={"integrator": config.integrator.chosen(**manifest["pilot"]["chosen"])})
+    try:
+        options = config.integrator.chosen(**manifest["pilot"]["chosen"]).options()
+    except (TypeError, KeyError, ValueError):  # pydantic's error is a ValueError
+        raise ConfigError(path, "pilot.chosen", "is not an estimator with its options, as a run writes it") from None
+    return with_integrator(config, {"type": config.integrator.type} | options, str(path), {})
 
 
-def _read(path: Path, config: Config) -> Any:
-    if not path.exists():
-        raise ConfigError(config.source, OPTION, f"needs {path}, which the run wrote")
-    array = np.array(mi.Bitmap(str(path)), dtype=np.float32)
-    target = mi.TensorXf(np.ascontiguousarray(array if array.ndim == 3 else array[:, :, None]))
+def _samples_per_pass(memory: Any, path: Path) -> int:
+    count = memory.get("samples_per_pass") if isinstance(memory, dict) else None
+    if type(count) is not int or not 1 <= count < 2**31:
+        raise ConfigError(path, "memory.samples_per_pass", "is not a number of samples, as a run writes it")
+    return count
+
+
+def _read_target(path: Path, problem: Problem, sensor: int) -> Any:
+    """The target image that a run wrote, as a tensor. Raises ConfigError where it is not one for this sensor."""
+    film = problem.scene.sensors()[sensor].film()
+    width, height = film.crop_size()
+    array = np.array(read_bitmap(path, (int(width), int(height))), dtype=np.float32)
+    array = array if array.ndim == 3 else array[:, :, None]
+    colors = color_channels(film)
+    if array.shape[2] != colors:
+        raise ConfigError(path, "", f"must have the film's channels; its own: {array.shape[2]}, the film's: {colors}")
+    target = mi.TensorXf(np.ascontiguousarray(array))
     dr.make_opaque(target)
     return target

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from reslrb_cli.cli.output import echo
 from reslrb_cli.errors import ConfigError, ExitCode
 
 if TYPE_CHECKING:
@@ -53,7 +54,7 @@ def run_suite_command(
         if name not in CASES:
             near = difflib.get_close_matches(name, list(CASES), n=1, cutoff=0)
             raise ConfigError("--case", "", f"there is no case `{name}`; did you mean {near[0]}?")
-    click.echo(f"{device_name(variant)}, {variant}")
+    echo(f"{device_name(variant)}, {variant}")
     records: list[GradcheckRecord] = []
     with ExitStack() as stack:
         writer = None if json_file is None else stack.enter_context(GradcheckWriter(json_file))
@@ -71,10 +72,10 @@ def run_suite_command(
             for record in rows:
                 if writer is not None:
                     writer.write(record)
-            click.echo(_case_line(case, rows))
+            echo(_case_line(case, rows))
         interrupted = interrupts.requested
     for line in summary_lines(records):
-        click.echo(line)
+        echo(line)
     if markdown_file is not None:
         about = {name: case.about for name, case in CASES.items()}
         markdown_file.write_text(_document(records, about, f"{device_name(variant)}, {variant}"), encoding="utf-8")

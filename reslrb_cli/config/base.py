@@ -5,8 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Discriminator, Field, ValidationInfo, WithJsonSchema
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Discriminator, Field, Tag, ValidationInfo, WithJsonSchema
 from pydantic_core import PydanticCustomError
+
+from .limits import PART_BYTES, PATH_BYTES
 
 #: Largest seed plus one: Mitsuba's seeds are uint32.
 SEED_END = 2**32
@@ -31,22 +33,29 @@ def wrong(message: str) -> PydanticCustomError:
 # --- paths ------------------------------------------------------------------------------------------------------------
 
 
-def _path(value: Any) -> Path:
+def _path(folder: Path, value: Any) -> Path:
+    """The path `value`, relative to `folder`. Joined, not resolved: `..` after a symbolic link is the system's."""
     if not isinstance(value, (str, Path)) or not str(value).strip() or "\0" in str(value):
         raise wrong("must be a path")
     try:
-        return Path(value).expanduser()
+        path = folder / Path(value).expanduser()
     except RuntimeError:
         raise wrong("must be a path: there is no such user") from None
+    try:
+        sizes = [len(part.encode()) for part in (str(path), *path.parts)]
+    except UnicodeEncodeError:
+        raise wrong("names a file or a folder whose name is not UTF-8; rename it, since Mitsuba opens none") from None
+    if max(sizes[1:]) > PART_BYTES or sizes[0] > PATH_BYTES:
+        raise wrong(f"must be a path of at most {PATH_BYTES} bytes, and each name in it of at most {PART_BYTES}")
+    return path
 
 
-# Joined, not resolved: `..` after a symbolic link is the system's to follow.
 def _below_config(value: Any, info: ValidationInfo) -> Path:
-    return Path((info.context or {}).get("folder", "")).absolute() / _path(value)
+    return _path(Path((info.context or {}).get("folder", "")).absolute(), value)
 
 
 def _below_working_directory(value: Any) -> Path:
-    return Path.cwd() / _path(value)
+    return _path(Path.cwd(), value)
 
 
 _PATH_SCHEMA = WithJsonSchema({"type": "string", "format": "path"})
@@ -60,16 +69,23 @@ WorkPath = Annotated[Path, BeforeValidator(_below_working_directory), _PATH_SCHE
 # --- unions -----------------------------------------------------------------------------------------------------------
 
 
-def by_type(default: str) -> Discriminator:
-    """Tells the members of a union apart by their key `type`, `default` where it is left out.
+#: What the tags of unions' members begin with. pydantic puts tags among the keys of an error's location; no key of a
+#: file or a command line can hold this character.
+MARK = "\0"
 
-    The members' tags are `<name>`: unlike those of pydantic's own way they cannot be mistaken for keys in a location.
-    """
+
+def mark(name: str) -> Tag:
+    """The tag of a union's member."""
+    return Tag(MARK + name)
+
+
+def by_type(default: str) -> Discriminator:
+    """Tells the members of a union apart by their key `type`, `default` where it is left out."""
 
     def tag(value: Any) -> str | None:
         if isinstance(value, Section):
-            return f"<{getattr(value, 'type', '')}>"
-        return f"<{value.get('type', default)}>" if isinstance(value, dict) else None
+            return f"{MARK}{getattr(value, 'type', '')}"
+        return f"{MARK}{value.get('type', default)}" if isinstance(value, dict) else None
 
     return Discriminator(tag)
 
@@ -77,17 +93,17 @@ def by_type(default: str) -> Discriminator:
 def by_kind(expected: str, word: str | None = None) -> Discriminator:
     """Tells the members of a union apart by the kind of the value; `expected` says in an error what is right.
 
-    Tags: `<mapping>`, `<list>`, `<number>`, and `<text>` for `word`, the only text that the union knows.
+    Tags: `mapping`, `list`, `number`, and `text` for `word`, the only text that the union knows.
     """
 
     def tag(value: Any) -> str | None:
         if isinstance(value, (dict, Section)):
-            return "<mapping>"
+            return MARK + "mapping"
         if isinstance(value, (list, tuple)):
-            return "<list>"
+            return MARK + "list"
         if isinstance(value, (int, float)) and not isinstance(value, bool):
-            return "<number>"
-        return "<text>" if word is not None and value == word else None
+            return MARK + "number"
+        return MARK + "text" if word is not None and value == word else None
 
     return Discriminator(tag, custom_error_type="wrong", custom_error_message=f"must be {expected}")
 

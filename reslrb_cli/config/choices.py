@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Literal
 
-from pydantic import ConfigDict, Field, SerializerFunctionWrapHandler, Tag, model_serializer, model_validator
+from pydantic import ConfigDict, Field, SerializerFunctionWrapHandler, model_serializer, model_validator
 from typing_extensions import Self
 
-from .base import Count, Positive, Section, by_type, located
+from .base import Count, Positive, Section, by_type, located, mark
 
 #: For JSON Schema: `type` may be left out only for the first member of a union.
 _NEEDS_TYPE = ConfigDict(json_schema_extra={"required": ["type"]})
@@ -163,11 +163,11 @@ class Trajectory(LightTracer):
 
 
 AnyIntegrator = Annotated[
-    Annotated[Reslrb, Tag("<reslrb>")]
-    | Annotated[Ptracer, Tag("<ptracer>")]
-    | Annotated[Prb, Tag("<prb>")]
-    | Annotated[WalkAd, Tag("<walk_ad>")]
-    | Annotated[Trajectory, Tag("<trajectory>")],
+    Annotated[Reslrb, mark("reslrb")]
+    | Annotated[Ptracer, mark("ptracer")]
+    | Annotated[Prb, mark("prb")]
+    | Annotated[WalkAd, mark("walk_ad")]
+    | Annotated[Trajectory, mark("trajectory")],
     by_type("reslrb"),
 ]
 
@@ -213,10 +213,10 @@ class LogL2(Loss):
 
 
 AnyLoss = Annotated[
-    Annotated[L2, Tag("<l2>")]
-    | Annotated[L1, Tag("<l1>")]
-    | Annotated[RelativeL2, Tag("<relative_l2>")]
-    | Annotated[LogL2, Tag("<log_l2>")],
+    Annotated[L2, mark("l2")]
+    | Annotated[L1, mark("l1")]
+    | Annotated[RelativeL2, mark("relative_l2")]
+    | Annotated[LogL2, mark("log_l2")],
     by_type("l2"),
 ]
 
@@ -318,9 +318,9 @@ class SGD(Optimizer):
 
 
 AnyOptimizer = Annotated[
-    Annotated[Adam, Tag("<adam>")]
-    | Annotated[AdamW, Tag("<adamw>")]
-    | Annotated[RMSProp, Tag("<rmsprop>")]
-    | Annotated[SGD, Tag("<sgd>")],
+    Annotated[Adam, mark("adam")]
+    | Annotated[AdamW, mark("adamw")]
+    | Annotated[RMSProp, mark("rmsprop")]
+    | Annotated[SGD, mark("sgd")],
     by_type("adam"),
 ]

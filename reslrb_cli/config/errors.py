@@ -12,7 +12,7 @@ from typing import Any, get_args
 from pydantic import ValidationError
 from pydantic_core import ErrorDetails
 
-from .base import Section
+from .base import MARK, Section
 from .schema import Config
 from .text import Location, format_location
 
@@ -32,35 +32,42 @@ _EXPECTED = {
     "less_than": "below {lt}",
     "less_than_equal": "at most {le}",
     "string_too_short": "nonempty text",
+    "string_too_long": "text of at most {max_length} characters",
     "literal_error": "{expected}",
-    "invalid_key": "given under a key that is text",
 }
 
 
 @dataclass(frozen=True)
 class Problem:
-    """One error: where it is, in the notation of `--set`, and what would be right."""
+    """One error: where it is, in the notation of `--set`, and what is wrong; `explain` says what would be right.
+
+    `unknown` is pydantic's location of a key that is not known, whose nearest known key takes time to find.
+    """
 
     key: str
     message: str
-    unknown_key: bool = False
+    unknown: tuple[int | str, ...] | None = None
+
+    def explain(self) -> str:
+        """What is wrong, and what would be right."""
+        return self.message if self.unknown is None else _unknown_key(self.unknown)
 
 
 def problems(error: ValidationError, data: Any) -> list[Problem]:
     """The problems that `error` reports of `data`, each once; unknown keys first, as they explain missing ones."""
     found = dict.fromkeys(_problem(detail, data) for detail in error.errors(include_url=False))
-    return sorted(found, key=lambda problem: not problem.unknown_key)
+    return sorted(found, key=lambda problem: problem.unknown is None)
 
 
 def _problem(detail: ErrorDetails, data: Any) -> Problem:
     kind, value, context = detail["type"], detail["input"], detail.get("ctx", {})
     location = _location(detail["loc"], data)
     if kind == "extra_forbidden":
-        return Problem(format_location(location), _unknown_key(location, detail["loc"]), unknown_key=True)
+        return Problem(format_location(location), "unknown key", unknown=detail["loc"])
     if kind == "located":
         return Problem(_join(format_location(location), context["key"]), context["message"])
     if kind.startswith("union_tag"):
-        return _wrong_type(location, value, context)
+        return _wrong_type(location, value, detail["loc"])
     if kind == "missing" and isinstance(location[-1], str):
         return Problem(format_location(location), "missing; it has no default")
     if kind in ("missing", "too_short", "too_long"):  # `missing`: an entry of a pair
@@ -82,7 +89,7 @@ def _location(loc: tuple[int | str, ...], data: Any) -> Location:
     """pydantic's location without what is not in the file: tags of unions, the index into a list that we made."""
     location: list[str | int] = []
     for part in loc:
-        if _is_tag(part) or part == "[key]" or (isinstance(part, int) and isinstance(data, str)):
+        if _is_tag(part) or (isinstance(part, int) and isinstance(data, str)):
             continue
         location.append(str(part) if isinstance(data, dict) else part)
         try:
@@ -93,7 +100,7 @@ def _location(loc: tuple[int | str, ...], data: Any) -> Location:
 
 
 def _is_tag(part: int | str) -> bool:
-    return isinstance(part, str) and re.fullmatch(r"<.*>", part) is not None
+    return isinstance(part, str) and part.startswith(MARK)
 
 
 def _join(key: str, below: str) -> str:
@@ -116,7 +123,7 @@ def _candidates(loc: tuple[int | str, ...]) -> tuple[list[type[Section]], type[S
     chosen: type[Section] = Config
     for part in loc:
         if _is_tag(part):
-            chosen = next((s for s in union if _type_name(s) == str(part)[1:-1]), chosen)
+            chosen = next((s for s in union if _type_name(s) == str(part)[len(MARK) :]), chosen)
         elif part in chosen.model_fields:
             union = _sections(chosen.model_fields[str(part)].annotation)
             chosen = union[0] if union else chosen
@@ -127,13 +134,13 @@ def _type_name(section: type[Section]) -> str | None:
     return section.model_fields["type"].default if "type" in section.model_fields else None
 
 
-def _unknown_key(location: Location, loc: tuple[int | str, ...]) -> str:
-    key = str(location[-1])
+def _unknown_key(loc: tuple[int | str, ...]) -> str:
+    key = str(loc[-1])
     union, chosen = _candidates(loc[:-1])
     owners = [str(_type_name(section)) for section in union if key in section.model_fields]
     if owners:
         return f"not an option of {_type_name(chosen)} but of {', '.join(owners)}; remove it, or change the type"
-    here = format_location(location[:-1])
+    here = format_location(tuple(part for part in loc[:-1] if not _is_tag(part)))
     meant = _nearest(key, chosen.model_fields) or _below(chosen, here, key) or _below(Config, "", key)
     if meant:
         return f"unknown key; did you mean `{meant[0]}`?"
@@ -157,11 +164,11 @@ def _below(section: type[Section], name: str, key: str) -> list[str]:
 # --- values -----------------------------------------------------------------------------------------------------------
 
 
-def _wrong_type(location: Location, value: Any, context: dict[str, Any]) -> Problem:
+def _wrong_type(location: Location, value: Any, loc: tuple[int | str, ...]) -> Problem:
     if not isinstance(value, dict):
         return Problem(format_location(location), _but_is("must be a mapping such as {type: NAME}", value))
     given = value.get("type")
-    known = re.findall(r"<(\w+)>", context.get("expected_tags", ""))
+    known = [str(_type_name(section)) for section in _candidates(loc)[0]]
     return Problem(format_location((*location, "type")), _but_is("must be " + _one_of(known, given), given))
 
 

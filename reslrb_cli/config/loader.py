@@ -10,9 +10,11 @@ from pydantic import ValidationError
 
 from ..errors import ConfigError
 from .errors import Problem, problems
-from .overrides import apply, parse_override
+from .files import read_file
+from .limits import CONFIG_BYTES, NODES, OVERRIDES, OVERRIDES_LENGTH
+from .overrides import Override, apply, parse_override
 from .schema import Config
-from .text import parse, write
+from .text import count_values, parse, write
 
 
 def load(path: Path | str, overrides: Sequence[str] = ()) -> Config:
@@ -26,12 +28,18 @@ def load(path: Path | str, overrides: Sequence[str] = ()) -> Config:
 def loads(text: str, path: Path | str, overrides: Sequence[str] = ()) -> Config:
     """The same from the text of a file; `path` names it, and paths in it are relative to where that is."""
     source = str(path)
+    if len(overrides) > OVERRIDES:
+        raise ConfigError("--set", "", f"is given {len(overrides)} times; more than {OVERRIDES} belong in a file")
+    if sum(map(len, overrides)) > OVERRIDES_LENGTH:
+        raise ConfigError("--set", "", f"holds more than {OVERRIDES_LENGTH} characters; so many belong in a file")
     parsed = [parse_override(override) for override in overrides]
     data = parse(text, source)
     if data is None and not parsed:
         raise ConfigError(source, "", "is empty; it needs at least scene, target and parameters")
     if not isinstance(data, dict) and data is not None:
         raise ConfigError(source, "", "must hold sections (scene: ...) at its top level, not a list or a single value")
+    if sum(count_values(value, NODES + 1) for value in (data, *(override.value for override in parsed))) > NODES:
+        raise ConfigError(source, "", f"holds more than {NODES} values, together with what --set puts in")
     stages: list[dict[str, Any]] = [data or {}]
     for override in parsed:
         stages.append(apply(stages[-1], override))
@@ -39,14 +47,25 @@ def loads(text: str, path: Path | str, overrides: Sequence[str] = ()) -> Config:
     config, found = _validate(stages[-1], Path(path))
     if config is not None:
         return config
-    # The last override without which the first problem is not there is to blame; without any, the file is.
-    blame = source
-    for stage, override in reversed(list(zip(stages, parsed, strict=False))):
-        if found[0] not in _validate(stage, Path(path))[1]:
-            blame = override.label
-            break
     more = f" (and {len(found) - 1} more)" if len(found) > 1 else ""
-    raise ConfigError(blame, found[0].key, found[0].message + more)
+    raise ConfigError(_blame(stages, parsed, found[0], Path(path)), found[0].key, found[0].explain() + more)
+
+
+def _blame(stages: list[dict[str, Any]], overrides: list[Override], problem: Problem, path: Path) -> str:
+    """Who made `problem`: an override without which it is not there yet, and with which it is; else the file.
+
+    `stages` hold the file's settings, and those after each override. Found by halving: a check takes time.
+    """
+    without, having = 0, len(stages) - 1
+    if having == 0 or problem in _validate(stages[0], path)[1]:
+        return str(path)
+    while having - without > 1:
+        middle = (without + having) // 2
+        if problem in _validate(stages[middle], path)[1]:
+            having = middle
+        else:
+            without = middle
+    return overrides[without].label
 
 
 def with_integrator(config: Config, values: dict[str, Any], blame: str, adjoint: dict[str, Any]) -> Config:
@@ -61,7 +80,7 @@ def with_integrator(config: Config, values: dict[str, Any], blame: str, adjoint:
     data["run"] |= adjoint
     changed, found = _validate(data, config.source)
     if changed is None:
-        raise ConfigError(blame, found[0].key, found[0].message)
+        raise ConfigError(blame, found[0].key, found[0].explain())
     return changed
 
 
@@ -81,15 +100,9 @@ def _plain(value: Any) -> Any:
 def read_text(path: Path, source: str) -> str:
     """The text of a configuration file, which `source` names in errors. Raises ConfigError where it is none."""
     try:
-        return path.read_bytes().decode("utf-8-sig")
+        return read_file(path, CONFIG_BYTES).decode("utf-8-sig")
     except UnicodeDecodeError:
         raise ConfigError(source, "", "is not UTF-8 text; a configuration is a YAML file") from None
-    except FileNotFoundError:
-        raise ConfigError(source, "", "no such file") from None
-    except IsADirectoryError:
-        raise ConfigError(source, "", "is a folder; name the YAML file in it") from None
-    except (OSError, ValueError) as error:  # ValueError: a null character in the path
-        raise ConfigError(source, "", f"cannot be read: {getattr(error, 'strerror', None) or error}") from None
 
 
 def _validate(raw: dict[str, Any], path: Path) -> tuple[Config | None, list[Problem]]:
@@ -98,7 +111,7 @@ def _validate(raw: dict[str, Any], path: Path) -> tuple[Config | None, list[Prob
     data = {key: value for key, value in raw.items() if value is not None or key not in Config.model_fields}
     run = data.setdefault("run", {})
     if isinstance(run, dict) and run.get("name") is None:
-        data["run"] = {**run, "name": path.stem}
+        data["run"] = {**run, "name": path.stem.encode(errors="replace").decode()}  # bytes that are no UTF-8 as `?`
     try:
         config = Config.model_validate(
             data, context={"folder": path.absolute().parent, "working_directory": Path.cwd()}

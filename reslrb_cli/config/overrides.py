@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import copy
 import re
-import textwrap
+import shlex
 from dataclasses import dataclass
 from typing import Any
 
-from ..errors import ConfigError
-from .text import Location, format_location, parse
+from ..errors import ConfigError, one_line
+from .limits import DEPTH
+from .text import UNFIT, Location, format_location, parse
 
 #: Mappings whose keys are the user's own and may hold dots: what follows their name is one key.
 FREE_MAPPINGS: tuple[Location, ...] = (("scene", "options"), ("target", "render", "parameters"))
@@ -28,24 +28,33 @@ class Override:
 
 def parse_override(text: str) -> Override:
     """An override from `a.b=value`. Raises ConfigError where `text` is none."""
-    label = "--set " + textwrap.shorten(text, 100, placeholder="...")
+    label = "--set " + one_line(text, 100)
     path, equals, value = text.partition("=")
     path = path.strip()
     if not equals or not path:
         raise ConfigError(label, "", "must be KEY=VALUE, such as run.spp=32")
-    return Override(label, _parse_location(path, label), parse(value, label, name_line=False))
+    location = _parse_location(path, label)
+
+    def in_shell(mended: str) -> str:
+        return f"--set {shlex.quote(f'{path}={mended}')}"
+
+    return Override(label, location, parse(value, label, name_line=False, example=in_shell))
 
 
 def _parse_location(path: str, label: str) -> Location:
+    if UNFIT.search(path):
+        raise ConfigError(label, "", "a key must not hold control characters, or bytes that are not UTF-8")
     location: list[str | int] = []
     position = 0
     while position < len(path):
         match = _PART.match(path, position)
         if match is None:
-            raise ConfigError(label, "", f"`{path}` is no key; write it as in parameters[0].bounds")
+            raise ConfigError(label, "", f"`{one_line(path, 100)}` is no key; write it as in parameters[0].bounds")
         index, name = match.groups()
         location.append(int(index[:9]) if index else name)
         position = match.end()
+        if len(location) > DEPTH:
+            raise ConfigError(label, "", f"leads deeper than {DEPTH} levels; no setting lies there")
         if tuple(location) in FREE_MAPPINGS and path[position : position + 1] == "." and path[position + 1 :]:
             return (*location, path[position + 1 :])
     return tuple(location)
@@ -54,9 +63,10 @@ def _parse_location(path: str, label: str) -> Location:
 def apply(data: dict[str, Any], override: Override) -> dict[str, Any]:
     """A copy of `data` with the override's value in its place; sections on the way are made.
 
-    Raises ConfigError where the place cannot be: an index out of range, a key below a value that has none.
+    What is not on the way is shared with `data`. Raises ConfigError where the place cannot be: an index out of range, a
+    key below a value that has none.
     """
-    result = copy.deepcopy(data)
+    result = dict(data)
     at: Any = result
     for i, part in enumerate(override.location):
         here = override.location[:i]
@@ -67,6 +77,8 @@ def apply(data: dict[str, Any], override: Override) -> dict[str, Any]:
             value = at[part] if (part in at if isinstance(at, dict) else part < len(at)) else None
             if value is None:
                 value = [] if isinstance(override.location[i + 1], int) else {}
+            elif isinstance(value, (dict, list)):
+                value = value.copy()
         if isinstance(at, list) and part == len(at):
             at.append(value)
         else:
@@ -83,7 +95,8 @@ def _check_part(at: Any, part: str | int, here: Location, override: Override) ->
         if not isinstance(part, int):
             raise ConfigError(override.label, name, f"is a list; name an entry, such as {name}[0]")
         if part > len(at):
-            raise ConfigError(override.label, name, f"has {len(at)} entries; there is no [{part}]")
+            has = "1 entry" if len(at) == 1 else f"{len(at)} entries"
+            raise ConfigError(override.label, name, f"has {has}; there is no [{part}]")
         return part
     if not isinstance(at, dict):
         raise ConfigError(override.label, name, "is a single value; replace it as a whole")

@@ -51,13 +51,15 @@ _HEAD = """\
 
 One YAML file is one experiment. Unknown keys are errors. Paths are relative to the file they stand in, except
 `run.output`, which is relative to the working directory. The file is read as YAML 1.2: `1e-3` is a number, `yes` and
-`no` are text.
+`no` are text, and text that begins with `*`, `&`, `!`, `%`, `@` or a brace wants quotes: `key: "*.data"`. A file has at
+most 256 KiB and 20,000 values, aliases spelt out. What it names is read where it is a regular file.
 [config.schema.json](config.schema.json) is the same as JSON Schema, for editors.
 
 On the command line `--set KEY=VALUE` changes a value; VALUE is YAML too, and later ones win:
 
     --set run.spp=64 --set parameters[0].bounds=[0,1] --set 'integrator={type: prb}'
     --set target.render.parameters.floor.reflectance.value=[0.2,0.4,0.6]
+    --set 'parameters[0].key="*.reflectance.data"'
 
 Below `scene.options` and `target.render.parameters` the rest of KEY is one name, dots and all. To change a section's
 `type` where it holds options that the new type does not have, replace the section as a whole.

@@ -6,7 +6,6 @@ Units, defaults and meanings stand in the fields' descriptions; `reference.py` w
 from __future__ import annotations
 
 import math
-import re
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -15,7 +14,6 @@ from pydantic import (
     Field,
     PrivateAttr,
     SerializerFunctionWrapHandler,
-    Tag,
     WithJsonSchema,
     field_validator,
     model_serializer,
@@ -23,8 +21,10 @@ from pydantic import (
 )
 from typing_extensions import Self
 
-from .base import ConfigPath, Count, Positive, Section, Seed, WorkPath, by_kind, located, wrong
+from .base import ConfigPath, Count, Positive, Section, Seed, WorkPath, by_kind, located, mark, wrong
 from .choices import L2, Adam, AnyIntegrator, AnyLoss, AnyOptimizer, Integrator, Reslrb
+from .limits import KEY_LENGTH, PIXELS
+from .names import check_name, folder_name
 from .sizes import Memory, memory_bytes
 
 ColorSpace = Literal["auto", "linear", "srgb"]
@@ -51,15 +51,15 @@ class ImageFile(Section):
 _Numbers = Annotated[list[float], Field(min_length=1)]
 #: A value for a scene parameter: one number, a list such as [r, g, b], or an image file.
 Value = Annotated[
-    Annotated[float, Tag("<number>")] | Annotated[_Numbers, Tag("<list>")] | Annotated[ImageFile, Tag("<mapping>")],
+    Annotated[float, mark("number")] | Annotated[_Numbers, mark("list")] | Annotated[ImageFile, mark("mapping")],
     by_kind("a number, a list of numbers, or {file: IMAGE}"),
 ]
 #: The same, or "scene": the value that the scene file gives.
 Initial = Annotated[
-    Annotated[float, Tag("<number>")]
-    | Annotated[_Numbers, Tag("<list>")]
-    | Annotated[ImageFile, Tag("<mapping>")]
-    | Annotated[Literal["scene"], Tag("<text>")],
+    Annotated[float, mark("number")]
+    | Annotated[_Numbers, mark("list")]
+    | Annotated[ImageFile, mark("mapping")]
+    | Annotated[Literal["scene"], mark("text")],
     by_kind("a number, a list of numbers, {file: IMAGE}, or `scene`", "scene"),
 ]
 
@@ -77,8 +77,8 @@ class SceneConfig(Section):
         "in place of warning of it.",
     )
     sensors: Annotated[
-        Annotated[Annotated[list[Annotated[int, Field(ge=0)]], Field(min_length=1)], Tag("<list>")]
-        | Annotated[Literal["all"], Tag("<text>")],
+        Annotated[Annotated[list[Annotated[int, Field(ge=0)]], Field(min_length=1)], mark("list")]
+        | Annotated[Literal["all"], mark("text")],
         by_kind("a list of sensor indices, or `all`", "all"),
     ] = Field(default=[0], description="Indices of the scene's sensors that are used, or `all`.")
 
@@ -103,6 +103,13 @@ class Rendering(Section):
     integrator: AnyIntegrator | None = Field(
         default=None, description="Integrator of the target; null: that of the run."
     )
+
+    @field_validator("parameters")
+    @classmethod
+    def _check_keys(cls, value: dict[str, Any]) -> dict[str, Any]:
+        if not all(0 < len(key) <= KEY_LENGTH for key in value):
+            raise wrong(f"must have keys that are not empty, and have at most {KEY_LENGTH} characters")
+        return value
 
 
 _PATH = {"type": "string", "format": "path"}
@@ -150,6 +157,7 @@ class ParameterSpec(Section):
 
     key: str = Field(
         min_length=1,
+        max_length=KEY_LENGTH,
         description="Key as `reslrb inspect` lists it: the names of `mi.traverse`, in which an object without an id "
         "goes by its kind and number in the scene file, such as `Sphere_3`. Or a glob such as `*.reflectance.data`.",
     )
@@ -184,6 +192,13 @@ class ParameterSpec(Section):
             raise wrong(f"must be [low, high] with low < high, not [{value[0]:g}, {value[1]:g}]")
         return value
 
+    @field_validator("resolution")
+    @classmethod
+    def _check_resolution(cls, value: tuple[int, int] | None) -> tuple[int, int] | None:
+        if value is not None and value[0] * value[1] > PIXELS:
+            raise wrong(f"must have at most {PIXELS} texels, not {value[0] * value[1]}")
+        return value
+
     @model_validator(mode="after")
     def _check_transform(self) -> Self:
         low, high = self.bounds or (-math.inf, math.inf)
@@ -215,7 +230,8 @@ class RunConfig(Section):
     name: str = Field(
         default="run",
         min_length=1,
-        description="Name of the run and of its folder; left out: the config file's name without its suffix.",
+        description="Name of the run and of its folder, not a path, of at most 200 bytes; left out: the config file's "
+        "name without its suffix.",
         json_schema_extra=_without_default,
     )
     output: WorkPath = Field(
@@ -271,9 +287,7 @@ class RunConfig(Section):
     @field_validator("name")
     @classmethod
     def _check_name(cls, value: str) -> str:
-        if not _folder_name(value):
-            raise wrong("must hold a letter or a digit")
-        return value
+        return check_name(value)
 
     @model_serializer(mode="wrap")
     def _without_unused(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
@@ -290,11 +304,7 @@ class RunConfig(Section):
     @property
     def folder_name(self) -> str:
         """The run's name as the name of a folder: what is no letter, digit, `.`, `_`, `+`, `=` becomes `-`."""
-        return _folder_name(self.name)
-
-
-def _folder_name(name: str) -> str:
-    return re.sub(r"[^\w.+=]+", "-", name).strip("-.")
+        return folder_name(self.name)
 
 
 class Config(Section):
@@ -345,11 +355,13 @@ class Config(Section):
     def _check_together(self) -> Self:
         sensors, files = self.scene.sensors, self.target.file
         if files is not None and sensors != "all" and len(files) != len(sensors):
-            raise located("target.file", f"names {len(files)} images for {len(sensors)} sensors; give one for each")
-        keys = [spec.key for spec in self.parameters]
-        for i, key in enumerate(keys):
-            if key in keys[:i]:
-                raise located(f"parameters[{i}].key", f"`{key}` stands in parameters[{keys.index(key)}] already")
+            raise located(
+                "target.file", f"must name one image for each sensor; images: {len(files)}, sensors: {len(sensors)}"
+            )
+        places: dict[str, int] = {}
+        for i, spec in enumerate(self.parameters):
+            if places.setdefault(spec.key, i) < i:
+                raise located(f"parameters[{i}].key", f"`{spec.key}` stands in parameters[{places[spec.key]}] already")
         _check_passes(self.integrator, self.run.spp, "integrator", "run.spp")
         for option in sorted({"batches", "first_batch"} & self.run.model_fields_set):
             if self.run.adjoint not in ("auto", "batched"):

@@ -25,7 +25,7 @@ def memory_bytes(value: int | float | str) -> int:
         if match:
             number, unit = float(match[1]), match[2].lower()
     elif not isinstance(value, bool):
-        number = float(value)
+        number = float(value) if abs(value) < 2**63 else float("inf")  # longer integers fit into no float
     if unit not in _UNITS or not 1 <= number * _UNITS[unit] < 2**63:
         raise ValueError(f"{value!r} is no amount of memory")
     return int(number * _UNITS[unit])

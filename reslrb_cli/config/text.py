@@ -1,7 +1,4 @@
-"""YAML to plain data and back, by the rules of YAML 1.2.
-
-PyYAML alone reads YAML 1.1, where `1e-3` is text, `no` is false, `010` is 8 and `1:30` is 90.
-"""
+"""YAML to plain data and back, by the rules of YAML 1.2."""
 
 from __future__ import annotations
 
@@ -12,8 +9,14 @@ from typing import Any
 import yaml
 
 from ..errors import ConfigError
+from .yaml_loader import DIGITS, FLOAT, INTEGER, TEXT_TAGS, Loader
 
 Location = tuple["str | int", ...]
+
+#: What no key holds: control characters, and halves of surrogate pairs.
+UNFIT = re.compile(r"[\x00-\x1f\x7f-\x9f\ud800-\udfff]")
+#: What an alias begins with, up to where YAML or a reader would take it to end.
+_ALIAS = re.compile(r"\*[^\s,\]}]*")
 
 
 def format_location(location: Location) -> str:
@@ -27,93 +30,89 @@ def format_location(location: Location) -> str:
     return text
 
 
-class _Loader(yaml.SafeLoader):
-    yaml_implicit_resolvers: dict[str, list[Any]] = {}  # noqa: RUF012 (PyYAML's own convention)
-
-
-_FLOAT = re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?$|[-+]?\.(inf|Inf|INF)$|\.(nan|NaN|NAN)$")
-_INT = re.compile(r"[-+]?[0-9]+$|0o[0-7]+$|0x[0-9a-fA-F]+$")
-_DIGITS = list("-+.0123456789")
-_Loader.add_implicit_resolver("tag:yaml.org,2002:null", re.compile(r"(~|null|Null|NULL)?$"), ["~", "n", "N", ""])
-_Loader.add_implicit_resolver(
-    "tag:yaml.org,2002:bool", re.compile(r"(true|True|TRUE|false|False|FALSE)$"), list("tTfF")
-)
-_Loader.add_implicit_resolver("tag:yaml.org,2002:int", _INT, _DIGITS)
-_Loader.add_implicit_resolver("tag:yaml.org,2002:float", _FLOAT, _DIGITS)
-_Loader.add_implicit_resolver("tag:yaml.org,2002:merge", re.compile(r"<<$"), ["<"])
-
-
-def _construct_int(loader: _Loader, node: yaml.ScalarNode) -> int:
-    text = loader.construct_scalar(node)
-    try:
-        return int(text, {"0o": 8, "0x": 16}.get(text[:2], 10))
-    except ValueError:
-        raise yaml.constructor.ConstructorError(None, None, "not an integer or too long", node.start_mark) from None
-
-
-def _construct_float(loader: _Loader, node: yaml.ScalarNode) -> float:
-    text = loader.construct_scalar(node).lower()
-    try:
-        return float(text.replace(".inf", "inf").replace(".nan", "nan"))
-    except ValueError:
-        raise yaml.constructor.ConstructorError(None, None, "not a number", node.start_mark) from None
-
-
-_Loader.add_constructor("tag:yaml.org,2002:int", _construct_int)
-_Loader.add_constructor("tag:yaml.org,2002:float", _construct_float)
-
-
-def parse(text: str, source: str, name_line: bool = True) -> Any:
+def parse(text: str, source: str, name_line: bool = True, example: Callable[[str], str] | None = None) -> Any:
     """Plain data from YAML `text`; `source` names it in errors, with the line where `name_line` says so.
 
-    Raises ConfigError where the text is not YAML, holds a tag that is not plain data, or gives a key twice.
+    The keys of all mappings are text without control characters. `example` shows how a mended text is to be written
+    where it came from. Raises ConfigError where the text is not YAML, holds a tag that is not plain data, a key twice,
+    or one that is no text; where it is too deep, and where it holds more than NODES values.
     """
 
     def at(line: int) -> str:
-        return f"{source}:{line}" if name_line else source
+        return f"{source}:{line}" if name_line and line else source
 
     try:
-        loader = _Loader(text)
+        loader = Loader(text, at)
         try:
             node = loader.get_single_node()
             if node is None:
                 return None
-            _check_duplicates(node, at, (), set())
+            _check_keys(node, at, (), set())
             return loader.construct_document(node)
         finally:
             loader.dispose()
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         place = source if mark is None else at(mark.line + 1)
-        problem = ", ".join(part for part in (error.context, error.problem) if part)
-        raise ConfigError(place, "", f"not valid YAML: {problem}") from None
+        raise ConfigError(place, "", _problem(error, text, example)) from None
     except yaml.reader.ReaderError as error:
         line = text.count("\n", 0, error.position) + 1
-        raise ConfigError(at(line), "", "not valid YAML: holds a control character") from None
-    except (ValueError, KeyError, AttributeError, TypeError):  # PyYAML on `!!bool x`, `!!timestamp x`
+        reason = "holds a control character, or bytes that are not UTF-8"
+        raise ConfigError(at(line), "", f"not valid YAML: {reason}") from None
+    except (ValueError, KeyError, AttributeError, TypeError):  # PyYAML on `!!bool x`
         raise ConfigError(source, "", "not valid YAML: a value contradicts its explicit !! tag") from None
-    except RecursionError:
-        raise ConfigError(source, "", "nested too deeply") from None
 
 
-def _check_duplicates(node: yaml.Node, at: Callable[[int], str], location: Location, seen: set[int]) -> None:
-    if id(node) in seen:  # an alias, which may point to where it stands
+def _problem(error: yaml.MarkedYAMLError, text: str, example: Callable[[str], str] | None) -> str:
+    """What is wrong, in a line; where it is text that wants quotes, with the quotes."""
+    problem = ", ".join(part for part in (error.context, error.problem) if part)
+    mark = error.context_mark or error.problem_mark
+    word = None if mark is None else _ALIAS.match(text, mark.index)
+    if word is not None and "alias" in problem:
+        quoted = f'"{word[0]}"'
+        mended = quoted if example is None else example(text[: word.start()] + quoted + text[word.end() :])
+        return f"{word[0]} is an alias in YAML, and names nothing here; text that begins with * wants quotes: {mended}"
+    hint = "; put text that begins with it in quotes" if "cannot start any token" in problem else ""
+    return f"not valid YAML: {problem}{hint}"
+
+
+def count_values(data: Any, most: int) -> int:
+    """How many values and keys plain `data` holds, where the same list stands twice counted twice; at most `most`."""
+    count, waiting = 0, [data]
+    while waiting and count < most:
+        value = waiting.pop()
+        count += 1
+        if isinstance(value, dict):
+            count += len(value)
+            waiting += value.values()
+        elif isinstance(value, list):
+            waiting += value
+    return min(count, most)
+
+
+def _check_keys(node: yaml.Node, at: Callable[[int], str], location: Location, seen: set[int]) -> None:
+    """Raise where a key is no text, or stands twice in its mapping."""
+    if id(node) in seen:  # an alias
         return
     seen.add(id(node))
     if isinstance(node, yaml.SequenceNode):
         for i, child in enumerate(node.value):
-            _check_duplicates(child, at, (*location, i), seen)
+            _check_keys(child, at, (*location, i), seen)
     elif isinstance(node, yaml.MappingNode):
-        lines: dict[tuple[str, str], int] = {}
+        lines: dict[str, int] = {}
         for key, child in node.value:
-            line = key.start_mark.line + 1
-            if isinstance(key, yaml.ScalarNode):
-                here = (*location, str(key.value))
-                first = lines.get((key.tag, key.value))
-                if first is not None:
-                    raise ConfigError(at(line), format_location(here), f"given twice, first in line {first}")
-                lines[key.tag, key.value] = line
-                _check_duplicates(child, at, here, seen)
+            source = at(key.start_mark.line + 1)
+            if not isinstance(key, yaml.ScalarNode):
+                raise ConfigError(source, format_location(location), "has a key that is a list or a mapping, not text")
+            here = (*location, key.value)
+            if key.tag not in TEXT_TAGS:
+                raise ConfigError(source, format_location(here), "a key must be text; put it in quotes")
+            if UNFIT.search(key.value):
+                raise ConfigError(source, format_location(here), "a key must not hold control characters")
+            if key.value in lines:
+                raise ConfigError(source, format_location(here), f"given twice, first in line {lines[key.value]}")
+            lines[key.value] = key.start_mark.line + 1
+            _check_keys(child, at, here, seen)
 
 
 class _Dumper(yaml.SafeDumper):
@@ -128,8 +127,8 @@ def _represent_list(dumper: _Dumper, data: list[Any]) -> yaml.SequenceNode:
     return dumper.represent_sequence("tag:yaml.org,2002:seq", data, flow_style=short)
 
 
-_Dumper.add_implicit_resolver("tag:yaml.org,2002:float", _FLOAT, _DIGITS)
-_Dumper.add_implicit_resolver("tag:yaml.org,2002:int", _INT, _DIGITS)
+_Dumper.add_implicit_resolver("tag:yaml.org,2002:float", FLOAT, DIGITS)
+_Dumper.add_implicit_resolver("tag:yaml.org,2002:int", INTEGER, DIGITS)
 _Dumper.add_representer(list, _represent_list)
 
 

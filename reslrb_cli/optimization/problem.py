@@ -168,13 +168,16 @@ def load_for_rendering(config: Config, initial: bool) -> tuple[Any, list[int], A
 def assemble_scene(config: Config, scene: Any = None, values: Mapping[str, Array] | None = None) -> Problem:
     """Load and check what `config` names, targets left out.
 
-    `scene` is used in place of `scene.file`, `values` in place of the parameters' initial ones.
+    `scene` is used in place of `scene.file`, `values` in place of the parameters' initial ones. Raises ValueError where
+    these are not one finite array for each parameter, of its shape.
     """
     scene = load_configured(config) if scene is None else scene
     sensors = choose_sensors(config, scene)
     _check_supported(config, config.integrator.type, config.integrator.hide_emitters, scene, sensors)
     selection = select_parameters(scene, config.parameters, config.source)
-    selection.set_arrays(values or {})
+    if values is not None:
+        _check_values(selection, values)
+        selection.set_arrays(values)
     specs = {key: selection.spec(key) for key in selection.keys}
     optimizer = Optimizer(
         config.optimizer.type,
@@ -198,6 +201,18 @@ def assemble_scene(config: Config, scene: Any = None, values: Mapping[str, Array
     )
     problem.apply()
     return problem
+
+
+def _check_values(selection: Selection, values: Mapping[str, Array]) -> None:
+    foreign = sorted(set(values) ^ set(selection.keys))
+    if foreign:
+        raise ValueError(f"it {'has' if foreign[0] in values else 'lacks'} `{foreign[0]}`")
+    for key, value in values.items():
+        shape = selection.array(key).shape
+        if value.shape != shape or value.dtype.kind != "f":
+            raise ValueError(f"`{key}` is {value.dtype} of shape {value.shape}, not numbers of shape {shape}")
+        if not np.isfinite(value).all():
+            raise ValueError(f"`{key}` holds a value that is not finite")
 
 
 def choose_sensors(config: Config, scene: Any) -> list[int]:
@@ -233,7 +248,11 @@ def read_target(config: Config, problem: Problem, index: int) -> Array:
     assert files is not None, "called for target files only"
     key = "target.file" if len(files) == 1 else f"target.file[{index}]"
     if len(files) != len(problem.sensors):
-        raise ConfigError(config.source, "target.file", f"names {len(files)} images for {len(problem.sensors)} sensors")
+        raise ConfigError(
+            config.source,
+            "target.file",
+            f"must name one image for each sensor; images: {len(files)}, sensors: {len(problem.sensors)}",
+        )
     width, height = problem.scene.sensors()[problem.sensors[index]].film().crop_size()
     try:
         return read_image(files[index], config.target.color_space, (int(width), int(height)))
@@ -243,12 +262,17 @@ def read_target(config: Config, problem: Problem, index: int) -> Array:
 
 def _target(problem: Problem, image: Array, sensor: int) -> Any:
     """`image` as a tensor with as many channels as the film of `sensor` has without its alpha."""
-    colors = 1 if int(problem.scene.sensors()[sensor].film().base_channels_count()) <= 2 else 3
+    colors = color_channels(problem.scene.sensors()[sensor].film())
     if colors == 1 and image.shape[2] >= 3:
         image = image[:, :, :3] @ LUMINANCE[:, None]
     target = mi.TensorXf(np.ascontiguousarray(image[:, :, :colors], dtype=np.float32))
     dr.make_opaque(target)
     return target
+
+
+def color_channels(film: mi.Film) -> int:
+    """How many channels an image of `film` has without alpha."""
+    return 1 if int(film.base_channels_count()) <= 2 else 3
 
 
 def _check_supported(config: Config, type: str, hide_emitters: bool, scene: Any, sensors: list[int]) -> None:

@@ -5,12 +5,16 @@
 
 from __future__ import annotations
 
+import os
+import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from reslrb_cli.config.files import open_file
+from reslrb_cli.errors import ConfigError
 from reslrb_cli.records.atomic import write_atomically
 
 FILE_NAME = "state.npz"
@@ -41,11 +45,22 @@ def save_nonfinite(folder: Path, iteration: int, parameters: Mapping[str, np.nda
 
 
 def load_nonfinite(folder: Path) -> tuple[int, dict[str, np.ndarray[Any, Any]]] | None:
-    """What `save_nonfinite` wrote into `folder`, iteration and parameters; None where there is nothing."""
+    """What `save_nonfinite` wrote into `folder`, iteration and parameters; None where there is nothing.
+
+    Raises ConfigError, located in the file, where it cannot be read, is damaged, or is nothing that a run wrote.
+    """
+    path = folder / NONFINITE_FILE_NAME
+    if not os.path.lexists(path):
+        return None
     try:
-        with np.load(folder / NONFINITE_FILE_NAME) as arrays:
+        with open_file(path) as file, np.load(file, allow_pickle=False) as arrays:
+            if any(entry.compress_type != zipfile.ZIP_STORED for entry in arrays.zip.infolist()):
+                raise ValueError("compressed, which no run writes, and small files may so stand for large arrays")
             names = [name for name in arrays.files if name.startswith("parameter/")]
             parameters = {name.removeprefix("parameter/"): arrays[name] for name in names}
             return int(arrays["iteration"]), parameters
-    except FileNotFoundError:
-        return None
+    except ConfigError:
+        raise
+    except Exception as error:  # of many kinds, from the readers of archives, arrays and their heads
+        reason = str(error) or type(error).__name__
+        raise ConfigError(path, "", f"is damaged, cut off, or not written by a run ({reason})") from None

@@ -13,10 +13,14 @@ from pathlib import Path
 from typing import Any
 
 from reslrb_cli import __version__
+from reslrb_cli.config.files import read_file
+from reslrb_cli.errors import ConfigError, printable
 from reslrb_cli.records.atomic import write_atomically
 
 FILE_NAME = "manifest.json"
 PROGRAM = "reslrb"
+#: Bytes of a manifest; the largest part of one is a pilot's table, of some kB.
+MOST_BYTES = 2**24
 PACKAGES = ("mitsuba", "drjit", "numpy")
 
 
@@ -60,7 +64,7 @@ class Manifest:
     seed: int
     config: str
     status: Status = Status.RUNNING
-    command_line: list[str] = field(default_factory=lambda: list(sys.argv))
+    command_line: list[str] = field(default_factory=lambda: [printable(word) for word in sys.argv])
     versions: dict[str, str] = field(default_factory=versions)
     platform: str = field(default_factory=platform.platform)
     started: str = field(default_factory=now)
@@ -85,7 +89,7 @@ class Manifest:
 def read_manifest(folder: Path) -> dict[str, Any] | None:
     """Return the manifest in `folder`, or None where there is none that `reslrb` wrote."""
     try:
-        content = json.loads((folder / FILE_NAME).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+        content = json.loads(read_file(folder / FILE_NAME, MOST_BYTES))
+    except (ConfigError, ValueError, RecursionError):
         return None
     return content if isinstance(content, dict) and content.get("program") == PROGRAM else None

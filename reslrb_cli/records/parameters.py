@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -12,14 +11,10 @@ import mitsuba as mi
 import numpy as np
 
 from reslrb_cli.records.atomic import write_atomically
+from reslrb_cli.records.file_names import file_stem
 from reslrb_cli.records.images import write_image
 
 Array = np.ndarray[Any, Any]
-
-
-def file_stem(key: str) -> str:
-    """A file name for the parameter `key`: the key, with what file systems mind replaced by `_`."""
-    return re.sub(r"[^\w.\-]", "_", key)
 
 
 def write_parameters(folder: Path, values: Mapping[str, Array]) -> None:

@@ -44,7 +44,7 @@ def plot_bench(series: Sequence[tuple[str, Sequence[BenchRecord]]], path: Path, 
         crosses = " or ".join(words[end] for end in sorted(ends))
         memory_axis.set_title(f"×: {crosses}", fontsize="small", loc="left")
     time_axis.legend(fontsize="small")
-    figure.suptitle(title, fontsize="medium")
+    figure.suptitle(title, fontsize="medium", parse_math=False)  # a path may hold a $
     figure.savefig(path, format="png", dpi=150)
 
 

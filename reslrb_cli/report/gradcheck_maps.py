@@ -8,6 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from reslrb_cli.errors import one_line
+from reslrb_cli.records.file_names import bounded
 from reslrb_cli.records.gradcheck import GradcheckRecord
 from reslrb_cli.report.gradcheck_table import integrator_name, reference_name
 
@@ -39,7 +41,8 @@ def plot_maps(record: GradcheckRecord, gradient: np.ndarray, reference: np.ndarr
         axis.set_title(title, fontsize=9)
         axis.tick_params(labelsize=7)
         figure.colorbar(shown, ax=axis, extend="both").ax.tick_params(labelsize=7)
-    figure.suptitle(f"{record.parameter}, sum over channels, {record.seeds} seeds: {record.verdict.value}", fontsize=10)
+    title = f"{record.parameter}, sum over channels, {record.seeds} seeds: {record.verdict.value}"
+    figure.suptitle(one_line(title, 150), fontsize=10, parse_math=False)  # a key may hold a $
     path = folder / f"{map_name(record)}.png"
     figure.savefig(path, dpi=110)
     return path
@@ -48,4 +51,4 @@ def plot_maps(record: GradcheckRecord, gradient: np.ndarray, reference: np.ndarr
 def map_name(record: GradcheckRecord) -> str:
     """Name of a record's file, without its suffix."""
     parts = (record.parameter, record.integrator, record.estimator, record.reference.value)
-    return "-".join(re.sub(r"[^\w.=]+", "_", part).strip("_") for part in parts if part)
+    return bounded("-".join(re.sub(r"[^\w.=]+", "_", part).strip("_") for part in parts if part))

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 
+from reslrb_cli.errors import printable
+
 #: What stands in place of the middle of a shortened key.
 ELLIPSIS = "..."
 
@@ -41,11 +43,6 @@ def duration(seconds: float) -> str:
 def count(amount: int, what: str) -> str:
     """An amount of things whose plural ends in s."""
     return f"{amount} {what}" if amount == 1 else f"{amount} {what}s"
-
-
-def printable(text: str) -> str:
-    """`text` with what is no character to show, such as a terminal's control sequences, escaped."""
-    return "".join(c if c.isprintable() else c.encode("unicode_escape", "backslashreplace").decode() for c in text)
 
 
 def shorten(text: str, width: int) -> str:

@@ -16,7 +16,7 @@ MOVING_EMITTERS = {"PointLight": "position", "SpotLight": "to_world", "Projector
 def moving_shape_obstacle(shape: mi.Shape, key: str) -> str | None:
     """Why there is no derivative of the parameter `key` of a shape; None where there is one."""
     name = key.rpartition(".")[2]
-    if shape.is_mesh():
+    if shape.is_mesh() and shape.class_name() not in MOVING_SHAPES:  # Mitsuba takes a rectangle for a mesh, too
         if name not in MOVING_MESH:
             return f"of a mesh, {' and '.join(MOVING_MESH)} have derivatives, not {name}"
         if shape.is_emitter():

@@ -9,35 +9,24 @@ import mitsuba as mi
 import numpy as np
 
 from ..errors import ConfigError
+from .image_file import read_bitmap
 
 Image = np.ndarray[Any, Any]
 
 
 def read_image(path: Path, color_space: str = "auto", size: tuple[int, int] | None = None) -> Image:
-    """Read an EXR, PNG, JPG or HDR file as linear Rec. 709: (H, W, 3) float32.
+    """Read an EXR, PNG, JPG, HDR, PFM, PPM or BMP file as linear Rec. 709: (H, W, 3) float32.
 
     `color_space` says how the file's values are encoded: `linear`, `srgb`, or `auto` (integers srgb, floats linear).
     Alpha is dropped; one channel becomes three. `size` is the (width, height) that the image must have. Raises
-    ConfigError, located in the file, where it is missing or no image, of another size, or holds a value that is
-    negative or not finite.
+    ConfigError, located in the file, where it is missing or no image, damaged, cut off, too large or of another size,
+    or holds a value that is negative or not finite.
     """
     path = Path(path)
-    try:
-        with path.open("rb"):
-            pass
-        bitmap = mi.Bitmap(str(path))
-    except IsADirectoryError:
-        raise ConfigError(path, "", "is a folder, not an image") from None
-    except OSError as error:
-        raise ConfigError(path, "", f"cannot be read: {error.strerror}") from None
-    except Exception:
-        raise ConfigError(path, "", "is not an image that can be read (EXR, PNG, JPG or HDR)") from None
-
+    bitmap = read_bitmap(path, size)
     if bitmap.pixel_format() == mi.Bitmap.PixelFormat.MultiChannel:
         raise ConfigError(path, "", f"has {bitmap.channel_count()} channels; give one with R, G, B or Y only")
     width, height = (int(n) for n in bitmap.size())
-    if size is not None and (width, height) != size:
-        raise ConfigError(path, "", f"is {width}x{height} pixels; it must be {size[0]}x{size[1]}")
 
     is_float = bitmap.component_format() in (
         mi.Struct.Type.Float16,

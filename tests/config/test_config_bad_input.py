@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import shlex
 from pathlib import Path
 
 import pytest
@@ -48,16 +50,16 @@ FILES: dict[str, tuple[str | bytes, tuple[str, ...]]] = {
     "two documents": (GOOD + "---\n" + GOOD, ("x.yaml:5: not valid YAML",)),
     "python object": ("scene: !!python/object:os.x {}", ("x.yaml:1: not valid YAML",)),
     "contradicting tag": ("variant: !!bool maybe", ("x.yaml: not valid YAML",)),
-    "deep nesting": ("[" * 20_000, ("x.yaml: nested too deeply",)),
-    "endless integer": ("variant: " + "1" * 6000, ("x.yaml:1: not valid YAML", "too long")),
-    "unhashable key": (GOOD + "? [a]\n: 1\n", ("x.yaml:5: not valid YAML",)),
+    "deep nesting": ("[" * 20_000, ("x.yaml:1: nested too deeply",)),
+    "endless integer": ("variant: " + "1" * 6000, ("x.yaml:1: the integer 1111", "more than 64 bits")),
+    "unhashable key": (GOOD + "? [a]\n: 1\n", ("x.yaml:5: has a key that is a list",)),
     "value that holds itself": (
         changed(f"\n  - {PARAMETER}", " &a [*a]"),
-        ("x.yaml: parameters[0]: must be a mapping",),
+        ("x.yaml:3: an alias", "stands in itself"),
     ),
     "duplicate key": (GOOD + "run: {spp: 1}\nrun: {spp: 2}\n", ("x.yaml:6: run: given twice", "line 5")),
     "duplicate in a list": (changed(PARAMETER, "{key: a, key: b}"), ("x.yaml:4: parameters[0].key: given twice",)),
-    "key is a number": (GOOD + "1: 2\n", ("x.yaml: 1: ", "text")),
+    "key is a number": (GOOD + "1: 2\n", ("x.yaml:5: 1: a key must be text",)),
     "unknown section": (GOOD + "optimiser: {}\n", ("x.yaml: optimiser: unknown key", "`optimizer`")),
     "unknown key": (GOOD + "run: {iteration: 3}\n", ("x.yaml: run.iteration: unknown key", "`iterations`")),
     "unknown key, none near": (GOOD + "run: {xyz: 3}\n", ("x.yaml: run.xyz: unknown key; known here: name, output",)),
@@ -147,7 +149,7 @@ FILES: dict[str, tuple[str | bytes, tuple[str, ...]]] = {
     "target file empty": (changed("{render: {}}", "{file: ''}"), ("x.yaml: target.file: must be a path",)),
     "fewer targets than sensors": (
         changed("{render: {}}", "{file: [a.exr, b.exr]}"),
-        ("x.yaml: target.file: names 2 images for 1 sensors",),
+        ("x.yaml: target.file: must name one image for each sensor; images: 2, sensors: 1",),
     ),
     "colour space of a rendered target": (
         changed("{render: {}}", "{render: {}, color_space: srgb}"),
@@ -289,8 +291,58 @@ FILES: dict[str, tuple[str | bytes, tuple[str, ...]]] = {
         GOOD + "run: {adjoint: correlate}\n",
         ("x.yaml: run.adjoint: must be one of auto, correlated, independent, batched",),
     ),
-    "name without letters": (GOOD + "run: {name: '..'}\n", ("x.yaml: run.name: must hold a letter or a digit",)),
+    "name without letters": (GOOD + "run: {name: '---'}\n", ("x.yaml: run.name: must hold a letter or a digit",)),
     "variant": (GOOD + "variant: scalar_rgb\n", ("x.yaml: variant: must be one of auto, llvm_ad_rgb",)),
+    "one image, two sensors": (
+        changed("{render: {}}", "{file: a.exr}").replace("scene.xml", "scene.xml, sensors: [0, 1]"),
+        ("x.yaml: target.file: must name one image for each sensor; images: 1, sensors: 2",),
+    ),
+    "key that looks like a tag": (GOOD + "<script>: 1\n", ("x.yaml: <script>: unknown key; known here: variant",)),
+    "key that looks like pydantic's": (GOOD + '"[key]": 1\n', ("x.yaml: [key]: unknown key; known here: variant",)),
+    "such keys in a choice": (
+        GOOD + "integrator: {<prb>: 1, '[key]': {type: 3}}\n",
+        ("x.yaml: integrator.<prb>: unknown key", "(and 1 more)"),
+    ),
+    "control character in a key": (
+        GOOD + 'run: {"\\e[31m": 1}\n',
+        (
+            "x.yaml:5: run.",
+            "must not hold control",
+        ),
+    ),
+    "half a surrogate pair": (GOOD + 'run: {name: "\\ud800"}\n', ("x.yaml:5: ", "half of a surrogate pair")),
+    "half a surrogate pair in a key": (GOOD + '"\\ud800": 1\n', ("x.yaml:5: ", "must not hold control")),
+    "a byte of a path": (changed("scene.xml", '"\\udcff.xml"'), ("x.yaml:1: ", "half of a surrogate pair")),
+    "endless hexadecimal": (GOOD + f"run: {{spp: 0x{'f' * 20_000}}}\n", ("x.yaml:5: the integer 0xff", "64 bits")),
+    "memory of 400 digits": (GOOD + f"run: {{memory_budget: {'9' * 400}}}\n", ("x.yaml:5: the integer 99", "64 bits")),
+    "tag of other data": (GOOD + "run: {name: !!binary aGFsbG8=}\n", ("x.yaml:5: not valid YAML: the tag !!binary",)),
+    "glob without quotes": (
+        changed("floor.reflectance.data", "*.data"),
+        ("x.yaml:4: *.data is an alias in YAML", 'wants quotes: "*.data"'),
+    ),
+    "long name": (GOOD + f"run: {{name: {'a' * 300}}}\n", ("x.yaml: run.name: must have at most 200 bytes", "not 300")),
+    "name of many bytes": (GOOD + f"run: {{name: {'ü' * 101}}}\n", ("x.yaml: run.name: must have", "not 202")),
+    "name that leads out": (GOOD + "run: {name: ../x}\n", ("x.yaml: run.name: must be a name and not a path",)),
+    "name that leads back": (GOOD + "run: {name: 'a/../b'}\n", ("x.yaml: run.name: must be a name and not a path",)),
+    "name from the root": (GOOD + "run: {name: /etc/x}\n", ("x.yaml: run.name: must be a name and not a path",)),
+    "name from a home": (GOOD + "run: {name: ~root/x}\n", ("x.yaml: run.name: must be a name and not a path",)),
+    "name of the folder": (GOOD + "run: {name: '..'}\n", ("x.yaml: run.name: must be a name and not a path",)),
+    "name of a drive": (GOOD + "run: {name: 'C:\\x'}\n", ("x.yaml: run.name: must be a name and not a path",)),
+    "name of a device": (GOOD + "run: {name: Aux.1}\n", ("x.yaml: run.name: must be another name: Aux.1",)),
+    "long part of a path": (changed("scene.xml", "a" * 300), ("x.yaml: scene.file: must be a path of at most",)),
+    "long path": (GOOD + f"run: {{output: {'a/' * 2000}}}\n", ("x.yaml: run.output: must be a path of at most 3000",)),
+    "long glob": (
+        changed("floor.reflectance.data", "'" + "[" * 2000 + "'"),
+        ("x.yaml: parameters[0].key: must be text of at most 1000 characters",),
+    ),
+    "empty key of a target": (
+        changed("{render: {}}", "{render: {parameters: {'': 1}}}"),
+        ("x.yaml: target.render.parameters: must have keys that are not empty",),
+    ),
+    "more texels than an image has": (
+        changed(PARAMETER, "{key: a, resolution: [100000, 100000]}"),
+        ("x.yaml: parameters[0].resolution: must have at most 134217728 texels, not 10000000000",),
+    ),
 }
 
 #: An override of the good file, and what its error line holds.
@@ -306,11 +358,22 @@ OVERRIDES: dict[str, tuple[str, ...]] = {
     "integrator.estimater=reservoir": ("integrator.estimater: unknown key; did you mean `estimator`?",),
     "parameters[0].bounds=[1,0]": ("--set parameters[0].bounds=[1,0]: parameters[0].bounds: must be [low, high]",),
     "parameters.0.bounds=[1,0]": ("--set parameters.0.bounds=[1,0]: parameters[0].bounds: must be [low, high]",),
-    "parameters[2].bounds=[0,1]": (": parameters: has 1 entries; there is no [2]",),
+    "parameters[2].bounds=[0,1]": (": parameters: has 1 entry; there is no [2]",),
     "parameters.bounds=[0,1]": (": parameters: is a list; name an entry, such as parameters[0]",),
     "scene.file.name=x": (": scene.file: is a single value",),
     "scene[0]=x": (": scene: is no list",),
     "scene=null": ("--set scene=null: scene: missing",),
+    "parameters[0].key=*.data": (
+        "--set parameters[0].key=*.data: *.data is an alias in YAML",
+        """wants quotes: --set 'parameters[0].key="*.data"'""",
+    ),
+    "parameters=[{key: *.data}]": ("""wants quotes: --set 'parameters=[{key: "*.data"}]'""",),
+    "a" + ".a" * 3000 + "=1": (": leads deeper than 20 levels",),
+    "run.name=\udcff": (
+        "--set run.name=\\udcff: not valid YAML: holds a control character, or bytes that are not UTF-8",
+    ),
+    "\x1b[31m=1": ("--set \\x1b[31m=1: a key must not hold control characters",),
+    "run.name=../x": ("--set run.name=../x: run.name: must be a name and not a path",),
     "target.file=x.exr": (
         "--set target.file=x.exr: target: must have exactly one of `file` and `render`, and has both",
     ),
@@ -324,6 +387,13 @@ def test_file_errors_are_located(case: str, tmp_path: Path) -> None:
     assert line.startswith(start)
     for part in parts:
         assert part in line
+
+
+def test_the_mended_override_is_right(tmp_path: Path) -> None:
+    line = line_of(tmp_path, GOOD, ("parameters[0].key=*.data",))
+    option, mended = shlex.split(line.partition("wants quotes: ")[2])
+    assert option == "--set"
+    assert load(tmp_path / "x.yaml", [mended]).parameters[0].key == "*.data"
 
 
 @pytest.mark.parametrize("override", OVERRIDES)
@@ -361,10 +431,11 @@ def test_folder_in_place_of_a_file(tmp_path: Path) -> None:
 
 
 def test_unreadable_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def refuse(self: Path) -> bytes:
+    def refuse(*_args: object) -> int:
         raise PermissionError(13, "Permission denied")
 
-    monkeypatch.setattr(Path, "read_bytes", refuse)  # root may read what chmod forbids
+    (tmp_path / "x.yaml").write_text(GOOD)
+    monkeypatch.setattr(os, "open", refuse)  # root may read what chmod forbids
     with pytest.raises(ConfigError, match=r"x\.yaml: cannot be read: Permission denied"):
         load(tmp_path / "x.yaml")
 

@@ -7,6 +7,8 @@ import os
 
 import pytest
 
+from reslrb_cli.config.limits import NAME_BYTES
+from reslrb_cli.config.names import check_name
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.records.manifest import Manifest, Status
 from reslrb_cli.records.run_folder import RunFolder, check_output
@@ -40,6 +42,11 @@ def test_a_new_folder_is_whole(tmp_path):
 def test_taken_names_get_a_number(tmp_path):
     (tmp_path / "run-3").write_text("a file of that name")
     assert [create(tmp_path).path.name for _ in range(3)] == ["run", "run-2", "run-4"]
+
+
+def test_the_longest_name_leaves_room_for_a_number(tmp_path):
+    name = check_name("ü" * (NAME_BYTES // 2))
+    assert [create(tmp_path, name).path.name for _ in range(2)] == [name, f"{name}-2"]
 
 
 def test_an_empty_folder_of_that_name_is_not_taken_over(tmp_path):

@@ -67,7 +67,7 @@ def growing() -> str:
         (HEAD + '\n<include filename="scene.xml"/></scene>', 3, "files are included more than 15 levels deep"),
         (HEAD + TEXTURE.format("pipe") + "</scene>", 3, "pipe is no regular file"),
         (HEAD + TEXTURE.format("/dev/zero") + "</scene>", 3, "/dev/zero is no regular file"),
-        (HEAD + '<include filename="pipe"/></scene>', 2, "pipe, which is no regular file"),
+        (HEAD + '<include filename="pipe"/></scene>', 2, "pipe, which is a pipe, not a regular file"),
     ],
 )  # fmt: skip
 def test_refused_at_once(tmp_path, text, line, said):
@@ -110,7 +110,7 @@ def test_what_mitsuba_would_crash_on_or_not_locate(tmp_path, objects, said):
 def test_what_is_no_regular_file(tmp_path):
     os.mkfifo(tmp_path / "pipe.xml")
     for file in (tmp_path / "pipe.xml", Path("/dev/zero")):
-        with pytest.raises(ConfigError, match=f"{file}: is no regular file"):
+        with pytest.raises(ConfigError, match=f"{file}: is a (pipe|device), not a regular file"):
             load_scene(file)
 
 
@@ -121,7 +121,7 @@ def test_files_are_bounded_together(tmp_path, monkeypatch):
     with pytest.raises(ConfigError, match=f"{file}:4: includes {tmp_path}/part.xml, which is too large: a scene"):
         load_scene(file)
     monkeypatch.setattr(reading, "MAX_BYTES", 10)
-    with pytest.raises(ConfigError, match=f"{file}: is too large: a scene may have"):
+    with pytest.raises(ConfigError, match=f"{file}: has .* bytes are not read"):
         load_scene(file)
 
 

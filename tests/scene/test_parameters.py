@@ -143,7 +143,7 @@ def test_bounds_hold_for_the_nearest_float(make_scene):
             "begins at 3 at entry 2; transform: sigmoid yields values between its bounds, 0 and 3 alone",
         ),
         ([{"key": LAMP, "initial": ImageFile(file="/none.exr")}], "initial", "is no texture; give a number"),
-        ([{"key": TEXTURE, "initial": ImageFile(file="/none.exr")}], "initial.file", "/none.exr: cannot be read"),
+        ([{"key": TEXTURE, "initial": ImageFile(file="/none.exr")}], "initial.file", "/none.exr: no such file"),
     ],
 )
 def test_refused(make_scene, specs, where, what):

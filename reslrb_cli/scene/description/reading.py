@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import re
-import stat
 from pathlib import Path
 from typing import Any
 from xml.parsers import expat
 
+from ...config.files import read_file
 from ...errors import ConfigError
 from .element import Element, Source
 
@@ -28,28 +28,13 @@ def read_document(file: Path, max_bytes: int) -> tuple[Element, int]:
     Raises ConfigError, located in the file, where it cannot be read, is no regular file or larger than `max_bytes`, is
     not XML, is nested more than MAX_DEPTH levels deep, or declares entities.
     """
-    data = _read(file, max_bytes)
+    data = read_file(file, MAX_BYTES)
+    if len(data) > max_bytes:
+        raise ConfigError(
+            file, "", f"is too large: a scene may have {MAX_BYTES >> 20} MiB of XML, with all that it includes"
+        )
     text = _COMMENT.sub(lambda comment: "\n" * comment[0].count("\n"), _decode(data))
     return _parse(file, _BARE_AMPERSAND.sub("&amp;", text)), len(data)
-
-
-def _read(file: Path, max_bytes: int) -> bytes:
-    try:
-        info = file.stat()
-        if stat.S_ISDIR(info.st_mode):
-            raise ConfigError(file, "", "is a folder, not a Mitsuba scene file (XML)")
-        if not stat.S_ISREG(info.st_mode):
-            raise ConfigError(file, "", "is no regular file, and cannot be a Mitsuba scene file (XML)")
-        if info.st_size > max_bytes:
-            raise ConfigError(
-                file, "", f"is too large: a scene may have {MAX_BYTES >> 20} MiB of XML, with all that it includes"
-            )
-        with file.open("rb") as opened:
-            return opened.read(max_bytes)
-    except OSError as error:
-        raise ConfigError(file, "", f"cannot be read: {error.strerror}") from None
-    except ValueError:  # a null character in the path
-        raise ConfigError(repr(str(file)), "", "cannot be read: no such path") from None
 
 
 def _decode(data: bytes) -> str:

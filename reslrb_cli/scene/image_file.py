@@ -1,0 +1,201 @@
+"""Image files before they are decoded: how large they say they are, and whether they end where they should.
+
+A file of some kilobytes can say that it is an image of gigabytes, and Mitsuba's reader fills what a JPEG lacks with
+grey. A file that was cut off and then padded is told as well where its format is compressed, but for the last lines of
+an EXR, which has no check sums.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import re
+import struct
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, nullcontext, suppress
+from pathlib import Path
+from typing import BinaryIO
+
+import mitsuba as mi
+
+from ..config.files import open_file
+from ..config.limits import IMAGE_BYTES, PIXELS
+from ..errors import ConfigError, is_out_of_memory
+
+logger = logging.getLogger(__name__)
+
+FORMATS = "EXR, PNG, JPG, HDR, PFM, PPM or BMP"
+#: Bytes in which a file says how large its image is; a preview may stand before it.
+_HEAD = 2**20
+#: Parts that a PNG or a JPEG has at most, so that one of nothing but empty parts takes no time.
+_MOST_PARTS = 2**20
+
+Size = tuple[int, int]
+
+
+class _CutOff(Exception):
+    """The file ends before its image does."""
+
+
+def read_bitmap(path: Path, size: Size | None = None) -> mi.Bitmap:
+    """Decode the image file `path`; `size` is the (width, height) that it must have, None for any.
+
+    Raises ConfigError, located in the file, where it cannot be read, is no image, too large, of another size, damaged
+    or cut off. What is checked first is what the file says of itself.
+    """
+    with open_file(path, IMAGE_BYTES) as file:
+        try:
+            says, is_jpeg = _examine(file)
+        except _CutOff:
+            raise ConfigError(path, "", "is cut off: the file ends before its image; copy or save it again") from None
+        except OSError as error:
+            raise ConfigError(path, "", f"cannot be read: {error.strerror}") from None
+    if says is None or min(says) < 1:
+        raise ConfigError(path, "", f"is not an image that can be read ({FORMATS})")
+    if size is not None and says != size:
+        raise ConfigError(path, "", f"is {says[0]}x{says[1]} pixels; it must be {size[0]}x{size[1]}")
+    if says[0] * says[1] > PIXELS:
+        raise ConfigError(path, "", f"is {says[0]}x{says[1]} pixels; more than {PIXELS} are not read")
+    complaints: list[str] = []
+    try:
+        with _heard(complaints) if is_jpeg else nullcontext():
+            bitmap = mi.Bitmap(str(path))
+    except Exception as error:
+        if is_out_of_memory(error):
+            raise
+        raise ConfigError(path, "", "is damaged or cut off, or of a kind that Mitsuba does not decode") from None
+    for line in complaints:
+        if line.startswith(("Corrupt JPEG data", "Premature end")):
+            raise ConfigError(path, "", f"is damaged or cut off ({line}); copy or save it again")
+        logger.warning("%s: %s", path, line)
+    if (int(bitmap.width()), int(bitmap.height())) != says:
+        raise ConfigError(path, "", f"says that it is {says[0]}x{says[1]} pixels, and is not")
+    return bitmap
+
+
+def _examine(file: BinaryIO) -> tuple[Size | None, bool]:
+    """The (width, height) that a file says its image has, None where it is no image; and whether it is a JPEG.
+
+    Raises _CutOff where a PNG or JPEG has no end; the readers of the other formats tell that themselves.
+    """
+    head = file.read(_HEAD) or b""
+    for magic, size_of in _SIZES.items():
+        if head.startswith(magic):
+            with suppress(struct.error, ValueError):  # a head that is cut off is none
+                return size_of(head, file), magic == _JPEG
+            return None, False
+    return None, False
+
+
+# --- formats ----------------------------------------------------------------------------------------------------------
+
+_PNG, _JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff"
+#: The next marker after compressed data, in which 0xFF stands before 0, or before the number of a restart.
+_MARKER = re.compile(rb"\xff+[\x01-\xcf\xd8-\xfe]")
+
+
+def _png_size(head: bytes, file: BinaryIO) -> Size | None:
+    if head[12:16] != b"IHDR":
+        return None
+    width, height = struct.unpack(">II", head[16:24])
+    end, position = file.seek(0, os.SEEK_END), len(_PNG)
+    for _ in range(_MOST_PARTS):
+        file.seek(position)
+        length, kind = struct.unpack(">I4s", file.read(8).ljust(8, b"\0"))
+        position += 12 + length  # with its check sum
+        if position > end:
+            raise _CutOff
+        if kind == b"IEND":
+            return width, height
+    return None
+
+
+def _jpeg_size(head: bytes, file: BinaryIO) -> Size | None:
+    file.seek(0)
+    data, position, size = file.read(), 2, None
+    for _ in range(_MOST_PARTS):
+        found = _MARKER.search(data, position)
+        if found is None:
+            raise _CutOff
+        kind, position = data[found.end() - 1], found.end()
+        if kind == 0xD9:  # the end of the image
+            return size
+        if kind == 0x01 or kind == 0xD8:
+            continue
+        if position + 2 > len(data):
+            raise _CutOff
+        [length] = struct.unpack_from(">H", data, position)
+        if 0xC0 <= kind <= 0xCF and kind not in (0xC4, 0xC8, 0xCC) and position + 7 <= len(data):
+            height, width = struct.unpack_from(">HH", data, position + 3)
+            size = (width, height)
+        position += length
+    return None
+
+
+def _exr_size(head: bytes, file: BinaryIO) -> Size | None:
+    position = 8
+    while True:  # attributes: a name and a type, each ended by a zero, the number of bytes, and these
+        name, _, rest = head[position : position + 600].partition(b"\0")
+        kind, _, _ = rest.partition(b"\0")
+        position += len(name) + len(kind) + 2
+        [length] = struct.unpack_from("<i", head, position)
+        if not name or length < 0:
+            return None
+        if name == b"dataWindow":
+            left, top, right, bottom = struct.unpack_from("<4i", head, position + 4)
+            return right - left + 1, bottom - top + 1
+        position += 4 + length
+
+
+def _hdr_size(head: bytes, file: BinaryIO) -> Size | None:
+    found = re.search(rb"\n-Y (\d{1,9}) \+X (\d{1,9})\n", head)
+    return (int(found[2]), int(found[1])) if found else None
+
+
+def _netpbm_size(head: bytes, file: BinaryIO) -> Size | None:
+    found = re.match(rb"..(?:\s|#[^\n]*\n)+(\d{1,9})(?:\s|#[^\n]*\n)+(\d{1,9})\s", head)
+    return (int(found[1]), int(found[2])) if found else None
+
+
+def _bmp_size(head: bytes, file: BinaryIO) -> Size | None:
+    width, height = struct.unpack_from("<ii", head, 18)
+    return width, abs(height)
+
+
+_SIZES: dict[bytes, Callable[[bytes, BinaryIO], Size | None]] = {
+    b"\x76\x2f\x31\x01": _exr_size,
+    _PNG: _png_size,
+    _JPEG: _jpeg_size,
+    b"#?": _hdr_size,
+    **dict.fromkeys((b"PF", b"Pf", b"P5", b"P6"), _netpbm_size),
+    b"BM": _bmp_size,
+}
+
+
+# --- what a C library says --------------------------------------------------------------------------------------------
+
+
+@contextmanager
+def _heard(lines: list[str]) -> Iterator[None]:
+    """Adds to `lines` what is written to the process's standard error meanwhile, in place of the terminal.
+
+    That is the only way in which libjpeg, inside of Mitsuba, tells of missing data where a file has its end.
+    """
+    try:
+        before = os.dup(2)
+    except OSError:  # closed: nothing is heard
+        yield
+        return
+    listening, speaking = os.pipe()
+    for end in (listening, speaking):  # what does not fit is not heard; neither end waits for the other
+        os.set_blocking(end, False)
+    os.dup2(speaking, 2)
+    os.close(speaking)
+    try:
+        yield
+    finally:
+        os.dup2(before, 2)
+        os.close(before)
+        with suppress(BlockingIOError):
+            lines += os.read(listening, 2**16).decode(errors="replace").splitlines()
+        os.close(listening)

@@ -1,0 +1,197 @@
+"""`reslrb inspect --nonfinite` on run folders that are damaged, cut off, empty, or of another run."""
+
+from __future__ import annotations
+
+import io
+import json
+import logging
+import os
+import shutil
+import struct
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+from cli.test_nonfinite import CONFIG, KEY, PLAIN, SCENE, reslrb
+
+from reslrb_cli.cli import main
+
+ARCHIVE, MANIFEST, TARGET = "checkpoint/nonfinite.npz", "manifest.json", "images/target.exr"
+
+
+@pytest.fixture(scope="module")
+def finished(llvm, tmp_path_factory):
+    """The folder of a run that met values that are not finite."""
+    import mitsuba as mi
+
+    folder = tmp_path_factory.mktemp("run")
+    wall = np.full((8, 8, 3), 0.5, np.float32)
+    wall[4, 1, 1] = np.nan
+    mi.Bitmap(wall).write(str(folder / "wall.exr"))
+    mi.Bitmap(np.full((8, 8, 3), 0.2, np.float32)).write(str(folder / "target.exr"))
+    (folder / "scene.xml").write_text(SCENE.replace("REFLECTANCE", PLAIN))
+    (folder / "config.yaml").write_text(CONFIG)
+    before = os.getcwd()
+    os.chdir(folder)
+    try:
+        with pytest.raises(SystemExit) as end:
+            main.main(["optimize", "config.yaml", "--quiet", "--set", "run.on_nonfinite=stop"])
+    finally:
+        os.chdir(before)
+        logging.getLogger("reslrb_cli").handlers.clear()
+    assert end.value.code == 5
+    return folder / "runs/config"
+
+
+@pytest.fixture
+def run(finished, tmp_path):
+    """A copy of it."""
+    return Path(shutil.copytree(finished, tmp_path / "run"))
+
+
+def told(capsys, run):
+    """The line that ends the command, without the folder."""
+    code, out, err = reslrb(capsys, "inspect", run / "config.yaml", "--nonfinite")
+    assert (code, out) == (2, ""), err
+    assert "Traceback" not in err
+    return err.splitlines()[-1].replace(f"{run}/", "")
+
+
+def test_a_whole_folder_is_replayed(run, capsys):
+    code, out, _ = reslrb(capsys, "inspect", run / "config.yaml", "--nonfinite")
+    assert code == 0
+    assert out.startswith("iteration 0, sensor 0")
+
+
+def arrays(**changes):
+    """What the archive of the run holds, with changes; None leaves out."""
+    all_ = {"iteration": np.array(0), f"parameter/{KEY}": np.full(3, 0.5, np.float32)} | changes
+    return {name: value for name, value in all_.items() if value is not None}
+
+
+def archive(save=np.savez, **changes):
+    file = io.BytesIO()
+    save(file, **arrays(**changes))
+    return file.getvalue()
+
+
+def huge():
+    """An archive whose array says that it has a billion billion entries."""
+    file = io.BytesIO()
+    with zipfile.ZipFile(file, "w") as members:
+        head = b"{'descr': '<f4', 'fortran_order': False, 'shape': (1000000000000000000,), }\n"
+        members.writestr(f"parameter/{KEY}.npy", b"\x93NUMPY\x01\x00" + struct.pack("<H", len(head)) + head)
+        members.writestr("iteration.npy", b"x")
+    return file.getvalue()
+
+
+class Evil:
+    """Makes a file when it is unpickled."""
+
+    def __reduce__(self):
+        return Path.touch, (Path("evil"),)
+
+
+DAMAGED = {
+    "empty": b"",
+    "no archive": b"no archive",
+    "an array": b"\x93NUMPY\x01\x00v\x00",
+    "of zeros": bytes(5000),
+    "another archive": archive()[:0] + b"PK\x05\x06" + bytes(18),
+    "pickled": archive(iteration=np.array([Evil()], dtype=object)),
+    "compressed": archive(np.savez_compressed),
+    "huge": huge(),
+    "no iteration": archive(iteration=None),
+    "iteration of text": archive(iteration=np.array("x")),
+    "iteration of several": archive(iteration=np.arange(3)),
+}
+
+
+@pytest.mark.parametrize("case", DAMAGED)
+def test_a_damaged_archive_is_told(case, run, capsys):
+    (run / ARCHIVE).write_bytes(DAMAGED[case])
+    assert told(capsys, run).startswith(f"{ARCHIVE}: is damaged, cut off, or not written by a run (")
+    assert not Path("evil").exists()
+
+
+@pytest.mark.parametrize("share", [0.1, 0.5, 0.9, 0.99])
+def test_an_archive_that_is_cut_off_is_told(share, run, capsys):
+    data = (run / ARCHIVE).read_bytes()
+    (run / ARCHIVE).write_bytes(data[: int(share * len(data))])
+    assert told(capsys, run).startswith(f"{ARCHIVE}: is damaged")
+
+
+def test_bytes_that_changed_are_told(run, capsys):
+    data = bytearray((run / ARCHIVE).read_bytes())
+    place = data.index(np.float32(0.5).tobytes())
+    data[place : place + 4] = np.float32(0.75).tobytes()
+    (run / ARCHIVE).write_bytes(data)
+    assert "Bad CRC-32" in told(capsys, run)
+
+
+FOREIGN = {
+    "another shape": ({f"parameter/{KEY}": np.zeros((3, 1), np.float32)}, "is float32 of shape (3, 1), not numbers of"),
+    "another type": ({f"parameter/{KEY}": np.zeros(3, np.int64)}, "is int64 of shape (3,), not numbers of shape (3,)"),
+    "text": ({f"parameter/{KEY}": np.array("x")}, "is <U1 of shape ()"),
+    "not finite": ({f"parameter/{KEY}": np.full(3, np.nan, np.float32)}, "holds a value that is not finite"),
+    "another key": ({f"parameter/{KEY}": None, "parameter/a": np.zeros(3, np.float32)}, "it has `a`"),
+    "no key": ({f"parameter/{KEY}": None}, f"it lacks `{KEY}`"),
+    "a later iteration": ({"iteration": np.array(7)}, "iteration: is 7; the run has 3 iterations"),
+    "a negative iteration": ({"iteration": np.array(-1)}, "iteration: is -1; the run has"),
+}
+
+
+@pytest.mark.parametrize("case", FOREIGN)
+def test_an_archive_of_another_run_is_told(case, run, capsys):
+    changes, what = FOREIGN[case]
+    (run / ARCHIVE).write_bytes(archive(**changes))
+    line = told(capsys, run)
+    assert line.startswith(f"{ARCHIVE}: ")
+    assert what in line
+
+
+def test_a_pipe_in_place_of_the_archive(run, capsys):
+    (run / ARCHIVE).unlink()
+    os.mkfifo(run / ARCHIVE)
+    assert told(capsys, run) == f"{ARCHIVE}: is a pipe, not a regular file"
+
+
+@pytest.mark.parametrize("text", ["", "{", "[]", "{}", "[" * 100_000, '{"program": "other"}', "\0", "NaN"])
+def test_a_damaged_manifest_is_none(text, run, capsys):
+    (run / MANIFEST).write_text(text)
+    assert told(capsys, run).startswith("config.yaml: --nonfinite: is not in a run folder")
+
+
+MANIFESTS = {
+    "memory is a list": ({"memory": [1]}, "memory.samples_per_pass: is not a number of samples"),
+    "no samples": ({"memory": {"samples_per_pass": 0}}, "memory.samples_per_pass: is not a number of samples"),
+    "samples are text": ({"memory": {"samples_per_pass": "4"}}, "memory.samples_per_pass: is not a number of samples"),
+    "pilot is a list": ({"pilot": [1]}, "pilot.chosen: is not an estimator"),
+    "nothing chosen": ({"pilot": {"x": 1}}, "pilot.chosen: is not an estimator"),
+    "an unknown estimator": ({"pilot": {"chosen": {"estimator": "x"}}}, "pilot.chosen: is not an estimator"),
+    "an unknown option": ({"pilot": {"chosen": {"estimator": "stack", "x": 1}}}, "pilot.chosen: is not an estimator"),
+    "chosen is text": ({"pilot": {"chosen": "stack"}}, "pilot.chosen: is not an estimator"),
+}
+
+
+@pytest.mark.parametrize("case", MANIFESTS)
+def test_a_manifest_of_another_kind_is_told(case, run, capsys):
+    changes, what = MANIFESTS[case]
+    content = json.loads((run / MANIFEST).read_text())
+    (run / MANIFEST).write_text(json.dumps(content | changes))
+    assert told(capsys, run).startswith(f"{MANIFEST}: {what}")
+
+
+def test_targets_that_are_none_are_told(run, capsys):
+    import mitsuba as mi
+
+    data = (run / TARGET).read_bytes()
+    (run / TARGET).write_bytes(data[: len(data) // 2])
+    assert told(capsys, run).startswith(f"{TARGET}: is damaged or cut off")
+    mi.Bitmap(np.zeros((8, 8, 1), np.float32)).write(str(run / TARGET))
+    assert told(capsys, run) == f"{TARGET}: must have the film's channels; its own: 1, the film's: 3"
+    mi.Bitmap(np.zeros((4, 8, 3), np.float32)).write(str(run / TARGET))
+    assert told(capsys, run) == f"{TARGET}: is 8x4 pixels; it must be 8x8"
+    (run / TARGET).unlink()
+    assert told(capsys, run) == f"{TARGET}: no such file"

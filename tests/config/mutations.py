@@ -1,0 +1,204 @@
+"""Configurations that are nearly right: a good one, changed as text, as tokens or as data, and `--set` with it."""
+
+from __future__ import annotations
+
+import copy
+import json
+import random
+import re
+from collections.abc import Sequence
+from typing import Any
+
+import yaml
+
+from reslrb_cli.config.reference import DOCS, EXAMPLE
+from reslrb_cli.config.text import parse
+from reslrb_cli.errors import ConfigError
+
+#: Every section, every kind of value.
+FULL = """\
+variant: llvm_ad_rgb
+scene: {file: scene.xml, options: {resx: 64, fast: true, scale: 1e-3, text: "1e-3", no: no}, sensors: [2, 0]}
+target: {file: [t0.exr, /abs/t1.png], color_space: linear}
+parameters:
+  - {key: "*.reflectance.data", initial: 1, bounds: [-.inf, 1E0], learning_rate: 5e-2, resolution: [64, 32]}
+  - {key: white.reflectance.value, initial: [.5, +0.5, 1], bounds: [0, .inf], transform: log}
+  - {key: floor.data, initial: {file: floor.png, color_space: srgb}}
+integrator: {type: reslrb, max_depth: -1, rr_depth: 3, hide_emitters: true, estimator: event, capacity: 2}
+loss: {type: log_l2, epsilon: 1e-3}
+optimizer: {type: adamw, learning_rate: 1e-1, schedule: cosine, final_fraction: 1e-2, weight_decay: 0, scale: auto}
+run: {name: "Fläche: rot/blau", output: out, iterations: 3, spp: 16, adjoint: batched, batches: 4, memory_budget: 2GiB}
+"""
+RENDERED = """\
+scene: &s {file: a.xml}
+target: {render: {parameters: {a.b: 1e-3, c: {file: x.exr}}, spp: 4, integrator: &i {type: ptracer}}}
+parameters: [{key: c}]
+integrator: {<<: *i, samples_per_pass: 8}
+"""
+#: What no setting expects, as it stands in a file, parted by `¦`.
+TOKENS = (
+    *r"""1e400¦-1e400¦.nan¦.inf¦-.inf¦1e-400¦-0¦18446744073709551615¦18446744073709551616¦2147483648¦0o777¦1_000¦1:30¦~
+null¦true¦yes¦''¦""¦"\ud800"¦"\udcff\e[31m"¦"\0"¦"\x9b2J"¦"\u202e"¦../x¦/abs¦~nobody-here/x¦con¦..¦.¦/¦\¦C:\x¦名前¦$x
+!!python/object:os.system x¦!!binary x¦!!set {a}¦!!omap [a: 1]¦!!timestamp 2001-01-01¦!!bool x¦!!int x¦!!float x¦!!str
+!!str [a]¦!!map []¦!!seq {}¦!!null x¦!!merge x¦!!value x¦!x¦!<tag:x> y¦&a¦*a¦&a [*a]¦&a {x: *a}¦*s¦*i¦<<¦<<: *i¦<<: 3
+<<: [*i, *i]¦? [a]¦? {a: 1}¦?¦:¦-¦[¦]¦{¦}¦,¦|¦>¦|9¦%YAML 3¦---¦...¦@x¦`x¦#¦<script>¦[key]¦__class__¦type¦{type: [a]}
+{type: {a: 1}}¦{type: 3}¦'¦"¦*.data¦%d¦{0}""".replace("\n", "¦").split("¦"),
+    *("0x" + "f" * 5000, "9" * 400, "9" * 5000, "-" + "9" * 30, "a" * 300, "a" * 5000, "ü" * 150, "[" * 30),
+    *("{a: " * 30, "[" * 3000, "- " * 400, "[" + "1, " * 300 + "]"),
+    *("\t", "\r", "\x01", "\x7f", "\x85", "\u202e", "\u2028", "\ufeff"),
+)
+#: The same as data, in JSON.
+VALUES = (
+    *r"""null¦true¦0¦-1¦10000000000000000000000000¦18446744073709551616¦1e308¦NaN¦Infinity¦""¦" "¦"\u001b[31m"¦"\ud800"
+"a\u0000b"¦"scene"¦"all"¦"../../x"¦[]¦{}¦[[]]¦{"file": "x"}¦{"type": "reslrb"}¦{"type": null}¦{"<x>": 1, "[key]": 2}
+{"1": 2}¦{"": ""}¦{"null": 1}¦{"\u001b[2J": 1}""".replace("\n", "¦").split("¦"),
+    *("[" * 30 + "]" * 30, '{"a": [' * 7 + "]}" * 7),
+)
+#: Long ones, which take most of the time.
+LONG_VALUES = (
+    json.dumps("x" * 20_000),
+    json.dumps(list(range(15_000))),
+    json.dumps({f"k{i}": i for i in range(3000)}),
+    json.dumps([{"key": f"p{i}"} for i in range(2000)]),
+)
+
+
+def good_texts() -> list[str]:
+    """The shipped configurations, the reference's example, and two that have all kinds of settings."""
+    shipped = sorted((DOCS.parent / "configs").rglob("*.yaml"))
+    return [EXAMPLE, FULL, RENDERED, *(path.read_text(encoding="utf-8") for path in shipped)]
+
+
+def mutate(rng: random.Random, texts: Sequence[str]) -> tuple[bytes, list[str]]:
+    """A configuration's bytes, and overrides, most of which are wrong somewhere."""
+    text, overrides = rng.choice(texts), []
+    for _ in range(rng.choice((0, 1, 1, 1, 1, 1, 2, 4))):
+        [change] = rng.choices((_as_text, _as_tokens, _as_data, _as_bomb), (2, 4, 8, 1))
+        text = change(rng, text)
+    for _ in range(rng.choice((0, 0, 0, 0, 1, 1, 2, 5))):
+        overrides.append(_override(rng))
+    data = text.encode("utf-8", "surrogatepass")
+    if rng.random() < 0.05:
+        position = rng.randrange(len(data) + 1)
+        data = data[:position] + rng.randbytes(rng.choice((1, 2, 40))) + data[position + rng.choice((0, 1, 40)) :]
+    return data, overrides
+
+
+def _as_text(rng: random.Random, text: str) -> str:
+    start = rng.randrange(len(text) + 1)
+    end = min(len(text), start + rng.choice((0, 1, 3, 20, 200)))
+    kind = rng.randrange(6)
+    if kind == 0:
+        return text[:start] + text[end:]
+    if kind == 1:
+        return text[:end] + text[start:end] * rng.choice((1, 2, 300)) + text[end:]
+    if kind == 2:
+        return text[:start] + rng.choice(TOKENS) + text[end:]
+    if kind == 3:
+        return text[:start]
+    lines = text.splitlines(keepends=True)
+    if kind == 4:
+        rng.shuffle(lines)
+    elif lines:
+        i = rng.randrange(len(lines))
+        lines[i] = rng.choice((" ", "  ", "\t", "- ", "")) + rng.choice((lines[i], lines[i].lstrip(), lines[i] * 2))
+    return "".join(lines)
+
+
+def _as_tokens(rng: random.Random, text: str) -> str:
+    tokens = re.findall(r"[\w.*+-]+|\s+|.", text)
+    places = [i for i, token in enumerate(tokens) if not token.isspace()]
+    if not places:
+        return rng.choice(TOKENS)
+    for _ in range(rng.choice((1, 1, 2, 4))):
+        i = rng.choice(places)
+        tokens[i] = rng.choice((rng.choice(TOKENS), tokens[rng.choice(places)], tokens[i] * 2, tokens[i] + "x", ""))
+    return "".join(tokens)
+
+
+def _as_data(rng: random.Random, text: str) -> str:
+    try:
+        data = copy.deepcopy(parse(text, "x"))
+    except ConfigError:
+        return text
+    for _ in range(rng.choice((1, 1, 2, 4))):
+        places = list(_places(data))
+        if not places:
+            break
+        container, key = rng.choice(places)
+        kind = rng.randrange(5)
+        if kind == 0 and isinstance(container, dict):
+            name = rng.choice(("spp", "type", "file", "<x>", "[key]", "\x1b[2J", f"{key}x"))
+            container[name] = container.pop(key)
+        elif kind == 1:
+            other, where = rng.choice(places)
+            if _depth(other) < 8:
+                container[key] = json.loads(json.dumps(other[where], default=str))
+        elif kind == 2 and isinstance(container, list):
+            container.append(container[key])
+        else:
+            container[key] = json.loads(rng.choice(LONG_VALUES if rng.random() < 0.03 else VALUES))
+    if rng.random() < 0.5:
+        return json.dumps(data, default=str)
+    return str(
+        yaml.safe_dump(data, default_flow_style=rng.choice((True, False, None)), allow_unicode=rng.random() < 0.5)
+    )
+
+
+def _places(data: Any) -> Any:
+    """Every place in the data: a list or mapping, and an index or key of it; no more than some hundreds."""
+    waiting, count = [data], 0
+    while waiting and count < 300:
+        value = waiting.pop()
+        for key in list(value) if isinstance(value, dict) else range(len(value)) if isinstance(value, list) else ():
+            yield value, key
+            count += 1
+            if isinstance(value[key], (dict, list)):
+                waiting.append(value[key])
+
+
+def _depth(data: Any) -> int:
+    children = data.values() if isinstance(data, dict) else data if isinstance(data, list) else ()
+    return 1 + max(map(_depth, children), default=0)
+
+
+def _as_bomb(rng: random.Random, text: str) -> str:
+    """Aliases of aliases, plain or merged: a few hundred bytes that stand for billions of values."""
+    width, depth, merged = rng.choice((2, 5, 9)), rng.choice((3, 6, 12, 40)), rng.random() < 0.5
+    lines = ["b0: &b0 {x: 1, y: 2}"]
+    for i in range(depth):
+        aliases = ", ".join([f"*b{i}"] * width)
+        lines.append(f"b{i + 1}: &b{i + 1} " + (f"{{<<: [{aliases}]}}" if merged else f"[{aliases}]"))
+    bomb = "\n".join(lines) + "\n"
+    return bomb + text if rng.random() < 0.5 else text + "\n" + bomb + f"integrator: *b{depth}\n"
+
+
+#: Good overrides.
+_OVERRIDES = (
+    *("run.spp=16", "run.name=x", "scene.options.a.b=3", "parameters[0].bounds=[0, 1]", "parameters.0.key=a"),
+    *("integrator={type: prb}", "parameters[1].key=b", "target={render: {}}", "optimizer.type=sgd", "loss=l1"),
+    *("target.render.parameters.x.y={file: a.png}", "run.memory_budget=64 MiB", "scene.sensors=all", "variant=auto"),
+    "run.output=/tmp/x",
+)
+
+
+def _override(rng: random.Random) -> str:
+    text = rng.choice(_OVERRIDES)
+    kind = rng.randrange(12)
+    if kind == 1:
+        key, _, _ = text.partition("=")
+        return f"{key}={rng.choice(TOKENS)}"
+    if kind == 2:
+        _, _, value = text.partition("=")
+        return rng.choice(TOKENS) + "=" + value
+    if kind == 3:
+        return ".".join(["a"] * rng.choice((2, 19, 21, 3000))) + "=1"
+    if kind == 4:
+        return (
+            "parameters" + rng.choice(("[0]" * 30, "[99999999999999999999]", "[-1]", "[x]", "[", "..", "[0]key")) + "=1"
+        )
+    if kind == 5:
+        return "run.spp=" + rng.choice(
+            ("[" * 3000, "a" * 70_000, "\udcff", "\x1b]0;x\x07", "{" + "a: 1, " * 9000 + "}")
+        )
+    return _as_text(rng, text)

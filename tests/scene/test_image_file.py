@@ -1,0 +1,200 @@
+"""Files that are no whole images: cut off, padded, damaged, larger than they could be, and no files at all."""
+
+from __future__ import annotations
+
+import os
+import struct
+import zlib
+
+import numpy as np
+import pytest
+
+from reslrb_cli.errors import ConfigError, OutOfMemory
+from reslrb_cli.scene import image_file, read_image
+from reslrb_cli.scene.image_file import read_bitmap
+
+pytestmark = pytest.mark.usefixtures("llvm")
+
+
+def picture():
+    """(H, W, 3) float32 with detail everywhere."""
+    y, x = np.mgrid[0:96, 0:128].astype(np.float32)
+    noise = np.random.default_rng(3).uniform(0, 0.3, (96, 128, 3)).astype(np.float32)
+    return noise + np.stack([x / 200, y / 200, (x + y) / 400], axis=-1)
+
+
+@pytest.fixture(
+    params=["a.jpg", "progressive.jpg", "restarts.jpg", "a.png", "a.exr", "a.hdr", "a.pfm", "a.ppm", "a.bmp"]
+)
+def image(request, tmp_path):
+    """A whole image file of each format that can be read."""
+    import mitsuba as mi
+    from PIL import Image  # comes with matplotlib
+
+    path = tmp_path / request.param
+    array = picture() if path.suffix in (".exr", ".hdr", ".pfm") else (255 * picture()).astype(np.uint8)
+    if request.param in ("progressive.jpg", "restarts.jpg", "a.bmp"):
+        options = {"progressive.jpg": {"progressive": True}, "restarts.jpg": {"restart_marker_rows": 2}}
+        Image.fromarray(array).save(path, **options.get(request.param, {}))
+    else:
+        mi.Bitmap(array).write(str(path))
+    return path
+
+
+def refused(path, **options):
+    """The message for a file that is refused, which is located in it."""
+    with pytest.raises(ConfigError) as caught:
+        read_image(path, **options)
+    line = str(caught.value)
+    assert line.startswith(f"{path}: ")
+    return line.removeprefix(f"{path}: ")
+
+
+def test_a_whole_file_is_read(image, capfd):
+    assert read_image(image, size=(128, 96)).shape == (96, 128, 3)
+    image.write_bytes(image.read_bytes() + b"\0" * 500)  # what cameras and copies put behind the image
+    assert read_image(image).shape == (96, 128, 3)
+    assert capfd.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize("share", [0.0, 0.001, 0.25, 0.5, 0.75, 0.9, 0.99, 1.0])
+def test_a_file_that_is_cut_off_is_refused(image, share, capfd):
+    data = image.read_bytes()
+    image.write_bytes(data[: min(int(share * len(data)), len(data) - 1)])
+    assert refused(image).startswith(("is cut off", "is damaged or cut off", "is not an image that can be read"))
+    assert capfd.readouterr() == ("", "")  # libjpeg's own words do not reach the terminal
+
+
+@pytest.mark.parametrize("share", [0.25, 0.5, 0.9])
+@pytest.mark.parametrize("padding", ["zeros", "the end"])
+def test_a_file_that_is_cut_off_and_padded_is_refused(image, share, padding, capfd):
+    if image.suffix in (".pfm", ".ppm", ".bmp") or (image.suffix == ".exr" and share > 0.5):
+        pytest.skip("zeros are black pixels, or part of the last lines, which have no check sum")
+    data = image.read_bytes()
+    begin, end = data[: int(share * len(data))], data[-12:] if padding == "the end" else b""
+    if image.suffix == ".jpg":
+        end = b"\xff\xd9"
+    zeros = b"\0" * (len(data) - len(begin) - len(end)) if padding == "zeros" else b""
+    image.write_bytes(begin + zeros + end)
+    assert "is damaged or cut off" in refused(image) or image.suffix == ".png"
+    assert capfd.readouterr() == ("", "")
+
+
+def test_a_hole_in_the_midst_of_a_jpeg_is_refused(tmp_path):
+    import mitsuba as mi
+
+    path = tmp_path / "a.jpg"
+    mi.Bitmap((255 * picture()).astype(np.uint8)).write(str(path))
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2 : len(data) // 2 + 512] = b"\0" * 512
+    path.write_bytes(data)
+    assert "is damaged or cut off (Corrupt JPEG data" in refused(path)
+
+
+def test_what_libjpeg_says_is_heard_where_standard_error_is_closed(tmp_path, monkeypatch):
+    import mitsuba as mi
+
+    path = tmp_path / "a.jpg"
+    mi.Bitmap((255 * picture()).astype(np.uint8)).write(str(path))
+
+    def closed(_number):
+        raise OSError(9, "Bad file descriptor")
+
+    monkeypatch.setattr(image_file.os, "dup", closed)
+    assert read_image(path).shape == (96, 128, 3)
+
+
+def png(width, height, data=b""):
+    """A PNG file that says that it is of that size."""
+
+    def chunk(kind, content):
+        return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", zlib.crc32(kind + content))
+
+    head = chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0))
+    return b"\x89PNG\r\n\x1a\n" + head + chunk(b"IDAT", zlib.compress(data)) + chunk(b"IEND", b"")
+
+
+def exr(right, bottom):
+    """The head of an EXR file that says that it is of that size."""
+
+    def attribute(name, kind, content):
+        return name + b"\0" + kind + b"\0" + struct.pack("<i", len(content)) + content
+
+    window = struct.pack("<4i", 0, 0, right, bottom)
+    return b"\x76\x2f\x31\x01\x02\0\0\0" + attribute(b"dataWindow", b"box2i", window) + b"\0"
+
+
+@pytest.mark.parametrize(
+    ("name", "data"),
+    [
+        ("a.png", png(60_000, 60_000, bytes(20_000_000))),
+        ("a.exr", exr(59_999, 59_999)),
+        ("a.hdr", b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 60000 +X 60000\n" + bytes(20_000)),
+        ("a.pfm", b"PF\n60000 60000\n-1.0\n" + bytes(20_000)),
+        ("a.ppm", b"P6\n# a comment\n60000 60000\n255\n" + bytes(20_000)),
+        ("a.jpg", b"\xff\xd8\xff\xc0\0\x11\x08\xea\x60\xea\x60\x03\x01\x22\0\x02\x11\x01\x03\x11\x01\xff\xd9"),
+        ("a.bmp", b"BM" + bytes(16) + struct.pack("<ii", 60_000, -60_000) + bytes(100)),
+    ],
+)
+def test_what_says_that_it_is_huge_is_not_decoded(tmp_path, monkeypatch, name, data):
+    path = tmp_path / name
+    path.write_bytes(data)
+    monkeypatch.setattr(image_file, "mi", None)  # so that nothing can be
+    assert refused(path) == "is 60000x60000 pixels; more than 134217728 are not read"
+    assert refused(path, size=(6, 4)) == "is 60000x60000 pixels; it must be 6x4"
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        b"",
+        b"GIF89a" + bytes(100),
+        png(0, 7),
+        b"\x89PNG\r\n\x1a\n" + bytes(100),
+        exr(-1, 5),
+        b"\x76\x2f\x31\x01" + b"\x01" * 100,
+        b"#?RADIANCE\n\n",
+        b"PF\n4 99999999999999999999\n",
+        b"\xff\xd8\xff\xd9",
+        b"BM",
+    ],
+)
+def test_heads_that_say_nothing(tmp_path, data):
+    path = tmp_path / "a.png"
+    path.write_bytes(data)
+    assert refused(path).startswith("is not an image that can be read (EXR, PNG")
+
+
+def test_a_jpeg_of_empty_parts_takes_no_time(tmp_path, monkeypatch):
+    monkeypatch.setattr(image_file, "_MOST_PARTS", 1000)
+    path = tmp_path / "a.jpg"
+    path.write_bytes(b"\xff\xd8" + b"\xff\xe0\0\x02" * 2000)
+    assert refused(path).startswith("is not an image")
+
+
+@pytest.mark.parametrize("kind", ["pipe", "device", "sparse"])
+def test_what_is_no_regular_file_is_not_read(tmp_path, kind):
+    path = tmp_path / "a.png"
+    if kind == "pipe":
+        os.mkfifo(path)
+    elif kind == "device":
+        path.symlink_to("/dev/zero")
+    else:
+        path.touch()
+        os.truncate(path, 2**40)
+    assert refused(path).startswith(
+        "has 1100 GB; more than 2.1 GB" if kind == "sparse" else f"is a {kind}, not a regular"
+    )
+
+
+def test_an_allocation_that_fails_is_no_damage(tmp_path, monkeypatch):
+    class Full:
+        def Bitmap(self, _path):
+            raise MemoryError("std::bad_alloc")
+
+    path = tmp_path / "a.png"
+    path.write_bytes(png(2, 2, bytes(14)))
+    assert read_bitmap(path).width() == 2
+    monkeypatch.setattr(image_file, "mi", Full())
+    with pytest.raises((MemoryError, OutOfMemory)):
+        read_bitmap(path)

@@ -1,0 +1,105 @@
+"""Packages on the path that are not Mitsuba and Dr.Jit, or not those that are wanted: one line, exit code 3."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import reslrb_cli
+from reslrb_cli.backend import installation
+
+ROOT = Path(reslrb_cli.__file__).parents[1]
+PIP = "install it with `pip install '{}'`"
+MITSUBA, DRJIT = PIP.format("mitsuba>=3.9,<3.10"), PIP.format("drjit>=1.5,<1.6")
+WORKING = "def set_variant(name): pass\ndef variants(): return ['llvm_ad_rgb']\n"
+
+#: The file of a package, its text, and what is said of it, where {place} is the file.
+PACKAGES = {
+    "another mitsuba": (
+        "mitsuba.py",
+        "",
+        "the package mitsuba at {place} is not the one that is wanted (it has no set_v",
+    ),
+    "an older mitsuba": (
+        "mitsuba/__init__.py",
+        WORKING + "__version__ = '3.5.2'",
+        "mitsuba 3.5.2 was found at {place}; 3.9 is needed: " + MITSUBA,
+    ),
+    "a newer mitsuba": (
+        "mitsuba.py",
+        WORKING + "__version__ = '3.10.0'",
+        "mitsuba 3.10.0 was found at {place}; 3.9 is",
+    ),
+    "no version": ("mitsuba.py", WORKING, "mitsuba None was found at {place}; 3.9 is needed"),
+    "a version of words": (
+        "mitsuba.py",
+        WORKING + "__version__ = 'new'",
+        "mitsuba new was found at {place}; 3.9 is needed",
+    ),
+    "a newer drjit": (
+        "drjit.py",
+        "__version__ = '2.0'\ndef has_backend(b): pass\ndef eval(): pass\n",
+        "drjit 2.0 was found at {place}; 1.5 is needed: " + DRJIT,
+    ),
+    "one that fails": (
+        "drjit/__init__.py",
+        "raise RuntimeError('no\\n\\x1b[31mdriver')",
+        "Mitsuba cannot be loaded: drjit, found at {place}: RuntimeError: no \\x1b[31mdriver; " + DRJIT,
+    ),
+    "one that ends the process": (
+        "mitsuba.py",
+        "import sys; sys.exit('bye')",
+        "found at {place}: SystemExit: bye; " + MITSUBA,
+    ),
+    "no Python": ("mitsuba.py", "import {", "found at {place}: SyntaxError: "),
+    "a missing need": (
+        "mitsuba.py",
+        "import no_such_package",
+        "found at {place}: ModuleNotFoundError: No module named",
+    ),
+    "a missing library": (
+        "drjit.py",
+        "raise ImportError('libatomic.so.1: cannot open shared object file: No such file')",
+        "run scripts/setup, or install the package that holds it",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", PACKAGES)
+def test_what_is_found_is_told(case: str, tmp_path: Path, llvm: str) -> None:
+    name, text, what = PACKAGES[case]
+    place = tmp_path / "path" / name
+    place.parent.mkdir(parents=True)
+    place.write_text(text)
+    script = "from reslrb_cli.cli import main; main()"
+    for arguments in (["render", str(ROOT / "configs/furnace.yaml"), "-o", "x.png"], ["gradcheck"]):
+        done = subprocess.run(
+            [sys.executable, "-c", script, *arguments],
+            capture_output=True,
+            text=True,
+            check=False,
+            cwd=tmp_path,
+            env={**os.environ, "PYTHONPATH": f"{tmp_path / 'path'}{os.pathsep}{ROOT}"},
+        )
+        assert done.returncode == 3, done.stderr
+        assert "Traceback" not in done.stderr
+        assert what.format(place=place) in done.stderr.splitlines()[-1]
+        if case != "another mitsuba":
+            break  # every command asks in the same way
+
+
+def test_the_installed_ones_are_those_that_are_wanted(llvm: str) -> None:
+    assert [package.__name__ for package in installation.load_packages()] == ["drjit", "mitsuba"]
+
+
+def test_the_versions_are_those_of_pyproject() -> None:
+    text = (ROOT / "pyproject.toml").read_text()
+    for name, (first, end, _) in installation._WANTED.items():
+        found = re.search(rf'"{name}>=([\d.]+),<([\d.]+)"', text)
+        assert found is not None
+        assert found.groups() == (".".join(map(str, first)), ".".join(map(str, end)))
