@@ -161,7 +161,7 @@ def measure(subject: Subject, overrides: tuple[str, ...], samples: int) -> Condi
 
 def make_plan_report(config: Config, scene: Any, counts: bool) -> PlanReport | str:
     """The plan of a step for the first sensor that is used, or why there is none. Sets initial values in `scene`."""
-    from reslrb_cli.integrators import make_integrator
+    from reslrb_cli.integrators import Reslrb
     from reslrb_cli.integrators.plan_report import report_plan
     from reslrb_cli.optimization.problem import choose_sensors
     from reslrb_cli.scene import select_parameters
@@ -175,7 +175,7 @@ def make_plan_report(config: Config, scene: Any, counts: bool) -> PlanReport | s
     try:
         [sensor, *_] = choose_sensors(config, scene)
         selection = select_parameters(scene, config.parameters, config.source)
-        integrator = make_integrator("reslrb", **options)
+        integrator = Reslrb.of(**options)
         return report_plan(
             integrator, scene, scene.sensors()[sensor], selection.params, selection.keys, known=known, counts=counts
         )

@@ -54,7 +54,9 @@ def load_replay(config: Config) -> Replay:
         raise ConfigError(archive, "", f"does not fit to {config.source}: {error}") from None
     if manifest.get("memory"):
         problem.samples_per_pass = _samples_per_pass(manifest["memory"], written)
-        problem.integrator.samples_per_pass = problem.samples_per_pass
+        problem.integrator = problem.integrator.with_options(
+            samples_per_pass=problem.samples_per_pass, freeze=problem.integrator.freeze
+        )
     for sensor in problem.sensors:
         name = "target" if len(problem.sensors) == 1 else f"target-{sensor}"
         problem.targets.append(_read_target(folder.images / f"{name}.exr", problem, sensor))

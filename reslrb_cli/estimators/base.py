@@ -11,41 +11,55 @@ import drjit as dr
 import mitsuba as mi
 
 from reslrb_cli.transport.connection import Connection, stand_in
+from reslrb_cli.transport.emission import Emission, sample_emission
 from reslrb_cli.transport.factors import NO_ZERO, Product, showing
+from reslrb_cli.transport.hooks import Hooks, Vertex
 from reslrb_cli.transport.plan import Plan
-from reslrb_cli.transport.splat import AdjointImage, Film
+from reslrb_cli.transport.samples import Samples
+from reslrb_cli.transport.splat import AdjointImage
 from reslrb_cli.transport.transmittance import transmittance
-from reslrb_cli.transport.walk import Hooks, Vertex
+from reslrb_cli.transport.walk import walk
 
 
 @dataclass
 class Pass:
     """One set of samples as an estimator sees it.
 
-    `scale` brings a sum over paths to an image. `block` is the image to splat into, or None. `adjoint` is dL/dI, or
-    None while it is not known. `walk(hooks, active)` traces the same paths each time it is called and returns the
-    hooks' final state; `emission()` is E (C,) of each path, with derivatives.
+    `block` is the image to splat into, or None. `adjoint` is dL/dI, or None while it is not known.
     """
 
-    plan: Plan
-    scene: Any
-    sensor: Any
-    film: Film
-    scale: Any
-    block: Any
+    samples: Samples
+    block: mi.ImageBlock | None
     adjoint: AdjointImage | None
-    walk: Callable[..., Any]
-    emission: Callable[[], Any]
 
-    def delta(self, u: Any, active: Any) -> Any:
+    @property
+    def plan(self) -> Plan:
+        """What a walk has to do."""
+        return self.samples.plan
+
+    @property
+    def scale(self) -> mi.Float:
+        """What brings a sum over paths to an image."""
+        return self.samples.scale
+
+    def walk(self, hooks: Hooks, active: mi.Bool | bool = True) -> Any:
+        """Trace the paths, the same ones each time; the hooks' final state."""
+        return walk(self.samples, hooks, active)
+
+    def emission(self) -> Emission:
+        """The rays that leave the emitters, and E (C,) of each path, with derivatives."""
+        s = self.samples
+        return sample_emission(s.plan, s.scene, s.sensor, s.sampler())
+
+    def delta(self, u: mi.Point2f, active: mi.Bool) -> mi.Spectrum:
         """The adjoint (C,) at film position `u`; dL/dI is known."""
         assert self.adjoint is not None
         return self.adjoint.lookup(u, active)
 
-    def splat(self, u: Any, value: Any, active: Any) -> None:
+    def splat(self, u: mi.Point2f, value: mi.Spectrum, active: mi.Bool) -> None:
         """Add `value` (C,) to the image, where there is one."""
         if self.block is not None:
-            self.film.put(self.block, u, value, active)
+            self.samples.film.put(self.block, u, value, active)
 
 
 class Estimator(ABC):
@@ -59,6 +73,8 @@ class Estimator(ABC):
     """
 
     OPTIONS: ClassVar[dict[str, Any]] = {}
+    exact: ClassVar[bool] = False  # every connection of a path counts, as under naive AD of the same paths
+    attaches: ClassVar[bool] = False  # it has derivatives of what moves light
     splats_all: bool = True  # the image shows every connection, so that an image alone needs no estimator
 
     @abstractmethod
@@ -97,7 +113,7 @@ def differentiate_emission(p: Pass, weight: Callable[[Any], Any]) -> None:
     """Add the derivative of E, (C,), times `weight(E)`, where the plan differentiates emission at all."""
     if p.plan.differentiate_emission:
         with dr.resume_grad(), dr.isolate_grad():
-            E = p.emission()
+            E = p.emission().weight
             dr.backward_from(dr.dot(weight(dr.detach(E)), E))
 
 
@@ -149,7 +165,7 @@ def differentiate_passage(
     with dr.resume_grad(when=p.plan.differentiate_null):
         limit = p.plan.max_depth - depth - 1
         on_crossing = differentiate if p.plan.differentiate_null else None
-        return transmittance(p.scene, si, connection.target, limit, active, on_crossing).value
+        return transmittance(p.samples.scene, si, connection.target, limit, active, on_crossing).value
 
 
 def contribution(p: Pass, vertex: Vertex, connection: Connection) -> Product:

@@ -35,9 +35,9 @@ from reslrb_cli.estimators.events import Event, differentiate_event
 from reslrb_cli.estimators.reservoir import defended, is_taken, selection_weight, slot_adjoint
 from reslrb_cli.transport.connection import Connection
 from reslrb_cli.transport.factors import Product
+from reslrb_cli.transport.hooks import Vertex
 from reslrb_cli.transport.plan import Plan
 from reslrb_cli.transport.scattering import Scattering
-from reslrb_cli.transport.walk import Vertex
 
 
 @dataclass

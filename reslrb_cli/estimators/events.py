@@ -12,9 +12,9 @@ from reslrb_cli.estimators.base import Pass, PathAdjoint, adjoint_of_factor, dif
 from reslrb_cli.estimators.surface import SurfacePoint, blank_lobe, event, lobe
 from reslrb_cli.transport.connection import Connection, connect, stand_in
 from reslrb_cli.transport.factors import NO_ZERO
+from reslrb_cli.transport.hooks import Vertex
 from reslrb_cli.transport.plan import Plan
-from reslrb_cli.transport.scattering import Scattering, attached_factor
-from reslrb_cli.transport.walk import Vertex
+from reslrb_cli.transport.scattering import Scattering, tracked_factor
 
 
 @dataclass
@@ -77,7 +77,7 @@ def differentiate_event(p: Pass, kept: Event, adjoint: PathAdjoint, active: Any)
     rest = mi.Spectrum(kept.rest[0] if kept.rest else 0)
     if plan.passage_in_gradient:
         own, sample = kept.own
-        connection = connect(plan, p.sensor, si, kept.point.ray(), sample, active & own)
+        connection = connect(plan, p.samples.sensor, si, kept.point.ray(), sample, active & own)
 
         def adjoint_of(transmission: Any) -> Any:
             return adjoint_of_factor(adjoint, mi.Int32(NO_ZERO), transmission, 0)
@@ -87,5 +87,5 @@ def differentiate_event(p: Pass, kept: Event, adjoint: PathAdjoint, active: Any)
     weight = adjoint_of_factor(adjoint, kept.index, kept.f, rest)
     active &= plan.differentiates(bsdf)
     with dr.resume_grad():
-        f = attached_factor(plan, si, bsdf, event(kept.wo, kept.lobe), active)
+        f = tracked_factor(plan, si, bsdf, event(kept.wo, kept.lobe), active)
         dr.backward_from(dr.select(active, dr.dot(weight, f), 0))

@@ -29,9 +29,9 @@ from reslrb_cli.estimators.base import (
 from reslrb_cli.estimators.sums import AdjointSum
 from reslrb_cli.transport.connection import Connection, Seen, stand_in
 from reslrb_cli.transport.factors import NO_ZERO, Product
+from reslrb_cli.transport.hooks import Vertex
 from reslrb_cli.transport.plan import Plan
-from reslrb_cli.transport.scattering import Scattering, attached_factors
-from reslrb_cli.transport.walk import Vertex
+from reslrb_cli.transport.scattering import Scattering, tracked_factors
 
 WORDS = 2  # of visibility bits, 32 vertices each
 
@@ -173,7 +173,7 @@ class Taking(VertexHooks):
         weight_s = S.adjoint_of_factor(scattering.f, vertex.product, scattering.correction / scattering.pdf)
         connected, scattered = connected & useful, scattering.active & useful
         with dr.resume_grad():
-            f_c, f_s = attached_factors(plan, vertex.si, vertex.bsdf, connection.wo, connected, scattering, scattered)
+            f_c, f_s = tracked_factors(plan, vertex.si, vertex.bsdf, connection.wo, connected, scattering, scattered)
             dr.backward_from(dr.select(connected, weight_c * f_c, 0) + dr.select(scattered, weight_s * f_s, 0))
         return S
 
@@ -200,7 +200,9 @@ def plus(p: Pass, S: AdjointSum, vertex: Vertex, connection: Connection, C: Prod
 
 
 class Gather(Estimator):
-    """Exact: as many derivatives as naive AD of the same paths."""
+    """Every connection, by a replay."""
+
+    exact = True
 
     def forward(self, p: Pass) -> GatherState:
         state: GatherState = p.walk(Gathering(p))

@@ -34,9 +34,9 @@ from reslrb_cli.estimators.base import (
 from reslrb_cli.estimators.events import Event, differentiate_event
 from reslrb_cli.transport.connection import Connection
 from reslrb_cli.transport.factors import Product
+from reslrb_cli.transport.hooks import Vertex
 from reslrb_cli.transport.plan import Plan
-from reslrb_cli.transport.scattering import Scattering, attached_factor
-from reslrb_cli.transport.walk import Vertex
+from reslrb_cli.transport.scattering import Scattering, tracked_factor
 
 SHARE = 0.01  # the least share of a candidate in the weights up to it
 
@@ -181,7 +181,7 @@ class ReservoirReplay(VertexHooks):
         for slot, adjoint in self.kept:
             weight += dr.select(slot.last >= depth, adjoint_of_factor(adjoint, depth, scattering.f, rest), 0)
         with dr.resume_grad():
-            f = attached_factor(plan, vertex.si, bsdf, scattering, active)
+            f = tracked_factor(plan, vertex.si, bsdf, scattering, active)
             dr.backward_from(dr.select(active, weight * f, 0))
         return state
 

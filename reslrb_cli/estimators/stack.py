@@ -19,6 +19,7 @@ from typing import Any, ClassVar
 import drjit as dr
 import mitsuba as mi
 
+from reslrb_cli.estimators import attached
 from reslrb_cli.estimators.base import (
     Estimator,
     Pass,
@@ -36,9 +37,9 @@ from reslrb_cli.estimators.sums import AdjointSum, PlainSum
 from reslrb_cli.estimators.surface import SurfacePoint, blank_lobe, event, lobe
 from reslrb_cli.transport.connection import Connection, Seen, stand_in
 from reslrb_cli.transport.factors import NO_ZERO, Product
+from reslrb_cli.transport.hooks import Splat, Vertex
 from reslrb_cli.transport.plan import Plan
-from reslrb_cli.transport.scattering import Scattering, attached_factors
-from reslrb_cli.transport.walk import Vertex
+from reslrb_cli.transport.scattering import Scattering, tracked_factors
 
 STACK_SIZE = 64  # vertices
 
@@ -192,7 +193,7 @@ def walk_back(p: Pass, pushed: Pushed) -> AdjointSum:
         connected, scattered = dr.any(frame.weight_c != 0), dr.any(weight_s != 0)
         with dr.resume_grad():
             sampled = event(frame.wo_s, frame.lobe)
-            f_c, f_s = attached_factors(plan, si, bsdf, frame.wo_c, connected, sampled, scattered)
+            f_c, f_s = tracked_factors(plan, si, bsdf, frame.wo_c, connected, sampled, scattered)
             dr.backward_from(dr.select(connected, frame.weight_c * f_c, 0) + dr.select(scattered, weight_s * f_s, 0))
         behind_zero = [A.behind_zero[0] + frame.zeros[1], A.behind_zero[1]] if frame.zeros else []
         return height - 1, PlainSum(A.value + frame.own, A.rest, behind_zero), stack
@@ -213,18 +214,30 @@ def walk_back(p: Pass, pushed: Pushed) -> AdjointSum:
 class Stack(Estimator):
     """Exact, like `gather`, without tracing the paths a second time."""
 
+    exact = True
+    attaches = True
+
     OPTIONS: ClassVar[dict[str, Any]] = {"stack_size": STACK_SIZE}
 
     def __init__(self, stack_size: int = STACK_SIZE) -> None:
         at_least_one("stack_size", stack_size)
         self.stack_size, self.gather = stack_size, Gather()
 
-    def forward(self, p: Pass) -> GatherState | StackState:
+    def forward(self, p: Pass) -> Any:
+        if p.plan.attached:
+            if p.adjoint is not None:
+                return attached.sweep(p, self.stack_size)
+            assert p.block is not None
+            return p.walk(Splat(p.samples, p.block))  # nothing is kept of a path: it is traced again
         if p.adjoint is None or not p.plan.differentiate_bsdfs:
             return self.gather.forward(p)
         return self._sweep(p, None)
 
-    def backward(self, p: Pass, state: GatherState | StackState) -> None:
+    def backward(self, p: Pass, state: Any) -> None:
+        if p.plan.attached:
+            adjoint = state if isinstance(state, attached.Adjoint) else attached.sweep(p, self.stack_size)
+            attached.differentiate_start(p, adjoint)
+            return
         if isinstance(state, GatherState):
             if not p.plan.differentiate_bsdfs:
                 self.gather.backward(p, state)
@@ -237,11 +250,15 @@ class Stack(Estimator):
             p.walk(Taking(p, beyond, state.tail, state.first), (state.first > 0) & (state.first <= state.last))
 
     def kept(self, plan: Plan) -> Any:
+        if plan.attached:
+            return []
         # Visibility is there from an image pass that did not know delta; the sweep's own state comes beside it.
         S = AdjointSum.zero(plan.track_zeros)
         return [Visibility.none(max(plan.max_depth - 1, 0)), StackState(S, S, mi.UInt32(0), mi.UInt32(0))]
 
     def scratch_bytes(self, plan: Plan) -> int:
+        if plan.attached:
+            return attached.scratch_bytes(plan, self.stack_size)
         if not plan.differentiate_bsdfs:
             return 0
         return sum(entry_bytes(Frame.blank(plan).members())) * (places(plan, self.stack_size) + 1)

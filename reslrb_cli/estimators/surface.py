@@ -8,9 +8,9 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from reslrb_cli.transport.hooks import Vertex
 from reslrb_cli.transport.plan import Plan
 from reslrb_cli.transport.scattering import Scattering
-from reslrb_cli.transport.walk import Vertex
 
 
 @dataclass
@@ -47,6 +47,15 @@ class SurfacePoint:
         """The ray that reached the vertex; kept in scenes in which BSDFs read geometry."""
         return mi.Ray3f(*self.numbers[-2:])
 
+    def hit(self) -> tuple[mi.PreliminaryIntersection3f, mi.Ray3f]:
+        """What was hit, and the ray that hit it; kept in scenes in which BSDFs read geometry."""
+        pi = dr.zeros(mi.PreliminaryIntersection3f)
+        pi.valid = mi.Bool(True)  # not kept: a masked write of booleans to thread-local memory ends the process
+        pi.t, pi.prim_uv, pi.prim_index, shape, instance, o, d = self.numbers
+        pi.shape = dr.reinterpret_array(mi.ShapePtr, shape)
+        pi.instance = dr.reinterpret_array(mi.ShapePtr, instance)
+        return pi, mi.Ray3f(o, d)
+
     def interaction(self, plan: Plan, active: Any = True) -> tuple[Any, Any]:
         """The surface interaction, as far as BSDFs read it, and the BSDF."""
         if not plan.keep_geometry:
@@ -54,12 +63,8 @@ class SurfacePoint:
             si.uv, si.wi, *pointer = self.numbers
             si.t = mi.Float(0)  # valid
             return si, dr.reinterpret_array(mi.BSDFPtr, pointer[0]) if pointer else plan.sole_bsdf
-        pi = dr.zeros(mi.PreliminaryIntersection3f)
-        pi.valid = mi.Bool(True)  # not kept: a masked write of booleans to thread-local memory ends the process
-        pi.t, pi.prim_uv, pi.prim_index, shape, instance, o, d = self.numbers
-        pi.shape = dr.reinterpret_array(mi.ShapePtr, shape)
-        pi.instance = dr.reinterpret_array(mi.ShapePtr, instance)
-        si = pi.compute_surface_interaction(mi.Ray3f(o, d), mi.RayFlags.All, active)
+        pi, ray = self.hit()
+        si = pi.compute_surface_interaction(ray, mi.RayFlags.All, active)
         return si, si.bsdf()
 
 

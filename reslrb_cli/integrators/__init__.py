@@ -1,7 +1,9 @@
 """Integrators behind one interface: our light tracers as Mitsuba plugins, stock baselines, and the gradient step."""
 
 from reslrb_cli.integrators.adapter import register
+from reslrb_cli.integrators.interface import Job, StepIntegrator
 from reslrb_cli.integrators.refusal import Refused, first_channels
+from reslrb_cli.integrators.reslrb import Reslrb
 from reslrb_cli.integrators.step import (
     StepResult,
     gradient_step,
@@ -12,7 +14,10 @@ from reslrb_cli.integrators.step import (
 )
 
 __all__ = [
+    "Job",
     "Refused",
+    "Reslrb",
+    "StepIntegrator",
     "StepResult",
     "first_channels",
     "gradient_step",

@@ -6,9 +6,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
+import mitsuba as mi
 
 from reslrb_cli.errors import UnsupportedScene
 from reslrb_cli.scene.catalog import parameter_kind
+from reslrb_cli.scene.motion import moving_emitter_obstacle, moving_shape_obstacle
 
 #: Where a parameter of a BSDF is this small, paths are followed and chosen in spite of it.
 NEARLY_ZERO = 1e-2
@@ -21,39 +23,57 @@ class Differentiated:
     """What tracks derivatives.
 
     `bsdf_nodes` are the nodes of BSDFs that have such parameters: textures, nested BSDFs, and meshes whose attributes
-    textures read. `emission` says whether emission does, `zeros` whether any of the parameters is zero, or, of
-    those of BSDFs, nearly so.
+    textures read. `emission` says whether what emitters emit does, `zeros` whether any of the parameters is zero, or,
+    of those of BSDFs, nearly so. `shapes` are those that move, `emitters` whether rays move that leave an emitter.
     """
 
     bsdf_nodes: tuple[Any, ...]
     emission: bool
     zeros: bool
+    shapes: tuple[mi.Shape, ...]
+    emitters: bool
+
+    @property
+    def moves(self) -> bool:
+        """Whether anything moves that light leaves from or meets."""
+        return bool(self.shapes) or self.emitters
 
 
-def differentiated(params: Any) -> Differentiated:
-    """Look through `mi.SceneParameters` for parameters with derivatives enabled.
+def differentiated(params: mi.SceneParameters) -> Differentiated:
+    """Look through a scene's parameters for those with derivatives enabled.
 
-    Raises UnsupportedScene where one of them moves the geometry or the sensor: detached light tracing has no derivative
-    for that, and would silently leave it at zero.
+    Raises UnsupportedScene, with the reason, for one that light tracing has no derivative for, and would silently leave
+    at zero.
     """
     nodes: dict[Any, None] = {}
-    emission = zeros = False
+    shapes: dict[mi.Shape, None] = {}
+    emission = zeros = emitters = False
     with dr.resume_grad():  # where gradients are suspended, nothing says that it tracks them
-        attached = {key: value for key, value in params.items() if dr.grad_enabled(value)}
-    for key, value in attached.items():
-        kind = parameter_kind(params, key)
+        enabled = {key: value for key, value in params.items() if dr.grad_enabled(value)}
+    for key, value in enabled.items():
+        kind, node = parameter_kind(params, key), params.properties[key][2]
         if kind in ("bsdf", "attribute"):
-            nodes[params.properties[key][2]] = None
+            nodes[node] = None
+        elif kind == "shape":
+            _refuse(key, moving_shape_obstacle(node, key))
+            shapes[node] = None
+            emitters = emitters or node.is_emitter()
+        elif kind == "emitter" and key.rpartition(".")[2] in ("position", "to_world"):
+            _refuse(key, moving_emitter_obstacle(node))
+            emitters = True
         elif kind == "emitter":
             emission = True
         else:
-            raise UnsupportedScene(
-                f"{key}: detached light tracing has derivatives of BSDFs and emission only, not of what moves the "
-                "geometry or the sensor"
-            )
+            _refuse(key, "light tracing has derivatives of what light meets and leaves from, not of the sensor")
         dims = kind == "attribute" or (kind == "bsdf" and any(name in key for name in FACTORS))
-        zeros = zeros or _has_singular(key, value, NEARLY_ZERO if dims else 0)
-    return Differentiated(tuple(nodes), emission, zeros)
+        if kind not in ("shape", "sensor"):
+            zeros = zeros or _has_singular(key, value, NEARLY_ZERO if dims else 0)
+    return Differentiated(tuple(nodes), emission, zeros, tuple(shapes), emitters)
+
+
+def _refuse(key: str, reason: str | None) -> None:
+    if reason is not None:
+        raise UnsupportedScene(f"{key}: {reason}")
 
 
 def _has_singular(key: str, value: Any, least: float) -> bool:

@@ -15,7 +15,7 @@ from typing import Any
 import drjit as dr
 
 from reslrb_cli.errors import UnsupportedScene, is_machine_fault, is_out_of_memory
-from reslrb_cli.integrators.light_tracer import Samples
+from reslrb_cli.transport.samples import Samples
 from reslrb_cli.transport.splat import Film
 
 #: Paths beyond which nothing is recorded: Python does not show beside them, and the trials of a recording would.

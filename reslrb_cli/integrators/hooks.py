@@ -3,48 +3,38 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
 from reslrb_cli.transport.connection import Connection, passage
 from reslrb_cli.transport.factors import Product
-from reslrb_cli.transport.scattering import Scattering, attached_factor, evaluate
+from reslrb_cli.transport.hooks import Hooks, Splat, Vertex
+from reslrb_cli.transport.samples import Samples
+from reslrb_cli.transport.scattering import Scattering, evaluate, tracked_factor
 from reslrb_cli.transport.splat import AdjointImage
 from reslrb_cli.transport.transmittance import forward_derivatives, transmittance
-from reslrb_cli.transport.walk import Hooks, Vertex
-
-if TYPE_CHECKING:
-    from reslrb_cli.integrators.light_tracer import Samples
 
 
-class Splat(Hooks):
-    """Splat every connection."""
+class TrackedSplat(Splat):
+    """Splat every connection, derivatives of its factors tracked, and those of rays and film positions if `attached`
+    (walk_ad)."""
 
-    def __init__(self, samples: Samples, block: Any) -> None:
-        self.samples, self.block = samples, block
+    tracked = True
 
-    def connection(self, state: Any, vertex: Vertex, connection: Connection, numbers: list[Any]) -> Any:
-        s = self.samples
-        C = vertex.product.times(connection.c, vertex.depth).scaled(s.scale)
-        s.film.put(self.block, connection.u, C.value(), connection.active)
-        return state
-
-
-class AttachedSplat(Splat):
-    """Splat every connection, derivatives attached (walk_ad)."""
-
-    attached = True
+    def __init__(self, samples: Samples, block: mi.ImageBlock, attached: bool) -> None:
+        super().__init__(samples, block)
+        self.attached = attached
 
 
 class RecordedObjective(Hooks):
-    """Sum each path's share of the objective, S = sum_i delta_i C_i, derivatives attached (trajectory).
+    """Sum each path's share of the objective, S = sum_i delta_i C_i, derivatives tracked (trajectory).
 
     A splat in a loop that is reversed would have no derivative: side effects are none of the loop's state.
     """
 
-    attached = True
+    tracked = True
 
     def __init__(self, samples: Samples, adjoint: AdjointImage) -> None:
         self.samples, self.adjoint = samples, adjoint
@@ -90,10 +80,10 @@ class TangentSplat(Hooks):
         else:
             (seen, passed), d_passed = passage(s.plan, s.scene, vertex.si, vertex.depth, connection), mi.Spectrum(0)
         with dr.resume_grad(when=s.plan.differentiate_bsdfs):
-            # Two indirect calls: Dr.Jit cannot forward-propagate through one of our own (`attached_factors`) that reads
+            # Two indirect calls: Dr.Jit cannot forward-propagate through one of our own (`tracked_factors`) that reads
             # several parameters.
             f_c = evaluate(s.plan, vertex.si, vertex.bsdf, connection.wo, seen)
-            f_s = attached_factor(s.plan, vertex.si, vertex.bsdf, scattering, scattered)
+            f_s = tracked_factor(s.plan, vertex.si, vertex.bsdf, scattering, scattered)
             df_c, df = forward_derivatives(f_c, f_s)
             f_c = dr.detach(f_c)
         c = f_c * passed * connection.weight

@@ -13,8 +13,10 @@ import mitsuba as mi
 
 from reslrb_cli.integrators import light_tracer as lt
 from reslrb_cli.integrators.features import FEATURES, Feature
+from reslrb_cli.integrators.reslrb import Reslrb
 from reslrb_cli.scene.catalog import list_parameters
 from reslrb_cli.transport.plan import Plan
+from reslrb_cli.transport.samples import passes
 
 PATHS = 64  # traced to have kernels compiled
 LARGE = 100  # operations; smaller kernels develop images and prepare textures
@@ -44,7 +46,7 @@ class PlanReport:
     rows: list[PlanRow]
 
 
-def report_plan(integrator: Any, scene: Any, sensor: Any, params: Any, keys: Iterable[str], *, known: bool,
+def report_plan(integrator: Reslrb, scene: Any, sensor: Any, params: Any, keys: Iterable[str], *, known: bool,
                 counts: bool = True, limit_s: float = 20.0) -> PlanReport:  # fmt: skip
     """What a step of `integrator` (`reslrb`) has to do to differentiate the parameters `keys` of `params`.
 
@@ -52,7 +54,7 @@ def report_plan(integrator: Any, scene: Any, sensor: Any, params: Any, keys: Ite
     `limit_s` seconds have passed.
     """
     keys, start = list(keys), time.perf_counter()
-    with attached(params, keys):
+    with tracking(params, keys):
         plan = integrator.plan(scene, sensor, params)
         estimator = type(integrator.estimator).__name__.removesuffix("Estimator").lower()
         if not counts:
@@ -74,10 +76,10 @@ def report_plan(integrator: Any, scene: Any, sensor: Any, params: Any, keys: Ite
     return PlanReport(estimator, kernels, rows)
 
 
-def count(integrator: Any, plan: Plan, scene: Any, sensor: Any, known: bool) -> list[int]:
+def count(integrator: Reslrb, plan: Plan, scene: Any, sensor: Any, known: bool) -> list[int]:
     """Operations of each large kernel of a step by this plan."""
     with dr.suspend_grad():
-        [samples] = lt.passes(plan, scene, sensor, 0, 1, None)
+        [samples] = passes(plan, scene, sensor, 0, 1, None)
         samples = replace(samples, width=PATHS)
         channels = samples.film.film.base_channels_count()
         size = samples.film.size
@@ -97,7 +99,7 @@ def count(integrator: Any, plan: Plan, scene: Any, sensor: Any, known: bool) -> 
 
 
 @contextmanager
-def attached(params: Any, keys: Iterable[str]) -> Iterator[None]:
+def tracking(params: Any, keys: Iterable[str]) -> Iterator[None]:
     """Parameters `keys` of the scene track derivatives, for as long as the context lasts."""
     values = {key: type(params[key])(dr.detach(params[key])) for key in keys}
     for key, value in values.items():
@@ -128,7 +130,7 @@ def _row(feature: Feature, plan: Plan) -> PlanRow:
     return PlanRow(feature.name, needed, feature.present if needed else feature.absent)
 
 
-def _toggled(integrator: Any, feature: Feature, plan: Plan, scene: Any, sensor: Any, params: Any, keys: list[str],
+def _toggled(integrator: Reslrb, feature: Feature, plan: Plan, scene: Any, sensor: Any, params: Any, keys: list[str],
              known: bool) -> list[int] | str:  # fmt: skip
     """Kernels of the step with the feature the other way round, or the reason why there are none."""
     toggled = feature.toggle(plan)
@@ -140,7 +142,7 @@ def _toggled(integrator: Any, feature: Feature, plan: Plan, scene: Any, sensor: 
         if not more:
             return f"no {feature.parameters} has a parameter that can be differentiated"
         keys = [*keys, *more]
-    with attached(params, keys):
+    with tracking(params, keys):
         if toggled is None:
             toggled = replace(integrator.plan(scene, sensor, params), track_zeros=plan.track_zeros)
         return count(integrator, toggled, scene, sensor, known)

@@ -7,15 +7,15 @@ batched        the samples in batches, each with delta from the image of those b
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass, field
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import drjit as dr
 import mitsuba as mi
 
-from reslrb_cli.integrators.adapter import register, resolve_sensor
+from reslrb_cli.integrators.adapter import TRACERS, interface_of, make_tracer, resolve_sensor
+from reslrb_cli.integrators.interface import Job, StepIntegrator
 from reslrb_cli.integrators.refusal import Refused
 
 Adjoint = Literal["correlated", "independent", "batched"]
@@ -38,40 +38,41 @@ class StepResult:
     refused: Refused = field(default_factory=Refused)
 
 
-def make_integrator(type: str, **options: Any) -> Any:
+def make_integrator(type: str, **options: Any) -> StepIntegrator:
     """An integrator by its plugin's name and options: `reslrb`, `walk_ad`, or a stock one such as `ptracer`, `prb`.
 
     An option that is None is left out: Mitsuba would end the process. Raises ValueError for one that is unknown.
     """
-    register()
+    given = {name: value for name, value in options.items() if value is not None}
+    if type in TRACERS:
+        return make_tracer(type, given)
     properties = mi.Properties(type)
-    for name, value in options.items():
-        if value is not None:
-            properties[name] = value
+    for name, value in given.items():
+        properties[name] = value
     # `mi.load_dict` would look for a library `plugins/prb.so`, and so run one that lies in the working folder: it does
     # not know of plugins that are written in Python.
     integrator = mi.PluginManager.instance().create_object(properties)
     if properties.unqueried():
         raise ValueError(f"{type} has no option {', '.join(properties.unqueried())}")
-    return integrator
+    return interface_of(integrator)
 
 
-def render_image(integrator: Any, scene: Any, sensor: Any, seed: int, spp: int) -> Any:
+def render_image(integrator: StepIntegrator, scene: mi.Scene, sensor: mi.Sensor | int, seed: int, spp: int
+                 ) -> mi.TensorXf:  # fmt: skip
     """The image (H, W, C) without derivatives."""
-    with dr.suspend_grad():
-        return integrator.render(scene, resolve_sensor(scene, sensor), dr.opaque(mi.UInt32, seed), spp)
+    return integrator.image(Job(scene, resolve_sensor(scene, sensor), dr.opaque(mi.UInt32, seed), spp))
 
 
 def gradient_step(
-    integrator: Any,
-    scene: Any,
-    sensor: Any,
+    integrator: StepIntegrator | mi.Integrator,
+    scene: mi.Scene,
+    sensor: mi.Sensor | int,
     objective: Objective,
     *,
     seed: int,
     spp: int,
     adjoint: Adjoint = "correlated",
-    params: Any = None,
+    params: mi.SceneParameters | None = None,
     on_image: Callable[[], None] | None = None,
     batches: int = 4,
     first_batch: FirstBatch = "image",
@@ -83,39 +84,35 @@ def gradient_step(
     `on_image` is called once the image and the loss are evaluated, where a step has such a moment. `batches` and
     `first_batch` belong to `adjoint="batched"`, whose loss is that of all samples' image.
     """
-    sensor = resolve_sensor(scene, sensor)
-    params = params if params is not None else mi.traverse(scene)
+    work, job = interface_of(integrator), _job(scene, sensor, seed, spp, params)
     if adjoint == "batched":
-        return _batched(integrator, scene, sensor, objective, seed, spp, params, batches, first_batch)
-    image_seed, refused = mi.UInt32(seed), Refused()
-    dr.make_opaque(image_seed)
-    if hasattr(integrator, "trace") and adjoint == "correlated":  # reslrb
-        trace = integrator.trace(scene, sensor, image_seed, spp, params)
-        loss, gradient = _derivative(objective, trace.image, refused, on_image)
-        integrator.replay(trace, gradient, params)
-        return StepResult(trace.image, loss, refused)
-    replays = not isinstance(integrator, mi.AdjointIntegrator) and not hasattr(integrator, "attached_image")
-    if replays or adjoint == "independent":
-        gradient_seed = image_seed if adjoint == "correlated" else second_seed(image_seed)
-        with dr.suspend_grad():
-            image = integrator.render(scene, sensor, image_seed, spp)
-        loss, gradient = _derivative(objective, image, refused, on_image)
-        # Isolated, so that another view's propagation finds the edges above the scene's parameters intact.
-        with _naive_ad(integrator), dr.isolate_grad():
-            integrator.render_backward(scene, params, gradient, sensor, gradient_seed, spp)
-        return StepResult(image, loss, refused)
-    with _naive_ad(integrator), dr.isolate_grad():  # as above
-        if hasattr(integrator, "attached_image"):
-            image = integrator.attached_image(scene, sensor, image_seed, spp, params)
-        else:
-            image = integrator.render(scene, sensor, image_seed, spp, develop=True, evaluate=False)
-        loss, gradient = _derivative(objective, dr.detach(image), refused)
-        dr.backward_from(image * gradient)
-    return StepResult(dr.detach(image), loss, refused)
+        return _batched(work, job, objective, batches, first_batch)
+    losses: list[Any] = []
+    refused = Refused()
+
+    def derivative(image: mi.TensorXf) -> mi.TensorXf:
+        together = adjoint == "correlated" and not work.image_apart
+        loss, gradient = _derivative(objective, image, refused, None if together else on_image)
+        losses.append(loss)
+        return gradient
+
+    if adjoint == "correlated":
+        image = work.correlated(job, derivative)
+    else:
+        image = work.image(job)
+        work.backward(replace(job, seed=second_seed(job.seed)), derivative(image))
+    return StepResult(image, losses[0], refused)
 
 
 def known_step(
-    integrator: Any, scene: Any, sensor: Any, gradient: Any, *, seed: int, spp: int, params: Any = None
+    integrator: StepIntegrator | mi.Integrator,
+    scene: mi.Scene,
+    sensor: mi.Sensor | int,
+    gradient: mi.TensorXf,
+    *,
+    seed: int,
+    spp: int,
+    params: mi.SceneParameters | None = None,
 ) -> StepResult:
     """A step whose dL/dI, `gradient` (H, W, C), is known before its image: the loss is the sum of dL/dI times I.
 
@@ -123,63 +120,54 @@ def known_step(
     is as in `gradient_step`.
     """
     refused = Refused()
-    step = _known(integrator, scene, sensor, refused.take(dr.detach(gradient)), seed, spp, params)
-    return StepResult(step.image, step.loss, refused)
+    gradient = refused.take(dr.detach(gradient))
+    image = interface_of(integrator).known(_job(scene, sensor, seed, spp, params), gradient)
+    return StepResult(image, dr.sum((image * gradient).array), refused)
 
 
-def _known(integrator: Any, scene: Any, sensor: Any, gradient: Any, seed: Any, spp: int, params: Any) -> StepResult:
-    """The same with a dL/dI that is finite."""
-
-    def objective(image: Any) -> Any:
-        return dr.sum((image * gradient).array)
-
-    if not hasattr(integrator, "fused"):
-        return gradient_step(integrator, scene, sensor, objective, seed=seed, spp=spp, params=params)
-    params = params if params is not None else mi.traverse(scene)
+def _job(scene: mi.Scene, sensor: mi.Sensor | int, seed: int, spp: int, params: mi.SceneParameters | None) -> Job:
     image_seed = mi.UInt32(seed)
     dr.make_opaque(image_seed)
-    image = integrator.fused(scene, resolve_sensor(scene, sensor), image_seed, spp, gradient, params)
-    return StepResult(image, objective(image))
+    return Job(
+        scene, resolve_sensor(scene, sensor), image_seed, spp, params if params is not None else mi.traverse(scene)
+    )
 
 
-def _batched(integrator: Any, scene: Any, sensor: Any, objective: Objective, seed: Any, spp: int, params: Any,
-             batches: int, first_batch: FirstBatch) -> StepResult:  # fmt: skip
+def _batched(
+    integrator: StepIntegrator, job: Job, objective: Objective, batches: int, first_batch: FirstBatch
+) -> StepResult:
     """A step in batches (design of Deng et al. 2022's dual buffer): batch b takes delta from the image of those before.
 
     No path sees a delta that it helped to make, so that the gradient of an L2 loss is unbiased, as with `independent`,
     from half the paths. The first batch gives an image alone, or is traced `again` with the delta of all others.
     """
-    if batches < 2 or spp % batches:
-        raise ValueError(f"the samples per pixel ({spp}) must be a multiple of the batches ({batches}), at least 2")
-    size = spp // batches
-    seeds = batch_seeds(seed, batches)
+    if batches < 2 or job.spp % batches:
+        raise ValueError(f"the samples per pixel ({job.spp}) must be a multiple of the batches ({batches}), at least 2")
+    parts = [replace(job, seed=seed, spp=job.spp // batches) for seed in batch_seeds(job.seed, batches)]
     share = 1 / (batches if first_batch == "again" else batches - 1)
-    with dr.suspend_grad():
-        first = integrator.render(scene, sensor, seeds[0], size)
+    first = integrator.image(parts[0])
     image, refused = first, Refused()
     for b in range(1, batches):
         _, gradient = _derivative(objective, image, refused)
-        step = _known(integrator, scene, sensor, gradient * share, seeds[b], size, params)
-        image = image + (step.image - image) / (b + 1)
+        image = image + (integrator.known(parts[b], gradient * share) - image) / (b + 1)
         dr.eval(image)
     if first_batch == "again":
         others = (image * batches - first) / (batches - 1)
         _, gradient = _derivative(objective, others, refused)
-        with _naive_ad(integrator), dr.isolate_grad():
-            integrator.render_backward(scene, params, gradient * share, sensor, seeds[0], size)
+        integrator.backward(parts[0], gradient * share)
     return StepResult(image, dr.detach(objective(image)), refused)
 
 
 def _derivative(
-    objective: Objective, image: Any, refused: Refused, on_image: Callable[[], None] | None = None
-) -> tuple[Any, Any]:
+    objective: Objective, image: mi.TensorXf, refused: Refused, on_image: Callable[[], None] | None = None
+) -> tuple[mi.Float, mi.TensorXf]:
     """Loss and dL/dI, evaluated in one go; what of the latter is not finite is refused."""
     with dr.resume_grad(), dr.isolate_grad():
-        attached = type(image)(image)
-        dr.enable_grad(attached)
-        loss = objective(attached)
+        leaf = type(image)(image)
+        dr.enable_grad(leaf)
+        loss = objective(leaf)
         dr.backward_from(loss)
-        gradient = dr.grad(attached)
+        gradient = dr.grad(leaf)
     loss, gradient = dr.detach(loss), refused.take(dr.detach(gradient))
     dr.eval(loss, gradient, refused)
     if on_image is not None:
@@ -199,25 +187,15 @@ def sample_sets(seed: int, options: dict[str, Any]) -> list[tuple[str, Any, int]
     return [("image", first, spp), ("gradient", second_seed(first), spp)]
 
 
-def batch_seeds(seed: int, batches: int) -> list[Any]:
+def batch_seeds(seed: mi.UInt32 | int, batches: int) -> list[mi.UInt32]:
     """The seed of each batch."""
     seeds = [mi.sample_tea_32(mi.UInt32(seed), mi.UInt32(BATCH_STREAM + b))[0] for b in range(batches)]
     dr.make_opaque(seeds)
     return seeds
 
 
-def second_seed(seed: Any) -> Any:
+def second_seed(seed: mi.UInt32) -> mi.UInt32:
     """The seed of the gradient's own samples."""
     result = mi.sample_tea_32(seed, mi.UInt32(1))[0]
     dr.make_opaque(result)
     return result
-
-
-@contextmanager
-def _naive_ad(integrator: Any) -> Iterator[None]:
-    """Stock light tracing is differentiable in evaluated loops alone."""
-    if isinstance(integrator, mi.AdjointIntegrator):
-        with dr.scoped_set_flag(dr.JitFlag.SymbolicLoops, False):
-            yield
-    else:
-        yield

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from reslrb_cli.integrators import first_channels, gradient_step, make_integrator, render_image
+from reslrb_cli.integrators import Job, first_channels, gradient_step, make_integrator, render_image
 from reslrb_cli.measure.small_scenes import load
 
 
@@ -162,7 +162,7 @@ class Case:
 
         sensor, opaque = self.scene.sensors()[self.sensor], dr.opaque(mi.UInt32, seed)
         return self.weighted(
-            self.along(direction, lambda: integrator.render_forward(self.scene, self.params, sensor, opaque, spp))
+            self.along(direction, lambda: integrator.tangent(Job(self.scene, sensor, opaque, spp, self.params)))
         )
 
     def directions(self, count: int, seed: int = 3) -> np.ndarray:
@@ -197,7 +197,7 @@ def seeds(count: int, block: int = 0) -> range:
 
 
 def integrator(name: str, max_depth: int = 4, rr_depth: int = 1000, **options: Any) -> Any:
-    """An integrator without roulette unless asked for."""
+    """An integrator without roulette unless asked for, as `gradient_step` takes it."""
     return make_integrator(name, max_depth=max_depth, rr_depth=rr_depth, **options)
 
 

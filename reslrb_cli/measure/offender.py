@@ -13,12 +13,12 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from reslrb_cli.integrators import gradient_step, make_integrator, sample_sets
-from reslrb_cli.integrators.light_tracer import Samples
+from reslrb_cli.integrators import Job, Reslrb, gradient_step, sample_sets
 from reslrb_cli.measure.offender_paths import search_paths
 from reslrb_cli.optimization.problem import LIGHT_TRACERS, Problem
 from reslrb_cli.records.offender import Offender
 from reslrb_cli.seeds import seed
+from reslrb_cli.transport.samples import Samples
 
 Array = np.ndarray[Any, Any]
 
@@ -57,10 +57,10 @@ def _parts(problem: Problem, sensor: int, step_seed: int) -> Iterator[tuple[Samp
     """The samples of a step, pass by pass, with the sensor's index and a name; light paths are those of the run."""
     options = problem.config.integrator.options()
     shared = {name: options[name] for name in ("max_depth", "rr_depth", "hide_emitters")}
-    tracer = make_integrator("reslrb", estimator="gather", samples_per_pass=problem.samples_per_pass, **shared)
+    tracer = Reslrb.of(estimator="gather", samples_per_pass=problem.samples_per_pass, **shared)
     scene, params = problem.scene, problem.selection.params
     for name, samples_seed, spp in sample_sets(step_seed, problem.config.step_options()):
-        passes = tracer.passes(scene, scene.sensors()[sensor], samples_seed, spp, params)
+        passes = tracer.passes(Job(scene, scene.sensors()[sensor], samples_seed, spp, params))
         for number, samples in enumerate(passes):
             yield samples, sensor, name if len(passes) == 1 else f"{name}, pass {number + 1}"
 

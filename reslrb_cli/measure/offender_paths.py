@@ -9,12 +9,13 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from reslrb_cli.integrators.light_tracer import Samples, trace
 from reslrb_cli.measure.offender_walk import QUANTITIES, SearchHooks, Suspect, is_bad, reaches
 from reslrb_cli.records.offender import Offender, PathVertex
 from reslrb_cli.transport.emission import Emission, sample_emission
+from reslrb_cli.transport.samples import Samples
 from reslrb_cli.transport.transmittance import forward_derivatives
 from reslrb_cli.transport.visible import visible_radiance, visible_tangent
+from reslrb_cli.transport.walk import walk
 
 Array = np.ndarray[Any, Any]
 
@@ -35,7 +36,7 @@ def search_paths(samples: Samples, sensor: int, label: str, pixel: tuple[int, in
         with dr.resume_grad():
             E = sample_emission(plan, samples.scene, samples.sensor, samples.sampler())
             [dE] = forward_derivatives(E.weight) if plan.differentiate_emission else [mi.Spectrum(0)]
-        state = trace(samples, SearchHooks(samples, Emission(E.ray, dr.detach(E.weight)), dE, pixel))
+        state = walk(samples, SearchHooks(samples, Emission(E.ray, dr.detach(E.weight)), dE, pixel))
         dr.eval(state)
     describe = Describe(samples, sensor, label)
     size = np.array(dr.max(dr.abs(state.largest.value)))

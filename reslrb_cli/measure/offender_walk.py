@@ -8,13 +8,13 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from reslrb_cli.integrators.light_tracer import Samples
 from reslrb_cli.transport.connection import Connection
 from reslrb_cli.transport.factors import Product
-from reslrb_cli.transport.scattering import Scattering, attached_factor, evaluate
+from reslrb_cli.transport.hooks import Hooks, Vertex
+from reslrb_cli.transport.samples import Samples
+from reslrb_cli.transport.scattering import Scattering, evaluate, tracked_factor
 from reslrb_cli.transport.splat import Film
 from reslrb_cli.transport.transmittance import forward_derivatives
-from reslrb_cli.transport.walk import Hooks, Vertex
 
 #: What may not be finite; `Suspect.kind` is the index.
 QUANTITIES = (
@@ -106,7 +106,7 @@ class SearchHooks(Hooks):
 
         with dr.resume_grad(when=plan.differentiate_bsdfs):
             f_c = evaluate(plan, vertex.si, vertex.bsdf, connection.wo, seen)
-            f_s = attached_factor(plan, vertex.si, vertex.bsdf, scattering, scattered)
+            f_s = tracked_factor(plan, vertex.si, vertex.bsdf, scattering, scattered)
             df_c, df_s = forward_derivatives(f_c, f_s)
         useful = plan.differentiates(vertex.bsdf)
         C = vertex.product.times(connection.c, vertex.depth).scaled(self.samples.scale).value()

@@ -10,6 +10,7 @@ import mitsuba as mi
 
 from reslrb_cli.backend.device import resident_paths
 from reslrb_cli.estimators.base import entry_bytes
+from reslrb_cli.integrators import Reslrb
 from reslrb_cli.records.clock import MIB, peak_mib, reset_peak
 
 if TYPE_CHECKING:
@@ -71,7 +72,7 @@ def standing() -> int:
     return int(peak_mib(dr.backend_v(mi.Float)) * MIB)
 
 
-def estimate(problem: Problem, integrator: Any, samples: int, fixed: int) -> Estimate:
+def estimate(problem: Problem, integrator: Reslrb, samples: int, fixed: int) -> Estimate:
     """What a step takes whose passes have `samples` samples per pixel; `fixed` stands before it.
 
     The targets, which may not be there yet, are not part of `fixed`, but of the result's.
@@ -95,7 +96,7 @@ def estimate(problem: Problem, integrator: Any, samples: int, fixed: int) -> Est
     return Estimate(fixed + targets, images, scratch * resident_paths(), paths)
 
 
-def choose_samples(problem: Problem, integrator: Any, samples: int, budget: int, fixed: int) -> tuple[int, Estimate]:
+def choose_samples(problem: Problem, integrator: Reslrb, samples: int, budget: int, fixed: int) -> tuple[int, Estimate]:
     """The largest divisor of `samples` that fits into the budget, and what it takes; 0 and the least where none does.
 
     `samples` are those of a batch, or of a step.

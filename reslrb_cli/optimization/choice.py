@@ -14,7 +14,7 @@ import mitsuba as mi
 from reslrb_cli.backend.device import device_name
 from reslrb_cli.config import Config, Reslrb
 from reslrb_cli.errors import ConfigError
-from reslrb_cli.integrators import make_integrator
+from reslrb_cli.integrators import Reslrb as Tracer
 from reslrb_cli.optimization.budget import MemoryPlan, choose_samples, standing
 from reslrb_cli.optimization.pilot import Candidate, Measured, Outcome, Pilot
 from reslrb_cli.optimization.samples import sample_gradient, take_gradient
@@ -41,7 +41,7 @@ class Option:
     """A candidate, ready to run; `memory` where there is a budget."""
 
     options: dict[str, Any]
-    integrator: Any
+    integrator: Tracer
     memory: MemoryPlan | None
 
 
@@ -90,7 +90,7 @@ def _fitting(problem: Problem, integrator: Reslrb, choices: list[dict[str, Any]]
     fixed = 0 if budget is None else standing()
     for choice in choices:
         own = integrator.chosen(**choice).options() if choice else integrator.options()
-        made = make_integrator("reslrb", **own)
+        made = Tracer.of(**own)
         if budget is None:
             options.append(Option(choice, made, None))
             continue
@@ -100,7 +100,7 @@ def _fitting(problem: Problem, integrator: Reslrb, choices: list[dict[str, Any]]
             least.append(expected.total)
             continue
         if size < samples:
-            made.samples_per_pass = size
+            made = made.with_options(samples_per_pass=size, freeze=made.freeze)
         options.append(Option(choice, made, MemoryPlan(budget, size, samples // size, expected)))
     if not options:
         mib = -(-min(least) // MIB)
@@ -134,7 +134,7 @@ def run_pilot(problem: Problem, options: list[Option]) -> Outcome:
     """Measure the options, and say which is the most efficient."""
     run = problem.config.run
     batches = run.batches if problem.config.adjoint == "batched" else 1
-    integrators = {}
+    integrators: dict[str, Tracer] = {}
     made = [_candidate(option) for option in options]
     for candidate, option in zip(made, options, strict=True):
         integrators[candidate.label] = option.integrator
@@ -142,14 +142,10 @@ def run_pilot(problem: Problem, options: list[Option]) -> Outcome:
 
     def step(candidate: Candidate, round: int, spp: int) -> Measured:
         integrator = integrators[candidate.label]
-        samples, freeze = integrator.samples_per_pass, integrator.freeze
-        if candidate.passes > 1:
-            integrator.samples_per_pass = spp // (batches * candidate.passes)
-        integrator.freeze = False  # few steps of each sample count: a recording would cost more than it saves
-        try:
-            return measured_step(problem, integrator, clock, round, spp)
-        finally:
-            integrator.samples_per_pass, integrator.freeze = samples, freeze
+        samples = integrator.samples_per_pass if candidate.passes == 1 else spp // (batches * candidate.passes)
+        # Few steps of each sample count: a recording would cost more than it saves.
+        integrator = integrator.with_options(samples_per_pass=samples, freeze=False)
+        return measured_step(problem, integrator, clock, round, spp)
 
     unit = batches * max(candidate.passes for candidate in made)
     if problem.samples_per_pass is not None:  # the user's own passes

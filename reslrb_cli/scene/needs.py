@@ -21,6 +21,12 @@ _PLAIN_BSDFS = (
     *("SmoothDiffuse", "SmoothConductor", "RoughConductor", "SmoothDielectric", "RoughDielectric", "ThinDielectric"),
     *("SmoothPlastic", "RoughPlastic", "Principled", "PrincipledThin", "BlendBSDF", "MaskBSDF", "TwoSidedBRDF", "Null"),
 )
+#: BSDFs whose samples have the derivative of what they are samples of (`transport.scattering.following`), and those
+#: that only wrap others.
+_FOLLOWED_BSDFS = (
+    *("SmoothDiffuse", "SmoothConductor", "RoughConductor", "SmoothDielectric", "RoughDielectric", "ThinDielectric"),
+    *("TwoSidedBRDF", "BumpMap", "NormalMap", "Null"),
+)
 #: How many see-through surfaces a primary ray is followed through.
 _CROSSINGS = 32
 
@@ -46,6 +52,7 @@ class SceneNeeds:
     moving_shutter: bool
     thin_lens: bool
     principal_point: bool
+    unfollowed: tuple[mi.BSDF, ...] = ()  # surfaces' BSDFs whose sampling is not to be differentiated
 
 
 @dataclass(frozen=True)
@@ -86,6 +93,7 @@ def scene_needs(scene: Any, sensor: Any) -> SceneNeeds:
         moving_shutter=float(sensor.shutter_open_time()) > 0,
         thin_lens=bool(sensor.needs_aperture_sample()),
         principal_point=_has_principal_point(sensor),
+        unfollowed=tuple(bsdf for bsdf in graph.surface_bsdfs() if not _is_followed(graph, bsdf)),
     )
 
 
@@ -171,6 +179,11 @@ def _read_geometry(graph: SceneGraph) -> bool:
     textures = [texture for texture in graph.of_type(mi.Texture) if graph.owning_bsdfs(texture)]
     bsdfs = graph.of_type(mi.BSDF)
     return not all(map(plain, textures)) or any(bsdf.class_name() not in _PLAIN_BSDFS for bsdf in bsdfs)
+
+
+def _is_followed(graph: SceneGraph, bsdf: mi.BSDF) -> bool:
+    nested = (item for item in graph.of_type(mi.BSDF) if bsdf in graph.owning_bsdfs(item))
+    return all(item.class_name() in _FOLLOWED_BSDFS for item in nested)
 
 
 def _has_principal_point(sensor: Any) -> bool:

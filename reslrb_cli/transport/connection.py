@@ -33,9 +33,17 @@ class Connection:
     c: Any = None
 
 
-def connect(plan: Plan, sensor: Any, si: Any, ray: Any, sample: Any, active: Any) -> Connection:
-    """Find where the vertex `si` appears on the film. Detached: film positions do not move here."""
-    with dr.suspend_grad():
+def connect(
+    plan: Plan,
+    sensor: mi.Sensor,
+    si: mi.SurfaceInteraction3f,
+    ray: mi.Ray3f,
+    sample: mi.Point2f,
+    active: mi.Bool,
+    attached: bool = False,
+) -> Connection:
+    """Find where the vertex `si` appears on the film; film positions move with it if `attached`, else they do not."""
+    with dr.suspend_grad(when=not attached):
         ds, importance = sensor.sample_direction(si, sample, active)
         if plan.needs.principal_point:
             importance = _shifted_importance(sensor, ds)

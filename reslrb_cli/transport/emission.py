@@ -17,7 +17,7 @@ DEFENSIVE = 0.1  # share of directions that are drawn uniformly from an environm
 class Emission:
     """A ray that leaves an emitter. `weight` is E of the design notes: radiance over the density of the ray, (C,).
 
-    `weight` tracks derivatives of emission where they are enabled; the density does not.
+    `weight` tracks derivatives of emission where they are enabled; ray and density do where emitters move.
     """
 
     ray: Any
@@ -39,7 +39,7 @@ def sample_emission(plan: Plan, scene: Any, sensor: Any, sampler: Any) -> Emissi
     environment = scene.environment() if plan.environment_map else None
     if environment is None:
         ray, weight, _ = scene.sample_emitter_ray(time, wavelength_sample, sample_2, sample_3, True)
-        return Emission(dr.detach(ray), weight)
+        return Emission(ray if plan.moving_emission else dr.detach(ray), weight)
 
     index, index_weight, reused = scene.sample_emitter(wavelength_sample, True)
     is_environment = index == plan.needs.environment
@@ -49,7 +49,7 @@ def sample_emission(plan: Plan, scene: Any, sensor: Any, sampler: Any) -> Emissi
         ray_2, weight_2 = emitter.sample_ray(time, reused, sample_2, sample_3, ~is_environment)
         ray = dr.select(is_environment, ray, ray_2)
         weight = dr.select(is_environment, weight, weight_2)
-    return Emission(dr.detach(ray), weight * dr.detach(index_weight))
+    return Emission(ray if plan.moving_emission else dr.detach(ray), weight * dr.detach(index_weight))
 
 
 def _environment_ray(plan: Plan, scene: Any, environment: Any, time: Any, disk: Any, direction: Any) -> tuple[Any, Any]:

@@ -39,20 +39,20 @@ class Product:
 
     `nonzero` is the product of all factors (untracked), or of those that are not zero, with stand-ins for the others
     (tracked). `zero` holds, per channel, the index of the zero factor, NO_ZERO or MANY_ZEROS; it is empty where zeros
-    are not tracked. `attached` is the plain product with derivatives, for naive AD only; otherwise it is empty.
+    are not tracked. `tracked` is the plain product with derivatives, for naive AD only; otherwise it is empty.
     `raised` is the product of the factors, each at least DIM of its stand-in; it is empty where zeros are not tracked.
     """
 
     nonzero: Any
     zero: list[Any] = field(default_factory=list)
-    attached: list[Any] = field(default_factory=list)
+    tracked: list[Any] = field(default_factory=list)
     raised: list[Any] = field(default_factory=list)
 
     @staticmethod
-    def one(track_zeros: bool, attached: bool = False) -> Product:
+    def one(track_zeros: bool, tracked: bool = False) -> Product:
         """The empty product."""
         zero = [mi.Int32(NO_ZERO) for _ in range(len(mi.Spectrum(0)))] if track_zeros else []
-        return Product(mi.Spectrum(1), zero, [mi.Spectrum(1)] if attached else [], [mi.Spectrum(1)] if zero else [])
+        return Product(mi.Spectrum(1), zero, [mi.Spectrum(1)] if tracked else [], [mi.Spectrum(1)] if zero else [])
 
     @staticmethod
     def none(track_zeros: bool) -> Product:
@@ -64,28 +64,28 @@ class Product:
 
         `stand_in` takes its place in `nonzero` where it is zero: a positive number of the size of its derivative.
         """
-        attached = [self.attached[0] * factor] if self.attached else []
+        tracked = [self.tracked[0] * factor] if self.tracked else []
         factor = dr.detach(factor)
         if not self.zero:
-            return Product(self.nonzero * factor, [], attached)
+            return Product(self.nonzero * factor, [], tracked)
         nonzero = self.nonzero * dr.select(factor == 0, stand_in, factor)
         first = [dr.select(z == NO_ZERO, mi.Int32(index), MANY_ZEROS) for z in self.zero]
         zero = [dr.select(factor[c] == 0, first[c], z) for c, z in enumerate(self.zero)]
         raised = [r * dr.maximum(dr.abs(factor), mi.Spectrum(DIM * stand_in)) for r in self.raised]
-        return Product(nonzero, zero, attached, raised)
+        return Product(nonzero, zero, tracked, raised)
 
     def scaled(self, scale: Any) -> Product:
         """The product times a positive number that no parameter reaches, such as a roulette weight."""
-        attached, raised = ([value * scale for value in values] for values in (self.attached, self.raised))
-        return Product(self.nonzero * scale, self.zero, attached, raised)
+        tracked, raised = ([value * scale for value in values] for values in (self.tracked, self.raised))
+        return Product(self.nonzero * scale, self.zero, tracked, raised)
 
     def stored(self) -> Product:
         """The product without what is of no more use once it has been chosen."""
         return replace(self, raised=[])
 
     def value(self) -> Any:
-        """The contribution itself: zero in every channel that has a zero factor. Attached under naive AD."""
-        return self.attached[0] if self.attached else self._where(self.nonzero, [z == NO_ZERO for z in self.zero])
+        """The contribution itself: zero in every channel that has a zero factor. Tracked under naive AD."""
+        return self.tracked[0] if self.tracked else self._where(self.nonzero, [z == NO_ZERO for z in self.zero])
 
     def differentiable(self) -> Any:
         """Product of the nonzero factors in every channel whose value or derivative can be nonzero; else zero."""

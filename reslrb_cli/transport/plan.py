@@ -31,6 +31,13 @@ class Plan:
     # Whether any of those that are differentiated has delta lobes, or lets light pass straight through.
     differentiate_delta: bool = False
     differentiate_null: bool = False
+    # Whether directions, hit points and film positions have derivatives too, and what moves by itself: shapes, and the
+    # rays that emitters send out.
+    attached: bool = False
+    moving_shapes: tuple[mi.Shape, ...] = ()
+    moving_emission: bool = False
+    # Whether the normalisation of the reconstruction filter's weights has its derivative: finite differences have.
+    attached_normalization: bool = True
 
     @property
     def roulette(self) -> bool:
@@ -59,7 +66,7 @@ class Plan:
     @property
     def keep_geometry(self) -> bool:
         """Whether a vertex that is kept has to be found again on its surface."""
-        return self.needs.bsdfs_read_geometry or self.passage_in_gradient
+        return self.attached or self.needs.bsdfs_read_geometry or self.passage_in_gradient
 
     @property
     def sole_bsdf(self) -> Any:
@@ -79,6 +86,13 @@ class Plan:
         """Lanes in which a vertex with this BSDF (a pointer) has anything to differentiate, its connection's passage
         through masks included."""
         return mi.Bool(True) if self.differentiate_null else self.differentiates(bsdf)
+
+    def moves(self, shape: mi.ShapePtr) -> mi.Bool:
+        """Lanes in which the shape moves by itself."""
+        result = mi.Bool(False)
+        for other in self.moving_shapes:
+            result |= shape == mi.ShapePtr(other)
+        return result
 
     def differentiating(self, bsdfs: bool, emission: bool, track_zeros: bool, only_bsdfs: tuple[Any, ...] = ()) -> Plan:
         """The same plan for a step that differentiates these; `track_zeros`: some of their factors may be zero."""

@@ -72,12 +72,12 @@ def shading_correction(plan: Plan, si: Any, wi_world: Any, wo_world: Any, wo: An
 
 def scatter(
     plan: Plan, si: Any, bsdf: Any, ray: Any, sample_1: Any, sample_2: Any, active: Any,
-    connection_wo: Any, connected: Any,
+    connection_wo: Any, connected: Any, attached: bool = False,
 ) -> tuple[Scattering, Any]:  # fmt: skip
     """Sample the next direction, and evaluate f (C,) towards `connection_wo` in `connected` lanes (None: in no lane).
 
-    Detached; `attached_factors` has the derivatives. Both queries share one indirect call, and in it what they have in
-    common (looking up textures, mostly).
+    Detached, unless `attached`; `tracked_factors` has the derivatives of the factors alone. Both queries share one
+    indirect call, and in it what they have in common (looking up textures, mostly).
     """
     context = importance_context()
 
@@ -85,7 +85,7 @@ def scatter(
         bs, weight = self.sample(context, si, sample_1, sample_2, active)
         return evaluate(plan, si, self, wo, connected), bs.wo, bs.pdf, bs.eta, bs.sampled_type, weight
 
-    with dr.suspend_grad():
+    with dr.suspend_grad(when=not attached):
         if plan.needs.has_perturbed_normals:
             defensive = sample_1 < DEFENSIVE
             sample_1 = dr.select(defensive, sample_1 / DEFENSIVE, (sample_1 - DEFENSIVE) / (1 - DEFENSIVE))
@@ -99,6 +99,8 @@ def scatter(
             )
         if plan.needs.has_perturbed_normals:
             wo, pdf, eta, lobe = _mixed(si, bsdf, sample_2, defensive, active, wo, pdf, eta, lobe)
+        if attached:
+            wo, pdf, weight = following(plan, si, bsdf, active, wo, pdf, lobe, weight)
         d = si.to_world(wo)
         correction, valid = shading_correction(plan, si, -ray.d, d, wo)
         is_null = mi.has_flag(lobe, mi.BSDFFlags.Null) if plan.needs.has_null else mi.Bool(False)
@@ -124,6 +126,38 @@ def scatter(
             active=active & valid & (pdf > 0),
         )
         return scattering, f_connection
+
+
+def following(
+    plan: Plan,
+    si: mi.SurfaceInteraction3f,
+    bsdf: mi.BSDFPtr,
+    active: mi.Bool,
+    wo: mi.Vector3f,
+    pdf: mi.Float,
+    lobe: mi.UInt32,
+    weight: mi.Spectrum,
+) -> tuple[mi.Vector3f, mi.Float, mi.Spectrum]:
+    """Direction, density and weight (C,) of a sample whose derivative is that of the integral it stands for.
+
+    Where all that a BSDF does to make a sample is smooth (or its choice of a lobe is weighed accordingly, as Mitsuba's
+    dielectrics do), that is the derivative of the sample itself: the direction follows the surface, and a roughness.
+    Other BSDFs choose a lobe by a probability that depends on their parameters and on the incident direction, and the
+    derivative of a sample knows nothing of the choice. Their smooth lobes keep their direction, in the local frame, and
+    f / pdf is differentiated by f alone; their delta lobes keep the probability.
+    """
+    if not plan.needs.unfollowed:
+        return wo, pdf, weight
+    delta = mi.has_flag(lobe, mi.BSDFFlags.Delta)
+    fixed = mi.Bool(False)
+    for other in plan.needs.unfollowed:
+        fixed |= bsdf == mi.BSDFPtr(other)
+    kept = dr.detach(pdf)
+    weight = dr.select(fixed & delta & (kept > 0), weight * (pdf / kept), weight)
+    fixed = active & fixed & ~delta & (kept > 0)
+    wo, pdf = dr.select(fixed, dr.detach(wo), wo), dr.select(fixed, kept, pdf)
+    f = evaluate(plan, si, bsdf, wo, fixed)
+    return wo, pdf, dr.select(fixed, dr.replace_grad(weight, f / kept), weight)
 
 
 def _mixed(
@@ -161,7 +195,7 @@ def evaluate(plan: Plan, si: Any, bsdf: Any, wo: Any, active: Any) -> Any:
     return bsdf.eval(mi.BSDFContext(mi.TransportMode.Radiance), exchanged, si.wi, active)
 
 
-def attached_factor(plan: Plan, si: Any, bsdf: Any, scattering: Scattering, active: Any) -> Any:
+def tracked_factor(plan: Plan, si: Any, bsdf: Any, scattering: Scattering, active: Any) -> Any:
     """f (C,) with derivatives, of the event that `scattering` is.
 
     Call under `dr.resume_grad()`. What the scene has no lobes for is not compiled.
@@ -170,7 +204,7 @@ def attached_factor(plan: Plan, si: Any, bsdf: Any, scattering: Scattering, acti
     return _singular_factor(plan, si, bsdf, scattering, active, f)
 
 
-def attached_factors(
+def tracked_factors(
     plan: Plan, si: Any, bsdf: Any, connection_wo: Any, connected: Any, scattering: Scattering, scattered: Any
 ) -> tuple[Any, Any]:
     """f (C,) towards the sensor and f along the path, both with derivatives, from one indirect call.

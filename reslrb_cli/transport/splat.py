@@ -32,8 +32,15 @@ class Film:
         block.set_coalesce(False)  # splats of neighbouring lanes land anywhere
         return block
 
-    def put(self, block: Any, u: Any, value: Any, active: Any) -> None:
-        """Add `value` (C,) at film position `u` (pixels, relative to the crop window) through the filter."""
+    def put(self, block: Any, u: Any, value: Any, active: Any, normalization: bool = False) -> None:
+        """Add `value` (C,) at film position `u` (pixels, relative to the crop window) through the filter.
+
+        Under naive AD the weights of the pixels move with `u`. Mitsuba divides them by their sum, which it detaches;
+        with `normalization` the sum has its derivative too.
+        """
+        if normalization:
+            total = filter_weights(self.film.rfilter(), u)[2]
+            value = value * dr.select(total != 0, dr.detach(total) / total, 1)
         color = [value[c % len(value)] for c in range(N_COLOR)]  # a mono variant fills all three
         if block.channel_count() != len("RGBW"):
             color = [showing(c) for c in color]  # they are added up one by one, not as a packet
@@ -78,13 +85,16 @@ class AdjointImage:
         self.image, self.channels, self.film = image, channels, film
         self.filter = film.film.rfilter()
 
-    def lookup(self, u: Any, active: Any) -> Any:
-        """delta (C,) at film position `u` (pixels, relative to the crop window)."""
+    def lookup(self, u: Any, active: Any, normalization: bool = True) -> Any:
+        """delta (C,) at film position `u` (pixels, relative to the crop window), with its derivative by `u` if any.
+
+        Without `normalization` the sum that the filter's weights are divided by has no derivative, as in Mitsuba.
+        """
         if self.filter.is_box_filter():
             pixel = mi.Point2u(mi.Point2i(dr.floor(u)))
             inside = active & (pixel.x < self.film.size.x) & (pixel.y < self.film.size.y)
             return self._pixel(pixel, inside)
-        return self._filtered(u, active)
+        return self._filtered(u, active, normalization)
 
     def _pixel(self, pixel: Any, active: Any) -> Any:
         index = dr.fma(pixel.y, mi.UInt32(self.film.size.x), pixel.x)
@@ -95,19 +105,28 @@ class AdjointImage:
         color = [color[c] for c in range(N_COLOR)]
         return mi.Spectrum(*color) if len(mi.Spectrum(0)) == N_COLOR else mi.Spectrum(sum(color))
 
-    def _filtered(self, u: Any, active: Any) -> Any:
-        # The same taps and the same normalisation, off-film taps included, as ImageBlock.put(normalize=True).
-        radius = self.filter.radius()
-        taps = int(dr.ceil(2 * radius))
-        center = u - 0.5
-        first = mi.Point2i(dr.ceil(center - radius))
-        weights_x = [self.filter.eval(mi.Float(first.x + i) - center.x) for i in range(taps)]
-        weights_y = [self.filter.eval(mi.Float(first.y + i) - center.y) for i in range(taps)]
-        total = sum(weights_x) * sum(weights_y)
+    def _filtered(self, u: Any, active: Any, normalization: bool) -> Any:
+        first, (weights_x, weights_y), total = filter_weights(self.filter, u)
+        if not normalization:
+            total = dr.detach(total)
         delta = mi.Spectrum(0)
-        for y in range(taps):
-            for x in range(taps):
+        for y in range(len(weights_y)):
+            for x in range(len(weights_x)):
                 pixel = mi.Point2u(mi.Point2i(first.x + x, first.y + y))
                 inside = active & (pixel.x < self.film.size.x) & (pixel.y < self.film.size.y)
                 delta += self._pixel(pixel, inside) * (weights_x[x] * weights_y[y])
         return delta * dr.select(total != 0, dr.rcp(total), 0)
+
+
+def filter_weights(
+    rfilter: mi.ReconstructionFilter, u: mi.Point2f
+) -> tuple[mi.Point2i, tuple[list[mi.Float], list[mi.Float]], mi.Float]:
+    """What `ImageBlock.put` does at film position `u`: the first pixel that is touched, weights by column and by row,
+    and their sum over all pixels, off the film too."""
+    radius = rfilter.radius()
+    taps = int(dr.ceil(2 * radius))
+    center = u - 0.5
+    first = mi.Point2i(dr.ceil(center - radius))
+    columns = [rfilter.eval(mi.Float(first.x + i) - center.x) for i in range(taps)]
+    rows = [rfilter.eval(mi.Float(first.y + i) - center.y) for i in range(taps)]
+    return first, (columns, rows), sum(columns) * sum(rows)

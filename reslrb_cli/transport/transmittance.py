@@ -16,9 +16,9 @@ def forward_derivatives(*values: Any) -> list[Any]:
     In one propagation: a second one would meet the edges of the first. It leaves the parameters' own tangents standing,
     for the next vertex.
     """
-    attached = [value for value in values if dr.grad_enabled(value)]
-    if attached:
-        dr.forward_to(attached, flags=dr.ADFlag.ClearEdges | dr.ADFlag.ClearInterior)
+    tracked = [value for value in values if dr.grad_enabled(value)]
+    if tracked:
+        dr.forward_to(tracked, flags=dr.ADFlag.ClearEdges | dr.ADFlag.ClearInterior)
     return [dr.detach(dr.grad(value)) if dr.grad_enabled(value) else dr.zeros(type(value)) for value in values]
 
 
@@ -50,7 +50,7 @@ def transmittance(
     """Follow the segment from the interaction `start` to the point `target` through at most `limit` null surfaces.
 
     Each crossing counts as a vertex, as it does for `path`. `on_crossing(transmission, active)` is called at each one
-    with its transmission (C,), attached where gradients are enabled, to take its derivative there and then.
+    with its transmission (C,), tracked where gradients are enabled, to take its derivative there and then.
     With `tangents`, the derivative along the parameters' tangents is carried along (forward mode); call it where
     gradients are suspended then, since the loop itself must not track any.
     """

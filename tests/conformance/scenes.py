@@ -11,6 +11,7 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
+import reslrb_cli
 from reslrb_cli.integrators import make_integrator, render_image
 from reslrb_cli.measure.statistics import Agreement, compare
 
@@ -92,6 +93,12 @@ def stage(emitters: dict[str, Any] | None = None, sensor: Any = None, **things: 
     }
     scene.update(things)
     return mi.load_dict({key: value for key, value in scene.items() if value is not None}, optimize=False)
+
+
+def plugin(name: str, max_depth: int = 4, rr_depth: int = 1000, **options: Any) -> Any:
+    """An integrator as Mitsuba's users get it, without roulette unless asked for."""
+    reslrb_cli.register()
+    return mi.load_dict({"type": name, "max_depth": max_depth, "rr_depth": rr_depth, **options})
 
 
 def images(scene: Any, integrator: str, seeds: range, spp: int, sensor: int = 0, **options: Any) -> np.ndarray:

@@ -38,7 +38,7 @@ def gradients(case: GradientCase, adjoint: str, **options: object) -> tuple[list
         factor = 1 - 0.1 * step
         scene.set({key: value * factor for key, value in scene.initial.items()})
         found.append(scene.gradient(chosen, 5 + step, 8, adjoint=adjoint))
-        counts.append(chosen.recordings.counts())
+        counts.append(chosen.preparation.recordings.counts())
     return found, counts
 
 
@@ -115,4 +115,4 @@ def test_large_steps_are_not_recorded(monkeypatch: pytest.MonkeyPatch) -> None:
     for most, recorded in ((paths - 1, False), (paths, True)):
         monkeypatch.setattr(freezing, "MOST_PATHS", most)
         scene.gradient(chosen, 3, 8)
-        assert bool(chosen.recordings.counts()) == recorded
+        assert bool(chosen.preparation.recordings.counts()) == recorded

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 from conformance.gradient_cases import CASES
+from conformance.scenes import plugin
 
 from reslrb_cli.measure.gradients import Case, integrator, relative, seeds
 from reslrb_cli.measure.statistics import compare
@@ -46,8 +47,8 @@ def forward(scene: Case, integrator: Any, seed: int, spp: int) -> np.ndarray:
 def test_forward_mode_is_walk_ad(name: str):
     case = BY_NAME[name]
     scene, options = Case(case.scene(), case.keys), case.both | case.options
-    tangent = forward(scene, integrator("reslrb", **options), 3, 32)
-    naive = forward(scene, integrator("walk_ad", **options), 3, 32)
+    tangent = forward(scene, plugin("reslrb", **options), 3, 32)
+    naive = forward(scene, plugin("walk_ad", **options), 3, 32)
     assert np.abs(naive).max() > 0
     assert relative(tangent, naive) < 1e-5
     # The adjoint of the same derivative: <weights, J v> = <J^T weights, v>, at the seed that forward mode had.
@@ -60,11 +61,12 @@ def test_forward_against_backward(name: str):
     """<weights, J v> against <J^T weights, v>, where J^T is the reservoir's."""
     case = BY_NAME[name]
     scene = Case(case.scene(), case.keys)
-    ours = integrator("reslrb", **case.both | case.options)
+    options = case.both | case.options
+    ours = plugin("reslrb", **options)
     direction = np.abs(scene.directions(1)[0])
     scene.directions = lambda count: direction[None]  # one sign, so that the product is not lost in its noise
     tangents = np.array([np.sum(forward(scene, ours, s, case.spp) * np.array(scene.weights)) for s in seeds(16)])
-    gradients = scene.gradients(ours, seeds(16, 1), case.spp) @ direction
+    gradients = scene.gradients(integrator("reslrb", **options), seeds(16, 1), case.spp) @ direction
     result = compare(tangents[:, None], gradients[:, None], block=None)
     assert result
     assert result.relative_error < 0.03

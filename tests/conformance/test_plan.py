@@ -14,7 +14,7 @@ from conformance.gradient_cases import FLOOR
 
 from reslrb_cli.integrators import known_step
 from reslrb_cli.integrators.features import FEATURES
-from reslrb_cli.integrators.plan_report import attached, count, report_plan
+from reslrb_cli.integrators.plan_report import count, report_plan, tracking
 from reslrb_cli.measure.gradients import Case, integrator
 from reslrb_cli.measure.small_scenes import camera, diffuse, rgb, room, texture, transform
 
@@ -57,7 +57,7 @@ def step(case: Case, ours: Any) -> tuple[np.ndarray, np.ndarray]:
     import drjit as dr
     import mitsuba as mi
 
-    with attached(case.params, case.keys):
+    with tracking(case.params, case.keys):
         leaves = [case.params[key] for key in case.keys]
         for leaf in leaves:
             dr.set_grad(leaf, 0)
@@ -74,10 +74,10 @@ def both_ways(make: Callable[[], dict], keys: tuple[str, ...], feature: str, est
         case = Case(make(), keys)
         ours = integrator("reslrb", 5, estimator=estimator)
         if forced:
-            with attached(case.params, case.keys):
+            with tracking(case.params, case.keys):
                 plan = toggle(ours.plan(case.scene, case.scene.sensors()[0], case.params))
             ours.plan = lambda scene, sensor, params=None: plan  # noqa: B023
-        with attached(case.params, case.keys):
+        with tracking(case.params, case.keys):
             plan_now = ours.plan(case.scene, case.scene.sensors()[0], case.params)
             operations = sum(count(ours, plan_now, case.scene, case.scene.sensors()[0], known=True))
         results.append((operations, *step(case, ours)))
@@ -132,7 +132,7 @@ def test_only_what_is_asked_for_is_differentiated(keys: tuple[str, ...], more: t
     for chosen in (keys, keys + more):
         case = Case(plain(), chosen)
         ours = integrator("reslrb", 5, estimator=estimator)
-        with attached(case.params, chosen):
+        with tracking(case.params, chosen):
             plan = ours.plan(case.scene, case.scene.sensors()[0], case.params)
             kernels = count(ours, plan, case.scene, case.scene.sensors()[0], known=True)
         image, gradient = step(case, ours)
@@ -149,7 +149,7 @@ def test_emitters_alone_replay_no_path(estimator: str):
     """Beside the walk that makes the image, there is only the small kernel of emission."""
     case = Case(plain(), (RADIANCE,))
     ours = integrator("reslrb", 5, estimator=estimator)
-    with attached(case.params, case.keys):
+    with tracking(case.params, case.keys):
         plan = ours.plan(case.scene, case.scene.sensors()[0], case.params)
         walk, *others = count(ours, plan, case.scene, case.scene.sensors()[0], known=True)
     assert sum(others) < walk / 2

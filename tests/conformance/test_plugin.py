@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from conformance.gradient_cases import FLOOR, _mask, _textured
+from conformance.scenes import plugin
 
 from reslrb_cli.errors import UnsupportedScene
 from reslrb_cli.integrators import render_image
@@ -19,6 +20,7 @@ from reslrb_cli.measure.small_scenes import camera, lamp, rgb, room
 from reslrb_cli.measure.statistics import compare
 
 pytestmark = pytest.mark.usefixtures("llvm")
+
 
 SCRIPT = """
 import reslrb_cli
@@ -70,7 +72,7 @@ def _facing() -> Any:
 
 
 def test_defaults_are_ptracers():
-    ours, stock = integrator("reslrb", max_depth=-1, rr_depth=5), str(integrator("ptracer", max_depth=-1, rr_depth=5))
+    ours, stock = plugin("reslrb", -1, 5), str(plugin("ptracer", -1, 5))
     import mitsuba as mi
 
     default = mi.load_dict({"type": "reslrb"})
@@ -127,7 +129,7 @@ def test_mi_render_backward_through_a_latent_variable(case: Case):
     import drjit as dr
     import mitsuba as mi
 
-    ours, key, steps = integrator("reslrb"), FLOOR, []
+    ours, key, steps = plugin("reslrb"), FLOOR, []
     for seed in seeds(12):
         latent = mi.Float(0.8)
         dr.enable_grad(latent)
@@ -148,7 +150,7 @@ def test_mi_render_adds_to_gradients_that_are_there(case: Case):
     import drjit as dr
     import mitsuba as mi
 
-    ours, leaf = integrator("reslrb"), mi.TensorXf(case.params[FLOOR])
+    ours, leaf = plugin("reslrb"), mi.TensorXf(case.params[FLOOR])
     dr.enable_grad(leaf)
     sums = []
     for seed in (1, 2):

@@ -8,11 +8,13 @@ from typing import Any
 import pytest
 from conformance.gradient_cases import CASES
 
+from reslrb_cli.estimators.base import Pass
 from reslrb_cli.estimators.reservoir import ReservoirSelection
-from reslrb_cli.integrators import light_tracer
+from reslrb_cli.integrators import Job
 from reslrb_cli.measure.gradients import Case, integrator
 from reslrb_cli.measure.small_scenes import room
-from reslrb_cli.transport.walk import Hooks
+from reslrb_cli.transport.emission import sample_emission
+from reslrb_cli.transport.hooks import Hooks
 
 pytestmark = pytest.mark.usefixtures("llvm")
 
@@ -99,12 +101,12 @@ def test_replay_meets_the_same_vertices(name: str):
     scene = Case(case.scene(), case.keys)
     ours = integrator("reslrb", **case.both | case.options)
     with dr.suspend_grad():
-        [samples] = ours.passes(scene.scene, scene.scene.sensors()[0], mi.UInt32(5), 64)
-        context = samples.context(None, None)
+        [samples] = ours.passes(Job(scene.scene, scene.scene.sensors()[0], mi.UInt32(5), 64))
+        context = Pass(samples, None, None)
         kept = context.walk(Recording(context, 1, "luminance", False))
         dr.eval(kept)
         slot, active = kept.state.slots[0], kept.state.W > 0
-        emission = light_tracer.sample_emission(samples.plan, scene.scene, samples.sensor, samples.sampler()).weight
+        emission = sample_emission(samples.plan, scene.scene, samples.sensor, samples.sampler()).weight
         _, C, p, u, I = context.walk(Rewalk(samples, kept, emission), active)  # noqa: E741
         stored = slot.C.value()
         dr.eval(C, p, u, I, stored)

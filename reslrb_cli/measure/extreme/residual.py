@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
+from reslrb_cli.estimators.base import Pass
 from reslrb_cli.estimators.gather import Gathering, Taking
+from reslrb_cli.integrators import Job, Reslrb
 from reslrb_cli.measure.comparison import Comparison
 from reslrb_cli.measure.extreme.case import ExtremeCase
-from reslrb_cli.measure.gradients import Case, integrator
+from reslrb_cli.measure.gradients import Case
 from reslrb_cli.records.gradcheck import Verdict
 
 #: Of the root mean square of the sums.
@@ -22,10 +24,10 @@ def residual(case: ExtremeCase, setup: Case, seed: int = 1) -> Comparison:
     for key in setup.keys:
         dr.enable_grad(setup.params[key])
     setup.settle()
-    tracer = integrator("reslrb", **case.options, **case.ours, estimator="gather")
+    tracer = Reslrb.of(**{"rr_depth": 1000, **case.options, **case.ours, "estimator": "gather"})
     with dr.suspend_grad(), dr.isolate_grad():
-        [samples] = tracer.passes(setup.scene, setup.scene.sensors()[0], mi.UInt32(seed), case.spp, setup.params)
-        p = samples.context(None, samples.film.adjoint(setup.weights))
+        [samples] = tracer.passes(Job(setup.scene, setup.scene.sensors()[0], mi.UInt32(seed), case.spp, setup.params))
+        p = Pass(samples, None, samples.film.adjoint(setup.weights))
         state = p.walk(Gathering(p))
         dr.eval(state)
         [S] = state.S

@@ -1,0 +1,50 @@
+"""What a gradient step asks of an integrator, ours or a stock one."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol, TypeAlias
+
+import mitsuba as mi
+
+#: From an image (H, W, C) to dL/dI, of the same shape.
+Derivative: TypeAlias = "Callable[[mi.TensorXf], mi.TensorXf]"  # text: the type is there once a variant is set
+
+
+@dataclass(frozen=True)
+class Job:
+    """One set of samples: of which scene, through which sensor, with which random numbers.
+
+    `seed` is an opaque UInt32, `spp` are samples per pixel. Those of `params`, the scene's `mi.traverse`, that track
+    derivatives are differentiated; None for an image alone.
+    """
+
+    scene: mi.Scene
+    sensor: mi.Sensor
+    seed: mi.UInt32
+    spp: int
+    params: mi.SceneParameters | None = None
+
+
+class StepIntegrator(Protocol):
+    """Images and gradients; images and dL/dI are tensors (H, W, C), gradients are added to the job's parameters."""
+
+    #: Whether `correlated` has image and dL/dI evaluated before the rest of its work begins; naive AD has not.
+    image_apart: bool
+
+    def image(self, job: Job) -> mi.TensorXf:
+        """The image, without derivatives."""
+        ...
+
+    def backward(self, job: Job, gradient: mi.TensorXf) -> None:
+        """Add the gradient of the objective with dL/dI `gradient`."""
+        ...
+
+    def correlated(self, job: Job, derivative: Derivative) -> mi.TensorXf:
+        """The image, and the gradient of the same samples with the dL/dI that `derivative(image)` returns."""
+        ...
+
+    def known(self, job: Job, gradient: mi.TensorXf) -> mi.TensorXf:
+        """The image, and the gradient of the same samples, where dL/dI is known before either."""
+        ...

@@ -1,0 +1,111 @@
+"""What a light tracer finds out about a scene once, and keeps while that scene is traced."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import mitsuba as mi
+
+from reslrb_cli.errors import UnsupportedScene
+from reslrb_cli.integrators.differentiated import Differentiated, differentiated
+from reslrb_cli.integrators.freezing import Recordings
+from reslrb_cli.integrators.light_tracer import settle
+from reslrb_cli.scene.graph import SceneGraph
+from reslrb_cli.scene.needs import check_supported, scene_needs
+from reslrb_cli.transport.plan import Plan, make_plan
+
+
+@dataclass(frozen=True)
+class Motion:
+    """How derivatives of what moves light are taken.
+
+    `attached` is `auto` (where a parameter moves anything), or says so; `filter_normalization` is `attached` or
+    `detached`. Raises ValueError for anything else.
+    """
+
+    attached: bool | str = "auto"
+    filter_normalization: str = "attached"
+
+    def __post_init__(self) -> None:
+        if self.attached not in (True, False, "auto"):
+            raise ValueError('"attached" must be auto, true or false')
+        if self.filter_normalization not in ("attached", "detached"):
+            raise ValueError('"filter_normalization" must be attached or detached')
+
+
+def attach(plan: Plan, which: Differentiated, motion: Motion, sensor: mi.Sensor) -> Plan:
+    """The plan with attached derivatives, where they are asked for. Raises UnsupportedScene where there are none."""
+    if motion.attached is False and which.moves:
+        raise UnsupportedScene(
+            "attached: false leaves out the derivatives of parameters that move light; leave it at auto"
+        )
+    if not (which.moves or (motion.attached is True and (which.bsdf_nodes or which.emission))):
+        return plan
+    if plan.needs.has_null:
+        raise UnsupportedScene("attached derivatives do not go through masks and other surfaces with null lobes")
+    if sensor.film().rfilter().is_box_filter():
+        raise UnsupportedScene(
+            f"sensor {sensor.id()} has a box filter, whose splats do not change while they move inside of a pixel; "
+            "take a smooth one, such as gaussian, for derivatives of what moves light"
+        )
+    return replace(
+        plan,
+        attached=True,
+        moving_shapes=which.shapes,
+        moving_emission=which.emitters,
+        attached_normalization=motion.filter_normalization == "attached",
+    )
+
+
+class Preparation:
+    """Plans by sensor, owners of parameters, and recordings of one scene: the last that was asked for."""
+
+    def __init__(self, max_depth: int, rr_depth: int, hide_emitters: bool, motion: Motion) -> None:
+        self._depths, self._hide_emitters, self._motion = (max_depth, rr_depth), hide_emitters, motion
+        self._scene: tuple[int, mi.Scene | None] | None = None  # its address, and, so that it is not used again, itself
+        self._plans: dict[int, Plan] = {}
+        self._owners: dict[Any, list[Any]] = {}  # BSDFs of its surfaces that use a node, and under None all of them
+        self._track_zeros = False
+        self.recordings = Recordings()
+
+    def plan(self, scene: mi.Scene, sensor: mi.Sensor, params: mi.SceneParameters | None = None) -> Plan:
+        """What a walk of this scene needs; `params` are those to look for derivatives in.
+
+        Raises UnsupportedScene for what cannot work.
+        """
+        self._turn_to(scene)
+        if sensor.ptr not in self._plans:
+            check_supported(scene, sensor, self._hide_emitters)
+            needs = scene_needs(scene, sensor)
+            settle(scene)
+            self._plans[sensor.ptr] = make_plan(needs, *self._depths, self._hide_emitters)
+        plan = self._plans[sensor.ptr]
+        if params is None:
+            return plan
+        which = differentiated(params)
+        # Once needed, kept: otherwise kernels would be compiled anew whenever a texel enters or leaves zero.
+        self._track_zeros |= which.zeros
+        only = self._bsdfs(scene, which.bsdf_nodes)
+        plan = plan.differentiating(bool(which.bsdf_nodes), which.emission, self._track_zeros, only)
+        return attach(plan, which, self._motion, sensor)
+
+    def _turn_to(self, scene: mi.Scene) -> None:
+        """Forget what was found out about another scene."""
+        if self._scene is None or self._scene[0] != scene.ptr:
+            # The scene's own integrator does not hold the scene: neither would ever be freed.
+            tracer = getattr(scene.integrator(), "tracer", None)
+            own = getattr(tracer, "preparation", None) is self
+            self._scene = (scene.ptr, None if own else scene)
+            self._plans.clear()
+            self._owners.clear()
+            self.recordings.clear()
+
+    def _bsdfs(self, scene: mi.Scene, nodes: tuple[Any, ...]) -> tuple[mi.BSDF, ...]:
+        """The surfaces' BSDFs that use any of these nodes; empty where that is all of them."""
+        if any(node not in self._owners for node in nodes):
+            graph = SceneGraph.of(scene)
+            owners = {n: [n.bsdf()] if isinstance(n, mi.Shape) else graph.owning_bsdfs(n) for n in nodes}
+            self._owners |= owners | {None: graph.surface_bsdfs()}
+        used = {bsdf: None for node in nodes for bsdf in self._owners[node]}
+        return () if all(bsdf in used for bsdf in self._owners.get(None, [])) else tuple(used)

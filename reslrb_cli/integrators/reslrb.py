@@ -1,0 +1,122 @@
+"""Reservoir light replay backpropagation: images and gradients by one of the estimators."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+import drjit as dr
+import mitsuba as mi
+
+from reslrb_cli.errors import UnsupportedScene
+from reslrb_cli.estimators import ESTIMATORS, Estimator
+from reslrb_cli.integrators import light_tracer as lt
+from reslrb_cli.integrators.interface import Derivative, Job
+from reslrb_cli.integrators.preparation import Motion
+from reslrb_cli.integrators.tracer import LightTracer
+from reslrb_cli.transport.plan import Plan
+from reslrb_cli.transport.samples import Samples
+
+
+class Reslrb(LightTracer):
+    """Derivatives by a replay of each path; the options beside OPTIONS are those of the estimator."""
+
+    OPTIONS: ClassVar[Mapping[str, Any]] = {
+        **LightTracer.OPTIONS,
+        "estimator": "reservoir",
+        "freeze": False,
+        "attached": "auto",
+        "filter_normalization": "attached",
+    }
+
+    def __init__(self, estimator: Estimator, **common: Any) -> None:
+        super().__init__(**common)
+        self.estimator = estimator
+
+    @classmethod
+    def of(
+        cls,
+        estimator: str = "reservoir",
+        attached: bool | str = "auto",
+        filter_normalization: str = "attached",
+        **options: Any,
+    ) -> Reslrb:
+        """From the estimator's name and all options. Raises ValueError where one is wrong."""
+        if estimator == "auto":
+            raise ValueError(
+                '"estimator" auto needs an experiment to measure on (`reslrb optimize`); as a plugin, name one of '
+                + ", ".join(ESTIMATORS)
+            )
+        if estimator not in ESTIMATORS:
+            raise ValueError(f'"estimator" must be one of {", ".join(ESTIMATORS)}, not "{estimator}"')
+        kind = ESTIMATORS[estimator]
+        own = {name: options.pop(name) for name in kind.OPTIONS if name in options}
+        return cls(kind(**own), motion=Motion(attached, filter_normalization), **options)
+
+    def plan(self, scene: mi.Scene, sensor: mi.Sensor, params: mi.SceneParameters | None = None) -> Plan:
+        plan = super().plan(scene, sensor, params)
+        if plan.attached and not self.estimator.attaches:
+            able = ", ".join(name for name, kind in ESTIMATORS.items() if kind.attaches)
+            name = next(name for name, kind in ESTIMATORS.items() if isinstance(self.estimator, kind))
+            raise UnsupportedScene(
+                f"estimator {name} has no derivatives of what moves light, which a replay would have to chain through "
+                f"every vertex; take {able}"
+            )
+        return plan
+
+    def image_estimator(self) -> Estimator | None:
+        return None if self.estimator.splats_all else self.estimator
+
+    def correlated(self, job: Job, derivative: Derivative) -> mi.TensorXf:
+        """The image, and the gradient of the same samples with the dL/dI that `derivative(image)` returns."""
+        estimator = self.estimator
+
+        def trace(samples: Samples) -> tuple[mi.TensorXf, Any]:
+            result = lt.trace_image([samples], estimator)
+            return result.image, result.state
+
+        with dr.suspend_grad():
+            parts = self.passes(job)
+            if self.freezes(parts):
+                traced = lt.Trace(parts, *self.preparation.recordings.call("trace", parts[0], trace))
+            else:
+                traced = lt.trace_image(parts, estimator)
+        self._replay(traced, derivative(traced.image), job.params)
+        return traced.image
+
+    def backward(self, job: Job, gradient: mi.TensorXf) -> None:
+        """Add the gradient of the objective with dL/dI `gradient` (H, W, C)."""
+        with dr.suspend_grad():
+            trace = lt.Trace(self.passes(job))
+        self._replay(trace, gradient, job.params)
+
+    def known(self, job: Job, gradient: mi.TensorXf) -> mi.TensorXf:
+        """The image, and the gradient of the objective with dL/dI `gradient` (H, W, C), known before either.
+
+        One set of samples, traced once for both where the estimator can.
+        """
+        estimator = self.estimator
+
+        def fused(samples: Samples, gradient: mi.TensorXf) -> mi.TensorXf:
+            return lt.fused([samples], estimator, gradient)
+
+        with dr.suspend_grad():
+            parts = self.passes(job)
+            if not self.freezes(parts):
+                return lt.fused(parts, estimator, gradient, job.params)
+            return self.preparation.recordings.call("fused", parts[0], fused, gradient)
+
+    def _replay(self, trace: lt.Trace, gradient: mi.TensorXf, params: mi.SceneParameters | None) -> None:
+        estimator = self.estimator
+
+        def replay(samples: Samples, gradient: mi.TensorXf, *state: Any) -> None:
+            lt.replay_all(lt.Trace([samples], None, *state), estimator, gradient)
+
+        with dr.suspend_grad():
+            recordings = self.preparation.recordings
+            if not self.freezes(trace.samples):
+                lt.replay_all(trace, estimator, gradient, params)
+            elif trace.state is None:
+                recordings.call("trace and replay", trace.samples[0], replay, gradient)
+            else:
+                recordings.call("replay", trace.samples[0], replay, gradient, trace.state)

@@ -1,0 +1,57 @@
+"""Mitsuba's own integrators, as a gradient step takes them."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+from reslrb_cli.integrators.interface import Derivative, Job
+
+
+class Replayed:
+    """An integrator whose gradient is a pass of its own, such as `prb`."""
+
+    image_apart = True
+
+    def __init__(self, plugin: mi.Integrator) -> None:
+        self.plugin = plugin
+
+    def image(self, job: Job) -> mi.TensorXf:
+        """The image, without derivatives."""
+        with dr.suspend_grad():
+            return self.plugin.render(job.scene, job.sensor, job.seed, job.spp)
+
+    def backward(self, job: Job, gradient: mi.TensorXf) -> None:
+        """Add the gradient of the objective with dL/dI `gradient`."""
+        # Isolated, so that another view's propagation finds the edges above the scene's parameters intact.
+        with dr.isolate_grad():
+            self.plugin.render_backward(job.scene, job.params, gradient, job.sensor, job.seed, job.spp)
+
+    def correlated(self, job: Job, derivative: Derivative) -> mi.TensorXf:
+        """The image, and the gradient of the same samples."""
+        image = self.image(job)
+        self.backward(job, derivative(image))
+        return image
+
+    def known(self, job: Job, gradient: mi.TensorXf) -> mi.TensorXf:
+        """The same with a dL/dI that is known."""
+        return self.correlated(job, lambda image: gradient)
+
+
+class NaiveAD(Replayed):
+    """An integrator that is differentiated with the whole graph of its image, such as `ptracer`: a "sweep".
+
+    Stock light tracing is differentiable in evaluated loops alone.
+    """
+
+    image_apart = False
+
+    def backward(self, job: Job, gradient: mi.TensorXf) -> None:
+        with dr.scoped_set_flag(dr.JitFlag.SymbolicLoops, False):
+            super().backward(job, gradient)
+
+    def correlated(self, job: Job, derivative: Derivative) -> mi.TensorXf:
+        with dr.scoped_set_flag(dr.JitFlag.SymbolicLoops, False), dr.isolate_grad():
+            image = self.plugin.render(job.scene, job.sensor, job.seed, job.spp, develop=True, evaluate=False)
+            dr.backward_from(image * derivative(dr.detach(image)))
+        return dr.detach(image)

@@ -1,0 +1,113 @@
+"""The samples of one pass over a light-traced image: which random numbers, how many light paths, for which film."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import drjit as dr
+import mitsuba as mi
+
+from reslrb_cli.transport.plan import Plan
+from reslrb_cli.transport.splat import Film
+from reslrb_cli.transport.visible import PrimaryRay, primary_ray
+
+#: Names of the random streams beside the sampler's own, mixed into the seed.
+SELECTION_STREAM = 0x5E1EC7  # what hooks draw to select
+VISIBLE_STREAM = 0xD1EC7  # primary rays
+PASS_STREAM = 0x9A55E5  # seeds of the second pass and those after it
+#: Samples per pixel of one pass. In single precision a sum loses terms below a 2^24th of it, and thousands of such
+#: passes can be added to one another.
+LARGEST_PASS = 1 << 18
+
+
+@dataclass
+class Samples:
+    """The samples of one pass. `seed` is an opaque UInt32; `width` is the number of light paths.
+
+    `scale` (width 1) brings a sum over light paths to an image; of all samples of that image, these are the part
+    `fraction` (width 1).
+    """
+
+    scene: mi.Scene
+    sensor: mi.Sensor
+    plan: Plan
+    film: Film
+    seed: mi.UInt32
+    spp: int
+    width: int
+    scale: mi.Float
+    fraction: mi.Float
+
+    def sampler(self) -> mi.Sampler:
+        """A sampler at the beginning of these samples' stream."""
+        sampler = self.sensor.sampler().clone()
+        sampler.set_sample_count(self.spp)
+        sampler.set_samples_per_wavefront(self.spp)
+        sampler.seed(self.seed, self.width)
+        return sampler
+
+    def stream(self, name: int) -> mi.PCG32:
+        """Random numbers beside the sampler's own.
+
+        Hashed for each lane, as Mitsuba's samplers do: generators that differ in their sequence's number alone begin
+        with numbers that are evenly spread over the lanes, and off their mean alike for all seeds.
+        """
+        seed = mi.sample_tea_32(self.seed, mi.UInt32(name))[0]
+        state, sequence = mi.sample_tea_32(seed, dr.arange(mi.UInt32, self.width))
+        return mi.PCG32(1, mi.UInt64(state), mi.UInt64(sequence))
+
+    def primary_ray(self) -> PrimaryRay:
+        """Rays for C_0, from a stream of their own: the light paths are those of `ptracer` with or without them."""
+        return primary_ray(self.plan, self.sensor, _NumberStream(self.stream(VISIBLE_STREAM)), self.width)
+
+
+class _NumberStream:
+    """The two methods of a Mitsuba sampler that emission asks for, over a bare generator."""
+
+    def __init__(self, generator: mi.PCG32) -> None:
+        self.generator = generator
+
+    def next_1d(self) -> mi.Float:
+        return self.generator.next_float32()
+
+    def next_2d(self) -> mi.Point2f:
+        return mi.Point2f(self.generator.next_float32(), self.generator.next_float32())
+
+
+def make_samples(plan: Plan, scene: mi.Scene, sensor: mi.Sensor, seed: mi.UInt32, spp: int, total_spp: int) -> Samples:
+    """`spp` of `total_spp` samples per pixel; the film's full size counts, not the crop's, as for `ptracer`.
+
+    Raises ValueError where one pass would hold more than 2^32 - 1 paths.
+    """
+    film = Film(sensor)
+    width = spp * int(dr.prod(sensor.film().size()))
+    if width > 0xFFFFFFFF:
+        raise ValueError(f"{width} paths in one pass are more than 2^32 - 1: set samples_per_pass below {spp}")
+    # Opaque: as literals they would give every sample count kernels of its own.
+    scale = dr.opaque(mi.Float, float(dr.prod(film.size)) / (float(dr.prod(sensor.film().size())) * total_spp))
+    return Samples(scene, sensor, plan, film, mi.UInt32(seed), spp, width, scale, dr.opaque(mi.Float, spp / total_spp))
+
+
+def passes(
+    plan: Plan, scene: mi.Scene, sensor: mi.Sensor, seed: mi.UInt32, spp: int, spp_per_pass: int | None
+) -> list[Samples]:
+    """All samples of an image, in passes of `spp_per_pass` samples per pixel, which must divide `spp`, or less.
+
+    The first pass has the seed itself, so that it traces what `ptracer` does.
+    """
+    unit = spp if spp_per_pass is None else min(spp_per_pass, spp)
+    if spp % unit:
+        raise ValueError(f"the sample count ({spp}) must be a multiple of samples_per_pass ({unit})")
+    sizes = _parts(unit) * (spp // unit)
+    # Opaque: a seed that reached the kernel as a literal would compile a new one each step.
+    others = [mi.sample_tea_32(mi.UInt32(seed), mi.UInt32(PASS_STREAM + p))[0] for p in range(1, len(sizes))]
+    seeds = [mi.UInt32(seed), *others]
+    dr.make_opaque(seeds)
+    made = {size: make_samples(plan, scene, sensor, seeds[0], size, spp) for size in set(sizes)}
+    return [replace(made[size], seed=s) for size, s in zip(sizes, seeds, strict=True)]
+
+
+def _parts(spp: int) -> list[int]:
+    """The fewest parts of at most LARGEST_PASS samples, of sizes that differ by 1 at most."""
+    count = -(-spp // LARGEST_PASS)
+    return [spp // count + (part < spp % count) for part in range(count)]
