@@ -12,7 +12,6 @@ from reslrb_cli.integrators.comparisons import Trajectory, WalkAd
 from reslrb_cli.integrators.interface import Job, StepIntegrator
 from reslrb_cli.integrators.reslrb import Reslrb
 from reslrb_cli.integrators.stock import NaiveAD, Replayed
-from reslrb_cli.integrators.tracer import LightTracer
 
 #: Our integrators by the names of their plugins.
 TRACERS = ("reslrb", "walk_ad", "trajectory")
@@ -31,6 +30,9 @@ def register() -> None:
 
 def make_tracer(type: str, options: Mapping[str, Any]) -> Reslrb | WalkAd | Trajectory:
     """One of our integrators. Raises ValueError where an option is wrong."""
+    unknown = [name for name in options if name not in _option_names(type, options.get("estimator"))]
+    if unknown:
+        raise ValueError(f"{type} has no option {', '.join(unknown)}")
     if type == "reslrb":
         return Reslrb.of(**options)
     return WalkAd(**options) if type == "walk_ad" else Trajectory(**options)
@@ -100,11 +102,16 @@ def _plugin_class() -> Any:
 
 def _take_options(type: str, props: mi.Properties) -> dict[str, Any]:
     """The options that an integrator of this type has. What stays unread Mitsuba reports as an error."""
-    names = list(WalkAd.OPTIONS if type == "walk_ad" else LightTracer.OPTIONS)
-    if type == "reslrb":
-        kind = ESTIMATORS.get(props.get("estimator", Reslrb.OPTIONS["estimator"]))
-        names = [*Reslrb.OPTIONS, *(kind.OPTIONS if kind is not None else ())]
-    return {name: props.get(name) for name in names if name in props}
+    estimator = props.get("estimator", None) if type == "reslrb" else None  # what is asked for counts as read
+    return {name: props.get(name) for name in _option_names(type, estimator) if name in props}
+
+
+def _option_names(type: str, estimator: Any) -> list[str]:
+    """The names of an integrator's options, those of its estimator among them."""
+    if type != "reslrb":
+        return list(WalkAd.OPTIONS if type == "walk_ad" else Trajectory.OPTIONS)
+    kind = ESTIMATORS.get(Reslrb.OPTIONS["estimator"] if estimator is None else estimator)
+    return [*Reslrb.OPTIONS, *(kind.OPTIONS if kind is not None else ())]
 
 
 def _job(scene: mi.Scene, params: Any, sensor: mi.Sensor | int, seed: Any, spp: int) -> Job:

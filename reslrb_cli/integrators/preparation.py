@@ -21,11 +21,12 @@ class Motion:
     """How derivatives of what moves light are taken.
 
     `attached` is `auto` (where a parameter moves anything), or says so; `filter_normalization` is `attached` or
-    `detached`. Raises ValueError for anything else.
+    `detached`. Raises ValueError for anything else. `obstacle` is the reason where an integrator has none.
     """
 
     attached: bool | str = "auto"
     filter_normalization: str = "attached"
+    obstacle: str | None = None
 
     def __post_init__(self) -> None:
         if self.attached not in (True, False, "auto"):
@@ -42,6 +43,8 @@ def attach(plan: Plan, which: Differentiated, motion: Motion, sensor: mi.Sensor)
         )
     if not (which.moves or (motion.attached is True and (which.bsdf_nodes or which.emission))):
         return plan
+    if motion.obstacle is not None:
+        raise UnsupportedScene(motion.obstacle)
     if plan.needs.has_null:
         raise UnsupportedScene("attached derivatives do not go through masks and other surfaces with null lobes")
     if sensor.film().rfilter().is_box_filter():

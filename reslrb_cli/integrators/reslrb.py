@@ -8,13 +8,11 @@ from typing import Any, ClassVar
 import drjit as dr
 import mitsuba as mi
 
-from reslrb_cli.errors import UnsupportedScene
 from reslrb_cli.estimators import ESTIMATORS, Estimator
 from reslrb_cli.integrators import light_tracer as lt
 from reslrb_cli.integrators.interface import Derivative, Job
 from reslrb_cli.integrators.preparation import Motion
 from reslrb_cli.integrators.tracer import LightTracer
-from reslrb_cli.transport.plan import Plan
 from reslrb_cli.transport.samples import Samples
 
 
@@ -51,18 +49,8 @@ class Reslrb(LightTracer):
             raise ValueError(f'"estimator" must be one of {", ".join(ESTIMATORS)}, not "{estimator}"')
         kind = ESTIMATORS[estimator]
         own = {name: options.pop(name) for name in kind.OPTIONS if name in options}
-        return cls(kind(**own), motion=Motion(attached, filter_normalization), **options)
-
-    def plan(self, scene: mi.Scene, sensor: mi.Sensor, params: mi.SceneParameters | None = None) -> Plan:
-        plan = super().plan(scene, sensor, params)
-        if plan.attached and not self.estimator.attaches:
-            able = ", ".join(name for name, kind in ESTIMATORS.items() if kind.attaches)
-            name = next(name for name, kind in ESTIMATORS.items() if isinstance(self.estimator, kind))
-            raise UnsupportedScene(
-                f"estimator {name} has no derivatives of what moves light, which a replay would have to chain through "
-                f"every vertex; take {able}"
-            )
-        return plan
+        motion = Motion(attached, filter_normalization, None if kind.attaches else _no_attached(estimator))
+        return cls(kind(**own), motion=motion, **options)
 
     def image_estimator(self) -> Estimator | None:
         return None if self.estimator.splats_all else self.estimator
@@ -120,3 +108,11 @@ class Reslrb(LightTracer):
                 recordings.call("trace and replay", trace.samples[0], replay, gradient)
             else:
                 recordings.call("replay", trace.samples[0], replay, gradient, trace.state)
+
+
+def _no_attached(estimator: str) -> str:
+    able = ", ".join(name for name, kind in ESTIMATORS.items() if kind.attaches)
+    return (
+        f"estimator {estimator} has no derivatives of what moves light, which a replay would have to chain through "
+        f"every vertex; take {able}"
+    )

@@ -11,6 +11,7 @@ import shutil
 import signal
 import subprocess
 import tempfile
+import threading
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -50,16 +51,21 @@ class Refused(ReslrbError):
 
 #: Those that have not been closed.
 _at_work: list[Process] = []
+#: Held while one is made, and from `abandon_all` on.
+_making = threading.Lock()
 
 
 def abandon_all() -> None:
-    """End all processes and remove their folders, in a program that is about to end; from any thread."""
+    """End all processes and remove their folders, in a program that is about to end; from any thread.
+
+    None is made from then on.
+    """
+    _making.acquire(timeout=ABANDON_SECONDS)
     for process in list(_at_work):
-        with contextlib.suppress(AttributeError, subprocess.TimeoutExpired):  # AttributeError: it is just being made
+        with contextlib.suppress(subprocess.TimeoutExpired):
             process._process.kill()
             process._process.wait(timeout=ABANDON_SECONDS)
-        with contextlib.suppress(AttributeError):
-            shutil.rmtree(process._folder.name, ignore_errors=True)
+        shutil.rmtree(process._folder.name, ignore_errors=True)
 
 
 class Process:
@@ -68,18 +74,19 @@ class Process:
     def __init__(self, first: dict[str, Any], command: list[str] | None = None) -> None:
         self.limit: int | None = first["memory_limit"]
         self.peak_bytes = 0  # of address space
-        _at_work.append(self)
-        self._folder = tempfile.TemporaryDirectory(prefix="reslrb-bench-", ignore_cleanup_errors=True)
-        self._words = Path(self._folder.name) / "stderr"
         self._buffer = b""
-        with self._words.open("wb") as words:
-            self._process = subprocess.Popen(
-                command or python_command("from reslrb_cli.measure.worker import run\nrun()"),
-                stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE,
-                stderr=words,
-                start_new_session=True,  # Ctrl-C is for us
-            )
+        with _making:
+            self._folder = tempfile.TemporaryDirectory(prefix="reslrb-bench-", ignore_cleanup_errors=True)
+            self._words = Path(self._folder.name) / "stderr"
+            with self._words.open("wb") as words:
+                self._process = subprocess.Popen(
+                    command or python_command("from reslrb_cli.measure.worker import run\nrun()"),
+                    stdin=subprocess.PIPE,
+                    stdout=subprocess.PIPE,
+                    stderr=words,
+                    start_new_session=True,  # Ctrl-C is for us
+                )
+            _at_work.append(self)
         self.ask(first | {"cache": self._folder.name})
 
     def ask(self, question: dict[str, Any]) -> None:

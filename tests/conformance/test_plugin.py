@@ -116,7 +116,7 @@ def test_an_option_that_an_integrator_does_not_have_is_refused():
     for type in ("reslrb", "ptracer", "prb"):
         with pytest.raises(ValueError, match=f"{type} has no option colour"):
             make_integrator(type, colour=3)
-        assert make_integrator(type, max_depth=3, rr_depth=None).class_name()
+        assert make_integrator(type, max_depth=3, rr_depth=None) is not None
 
 
 def test_samples_that_passes_do_not_divide_raise(case: Case):
@@ -210,18 +210,24 @@ def test_one_latent_for_several_sensors(llvm: str):
         scene.set(scene.initial)
 
 
-@pytest.mark.parametrize("key", ["floor_shape.to_world", "lamp.to_world"])
-@pytest.mark.parametrize("name", ["reslrb", "walk_ad"])
-def test_geometry_is_refused(name: str, key: str):
+@pytest.mark.parametrize("key", ["floor_shape.to_world", "lamp.to_world", "camera.to_world"])
+@pytest.mark.parametrize(("name", "options"), [("reslrb", {}), ("reslrb", {"estimator": "stack"}), ("walk_ad", {})])
+def test_what_moves_is_refused_with_the_reason(name: str, options: dict[str, str], key: str):
     import drjit as dr
 
     from reslrb_cli.integrators import gradient_step
 
-    case = Case(_textured(), (FLOOR,))
+    case = Case(_textured(), (FLOOR,))  # its sensor has a box filter
     dr.enable_grad(case.params[key])
     case.params.update()
-    with pytest.raises(UnsupportedScene, match=key):
-        gradient_step(integrator(name), case.scene, 0, case.objective, seed=1, spp=4)
+    reasons = {"walk_ad": "leave it at auto", "stack": "box filter", "reservoir": "estimator reservoir has no"}
+    reason = (
+        "not of the sensor"
+        if "camera" in key
+        else reasons[options.get("estimator", "reservoir") if name == "reslrb" else name]
+    )
+    with pytest.raises(UnsupportedScene, match=reason):
+        gradient_step(integrator(name, **options), case.scene, 0, case.objective, seed=1, spp=4)
 
 
 def test_correlated_and_independent(case: Case):

@@ -90,16 +90,16 @@ def test_forward_mode_without_the_weight_of_roulette(monkeypatch: pytest.MonkeyP
 
 def test_a_fault_of_the_walk_is_none_of_its_own_references(monkeypatch: pytest.MonkeyPatch):
     """Connections that are a third too strong: image and stock reference differ, naive AD and differences do not."""
-    from reslrb_cli.transport import walk
+    from reslrb_cli.transport import segment
 
-    right = walk.connect
+    right = segment.connect
 
     def connect(*arguments):
         connection = right(*arguments)
         connection.weight = connection.weight * 1.3
         return connection
 
-    monkeypatch.setattr(walk, "connect", connect)
+    monkeypatch.setattr(segment, "connect", connect)
     assert failures(check(estimators="stack")) == {(None, "ptracer"), ("stack", "ptracer")}
 
 
