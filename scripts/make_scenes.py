@@ -26,7 +26,8 @@ def main(arguments: list[str]) -> None:
     folder = Path(arguments[0]) if arguments else SCENES
     for name, image in images().items():
         write_exr(folder / name, image)
-    Picture.fromarray(mottled_wall(736, 1472)).save(folder / "stiff" / "wall.png", optimize=True)
+    Picture.fromarray(mottled_wall(192, 384)).save(folder / "stiff" / "wall.png", optimize=True)
+    Picture.fromarray(np.uint8([[255, 13]])).save(folder / "stiff" / "filter.png")  # a torch's halves: 1 and 0.05
     write_ply(folder / "caustic_slab" / "slab.ply", *slab())
 
 

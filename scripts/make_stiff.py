@@ -26,7 +26,7 @@ from reslrb_cli.config import load
 from reslrb_cli.optimization import Problem, assemble, assemble_scene, find_reached, optimize
 
 ROOT = Path(__file__).resolve().parent.parent
-TITLES = {"lamp": "albedo and intensity", "plate": "roughness and radiance", "wall": "a million texels and one number"}
+TITLES = {"lamp": "albedo and intensity", "plate": "roughness and radiance", "wall": "73,728 texels and one number"}
 #: Exponents of the learning rates: half decades around all that the parameters' own units suggest.
 GRIDS = {"lamp": (-3, 9), "plate": (-3, 9), "wall": (-3, 4)}
 #: What else a user of plain Adam could try, and the learning rates that might suit it.
@@ -37,7 +37,7 @@ OTHERS: dict[str, tuple[str, str, tuple[float, ...]]] = {
     "wall": ("plain, epsilon 1e-16", "optimizer.epsilon=1e-16", (0.01, 0.03, 0.1)),
 }
 #: Texels of the wall that a pixel is wide.
-BLOCK = 23
+BLOCK = 6
 #: Iterations between two points of a curve.
 EVERY = 4
 

@@ -8,6 +8,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from reslrb_cli.errors import UnsupportedScene
 from reslrb_cli.estimators import Estimator
 from reslrb_cli.estimators.base import Pass
 from reslrb_cli.integrators.hooks import RecordedObjective, TangentSplat, TrackedSplat
@@ -26,12 +27,20 @@ def settle(scene: Any) -> None:
     """Have textures and emitters set up now what they set up when they are first used (padded storage, distributions).
 
     In the midst of tracing this would cut the first step's kernels in two, and the second would compile them anew.
+    Raises UnsupportedScene where there is an emitter that Mitsuba cannot sample, such as a spot with a checkerboard.
     """
     with dr.suspend_grad():
         for texture in SceneGraph.of(scene).of_type(mi.Texture):
             if texture.class_name().startswith("BitmapTexture"):
                 texture.eval(dr.zeros(mi.SurfaceInteraction3f))
-        _, weight, _ = scene.sample_emitter_ray(0, 0.5, mi.Point2f(0.5), mi.Point2f(0.5), True)
+        try:
+            _, weight, _ = scene.sample_emitter_ray(0, 0.5, mi.Point2f(0.5), mi.Point2f(0.5), True)
+        except RuntimeError as error:
+            if "not implemented" not in str(error):
+                raise
+            raise UnsupportedScene(
+                f"Mitsuba cannot sample the rays of an emitter: {' '.join(str(error).split())}"
+            ) from None
         dr.eval(weight)
 
 

@@ -230,6 +230,14 @@ def test_what_moves_is_refused_with_the_reason(name: str, options: dict[str, str
         gradient_step(integrator(name, **options), case.scene, 0, case.objective, seed=1, spp=4)
 
 
+def test_an_emitter_that_mitsuba_cannot_sample_is_refused():
+    scene = _textured()
+    scene["spot"] = {"type": "spot", "texture": {"type": "checkerboard"}}
+    case = Case(scene, (FLOOR,))
+    with pytest.raises(UnsupportedScene, match="cannot sample the rays of an emitter: .*sample_spectrum"):
+        case.gradient(integrator("reslrb"), 1, 4)
+
+
 def test_correlated_and_independent(case: Case):
     """Equal in expectation for a linear objective; a nonlinear one shows which samples delta comes from."""
     import drjit as dr

@@ -1,0 +1,53 @@
+"""Every experiment that is shipped, run to its end as it stands: it recovers what it promises, in the README's time."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+
+from reslrb_cli.cli import main
+from reslrb_cli.records.manifest import read_manifest
+
+ROOT = Path(__file__).resolve().parents[2]
+CONFIGS = sorted((ROOT / "configs").rglob("*.yaml"))
+#: What may be left of a parameter's error at the start: over the texels that light and sensor reach.
+MOST = 0.2
+#: What the README says of single ones.
+MOST_OF = {"painting.reflectance.data": 0.5}
+
+
+def stated_seconds(name: str) -> float:
+    """The time that the README's table of results states for an experiment; its row begins with the name."""
+    row = re.search(rf"^\| `{re.escape(name)}`.*$", (ROOT / "README.md").read_text(), re.MULTILINE)
+    assert row is not None, f"{name} has no row in the README's table of results"
+    found = re.search(r"\| (\d+) s \|", row[0])
+    assert found is not None, row[0]
+    return float(found[1])
+
+
+def name_of(path: Path) -> str:
+    return str(path.relative_to(ROOT / "configs").with_suffix(""))
+
+
+@pytest.mark.parametrize("config", CONFIGS, ids=name_of)
+def test_the_readme_states_its_time(config: Path) -> None:
+    assert stated_seconds(name_of(config)) > 0
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("config", CONFIGS, ids=name_of)
+def test_it_recovers_what_it_promises(config: Path, tmp_path: Path) -> None:
+    """The time is that of the iterations, twice what is stated at most: the README's machine is not this one."""
+    main.main(
+        ["optimize", str(config), "--set", f"run.output={tmp_path}", "--set", "run.name=it"], standalone_mode=False
+    )
+    results = read_manifest(tmp_path / "it")["results"]
+    errors = results["parameter_rmse"]
+    print(name_of(config), f"{results['elapsed_s']:.0f} s", errors)
+    assert errors, "no true value is known"
+    for key, error in errors.items():
+        assert error["final"] <= MOST_OF.get(key, MOST) * error["initial"], key
+    assert results["worse"] == []
+    assert results["elapsed_s"] <= 2 * stated_seconds(name_of(config))
