@@ -41,7 +41,6 @@ def test_the_stiff_wall_is_what_the_script_makes():
     import mitsuba as mi
 
     found = np.array(mi.Bitmap(str(ROOT / "scenes" / "stiff" / "wall.png")))
-    assert found.size > 10**6
     assert np.abs(np.squeeze(found).astype(int) - make_scenes().mottled_wall(192, 384)).max() <= 1
 
 
