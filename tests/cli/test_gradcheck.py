@@ -125,15 +125,24 @@ def test_a_case_of_the_suite(tmp_path: Path, capsys: pytest.CaptureFixture[str])
 
 
 def test_ctrl_c_prints_what_is_done() -> None:
-    command = [sys.executable, "-c", "from reslrb_cli.cli import main; main()", "gradcheck", *SMALL, "--seeds", "4000"]
+    command = [sys.executable, "-c", "from reslrb_cli.cli import main; main()", "gradcheck", *SMALL, "--seeds", "80"]
     process = subprocess.Popen(
         [*command, "--estimators", "stack"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=os.environ
     )
     assert process.stderr is not None
     for line in process.stderr:
-        if line.startswith("seed 16 "):
+        if line.startswith("image ptracer: seeds 80"):
             break
     process.send_signal(signal.SIGINT)
     output, _ = process.communicate(timeout=60)
     assert process.returncode == 130
-    assert "of 5 comparisons hold" in output
+    done = re.search(r"\d of (\d) comparisons hold", output)
+    assert done
+    assert 1 <= int(done[1]) < 5
+
+
+def test_a_budget_that_suffices_for_nothing_is_no_check_that_holds(capsys: pytest.CaptureFixture[str]) -> None:
+    assert call(*SMALL, "--budget", "0", "--estimators", "stack") == 1
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[-2] == "0 of 5 comparisons hold, 0 fail, 5 leave the question open"
+    assert lines[-1] == "open: 5 not measured: the budget was spent; allow more with --budget"
