@@ -109,7 +109,7 @@ def _run(check: Gradcheck, json_file: Path | None, folder: Path | None) -> tuple
     from contextlib import ExitStack
 
     from reslrb_cli.cli.interrupts import Interrupts
-    from reslrb_cli.records.gradcheck import GradcheckWriter
+    from reslrb_cli.records.gradcheck import GradcheckWriter, Verdict
     from reslrb_cli.report.gradcheck_table import Table
 
     records: list[GradcheckRecord] = []
@@ -122,8 +122,9 @@ def _run(check: Gradcheck, json_file: Path | None, folder: Path | None) -> tuple
         for result in check.run(lambda: interrupts.requested, logger.info):
             if writer is not None:
                 writer.write(result.record)
-            echo(table.line(result.record))
             records.append(result.record)
+            if result.record.verdict is not Verdict.NOT_MEASURED:  # the last lines say how many there are
+                echo(table.line(result.record))
             _draw(result, folder)
             drawn = drawn or result.maps is not None
     if folder is not None and drawn:

@@ -21,7 +21,7 @@ from reslrb_cli.measure.comparison import ROUNDING, Comparison, Family, compare_
 from reslrb_cli.measure.entries import entry_count
 from reslrb_cli.measure.pace import NO_TIME
 from reslrb_cli.measure.participants import Settings
-from reslrb_cli.measure.sampling import Name, Sampling
+from reslrb_cli.measure.sampling import NAIVE, Name, Sampling
 from reslrb_cli.measure.statistics import paired_z_scores
 from reslrb_cli.records.gradcheck import GradcheckRecord, Kind, Reference, Verdict
 
@@ -70,7 +70,7 @@ class Gradcheck:
 
     @cached_property
     def rows(self) -> list[Row]:
-        """What is compared, in the order of the table."""
+        """What is compared, in the order of the table: last, what needs naive AD, which compiles for longest."""
         parts = self.participants
         found = [] if parts.image is None else [Row(None, "reslrb", parts.image, Kind.IMAGE)]
         for key in parts.case.keys:
@@ -82,7 +82,7 @@ class Gradcheck:
                 references += [Reference.ANALYTIC] if key in parts.exact else []
                 references += [Reference.FINITE_DIFFERENCE, Reference.FORWARD_MODE]
                 found += [Row(key, listed.label, reference, Kind.EXPECTATION) for reference in references]
-        return found
+        return sorted(found, key=lambda row: row.key is not None and row.reference.value in NAIVE)
 
     def conditions(self) -> str:
         """What is measured, in one line."""

@@ -17,6 +17,8 @@ LEAST_SEEDS, MOST_SEEDS = 8, 64
 FEWEST = 3
 #: Shares of the budget: what more than LEAST_SEEDS are taken of has the larger one.
 LARGE_SHARE, SMALL_SHARE = 3, 1
+#: Whose gradients are naive AD, and compile for much longer than any other.
+NAIVE = ("walk_ad", "ptracer")
 #: Bytes that samples may take.
 MEMORY = 2**30
 
@@ -38,7 +40,7 @@ class Sampling:
         self.participants = Participants(settings)
         self._samples: dict[Name, list[np.ndarray]] = {}
         self._to_do: list[Name] = []
-        self._first_s: dict[str, float] = {}  # how long a first sample took, at most, by kind
+        self._first_s: dict[tuple[str, bool], float] = {}  # how long a first sample took, at most, by kind
 
     def expect(self, names: Iterable[Name]) -> None:
         """Say what will be asked for, so that each has its share of the time."""
@@ -77,7 +79,7 @@ class Sampling:
             before = now
             if len(samples) == 1:
                 first_s, next_s = now - begin, 0.0  # which says nothing of the next one
-                self._first_s[kind] = max(first_s, self._first_s.get(kind, 0.0))
+                self._first_s[_kind(name)] = max(first_s, self._first_s.get(_kind(name), 0.0))
                 ends = self._ends(name, now)
             if limited and now + next_s >= next(end for least, end in ends if len(samples) < least):
                 break
@@ -86,7 +88,7 @@ class Sampling:
 
     def _expected_s(self, name: Name) -> float:
         """What a first sample may take, by those that were taken."""
-        return self._first_s.get(name[0], max(self._first_s.values(), default=0.0))
+        return self._first_s.get(_kind(name), max(self._first_s.values(), default=0.0))
 
     def _ends(self, name: Name, now: float) -> list[tuple[float, float]]:
         """Until when samples of `name` are taken while there are fewer than so many.
@@ -133,3 +135,9 @@ class Sampling:
             return np.asarray(parts.differences(of, seed))
         # Forward mode is the same for all estimators.
         return np.asarray(parts.tangents(self.settings.integrators[0].label, of, seed))
+
+
+def _kind(name: Name) -> tuple[str, bool]:
+    """What takes as long to compile as others of its kind: the kind, and whether it is naive AD."""
+    kind, of = name
+    return kind, kind == "gradient" and of in NAIVE
