@@ -249,7 +249,7 @@ def test_what_is_there_is_shown_without_what_is_missing(tmp_path):
 
 
 def test_a_page_of_a_long_run_with_large_pictures_is_small(tmp_path):
-    folder = make_run(tmp_path / "long", iterations=5000, size=(900, 1400))
+    folder = make_run(tmp_path / "long", iterations=5000, size=(600, 1000))
     page = write_report(folder)
     assert page.stat().st_size < 6e6
     parsed = Page(page.read_text())
