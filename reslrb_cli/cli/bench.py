@@ -50,7 +50,9 @@ class Size(click.ParamType):
 @click.option("--memory-limit", type=Size(),
               help="Address space of each process, e.g. 2GiB (CPU only); default: the machine's memory.")  # fmt: skip
 @click.option("--budget", type=click.FloatRange(min=0), default=240.0, show_default=True, metavar="SECONDS",
-              help="Time for the whole; what it does not suffice for is still measured three times.")  # fmt: skip
+              help="Time for the whole, compiling included; what it does not suffice for is named.")  # fmt: skip
+@click.option("--rounds", type=click.IntRange(min=1, max=COUNT.max), metavar="N",
+              help="Number of steps of each, whatever time they take.")  # fmt: skip
 @click.option("--json", "json_file", type=click.Path(path_type=Path, dir_okay=False),
               help="Write one object a line, as results come.")  # fmt: skip
 @click.option("--plot", "plot_file", type=click.Path(path_type=Path, dir_okay=False),
@@ -64,6 +66,7 @@ def command(
     objective: str,
     memory_limit: int | None,
     budget: float,
+    rounds: int | None,
     json_file: Path | None,
     plot_file: Path | None,
 ) -> int:
@@ -106,6 +109,7 @@ def command(
         memory_limit=memory_limit or (None if variant.startswith("cuda") else memory),
         memory=memory,
         budget_s=budget,
+        rounds=rounds,
     )
     sweep.check()
     echo(f"{device_name(variant)}, {variant}")

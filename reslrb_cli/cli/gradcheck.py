@@ -30,7 +30,8 @@ logger = logging.getLogger(__name__)
               help="What to check: ESTIMATOR[(OPTION=VALUE,...)], separated by commas. Default: all four, with the "
                    "options of CONFIG.")  # fmt: skip
 @click.option("--budget", type=click.FloatRange(min=0), default=45.0, show_default=True, metavar="SECONDS",
-              help="Time for the whole; it decides how many seeds there are, eight at least.")  # fmt: skip
+              help="Time for the whole, compiling included; it decides how many seeds there are. What it does not "
+                   "suffice for is named.")  # fmt: skip
 @click.option("--seeds", type=click.IntRange(min=3, max=COUNT.max), metavar="N",
               help="Number of seeds, whatever time they take.")  # fmt: skip
 @click.option("--spp", type=COUNT,
@@ -73,6 +74,7 @@ def command(
     from reslrb_cli.measure.cases import all_estimators, parse_estimators
     from reslrb_cli.measure.gradcheck import Gradcheck
     from reslrb_cli.measure.participants import Settings
+    from reslrb_cli.records.gradcheck import Verdict
 
     check_writable("--json", json_file)
     check_writable("--markdown", markdown_file)
@@ -97,7 +99,9 @@ def command(
     _finish(records, markdown_file)
     if interrupted:
         return ExitCode.INTERRUPTED
-    return ExitCode.CHECK_FAILED if any(record.holds is False for record in records) else ExitCode.DONE
+    nothing = all(record.verdict in (Verdict.NOT_MEASURED, Verdict.NO_REFERENCE) for record in records)
+    failed = nothing or any(record.holds is False for record in records)
+    return ExitCode.CHECK_FAILED if failed else ExitCode.DONE
 
 
 def _run(check: Gradcheck, json_file: Path | None, folder: Path | None) -> tuple[list[GradcheckRecord], bool]:
@@ -105,25 +109,25 @@ def _run(check: Gradcheck, json_file: Path | None, folder: Path | None) -> tuple
     from contextlib import ExitStack
 
     from reslrb_cli.cli.interrupts import Interrupts
-    from reslrb_cli.records.gradcheck import GradcheckWriter
+    from reslrb_cli.records.gradcheck import GradcheckWriter, Verdict
     from reslrb_cli.report.gradcheck_table import Table
 
     records: list[GradcheckRecord] = []
-    table: Table | None = None
+    drawn = False
     with ExitStack() as stack:
         writer = None if json_file is None else stack.enter_context(GradcheckWriter(json_file))
         interrupts = stack.enter_context(Interrupts())
-        results = list(check.run(lambda: interrupts.requested, logger.info))
-        for result in results:
-            if table is None:
-                table = Table([other.record for other in results])
-                echo(table.head())
+        table = Table(check.expected())
+        echo(table.head())
+        for result in check.run(lambda: interrupts.requested, logger.info):
             if writer is not None:
                 writer.write(result.record)
-            echo(table.line(result.record))
             records.append(result.record)
+            if result.record.verdict is not Verdict.NOT_MEASURED:  # the last lines say how many there are
+                echo(table.line(result.record))
             _draw(result, folder)
-    if folder is not None and any(result.maps is not None for result in results):
+            drawn = drawn or result.maps is not None
+    if folder is not None and drawn:
         echo(f"look at {os.path.relpath(folder)}")
     return records, interrupts.requested
 

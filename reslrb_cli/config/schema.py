@@ -247,8 +247,9 @@ class RunConfig(Section):
         description="Samples that the adjoint image dL/dI comes from: the batches before the one that is "
         "differentiated (`batched`), a second set (`independent`, twice the paths), or those of the gradient "
         "(`correlated`). Gradients of `l2` and `relative_l2` are unbiased with the first two; with `correlated` the "
-        "noise that both share pulls parameters, mostly towards darker. `l1` and `log_l2` are biased with any of them, "
-        "since noise in the image does not average out of their derivatives; more samples help. `auto`: `batched` "
+        "noise that both share pulls parameters, mostly towards darker: a run says by how much, where a measurement "
+        "before its first iteration can see it. `l1` and `log_l2` are biased with any of them, since noise in the "
+        "image does not average out of their derivatives; more samples help. `auto`: `batched` "
         "where `batches` divides `spp`, else `independent`.",
     )
     batches: Annotated[int, Field(ge=2)] = Field(

@@ -6,6 +6,7 @@ from reslrb_cli.integrators.refusal import Refused, first_channels
 from reslrb_cli.integrators.reslrb import Reslrb
 from reslrb_cli.integrators.step import (
     StepResult,
+    cross_step,
     gradient_step,
     known_step,
     make_integrator,
@@ -19,6 +20,7 @@ __all__ = [
     "Reslrb",
     "StepIntegrator",
     "StepResult",
+    "cross_step",
     "first_channels",
     "gradient_step",
     "known_step",

@@ -18,21 +18,26 @@ from reslrb_cli.errors import UnsupportedScene, is_machine_fault, is_out_of_memo
 from reslrb_cli.transport.samples import Samples
 from reslrb_cli.transport.splat import Film
 
+logger = logging.getLogger(__name__)
+
 #: Paths beyond which nothing is recorded: Python does not show beside them, and the trials of a recording would.
 MOST_PATHS = 2**22
 #: Recordings of one kind of call that are kept, for inputs that change in more than their values.
 KEPT = 4
 #: Calls after which a recording is in use, at most: Dr.Jit makes some twice before it trusts them.
 TRIALS = 4
-#: A call that is recorded more often than that gains nothing by it; Dr.Jit then warns.
-WARN_AFTER = 10
+#: A call that is recorded more often than that gains nothing by it, and is made plainly from then on. Dr.Jit would warn
+#: after ten.
+MOST_RECORDINGS = 8
+#: Calls that are recorded: a script that makes a new sensor for every image would go on for ever.
+MOST_CALLS = 256
 
 
 class Recordings:
-    """Calls on the samples of one scene, by kind and plan."""
+    """Calls on the samples of one scene, by kind, plan and sensor."""
 
     def __init__(self) -> None:
-        self._functions: dict[Any, Any] = {}  # None where Dr.Jit cannot record the call
+        self._functions: dict[Any, Any] = {}  # None where a call is not recorded: it cannot be, or gains nothing by it
 
     def clear(self) -> None:
         """Forget all of them, for a new scene."""
@@ -43,16 +48,21 @@ class Recordings:
 
         `function` depends on nothing but its inputs and, of what is no Dr.Jit array, on `kind`; the derivatives that it
         adds to parameters are proportional to the first of `inputs`. A call that cannot be recorded is made as it is:
-        scenes that live beside this one, for example, take part in its indirect calls, and are none of its inputs.
-        Raises UnsupportedScene where a recording is there, and no longer fits.
+        scenes that live beside this one, for example, take part in its indirect calls, and are none of its inputs. So
+        is one that had to be recorded anew again and again. Raises UnsupportedScene where a recording is there, and no
+        longer fits.
         """
         s = samples
-        key = (kind, s.plan, s.spp, s.width, tuple(s.film.size))
+        # Sensors that share a recording have it made anew whenever another one's turn comes.
+        key = (kind, s.plan, s.spp, s.width, tuple(s.film.size), s.sensor.ptr)
         plain = _on_samples(samples, function)
         common = (s.scene, s.sensor, s.seed, s.scale, s.fraction)
-        if key not in self._functions:
+        if key not in self._functions and len(self._functions) < MOST_CALLS:
             self._functions[key] = _record(kind, plain, common, inputs)
-        recorded = self._functions[key]
+        recorded = self._functions.get(key)
+        if recorded is not None and recorded.n_recordings >= MOST_RECORDINGS:
+            logger.debug("no longer recorded (%s): it was %d times", kind, recorded.n_recordings)
+            recorded = self._functions[key] = None
         if recorded is None:
             return plain(*common, *inputs)
         try:
@@ -82,7 +92,7 @@ def _record(kind: str, plain: Callable[..., Any], common: tuple[Any, ...], input
     Dr.Jit finds that out after all has been computed and derivatives were added. So it is tried with a first input of
     zeros, which adds none, and until it is in use: what follows a step then has the same kernels from the first one on.
     """
-    recorded = dr.freeze(plain, limit=KEPT, warn_after=WARN_AFTER)
+    recorded = dr.freeze(plain, limit=KEPT)
     if inputs:
         zeros = dr.zeros(type(inputs[0]), inputs[0].shape)
         dr.make_opaque(zeros)
@@ -97,7 +107,7 @@ def _record(kind: str, plain: Callable[..., Any], common: tuple[Any, ...], input
     except RuntimeError as error:
         if is_out_of_memory(error) or is_machine_fault(error):
             raise
-        logging.getLogger(__name__).debug("not recorded (%s): %s", kind, error.__cause__ or error)
+        logger.debug("not recorded (%s): %s", kind, error.__cause__ or error)
         return None
     return recorded
 

@@ -125,6 +125,27 @@ def known_step(
     return StepResult(image, dr.sum((image * gradient).array), refused)
 
 
+def cross_step(
+    integrator: StepIntegrator | mi.Integrator,
+    scene: mi.Scene,
+    sensor: mi.Sensor | int,
+    objective: Objective,
+    *,
+    image_seed: int,
+    seed: int,
+    spp: int,
+    params: mi.SceneParameters | None = None,
+) -> None:
+    """Add the gradient by the samples of `seed`, with dL/dI from the image of those of `image_seed`.
+
+    Equal seeds are what `correlated` does, others `independent`. The rest is as in `gradient_step`.
+    """
+    work, job = interface_of(integrator), _job(scene, sensor, seed, spp, params)
+    image = work.image(replace(job, seed=dr.opaque(mi.UInt32, image_seed)))
+    _, gradient = _derivative(objective, image, Refused())
+    work.backward(job, gradient)
+
+
 def _job(scene: mi.Scene, sensor: mi.Sensor | int, seed: int, spp: int, params: mi.SceneParameters | None) -> Job:
     image_seed = mi.UInt32(seed)
     dr.make_opaque(image_seed)

@@ -7,22 +7,23 @@ steps also share a seed. The order turns from round to round.
 
 A case that runs out of memory is tried again at greater depths: what is recorded was seen, and a failure costs no more
 time than it takes to fill the memory once.
+
+The budget covers loading and compiling. Once it is spent, what is not warm is left out, and named; what is takes one
+round, if it had none.
 """
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 from reslrb_cli.config import Config, dump
 from reslrb_cli.measure.cases import Case
+from reslrb_cli.measure.pace import NO_TIME, Pace
 from reslrb_cli.measure.processes import Ended, Process, Stopped
 from reslrb_cli.records.bench import BenchRecord, BenchStatus, Spread
 
-MIN_ROUNDS = 3
-MAX_ROUNDS = 25
 #: Steps after the cold one until no new kernel comes, at most.
 MAX_WARM_UPS = 4
 #: Where the cases of a depth together hold more than this share of the memory, each releases its own after a step.
@@ -30,13 +31,16 @@ MEMORY_SHARE = 0.7
 MIB = 2**20
 #: What is measured of every step.
 TIMES = ("step_ms", "kernel_ms", "codegen_ms", "tracing_ms")
-#: How much more of the time is for the next depth, whose kernels take longer to compile and to run.
-GROWTH = 1.3
+#: First steps that take longer are told of as they are done, in seconds.
+SLOW = 10.0
 
 
 @dataclass(frozen=True)
 class Sweep:
-    """What is measured. `memory_limit` is of each process, None: none; `memory` is what the machine has, in bytes."""
+    """What is measured. `memory_limit` is of each process, None: none; `memory` is what the machine has, in bytes.
+
+    `rounds` is None where `budget_s` decides their number; else there are so many, whatever time they take.
+    """
 
     config: Config
     variant: str
@@ -47,6 +51,7 @@ class Sweep:
     memory_limit: int | None
     memory: int
     budget_s: float
+    rounds: int | None = None
 
     def at(self, case: Case, depth: int) -> Config:
         """The experiment of one case. Raises ConfigError."""
@@ -83,20 +88,32 @@ class _Run:
     cold: dict[str, Any] | None = None
     steps: dict[int, dict[str, Any]] = field(default_factory=dict)  # by round
     end: Ended | None = None
+    late: bool = False
 
-    def ask(self, round: int, cold: bool, release: bool, stop: Callable[[], bool]) -> dict[str, Any] | None:
-        """One step; None where the process ended over it."""
+    @property
+    def alive(self) -> bool:
+        """Whether it can be asked for a step."""
+        return self.end is None and not self.late
+
+    def ask(
+        self, round: int, cold: bool, release: bool, stop: Callable[[], bool], over: Callable[[], bool] = lambda: False
+    ) -> dict[str, Any] | None:
+        """One step; None where the process ended over it, or time was up. Raises Stopped once `stop()`."""
         self.process.ask({"round": round, "cold": cold, "release": release})
-        return self.answer(stop)
+        return self.answer(stop, over)
 
-    def answer(self, stop: Callable[[], bool]) -> dict[str, Any] | None:
+    def answer(self, stop: Callable[[], bool], over: Callable[[], bool]) -> dict[str, Any] | None:
         try:
-            result: dict[str, Any] = self.process.answer(stop)
+            result: dict[str, Any] = self.process.answer(lambda: stop() or over())
             return result
         except Ended as end:
             self.end = end
-            self.process.close()  # what it held is for the others
-            return None
+        except Stopped:
+            if stop():
+                raise
+            self.late = True
+        self.process.close()  # what it held is for the others
+        return None
 
 
 def bench(
@@ -107,54 +124,33 @@ def bench(
 ) -> Iterator[list[Result]]:
     """Measure depth by depth; yield the results of each. Ends early, with what is done, once `stop()`.
 
-    Where the budget is spent, each depth still gets MIN_ROUNDS rounds. Raises Refused where no case can begin.
+    `say` is told what the budget did not suffice for, and, once, what the scene's loading warned of. Raises Refused
+    where no case can begin.
     """
-    pace = Pace(sweep.budget_s, len(sweep.depths))
-    for depth in sweep.depths:
+    pace = Pace(sweep.budget_s, len(sweep.depths), sweep.rounds)
+    warned: set[str] = set()
+    for number, depth in enumerate(sweep.depths):
+        if pace.over():
+            left = ", ".join(str(depth) for depth in sweep.depths[number:])
+            say(f"not measured: depth {left}: {NO_TIME}")
+            return
         pace.begin_depth()
         runs = [_begin(sweep, case, depth, start) for case in sweep.cases]
         try:
-            _measure(sweep, runs, depth, pace, stop, say)
+            _measure(sweep, runs, depth, pace, stop, say, warned)
             stopped = False
         except Stopped:
             stopped = True
         finally:
             for run in runs:
                 run.process.close()
+        late = ", ".join(run.case.label for run in runs if run.late and not run.steps)
+        if late:
+            say(f"not measured: depth {depth}, {late}: {NO_TIME}")
         done = [run for run in runs if run.end is not None or run.steps]
         yield [_result(run, depth, sweep, runs) for run in done]
         if stopped:
             return
-
-
-class Pace:
-    """Divides the time among depths, each of which gets GROWTH times as much as the one before it.
-
-    What a depth leaves is for the others. None gets fewer than MIN_ROUNDS rounds, whatever they cost.
-    """
-
-    def __init__(self, budget_s: float, depths: int, now: Callable[[], float] = time.monotonic) -> None:
-        self._now, self._end, self._left = now, now() + budget_s, depths
-        self._rounds_start = self._depth_end = now()
-
-    def begin_depth(self) -> None:
-        """A depth begins."""
-        now = self._now()
-        self._depth_end = now + (self._end - now) / sum(GROWTH**k for k in range(self._left))
-        self._left -= 1
-
-    def begin_rounds(self) -> None:
-        """Its processes are warm."""
-        self._rounds_start = self._now()
-
-    def another(self, done: int) -> bool:
-        """Whether there is time for another round after `done` of them."""
-        if done < MIN_ROUNDS:
-            return True
-        if done >= MAX_ROUNDS:
-            return False
-        now = self._now()
-        return now + (now - self._rounds_start) / done <= self._depth_end
 
 
 def _begin(sweep: Sweep, case: Case, depth: int, start: Callable[[dict[str, Any]], Any]) -> _Run:
@@ -170,19 +166,31 @@ def _begin(sweep: Sweep, case: Case, depth: int, start: Callable[[dict[str, Any]
 
 
 def _measure(
-    sweep: Sweep, runs: list[_Run], depth: int, pace: Pace, stop: Callable[[], bool], say: Callable[[str], None]
+    sweep: Sweep,
+    runs: list[_Run],
+    depth: int,
+    pace: Pace,
+    stop: Callable[[], bool],
+    say: Callable[[str], None],
+    warned: set[str],
 ) -> None:
     def alive() -> list[_Run]:
-        return [run for run in runs if run.end is None]
+        return [run for run in runs if run.alive]
 
     for run in runs:
-        answer = run.answer(stop)
+        answer = run.answer(stop, pace.over)
         if answer is not None:
             run.size = (answer["width"], answer["height"])
+            for line in answer.get("warnings", ()):
+                if line not in warned:  # every process loads the same scene
+                    warned.add(line)
+                    say(line)
     for run in alive():
-        run.cold = run.ask(0, True, False, stop)
+        run.cold = run.ask(0, True, False, stop, pace.over)
+        if run.cold is not None and run.cold["step_ms"] > 1e3 * SLOW:
+            say(f"depth {depth}, {run.case.label}: the first step took {run.cold['step_ms'] / 1e3:.0f} s")
         for _ in range(MAX_WARM_UPS):
-            answer = run.ask(0, False, _tight(sweep, runs), stop) if run.end is None else None
+            answer = run.ask(0, False, _tight(sweep, runs), stop, pace.over) if run.alive else None
             if answer is None or not answer["new_kernels"]:
                 break
     tight = _tight(sweep, runs)
@@ -200,7 +208,7 @@ def _measure(
 
 
 def _tight(sweep: Sweep, runs: list[_Run]) -> bool:
-    held = sum(run.cold["peak_mib"] for run in runs if run.cold is not None and run.end is None) * MIB
+    held = sum(run.cold["peak_mib"] for run in runs if run.cold is not None and run.alive) * MIB
     return held > MEMORY_SHARE * sweep.memory
 
 

@@ -1,10 +1,11 @@
 """Whether the gradients of an experiment can be trusted: each estimator against everything that counts as a reference.
 
 The objective is sum(G * I) with a fixed random image G, some of it negative, so that every integrator estimates the
-same gradient; the configuration's loss would have each add a bias of its own, which the noise of its image makes. Every
+same gradient; the configuration's loss would have each add a bias of its own, which the noise of its image makes. A
 seed gives one gradient of each integrator, finite differences, and forward derivatives along the same directions; all
-comparisons are of estimates at equal seeds. What is cheap goes on to more seeds while the budget lasts: the estimators
-and the stock reference, whose comparisons are the noisiest.
+comparisons are of estimates at equal seeds. Comparisons are made one after the other, each as soon as it has what it
+needs, and what one needs is there for those that follow. Of what is cheap there are more seeds while the budget lasts:
+of the estimators and the stock reference, whose comparisons are the noisiest.
 """
 
 from __future__ import annotations
@@ -18,8 +19,9 @@ import numpy as np
 
 from reslrb_cli.measure.comparison import ROUNDING, Comparison, Family, compare_equal_seeds, compare_expectations
 from reslrb_cli.measure.entries import entry_count
+from reslrb_cli.measure.pace import NO_TIME
 from reslrb_cli.measure.participants import Settings
-from reslrb_cli.measure.sampling import Sampling
+from reslrb_cli.measure.sampling import NAIVE, Name, Sampling
 from reslrb_cli.measure.statistics import paired_z_scores
 from reslrb_cli.records.gradcheck import GradcheckRecord, Kind, Reference, Verdict
 
@@ -68,7 +70,7 @@ class Gradcheck:
 
     @cached_property
     def rows(self) -> list[Row]:
-        """What is compared, in the order of the table."""
+        """What is compared, in the order of the table: last, what needs naive AD, which compiles for longest."""
         parts = self.participants
         found = [] if parts.image is None else [Row(None, "reslrb", parts.image, Kind.IMAGE)]
         for key in parts.case.keys:
@@ -80,7 +82,7 @@ class Gradcheck:
                 references += [Reference.ANALYTIC] if key in parts.exact else []
                 references += [Reference.FINITE_DIFFERENCE, Reference.FORWARD_MODE]
                 found += [Row(key, listed.label, reference, Kind.EXPECTATION) for reference in references]
-        return found
+        return sorted(found, key=lambda row: row.key is not None and row.reference.value in NAIVE)
 
     def conditions(self) -> str:
         """What is measured, in one line."""
@@ -93,15 +95,40 @@ class Gradcheck:
             f"({width * height * parts.spp} light paths a seed), max_depth {integrator.max_depth}, {roulette}"
         )
 
+    def expected(self) -> list[GradcheckRecord]:
+        """A record of every line of the table to come, without figures."""
+        return [self._record(row, Comparison(Verdict.NOT_MEASURED, None), 0) for row in self.rows] + [
+            result.record for result in self._without_reference()
+        ]
+
     def run(self, stop: Callable[[], bool], say: Callable[[str], None]) -> Iterator[Result]:
-        """Measure, then yield the result of each row; ends with fewer seeds, or none, once `stop()`."""
-        self._sampling.run(stop, say)
-        if not self._sampling.enough:
-            return
-        family = self._family()
+        """Measure and compare, row by row; once `stop()`, only what has been measured is compared.
+
+        Of what the budget did not suffice for the records say so.
+        """
+        self._sampling.expect(name for row in self.rows for name in self._needs(row))
+        family, compared = self._family(), False
         for row in self.rows:
-            yield self._result(row, family)
-        yield from self._without_reference()
+            if all(self._sampling.take(name, stop, say) for name in self._needs(row)):
+                compared = True
+                yield self._result(row, family)
+            elif not stop():
+                yield Result(self._record(row, Comparison(Verdict.NOT_MEASURED, None, message=NO_TIME), 0))
+        if compared or not stop():
+            yield from self._without_reference()
+
+    def _needs(self, row: Row) -> list[Name]:
+        """The samples that a comparison is made of."""
+        if row.key is None:
+            return [("image", "walk_ad"), ("image", row.reference.value)]
+        ours = ("gradient", row.label)
+        if row.reference is Reference.ANALYTIC:
+            return [ours]
+        if row.reference is Reference.FINITE_DIFFERENCE:
+            return [ours, ("differences", row.key)]
+        if row.reference is Reference.FORWARD_MODE:
+            return [ours, ("tangents", row.key)]
+        return [ours, ("gradient", row.reference.value)]
 
     # --- comparing ----------------------------------------------------------------------------------------------------
 
@@ -122,18 +149,20 @@ class Gradcheck:
     def _result(self, row: Row, family: Family) -> Result:
         parts = self.participants
         if row.key is None:
-            ours, reference = self._sampling.of("image", "walk_ad"), self._sampling.of("image", row.reference.value)
-            shape = tuple(parts.case.weights.shape)
+            ours, reference = (self._sampling.of(name) for name in self._needs(row))
+            shape, least = tuple(parts.case.weights.shape), min(len(ours), len(reference))
+            ours, reference = ours[:least], reference[:least]
             figures = compare_expectations(ours, reference, family, shape=shape, rounding=STOCK_ROUNDING)
             return Result(self._record(row, figures, len(ours)))
-        ours = self._sampling.of("gradient", row.label)[:, parts.slices()[row.key]]
+        ours = self._sampling.of(("gradient", row.label))[:, parts.slices()[row.key]]
         if row.reference in ALONG_DIRECTIONS:
             return self._along(row, ours, family)
         shape = parts.shape(row.key)
         if row.reference is Reference.ANALYTIC:
             return Result(self._record(row, compare_expectations(ours, parts.exact[row.key], family), len(ours)))
-        reference = self._sampling.of("gradient", row.reference.value)[:, parts.slices()[row.key]]
-        ours = ours[: len(reference)]
+        reference = self._sampling.of(("gradient", row.reference.value))[:, parts.slices()[row.key]]
+        least = min(len(ours), len(reference))
+        ours, reference = ours[:least], reference[:least]
         if row.kind is Kind.EQUAL_SEEDS:
             figures = compare_equal_seeds(ours, reference)
         else:
@@ -147,11 +176,12 @@ class Gradcheck:
         chosen, place = self.participants.directions[row.key], self.participants.slices()[row.key]
         projected = ours @ np.array([direction.vector[place] for direction in chosen]).T
         if row.reference is Reference.FINITE_DIFFERENCE:
-            reference, bias = self._sampling.of("differences", row.key), np.array([d.truncation for d in chosen])
+            reference, bias = self._sampling.of(("differences", row.key)), np.array([d.truncation for d in chosen])
         else:
-            reference, bias = self._sampling.of("tangents", row.key), np.zeros(len(chosen))
-        figures = compare_expectations(projected[: len(reference)], reference, family, bias=bias)
-        return Result(self._record(row, figures, len(reference)))
+            reference, bias = self._sampling.of(("tangents", row.key)), np.zeros(len(chosen))
+        least = min(len(projected), len(reference))
+        figures = compare_expectations(projected[:least], reference[:least], family, bias=bias)
+        return Result(self._record(row, figures, least))
 
     def _record(self, row: Row, figures: Comparison, seeds: int) -> GradcheckRecord:
         kind, _, estimator = row.label.partition(":")

@@ -148,6 +148,10 @@ class Participants:
             at += len(values)
         return found
 
+    def stock_labels(self) -> list[str]:
+        """The stock integrators that are references of gradients."""
+        return sorted({reference.value for reference in self.stock.values() if reference is not None})
+
     def choose_steps(self, key: str) -> None:
         """Choose the steps of the finite differences of a parameter."""
         image, pilot = self.integrators[DIFFERENCED], seeds(PILOT_SEEDS, 9)

@@ -1,99 +1,143 @@
-"""Samples of what takes part in a gradcheck, seed by seed, until there are enough or time is up."""
+"""Samples of what takes part in a gradcheck, taken when they are first needed, until they are enough or time is up."""
 
 from __future__ import annotations
 
+import math
 import time
-from collections import defaultdict
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Iterable
 
 import numpy as np
 
 from reslrb_cli.measure.gradients import seeds
 from reslrb_cli.measure.participants import Participants, Settings
 
-#: Seeds, where no number is given: so many of everything, then more of what is cheap, as the budget allows.
+#: Seeds, where no number is given: so many of everything, more of what is cheap, as the budget allows.
 LEAST_SEEDS, MOST_SEEDS = 8, 64
-#: After which seeds the caller is told.
-REPORTED = tuple(2**k for k in range(3, 20))
-#: Fewer seeds have no standard error worth the name; what is interrupted before is not judged.
+#: Fewer seeds have no standard error worth the name, and are not judged.
 FEWEST = 3
+#: Shares of the budget: what more than LEAST_SEEDS are taken of has the larger one.
+LARGE_SHARE, SMALL_SHARE = 3, 1
+#: Whose gradients are naive AD, and compile for much longer than any other.
+NAIVE = ("walk_ad", "ptracer")
 #: Bytes that samples may take.
 MEMORY = 2**30
 
+#: What samples are of: `gradient` or `image` and an integrator's label, `differences` or `tangents` and a parameter.
 Name = tuple[str, str]
-Sample = Callable[[], np.ndarray]
 
 
 class Sampling:
-    """Samples by kind and name; `now` is the clock that the budget is measured with, from the beginning."""
+    """Samples by kind and name; `now` is the clock that the budget is measured with, from the beginning.
+
+    The budget covers loading and compiling. Its rest is shared among what is still to be sampled, and what one leaves
+    is for the others. Only what runs already is waited for: nothing is begun whose first sample, which compiles, would
+    take longer than is left, by those of its kind so far, or, of the first of its kind, by the others'.
+    """
 
     def __init__(self, settings: Settings, now: Callable[[], float] = time.monotonic) -> None:
-        self._start, self._now, self.settings = now(), now, settings
+        self._now, self.settings = now, settings
+        self._end = now() + settings.budget_s
         self.participants = Participants(settings)
-        self._samples: dict[Name, list[np.ndarray]] = defaultdict(list)
+        self._samples: dict[Name, list[np.ndarray]] = {}
+        self._to_do: list[Name] = []
+        self._first_s: dict[tuple[str, bool], float] = {}  # how long a first sample took, at most, by kind
 
-    def of(self, kind: str, name: str) -> np.ndarray:
-        """The samples of one kind, (N, P): `gradient` and `image` by an integrator's label, `differences` and
-        `tangents` (N, directions) by a parameter."""
-        return np.stack(self._samples[kind, name]).astype(np.float64)
+    def expect(self, names: Iterable[Name]) -> None:
+        """Say what will be asked for, so that each has its share of the time."""
+        self._to_do = list(dict.fromkeys(names))
 
-    @property
-    def enough(self) -> bool:
-        """Whether there is something to compare."""
-        return bool(self._samples) and all(len(samples) >= FEWEST for samples in self._samples.values())
+    def take(self, name: Name, stop: Callable[[], bool], say: Callable[[str], None]) -> bool:
+        """Take the samples of `name`, where that was not done yet; whether there are enough to compare.
 
-    def run(self, stop: Callable[[], bool], say: Callable[[str], None]) -> None:
-        """Take the samples of one seed after the other; ends with what is done once `stop()`."""
-        settings, parts = self.settings, self.participants
-        for key in parts.case.keys:
+        Ends with what is done once `stop()`.
+        """
+        if name not in self._samples and not stop():
+            self._samples[name] = []
+            self._measure(name, stop, say)
+        return len(self._samples.get(name, [])) >= FEWEST
+
+    def of(self, name: Name) -> np.ndarray:
+        """The samples, (N, P): of gradients and images, or (N, directions) of differences and tangents."""
+        return np.stack(self._samples[name]).astype(np.float64)
+
+    def _measure(self, name: Name, stop: Callable[[], bool], say: Callable[[str], None]) -> None:
+        kind, samples = name[0], self._samples[name]
+        if name in self._to_do:
+            self._to_do.remove(name)
+        limited, begin = self.settings.seeds is None, self._now()
+        if limited and begin + self._expected_s(name) >= self._end:
+            return
+        if kind == "differences":
+            self.participants.choose_steps(name[1])
+        before = first_s = 0.0
+        for seed in seeds(self._most(name)):
             if stop():
-                return
-            parts.choose_steps(key)
-        least = settings.seeds or LEAST_SEEDS
-        most = settings.seeds or max(least, min(MOST_SEEDS, self._seeds_in_memory()))
-        for number, seed in enumerate(seeds(most)):
-            begin = self._now()
-            samples = self._samples_of(seed, everything=number < least)
-            if not self._take(samples, stop):
-                return
+                break
+            samples.append(self._sample(name, seed).astype(np.float32))
             now = self._now()
-            if number == 0:
-                say(f"first seed after {now - self._start:.1f} s, compiling included")
-            elif number + 1 in REPORTED:
-                say(f"seed {number + 1} after {now - self._start:.1f} s")
-            if number >= least - 1 and settings.seeds is None and 2 * now - begin - self._start > settings.budget_s:
-                return
+            next_s = now - before
+            before = now
+            if len(samples) == 1:
+                first_s, next_s = now - begin, 0.0  # which says nothing of the next one
+                self._first_s[_kind(name)] = max(first_s, self._first_s.get(_kind(name), 0.0))
+                ends = self._ends(name, now)
+            if limited and now + next_s >= next(end for least, end in ends if len(samples) < least):
+                break
+        if samples:
+            say(f"{kind} {name[1]}: seeds {len(samples)}, {now - begin:.1f} s, of which the first {first_s:.1f} s")
+
+    def _expected_s(self, name: Name) -> float:
+        """What a first sample may take, by those that were taken."""
+        return self._first_s.get(_kind(name), max(self._first_s.values(), default=0.0))
+
+    def _ends(self, name: Name, now: float) -> list[tuple[float, float]]:
+        """Until when samples of `name` are taken while there are fewer than so many.
+
+        Those without which there is no comparison have all the time. Others leave what is still to be sampled the time
+        of its first samples, and what goes beyond the least has a share of what then remains.
+        """
+        kept = self._end - sum(self._expected_s(other) for other in self._to_do)
+        own = self._share(name)
+        share = now + max(kept - now, 0.0) * own / (own + sum(self._share(other) for other in self._to_do))
+        return [(FEWEST, self._end), (LEAST_SEEDS, kept), (math.inf, share)]
+
+    def _share(self, name: Name) -> int:
+        return LARGE_SHARE if self._is_cheap(name) else SMALL_SHARE
+
+    def _is_cheap(self, name: Name) -> bool:
+        """Whether more than LEAST_SEEDS are taken: of estimators and stock references, which have the most noise."""
+        return name[0] == "image" or (name[0] == "gradient" and name[1] != "walk_ad")
+
+    def _most(self, name: Name) -> int:
+        """Seeds of `name`, at most."""
+        if self.settings.seeds is not None:
+            return self.settings.seeds
+        if not self._is_cheap(name):
+            return LEAST_SEEDS
+        most = max(LEAST_SEEDS, min(MOST_SEEDS, self._seeds_in_memory()))
+        if name[0] == "gradient" and not self.participants.exact:
+            # More than the stock reference has are compared with nothing.
+            stock = [len(self._samples.get(("gradient", label), [])) for label in self.participants.stock_labels()]
+            most = min(most, max(LEAST_SEEDS, *stock)) if any(stock) else most
+        return most
 
     def _seeds_in_memory(self) -> int:
         size = sum(len(values) for values in self.participants.case.initial.values())
         return MEMORY // (4 * size * (len(self.settings.integrators) + 2))
 
-    def _take(self, samples: list[tuple[Name, Sample]], stop: Callable[[], bool]) -> bool:
-        """Everything at one seed; whether it was done."""
-        taken = []
-        for name, sample in samples:
-            if stop():
-                return False
-            taken.append((name, sample()))
-        for name, value in taken:
-            self._samples[name].append(value.astype(np.float32))
-        return True
+    def _sample(self, name: Name, seed: int) -> np.ndarray:
+        parts, (kind, of) = self.participants, name
+        if kind == "gradient":
+            return parts.gradient(of, seed)
+        if kind == "image":
+            return parts.picture(of, seed)
+        if kind == "differences":
+            return np.asarray(parts.differences(of, seed))
+        # Forward mode is the same for all estimators.
+        return np.asarray(parts.tangents(self.settings.integrators[0].label, of, seed))
 
-    def _samples_of(self, seed: int, everything: bool) -> list[tuple[Name, Sample]]:
-        parts, found = self.participants, []
 
-        def add(kind: str, name: str, function: Callable[..., Any], *arguments: Any) -> None:
-            found.append(((kind, name), lambda: np.asarray(function(*arguments))))
-
-        stock = {reference.value for reference in parts.stock.values() if reference is not None}
-        naive = ["walk_ad"] if everything else []
-        for label in [*(listed.label for listed in self.settings.integrators), *sorted(stock), *naive]:
-            add("gradient", label, parts.gradient, label, seed)
-        for label in () if parts.image is None else ("walk_ad", parts.image.value):
-            add("image", label, parts.picture, label, seed)
-        for key in parts.case.keys if everything else ():
-            add("differences", key, parts.differences, key, seed)
-            # Forward mode is the same for all estimators.
-            add("tangents", key, parts.tangents, self.settings.integrators[0].label, key, seed)
-        return found
+def _kind(name: Name) -> tuple[str, bool]:
+    """What takes as long to compile as others of its kind: the kind, and whether it is naive AD."""
+    kind, of = name
+    return kind, kind == "gradient" and of in NAIVE

@@ -7,6 +7,7 @@ the case; each other one asks for a step. What else is printed goes to standard 
 from __future__ import annotations
 
 import json
+import logging
 import os
 import sys
 from typing import IO, Any
@@ -26,6 +27,18 @@ def main() -> int:
     return 0
 
 
+class Warnings(logging.Handler):
+    """Keeps what is warned of: every process loads the same scene, and the one that asks says it once."""
+
+    def __init__(self) -> None:
+        super().__init__(logging.WARNING)
+        self.lines: list[str] = []
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Keep one line."""
+        self.lines.append(record.getMessage())
+
+
 def _serve(first: dict[str, Any], questions: IO[str], answers: IO[str]) -> None:
     os.environ |= {
         "HOME": first["cache"],  # where Dr.Jit keeps compiled kernels: a cold step is to find none
@@ -41,8 +54,10 @@ def _serve(first: dict[str, Any], questions: IO[str], answers: IO[str]) -> None:
 
     # Only now: a library that finds no room looks like one that is not there.
     _limit(first["memory_limit"])
+    warnings = Warnings()
+    logging.getLogger("reslrb_cli").addHandler(warnings)
     stepper = Stepper(loads(first["config"], first["source"]), first["objective"])
-    _answer(answers, {"width": stepper.size[0], "height": stepper.size[1]})
+    _answer(answers, {"width": stepper.size[0], "height": stepper.size[1], "warnings": warnings.lines})
     for line in questions:
         question = json.loads(line)
         _answer(answers, stepper.step(question["round"], question["cold"], question["release"]))

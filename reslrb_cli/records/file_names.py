@@ -10,13 +10,20 @@ MOST_BYTES = 180
 
 
 def file_stem(key: str) -> str:
-    """A file name for the parameter `key`: the key, with what file systems mind replaced by `_`, and not too long."""
-    return bounded(re.sub(r"[^\w.\-]", "_", key))
+    """A file name for the parameter `key`, not too long, and another for every key.
+
+    Where file systems mind something of it that is `_` in its place, and a number tells it from others like it.
+    """
+    stem = re.sub(r"[^\w.\-]", "_", key)
+    return bounded(stem) if stem == key else _numbered(stem, key)
 
 
 def bounded(stem: str) -> str:
     """`stem`, or where it is too long for a file's name its beginning, and a number that tells it from others."""
-    if len(stem.encode()) <= MOST_BYTES:
-        return stem
-    digest = hashlib.blake2b(stem.encode(), digest_size=6).hexdigest()
-    return f"{stem.encode()[: MOST_BYTES - 13].decode(errors='ignore')}-{digest}"
+    return stem if len(stem.encode()) <= MOST_BYTES else _numbered(stem, stem)
+
+
+def _numbered(stem: str, whole: str) -> str:
+    """`stem`, or its beginning, and a number made from `whole`."""
+    digest = hashlib.blake2b(whole.encode(errors="surrogatepass"), digest_size=6).hexdigest()
+    return f"{stem.encode(errors='replace')[: MOST_BYTES - 13].decode(errors='ignore')}-{digest}"

@@ -40,7 +40,7 @@ class Verdict(str, enum.Enum):
 
     `heavy_tailed`: single seeds carry the variance, so that z scores prove nothing. `unresolved`: noise hides
     deviations as large as the gradient itself. `unreached`: gradient and reference are exactly zero.
-    `no_reference`: nothing here counts as one.
+    `no_reference`: nothing here counts as one. `not_measured`: time was up before there were samples.
     """
 
     HOLDS = "holds"
@@ -49,6 +49,7 @@ class Verdict(str, enum.Enum):
     UNRESOLVED = "unresolved"
     UNREACHED = "unreached"
     NO_REFERENCE = "no_reference"
+    NOT_MEASURED = "not_measured"
 
 
 @dataclass(frozen=True)

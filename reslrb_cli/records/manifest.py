@@ -45,10 +45,11 @@ class Manifest:
     """Provenance and outcome of one run.
 
     `process` is who works in the folder. `pilot` is the table by which an estimator was chosen, `memory` how a memory
-    budget is kept, `scaling` what was measured of each parameter for `scale: auto`; each is None where that was not
-    asked for. `results` holds what the run found (`iterations`, values and errors by key, `warnings`, ...); `error` is
-    the line that the user saw where the run failed. `missing` names the parts of the folder that are not there (not
-    yet, where the process ended among them), and says why.
+    budget is kept, `scaling` what was measured of each parameter for `scale: auto`, `correlated_bias` what of the bias
+    of `adjoint: correlated`; each is None where that was not asked for. `results` holds what the run found
+    (`iterations`, values and errors by key, `warnings`, ...); `error` is the line that the user saw where the run
+    failed. `missing` names the parts of the folder that are not there (not yet, where the process ended among them),
+    and says why.
     """
 
     variant: str
@@ -67,6 +68,7 @@ class Manifest:
     pilot: dict[str, Any] | None = None
     memory: dict[str, Any] | None = None
     scaling: list[dict[str, Any]] | None = None
+    correlated_bias: dict[str, Any] | None = None
     results: dict[str, Any] = field(default_factory=dict)
 
     def write(self, folder: Path) -> None:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from reslrb_cli.errors import one_line
-from reslrb_cli.records.file_names import bounded
+from reslrb_cli.records.file_names import bounded, file_stem
 from reslrb_cli.records.gradcheck import GradcheckRecord
 from reslrb_cli.report.gradcheck_table import integrator_name, reference_name
 
@@ -50,5 +50,6 @@ def plot_maps(record: GradcheckRecord, gradient: np.ndarray, reference: np.ndarr
 
 def map_name(record: GradcheckRecord) -> str:
     """Name of a record's file, without its suffix."""
-    parts = (record.parameter, record.integrator, record.estimator, record.reference.value)
-    return bounded("-".join(re.sub(r"[^\w.=]+", "_", part).strip("_") for part in parts if part))
+    what = (record.integrator, record.estimator, record.reference.value)
+    parts = [file_stem(record.parameter)] if record.parameter else []
+    return bounded("-".join(parts + [re.sub(r"[^\w.=]+", "_", part).strip("_") for part in what if part]))

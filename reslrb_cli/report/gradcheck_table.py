@@ -70,8 +70,11 @@ def summary_lines(records: Sequence[GradcheckRecord]) -> list[str]:
     open_ = [record for record in records if record.holds is None]
     line = f"{count[Verdict.HOLDS]} of {len(records)} comparisons hold, {count[Verdict.FAILS]} fail"
     lines = [line + (f", {len(open_)} leave the question open" if open_ else "")]
+    if count[Verdict.NOT_MEASURED]:
+        message = next(record.message for record in open_ if record.verdict is Verdict.NOT_MEASURED)
+        lines.append(f"open: {count[Verdict.NOT_MEASURED]} not measured: {message}")
     reasons: dict[tuple[str, str], list[GradcheckRecord]] = {}
-    for record in open_:
+    for record in (record for record in open_ if record.verdict is not Verdict.NOT_MEASURED):
         reasons.setdefault((parameter_name(record), record.message), []).append(record)
     for (what, message), group in reasons.items():
         pairs = dict.fromkeys(f"{integrator_name(r)} against {reference_name(r)}" for r in group)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from conformance.gradient_cases import CASES, GradientCase
 from reslrb_cli.errors import UnsupportedScene
 from reslrb_cli.integrators import freezing
 from reslrb_cli.measure.gradients import Case, integrator, relative
+from reslrb_cli.measure.small_scenes import camera
 
 pytestmark = pytest.mark.usefixtures("llvm")
 
@@ -88,6 +90,64 @@ def test_a_recording_that_no_longer_fits_is_an_error(monkeypatch: pytest.MonkeyP
     case = BY_NAME["texture"]
     with pytest.raises(UnsupportedScene, match=r"the inputs are others.*integrator\.freeze"):
         Case(case.scene(), case.keys).gradient(integrator("reslrb", freeze=True), 3, 8)
+
+
+@pytest.mark.parametrize("adjoint", KINDS)
+def test_sensors_have_recordings_of_their_own(adjoint: str, capfd: pytest.CaptureFixture[str]) -> None:
+    """One for all was made anew for each of three sensors in each step, and Dr.Jit warned every time."""
+    case = BY_NAME["texture"]
+    cameras = {f"camera_{n}": camera(sensor="thinlens" if n == 3 else "perspective") for n in range(4)}
+    scene = Case({**case.scene(), "camera": cameras.pop("camera_0"), **cameras}, case.keys)
+    chosen = integrator("reslrb", estimator="stack", freeze=True)
+    plain = integrator("reslrb", estimator="stack", freeze=False)
+    counts = []
+    for step in range(8):
+        for sensor in range(4):
+            scene.sensor = sensor
+            found = scene.gradient(chosen, step, 4, adjoint=adjoint)
+            if step == 7:
+                assert relative(found, scene.gradient(plain, step, 4, adjoint=adjoint)) < 1e-5
+        counts.append(chosen.preparation.recordings.counts())
+    assert KINDS[adjoint] & set(counts[-1])
+    assert counts[-1] == counts[2]
+    assert "frozen function" not in capfd.readouterr().err
+
+
+def test_what_is_recorded_anew_each_time_no_longer_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Restless:
+        """Is recorded anew in each call."""
+
+        calls = 0
+
+        def __init__(self, function: Callable[..., object], **options: object) -> None:
+            self.function, self.n_recordings = function, 0
+
+        def __call__(self, *inputs: object) -> object:
+            self.n_recordings += 1
+            Restless.calls += 1
+            return self.function(*inputs)
+
+    monkeypatch.setattr("drjit.freeze", Restless)
+    case = BY_NAME["texture"]
+    scene, chosen = Case(case.scene(), case.keys), integrator("reslrb", estimator="event", freeze=True)
+    plain = integrator("reslrb", estimator="event", freeze=False)
+    for seed in range(12):
+        assert relative(scene.gradient(chosen, seed, 4), scene.gradient(plain, seed, 4)) < 1e-5
+    assert Restless.calls == len(KINDS["correlated"]) * freezing.MOST_RECORDINGS
+    assert chosen.preparation.recordings.counts() == {}
+
+
+def test_sensors_without_end_are_not_all_recorded(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(freezing, "MOST_CALLS", 2)
+    case = BY_NAME["texture"]
+    cameras = {f"camera_{n}": camera() for n in range(3)}
+    scene = Case({**case.scene(), **cameras}, case.keys)
+    chosen = integrator("reslrb", estimator="event", freeze=True)
+    for sensor in range(4):
+        scene.sensor = sensor
+        scene.gradient(chosen, 3, 4)
+    assert set(chosen.preparation.recordings.counts()) == KINDS["correlated"]
+    assert len(chosen.preparation.recordings._functions) == 2
 
 
 def test_another_scene_is_another_recording() -> None:

@@ -19,7 +19,7 @@ pytestmark = pytest.mark.usefixtures("llvm")
 KEYS = ["integrator", "estimator", "capacity", "max_depth", "rr_depth", "spp", "width", "height", "status", "step_ms",
         "kernel_ms", "codegen_ms", "tracing_ms", "cold_ms", "cold_codegen_ms", "peak_mib", "scratch_bytes",
         "repeats"]  # fmt: skip
-SMALL = ["--set", "scene.options.size=16", "--set", "run.spp=1", "--budget", "0"]
+SMALL = ["--set", "scene.options.size=16", "--set", "run.spp=1", "--rounds", "3"]
 
 
 def call(*args: str) -> int:
@@ -80,6 +80,11 @@ def test_l2(tmp_path: Path) -> None:
     assert not (tmp_path / "bench.png").exists()
 
 
+def test_a_budget_that_suffices_for_nothing_says_so(capsys: pytest.CaptureFixture[str]) -> None:
+    assert call("--budget", "0", "--max-depth", "4", "--integrators", "reslrb:stack") == 1
+    assert "not measured: depth 2, 4: the budget was spent; allow more with --budget" in capsys.readouterr().err
+
+
 def test_no_memory(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file = tmp_path / "bench.json"
     args = ["--max-depth", "4", "--integrators", "ptracer", "--memory-limit", "100MiB", "--json", str(file)]
@@ -93,14 +98,16 @@ def test_no_memory(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
 
 def test_a_case_that_fails_says_why(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file = tmp_path / "bench.json"
-    (tmp_path / "scene.xml").write_text(MASKED)
+    (tmp_path / "scene.xml").write_text(MASKED.replace("to_world", "toWorld"))
     (tmp_path / "x.yaml").write_text(
         "scene: {file: scene.xml}\ntarget: {render: {}}\nparameters: [{key: veil.opacity.value}]\n"
     )
     args = ["--max-depth", "2", "--integrators", "reslrb:gather,trajectory", "--json", str(file)]
-    assert call(str(tmp_path / "x.yaml"), *args, "--set", "run.spp=1", "--budget", "0") == 0
+    assert call(str(tmp_path / "x.yaml"), *args, "--set", "run.spp=1", "--rounds", "3") == 0
     assert [row["status"] for row in read(file)] == ["ok", "failed"]
-    assert "depth 2, trajectory: UnsupportedScene: trajectory: Dr.Jit cannot reverse" in capsys.readouterr().out
+    printed = capsys.readouterr()
+    assert "depth 2, trajectory: UnsupportedScene: trajectory: Dr.Jit cannot reverse" in printed.out
+    assert printed.err.count("toWorld") == 1  # both processes mend the scene
 
 
 @pytest.mark.parametrize("limit", ["200MiB", "420MiB"])

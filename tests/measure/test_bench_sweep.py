@@ -10,8 +10,9 @@ import pytest
 
 from reslrb_cli.config import loads
 from reslrb_cli.errors import ConfigError
-from reslrb_cli.measure.bench import MAX_ROUNDS, MIN_ROUNDS, Pace, Result, Sweep, bench
+from reslrb_cli.measure.bench import Result, Sweep, bench
 from reslrb_cli.measure.cases import choose_baseline, depths, parse_cases
+from reslrb_cli.measure.pace import MAX_ROUNDS, MIN_ROUNDS, Pace
 from reslrb_cli.measure.processes import Ended, Stopped
 from reslrb_cli.records.bench import BenchStatus, Spread
 
@@ -70,7 +71,7 @@ def sweep(list_of: str = LIST, baseline: str | None = None, **changes: Any) -> S
     values: dict[str, Any] = {
         "config": loads(CONFIG, Path("x.yaml")), "variant": "llvm_ad_rgb", "cases": cases,
         "baseline": choose_baseline(cases, baseline), "depths": [2, 4], "objective": "fixed", "memory_limit": None,
-        "memory": 2**40, "budget_s": 0.0,
+        "memory": 2**40, "budget_s": 0.0, "rounds": MIN_ROUNDS,
     }  # fmt: skip
     return Sweep(**(values | changes))
 
@@ -160,7 +161,7 @@ def test_cases_that_need_the_memory_of_each_other_release_it() -> None:
 
 def test_pace_divides_the_budget() -> None:
     now = [0.0]
-    pace, spent = Pace(100.0, 3, now=lambda: now[0]), Pace(100.0, 1, now=lambda: now[0])
+    pace, spent = Pace(100.0, 3, now=lambda: now[0]), Pace(200.0, 2, now=lambda: now[0])
 
     def rounds(begin_s: float, round_s: float, pace: Pace = pace) -> int:
         pace.begin_depth()
@@ -177,10 +178,60 @@ def test_pace_divides_the_budget() -> None:
     assert rounds(3.0, 4.0) == 7
     assert rounds(1.0, 5.0) == 9
     assert 95.0 < now[0] <= 100.0
-    assert rounds(1.0, 50.0, spent) == MIN_ROUNDS
+    assert rounds(1.0, 30.0, spent) == MIN_ROUNDS
+    assert rounds(1.0, 50.0, Pace(100.0, 1, now=lambda: now[0])) == 1  # a second one would overrun the whole
+    assert rounds(1.0, 50.0, Pace(0.0, 1, rounds=7, now=lambda: now[0])) == 7
     cheap = Pace(1e6, 1, now=lambda: 0.0)
     cheap.begin_depth()
     assert [cheap.another(done) for done in (MAX_ROUNDS - 1, MAX_ROUNDS)] == [True, False]
+
+
+@pytest.mark.parametrize(
+    ("budget_s", "measured", "left"),
+    [
+        (1000.0, {2: LIST.split(","), 4: LIST.split(",")}, []),
+        # Of the second depth only the first has compiled when time is up; what has compiled is measured all the same.
+        (130.0, {2: LIST.split(","), 4: ["ptracer"]}, ["depth 4, reslrb:stack, walk_ad"]),
+        (85.0, {2: LIST.split(",")[:2]}, ["depth 2, walk_ad", "depth 4"]),
+        (10.0, {}, ["depth 2, ptracer, reslrb:stack, walk_ad", "depth 4"]),
+    ],
+)
+def test_the_budget_covers_compilation(
+    budget_s: float, measured: dict[int, list[str]], left: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A first step takes 30 s, later ones a tenth; what is waited for ends when time is up."""
+    now, said = [0.0], []
+
+    class Slow(Pretended):
+        def answer(self, stop: Callable[[], bool]) -> dict[str, Any]:
+            for _ in range(300 if self.asked == 1 else 1):
+                now[0] += 0.1
+                if stop():
+                    raise Stopped
+            return super().answer(stop)
+
+    monkeypatch.setattr("reslrb_cli.measure.bench.Pace", lambda *arguments: Pace(*arguments, now=lambda: now[0]))
+    limited = sweep(rounds=None, budget_s=budget_s)
+    rows = [row for depth in bench(limited, lambda: False, said.append, Slow) for row in depth]
+    found: dict[int, list[str]] = {}
+    for row in rows:
+        found.setdefault(row.record.max_depth, []).append(row.case.label)
+        assert row.record.status is BenchStatus.OK
+    assert found == measured
+    assert said == [f"not measured: {what}: the budget was spent; allow more with --budget" for what in left]
+    assert now[0] < budget_s + 0.5
+    assert Pretended.alive == 0
+
+
+def test_what_every_process_warns_of_is_said_once() -> None:
+    class Warning(Pretended):
+        def answer(self, stop: Callable[[], bool]) -> dict[str, Any]:
+            answer = super().answer(stop)
+            return answer | ({"warnings": ["scene.xml:3: old"]} if "width" in answer else {})
+
+    said: list[str] = []
+    list(bench(sweep(), lambda: False, said.append, Warning))
+    assert said == ["scene.xml:3: old"]
 
 
 def test_depths() -> None:

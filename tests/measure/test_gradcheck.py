@@ -26,6 +26,7 @@ from reslrb_cli.measure.references import (
 )
 from reslrb_cli.measure.small_scenes import camera, diffuse, rgb, room, transform
 from reslrb_cli.records.gradcheck import Kind, Reference, Verdict
+from reslrb_cli.report.gradcheck_table import summary_lines
 
 pytestmark = pytest.mark.usefixtures("llvm")
 
@@ -50,7 +51,7 @@ def test_it_holds():
     assert [record.kind for record in records].count(Kind.IMAGE) == 1
     for name in ("reservoir", "event", "gather", "stack"):
         of = {record.reference: record for record in records if record.estimator == name}
-        assert list(of) == [Reference.WALK_AD, Reference.PTRACER, Reference.FINITE_DIFFERENCE, Reference.FORWARD_MODE]
+        assert list(of) == [Reference.FINITE_DIFFERENCE, Reference.FORWARD_MODE, Reference.WALK_AD, Reference.PTRACER]
         exact = name in ("gather", "stack")
         assert (of[Reference.WALK_AD].kind is Kind.EQUAL_SEEDS) is exact
         assert of[Reference.WALK_AD].relative_l2 < (1e-5 if exact else 0.5)
@@ -103,22 +104,47 @@ def test_a_fault_of_the_walk_is_none_of_its_own_references(monkeypatch: pytest.M
     assert failures(check(estimators="stack")) == {(None, "ptracer"), ("stack", "ptracer")}
 
 
-def test_budget_decides_how_many_seeds():
+def test_rows_come_as_they_are_measured():
+    """The first is there before the last estimator has taken a step, and what one row measured the next one uses."""
     config = loads(cornell_box.CONFIG, cornell_box.SOURCE, SMALL)
-    time = iter(range(10_000))
-    made = Gradcheck(Settings(config, parse_estimators("stack"), 30), now=lambda: next(time))
+    made = Gradcheck(Settings(config, parse_estimators("event,stack"), 0, 3))
+    said: list[str] = []
+    rows = made.run(lambda: False, said.append)
+    next(rows)
+    assert [line.partition(":")[0] for line in said] == ["image walk_ad", "image ptracer"]
+    next(rows)
+    assert not any("reslrb:stack" in line for line in said)
+    list(rows)
+    assert len(said) == len(set(said)) == 8
+    expected, found = made.expected(), [result.record for result in made.run(lambda: False, said.append)]
+    assert [(r.parameter, r.estimator, r.reference) for r in expected] == [
+        (r.parameter, r.estimator, r.reference) for r in found
+    ]
+
+
+def test_what_the_budget_does_not_suffice_for_is_named():
+    config = loads(cornell_box.CONFIG, cornell_box.SOURCE, SMALL)
+    ticks = iter(range(10_000))
+    made = Gradcheck(Settings(config, parse_estimators("stack,event"), 40), now=lambda: next(ticks))
     records = [result.record for result in made.run(lambda: False, lambda line: None)]
-    counts = {record.reference: record.seeds for record in records}
-    assert counts[Reference.WALK_AD] == counts[Reference.FINITE_DIFFERENCE] == 8
-    assert 8 < counts[Reference.PTRACER] < 20
+    assert next(ticks) < 50
+    assert [record.verdict for record in records[:2]] == [Verdict.HOLDS] * 2
+    left = [record for record in records if record.verdict is Verdict.NOT_MEASURED]
+    assert left
+    assert {(record.seeds, record.holds) for record in left} == {(0, None)}
+    assert (
+        summary_lines(records)[1] == f"open: {len(left)} not measured: the budget was spent; allow more with --budget"
+    )
 
 
 def test_what_is_interrupted_is_compared_with_what_is_done():
     config = loads(cornell_box.CONFIG, cornell_box.SOURCE, SMALL)
     asked = iter(range(10_000))
     made = Gradcheck(Settings(config, parse_estimators("stack"), 0, 8))
-    records = [result.record for result in made.run(lambda: next(asked) > 40, lambda line: None)]
-    assert {record.seeds for record in records} == {5}
+    records = [result.record for result in made.run(lambda: next(asked) > 32, lambda line: None)]
+    assert [(record.reference, record.seeds) for record in records] == [
+        (Reference.PTRACER, 8), (Reference.FINITE_DIFFERENCE, 5)
+    ]  # fmt: skip
     assert list(made.run(lambda: True, lambda line: None)) != []
     fresh = Gradcheck(Settings(config, parse_estimators("stack"), 0, 8))
     assert list(fresh.run(lambda: True, lambda line: None)) == []

@@ -14,8 +14,8 @@ from measure.faults import CHECKS, FAULTS, Fault
 
 from reslrb_cli.records.gradcheck import GradcheckRecord, Verdict
 
-#: Those that take seconds, of the default suite.
-QUICK = ("one_visibility_bit_late", "stack_without_last_vertex", "zero_factor_dropped")
+#: Of the default suite: it shows that the machinery works, and all others take minutes.
+QUICK = ("stack_without_last_vertex",)
 
 
 @pytest.fixture(autouse=True)

@@ -177,6 +177,21 @@ def test_pilot_scaling_memory_and_run_are_tables(tmp_path):
     assert "None" not in everything
 
 
+def test_the_bias_of_correlated_samples_is_a_table(tmp_path):
+    rows = [
+        {"key": LAMP, "share": -0.38, "error": 0.06, "along": True, "exceeds": False},
+        {"key": FLOOR, "share": None, "error": None, "along": False, "exceeds": False},
+    ]
+    bias = {"rounds": 8, "spp": 4, "parameters": rows}
+    page = page_of(make_run(tmp_path / "lamp", correlated_bias=bias))
+    assert f"its bias is -38 % +- 6 % of the gradient of `{LAMP}`" in page.sections["Bias of correlated samples"]
+    assert page.row("Bias of correlated samples", LAMP)[1:] == ["-38 % ± 6 %", "of the gradient"]
+    assert page.row("Bias of correlated samples", FLOOR)[1:] == ["", "not seen"]
+    for damaged in (None, {"rounds": 8}):
+        other = page_of(make_run(tmp_path / f"other {damaged}", correlated_bias=damaged))
+        assert "Bias of correlated samples" not in other.sections
+
+
 def test_what_went_wrong_stands_first(tmp_path):
     trend = {"start": {"mean": 0.0131, "error": 0.0004}, "end": {"mean": 0.0133, "error": 0.0004}, "change": "flat"}
     page = page_of(make_run(tmp_path / "lamp", results={"loss_trend": trend, "worse": [LAMP]}))
@@ -234,7 +249,7 @@ def test_what_is_there_is_shown_without_what_is_missing(tmp_path):
 
 
 def test_a_page_of_a_long_run_with_large_pictures_is_small(tmp_path):
-    folder = make_run(tmp_path / "long", iterations=5000, size=(900, 1400))
+    folder = make_run(tmp_path / "long", iterations=5000, size=(600, 1000))
     page = write_report(folder)
     assert page.stat().st_size < 6e6
     parsed = Page(page.read_text())

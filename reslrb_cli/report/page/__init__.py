@@ -50,6 +50,7 @@ def render_page(folder: Path) -> str:
         section("Clamped gradients", facts.clamped(results.get("clamped"))),
         section("Run", facts.run_facts(manifest, records)),
         section("Choice of the estimator", facts.pilot_table(manifest.get("pilot"))),
+        section("Bias of correlated samples", facts.correlated_bias_table(manifest.get("correlated_bias"))),
         section("Scale of the parameters", facts.scaling_table(manifest.get("scaling"))),
         section("Memory budget", facts.memory_table(manifest.get("memory"))),
         section("Configuration", f"<pre>{text(_read(folder / 'config.yaml'))}</pre>"),

@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from datetime import datetime
 from typing import Any
 
+from reslrb_cli.optimization.correlated_bias import CorrelatedBias, share_words
 from reslrb_cli.optimization.pilot import Outcome
 from reslrb_cli.report.page.markup import breakable, facts, table, text
 from reslrb_cli.report.words import duration, number
@@ -91,6 +92,20 @@ def pilot_table(pilot: Mapping[str, Any] | None) -> str:
         cells.append([text(name), *map(text, (number(share, 3), number(row.variance, 3), time, row.rounds, row.note))])
     head = ("estimator", "efficiency over the best", "variance", "kernels", "rounds", "note")
     return f"<p>{text(outcome.line())}</p>" + table(head, cells)
+
+
+def correlated_bias_table(measured: Mapping[str, Any] | None) -> str:
+    """What was measured of the bias of `adjoint: correlated`, by parameter."""
+    try:
+        bias = CorrelatedBias.from_json(dict(measured or {}))
+    except (TypeError, KeyError):  # there was none, or another version's
+        return ""
+    rows = []
+    for row in bias.parameters:
+        what = "larger than the gradient" if row.exceeds else "of the gradient" if row.along else "not seen"
+        rows.append([breakable(row.key), text(share_words(row, "±")), text(what)])
+    line = f"Measured at the start, in {bias.rounds} rounds of {bias.spp} samples per pixel."
+    return f"<p>{text(bias.line() or line)}</p>" + table(("parameter", "share of the gradient", "bias"), rows)
 
 
 def scaling_table(scaling: Sequence[Mapping[str, Any]] | None) -> str:

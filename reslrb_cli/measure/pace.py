@@ -1,0 +1,50 @@
+"""How the time of a sweep is spent: so much for each depth, and as many rounds there as fit."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+
+MIN_ROUNDS = 3
+MAX_ROUNDS = 25
+#: How much more of the time is for the next depth, whose kernels take longer to compile and to run.
+GROWTH = 1.3
+#: What is said of what a budget did not suffice for.
+NO_TIME = "the budget was spent; allow more with --budget"
+
+
+class Pace:
+    """Divides the time among depths, each of which gets GROWTH times as much as the one before it.
+
+    What a depth leaves is for the others. None gets fewer than MIN_ROUNDS rounds while there is time at all, whatever
+    its own share. With `rounds` time does not count.
+    """
+
+    def __init__(
+        self, budget_s: float, depths: int, rounds: int | None = None, now: Callable[[], float] = time.monotonic
+    ) -> None:
+        self._now, self._end, self._left, self._rounds = now, now() + budget_s, depths, rounds
+        self._rounds_start = self._depth_end = now()
+
+    def over(self) -> bool:
+        """Whether the time is up."""
+        return self._rounds is None and self._now() >= self._end
+
+    def begin_depth(self) -> None:
+        """A depth begins."""
+        now = self._now()
+        self._depth_end = now + (self._end - now) / sum(GROWTH**k for k in range(self._left))
+        self._left -= 1
+
+    def begin_rounds(self) -> None:
+        """Its processes are warm."""
+        self._rounds_start = self._now()
+
+    def another(self, done: int) -> bool:
+        """Whether there is time for another round after `done` of them."""
+        if self._rounds is not None:
+            return done < self._rounds
+        if done == 0 or done >= MAX_ROUNDS:
+            return done == 0
+        now = self._now()
+        return now + (now - self._rounds_start) / done <= (self._end if done < MIN_ROUNDS else self._depth_end)

@@ -1,0 +1,127 @@
+"""What `run.adjoint: correlated` does to a gradient: its bias, from rounds of few samples (`correlated_rounds.py`).
+
+With delta(I) = dL/dI and J the derivative of the image by the parameters, each of its samples,
+
+    g = J(samples)^T delta(I(samples))          correlated: noise of I meets its own in J
+    h = J(samples)^T delta(I(other samples))    independent
+
+have expectations that differ by the bias b = E[g - h]. Rounds r of independent samples give d_r = g_r - h_r and h_r.
+Inner products of expectations are estimated without bias from pairs of different rounds (U-statistics)
+
+    <a, c> = mean over r != s of <a_r, c_s>
+
+and their standard errors by the jackknife over rounds. Two things are asked of each parameter: what share of the
+gradient the bias makes, <b, h> / <h, h>, where noise does not hide the gradient; and whether the bias is longer than
+the gradient, <b, b> > <h, h>, which keeps its sense where the gradient vanishes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+from scipy import stats
+
+Array = np.ndarray[Any, Any]
+
+#: Probability that a run without bias is told of one: that of three standard errors.
+ALPHA = 0.0027
+
+
+@dataclass(frozen=True)
+class Bias:
+    """Of one parameter: the bias as a share of the gradient, with its standard error; None where noise hides that.
+
+    `along` says that this share is no accident, `exceeds` that the bias is longer than the gradient, by no accident.
+    """
+
+    key: str
+    share: float | None
+    error: float | None
+    along: bool
+    exceeds: bool
+
+
+@dataclass(frozen=True)
+class CorrelatedBias:
+    """What was measured, by parameter, in so many rounds of `spp` samples per pixel."""
+
+    rounds: int
+    spp: int
+    parameters: list[Bias]
+
+    def to_json(self) -> dict[str, Any]:
+        """As a mapping for JSON."""
+        return asdict(self)
+
+    @staticmethod
+    def from_json(data: dict[str, Any]) -> CorrelatedBias:
+        """The same again. Raises TypeError or KeyError where `data` is nothing that `to_json` made."""
+        return CorrelatedBias(**{**data, "parameters": [Bias(**row) for row in data["parameters"]]})
+
+    def line(self) -> str | None:
+        """What the user is told, of the parameter that has the largest bias; None where none was seen."""
+        seen = sorted((row for row in self.parameters if row.along or row.exceeds), key=_size)
+        if not seen:
+            return None
+        worst, others = seen[-1], len(seen) - 1
+        more = f" ({others} more {'has' if others == 1 else 'have'} one)" if others else ""
+        what = f"is larger than the gradient of `{worst.key}` itself"
+        if worst.along:
+            what = f"is {share_words(worst)} of the gradient of `{worst.key}`"
+        return f"run.adjoint: correlated: at the start its bias {what}{more}; `batched` has none of it"
+
+
+def share_words(row: Bias, sign: str = "+-") -> str:
+    """A bias as a share of the gradient, with its standard error; empty where noise hides it."""
+    if row.share is None or row.error is None:
+        return ""
+    digits = 0 if row.error >= 0.005 else 1
+    return f"{100 * row.share:+.{digits}f} % {sign} {max(100 * row.error, 10**-digits):.{digits}f} %"
+
+
+def find_bias(
+    key: str, differences: Sequence[Array], gradients: Sequence[Array], scale: float = 1.0, parameters: int = 1
+) -> Bias:
+    """Judge the bias of a parameter by d_r and h_r of each round; it is `scale` times as large in the run.
+
+    Corrected for the number of parameters, each with two questions.
+    """
+    d, h = (np.array(rows, dtype=np.float64) for rows in (differences, gradients))
+    d = d * scale
+    products = np.array([d @ h.T, h @ h.T, d @ d.T])
+    limit = float(stats.t.isf(ALPHA / (4 * parameters), len(d) - 1))
+    (_, gradient, _), (_, gradient_error, _) = _jackknife(products, lambda u: u)
+    [share], [error] = _jackknife(products, lambda u: u[:1] / np.where(u[1:2] == 0, np.inf, u[1:2]))
+    [excess], [excess_error] = _jackknife(products, lambda u: u[2:] - u[1:2])
+    known = gradient > limit * gradient_error
+    return Bias(
+        key,
+        share=float(share) if known else None,
+        error=float(error) if known else None,
+        along=bool(known and abs(share) > limit * error),
+        exceeds=bool(excess > limit * excess_error),
+    )
+
+
+def _jackknife(products: Array, function: Callable[[Array], Array]) -> tuple[Array, Array]:
+    """`function` of the means over r != s of (K, R, R) inner products (K,), and its standard errors."""
+    rounds = products.shape[1]
+    without = np.array([
+        function(_off_diagonal_mean(np.delete(np.delete(products, r, axis=1), r, axis=2))) for r in range(rounds)
+    ])  # fmt: skip
+    errors = np.sqrt((rounds - 1) / rounds * np.sum(np.square(without - without.mean(0)), axis=0))
+    return function(_off_diagonal_mean(products)), errors
+
+
+def _off_diagonal_mean(products: Array) -> Array:
+    rounds = products.shape[1]
+    total = products.sum(axis=(1, 2)) - np.trace(products, axis1=1, axis2=2)
+    mean: Array = total / (rounds * (rounds - 1))
+    return mean
+
+
+def _size(row: Bias) -> float:
+    return abs(row.share) if row.along and row.share is not None else np.inf
