@@ -19,9 +19,19 @@ from .choices import (
     WalkAd,
 )
 from .loader import dump, load, loads, with_integrator
-from .schema import ColorSpace, Config, ImageFile, ParameterSpec, Rendering, RunConfig, SceneConfig, TargetConfig
+from .parameters import (
+    HEIGHTMAP,
+    ColorSpace,
+    HeightmapSpec,
+    ImageFile,
+    MotionSpec,
+    ParameterSpec,
+    Settings,
+)
+from .schema import Config, Rendering, RunConfig, SceneConfig, TargetConfig
 
 __all__ = [
+    "HEIGHTMAP",
     "L1",
     "L2",
     "SGD",
@@ -29,10 +39,12 @@ __all__ = [
     "AdamW",
     "ColorSpace",
     "Config",
+    "HeightmapSpec",
     "ImageFile",
     "Integrator",
     "LogL2",
     "Loss",
+    "MotionSpec",
     "Optimizer",
     "ParameterSpec",
     "Prb",
@@ -43,6 +55,7 @@ __all__ = [
     "Reslrb",
     "RunConfig",
     "SceneConfig",
+    "Settings",
     "TargetConfig",
     "Trajectory",
     "WalkAd",
