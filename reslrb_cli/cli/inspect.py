@@ -108,7 +108,7 @@ def command(
         for line in [f"none: {plan}"] if isinstance(plan, str) else plan_lines(plan):
             echo(f"  {line}")
     echo("parameters")
-    wanted = [] if "parameters" in subject.missing else [spec.key for spec in config.parameters]
+    wanted = [] if "parameters" in subject.missing else [key for spec in config.parameters for key in spec.keys]
     for line in parameter_lines(summary.parameters, wanted, everything):
         echo(f"  {line}")
     if measured is not None:
@@ -176,8 +176,7 @@ def make_plan_report(config: Config, scene: Any, counts: bool) -> PlanReport | s
         [sensor, *_] = choose_sensors(config, scene)
         selection = select_parameters(scene, config.parameters, config.source)
         integrator = Reslrb.of(**options)
-        return report_plan(
-            integrator, scene, scene.sensors()[sensor], selection.params, selection.keys, known=known, counts=counts
-        )
+        params, keys = selection.params, selection.scene_keys
+        return report_plan(integrator, scene, scene.sensors()[sensor], params, keys, known=known, counts=counts)
     except (ConfigError, UnsupportedScene) as error:
         return str(error)

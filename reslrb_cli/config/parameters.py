@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -191,7 +192,7 @@ class MotionSpec(Section):
     @classmethod
     def _check_pivot(cls, value: list[float] | None) -> list[float] | None:
         if value is not None and len(value) != 3:
-            raise wrong(f"must be a point, [x, y, z], and has {len(value)} numbers")
+            raise wrong(f"must be a point, [x, y, z], not a list of length {len(value)}")
         return value
 
     @field_validator("of", "free")
@@ -284,6 +285,10 @@ class ParameterSpec(Section):
                 found += [(option, i, name) for i, name in enumerate(names or ())]
         return found
 
+    def at(self, option: str, word: str) -> str:
+        """Where in this section `option` is set for what `word` names."""
+        return f"{option}.{word}" if isinstance(getattr(self, option, None), _ByWord) else option
+
     def settings(self, word: str = "") -> Settings:
         """What is said of the array of a motion that `word` names; "": of what is no motion."""
 
@@ -344,9 +349,7 @@ class ParameterSpec(Section):
         for word in self.motion.free if self.motion is not None else ("",):
             settings = self.settings(word)
 
-            def at(option: str, word: str = word) -> str:
-                return f"{option}.{word}" if isinstance(getattr(self, option), _ByWord) else option
-
+            at = functools.partial(self.at, word=word)
             _check_bounds(settings, at)
             _check_transform(settings, at)
             _check_initial(settings, at)

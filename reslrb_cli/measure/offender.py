@@ -99,7 +99,7 @@ def _take_step(problem: Problem, sensor: int, target: Any, step_seed: int) -> St
         problem.integrator, problem.scene, sensor, lambda image: problem.compare(image, target) / len(problem.sensors),
         seed=step_seed, **problem.config.step_options(), params=problem.selection.params,
     )  # fmt: skip
-    gradients = {key: np.array(optimizer.gradient(key)) for key in keys}
+    gradients = {key: np.array(gradient) for key, gradient in problem.gradients().items()}
     for key in keys:
         optimizer.clear_gradient(key)
     return Step(np.array(step.image), gradients, step.refused.entry())

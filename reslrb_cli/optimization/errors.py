@@ -12,6 +12,7 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
+from reslrb_cli.scene import Selection
 from reslrb_cli.scene.values import resample
 
 Array = np.ndarray[Any, Any]
@@ -29,11 +30,16 @@ _EMITTED = {
 }
 
 
-def quantity(params: Any, key: str) -> str:
-    """The radiometric quantity of a `mi.traverse` entry: `radiance`, `irradiance`, `intensity`, or "", without a unit.
+def quantity(selection: Selection, key: str) -> str:
+    """What a parameter is in units of: `radiance`, `irradiance`, `intensity`, `length`, `degrees`, or "", without one.
 
-    Without a unit are all parameters of BSDFs, mesh attributes, and factors of emitters (`scale`, a spot's `texture`).
+    Without a unit are all parameters of BSDFs, mesh attributes, and factors (`scale`, a spot's `texture`).
     """
+    if key in selection.deformation.values:
+        return selection.deformation.quantities[key]
+    if key.endswith((".vertex_positions", ".position")):
+        return "length"
+    params = selection.params
     node = own = params.properties[key][2]
     while node is not None and not isinstance(node, mi.Emitter):
         node = params.hierarchy[node][0]

@@ -68,7 +68,7 @@ WRONG = {
     "nothing moves": ("{motion: {of: []}}", ("parameters[0].motion.of: must have at least one entry",)),
     "nothing free": ("{motion: {of: a, free: []}}", ("parameters[0].motion.free: must have at least one entry",)),
     "unknown word": ("{motion: {of: a, free: [shear]}}", ("parameters[0].motion.free[0]: must be one of", "rotation")),
-    "pivot of two": ("{motion: {of: a, pivot: [1, 2]}}", ("parameters[0].motion.pivot: must be a list",)),
+    "pivot of two": ("{motion: {of: a, pivot: [1, 2]}}", ("motion.pivot: must be a point, [x, y, z], not",)),
     "unknown key of a motion": ("{motion: {of: a, about: [1, 2, 3]}}", ("parameters[0].motion.about: unknown key",)),
     "no resolution": ("{heightmap: {mesh: a}}", ("parameters[0].heightmap.resolution: missing",)),
     "resolution of one": ("{heightmap: {mesh: a, resolution: [1, 4]}}", ("heightmap.resolution: must be at least",)),

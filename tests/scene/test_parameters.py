@@ -113,7 +113,7 @@ def test_bounds_hold_for_the_nearest_float(make_scene):
     [
         ([{"key": "flor.reflectance.data"}], "key", f"matches no parameter of the scene; did you mean `{TEXTURE}`"),
         ([{"key": "zzz*"}], "key", "matches no parameter"),
-        ([{"key": "plane.to_world"}], "key", "moves geometry"),
+        ([{"key": "plane.to_world"}], "key", "is recovered as a motion"),
         ([{"key": "camera.x_fov"}], "key", "belongs to the sensor"),
         ([{"key": "camera.film.size"}], "key", "belongs to the film"),
         ([{"key": "lamp.position"}], "key", "moves the light"),
