@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from reslrb_cli.integrators.plan_report import PlanReport
     from reslrb_cli.scene import ParameterInfo, SceneSummary, SensorSummary
+    from reslrb_cli.scene.inspect import MovableSummary
 
 #: Sensors, parameters that can be recovered, and keys that one reason names, without `--all`.
 LISTED_SENSORS, _LISTED, _NAMED = 3, 30, 3
@@ -88,6 +89,16 @@ def parameter_lines(infos: Sequence[ParameterInfo], wanted: Sequence[str], every
     if others:
         lines.append(f"others: {len(others)}; --all lists them")
         lines += [f"  {line}" for line in _reasons(others)]
+    return lines
+
+
+def moving_lines(movable: Sequence[MovableSummary], everything: bool) -> list[str]:
+    """What can be moved, and by what."""
+    shown = movable if everything else movable[:_LISTED]
+    lines = [f"can be moved: {len(movable) or 'nothing'}"]
+    lines += [f"  {line}" for line in _columns([(item.id, ", ".join(item.by)) for item in shown])]
+    if len(shown) < len(movable):
+        lines.append(f"  and {len(movable) - len(shown)} more; --all lists them")
     return lines
 
 

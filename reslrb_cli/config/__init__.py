@@ -21,6 +21,7 @@ from .choices import (
 from .loader import dump, load, loads, with_integrator
 from .parameters import (
     HEIGHTMAP,
+    WORDS,
     ColorSpace,
     HeightmapSpec,
     ImageFile,
@@ -35,6 +36,7 @@ __all__ = [
     "L1",
     "L2",
     "SGD",
+    "WORDS",
     "Adam",
     "AdamW",
     "ColorSpace",

@@ -17,6 +17,7 @@ from reslrb_cli.optimization.budget import MemoryPlan
 from reslrb_cli.optimization.choice import Cache, find_options, settle_integrator
 from reslrb_cli.optimization.errors import ErrorMeter, comparison_grid, quantity
 from reslrb_cli.optimization.losses import Loss, make_loss
+from reslrb_cli.optimization.moving import check_moving
 from reslrb_cli.optimization.optimizers import Optimizer
 from reslrb_cli.optimization.pilot import Outcome
 from reslrb_cli.optimization.rendering import render_in_passes
@@ -205,6 +206,7 @@ def assemble_scene(config: Config, scene: Any = None, values: Mapping[str, Array
         quantities={key: quantity(selection, key) for key in selection.keys},
     )
     problem.apply()
+    check_moving(problem)
     return problem
 
 

@@ -167,8 +167,7 @@ def _obstacle(kind: str, key: str, value: Any, differentiable: bool, node: Any) 
 def _moving_obstacle(kind: str, id: str, name: str, node: Any) -> str | None:
     """Why the place of a shape or an emitter is not recovered by this name; None where it is."""
     if kind == "shape" and name not in ("to_world", "vertex_positions"):
-        follows = "; they follow from its vertices" if name == "vertex_normals" else ""
-        return f"is no place: of shapes, vertices and motions are recovered{follows}"
+        return "belongs to a shape, of which vertices and motions are recovered"
     reason = moving_shape_obstacle(node, name) if kind == "shape" else moving_emitter_obstacle(node)
     if reason is not None:
         return f"cannot be moved ({reason})"

@@ -80,6 +80,15 @@ def heightmap_obstacle(item: Movable) -> str | None:
     return None
 
 
+def casts_edges(scene: mi.Scene, item: Movable) -> bool:
+    """Whether what moves can have a silhouette or throw a shadow: a shape that does not enclose all others."""
+    if not item.is_shape:
+        return False
+    own = item.node.bbox()
+    others = [shape.bbox() for shape in scene.shapes() if shape.ptr != item.node.ptr]
+    return not all(own.contains(box, strict=True) for box in others)
+
+
 def where_moved(params: mi.SceneParameters, keys: list[str]) -> list[Movable]:
     """The objects that the scene parameters `keys` move."""
     kinds = (*MOVING_SHAPES, *MOVING_EMITTERS)

@@ -10,7 +10,7 @@ from typing import Any
 
 import mitsuba as mi
 
-from ..config import ParameterSpec, Settings
+from ..config import HEIGHTMAP, WORDS, ParameterSpec, Settings
 from .catalog import describe, list_parameters
 from .deformation import Deformation
 from .movable import Movable, find_movable, heightmap_obstacle
@@ -167,6 +167,10 @@ def _matching(params: mi.SceneParameters, pattern: str, place: Place, names: Seq
         near = difflib.get_close_matches(pattern, [*names, *params.properties], n=3, cutoff=0.5)
         near = near or difflib.get_close_matches(pattern, _recoverable(params), n=3, cutoff=0)
         hint = " or ".join(f"`{key}`" for key in near)
+        id, _, word = pattern.rpartition(".")
+        if word in (*WORDS, HEIGHTMAP) and isinstance(find_movable(params, id), Movable):
+            kind = "heightmap" if word == HEIGHTMAP else "motion"
+            raise place.fail("key", f"`{pattern}` belongs to a {kind} of `{id}`, and `parameters` have none that is so")
         raise place.fail("key", f"`{pattern}` matches no parameter of the scene; did you mean {hint}?")
     infos = [describe(params, key) for key in matches]
     usable = [info.key for info in infos if info.obstacle is None]
