@@ -21,6 +21,7 @@ SEED, SPP = 3, 256
 MOTIONS = "parameters=[{motion: {of: slab, free: [translation, rotation, scale], pivot: [0.2, 1.5, 0.1]}}, "
 MOTIONS += "{heightmap: {mesh: slab, resolution: [5, 4]}}, {motion: {of: lamp}}]"
 NO_TRUTH = "target.render.parameters={}"
+FLOOR = "parameters=[{key: floor.bsdf.reflectance.value}]"
 #: Steps of central differences, by what is recovered.
 STEPS = {"translation": 1e-2, "rotation": 0.3, "scale": 1e-2, "heightmap": 2e-3}
 
@@ -159,7 +160,7 @@ REFUSED = {
         ["scene.options.filter=box", "integrator={type: ptracer}"], "scene.file", "camera has a box filter",
     ),
     "alpha by gather": (
-        ["parameters=[{key: floor.bsdf.reflectance.value}]", NO_TRUTH, "integrator={estimator: gather, attached: true}"],
+        [FLOOR, NO_TRUTH, "integrator={estimator: gather, attached: true}"],
         "integrator.estimator", "take stack",
     ),
 }  # fmt: skip

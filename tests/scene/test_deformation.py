@@ -112,9 +112,8 @@ def test_shapes_and_emitters_move_with_a_mesh(scene):
     spot = matrix(selection, "spot.to_world")
     assert np.allclose(spot[:3, :3], turn(POSE["rotation"]) @ old["spot.to_world"][:3, :3], atol=1e-5)
     assert np.allclose(spot[:3, 3], (M @ old["spot.to_world"])[:3, 3], atol=1e-5)
-    assert np.allclose(
-        matrix(selection, "sun.to_world")[:3, :3], turn(POSE["rotation"]) @ old["sun.to_world"][:3, :3], atol=1e-5
-    )
+    turned = turn(POSE["rotation"]) @ old["sun.to_world"][:3, :3]
+    assert np.allclose(matrix(selection, "sun.to_world")[:3, :3], turned, atol=1e-5)
 
 
 def test_a_heightmap_displaces_along_the_initial_normals(scene):
@@ -150,9 +149,8 @@ def test_a_heightmap_moves_with_its_mesh_and_one_map_serves_several(scene):
     plain = select(scene, motion("box"))
     before, normals = positions(plain), np.array(plain.params["box.vertex_normals"]).reshape(-1, 3)
     other = positions(plain, "other.vertex_positions")
-    shift = motion(
-        "box", "rotation", "translation", pivot=[0, 0, 0], initial={"rotation": [0, 0, 90], "translation": 1}
-    )
+    start = {"rotation": [0, 0, 90], "translation": 1}
+    shift = motion("box", "rotation", "translation", pivot=[0, 0, 0], initial=start)
     selection = select(scene, heightmap(["box", "other"], initial=0.1), shift)
     assert selection.keys == ["box.heightmap", "box.rotation", "box.translation"]
     expected = 1 + (before + 0.1 * normals) @ turn([0, 0, 90]).T
@@ -198,9 +196,8 @@ def test_gradients_come_back_to_what_moves(scene):
                 moved = base.copy().reshape(-1)
                 moved[entry] += side * h
                 selection.set_arrays({key: moved.reshape(base.shape)})
-                ends.append(
-                    positions(selection).ravel() @ by_vertex + (matrix(selection, "ball.to_world") * by_place).sum()
-                )
+                ball = (matrix(selection, "ball.to_world") * by_place).sum()
+                ends.append(positions(selection).ravel() @ by_vertex + ball)
             selection.set_arrays({key: base})
             assert gradient[entry] == pytest.approx((ends[0] - ends[1]) / (2 * h), rel=2e-3, abs=2e-3), key
 
@@ -275,7 +272,7 @@ def test_true_values_move_the_scene(scene, tmp_path):
         ([motion("box", initial={"translation": [1, 2]})], "[0].initial.translation", "takes 3 numbers"),
         ([motion("box", "scale", initial=[1, 2])], "[0].initial", "takes 1 number"),
         ([motion("box", bounds={"scale": [2, 3]})], "[0].bounds.scale", "exclude the initial value of `box.scale`, 1"),
-        ([motion("box", transform={"rotation": "log"})], "[0].initial.rotation", "begins at 0"),
+        ([motion("box", transform={"rotation": "log"})], "[0].initial", "`box.rotation` begins at 0"),
         ([heightmap("box", bounds=(1, 2))], "[0].bounds", "exclude the initial value of `box.heightmap`, 0"),
     ],
 )
