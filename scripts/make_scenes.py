@@ -133,16 +133,12 @@ def paper(size: int) -> Image:
 
 
 def heights(size: int) -> Image:
-    """Smooth waves of glass, in scene units: of two to three ripples across, so shallow that light does not fold."""
+    """Smooth waves of glass, in scene units: two to four ripples across, so shallow that light does not fold."""
     y, x = (np.mgrid[0:size, 0:size] + 0.5) / size
-    waves = [
-        ((7.0, 9.0), 0.4, 0.0060),
-        ((-11.0, 6.0), 1.9, 0.0050),
-        ((15.0, 3.0), 4.1, 0.0032),
-        ((4.0, -17.0), 2.7, 0.0030),
-    ]
-    value = sum(amplitude * np.sin(kx * x + ky * y + phase) for (kx, ky), phase, amplitude in waves)
-    return quantise(np.repeat((value - value.mean())[:, :, None], 3, axis=2), 2.0**-16)
+    # (ripples across the map, along x and y), phase, amplitude
+    waves = [((2, 2), 0.4, 1.4e-3), ((-3, 1), 1.9, 1.1e-3), ((1, -3), 4.1, 1.1e-3), ((3, 2), 2.7, 0.8e-3)]
+    value = sum(amplitude * np.sin(2 * np.pi * (kx * x + ky * y) + phase) for (kx, ky), phase, amplitude in waves)
+    return quantise(np.repeat((value - value.mean())[:, :, None], 3, axis=2), 2.0**-20)
 
 
 def beam(size: int) -> Image:

@@ -14,6 +14,8 @@ if TYPE_CHECKING:
 
 #: Sensors, parameters that can be recovered, and keys that one reason names, without `--all`.
 LISTED_SENSORS, _LISTED, _NAMED = 3, 30, 3
+#: And what can be moved.
+_MOVED = 10
 
 
 def scene_lines(summary: SceneSummary) -> list[str]:
@@ -94,11 +96,15 @@ def parameter_lines(infos: Sequence[ParameterInfo], wanted: Sequence[str], every
 
 def moving_lines(movable: Sequence[MovableSummary], everything: bool) -> list[str]:
     """What can be moved, and by what."""
-    shown = movable if everything else movable[:_LISTED]
     lines = [f"can be moved: {len(movable) or 'nothing'}"]
-    lines += [f"  {line}" for line in _columns([(item.id, ", ".join(item.by)) for item in shown])]
-    if len(shown) < len(movable):
-        lines.append(f"  and {len(movable) - len(shown)} more; --all lists them")
+    if everything:
+        return lines + [f"  {line}" for line in _columns([(item.id, ", ".join(item.by)) for item in movable])]
+    groups: dict[str, list[str]] = {}
+    for item in movable:
+        groups.setdefault(" and ".join(item.by), []).append(item.id)
+    for by, ids in groups.items():
+        more = f" and {len(ids) - _MOVED} more; --all lists them" if len(ids) > _MOVED else ""
+        lines.append(f"  by {by}: {', '.join(ids[:_MOVED])}{more}")
     return lines
 
 
