@@ -49,7 +49,7 @@ def images() -> dict[str, Image]:
 def meshes() -> dict[str, tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]]:
     """Meshes with texture coordinates, by their paths below the scenes folder: what `height_field` returns."""
     return {
-        "caustic_heightmap/face.ply": height_field(128, 0.82, lambda x, z: 0 * x),
+        "caustic_heightmap/face.ply": height_field(128, 0.805, lambda x, z: 0 * x),
         "lens_pose/lens.ply": height_field(64, 0.6, lens),
     }
 

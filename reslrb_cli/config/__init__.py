@@ -19,16 +19,8 @@ from .choices import (
     WalkAd,
 )
 from .loader import dump, load, loads, with_integrator
-from .parameters import (
-    HEIGHTMAP,
-    WORDS,
-    ColorSpace,
-    HeightmapSpec,
-    ImageFile,
-    MotionSpec,
-    ParameterSpec,
-    Settings,
-)
+from .moving import HEIGHTMAP, WORDS, HeightmapSpec, MotionSpec
+from .parameters import ColorSpace, ImageFile, ParameterSpec, Settings
 from .schema import Config, Rendering, RunConfig, SceneConfig, TargetConfig
 
 __all__ = [
