@@ -64,7 +64,7 @@ Initial = Annotated[
     Discriminator(
         _initial_tag,
         custom_error_type="wrong",
-        custom_error_message="must be a number, a list of numbers, {{file: IMAGE}}, or `scene`",
+        custom_error_message="must be a number, a list of numbers, {file: IMAGE}, or `scene`",
     ),
 ]
 _AnyBounds = Annotated[Annotated[Bounds, mark("list")] | Annotated[MotionBounds, mark(ByWord.TAG)], or_words("list")]
