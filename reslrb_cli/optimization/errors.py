@@ -12,7 +12,6 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
-from reslrb_cli.scene import Selection
 from reslrb_cli.scene.values import resample
 
 Array = np.ndarray[Any, Any]
@@ -30,16 +29,13 @@ _EMITTED = {
 }
 
 
-def quantity(selection: Selection, key: str) -> str:
-    """What a parameter is in units of: `radiance`, `irradiance`, `intensity`, `length`, `degrees`, or "", without one.
+def quantity(params: Any, key: str) -> str:
+    """What a `mi.traverse` entry is in units of: `radiance`, `irradiance`, `intensity`, `length`, or "", without one.
 
     Without a unit are all parameters of BSDFs, mesh attributes, and factors (`scale`, a spot's `texture`).
     """
-    if key in selection.deformation.values:
-        return selection.deformation.quantities[key]
     if key.endswith((".vertex_positions", ".position")):
         return "length"
-    params = selection.params
     node = own = params.properties[key][2]
     while node is not None and not isinstance(node, mi.Emitter):
         node = params.hierarchy[node][0]

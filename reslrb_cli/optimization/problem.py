@@ -203,7 +203,7 @@ def assemble_scene(config: Config, scene: Any = None, values: Mapping[str, Array
         loss=make_loss(config.loss.type, **config.loss.options()),
         optimizer=optimizer,
         samples_per_pass=samples_per_pass(config),
-        quantities={key: quantity(selection, key) for key in selection.keys},
+        quantities={key: selection.quantity(key) or quantity(selection.params, key) for key in selection.keys},
     )
     problem.apply()
     check_moving(problem)

@@ -87,7 +87,7 @@ class Deformation:
 
     params: mi.SceneParameters
     values: dict[str, Any] = field(default_factory=dict)
-    #: What is measured in units of length, in degrees, or in none, by name.
+    #: `length`, `degrees` or `scale`, by name: what has one of these units adds up.
     quantities: dict[str, str] = field(default_factory=dict)
     _moved: dict[str, _Moved] = field(default_factory=dict)
     _corners: dict[tuple[str, int, int], tuple[list[mi.UInt32], list[mi.Float]]] = field(default_factory=dict)
@@ -106,7 +106,7 @@ class Deformation:
             self._place(item).motion = motion
         for word, name in names.items():
             self.values[name] = identity(word)
-            self.quantities[name] = {"translation": "length", "rotation": "degrees"}.get(word, "")
+            self.quantities[name] = {"translation": "length", "rotation": "degrees"}.get(word, word)
 
     def add_heightmap(self, items: tuple[Movable, ...], resolution: tuple[int, int]) -> None:
         """Displace the meshes `items`, none of which has a heightmap yet."""

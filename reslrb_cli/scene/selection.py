@@ -48,6 +48,10 @@ class Selection:
         """The current value of `key`, as Dr.Jit has it."""
         return self.deformation.values[key] if key in self.deformation.values else self.params[key]
 
+    def quantity(self, key: str) -> str | None:
+        """What `key` measures: `length`, `degrees` or `scale` of what moves; None of what is the scene's own."""
+        return self.deformation.quantities.get(key)
+
     def array(self, key: str) -> np.ndarray[Any, Any]:
         """The current value of `key`: a texture (H, W, C), a colour (C,), a buffer (N,), a number ().
 

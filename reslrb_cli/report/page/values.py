@@ -20,7 +20,7 @@ _FOLDERS = {"initial": "initial", "final": "", "true": "true"}
 #: Parameters of three numbers that are no colours to look at.
 _NO_COLORS = ("eta", "k")
 #: What is no light and no colour, but where something is.
-_PLACES = ("length", "degrees")
+_PLACES = ("length", "degrees", "scale")
 
 
 def parameter_table(results: Mapping[str, Any]) -> str:
