@@ -73,9 +73,16 @@ class ConfigError(ReslrbError):
 
 
 class UnsupportedScene(ReslrbError):
-    """A scene that light tracing cannot render; the message gives the reason."""
+    """A scene that light tracing cannot render, or differentiate; the message gives the reason.
+
+    `option` is the setting that is to blame, where one is (`estimator`).
+    """
 
     exit_code = ExitCode.USAGE
+
+    def __init__(self, message: str = "", option: str = "") -> None:
+        super().__init__(message)
+        self.option = option
 
 
 class BackendError(ReslrbError):

@@ -10,6 +10,7 @@ from the last bits of sines and cosines, which are rounded away; a test compares
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -29,6 +30,8 @@ def main(arguments: list[str]) -> None:
     Picture.fromarray(mottled_wall(192, 384)).save(folder / "stiff" / "wall.png", optimize=True)
     Picture.fromarray(np.uint8([[255, 13]])).save(folder / "stiff" / "filter.png")  # a torch's halves: 1 and 0.05
     write_ply(folder / "caustic_slab" / "slab.ply", *slab())
+    for name, mesh in meshes().items():
+        write_ply(folder / name, *mesh)
 
 
 def images() -> dict[str, Image]:
@@ -39,6 +42,16 @@ def images() -> dict[str, Image]:
         "grey_room/painting.exr": painting(20),
         "grey_room/sky.exr": sky(64),
         "caustic_slab/paper.exr": paper(64),
+        "caustic_heightmap/heights.exr": heights(32),
+        "lens_pose/beam.exr": beam(64),
+    }
+
+
+def meshes() -> dict[str, tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]]:
+    """Meshes with texture coordinates, by their paths below the scenes folder: what `height_field` returns."""
+    return {
+        "caustic_heightmap/face.ply": height_field(128, 0.805, lambda x, z: 0 * x),
+        "lens_pose/lens.ply": height_field(64, 0.6, lens),
     }
 
 
@@ -120,6 +133,22 @@ def paper(size: int) -> Image:
     return quantise(color)
 
 
+def heights(size: int) -> Image:
+    """Smooth waves of glass, in scene units: two to four ripples across, so shallow that light does not fold."""
+    y, x = (np.mgrid[0:size, 0:size] + 0.5) / size
+    # (ripples across the map, along x and y), phase, amplitude
+    waves = [((2, 2), 0.4, 1.4e-3), ((-3, 1), 1.9, 1.1e-3), ((1, -3), 4.1, 1.1e-3), ((3, 2), 2.7, 0.8e-3)]
+    value = sum(amplitude * np.sin(2 * np.pi * (kx * x + ky * y) + phase) for (kx, ky), phase, amplitude in waves)
+    return quantise(np.repeat((value - value.mean())[:, :, None], 3, axis=2), 2.0**-20)
+
+
+def beam(size: int) -> Image:
+    """The cross-section of a beam: soft dots, five across."""
+    y, x = (np.mgrid[0:size, 0:size] + 0.5) / size * 2 * np.pi * 5
+    value = 0.1 + 0.9 * ((0.5 + 0.5 * np.cos(x)) * (0.5 + 0.5 * np.cos(y))) ** 1.5
+    return quantise(np.repeat(value[:, :, None], 3, axis=2))
+
+
 def mottled_wall(width: int, height: int) -> np.ndarray:
     """Soft waves of grey, (H, W) uint8, linear: no detail finer than a pixel of the picture shows."""
     y, x = (np.mgrid[0:height, 0:width] + 0.5) / height
@@ -183,6 +212,32 @@ def slab(cells: int = 96) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return positions, quantise(normal.reshape(-1, 3), 2.0**-20), faces.astype(np.int32)
 
 
+def height_field(cells: int, half: float, height: Callable[[np.ndarray, np.ndarray], np.ndarray]
+                 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
+    """A surface y = height(x, z) over [-half, half]^2, normals downwards, u along x, v along z.
+
+    Positions and normals (V, 3), texture coordinates (V, 2) float32, and triangles (F, 3) int32.
+    """
+    axis = np.linspace(-half, half, cells + 1)
+    x, z = np.meshgrid(axis, axis, indexing="ij")
+    y, step = height(x, z), 1e-5
+    dx = (height(x + step, z) - height(x - step, z)) / (2 * step)
+    dz = (height(x, z + step) - height(x, z - step)) / (2 * step)
+    normal = np.stack([dx, -np.ones_like(x), dz], -1)
+    normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
+    index = np.arange((cells + 1) ** 2).reshape(cells + 1, cells + 1)
+    a, b, c, d = index[:-1, :-1], index[1:, :-1], index[1:, 1:], index[:-1, 1:]
+    faces = np.concatenate([np.stack([a, b, c], -1).reshape(-1, 3), np.stack([a, c, d], -1).reshape(-1, 3)])
+    positions = quantise(np.stack([x, y, z], -1).reshape(-1, 3), 2.0**-20)
+    uv = np.stack([x + half, z + half], -1).reshape(-1, 2) / (2 * half)
+    return positions, quantise(normal.reshape(-1, 3), 2.0**-20), quantise(uv, 2.0**-20), faces.astype(np.int32)
+
+
+def lens(x: np.ndarray, z: np.ndarray) -> np.ndarray:
+    """The lower face of a lens that is stronger along x than along z, and has coma, so that every turn of it shows."""
+    return x**2 / 1.6 + z**2 / 3.2 + 0.2 * x**3 + 0.2 * x * z**2 + 0.15 * z**3
+
+
 # ---- Tools ----------------------------------------------------------------------------------------------------------
 
 
@@ -215,15 +270,18 @@ def write_exr(path: Path, image: Image) -> None:
     OpenEXR.File(header, {"RGB": np.ascontiguousarray(image)}).write(str(path))
 
 
-def write_ply(path: Path, positions: np.ndarray, normals: np.ndarray, faces: np.ndarray) -> None:
-    """Write a triangle mesh as binary PLY."""
+def write_ply(path: Path, *arrays: np.ndarray) -> None:
+    """Write a triangle mesh as binary PLY: positions, normals, texture coordinates where it has any, and faces."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    properties = "".join(f"property float {name}\n" for name in ("x", "y", "z", "nx", "ny", "nz"))
-    head = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(positions)}\n{properties}"
+    *vertices, faces = arrays
+    columns = np.hstack(vertices)
+    names = ("x", "y", "z", "nx", "ny", "nz", "u", "v")[: columns.shape[1]]
+    properties = "".join(f"property float {name}\n" for name in names)
+    head = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(columns)}\n{properties}"
     head += f"element face {len(faces)}\nproperty list uchar int vertex_index\nend_header\n"
     polygons = np.empty(len(faces), dtype=[("count", "u1"), ("index", "<i4", 3)])
     polygons["count"], polygons["index"] = 3, faces
-    path.write_bytes(head.encode() + np.hstack([positions, normals]).astype("<f4").tobytes() + polygons.tobytes())
+    path.write_bytes(head.encode() + columns.astype("<f4").tobytes() + polygons.tobytes())
 
 
 if __name__ == "__main__":

@@ -11,7 +11,14 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from reslrb_cli.cli.experiment import overrides_option, start_variant
-from reslrb_cli.cli.listing import LISTED_SENSORS, parameter_lines, plan_lines, scene_lines, sensor_lines
+from reslrb_cli.cli.listing import (
+    LISTED_SENSORS,
+    moving_lines,
+    parameter_lines,
+    plan_lines,
+    scene_lines,
+    sensor_lines,
+)
 from reslrb_cli.cli.offending import show_offenders, without_nan
 from reslrb_cli.cli.output import echo
 from reslrb_cli.cli.subject import Subject, read_subject
@@ -21,7 +28,7 @@ if TYPE_CHECKING:
     from reslrb_cli.config import Config
     from reslrb_cli.integrators.plan_report import PlanReport
     from reslrb_cli.measure.conditioning import Conditioning
-    from reslrb_cli.scene import SceneSummary
+    from reslrb_cli.scene import SceneSummary, Selection
 
 #: Gradients that `--conditioning` takes.
 SAMPLES = 8
@@ -83,12 +90,14 @@ def command(
 
     scene = load_configured(config)
     summary = summarise(scene, config.integrator.hide_emitters)
-    plan = None if "parameters" in subject.missing else make_plan_report(config, scene, counts=not no_counts)
+    selection = None if "parameters" in subject.missing else select(config, scene)
+    plan = None if selection is None else make_plan_report(config, scene, selection, counts=not no_counts)
+    edges = [] if selection is None or isinstance(selection, str) else edges_of(scene, selection)
     measured = measure(subject, overrides, samples or SAMPLES) if conditioning else None
     if as_json:
         report = {"obstacle": plan} if isinstance(plan, str) else plan and dataclasses.asdict(plan)
         extra = {} if measured is None else {"conditioning": measured.to_json()}
-        everything_known = {"run": subject.run} | dataclasses.asdict(summary) | {"plan": report} | extra
+        everything_known = {"run": subject.run} | dataclasses.asdict(summary) | {"plan": report, "edges": edges} | extra
         click.echo(json.dumps(without_nan(everything_known), indent=2, allow_nan=False))
         return None
     if subject.run is not None:
@@ -108,9 +117,11 @@ def command(
         for line in [f"none: {plan}"] if isinstance(plan, str) else plan_lines(plan):
             echo(f"  {line}")
     echo("parameters")
-    wanted = [] if "parameters" in subject.missing else [spec.key for spec in config.parameters]
-    for line in parameter_lines(summary.parameters, wanted, everything):
+    wanted = [] if "parameters" in subject.missing else [key for spec in config.parameters for key in spec.keys]
+    for line in [*parameter_lines(summary.parameters, wanted, everything), *moving_lines(summary.movable, everything)]:
         echo(f"  {line}")
+    for name in edges:
+        echo(f"  silhouettes and shadow edges of {name} are not in its derivatives")
     if measured is not None:
         from reslrb_cli.report.conditioning_table import conditioning_lines
 
@@ -159,13 +170,32 @@ def measure(subject: Subject, overrides: tuple[str, ...], samples: int) -> Condi
     return measure_conditioning(assemble(config, logging.getLogger(__name__).info), samples)
 
 
-def make_plan_report(config: Config, scene: Any, counts: bool) -> PlanReport | str:
-    """The plan of a step for the first sensor that is used, or why there is none. Sets initial values in `scene`."""
+def select(config: Config, scene: Any) -> Selection | str:
+    """What the configuration recovers, or why that cannot be. Sets initial values in `scene`."""
+    from reslrb_cli.scene import select_parameters
+
+    try:
+        return select_parameters(scene, config.parameters, config.source)
+    except ConfigError as error:
+        return str(error)
+
+
+def edges_of(scene: Any, selection: Selection) -> list[str]:
+    """The shapes that the configuration moves whose edges move, too."""
+    from reslrb_cli.scene.movable import casts_edges, where_moved
+
+    moved = where_moved(selection.params, selection.scene_keys)
+    return [item.id for item in moved if casts_edges(scene, item)]
+
+
+def make_plan_report(config: Config, scene: Any, selection: Selection | str, counts: bool) -> PlanReport | str:
+    """The plan of a step for the first sensor that is used, or why there is none."""
     from reslrb_cli.integrators import Reslrb
     from reslrb_cli.integrators.plan_report import report_plan
     from reslrb_cli.optimization.problem import choose_sensors
-    from reslrb_cli.scene import select_parameters
 
+    if isinstance(selection, str):
+        return selection
     if config.integrator.type != "reslrb":
         return f"integrator.type is {config.integrator.type}; `reslrb` alone plans its kernels"
     options = config.integrator.options()
@@ -174,10 +204,8 @@ def make_plan_report(config: Config, scene: Any, counts: bool) -> PlanReport | s
     known = config.adjoint == "batched" or options.get("weight") == "adjoint"
     try:
         [sensor, *_] = choose_sensors(config, scene)
-        selection = select_parameters(scene, config.parameters, config.source)
         integrator = Reslrb.of(**options)
-        return report_plan(
-            integrator, scene, scene.sensors()[sensor], selection.params, selection.keys, known=known, counts=counts
-        )
+        params, keys = selection.params, selection.scene_keys
+        return report_plan(integrator, scene, scene.sensors()[sensor], params, keys, known=known, counts=counts)
     except (ConfigError, UnsupportedScene) as error:
         return str(error)

@@ -10,9 +10,12 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from reslrb_cli.integrators.plan_report import PlanReport
     from reslrb_cli.scene import ParameterInfo, SceneSummary, SensorSummary
+    from reslrb_cli.scene.inspect import MovableSummary
 
 #: Sensors, parameters that can be recovered, and keys that one reason names, without `--all`.
 LISTED_SENSORS, _LISTED, _NAMED = 3, 30, 3
+#: And what can be moved.
+_MOVED = 10
 
 
 def scene_lines(summary: SceneSummary) -> list[str]:
@@ -88,6 +91,20 @@ def parameter_lines(infos: Sequence[ParameterInfo], wanted: Sequence[str], every
     if others:
         lines.append(f"others: {len(others)}; --all lists them")
         lines += [f"  {line}" for line in _reasons(others)]
+    return lines
+
+
+def moving_lines(movable: Sequence[MovableSummary], everything: bool) -> list[str]:
+    """What can be moved, and by what."""
+    lines = [f"can be moved: {len(movable) or 'nothing'}"]
+    if everything:
+        return lines + [f"  {line}" for line in _columns([(item.id, ", ".join(item.by)) for item in movable])]
+    groups: dict[str, list[str]] = {}
+    for item in movable:
+        groups.setdefault(" and ".join(item.by), []).append(item.id)
+    for by, ids in groups.items():
+        more = f" and {len(ids) - _MOVED} more; --all lists them" if len(ids) > _MOVED else ""
+        lines.append(f"  by {by}: {', '.join(ids[:_MOVED])}{more}")
     return lines
 
 

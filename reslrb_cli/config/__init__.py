@@ -19,20 +19,26 @@ from .choices import (
     WalkAd,
 )
 from .loader import dump, load, loads, with_integrator
-from .schema import ColorSpace, Config, ImageFile, ParameterSpec, Rendering, RunConfig, SceneConfig, TargetConfig
+from .moving import HEIGHTMAP, WORDS, HeightmapSpec, MotionSpec
+from .parameters import ColorSpace, ImageFile, ParameterSpec, Settings
+from .schema import Config, Rendering, RunConfig, SceneConfig, TargetConfig
 
 __all__ = [
+    "HEIGHTMAP",
     "L1",
     "L2",
     "SGD",
+    "WORDS",
     "Adam",
     "AdamW",
     "ColorSpace",
     "Config",
+    "HeightmapSpec",
     "ImageFile",
     "Integrator",
     "LogL2",
     "Loss",
+    "MotionSpec",
     "Optimizer",
     "ParameterSpec",
     "Prb",
@@ -43,6 +49,7 @@ __all__ = [
     "Reslrb",
     "RunConfig",
     "SceneConfig",
+    "Settings",
     "TargetConfig",
     "Trajectory",
     "WalkAd",

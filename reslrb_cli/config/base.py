@@ -95,17 +95,20 @@ def by_kind(expected: str, word: str | None = None) -> Discriminator:
 
     Tags: `mapping`, `list`, `number`, and `text` for `word`, the only text that the union knows.
     """
+    return Discriminator(
+        lambda value: kind_tag(value, word), custom_error_type="wrong", custom_error_message=f"must be {expected}"
+    )
 
-    def tag(value: Any) -> str | None:
-        if isinstance(value, (dict, Section)):
-            return MARK + "mapping"
-        if isinstance(value, (list, tuple)):
-            return MARK + "list"
-        if isinstance(value, (int, float)) and not isinstance(value, bool):
-            return MARK + "number"
-        return MARK + "text" if word is not None and value == word else None
 
-    return Discriminator(tag, custom_error_type="wrong", custom_error_message=f"must be {expected}")
+def kind_tag(value: Any, word: str | None = None) -> str | None:
+    """The tag of `by_kind` for a value."""
+    if isinstance(value, (dict, Section)):
+        return MARK + "mapping"
+    if isinstance(value, (list, tuple)):
+        return MARK + "list"
+    if isinstance(value, (int, float)) and not isinstance(value, bool):
+        return MARK + "number"
+    return MARK + "text" if word is not None and value == word else None
 
 
 # --- numbers ----------------------------------------------------------------------------------------------------------

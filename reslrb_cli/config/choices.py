@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Literal
 
-from pydantic import ConfigDict, Field, SerializerFunctionWrapHandler, model_serializer, model_validator
+from pydantic import ConfigDict, Discriminator, Field, SerializerFunctionWrapHandler, model_serializer, model_validator
 from typing_extensions import Self
 
-from .base import Count, Positive, Section, by_type, located, mark
+from .base import MARK, Count, Positive, Section, by_type, located, mark
 
 #: For JSON Schema: `type` may be left out only for the first member of a union.
 _NEEDS_TYPE = ConfigDict(json_schema_extra={"required": ["type"]})
@@ -51,6 +51,25 @@ class LightTracer(Integrator):
     )
 
 
+class AttachingTracer(LightTracer):
+    """Options of light tracers that have derivatives of what moves light."""
+
+    attached: Annotated[
+        Annotated[bool, mark("flag")] | Annotated[Literal["auto"], mark("text")],
+        Discriminator(lambda value: MARK + ("flag" if isinstance(value, bool) else "text")),
+    ] = Field(
+        default="auto",
+        description="Whether derivatives follow light where it goes: of rays, hit points and film positions, beside "
+        "those of what light carries. `auto`: where a parameter moves anything that light leaves from or meets; true: "
+        "for roughness and index of refraction too, whose derivatives are detached otherwise.",
+    )
+    filter_normalization: Literal["attached", "detached"] = Field(
+        default="attached",
+        description="Whether the sum of the reconstruction filter's weights has its derivative too, where light moves "
+        "over the film: `attached` is what finite differences find, `detached` what `ptracer` computes.",
+    )
+
+
 #: The options of `reslrb` that belong to an estimator, by its name; the others have no use for them.
 ESTIMATOR_OPTIONS: dict[str, tuple[str, ...]] = {
     "auto": (),
@@ -63,7 +82,7 @@ ESTIMATOR_OPTIONS: dict[str, tuple[str, ...]] = {
 _ANY_ESTIMATORS = {"estimator", *(option for options in ESTIMATOR_OPTIONS.values() for option in options)}
 
 
-class Reslrb(LightTracer):
+class Reslrb(AttachingTracer):
     """Reservoir light replay backpropagation: light tracing whose memory does not depend on path length."""
 
     type: Literal["reslrb"] = Field(
@@ -141,7 +160,7 @@ class Prb(Integrator):
     type: Literal["prb"] = Field(default="prb", description="Mitsuba's path replay backpropagation, from the sensor.")
 
 
-class WalkAd(LightTracer):
+class WalkAd(AttachingTracer):
     """The light-path walk of `reslrb` under naive reverse-mode differentiation, for comparisons at equal seeds."""
 
     model_config = _NEEDS_TYPE

@@ -123,7 +123,7 @@ def _candidates(loc: tuple[int | str, ...]) -> tuple[list[type[Section]], type[S
     chosen: type[Section] = Config
     for part in loc:
         if _is_tag(part):
-            chosen = next((s for s in union if _type_name(s) == str(part)[len(MARK) :]), chosen)
+            chosen = next((s for s in union if _tag(s) == str(part)[len(MARK) :]), chosen)
         elif part in chosen.model_fields:
             union = _sections(chosen.model_fields[str(part)].annotation)
             chosen = union[0] if union else chosen
@@ -132,6 +132,11 @@ def _candidates(loc: tuple[int | str, ...]) -> tuple[list[type[Section]], type[S
 
 def _type_name(section: type[Section]) -> str | None:
     return section.model_fields["type"].default if "type" in section.model_fields else None
+
+
+def _tag(section: type[Section]) -> str | None:
+    """What marks a section as a member of a union."""
+    return getattr(section, "TAG", None) or _type_name(section)
 
 
 def _unknown_key(loc: tuple[int | str, ...]) -> str:

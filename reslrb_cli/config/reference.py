@@ -114,8 +114,8 @@ def _section(name: str, value: dict[str, Any], defs: dict[str, Any], level: int 
 
 
 def _has_own_section(key: str) -> bool:
-    """Image files are told apart in the text of their key's type; `target.render.integrator` is as `integrator`."""
-    return key == "render"
+    """Others are told apart in the text of their key's type; `target.render.integrator` is as `integrator`."""
+    return key in ("render", "heightmap", "motion")
 
 
 def _members(value: dict[str, Any], defs: dict[str, Any]) -> list[dict[str, Any]]:
@@ -155,6 +155,15 @@ def _default(value: dict[str, Any]) -> str:
 # --- types ------------------------------------------------------------------------------------------------------------
 
 
+#: Sections that are written in the line of their key.
+_IN_A_LINE = {
+    "ImageFile": "{file, color_space}",
+    **dict.fromkeys(
+        ("MotionInitial", "MotionBounds", "MotionTransform", "MotionRates"), "{translation, rotation, scale}"
+    ),
+}
+
+
 def _type(value: dict[str, Any]) -> str:
     """A key's type in words, from its JSON Schema."""
     for union in ("oneOf", "anyOf"):
@@ -164,7 +173,7 @@ def _type(value: dict[str, Any]) -> str:
                 names.remove("integer")
             return " or ".join(names) if "section" not in names else "section" + " or null" * ("null" in names)
     if "$ref" in value:
-        return "{file, color_space}" if value["$ref"].endswith("/ImageFile") else "section"
+        return _IN_A_LINE.get(value["$ref"].rsplit("/", 1)[1], "section")
     if "enum" in value:
         return ", ".join(f"`{name}`" for name in value["enum"])
     if "const" in value:
@@ -184,6 +193,8 @@ def _type(value: dict[str, Any]) -> str:
 
 
 def _plural(name: str) -> str:
+    if name.startswith("`"):  # words of which each is one
+        return name
     head, *rest = name.split(" ", 1)
     return head + "s" + "".join(f" {part}" for part in rest)
 

@@ -21,14 +21,12 @@ from pydantic import (
 )
 from typing_extensions import Self
 
-from .base import ConfigPath, Count, Positive, Section, Seed, WorkPath, by_kind, located, mark, wrong
+from .base import ConfigPath, Count, Section, Seed, WorkPath, by_kind, located, mark, wrong
 from .choices import L2, Adam, AnyIntegrator, AnyLoss, AnyOptimizer, Integrator, Reslrb
-from .limits import KEY_LENGTH, PIXELS
+from .limits import KEY_LENGTH
 from .names import check_name, folder_name
+from .parameters import COLOR_SPACE, ColorSpace, ParameterSpec, Value
 from .sizes import Memory, memory_bytes
-
-ColorSpace = Literal["auto", "linear", "srgb"]
-_COLOR_SPACE = "How values are encoded: `linear`, `srgb`, or `auto` (8-bit files srgb, float files linear)."
 
 
 def _list_of_one(value: Any) -> Any:
@@ -39,29 +37,6 @@ def _scalar(value: Any) -> Any:
     if not isinstance(value, (bool, int, float, str)) or (isinstance(value, float) and not math.isfinite(value)):
         raise wrong("must be text, a finite number, true or false")
     return value
-
-
-class ImageFile(Section):
-    """An image file that holds a texture."""
-
-    file: ConfigPath = Field(description="EXR, PNG, JPG or HDR file, relative to the config file.")
-    color_space: ColorSpace = Field(default="auto", description=_COLOR_SPACE)
-
-
-_Numbers = Annotated[list[float], Field(min_length=1)]
-#: A value for a scene parameter: one number, a list such as [r, g, b], or an image file.
-Value = Annotated[
-    Annotated[float, mark("number")] | Annotated[_Numbers, mark("list")] | Annotated[ImageFile, mark("mapping")],
-    by_kind("a number, a list of numbers, or {file: IMAGE}"),
-]
-#: The same, or "scene": the value that the scene file gives.
-Initial = Annotated[
-    Annotated[float, mark("number")]
-    | Annotated[_Numbers, mark("list")]
-    | Annotated[ImageFile, mark("mapping")]
-    | Annotated[Literal["scene"], mark("text")],
-    by_kind("a number, a list of numbers, {file: IMAGE}, or `scene`", "scene"),
-]
 
 
 class SceneConfig(Section):
@@ -129,7 +104,7 @@ class TargetConfig(Section):
         description="Target image (EXR, PNG, JPG, HDR), or a list with one for each sensor, in their order; "
         "relative to the config file.",
     )
-    color_space: ColorSpace = Field(default="auto", description=f"{_COLOR_SPACE} Only with `file`.")
+    color_space: ColorSpace = Field(default="auto", description=f"{COLOR_SPACE} Only with `file`.")
     render: Rendering | None = Field(default=None, description="Render the target from the scene.")
 
     @model_validator(mode="after")
@@ -147,76 +122,6 @@ class TargetConfig(Section):
         if self.render is not None:
             values.pop("color_space", None)
         return values
-
-
-_Bound = Annotated[float, Field(allow_inf_nan=True)]
-
-
-class ParameterSpec(Section):
-    """One scene parameter, or all that a glob matches, to be recovered."""
-
-    key: str = Field(
-        min_length=1,
-        max_length=KEY_LENGTH,
-        description="Key as `reslrb inspect` lists it: the names of `mi.traverse`, in which an object without an id "
-        "goes by its kind and number in the scene file, such as `Sphere_3`. Or a glob such as `*.reflectance.data`.",
-    )
-    initial: Initial = Field(
-        default="scene",
-        description="Value to start from: a number (all entries), a list of numbers (one per channel), an "
-        "image file, or `scene` (the scene's own value).",
-    )
-    bounds: Annotated[tuple[_Bound, _Bound], Field(strict=False)] | None = Field(
-        default=None,
-        description="[low, high], in the parameter's units; values are clamped to them after each step. "
-        "`-.inf` and `.inf` leave a side open.",
-    )
-    transform: Literal["none", "sigmoid", "log", "softplus"] = Field(
-        default="none",
-        description="What the optimizer moves in place of the value x: `sigmoid`: the logit of x between its `bounds`, "
-        "which it never reaches; `log`: log(x), for positive values known to an order of magnitude at best; "
-        "`softplus`: log(exp(x) - 1), for positive values; as `log` well below 1, as `none` well above. Learning "
-        "rates are in units of that variable.",
-    )
-    learning_rate: Positive | None = Field(
-        default=None, description="Step size of this parameter, in the optimizer's units; null: the optimizer's."
-    )
-    resolution: Annotated[tuple[Count, Count], Field(strict=False)] | None = Field(
-        default=None, description="[width, height] in texels to which a texture is resampled before the start."
-    )
-
-    @field_validator("bounds")
-    @classmethod
-    def _check_bounds(cls, value: tuple[float, float] | None) -> tuple[float, float] | None:
-        if value is not None and not value[0] < value[1]:
-            raise wrong(f"must be [low, high] with low < high, not [{value[0]:g}, {value[1]:g}]")
-        return value
-
-    @field_validator("resolution")
-    @classmethod
-    def _check_resolution(cls, value: tuple[int, int] | None) -> tuple[int, int] | None:
-        if value is not None and value[0] * value[1] > PIXELS:
-            raise wrong(f"must have at most {PIXELS} texels, not {value[0] * value[1]}")
-        return value
-
-    @model_validator(mode="after")
-    def _check_transform(self) -> Self:
-        low, high = self.bounds or (-math.inf, math.inf)
-        if self.transform == "sigmoid" and not (math.isfinite(low) and math.isfinite(high)):
-            has = "has none" if self.bounds is None else f"has [{low:g}, {high:g}]"
-            raise located("transform", f"sigmoid maps to finite `bounds`, [low, high]; this parameter {has}")
-        if self.transform in ("log", "softplus") and high <= 0:
-            raise located("bounds", f"leave no positive value, and transform: {self.transform} yields nothing else")
-        return self
-
-    @model_validator(mode="after")
-    def _check_initial(self) -> Self:
-        if self.bounds is not None and isinstance(self.initial, (float, list)):
-            low, high = self.bounds
-            for number in self.initial if isinstance(self.initial, list) else [self.initial]:
-                if not low <= number <= high:
-                    raise located("initial", f"{number:g} is outside of the bounds [{low:g}, {high:g}]")
-        return self
 
 
 def _without_default(schema: dict[str, Any]) -> None:
@@ -359,10 +264,14 @@ class Config(Section):
             raise located(
                 "target.file", f"must name one image for each sensor; images: {len(files)}, sensors: {len(sensors)}"
             )
-        places: dict[str, int] = {}
+        places: dict[tuple[str, str], int] = {}
         for i, spec in enumerate(self.parameters):
-            if places.setdefault(spec.key, i) < i:
-                raise located(f"parameters[{i}].key", f"`{spec.key}` stands in parameters[{places[spec.key]}] already")
+            for option, j, name in spec.objects():
+                if places.setdefault((option, name), i) < i:
+                    at = option if j is None else f"{option}[{j}]"
+                    raise located(
+                        f"parameters[{i}].{at}", f"`{name}` stands in parameters[{places[option, name]}] already"
+                    )
         _check_passes(self.integrator, self.run.spp, "integrator", "run.spp")
         for option in sorted({"batches", "first_batch"} & self.run.model_fields_set):
             if self.run.adjoint not in ("auto", "batched"):

@@ -39,12 +39,12 @@ def attach(plan: Plan, which: Differentiated, motion: Motion, sensor: mi.Sensor)
     """The plan with attached derivatives, where they are asked for. Raises UnsupportedScene where there are none."""
     if motion.attached is False and which.moves:
         raise UnsupportedScene(
-            "attached: false leaves out the derivatives of parameters that move light; leave it at auto"
+            "attached: false leaves out the derivatives of parameters that move light; leave it at auto", "attached"
         )
     if not (which.moves or (motion.attached is True and (which.bsdf_nodes or which.emission))):
         return plan
     if motion.obstacle is not None:
-        raise UnsupportedScene(motion.obstacle)
+        raise UnsupportedScene(motion.obstacle, "estimator")
     if plan.needs.has_null:
         raise UnsupportedScene("attached derivatives do not go through masks and other surfaces with null lobes")
     if sensor.film().rfilter().is_box_filter():

@@ -15,6 +15,7 @@ import numpy as np
 
 from reslrb_cli.integrators import Job, Reslrb, gradient_step, sample_sets
 from reslrb_cli.measure.offender_paths import search_paths
+from reslrb_cli.optimization.moving import is_attached
 from reslrb_cli.optimization.problem import LIGHT_TRACERS, Problem
 from reslrb_cli.records.offender import Offender
 from reslrb_cli.seeds import seed
@@ -43,7 +44,8 @@ def _of_view(problem: Problem, iteration: int, sensor: int, target: Any) -> Offe
     step = _take_step(problem, sensor, target, step_seed)
     if problem.config.integrator.type not in LIGHT_TRACERS:
         return _of_step(step, sensor, target, None)
-    _set_tangents(problem)
+    if not is_attached(problem):
+        _set_tangents(problem)
     found = [search_paths(*part, step.pixel) for part in _parts(problem, sensor, step_seed)]
     problem.apply()
     offenders = sorted((part for part in found if part.offender is not None), key=lambda part: not part.there)
@@ -58,7 +60,9 @@ def _parts(problem: Problem, sensor: int, step_seed: int) -> Iterator[tuple[Samp
     options = problem.config.integrator.options()
     shared = {name: options[name] for name in ("max_depth", "rr_depth", "hide_emitters")}
     tracer = Reslrb.of(estimator="gather", samples_per_pass=problem.samples_per_pass, **shared)
-    scene, params = problem.scene, problem.selection.params
+    scene = problem.scene
+    # Of what moves light, contributions alone are looked at: `gather` has no derivatives of it.
+    params = None if is_attached(problem) else problem.selection.params
     for name, samples_seed, spp in sample_sets(step_seed, problem.config.step_options()):
         passes = tracer.passes(Job(scene, scene.sensors()[sensor], samples_seed, spp, params))
         for number, samples in enumerate(passes):
@@ -99,7 +103,7 @@ def _take_step(problem: Problem, sensor: int, target: Any, step_seed: int) -> St
         problem.integrator, problem.scene, sensor, lambda image: problem.compare(image, target) / len(problem.sensors),
         seed=step_seed, **problem.config.step_options(), params=problem.selection.params,
     )  # fmt: skip
-    gradients = {key: np.array(optimizer.gradient(key)) for key in keys}
+    gradients = {key: np.array(gradient) for key, gradient in problem.gradients().items()}
     for key in keys:
         optimizer.clear_gradient(key)
     return Step(np.array(step.image), gradients, step.refused.entry())

@@ -71,7 +71,7 @@ class Stepper:
             dr.clear_grad(problem.optimizer[key])
         with self.clock.step() as times:
             result = self._take(seed(problem.config.run.seed, round, self.sensor, "image"))
-            dr.eval(result.image, result.loss, [problem.optimizer.gradient(key) for key in problem.selection.keys])
+            dr.eval(result.image, result.loss, problem.gradients())
         return times
 
     def _take(self, seed: int) -> Any:

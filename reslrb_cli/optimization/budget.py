@@ -91,7 +91,7 @@ def estimate(problem: Problem, integrator: Reslrb, samples: int, fixed: int) -> 
         scratch = max(scratch, integrator.estimator.scratch_bytes(plan))
     copies = PARAMETER_COPIES + (0 if problem.config.optimizer.clamp_gradient is None else CLAMP_COPIES)
     for key in problem.selection.keys:
-        size = int(dr.prod(dr.shape(problem.selection.params[key])))
+        size = int(dr.prod(dr.shape(problem.selection.value(key))))
         images += copies * _allocated(4 * size) + _replicas(size)
     return Estimate(fixed + targets, images, scratch * resident_paths(), paths)
 

@@ -16,6 +16,7 @@ from reslrb_cli.config import Config, Reslrb
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.integrators import Reslrb as Tracer
 from reslrb_cli.optimization.budget import MemoryPlan, choose_samples, standing
+from reslrb_cli.optimization.moving import ATTACHED, is_attached
 from reslrb_cli.optimization.pilot import Candidate, Measured, Outcome, Pilot
 from reslrb_cli.optimization.samples import sample_gradient, take_gradient
 from reslrb_cli.records.clock import MIB, StepClock
@@ -54,16 +55,20 @@ def find_options(problem: Problem) -> list[Option]:
     if not isinstance(config.integrator, Reslrb):
         return []
     if config.integrator.estimator == "auto":
-        return _fitting(problem, config.integrator, candidates(config))
+        choices = [{"estimator": ATTACHED}] if is_attached(problem) else candidates(config)
+        return _fitting(problem, config.integrator, choices)
     return [] if config.run.memory_budget is None else _fitting(problem, config.integrator, [{}])
 
 
 def settle_integrator(problem: Problem, options: list[Option], say: Say, cache: Cache | None = None) -> None:
-    """Replace `problem.integrator` by the best of the options, where there are any; of several a pilot finds it."""
+    """Replace `problem.integrator` by the best of the options, where there are any; of several a pilot finds it.
+
+    What moves light leaves one estimator, which needs no pilot.
+    """
     if not options:
         return
     chosen = options[0]
-    if chosen.options:
+    if len(options) > 1 and chosen.options:
         problem.pilot = _outcome(problem, options, say, cache)
         chosen = next(option for option in options if option.options == problem.pilot.chosen)
         say(problem.pilot.line())

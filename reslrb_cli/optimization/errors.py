@@ -30,10 +30,12 @@ _EMITTED = {
 
 
 def quantity(params: Any, key: str) -> str:
-    """The radiometric quantity of a `mi.traverse` entry: `radiance`, `irradiance`, `intensity`, or "", without a unit.
+    """What a `mi.traverse` entry is in units of: `radiance`, `irradiance`, `intensity`, `length`, or "", without one.
 
-    Without a unit are all parameters of BSDFs, mesh attributes, and factors of emitters (`scale`, a spot's `texture`).
+    Without a unit are all parameters of BSDFs, mesh attributes, and factors (`scale`, a spot's `texture`).
     """
+    if key.endswith((".vertex_positions", ".position")):
+        return "length"
     node = own = params.properties[key][2]
     while node is not None and not isinstance(node, mi.Emitter):
         node = params.hierarchy[node][0]

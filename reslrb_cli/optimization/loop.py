@@ -127,7 +127,7 @@ def gradient(
     of squares (of its finite entries) and the number of entries that are not finite, and for each view what was
     refused.
     """
-    config, optimizer = problem.config, problem.optimizer
+    config = problem.config
     views = len(problem.sensors)
 
     def view_loss(target: Any, image: Any) -> Any:
@@ -148,7 +148,7 @@ def gradient(
             on_image=split.image,
         )
         # One view's kernels are not to wait for the next one's: memory would grow with the number of views.
-        gradients = {key: optimizer.gradient(key) for key in optimizer.keys()}  # noqa: SIM118 (not a mapping)
+        gradients = problem.gradients()
         dr.eval(step.loss, gradients)
         total = total + step.loss
         refused.append(step.refused)

@@ -10,19 +10,28 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from reslrb_cli.config import Config, Integrator, ParameterSpec, Reslrb
+from reslrb_cli.config import Config, Integrator, Reslrb
 from reslrb_cli.errors import ConfigError, UnsupportedScene
 from reslrb_cli.integrators import first_channels, make_integrator
 from reslrb_cli.optimization.budget import MemoryPlan
 from reslrb_cli.optimization.choice import Cache, find_options, settle_integrator
 from reslrb_cli.optimization.errors import ErrorMeter, comparison_grid, quantity
 from reslrb_cli.optimization.losses import Loss, make_loss
+from reslrb_cli.optimization.moving import check_moving
 from reslrb_cli.optimization.optimizers import Optimizer
 from reslrb_cli.optimization.pilot import Outcome
 from reslrb_cli.optimization.rendering import render_in_passes
 from reslrb_cli.optimization.scaling import Scaled
 from reslrb_cli.optimization.transforms import make_transform
-from reslrb_cli.scene import Selection, check_camera_paths, check_supported, load_scene, read_image, select_parameters
+from reslrb_cli.scene import (
+    Selection,
+    check_camera_paths,
+    check_supported,
+    load_scene,
+    read_image,
+    select_parameters,
+    set_values,
+)
 
 Array = np.ndarray[Any, Any]
 
@@ -62,16 +71,13 @@ class Problem:
 
     def apply(self, others: Mapping[str, Any] | None = None) -> None:
         """Hand the optimiser's values to the scene, or, of the keys in `others`, those."""
-        for key in self.selection.keys:
-            self.selection.params[key] = others[key] if others and key in others else self.optimizer[key]
-        self.selection.params.update()
-        # A texture pads its storage when it is first looked up, and unpads it when it is read. Left to the step, either
-        # would cut its kernels in two, and differently in the first step and the second.
-        for key in self.selection.keys:
-            node = self.selection.params.properties[key][2]
-            if isinstance(node, mi.Texture):
-                node.eval(dr.zeros(mi.SurfaceInteraction3f))
-        dr.eval([self.selection.params[key] for key in self.selection.keys])
+        values = {key: self.optimizer[key] for key in self.selection.keys}
+        self.selection.hand_over({**values, **(others or {})})
+
+    def gradients(self) -> dict[str, Any]:
+        """The gradient of each parameter that steps have added up since it was last handed over or cleared."""
+        self.selection.collect()
+        return {key: self.optimizer.gradient(key) for key in self.selection.keys}
 
     def compare(self, image: Any, target: Any) -> Any:
         """The loss of an (H, W, C) image, attached; alpha is left out."""
@@ -183,7 +189,7 @@ def assemble_scene(config: Config, scene: Any = None, values: Mapping[str, Array
         config.optimizer.type,
         config.optimizer.learning_rate,
         config.optimizer.own_options(),
-        values={key: selection.params[key] for key in selection.keys},
+        values={key: selection.value(key) for key in selection.keys},
         rates={key: spec.learning_rate for key, spec in specs.items()},
         bounds={key: spec.bounds for key, spec in specs.items()},
         transforms={key: make_transform(spec.transform, spec.bounds) for key, spec in specs.items()},
@@ -197,9 +203,10 @@ def assemble_scene(config: Config, scene: Any = None, values: Mapping[str, Array
         loss=make_loss(config.loss.type, **config.loss.options()),
         optimizer=optimizer,
         samples_per_pass=samples_per_pass(config),
-        quantities={key: quantity(selection.params, key) for key in selection.keys},
+        quantities={key: selection.quantity(key) or quantity(selection.params, key) for key in selection.keys},
     )
     problem.apply()
+    check_moving(problem)
     return problem
 
 
@@ -234,12 +241,7 @@ def set_true_values(config: Config, scene: Any) -> Selection:
     """
     render = config.target.render
     assert render is not None, "called for rendered targets only"
-    specs = [ParameterSpec(key=key, initial=value) for key, value in render.parameters.items()]
-    try:
-        return select_parameters(scene, specs, config.source)
-    except ConfigError as error:
-        index = int(error.key.removeprefix("parameters[").partition("]")[0])
-        raise ConfigError(config.source, f"target.render.parameters.{specs[index].key}", error.message) from None
+    return set_values(scene, config.parameters, render.parameters, config.source, "target.render.parameters")
 
 
 def read_target(config: Config, problem: Problem, index: int) -> Array:

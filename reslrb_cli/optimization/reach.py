@@ -35,8 +35,10 @@ def find_reached(problem: Problem, say: Callable[[str], None] = lambda line: Non
     for key in problem.truth:
         mask: Array = sensitive[key]
         if mask.ndim == 3:
-            sensors = [problem.scene.sensors()[index] for index in problem.sensors]
-            mask = np.any(mask, axis=2) & _without_halo(visible_texels(problem.scene, sensors, key), mask.shape[1])
+            mask = np.any(mask, axis=2)
+            if key in problem.selection.params:  # a heightmap is no texture to be seen
+                sensors = [problem.scene.sensors()[index] for index in problem.sensors]
+                mask = mask & _without_halo(visible_texels(problem.scene, sensors, key), mask.shape[1])
         problem.masks[key] = mask
 
 
@@ -62,8 +64,8 @@ def sensitivity(problem: Problem) -> dict[str, Array]:
                 spp=part,
                 params=problem.selection.params,
             )
-            for key in optimizer.keys():  # noqa: SIM118 (not a mapping)
-                nonzero = np.array(optimizer.gradient(key) != 0.0)
+            for key, gradient in problem.gradients().items():
+                nonzero = np.array(gradient != 0.0)
                 optimizer.clear_gradient(key)
                 found[key] = found[key] | nonzero if key in found else nonzero
     return {key: _like(problem.selection.array(key), value) for key, value in found.items()}

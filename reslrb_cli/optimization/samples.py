@@ -29,7 +29,7 @@ def sample_gradient(problem: Problem, integrator: Any, round: int, purpose: str,
             integrator, problem.scene, sensor, loss, seed=seed(run.seed, round, sensor, purpose),
             **{**problem.config.step_options(), "spp": spp}, params=problem.selection.params,
         )  # fmt: skip
-        gradients = {key: problem.optimizer.gradient(key) for key in problem.selection.keys}
+        gradients = problem.gradients()
         dr.eval(step.loss, gradients)
     return gradients
 
@@ -37,8 +37,8 @@ def sample_gradient(problem: Problem, integrator: Any, round: int, purpose: str,
 def take_gradient(problem: Problem) -> dict[str, np.ndarray[Any, Any]]:
     """The gradients that have been accumulated, each in a row, 0 where they are not finite; they are cleared."""
     taken = {}
-    for key in problem.selection.keys:
-        gradient = np.array(problem.optimizer.gradient(key), dtype=np.float32)
+    for key, value in problem.gradients().items():
+        gradient = np.array(value, dtype=np.float32)
         taken[key] = np.nan_to_num(gradient, nan=0.0, posinf=0.0, neginf=0.0).ravel()
         problem.optimizer.clear_gradient(key)
     return taken

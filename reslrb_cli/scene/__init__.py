@@ -5,8 +5,9 @@ from .graph import SceneGraph
 from .inspect import SceneSummary, SensorSummary, summarise
 from .load import load_scene
 from .needs import SceneNeeds, View, check_camera_paths, check_supported, look, scene_needs
-from .parameters import Selection, select_parameters
+from .parameters import select_parameters, set_values
 from .reach import visible_texels
+from .selection import Selection
 from .target import read_image
 
 __all__ = [
@@ -25,6 +26,7 @@ __all__ = [
     "read_image",
     "scene_needs",
     "select_parameters",
+    "set_values",
     "summarise",
     "visible_texels",
 ]

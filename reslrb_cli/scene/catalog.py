@@ -9,6 +9,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from .motion import moving_emitter_obstacle, moving_shape_obstacle
+
 #: Emitter parameters that Mitsuba flags as differentiable, but that change where light goes and not how much it is.
 _BEAM_SHAPES = {
     "cutoff_angle": "shapes the beam",
@@ -70,7 +72,7 @@ def describe(params: Any, key: str) -> ParameterInfo:
         shape=value_shape(value, halo(node, value)),
         differentiable=differentiable,
         discontinuous=flags & int(mi.ParamFlags.Discontinuous) != 0,
-        obstacle=_obstacle(kind, key.rpartition(".")[2], value, differentiable, node),
+        obstacle=_obstacle(kind, key, value, differentiable, node),
     )
 
 
@@ -138,16 +140,15 @@ def _is_attribute(name: str) -> bool:
     return name.startswith(("vertex_", "face_")) and name not in _MESH_GEOMETRY
 
 
-def _obstacle(kind: str, name: str, value: Any, differentiable: bool, node: Any) -> str | None:
-    only = "only BSDF and emission parameters have derivatives so far"
-    if kind == "shape":
-        return f"moves geometry; {only}"
+def _obstacle(kind: str, key: str, value: Any, differentiable: bool, node: Any) -> str | None:
+    only = "only materials, emission, shapes and lights have derivatives"
+    id, _, name = key.rpartition(".")
+    if kind == "shape" or (kind == "emitter" and name in ("to_world", "position")):
+        return _moving_obstacle(kind, id, name, node)
     if kind in ("sensor", "film"):
         return f"belongs to the {kind}; {only}"
     if kind not in ("bsdf", "emitter", "attribute"):
         return f"is no property of a material or a light; {only}"
-    if kind == "emitter" and name in ("to_world", "position"):
-        return f"moves the light; {only}"
     if kind == "emitter" and name in _BEAM_SHAPES:
         return f"{_BEAM_SHAPES[name]}; of an emitter, only what it emits has derivatives"
     bits = _storage_bits(value)
@@ -160,6 +161,18 @@ def _obstacle(kind: str, name: str, value: Any, differentiable: bool, node: Any)
         return f"is not differentiable ({node.class_name()})"
     if bits is None:
         return f"is no number with derivatives ({type(value).__name__})"
+    return None
+
+
+def _moving_obstacle(kind: str, id: str, name: str, node: Any) -> str | None:
+    """Why the place of a shape or an emitter is not recovered by this name; None where it is."""
+    if kind == "shape" and name not in ("to_world", "vertex_positions"):
+        return "belongs to a shape, of which vertices and motions are recovered"
+    reason = moving_shape_obstacle(node, name) if kind == "shape" else moving_emitter_obstacle(node)
+    if reason is not None:
+        return f"cannot be moved ({reason})"
+    if name == "to_world":
+        return f"is recovered as a motion (`motion: {{of: {id}}}`)"
     return None
 
 

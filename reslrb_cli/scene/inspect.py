@@ -12,6 +12,7 @@ import mitsuba as mi
 from ..errors import UnsupportedScene
 from .catalog import ParameterInfo, list_parameters
 from .graph import SceneGraph
+from .movable import Movable, heightmap_obstacle, list_movable
 from .needs import SceneNeeds, View, check_supported, look, scene_needs, unsupported_part
 
 
@@ -37,8 +38,16 @@ class SensorSummary:
 
 
 @dataclass(frozen=True)
+class MovableSummary:
+    """A shape or an emitter by its id, and what can move it: `motion`, `heightmap`."""
+
+    id: str
+    by: list[str]
+
+
+@dataclass(frozen=True)
 class SceneSummary:
-    """What a scene contains: class names and how often each occurs, sensors, and all parameters."""
+    """What a scene contains: class names and how often each occurs, sensors, all parameters, and what can be moved."""
 
     emitters: dict[str, int]
     bsdfs: dict[str, int]
@@ -46,6 +55,7 @@ class SceneSummary:
     triangles: int
     sensors: list[SensorSummary]
     parameters: list[ParameterInfo]
+    movable: list[MovableSummary]
 
 
 def summarise(scene: Any, hide_emitters: bool = False, sensors: Sequence[int] | None = None) -> SceneSummary:
@@ -53,14 +63,20 @@ def summarise(scene: Any, hide_emitters: bool = False, sensors: Sequence[int] | 
     graph = SceneGraph.of(scene)
     shapes = graph.shapes()
     indices = range(len(scene.sensors())) if sensors is None else sensors
+    params = mi.traverse(scene)
     return SceneSummary(
         emitters=_count(scene.emitters()),
         bsdfs=_count(graph.of_type(mi.BSDF)),
         shapes=_count(shapes),
         triangles=sum(int(shape.face_count()) for shape in shapes if shape.is_mesh()),
         sensors=[_sensor(scene, index, hide_emitters) for index in indices],
-        parameters=list_parameters(mi.traverse(scene), values=True),
+        parameters=list_parameters(params, values=True),
+        movable=[MovableSummary(item.id, _moved_by(item)) for item in list_movable(params)],
     )
+
+
+def _moved_by(item: Movable) -> list[str]:
+    return ["motion"] if heightmap_obstacle(item) else ["motion", "heightmap"]
 
 
 def _count(objects: Sequence[Any]) -> dict[str, int]:

@@ -14,13 +14,15 @@ from .image_file import read_bitmap
 Image = np.ndarray[Any, Any]
 
 
-def read_image(path: Path, color_space: str = "auto", size: tuple[int, int] | None = None) -> Image:
+def read_image(
+    path: Path, color_space: str = "auto", size: tuple[int, int] | None = None, signed: bool = False
+) -> Image:
     """Read an EXR, PNG, JPG, HDR, PFM, PPM or BMP file as linear Rec. 709: (H, W, 3) float32.
 
     `color_space` says how the file's values are encoded: `linear`, `srgb`, or `auto` (integers srgb, floats linear).
     Alpha is dropped; one channel becomes three. `size` is the (width, height) that the image must have. Raises
     ConfigError, located in the file, where it is missing or no image, damaged, cut off, too large or of another size,
-    or holds a value that is negative or not finite.
+    or holds a value that is not finite or, unless `signed`, negative.
     """
     path = Path(path)
     bitmap = read_bitmap(path, size)
@@ -37,7 +39,7 @@ def read_image(path: Path, color_space: str = "auto", size: tuple[int, int] | No
     bitmap.set_srgb_gamma(False)  # values as they stand in the file; decoded below
     bitmap = bitmap.convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.Float32, False)
     image = np.array(bitmap, dtype=np.float32).reshape(height, width, 3)
-    _check_values(path, image)
+    _check_values(path, image, signed)
     return decode_srgb(image) if decode else image
 
 
@@ -48,9 +50,9 @@ def decode_srgb(image: Image) -> Image:
     return np.asarray(eotf_sRGB(image), dtype=np.float32)
 
 
-def _check_values(path: Path, image: Image) -> None:
+def _check_values(path: Path, image: Image, signed: bool) -> None:
     for bad, what in ((~np.isfinite(image), "not finite"), (image < 0, "negative")):
-        if bad.any():
+        if bad.any() and not (signed and what == "negative"):
             y, x, channel = (int(n) for n in np.argwhere(bad)[0])
             value = f"{image[y, x, channel]:g}"
             count = int(bad.any(axis=2).sum())

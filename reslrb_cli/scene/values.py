@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +10,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..config import ParameterSpec
+from ..config import Settings
 from ..errors import ConfigError
 from .catalog import halo
 from .target import read_image
@@ -18,42 +19,50 @@ Array = np.ndarray[Any, Any]
 
 
 class Place:
-    """Where in the configuration a value stands: `fail` raises there."""
+    """Where in the configuration a value stands: `fail` raises there.
 
-    def __init__(self, source: object, key: str) -> None:
-        self.source, self.key = source, key
+    `at` says by what name an option of it goes there, "" where it has none.
+    """
+
+    def __init__(self, source: object, key: str, at: Callable[[str], str] = str) -> None:
+        self.source, self.key, self.at = source, key, at
 
     def fail(self, option: str, message: str) -> ConfigError:
         """The error for `option` of this place."""
+        option = self.at(option)
         return ConfigError(self.source, f"{self.key}.{option}" if option else self.key, message)
 
 
 class Slot:
-    """One parameter of a scene as a NumPy array: a texture (H, W, C), a colour (C,), a buffer (N,), a number ().
+    """One value of `holder` as a NumPy array: a texture (H, W, C), a colour (C,), a buffer (N,), a number ().
 
-    An environment map stands without the halo columns that Mitsuba adds to it.
+    `holder` is a scene's `mi.traverse`, or maps names to values that are none of the scene's own. An environment map
+    stands without the halo columns that Mitsuba adds to it.
     """
 
-    def __init__(self, params: Any, key: str) -> None:
-        self.params, self.key = params, key
-        value, node = params[key], params.properties[key][2]
+    def __init__(self, holder: Any, key: str) -> None:
+        self.holder, self.key = holder, key
+        value = holder[key]
+        node = holder.properties[key][2] if hasattr(holder, "properties") else None
         self.type = type(value)
         self.is_tensor = bool(dr.is_tensor_v(value))
         self.is_texture = self.is_tensor and len(value.shape) == 3
-        self.halo = halo(node, value)
+        self.halo = 0 if node is None else halo(node, value)
+        #: Whether its values may be negative, which those of colours are not: of what is none of the scene's own.
+        self.is_signed = node is None
         #: How many numbers a list has that fills the parameter.
         self.channels = _channels(node, key, value, self.is_tensor)
 
     def get(self) -> Array:
         """The current value."""
-        value = dr.detach(self.params[self.key])
+        value = dr.detach(self.holder[self.key])
         array = np.array(value, dtype=np.float32)
         if not self.is_tensor and array.ndim and array.shape[-1] == 1:
             array = array[..., 0]
         return array[:, self.halo : array.shape[1] - self.halo] if self.halo else array
 
     def set(self, array: Array) -> None:
-        """Set the value; `params.update()` has to follow."""
+        """Set the value; of a scene, `params.update()` has to follow."""
         if self.halo:
             array = np.concatenate([array[:, -self.halo :], array, array[:, : self.halo]], axis=1)
         array = np.ascontiguousarray(array, dtype=np.float32)
@@ -62,13 +71,16 @@ class Slot:
         # that a later step, whose values are Dr.Jit's own, would compile them anew.
         value = self.type(value + dr.opaque(mi.Float, 0))
         dr.make_opaque(value)
-        self.params[self.key] = value
+        self.holder[self.key] = value
 
 
-def initial_array(slot: Slot, initial: Any, resolution: tuple[int, int] | None, place: Place) -> Array:
+def initial_array(
+    slot: Slot, initial: Any, resolution: tuple[int, int] | None, place: Place, any_size: bool = False
+) -> Array:
     """The value that `initial` ("scene", a number, a list of numbers, or an image file) gives the parameter in `slot`.
 
-    `resolution` is the (width, height) to which a texture is resampled, or None. Raises ConfigError at `place`.
+    `resolution` is the (width, height) to which a texture is resampled, or None; with `any_size` it may be that of the
+    file. Raises ConfigError at `place`.
     """
     current = slot.get()
     if resolution is not None:
@@ -84,7 +96,7 @@ def initial_array(slot: Slot, initial: Any, resolution: tuple[int, int] | None, 
     elif isinstance(initial, (list, tuple)):
         array = _fill(slot, current, list(initial), place)
     else:
-        array = _from_file(slot, current, initial, resolution, place)
+        array = _from_file(slot, current, initial, any_size or resolution is not None, place)
     if resolution is not None and array.shape[:2] != resolution[::-1]:
         array = resample(array, resolution)
     _check_finite(slot, array, place)
@@ -101,7 +113,7 @@ def check_bounds(slot: Slot, array: Array, bounds: tuple[float, float], place: P
         raise place.fail("bounds", f"exclude the initial value of `{slot.key}`, {value:g}{where}")
 
 
-def check_transform(slot: Slot, array: Array, spec: ParameterSpec, place: Place) -> None:
+def check_transform(slot: Slot, array: Array, spec: Settings, place: Place) -> None:
     """Raise ConfigError at `place` where an entry of `array` is not among the values that the transform yields."""
     if spec.transform == "none":
         return
@@ -146,16 +158,16 @@ def _fill(slot: Slot, current: Array, numbers: list[float], place: Place) -> Arr
     return np.tile(np.array(numbers, dtype=np.float32), current.size // len(numbers)).reshape(current.shape)
 
 
-def _from_file(slot: Slot, current: Array, image_file: Any, resolution: tuple[int, int] | None, place: Place) -> Array:
+def _from_file(slot: Slot, current: Array, image_file: Any, any_size: bool, place: Place) -> Array:
     if not slot.is_texture:
         raise place.fail("initial", f"`{slot.key}` is no texture; give a number or a list of numbers")
     path: Path = image_file.file
     try:
-        image = read_image(path, image_file.color_space)
+        image = read_image(path, image_file.color_space, signed=slot.is_signed)
     except ConfigError as error:
         raise place.fail("initial.file", f"{path}: {error.message}") from None
     height, width = current.shape[:2]
-    if resolution is None and image.shape[:2] != (height, width):
+    if not any_size and image.shape[:2] != (height, width):
         size = f"{image.shape[1]}x{image.shape[0]}"
         raise place.fail(
             "initial.file",

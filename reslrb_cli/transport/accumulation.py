@@ -7,6 +7,7 @@ has a block and gradients of its own, and these are added to one another.
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -43,7 +44,8 @@ class GradientSum:
 
     def __init__(self, params: mi.SceneParameters) -> None:
         with dr.resume_grad():  # where gradients are suspended, nothing says that it tracks them
-            self.values = [value for _, value in params.items() if dr.grad_enabled(value)]
+            enabled = [value for _, value in params.items() if dr.grad_enabled(value)]
+            self.values = [array for value in enabled for array in _arrays(value)]
         self.totals: list[dr.ArrayBase] = []
 
     def take(self) -> None:
@@ -60,6 +62,11 @@ class GradientSum:
         with dr.resume_grad():
             for value, total in zip(self.values, self.totals, strict=True):
                 dr.accum_grad(value, total)
+
+
+def _arrays(value: Any) -> list[Any]:
+    """The arrays of a parameter that gradients can be added to: a transform, which cannot be added, has two."""
+    return [value.matrix, value.inverse_transpose] if isinstance(value, mi.AffineTransform4f) else [value]
 
 
 def finish_pass(*results: object) -> None:

@@ -303,7 +303,7 @@ def test_inspect_tells_what_can_be_recovered(experiment, capsys):
     assert code == 0
     assert any(line.split()[:4] == ["*", KEY, "4x4", "texels"] for line in out.splitlines())
     code, out, _ = reslrb(capsys, "inspect", "box.yaml", "--all", "--no-counts")
-    assert any("poster_shape.to_world" in line and "moves geometry" in line for line in out.splitlines())
+    assert any("poster_shape.to_world" in line and "is recovered as a motion" in line for line in out.splitlines())
     code, out, _ = reslrb(capsys, "inspect", "box.yaml", "--json")
     parameters = {entry["key"]: entry for entry in json.loads(out)["parameters"]}
     assert parameters[KEY]["obstacle"] is None

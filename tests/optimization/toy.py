@@ -25,13 +25,6 @@ run: {iterations: 20, spp: 3, seed: 5}
 class Params(dict):
     """Stands in for `mi.SceneParameters` without a scene."""
 
-    @property
-    def properties(self):
-        return dict.fromkeys(self, (None, None, None, 0))
-
-    def update(self):
-        pass
-
 
 def make_problem(tmp_path, views=1, sets=(), keys=("albedo",)):
     path = tmp_path / "config.yaml"
@@ -47,11 +40,13 @@ def make_problem(tmp_path, views=1, sets=(), keys=("albedo",)):
         dict.fromkeys(keys, (0.0, 1.0)),
     )
     params = Params(values)
+    selection = types.SimpleNamespace(keys=list(keys), params=params, array=lambda key: np.array(params[key]))
+    selection.hand_over, selection.collect = params.update, lambda: None
     problem = Problem(
         config=config,
         scene=None,
         sensors=list(range(views)),
-        selection=types.SimpleNamespace(keys=list(keys), params=params, array=lambda key: np.array(params[key])),
+        selection=selection,
         integrator=None,
         loss=make_loss("l2"),
         optimizer=optimizer,

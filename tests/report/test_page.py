@@ -14,6 +14,7 @@ from report.run_folder import FLOOR, LAMP, MEMORY, PILOT, SCALING, make_run
 
 from reslrb_cli.records.manifest import Status
 from reslrb_cli.report.page import render_page, write_report
+from reslrb_cli.report.page.values import parameter_table, texture_pictures
 
 
 class Page(html.parser.HTMLParser):
@@ -104,6 +105,29 @@ def test_textures_stand_beside_each_other(tmp_path):
     linear = np.load(tmp_path / "lamp" / "parameters" / "true" / "parameters.npz")[FLOOR]
     expected = np.where(linear > 0.0031308, 1.055 * linear ** (1 / 2.4) - 0.055, 12.92 * linear)
     np.testing.assert_allclose(shown[f"true: {FLOOR}"], expected, atol=0.01)
+
+
+def test_heights_are_shown_from_the_lowest_to_the_highest(tmp_path):
+    """They may be negative, and far below what a picture shows."""
+    heights = np.array([[-1e-3, 0, 3e-3]], np.float32)[:, :, None]
+    (tmp_path / "true").mkdir()
+    np.savez(tmp_path / "parameters.npz", **{"slab.heightmap": np.zeros_like(heights)})
+    np.savez(tmp_path / "true" / "parameters.npz", **{"slab.heightmap": heights})
+    about = {"quantity": "length", "shape": [1, 3, 1]}
+    page = Page(texture_pictures(tmp_path, {"parameters": {"slab.heightmap": about}}))
+    shown = {alt: pixels(uri) for alt, uri in page.pictures}
+    assert shown["true: slab.heightmap"][0, 0, 0] == 0
+    assert shown["true: slab.heightmap"][0, 2, 0] == 1
+    assert shown["true: slab.heightmap"][0, 1, 0] == pytest.approx(shown["end: slab.heightmap"][0, 0, 0], abs=1e-6)
+    assert "black is -0.001, white is 0.003" in page.sections[""]
+
+
+def test_a_place_has_no_colour():
+    values = {"value": [0.1, 0.2, 0.3]}
+    results = {"parameters": {"lamp.translation": {"quantity": "length", "shape": [3], "final": values}}}
+    assert "swatch" not in parameter_table(results)
+    results["parameters"]["lamp.translation"]["quantity"] = "intensity"
+    assert "swatch" in parameter_table(results)
 
 
 @pytest.mark.parametrize("sensors", [1, 3])

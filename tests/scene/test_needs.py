@@ -125,7 +125,7 @@ def test_summary(make_scene):
     assert by_key["floor.reflectance.data"].shape == (4, 6, 3)
     assert by_key["floor.reflectance.data"].obstacle is None
     assert by_key["plane.to_world"].discontinuous
-    assert by_key["plane.to_world"].obstacle.startswith("moves geometry")
+    assert by_key["plane.to_world"].obstacle.startswith("is recovered as a motion")
 
 
 def test_summary_of_what_cannot_be_rendered(make_scene):

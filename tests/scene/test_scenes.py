@@ -9,10 +9,18 @@ import numpy as np
 import pytest
 
 from reslrb_cli.config import load
-from reslrb_cli.scene import check_supported, load_scene, look, scene_needs, select_parameters, visible_texels
+from reslrb_cli.scene import (
+    check_supported,
+    load_scene,
+    look,
+    scene_needs,
+    select_parameters,
+    set_values,
+    visible_texels,
+)
 
 ROOT = Path(__file__).resolve().parents[2]
-NAMES = ("cornell_floor", "grey_room", "caustic_slab", "furnace")
+NAMES = ("cornell_floor", "grey_room", "caustic_slab", "furnace", "lens_pose", "caustic_heightmap")
 
 pytestmark = pytest.mark.usefixtures("llvm")
 
@@ -53,6 +61,33 @@ def test_mesh_is_what_the_script_makes():
     assert np.allclose(np.array(mesh.vertex_normals_buffer()).reshape(-1, 3), normals, atol=2e-6)
     assert np.array_equal(np.array(mesh.faces_buffer()).reshape(-1, 3), faces)
     assert (normals[:, 1] < 0).all()
+
+
+def test_meshes_are_what_the_script_makes():
+    import mitsuba as mi
+
+    for name, (positions, normals, texcoords, faces) in make_scenes().meshes().items():
+        mesh = mi.load_dict({"type": "ply", "filename": str(ROOT / "scenes" / name)})
+        assert np.allclose(np.array(mesh.vertex_positions_buffer()).reshape(-1, 3), positions, atol=2e-6), name
+        assert np.allclose(np.array(mesh.vertex_normals_buffer()).reshape(-1, 3), normals, atol=2e-6), name
+        assert np.allclose(np.array(mesh.vertex_texcoords_buffer()).reshape(-1, 2), texcoords, atol=2e-6), name
+        assert np.array_equal(np.array(mesh.faces_buffer()).reshape(-1, 3), faces), name
+        assert (normals[:, 1] < 0).all(), name
+
+
+@pytest.mark.parametrize("name", ["lens_pose", "caustic_heightmap"])
+def test_light_that_is_to_be_moved_stays_off_the_border(name):
+    """Where it crosses that, derivatives of what moves it are cut off."""
+    import mitsuba as mi
+
+    config = load(ROOT / "configs" / f"{name}.yaml", [])
+    render = config.target.render
+    scene = load_scene(config.scene.file, {"resx": 32, "resy": 32, "spp": 64})
+    set_values(scene, config.parameters, render.parameters, config.source, "target.render.parameters")
+    image = np.array(mi.render(scene, integrator=mi.load_dict({"type": "ptracer", "max_depth": 5}))).mean(axis=2)
+    total = image.sum()
+    image[2:-2, 2:-2] = 0
+    assert image.sum() < 2e-3 * total  # what glass reflects within itself
 
 
 def test_floor_has_detail_at_the_scale_of_its_texels():

@@ -19,6 +19,8 @@ MOMENTS = (("start", "initial"), ("end", "final"), ("true", "true"))
 _FOLDERS = {"initial": "initial", "final": "", "true": "true"}
 #: Parameters of three numbers that are no colours to look at.
 _NO_COLORS = ("eta", "k")
+#: What is no light and no colour, but where something is.
+_PLACES = ("length", "degrees", "scale")
 
 
 def parameter_table(results: Mapping[str, Any]) -> str:
@@ -50,7 +52,10 @@ def texture_pictures(folder: Path, results: Mapping[str, Any]) -> str:
     archives = {moment: _archive(folder / sub / "parameters.npz") for moment, sub in _FOLDERS.items()}
     for key, about in (results.get("parameters") or {}).items():
         arrays = {moment: _texture(archive, key) for moment, archive in archives.items()}
-        exposure = _exposure(arrays)
+        exposure, words = _exposure(arrays), ""
+        if about.get("quantity") in _PLACES:
+            arrays, words = _as_relief(arrays)
+            exposure = 1.0
         shown = [
             _figure(title, f"{title}: {key}", array, about.get(moment), exposure)
             for title, moment in MOMENTS
@@ -61,10 +66,21 @@ def texture_pictures(folder: Path, results: Mapping[str, Any]) -> str:
             share = f"<b>reached</b> by light and sensor (white): {100 * mask.mean():.3g} %"
             shown.append(_picture(mask[:, :, None].astype(np.float32), f"reached: {key}", share))
         if shown:
-            words = exposure_words(exposure)
+            words = words or exposure_words(exposure)
             parts.append(f"<h3>{breakable(key)}</h3>" + (f'<p class="soft small">{words}</p>' if words else ""))
             parts.append(figures(shown))
     return "".join(parts)
+
+
+def _as_relief(arrays: Mapping[str, Array | None]) -> tuple[dict[str, Array | None], str]:
+    """Heights, which may be negative, from black to white, at all moments alike; and words that say so."""
+    known = [array[np.isfinite(array)] for array in arrays.values() if array is not None]
+    known = [values for values in known if values.size]
+    low = min((float(values.min()) for values in known), default=0.0)
+    high = max((float(values.max()) for values in known), default=0.0)
+    span = (high - low) or 1.0
+    shown = {moment: None if array is None else (array - low) / span for moment, array in arrays.items()}
+    return shown, f"black is {number(low, 3)}, white is {number(high, 3)}"
 
 
 def _exposure(arrays: Mapping[str, Array | None]) -> float:
@@ -132,7 +148,7 @@ def _swatches(key: str, about: Mapping[str, Any]) -> dict[str, str]:
         if isinstance(values, list) and len(values) == 3 and None not in values:
             colors[moment] = np.array(values, dtype=np.float64)
     parts = key.split(".")
-    if any(part in _NO_COLORS for part in parts[-2:]) or not colors:
+    if any(part in _NO_COLORS for part in parts[-2:]) or about.get("quantity") in _PLACES or not colors:
         return {}
     brightest = max(float(color.max()) for color in colors.values())
     unit = brightest if brightest > 1 or (about.get("quantity") and brightest > 0) else 1.0

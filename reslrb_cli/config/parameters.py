@@ -1,0 +1,260 @@
+"""What is recovered: scene parameters by key, heightmaps on meshes, and motions of shapes and emitters."""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Annotated, Any, Literal
+
+from pydantic import Discriminator, Field, field_validator, model_validator
+from typing_extensions import Self
+
+from .base import MARK, ConfigPath, Count, Positive, Section, by_kind, kind_tag, located, mark, wrong
+from .limits import PIXELS
+from .moving import (
+    HEIGHTMAP,
+    Bounds,
+    ByWord,
+    HeightmapSpec,
+    MotionBounds,
+    MotionInitial,
+    MotionRates,
+    MotionSpec,
+    MotionTransform,
+    Name,
+    Numbers,
+    TransformName,
+    Word,
+    or_words,
+)
+
+ColorSpace = Literal["auto", "linear", "srgb"]
+COLOR_SPACE = "How values are encoded: `linear`, `srgb`, or `auto` (8-bit files srgb, float files linear)."
+
+
+class ImageFile(Section):
+    """An image file that holds a texture."""
+
+    file: ConfigPath = Field(description="EXR, PNG, JPG or HDR file, relative to the config file.")
+    color_space: ColorSpace = Field(default="auto", description=COLOR_SPACE)
+
+
+#: A value for a scene parameter: one number, a list such as [r, g, b], or an image file.
+Value = Annotated[
+    Annotated[float, mark("number")] | Annotated[Numbers, mark("list")] | Annotated[ImageFile, mark("mapping")],
+    by_kind("a number, a list of numbers, or {file: IMAGE}"),
+]
+
+
+def _initial_tag(value: Any) -> str | None:
+    if isinstance(value, ByWord) or (isinstance(value, dict) and not {"file", "color_space"} & value.keys()):
+        return MARK + ByWord.TAG
+    return kind_tag(value, "scene")
+
+
+#: A value to start from; "scene" is the one that the scene file gives.
+Initial = Annotated[
+    Annotated[float, mark("number")]
+    | Annotated[Numbers, mark("list")]
+    | Annotated[ImageFile, mark("mapping")]
+    | Annotated[MotionInitial, mark(ByWord.TAG)]
+    | Annotated[Literal["scene"], mark("text")],
+    Discriminator(
+        _initial_tag,
+        custom_error_type="wrong",
+        custom_error_message="must be a number, a list of numbers, {file: IMAGE}, or `scene`",
+    ),
+]
+_AnyBounds = Annotated[Annotated[Bounds, mark("list")] | Annotated[MotionBounds, mark(ByWord.TAG)], or_words("list")]
+_AnyRate = Annotated[Annotated[Positive, mark("number")] | Annotated[MotionRates, mark(ByWord.TAG)], or_words("number")]
+_AnyTransform = Annotated[
+    Annotated[TransformName, mark("text")] | Annotated[MotionTransform, mark(ByWord.TAG)], or_words("text")
+]
+
+
+#: One key, or several that are tied.
+_Key = Annotated[
+    Annotated[Name, mark("text")] | Annotated[list[Name], Field(min_length=1), mark("list")],
+    Discriminator(lambda value: MARK + ("list" if isinstance(value, list) else "text")),
+]
+
+
+# --- what is recovered ------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What is said of one array that is recovered; `word` is that of a motion, "" otherwise."""
+
+    initial: Any = "scene"
+    bounds: tuple[float, float] | None = None
+    transform: TransformName = "none"
+    learning_rate: float | None = None
+    resolution: tuple[int, int] | None = None
+    word: str = ""
+
+
+class ParameterSpec(Section):
+    """What is recovered, by exactly one of `key`, `heightmap` and `motion`."""
+
+    key: _Key | None = Field(
+        default=None,
+        description="Key as `reslrb inspect` lists it: the names of `mi.traverse`, in which an object without an id "
+        "goes by its kind and number in the scene file, such as `Sphere_3`. Or a glob such as `*.reflectance.data`. A "
+        "list of keys ties them to one value, which is recorded by the first.",
+    )
+    heightmap: HeightmapSpec | None = Field(
+        default=None, description="A displacement of a mesh, recorded as `MESH.heightmap`."
+    )
+    motion: MotionSpec | None = Field(
+        default=None,
+        description="A motion of shapes and emitters, recorded as `ID.translation`, `ID.rotation` and `ID.scale`. With "
+        "several `free`, `initial`, `bounds`, `transform` and `learning_rate` are mappings by these words, such as "
+        "`bounds: {rotation: [-10, 10]}`; `transform` and `learning_rate` may also be one for all.",
+    )
+    initial: Initial = Field(
+        default="scene",
+        description="Value to start from: a number (all entries), a list of numbers (one per channel), an "
+        "image file, or `scene` (the scene's own value; a heightmap is flat there, and nothing is moved).",
+    )
+    bounds: _AnyBounds | None = Field(
+        default=None,
+        description="[low, high], in the parameter's units; values are clamped to them after each step. "
+        "`-.inf` and `.inf` leave a side open.",
+    )
+    transform: _AnyTransform = Field(
+        default="none",
+        description="What the optimizer moves in place of the value x: `sigmoid`: the logit of x between its `bounds`, "
+        "which it never reaches; `log`: log(x), for positive values known to an order of magnitude at best; "
+        "`softplus`: log(exp(x) - 1), for positive values; as `log` well below 1, as `none` well above. Learning "
+        "rates are in units of that variable.",
+    )
+    learning_rate: _AnyRate | None = Field(
+        default=None, description="Step size of this parameter, in the optimizer's units; null: the optimizer's."
+    )
+    resolution: Annotated[tuple[Count, Count], Field(strict=False)] | None = Field(
+        default=None, description="[width, height] in texels to which a texture is resampled before the start."
+    )
+
+    @property
+    def names(self) -> list[str]:
+        """Keys and globs, or the names by which a heightmap or a motion is recorded."""
+        if self.heightmap is not None:
+            return [f"{self.heightmap.mesh[0]}.{HEIGHTMAP}"]
+        if self.motion is not None:
+            return [f"{self.motion.of[0]}.{word}" for word in self.motion.free]
+        return self.keys
+
+    @property
+    def keys(self) -> list[str]:
+        """The keys and globs in `key`."""
+        return [self.key] if isinstance(self.key, str) else list(self.key or ())
+
+    def objects(self) -> list[tuple[str, int | None, str]]:
+        """What it names, each with its option and, in a list, its place there."""
+        lists: list[tuple[str, Any]] = [("key", self.key)]
+        lists += [] if self.heightmap is None else [("heightmap.mesh", self.heightmap.mesh)]
+        lists += [] if self.motion is None else [("motion.of", self.motion.of)]
+        found: list[tuple[str, int | None, str]] = []
+        for option, names in lists:
+            if isinstance(names, str):
+                found.append((option, None, names))
+            else:
+                found += [(option, i, name) for i, name in enumerate(names or ())]
+        return found
+
+    def at(self, option: str, word: str) -> str:
+        """Where in this section `option` is set for what `word` names."""
+        return f"{option}.{word}" if isinstance(getattr(self, option, None), ByWord) else option
+
+    def settings(self, word: str = "") -> Settings:
+        """What is said of the array of a motion that `word` names; "": of what is no motion."""
+
+        def of(option: str, default: Any = None) -> Any:
+            value = getattr(self, option)
+            return value.words().get(word, default) if isinstance(value, ByWord) else value
+
+        resolution = self.resolution if self.heightmap is None else self.heightmap.resolution
+        return Settings(
+            of("initial", "scene"), of("bounds"), of("transform", "none"), of("learning_rate"), resolution, word
+        )
+
+    @field_validator("resolution")
+    @classmethod
+    def _check_resolution(cls, value: tuple[int, int] | None) -> tuple[int, int] | None:
+        if value is not None and value[0] * value[1] > PIXELS:
+            raise wrong(f"must have at most {PIXELS} texels, not {value[0] * value[1]}")
+        return value
+
+    @model_validator(mode="after")
+    def _check_kind(self) -> Self:
+        has = [option for option in ("key", "heightmap", "motion") if getattr(self, option) is not None]
+        if not has:
+            raise located("", "must have one of `key`, `heightmap` and `motion`")
+        if len(has) > 1:
+            raise located(has[1], f"cannot stand beside `{has[0]}`; make two parameters of them")
+        if len(self.keys) > 1:
+            if len(set(self.keys)) < len(self.keys):
+                raise located("key", "must name each once")
+            if self.resolution is not None:
+                raise located("resolution", "goes with one key alone, not with a list that ties several together")
+        if self.heightmap is not None and self.resolution is not None:
+            raise located("resolution", "belongs into `heightmap`, which has its own; remove it here")
+        if self.motion is not None and self.resolution is not None:
+            raise located("resolution", "has no effect on a motion, which is no texture; remove it")
+        return self
+
+    @model_validator(mode="after")
+    def _check_words(self) -> Self:
+        free: list[Word] = self.motion.free if self.motion is not None else []
+        for option in ("initial", "bounds", "transform", "learning_rate"):
+            value = getattr(self, option)
+            if isinstance(value, ByWord):
+                if self.motion is None:
+                    raise located(option, "is a mapping by the words of a motion, and this is none")
+                for word in value.words():
+                    if word not in free:
+                        raise located(f"{option}.{word}", f"has no effect: `motion.free` has {', '.join(free)} alone")
+            elif isinstance(value, ImageFile) and self.motion is not None:
+                raise located(option, "is an image file, and a motion is no texture; give numbers")
+            elif len(free) > 1 and option in ("initial", "bounds") and value not in (None, "scene"):
+                words = ", ".join(f"{word}: ..." for word in free)
+                raise located(option, f"must be a mapping by what is free, {{{words}}}: they have different units")
+        return self
+
+    @model_validator(mode="after")
+    def _check_values(self) -> Self:
+        for word in self.motion.free if self.motion is not None else ("",):
+            settings = self.settings(word)
+
+            at = functools.partial(self.at, word=word)
+            _check_bounds(settings, at)
+            _check_transform(settings, at)
+            _check_initial(settings, at)
+        return self
+
+
+def _check_bounds(settings: Settings, at: Callable[[str], str]) -> None:
+    value = settings.bounds
+    if value is not None and not value[0] < value[1]:
+        raise located(at("bounds"), f"must be [low, high] with low < high, not [{value[0]:g}, {value[1]:g}]")
+
+
+def _check_transform(settings: Settings, at: Callable[[str], str]) -> None:
+    low, high = settings.bounds or (-math.inf, math.inf)
+    if settings.transform == "sigmoid" and not (math.isfinite(low) and math.isfinite(high)):
+        has = "has none" if settings.bounds is None else f"has [{low:g}, {high:g}]"
+        raise located(at("transform"), f"sigmoid maps to finite `bounds`, [low, high]; this parameter {has}")
+    if settings.transform in ("log", "softplus") and high <= 0:
+        raise located(at("bounds"), f"leave no positive value, and transform: {settings.transform} yields nothing else")
+
+
+def _check_initial(settings: Settings, at: Callable[[str], str]) -> None:
+    if settings.bounds is None or not isinstance(settings.initial, (float, list)):
+        return
+    low, high = settings.bounds
+    for number in settings.initial if isinstance(settings.initial, list) else [settings.initial]:
+        if not low <= number <= high:
+            raise located(at("initial"), f"{number:g} is outside of the bounds [{low:g}, {high:g}]")

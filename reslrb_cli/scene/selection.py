@@ -1,0 +1,104 @@
+"""What is recovered of a scene, and the way between its values and the scene."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..config import Settings
+from .deformation import Deformation
+from .values import Slot
+
+
+@dataclass(frozen=True)
+class Selection:
+    """The parameters that are recovered, by the keys that they are recorded by.
+
+    `params` is all of the scene's `mi.traverse`; `specs` holds the settings of each key, in the order of the
+    configuration and, for a glob, of the scene. A key is one of `params`, or a value of `deformation`: a motion's
+    `ID.translation`, or a heightmap. `tied` has, by such a key, the others of `params` that have the same value.
+    """
+
+    params: mi.SceneParameters
+    specs: dict[str, Settings]
+    tied: dict[str, list[str]]
+    deformation: Deformation
+
+    @property
+    def keys(self) -> list[str]:
+        """The keys of what is recovered."""
+        return list(self.specs)
+
+    @property
+    def scene_keys(self) -> list[str]:
+        """The entries of `params` that what is recovered determines."""
+        own = [key for key in self.keys if key not in self.deformation.values]
+        return [*own, *(other for key in own for other in self.tied.get(key, ())), *self.deformation.keys]
+
+    def spec(self, key: str) -> Settings:
+        """What the configuration says about the selected `key`."""
+        return self.specs[key]
+
+    def value(self, key: str) -> Any:
+        """The current value of `key`, as Dr.Jit has it."""
+        return self.deformation.values[key] if key in self.deformation.values else self.params[key]
+
+    def quantity(self, key: str) -> str | None:
+        """What `key` measures: `length`, `degrees` or `scale` of what moves; None of what is the scene's own."""
+        return self.deformation.quantities.get(key)
+
+    def array(self, key: str) -> np.ndarray[Any, Any]:
+        """The current value of `key`: a texture (H, W, C), a colour (C,), a buffer (N,), a number ().
+
+        An environment map comes without the halo columns that its tensor has.
+        """
+        return self.slot(key).get()
+
+    def hand_over(self, values: Mapping[str, Any]) -> None:
+        """Give the scene these values of keys, as Dr.Jit has them; gradients of a step find their way back to them.
+
+        All is evaluated, so that a step's kernels are the same from the first one on.
+        """
+        for key, value in values.items():
+            if key in self.deformation.values:
+                self.deformation.values[key] = value
+            else:
+                for each in (key, *self.tied.get(key, ())):
+                    self.params[each] = value
+        moved = self.deformation.place()
+        self.params.update()
+        # A texture pads its storage when it is first looked up, and unpads it when it is read. Left to the step, either
+        # would cut its kernels in two, and differently in the first step and the second.
+        own = [each for key in values for each in (key, *self.tied.get(key, ())) if key not in self.deformation.values]
+        for key in own:
+            node = self.params.properties[key][2]
+            if isinstance(node, mi.Texture):
+                node.eval(dr.zeros(mi.SurfaceInteraction3f))
+        dr.eval([self.params[key] for key in own], moved)
+
+    def collect(self) -> None:
+        """Bring what steps added to the gradients of moved things on to that of the values that move them."""
+        self.deformation.collect()
+
+    def set_arrays(self, values: Mapping[str, np.ndarray[Any, Any]]) -> None:
+        """Set parameters in the scene, from arrays as `array` returns them."""
+        for key, value in values.items():
+            self.slot(key).set(value)
+        self.update()
+
+    def update(self) -> None:
+        """Have the scene follow values that were set: of tied keys, and of what moves."""
+        for key, others in self.tied.items():
+            for other in others:
+                self.params[other] = type(self.params[other])(self.params[key])
+        self.deformation.place()
+        self.params.update()
+
+    def slot(self, key: str) -> Slot:
+        """The value of `key`, to be read and set; `update` has to follow."""
+        return Slot(self.deformation.values if key in self.deformation.values else self.params, key)

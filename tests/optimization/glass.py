@@ -1,0 +1,83 @@
+"""A spot light, a glass slab whose lower face is a flat mesh, and a floor below it: an experiment of 24x24 pixels."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+CELLS = 16
+SCENE = """<scene version="3.0.0">
+    <default name="filter" value="gaussian"/>
+    <sensor type="perspective" id="camera">
+        <float name="fov" value="90"/>
+        <transform name="to_world"><lookat origin="0, 1, 0" target="0, 0, 0" up="0, 0, -1"/></transform>
+        <film type="hdrfilm">
+            <integer name="width" value="24"/> <integer name="height" value="24"/>
+            <string name="pixel_format" value="rgb"/> <rfilter type="$filter"/>
+        </film>
+    </sensor>
+    <bsdf type="dielectric" id="glass"/>
+    <shape type="rectangle" id="floor">
+        <transform name="to_world"><rotate x="1" angle="-90"/></transform>
+        <bsdf type="diffuse"><rgb name="reflectance" value="0.8, 0.7, 0.6"/></bsdf>
+    </shape>
+    <shape type="rectangle" id="top">
+        <transform name="to_world"><rotate x="1" angle="-90"/><translate y="2.2"/></transform> <ref id="glass"/>
+    </shape>
+    <shape type="ply" id="slab"><string name="filename" value="slab.ply"/> <ref id="glass"/></shape>
+    <shape type="cube" id="bare">
+        <boolean name="face_normals" value="true"/>
+        <transform name="to_world"><scale value="0.05"/><translate x="30"/></transform>
+        <bsdf type="diffuse"><rgb name="reflectance" value="0.1, 0.2, 0.3"/></bsdf>
+    </shape>
+    <emitter type="spot" id="lamp">
+        <rgb name="intensity" value="10, 9, 8"/>
+        <float name="cutoff_angle" value="12"/> <float name="beam_width" value="4"/>
+        <transform name="to_world"><lookat origin="0, 5, 0" target="0, 0, 0" up="0, 0, -1"/></transform>
+    </emitter>
+</scene>
+"""
+CONFIG = """
+variant: llvm_ad_rgb
+scene: {file: scene.xml}
+target: {render: {spp: 64, parameters: {lamp.translation: [0.05, 0.1, -0.05]}}}
+parameters:
+  - motion: {of: lamp, free: [translation]}
+    learning_rate: 0.02
+integrator: {max_depth: 4, rr_depth: 100, estimator: stack}
+run: {iterations: 3, spp: 16, reach_spp: 4, final_spp: 16}
+"""
+
+
+def write_experiment(folder: Path) -> Path:
+    """Scene, mesh and `glass.yaml` in `folder`; a variant must be set."""
+    import mitsuba as mi
+
+    axis = np.linspace(-1, 1, CELLS + 1)
+    x, z = np.meshgrid(axis, axis, indexing="ij")
+    y = np.full_like(x, 2)
+    index = np.arange(x.size).reshape(x.shape)
+    a, b, c, d = index[:-1, :-1], index[1:, :-1], index[1:, 1:], index[:-1, 1:]
+    faces = np.concatenate([np.stack([a, b, c], -1).reshape(-1, 3), np.stack([a, c, d], -1).reshape(-1, 3)])
+    mesh = mi.Mesh("slab", x.size, len(faces), has_vertex_normals=True, has_vertex_texcoords=True)
+    params = mi.traverse(mesh)
+    params["vertex_positions"] = np.stack([x, y, z], -1).ravel().astype(np.float32)
+    params["vertex_texcoords"] = np.stack([(x + 1) / 2, (z + 1) / 2], -1).ravel().astype(np.float32)
+    params["faces"] = faces.ravel().astype(np.uint32)
+    params.update()
+    mesh.recompute_vertex_normals()
+    mesh.write_ply(str(folder / "slab.ply"))
+    (folder / "scene.xml").write_text(SCENE)
+    path = folder / "glass.yaml"
+    path.write_text(CONFIG)
+    return path
+
+
+def assemble(folder: Path, *sets: str) -> Any:
+    """The problem of the experiment, without targets."""
+    from reslrb_cli.config import load
+    from reslrb_cli.optimization import assemble_scene
+
+    return assemble_scene(load(write_experiment(folder), list(sets)))
