@@ -10,7 +10,7 @@ import mitsuba as mi
 
 from reslrb_cli.errors import UnsupportedScene
 from reslrb_cli.scene.catalog import parameter_kind
-from reslrb_cli.scene.motion import moving_emitter_obstacle, moving_shape_obstacle
+from reslrb_cli.scene.motion import BEAMS, PLACES, moving_emitter_obstacle, moving_shape_obstacle
 
 #: Where a parameter of a BSDF is this small, paths are followed and chosen in spite of it.
 NEARLY_ZERO = 1e-2
@@ -58,9 +58,10 @@ def differentiated(params: mi.SceneParameters) -> Differentiated:
             _refuse(key, moving_shape_obstacle(node, key))
             shapes[node] = None
             emitters = emitters or node.is_emitter()
-        elif kind == "emitter" and key.rpartition(".")[2] in ("position", "to_world"):
-            _refuse(key, moving_emitter_obstacle(node))
+        elif kind == "emitter" and key.rpartition(".")[2] in (*PLACES, *BEAMS):
+            _refuse(key, moving_emitter_obstacle(node, key))
             emitters = True
+            continue  # no factor of a path
         elif kind == "emitter":
             emission = True
         else:

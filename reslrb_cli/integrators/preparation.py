@@ -12,6 +12,7 @@ from reslrb_cli.integrators.differentiated import Differentiated, differentiated
 from reslrb_cli.integrators.freezing import Recordings
 from reslrb_cli.integrators.light_tracer import settle
 from reslrb_cli.scene.graph import SceneGraph
+from reslrb_cli.scene.horizon import Horizon, Surroundings
 from reslrb_cli.scene.needs import check_supported, scene_needs
 from reslrb_cli.transport.plan import Plan, make_plan
 
@@ -70,6 +71,9 @@ class Preparation:
         self._plans: dict[int, Plan] = {}
         self._owners: dict[Any, list[Any]] = {}  # BSDFs of its surfaces that use a node, and under None all of them
         self._track_zeros = False
+        self._surroundings = Surroundings()
+        self._meshes: list[mi.Shape] = []  # those that emit, of which Mitsuba keeps the faces' areas
+        self._infinite = False  # whether any emitter is infinitely far away
         self.recordings = Recordings()
 
     def plan(self, scene: mi.Scene, sensor: mi.Sensor, params: mi.SceneParameters | None = None) -> Plan:
@@ -81,9 +85,11 @@ class Preparation:
         if sensor.ptr not in self._plans:
             check_supported(scene, sensor, self._hide_emitters)
             needs = scene_needs(scene, sensor)
+            self._meshes = [lamp.shape for lamp in needs.lamps if lamp.faces_by_area]
+            self._infinite = any(mi.has_flag(e.flags(), mi.EmitterFlags.Infinite) for e in scene.emitters())
             settle(scene)
             self._plans[sensor.ptr] = make_plan(needs, *self._depths, self._hide_emitters)
-        plan = self._plans[sensor.ptr]
+        plan = replace(self._plans[sensor.ptr], horizon=self._renewed(scene))
         if params is None:
             return plan
         which = differentiated(params)
@@ -92,6 +98,12 @@ class Preparation:
         only = self._bsdfs(scene, which.bsdf_nodes)
         plan = plan.differentiating(bool(which.bsdf_nodes), which.emission, self._track_zeros, only)
         return attach(plan, which, self._motion, sensor)
+
+    def _renewed(self, scene: mi.Scene) -> Horizon | None:
+        """Renew what shapes that have moved made stale, ahead of tracing: the horizon, and meshes' areas."""
+        for mesh in self._meshes:
+            mesh.surface_area()
+        return self._surroundings.follow(scene) if self._infinite else None
 
     def _turn_to(self, scene: mi.Scene) -> None:
         """Forget what was found out about another scene."""

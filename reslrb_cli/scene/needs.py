@@ -11,6 +11,7 @@ import numpy as np
 
 from ..errors import UnsupportedScene
 from .graph import SceneGraph
+from .lamps import Lamp, find_lamps
 
 #: Sensors to which a light path can connect: `sample_direction` is there, and its density is that of `sample_ray`.
 SENSORS = ("PerspectiveCamera", "ThinLensCamera")
@@ -53,6 +54,7 @@ class SceneNeeds:
     thin_lens: bool
     principal_point: bool
     unfollowed: tuple[mi.BSDF, ...] = ()  # surfaces' BSDFs whose sampling is not to be differentiated
+    lamps: tuple[Lamp, ...] = ()  # shapes that emit
 
 
 @dataclass(frozen=True)
@@ -94,6 +96,7 @@ def scene_needs(scene: Any, sensor: Any) -> SceneNeeds:
         thin_lens=bool(sensor.needs_aperture_sample()),
         principal_point=_has_principal_point(sensor),
         unfollowed=tuple(bsdf for bsdf in graph.surface_bsdfs() if not _is_followed(graph, bsdf)),
+        lamps=find_lamps(scene, graph),
     )
 
 

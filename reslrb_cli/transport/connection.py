@@ -37,19 +37,24 @@ def connect(
     plan: Plan,
     sensor: mi.Sensor,
     si: mi.SurfaceInteraction3f,
-    ray: mi.Ray3f,
+    ray: mi.Ray3f | None,
     sample: mi.Point2f,
     active: mi.Bool,
     attached: bool = False,
 ) -> Connection:
-    """Find where the vertex `si` appears on the film; film positions move with it if `attached`, else they do not."""
+    """Find where the vertex `si` appears on the film; film positions move with it if `attached`, else they do not.
+
+    `ray` reaches the vertex; None: light begins there, on an emitter.
+    """
     with dr.suspend_grad(when=not attached):
         ds, importance = sensor.sample_direction(si, sample, active)
         if plan.needs.principal_point:
             importance = _shifted_importance(sensor, ds)
         # From the vertex itself, where `ptracer` takes the shadow ray's direction, which starts a little off it.
         wo = si.to_local(ds.d)
-        correction, valid = shading_correction(plan, si, -ray.d, ds.d, wo)
+        correction, valid = mi.Float(1), mi.Bool(True)
+        if ray is not None:
+            correction, valid = shading_correction(plan, si, -ray.d, ds.d, wo)
         return Connection(importance * correction, ds.uv, ds.p, wo, active & valid & (ds.pdf > 0), sample)
 
 

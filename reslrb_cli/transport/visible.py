@@ -101,7 +101,8 @@ def _look(
     tangents: bool = False,
 ) -> Any:
     def look(state: _Look) -> tuple[_Look]:
-        si = scene.ray_intersect(state.ray, state.active)
+        with dr.suspend_grad():  # where shapes move, `visible_lamps.py` has the derivative
+            si = scene.ray_intersect(state.ray, state.active)
         hit = state.active & si.is_valid()
         with dr.resume_grad(when=tangents):
             Le = si.emitter(scene).eval(si, state.active)

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 class AttachedFault:
     """`right`, in the source of the function `where`, becomes `wrong`; `case` then fails.
 
-    `quick`: part of the default suite.
+    `stock`: naive AD of our walk shares it, so that `ptracer` has to find it. `quick`: part of the default suite.
     """
 
     name: str
@@ -17,6 +17,7 @@ class AttachedFault:
     where: str
     right: str
     wrong: str
+    stock: bool = False
     quick: bool = False
 
 
@@ -53,17 +54,17 @@ FAULTS = [
                   "aperture=[connection.sample]", "aperture=[mi.Point2f(0.5)]"),
     # ---- The segment: naive AD shares the fault, `ptracer` does not ----
     AttachedFault("next_ray_detached", "slab", "transport.segment:Segment.next_ray",
-                  "return ray if attached else dr.detach(ray)", "return dr.detach(ray)"),
+                  "return ray if attached else dr.detach(ray)", "return dr.detach(ray)", stock=True),
     AttachedFault("hit_point_detached", "slab", "transport.segment:find_vertex",
-                  "pi.compute_surface_interaction(ray,", "pi.compute_surface_interaction(dr.detach(ray, False),"),
+                  "pi.compute_surface_interaction(ray,", "pi.compute_surface_interaction(dr.detach(ray, False),", stock=True),
     AttachedFault("shading_normals_detached", "slab", "transport.scattering:shading_correction",
                   "dr.abs((cos_i * wo_dot_n) / (cos_o * wi_dot_n))",
-                  "dr.detach(dr.abs((cos_i * wo_dot_n) / (cos_o * wi_dot_n)))", quick=True),
+                  "dr.detach(dr.abs((cos_i * wo_dot_n) / (cos_o * wi_dot_n)))", stock=True, quick=True),
     AttachedFault("importance_detached", "slab", "transport.connection:connect",
-                  "Connection(importance * correction", "Connection(dr.detach(importance) * correction"),
+                  "Connection(importance * correction", "Connection(dr.detach(importance) * correction", stock=True),
     AttachedFault("connection_turned_away", "rough_slab", "transport.connection:connect",
-                  "wo = si.to_local(ds.d)", "wo = dr.detach(si.to_local(ds.d))"),
+                  "wo = si.to_local(ds.d)", "wo = dr.detach(si.to_local(ds.d))", stock=True),
     AttachedFault("density_of_rough_glass_detached", "rough_slab", "transport.scattering:scatter",
                   "wo, pdf, weight = following(plan, si, bsdf, active, wo, pdf, lobe, weight)",
-                  "weight = dr.detach(weight)"),
+                  "weight = dr.detach(weight)", stock=True),
 ]  # fmt: skip

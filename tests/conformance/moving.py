@@ -43,6 +43,7 @@ class Moving:
     loaded: mi.Scene = field(init=False)
     params: mi.SceneParameters = field(init=False)
     weights: mi.TensorXf = field(init=False)
+    image: np.ndarray = field(init=False)  # of the last step
 
     def __post_init__(self) -> None:
         self.loaded = load(self.scene)
@@ -75,7 +76,8 @@ class Moving:
         dr.enable_grad(list(leaves.values()))
         # Copies: a parameter may be what a latent is, and `update` may put something else in its place.
         self.set({name: type(leaf)(leaf) for name, leaf in leaves.items()})
-        known_step(integrator, self.loaded, self.sensor, self.weights, seed=seed, spp=spp, params=self.params)
+        step = known_step(integrator, self.loaded, self.sensor, self.weights, seed=seed, spp=spp, params=self.params)
+        self.image = np.array(step.image, np.float64)
         result = {name: np.array(dr.grad(leaf), np.float64).ravel() for name, leaf in leaves.items()}
         self.set({name: dr.detach(leaf) for name, leaf in leaves.items()})
         return result
