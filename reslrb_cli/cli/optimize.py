@@ -39,6 +39,7 @@ def command(config_file: Path, overrides: tuple[str, ...], force: bool, quiet: b
     from reslrb_cli.cli.progress import Progress
     from reslrb_cli.cli.recording import Recording
     from reslrb_cli.optimization import assemble, find_reached
+    from reslrb_cli.optimization.border import warn_of_border
     from reslrb_cli.records.pilot_cache import PilotCache
     from reslrb_cli.report.run_table import parameter_lines, terminal_width
     from reslrb_cli.report.verdict import last_line
@@ -46,6 +47,7 @@ def command(config_file: Path, overrides: tuple[str, ...], force: bool, quiet: b
     say = logging.getLogger(__name__).info
     problem = assemble(config, say, PilotCache())
     find_reached(problem, say)
+    warn_of_border(problem, logging.getLogger(__name__).warning)
     manifest = Manifest(
         variant=variant, device=device_name(variant), seed=config.run.seed, config=printable(config_file)
     )

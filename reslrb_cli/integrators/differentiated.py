@@ -24,19 +24,19 @@ class Differentiated:
 
     `bsdf_nodes` are the nodes of BSDFs that have such parameters: textures, nested BSDFs, and meshes whose attributes
     textures read. `emission` says whether what emitters emit does, `zeros` whether any of the parameters is zero, or,
-    of those of BSDFs, nearly so. `shapes` are those that move, `emitters` whether rays move that leave an emitter.
+    of those of BSDFs, nearly so. `shapes` are those that move, `emitters` those whose rays do.
     """
 
     bsdf_nodes: tuple[Any, ...]
     emission: bool
     zeros: bool
     shapes: tuple[mi.Shape, ...]
-    emitters: bool
+    emitters: tuple[mi.Emitter, ...]
 
     @property
     def moves(self) -> bool:
         """Whether anything moves that light leaves from or meets."""
-        return bool(self.shapes) or self.emitters
+        return bool(self.shapes or self.emitters)
 
 
 def differentiated(params: mi.SceneParameters) -> Differentiated:
@@ -47,7 +47,8 @@ def differentiated(params: mi.SceneParameters) -> Differentiated:
     """
     nodes: dict[Any, None] = {}
     shapes: dict[mi.Shape, None] = {}
-    emission = zeros = emitters = False
+    emitters: dict[mi.Emitter, None] = {}
+    emission = zeros = False
     with dr.resume_grad():  # where gradients are suspended, nothing says that it tracks them
         enabled = {key: value for key, value in params.items() if dr.grad_enabled(value)}
     for key, value in enabled.items():
@@ -57,10 +58,11 @@ def differentiated(params: mi.SceneParameters) -> Differentiated:
         elif kind == "shape":
             _refuse(key, moving_shape_obstacle(node, key))
             shapes[node] = None
-            emitters = emitters or node.is_emitter()
+            if node.is_emitter():
+                emitters[node.emitter()] = None
         elif kind == "emitter" and key.rpartition(".")[2] in (*PLACES, *BEAMS):
             _refuse(key, moving_emitter_obstacle(node, key))
-            emitters = True
+            emitters[node] = None
             continue  # no factor of a path
         elif kind == "emitter":
             emission = True
@@ -69,7 +71,7 @@ def differentiated(params: mi.SceneParameters) -> Differentiated:
         dims = kind == "attribute" or (kind == "bsdf" and any(name in key for name in FACTORS))
         if kind not in ("shape", "sensor"):
             zeros = zeros or _has_singular(key, value, NEARLY_ZERO if dims else 0)
-    return Differentiated(tuple(nodes), emission, zeros, tuple(shapes), emitters)
+    return Differentiated(tuple(nodes), emission, zeros, tuple(shapes), tuple(emitters))
 
 
 def _refuse(key: str, reason: str | None) -> None:

@@ -196,11 +196,16 @@ def _has_principal_point(sensor: Any) -> bool:
     return any(np.any(np.array(params[key]) != 0) for key in keys if key in params)
 
 
-def _has_shading_normals(shape: Any) -> bool:
+def interpolates_normals(shape: mi.Shape) -> bool:
+    """Whether the shape is a mesh whose shading normals, as soon as it bends, differ from its geometric ones."""
+    return shape.is_mesh() and shape.has_vertex_normals() and not shape.has_face_normals()
+
+
+def _has_shading_normals(shape: mi.Shape) -> bool:
     """Whether the shape's shading normals differ from its geometric ones anywhere."""
     if not shape.is_mesh():
         return shape.class_name() not in _PLAIN_SHAPES
-    if not shape.has_vertex_normals() or shape.has_face_normals():
+    if not interpolates_normals(shape):
         return False
     positions = np.array(shape.vertex_positions_buffer()).reshape(-1, 3)
     normals = np.array(shape.vertex_normals_buffer()).reshape(-1, 3)

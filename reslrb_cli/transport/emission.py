@@ -35,6 +35,7 @@ class Emission:
 
     ray: mi.Ray3f
     weight: mi.Spectrum
+    emitter: mi.EmitterPtr
 
 
 def sample_time(plan: Plan, sensor: mi.Sensor, sampler: Numbered) -> mi.Float:
@@ -51,10 +52,11 @@ def sample_emission(samples: Samples, sampler: mi.Sampler) -> Emission:
     time = sample_time(plan, samples.sensor, sampler)
     wavelength_sample, sample_2, sample_3 = sampler.next_1d(), sampler.next_2d(), sampler.next_2d()
     if not (plan.environment_map or plan.placed_lamps):
-        ray, weight, _ = scene.sample_emitter_ray(time, wavelength_sample, sample_2, sample_3, True)
-        return Emission(ray if plan.moving_emission else dr.detach(ray), weight)
+        ray, weight, emitter = scene.sample_emitter_ray(time, wavelength_sample, sample_2, sample_3, True)
+        return Emission(ray if plan.moving_emission else dr.detach(ray), weight, emitter)
 
     index, index_weight, reused = scene.sample_emitter(wavelength_sample, True)
+    emitter = dr.gather(mi.EmitterPtr, scene.emitters_dr(), index)
     placed = [(lamp.index, _placed_by(samples, lamp, time, reused, sample_2, sample_3)) for lamp in plan.placed_lamps]
     if plan.environment_map:
         assert plan.needs.environment is not None
@@ -67,9 +69,8 @@ def sample_emission(samples: Samples, sampler: mi.Sampler) -> Emission:
         ours = mi.Bool(False)
         for number, _ in placed:
             ours |= index == number
-        emitter = dr.gather(mi.EmitterPtr, scene.emitters_dr(), index)
         ray, weight = _either(ours, ray, weight, *emitter.sample_ray(time, reused, sample_2, sample_3, ~ours))
-    return Emission(ray if plan.moving_emission else dr.detach(ray), weight * dr.detach(index_weight))
+    return Emission(ray if plan.moving_emission else dr.detach(ray), weight * dr.detach(index_weight), emitter)
 
 
 def _placed_by(

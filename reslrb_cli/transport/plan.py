@@ -37,11 +37,16 @@ class Plan:
     # rays that emitters send out.
     attached: bool = False
     moving_shapes: tuple[mi.Shape, ...] = ()
-    moving_emission: bool = False
+    moving_emitters: tuple[mi.Emitter, ...] = ()
     # Whether the normalisation of the reconstruction filter's weights has its derivative: finite differences have.
     attached_normalization: bool = True
     # The sphere that infinite emitters light.
     horizon: Horizon | None = None
+
+    @property
+    def moving_emission(self) -> bool:
+        """Whether any emitter moves."""
+        return bool(self.moving_emitters)
 
     @property
     def roulette(self) -> bool:

@@ -234,8 +234,8 @@ FAULTS = {
     "normal_of_sphere_as_mitsuba_has_it": ("sphere", "transport.lamps:lamp_point", "if lamp.is_sphere:", "if False:"),
     "density_detached": ("parallel", "transport.lamps:lamp_ray", "radiance * weight", "radiance * dr.detach(weight)"),
     "rays_detached": ("spot", "transport.emission:sample_emission",
-                      "Emission(ray if plan.moving_emission else dr.detach(ray), weight)",
-                      "Emission(dr.detach(ray), weight)"),
+                      "Emission(ray if plan.moving_emission else dr.detach(ray), weight, emitter)",
+                      "Emission(dr.detach(ray), weight, emitter)"),
 }  # fmt: skip
 QUICK = "area_of_faces_detached"
 
