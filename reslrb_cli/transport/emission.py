@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Protocol
 import drjit as dr
 import mitsuba as mi
 
-from reslrb_cli.scene.lamps import Lamp
 from reslrb_cli.transport.lamps import lamp_ray
 from reslrb_cli.transport.plan import Plan
 
@@ -57,33 +56,27 @@ def sample_emission(samples: Samples, sampler: mi.Sampler) -> Emission:
 
     index, index_weight, reused = scene.sample_emitter(wavelength_sample, True)
     emitter = dr.gather(mi.EmitterPtr, scene.emitters_dr(), index)
-    placed = [(lamp.index, _placed_by(samples, lamp, time, reused, sample_2, sample_3)) for lamp in plan.placed_lamps]
+    lamps = {lamp.emitter: (lamp, samples.areas(lamp)) for lamp in plan.placed_lamps}
+
+    def leave(
+        self: mi.Emitter, time: mi.Float, number: mi.Float, position: mi.Point2f, direction: mi.Point2f, active: mi.Bool
+    ) -> tuple[mi.Ray3f, mi.Spectrum]:
+        if self in lamps:
+            lamp, areas = lamps[self]
+            return lamp_ray(lamp, areas, time, number, position, direction, active)
+        return self.sample_ray(time, number, position, direction, active)
+
     if plan.environment_map:
-        assert plan.needs.environment is not None
-        environment = _environment_ray(plan, scene.environment(), time, sample_2, sample_3)
-        placed.append((plan.needs.environment, environment))
-    (number, (ray, weight)), *others = placed
-    for number, (other_ray, other_weight) in others:
-        ray, weight = _either(index == number, other_ray, other_weight, ray, weight)
-    if len(placed) < len(plan.needs.emitters):
-        ours = mi.Bool(False)
-        for number, _ in placed:
-            ours |= index == number
-        ray, weight = _either(ours, ray, weight, *emitter.sample_ray(time, reused, sample_2, sample_3, ~ours))
+        is_environment = index == plan.needs.environment
+        ray, weight = _environment_ray(plan, scene.environment(), time, sample_2, sample_3)
+        if len(plan.needs.emitters) > 1:
+            other = dr.dispatch(emitter, leave, time, reused, sample_2, sample_3, ~is_environment)
+            ray, weight = (dr.select(is_environment, a, b) for a, b in zip((ray, weight), other, strict=True))
+    else:
+        # In an indirect call, although there may be one emitter alone: outside of one the derivative by each number of
+        # a transformation is a sum over all paths, for which they would be traced again.
+        ray, weight = dr.dispatch(emitter, leave, time, reused, sample_2, sample_3, mi.Bool(True))
     return Emission(ray if plan.moving_emission else dr.detach(ray), weight * dr.detach(index_weight), emitter)
-
-
-def _placed_by(
-    samples: Samples, lamp: Lamp, time: mi.Float, number: mi.Float, position: mi.Point2f, direction: mi.Point2f
-) -> tuple[mi.Ray3f, mi.Spectrum]:
-    return lamp_ray(lamp, samples.areas(lamp), time, number, position, direction, mi.Bool(True))
-
-
-def _either(
-    mask: mi.Bool, ray: mi.Ray3f, weight: mi.Spectrum, other: mi.Ray3f, other_weight: mi.Spectrum
-) -> tuple[mi.Ray3f, mi.Spectrum]:
-    """One ray and its weight where `mask` says so, else the other."""
-    return dr.select(mask, ray, other), dr.select(mask, weight, other_weight)
 
 
 def _environment_ray(

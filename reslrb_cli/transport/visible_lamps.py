@@ -39,13 +39,23 @@ def _splat(samples: Samples, lamp: Lamp) -> tuple[mi.Point2f, mi.Spectrum, mi.Bo
     plan, sensor, numbers = samples.plan, samples.sensor, samples.lamp_numbers(lamp)
     time = sample_time(plan, sensor, numbers)
     position, aperture = numbers.next_2d(), numbers.next_2d()
-    si, weight = lamp_point(lamp, samples.areas(lamp), time, position, mi.Bool(True))
+    emitter = dr.gather(mi.EmitterPtr, samples.scene.emitters_dr(), mi.UInt32(lamp.index))
+    areas = samples.areas(lamp)
+
+    def point(
+        self: mi.Emitter, time: mi.Float, position: mi.Point2f, active: mi.Bool
+    ) -> tuple[mi.SurfaceInteraction3f, mi.Float]:
+        if self != lamp.emitter:  # of this scene, or of another one
+            return dr.zeros(mi.SurfaceInteraction3f), mi.Float(0)
+        return lamp_point(lamp, areas, time, position, active)
+
+    si, weight = dr.dispatch(emitter, point, time, position, mi.Bool(True))  # as in `sample_emission`
     si.time = time
     connection = connect(plan, sensor, si, None, aperture, mi.Bool(True), attached=True)
     cos = dr.dot(si.n, si.to_world(connection.wo))
     active = connection.active & (cos > 0)
     si.wi = connection.wo
-    radiance = lamp.emitter.eval(si, active)
+    radiance = emitter.eval(si, active)
     with dr.suspend_grad():
         active = active & ~samples.scene.ray_test(si.spawn_ray_to(connection.target), active)
     C = dr.select(active, radiance * (cos * weight) * connection.weight * samples.scale, 0)

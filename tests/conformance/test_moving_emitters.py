@@ -15,6 +15,7 @@ from measure.test_mutations import plant
 from reslrb_cli.errors import UnsupportedScene
 from reslrb_cli.integrators import render_image
 from reslrb_cli.integrators.interface import StepIntegrator
+from reslrb_cli.integrators.plan_report import count, tracking
 from reslrb_cli.measure.comparison import Family, compare_expectations
 from reslrb_cli.measure.gradients import integrator, relative, seeds
 from reslrb_cli.measure.small_scenes import diffuse, load, rgb, transform
@@ -198,6 +199,18 @@ def test_walk_ad_shows_a_moving_lamp_as_it_is():
         moving.gradient(integrator(name, 2, **options), 1, 16)
         results.append(moving.image)
     assert relative(*results) < 1e-5
+
+
+@pytest.mark.parametrize("kind", ["rectangle", "sphere"])
+@pytest.mark.parametrize("emitter", ["area", "directionalarea"])
+def test_one_kernel_has_it_all(kind: str, emitter: str):
+    """The derivative by a number of a transformation is a sum over all paths; none is traced again for it."""
+    scene = load(over_floor(surface(kind, emitter)))
+    params, sensor = mi.traverse(scene), scene.sensors()[0]
+    ours = integrator("reslrb", 3, estimator="stack")
+    with tracking(params, ["light.to_world"]):
+        kernels = count(ours, ours.plan(scene, sensor, params), scene, sensor, known=True)
+    assert len(kernels) == 1
 
 
 # ---- What is refused ----
