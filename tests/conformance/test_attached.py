@@ -27,6 +27,8 @@ pytestmark = pytest.mark.usefixtures("llvm")
 
 #: What Mitsuba's own light tracer differs by, relative to the entries, over many seeds (`measure.gradcheck`).
 STOCK_ROUNDING = 1e-3
+#: What twice the distance of the two references may be: more is a fault of the walk that both of ours share.
+FARTHEST = 1e-3
 BY_NAME = {case.name: case for case in CASES}
 DEEP = {"slab.vertex_positions": None, "shell.bsdf.reflectance.value": None}
 
@@ -64,7 +66,7 @@ def check(case: AttachedCase) -> None:
     for what, distance, limit in distances(case):
         print(f"{case.name}: {what}: {distance:.1e}, at most {limit:.1e}")
         assert distance <= limit, f"{what}: {distance:.1e} > {limit:.1e}"
-        assert limit <= 20 * case.limit, f"{what}: the references are {limit / 2:.1e} apart"
+        assert limit <= FARTHEST, f"{what}: the references are {limit / 2:.1e} apart"
 
 
 @pytest.mark.parametrize("name", [pytest.param(c.name, marks=() if c.quick else pytest.mark.long) for c in CASES])
