@@ -25,7 +25,7 @@ BACK = "estimators.attached:walk_back"
 FAULTS = [
     # ---- The walk back: naive AD of our walk is right ----
     AttachedFault("sign_of_adjoint_of_origin", "slab", BACK,
-                  "Adjoint(mi.Vector3f(dr.grad(ray.o))", "Adjoint(-mi.Vector3f(dr.grad(ray.o))", quick=True),
+                  "scattered, dr.grad(ray.o),", "scattered, -dr.grad(ray.o),", quick=True),
     AttachedFault("direction_has_no_adjoint", "slab", BACK, " + dr.dot(following.d, adjoint.direction)", ""),
     AttachedFault("prefix_missing", "bounces", BACK, "dr.dot(P, own + later)", "dr.sum(own + later)"),
     AttachedFault("own_contribution_not_carried", "bounces", BACK, "dr.detach(own + later))", "dr.detach(later))"),
