@@ -39,6 +39,7 @@ def command(config_file: Path, overrides: tuple[str, ...], force: bool, quiet: b
     from reslrb_cli.cli.progress import Progress
     from reslrb_cli.cli.recording import Recording
     from reslrb_cli.optimization import assemble, find_reached
+    from reslrb_cli.optimization.border import warn_of_border
     from reslrb_cli.optimization.correlated_rounds import measure_correlated_bias
     from reslrb_cli.records.pilot_cache import PilotCache
     from reslrb_cli.report.run_table import parameter_lines, terminal_width
@@ -51,6 +52,7 @@ def command(config_file: Path, overrides: tuple[str, ...], force: bool, quiet: b
     bias = measure_correlated_bias(problem, say)
     if bias is not None and bias.line() is not None:
         logger.warning(bias.line())
+    warn_of_border(problem, logger.warning)
     manifest = Manifest(
         variant=variant, device=device_name(variant), seed=config.run.seed, config=printable(config_file)
     )

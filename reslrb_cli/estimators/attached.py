@@ -157,6 +157,12 @@ class Adjoint:
     B: mi.Spectrum
 
     @staticmethod
+    def where(mask: mi.Bool, origin: mi.Point3f, direction: mi.Vector3f, B: mi.Spectrum) -> Adjoint:
+        """These in the lanes of the mask, zero in the others."""
+        values = mi.Vector3f(origin), direction, B
+        return Adjoint(*(dr.select(mask, value, 0) for value in values))
+
+    @staticmethod
     def zero() -> Adjoint:
         """Behind the last vertex."""
         return Adjoint(mi.Vector3f(0), mi.Vector3f(0), mi.Spectrum(0))
@@ -219,7 +225,8 @@ def walk_back(p: Pass, size: int, pushed: Pushed, top: mi.UInt32, bottom: mi.UIn
             later = dr.select(scattered, this.scattering.weight * (r * B), 0)
             moved = dr.dot(following.o, adjoint.origin) + dr.dot(following.d, adjoint.direction)
             dr.backward_from(dr.dot(P, own + later) + dr.select(scattered, moved, 0))
-            before = Adjoint(mi.Vector3f(dr.grad(ray.o)), dr.grad(ray.d), dr.detach(own + later))
+            # What a lane without light computes may be no number: none of it goes on to the vertices before.
+            before = Adjoint.where(connected | scattered, dr.grad(ray.o), dr.grad(ray.d), dr.detach(own + later))
         return number - 1, before, stack, roulette
 
     _, adjoint, _, _ = dr.while_loop(

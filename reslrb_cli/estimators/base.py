@@ -48,8 +48,7 @@ class Pass:
 
     def emission(self) -> Emission:
         """The rays that leave the emitters, and E (C,) of each path, with derivatives."""
-        s = self.samples
-        return sample_emission(s.plan, s.scene, s.sensor, s.sampler())
+        return sample_emission(self.samples, self.samples.sampler())
 
     def delta(self, u: mi.Point2f, active: mi.Bool) -> mi.Spectrum:
         """The adjoint (C,) at film position `u`; dL/dI is known."""

@@ -16,6 +16,9 @@ from reslrb_cli.integrators.tracer import Reversed
 from reslrb_cli.transport.accumulation import in_passes
 from reslrb_cli.transport.samples import Samples
 
+#: No light may reach what is differentiated.
+_MAY_LACK = dr.ADFlag.Default | dr.ADFlag.AllowNoGrad
+
 
 class WalkAd(Reversed):
     """The same walk under naive AD: for comparisons at equal seeds."""
@@ -43,12 +46,12 @@ class WalkAd(Reversed):
     def correlated(self, job: Job, derivative: Derivative) -> mi.TensorXf:
         with dr.isolate_grad():
             image = self.graph(job)
-            dr.backward_from(image * derivative(dr.detach(image)))
+            dr.backward_from(image * derivative(dr.detach(image)), flags=_MAY_LACK)
         return dr.detach(image)
 
     def backward(self, job: Job, gradient: mi.TensorXf) -> None:
         with dr.resume_grad(), dr.isolate_grad():
-            dr.backward_from(self.graph(job) * gradient)
+            dr.backward_from(self.graph(job) * gradient, flags=_MAY_LACK)
 
     def tangent(self, job: Job) -> mi.TensorXf:
         with dr.resume_grad():

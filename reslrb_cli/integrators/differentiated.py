@@ -10,7 +10,7 @@ import mitsuba as mi
 
 from reslrb_cli.errors import UnsupportedScene
 from reslrb_cli.scene.catalog import parameter_kind
-from reslrb_cli.scene.motion import moving_emitter_obstacle, moving_shape_obstacle
+from reslrb_cli.scene.motion import BEAMS, PLACES, moving_emitter_obstacle, moving_shape_obstacle
 
 #: Where a parameter of a BSDF is this small, paths are followed and chosen in spite of it.
 NEARLY_ZERO = 1e-2
@@ -24,19 +24,19 @@ class Differentiated:
 
     `bsdf_nodes` are the nodes of BSDFs that have such parameters: textures, nested BSDFs, and meshes whose attributes
     textures read. `emission` says whether what emitters emit does, `zeros` whether any of the parameters is zero, or,
-    of those of BSDFs, nearly so. `shapes` are those that move, `emitters` whether rays move that leave an emitter.
+    of those of BSDFs, nearly so. `shapes` are those that move, `emitters` those whose rays do.
     """
 
     bsdf_nodes: tuple[Any, ...]
     emission: bool
     zeros: bool
     shapes: tuple[mi.Shape, ...]
-    emitters: bool
+    emitters: tuple[mi.Emitter, ...]
 
     @property
     def moves(self) -> bool:
         """Whether anything moves that light leaves from or meets."""
-        return bool(self.shapes) or self.emitters
+        return bool(self.shapes or self.emitters)
 
 
 def differentiated(params: mi.SceneParameters) -> Differentiated:
@@ -47,7 +47,8 @@ def differentiated(params: mi.SceneParameters) -> Differentiated:
     """
     nodes: dict[Any, None] = {}
     shapes: dict[mi.Shape, None] = {}
-    emission = zeros = emitters = False
+    emitters: dict[mi.Emitter, None] = {}
+    emission = zeros = False
     with dr.resume_grad():  # where gradients are suspended, nothing says that it tracks them
         enabled = {key: value for key, value in params.items() if dr.grad_enabled(value)}
     for key, value in enabled.items():
@@ -57,18 +58,20 @@ def differentiated(params: mi.SceneParameters) -> Differentiated:
         elif kind == "shape":
             _refuse(key, moving_shape_obstacle(node, key))
             shapes[node] = None
-            emitters = emitters or node.is_emitter()
-        elif kind == "emitter" and key.rpartition(".")[2] in ("position", "to_world"):
-            _refuse(key, moving_emitter_obstacle(node))
-            emitters = True
+            if node.is_emitter():
+                emitters[node.emitter()] = None
+        elif kind == "emitter" and key.rpartition(".")[2] in (*PLACES, *BEAMS):
+            _refuse(key, moving_emitter_obstacle(node, key))
+            emitters[node] = None
+            continue  # no factor of a path
         elif kind == "emitter":
             emission = True
         else:
             _refuse(key, "light tracing has derivatives of what light meets and leaves from, not of the sensor")
-        moves = kind == "shape" or key.rpartition(".")[2] in ("position", "to_world")  # no factor of anything
         dims = kind == "attribute" or (kind == "bsdf" and any(name in key for name in FACTORS))
-        zeros = zeros or (not moves and _has_singular(key, value, NEARLY_ZERO if dims else 0))
-    return Differentiated(tuple(nodes), emission, zeros, tuple(shapes), emitters)
+        if kind != "shape":
+            zeros = zeros or _has_singular(key, value, NEARLY_ZERO if dims else 0)
+    return Differentiated(tuple(nodes), emission, zeros, tuple(shapes), tuple(emitters))
 
 
 def _refuse(key: str, reason: str | None) -> None:

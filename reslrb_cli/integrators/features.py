@@ -78,6 +78,32 @@ def _null(plan: Plan) -> Plan | str:
     return replace(plan, differentiate_null=not plan.differentiate_null)
 
 
+def _attached(plan: Plan) -> Plan | str:
+    if not plan.attached:
+        return "nothing moves"
+    return "without them parameters that move light have no derivative"
+
+
+def _at_rest(plan: Plan) -> Plan | str:
+    return replace(plan, moving_emitters=()) if plan.moving_emission else "no emitter has a parameter that moves it"
+
+
+def _seen_moving(plan: Plan) -> Plan | str:
+    if not plan.visible_moving_lamps:
+        return "no lamp moves, or none is to be seen"
+    return "goes with visible emitters, and with moving ones"
+
+
+def _placed(plan: Plan) -> Plan | str:
+    return "what Mitsuba makes of them is wrong" if plan.placed_lamps else "there are none"
+
+
+def _normalization(plan: Plan) -> Plan | str:
+    if not plan.attached:
+        return "nothing moves"
+    return replace(plan, attached_normalization=not plan.attached_normalization)
+
+
 def _several(plan: Plan) -> Plan | str:
     return "follows from the number of emitters, in Mitsuba itself"
 
@@ -133,6 +159,17 @@ FEATURES = (
             "no BSDF with parameters has any", _delta),
     Feature("derivatives of null surfaces", lambda p: p.differentiate_null, "a BSDF with parameters is see-through",
             "no BSDF with parameters is", _null),
+    Feature("attached derivatives", lambda p: p.attached, "a parameter moves what light leaves from or meets",
+            "nothing moves: directions and film positions are constants", _attached),
+    Feature("moving emitters", lambda p: p.moving_emission, "rays have the derivative of where they start",
+            "emitters are at rest", _at_rest),
+    Feature("moving lamps in view", lambda p: bool(p.visible_moving_lamps),
+            "their outline moves in the image; what they cover, and shadows, do not", "no lamp that moves is seen",
+            _seen_moving),
+    Feature("placed lamps", lambda p: bool(p.placed_lamps), "spheres, parallel lamps, meshes that move: by the walk",
+            "Mitsuba samples all emitters", _placed),
+    Feature("derivative of the filter's normalization", lambda p: p.attached and p.attached_normalization,
+            "as finite differences have it", "nothing moves, or it is detached", _normalization),
     Feature("zero-factor bookkeeping", lambda p: p.track_zeros, "a parameter is zero somewhere, or nearly so",
             "no parameter is nearly zero", _zeros),
     Feature("geometry read by BSDFs", lambda p: p.needs.bsdfs_read_geometry,

@@ -20,6 +20,7 @@ from reslrb_cli.transport.samples import Samples
 from reslrb_cli.transport.splat import AdjointImage, Film
 from reslrb_cli.transport.transmittance import forward_derivatives
 from reslrb_cli.transport.visible import differentiate_visible_radiance, visible_radiance, visible_tangent
+from reslrb_cli.transport.visible_lamps import moving_splats
 from reslrb_cli.transport.walk import walk
 
 
@@ -173,6 +174,10 @@ def differentiate_visible_emission(samples: Samples, adjoint: AdjointImage) -> N
         primary = samples.primary_ray()
         delta = adjoint.lookup(primary.u, primary.active) * primary.weight * samples.fraction
         differentiate_visible_radiance(plan, samples.scene, primary, delta)
+    if plan.visible_moving_lamps:
+        with dr.resume_grad():
+            for u, C, active in moving_splats(samples):
+                dr.backward_from(dr.dot(adjoint.lookup(u, active, plan.attached_normalization), C))
 
 
 def splat_tangents(samples: Samples, block: Any) -> None:
@@ -180,7 +185,7 @@ def splat_tangents(samples: Samples, block: Any) -> None:
     plan, dE = samples.plan, mi.Spectrum(0)
     with dr.resume_grad():
         if plan.differentiate_emission:
-            E = sample_emission(plan, samples.scene, samples.sensor, samples.sampler()).weight
+            E = sample_emission(samples, samples.sampler()).weight
             [dE] = forward_derivatives(E)
         if plan.visible_emission and (plan.differentiate_emission or plan.differentiate_null):
             primary = samples.primary_ray()
@@ -193,4 +198,7 @@ def splat_tracked(samples: Samples, block: Any) -> None:
     """Add the contributions with derivatives tracked to the block: naive AD, its memory proportional to depth."""
     with dr.resume_grad():
         splat_visible_emission(samples, block, "evaluated")
+        for u, C, active in moving_splats(samples):  # twice, so that the image stays as it is
+            samples.film.put(block, u, C, active, samples.plan.attached_normalization)
+            samples.film.put(block, dr.detach(u), -dr.detach(C), active)
         walk(samples, TrackedSplat(samples, block, samples.plan.attached))

@@ -11,8 +11,9 @@ from reslrb_cli.errors import UnsupportedScene
 from reslrb_cli.integrators.differentiated import Differentiated, differentiated
 from reslrb_cli.integrators.freezing import Recordings
 from reslrb_cli.integrators.light_tracer import settle
+from reslrb_cli.integrators.renewal import Renewal, with_shading_normals
 from reslrb_cli.scene.graph import SceneGraph
-from reslrb_cli.scene.needs import check_supported, scene_needs
+from reslrb_cli.scene.needs import check_supported, interpolates_normals, scene_needs
 from reslrb_cli.transport.plan import Plan, make_plan
 
 
@@ -52,11 +53,13 @@ def attach(plan: Plan, which: Differentiated, motion: Motion, sensor: mi.Sensor)
             f"sensor {sensor.id()} has a box filter, whose splats do not change while they move inside of a pixel; "
             "take a smooth one, such as gaussian, for derivatives of what moves light"
         )
+    if any(interpolates_normals(shape) for shape in which.shapes):
+        plan = with_shading_normals(plan)  # a flat mesh is about to bend
     return replace(
         plan,
         attached=True,
         moving_shapes=which.shapes,
-        moving_emission=which.emitters,
+        moving_emitters=which.emitters,
         attached_normalization=motion.filter_normalization == "attached",
     )
 
@@ -70,6 +73,7 @@ class Preparation:
         self._plans: dict[int, Plan] = {}
         self._owners: dict[Any, list[Any]] = {}  # BSDFs of its surfaces that use a node, and under None all of them
         self._track_zeros = False
+        self._renewal: Renewal | None = None
         self.recordings = Recordings()
 
     def plan(self, scene: mi.Scene, sensor: mi.Sensor, params: mi.SceneParameters | None = None) -> Plan:
@@ -81,9 +85,11 @@ class Preparation:
         if sensor.ptr not in self._plans:
             check_supported(scene, sensor, self._hide_emitters)
             needs = scene_needs(scene, sensor)
+            self._renewal = self._renewal or Renewal(scene)
             settle(scene)
             self._plans[sensor.ptr] = make_plan(needs, *self._depths, self._hide_emitters)
-        plan = self._plans[sensor.ptr]
+        assert self._renewal is not None
+        plan = self._renewal.renew(self._plans[sensor.ptr], scene)
         if params is None:
             return plan
         which = differentiated(params)
@@ -102,6 +108,7 @@ class Preparation:
             self._scene = (scene.ptr, None if own else scene)
             self._plans.clear()
             self._owners.clear()
+            self._renewal = None
             self.recordings.clear()
 
     def _bsdfs(self, scene: mi.Scene, nodes: tuple[Any, ...]) -> tuple[mi.BSDF, ...]:

@@ -6,6 +6,7 @@ import drjit as dr
 import mitsuba as mi
 
 from reslrb_cli.integrators.interface import Derivative, Job
+from reslrb_cli.scene.horizon import Surroundings
 
 
 class Replayed:
@@ -15,14 +16,17 @@ class Replayed:
 
     def __init__(self, plugin: mi.Integrator) -> None:
         self.plugin = plugin
+        self.surroundings = Surroundings()
 
     def image(self, job: Job) -> mi.TensorXf:
         """The image, without derivatives."""
+        self.surroundings.follow(job.scene)
         with dr.suspend_grad():
             return self.plugin.render(job.scene, job.sensor, job.seed, job.spp)
 
     def backward(self, job: Job, gradient: mi.TensorXf) -> None:
         """Add the gradient of the objective with dL/dI `gradient`."""
+        self.surroundings.follow(job.scene)
         # Isolated, so that another view's propagation finds the edges above the scene's parameters intact.
         with dr.isolate_grad():
             self.plugin.render_backward(job.scene, job.params, gradient, job.sensor, job.seed, job.spp)
@@ -51,6 +55,7 @@ class NaiveAD(Replayed):
             super().backward(job, gradient)
 
     def correlated(self, job: Job, derivative: Derivative) -> mi.TensorXf:
+        self.surroundings.follow(job.scene)
         with dr.scoped_set_flag(dr.JitFlag.SymbolicLoops, False), dr.isolate_grad():
             image = self.plugin.render(job.scene, job.sensor, job.seed, job.spp, develop=True, evaluate=False)
             dr.backward_from(image * derivative(dr.detach(image)))

@@ -17,6 +17,7 @@ from functools import cached_property
 
 import numpy as np
 
+from reslrb_cli.estimators import ESTIMATORS
 from reslrb_cli.measure.comparison import ROUNDING, Comparison, Family, compare_equal_seeds, compare_expectations
 from reslrb_cli.measure.entries import entry_count
 from reslrb_cli.measure.pace import NO_TIME
@@ -25,8 +26,6 @@ from reslrb_cli.measure.sampling import NAIVE, Name, Sampling
 from reslrb_cli.measure.statistics import paired_z_scores
 from reslrb_cli.records.gradcheck import GradcheckRecord, Kind, Reference, Verdict
 
-#: Estimators that agree with naive AD to rounding at equal seeds.
-EXACT = ("gather", "stack")
 #: What a stock integrator on the same paths differs by from this one, relative to the entries: whether a point is
 #: visible is another matter of rounding to each.
 STOCK_ROUNDING = 1e-3
@@ -75,7 +74,8 @@ class Gradcheck:
         found = [] if parts.image is None else [Row(None, "reslrb", parts.image, Kind.IMAGE)]
         for key in parts.case.keys:
             for listed in self.settings.integrators:
-                kind = Kind.EQUAL_SEEDS if listed.options["estimator"] in EXACT else Kind.EXPECTATION
+                exact = ESTIMATORS[listed.options["estimator"]].exact
+                kind = Kind.EQUAL_SEEDS if exact else Kind.EXPECTATION
                 found.append(Row(key, listed.label, Reference.WALK_AD, kind))
                 stock = parts.stock[key]
                 references = [] if stock is None else [stock]

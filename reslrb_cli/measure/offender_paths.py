@@ -34,9 +34,9 @@ def search_paths(samples: Samples, sensor: int, label: str, pixel: tuple[int, in
     plan = samples.plan
     with dr.suspend_grad():
         with dr.resume_grad():
-            E = sample_emission(plan, samples.scene, samples.sensor, samples.sampler())
+            E = sample_emission(samples, samples.sampler())
             [dE] = forward_derivatives(E.weight) if plan.differentiate_emission else [mi.Spectrum(0)]
-        state = walk(samples, SearchHooks(samples, Emission(E.ray, dr.detach(E.weight)), dE, pixel))
+        state = walk(samples, SearchHooks(samples, Emission(E.ray, dr.detach(E.weight), E.emitter), dE, pixel))
         dr.eval(state)
     describe = Describe(samples, sensor, label)
     size = np.array(dr.max(dr.abs(state.largest.value)))

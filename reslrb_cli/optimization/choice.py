@@ -14,6 +14,7 @@ import mitsuba as mi
 from reslrb_cli.backend.device import device_name
 from reslrb_cli.config import Config, Reslrb
 from reslrb_cli.errors import ConfigError
+from reslrb_cli.estimators import ESTIMATORS
 from reslrb_cli.integrators import Reslrb as Tracer
 from reslrb_cli.optimization.budget import MemoryPlan, choose_samples, standing
 from reslrb_cli.optimization.moving import ATTACHED, is_attached
@@ -165,7 +166,7 @@ def _candidate(option: Option) -> Candidate:
     if options.get("capacity", 1) > 1 or "weight" in options:
         parent = Candidate({"estimator": options["estimator"], "capacity": 1}, exact=False).label
     several = option.memory is not None and option.memory.passes > 1
-    return Candidate(options, options["estimator"] in ("stack", "gather"), 2 if several else 1, parent)
+    return Candidate(options, ESTIMATORS[options["estimator"]].exact, 2 if several else 1, parent)
 
 
 def measured_step(problem: Problem, integrator: Any, clock: StepClock, round: int, spp: int) -> Measured:

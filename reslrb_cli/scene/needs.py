@@ -11,6 +11,7 @@ import numpy as np
 
 from ..errors import UnsupportedScene
 from .graph import SceneGraph
+from .lamps import Lamp, find_lamps
 
 #: Sensors to which a light path can connect: `sample_direction` is there, and its density is that of `sample_ray`.
 SENSORS = ("PerspectiveCamera", "ThinLensCamera")
@@ -53,6 +54,7 @@ class SceneNeeds:
     thin_lens: bool
     principal_point: bool
     unfollowed: tuple[mi.BSDF, ...] = ()  # surfaces' BSDFs whose sampling is not to be differentiated
+    lamps: tuple[Lamp, ...] = ()  # shapes that emit
 
 
 @dataclass(frozen=True)
@@ -94,6 +96,7 @@ def scene_needs(scene: Any, sensor: Any) -> SceneNeeds:
         thin_lens=bool(sensor.needs_aperture_sample()),
         principal_point=_has_principal_point(sensor),
         unfollowed=tuple(bsdf for bsdf in graph.surface_bsdfs() if not _is_followed(graph, bsdf)),
+        lamps=find_lamps(scene, graph),
     )
 
 
@@ -193,11 +196,16 @@ def _has_principal_point(sensor: Any) -> bool:
     return any(np.any(np.array(params[key]) != 0) for key in keys if key in params)
 
 
-def _has_shading_normals(shape: Any) -> bool:
+def interpolates_normals(shape: mi.Shape) -> bool:
+    """Whether the shape is a mesh whose shading normals, as soon as it bends, differ from its geometric ones."""
+    return shape.is_mesh() and shape.has_vertex_normals() and not shape.has_face_normals()
+
+
+def _has_shading_normals(shape: mi.Shape) -> bool:
     """Whether the shape's shading normals differ from its geometric ones anywhere."""
     if not shape.is_mesh():
         return shape.class_name() not in _PLAIN_SHAPES
-    if not shape.has_vertex_normals() or shape.has_face_normals():
+    if not interpolates_normals(shape):
         return False
     positions = np.array(shape.vertex_positions_buffer()).reshape(-1, 3)
     normals = np.array(shape.vertex_normals_buffer()).reshape(-1, 3)

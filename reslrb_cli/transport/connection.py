@@ -24,11 +24,11 @@ class Connection:
     """
 
     weight: Any
-    u: Any
-    target: Any
-    wo: Any
-    active: Any
-    sample: Any  # of the aperture
+    u: mi.Point2f
+    target: mi.Point3f
+    wo: mi.Vector3f
+    active: mi.Bool
+    sample: mi.Point2f  # of the aperture
     f: Any = None
     c: Any = None
 
@@ -37,23 +37,28 @@ def connect(
     plan: Plan,
     sensor: mi.Sensor,
     si: mi.SurfaceInteraction3f,
-    ray: mi.Ray3f,
+    ray: mi.Ray3f | None,
     sample: mi.Point2f,
     active: mi.Bool,
     attached: bool = False,
 ) -> Connection:
-    """Find where the vertex `si` appears on the film; film positions move with it if `attached`, else they do not."""
+    """Find where the vertex `si` appears on the film; film positions move with it if `attached`, else they do not.
+
+    `ray` reaches the vertex; None: light begins there, on an emitter.
+    """
     with dr.suspend_grad(when=not attached):
         ds, importance = sensor.sample_direction(si, sample, active)
         if plan.needs.principal_point:
             importance = _shifted_importance(sensor, ds)
         # From the vertex itself, where `ptracer` takes the shadow ray's direction, which starts a little off it.
         wo = si.to_local(ds.d)
-        correction, valid = shading_correction(plan, si, -ray.d, ds.d, wo)
+        correction, valid = mi.Float(1), mi.Bool(True)
+        if ray is not None:
+            correction, valid = shading_correction(plan, si, -ray.d, ds.d, wo)
         return Connection(importance * correction, ds.uv, ds.p, wo, active & valid & (ds.pdf > 0), sample)
 
 
-def _shifted_importance(sensor: Any, ds: Any) -> Any:
+def _shifted_importance(sensor: mi.Sensor, ds: Any) -> Any:
     """Importance and geometry of a pinhole camera whose principal point is not the film's centre.
 
     Mitsuba's own is zero wherever a film that is not shifted would end.
@@ -70,7 +75,7 @@ def _shifted_importance(sensor: Any, ds: Any) -> Any:
 class Seen:
     """What an earlier walk saw of the sensor: `visible`, in the lanes that are `known` (None: in all)."""
 
-    visible: Any
+    visible: mi.Bool
     known: Any = None
 
 
@@ -82,9 +87,9 @@ def stand_in(connection: Connection) -> tuple[Any, Any]:
 
 def passage(
     plan: Plan,
-    scene: Any,
-    si: Any,
-    depth: Any,
+    scene: mi.Scene,
+    si: mi.SurfaceInteraction3f,
+    depth: mi.UInt32,
     connection: Connection,
     seen: Seen | None = None,
     loop_mode: str = "symbolic",

@@ -3,14 +3,26 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Protocol
 
 import drjit as dr
 import mitsuba as mi
 
+from reslrb_cli.transport.lamps import lamp_ray
 from reslrb_cli.transport.plan import Plan
 
+if TYPE_CHECKING:
+    from reslrb_cli.transport.samples import Samples
+
 DEFENSIVE = 0.1  # share of directions that are drawn uniformly from an environment map
+
+
+class Numbered(Protocol):
+    """What draws random numbers: a sampler, or a stream beside it."""
+
+    def next_1d(self) -> mi.Float: ...
+
+    def next_2d(self) -> mi.Point2f: ...
 
 
 @dataclass
@@ -20,11 +32,12 @@ class Emission:
     `weight` tracks derivatives of emission where they are enabled; ray and density do where emitters move.
     """
 
-    ray: Any
-    weight: Any
+    ray: mi.Ray3f
+    weight: mi.Spectrum
+    emitter: mi.EmitterPtr
 
 
-def sample_time(plan: Plan, sensor: Any, sampler: Any) -> Any:
+def sample_time(plan: Plan, sensor: mi.Sensor, sampler: Numbered) -> mi.Float:
     """A time within the shutter interval; draws a number only where the shutter is open for some time."""
     time = mi.Float(sensor.shutter_open())
     if plan.needs.moving_shutter:
@@ -32,37 +45,53 @@ def sample_time(plan: Plan, sensor: Any, sampler: Any) -> Any:
     return time
 
 
-def sample_emission(plan: Plan, scene: Any, sensor: Any, sampler: Any) -> Emission:
+def sample_emission(samples: Samples, sampler: mi.Sampler) -> Emission:
     """Sample a ray from a random emitter of the scene. Draws as many numbers, in the same order, as `ptracer`."""
-    time = sample_time(plan, sensor, sampler)
+    plan, scene = samples.plan, samples.scene
+    time = sample_time(plan, samples.sensor, sampler)
     wavelength_sample, sample_2, sample_3 = sampler.next_1d(), sampler.next_2d(), sampler.next_2d()
-    environment = scene.environment() if plan.environment_map else None
-    if environment is None:
-        ray, weight, _ = scene.sample_emitter_ray(time, wavelength_sample, sample_2, sample_3, True)
-        return Emission(ray if plan.moving_emission else dr.detach(ray), weight)
+    if not (plan.environment_map or plan.placed_lamps):
+        ray, weight, emitter = scene.sample_emitter_ray(time, wavelength_sample, sample_2, sample_3, True)
+        return Emission(ray if plan.moving_emission else dr.detach(ray), weight, emitter)
 
     index, index_weight, reused = scene.sample_emitter(wavelength_sample, True)
-    is_environment = index == plan.needs.environment
-    ray, weight = _environment_ray(plan, scene, environment, time, sample_2, sample_3)
-    if len(plan.needs.emitters) > 1:
-        emitter = dr.gather(mi.EmitterPtr, scene.emitters_dr(), index)
-        ray_2, weight_2 = emitter.sample_ray(time, reused, sample_2, sample_3, ~is_environment)
-        ray = dr.select(is_environment, ray, ray_2)
-        weight = dr.select(is_environment, weight, weight_2)
-    return Emission(ray if plan.moving_emission else dr.detach(ray), weight * dr.detach(index_weight))
+    emitter = dr.gather(mi.EmitterPtr, scene.emitters_dr(), index)
+    lamps = {lamp.emitter: (lamp, samples.areas(lamp)) for lamp in plan.placed_lamps}
+
+    def leave(
+        self: mi.Emitter, time: mi.Float, number: mi.Float, position: mi.Point2f, direction: mi.Point2f, active: mi.Bool
+    ) -> tuple[mi.Ray3f, mi.Spectrum]:
+        if self in lamps:
+            lamp, areas = lamps[self]
+            return lamp_ray(lamp, areas, time, number, position, direction, active)
+        return self.sample_ray(time, number, position, direction, active)
+
+    if plan.environment_map:
+        is_environment = index == plan.needs.environment
+        ray, weight = _environment_ray(plan, scene.environment(), time, sample_2, sample_3)
+        if len(plan.needs.emitters) > 1:
+            other = dr.dispatch(emitter, leave, time, reused, sample_2, sample_3, ~is_environment)
+            ray, weight = (dr.select(is_environment, a, b) for a, b in zip((ray, weight), other, strict=True))
+    else:
+        # In an indirect call, although there may be one emitter alone: outside of one the derivative by each number of
+        # a transformation is a sum over all paths, for which they would be traced again.
+        ray, weight = dr.dispatch(emitter, leave, time, reused, sample_2, sample_3, mi.Bool(True))
+    return Emission(ray if plan.moving_emission else dr.detach(ray), weight * dr.detach(index_weight), emitter)
 
 
-def _environment_ray(plan: Plan, scene: Any, environment: Any, time: Any, disk: Any, direction: Any) -> tuple[Any, Any]:
+def _environment_ray(
+    plan: Plan, environment: mi.Emitter, time: mi.Float, disk: mi.Point2f, direction: mi.Point2f
+) -> tuple[mi.Ray3f, mi.Spectrum]:
     """A ray from an environment map, on a disk perpendicular to it that covers the scene's bounding sphere.
 
     Stock `envmap.sample_ray` places the disk in the map's local frame, which is wrong where `to_world` rotates it.
     Directions are drawn in proportion to the map's radiance, and, where that is differentiated, some uniformly: texels
     that are black beside a sun have derivatives as large as any.
     """
-    sphere = scene.bbox().bounding_sphere()
-    radius = sphere.radius * (1 + 1e-4)
+    assert plan.horizon is not None
+    center, radius = mi.Point3f(*plan.horizon.center), plan.horizon.radius * (1 + 1e-4)
     reference = dr.zeros(mi.Interaction3f)
-    reference.p, reference.time = mi.Point3f(sphere.center), time
+    reference.p, reference.time = center, time
     if plan.differentiate_emission:
         ds, weight = _any_direction(environment, reference, direction)
     else:
@@ -70,11 +99,13 @@ def _environment_ray(plan: Plan, scene: Any, environment: Any, time: Any, disk: 
     d = -dr.detach(ds.d)
     offset = mi.warp.square_to_uniform_disk_concentric(disk)
     perpendicular = mi.Frame3f(d).to_world(mi.Vector3f(offset.x, offset.y, 0))
-    ray = mi.Ray3f(sphere.center + (perpendicular - d) * radius, d, time, [])
+    ray = mi.Ray3f(center + (perpendicular - d) * radius, d, time, [])
     return ray, weight * (dr.pi * radius**2)
 
 
-def _any_direction(environment: Any, reference: Any, sample: Any) -> tuple[Any, Any]:
+def _any_direction(
+    environment: mi.Emitter, reference: mi.Interaction3f, sample: mi.Point2f
+) -> tuple[mi.DirectionSample3f, mi.Spectrum]:
     """A direction from a mixture of the environment's own density and the uniform one; radiance over density."""
     with dr.suspend_grad():
         uniform = sample.x < DEFENSIVE

@@ -7,6 +7,8 @@ from typing import Any
 
 import mitsuba as mi
 
+from reslrb_cli.scene.horizon import Horizon
+from reslrb_cli.scene.lamps import Lamp
 from reslrb_cli.scene.needs import SceneNeeds
 
 UNBOUNDED = 0xFFFFFFFF
@@ -35,9 +37,16 @@ class Plan:
     # rays that emitters send out.
     attached: bool = False
     moving_shapes: tuple[mi.Shape, ...] = ()
-    moving_emission: bool = False
+    moving_emitters: tuple[mi.Emitter, ...] = ()
     # Whether the normalisation of the reconstruction filter's weights has its derivative: finite differences have.
     attached_normalization: bool = True
+    # The sphere that infinite emitters light.
+    horizon: Horizon | None = None
+
+    @property
+    def moving_emission(self) -> bool:
+        """Whether any emitter moves."""
+        return bool(self.moving_emitters)
 
     @property
     def roulette(self) -> bool:
@@ -56,6 +65,24 @@ class Plan:
             self.needs.environment is not None
             and self.needs.emitters[self.needs.environment] == "EnvironmentMapEmitter"
         )
+
+    @property
+    def placed_lamps(self) -> tuple[Lamp, ...]:
+        """Shapes whose light we place ourselves."""
+        reshaped = self.reshaped_lamps
+        return tuple(lamp for lamp in self.needs.lamps if lamp.parallel or lamp.is_sphere or lamp in reshaped)
+
+    @property
+    def reshaped_lamps(self) -> tuple[Lamp, ...]:
+        """Those of them, meshes, whose faces move, and are drawn in proportion to their areas."""
+        return tuple(lamp for lamp in self.needs.lamps if lamp.faces_by_area and lamp.shape in self.moving_shapes)
+
+    @property
+    def visible_moving_lamps(self) -> tuple[Lamp, ...]:
+        """Shapes that move, emit in all directions, and may be seen directly."""
+        if not (self.visible_emission and self.moving_emission):
+            return ()
+        return tuple(lamp for lamp in self.needs.lamps if lamp.shape in self.moving_shapes and not lamp.parallel)
 
     @property
     def passage_in_gradient(self) -> bool:

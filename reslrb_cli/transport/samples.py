@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import drjit as dr
 import mitsuba as mi
 
+from reslrb_cli.scene.lamps import Lamp
+from reslrb_cli.transport.emission import Numbered
+from reslrb_cli.transport.lamps import sums_of_areas
 from reslrb_cli.transport.plan import Plan
 from reslrb_cli.transport.splat import Film
 from reslrb_cli.transport.visible import PrimaryRay, primary_ray
@@ -14,6 +17,7 @@ from reslrb_cli.transport.visible import PrimaryRay, primary_ray
 #: Names of the random streams beside the sampler's own, mixed into the seed.
 SELECTION_STREAM = 0x5E1EC7  # what hooks draw to select
 VISIBLE_STREAM = 0xD1EC7  # primary rays
+LAMP_STREAM = 0x1A3B5 << 12  # points of lamps; the lamp's number is added
 PASS_STREAM = 0x9A55E5  # seeds of the second pass and those after it
 #: Samples per pixel of one pass. In single precision a sum loses terms below a 2^24th of it, and thousands of such
 #: passes can be added to one another.
@@ -37,6 +41,16 @@ class Samples:
     width: int
     scale: mi.Float
     fraction: mi.Float
+    _areas: list[mi.Float] = field(init=False)  # of the lamps that are reshaped: `sums_of_areas`
+
+    def __post_init__(self) -> None:
+        # Now: in the midst of tracing they would cut a kernel in two.
+        self._areas = sums_of_areas(self.plan.reshaped_lamps)
+
+    def areas(self, lamp: Lamp) -> mi.Float | None:
+        """Sums of the areas of a lamp's faces, where these move; else None."""
+        reshaped = self.plan.reshaped_lamps
+        return self._areas[reshaped.index(lamp)] if lamp in reshaped else None
 
     def sampler(self) -> mi.Sampler:
         """A sampler at the beginning of these samples' stream."""
@@ -59,6 +73,10 @@ class Samples:
     def primary_ray(self) -> PrimaryRay:
         """Rays for C_0, from a stream of their own: the light paths are those of `ptracer` with or without them."""
         return primary_ray(self.plan, self.sensor, _NumberStream(self.stream(VISIBLE_STREAM)), self.width)
+
+    def lamp_numbers(self, lamp: Lamp) -> Numbered:
+        """Random numbers for points of a lamp that moves and is seen directly."""
+        return _NumberStream(self.stream(LAMP_STREAM + lamp.index))
 
 
 class _NumberStream:

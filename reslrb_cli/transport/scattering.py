@@ -42,19 +42,21 @@ class Scattering:
 
     weight: Any
     f: Any
-    wo: Any
-    d: Any
-    pdf: Any
-    eta: Any
-    correction: Any
-    is_delta: Any
-    is_null: Any
-    sample_1: Any
-    sample_2: Any
-    active: Any
+    wo: mi.Vector3f
+    d: mi.Vector3f
+    pdf: mi.Float
+    eta: mi.Float
+    correction: mi.Float
+    is_delta: mi.Bool
+    is_null: mi.Bool
+    sample_1: mi.Float
+    sample_2: mi.Point2f
+    active: mi.Bool
 
 
-def shading_correction(plan: Plan, si: Any, wi_world: Any, wo_world: Any, wo: Any) -> tuple[Any, Any]:
+def shading_correction(
+    plan: Plan, si: mi.SurfaceInteraction3f, wi_world: mi.Vector3f, wo_world: mi.Vector3f, wo: mi.Vector3f
+) -> tuple[Any, Any]:
     """Veach's factor for shading normals (thesis, p. 155) and whether both directions are on consistent sides.
 
     Without shading normals the factor is 1 and both sides are consistent by construction: neither is computed. With
@@ -71,9 +73,17 @@ def shading_correction(plan: Plan, si: Any, wi_world: Any, wo_world: Any, wo: An
 
 
 def scatter(
-    plan: Plan, si: Any, bsdf: Any, ray: Any, sample_1: Any, sample_2: Any, active: Any,
-    connection_wo: Any, connected: Any, attached: bool = False,
-) -> tuple[Scattering, Any]:  # fmt: skip
+    plan: Plan,
+    si: mi.SurfaceInteraction3f,
+    bsdf: mi.BSDFPtr,
+    ray: mi.Ray3f,
+    sample_1: mi.Float,
+    sample_2: mi.Point2f,
+    active: mi.Bool,
+    connection_wo: mi.Vector3f,
+    connected: mi.Bool | None,
+    attached: bool = False,
+) -> tuple[Scattering, Any]:
     """Sample the next direction, and evaluate f (C,) towards `connection_wo` in `connected` lanes (None: in no lane).
 
     Detached, unless `attached`; `tracked_factors` has the derivatives of the factors alone. Both queries share one
@@ -81,7 +91,16 @@ def scatter(
     """
     context = importance_context()
 
-    def both(self: Any, si: Any, wo: Any, sample_1: Any, sample_2: Any, connected: Any, active: Any, any_: Any) -> Any:
+    def both(
+        self: Any,
+        si: mi.SurfaceInteraction3f,
+        wo: mi.Vector3f,
+        sample_1: mi.Float,
+        sample_2: mi.Point2f,
+        connected: mi.Bool,
+        active: mi.Bool,
+        any_: Any,
+    ) -> Any:
         bs, weight = self.sample(context, si, sample_1, sample_2, active)
         return evaluate(plan, si, self, wo, connected), bs.wo, bs.pdf, bs.eta, bs.sampled_type, weight
 
@@ -161,7 +180,15 @@ def following(
 
 
 def _mixed(
-    si: Any, bsdf: Any, sample_2: Any, defensive: Any, active: Any, wo: Any, pdf: Any, eta: Any, lobe: Any
+    si: mi.SurfaceInteraction3f,
+    bsdf: mi.BSDFPtr,
+    sample_2: mi.Point2f,
+    defensive: mi.Bool,
+    active: mi.Bool,
+    wo: mi.Vector3f,
+    pdf: mi.Float,
+    eta: mi.Float,
+    lobe: mi.UInt32,
 ) -> tuple[Any, Any, Any, Any]:
     """A BSDF's sample, replaced by one of the cosine-weighted hemisphere in `defensive` lanes; the mixture's density.
 
@@ -180,13 +207,13 @@ def _mixed(
     return wo, pdf, eta, dr.select(defensive, mi.UInt32(int(mi.BSDFFlags.GlossyReflection)), lobe)
 
 
-def _delta_correction(wi: Any, wo: Any, eta: Any) -> Any:
+def _delta_correction(wi: mi.Vector3f, wo: mi.Vector3f, eta: mi.Float) -> Any:
     """cos_p wi / cos_p wo of a mirror or refraction, whose normal p is along wi + eta wo."""
     h = dr.fma(eta, wo, wi)
     return dr.abs(dr.dot(h, wi) / dr.dot(h, wo))
 
 
-def evaluate(plan: Plan, si: Any, bsdf: Any, wo: Any, active: Any) -> Any:
+def evaluate(plan: Plan, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, wo: mi.Vector3f, active: mi.Bool) -> Any:
     """A smooth lobe's bsdf * cos (C,) towards `wo`, for a path that carries importance."""
     if not plan.needs.has_perturbed_normals:
         return bsdf.eval(importance_context(), si, wo, active)
@@ -195,7 +222,9 @@ def evaluate(plan: Plan, si: Any, bsdf: Any, wo: Any, active: Any) -> Any:
     return bsdf.eval(mi.BSDFContext(mi.TransportMode.Radiance), exchanged, si.wi, active)
 
 
-def tracked_factor(plan: Plan, si: Any, bsdf: Any, scattering: Scattering, active: Any) -> Any:
+def tracked_factor(
+    plan: Plan, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, scattering: Scattering, active: mi.Bool
+) -> Any:
     """f (C,) with derivatives, of the event that `scattering` is.
 
     Call under `dr.resume_grad()`. What the scene has no lobes for is not compiled.
@@ -205,14 +234,22 @@ def tracked_factor(plan: Plan, si: Any, bsdf: Any, scattering: Scattering, activ
 
 
 def tracked_factors(
-    plan: Plan, si: Any, bsdf: Any, connection_wo: Any, connected: Any, scattering: Scattering, scattered: Any
+    plan: Plan,
+    si: mi.SurfaceInteraction3f,
+    bsdf: mi.BSDFPtr,
+    connection_wo: mi.Vector3f,
+    connected: mi.Bool,
+    scattering: Scattering,
+    scattered: mi.Bool,
 ) -> tuple[Any, Any]:
     """f (C,) towards the sensor and f along the path, both with derivatives, from one indirect call.
 
     Call under `dr.resume_grad()`.
     """
 
-    def both(self: Any, si: Any, wo_c: Any, wo_s: Any, connected: Any, smooth: Any, any_: Any) -> Any:
+    def both(
+        self: Any, si: mi.SurfaceInteraction3f, wo_c: Any, wo_s: Any, connected: mi.Bool, smooth: Any, any_: Any
+    ) -> Any:
         return evaluate(plan, si, self, wo_c, connected), evaluate(plan, si, self, wo_s, smooth)
 
     smooth = scattered & ~(scattering.is_delta | scattering.is_null)
@@ -220,7 +257,9 @@ def tracked_factors(
     return f_c, _singular_factor(plan, si, bsdf, scattering, scattered, f_s)
 
 
-def _singular_factor(plan: Plan, si: Any, bsdf: Any, scattering: Scattering, active: Any, f: Any) -> Any:
+def _singular_factor(
+    plan: Plan, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, scattering: Scattering, active: mi.Bool, f: Any
+) -> Any:
     """`f`, replaced where a delta lobe was sampled or light passed straight through, where that has derivatives."""
     if plan.differentiate_delta:
         delta = active & scattering.is_delta

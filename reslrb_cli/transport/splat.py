@@ -19,7 +19,7 @@ N_COLOR = 3  # a film's block holds R, G, B, perhaps alpha, and a weight that li
 class Film:
     """The film of one sensor as light tracing uses it: image blocks to splat into, adjoint images to look up."""
 
-    def __init__(self, sensor: Any) -> None:
+    def __init__(self, sensor: mi.Sensor) -> None:
         self.film = sensor.film()
         self.film.prepare([])
         self.size = self.film.crop_size()
@@ -32,7 +32,9 @@ class Film:
         block.set_coalesce(False)  # splats of neighbouring lanes land anywhere
         return block
 
-    def put(self, block: Any, u: Any, value: Any, active: Any, normalization: bool = False) -> None:
+    def put(
+        self, block: mi.ImageBlock, u: mi.Point2f, value: mi.Spectrum, active: mi.Bool, normalization: bool = False
+    ) -> None:
         """Add `value` (C,) at film position `u` (pixels, relative to the crop window) through the filter.
 
         Under naive AD the weights of the pixels move with `u`. Mitsuba divides them by their sum, which it detaches;
@@ -46,7 +48,7 @@ class Film:
             color = [showing(c) for c in color]  # they are added up one by one, not as a packet
         block.put(u + mi.Vector2f(self.offset), color + [mi.Float(0)] * (block.channel_count() - N_COLOR), active)
 
-    def develop(self, block: Any) -> Any:
+    def develop(self, block: mi.ImageBlock) -> Any:
         """The image (H, W, channels) in the film's own pixel format; differentiable with respect to the block."""
         self.film.prepare([])
         if block.channel_count() == len("RGBAW"):
@@ -56,13 +58,13 @@ class Film:
         self.film.put_block(block)
         return self.film.develop()
 
-    def develop_tangent(self, block: Any) -> Any:
+    def develop_tangent(self, block: mi.ImageBlock) -> Any:
         """Derivative of the image from that of the block: `develop` is linear but for the opaque alpha channel."""
         self.film.prepare([])
         self.film.put_block(block)
         return self.film.develop()
 
-    def adjoint(self, image_gradient: Any) -> AdjointImage:
+    def adjoint(self, image_gradient: mi.TensorXf) -> AdjointImage:
         """dL/d(block) from dL/d(developed image): what `AdjointImage` looks up."""
         with dr.resume_grad():
             block = self.block()
@@ -81,11 +83,11 @@ class AdjointImage:
     `image` is a flat array, H * W * `channels` values, in the order of the film's block.
     """
 
-    def __init__(self, film: Film, image: Any, channels: int) -> None:
+    def __init__(self, film: Film, image: mi.Float, channels: int) -> None:
         self.image, self.channels, self.film = image, channels, film
         self.filter = film.film.rfilter()
 
-    def lookup(self, u: Any, active: Any, normalization: bool = True) -> Any:
+    def lookup(self, u: mi.Point2f, active: mi.Bool, normalization: bool = True) -> Any:
         """delta (C,) at film position `u` (pixels, relative to the crop window), with its derivative by `u` if any.
 
         Without `normalization` the sum that the filter's weights are divided by has no derivative, as in Mitsuba.
@@ -96,7 +98,7 @@ class AdjointImage:
             return self._pixel(pixel, inside)
         return self._filtered(u, active, normalization)
 
-    def _pixel(self, pixel: Any, active: Any) -> Any:
+    def _pixel(self, pixel: mi.Point2u, active: mi.Bool) -> Any:
         index = dr.fma(pixel.y, mi.UInt32(self.film.size.x), pixel.x)
         if self.channels == len("RGBW"):
             color = dr.gather(mi.Vector4f, self.image, index, active)  # one packet
@@ -105,7 +107,7 @@ class AdjointImage:
         color = [color[c] for c in range(N_COLOR)]
         return mi.Spectrum(*color) if len(mi.Spectrum(0)) == N_COLOR else mi.Spectrum(sum(color))
 
-    def _filtered(self, u: Any, active: Any, normalization: bool) -> Any:
+    def _filtered(self, u: mi.Point2f, active: mi.Bool, normalization: bool) -> Any:
         first, (weights_x, weights_y), total = filter_weights(self.filter, u)
         if not normalization:
             total = dr.detach(total)

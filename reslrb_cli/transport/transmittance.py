@@ -30,19 +30,19 @@ class Passage:
     `reached` becomes true where nothing is left in the way.
     """
 
-    active: Any
-    value: Any
-    crossings: Any
-    reached: Any
+    active: mi.Bool
+    value: mi.Spectrum
+    crossings: mi.UInt32
+    reached: mi.Bool
     tangent: list[Any] = field(default_factory=list)
 
 
 def transmittance(
-    scene: Any,
+    scene: mi.Scene,
     start: Any,
-    target: Any,
-    limit: Any,
-    active: Any,
+    target: mi.Point3f,
+    limit: mi.UInt32,
+    active: mi.Bool,
     on_crossing: Callable[[Any, Any], None] | None = None,
     loop_mode: str = "symbolic",
     tangents: bool = False,
@@ -55,7 +55,7 @@ def transmittance(
     gradients are suspended then, since the loop itself must not track any.
     """
 
-    def body(passage: Passage, ray: Any) -> tuple[Passage, Any]:
+    def body(passage: Passage, ray: mi.Ray3f) -> tuple[Passage, Any]:
         si = scene.ray_intersect(ray, passage.active)
         hit = passage.active & si.is_valid()
         with dr.resume_grad(when=tangents):

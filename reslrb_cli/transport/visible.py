@@ -23,13 +23,13 @@ class PrimaryRay:
     """A ray through film position `u` (pixels, relative to the crop window); `weight` (C,) is its sensor importance
     times what brings a sum over lanes to the mean over each pixel's samples."""
 
-    ray: Any
-    u: Any
+    ray: mi.Ray3f
+    u: mi.Point2f
     weight: Any
-    active: Any
+    active: mi.Bool
 
 
-def primary_ray(plan: Plan, sensor: Any, sampler: Any, width: int) -> PrimaryRay:
+def primary_ray(plan: Plan, sensor: mi.Sensor, sampler: Any, width: int) -> PrimaryRay:
     """Sample `width` rays, as many in each pixel of the crop window, or one more."""
     size = sensor.film().crop_size()
     n_pixels = int(size[0] * size[1])
@@ -49,15 +49,15 @@ class _Look:
     """State of a primary ray on its way through null surfaces; `tangents`, in forward mode, are the derivatives of
     transmittance and radiance."""
 
-    active: Any
-    ray: Any
-    transmittance: Any
-    radiance: Any
-    crossings: Any
+    active: mi.Bool
+    ray: mi.Ray3f
+    transmittance: mi.Spectrum
+    radiance: mi.Spectrum
+    crossings: mi.UInt32
     tangents: list[Any] = field(default_factory=list)
 
 
-def visible_radiance(plan: Plan, scene: Any, primary: PrimaryRay, loop_mode: str = "symbolic") -> Any:
+def visible_radiance(plan: Plan, scene: mi.Scene, primary: PrimaryRay, loop_mode: str = "symbolic") -> Any:
     """Radiance (C,) that arrives along the primary ray, through null surfaces where the scene has any.
 
     With `loop_mode` evaluated it carries derivatives where they are enabled, for naive AD.
@@ -65,13 +65,13 @@ def visible_radiance(plan: Plan, scene: Any, primary: PrimaryRay, loop_mode: str
     return _look(plan, scene, primary, None, loop_mode).radiance
 
 
-def visible_tangent(plan: Plan, scene: Any, primary: PrimaryRay) -> Any:
+def visible_tangent(plan: Plan, scene: mi.Scene, primary: PrimaryRay) -> Any:
     """Derivative (C,) of that radiance along the parameters' tangents (forward mode)."""
     with dr.suspend_grad():  # the loop itself tracks nothing
         return _look(plan, scene, primary, None, "symbolic", tangents=True).tangents[1]
 
 
-def differentiate_visible_radiance(plan: Plan, scene: Any, primary: PrimaryRay, adjoint: Any) -> None:
+def differentiate_visible_radiance(plan: Plan, scene: mi.Scene, primary: PrimaryRay, adjoint: mi.Spectrum) -> None:
     """Add the derivatives of the radiance along the primary rays, times `adjoint` (C,), to the parameters.
 
     Transmission is divided out of the radiance behind it, which a first look measures.
@@ -79,7 +79,7 @@ def differentiate_visible_radiance(plan: Plan, scene: Any, primary: PrimaryRay, 
     masks = plan.differentiate_null
     total = visible_radiance(plan, scene, primary) if masks else mi.Spectrum(0)
 
-    def differentiate(state: _Look, Le: Any, radiance: Any, transmission: Any) -> None:
+    def differentiate(state: _Look, Le: Any, radiance: mi.Spectrum, transmission: Any) -> None:
         weight = dr.select(state.active, adjoint * state.transmittance, 0)
         objective = weight * Le if plan.differentiate_emission else mi.Spectrum(0)
         if masks:
@@ -94,14 +94,15 @@ def differentiate_visible_radiance(plan: Plan, scene: Any, primary: PrimaryRay, 
 
 def _look(
     plan: Plan,
-    scene: Any,
+    scene: mi.Scene,
     primary: PrimaryRay,
     on_surface: Callable[..., None] | None,
     mode: str,
     tangents: bool = False,
 ) -> Any:
     def look(state: _Look) -> tuple[_Look]:
-        si = scene.ray_intersect(state.ray, state.active)
+        with dr.suspend_grad():  # where shapes move, `visible_lamps.py` has the derivative
+            si = scene.ray_intersect(state.ray, state.active)
         hit = state.active & si.is_valid()
         with dr.resume_grad(when=tangents):
             Le = si.emitter(scene).eval(si, state.active)

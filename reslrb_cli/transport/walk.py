@@ -47,7 +47,7 @@ def walk(samples: Samples, hooks: Hooks, active: mi.Bool | bool = True) -> Any:
 
     # ---- Leave the emitter ----
     loop_mode = "evaluated" if hooks.tracked and hooks.max_iterations is None else "symbolic"
-    emission = sample_emission(plan, scene, sensor, sampler)
+    emission = sample_emission(samples, sampler)
     product, active, eta = Product.one(plan.track_zeros, hooks.tracked), mi.Bool(active), mi.Float(1)
     if not hooks.replaying:
         product = product.times(emission.weight, mi.Int32(0))

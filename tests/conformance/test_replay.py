@@ -106,7 +106,7 @@ def test_replay_meets_the_same_vertices(name: str):
         kept = context.walk(Recording(context, 1, "luminance", False))
         dr.eval(kept)
         slot, active = kept.state.slots[0], kept.state.W > 0
-        emission = sample_emission(samples.plan, scene.scene, samples.sensor, samples.sampler()).weight
+        emission = sample_emission(samples, samples.sampler()).weight
         _, C, p, u, I = context.walk(Rewalk(samples, kept, emission), active)  # noqa: E741
         stored = slot.C.value()
         dr.eval(C, p, u, I, stored)

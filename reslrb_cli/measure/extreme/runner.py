@@ -20,8 +20,6 @@ from reslrb_cli.records.gradcheck import GradcheckRecord, Kind, Reference, Verdi
 
 #: All z scores of the suite are corrected for together; a little more than it has.
 FAMILY = Family(rows=1500, entries=30000)
-#: Estimators that use every connection of a path, so that equal seeds give equal gradients.
-EXACT = ("gather", "stack")
 #: What rounding may leave below zero, of the largest entry.
 BELOW_ZERO = 1e-5
 
@@ -99,7 +97,7 @@ def _comparisons(
     for parameter, columns, shape in _parameters(setup):
         if naive is not None:
             mine, its = ours[:, columns], naive[:, columns]
-            if name in EXACT:
+            if ESTIMATORS[name].exact:
                 kind, found = Kind.EQUAL_SEEDS, compare_equal_seeds(mine, its, case.equal)
             else:
                 kind, found = Kind.EXPECTATION, compare_expectations(mine, its, FAMILY, shape=shape)

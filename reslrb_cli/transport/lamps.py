@@ -1,0 +1,79 @@
+"""Light that leaves surfaces, where Mitsuba's own samples of it are wrong, or lack a derivative.
+
+sphere             Mitsuba turns the points of a sphere with its `to_world`, and not their normals
+directionalarea    it remembers the area that the shape had when it was loaded
+mesh that moves    it draws a face in proportion to its area, and so divides by the area of the whole. Both are
+                   constants to it; the density on face f is P_f / A_f(theta), of which P_f alone is one
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import drjit as dr
+import mitsuba as mi
+
+from reslrb_cli.scene.lamps import Lamp
+
+
+def lamp_ray(
+    lamp: Lamp,
+    areas: mi.Float | None,
+    time: mi.Float,
+    wavelength_sample: mi.Float,
+    position: mi.Point2f,
+    direction: mi.Point2f,
+    active: mi.Bool,
+) -> tuple[mi.Ray3f, mi.Spectrum]:
+    """A ray that leaves the lamp, and radiance over density (C,), from the numbers that Mitsuba takes.
+
+    `areas` are the sums of `sums_of_areas` for a mesh whose faces move, else None.
+    """
+    si, weight = lamp_point(lamp, areas, time, position, active)
+    _, radiance = lamp.emitter.sample_wavelengths(si, wavelength_sample, active)
+    if lamp.parallel:
+        d = mi.Vector3f(si.n)
+    else:
+        d, weight = si.to_world(mi.warp.square_to_cosine_hemisphere(direction)), weight * dr.pi
+    si.time = time
+    return si.spawn_ray(d), radiance * weight
+
+
+def lamp_point(
+    lamp: Lamp, areas: mi.Float | None, time: mi.Float, sample: mi.Point2f, active: mi.Bool
+) -> tuple[mi.SurfaceInteraction3f, mi.Float]:
+    """A point of the lamp, and the reciprocal of its density; both move with the lamp."""
+    ps, weight = lamp.emitter.sample_position(time, sample, active)
+    if lamp.is_sphere:
+        center = mi.traverse(lamp.shape)["to_world"] @ mi.Point3f(0)
+        outward = dr.normalize(ps.p - center)
+        ps.n = mi.Normal3f(-outward if lamp.shape.has_flipped_normals() else outward)
+    if areas is not None:
+        face = drawn_face(areas, sample.y)
+        area = face_area(lamp.shape, face)
+        weight = weight * (area / dr.detach(area))
+        si = mi.SurfaceInteraction3f(ps, mi.Color0f())
+        si.n = lamp.shape.face_normal(face)  # `ps.n` is interpolated where the mesh has vertex normals
+        return si, weight
+    return mi.SurfaceInteraction3f(ps, mi.Color0f()), weight
+
+
+def sums_of_areas(lamps: Sequence[Lamp]) -> list[mi.Float]:
+    """Of each lamp, a mesh, the areas of its first faces, summed: (F,), evaluated and detached."""
+    with dr.suspend_grad():
+        found = [dr.cumsum(face_area(lamp.shape, dr.arange(mi.UInt32, lamp.shape.face_count()))) for lamp in lamps]
+        dr.eval(found)
+        return found
+
+
+def face_area(mesh: mi.Mesh, face: mi.UInt32) -> mi.Float:
+    """The area of a face of a mesh."""
+    a, b, c = (mesh.vertex_position(vertex) for vertex in mesh.face_indices(face))
+    return 0.5 * dr.norm(dr.cross(b - a, c - a))
+
+
+def drawn_face(areas: mi.Float, sample: mi.Float) -> mi.UInt32:
+    """The face that Mitsuba draws with this number, by these sums of areas."""
+    last = dr.width(areas) - 1
+    value = sample * dr.gather(mi.Float, areas, mi.UInt32(last))
+    return dr.binary_search(0, last, lambda index: dr.gather(mi.Float, areas, index) < value)

@@ -1,0 +1,152 @@
+"""The cases of test_attached.py: which scene, what of it moves, and what it is compared with."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+from conformance.moving import (
+    GLASS,
+    WHITE,
+    Latents,
+    Moving,
+    Place,
+    beam,
+    camera,
+    enclosed,
+    flat,
+    rippled,
+    sheet,
+    textured,
+    transform,
+    turned,
+    under_glass,
+)
+
+from reslrb_cli.measure.small_scenes import bitmap, diffuse, rgb
+
+#: Relative L2 distance at equal seeds that rounding makes, through smooth glass and mirrors, and through rough ones.
+SMOOTH, ROUGH = 5e-5, 5e-4
+
+
+@dataclass(frozen=True)
+class AttachedCase:
+    """One scene and what is differentiated, as `Moving` takes them; `scene` is a function, since it needs Mitsuba.
+
+    `stock`: Mitsuba's own `ptracer` has these derivatives too. `both` are options of all integrators, `ours` of
+    `reslrb` alone. `quick`: part of the default suite.
+    """
+
+    name: str
+    scene: Callable[[], dict[str, Any]]
+    start: dict[str, Any]
+    place: Place | None = None
+    depth: int = 5
+    stock: bool = True
+    limit: float = SMOOTH
+    spp: int = 16
+    sensor: int = 0
+    both: dict[str, Any] = field(default_factory=dict)
+    ours: dict[str, Any] = field(default_factory=dict)
+    quick: bool = False
+
+    def moving(self) -> Moving:
+        """The scene, loaded."""
+        return Moving(self.scene(), self.start, self.place, self.sensor)
+
+
+def rough(alpha: float = 0.1) -> dict[str, Any]:
+    """Rough glass."""
+    return {"type": "roughdielectric", "distribution": "ggx", "alpha": alpha, "int_ior": 1.5}
+
+
+def mirrored(bsdf: dict[str, Any]) -> dict[str, Any]:
+    """Slanted parallel light off a rippled mirror, which faces up, onto a receiver above; the camera is between."""
+    down = mi.ScalarTransform4f().look_at([-2, 2, 0], [0, 0, 0], [0, 1, 0]) @ mi.ScalarTransform4f().scale(0.5)
+    receiver = {"type": "rectangle", "to_world": transform(translate=[2, 2, 0], rotate=([1, 0, 0], 90)), "bsdf": WHITE}
+    up = mi.ScalarTransform4f().look_at([2, 1, 0], [2, 2, 0], [0, 0, -1])
+    return {"type": "scene", "camera": camera() | {"to_world": up}, "mirror": sheet("mirror", bsdf, 0.0),
+            "lamp": beam() | {"to_world": down}, "receiver": receiver}  # fmt: skip
+
+
+def two_lenses() -> dict[str, Any]:
+    """A ball of glass between the slab and the receiver."""
+    ball = {"type": "sphere", "center": [0.1, 1.2, 0.05], "radius": 0.3, "bsdf": GLASS}
+    return under_glass(ball=ball, camera=camera() | {"to_world": mi.ScalarTransform4f().look_at(
+        [0.9, 0.9, 0.9], [0, 0, 0], [0, 1, 0])})  # fmt: skip
+
+
+def move_ball(params: mi.SceneParameters, latents: Latents) -> None:
+    """The ball to the side, and larger."""
+    moved = mi.AffineTransform4f().translate(mi.Vector3f(latents["x"], 0, 0))
+    ball = mi.AffineTransform4f(transform(translate=[0.1, 1.2, 0.05], scale=0.3).matrix)
+    params["ball.to_world"] = moved @ ball @ mi.AffineTransform4f().scale(latents["size"])
+
+
+def tilt_receiver(params: mi.SceneParameters, latents: Latents) -> None:
+    """The receiver turned about z and lifted."""
+    moved = turned(latents["angle"], [0, 0, 1], [0, latents["y"], 0])
+    params["receiver.to_world"] = moved @ mi.AffineTransform4f(transform(rotate=([1, 0, 0], -90)).matrix)
+
+
+def stretch_slab(params: mi.SceneParameters, latents: Latents) -> None:
+    """The slab's ripples times a number, and the slab lifted."""
+    heights, rest = (mi.Float(rippled(2.0, 12, ripples).astype(np.float32).ravel()) for ripples in (1.0, 0.0))
+    up = np.tile(np.array([0, 1, 0], np.float32), 13 * 13)
+    params["slab.vertex_positions"] = rest + (heights - rest) * latents["size"] + mi.Float(up) * latents["lift"]
+
+
+SLAB = {"slab.vertex_positions": None}
+CASES = [
+    # ---- What a walk may do, through smooth glass ----
+    AttachedCase("slab", under_glass, SLAB, quick=True),
+    AttachedCase("slab_9", under_glass, SLAB, depth=9),
+    AttachedCase("slab_16", under_glass, SLAB, depth=16),
+    AttachedCase("texture_beside", lambda: under_glass(receiver=textured()),
+                 SLAB | {"receiver.bsdf.reflectance.data": None}, depth=6),
+    AttachedCase("bounces", lambda: enclosed(receiver=textured()),
+                 SLAB | {"receiver.bsdf.reflectance.data": None, "lamp.emitter.radiance.value": None,
+                         "shell.bsdf.reflectance.value": None}, depth=7),
+    AttachedCase("bounces_4", enclosed, SLAB, depth=4),
+    AttachedCase("bounces_16", lambda: enclosed(albedo=0.9), SLAB, depth=16),
+    AttachedCase("two_lenses", two_lenses, SLAB | {"x": 0.0, "size": 1.0}, move_ball, depth=9),
+    AttachedCase("roulette", lambda: enclosed(albedo=0.9), SLAB, depth=10, stock=False, both={"rr_depth": 2}),
+    AttachedCase("stack_of_2", lambda: enclosed(albedo=0.9), SLAB, depth=6, stock=False, ours={"stack_size": 2},
+                 both={"rr_depth": 3}, quick=True),
+    AttachedCase("passes", under_glass, SLAB, stock=False, both={"samples_per_pass": 8}, quick=True),
+    AttachedCase("receiver", enclosed, {"angle": 5.0, "y": 0.1}, tilt_receiver, depth=6),
+    AttachedCase("latents", under_glass, {"size": 1.0, "lift": 0.0}, stretch_slab),
+    # ---- Sensors and films ----
+    AttachedCase("thin_lens", lambda: under_glass(camera=camera(sensor="thinlens")), SLAB),
+    AttachedCase("second_sensor", lambda: under_glass(other=camera(size=24) | {
+                     "to_world": mi.ScalarTransform4f().look_at([0.3, 1.2, 0.4], [0, 0, 0], [0, 1, 0])}), SLAB,
+                 sensor=1),
+    AttachedCase("crop", lambda: under_glass(camera=camera("tent", crop_offset_x=5, crop_offset_y=9, crop_width=17,
+                                                           crop_height=13)), SLAB),
+    AttachedCase("lanczos", lambda: under_glass(camera=camera("lanczos", pixel_format="luminance")), SLAB),
+    # ---- Mirrors, rough surfaces, other BSDFs ----
+    AttachedCase("mirror", lambda: mirrored({"type": "conductor", "material": "Ag"}),
+                 {"mirror.vertex_positions": None}),
+    AttachedCase("rough_mirror", lambda: mirrored({"type": "roughconductor", "alpha": 0.15, "material": "Al"}),
+                 {"mirror.vertex_positions": None}, limit=ROUGH),
+    AttachedCase("rough_slab", lambda: enclosed(rough()), SLAB, depth=5, limit=ROUGH, quick=True),
+    AttachedCase("rough_slab_9", lambda: enclosed(rough()), SLAB, depth=9, limit=ROUGH),
+    AttachedCase("roughness_and_index", lambda: enclosed(rough(0.2)),
+                 SLAB | {"slab.bsdf.alpha.value": None, "slab.bsdf.eta": None}, limit=ROUGH, depth=6),
+    AttachedCase("roughness_alone", lambda: under_glass(rough(0.2)),
+                 {"slab.bsdf.alpha.value": None, "slab.bsdf.eta": None}, limit=ROUGH, depth=6,
+                 ours={"attached": True}),
+    AttachedCase("plastic", lambda: enclosed(receiver=flat({"type": "roughplastic", "alpha": 0.3})), SLAB, depth=6,
+                 stock=False, limit=ROUGH),
+    AttachedCase("principled", lambda: enclosed(receiver=flat({
+                     "type": "principled", "base_color": rgb(0.6, 0.5, 0.4), "roughness": 0.4, "metallic": 0.3})),
+                 SLAB, depth=6, stock=False, limit=ROUGH),
+    AttachedCase("blend", lambda: enclosed(receiver=flat({
+                     "type": "blendbsdf", "weight": bitmap([[[0.3], [0.6]], [[0.8], [0.4]]], "bilinear"),
+                     "first": diffuse(0.8, 0.3, 0.2), "second": {"type": "roughconductor", "alpha": 0.3}})),
+                 SLAB, depth=6, stock=False, limit=ROUGH),
+    AttachedCase("two_sided", lambda: enclosed(receiver=flat({"type": "twosided", "bsdf": WHITE})), SLAB, depth=6),
+]  # fmt: skip

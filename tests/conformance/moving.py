@@ -1,0 +1,212 @@
+"""Scenes in which something moves light, and what of them is differentiated: for test_attached.py and test_moving_*.py.
+
+Light leaves in parallel or in a cone, goes through glass or off a mirror, and falls on a receiver that a camera looks
+down on. y is up; the camera sees the receiver alone, and no emitter.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from reslrb_cli.integrators import known_step, render_image
+from reslrb_cli.integrators.interface import StepIntegrator
+from reslrb_cli.measure.small_scenes import diffuse, load, rgb, texture, transform
+
+SIZE = 32
+#: Slopes that bend light, and do not fold: amplitude, wave vector and phase of each wave.
+WAVES = ((0.0135, (5.1, 2.3), 0.4), (0.012, (-3.7, 5.9), 1.9), (0.0062, (7.9, -4.6), 4.1), (0.0055, (2.2, -8.8), 2.7))
+
+#: Numbers, or arrays of them, that a case is differentiated by.
+Latents = dict[str, Any]
+Place = Callable[[mi.SceneParameters, Latents], None]
+
+
+@dataclass
+class Moving:
+    """A scene whose parameters are a function of `start`, a number or a row of them for each name.
+
+    Names that are keys of the scene are set as they are, and start where the scene has them if `start` says None. With
+    all others, as Dr.Jit arrays, `place(params, latents)` sets parameters of the scene, which follow their derivatives.
+    """
+
+    scene: dict[str, Any]
+    start: dict[str, Any]
+    place: Place | None = None
+    sensor: int = 0
+    seed: int = 7
+    loaded: mi.Scene = field(init=False)
+    params: mi.SceneParameters = field(init=False)
+    weights: mi.TensorXf = field(init=False)
+    image: np.ndarray = field(init=False)  # of the last step
+
+    def __post_init__(self) -> None:
+        self.loaded = load(self.scene)
+        self.params = mi.traverse(self.loaded)
+        self.start = {
+            name: np.array(self.params[name], np.float64).ravel() if value is None else np.float64(value)
+            for name, value in self.start.items()
+        }
+        film = self.loaded.sensors()[self.sensor].film()
+        width, height = film.crop_size()
+        shape = (int(height), int(width), int(film.base_channels_count()))
+        self.weigh(np.random.default_rng(self.seed).uniform(0.2, 1.8, shape))
+
+    def weigh(self, weights: np.ndarray) -> None:
+        """Set dL/dI, (H, W, C)."""
+        self.weights = mi.TensorXf(np.ascontiguousarray(weights, np.float32)) + dr.opaque(mi.Float, 0)
+        dr.make_opaque(self.weights)
+
+    def set(self, latents: Latents) -> None:
+        """Move what moves."""
+        for key in latents.keys() & self.params.properties.keys():
+            self.params[key] = _as(self.params[key], latents[key])
+        if self.place is not None:
+            self.place(self.params, {name: value for name, value in latents.items() if name not in self.params})
+        self.params.update()
+
+    def gradient(self, integrator: StepIntegrator, seed: int = 1, spp: int = 16) -> dict[str, np.ndarray]:
+        """The derivative of sum(image * weights) by each of the latents, from one step."""
+        leaves = {name: _leaf(value) for name, value in self.start.items()}
+        dr.enable_grad(list(leaves.values()))
+        # Copies: a parameter may be what a latent is, and `update` may put something else in its place.
+        self.set({name: type(leaf)(leaf) for name, leaf in leaves.items()})
+        step = known_step(integrator, self.loaded, self.sensor, self.weights, seed=seed, spp=spp, params=self.params)
+        self.image = np.array(step.image, np.float64)
+        result = {name: np.array(dr.grad(leaf), np.float64).ravel() for name, leaf in leaves.items()}
+        self.set({name: dr.detach(leaf) for name, leaf in leaves.items()})
+        return result
+
+    def value(self, integrator: StepIntegrator, seed: int, spp: int, **shifts: float) -> float:
+        """The objective, with some of the latents shifted."""
+        self.set({name: _leaf(value + shifts.get(name, 0.0)) for name, value in self.start.items()})
+        image = np.array(render_image(integrator, self.loaded, self.sensor, seed, spp), np.float64)
+        return float(np.sum(image * np.array(self.weights, np.float64)))
+
+    def difference(self, integrator: StepIntegrator, name: str, step: float, seed: int = 1, spp: int = 16) -> float:
+        """Central difference by one latent, at common random numbers; of fourth order, from two steps."""
+        near, far = (
+            (self.value(integrator, seed, spp, **{name: h}) - self.value(integrator, seed, spp, **{name: -h})) / (2 * h)
+            for h in (step, 2 * step)
+        )
+        self.set({key: _leaf(value) for key, value in self.start.items()})
+        return (4 * near - far) / 3
+
+
+def _leaf(value: Any) -> mi.Float:
+    """A number or a row in memory of its own: NumPy's would have kernels depend on how it is aligned."""
+    leaf = mi.Float(np.atleast_1d(np.asarray(value, np.float32))) + dr.opaque(mi.Float, 0)
+    dr.make_opaque(leaf)
+    return leaf
+
+
+def _as(current: Any, value: mi.Float) -> Any:
+    """A row as the type that a parameter has."""
+    if dr.is_tensor_v(current):
+        return type(current)(value, current.shape)
+    return dr.unravel(type(current), value, order="C") if dr.depth_v(current) > 1 else value
+
+
+# ---- Things ----
+
+
+def height(x: Any, z: Any) -> Any:
+    """The height of a rippled surface."""
+    return sum(a * np.sin(kx * x + kz * z + phase) for a, (kx, kz), phase in WAVES)
+
+
+def rippled(y: float, cells: int, ripples: float = 1.0, side: float = 1.0) -> np.ndarray:
+    """The vertices of a `sheet`, (N, 3)."""
+    axis = np.linspace(-1, 1, cells + 1)
+    x, z = np.meshgrid(axis, axis, indexing="ij")
+    return np.stack([side * x, y + ripples * height(x, z), side * z], -1).reshape(-1, 3)
+
+
+def sheet(name: str, bsdf: dict[str, Any], y: float, cells: int = 12, ripples: float = 1.0, side: float = 1.0,
+          **things: Any) -> mi.Mesh:  # fmt: skip
+    """A horizontal mesh that faces up, a square of `cells` x `cells`, rippled, with interpolated normals and texture
+    coordinates; `things` go into its dictionary (an emitter)."""
+    axis = np.linspace(-1, 1, cells + 1)
+    x, z = np.meshgrid(axis, axis, indexing="ij")
+    positions = rippled(y, cells, ripples, side)
+    at = np.arange((cells + 1) ** 2).reshape(cells + 1, cells + 1)
+    a, b, c, d = at[:-1, :-1], at[1:, :-1], at[1:, 1:], at[:-1, 1:]
+    faces = np.concatenate([np.stack([a, c, b], -1).reshape(-1, 3), np.stack([a, d, c], -1).reshape(-1, 3)])
+    properties = mi.Properties()
+    for key, thing in {"bsdf": bsdf, **things}.items():
+        properties[key] = mi.load_dict(thing)
+    mesh = mi.Mesh(name, len(positions), len(faces), properties, has_vertex_normals=True, has_vertex_texcoords=True)
+    params = mi.traverse(mesh)
+    params["vertex_positions"] = positions.astype(np.float32).ravel()
+    params["vertex_texcoords"] = np.stack([(x + 1) / 2, (z + 1) / 2], -1).astype(np.float32).ravel()
+    params["faces"] = faces.astype(np.uint32).ravel()
+    params.update()
+    return mesh
+
+
+def camera(rfilter: str = "gaussian", size: int = SIZE, sensor: str = "perspective", **film: Any) -> dict[str, Any]:
+    """A camera that looks down on the receiver."""
+    lens = {"aperture_radius": 0.1, "focus_distance": 1.2} if sensor == "thinlens" else {}
+    return {
+        "type": sensor, "fov": 90, **lens,
+        "to_world": mi.ScalarTransform4f().look_at([0, 1, 0], [0, 0, 0], [0, 0, -1]),
+        "film": {"type": "hdrfilm", "width": size, "height": size, "pixel_format": "rgb",
+                 "rfilter": {"type": rfilter}, **film},
+        "sampler": {"type": "independent"},
+    }  # fmt: skip
+
+
+def flat(bsdf: dict[str, Any], y: float = 0.0, scale: float = 1.0, **things: Any) -> dict[str, Any]:
+    """A rectangle that faces up."""
+    return {"type": "rectangle", "to_world": transform(translate=[0, y, 0], rotate=([1, 0, 0], -90), scale=scale),
+            "bsdf": bsdf} | things  # fmt: skip
+
+
+def beam(scale: float = 0.8, y: float = 3.0) -> dict[str, Any]:
+    """Parallel light, straight down."""
+    return {"type": "rectangle", "to_world": transform(translate=[0, y, 0], rotate=([1, 0, 0], 90), scale=scale),
+            "emitter": {"type": "directionalarea", "radiance": rgb(3.2, 3.0, 2.6)}}  # fmt: skip
+
+
+GLASS = {"type": "dielectric", "int_ior": 1.5, "ext_ior": 1.0}
+WHITE = diffuse(0.8, 0.7, 0.6)
+
+
+def under_glass(bsdf: dict[str, Any] | None = None, cells: int = 12, **changes: Any) -> dict[str, Any]:
+    """Parallel light through a slab, flat above and rippled below (`slab`), onto the receiver.
+
+    `changes` replace or add objects; None takes one away.
+    """
+    bsdf = bsdf or GLASS
+    scene = {
+        "type": "scene",
+        "camera": camera(),
+        "receiver": flat(WHITE),
+        # Light comes from inside of the glass: its outside is below.
+        "top": flat(bsdf, 2.2),
+        "slab": sheet("slab", bsdf, 2.0, cells),
+        "lamp": beam(),
+    } | changes
+    return {key: value for key, value in scene.items() if value is not None}
+
+
+def textured() -> dict[str, Any]:
+    """A receiver with a texture of its own, `receiver.bsdf.reflectance.data`."""
+    return flat({"type": "diffuse", "reflectance": texture(4, 4)})
+
+
+def enclosed(bsdf: dict[str, Any] | None = None, albedo: float = 0.7, **changes: Any) -> dict[str, Any]:
+    """The same inside a sphere, where light goes on after it has met the receiver."""
+    shell = {"type": "sphere", "center": [0, 1.3, 0], "radius": 2.0, "flip_normals": True,
+             "bsdf": diffuse(albedo, 0.9 * albedo, albedo)}  # fmt: skip
+    return under_glass(bsdf, shell=shell, **changes)
+
+
+def turned(angle: Any, axis: Any, shift: list[Any]) -> Any:
+    """A rotation by `angle` (degrees), then a translation, whose derivatives those of the numbers are."""
+    return mi.AffineTransform4f().translate(mi.Vector3f(*shift)) @ mi.AffineTransform4f().rotate(axis, angle)

@@ -1,0 +1,277 @@
+"""Emitters that move: derivatives by where they are, against finite differences with common random numbers."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from conformance.moving import Moving, flat
+from conformance.moving_lamps import CASES, PIVOT, LampCase, mesh, over_floor, smooth_weights, surface
+from measure.faults import Fault
+from measure.test_mutations import plant
+
+from reslrb_cli.errors import UnsupportedScene
+from reslrb_cli.integrators import render_image
+from reslrb_cli.integrators.interface import StepIntegrator
+from reslrb_cli.integrators.plan_report import count, tracking
+from reslrb_cli.measure.comparison import Family, compare_expectations
+from reslrb_cli.measure.gradients import integrator, relative, seeds
+from reslrb_cli.measure.small_scenes import diffuse, load, rgb, transform
+from reslrb_cli.records.gradcheck import Verdict
+
+pytestmark = pytest.mark.usefixtures("llvm")
+
+#: What derivatives may differ by from finite differences, relative to the root mean square of those of a case.
+CLOSE = 0.005
+FAMILY = Family(len(CASES), 5 * len(CASES))
+
+
+def tracer(case: LampCase, name: str = "reslrb") -> StepIntegrator:
+    """`stack`, or naive AD of the same walk."""
+    own: dict[str, Any] = {"estimator": "stack"} if name == "reslrb" else {"attached": True}
+    return integrator(name, **{"max_depth": 2, "hide_emitters": True} | own | case.options)
+
+
+def compare(case: LampCase, count: int) -> Any:
+    """Derivatives by each latent, in units in which they are alike, and differences, at the same seeds."""
+    moving, ours = case.moving(), tracer(case)
+    units = {name: 10.0 if name == "angle" else 1.0 for name in case.start}
+    steps, differences = [], []
+    for seed in seeds(count):
+        gradient = moving.gradient(ours, seed, case.spp)
+        steps.append([gradient[name][0] * unit for name, unit in units.items()])
+        differences.append([
+            moving.difference(ours, name, case.step * unit, seed, case.spp) * unit for name, unit in units.items()
+        ])  # fmt: skip
+    mine, theirs = np.array(steps), np.array(differences)
+    size = float(np.sqrt(np.mean(theirs.mean(0) ** 2)))
+    return compare_expectations(mine, theirs, FAMILY, bias=CLOSE * size, rounding=0.0)
+
+
+def check(case: LampCase, count: int) -> None:
+    """Assert that derivatives and differences agree, and well enough to say so."""
+    found = compare(case, count)
+    print(case.name, found)
+    assert found.verdict is not Verdict.FAILS, found
+    assert (found.relative_l2 or 0.0) < 0.05, found
+
+
+@pytest.mark.parametrize("case", [pytest.param(c, id=c.name, marks=() if c.quick else pytest.mark.long) for c in CASES])
+def test_finite_differences(case: LampCase):
+    check(case, 4 if case.quick else case.seeds)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
+def test_naive_ad(case: LampCase):
+    moving = case.moving()
+    ours, naive = (moving.gradient(tracer(case, name), 1, case.spp) for name in ("reslrb", "walk_ad"))
+    for name, value in ours.items():
+        size = np.sqrt(np.mean([float(other @ other) for other in naive.values()]))
+        assert abs(value - naive[name])[0] <= 5e-5 * max(size, abs(naive[name][0])), name
+
+
+# ---- What Mitsuba keeps from before a shape moved ----
+
+
+def image(scene: Any, name: str = "reslrb", spp: int = 64, **options: Any) -> np.ndarray:
+    """The image of a scene, without emitters that are seen directly."""
+    options = {"max_depth": 2, "hide_emitters": True} | options
+    return np.array(render_image(integrator(name, **options), scene, 0, 5, spp), np.float64)
+
+
+SKIES = {
+    "constant": {"type": "constant"},
+    "directional": {"type": "directional", "direction": [0.1, -1, 0]},
+    "envmap": {"type": "envmap", "data": None},
+    "sunsky": {"type": "sunsky"},
+}
+
+
+def tiles(x: float, sky: dict[str, Any]) -> dict[str, Any]:
+    """Two squares, one of them `x` aside, under a sky."""
+    if sky["type"] == "envmap":
+        sky = {"type": "envmap", "bitmap": mi.Bitmap(np.ones((4, 8, 3), np.float32))}
+    above = mi.ScalarTransform4f().look_at([0, 12, 0], [0, 0, 0], [0, 0, -1])
+    other = flat(diffuse(0.8, 0.8, 0.8), scale=0.5) | {"to_world": _aside(x)}
+    return over_floor(sky, floor=flat(diffuse(0.8, 0.8, 0.8), scale=0.5), other=other) | {
+        "camera": over_floor(sky)["camera"] | {"to_world": above}
+    }
+
+
+def _aside(x: float) -> Any:
+    return transform(translate=[x, 0, 0], rotate=([1, 0, 0], -90), scale=0.5)
+
+
+@pytest.mark.parametrize("name", ["reslrb", "ptracer"])
+@pytest.mark.parametrize("sky", list(SKIES))
+def test_what_leaves_the_scene_stays_lit(sky: str, name: str):
+    scene = load(tiles(0.4, SKIES[sky]))
+    before = image(scene, name)
+    params = mi.traverse(scene)
+    params["other.to_world"] = mi.AffineTransform4f(_aside(4).matrix)
+    params.update()
+    moved, fresh = image(scene, name).sum(), image(load(tiles(4, SKIES[sky])), name).sum()
+    assert moved == pytest.approx(fresh, rel=0.03)
+    assert before.sum() < 0.9 * moved  # else nothing left the scene: the squares overlapped
+
+
+def test_a_horizon_is_not_renewed_more_than_need_be():
+    scene = load(tiles(4, SKIES["constant"]))
+    ours = integrator("reslrb")
+    horizons = []
+    for x in (4, 3.9, 4.01, 4.1, 0.4):
+        params = mi.traverse(scene)
+        params["other.to_world"] = mi.AffineTransform4f(_aside(x).matrix)
+        params.update()
+        horizons.append(ours.plan(scene, scene.sensors()[0]).horizon)
+    assert horizons[0] == horizons[1] != horizons[2] == horizons[3] != horizons[4]
+
+
+def test_a_parallel_lamp_that_grows_sends_more_light():
+    lamp = surface("rectangle", "directionalarea")
+    scene = load(over_floor(lamp))
+    params = mi.traverse(scene)
+    params["light.to_world"] = params["light.to_world"] @ mi.AffineTransform4f().scale(1.5)
+    params.update()
+    larger = lamp | {"to_world": lamp["to_world"] @ mi.ScalarTransform4f().scale(1.5)}
+    assert image(scene).sum() == pytest.approx(image(load(over_floor(larger))).sum(), rel=1e-3)
+
+
+def test_a_sphere_that_is_turned_shines_outward():
+    turned = surface("sphere") | {"to_world": transform(translate=PIVOT, rotate=([1, 0, 0], 90), scale=0.4)}
+    straight = surface("sphere") | {"to_world": transform(translate=PIVOT, scale=0.4)}
+    expected, found = (image(load(over_floor(lamp)), spp=1024).sum() for lamp in (straight, turned))
+    assert found == pytest.approx(expected, rel=0.02)
+
+
+# ---- Lamps that are seen ----
+
+
+def seen(lamp: Any, **changes: Any) -> Moving:
+    """A lamp that faces the camera from the floor."""
+
+    def place(params: mi.SceneParameters, latents: dict[str, Any]) -> None:
+        shift = mi.AffineTransform4f().translate(mi.Vector3f(latents["x"], latents["y"], 0))
+        moved = shift @ mi.AffineTransform4f().scale(mi.Vector3f(latents["size"]))
+        params["light.to_world"] = moved @ mi.AffineTransform4f(transform(rotate=([1, 0, 0], -80), scale=0.4).matrix)
+
+    result = Moving(over_floor(lamp, floor=flat(diffuse(0, 0, 0)), **changes), {"x": 0.1, "y": 0.5, "size": 1.0}, place)
+    result.weigh(smooth_weights())
+    return result
+
+
+LAMPS = {
+    "rectangle": {"type": "rectangle", "emitter": {"type": "area", "radiance": rgb(3, 2, 4)}},
+    "sphere": {"type": "sphere", "emitter": {"type": "area", "radiance": rgb(3, 2, 4)}},
+}
+
+
+@pytest.mark.parametrize("kind", list(LAMPS))
+def test_the_outline_of_a_lamp_that_is_seen_moves(kind: str):
+    """Differences of primary rays, which hit it or not, are noisy: large steps, many samples."""
+    moving = seen(LAMPS[kind])
+    ours, naive = integrator("reslrb", 1, estimator="stack"), integrator("walk_ad", 1, attached=True)
+    gradients = [moving.gradient(ours, seed, 64) for seed in seeds(3)]
+    for name, value in moving.gradient(naive, seeds(3)[0], 64).items():
+        assert relative(gradients[0][name], value) < 1e-4
+    mine = np.array([[gradient[name][0] for name in moving.start] for gradient in gradients])
+    theirs = np.array([[moving.difference(ours, name, 0.1, seed, 512) for name in moving.start] for seed in seeds(3)])
+    found = compare_expectations(mine, theirs, FAMILY, bias=CLOSE * np.abs(theirs.mean(0)), rounding=0.0)
+    print(kind, found)
+    assert found.verdict is not Verdict.FAILS, found
+    assert (found.relative_l2 or 0.0) < 0.03
+
+
+def test_a_hidden_lamp_has_no_part():
+    moving = seen(LAMPS["rectangle"])
+    hidden = moving.gradient(integrator("reslrb", 2, estimator="stack", hide_emitters=True), 1, 16)
+    assert not any(value.any() for value in hidden.values())
+
+
+def test_walk_ad_shows_a_moving_lamp_as_it_is():
+    """Its derivative is splatted twice, and must not show in the image."""
+    moving = seen(LAMPS["rectangle"])
+    results = []
+    for name, options in (("walk_ad", {"attached": True}), ("reslrb", {"estimator": "stack"})):
+        moving.gradient(integrator(name, 2, **options), 1, 16)
+        results.append(moving.image)
+    assert relative(*results) < 1e-5
+
+
+@pytest.mark.parametrize("kind", ["rectangle", "sphere"])
+@pytest.mark.parametrize("emitter", ["area", "directionalarea"])
+def test_one_kernel_has_it_all(kind: str, emitter: str):
+    """The derivative by a number of a transformation is a sum over all paths; none is traced again for it."""
+    scene = load(over_floor(surface(kind, emitter)))
+    params, sensor = mi.traverse(scene), scene.sensors()[0]
+    ours = integrator("reslrb", 3, estimator="stack")
+    with tracking(params, ["light.to_world"]):
+        kernels = count(ours, ours.plan(scene, sensor, params), scene, sensor, known=True)
+    assert len(kernels) == 1
+
+
+# ---- What is refused ----
+
+REFUSED = {
+    "envmap": ({"type": "envmap", "data": None}, "light.to_world", "drawn from what it shows"),
+    "sunsky": ({"type": "sunsky"}, "light.to_world", "drawn from what it shows"),
+    "sun": ({"type": "sunsky"}, "light.sun_direction", "where the light"),
+    "cutoff": ({"type": "spot"}, "light.cutoff_angle", "where the light"),
+}
+
+
+@pytest.mark.parametrize("name", list(REFUSED))
+def test_refused_with_the_reason(name: str):
+    light, key, reason = REFUSED[name]
+    import drjit as dr
+
+    scene = load(tiles(1, light) if name != "cutoff" else over_floor(light))
+    params = mi.traverse(scene)
+    if key not in params:
+        pytest.skip(f"Mitsuba has no {key}")
+    dr.enable_grad(params[key])
+    params.update()
+    with pytest.raises(UnsupportedScene, match=f"{key}: .*{reason}"):
+        integrator("reslrb", estimator="stack").plan(scene, scene.sensors()[0], params)
+
+
+# ---- The code broken on purpose ----
+
+FAULTS = {
+    "area_of_faces_detached": ("mesh", "transport.lamps:lamp_point", "area / dr.detach(area)", "mi.Float(1)"),
+    "start_does_not_move": ("parallel", "estimators.attached:differentiate_start",
+                            "if plan.moving_emission:", "if False:"),
+    "normal_of_sphere_as_mitsuba_has_it": ("sphere", "transport.lamps:lamp_point", "if lamp.is_sphere:", "if False:"),
+    "density_detached": ("parallel", "transport.lamps:lamp_ray", "radiance * weight", "radiance * dr.detach(weight)"),
+    "rays_detached": ("spot", "transport.emission:sample_emission",
+                      "Emission(ray if plan.moving_emission else dr.detach(ray), weight, emitter)",
+                      "Emission(dr.detach(ray), weight, emitter)"),
+}  # fmt: skip
+QUICK = "area_of_faces_detached"
+
+
+@pytest.mark.parametrize("name", [pytest.param(n, marks=() if n == QUICK else pytest.mark.long) for n in FAULTS])
+def test_fault(name: str, monkeypatch: pytest.MonkeyPatch):
+    case, where, right, wrong = FAULTS[name]
+    plant(Fault(name, "", where, right, wrong, frozenset()), monkeypatch)
+    with pytest.raises(AssertionError):
+        check(next(c for c in CASES if c.name == case), 4)
+
+
+def test_faces_of_a_mesh_are_those_that_mitsuba_draws():
+    from reslrb_cli.scene.graph import SceneGraph
+    from reslrb_cli.scene.lamps import find_lamps
+    from reslrb_cli.transport.lamps import drawn_face, sums_of_areas
+
+    scene = load(over_floor(mesh()))
+    [lamp] = find_lamps(scene, SceneGraph.of(scene))
+    [areas] = sums_of_areas([lamp])
+    samples = mi.Float(np.random.default_rng(1).random(1000).astype(np.float32))
+    ps = lamp.shape.sample_position(0, mi.Point2f(0.3, samples))
+    face = drawn_face(areas, samples)
+    normal, corner = lamp.shape.face_normal(face), lamp.shape.vertex_position(lamp.shape.face_indices(face)[0])
+    assert np.abs(np.array((ps.p - corner).x * normal.x + (ps.p - corner).y * normal.y + (ps.p - corner).z * normal.z)
+                  ).max() < 1e-5  # fmt: skip
