@@ -65,9 +65,9 @@ def differentiated(params: mi.SceneParameters) -> Differentiated:
             emission = True
         else:
             _refuse(key, "light tracing has derivatives of what light meets and leaves from, not of the sensor")
+        moves = kind == "shape" or key.rpartition(".")[2] in ("position", "to_world")  # no factor of anything
         dims = kind == "attribute" or (kind == "bsdf" and any(name in key for name in FACTORS))
-        if kind not in ("shape", "sensor"):
-            zeros = zeros or _has_singular(key, value, NEARLY_ZERO if dims else 0)
+        zeros = zeros or (not moves and _has_singular(key, value, NEARLY_ZERO if dims else 0))
     return Differentiated(tuple(nodes), emission, zeros, tuple(shapes), emitters)
 
 

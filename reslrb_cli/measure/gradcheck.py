@@ -72,13 +72,13 @@ class Gradcheck:
         parts = self.participants
         found = [] if parts.image is None else [Row(None, "reslrb", parts.image, Kind.IMAGE)]
         for key in parts.case.keys:
-            for listed in self.settings.integrators:
+            for listed in parts.listed:
                 kind = Kind.EQUAL_SEEDS if listed.options["estimator"] in EXACT else Kind.EXPECTATION
                 found.append(Row(key, listed.label, Reference.WALK_AD, kind))
                 stock = parts.stock[key]
                 references = [] if stock is None else [stock]
                 references += [Reference.ANALYTIC] if key in parts.exact else []
-                references += [Reference.FINITE_DIFFERENCE, Reference.FORWARD_MODE]
+                references += [Reference.FINITE_DIFFERENCE] + ([] if parts.attached else [Reference.FORWARD_MODE])
                 found += [Row(key, listed.label, reference, Kind.EXPECTATION) for reference in references]
         return found
 
@@ -126,7 +126,7 @@ class Gradcheck:
             shape = tuple(parts.case.weights.shape)
             figures = compare_expectations(ours, reference, family, shape=shape, rounding=STOCK_ROUNDING)
             return Result(self._record(row, figures, len(ours)))
-        ours = self._sampling.of("gradient", row.label)[:, parts.slices()[row.key]]
+        ours = self._sampling.of("gradient", parts.sampled(row.label, row.reference))[:, parts.slices()[row.key]]
         if row.reference in ALONG_DIRECTIONS:
             return self._along(row, ours, family)
         shape = parts.shape(row.key)

@@ -11,6 +11,7 @@ import numpy as np
 
 from reslrb_cli.measure.gradients import seeds
 from reslrb_cli.measure.participants import Participants, Settings
+from reslrb_cli.records.gradcheck import Reference
 
 #: Seeds, where no number is given: so many of everything, then more of what is cheap, as the budget allows.
 LEAST_SEEDS, MOST_SEEDS = 8, 64
@@ -67,7 +68,7 @@ class Sampling:
 
     def _seeds_in_memory(self) -> int:
         size = sum(len(values) for values in self.participants.case.initial.values())
-        return MEMORY // (4 * size * (len(self.settings.integrators) + 2))
+        return MEMORY // (4 * size * (len(self.participants.integrators) + 2))
 
     def _take(self, samples: list[tuple[Name, Sample]], stop: Callable[[], bool]) -> bool:
         """Everything at one seed; whether it was done."""
@@ -88,12 +89,14 @@ class Sampling:
 
         stock = {reference.value for reference in parts.stock.values() if reference is not None}
         naive = ["walk_ad"] if everything else []
-        for label in [*(listed.label for listed in self.settings.integrators), *sorted(stock), *naive]:
+        compared = [Reference.WALK_AD, Reference.FINITE_DIFFERENCE, *(r for r in parts.stock.values() if r is not None)]
+        ours = dict.fromkeys(parts.sampled(listed.label, other) for listed in parts.listed for other in compared)
+        for label in [*ours, *sorted(stock), *naive]:
             add("gradient", label, parts.gradient, label, seed)
         for label in () if parts.image is None else ("walk_ad", parts.image.value):
             add("image", label, parts.picture, label, seed)
         for key in parts.case.keys if everything else ():
             add("differences", key, parts.differences, key, seed)
-            # Forward mode is the same for all estimators.
-            add("tangents", key, parts.tangents, self.settings.integrators[0].label, key, seed)
+            if not parts.attached:  # forward mode is the same for all estimators, and has no attached derivatives
+                add("tangents", key, parts.tangents, parts.listed[0].label, key, seed)
         return found

@@ -36,7 +36,8 @@ class Plan:
     attached: bool = False
     moving_shapes: tuple[mi.Shape, ...] = ()
     moving_emission: bool = False
-    # Whether the normalisation of the reconstruction filter's weights has its derivative: finite differences have.
+    # Whether the normalisation of the reconstruction filter's weights has its derivative, and the correction for
+    # shading normals has none: so it matches finite differences, and otherwise `ptracer`.
     attached_normalization: bool = True
 
     @property
