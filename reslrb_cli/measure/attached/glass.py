@@ -13,7 +13,7 @@ from reslrb_cli.measure.attached.scene import FILTER, SIZE, AttachedScene
 from reslrb_cli.measure.small_scenes import bitmap, diffuse, rgb, transform
 
 GLASS = {"type": "dielectric", "int_ior": 1.5, "ext_ior": 1.0}
-ROUGH = {"type": "roughdielectric", "int_ior": 1.5, "ext_ior": 1.0, "alpha": 0.2, "distribution": "ggx"}
+ROUGH = {"type": "roughdielectric", "int_ior": 1.5, "ext_ior": 1.0, "alpha": 0.1}
 TOP = "top.vertex_positions"
 
 
@@ -140,8 +140,8 @@ SCENES = [
                   step=0.005),
     AttachedScene("slab_area", "the same, wide and under an area light",
                   lambda: slab(lamp=square_lamp(0.2, 2.3), half=40, wide=6, cells=160), waving),
-    AttachedScene("slab_depth_8", "the same with what is reflected inside of it up to four times", slab, waving,
-                  options={"max_depth": 8}),
+    AttachedScene("slab_depth_6", "the same with what is reflected inside of it twice", slab, waving,
+                  options={"max_depth": 6}),
     AttachedScene("slab_texture", "the same over a smooth texture", lambda: slab(floor=smooth_texture()), waving),
     AttachedScene("sphere_lens", "a ball of glass, moved and scaled", sphere_lens,
                   lambda scene: moving_sphere("lens", (0, 1.95, 0))),

@@ -28,7 +28,7 @@ def bulb(radius: float = 0.3) -> dict:
 
 def hills() -> dict:
     """A receiver that is bent a little, under a point light."""
-    positions, faces, uv = grid(64, lambda x, z: 0.05 * np.sin(2 * x + 1) * np.cos(3 * z), 40, 5)
+    positions, faces, uv = grid(128, lambda x, z: 0.05 * np.sin(2 * x + 1) * np.cos(3 * z), 4, 1.5)
     return setting(floor=mesh(positions, faces, diffuse(0.8, 0.7, 0.6), uv), lamp=point())
 
 
