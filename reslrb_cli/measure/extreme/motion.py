@@ -57,7 +57,7 @@ def pool(
     seen = camera([0, scale, 0], [0, 0, 0], [0, 0, -1], 90, SIZE)
     seen["film"]["rfilter"] = FILTER
     seen |= {"near_clip": 1e-2 * scale, "far_clip": 1e3 * scale}
-    positions, faces, uv = grid(64, lambda x, z: height + slope * waves(x, z), 2.5)
+    positions, faces, uv = grid(128, lambda x, z: height + slope * waves(x, z), 2.5)
     floor = transform(rotate=([1, 0, 0], -90), scale=20 * scale)
     scene = {
         "type": "scene",
@@ -97,7 +97,7 @@ def surface(ior: float = 1.5, alpha: float = 0, slope: float = 1) -> Callable[[]
 
 def totally_reflected() -> dict:
     """Light in glass that meets its surface from below, beyond the critical angle, and lights the receiver."""
-    return pool(glass(), beam((-1.87, 1.0), (-1.6, 1.2), 0.12), slope=0.5, height=1.2)
+    return pool(glass(), beam((-1.87, 1.0), (-1.6, 1.2), 0.12), slope=0.1, height=1.2)
 
 
 def grazing(degrees: float) -> dict:
