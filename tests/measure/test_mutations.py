@@ -15,7 +15,7 @@ from measure.faults import CHECKS, FAULTS, Fault
 from reslrb_cli.records.gradcheck import GradcheckRecord, Verdict
 
 #: Those that take seconds, of the default suite.
-QUICK = ("one_visibility_bit_late", "stack_without_last_vertex", "zero_factor_dropped")
+QUICK = ("one_visibility_bit_late", "stack_without_last_vertex", "zero_factor_dropped", "lamp_left_where_it_is")
 
 
 @pytest.fixture(autouse=True)

@@ -102,10 +102,12 @@ class Differences:
 class Extrapolated:
     """Finite differences of the image at the gradient's own random numbers, of each amplitude of what moves.
 
-    Those of `step` are corrected by those of twice the step, after Richardson; a tenth of the correction may be wrong.
+    Those of `step` are corrected by those of twice the step, after Richardson. A tenth of the correction may be wrong,
+    and `left` of their root mean square, which the faces of a mesh and higher powers of the step leave.
     """
 
     step: float
+    left: float = 1e-3
     reference = Reference.FINITE_DIFFERENCE
 
     def samples(self, case: ExtremeCase, setup: Case) -> Samples:
@@ -116,7 +118,9 @@ class Extrapolated:
             for step in (self.step, 2 * self.step)
         )
         correction = (near - far) / 3
-        return Samples(near + correction, True, along, bias=np.abs(correction.mean(0)) / 10)
+        values = near + correction
+        size = float(np.sqrt(np.mean(np.square(values.mean(0)))))
+        return Samples(values, True, along, bias=np.abs(correction.mean(0)) / 10 + self.left * size)
 
 
 @dataclass(frozen=True)

@@ -82,6 +82,11 @@ def bending(size: float = 1, scale: float = 1) -> Moves:
     return moves
 
 
+def sliding(scene: Any) -> Sequence[Move]:
+    """The surface, within itself."""
+    return [Displacement(TOP, smooth_fields(vertices(scene, "top"), 3, 1.0) * np.array([1, 0, 1]))]
+
+
 def with_lamp(scene: Any) -> Sequence[Move]:
     """The surface, and the lamp."""
     return [*bending()(scene), Pose("lamp.to_world", ("tx", "rz"), (0.5, 3, 0))]
@@ -109,8 +114,8 @@ def grazing(degrees: float) -> dict:
 
 
 def moved(name: str, about: str, scene: Callable[[], dict], step: float = 0.01, depth: int = 3,
-          moves: Moves | None = None, **more: Any) -> ExtremeCase:  # fmt: skip
-    return ExtremeCase(name, about, scene, (), Extrapolated(step), image="ptracer", seeds=8, signed=True,
+          moves: Moves | None = None, left: float = 1e-3, **more: Any) -> ExtremeCase:  # fmt: skip
+    return ExtremeCase(name, about, scene, (), Extrapolated(step, left), image="ptracer", seeds=8, signed=True,
                        options={"max_depth": depth}, moves=moves or bending(), **more)  # fmt: skip
 
 
@@ -118,6 +123,7 @@ CASES = [
     moved("slope_0", "a flat surface of glass that begins to bend", surface(slope=0)),
     moved("slope_1e-6", "slopes of a millionth", surface(slope=1e-5)),
     moved("slope_0.3", "slopes of a third", surface(slope=3), 0.005),
+    moved("sliding_faces", "a surface whose faces slide through the light", surface(), moves=sliding),
     moved("total_reflection", "a surface with waves, beyond the critical angle", totally_reflected, 0.003),
     moved("grazing_85", "light at 85 degrees on glass", lambda: grazing(85), 0.005, moves=bending(0.1)),
     moved("parallel_faces", "a slab with flat faces that begins to bend", slab(0), depth=4),
@@ -129,5 +135,5 @@ CASES = [
     moved("moved_rough_3", "rough glass of index 3", surface(3.0, 0.1), equal=1e-3),
     moved("millimetres", "a slab a thousand times its size", slab(scale=1e3), depth=4, moves=bending(1, 1e3)),
     moved("shrunk_to_0.03", "a slab three hundredths of its size", slab(scale=0.03), depth=4,
-          moves=bending(1, 0.03)),
+          moves=bending(1, 0.03), left=5e-3),
 ]  # fmt: skip
