@@ -59,6 +59,13 @@ def slab(bsdf: dict = GLASS, cells: int = 64, half: float = 1.0, wide: float = 0
     )
 
 
+def rough_surface() -> dict:
+    """Rough glass with waves, and the receiver inside of it."""
+    scene = slab(ROUGH)
+    del scene["bottom"]
+    return scene
+
+
 def vertices(scene: Any, name: str) -> np.ndarray:
     """Positions (V, 3) of a mesh."""
     import mitsuba as mi
@@ -135,25 +142,29 @@ def smooth_texture() -> dict:
 
 
 SCENES = [
-    AttachedScene("slab", "a glass slab with waves under a spot light", slab, waving),
+    AttachedScene("slab", "a glass slab with waves under a spot light", slab, waving, spp=512),
     AttachedScene("slab_beam", "the same under parallel light with a hard edge", lambda: slab(lamp=beam()), waving,
                   step=0.005),
     AttachedScene("slab_area", "the same, wide and under an area light",
-                  lambda: slab(lamp=square_lamp(0.2, 2.3), half=40, wide=6, cells=160), waving),
+                  lambda: slab(lamp=square_lamp(0.2, 2.3), half=40, wide=6, cells=160), waving, spp=2048),
     AttachedScene("slab_depth_6", "the same with what is reflected inside of it twice", slab, waving,
-                  options={"max_depth": 6}),
-    AttachedScene("slab_texture", "the same over a smooth texture", lambda: slab(floor=smooth_texture()), waving),
+                  options={"max_depth": 6}, spp=1024),
+    AttachedScene("slab_texture", "the same over a smooth texture", lambda: slab(floor=smooth_texture()), waving,
+                  spp=256),
     AttachedScene("sphere_lens", "a ball of glass, moved and scaled", sphere_lens,
-                  lambda scene: moving_sphere("lens", (0, 1.95, 0))),
-    AttachedScene("mesh_lens", "a ball of glass, a mesh that is bent", mesh_lens, bent),
+                  lambda scene: moving_sphere("lens", (0, 1.95, 0)), spp=256),
+    AttachedScene("mesh_lens", "a ball of glass, a mesh that is bent", mesh_lens, bent, spp=2048),
     AttachedScene("prism", "a tilted flat surface, turned and moved", prism,
-                  lambda scene: [Pose("top.to_world", ("rx", "rz", "ty"), (0, 1.9, 0))]),
+                  lambda scene: [Pose("top.to_world", ("rx", "rz", "ty"), (0, 1.9, 0))], spp=512),
     AttachedScene("two_lenses", "a slab with waves over a ball", two_lenses,
                   lambda scene: [*waving(scene, height=2.8), *moving_sphere("lens", (0, 1.55, 0))],
-                  options={"max_depth": 6}),
-    AttachedScene("rough_slab", "a rough glass slab with waves", lambda: slab(ROUGH), waving),
-    AttachedScene("rough_slab_alpha", "the roughness of rough glass", lambda: slab(ROUGH),
-                  lambda scene: [Number("top.bsdf.alpha.value")], options={"max_depth": 4, "attached": True}),
-    AttachedScene("rough_slab_eta", "the index of rough glass", lambda: slab(ROUGH),
-                  lambda scene: [Number("top.bsdf.eta")], options={"max_depth": 4, "attached": True}),
+                  options={"max_depth": 6}, spp=4096),
+    AttachedScene("rough_surface", "rough glass with waves, the receiver inside", rough_surface, waving,
+                  spp=2048, options={"max_depth": 3}),
+    AttachedScene("rough_surface_alpha", "the roughness of rough glass", rough_surface,
+                  lambda scene: [Number("top.bsdf.alpha.value")], step=0.03, spp=1024,
+                  options={"max_depth": 3, "attached": True}),
+    AttachedScene("rough_surface_eta", "the index of rough glass", rough_surface,
+                  lambda scene: [Number("top.bsdf.eta")], step=0.1, spp=8192,
+                  options={"max_depth": 3, "attached": True}),
 ]  # fmt: skip

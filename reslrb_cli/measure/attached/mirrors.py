@@ -29,10 +29,11 @@ def convex(bsdf: dict = MIRROR) -> dict:
 SCENES = [
     AttachedScene("mirror", "a mirror with waves", ceiling, lambda scene: waving(scene, "mirror", 1.9), step=0.002),
     AttachedScene("mirror_ball", "a mirror that is a ball, moved and scaled", convex,
-                  lambda scene: [Pose("mirror.to_world", ("tx", "ty", "tz", "s"), (0, 2.1, 0))]),
+                  lambda scene: [Pose("mirror.to_world", ("tx", "ty", "tz", "s"), (0, 2.1, 0))], spp=128),
     AttachedScene("rough_mirror", "a rough metal with waves", lambda: ceiling(BRUSHED),
                   lambda scene: waving(scene, "mirror", 1.9), step=0.003, options={"max_depth": 3}),
     AttachedScene("rough_mirror_alpha", "the roughness of a metal",
                   lambda: ceiling(BRUSHED | {"sample_visible": True}),
-                  lambda scene: [Number("mirror.bsdf.alpha.value")], options={"max_depth": 3, "attached": True}),
+                  lambda scene: [Number("mirror.bsdf.alpha.value")], spp=256,
+                  options={"max_depth": 3, "attached": True}),
 ]  # fmt: skip
