@@ -152,7 +152,7 @@ SCENES = [
     AttachedScene("slab_texture", "the same over a smooth texture", lambda: slab(floor=smooth_texture()), waving,
                   spp=256),
     AttachedScene("sphere_lens", "a ball of glass, moved and scaled", sphere_lens,
-                  lambda scene: moving_sphere("lens", (0, 1.95, 0)), spp=256),
+                  lambda scene: moving_sphere("lens", (0, 1.95, 0)), spp=1024),
     AttachedScene("mesh_lens", "a ball of glass, a mesh that is bent", mesh_lens, bent, spp=2048),
     AttachedScene("prism", "a tilted flat surface, turned and moved", prism,
                   lambda scene: [Pose("top.to_world", ("rx", "rz", "ty"), (0, 1.9, 0))], spp=512),
