@@ -89,7 +89,7 @@ def command(
         config = load(config_file, overrides)
     listed = all_estimators(config) if estimators is None else parse_estimators(estimators)
     _check_folder(folder)
-    settings = Settings(config, listed, budget, seeds, spp)
+    settings = Settings(config, listed, budget, seeds, spp, named=estimators is not None)
     settings.configs()  # before anything is loaded
     variant = set_variant(config.variant)
     check = Gradcheck(settings)

@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 
 from reslrb_cli.measure.gradients import Case
+from reslrb_cli.measure.moving import smooth_rows
 
 #: Steps that are tried, in units of the direction.
 STEPS = (0.1, 0.01, 0.001)
@@ -63,6 +64,12 @@ def directions(case: Case, key: str, bounds: tuple[float, float], count: int, se
         row = size * (inward if near_a_bound else signs)
         found.append(Direction(_embed(case, key, row), "up" if near_a_bound else "both"))
     return found
+
+
+def moving_directions(case: Case, key: str, extent: float, count: int) -> list[Direction]:
+    """Directions along which a parameter that moves light changes smoothly (`moving.smooth_rows`)."""
+    rows = smooth_rows(key, case.values.value(key), extent, count)
+    return [Direction(_embed(case, key, row), "both") for row in rows]
 
 
 def choose_step(case: Case, integrator: Any, direction: Direction, seeds: Sequence[int], spp: int) -> Direction:

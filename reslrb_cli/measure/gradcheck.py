@@ -73,14 +73,14 @@ class Gradcheck:
         parts = self.participants
         found = [] if parts.image is None else [Row(None, "reslrb", parts.image, Kind.IMAGE)]
         for key in parts.case.keys:
-            for listed in self.settings.integrators:
+            for listed in parts.listed:
                 exact = ESTIMATORS[listed.options["estimator"]].exact
                 kind = Kind.EQUAL_SEEDS if exact else Kind.EXPECTATION
                 found.append(Row(key, listed.label, Reference.WALK_AD, kind))
                 stock = parts.stock[key]
                 references = [] if stock is None else [stock]
                 references += [Reference.ANALYTIC] if key in parts.exact else []
-                references += [Reference.FINITE_DIFFERENCE, Reference.FORWARD_MODE]
+                references += [Reference.FINITE_DIFFERENCE] + ([] if parts.attached else [Reference.FORWARD_MODE])
                 found += [Row(key, listed.label, reference, Kind.EXPECTATION) for reference in references]
         return sorted(found, key=lambda row: row.key is not None and row.reference.value in NAIVE)
 
@@ -121,7 +121,7 @@ class Gradcheck:
         """The samples that a comparison is made of."""
         if row.key is None:
             return [("image", "walk_ad"), ("image", row.reference.value)]
-        ours = ("gradient", row.label)
+        ours = self._ours(row)
         if row.reference is Reference.ANALYTIC:
             return [ours]
         if row.reference is Reference.FINITE_DIFFERENCE:
@@ -129,6 +129,9 @@ class Gradcheck:
         if row.reference is Reference.FORWARD_MODE:
             return [ours, ("tangents", row.key)]
         return [ours, ("gradient", row.reference.value)]
+
+    def _ours(self, row: Row) -> Name:
+        return "gradient", self.participants.sampled(row.label, row.reference)
 
     # --- comparing ----------------------------------------------------------------------------------------------------
 
@@ -154,7 +157,7 @@ class Gradcheck:
             ours, reference = ours[:least], reference[:least]
             figures = compare_expectations(ours, reference, family, shape=shape, rounding=STOCK_ROUNDING)
             return Result(self._record(row, figures, len(ours)))
-        ours = self._sampling.of(("gradient", row.label))[:, parts.slices()[row.key]]
+        ours = self._sampling.of(self._ours(row))[:, parts.slices()[row.key]]
         if row.reference in ALONG_DIRECTIONS:
             return self._along(row, ours, family)
         shape = parts.shape(row.key)

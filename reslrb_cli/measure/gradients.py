@@ -13,22 +13,27 @@ import numpy as np
 
 from reslrb_cli.integrators import Job, first_channels, gradient_step, make_integrator, render_image
 from reslrb_cli.measure.small_scenes import load
+from reslrb_cli.measure.values import SceneValues, Values
 
 
 class Case:
     """A scene, its parameters, and a linear objective."""
 
     @classmethod
-    def of(cls, loaded: Any, keys: Iterable[str], sensor: int = 0) -> Case:
-        """A case of a scene that is loaded already, seen through one of its sensors."""
-        return cls(loaded, keys, sensor=sensor)
+    def of(cls, loaded: Any, keys: Iterable[str], sensor: int = 0, values: Values | None = None) -> Case:
+        """A case of a scene that is loaded already, seen through one of its sensors.
 
-    def __init__(self, scene: Any, keys: Iterable[str], seed: int = 7, sensor: int = 0) -> None:
-        import mitsuba as mi
+        `keys` are of `values`, where these are given, and of the scene otherwise.
+        """
+        return cls(loaded, keys, sensor=sensor, values=values)
 
+    def __init__(
+        self, scene: Any, keys: Iterable[str], seed: int = 7, sensor: int = 0, values: Values | None = None
+    ) -> None:
         self.scene = load(scene) if isinstance(scene, dict) else scene
         self.sensor = sensor
-        self.params = mi.traverse(self.scene)
+        self.values: Values = SceneValues(self.scene) if values is None else values
+        self.params = self.values.params
         self.keys = list(keys)
         self.initial = {key: self.flat(key) for key in self.keys}
         film = self.scene.sensors()[sensor].film()
@@ -54,39 +59,26 @@ class Case:
 
     def flat(self, key: str) -> np.ndarray:
         """The parameter's values in a row; colours that are stored by channel come channel by channel."""
-        return np.array(self.params[key], dtype=np.float64).ravel()
+        return np.array(self.values.value(key), dtype=np.float64).ravel()
 
     def shaped(self, key: str, row: np.ndarray) -> Any:
         """A row of values as the parameter's type."""
         import drjit as dr
 
-        kind, array = type(self.params[key]), np.asarray(row, np.float32)
+        now, array = self.values.value(key), np.asarray(row, np.float32)
+        kind = type(now)
         if dr.is_tensor_v(kind):
             # A sum, since NumPy's own memory would be used as it is: kernels depend on its alignment, which is random.
-            return kind(array.reshape(self.params[key].shape)) + dr.opaque(dr.array_t(kind), 0)
+            return kind(array.reshape(now.shape)) + dr.opaque(dr.array_t(kind), 0)
         return kind(*array.tolist()) if dr.depth_v(kind) > 1 else kind(array) + dr.opaque(kind, 0)
 
     def set(self, values: dict[str, np.ndarray]) -> None:
         """Set parameters from rows of values."""
         import drjit as dr
 
-        for key, value in values.items():
-            shaped = self.shaped(key, value)
-            dr.make_opaque(shaped)
-            self.params[key] = shaped
-        self.settle()
-
-    def settle(self) -> None:
-        """Run what parameters still have to do after a change (textures pad their storage), ahead of the next step."""
-        import drjit as dr
-        import mitsuba as mi
-
-        self.params.update()
-        for key in self.keys:
-            node = self.params.properties[key][2]
-            if isinstance(node, mi.Texture):
-                node.eval(dr.zeros(mi.SurfaceInteraction3f))
-        dr.eval([self.params[key] for key in self.keys])
+        shaped = {key: self.shaped(key, value) for key, value in values.items()}
+        dr.make_opaque(shaped)
+        self.values.hand_over(shaped)
 
     def objective(self, image: Any) -> Any:
         """sum(image * weights) over the colour channels."""
@@ -99,19 +91,35 @@ class Case:
         """The gradient of all parameters in a row, by one step; `options` are the step's."""
         import drjit as dr
 
-        # Leaves of our own: `update` may put something derived in their place (an environment map pads its columns).
-        leaves = {key: type(self.params[key])(dr.detach(self.params[key])) for key in self.keys}
-        for key, leaf in leaves.items():
-            dr.enable_grad(leaf)
-            self.params[key] = type(leaf)(leaf)
-        self.settle()
+        leaves = self.leaves()
         objective = objective or self.objective
         step(integrator, self.scene, self.sensor, objective, seed=seed, spp=spp, params=self.params, **options)
+        self.values.collect()
         result = [np.array(dr.grad(leaf), dtype=np.float64).ravel() for leaf in leaves.values()]
-        for key in self.keys:
-            self.params[key] = dr.detach(leaves[key])
-        self.settle()
+        self.release(leaves)
         return np.concatenate(result)
+
+    def leaves(self) -> dict[str, Any]:
+        """The parameters with derivatives enabled, handed over to the scene.
+
+        They are leaves of our own: the scene may put something derived in their place (an environment map pads its
+        columns).
+        """
+        import drjit as dr
+
+        leaves = {}
+        for key in self.keys:
+            value = self.values.value(key)
+            leaves[key] = type(value)(dr.detach(value))
+            dr.enable_grad(leaves[key])
+        self.values.hand_over({key: type(leaf)(leaf) for key, leaf in leaves.items()})
+        return leaves
+
+    def release(self, leaves: dict[str, Any]) -> None:
+        """Have the scene forget the derivatives that `leaves` gave it."""
+        import drjit as dr
+
+        self.values.hand_over({key: dr.detach(leaf) for key, leaf in leaves.items()})
 
     def gradients(self, integrator: Any, seeds: Iterable[int], spp: int, **step: Any) -> np.ndarray:
         """Gradients at all seeds: (N, P)."""
@@ -137,12 +145,7 @@ class Case:
         """
         import drjit as dr
 
-        leaves, at = {}, 0
-        for key in self.keys:
-            leaves[key] = type(self.params[key])(dr.detach(self.params[key]))
-            dr.enable_grad(leaves[key])
-            self.params[key] = type(leaves[key])(leaves[key])
-        self.params.update()
+        leaves, at = self.leaves(), 0
         for key, leaf in leaves.items():
             size = len(self.initial[key])
             dr.set_grad(leaf, self.shaped(key, direction[at : at + size]))
@@ -150,9 +153,7 @@ class Case:
             at += size
         dr.traverse(dr.ADMode.Forward, dr.ADFlag.ClearEdges)
         image = np.array(tangent(), dtype=np.float64)
-        for key in self.keys:
-            self.params[key] = dr.detach(leaves[key])
-        self.settle()
+        self.release(leaves)
         return image
 
     def tangent(self, integrator: Any, direction: np.ndarray, seed: int, spp: int) -> float:

@@ -9,13 +9,17 @@ from typing import Any
 import numpy as np
 
 from reslrb_cli.config import Config
+from reslrb_cli.errors import ConfigError
+from reslrb_cli.estimators import ESTIMATORS
 from reslrb_cli.integrators import known_step, make_integrator
+from reslrb_cli.integrators.interface import StepIntegrator
 from reslrb_cli.measure import cornell_box
 from reslrb_cli.measure.cases import Case as Listed
-from reslrb_cli.measure.differences import Direction, choose_step, directions, natural_bounds
+from reslrb_cli.measure.differences import Direction, choose_step, directions, moving_directions, natural_bounds
 from reslrb_cli.measure.film import shrink
 from reslrb_cli.measure.gradients import Case, seeds
 from reslrb_cli.measure.known import known_gradient
+from reslrb_cli.measure.moving import moves_light, smooth_weights
 from reslrb_cli.measure.references import (
     Situation,
     ends,
@@ -34,8 +38,12 @@ from reslrb_cli.scene.catalog import parameter_kind, value_shape
 PATHS = 2**16
 #: Directions of finite differences and of forward mode for each parameter.
 DIRECTIONS = 2
+#: The same of parameters that move light.
+MOVING_DIRECTIONS = 3
 #: A depth at which roulette never begins.
 NEVER = 1_000_000
+#: Values of `filter_normalization`: what differences have, and what `ptracer` has.
+WAYS = ("attached", "detached")
 #: The integrator whose images are differenced: ours, without roulette where paths end without.
 DIFFERENCED = "differenced"
 #: Seeds that the step of finite differences is chosen with.
@@ -44,13 +52,17 @@ PILOT_SEEDS = 2
 
 @dataclass(frozen=True)
 class Settings:
-    """What is checked. `seeds` and `spp` are None where they are to be chosen."""
+    """What is checked. `seeds` and `spp` are None where they are to be chosen.
+
+    `named`: the user named the integrators; otherwise those that cannot take part are left out.
+    """
 
     config: Config
     integrators: Sequence[Listed]
     budget_s: float
     seeds: int | None = None
     spp: int | None = None
+    named: bool = True
 
     @property
     def known(self) -> bool:
@@ -67,29 +79,37 @@ class Participants:
     """The scene, loaded, and every integrator by its label; a variant must be set.
 
     `stock` holds the stock reference of each parameter's gradient, or None, and `why` the reasons for what is not one;
-    `image` is the reference of the image, and `exact` holds gradients that are known in closed form. Raises ConfigError
-    and UnsupportedScene.
+    `image` is the reference of the image, and `exact` holds gradients that are known in closed form. `listed` are the
+    estimators that take part: where `attached` derivatives are asked for, those that have them. Raises ConfigError and
+    UnsupportedScene.
     """
 
     def __init__(self, settings: Settings) -> None:
         config, configs, self.known = settings.config, settings.configs(), settings.known
-        first = next(iter(configs.values()))
+        # Whatever moves, an estimator that follows it can be made.
+        able = [case.label for case in settings.integrators if ESTIMATORS[case.options["estimator"]].attaches]
+        first = configs[able[0]] if able else next(iter(configs.values()))
         built_in = config.scene.file == cornell_box.FILE
         problem = assemble_scene(first, cornell_box.build(config.scene.options) if built_in else None)
         scene, sensor = problem.scene, problem.sensors[0]
         shrink(scene, sensor, PATHS)
-        self.case = Case.of(scene, problem.selection.keys, sensor)
+        self.case = Case.of(scene, problem.selection.keys, sensor, problem.selection)
         self.sensor = scene.sensors()[sensor]
         self.film: tuple[int, int] = (self.case.weights.shape[1], self.case.weights.shape[0])
         self.spp = settings.spp or _samples(self.film, config.run.spp, problem.samples_per_pass)
         options = first.integrator.options()
         depth = config.integrator.max_depth
+        moved = tuple(key for key in problem.selection.scene_keys if moves_light(self.case.params, key))
+        self.attached = options.get("attached") is True or bool(moved)
+        self.listed = self._able(settings)
         shared = {name: options[name] for name in ("max_depth", "rr_depth", "hide_emitters")}
-        self.integrators = {
-            label: make_integrator(made.integrator.type, **made.integrator.options()) for label, made in configs.items()
-        }
+        self._way = options.get("filter_normalization", WAYS[0])
+        naive = {"samples_per_pass": options.get("samples_per_pass")}
+        if self.attached:
+            naive |= {"attached": True, "filter_normalization": self._way}
+        self.integrators = self._configured({case.label: configs[case.label] for case in self.listed})
         self.integrators |= {
-            "walk_ad": make_integrator("walk_ad", **shared, samples_per_pass=options.get("samples_per_pass")),
+            "walk_ad": make_integrator("walk_ad", **shared, **naive),
             # With roulette differences are heavy-tailed: now and then a path ends for one of the values alone.
             DIFFERENCED: make_integrator("walk_ad", **shared | ({"rr_depth": NEVER} if ends(depth) else {})),
             "ptracer": make_integrator("ptracer", **shared | {"rr_depth": NEVER}),
@@ -97,13 +117,48 @@ class Participants:
             "path": make_integrator("path", **shared),
         }
         hidden = config.integrator.hide_emitters
-        self._situation = Situation.of(scene, self.sensor, self.case.params, depth, hidden)
+        self._situation = Situation.of(scene, self.sensor, self.case.params, depth, hidden, self.attached, moved)
         self._choose_references()
         self._weigh()
         self.directions = self._directions(problem.selection)
         weights = np.array(self.case.weights, np.float64)
         known = {key: known_gradient(self._situation, self.sensor, key, weights) for key in self.case.keys}
         self.exact = {key: value for key, value in known.items() if value is not None}
+
+    def _able(self, settings: Settings) -> list[Listed]:
+        """The estimators that can take part. Raises ConfigError where one was named that cannot."""
+        able = [case for case in settings.integrators if ESTIMATORS[case.options["estimator"]].attaches]
+        others = [case for case in settings.integrators if case not in able]
+        if not self.attached or not others:
+            return list(settings.integrators)
+        if settings.named or not able:
+            names = ", ".join(name for name, kind in ESTIMATORS.items() if kind.attaches)
+            raise ConfigError(
+                "--estimators",
+                "",
+                f"{others[0].options['estimator']} has no derivatives of what moves light; take {names}",
+            )
+        return able
+
+    def _configured(self, configs: dict[str, Config]) -> dict[str, StepIntegrator]:
+        """The integrators by label, and, where derivatives are attached, with each way to take those of the film."""
+        made = {}
+        for label, config in configs.items():
+            kind, options = config.integrator.type, config.integrator.options()
+            made[label] = make_integrator(kind, **options)
+            for way in WAYS if self.attached else ():
+                if way != self._way:
+                    made[f"{label}, {way}"] = make_integrator(kind, **options | {"filter_normalization": way})
+        return made
+
+    def sampled(self, label: str, reference: Reference) -> str:
+        """The integrator whose gradients stand for those of `label` beside this reference.
+
+        Where light moves over the film, differences have derivatives of the filter's normalisation, and `ptracer` none.
+        """
+        way = WAYS[1] if reference is Reference.PTRACER else WAYS[0]
+        own = not self.attached or reference is Reference.WALK_AD or way == self._way
+        return label if own else f"{label}, {way}"
 
     def _choose_references(self) -> None:
         at = self._situation
@@ -120,8 +175,14 @@ class Participants:
         self.image, self.why_no_image = _first(reasons)
 
     def _weigh(self) -> None:
-        """Random weights of mean 1, so that entries do not cancel, a sixth negative; 0 where the border lacks light."""
+        """Random weights of mean 1, so that entries do not cancel, a sixth negative; 0 where the border lacks light.
+
+        Where light moves, smooth ones.
+        """
         shape = tuple(self.case.weights.shape)
+        if self._situation.moved:
+            self.case.weigh(smooth_weights(*shape))
+            return
         weights = np.random.default_rng(7).uniform(-0.5, 2.5, shape)
         if {*self.stock.values(), self.image} & {Reference.PRB, Reference.PATH}:
             weights *= interior(shape, self.sensor)[:, :, None]
@@ -129,7 +190,12 @@ class Participants:
 
     def _directions(self, selection: Any) -> dict[str, list[Direction]]:
         found = {}
+        box = self._situation.scene.bbox()
+        extent = float(np.linalg.norm(np.array(box.max - box.min)))
         for key in self.case.keys:
+            if moves_light(self.case.params, key):
+                found[key] = moving_directions(self.case, key, extent, MOVING_DIRECTIONS)
+                continue
             bounds = selection.spec(key).bounds
             if bounds is None or not np.all(np.isfinite(bounds)):
                 bounds = natural_bounds(parameter_kind(self.case.params, key), self.case.initial[key])
@@ -138,7 +204,7 @@ class Participants:
 
     def shape(self, key: str) -> tuple[int, ...]:
         """Shape of a parameter."""
-        return value_shape(self.case.params[key])
+        return value_shape(self.case.values.value(key))
 
     def slices(self) -> dict[str, slice]:
         """Where each parameter stands in a gradient."""

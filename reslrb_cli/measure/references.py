@@ -12,6 +12,7 @@ import mitsuba as mi
 import numpy as np
 
 from reslrb_cli.errors import UnsupportedScene
+from reslrb_cli.measure.moving import moves_light
 from reslrb_cli.scene import SceneGraph, SceneNeeds, View, check_camera_paths, look, scene_needs
 from reslrb_cli.scene.catalog import parameter_kind
 
@@ -24,7 +25,10 @@ _ROUGHNESS = ("alpha", "alpha_u", "alpha_v")
 
 @dataclass(frozen=True)
 class Situation:
-    """What decides: a scene as one sensor sees it, the paths' greatest depth, and whether emitters are hidden."""
+    """What decides: a scene as one sensor sees it, the paths' greatest depth, and whether emitters are hidden.
+
+    `attached`: derivatives are; `moved` are the scene's parameters that move light and are recovered.
+    """
 
     scene: Any
     params: Any
@@ -33,12 +37,17 @@ class Situation:
     view: View
     max_depth: int
     hide_emitters: bool
+    attached: bool = False
+    moved: tuple[str, ...] = ()
 
     @classmethod
-    def of(cls, scene: Any, sensor: Any, params: Any, max_depth: int, hide_emitters: bool) -> Situation:
+    def of(
+        cls, scene: Any, sensor: Any, params: Any, max_depth: int, hide_emitters: bool, attached: bool = False,
+        moved: tuple[str, ...] = (),
+    ) -> Situation:  # fmt: skip
         """The situation of a loaded scene, whose `mi.traverse` is `params`."""
-        graph = SceneGraph.of(scene)
-        return cls(scene, params, graph, scene_needs(scene, sensor), look(scene, sensor), max_depth, hide_emitters)
+        graph, needs, view = SceneGraph.of(scene), scene_needs(scene, sensor), look(scene, sensor)
+        return cls(scene, params, graph, needs, view, max_depth, hide_emitters, attached, moved)
 
 
 def ptracer_image(at: Situation) -> str | None:
@@ -87,18 +96,35 @@ def ptracer_gradient(at: Situation, key: str) -> str | None:
     reason = ptracer_image(at)
     if reason is not None:
         return reason
+    if moves_light(at.params, key):
+        return _ptracer_motion(at, (key,) if key in at.params.properties else at.moved)
     if _all_zero_somewhere(at.params[key]):
         return "it stops paths whose throughput is 0"
     if parameter_kind(at.params, key) == "emitter":
         return None if key.endswith(".value") else "it differentiates how a textured emitter is sampled"
+    if at.attached and not at.needs.unfollowed:
+        return None
     if key.split(".")[-2 if key.endswith((".value", ".data")) else -1] in _ROUGHNESS:
         return "it differentiates how roughness is sampled"
     others = {bsdf.class_name() for bsdf in _bsdfs(at, key)} - set(_FIXED_SAMPLING)
     return f"it differentiates how a {sorted(others)[0]} is sampled" if others else None
 
 
+def _ptracer_motion(at: Situation, keys: tuple[str, ...]) -> str | None:
+    """Of the gradient with respect to what these parameters of the scene move."""
+    for key in keys:
+        node = at.params.properties[key][2]
+        if not isinstance(node, mi.Shape) or node.is_emitter():
+            return "it does not differentiate how an emitter that moves is sampled"
+    if at.needs.unfollowed:
+        return f"it differentiates how a {at.needs.unfollowed[0].class_name()} is sampled, but not its choice of a lobe"
+    return None
+
+
 def prb_gradient(at: Situation, key: str) -> str | None:
     """Of the gradient with respect to the parameter `key`, by path replay backpropagation from the sensor."""
+    if moves_light(at.params, key):
+        return "it has no derivatives of what moves light"
     reason = prb_image(at)
     if reason is not None:
         return reason

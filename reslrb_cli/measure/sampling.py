@@ -123,7 +123,7 @@ class Sampling:
 
     def _seeds_in_memory(self) -> int:
         size = sum(len(values) for values in self.participants.case.initial.values())
-        return MEMORY // (4 * size * (len(self.settings.integrators) + 2))
+        return MEMORY // (4 * size * (len(self.participants.integrators) + 2))
 
     def _sample(self, name: Name, seed: int) -> np.ndarray:
         parts, (kind, of) = self.participants, name
@@ -134,7 +134,7 @@ class Sampling:
         if kind == "differences":
             return np.asarray(parts.differences(of, seed))
         # Forward mode is the same for all estimators.
-        return np.asarray(parts.tangents(self.settings.integrators[0].label, of, seed))
+        return np.asarray(parts.tangents(self.participants.listed[0].label, of, seed))
 
 
 def _kind(name: Name) -> tuple[str, bool]:

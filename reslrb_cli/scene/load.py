@@ -13,6 +13,7 @@ import mitsuba as mi
 from ..errors import ConfigError
 from .description import build, check, mend, name_objects, notes, read_description
 from .extent import lost_light
+from .thin_glass import thin_glass
 
 logger = logging.getLogger(__name__)
 
@@ -27,7 +28,7 @@ def load_scene(file: Path, options: Mapping[str, Any] | None = None, strict: boo
     own. Plugins are loaded from Mitsuba's own folder alone.
 
     Raises ConfigError, located in the scene file, where it is missing or wrong, has nothing in it, or no light. Warns,
-    too, of a scene that is too far from the origin, or too small.
+    too, of a scene that is too far from the origin, or too small, and of glass that is too thin.
     """
     file = Path(file)
     description = read_description(file, {name: _as_text(value) for name, value in (options or {}).items()})
@@ -51,9 +52,9 @@ def load_scene(file: Path, options: Mapping[str, Any] | None = None, strict: boo
     found = [note for note in found if note.element not in lost]
     for line in notes.warnings(notes.in_order([*found, *unused], root)):
         _warn(line)
-    loss = lost_light(scene)
-    if loss is not None:
-        _warn(f"{file}: {loss}")
+    for loss in (lost_light(scene), thin_glass(scene)):
+        if loss is not None:
+            _warn(f"{file}: {loss}")
     return scene
 
 

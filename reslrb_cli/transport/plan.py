@@ -38,7 +38,8 @@ class Plan:
     attached: bool = False
     moving_shapes: tuple[mi.Shape, ...] = ()
     moving_emitters: tuple[mi.Emitter, ...] = ()
-    # Whether the normalisation of the reconstruction filter's weights has its derivative: finite differences have.
+    # Whether the normalisation of the reconstruction filter's weights has its derivative, and the correction for
+    # shading normals has none: so it matches finite differences, and otherwise `ptracer`.
     attached_normalization: bool = True
     # The sphere that infinite emitters light.
     horizon: Horizon | None = None

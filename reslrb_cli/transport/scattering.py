@@ -69,7 +69,11 @@ def shading_correction(
     valid = (wi_dot_n * cos_i > 0) & (wo_dot_n * cos_o > 0)
     if plan.needs.has_perturbed_normals:
         return dr.select(valid, dr.abs(wo_dot_n / wi_dot_n), 0), valid
-    return dr.select(valid, dr.abs((cos_i * wo_dot_n) / (cos_o * wi_dot_n)), 0), valid
+    correction = dr.select(valid, dr.abs((cos_i * wo_dot_n) / (cos_o * wi_dot_n)), 0)
+    # On a mesh it swings about 1 within each face and jumps at its edges, however fine the mesh is. A derivative that
+    # knows the slopes and not the jumps is wrong by several percent where faces move through the light; without either
+    # it is right. `ptracer` has the slopes.
+    return (dr.detach(correction) if plan.attached_normalization else correction), valid
 
 
 def scatter(

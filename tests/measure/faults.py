@@ -44,6 +44,15 @@ def cornell(*overrides: str, estimators: str, seeds: int = 8) -> Check:
     return lambda: checked(loads(cornell_box.CONFIG, cornell_box.SOURCE, [*SMALL, *overrides]), estimators, seeds)
 
 
+def moving(name: str, key: str) -> Check:
+    """The same of a parameter that moves light in a scene that stands beside this file."""
+
+    def check() -> list[GradcheckRecord]:
+        return checked(room(name, key), "stack", 6)
+
+    return check
+
+
 def extreme(case: str, *estimators: str) -> Check:
     """A case of the extreme suite, with these estimators, or all."""
     return lambda: run_suite([case], estimators or None)
@@ -78,6 +87,9 @@ CHECKS: dict[str, Check] = {
     "behind_mask": extreme("albedo_0_behind_mask", "stack"),
     "opacity": extreme("opacity_0.4", "stack"),
     "deep": extreme("white_box_100", "gather"),
+    "wavy_glass": moving("wavy_glass.xml", "top.vertex_positions"),
+    "sliding": extreme("sliding_faces", "stack"),
+    "moved_lamp": moving("lamp_over_floor.xml", "lamp.position"),
 }
 
 
@@ -104,6 +116,8 @@ def by(estimators: str, *references: str) -> frozenset[tuple[str | None, str]]:
 
 GRADIENT = ("walk_ad", "finite_difference", "forward_mode")  # of an estimator whose walk is right
 WALK = "transport.walk:walk"
+BACK = "estimators.attached:walk_back"
+MOVED = ("walk_ad", "ptracer", "finite_difference")  # of a mesh that moves
 
 FAULTS = [
     # ---- Light paths: naive AD and differences share the fault, a stock integrator does not ----
@@ -197,6 +211,38 @@ FAULTS = [
           by("reservoir", *GRADIENT, "ptracer")),
     Fault("sum_ends_a_vertex_early", "cornell", "estimators.gather:needed",
           "dr.minimum(latest + 1, depth)", "latest", by("gather", *GRADIENT)),
+    # ---- What moves light: differences share no derivative, and `ptracer` none of ours ----
+    Fault("origin_of_ray_backwards", "wavy_glass", BACK,
+          "moved = dr.dot(following.o, adjoint.origin)", "moved = -dr.dot(following.o, adjoint.origin)",
+          by("stack", *MOVED)),
+    Fault("direction_of_ray_forgotten", "wavy_glass", BACK,
+          "dr.dot(following.o, adjoint.origin) + dr.dot(following.d, adjoint.direction)",
+          "dr.dot(following.o, adjoint.origin)", by("stack", *MOVED)),
+    Fault("throughput_forgotten_on_the_way_back", "wavy_glass", BACK,
+          "dr.backward_from(dr.dot(P, own + later)", "dr.backward_from(dr.dot(mi.Spectrum(1), own + later)",
+          by("stack", *MOVED)),
+    Fault("film_position_detached", "wavy_glass", BACK,
+          "image.lookup(there.u,", "image.lookup(dr.detach(there.u),", by("stack", *MOVED)),
+    Fault("factor_detached", "wavy_glass", BACK,
+          "this.scattering.weight * (r * B)", "dr.detach(this.scattering.weight) * (r * B)", by("stack", "walk_ad")),
+    Fault("adjoints_of_origin_and_direction_exchanged", "wavy_glass", BACK,
+          "Adjoint(mi.Vector3f(dr.grad(ray.o)), dr.grad(ray.d),",
+          "Adjoint(dr.grad(ray.d), mi.Vector3f(dr.grad(ray.o)),",
+          by("stack", *MOVED)),
+    Fault("last_vertex_of_the_attached_stack", "wavy_glass", "estimators.attached:Pushing.scattering",
+          "dr.select(seen & pushed, count, state.needed)", "dr.select(seen & pushed, state.count, state.needed)",
+          by("stack", *MOVED)),
+    Fault("next_ray_detached", "wavy_glass", "transport.segment:Segment.next_ray",
+          "ray if attached else dr.detach(ray)", "dr.detach(ray)", by("stack", "ptracer", "finite_difference")),
+    Fault("shape_detached", "wavy_glass", "transport.segment:find_vertex",
+          "mi.RayFlags.All", "mi.RayFlags.All | mi.RayFlags.DetachShape", by("stack", "ptracer", "finite_difference")),
+    Fault("connection_detached", "wavy_glass", "transport.connection:connect",
+          "dr.suspend_grad(when=not attached)", "dr.suspend_grad()", by("stack", "ptracer", "finite_difference")),
+    Fault("shading_correction_without_its_jumps", "sliding", "transport.scattering:shading_correction",
+          "dr.detach(correction) if plan.attached_normalization else correction", "correction",
+          by("stack", "finite_difference")),
+    Fault("lamp_left_where_it_is", "moved_lamp", "estimators.attached:differentiate_start",
+          "dr.dot(adjoint.origin, emission.ray.o) + ", "", by("stack", "walk_ad", "finite_difference")),
     # ---- Forward mode: all estimators share it ----
     Fault("forward_without_emission", "glow", "integrators.hooks:TangentSplat.start",
           "mi.Spectrum(self.dE)", "mi.Spectrum(0)", by("event stack", "forward_mode")),

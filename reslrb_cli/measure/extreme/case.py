@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
 from reslrb_cli.measure.analytic_scenes import KnownScene
+from reslrb_cli.measure.attached.amplitudes import AMPLITUDES, Displaced, Move
 from reslrb_cli.measure.gradients import Case, integrator, seeds
+from reslrb_cli.measure.moving import smooth_weights
+from reslrb_cli.measure.small_scenes import load
 from reslrb_cli.records.gradcheck import Reference
 
 Scene = Callable[[], dict]
@@ -19,12 +22,14 @@ Scene = Callable[[], dict]
 class Samples:
     """A reference's gradients: (N, P) of seeds of its own, (N, P) of ours (`paired`), or (P,) exact values.
 
-    `along` (K, P) are directions in which alone it knows the derivative; None: all entries.
+    `along` (K, P) are directions in which alone it knows the derivative; None: all entries. By `bias` the reference
+    may be wrong itself.
     """
 
     values: np.ndarray
     paired: bool = False
     along: np.ndarray | None = None
+    bias: np.ndarray | float = 0.0
 
 
 @dataclass(frozen=True)
@@ -94,6 +99,31 @@ class Differences:
 
 
 @dataclass(frozen=True)
+class Extrapolated:
+    """Finite differences of the image at the gradient's own random numbers, of each amplitude of what moves.
+
+    Those of `step` are corrected by those of twice the step, after Richardson. A tenth of the correction may be wrong,
+    and `left` of their root mean square, which the faces of a mesh and higher powers of the step leave.
+    """
+
+    step: float
+    left: float = 1e-3
+    reference = Reference.FINITE_DIFFERENCE
+
+    def samples(self, case: ExtremeCase, setup: Case) -> Samples:
+        along = np.eye(sum(len(value) for value in setup.initial.values()))
+        tracer = integrator("reslrb", **without_roulette(case))
+        near, far = (
+            np.array([[setup.difference(tracer, d, seed, case.spp, step) for d in along] for seed in seeds(case.seeds)])
+            for step in (self.step, 2 * self.step)
+        )
+        correction = (near - far) / 3
+        values = near + correction
+        size = float(np.sqrt(np.mean(np.square(values.mean(0)))))
+        return Samples(values, True, along, bias=np.abs(correction.mean(0)) / 10 + self.left * size)
+
+
+@dataclass(frozen=True)
 class Exact:
     """Values in closed form."""
 
@@ -114,7 +144,7 @@ class Zero:
         return Samples(np.zeros(sum(len(value) for value in setup.initial.values())))
 
 
-Source = Stock | Twin | Differences | Exact | Zero
+Source = Stock | Twin | Differences | Extrapolated | Exact | Zero
 
 
 @dataclass(frozen=True)
@@ -127,6 +157,8 @@ class ExtremeCase:
     have derivatives of either sign; in the others nothing may be negative. `equal` limits the relative L2 distance at
     equal seeds, and from exact values where there is one seed only. `residual`: what `gather`'s replay leaves of its
     sum is looked at. `open_ended` names the parameters that no z-test can decide, and why; equal seeds decide there.
+    `moves` are what moves light, by amplitudes that are then the one parameter (`keys` is empty): estimators that do
+    not follow it are left out, and dL/dI is smooth.
     """
 
     name: str
@@ -145,6 +177,20 @@ class ExtremeCase:
     residual: bool = False
     equal: float = 1e-4
     open_ended: Mapping[str, str] = field(default_factory=dict)
+    moves: Callable[[Any], Sequence[Move]] | None = None
+
+    def setup(self) -> Case:
+        """The scene, loaded, with its parameters."""
+        if self.moves is None:
+            return Case(self.scene(), self.keys)
+        scene = load(self.scene())
+        case = Case.of(scene, [AMPLITUDES], values=Displaced(scene, self.moves(scene)))
+        case.weigh(smooth_weights(*case.weights.shape))
+        return case
+
+    def naive_options(self) -> dict[str, Any]:
+        """The options of `walk_ad`."""
+        return {**self.options, **self.ours} | ({} if self.moves is None else {"attached": True})
 
 
 def without_roulette(case: ExtremeCase) -> dict[str, Any]:

@@ -21,9 +21,7 @@ def residual(case: ExtremeCase, setup: Case, seed: int = 1) -> Comparison:
     import drjit as dr
     import mitsuba as mi
 
-    for key in setup.keys:
-        dr.enable_grad(setup.params[key])
-    setup.settle()
+    leaves = setup.leaves()
     tracer = Reslrb.of(**{"rr_depth": 1000, **case.options, **case.ours, "estimator": "gather"})
     with dr.suspend_grad(), dr.isolate_grad():
         [samples] = tracer.passes(Job(setup.scene, setup.scene.sensors()[0], mi.UInt32(seed), case.spp, setup.params))
@@ -33,9 +31,7 @@ def residual(case: ExtremeCase, setup: Case, seed: int = 1) -> Comparison:
         [S] = state.S
         left = p.walk(Taking(p, state.visibility, S), state.visibility.last > 0)
         sizes = [np.linalg.norm(np.array(value, np.float64)) for value in (left.value + left.rest, S.value)]
-    for key in setup.keys:
-        setup.params[key] = dr.detach(setup.params[key])
-    setup.settle()
+    setup.release(leaves)
     found = float(sizes[0] / sizes[1])
     verdict = Verdict.HOLDS if found < LIMIT else Verdict.FAILS
     return Comparison(verdict, None, relative_l2=found, relative_l2_limit=LIMIT, message="residual of the replay")

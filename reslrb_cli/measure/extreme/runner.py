@@ -34,16 +34,16 @@ def run_cases(
 
 
 def _run(case: ExtremeCase, estimators: tuple[str, ...]) -> Iterator[GradcheckRecord]:
-    setup = Case(case.scene(), case.keys)
+    setup = case.setup()
     weights = np.array(setup.weights) if case.weights is None else case.weights(np.array(setup.weights))
     # What is refused of dL/dI counts as zero; references are never shown it.
     setup.weights = type(setup.weights)(np.where(np.isfinite(weights), weights, 0))
     reference = case.source.samples(case, setup)
-    walk_ad = integrator("walk_ad", **case.options, **case.ours)
+    walk_ad = integrator("walk_ad", **case.naive_options())
     naive = setup.gradients(walk_ad, seeds_of(case.seeds), case.spp) if case.naive else None
     stock = _stock_images(case, setup) if case.image else None
     setup.weights = type(setup.weights)(weights)
-    for name in estimators:
+    for name in estimators if case.moves is None else [name for name in estimators if ESTIMATORS[name].attaches]:
         taken = _steps(case, setup, name)
         rows = list(_comparisons(case, setup, name, taken.gradients, naive, reference))
         if stock is not None:
@@ -111,7 +111,7 @@ def _comparisons(
             yield parameter, case.source.reference, Kind.EXPECTATION, _settled(case, parameter, found, mine)
     if reference.along is not None:
         mine = ours @ reference.along.T
-        found = compare_expectations(mine, reference.values, FAMILY, paired=reference.paired)
+        found = compare_expectations(mine, reference.values, FAMILY, paired=reference.paired, bias=reference.bias)
         yield None, case.source.reference, Kind.EXPECTATION, _settled(case, None, found, mine)
 
 
@@ -119,7 +119,7 @@ def _parameters(setup: Case) -> Iterator[tuple[str, slice, tuple[int, ...]]]:
     """Each parameter: its name, where it stands in a gradient, and its shape."""
     at = 0
     for key, value in setup.initial.items():
-        shape = np.shape(setup.params[key])
+        shape = np.shape(setup.values.value(key))
         yield key, slice(at, at + len(value)), shape if np.prod(shape, dtype=int) == len(value) else (len(value),)
         at += len(value)
 

@@ -1,0 +1,36 @@
+"""What `bench` measures where parameters move light: every integrator that can takes steps, and memory stays flat."""
+
+from __future__ import annotations
+
+import gc
+
+import drjit as dr
+import mitsuba as mi
+import pytest
+from measure.faults import room
+
+from reslrb_cli.measure.cases import parse_cases
+from reslrb_cli.measure.stepper import Stepper
+from reslrb_cli.records.clock import peak_mib, reset_peak
+
+pytestmark = pytest.mark.usefixtures("llvm")
+
+
+def peak(name: str, depth: int) -> float:
+    """Of a cold step, in MiB, beyond what the scene and what was loaded before it take."""
+    [case] = parse_cases(name)
+    stepper = Stepper(case.at(room("wavy_glass.xml", "top.vertex_positions"), depth, known=True), "fixed")
+    gc.collect()
+    dr.flush_malloc_cache()
+    reset_peak()
+    before = peak_mib(dr.backend_v(mi.Float))
+    cold = stepper.step(0, True, False)
+    warm = stepper.step(1, False, False)
+    assert warm["kernel_ms"] > 0
+    return float(cold["peak_mib"]) - before
+
+
+def test_memory_of_stack_does_not_grow_with_depth():
+    ours, naive = ([peak(name, depth) for depth in (4, 16)] for name in ("reslrb:stack", "ptracer"))
+    assert ours[1] < 1.1 * ours[0]  # so small that what the allocator rounds to shows
+    assert naive[1] > 2 * naive[0] > 4 * ours[0]
