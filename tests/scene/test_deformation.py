@@ -255,7 +255,6 @@ def test_true_values_move_the_scene(scene, tmp_path):
         ([motion("bx")], "[0].motion.of", "there is no `bx` in the scene; did you mean `box`"),
         ([motion(["box", "camera"])], "[0].motion.of[1]", "`camera` is a PerspectiveCamera; shapes and emitters"),
         ([motion("floor")], "[0].motion.of", "`floor` has neither vertices nor a place"),
-        ([motion("glow")], "[0].motion.of", "`glow` cannot be moved: a mesh that emits"),
         ([heightmap("ball")], "[0].heightmap.mesh", "`ball` is a Sphere; a heightmap displaces the vertices"),
         ([heightmap(["box", "bare"])], "[0].heightmap.mesh[1]", "`bare` has no texture coordinates"),
         ([motion("sun", "translation")], "[0].motion.free", "translation does not move `sun`, which is a direction"),
@@ -301,3 +300,11 @@ def test_true_values_are_refused_where_they_stand(scene, values, what):
         set_values(scene, specs(motion("box", "translation")), values, "c.yaml", "target.render.parameters")
     assert error.value.key == f"target.render.parameters.{next(iter(values))}"
     assert what in error.value.message
+
+
+def test_a_mesh_that_emits_moves(scene):
+    before = positions(select(scene, motion("box", "translation")))
+    selection = select(scene, motion("glow", "translation"))
+    assert selection.keys == ["glow.translation"]
+    assert selection.scene_keys == ["glow.vertex_positions"]
+    assert np.array_equal(positions(selection), before)  # the box stays
