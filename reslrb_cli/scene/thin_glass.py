@@ -12,8 +12,8 @@ from .graph import SceneGraph
 LEAST_OFFSETS = 10
 #: Of the crossings that light meets, the share that may be nearer: at edges, and where it grazes a ball.
 SHARE = 0.01
-#: What rounding may put between the places where two rays meet one surface, in offsets.
-ROUNDING = 0.1
+#: What rounding may put between the places where two rays meet one surface: in offsets, and of the longer ray's length.
+ROUNDING, FAR = 0.1, 1e-5
 #: Paths that are followed, and surfaces along each.
 _PATHS, _SURFACES = 4096, 8
 
@@ -41,7 +41,11 @@ def thin_glass(scene: mi.Scene) -> str | None:
         back = scene.ray_intersect(following.spawn_ray(-ray.d), onward)
         offset = mi.math.RayEpsilon * (1 + dr.max(dr.abs(si.p)))
         jumped = dr.dot(back.p - si.p, ray.d)
-        apart = dr.select(onward & back.is_valid() & (jumped > offset * ROUNDING), jumped, dr.norm(following.p - si.p))
+        apart = dr.select(
+            onward & back.is_valid() & (jumped > offset * ROUNDING + FAR * following.t),
+            jumped,
+            dr.norm(following.p - si.p),
+        )
         gaps.append(np.array(dr.select(onward, apart / offset, dr.nan)))
         si, active = following, onward
     found = np.concatenate(gaps)
