@@ -15,6 +15,7 @@ from reslrb_cli.cli.listing import (
     LISTED_SENSORS,
     moving_lines,
     parameter_lines,
+    plain,
     plan_lines,
     scene_lines,
     sensor_lines,
@@ -97,7 +98,7 @@ def command(
     if as_json:
         report = {"obstacle": plan} if isinstance(plan, str) else plan and dataclasses.asdict(plan)
         extra = {} if measured is None else {"conditioning": measured.to_json()}
-        everything_known = {"run": subject.run} | dataclasses.asdict(summary) | {"plan": report, "edges": edges} | extra
+        everything_known = {"run": subject.run} | plain(summary) | {"plan": report, "edges": edges} | extra
         click.echo(json.dumps(without_nan(everything_known), indent=2, allow_nan=False))
         return None
     if subject.run is not None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 from fnmatch import fnmatchcase
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from reslrb_cli.integrators.plan_report import PlanReport
@@ -35,7 +35,7 @@ def sensor_lines(sensor: SensorSummary) -> list[str]:
     if sensor.view is not None:
         shares = dataclasses.asdict(sensor.view)
         lines.append("sees " + ", ".join(f"{name} {100 * share:.0f} %" for name, share in shares.items()))
-    needs = [name for name, value in dataclasses.asdict(sensor.needs).items() if value is True]
+    needs = [field.name for field in dataclasses.fields(sensor.needs) if getattr(sensor.needs, field.name) is True]
     lines.append(
         f"needs {', '.join(name.removeprefix('has_').replace('_', ' ') for name in needs) or 'nothing special'}"
     )
@@ -152,3 +152,14 @@ def _value(info: ParameterInfo) -> str:
 def _flags(info: ParameterInfo) -> str:
     flags = ["differentiable" if info.differentiable else "not differentiable"]
     return ", ".join([*flags, *(["discontinuous"] if info.discontinuous else [])])
+
+
+def plain(value: object) -> Any:
+    """What a dataclass holds as JSON can have it; objects of the scene, which cannot be copied, by their ids."""
+    if dataclasses.is_dataclass(value):
+        return {field.name: plain(getattr(value, field.name)) for field in dataclasses.fields(value)}
+    if isinstance(value, dict):
+        return {key: plain(entry) for key, entry in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [plain(entry) for entry in value]
+    return value.id() if hasattr(value, "id") else value
