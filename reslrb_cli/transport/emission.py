@@ -56,27 +56,47 @@ def sample_emission(samples: Samples, sampler: mi.Sampler) -> Emission:
 
     index, index_weight, reused = scene.sample_emitter(wavelength_sample, True)
     emitter = dr.gather(mi.EmitterPtr, scene.emitters_dr(), index)
-    lamps = {lamp.emitter: (lamp, samples.areas(lamp)) for lamp in plan.placed_lamps}
-
-    def leave(
-        self: mi.Emitter, time: mi.Float, number: mi.Float, position: mi.Point2f, direction: mi.Point2f, active: mi.Bool
-    ) -> tuple[mi.Ray3f, mi.Spectrum]:
-        if self in lamps:
-            lamp, areas = lamps[self]
-            return lamp_ray(lamp, areas, time, number, position, direction, active)
-        return self.sample_ray(time, number, position, direction, active)
-
     if plan.environment_map:
         is_environment = index == plan.needs.environment
         ray, weight = _environment_ray(plan, scene.environment(), time, sample_2, sample_3)
         if len(plan.needs.emitters) > 1:
-            other = dr.dispatch(emitter, leave, time, reused, sample_2, sample_3, ~is_environment)
+            other = _emitter_ray(samples, emitter, time, reused, sample_2, sample_3, ~is_environment)
             ray, weight = (dr.select(is_environment, a, b) for a, b in zip((ray, weight), other, strict=True))
     else:
+        ray, weight = _emitter_ray(samples, emitter, time, reused, sample_2, sample_3, mi.Bool(True))
+    return Emission(ray if plan.moving_emission else dr.detach(ray), weight * dr.detach(index_weight), emitter)
+
+
+def _emitter_ray(
+    samples: Samples,
+    emitter: mi.EmitterPtr,
+    time: mi.Float,
+    number: mi.Float,
+    position: mi.Point2f,
+    direction: mi.Point2f,
+    active: mi.Bool,
+) -> tuple[mi.Ray3f, mi.Spectrum]:
+    """A ray that leaves each lane's emitter: from lamps that we place as `lamp_ray` has it, else as Mitsuba has it."""
+    lamps = {lamp.emitter: (lamp, samples.areas(lamp)) for lamp in samples.plan.placed_lamps}
+    if samples.plan.moving_emission:
         # In an indirect call, although there may be one emitter alone: outside of one the derivative by each number of
         # a transformation is a sum over all paths, for which they would be traced again.
-        ray, weight = dr.dispatch(emitter, leave, time, reused, sample_2, sample_3, mi.Bool(True))
-    return Emission(ray if plan.moving_emission else dr.detach(ray), weight * dr.detach(index_weight), emitter)
+        def leave(
+            self: mi.Emitter, time: mi.Float, number: mi.Float, position: mi.Point2f, direction: mi.Point2f,
+            active: mi.Bool,
+        ) -> tuple[mi.Ray3f, mi.Spectrum]:  # fmt: skip
+            if self in lamps:
+                return lamp_ray(*lamps[self], time, number, position, direction, active)
+            return self.sample_ray(time, number, position, direction, active)
+
+        return dr.dispatch(emitter, leave, time, number, position, direction, active)
+    # Forward mode does not get through an indirect call of ours.
+    ray, weight = emitter.sample_ray(time, number, position, direction, active)
+    for lamp, areas in lamps.values():
+        here = emitter == mi.EmitterPtr(lamp.emitter)
+        own = lamp_ray(lamp, areas, time, number, position, direction, active & here)
+        ray, weight = (dr.select(here, a, b) for a, b in zip(own, (ray, weight), strict=True))
+    return ray, weight
 
 
 def _environment_ray(
