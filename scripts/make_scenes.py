@@ -205,11 +205,16 @@ def slab(cells: int = 96) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     normal = np.stack([dx, -np.ones_like(x), dz], -1)
     normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
 
+    positions = quantise(np.stack([x, y, z], -1).reshape(-1, 3), 2.0**-20)
+    return positions, quantise(normal.reshape(-1, 3), 2.0**-20), grid_faces(cells)
+
+
+def grid_faces(cells: int) -> np.ndarray:
+    """The triangles of a grid of (cells + 1)^2 vertices, row by row: (F, 3) int32."""
     index = np.arange((cells + 1) ** 2).reshape(cells + 1, cells + 1)
     a, b, c, d = index[:-1, :-1], index[1:, :-1], index[1:, 1:], index[:-1, 1:]
     faces = np.concatenate([np.stack([a, b, c], -1).reshape(-1, 3), np.stack([a, c, d], -1).reshape(-1, 3)])
-    positions = quantise(np.stack([x, y, z], -1).reshape(-1, 3), 2.0**-20)
-    return positions, quantise(normal.reshape(-1, 3), 2.0**-20), faces.astype(np.int32)
+    return faces.astype(np.int32)
 
 
 def height_field(cells: int, half: float, height: Callable[[np.ndarray, np.ndarray], np.ndarray]
@@ -225,12 +230,9 @@ def height_field(cells: int, half: float, height: Callable[[np.ndarray, np.ndarr
     dz = (height(x, z + step) - height(x, z - step)) / (2 * step)
     normal = np.stack([dx, -np.ones_like(x), dz], -1)
     normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
-    index = np.arange((cells + 1) ** 2).reshape(cells + 1, cells + 1)
-    a, b, c, d = index[:-1, :-1], index[1:, :-1], index[1:, 1:], index[:-1, 1:]
-    faces = np.concatenate([np.stack([a, b, c], -1).reshape(-1, 3), np.stack([a, c, d], -1).reshape(-1, 3)])
     positions = quantise(np.stack([x, y, z], -1).reshape(-1, 3), 2.0**-20)
     uv = np.stack([x + half, z + half], -1).reshape(-1, 2) / (2 * half)
-    return positions, quantise(normal.reshape(-1, 3), 2.0**-20), quantise(uv, 2.0**-20), faces.astype(np.int32)
+    return positions, quantise(normal.reshape(-1, 3), 2.0**-20), quantise(uv, 2.0**-20), grid_faces(cells)
 
 
 def lens(x: np.ndarray, z: np.ndarray) -> np.ndarray:

@@ -8,6 +8,8 @@ from typing import Any, Protocol
 import drjit as dr
 import mitsuba as mi
 
+from reslrb_cli.scene.values import settle
+
 
 class Values(Protocol):
     """What `scene.Selection` has of this kind: the parameters of a scene, or what they are functions of."""
@@ -45,13 +47,7 @@ class SceneValues:
         for key, value in values.items():
             self.params[key] = value
         self.params.update()
-        for key in values:
-            node = self.params.properties[key][2]
-            if isinstance(node, mi.Texture):
-                node.eval(dr.zeros(mi.SurfaceInteraction3f))
-            elif isinstance(node, mi.Mesh) and node.has_vertex_normals():
-                dr.eval(node.vertex_normals_buffer())
-        dr.eval([self.params[key] for key in values])
+        dr.eval([self.params[key] for key in values], settle(self.params, values))
 
     def collect(self) -> None:
         """They are in the scene: nothing is to be done."""

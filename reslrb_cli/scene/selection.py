@@ -12,7 +12,7 @@ import numpy as np
 
 from ..config import Settings
 from .deformation import Deformation
-from .values import Slot
+from .values import Slot, settle
 
 
 @dataclass(frozen=True)
@@ -72,18 +72,8 @@ class Selection:
                     self.params[each] = value
         moved = self.deformation.place()
         self.params.update()
-        # A texture pads its storage when it is first looked up, and unpads it when it is read; the normals of a mesh
-        # follow its vertices. Left to the step, either would cut its kernels in two, and differently in the first step
-        # and the second.
         own = [each for key in values for each in (key, *self.tied.get(key, ())) if key not in self.deformation.values]
-        normals = []
-        for key in (*own, *self.deformation.keys):
-            node = self.params.properties[key][2]
-            if isinstance(node, mi.Texture):
-                node.eval(dr.zeros(mi.SurfaceInteraction3f))
-            elif isinstance(node, mi.Mesh) and node.has_vertex_normals():
-                normals.append(node.vertex_normals_buffer())
-        dr.eval([self.params[key] for key in own], moved, normals)
+        dr.eval([self.params[key] for key in own], moved, settle(self.params, (*own, *self.deformation.keys)))
 
     def collect(self) -> None:
         """Bring what steps added to the gradients of moved things on to that of the values that move them."""

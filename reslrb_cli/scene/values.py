@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -196,3 +196,20 @@ def _entry(array: Array, mask: Array) -> str:
     if array.ndim == 3:
         return f" at texel ({index[1]}, {index[0]}), channel {index[2]}"
     return f" at entry {index[0] if len(index) == 1 else index}"
+
+
+def settle(params: mi.SceneParameters, keys: Iterable[str]) -> list[Any]:
+    """Have what follows from parameters that were just set made up now; returns what is left to evaluate.
+
+    A texture pads its storage when it is first looked up, and unpads it when it is read; the normals of a mesh follow
+    its vertices. Left to the step, either would cut its kernels in two, and differently in the first step and the
+    second.
+    """
+    normals = []
+    for key in keys:
+        node = params.properties[key][2]
+        if isinstance(node, mi.Texture):
+            node.eval(dr.zeros(mi.SurfaceInteraction3f))
+        elif isinstance(node, mi.Mesh) and node.has_vertex_normals():
+            normals.append(node.vertex_normals_buffer())
+    return normals
