@@ -23,7 +23,7 @@ from reslrb_cli.backend.variant import set_variant
 from reslrb_cli.config import load
 from reslrb_cli.optimization import assemble
 from reslrb_cli.optimization.choice import Option, find_options, measured_step, run_pilot
-from reslrb_cli.optimization.pilot import ITERATIONS, Candidate, Gradients, sample_variance, square
+from reslrb_cli.optimization.pilot_records import ITERATIONS, Candidate, Gradients, sample_variance, square
 from reslrb_cli.records.clock import StepClock
 
 ROOT = Path(__file__).resolve().parent.parent

@@ -86,7 +86,7 @@ def run_suite_command(
 
 def _estimators(text: str | None) -> list[str] | None:
     """Names of estimators, without options: the cases have their own."""
-    from reslrb_cli.config.choices import ESTIMATOR_OPTIONS
+    from reslrb_cli.config.integrators import ESTIMATOR_OPTIONS
     from reslrb_cli.measure.cases import parse_estimators
 
     if text is None:

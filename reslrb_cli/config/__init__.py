@@ -1,25 +1,10 @@
 """The configuration: one YAML file is one experiment. Knows no Mitsuba."""
 
-from .choices import (
-    L1,
-    L2,
-    SGD,
-    Adam,
-    AdamW,
-    Integrator,
-    LogL2,
-    Loss,
-    Optimizer,
-    Prb,
-    Ptracer,
-    RelativeL2,
-    Reslrb,
-    RMSProp,
-    Trajectory,
-    WalkAd,
-)
+from .integrators import Integrator, Prb, Ptracer, Reslrb, Trajectory, WalkAd
 from .loader import dump, load, loads, with_integrator
+from .losses import L1, L2, LogL2, Loss, RelativeL2
 from .moving import HEIGHTMAP, WORDS, HeightmapSpec, MotionSpec
+from .optimizers import SGD, Adam, AdamW, Optimizer, RMSProp
 from .parameters import ColorSpace, ImageFile, ParameterSpec, Settings
 from .schema import Config, Rendering, RunConfig, SceneConfig, TargetConfig
 

@@ -30,6 +30,21 @@ def wrong(message: str) -> PydanticCustomError:
     return PydanticCustomError("wrong", "{message}", {"message": message})
 
 
+# --- sections that are chosen by their `type` -----------------------------------------------------------------------
+
+
+#: For JSON Schema: `type` may be left out only for the first member of a union.
+NEEDS_TYPE = ConfigDict(json_schema_extra={"required": ["type"]})
+
+
+class Choice(Section):
+    """A section whose `type` says which options it has."""
+
+    def options(self) -> dict[str, Any]:
+        """The options of this type by name, without `type` and without those that are None."""
+        return self.model_dump(exclude={"type"}, exclude_none=True)
+
+
 # --- paths ------------------------------------------------------------------------------------------------------------
 
 

@@ -22,9 +22,11 @@ from pydantic import (
 from typing_extensions import Self
 
 from .base import ConfigPath, Count, Section, Seed, WorkPath, by_kind, located, mark, wrong
-from .choices import L2, Adam, AnyIntegrator, AnyLoss, AnyOptimizer, Integrator, Reslrb
+from .integrators import AnyIntegrator, Integrator, Reslrb
 from .limits import KEY_LENGTH
+from .losses import L2, AnyLoss
 from .names import check_name, folder_name
+from .optimizers import Adam, AnyOptimizer
 from .parameters import COLOR_SPACE, ColorSpace, ParameterSpec, Value
 from .sizes import Memory, memory_bytes
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from reslrb_cli.config import Config, Prb, Ptracer, Reslrb, Trajectory, WalkAd, with_integrator
-from reslrb_cli.config.choices import ESTIMATOR_OPTIONS
+from reslrb_cli.config.integrators import ESTIMATOR_OPTIONS
 from reslrb_cli.config.text import parse
 from reslrb_cli.errors import ConfigError
 

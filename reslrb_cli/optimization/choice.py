@@ -18,7 +18,8 @@ from reslrb_cli.estimators import ESTIMATORS
 from reslrb_cli.integrators import Reslrb as Tracer
 from reslrb_cli.optimization.budget import MemoryPlan, choose_samples, standing
 from reslrb_cli.optimization.moving import ATTACHED, is_attached
-from reslrb_cli.optimization.pilot import Candidate, Measured, Outcome, Pilot
+from reslrb_cli.optimization.pilot import Pilot
+from reslrb_cli.optimization.pilot_records import Candidate, Measured, Outcome
 from reslrb_cli.optimization.samples import sample_gradient, take_gradient
 from reslrb_cli.records.clock import MIB, StepClock
 from reslrb_cli.records.manifest import versions

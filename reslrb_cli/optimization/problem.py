@@ -19,7 +19,7 @@ from reslrb_cli.optimization.errors import ErrorMeter, comparison_grid, quantity
 from reslrb_cli.optimization.losses import Loss, make_loss
 from reslrb_cli.optimization.moving import check_moving
 from reslrb_cli.optimization.optimizers import Optimizer
-from reslrb_cli.optimization.pilot import Outcome
+from reslrb_cli.optimization.pilot_records import Outcome
 from reslrb_cli.optimization.rendering import render_in_passes
 from reslrb_cli.optimization.scaling import Scaled
 from reslrb_cli.optimization.transforms import make_transform

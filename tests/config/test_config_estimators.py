@@ -7,7 +7,7 @@ from typing import get_args
 import pytest
 
 from reslrb_cli.config import Reslrb
-from reslrb_cli.config.choices import ESTIMATOR_OPTIONS
+from reslrb_cli.config.integrators import ESTIMATOR_OPTIONS
 from reslrb_cli.config.sizes import memory_bytes
 from reslrb_cli.estimators import ESTIMATORS
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from reslrb_cli.optimization.pilot import ITERATIONS, SHARE, Candidate, Measured, Outcome, Pilot
+from reslrb_cli.optimization.pilot import SHARE, Pilot
+from reslrb_cli.optimization.pilot_records import ITERATIONS, Candidate, Measured, Outcome
 
 STACK, GATHER = Candidate({"estimator": "stack"}, True), Candidate({"estimator": "gather"}, True)
 RESERVOIR = Candidate({"estimator": "reservoir", "capacity": 1}, False)

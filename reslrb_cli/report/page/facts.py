@@ -9,7 +9,7 @@ from datetime import datetime
 from typing import Any
 
 from reslrb_cli.optimization.correlated_bias import CorrelatedBias, share_words
-from reslrb_cli.optimization.pilot import Outcome
+from reslrb_cli.optimization.pilot_records import Outcome
 from reslrb_cli.report.page.markup import breakable, facts, table, text
 from reslrb_cli.report.words import duration, number
 

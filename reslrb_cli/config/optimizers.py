@@ -1,0 +1,113 @@
+"""The optimisers, each with the options that it knows."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
+from typing_extensions import Self
+
+from .base import NEEDS_TYPE, Choice, Positive, by_type, located, mark
+
+_Decay = Annotated[float, Field(ge=0, lt=1)]
+
+
+class Optimizer(Choice):
+    """Options that all optimisers share: the learning rate and its schedule."""
+
+    type: str
+    learning_rate: Positive = Field(
+        default=0.02,
+        description="Step size at the first iteration, in the parameter's units; in those of its `transform`, where it "
+        "has one; with `scale: auto`, as a share of the measured length.",
+    )
+    scale: Literal["none", "auto"] = Field(
+        default="none",
+        description="`auto`: before the first iteration, measure for each parameter the length by which it would have "
+        "to change to make up the image where it has an effect, and how large its gradient is, and let the optimizer "
+        "move each in units of its own: one learning rate serves parameters that differ by orders of magnitude, and "
+        "`epsilon` does not matter. Learning rates are then shares of that length: 0.02 is 2 % a step.",
+    )
+    schedule: Literal["constant", "cosine", "exponential"] = Field(
+        default="constant", description="How the learning rate runs from its first value to its last."
+    )
+    final_fraction: float = Field(
+        default=0.01,
+        gt=0,
+        le=1,
+        description="Last learning rate over the first; only with a schedule other than `constant`.",
+    )
+
+    clamp_gradient: Annotated[float, Field(ge=1)] | None = Field(
+        default=None,
+        description="Clamp each entry of a gradient at so many times its usual size: the larger of the running means "
+        "of its own absolute value and of those of all entries of the parameter. Takes the noise of rare bright paths, "
+        "and is biased by what it takes, which the run reports. null: no clamp.",
+    )
+
+    @model_validator(mode="after")
+    def _check_schedule(self) -> Self:
+        if self.schedule == "constant" and "final_fraction" in self.model_fields_set:
+            raise located("final_fraction", "has no effect on a constant learning rate; set `schedule` or remove it")
+        return self
+
+    @model_serializer(mode="wrap")
+    def _without_unused(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        values: dict[str, Any] = handler(self)
+        if self.schedule == "constant":
+            values.pop("final_fraction", None)
+        return values
+
+    def own_options(self) -> dict[str, Any]:
+        """Options of the update rule itself (beta_1, momentum, ...): those that not all types share."""
+        return {name: value for name, value in self.options().items() if name not in Optimizer.model_fields}
+
+
+class _AdamOptions(Optimizer):
+    beta_1: _Decay = Field(default=0.9, description="Decay of the running mean of the gradient.")
+    beta_2: _Decay = Field(default=0.999, description="Decay of the running mean of the squared gradient.")
+    epsilon: Positive = Field(default=1e-8, description="Added to the root of the mean squared gradient.")
+
+
+class Adam(_AdamOptions):
+    """Adam (Kingma and Ba 2015)."""
+
+    type: Literal["adam"] = Field(default="adam", description="Adam (Kingma and Ba 2015).")
+
+
+class AdamW(_AdamOptions):
+    """Adam with decoupled weight decay (Loshchilov and Hutter 2019)."""
+
+    model_config = NEEDS_TYPE
+    type: Literal["adamw"] = Field(
+        default="adamw", description="Adam with decoupled weight decay (Loshchilov, Hutter 2019)."
+    )
+    weight_decay: float = Field(
+        default=0.01, ge=0, description="Share of the value that a step removes, per learning rate."
+    )
+
+
+class RMSProp(Optimizer):
+    """RMSProp (Hinton 2012)."""
+
+    model_config = NEEDS_TYPE
+    type: Literal["rmsprop"] = Field(default="rmsprop", description="RMSProp (Hinton 2012).")
+    decay: _Decay = Field(default=0.99, description="Decay of the running mean of the squared gradient.")
+    epsilon: Positive = Field(default=1e-8, description="Added to the root of the mean squared gradient.")
+
+
+class SGD(Optimizer):
+    """Gradient descent with momentum."""
+
+    model_config = NEEDS_TYPE
+    type: Literal["sgd"] = Field(default="sgd", description="Gradient descent, with momentum if that is above 0.")
+    momentum: _Decay = Field(default=0.0, description="Decay of the running sum of gradients; 0: none.")
+
+
+AnyOptimizer = Annotated[
+    Annotated[Adam, mark("adam")]
+    | Annotated[AdamW, mark("adamw")]
+    | Annotated[RMSProp, mark("rmsprop")]
+    | Annotated[SGD, mark("sgd")],
+    by_type("adam"),
+]
