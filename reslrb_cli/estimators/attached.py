@@ -20,7 +20,6 @@ traced again for those before, block by block, the last block first.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -56,12 +55,12 @@ class Frame:
         aperture = [mi.Point2f(0)] if plan.needs.thin_lens else []
         return Frame(SurfacePoint.blank(plan), mi.Float(0), mi.Point2f(0), mi.Spectrum(0), mi.UInt32(0), aperture)
 
-    def members(self) -> list[Any]:
+    def members(self) -> list[dr.ArrayBase]:
         """All arrays, in the order of `like`."""
         plain = [self.sample_1, self.sample_2, self.prefix, self.connected]
         return [*self.point.numbers, *plain, *self.aperture]
 
-    def like(self, members: list[Any]) -> Frame:
+    def like(self, members: list[dr.ArrayBase]) -> Frame:
         """The frame of the same form that has these members."""
         values = iter(members)
         point = SurfacePoint([next(values) for _ in self.point.numbers])
@@ -203,7 +202,9 @@ def walk_back(p: Pass, size: int, pushed: Pushed, top: mi.UInt32, bottom: mi.UIn
     assert p.adjoint is not None
     image = p.adjoint
 
-    def body(number: mi.UInt32, adjoint: Adjoint, stack: list[dr.Local], roulette: list[dr.Local]) -> tuple[Any, ...]:
+    def body(
+        number: mi.UInt32, adjoint: Adjoint, stack: list[dr.Local], roulette: list[dr.Local]
+    ) -> tuple[mi.UInt32, Adjoint, list[dr.Local], list[dr.Local]]:
         place = (number - 1) % size
         frame = form.like([array.read(place) for array in stack])
         r = roulette[0].read(place) if roulette else mi.Float(1)

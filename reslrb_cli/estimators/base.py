@@ -108,7 +108,7 @@ def entry_bytes(tree: Any) -> list[int]:
     return [size for part in parts for size in entry_bytes(part)]
 
 
-def differentiate_emission(p: Pass, weight: Callable[[Any], Any]) -> None:
+def differentiate_emission(p: Pass, weight: Callable[[mi.Spectrum], mi.Spectrum]) -> None:
     """Add the derivative of E, (C,), times `weight(E)`, where the plan differentiates emission at all."""
     if p.plan.differentiate_emission:
         with dr.resume_grad(), dr.isolate_grad():
@@ -124,11 +124,13 @@ class PathAdjoint:
     without one; `product` says which factor is zero, if any.
     """
 
-    value: Any
+    value: mi.Spectrum
     product: Product
 
 
-def adjoint_of_factor(adjoint: PathAdjoint, index: Any, f: Any, rest: Any) -> Any:
+def adjoint_of_factor(
+    adjoint: PathAdjoint, index: mi.UInt32 | mi.Int32, f: mi.Spectrum, rest: mi.Spectrum | float
+) -> mi.Spectrum:
     """d(objective)/df (C,), for the factor `f * rest` that stands at position `index` of the path; detached.
 
     A factor that is not zero gets adjoint / f where no factor is zero; one that is, adjoint * rest where it is the only
@@ -145,8 +147,13 @@ def adjoint_of_factor(adjoint: PathAdjoint, index: Any, f: Any, rest: Any) -> An
 
 
 def differentiate_passage(
-    p: Pass, si: Any, depth: Any, connection: Connection, active: Any, adjoint: Callable[[Any], Any]
-) -> Any:
+    p: Pass,
+    si: mi.SurfaceInteraction3f,
+    depth: mi.UInt32,
+    connection: Connection,
+    active: mi.Bool,
+    adjoint: Callable[[mi.Spectrum], mi.Spectrum],
+) -> mi.Spectrum:
     """Transmittance (C,) of the masks between a vertex and the sensor; adds its derivative.
 
     `adjoint(transmission)` is d(objective)/d(transmission) of one of them. One with a transmission of zero ends the
@@ -156,7 +163,7 @@ def differentiate_passage(
     if not p.plan.passage_in_gradient:
         return mi.Spectrum(1)
 
-    def differentiate(transmission: Any, hit: Any) -> None:
+    def differentiate(transmission: mi.Spectrum, hit: mi.Bool) -> None:
         objective = dr.select(hit, adjoint(dr.detach(transmission)) * transmission, 0)
         # Masks may be there and have no parameter that is differentiated.
         dr.backward_from(objective, flags=dr.ADFlag.Default | dr.ADFlag.AllowNoGrad)
@@ -178,11 +185,11 @@ class VertexHooks(Hooks):
     def __init__(self, p: Pass) -> None:
         self.p = p
 
-    def concerned(self, state: Any) -> Any:
+    def concerned(self, state: Any) -> mi.Bool:
         """Lanes with anything to differentiate before the current vertex, where emission is not differentiated."""
         return mi.Bool(True)
 
-    def wants(self, state: Any, vertex: Vertex) -> Any:
+    def wants(self, state: Any, vertex: Vertex) -> mi.Bool:
         """Where there is no image to splat into, connections with anything to differentiate."""
         plan = self.p.plan
         if self.p.block is not None or plan.differentiate_emission:

@@ -44,9 +44,9 @@ from reslrb_cli.transport.scattering import Scattering
 class Slot:
     """One kept pair of a connection and an event."""
 
-    w: Any  # selection weight of the connection; 0: nothing kept
+    w: mi.Float  # selection weight of the connection; 0: nothing kept
     C: Product
-    u: Any
+    u: mi.Point2f
     event: Event
 
     @staticmethod
@@ -59,18 +59,18 @@ class Slot:
 class EventState:
     """Loop state: Q, W, and for each slot the prefix's event, and the kept pair."""
 
-    Q: Any
-    W: Any
+    Q: mi.Float
+    W: mi.Float
     prefix: list[Event]
     slots: list[Slot]
-    numbers: list[Any]  # that chose between prefix and vertex in this one's connection
+    numbers: list[mi.Float]  # that chose between prefix and vertex in this one's connection
 
 
 @dataclass
 class Kept:
     """What is kept of a path."""
 
-    W: Any
+    W: mi.Float
     slots: list[Slot]
 
 
@@ -88,10 +88,12 @@ class EventSelection(VertexHooks):
         Q = mi.Float(1 if plan.differentiate_emission else 0)
         return EventState(Q, mi.Float(0), prefix, slots, [mi.Float(0) for _ in slots])
 
-    def concerned(self, state: EventState) -> Any:
+    def concerned(self, state: EventState) -> mi.Bool:
         return state.Q > 0
 
-    def connection(self, state: EventState, vertex: Vertex, connection: Connection, numbers: list[Any]) -> EventState:
+    def connection(
+        self, state: EventState, vertex: Vertex, connection: Connection, numbers: list[mi.Float]
+    ) -> EventState:
         p, plan = self.p, self.p.plan
         C = contribution(p, vertex, connection)
         p.splat(connection.u, C.value(), connection.active)
@@ -147,7 +149,7 @@ class EventEstimator(Estimator):
     def backward(self, p: Pass, state: Kept) -> None:
         adjoints = [slot_adjoint(p, state.W, slot, self.capacity) for slot in state.slots]
 
-        def emission_weight(E: Any) -> Any:
+        def emission_weight(E: mi.Spectrum) -> mi.Spectrum:
             total = mi.Spectrum(0)
             for slot, adjoint in zip(state.slots, adjoints, strict=True):
                 total += dr.select(slot.event.index == 0, adjoint_of_factor(adjoint, mi.Int32(0), E, 1), 0)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -26,13 +25,13 @@ class Event:
     aperture, where masks may stand between it and the sensor.
     """
 
-    index: Any
+    index: mi.UInt32
     point: SurfacePoint
-    wo: Any
-    f: Any
-    rest: list[Any]
-    lobe: list[Any]
-    own: list[Any]
+    wo: mi.Vector3f
+    f: mi.Spectrum
+    rest: list[mi.Float]
+    lobe: list[mi.UInt32 | mi.Float | mi.Point2f]
+    own: list[mi.Bool | mi.Point2f]
 
     @staticmethod
     def emission(plan: Plan) -> Event:
@@ -70,7 +69,7 @@ class Event:
         )
 
 
-def differentiate_event(p: Pass, kept: Event, adjoint: PathAdjoint, active: Any) -> None:
+def differentiate_event(p: Pass, kept: Event, adjoint: PathAdjoint, active: mi.Bool) -> None:
     """Add the derivative of an event, of a connection with this adjoint, in `active` lanes that hold one."""
     plan, active = p.plan, active & (kept.index > 0)
     si, bsdf = kept.point.interaction(plan, active)
@@ -79,7 +78,7 @@ def differentiate_event(p: Pass, kept: Event, adjoint: PathAdjoint, active: Any)
         own, sample = kept.own
         connection = connect(plan, p.samples.sensor, si, kept.point.ray(), sample, active & own)
 
-        def adjoint_of(transmission: Any) -> Any:
+        def adjoint_of(transmission: mi.Spectrum) -> mi.Spectrum:
             return adjoint_of_factor(adjoint, mi.Int32(NO_ZERO), transmission, 0)
 
         passed = differentiate_passage(p, si, kept.index, connection, active & own, adjoint_of)

@@ -11,7 +11,6 @@ beyond the last bit trace their shadow rays again, so that memory is constant.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -40,22 +39,23 @@ WORDS = 2  # of visibility bits, 32 vertices each
 class Visibility:
     """Which connections of a path were visible: one bit for each of 32 * WORDS vertices, and the last of all."""
 
-    words: list[Any]
-    last: Any  # the last vertex that there is need to visit again, mostly the last with a visible connection; 0: none
+    words: list[mi.UInt32]
+    # The last vertex that there is need to visit again, mostly the last with a visible connection; 0: none.
+    last: mi.UInt32
 
     @staticmethod
     def none(plan_depth: int) -> Visibility:
         """No vertex seen yet, with as many words as paths of that many vertices can fill."""
         return Visibility([mi.UInt32(0) for _ in range(min(WORDS, -(-plan_depth // 32)))], mi.UInt32(0))
 
-    def with_vertex(self, depth: Any, visible: Any, last: Any) -> Visibility:
+    def with_vertex(self, depth: mi.UInt32, visible: mi.Bool, last: mi.UInt32) -> Visibility:
         """Remember whether the connection from vertex `depth` is visible; if so, `last` is to be visited."""
         index = depth - 1
         bit = mi.UInt32(1) << (index & 31)
         words = [word | dr.select(visible & ((index >> 5) == k), bit, 0) for k, word in enumerate(self.words)]
         return Visibility(words, dr.select(visible, last, self.last))
 
-    def seen(self, depth: Any, vertices: int) -> Seen:
+    def seen(self, depth: mi.UInt32, vertices: int) -> Seen:
         """What is known at vertex `depth`, of paths that have at most so many vertices."""
         index = depth - 1
         visible = mi.Bool(False)
@@ -74,7 +74,7 @@ class GatherState:
 
     visibility: Visibility
     S: list[AdjointSum]
-    latest: list[Any]
+    latest: list[mi.UInt32]
 
 
 class Gathering(VertexHooks):
@@ -89,7 +89,9 @@ class Gathering(VertexHooks):
             return GatherState(visibility, [], [])
         return GatherState(visibility, [AdjointSum.zero(p.plan.track_zeros)], [mi.UInt32(0)])
 
-    def connection(self, state: GatherState, vertex: Vertex, connection: Connection, numbers: list[Any]) -> GatherState:
+    def connection(
+        self, state: GatherState, vertex: Vertex, connection: Connection, numbers: list[mi.Float]
+    ) -> GatherState:
         p, depth, last = self.p, vertex.depth, vertex.depth
         C = contribution(p, vertex, connection)
         p.splat(connection.u, C.value(), connection.active)
@@ -105,8 +107,8 @@ class Summed:
     """State of a walk that sums: S_0 so far, `latest` as in GatherState, the last vertex that a replay has to visit."""
 
     S: AdjointSum
-    latest: Any
-    last: Any
+    latest: mi.UInt32
+    last: mi.UInt32
 
 
 class Summing(VertexHooks):
@@ -122,10 +124,10 @@ class Summing(VertexHooks):
     def seen(self, vertex: Vertex) -> Seen:
         return self.visibility.seen(vertex.depth, vertices(self.p))
 
-    def goes_on(self, state: Summed, vertex: Vertex) -> Any:
+    def goes_on(self, state: Summed, vertex: Vertex) -> mi.Bool:
         return vertex.depth < self.visibility.last
 
-    def connection(self, state: Summed, vertex: Vertex, connection: Connection, numbers: list[Any]) -> Summed:
+    def connection(self, state: Summed, vertex: Vertex, connection: Connection, numbers: list[mi.Float]) -> Summed:
         S = plus(self.p, state.S, vertex, connection, contribution(self.p, vertex, connection))
         latest = latest_concerned(self.p, vertex, state.latest)
         last = dr.select(connection.active, needed(latest, vertex.depth), state.last)
@@ -138,7 +140,7 @@ class Taking(VertexHooks):
     `S` sums the connections of the vertices from `first` on; what comes before them is left alone. None: of all.
     """
 
-    def __init__(self, p: Pass, visibility: Visibility, S: AdjointSum, first: Any = None) -> None:
+    def __init__(self, p: Pass, visibility: Visibility, S: AdjointSum, first: mi.UInt32 | None = None) -> None:
         super().__init__(p)
         self.visibility, self.S, self.first = visibility, S, first
 
@@ -148,10 +150,12 @@ class Taking(VertexHooks):
     def seen(self, vertex: Vertex) -> Seen:
         return self.visibility.seen(vertex.depth, vertices(self.p))
 
-    def goes_on(self, state: AdjointSum, vertex: Vertex) -> Any:
+    def goes_on(self, state: AdjointSum, vertex: Vertex) -> mi.Bool:
         return vertex.depth < self.visibility.last
 
-    def scattering(self, state: AdjointSum, vertex: Vertex, connection: Connection, scattering: Scattering) -> Any:
+    def scattering(
+        self, state: AdjointSum, vertex: Vertex, connection: Connection, scattering: Scattering
+    ) -> AdjointSum:
         p, plan, connected = self.p, self.p.plan, connection.active
         useful = plan.differentiates(vertex.bsdf)
         if self.first is not None:
@@ -165,7 +169,7 @@ class Taking(VertexHooks):
         rest_c = mi.Spectrum(dr.rcp(stand_in(connection)[0]))
         if plan.needs.has_null:
 
-            def adjoint_of(transmission: Any) -> Any:
+            def adjoint_of(transmission: mi.Spectrum) -> mi.Spectrum:
                 return adjoint_of_factor(own, mi.Int32(NO_ZERO), transmission, 0)
 
             rest_c *= differentiate_passage(p, vertex.si, vertex.depth, connection, connected, adjoint_of)
@@ -178,12 +182,12 @@ class Taking(VertexHooks):
         return S
 
 
-def latest_concerned(p: Pass, vertex: Vertex, before: Any) -> Any:
+def latest_concerned(p: Pass, vertex: Vertex, before: mi.UInt32) -> mi.UInt32:
     """The latest vertex with anything to differentiate up to this one, `before` without it; 0: none."""
     return dr.select(p.plan.concerns(vertex.bsdf), vertex.depth, before)
 
 
-def needed(latest: Any, depth: Any) -> Any:
+def needed(latest: mi.UInt32, depth: mi.UInt32) -> mi.UInt32:
     """The last vertex that a replay has to visit for a connection from vertex `depth`: one after the latest with
     anything to differentiate, whose scattering is then sampled, or that vertex itself; 0: none."""
     return dr.select(latest > 0, dr.minimum(latest + 1, depth), 0)
@@ -220,6 +224,6 @@ class Gather(Estimator):
         if p.plan.differentiate_bsdfs:
             p.walk(Taking(p, visibility, S), visibility.last > 0)
 
-    def kept(self, plan: Plan) -> Any:
+    def kept(self, plan: Plan) -> GatherState:
         visibility = Visibility.none(max(plan.max_depth - 1, 0))
         return GatherState(visibility, [AdjointSum.zero(plan.track_zeros)], [mi.UInt32(0)])

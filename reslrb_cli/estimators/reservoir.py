@@ -15,7 +15,7 @@ differentiate is no candidate.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Protocol
 
 import drjit as dr
 import mitsuba as mi
@@ -41,6 +41,14 @@ from reslrb_cli.transport.scattering import Scattering, tracked_factor
 SHARE = 0.01  # the least share of a candidate in the weights up to it
 
 
+class Chosen(Protocol):
+    """What any slot holds of its connection: selection weight (0: it holds none), contribution, film position."""
+
+    w: mi.Float
+    C: Product
+    u: mi.Point2f
+
+
 @dataclass
 class Slot:
     """One kept connection, 28 bytes (and 12 more where zero factors are tracked).
@@ -48,10 +56,10 @@ class Slot:
     Where BSDFs are differentiated, `event` holds c_I, about 50 bytes, so that the replay ends a vertex earlier.
     """
 
-    w: Any  # its selection weight
-    last: Any  # the last vertex before its own with anything to differentiate; 0: none
+    w: mi.Float  # its selection weight
+    last: mi.UInt32  # the last vertex before its own with anything to differentiate; 0: none
     C: Product  # its contribution
-    u: Any  # its film position
+    u: mi.Point2f  # its film position
     event: list[Event]
 
 
@@ -59,9 +67,9 @@ class Slot:
 class ReservoirState:
     """What is kept of a path."""
 
-    W: Any  # sum of all candidates' weights
+    W: mi.Float  # sum of all candidates' weights
     slots: list[Slot]
-    latest: list[Any]  # on the way: the latest vertex with anything to differentiate; 0: none
+    latest: list[mi.UInt32]  # on the way: the latest vertex with anything to differentiate; 0: none
 
     @staticmethod
     def empty(plan: Plan, capacity: int) -> ReservoirState:
@@ -74,7 +82,7 @@ class ReservoirState:
         return ReservoirState(mi.Float(0), [slot() for _ in range(capacity)], [mi.UInt32(0)])
 
 
-def selection_weight(p: Pass, weight: str, connection: Connection, C: Product) -> Any:
+def selection_weight(p: Pass, weight: str, connection: Connection, C: Product) -> mi.Float:
     """w of a connection: `luminance` of C, or `adjoint`, sum_c |delta_c C_c|.
 
     Raises ValueError where the latter is asked for and delta is not known.
@@ -87,7 +95,7 @@ def selection_weight(p: Pass, weight: str, connection: Connection, C: Product) -
     return dr.sum(dr.abs(p.delta(connection.u, connection.active) * value))
 
 
-def is_taken(number: Any, w: Any, W: Any) -> Any:
+def is_taken(number: mi.Float, w: mi.Float, W: mi.Float) -> mi.Bool:
     """Whether a candidate of weight `w` takes the slot, `W` being the sum up to it: with probability w / W.
 
     A weight that is not finite is always taken, and so is all that follows: what is wrong must not be lost.
@@ -95,7 +103,7 @@ def is_taken(number: Any, w: Any, W: Any) -> Any:
     return (w != 0) & ((number * W < w) | ~dr.isfinite(W))
 
 
-def defended(w: Any, W: Any) -> Any:
+def defended(w: mi.Float, W: mi.Float) -> mi.Float:
     """A candidate's weight, raised to SHARE of all before it, W, unless it is 0.
 
     What comes after a heavy connection may be all that some parameter has: it is chosen with a probability of SHARE at
@@ -106,13 +114,13 @@ def defended(w: Any, W: Any) -> Any:
     return dr.select((w != 0) & (w < least), least, w)  # a comparison: what is not a number stays
 
 
-def unselected(W: Any, slot: Any, capacity: int) -> Any:
+def unselected(W: mi.Float, slot: Chosen, capacity: int) -> mi.Float:
     """W / (m w): 1 over the probability of a slot's selection, shared among the slots; 0 where it holds nothing."""
     return dr.select(slot.w != 0, W / (capacity * slot.w), 0)
 
 
-def slot_adjoint(p: Pass, W: Any, slot: Any, capacity: int) -> PathAdjoint:
-    """Sensitivity of the objective to what a slot holds (`w`, `C`, `u`), standing for all that it was chosen from."""
+def slot_adjoint(p: Pass, W: mi.Float, slot: Chosen, capacity: int) -> PathAdjoint:
+    """Sensitivity of the objective to what a slot holds, standing for all that it was chosen from."""
     delta = p.delta(slot.u, slot.w != 0)
     return PathAdjoint(delta * slot.C.nonzero * unselected(W, slot, capacity), slot.C)
 
@@ -127,11 +135,11 @@ class ReservoirSelection(VertexHooks):
     def start(self, product: Product) -> ReservoirState:
         return ReservoirState.empty(self.p.plan, self.numbers)
 
-    def concerned(self, state: ReservoirState) -> Any:
+    def concerned(self, state: ReservoirState) -> mi.Bool:
         return state.latest[0] > 0
 
     def connection(
-        self, state: ReservoirState, vertex: Vertex, connection: Connection, numbers: list[Any]
+        self, state: ReservoirState, vertex: Vertex, connection: Connection, numbers: list[mi.Float]
     ) -> ReservoirState:
         C = contribution(self.p, vertex, connection)
         if self.splat:
@@ -168,10 +176,10 @@ class ReservoirReplay(VertexHooks):
         for slot in slots[1:]:
             self.last = dr.maximum(self.last, slot.last)
 
-    def goes_on(self, state: Any, vertex: Vertex) -> Any:
+    def goes_on(self, state: Any, vertex: Vertex) -> mi.Bool:
         return vertex.depth <= self.last
 
-    def is_followed(self, state: Any, vertex: Vertex) -> Any:
+    def is_followed(self, state: Any, vertex: Vertex) -> mi.Bool:
         return vertex.depth < self.last
 
     def scattering(self, state: Any, vertex: Vertex, connection: Connection, scattering: Scattering) -> Any:
@@ -214,7 +222,7 @@ class Reservoir(Estimator):
     def backward(self, p: Pass, state: ReservoirState) -> None:
         adjoints = [slot_adjoint(p, state.W, slot, self.capacity) for slot in state.slots]
 
-        def emission_weight(E: Any) -> Any:
+        def emission_weight(E: mi.Spectrum) -> mi.Spectrum:
             weights = [adjoint_of_factor(adjoint, mi.Int32(0), E, 1) for adjoint in adjoints]
             return sum(weights[1:], weights[0])
 

@@ -53,13 +53,14 @@ class Frame:
     """
 
     point: SurfacePoint
-    wo_c: Any
-    wo_s: Any
-    weight_c: Any
-    f_s: Any
-    own: Any
-    zeros: list[Any]  # where zeros are tracked: correction / pdf of the scattering, and `own` behind a zero factor
-    lobe: list[Any]
+    wo_c: mi.Vector3f
+    wo_s: mi.Vector3f
+    weight_c: mi.Spectrum
+    f_s: mi.Spectrum
+    own: mi.Spectrum
+    # Where zeros are tracked: correction / pdf of the scattering, and `own` behind a zero factor.
+    zeros: list[mi.Float | mi.Spectrum]
+    lobe: list[mi.UInt32 | mi.Float | mi.Point2f]
 
     @staticmethod
     def blank(plan: Plan) -> Frame:
@@ -69,12 +70,12 @@ class Frame:
         point, lobe = SurfacePoint.blank(plan), blank_lobe(plan)
         return Frame(point, wo, wo, mi.Spectrum(0), mi.Spectrum(0), mi.Spectrum(0), zeros, lobe)
 
-    def members(self) -> list[Any]:
+    def members(self) -> list[dr.ArrayBase]:
         """All arrays, in the order of `like`."""
         plain = [self.wo_c, self.wo_s, self.weight_c, self.f_s, self.own]
         return [*self.point.numbers, *plain, *self.zeros, *self.lobe]
 
-    def like(self, members: list[Any]) -> Frame:
+    def like(self, members: list[dr.ArrayBase]) -> Frame:
         """The frame of the same form that has these members."""
         values = iter(members)
         point = SurfacePoint([next(values) for _ in self.point.numbers])
@@ -87,12 +88,12 @@ class Frame:
 class Pushed:
     """Loop state of the way out."""
 
-    stack: list[Any]  # thread-local arrays, one for each member of a frame
-    height: Any
+    stack: list[dr.Local]  # thread-local arrays, one for each member of a frame
+    height: mi.UInt32
     since: AdjointSum  # contributions since the last vertex that was pushed
     tail: AdjointSum  # contributions from vertex `first` on
-    first: Any  # the first vertex that found the stack full; 0: none
-    last: Any  # last vertex with a visible connection; 0: none
+    first: mi.UInt32  # the first vertex that found the stack full; 0: none
+    last: mi.UInt32  # last vertex with a visible connection; 0: none
 
 
 @dataclass
@@ -101,8 +102,8 @@ class StackState:
 
     S: AdjointSum
     tail: AdjointSum
-    first: Any
-    last: Any
+    first: mi.UInt32
+    last: mi.UInt32
 
 
 def places(plan: Plan, stack_size: int) -> int:
@@ -129,13 +130,13 @@ class Pushing(VertexHooks):
         # Three zeros: state variables may not be one object.
         return Pushed(stack, mi.UInt32(0), since, tail, mi.UInt32(0), mi.UInt32(0))
 
-    def concerned(self, state: Pushed) -> Any:
+    def concerned(self, state: Pushed) -> mi.Bool:
         return state.height > 0
 
     def seen(self, vertex: Vertex) -> Seen | None:
         return None if self.visibility is None else self.visibility.seen(vertex.depth, vertices(self.p))
 
-    def goes_on(self, state: Pushed, vertex: Vertex) -> Any:
+    def goes_on(self, state: Pushed, vertex: Vertex) -> mi.Bool:
         return mi.Bool(True) if self.visibility is None else vertex.depth < self.visibility.last
 
     def scattering(self, state: Pushed, vertex: Vertex, connection: Connection, scattering: Scattering) -> Pushed:
@@ -147,7 +148,7 @@ class Pushing(VertexHooks):
         rest_c = mi.Spectrum(dr.rcp(stand_in(connection)[0]))
         if plan.needs.has_null:
 
-            def adjoint_of(transmission: Any) -> Any:
+            def adjoint_of(transmission: mi.Spectrum) -> mi.Spectrum:
                 return adjoint_of_factor(own, mi.Int32(NO_ZERO), transmission, 0)
 
             rest_c *= differentiate_passage(p, vertex.si, depth, connection, connected, adjoint_of)
@@ -185,7 +186,7 @@ def walk_back(p: Pass, pushed: Pushed) -> AdjointSum:
     """Pop all vertices, differentiate both factors of each, and return S_0. Traces no ray."""
     plan, form = p.plan, Frame.blank(p.plan)
 
-    def body(height: Any, A: AdjointSum, stack: list[Any]) -> tuple[Any, AdjointSum, list[Any]]:
+    def body(height: mi.UInt32, A: AdjointSum, stack: list[dr.Local]) -> tuple[mi.UInt32, AdjointSum, list[dr.Local]]:
         frame = form.like([array.read(height - 1) for array in stack])
         si, bsdf = frame.point.interaction(plan)
         rest_s = frame.zeros[0] if frame.zeros else 1

@@ -8,7 +8,6 @@ summed apart, without it: their value is nothing, and their derivative with resp
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -24,9 +23,9 @@ class AdjointSum:
     where zeros are not tracked.
     """
 
-    value: Any
-    rest: Any
-    behind_zero: list[Any]
+    value: mi.Spectrum
+    rest: mi.Spectrum
+    behind_zero: list[mi.Spectrum]
 
     @classmethod
     def zero(cls, track_zeros: bool) -> AdjointSum:
@@ -34,15 +33,15 @@ class AdjointSum:
         behind_zero = [mi.Spectrum(0), mi.Spectrum(0)] if track_zeros else []
         return cls(mi.Spectrum(0), mi.Spectrum(0), behind_zero)
 
-    def plus(self, delta: Any, C: Product, index: Any, active: Any) -> AdjointSum:
+    def plus(self, delta: mi.Spectrum, C: Product, index: mi.UInt32, active: mi.Bool) -> AdjointSum:
         """The sum with delta C of one more connection, that of vertex `index`."""
         return self._shifted(dr.select(active, delta, 0), C, index)
 
-    def minus(self, delta: Any, C: Product, index: Any, active: Any) -> AdjointSum:
+    def minus(self, delta: mi.Spectrum, C: Product, index: mi.UInt32, active: mi.Bool) -> AdjointSum:
         """The sum without delta C of a connection that is in it."""
         return self._shifted(dr.select(active, -delta, 0), C, index)
 
-    def _shifted(self, delta: Any, C: Product, index: Any) -> AdjointSum:
+    def _shifted(self, delta: mi.Spectrum, C: Product, index: mi.UInt32) -> AdjointSum:
         value, rest = self._add(self.value, self.rest, delta * C.value())
         if not self.behind_zero:
             return type(self)(value, rest, [])
@@ -52,7 +51,7 @@ class AdjointSum:
             term[c] = dr.select((zero >= 0) & (zero != mi.Int32(index)), term[c], 0)
         return type(self)(value, rest, list(self._add(self.behind_zero[0], self.behind_zero[1], term)))
 
-    def adjoint_of_factor(self, f: Any, prefix: Product, rest: Any) -> Any:
+    def adjoint_of_factor(self, f: mi.Spectrum, prefix: Product, rest: mi.Float | float) -> mi.Spectrum:
         """d(sum)/df (C,), for a factor `f * rest` of the path with this prefix, before all connections in the sum."""
         f, total = dr.detach(f), self.value + self.rest
         result = dr.select(f != 0, total / f, 0)
@@ -62,12 +61,12 @@ class AdjointSum:
                 result[c] = dr.select((f[c] == 0) & (zero == NO_ZERO), behind[c], result[c])
         return showing(result)
 
-    def adjoint_of_emission(self, E: Any) -> Any:
+    def adjoint_of_emission(self, E: mi.Spectrum) -> mi.Spectrum:
         """d(sum)/dE (C,)."""
         return self.adjoint_of_factor(E, Product.one(bool(self.behind_zero)), 1)
 
     @staticmethod
-    def _add(value: Any, rest: Any, term: Any) -> tuple[Any, Any]:
+    def _add(value: mi.Spectrum, rest: mi.Spectrum, term: mi.Spectrum) -> tuple[mi.Spectrum, mi.Spectrum]:
         """value + rest + term, as the rounded sum and what it lost (Knuth 1969, 4.2.2, theorem B)."""
         total = value + term
         part = total - value
@@ -78,5 +77,5 @@ class PlainSum(AdjointSum):
     """The same for sums that are only ever added to, where nothing cancels: `rest` stays zero."""
 
     @staticmethod
-    def _add(value: Any, rest: Any, term: Any) -> tuple[Any, Any]:
+    def _add(value: mi.Spectrum, rest: mi.Spectrum, term: mi.Spectrum) -> tuple[mi.Spectrum, mi.Spectrum]:
         return value + term, rest

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -22,7 +21,7 @@ class SurfacePoint:
     instance, o, d]`.
     """
 
-    numbers: list[Any]
+    numbers: list[dr.ArrayBase]
 
     @staticmethod
     def of(plan: Plan, vertex: Vertex) -> SurfacePoint:
@@ -43,7 +42,7 @@ class SurfacePoint:
         indices = [mi.UInt32(0), mi.UInt32(0), mi.UInt32(0)]
         return SurfacePoint([mi.Float(0), mi.Point2f(0), *indices, mi.Point3f(0), mi.Vector3f(0)])
 
-    def ray(self) -> Any:
+    def ray(self) -> mi.Ray3f:
         """The ray that reached the vertex; kept in scenes in which BSDFs read geometry."""
         return mi.Ray3f(*self.numbers[-2:])
 
@@ -56,7 +55,7 @@ class SurfacePoint:
         pi.instance = dr.reinterpret_array(mi.ShapePtr, instance)
         return pi, mi.Ray3f(o, d)
 
-    def interaction(self, plan: Plan, active: Any = True) -> tuple[Any, Any]:
+    def interaction(self, plan: Plan, active: mi.Bool | bool = True) -> tuple[mi.SurfaceInteraction3f, mi.BSDFPtr]:
         """The surface interaction, as far as BSDFs read it, and the BSDF."""
         if not plan.keep_geometry:
             si = dr.zeros(mi.SurfaceInteraction3f)
@@ -68,7 +67,7 @@ class SurfacePoint:
         return si, si.bsdf()
 
 
-def event(wo: Any, lobe: list[Any]) -> Scattering:
+def event(wo: mi.Vector3f, lobe: list[mi.UInt32 | mi.Float | mi.Point2f]) -> Scattering:
     """A sampled event that was kept as its direction and `lobe`, as far as its factor needs it."""
     kind, sample_1, sample_2 = lobe or [mi.UInt32(0), None, None]
     return Scattering(
@@ -77,11 +76,11 @@ def event(wo: Any, lobe: list[Any]) -> Scattering:
     )  # fmt: skip
 
 
-def _index(pointer: Any) -> Any:
+def _index(pointer: mi.BSDFPtr | mi.ShapePtr) -> mi.UInt32:
     return dr.reinterpret_array(mi.UInt32, pointer)
 
 
-def lobe(plan: Plan, scattering: Any) -> list[Any]:
+def lobe(plan: Plan, scattering: Scattering) -> list[mi.UInt32 | mi.Float | mi.Point2f]:
     """Which lobe was sampled (1: delta, 2: null), with which numbers; nothing where just smooth ones matter."""
     if not (plan.differentiate_delta or plan.differentiate_null):
         return []
@@ -89,7 +88,7 @@ def lobe(plan: Plan, scattering: Any) -> list[Any]:
     return [kind, scattering.sample_1, scattering.sample_2]
 
 
-def blank_lobe(plan: Plan) -> list[Any]:
+def blank_lobe(plan: Plan) -> list[mi.UInt32 | mi.Float | mi.Point2f]:
     """Zeros of the same form."""
     singular = plan.differentiate_delta or plan.differentiate_null
     return [mi.UInt32(0), mi.Float(0), mi.Point2f(0)] if singular else []

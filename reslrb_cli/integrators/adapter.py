@@ -60,7 +60,7 @@ def _on_variant(old: str | None, new: str) -> None:
             mi.register_integrator(name, lambda props, name=name: plugin(name, props))
 
 
-def _plugin_class() -> Any:
+def _plugin_class() -> type[mi.CppADIntegrator]:
     """The class of our plugins. It derives from one of the variant's, so that there is one for each variant."""
 
     class LightTracerPlugin(mi.CppADIntegrator):
@@ -77,18 +77,18 @@ def _plugin_class() -> Any:
             self.max_depth, self.rr_depth = self.tracer.max_depth, self.tracer.rr_depth
             self.samples_per_pass = self.tracer.samples_per_pass
 
-        def render(self, scene: mi.Scene, sensor: mi.Sensor | int = 0, seed: Any = 0, spp: int = 0,
+        def render(self, scene: mi.Scene, sensor: mi.Sensor | int = 0, seed: mi.UInt32 | int = 0, spp: int = 0,
                    develop: bool = True, evaluate: bool = True) -> mi.TensorXf:  # fmt: skip
             if not develop:
                 raise ValueError("develop=True must be specified when invoking AD integrators")
             return self.tracer.image(Job(scene, resolve_sensor(scene, sensor), seed, spp), evaluate)
 
-        def render_forward(self, scene: mi.Scene, params: Any, sensor: mi.Sensor | int = 0, seed: Any = 0,
+        def render_forward(self, scene: mi.Scene, params: Any, sensor: mi.Sensor | int = 0, seed: mi.UInt32 | int = 0,
                            spp: int = 0) -> mi.TensorXf:  # fmt: skip
             return self.tracer.tangent(_job(scene, params, sensor, seed, spp))
 
         def render_backward(self, scene: mi.Scene, params: Any, grad_in: mi.TensorXf, sensor: mi.Sensor | int = 0,
-                            seed: Any = 0, spp: int = 0) -> None:  # fmt: skip
+                            seed: mi.UInt32 | int = 0, spp: int = 0) -> None:  # fmt: skip
             self.tracer.backward(_job(scene, params, sensor, seed, spp), grad_in)
 
         def aov_names(self) -> list[str]:
@@ -106,7 +106,7 @@ def _take_options(type: str, props: mi.Properties) -> dict[str, Any]:
     return {name: props.get(name) for name in _option_names(type, estimator) if name in props}
 
 
-def _option_names(type: str, estimator: Any) -> list[str]:
+def _option_names(type: str, estimator: str | None) -> list[str]:
     """The names of an integrator's options, those of its estimator among them."""
     if type != "reslrb":
         return list(WalkAd.OPTIONS if type == "walk_ad" else Trajectory.OPTIONS)
@@ -114,7 +114,7 @@ def _option_names(type: str, estimator: Any) -> list[str]:
     return [*Reslrb.OPTIONS, *(kind.OPTIONS if kind is not None else ())]
 
 
-def _job(scene: mi.Scene, params: Any, sensor: mi.Sensor | int, seed: Any, spp: int) -> Job:
+def _job(scene: mi.Scene, params: Any, sensor: mi.Sensor | int, seed: mi.UInt32 | int, spp: int) -> Job:
     """A job that differentiates the user's parameters, or all of the scene's."""
     params = params if isinstance(params, mi.SceneParameters) else mi.traverse(scene)
     return Job(scene, resolve_sensor(scene, sensor), seed, spp, params)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -27,7 +26,7 @@ class Differentiated:
     of those of BSDFs, nearly so. `shapes` are those that move, `emitters` those whose rays do.
     """
 
-    bsdf_nodes: tuple[Any, ...]
+    bsdf_nodes: tuple[mi.Object, ...]
     emission: bool
     zeros: bool
     shapes: tuple[mi.Shape, ...]
@@ -45,7 +44,7 @@ def differentiated(params: mi.SceneParameters) -> Differentiated:
     Raises UnsupportedScene, with the reason, for one that light tracing has no derivative for, and would silently leave
     at zero.
     """
-    nodes: dict[Any, None] = {}
+    nodes: dict[mi.Object, None] = {}
     shapes: dict[mi.Shape, None] = {}
     emitters: dict[mi.Emitter, None] = {}
     emission = zeros = False
@@ -79,7 +78,7 @@ def _refuse(key: str, reason: str | None) -> None:
         raise UnsupportedScene(f"{key}: {reason}")
 
 
-def _has_singular(key: str, value: Any, least: float) -> bool:
+def _has_singular(key: str, value: dr.ArrayBase, least: float) -> bool:
     """Whether a factor of this parameter is `least` or less somewhere: near 0, or at 1 where 1 - x is a factor too."""
     flat = dr.detach(value.array if dr.is_tensor_v(value) else dr.ravel(value))
     singular = flat <= least

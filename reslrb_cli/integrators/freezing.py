@@ -13,6 +13,7 @@ from contextlib import contextmanager
 from typing import Any
 
 import drjit as dr
+import mitsuba as mi
 
 from reslrb_cli.errors import UnsupportedScene, is_machine_fault, is_out_of_memory
 from reslrb_cli.transport.samples import Samples
@@ -86,7 +87,12 @@ class Recordings:
         return counts
 
 
-def _record(kind: str, plain: Callable[..., Any], common: tuple[Any, ...], inputs: tuple[Any, ...]) -> Any:
+def _record(
+    kind: str,
+    plain: Callable[..., Any],
+    common: tuple[mi.Scene, mi.Sensor, mi.UInt32, mi.Float, mi.Float],
+    inputs: tuple[Any, ...],
+) -> Any:
     """A recording, or None where there cannot be one.
 
     Dr.Jit finds that out after all has been computed and derivatives were added. So it is tried with a first input of
@@ -129,7 +135,9 @@ def _on_samples(samples: Samples, function: Callable[..., Any]) -> Callable[...,
     # Only these: arrays would be constants of the recording, and a scene would never be freed.
     plan, spp, width = samples.plan, samples.spp, samples.width
 
-    def on_samples(scene: Any, sensor: Any, seed: Any, scale: Any, fraction: Any, *inputs: Any) -> Any:
+    def on_samples(
+        scene: mi.Scene, sensor: mi.Sensor, seed: mi.UInt32, scale: mi.Float, fraction: mi.Float, *inputs: Any
+    ) -> Any:
         return function(Samples(scene, sensor, plan, Film(sensor), seed, spp, width, scale, fraction), *inputs)
 
     return on_samples

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -40,10 +39,10 @@ class RecordedObjective(Hooks):
         self.samples, self.adjoint = samples, adjoint
         self.max_iterations = max(samples.plan.max_depth - 1, 1)
 
-    def start(self, product: Product) -> Any:
+    def start(self, product: Product) -> mi.Float:
         return mi.Float(0)
 
-    def connection(self, state: Any, vertex: Vertex, connection: Connection, numbers: list[Any]) -> Any:
+    def connection(self, state: mi.Float, vertex: Vertex, connection: Connection, numbers: list[mi.Float]) -> mi.Float:
         C = vertex.product.times(connection.c, vertex.depth).scaled(self.samples.scale).value()
         delta = self.adjoint.lookup(connection.u, connection.active)
         return state + dr.select(connection.active, dr.dot(delta, C), 0)
@@ -53,7 +52,7 @@ class RecordedObjective(Hooks):
 class Tangent:
     """Derivative of the product of the factors so far, (C,)."""
 
-    d_product: Any
+    d_product: mi.Spectrum
 
 
 class TangentSplat(Hooks):
@@ -65,7 +64,7 @@ class TangentSplat(Hooks):
 
     connects = False  # it evaluates them itself, with their derivatives
 
-    def __init__(self, samples: Samples, block: Any, dE: Any) -> None:
+    def __init__(self, samples: Samples, block: mi.ImageBlock, dE: mi.Spectrum) -> None:
         self.samples, self.block, self.dE = samples, block, dE
 
     def start(self, product: Product) -> Tangent:
@@ -92,5 +91,5 @@ class TangentSplat(Hooks):
         ds = dr.select(scattered, df * (scattering.correction / scattering.pdf), 0)
         return Tangent(state.d_product * scattering.weight + P * ds)
 
-    def survived(self, state: Tangent, weight: Any) -> Tangent:
+    def survived(self, state: Tangent, weight: mi.Float) -> Tangent:
         return Tangent(state.d_product * weight)

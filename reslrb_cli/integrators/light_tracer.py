@@ -24,7 +24,7 @@ from reslrb_cli.transport.visible_lamps import moving_splats
 from reslrb_cli.transport.walk import walk
 
 
-def settle(scene: Any) -> None:
+def settle(scene: mi.Scene) -> None:
     """Have textures and emitters set up now what they set up when they are first used (padded storage, distributions).
 
     In the midst of tracing this would cut the first step's kernels in two, and the second would compile them anew.
@@ -45,7 +45,7 @@ def settle(scene: Any) -> None:
         dr.eval(weight)
 
 
-def splat_visible_emission(samples: Samples, block: Any, loop_mode: str = "symbolic") -> None:
+def splat_visible_emission(samples: Samples, block: mi.ImageBlock, loop_mode: str = "symbolic") -> None:
     """Add C_0 to the block."""
     if samples.plan.visible_emission:
         primary = samples.primary_ray()
@@ -53,18 +53,18 @@ def splat_visible_emission(samples: Samples, block: Any, loop_mode: str = "symbo
         samples.film.put(block, primary.u, radiance * primary.weight * samples.fraction, primary.active)
 
 
-def splat_image(samples: Samples, block: Any) -> None:
+def splat_image(samples: Samples, block: mi.ImageBlock) -> None:
     """Add the samples' contributions to the block; keep nothing."""
     splat_visible_emission(samples, block)
     walk(samples, Splat(samples, block))
 
 
-def image_of(samples: list[Samples], estimator: Estimator | None) -> Any:
+def image_of(samples: list[Samples], estimator: Estimator | None) -> mi.TensorXf:
     """The image of all passes, as the estimator makes it where it makes one of its own (else None); nothing is kept."""
     film = samples[0].film
     block = film.block()
 
-    def splat(part: Samples, own: Any) -> None:
+    def splat(part: Samples, own: mi.ImageBlock | None) -> None:
         if estimator is None:
             splat_image(part, own)
         else:
@@ -74,7 +74,9 @@ def image_of(samples: list[Samples], estimator: Estimator | None) -> Any:
     return film.develop(block)
 
 
-def forward(samples: Samples, estimator: Estimator, block: Any, adjoint: AdjointImage | None = None) -> Any:
+def forward(
+    samples: Samples, estimator: Estimator, block: mi.ImageBlock | None, adjoint: AdjointImage | None = None
+) -> Any:
     """Trace the samples: add their contributions to the block (None: no image). What is kept of each path is returned,
     and not evaluated."""
     if block is not None:
@@ -90,7 +92,7 @@ class Trace:
     """
 
     samples: list[Samples]
-    image: Any = None
+    image: mi.TensorXf | None = None
     state: Any = None
 
     @property
@@ -120,7 +122,9 @@ def replay(samples: Samples, estimator: Estimator, state: Any, adjoint: AdjointI
     estimator.backward(Pass(samples, None, adjoint), state)
 
 
-def replay_all(trace: Trace, estimator: Estimator, gradient: Any, params: Any = None) -> None:
+def replay_all(
+    trace: Trace, estimator: Estimator, gradient: mi.TensorXf, params: mi.SceneParameters | None = None
+) -> None:
     """Add the gradient of the objective with dL/dI `gradient` (H, W, C) to `params`, which one pass need not know."""
     adjoint = trace.film.adjoint(gradient)
     if trace.state is None:
@@ -132,7 +136,9 @@ def replay_all(trace: Trace, estimator: Estimator, gradient: Any, params: Any = 
         replay(trace.samples[0], estimator, trace.state, adjoint)
 
 
-def fused(samples: list[Samples], estimator: Estimator, gradient: Any, params: Any = None) -> Any:
+def fused(
+    samples: list[Samples], estimator: Estimator, gradient: mi.TensorXf, params: mi.SceneParameters | None = None
+) -> mi.TensorXf:
     """The image, and the same gradient, where dL/dI is known before either."""
     film = samples[0].film
     block = film.block()
@@ -141,14 +147,18 @@ def fused(samples: list[Samples], estimator: Estimator, gradient: Any, params: A
 
 
 def differentiate_passes(
-    samples: list[Samples], estimator: Estimator, block: Any, adjoint: AdjointImage, params: Any
+    samples: list[Samples],
+    estimator: Estimator,
+    block: mi.ImageBlock | None,
+    adjoint: AdjointImage,
+    params: mi.SceneParameters | None,
 ) -> None:
     """Trace samples whose dL/dI is known and add their derivatives, and to the block (None: none) their contributions.
 
     What is kept of a path goes from one to the other within the kernel, and takes no memory.
     """
 
-    def differentiate(part: Samples, own: Any) -> None:
+    def differentiate(part: Samples, own: mi.ImageBlock | None) -> None:
         with dr.isolate_grad():  # as above
             replay(part, estimator, forward(part, estimator, own, adjoint), adjoint)
             image = [] if own is None else [own.tensor()]
@@ -180,7 +190,7 @@ def differentiate_visible_emission(samples: Samples, adjoint: AdjointImage) -> N
                 dr.backward_from(dr.dot(adjoint.lookup(u, active, plan.attached_normalization), C))
 
 
-def splat_tangents(samples: Samples, block: Any) -> None:
+def splat_tangents(samples: Samples, block: mi.ImageBlock) -> None:
     """Add the forward-mode derivative of the samples' contributions to the block, exactly and in one traversal."""
     plan, dE = samples.plan, mi.Spectrum(0)
     with dr.resume_grad():
@@ -194,7 +204,7 @@ def splat_tangents(samples: Samples, block: Any) -> None:
     walk(samples, TangentSplat(samples, block, dE))
 
 
-def splat_tracked(samples: Samples, block: Any) -> None:
+def splat_tracked(samples: Samples, block: mi.ImageBlock) -> None:
     """Add the contributions with derivatives tracked to the block: naive AD, its memory proportional to depth."""
     with dr.resume_grad():
         splat_visible_emission(samples, block, "evaluated")

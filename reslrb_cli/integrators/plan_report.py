@@ -6,7 +6,6 @@ import time
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -46,8 +45,9 @@ class PlanReport:
     rows: list[PlanRow]
 
 
-def report_plan(integrator: Reslrb, scene: Any, sensor: Any, params: Any, keys: Iterable[str], *, known: bool,
-                counts: bool = True, limit_s: float = 20.0) -> PlanReport:  # fmt: skip
+def report_plan(integrator: Reslrb, scene: mi.Scene, sensor: mi.Sensor, params: mi.SceneParameters,
+                keys: Iterable[str], *, known: bool, counts: bool = True, limit_s: float = 20.0
+                ) -> PlanReport:  # fmt: skip
     """What a step of `integrator` (`reslrb`) has to do to differentiate the parameters `keys` of `params`.
 
     `known`: dL/dI is known before the paths are traced. With `counts`, every feature is compiled both ways, until
@@ -76,7 +76,7 @@ def report_plan(integrator: Reslrb, scene: Any, sensor: Any, params: Any, keys: 
     return PlanReport(estimator, kernels, rows)
 
 
-def count(integrator: Reslrb, plan: Plan, scene: Any, sensor: Any, known: bool) -> list[int]:
+def count(integrator: Reslrb, plan: Plan, scene: mi.Scene, sensor: mi.Sensor, known: bool) -> list[int]:
     """Operations of each large kernel of a step by this plan."""
     with dr.suspend_grad():
         [samples] = passes(plan, scene, sensor, 0, 1, None)
@@ -99,7 +99,7 @@ def count(integrator: Reslrb, plan: Plan, scene: Any, sensor: Any, known: bool) 
 
 
 @contextmanager
-def tracking(params: Any, keys: Iterable[str]) -> Iterator[None]:
+def tracking(params: mi.SceneParameters, keys: Iterable[str]) -> Iterator[None]:
     """Parameters `keys` of the scene track derivatives, for as long as the context lasts."""
     values = {key: type(params[key])(dr.detach(params[key])) for key in keys}
     for key, value in values.items():
@@ -115,7 +115,7 @@ def tracking(params: Any, keys: Iterable[str]) -> Iterator[None]:
         _update(params, values)
 
 
-def _update(params: Any, keys: Iterable[str]) -> None:
+def _update(params: mi.SceneParameters, keys: Iterable[str]) -> None:
     """Have textures do now what they do when they are first looked up: it is no part of the step."""
     params.update()
     for key in keys:
@@ -130,8 +130,8 @@ def _row(feature: Feature, plan: Plan) -> PlanRow:
     return PlanRow(feature.name, needed, feature.present if needed else feature.absent)
 
 
-def _toggled(integrator: Reslrb, feature: Feature, plan: Plan, scene: Any, sensor: Any, params: Any, keys: list[str],
-             known: bool) -> list[int] | str:  # fmt: skip
+def _toggled(integrator: Reslrb, feature: Feature, plan: Plan, scene: mi.Scene, sensor: mi.Sensor,
+             params: mi.SceneParameters, keys: list[str], known: bool) -> list[int] | str:  # fmt: skip
     """Kernels of the step with the feature the other way round, or the reason why there are none."""
     toggled = feature.toggle(plan)
     if isinstance(toggled, str):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import mitsuba as mi
 
@@ -71,7 +70,8 @@ class Preparation:
         self._depths, self._hide_emitters, self._motion = (max_depth, rr_depth), hide_emitters, motion
         self._scene: tuple[int, mi.Scene | None] | None = None  # its address, and, so that it is not used again, itself
         self._plans: dict[int, Plan] = {}
-        self._owners: dict[Any, list[Any]] = {}  # BSDFs of its surfaces that use a node, and under None all of them
+        # BSDFs of its surfaces that use a node, and under None all of them.
+        self._owners: dict[mi.Object | None, list[mi.BSDF]] = {}
         self._track_zeros = False
         self._renewal: Renewal | None = None
         self.recordings = Recordings()
@@ -111,7 +111,7 @@ class Preparation:
             self._renewal = None
             self.recordings.clear()
 
-    def _bsdfs(self, scene: mi.Scene, nodes: tuple[Any, ...]) -> tuple[mi.BSDF, ...]:
+    def _bsdfs(self, scene: mi.Scene, nodes: tuple[mi.Object, ...]) -> tuple[mi.BSDF, ...]:
         """The surfaces' BSDFs that use any of these nodes; empty where that is all of them."""
         if any(node not in self._owners for node in nodes):
             graph = SceneGraph.of(scene)

@@ -7,7 +7,6 @@ the way. Both are done in the kernel that computes dL/dI, and nobody waits for t
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -15,11 +14,11 @@ import mitsuba as mi
 NONE = 0xFFFFFFFF
 
 
-def _count() -> Any:
+def _count() -> mi.UInt32:
     return dr.zeros(mi.UInt32, 1)
 
 
-def _first() -> Any:
+def _first() -> mi.UInt32:
     return dr.full(mi.UInt32, NONE, 1)
 
 
@@ -28,11 +27,11 @@ class Refused:
     """Entries of dL/dI that were not finite: how many, and the first one's flat index, of width 1; the shape of dL/dI,
     (H, W, C)."""
 
-    count: Any = field(default_factory=_count)
-    first: Any = field(default_factory=_first)
+    count: mi.UInt32 = field(default_factory=_count)
+    first: mi.UInt32 = field(default_factory=_first)
     shape: tuple[int, ...] = (0, 0, 0)
 
-    def take(self, gradient: Any) -> Any:
+    def take(self, gradient: mi.TensorXf) -> mi.TensorXf:
         """dL/dI with 0 for what is not finite, which is added to the count; neither is evaluated here."""
         self.shape, flat = gradient.shape, gradient.array
         bad = ~dr.isfinite(flat)
@@ -51,7 +50,7 @@ class Refused:
         return index // channels % width, index // channels // width, index % channels
 
 
-def first_channels(image: Any, count: int) -> Any:
+def first_channels(image: mi.TensorXf, count: int) -> mi.TensorXf:
     """`image[:, :, :count]`, whose derivative keeps a NaN.
 
     That of a slice adds up with atomics, which drop it on a CPU (`transport.factors.showing`).

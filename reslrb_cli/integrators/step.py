@@ -33,8 +33,8 @@ class StepResult:
     Entries of dL/dI that are not finite count as 0; `refused` says how many there were, and where the first.
     """
 
-    image: Any
-    loss: Any
+    image: mi.TensorXf
+    loss: mi.Float | mi.TensorXf
     refused: Refused = field(default_factory=Refused)
 
 
@@ -87,7 +87,7 @@ def gradient_step(
     work, job = interface_of(integrator), _job(scene, sensor, seed, spp, params)
     if adjoint == "batched":
         return _batched(work, job, objective, batches, first_batch)
-    losses: list[Any] = []
+    losses: list[mi.Float | mi.TensorXf] = []
     refused = Refused()
 
     def derivative(image: mi.TensorXf) -> mi.TensorXf:
@@ -181,7 +181,7 @@ def _batched(
 
 def _derivative(
     objective: Objective, image: mi.TensorXf, refused: Refused, on_image: Callable[[], None] | None = None
-) -> tuple[mi.Float, mi.TensorXf]:
+) -> tuple[mi.Float | mi.TensorXf, mi.TensorXf]:
     """Loss and dL/dI, evaluated in one go; what of the latter is not finite is refused."""
     with dr.resume_grad(), dr.isolate_grad():
         leaf = type(image)(image)
@@ -196,7 +196,7 @@ def _derivative(
     return loss, gradient
 
 
-def sample_sets(seed: int, options: dict[str, Any]) -> list[tuple[str, Any, int]]:
+def sample_sets(seed: int, options: dict[str, Any]) -> list[tuple[str, mi.UInt32, int]]:
     """The sets of samples of a step with these options (`Config.step_options`): name, seed, samples per pixel."""
     spp, adjoint = options["spp"], options["adjoint"]
     if adjoint == "batched":

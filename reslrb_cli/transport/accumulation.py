@@ -7,7 +7,6 @@ has a block and gradients of its own, and these are added to one another.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -64,7 +63,7 @@ class GradientSum:
                 dr.accum_grad(value, total)
 
 
-def _arrays(value: Any) -> list[Any]:
+def _arrays(value: dr.ArrayBase | mi.AffineTransform4f) -> list[dr.ArrayBase]:
     """The arrays of a parameter that gradients can be added to: a transform, which cannot be added, has two."""
     return [value.matrix, value.inverse_transpose] if isinstance(value, mi.AffineTransform4f) else [value]
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -23,14 +22,14 @@ class Connection:
     is seen.
     """
 
-    weight: Any
+    weight: mi.Spectrum
     u: mi.Point2f
     target: mi.Point3f
     wo: mi.Vector3f
     active: mi.Bool
     sample: mi.Point2f  # of the aperture
-    f: Any = None
-    c: Any = None
+    f: mi.Spectrum | None = None
+    c: mi.Spectrum | None = None
 
 
 def connect(
@@ -58,7 +57,7 @@ def connect(
         return Connection(importance * correction, ds.uv, ds.p, wo, active & valid & (ds.pdf > 0), sample)
 
 
-def _shifted_importance(sensor: mi.Sensor, ds: Any) -> Any:
+def _shifted_importance(sensor: mi.Sensor, ds: mi.DirectionSample3f) -> mi.Spectrum:
     """Importance and geometry of a pinhole camera whose principal point is not the film's centre.
 
     Mitsuba's own is zero wherever a film that is not shifted would end.
@@ -76,10 +75,10 @@ class Seen:
     """What an earlier walk saw of the sensor: `visible`, in the lanes that are `known` (None: in all)."""
 
     visible: mi.Bool
-    known: Any = None
+    known: mi.Bool | None = None
 
 
-def stand_in(connection: Connection) -> tuple[Any, Any]:
+def stand_in(connection: Connection) -> tuple[mi.Float, mi.Spectrum]:
     """What stands for bsdf * cos, and for c_i (C,), where they are zero (`Product.times`): those of a white surface."""
     f = dr.maximum(dr.abs(mi.Frame3f.cos_theta(connection.wo)), 1e-3) * dr.inv_pi
     return f, connection.weight * f
@@ -93,7 +92,7 @@ def passage(
     connection: Connection,
     seen: Seen | None = None,
     loop_mode: str = "symbolic",
-) -> tuple[Any, Any]:
+) -> tuple[mi.Bool, mi.Spectrum]:
     """Where the sensor is seen, and the transmittance (C,) of masks on the way: traces the shadow ray.
 
     No ray is traced in lanes in which `seen` knows the answer. In a scene without surfaces that light passes straight

@@ -14,7 +14,6 @@ derivative is as large as any. Roulette and selection go by `weight`, in which n
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -24,7 +23,7 @@ MANY_ZEROS = -2  # two or more are: value and derivatives vanish
 DIM = 0.1  # the least that a factor counts in a weight, as a fraction of its stand-in
 
 
-def showing(value: Any) -> Any:
+def showing(value: mi.Float | mi.Spectrum) -> mi.Float | mi.Spectrum:
     """`value`, with infinity in place of NaN where the backend's atomic sums would drop that.
 
     On a CPU they pass over a NaN unless it shares its address with other numbers of the same packet (Dr.Jit 1.5): it
@@ -43,10 +42,10 @@ class Product:
     `raised` is the product of the factors, each at least DIM of its stand-in; it is empty where zeros are not tracked.
     """
 
-    nonzero: Any
-    zero: list[Any] = field(default_factory=list)
-    tracked: list[Any] = field(default_factory=list)
-    raised: list[Any] = field(default_factory=list)
+    nonzero: mi.Spectrum
+    zero: list[mi.Int32] = field(default_factory=list)
+    tracked: list[mi.Spectrum] = field(default_factory=list)
+    raised: list[mi.Spectrum] = field(default_factory=list)
 
     @staticmethod
     def one(track_zeros: bool, tracked: bool = False) -> Product:
@@ -59,7 +58,7 @@ class Product:
         """The product of a connection that is not there: neither its value nor its derivative is anything."""
         return Product(mi.Spectrum(0), [mi.Int32(MANY_ZEROS) for _ in Product.one(track_zeros).zero])
 
-    def times(self, factor: Any, index: Any, stand_in: Any = 1) -> Product:
+    def times(self, factor: mi.Spectrum, index: mi.UInt32 | mi.Int32, stand_in: mi.Spectrum | float = 1) -> Product:
         """The product with one more factor, (C,) per lane, that stands at position `index` of the path.
 
         `stand_in` takes its place in `nonzero` where it is zero: a positive number of the size of its derivative.
@@ -74,7 +73,7 @@ class Product:
         raised = [r * dr.maximum(dr.abs(factor), mi.Spectrum(DIM * stand_in)) for r in self.raised]
         return Product(nonzero, zero, tracked, raised)
 
-    def scaled(self, scale: Any) -> Product:
+    def scaled(self, scale: mi.Float) -> Product:
         """The product times a positive number that no parameter reaches, such as a roulette weight."""
         tracked, raised = ([value * scale for value in values] for values in (self.tracked, self.raised))
         return Product(self.nonzero * scale, self.zero, tracked, raised)
@@ -83,24 +82,24 @@ class Product:
         """The product without what is of no more use once it has been chosen."""
         return replace(self, raised=[])
 
-    def value(self) -> Any:
+    def value(self) -> mi.Spectrum:
         """The contribution itself: zero in every channel that has a zero factor. Tracked under naive AD."""
         return self.tracked[0] if self.tracked else self._where(self.nonzero, [z == NO_ZERO for z in self.zero])
 
-    def differentiable(self) -> Any:
+    def differentiable(self) -> mi.Spectrum:
         """Product of the nonzero factors in every channel whose value or derivative can be nonzero; else zero."""
         return self._where(self.nonzero, [z != MANY_ZEROS for z in self.zero])
 
-    def weight(self) -> Any:
+    def weight(self) -> mi.Spectrum:
         """How much there may be to differentiate behind this product, (C,): what roulette and selection go by."""
         return self._where(self.raised[0] if self.raised else self.nonzero, [z != MANY_ZEROS for z in self.zero])
 
-    def alive(self) -> Any:
+    def alive(self) -> mi.Bool:
         """Whether any channel's value or derivative can be nonzero."""
         return dr.any(self.differentiable() != 0)
 
     @staticmethod
-    def _where(values: Any, keep: list[Any]) -> Any:
+    def _where(values: mi.Spectrum, keep: list[mi.Bool]) -> mi.Spectrum:
         result = mi.Spectrum(values)
         for c, mask in enumerate(keep):
             result[c] = dr.select(mask, result[c], 0)

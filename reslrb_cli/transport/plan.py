@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import mitsuba as mi
 
@@ -29,7 +28,7 @@ class Plan:
     differentiate_bsdfs: bool = False
     differentiate_emission: bool = False
     # The BSDFs of surfaces that are differentiated, where not all of them are.
-    only_bsdfs: tuple[Any, ...] = ()
+    only_bsdfs: tuple[mi.BSDF, ...] = ()
     # Whether any of those that are differentiated has delta lobes, or lets light pass straight through.
     differentiate_delta: bool = False
     differentiate_null: bool = False
@@ -97,11 +96,11 @@ class Plan:
         return self.attached or self.needs.bsdfs_read_geometry or self.passage_in_gradient
 
     @property
-    def sole_bsdf(self) -> Any:
+    def sole_bsdf(self) -> mi.BSDFPtr | None:
         """The one BSDF that is differentiated (a pointer), where there is just one; otherwise None."""
         return mi.BSDFPtr(self.only_bsdfs[0]) if len(self.only_bsdfs) == 1 else None
 
-    def differentiates(self, bsdf: Any) -> Any:
+    def differentiates(self, bsdf: mi.BSDFPtr) -> mi.Bool:
         """Lanes in which the BSDF (a pointer) has anything to differentiate."""
         if not self.only_bsdfs:
             return mi.Bool(self.differentiate_bsdfs)
@@ -110,7 +109,7 @@ class Plan:
             result |= bsdf == mi.BSDFPtr(other)
         return result
 
-    def concerns(self, bsdf: Any) -> Any:
+    def concerns(self, bsdf: mi.BSDFPtr) -> mi.Bool:
         """Lanes in which a vertex with this BSDF (a pointer) has anything to differentiate, its connection's passage
         through masks included."""
         return mi.Bool(True) if self.differentiate_null else self.differentiates(bsdf)
@@ -122,7 +121,9 @@ class Plan:
             result |= shape == mi.ShapePtr(other)
         return result
 
-    def differentiating(self, bsdfs: bool, emission: bool, track_zeros: bool, only_bsdfs: tuple[Any, ...] = ()) -> Plan:
+    def differentiating(
+        self, bsdfs: bool, emission: bool, track_zeros: bool, only_bsdfs: tuple[mi.BSDF, ...] = ()
+    ) -> Plan:
         """The same plan for a step that differentiates these; `track_zeros`: some of their factors may be zero."""
         delta, null = self.needs.has_delta_lobes, self.needs.has_null
         if only_bsdfs:

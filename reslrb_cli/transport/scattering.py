@@ -20,7 +20,6 @@ which is the adjoint BSDF by definition, and needs neither p nor reciprocity.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -30,7 +29,7 @@ from reslrb_cli.transport.plan import Plan
 DEFENSIVE = 0.2  # share of samples that a perturbed BSDF does not draw itself
 
 
-def importance_context() -> Any:
+def importance_context() -> mi.BSDFContext:
     """BSDF queries of a path that carries importance towards the sensor, so that eta^2 is not applied twice."""
     return mi.BSDFContext(mi.TransportMode.Importance)
 
@@ -40,8 +39,8 @@ class Scattering:
     """What happened at a vertex. `weight` is s_j (C,), with Veach's correction; `f` (C,) is what of it has derivatives,
     weight = f correction / pdf; `wo` is local, `d` in world space."""
 
-    weight: Any
-    f: Any
+    weight: mi.Spectrum
+    f: mi.Spectrum
     wo: mi.Vector3f
     d: mi.Vector3f
     pdf: mi.Float
@@ -56,7 +55,7 @@ class Scattering:
 
 def shading_correction(
     plan: Plan, si: mi.SurfaceInteraction3f, wi_world: mi.Vector3f, wo_world: mi.Vector3f, wo: mi.Vector3f
-) -> tuple[Any, Any]:
+) -> tuple[mi.Float, mi.Bool]:
     """Veach's factor for shading normals (thesis, p. 155) and whether both directions are on consistent sides.
 
     Without shading normals the factor is 1 and both sides are consistent by construction: neither is computed. With
@@ -87,7 +86,7 @@ def scatter(
     connection_wo: mi.Vector3f,
     connected: mi.Bool | None,
     attached: bool = False,
-) -> tuple[Scattering, Any]:
+) -> tuple[Scattering, mi.Spectrum | None]:
     """Sample the next direction, and evaluate f (C,) towards `connection_wo` in `connected` lanes (None: in no lane).
 
     Detached, unless `attached`; `tracked_factors` has the derivatives of the factors alone. Both queries share one
@@ -96,15 +95,15 @@ def scatter(
     context = importance_context()
 
     def both(
-        self: Any,
+        self: mi.BSDF,
         si: mi.SurfaceInteraction3f,
         wo: mi.Vector3f,
         sample_1: mi.Float,
         sample_2: mi.Point2f,
         connected: mi.Bool,
         active: mi.Bool,
-        any_: Any,
-    ) -> Any:
+        any_: mi.Bool,
+    ) -> tuple[mi.Spectrum, mi.Vector3f, mi.Float, mi.Float, mi.UInt32, mi.Spectrum]:
         bs, weight = self.sample(context, si, sample_1, sample_2, active)
         return evaluate(plan, si, self, wo, connected), bs.wo, bs.pdf, bs.eta, bs.sampled_type, weight
 
@@ -193,7 +192,7 @@ def _mixed(
     pdf: mi.Float,
     eta: mi.Float,
     lobe: mi.UInt32,
-) -> tuple[Any, Any, Any, Any]:
+) -> tuple[mi.Vector3f, mi.Float, mi.Float, mi.UInt32]:
     """A BSDF's sample, replaced by one of the cosine-weighted hemisphere in `defensive` lanes; the mixture's density.
 
     A BSDF with a perturbed normal samples around the normal as it is turned to wi, and its exchanged evaluation turns
@@ -211,13 +210,15 @@ def _mixed(
     return wo, pdf, eta, dr.select(defensive, mi.UInt32(int(mi.BSDFFlags.GlossyReflection)), lobe)
 
 
-def _delta_correction(wi: mi.Vector3f, wo: mi.Vector3f, eta: mi.Float) -> Any:
+def _delta_correction(wi: mi.Vector3f, wo: mi.Vector3f, eta: mi.Float) -> mi.Float:
     """cos_p wi / cos_p wo of a mirror or refraction, whose normal p is along wi + eta wo."""
     h = dr.fma(eta, wo, wi)
     return dr.abs(dr.dot(h, wi) / dr.dot(h, wo))
 
 
-def evaluate(plan: Plan, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, wo: mi.Vector3f, active: mi.Bool) -> Any:
+def evaluate(
+    plan: Plan, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr | mi.BSDF, wo: mi.Vector3f, active: mi.Bool
+) -> mi.Spectrum:
     """A smooth lobe's bsdf * cos (C,) towards `wo`, for a path that carries importance."""
     if not plan.needs.has_perturbed_normals:
         return bsdf.eval(importance_context(), si, wo, active)
@@ -228,7 +229,7 @@ def evaluate(plan: Plan, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, wo: mi.V
 
 def tracked_factor(
     plan: Plan, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, scattering: Scattering, active: mi.Bool
-) -> Any:
+) -> mi.Spectrum:
     """f (C,) with derivatives, of the event that `scattering` is.
 
     Call under `dr.resume_grad()`. What the scene has no lobes for is not compiled.
@@ -245,15 +246,21 @@ def tracked_factors(
     connected: mi.Bool,
     scattering: Scattering,
     scattered: mi.Bool,
-) -> tuple[Any, Any]:
+) -> tuple[mi.Spectrum, mi.Spectrum]:
     """f (C,) towards the sensor and f along the path, both with derivatives, from one indirect call.
 
     Call under `dr.resume_grad()`.
     """
 
     def both(
-        self: Any, si: mi.SurfaceInteraction3f, wo_c: Any, wo_s: Any, connected: mi.Bool, smooth: Any, any_: Any
-    ) -> Any:
+        self: mi.BSDF,
+        si: mi.SurfaceInteraction3f,
+        wo_c: mi.Vector3f,
+        wo_s: mi.Vector3f,
+        connected: mi.Bool,
+        smooth: mi.Bool,
+        any_: mi.Bool,
+    ) -> tuple[mi.Spectrum, mi.Spectrum]:
         return evaluate(plan, si, self, wo_c, connected), evaluate(plan, si, self, wo_s, smooth)
 
     smooth = scattered & ~(scattering.is_delta | scattering.is_null)
@@ -262,8 +269,13 @@ def tracked_factors(
 
 
 def _singular_factor(
-    plan: Plan, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, scattering: Scattering, active: mi.Bool, f: Any
-) -> Any:
+    plan: Plan,
+    si: mi.SurfaceInteraction3f,
+    bsdf: mi.BSDFPtr,
+    scattering: Scattering,
+    active: mi.Bool,
+    f: mi.Spectrum,
+) -> mi.Spectrum:
     """`f`, replaced where a delta lobe was sampled or light passed straight through, where that has derivatives."""
     if plan.differentiate_delta:
         delta = active & scattering.is_delta

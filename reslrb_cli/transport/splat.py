@@ -6,8 +6,6 @@ lookup:  delta = sum_p filter_p(u) dL/dI_p
 
 from __future__ import annotations
 
-from typing import Any
-
 import drjit as dr
 import mitsuba as mi
 
@@ -25,7 +23,7 @@ class Film:
         self.size = self.film.crop_size()
         self.offset = self.film.crop_offset()
 
-    def block(self) -> Any:
+    def block(self) -> mi.ImageBlock:
         """An empty image block that covers the crop window; filter weights are normalised per splat."""
         block = self.film.create_block(normalize=True, borders=False)
         block.set_offset(self.offset)
@@ -48,7 +46,7 @@ class Film:
             color = [showing(c) for c in color]  # they are added up one by one, not as a packet
         block.put(u + mi.Vector2f(self.offset), color + [mi.Float(0)] * (block.channel_count() - N_COLOR), active)
 
-    def develop(self, block: mi.ImageBlock) -> Any:
+    def develop(self, block: mi.ImageBlock) -> mi.TensorXf:
         """The image (H, W, channels) in the film's own pixel format; differentiable with respect to the block."""
         self.film.prepare([])
         if block.channel_count() == len("RGBAW"):
@@ -58,7 +56,7 @@ class Film:
         self.film.put_block(block)
         return self.film.develop()
 
-    def develop_tangent(self, block: mi.ImageBlock) -> Any:
+    def develop_tangent(self, block: mi.ImageBlock) -> mi.TensorXf:
         """Derivative of the image from that of the block: `develop` is linear but for the opaque alpha channel."""
         self.film.prepare([])
         self.film.put_block(block)
@@ -87,7 +85,7 @@ class AdjointImage:
         self.image, self.channels, self.film = image, channels, film
         self.filter = film.film.rfilter()
 
-    def lookup(self, u: mi.Point2f, active: mi.Bool, normalization: bool = True) -> Any:
+    def lookup(self, u: mi.Point2f, active: mi.Bool, normalization: bool = True) -> mi.Spectrum:
         """delta (C,) at film position `u` (pixels, relative to the crop window), with its derivative by `u` if any.
 
         Without `normalization` the sum that the filter's weights are divided by has no derivative, as in Mitsuba.
@@ -98,7 +96,7 @@ class AdjointImage:
             return self._pixel(pixel, inside)
         return self._filtered(u, active, normalization)
 
-    def _pixel(self, pixel: mi.Point2u, active: mi.Bool) -> Any:
+    def _pixel(self, pixel: mi.Point2u, active: mi.Bool) -> mi.Spectrum:
         index = dr.fma(pixel.y, mi.UInt32(self.film.size.x), pixel.x)
         if self.channels == len("RGBW"):
             color = dr.gather(mi.Vector4f, self.image, index, active)  # one packet
@@ -107,7 +105,7 @@ class AdjointImage:
         color = [color[c] for c in range(N_COLOR)]
         return mi.Spectrum(*color) if len(mi.Spectrum(0)) == N_COLOR else mi.Spectrum(sum(color))
 
-    def _filtered(self, u: mi.Point2f, active: mi.Bool, normalization: bool) -> Any:
+    def _filtered(self, u: mi.Point2f, active: mi.Bool, normalization: bool) -> mi.Spectrum:
         first, (weights_x, weights_y), total = filter_weights(self.filter, u)
         if not normalization:
             total = dr.detach(total)

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
 
-def forward_derivatives(*values: Any) -> list[Any]:
+def forward_derivatives(*values: mi.Spectrum) -> list[mi.Spectrum]:
     """Derivatives of `values` along the parameters' tangents; zero for those that depend on none of them.
 
     In one propagation: a second one would meet the edges of the first. It leaves the parameters' own tangents standing,
@@ -34,16 +33,16 @@ class Passage:
     value: mi.Spectrum
     crossings: mi.UInt32
     reached: mi.Bool
-    tangent: list[Any] = field(default_factory=list)
+    tangent: list[mi.Spectrum] = field(default_factory=list)
 
 
 def transmittance(
     scene: mi.Scene,
-    start: Any,
+    start: mi.Interaction3f,
     target: mi.Point3f,
     limit: mi.UInt32,
     active: mi.Bool,
-    on_crossing: Callable[[Any, Any], None] | None = None,
+    on_crossing: Callable[[mi.Spectrum, mi.Bool], None] | None = None,
     loop_mode: str = "symbolic",
     tangents: bool = False,
 ) -> Passage:
@@ -55,7 +54,7 @@ def transmittance(
     gradients are suspended then, since the loop itself must not track any.
     """
 
-    def body(passage: Passage, ray: mi.Ray3f) -> tuple[Passage, Any]:
+    def body(passage: Passage, ray: mi.Ray3f) -> tuple[Passage, mi.Ray3f]:
         si = scene.ray_intersect(ray, passage.active)
         hit = passage.active & si.is_valid()
         with dr.resume_grad(when=tangents):

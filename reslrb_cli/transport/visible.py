@@ -8,12 +8,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
-from reslrb_cli.transport.emission import sample_time
+from reslrb_cli.transport.emission import Numbered, sample_time
 from reslrb_cli.transport.plan import Plan
 from reslrb_cli.transport.transmittance import forward_derivatives
 
@@ -25,11 +24,11 @@ class PrimaryRay:
 
     ray: mi.Ray3f
     u: mi.Point2f
-    weight: Any
+    weight: mi.Spectrum
     active: mi.Bool
 
 
-def primary_ray(plan: Plan, sensor: mi.Sensor, sampler: Any, width: int) -> PrimaryRay:
+def primary_ray(plan: Plan, sensor: mi.Sensor, sampler: Numbered, width: int) -> PrimaryRay:
     """Sample `width` rays, as many in each pixel of the crop window, or one more."""
     size = sensor.film().crop_size()
     n_pixels = int(size[0] * size[1])
@@ -54,10 +53,10 @@ class _Look:
     transmittance: mi.Spectrum
     radiance: mi.Spectrum
     crossings: mi.UInt32
-    tangents: list[Any] = field(default_factory=list)
+    tangents: list[mi.Spectrum] = field(default_factory=list)
 
 
-def visible_radiance(plan: Plan, scene: mi.Scene, primary: PrimaryRay, loop_mode: str = "symbolic") -> Any:
+def visible_radiance(plan: Plan, scene: mi.Scene, primary: PrimaryRay, loop_mode: str = "symbolic") -> mi.Spectrum:
     """Radiance (C,) that arrives along the primary ray, through null surfaces where the scene has any.
 
     With `loop_mode` evaluated it carries derivatives where they are enabled, for naive AD.
@@ -65,7 +64,7 @@ def visible_radiance(plan: Plan, scene: mi.Scene, primary: PrimaryRay, loop_mode
     return _look(plan, scene, primary, None, loop_mode).radiance
 
 
-def visible_tangent(plan: Plan, scene: mi.Scene, primary: PrimaryRay) -> Any:
+def visible_tangent(plan: Plan, scene: mi.Scene, primary: PrimaryRay) -> mi.Spectrum:
     """Derivative (C,) of that radiance along the parameters' tangents (forward mode)."""
     with dr.suspend_grad():  # the loop itself tracks nothing
         return _look(plan, scene, primary, None, "symbolic", tangents=True).tangents[1]
@@ -79,7 +78,7 @@ def differentiate_visible_radiance(plan: Plan, scene: mi.Scene, primary: Primary
     masks = plan.differentiate_null
     total = visible_radiance(plan, scene, primary) if masks else mi.Spectrum(0)
 
-    def differentiate(state: _Look, Le: Any, radiance: mi.Spectrum, transmission: Any) -> None:
+    def differentiate(state: _Look, Le: mi.Spectrum, radiance: mi.Spectrum, transmission: mi.Spectrum) -> None:
         weight = dr.select(state.active, adjoint * state.transmittance, 0)
         objective = weight * Le if plan.differentiate_emission else mi.Spectrum(0)
         if masks:
@@ -96,10 +95,10 @@ def _look(
     plan: Plan,
     scene: mi.Scene,
     primary: PrimaryRay,
-    on_surface: Callable[..., None] | None,
+    on_surface: Callable[[_Look, mi.Spectrum, mi.Spectrum, mi.Spectrum], None] | None,
     mode: str,
     tangents: bool = False,
-) -> Any:
+) -> _Look:
     def look(state: _Look) -> tuple[_Look]:
         with dr.suspend_grad():  # where shapes move, `visible_lamps.py` has the derivative
             si = scene.ray_intersect(state.ray, state.active)

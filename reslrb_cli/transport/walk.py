@@ -60,7 +60,9 @@ def walk(samples: Samples, hooks: Hooks, active: mi.Bool | bool = True) -> Any:
     pi, active = intersect(plan, scene, emission.ray, active)
     path = Path(active, mi.UInt32(1), emission.ray, pi, product, eta)
 
-    def body(path: Path, state: Any, sampler: Any, selection: Any) -> tuple[Path, Any, Any, Any]:
+    def body(
+        path: Path, state: Any, sampler: mi.Sampler, selection: mi.PCG32 | None
+    ) -> tuple[Path, Any, mi.Sampler, mi.PCG32 | None]:
         si, bsdf = find_vertex(path.ray, path.pi, path.active)
         vertex = Vertex(path.pi, si, bsdf, path.ray, path.depth, path.product, path.active)
 
@@ -84,7 +86,7 @@ def walk(samples: Samples, hooks: Hooks, active: mi.Bool | bool = True) -> Any:
             else:
                 connection.f = dr.select(connection.active, connection.f, 0)
             connection.c = connection.f * transmittance * connection.weight
-            chosen_by = [selection.next_float32() for _ in range(hooks.numbers)]
+            chosen_by = [] if selection is None else [selection.next_float32() for _ in range(hooks.numbers)]
             state = hooks.connection(state, vertex, connection, chosen_by)
         state = hooks.scattering(state, vertex, connection, scattering)
         if hooks.replaying:
