@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any, ClassVar
 
 import drjit as dr
@@ -89,7 +90,7 @@ class LightTracer:
             return lt.image_of([samples], estimator)
 
         with dr.suspend_grad():
-            parts = self.passes(job)
+            parts = self.passes(replace(job, params=None))  # an image has no use for what derivatives ask of a walk
             if evaluate and self.freezes(parts):
                 return self.preparation.recordings.call("image", parts[0], image)
             result = lt.image_of(parts, estimator)

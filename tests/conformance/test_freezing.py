@@ -176,3 +176,13 @@ def test_large_steps_are_not_recorded(monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(freezing, "MOST_PATHS", most)
         scene.gradient(chosen, 3, 8)
         assert bool(chosen.preparation.recordings.counts()) == recorded
+
+
+def test_an_image_is_the_same_call_alone_and_in_a_step() -> None:
+    """Of what derivatives ask of a walk, an image knows nothing: else it would carry that, and be recorded twice."""
+    case = BY_NAME["texture"]
+    scene, chosen = Case(case.scene(), case.keys), integrator("reslrb", estimator="stack", freeze=True)
+    scene.image(chosen, 3, 8)
+    scene.gradient(chosen, 3, 8, adjoint="independent")
+    calls = [kind for kind, *_ in chosen.preparation.recordings._functions]
+    assert sorted(calls) == ["image", "trace and replay"]
