@@ -40,9 +40,9 @@ class Size(click.ParamType):
 @optional_experiment_arguments
 @click.option("--max-depth", type=click.IntRange(min=2, max=COUNT.max), default=32, show_default=True,
               help="Greatest path depth; measured are 2, 4, 8, ... and this one.")  # fmt: skip
-@click.option("--integrators", default=INTEGRATORS, show_default=True, metavar="LIST",
+@click.option("--integrators", metavar="LIST",
               help="What to compare: TYPE[:ESTIMATOR][(OPTION=VALUE,...)], separated by commas; OPTION is one of the "
-                   "integrator's, or adjoint.")  # fmt: skip
+                   f"integrator's, or adjoint. Default: those of {INTEGRATORS} that can do CONFIG.")  # fmt: skip
 @click.option("--baseline", metavar="NAME",
               help="Entry of that list that times are divided by; default: ptracer, or else the first.")  # fmt: skip
 @click.option("--objective", type=click.Choice(["fixed", "l2"]), default="fixed", show_default=True,
@@ -61,7 +61,7 @@ def command(
     config_file: Path | None,
     overrides: tuple[str, ...],
     max_depth: int,
-    integrators: str,
+    integrators: str | None,
     baseline: str | None,
     objective: str,
     memory_limit: int | None,
@@ -90,7 +90,7 @@ def command(
         config = loads(cornell_box.CONFIG, cornell_box.SOURCE, overrides)
     else:
         config = load(config_file, overrides)
-    cases = parse_cases(integrators)
+    cases = parse_cases(integrators or INTEGRATORS)
     if json_file is not None and plot_file is None:
         plot_file = json_file.with_suffix(".png")
     for option, path in (("--json", json_file), ("--plot", plot_file)):
@@ -110,6 +110,7 @@ def command(
         memory=memory,
         budget_s=budget,
         rounds=rounds,
+        default=integrators is None,
     )
     sweep.check()
     echo(f"{device_name(variant)}, {variant}")

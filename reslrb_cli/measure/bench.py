@@ -8,6 +8,8 @@ steps also share a seed. The order turns from round to round.
 A case that runs out of memory is tried again at greater depths: what is recorded was seen, and a failure costs no more
 time than it takes to fill the memory once.
 
+A case that nobody named, but the default list, and that refuses the scene, is left out, and named with its reason.
+
 The budget covers loading and compiling. Once it is spent, what is not warm is left out, and named; what is takes one
 round, if it had none.
 """
@@ -21,7 +23,7 @@ from typing import Any
 from reslrb_cli.config import Config, dump
 from reslrb_cli.measure.cases import Case
 from reslrb_cli.measure.pace import NO_TIME, Pace
-from reslrb_cli.measure.processes import Ended, Process, Stopped
+from reslrb_cli.measure.processes import Ended, Process, Refused, Stopped
 from reslrb_cli.records.bench import BenchRecord, BenchStatus, Spread
 
 #: Steps after the cold one until no new kernel comes, at most.
@@ -39,7 +41,8 @@ SLOW = 10.0
 class Sweep:
     """What is measured. `memory_limit` is of each process, None: none; `memory` is what the machine has, in bytes.
 
-    `rounds` is None where `budget_s` decides their number; else there are so many, whatever time they take.
+    `rounds` is None where `budget_s` decides their number; else there are so many, whatever time they take. Of the
+    `cases`, those that cannot do what the scene asks for are left out where they are the `default` ones.
     """
 
     config: Config
@@ -52,6 +55,11 @@ class Sweep:
     memory: int
     budget_s: float
     rounds: int | None = None
+    default: bool = False
+
+    def may_refuse(self, case: Case) -> bool:
+        """Whether the rest goes on without this case, where it refuses the scene."""
+        return self.default and case != self.baseline
 
     def at(self, case: Case, depth: int) -> Config:
         """The experiment of one case. Raises ConfigError."""
@@ -84,16 +92,18 @@ class _Run:
     case: Case
     config: Config
     process: Any
+    may_refuse: bool
     size: tuple[int, int] | None = None
     cold: dict[str, Any] | None = None
     steps: dict[int, dict[str, Any]] = field(default_factory=dict)  # by round
     end: Ended | None = None
+    refusal: Refused | None = None
     late: bool = False
 
     @property
     def alive(self) -> bool:
         """Whether it can be asked for a step."""
-        return self.end is None and not self.late
+        return self.end is None and self.refusal is None and not self.late
 
     def ask(
         self, round: int, cold: bool, release: bool, stop: Callable[[], bool], over: Callable[[], bool] = lambda: False
@@ -108,6 +118,10 @@ class _Run:
             return result
         except Ended as end:
             self.end = end
+        except Refused as refusal:
+            if not self.may_refuse:
+                raise
+            self.refusal = refusal
         except Stopped:
             if stop():
                 raise
@@ -125,17 +139,18 @@ def bench(
     """Measure depth by depth; yield the results of each. Ends early, with what is done, once `stop()`.
 
     `say` is told what the budget did not suffice for, and, once, what the scene's loading warned of. Raises Refused
-    where no case can begin.
+    where a case that may not be left out cannot begin.
     """
     pace = Pace(sweep.budget_s, len(sweep.depths), sweep.rounds)
     warned: set[str] = set()
+    cases = list(sweep.cases)
     for number, depth in enumerate(sweep.depths):
         if pace.over():
             left = ", ".join(str(depth) for depth in sweep.depths[number:])
             say(f"not measured: depth {left}: {NO_TIME}")
             return
         pace.begin_depth()
-        runs = [_begin(sweep, case, depth, start) for case in sweep.cases]
+        runs = [_begin(sweep, case, depth, start) for case in cases]
         try:
             _measure(sweep, runs, depth, pace, stop, say, warned)
             stopped = False
@@ -144,6 +159,10 @@ def bench(
         finally:
             for run in runs:
                 run.process.close()
+        for run in runs:
+            if run.refusal is not None:
+                say(f"left out: {run.case.label}: {run.refusal}")
+                cases.remove(run.case)
         late = ", ".join(run.case.label for run in runs if run.late and not run.steps)
         if late:
             say(f"not measured: depth {depth}, {late}: {NO_TIME}")
@@ -162,7 +181,7 @@ def _begin(sweep: Sweep, case: Case, depth: int, start: Callable[[dict[str, Any]
         "objective": sweep.objective,
         "memory_limit": sweep.memory_limit,
     }
-    return _Run(case, config, start(first))
+    return _Run(case, config, start(first), sweep.may_refuse(case))
 
 
 def _measure(

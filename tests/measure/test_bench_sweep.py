@@ -13,7 +13,7 @@ from reslrb_cli.errors import ConfigError
 from reslrb_cli.measure.bench import Result, Sweep, bench
 from reslrb_cli.measure.cases import choose_baseline, depths, parse_cases
 from reslrb_cli.measure.pace import MAX_ROUNDS, MIN_ROUNDS, Pace
-from reslrb_cli.measure.processes import Ended, Stopped
+from reslrb_cli.measure.processes import Ended, Refused, Stopped
 from reslrb_cli.records.bench import BenchStatus, Spread
 
 CONFIG = """\
@@ -31,6 +31,7 @@ class Pretended:
 
     log: list[tuple[int, str, Any]] = []  # noqa: RUF012 (shared by all, as the machine is)
     ends: dict[tuple[str, int], int] = {}  # noqa: RUF012
+    refusing: set[str] = set()  # noqa: RUF012
     alive = 0
 
     def __init__(self, first: dict[str, Any]) -> None:
@@ -47,6 +48,8 @@ class Pretended:
     def answer(self, stop: Callable[[], bool]) -> dict[str, Any]:
         if stop():
             raise Stopped
+        if self.type in self.refusing:
+            raise Refused("no derivatives of what moves light", 2)
         if self.ends.get((self.type, self.depth)) == self.asked:
             raise Ended(BenchStatus.OUT_OF_MEMORY, "ended by SIGSEGV")
         if self.question is None:
@@ -63,7 +66,7 @@ class Pretended:
 
 @pytest.fixture(autouse=True)
 def _clean() -> None:
-    Pretended.log, Pretended.ends, Pretended.alive = [], {}, 0
+    Pretended.log, Pretended.ends, Pretended.refusing, Pretended.alive = [], {}, set(), 0
 
 
 def sweep(list_of: str = LIST, baseline: str | None = None, **changes: Any) -> Sweep:
@@ -284,3 +287,21 @@ def test_wrong_lists_are_located(text: str, line: str) -> None:
 def test_an_unknown_baseline_is_located() -> None:
     with pytest.raises(ConfigError, match=r"--baseline: `prb` is none of ptracer, reslrb:stack"):
         sweep(baseline="prb")
+
+
+def test_what_nobody_named_is_left_out_where_it_refuses():
+    Pretended.refusing = {"reslrb"}
+    lines: list[str] = []
+    results = [r for rows in bench(sweep(default=True), lambda: False, lines.append, Pretended) for r in rows]
+    assert {result.record.integrator for result in results} == {"ptracer", "walk_ad"}
+    assert {result.record.max_depth for result in results} == set(sweep().depths)
+    assert lines == ["left out: reslrb:stack: no derivatives of what moves light"]
+    assert Pretended.alive == 0
+
+
+@pytest.mark.parametrize(("refusing", "default"), [("reslrb", False), ("ptracer", True)])
+def test_what_somebody_named_or_divides_by_is_not_left_out(refusing: str, default: bool):
+    Pretended.refusing = {refusing}
+    with pytest.raises(Refused, match="what moves light"):
+        list(bench(sweep(default=default), lambda: False, lambda line: None, Pretended))
+    assert Pretended.alive == 0

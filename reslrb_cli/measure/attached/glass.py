@@ -109,7 +109,7 @@ def sphere_lens(radius: float = 0.8, y: float = 1.95, cutoff: float = 18, bsdf: 
 def mesh_lens(radius: float = 0.8, y: float = 1.95) -> dict:
     """The same as a mesh."""
     return setting(lamp=spot(cutoff=18, origin=(0.1, 3.6, -0.08), target=(0.05, y, 0)),
-                   lens=mesh(*ball(radius, (0, y, 0), 4), GLASS))  # fmt: skip
+                   lens=mesh(*ball(radius, (0, y, 0), 5), GLASS))  # fmt: skip
 
 
 def bent(scene: Any, name: str = "lens", count: int = 10, span: float = 0.8) -> list[Move]:
@@ -142,29 +142,30 @@ def smooth_texture() -> dict:
 
 
 SCENES = [
-    AttachedScene("slab", "a glass slab with waves under a spot light", slab, waving, spp=512),
+    AttachedScene("slab", "a glass slab with waves under a spot light", slab, waving, spp=256),
     AttachedScene("slab_beam", "the same under parallel light with a hard edge", lambda: slab(lamp=beam()), waving,
                   step=0.005),
     AttachedScene("slab_area", "the same, wide and under an area light",
-                  lambda: slab(lamp=square_lamp(0.2, 2.3), half=40, wide=6, cells=160), waving, spp=2048),
+                  lambda: slab(lamp=square_lamp(0.2, 2.3), half=40, wide=6, cells=160), waving, spp=512, seeds=16),
     AttachedScene("slab_depth_6", "the same with what is reflected inside of it twice", slab, waving,
-                  options={"max_depth": 6}, spp=1024),
+                  options={"max_depth": 6}, step=0.0025, spp=512, seeds=16),
     AttachedScene("slab_texture", "the same over a smooth texture", lambda: slab(floor=smooth_texture()), waving,
                   spp=256),
     AttachedScene("sphere_lens", "a ball of glass, moved and scaled", sphere_lens,
-                  lambda scene: moving_sphere("lens", (0, 1.95, 0)), spp=1024),
-    AttachedScene("mesh_lens", "a ball of glass, a mesh that is bent", mesh_lens, bent, spp=2048),
+                  lambda scene: moving_sphere("lens", (0, 1.95, 0)), spp=512),
+    AttachedScene("mesh_lens", "a ball of glass, a mesh that is bent", mesh_lens, bent,
+                  step=0.005, spp=512, seeds=24),
     AttachedScene("prism", "a tilted flat surface, turned and moved", prism,
-                  lambda scene: [Pose("top.to_world", ("rx", "rz", "ty"), (0, 1.9, 0))], spp=512),
+                  lambda scene: [Pose("top.to_world", ("rx", "rz", "ty"), (0, 1.9, 0))], spp=512, seeds=16),
     AttachedScene("two_lenses", "a slab with waves over a ball", two_lenses,
                   lambda scene: [*waving(scene, height=2.8), *moving_sphere("lens", (0, 1.55, 0))],
-                  options={"max_depth": 6}, spp=4096),
+                  options={"max_depth": 6}, spp=512, seeds=24),
     AttachedScene("rough_surface", "rough glass with waves, the receiver inside", rough_surface, waving,
-                  spp=2048, options={"max_depth": 3}),
+                  spp=512, seeds=32, options={"max_depth": 3}),
     AttachedScene("rough_surface_alpha", "the roughness of rough glass", rough_surface,
-                  lambda scene: [Number("top.bsdf.alpha.value")], step=0.03, spp=1024,
+                  lambda scene: [Number("top.bsdf.alpha.value")], step=0.03, spp=512, seeds=32,
                   options={"max_depth": 3, "attached": True}),
     AttachedScene("rough_surface_eta", "the index of rough glass", rough_surface,
-                  lambda scene: [Number("top.bsdf.eta")], step=0.1, spp=8192,
+                  lambda scene: [Number("top.bsdf.eta")], step=0.1, spp=1024, seeds=96,
                   options={"max_depth": 3, "attached": True}),
 ]  # fmt: skip
