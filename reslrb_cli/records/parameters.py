@@ -10,9 +10,10 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
+from reslrb_cli.config import HEIGHTMAP
 from reslrb_cli.records.atomic import write_atomically
 from reslrb_cli.records.file_names import file_stem
-from reslrb_cli.records.images import write_bitmap, write_image
+from reslrb_cli.records.images import write_bitmap, write_file
 
 Array = np.ndarray[Any, Any]
 
@@ -21,15 +22,17 @@ def write_parameters(folder: Path, values: Mapping[str, Array]) -> None:
     """Write parameter values into `folder`.
 
     Textures (H, W, C) as `<key>.exr`, which can stand in the scene file in place of the texture that it began with,
-    and `<key>.png` to look at; the shape of every parameter, and the values of those that are no textures, in
-    `parameters.json`; everything in `parameters.npz`.
+    and `<key>.png` to look at (a heightmap from its lowest point in black to its highest in white); the shape of every
+    parameter, and the values of those that are no textures, in `parameters.json`; everything in `parameters.npz`.
     """
     folder.mkdir(exist_ok=True)
     summary: dict[str, Any] = {}
     for key, value in values.items():
         entry: dict[str, Any] = {"shape": list(value.shape)}
         if value.ndim == 3:
-            write_image(folder / file_stem(key), value)
+            write_file(folder / f"{file_stem(key)}.exr", value, linear=True)
+            shown = _relief(value) if key.endswith(f".{HEIGHTMAP}") else value
+            write_file(folder / f"{file_stem(key)}.png", shown, linear=False)
             entry["file"] = file_stem(key) + ".exr"
         elif value.size <= 64:
             entry["value"] = value.tolist()
@@ -50,3 +53,10 @@ def write_mask(folder: Path, key: str, mask: Array) -> None:
     if mask.ndim == 2:
         bitmap = mi.Bitmap(np.ascontiguousarray(mask[:, :, None] * np.uint8(255)))
         write_bitmap(folder / f"{stem}.png", bitmap)
+
+
+def _relief(heights: Array) -> Array:
+    """Heights, which may be negative and far below 1, over the range that they have."""
+    finite = heights[np.isfinite(heights)]
+    low, high = (float(finite.min()), float(finite.max())) if finite.size else (0.0, 0.0)
+    return (heights - low) / ((high - low) or 1.0)

@@ -57,6 +57,21 @@ def test_parameters_and_masks_are_written_like_that(tmp_path, file_size_limit):
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_heightmap_is_seen_from_its_lowest_point_to_its_highest(tmp_path):
+    from matplotlib.image import imread
+
+    from reslrb_cli.records.images import read_exr
+    from reslrb_cli.records.parameters import write_parameters
+
+    heights = np.linspace(-1e-3, 2e-3, 12, dtype=np.float32).reshape(3, 4, 1)
+    write_parameters(tmp_path, {"face.heightmap": heights, "wall.data": np.abs(heights)})
+    assert np.array_equal(read_exr(tmp_path / "face.heightmap.exr"), heights)
+    seen = imread(tmp_path / "face.heightmap.png")
+    assert (seen.min(), seen.max()) == (0, 1)
+    assert np.all(np.diff(seen.ravel()[: heights.size]) >= 0)
+    assert imread(tmp_path / "wall.data.png").max() < 0.1
+
+
 def test_a_checkpoint_that_does_not_fit_leaves_the_one_before(tmp_path, file_size_limit, monkeypatch):
     from reslrb_cli.records.checkpoint import save_checkpoint
 
