@@ -18,8 +18,8 @@ SIZE = 32
 #: A filter so wide that what lands between two pixels counts as much as on one. That of the default width (0.5) changes
 #: the slope of a smooth dL/dI by a few percent within each pixel, which steps would have to be small against.
 FILTER = {"type": "gaussian", "stddev": 0.7}
-#: At how many seeds truncation is measured, by differences of twice the step.
-EXTRAPOLATED = 3
+#: At how many seeds truncation is measured, by differences of twice the step: one in so many, and at least that many.
+ONE_IN, EXTRAPOLATED = 4, 3
 
 
 @dataclass(frozen=True)
@@ -117,5 +117,5 @@ def compare_with_differences(scene: AttachedScene, estimator: str = "stack", cou
         return np.array([[case.difference(tracer, d, seed, scene.spp, step) for d in directions] for seed in some])
 
     near = differences(scene.step, chosen)
-    few = chosen[:EXTRAPOLATED]
+    few = chosen[: max(len(chosen) // ONE_IN, EXTRAPOLATED)]
     return Differenced(ours, near, (near[: len(few)] - differences(2 * scene.step, few)) / 3)
