@@ -13,15 +13,15 @@ from reslrb_cli.scene.graph import SceneGraph
 class Lamp:
     """A shape that emits; `emitter` is its emitter, and `index` the number of that in `scene.emitters()`.
 
-    `parallel`: light leaves along the normal alone (`directionalarea`). `by_area`: its points are sampled evenly over
-    its area, and not in proportion to a texture.
+    `parallel`: light leaves along the normal alone (`directionalarea`). `texture`: what its points are sampled in
+    proportion to; None: evenly over its area.
     """
 
     shape: mi.Shape
     emitter: mi.Emitter
     index: int
     parallel: bool
-    by_area: bool
+    texture: mi.Texture | None
 
     @property
     def is_sphere(self) -> bool:
@@ -31,7 +31,16 @@ class Lamp:
     @property
     def faces_by_area(self) -> bool:
         """Whether one of its faces is drawn in proportion to its area, as Mitsuba has it now."""
-        return self.by_area and self.shape.is_mesh() and self.shape.class_name() != "Rectangle"
+        return self._has_faces and self.texture is None
+
+    @property
+    def faces_by_texture(self) -> bool:
+        """Whether its points are drawn from a texture, and looked up among its faces."""
+        return self._has_faces and self.texture is not None
+
+    @property
+    def _has_faces(self) -> bool:
+        return self.shape.is_mesh() and self.shape.class_name() != "Rectangle"
 
 
 def find_lamps(scene: mi.Scene, graph: SceneGraph) -> tuple[Lamp, ...]:
@@ -43,6 +52,6 @@ def find_lamps(scene: mi.Scene, graph: SceneGraph) -> tuple[Lamp, ...]:
             continue
         parallel = emitter.class_name() == "DirectionalArea"
         textures = [item for item in graph.of_type(mi.Texture) if emitter in graph.parents[item]]
-        by_area = parallel or not any(texture.is_spatially_varying() for texture in textures)
-        found.append(Lamp(shape, emitter, index, parallel, by_area))
+        varying = [texture for texture in textures if texture.is_spatially_varying()]
+        found.append(Lamp(shape, emitter, index, parallel, varying[0] if varying and not parallel else None))
     return tuple(found)

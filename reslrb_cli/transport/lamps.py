@@ -4,6 +4,9 @@ sphere             Mitsuba turns the points of a sphere with its `to_world`, and
 directionalarea    it remembers the area that the shape had when it was loaded
 mesh that moves    it draws a face in proportion to its area, and so divides by the area of the whole. Both are
                    constants to it; the density on face f is P_f / A_f(theta), of which P_f alone is one
+textured mesh that moves
+                   its points are looked up by a ray in the plane of texture coordinates, and Mitsuba differentiates
+                   them as if they moved along that ray
 """
 
 from __future__ import annotations
@@ -32,7 +35,7 @@ def lamp_ray(
     si, weight = lamp_point(lamp, areas, time, position, active)
     _, radiance = lamp.emitter.sample_wavelengths(si, wavelength_sample, active)
     if lamp.parallel:
-        d = mi.Vector3f(si.n)
+        d = mi.Vector3f(si.sh_frame.n)  # of a mesh the interpolated one, as Mitsuba has it
     else:
         d, weight = si.to_world(mi.warp.square_to_cosine_hemisphere(direction)), weight * dr.pi
     si.time = time
@@ -43,6 +46,8 @@ def lamp_point(
     lamp: Lamp, areas: mi.Float | None, time: mi.Float, sample: mi.Point2f, active: mi.Bool
 ) -> tuple[mi.SurfaceInteraction3f, mi.Float]:
     """A point of the lamp, and the reciprocal of its density; both move with the lamp."""
+    if lamp.texture is not None and lamp.faces_by_texture:
+        return _textured_point(lamp.shape, lamp.texture, sample, active)
     ps, weight = lamp.emitter.sample_position(time, sample, active)
     if lamp.is_sphere:
         center = mi.traverse(lamp.shape)["to_world"] @ mi.Point3f(0)
@@ -53,9 +58,22 @@ def lamp_point(
         area = face_area(lamp.shape, face)
         weight = weight * (area / dr.detach(area))
         si = mi.SurfaceInteraction3f(ps, mi.Color0f())
-        si.n = lamp.shape.face_normal(face)  # `ps.n` is interpolated where the mesh has vertex normals
+        si.n = lamp.shape.face_normal(face)  # rays start off the face; they leave about `ps.n`, which is interpolated
         return si, weight
     return mi.SurfaceInteraction3f(ps, mi.Color0f()), weight
+
+
+def _textured_point(
+    mesh: mi.Mesh, texture: mi.Texture, sample: mi.Point2f, active: mi.Bool
+) -> tuple[mi.SurfaceInteraction3f, mi.Float]:
+    """The point that Mitsuba draws from a texture, which stays where it is within its face as that moves."""
+    uv, density = texture.sample_position(sample, active)
+    active = active & (density != 0)
+    there = mesh.eval_parameterization(uv, mi.RayFlags.All | mi.RayFlags.FollowShape, active)
+    weight = dr.select(active & there.is_valid(), dr.norm(dr.cross(there.dp_du, there.dp_dv)) / density, 0)
+    si = mi.SurfaceInteraction3f(mi.PositionSample3f(there), mi.Color0f())
+    si.n = there.n
+    return si, weight
 
 
 def sums_of_areas(lamps: Sequence[Lamp]) -> list[mi.Float]:

@@ -69,8 +69,13 @@ class Plan:
     @property
     def placed_lamps(self) -> tuple[Lamp, ...]:
         """Shapes whose light we place ourselves."""
-        reshaped = self.reshaped_lamps
-        return tuple(lamp for lamp in self.needs.lamps if lamp.parallel or lamp.is_sphere or lamp in reshaped)
+        return tuple(
+            lamp
+            for lamp in self.needs.lamps
+            if lamp.parallel
+            or lamp.is_sphere
+            or ((lamp.faces_by_area or lamp.faces_by_texture) and lamp.shape in self.moving_shapes)
+        )
 
     @property
     def reshaped_lamps(self) -> tuple[Lamp, ...]:

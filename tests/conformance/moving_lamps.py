@@ -6,7 +6,7 @@ does there, where derivatives are cut off, has no part. Nothing casts a shadow.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -102,12 +102,12 @@ def surface(kind: str, emitter: str = "area", radiance: Any = None) -> dict[str,
             "emitter": {"type": emitter, "radiance": radiance or RADIANCE}}  # fmt: skip
 
 
-def mesh(emitter: str = "area", radiance: Any = None, name: str = "light") -> mi.Mesh:
-    """A rippled sheet that shines down, with faces of different areas."""
+def mesh(emitter: str = "area", radiance: Any = None, name: str = "light", at: Sequence[float] = PIVOT) -> mi.Mesh:
+    """A rippled sheet that shines down, with faces of different areas, in the middle of what moves or elsewhere."""
     light = sheet(name, BLACK, 0.0, 5, 4.0, 0.5, emitter={"type": emitter, "radiance": radiance or RADIANCE})
     params = mi.traverse(light)
     x, y, z = np.array(params["vertex_positions"]).reshape(-1, 3).T
-    down = np.stack([x * (1 + 0.3 * x) + PIVOT[0], PIVOT[1] - y, -z + PIVOT[2]], -1)
+    down = np.stack([x * (1 + 0.3 * x) + at[0], at[1] - y, -z + at[2]], -1)
     params["vertex_positions"] = down.astype(np.float32).ravel()
     params.update()
     return light
@@ -134,7 +134,7 @@ CASES = [
     LampCase("point", lambda: over_floor({"type": "point", "position": list(PIVOT), "intensity": RADIANCE}), SHIFT,
              "light.position", quick=True),
     LampCase("point_bounces", lambda: within({"type": "point", "position": list(PIVOT), "intensity": RADIANCE}), SHIFT,
-             "light.position", options=DEEP),
+             "light.position", spp=256, options=DEEP),
     LampCase("spot", lambda: over_floor(looking_down(type="spot", intensity=RADIANCE, cutoff_angle=30, beam_width=5)),
              TURN, PLACE),
     LampCase("spot_bounces", lambda: within(looking_down(type="spot", intensity=RADIANCE, cutoff_angle=30,
@@ -152,6 +152,7 @@ CASES = [
     LampCase("parallel", lambda: over_floor(surface("rectangle", "directionalarea")), ALL, PLACE, quick=True),
     LampCase("parallel_disk", lambda: over_floor(surface("disk", "directionalarea")), ALL, PLACE),
     LampCase("parallel_mesh", lambda: over_floor(mesh("directionalarea")), ALL, VERTICES),
-    LampCase("beside_others", lambda: over_floor(surface("sphere"), second=mesh(name="second"), third={
-                 "type": "point", "position": [1, 4, 0], "intensity": RADIANCE}), ALL, PLACE),
+    LampCase("beside_others", lambda: over_floor(
+        surface("sphere"), second=mesh(name="second", at=(2.6, 3.8, 0)),
+        third={"type": "point", "position": [1, 4, 0], "intensity": RADIANCE}), ALL, PLACE),
 ]  # fmt: skip

@@ -244,7 +244,10 @@ FAULTS = {
     "area_of_faces_detached": ("mesh", "transport.lamps:lamp_point", "area / dr.detach(area)", "mi.Float(1)"),
     "start_does_not_move": ("parallel", "estimators.attached:differentiate_start",
                             "if plan.moving_emission:", "if False:"),
-    "normal_of_sphere_as_mitsuba_has_it": ("sphere", "transport.lamps:lamp_point", "if lamp.is_sphere:", "if False:"),
+    "normal_of_sphere_as_mitsuba_has_it": ("turned", "transport.lamps:lamp_point", "if lamp.is_sphere:", "if False:"),
+    "parallel_light_off_the_face": ("parallel_mesh", "transport.lamps:lamp_ray", "si.sh_frame.n", "si.n"),
+    "texture_looked_up_along_a_ray": ("textured_mesh", "transport.lamps:_textured_point",
+                                      "mi.RayFlags.All | mi.RayFlags.FollowShape", "mi.RayFlags.All"),
     "density_detached": ("parallel", "transport.lamps:lamp_ray", "radiance * weight", "radiance * dr.detach(weight)"),
     "rays_detached": ("spot", "transport.emission:sample_emission",
                       "Emission(ray if plan.moving_emission else dr.detach(ray), weight, emitter)",
@@ -257,6 +260,10 @@ QUICK = "area_of_faces_detached"
 def test_fault(name: str, monkeypatch: pytest.MonkeyPatch):
     case, where, right, wrong = FAULTS[name]
     plant(Fault(name, "", where, right, wrong, frozenset()), monkeypatch)
+    if case == "turned":  # differences have the fault too
+        with pytest.raises(AssertionError):
+            test_a_sphere_that_is_turned_shines_outward()
+        return
     with pytest.raises(AssertionError):
         check(next(c for c in CASES if c.name == case), 4)
 
