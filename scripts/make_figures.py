@@ -35,6 +35,9 @@ SCENES = {
     "furnace": (64, 8, 0.2),
 }
 
+#: Of the experiments that move light, samples per pixel and exposure of the target's picture.
+EXPERIMENTS = {"lens_pose": (4096, 1.0), "caustic_heightmap": (4096, 0.6)}
+
 Image = np.ndarray[Any, Any]
 
 
@@ -67,9 +70,11 @@ def run_panels(folder: Path) -> list[tuple[str, Image]]:
 
 
 def scene_panels() -> list[tuple[str, Image]]:
-    """The scenes in `scenes/`, light-traced by `reslrb`."""
+    """The scenes in `scenes/`, light-traced by `reslrb`; of those in which light is moved the target."""
     from reslrb_cli.backend.variant import set_variant
+    from reslrb_cli.config import load
     from reslrb_cli.integrators import make_integrator
+    from reslrb_cli.optimization.problem import assemble
     from reslrb_cli.optimization.rendering import render_in_passes
     from reslrb_cli.scene import load_scene
 
@@ -81,6 +86,10 @@ def scene_panels() -> list[tuple[str, Image]]:
         integrator = make_integrator("reslrb", max_depth=max_depth)
         image = render_in_passes(integrator, scene, 0, spp, 0, 0, "figure", None)
         panels.append((name, encode(image * exposure)))
+    for name, (spp, exposure) in EXPERIMENTS.items():
+        size = [f"scene.options.{side}={HEIGHT}" for side in ("resx", "resy")]
+        problem = assemble(load(ROOT / "configs" / f"{name}.yaml", [*size, f"target.render.spp={spp}"]))
+        panels.append((name, encode(np.array(problem.targets[0]) * exposure)))
     return panels
 
 
