@@ -45,7 +45,8 @@ RESOLUTION = 1.0
 TAIL = 0.5
 #: A parameter is divided no finer than its tiles have tails lighter than this: z of skewed samples is too large.
 TILE_TAIL = 0.12
-#: Tails of noise below so many times what rounding may cause do not matter.
+#: Tails of noise below so many times what rounding may cause do not matter, nor those of noise so many times below what
+#: the reference may be wrong by: no z score is large for them.
 NOISY = 10
 #: Fewer seeds than these say nothing of tails.
 TAIL_SEEDS = 8
@@ -129,7 +130,8 @@ def compare_expectations(
     z_max, z_rms = float(np.abs(z).max()), combined_z_rms(z)
     rms_limit = family.z_rms_limit(independent)
     detectable = _detectable(standard_error, bias, expected, family)
-    heavy = any(tail_weight(side[:, noise > (NOISY * floor) ** 2]) > TAIL for side in sides)
+    counts = noise > np.maximum(NOISY * floor, (bias if joined else 0.0) / NOISY) ** 2
+    heavy = any(tail_weight(side[:, counts]) > TAIL for side in sides)
     our_mean, its_mean = ours.mean(0), np.atleast_2d(reference).mean(0)
     verdict, message = Verdict.HOLDS, ""
     if heavy:

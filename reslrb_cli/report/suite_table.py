@@ -13,7 +13,8 @@ def suite_table(records: Iterable[GradcheckRecord], about: Mapping[str, str]) ->
     """A Markdown table; `about` says by case what it is about.
 
     Under each estimator stand the largest deviation in standard errors of all comparisons over many seeds, then the
-    largest relative L2 distance of all comparisons at equal seeds, and what did not hold or could not be decided.
+    largest relative L2 distance of all comparisons at equal seeds, and what did not hold or could not be decided; a
+    dash where it cannot do the case.
     """
     cases: dict[str, list[GradcheckRecord]] = {}
     for record in records:
@@ -42,6 +43,8 @@ def _references(rows: Sequence[GradcheckRecord]) -> str:
 
 
 def _cell(rows: Sequence[GradcheckRecord]) -> str:
+    if not rows:
+        return "-"
     z = max((r.z_max for r in rows if r.z_max is not None and r.verdict is Verdict.HOLDS), default=None)
     distance = max((r.relative_l2 or 0.0 for r in rows if r.relative_l2_limit is not None), default=None)
     parts = [] if z is None else [f"{z:.1f}"]

@@ -69,6 +69,15 @@ def test_a_single_seed_that_carries_the_variance_is_no_pass():
     ours = noisy(1)
     ours[3] += 100
     assert compare_expectations(ours, noisy(2), FAMILY).verdict is Verdict.HEAVY_TAILED
+
+
+def test_tails_of_noise_that_is_nothing_beside_the_reference_own_error_do_not_matter():
+    reference = np.ones((16, 4))
+    ours = reference + 1e-4
+    ours[3] += 3e-2  # one seed carries the variance, of a standard error of 2e-3
+    assert compare_expectations(ours, reference, FAMILY, bias=5e-3).verdict is Verdict.HEAVY_TAILED
+    assert compare_expectations(ours, reference, FAMILY, bias=5e-2).verdict is Verdict.HOLDS
+    assert compare_expectations(ours + 0.1, reference, FAMILY, bias=5e-2).verdict is Verdict.FAILS
     assert tail_weight(ours) > 0.9
     assert abs(tail_weight(noisy(3, 30))) < 0.1
 
