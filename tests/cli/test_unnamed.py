@@ -149,8 +149,8 @@ def test_the_other_commands_know_the_names(folder):
     )
     reslrb("render", "lamps.yaml", "-o", "image.exr")
     assert f"* {key}" in reslrb("inspect", "lamps.yaml", "--no-counts")
-    assert key in reslrb("gradcheck", "lamps.yaml", "--budget", "1")
-    reslrb("bench", "lamps.yaml", "--max-depth", "2", "--budget", "1", "--integrators", "reslrb:stack")
+    assert key in reslrb("gradcheck", "lamps.yaml", "--seeds", "3")
+    reslrb("bench", "lamps.yaml", "--max-depth", "2", "--rounds", "1", "--integrators", "reslrb:stack")
     reslrb("optimize", "lamps.yaml", "--quiet")
     truth = json.loads((folder / "runs" / "lamps" / "parameters" / "true" / "parameters.json").read_text())
     assert truth[key]["value"] == [2, 3, 4]

@@ -226,7 +226,7 @@ FAULTS = [
     Fault("factor_detached", "wavy_glass", BACK,
           "this.scattering.weight * (r * B)", "dr.detach(this.scattering.weight) * (r * B)", by("stack", "walk_ad")),
     Fault("adjoints_of_origin_and_direction_exchanged", "wavy_glass", BACK,
-          "dr.grad(ray.o), dr.grad(ray.d), dr.detach", "dr.grad(ray.d), dr.grad(ray.o), dr.detach",
+          "dr.grad(ray.o), dr.grad(ray.d), dr.detach", "dr.grad(ray.d), mi.Vector3f(dr.grad(ray.o)), dr.detach",
           by("stack", *MOVED)),
     Fault("last_vertex_of_the_attached_stack", "wavy_glass", "estimators.attached:Pushing.scattering",
           "dr.select(seen & pushed, count, state.needed)", "dr.select(seen & pushed, state.count, state.needed)",

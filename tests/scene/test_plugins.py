@@ -151,8 +151,8 @@ CONFIG_FILE = "../c.yaml"
         pytest.param(
             [
                 ["optimize", CONFIG_FILE],
-                ["gradcheck", CONFIG_FILE, "--budget", "1"],
-                ["bench", CONFIG_FILE, "--max-depth", "2", "--budget", "1", "--integrators", "reslrb:stack,ptracer"],
+                ["gradcheck", CONFIG_FILE, "--seeds", "3"],
+                ["bench", CONFIG_FILE, "--max-depth", "2", "--rounds", "1", "--integrators", "reslrb:stack,ptracer"],
                 ["doctor"],
             ],
             id="long",
