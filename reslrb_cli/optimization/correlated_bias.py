@@ -88,11 +88,11 @@ def find_bias(
 
     Corrected for the number of parameters, each with two questions.
     """
+    from scipy import stats  # here, since every run would wait a second for it that few have a use for
+
     d, h = (np.array(rows, dtype=np.float64) for rows in (differences, gradients))
     d = d * scale
     products = np.array([d @ h.T, h @ h.T, d @ d.T])
-    from scipy import stats  # here, since every run would wait a second for it that few have a use for
-
     limit = float(stats.t.isf(ALPHA / (4 * parameters), len(d) - 1))
     (_, gradient, _), (_, gradient_error, _) = _jackknife(products, lambda u: u)
     [share], [error] = _jackknife(products, lambda u: u[:1] / np.where(u[1:2] == 0, np.inf, u[1:2]))

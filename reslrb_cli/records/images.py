@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -14,13 +15,21 @@ from reslrb_cli.records.atomic import write_atomically
 FORMATS = {".exr": "OpenEXR", ".hdr": "RGBE", ".pfm": "PFM", ".png": "PNG", ".jpg": "JPEG", ".jpeg": "JPEG"}
 
 
-def write_image(stem: Path, image: np.ndarray[Any, Any]) -> None:
-    """Write an (H, W, C) image of linear values as `<stem>.exr` and `<stem>.png`.
+def write_image(stem: Path, image: np.ndarray[Any, Any], shown: np.ndarray[Any, Any] | None = None) -> None:
+    """Write an (H, W, C) image of linear values as `<stem>.exr`, and it or what is `shown` of it as `<stem>.png`.
 
     `stem` is appended to rather than given a new suffix: keys of parameters have dots of their own.
     """
     write_file(Path(f"{stem}.exr"), image, linear=True)
-    write_file(Path(f"{stem}.png"), image, linear=False)
+    write_file(Path(f"{stem}.png"), image if shown is None else shown, linear=False)
+
+
+def finite_range(arrays: Iterable[np.ndarray[Any, Any]]) -> tuple[float, float]:
+    """The least and the greatest finite value in any of the arrays; 0 and 0 where there is none."""
+    known = [values for array in arrays if (values := array[np.isfinite(array)]).size]
+    if not known:
+        return 0.0, 0.0
+    return min(float(values.min()) for values in known), max(float(values.max()) for values in known)
 
 
 def write_file(path: Path, image: np.ndarray[Any, Any], linear: bool) -> None:

@@ -13,7 +13,7 @@ import numpy as np
 from reslrb_cli.config import HEIGHTMAP
 from reslrb_cli.records.atomic import write_atomically
 from reslrb_cli.records.file_names import file_stem
-from reslrb_cli.records.images import write_bitmap, write_file
+from reslrb_cli.records.images import finite_range, write_bitmap, write_image
 
 Array = np.ndarray[Any, Any]
 
@@ -30,9 +30,8 @@ def write_parameters(folder: Path, values: Mapping[str, Array]) -> None:
     for key, value in values.items():
         entry: dict[str, Any] = {"shape": list(value.shape)}
         if value.ndim == 3:
-            write_file(folder / f"{file_stem(key)}.exr", value, linear=True)
-            shown = _relief(value) if key.endswith(f".{HEIGHTMAP}") else value
-            write_file(folder / f"{file_stem(key)}.png", shown, linear=False)
+            shown = _relief(value) if key.endswith(f".{HEIGHTMAP}") else None
+            write_image(folder / file_stem(key), value, shown)
             entry["file"] = file_stem(key) + ".exr"
         elif value.size <= 64:
             entry["value"] = value.tolist()
@@ -57,6 +56,5 @@ def write_mask(folder: Path, key: str, mask: Array) -> None:
 
 def _relief(heights: Array) -> Array:
     """Heights, which may be negative and far below 1, over the range that they have."""
-    finite = heights[np.isfinite(heights)]
-    low, high = (float(finite.min()), float(finite.max())) if finite.size else (0.0, 0.0)
+    low, high = finite_range([heights])
     return (heights - low) / ((high - low) or 1.0)

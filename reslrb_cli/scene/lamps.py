@@ -31,15 +31,11 @@ class Lamp:
     @property
     def faces_by_area(self) -> bool:
         """Whether one of its faces is drawn in proportion to its area, as Mitsuba has it now."""
-        return self._has_faces and self.texture is None
+        return self.has_faces and self.texture is None
 
     @property
-    def faces_by_texture(self) -> bool:
-        """Whether its points are drawn from a texture, and looked up among its faces."""
-        return self._has_faces and self.texture is not None
-
-    @property
-    def _has_faces(self) -> bool:
+    def has_faces(self) -> bool:
+        """Whether the shape is a mesh of which each vertex can move."""
         return self.shape.is_mesh() and self.shape.class_name() != "Rectangle"
 
 

@@ -46,7 +46,7 @@ def lamp_point(
     lamp: Lamp, areas: mi.Float | None, time: mi.Float, sample: mi.Point2f, active: mi.Bool
 ) -> tuple[mi.SurfaceInteraction3f, mi.Float]:
     """A point of the lamp, and the reciprocal of its density; both move with the lamp."""
-    if lamp.texture is not None and lamp.faces_by_texture:
+    if lamp.texture is not None and lamp.has_faces:
         return _textured_point(lamp.shape, lamp.texture, sample, active)
     ps, weight = lamp.emitter.sample_position(time, sample, active)
     if lamp.is_sphere:

@@ -72,9 +72,7 @@ class Plan:
         return tuple(
             lamp
             for lamp in self.needs.lamps
-            if lamp.parallel
-            or lamp.is_sphere
-            or ((lamp.faces_by_area or lamp.faces_by_texture) and lamp.shape in self.moving_shapes)
+            if lamp.parallel or lamp.is_sphere or (lamp.has_faces and lamp.shape in self.moving_shapes)
         )
 
     @property

@@ -84,12 +84,12 @@ def test_means_over_seeds_agree_with_ptracer(name: str):
         [moving.gradient(tracer(case, integrator), seed, case.spp) for seed in many]
         for integrator in ("reslrb", "ptracer")
     )
+    naive = moving.gradient(tracer(case, "walk_ad"), many[0], case.spp)
     for key in ours[0]:
         mine, theirs = (np.stack([gradient[key] for gradient in side]) for side in (ours, stock))
         # An entry is a sum of terms as large as the largest one, which may cancel: what rounding and the references'
         # own distance leave is by their size, not by its. `apart` is that of naive AD of our walk from stock.
-        naive = moving.gradient(tracer(case, "walk_ad"), many[0], case.spp)[key]
-        apart = relative(naive, theirs[0])
+        apart = relative(naive[key], theirs[0])
         assert apart <= FARTHEST / 2
         floor = max(case.limit, apart) * float(np.abs(theirs.mean(0)).max())
         found = compare_expectations(mine, theirs, Family(30, 3000), rounding=STOCK_ROUNDING, bias=floor)

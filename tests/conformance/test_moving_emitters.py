@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import mitsuba as mi
@@ -254,18 +255,17 @@ FAULTS = {
                       "Emission(dr.detach(ray), weight, emitter)"),
 }  # fmt: skip
 QUICK = "area_of_faces_detached"
+#: What finds a fault that differences have as well.
+FOUND_BY = {"turned": test_a_sphere_that_is_turned_shines_outward}
 
 
 @pytest.mark.parametrize("name", [pytest.param(n, marks=() if n == QUICK else pytest.mark.long) for n in FAULTS])
 def test_fault(name: str, monkeypatch: pytest.MonkeyPatch):
     case, where, right, wrong = FAULTS[name]
     plant(Fault(name, "", where, right, wrong, frozenset()), monkeypatch)
-    if case == "turned":  # differences have the fault too
-        with pytest.raises(AssertionError):
-            test_a_sphere_that_is_turned_shines_outward()
-        return
+    find = FOUND_BY.get(case) or partial(check, next(c for c in CASES if c.name == case), 4)
     with pytest.raises(AssertionError):
-        check(next(c for c in CASES if c.name == case), 4)
+        find()
 
 
 def test_faces_of_a_mesh_are_those_that_mitsuba_draws():

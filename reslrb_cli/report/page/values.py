@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from reslrb_cli.records.images import finite_range
 from reslrb_cli.report.page.markup import breakable, figure, figures, table, text
 from reslrb_cli.report.page.pictures import Array, encode, exposure_for, exposure_words, show
 from reslrb_cli.report.run_table import units_differ
@@ -74,10 +75,7 @@ def texture_pictures(folder: Path, results: Mapping[str, Any]) -> str:
 
 def _as_relief(arrays: Mapping[str, Array | None]) -> tuple[dict[str, Array | None], str]:
     """Heights, which may be negative, from black to white, at all moments alike; and words that say so."""
-    known = [array[np.isfinite(array)] for array in arrays.values() if array is not None]
-    known = [values for values in known if values.size]
-    low = min((float(values.min()) for values in known), default=0.0)
-    high = max((float(values.max()) for values in known), default=0.0)
+    low, high = finite_range(array for array in arrays.values() if array is not None)
     span = (high - low) or 1.0
     shown = {moment: None if array is None else (array - low) / span for moment, array in arrays.items()}
     return shown, f"black is {number(low, 3)}, white is {number(high, 3)}"
