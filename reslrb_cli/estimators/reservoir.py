@@ -20,6 +20,7 @@ from typing import Any, ClassVar, Protocol
 import drjit as dr
 import mitsuba as mi
 
+from reslrb_cli.estimators import chain
 from reslrb_cli.estimators.base import (
     Estimator,
     Pass,
@@ -38,6 +39,7 @@ from reslrb_cli.transport.hooks import Vertex
 from reslrb_cli.transport.plan import Plan
 from reslrb_cli.transport.scattering import Scattering, tracked_factor
 
+JACOBIAN_DAMPING = 0.1
 SHARE = 0.01  # the least share of a candidate in the weights up to it
 
 
@@ -200,26 +202,55 @@ class Reservoir(Estimator):
     `image` says which connections the image shows: `all`, or the `retained` ones alone, weighted by W / (m w_I).
     """
 
-    OPTIONS: ClassVar[dict[str, Any]] = {"capacity": 1, "weight": "luminance", "image": "all"}
+    attaches = True
 
-    def __init__(self, capacity: int = 1, weight: str = "luminance", image: str = "all") -> None:
+    OPTIONS: ClassVar[dict[str, Any]] = {
+        "capacity": 1,
+        "weight": "luminance",
+        "image": "all",
+        "jacobian_damping": JACOBIAN_DAMPING,
+    }
+
+    def __init__(
+        self,
+        capacity: int = 1,
+        weight: str = "luminance",
+        image: str = "all",
+        jacobian_damping: float = JACOBIAN_DAMPING,
+    ) -> None:
         one_of("weight", weight, ("luminance", "adjoint"))
         one_of("image", image, ("all", "retained"))
         at_least_one("capacity", capacity)
         if image == "retained" and weight == "adjoint":
             raise ValueError('image "retained" needs weight "luminance": an image is made before dL/dI is known')
-        self.capacity, self.weight, self.image = capacity, weight, image
+        if not jacobian_damping > 0:
+            raise ValueError(f'"jacobian_damping" must be positive, not {jacobian_damping}')
+        self.capacity, self.weight, self.image, self.damping = capacity, weight, image, jacobian_damping
         self.splats_all = image == "all"
 
-    def forward(self, p: Pass) -> ReservoirState:
-        selection = ReservoirSelection(p, self.capacity, self.weight, self.image == "all")
-        state: ReservoirState = replace(p.walk(selection), latest=[])
+    def forward(self, p: Pass) -> ReservoirState | chain.ChainState:
+        state: ReservoirState | chain.ChainState
+        if p.plan.attached:
+
+            def weigh(connection: Connection, C: Product, W: mi.Float) -> mi.Float:
+                return defended(selection_weight(p, self.weight, connection, C), W)
+
+            splat = self.image == "all"
+            selection = chain.ChainSelection(p, self.capacity, self.damping, splat, weigh, is_taken)
+            state = p.walk(selection).stored()
+        else:
+            state = replace(p.walk(ReservoirSelection(p, self.capacity, self.weight, self.image == "all")), latest=[])
         if self.image == "retained":
             for slot in state.slots:
                 p.splat(slot.u, slot.C.value() * unselected(state.W, slot, self.capacity), slot.w != 0)
         return state
 
-    def backward(self, p: Pass, state: ReservoirState) -> None:
+    def backward(self, p: Pass, state: ReservoirState | chain.ChainState) -> None:
+        if isinstance(state, chain.ChainState):
+            shares = [unselected(state.W, slot, self.capacity) for slot in state.slots]
+            kept = [chain.Kept.of(p, slot, share) for slot, share in zip(state.slots, shares, strict=True)]
+            chain.differentiate(p, kept, self.damping)
+            return
         adjoints = [slot_adjoint(p, state.W, slot, self.capacity) for slot in state.slots]
 
         def emission_weight(E: mi.Spectrum) -> mi.Spectrum:
@@ -233,5 +264,7 @@ class Reservoir(Estimator):
             replay = ReservoirReplay(p, state.slots, adjoints)
             p.walk(replay, replay.last > 0)
 
-    def kept(self, plan: Plan) -> ReservoirState:
+    def kept(self, plan: Plan) -> ReservoirState | chain.ChainState:
+        if plan.attached:
+            return chain.ChainState.empty(plan, self.capacity).stored()
         return replace(ReservoirState.empty(plan, self.capacity), latest=[])

@@ -1,0 +1,363 @@
+"""Attached derivatives of the connections that a reservoir keeps, by chains of Jacobians: constant memory, no stack.
+
+Let p_i be the coordinates of the ray that reaches vertex i (`transport.jacobian`), J_i = dp_{i+1}/dp_i, and J_{0->i} their
+product from the first vertex on that a parameter has a part in. Beside it each channel carries what the factors so far
+change by,
+
+    G_i = sum_{m<i} dlog s_m/dp_m J_{0->m}
+
+Of a connection I that is kept, so are du_I/dp_I J_{0->I} and dlog c_I/dp_I J_{0->I} + G_I, and with delta they make the
+adjoint of the first ray (W / (m w_I) is left out here; it stands before all of it):
+
+    a_0 = <d delta/du, C_I> du_I/dp_I J_{0->I} + delta C_I (dlog c_I/dp_I J_{0->I} + G_I)
+
+A replay takes it to every vertex, through the inverse of what has been passed,
+
+    a_{j+1} = (a_j - delta C_I dlog s_j/dp_j) J_j^{-1}
+    dS     += a_{j+1} dp_{j+1}/dtheta + delta C_I ds_j/s_j          and at I   d<delta(u_I), C_I> by c_I and u_I
+
+Source: the ResLRB paper, Section 2.5, which has no G, and inverts the accumulated Jacobian rather than one after the
+other. J_j of a diffuse vertex has rank 2; how it is made to have an inverse says `segment_jacobian`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import drjit as dr
+import mitsuba as mi
+
+from reslrb_cli.estimators.attached import Adjoint, differentiate_start
+from reslrb_cli.estimators.base import Pass, PathAdjoint, VertexHooks, adjoint_of_factor, contribution
+from reslrb_cli.transport.connection import Connection
+from reslrb_cli.transport.factors import Product
+from reslrb_cli.transport.hooks import Vertex
+from reslrb_cli.transport.jacobian import SegmentJacobian, row_times, segment_jacobian, spread
+from reslrb_cli.transport.numbers import Numbers
+from reslrb_cli.transport.plan import Plan
+from reslrb_cli.transport.scattering import Scattering
+from reslrb_cli.transport.segment import find_vertex, segment
+
+
+#: Vertices that are not specular in one block of a chain.
+BLOCK = 10
+
+
+@dataclass
+class Slot:
+    """One kept connection. `last` is the last vertex up to its own, `number`, with anything to differentiate; 0: none.
+
+    `prefix` (C,) is the path's throughput before its vertex. `u_rows` and `C_rows` are du_I/dp_I J_{0->I} and
+    dlog c_I/dp_I J_{0->I} + G_I. `block` holds the number of the block that J begins with, and that of all up to here,
+    where there may be several.
+    """
+
+    w: mi.Float
+    number: mi.UInt32
+    last: mi.UInt32
+    C: Product
+    u: mi.Point2f
+    prefix: mi.Spectrum
+    u_rows: list[mi.Vector4d]
+    C_rows: list[mi.Vector4d]
+    block: list[mi.UInt32]
+
+
+@dataclass
+class Blocks:
+    """Where a path stands in its blocks: vertices passed that are not specular, and which block the chain begins with."""
+
+    passed: mi.UInt32
+    chosen: mi.UInt32
+
+    @staticmethod
+    def of(plan: Plan) -> list[Blocks]:
+        """At the beginning; nothing where a path cannot have more than one."""
+        return [Blocks(mi.UInt32(0), mi.UInt32(0))] if plan.max_depth - 2 > BLOCK else []
+
+    @property
+    def number(self) -> mi.UInt32:
+        """Of the block that the ray from here on belongs to, from 0."""
+        return self.passed // BLOCK
+
+    def past(self, damped: mi.Bool) -> tuple[Blocks, mi.Bool]:
+        """Behind a vertex, and where a block begins with it."""
+        passed = self.passed + dr.select(damped, mi.UInt32(1), 0)
+        return Blocks(passed, self.chosen), damped & (passed % BLOCK == 0)
+
+
+@dataclass
+class ChainState:
+    """What is kept of a path; what is in a list is there on the way alone.
+
+    `latest` is the latest vertex with anything to differentiate (0: none), `J` is J_{0->i}, `G` has a row for each
+    channel, and `numbers` are those to select the current connection by.
+    """
+
+    W: mi.Float
+    slots: list[Slot]
+    latest: list[mi.UInt32]
+    J: list[mi.Matrix4d]
+    G: list[mi.Vector4d]
+    blocks: list[Blocks]
+    numbers: list[mi.Float]
+
+    @staticmethod
+    def empty(plan: Plan, capacity: int) -> ChainState:
+        """Nothing kept yet."""
+
+        def rows(count: int) -> list[mi.Vector4d]:
+            return [mi.Vector4d(0) for _ in range(count)]
+
+        channels = len(mi.Spectrum(0))
+        slots = [
+            Slot(mi.Float(0), mi.UInt32(0), mi.UInt32(0), Product.none(plan.track_zeros), mi.Point2f(0),
+                 mi.Spectrum(0), rows(2), rows(channels), [mi.UInt32(0) for _ in 2 * Blocks.of(plan)])
+            for _ in range(capacity)
+        ]  # fmt: skip
+        return ChainState(mi.Float(0), slots, [mi.UInt32(0)], [mi.Matrix4d(1)], rows(channels), Blocks.of(plan), [])
+
+    def stored(self) -> ChainState:
+        """What is left of it at the end of a path."""
+        return ChainState(self.W, self.slots, [], [], [], [], [])
+
+
+def begins(plan: Plan, vertex: Vertex) -> mi.Bool:
+    """Lanes in which the vertex itself has anything to differentiate."""
+    return plan.moves(vertex.si.shape) | plan.differentiates(vertex.bsdf)
+
+
+def numbers_of(connection: Connection, scattering: Scattering) -> Numbers:
+    """The numbers that a segment was made from."""
+    return Numbers(connection.sample, scattering.sample_2, scattering.sample_1)
+
+
+class ChainSelection(VertexHooks):
+    """Image pass: splat, chain Jacobians, and keep connections as `choose` says."""
+
+    def __init__(
+        self,
+        p: Pass,
+        capacity: int,
+        damping: float,
+        splat: bool,
+        weigh: Callable[[Connection, Product, mi.Float], mi.Float],
+        is_taken: Callable[[mi.Float, mi.Float, mi.Float], mi.Bool],
+    ) -> None:
+        """`weigh(connection, C, W)` is the selection weight w of a connection, W the sum before it; `is_taken(number, w,
+        W)` whether it takes a slot, W being the sum with it."""
+        super().__init__(p)
+        self.capacity, self.damping, self.splat = capacity, damping, splat
+        self.numbers = capacity + len(Blocks.of(p.plan))
+        self.weigh, self.is_taken = weigh, is_taken
+
+    def start(self, product: Product) -> ChainState:
+        return ChainState.empty(self.p.plan, self.capacity)
+
+    def concerned(self, state: ChainState) -> mi.Bool:
+        plan = self.p.plan
+        return mi.Bool(True) if plan.differentiate_emission or plan.moving_emission else state.latest[0] > 0
+
+    def wants(self, state: ChainState, vertex: Vertex) -> mi.Bool:
+        if self.p.block is not None:
+            return mi.Bool(True)
+        return self.concerned(state) | begins(self.p.plan, vertex)
+
+    def connection(
+        self, state: ChainState, vertex: Vertex, connection: Connection, numbers: list[mi.Float]
+    ) -> ChainState:
+        return replace(state, numbers=numbers)
+
+    def scattering(
+        self, state: ChainState, vertex: Vertex, connection: Connection, scattering: Scattering
+    ) -> ChainState:
+        p, plan = self.p, self.p.plan
+        C = contribution(p, vertex, connection)
+        if self.splat:
+            p.splat(connection.u, C.value(), connection.active)
+        here = begins(plan, vertex)
+        on = self.concerned(state) | here
+        latest = dr.select(here & vertex.active, vertex.depth, state.latest[0])
+        candidate = connection.active & on
+        numbers = numbers_of(connection, scattering)
+        jacobian = segment_jacobian(
+            plan, p.samples.sensor, vertex, numbers, candidate, scattering.active & on, self.damping
+        )
+        w = dr.select(candidate, self.weigh(connection, C, state.W), 0)
+        W = state.W + w
+        [J], G = state.J, state.G
+        this = Slot(
+            w=w,
+            number=vertex.depth,
+            last=latest,
+            C=C.stored(),
+            u=connection.u,
+            prefix=vertex.product.value(),
+            u_rows=[row_times(row, J) for row in jacobian.u],
+            C_rows=[row_times(row, J) + before for row, before in zip(jacobian.log_c, G, strict=True)],
+            block=[number for blocks in state.blocks for number in (blocks.chosen, blocks.number + 1)],
+        )
+        chosen_by = state.numbers[: self.capacity]
+        slots = [
+            dr.select(self.is_taken(number, w, W), this, slot)
+            for number, slot in zip(chosen_by, state.slots, strict=True)
+        ]
+        on &= scattering.active
+        G = [
+            dr.select(on, before + row_times(row, J), before) for row, before in zip(jacobian.log_s, G, strict=True)
+        ]
+        after = replace(state, W=W, slots=slots, latest=[latest], J=[dr.select(on, jacobian.ray @ J, J)], G=G)
+        return replace(self._begun_anew(after, jacobian.damped), numbers=[])
+
+    def _begun_anew(self, state: ChainState, damped: mi.Bool) -> ChainState:
+        """The chain begins anew with a block, instead of any before it, with one over their number as probability."""
+        if not state.blocks:
+            return state
+        blocks, begins = state.blocks[0].past(damped)
+        anew = begins & (state.numbers[-1] * (blocks.number + 1) < 1)
+        J = dr.select(anew, mi.Matrix4d(1), state.J[0])
+        G = [dr.select(anew, mi.Vector4d(0), row) for row in state.G]
+        chosen = dr.select(anew, blocks.number, blocks.chosen)
+        return replace(state, J=[J], G=G, blocks=[Blocks(blocks.passed, chosen)])
+
+
+@dataclass
+class Kept:
+    """A slot in a replay.
+
+    `share` is W / (m w_I), `adjoint` the sensitivity of the objective to its connection, `A` = delta C_I (C,) what of it
+    is left where factors are zero, `row` a_0; each with `share` in it.
+    """
+
+    slot: Slot
+    share: mi.Float
+    adjoint: PathAdjoint
+    A: mi.Spectrum
+    row: mi.Vector4d
+
+    @staticmethod
+    def of(p: Pass, slot: Slot, share: mi.Float) -> Kept:
+        """That of a slot, dL/dI being known."""
+        assert p.adjoint is not None
+        C = slot.C.value() * share
+        with dr.resume_grad():
+            u = mi.Point2f(slot.u)
+            dr.enable_grad(u)
+            delta = p.adjoint.lookup(u, slot.w != 0, p.plan.attached_normalization)
+            dr.backward_from(dr.dot(delta, C))
+            by_u = dr.grad(u)
+        delta = dr.detach(delta)
+        A, row = delta * C, mi.Vector4d(0)
+        for weight, one in zip([*by_u, *A], [*slot.u_rows, *slot.C_rows], strict=True):
+            row += mi.Float64(weight) * one
+        return Kept(slot, share, PathAdjoint(delta * slot.C.nonzero * share, slot.C), A, row)
+
+    def part(self, blocks: list[Blocks]) -> tuple[mi.Bool, mi.Float64]:
+        """Where a ray belongs to the block that the chain begins with, and what stands for all other blocks."""
+        if not blocks:
+            return mi.Bool(True), mi.Float64(1)
+        chosen, count = self.slot.block
+        return blocks[0].number == chosen, mi.Float64(count)
+
+
+@dataclass
+class ReplayState:
+    """Loop state of a replay: a_j of each slot, and whether the path has met anything to differentiate."""
+
+    rows: list[mi.Vector4d]
+    begun: mi.Bool
+    blocks: list[Blocks]
+
+
+class ChainReplay(VertexHooks):
+    """Replay up to the last vertex with anything to differentiate, and differentiate each segment's ray and factors."""
+
+    replaying = True
+    connects = False
+
+    def __init__(self, p: Pass, kept: list[Kept], damping: float) -> None:
+        super().__init__(p)
+        self.kept, self.damping = kept, damping
+        self.last = kept[0].slot.last
+        for other in kept[1:]:
+            self.last = dr.maximum(self.last, other.slot.last)
+
+    def start(self, product: Product) -> ReplayState:
+        plan = self.p.plan
+        return ReplayState(
+            [one.row for one in self.kept], mi.Bool(plan.differentiate_emission or plan.moving_emission), Blocks.of(plan)
+        )
+
+    def goes_on(self, state: ReplayState, vertex: Vertex) -> mi.Bool:
+        return vertex.depth <= self.last
+
+    def is_followed(self, state: ReplayState, vertex: Vertex) -> mi.Bool:
+        return vertex.depth < self.last
+
+    def scattering(
+        self, state: ReplayState, vertex: Vertex, connection: Connection, scattering: Scattering
+    ) -> ReplayState:
+        plan, depth = self.p.plan, vertex.depth
+        begun = state.begun | begins(plan, vertex)
+        numbers, on = numbers_of(connection, scattering), scattering.active & begun
+        jacobian = segment_jacobian(plan, self.p.samples.sensor, vertex, numbers, None, on, self.damping)
+        blocks = state.blocks
+        entered = mi.Bool(False)
+        if blocks:
+            passed, entered = blocks[0].past(jacobian.damped)
+            blocks = [passed]
+        inverse, rows, weighted = dr.rcp(jacobian.ray), [], []
+        for row, kept in zip(state.rows, self.kept, strict=True):
+            ahead = row - sum(mi.Float64(kept.A[c]) * log for c, log in enumerate(jacobian.log_s))
+            inside, weight = kept.part(blocks)
+            rows.append(dr.select(on & inside & ~entered & (depth < kept.slot.number), row_times(ahead, inverse), row))
+            weighted.append(dr.select(inside, rows[-1] * weight, 0))
+        self._differentiate(vertex, numbers, scattering, weighted)
+        return ReplayState(rows, begun, blocks)
+
+    def _differentiate(
+        self, vertex: Vertex, numbers: Numbers, scattering: Scattering, rows: list[mi.Vector4d]
+    ) -> None:
+        """Add the derivatives of the vertex's segment; `rows` are the adjoints of the ray that it ends in."""
+        p, plan, depth = self.p, self.p.plan, vertex.depth
+        here = vertex.active & begins(plan, vertex)
+        connected, scattered = mi.Bool(False), mi.Bool(False)
+        origin, direction, by_s, by_c = mi.Vector3f(0), mi.Vector3f(0), mi.Spectrum(0), mi.Spectrum(0)
+        for row, kept in zip(rows, self.kept, strict=True):
+            on, own = here & (depth < kept.slot.number), here & (depth == kept.slot.number)
+            by_o, by_d = spread(scattering.d, row)
+            origin, direction = origin + dr.select(on, by_o, 0), direction + dr.select(on, by_d, 0)
+            by_s += dr.select(on, adjoint_of_factor(kept.adjoint, depth, scattering.weight, 1), 0)
+            by_c += dr.select(own, kept.slot.prefix * (kept.share * p.scale), 0)
+            connected, scattered = connected | own, scattered | (on & scattering.active)
+        assert p.adjoint is not None
+        with dr.resume_grad():
+            si, bsdf = find_vertex(vertex.ray, vertex.pi, connected | scattered)
+            this = segment(
+                plan, p.samples.sensor, vertex.ray, si, bsdf, numbers, connected, scattered, attached=True
+            )
+            there, following = this.connection, this.next_ray(attached=True)
+            delta = p.adjoint.lookup(there.u, connected, plan.attached_normalization)
+            own_part = dr.select(connected, dr.dot(by_c, delta * there.f * there.weight), 0)
+            moved = dr.dot(origin, following.o) + dr.dot(direction, following.d)
+            later = dr.select(scattered, moved + dr.dot(by_s, this.scattering.weight), 0)
+            dr.backward_from(own_part + later)
+
+
+def differentiate(p: Pass, kept: list[Kept], damping: float) -> None:
+    """Add the derivatives of the kept connections."""
+    replay = ChainReplay(p, kept, damping)
+    if p.plan.differentiate_emission or p.plan.moving_emission:
+        emission = p.emission()
+        B, origin, direction = mi.Spectrum(0), mi.Vector3f(0), mi.Vector3f(0)
+        for one in kept:
+            inside, weight = one.part(Blocks.of(p.plan))
+            by_o, by_d = spread(emission.ray.d, dr.select(inside, one.row * weight, 0))
+            B, origin, direction = (
+                B + adjoint_of_factor(one.adjoint, mi.Int32(0), dr.detach(emission.weight), 1),
+                origin + by_o,
+                direction + by_d,
+            )
+        differentiate_start(p, dr.detach(Adjoint(origin, direction, B)))
+    p.walk(replay, replay.last > 0)

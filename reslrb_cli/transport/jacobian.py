@@ -1,0 +1,132 @@
+"""How one segment of a light path answers when the ray that reaches it is shifted and turned: its Jacobians.
+
+A ray has four coordinates, p = (q, w): q shifts its origin across it, w turns its direction, both in the two axes s, t of
+a frame about the ray. A segment maps p_i of the ray that reaches vertex i to p_{i+1} of the next one, to its scattering
+factor s_i, and to its connection, c_i at film position u_i. (The ResLRB paper, Section 2.5, takes the coordinates of both
+ends of a segment. Where these stand on planes that do not move, they are a change of coordinates, which the chain of
+Jacobians and its inverse cancel.)
+
+Derivatives are taken in forward mode, one propagation for each of the four, with gradients resumed for p alone: where
+those of the scene's parameters are resumed too, Dr.Jit 1.5 cannot propagate through the indirect calls of a loop.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from reslrb_cli.transport.hooks import Vertex
+from reslrb_cli.transport.numbers import Numbers
+from reslrb_cli.transport.plan import Plan
+from reslrb_cli.transport.segment import find_vertex, segment
+
+AXES = 4
+
+
+@dataclass
+class SegmentJacobian:
+    """Derivatives by p_i, in double precision: products of many of them have to be inverted.
+
+    `ray` is dp_{i+1}/dp_i, and `damped` says where `damping` has a part in it; `log_s` and `log_c` have a row for each channel, 0 where the factor is 0, and `u` one for each
+    film coordinate (in pixels).
+    """
+
+    ray: mi.Matrix4d
+    damped: mi.Bool
+    log_s: list[mi.Vector4d]
+    u: list[mi.Vector4d]
+    log_c: list[mi.Vector4d]
+
+
+def row_times(row: mi.Vector4d, matrix: mi.Matrix4d) -> mi.Vector4d:
+    """row @ matrix."""
+    return mi.Vector4d(matrix.T @ row)
+
+
+def coordinates(d: mi.Vector3f, change: mi.Vector3f) -> tuple[mi.Float, mi.Float]:
+    """A small change of a ray's origin, or of its direction, in the axes across the ray's direction `d`."""
+    frame = mi.Frame3f(d)
+    return dr.dot(frame.s, change), dr.dot(frame.t, change)
+
+
+def spread(d: mi.Vector3f, row: mi.Vector4d) -> tuple[mi.Vector3f, mi.Vector3f]:
+    """The derivatives by a ray's origin and by its direction `d` that a row of derivatives by p stands for."""
+    frame = mi.Frame3f(d)
+    q_s, q_t, w_s, w_t = (mi.Float(value) for value in row)
+    return frame.s * q_s + frame.t * q_t, frame.s * w_s + frame.t * w_t
+
+
+def segment_jacobian(
+    plan: Plan,
+    sensor: mi.Sensor,
+    vertex: Vertex,
+    numbers: Numbers,
+    connected: mi.Bool | None,
+    scattered: mi.Bool,
+    damping: float,
+) -> SegmentJacobian:
+    """The Jacobians of a vertex's segment; without `connected` (a mask) none of the connection's.
+
+    Where a diffuse surface scatters, the next ray does not depend on the direction of the one before, so that the Jacobian
+    has no inverse. `damping` makes one of it: at each vertex that is not specular the next ray turns by `damping` with the
+    one before, to either side with probability 1/2. What stands in a chain before its inverse depends on each of these
+    terms linearly, and its mean is that without them.
+    """
+    p = [mi.Float(0) for _ in range(AXES)]
+    frame = mi.Frame3f(vertex.ray.d)
+    evaluates = connected is not None
+    if connected is None:
+        connected = mi.Bool(False)
+    with dr.resume_grad(*p):
+        dr.enable_grad(p)
+        ray = mi.Ray3f(vertex.ray)
+        ray.o = ray.o + frame.s * p[0] + frame.t * p[1]
+        ray.d = dr.normalize(ray.d + frame.s * p[2] + frame.t * p[3])
+        si, bsdf = find_vertex(ray, vertex.pi, connected | scattered)
+        this = segment(plan, sensor, ray, si, bsdf, numbers, connected, scattered, evaluates, attached=True)
+        following, scattering, connection = this.next_ray(attached=True), this.scattering, this.connection
+        factors = [scattering.weight, connection.f * connection.weight] if evaluates else [scattering.weight]
+        outputs = [following.o, following.d, *factors, *([connection.u] if evaluates else [])]
+        changes = []
+        for axis in p:
+            dr.forward_from(axis, flags=dr.ADFlag.ClearInterior | dr.ADFlag.AllowNoGrad)
+            changes.append([dr.detach(dr.grad(value)) for value in outputs])
+            dr.clear_grad([axis, *outputs])
+    damped = scattered & ~scattering.is_delta
+    turned = dr.select(damped, damping * sign(numbers), 0)
+    columns = []
+    for axis, change in enumerate(changes):
+        column = [*coordinates(dr.detach(following.d), change[0]), *coordinates(dr.detach(following.d), change[1])]
+        if axis >= 2:
+            column[axis] = column[axis] + turned
+        columns.append([mi.Float64(dr.select(scattered, value, 0)) for value in column])
+    log_s = _logarithmic(scattering.weight, [change[2] for change in changes], scattered)
+    if not evaluates:
+        return SegmentJacobian(_matrix(columns), damped, log_s, [], [])
+    log_c = _logarithmic(factors[1], [change[3] for change in changes], connected)
+    u = [
+        mi.Vector4d(*(mi.Float64(dr.select(connected, change[4][axis], 0)) for change in changes)) for axis in range(2)
+    ]
+    return SegmentJacobian(_matrix(columns), damped, log_s, u, log_c)
+
+
+def sign(numbers: Numbers) -> mi.Float:
+    """1 or -1, with probability 1/2 each: the last bit of a number that the BSDF draws by.
+
+    It has no part in where light goes, and a replay finds it again.
+    """
+    return dr.select((mi.UInt32(numbers.bsdf_2d.x * float(1 << 23)) & 1) == 0, mi.Float(1), -1)
+
+
+def _matrix(columns: list[list[mi.Float64]]) -> mi.Matrix4d:
+    return mi.Matrix4d(*([columns[c][r] for c in range(AXES)] for r in range(AXES)))
+
+
+def _logarithmic(value: mi.Spectrum, changes: list[mi.Spectrum], active: mi.Bool) -> list[mi.Vector4d]:
+    """Rows of the derivatives of log(value), one for each channel."""
+    value = dr.detach(value)
+    used = active & (value != 0)
+    rows = [dr.select(used, change / value, 0) for change in changes]
+    return [mi.Vector4d(*(mi.Float64(row[c]) for row in rows)) for c in range(len(value))]
