@@ -25,6 +25,7 @@ import drjit as dr
 import mitsuba as mi
 
 from reslrb_cli.estimators.base import Pass, VertexHooks, entry_bytes
+from reslrb_cli.estimators.staying import Before, reach
 from reslrb_cli.estimators.surface import SurfacePoint
 from reslrb_cli.transport.connection import Connection
 from reslrb_cli.transport.factors import Product
@@ -32,14 +33,15 @@ from reslrb_cli.transport.hooks import Vertex
 from reslrb_cli.transport.numbers import Numbers
 from reslrb_cli.transport.plan import Plan
 from reslrb_cli.transport.scattering import Scattering
-from reslrb_cli.transport.segment import find_vertex, segment
+from reslrb_cli.transport.segment import segment
 
 
 @dataclass
 class Frame:
     """One vertex on the stack: all that its segment is done again from, and P_i.
 
-    `connected` is 1 where the sensor was seen. `aperture` holds the sample of the aperture where the sensor has one.
+    `connected` is 1 where the sensor was seen. `aperture` holds the sample of the aperture where the sensor has one,
+    `before` the vertex before where vertices stay on their surfaces.
     """
 
     point: SurfacePoint
@@ -48,24 +50,29 @@ class Frame:
     prefix: mi.Spectrum
     connected: mi.UInt32
     aperture: list[mi.Point2f]
+    before: list[Before]
 
     @staticmethod
     def blank(plan: Plan) -> Frame:
         """A frame of zeros with the members that the plan needs."""
         aperture = [mi.Point2f(0)] if plan.needs.thin_lens else []
-        return Frame(SurfacePoint.blank(plan), mi.Float(0), mi.Point2f(0), mi.Spectrum(0), mi.UInt32(0), aperture)
+        zeros = mi.Float(0), mi.Point2f(0), mi.Spectrum(0), mi.UInt32(0)
+        return Frame(SurfacePoint.blank(plan), *zeros, aperture, Before.start(plan))
 
     def members(self) -> list[dr.ArrayBase]:
         """All arrays, in the order of `like`."""
         plain = [self.sample_1, self.sample_2, self.prefix, self.connected]
-        return [*self.point.numbers, *plain, *self.aperture]
+        before = [member for one in self.before for member in one.members()]
+        return [*self.point.numbers, *plain, *self.aperture, *before]
 
     def like(self, members: list[dr.ArrayBase]) -> Frame:
         """The frame of the same form that has these members."""
         values = iter(members)
         point = SurfacePoint([next(values) for _ in self.point.numbers])
         sample_1, sample_2, prefix, connected = (next(values) for _ in range(4))
-        return Frame(point, sample_1, sample_2, prefix, connected, list(values))
+        aperture = [next(values) for _ in self.aperture]
+        before = [one.like(list(values)) for one in self.before]
+        return Frame(point, sample_1, sample_2, prefix, connected, aperture, before)
 
 
 @dataclass
@@ -74,7 +81,7 @@ class Pushed:
 
     `count` is the number of vertices that were to be pushed so far, `needed` what it was after the last visible
     connection. `stack` are thread-local arrays, one for each member of a frame, `roulette` is one more of r_i, where
-    roulette is played; `place` is where in them the current vertex stands.
+    roulette is played; `place` is where in them the current vertex stands, `before` is what the next one asks for.
     """
 
     count: mi.UInt32
@@ -82,6 +89,7 @@ class Pushed:
     place: mi.UInt32
     stack: list[dr.Local]
     roulette: list[dr.Local]
+    before: list[Before]
 
 
 class Pushing(VertexHooks):
@@ -98,7 +106,7 @@ class Pushing(VertexHooks):
         plan = self.p.plan
         stack = [dr.alloc_local(type(member), self.size + 1) for member in Frame.blank(plan).members()]
         roulette = [dr.alloc_local(mi.Float, self.size + 1)] if plan.roulette else []
-        return Pushed(mi.UInt32(0), mi.UInt32(0), mi.UInt32(0), stack, roulette)
+        return Pushed(mi.UInt32(0), mi.UInt32(0), mi.UInt32(0), stack, roulette, Before.start(plan))
 
     def concerned(self, state: Pushed) -> mi.Bool:
         return state.count > 0
@@ -127,12 +135,14 @@ class Pushing(VertexHooks):
             prefix=vertex.product.value(),
             connected=dr.select(seen, mi.UInt32(1), 0),
             aperture=[connection.sample] if plan.needs.thin_lens else [],
+            before=state.before,
         )
         place = dr.select(pushed, state.count % self.size, self.size)  # what is not pushed goes where nobody reads
         for array, value in zip(state.stack, frame.members(), strict=True):
             array.write(value, place, pushed)
         count = state.count + dr.select(pushed, mi.UInt32(1), 0)
-        return Pushed(count, dr.select(seen & pushed, count, state.needed), place, state.stack, state.roulette)
+        needed, before = dr.select(seen & pushed, count, state.needed), Before.of(plan, vertex, scattering)
+        return Pushed(count, needed, place, state.stack, state.roulette, before)
 
     def survived(self, state: Pushed, weight: mi.Float) -> Pushed:
         for array in state.roulette:
@@ -217,15 +227,15 @@ def walk_back(p: Pass, size: int, pushed: Pushed, top: mi.UInt32, bottom: mi.UIn
         with dr.resume_grad():
             ray.o, ray.d = mi.Point3f(ray.o), mi.Vector3f(ray.d)
             dr.enable_grad(ray.o, ray.d)
-            si, bsdf = find_vertex(ray, pi, connected | scattered)
-            this = segment(plan, sensor, ray, si, bsdf, numbers, connected, scattered, attached=True)
+            si, bsdf, reaching, reached = reach(plan, frame.before, ray, pi, connected | scattered)
+            this = segment(plan, sensor, reaching, si, bsdf, numbers, connected, scattered, attached=True)
             there, following = this.connection, this.next_ray(attached=True)
             seen = connected & there.active
             delta = image.lookup(there.u, seen, plan.attached_normalization) * p.scale
             own = dr.select(seen, delta * there.f * there.weight, 0)
             later = dr.select(scattered, this.scattering.weight * (r * B), 0)
             moved = dr.dot(following.o, adjoint.origin) + dr.dot(following.d, adjoint.direction)
-            dr.backward_from(dr.dot(P, own + later) + dr.select(scattered, moved, 0))
+            dr.backward_from(dr.dot(P, reached * (own + later)) + dr.select(scattered, moved, 0))
             # What a lane without light computes may be no number: none of it goes on to the vertices before.
             before = Adjoint.where(connected | scattered, dr.grad(ray.o), dr.grad(ray.d), dr.detach(own + later))
         return number - 1, before, stack, roulette

@@ -30,14 +30,15 @@ import mitsuba as mi
 
 from reslrb_cli.estimators.attached import Adjoint, differentiate_start
 from reslrb_cli.estimators.base import Pass, PathAdjoint, VertexHooks, adjoint_of_factor, contribution
+from reslrb_cli.estimators.jacobian import row_times, segment_jacobian, spread
+from reslrb_cli.estimators.staying import Before, is_staying, reach
 from reslrb_cli.transport.connection import Connection
 from reslrb_cli.transport.factors import Product
 from reslrb_cli.transport.hooks import Vertex
-from reslrb_cli.transport.jacobian import SegmentJacobian, row_times, segment_jacobian, spread
 from reslrb_cli.transport.numbers import Numbers
 from reslrb_cli.transport.plan import Plan
 from reslrb_cli.transport.scattering import Scattering
-from reslrb_cli.transport.segment import find_vertex, segment
+from reslrb_cli.transport.segment import segment
 
 
 #: Vertices that are not specular in one block of a chain.
@@ -101,6 +102,7 @@ class ChainState:
     J: list[mi.Matrix4d]
     G: list[mi.Vector4d]
     blocks: list[Blocks]
+    before: list[Before]
     numbers: list[mi.Float]
 
     @staticmethod
@@ -116,11 +118,11 @@ class ChainState:
                  mi.Spectrum(0), rows(2), rows(channels), [mi.UInt32(0) for _ in 2 * Blocks.of(plan)])
             for _ in range(capacity)
         ]  # fmt: skip
-        return ChainState(mi.Float(0), slots, [mi.UInt32(0)], [mi.Matrix4d(1)], rows(channels), Blocks.of(plan), [])
+        return ChainState(mi.Float(0), slots, [mi.UInt32(0)], [mi.Matrix4d(1)], rows(channels), Blocks.of(plan), Before.start(plan), [])
 
     def stored(self) -> ChainState:
         """What is left of it at the end of a path."""
-        return ChainState(self.W, self.slots, [], [], [], [], [])
+        return ChainState(self.W, self.slots, [], [], [], [], [], [])
 
 
 def begins(plan: Plan, vertex: Vertex) -> mi.Bool:
@@ -182,7 +184,7 @@ class ChainSelection(VertexHooks):
         candidate = connection.active & on
         numbers = numbers_of(connection, scattering)
         jacobian = segment_jacobian(
-            plan, p.samples.sensor, vertex, numbers, candidate, scattering.active & on, self.damping
+            plan, p.samples.sensor, vertex, state.before, numbers, candidate, scattering.active & on, self.damping
         )
         w = dr.select(candidate, self.weigh(connection, C, state.W), 0)
         W = state.W + w
@@ -208,7 +210,8 @@ class ChainSelection(VertexHooks):
             dr.select(on, before + row_times(row, J), before) for row, before in zip(jacobian.log_s, G, strict=True)
         ]
         after = replace(state, W=W, slots=slots, latest=[latest], J=[dr.select(on, jacobian.ray @ J, J)], G=G)
-        return replace(self._begun_anew(after, jacobian.damped), numbers=[])
+        before = Before.of(plan, vertex, scattering)
+        return replace(self._begun_anew(after, jacobian.damped), before=before, numbers=[])
 
     def _begun_anew(self, state: ChainState, damped: mi.Bool) -> ChainState:
         """The chain begins anew with a block, instead of any before it, with one over their number as probability."""
@@ -268,6 +271,7 @@ class ReplayState:
     rows: list[mi.Vector4d]
     begun: mi.Bool
     blocks: list[Blocks]
+    before: list[Before]
 
 
 class ChainReplay(VertexHooks):
@@ -286,7 +290,8 @@ class ChainReplay(VertexHooks):
     def start(self, product: Product) -> ReplayState:
         plan = self.p.plan
         return ReplayState(
-            [one.row for one in self.kept], mi.Bool(plan.differentiate_emission or plan.moving_emission), Blocks.of(plan)
+            [one.row for one in self.kept], mi.Bool(plan.differentiate_emission or plan.moving_emission), Blocks.of(plan),
+            Before.start(plan),
         )
 
     def goes_on(self, state: ReplayState, vertex: Vertex) -> mi.Bool:
@@ -301,7 +306,9 @@ class ChainReplay(VertexHooks):
         plan, depth = self.p.plan, vertex.depth
         begun = state.begun | begins(plan, vertex)
         numbers, on = numbers_of(connection, scattering), scattering.active & begun
-        jacobian = segment_jacobian(plan, self.p.samples.sensor, vertex, numbers, None, on, self.damping)
+        jacobian = segment_jacobian(
+            plan, self.p.samples.sensor, vertex, state.before, numbers, None, on, self.damping
+        )
         blocks = state.blocks
         entered = mi.Bool(False)
         if blocks:
@@ -313,35 +320,34 @@ class ChainReplay(VertexHooks):
             inside, weight = kept.part(blocks)
             rows.append(dr.select(on & inside & ~entered & (depth < kept.slot.number), row_times(ahead, inverse), row))
             weighted.append(dr.select(inside, rows[-1] * weight, 0))
-        self._differentiate(vertex, numbers, scattering, weighted)
-        return ReplayState(rows, begun, blocks)
+        self._differentiate(vertex, state.before, numbers, scattering, weighted)
+        return ReplayState(rows, begun, blocks, Before.of(plan, vertex, scattering))
 
     def _differentiate(
-        self, vertex: Vertex, numbers: Numbers, scattering: Scattering, rows: list[mi.Vector4d]
+        self, vertex: Vertex, before: list[Before], numbers: Numbers, scattering: Scattering, rows: list[mi.Vector4d]
     ) -> None:
         """Add the derivatives of the vertex's segment; `rows` are the adjoints of the ray that it ends in."""
         p, plan, depth = self.p, self.p.plan, vertex.depth
         here = vertex.active & begins(plan, vertex)
         connected, scattered = mi.Bool(False), mi.Bool(False)
+        after = Before.of(plan, vertex, scattering)
         origin, direction, by_s, by_c = mi.Vector3f(0), mi.Vector3f(0), mi.Spectrum(0), mi.Spectrum(0)
         for row, kept in zip(rows, self.kept, strict=True):
             on, own = here & (depth < kept.slot.number), here & (depth == kept.slot.number)
-            by_o, by_d = spread(scattering.d, row)
+            by_o, by_d = spread(scattering.d, row, is_staying(after))
             origin, direction = origin + dr.select(on, by_o, 0), direction + dr.select(on, by_d, 0)
             by_s += dr.select(on, adjoint_of_factor(kept.adjoint, depth, scattering.weight, 1), 0)
             by_c += dr.select(own, kept.slot.prefix * (kept.share * p.scale), 0)
             connected, scattered = connected | own, scattered | (on & scattering.active)
         assert p.adjoint is not None
         with dr.resume_grad():
-            si, bsdf = find_vertex(vertex.ray, vertex.pi, connected | scattered)
-            this = segment(
-                plan, p.samples.sensor, vertex.ray, si, bsdf, numbers, connected, scattered, attached=True
-            )
+            si, bsdf, ray, reached = reach(plan, before, vertex.ray, vertex.pi, connected | scattered)
+            this = segment(plan, p.samples.sensor, ray, si, bsdf, numbers, connected, scattered, attached=True)
             there, following = this.connection, this.next_ray(attached=True)
             delta = p.adjoint.lookup(there.u, connected, plan.attached_normalization)
-            own_part = dr.select(connected, dr.dot(by_c, delta * there.f * there.weight), 0)
+            own_part = dr.select(connected, dr.dot(by_c, reached * delta * there.f * there.weight), 0)
             moved = dr.dot(origin, following.o) + dr.dot(direction, following.d)
-            later = dr.select(scattered, moved + dr.dot(by_s, this.scattering.weight), 0)
+            later = dr.select(scattered, moved + dr.dot(by_s, reached * this.scattering.weight), 0)
             dr.backward_from(own_part + later)
 
 
@@ -353,7 +359,7 @@ def differentiate(p: Pass, kept: list[Kept], damping: float) -> None:
         B, origin, direction = mi.Spectrum(0), mi.Vector3f(0), mi.Vector3f(0)
         for one in kept:
             inside, weight = one.part(Blocks.of(p.plan))
-            by_o, by_d = spread(emission.ray.d, dr.select(inside, one.row * weight, 0))
+            by_o, by_d = spread(emission.ray.d, dr.select(inside, one.row * weight, 0), mi.Bool(False))
             B, origin, direction = (
                 B + adjoint_of_factor(one.adjoint, mi.Int32(0), dr.detach(emission.weight), 1),
                 origin + by_o,

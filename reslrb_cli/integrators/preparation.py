@@ -27,12 +27,15 @@ class Motion:
     attached: bool | str = "auto"
     filter_normalization: str = "attached"
     obstacle: str | None = None
+    sampling: str = "follow"
 
     def __post_init__(self) -> None:
         if self.attached not in (True, False, "auto"):
             raise ValueError('"attached" must be auto, true or false')
         if self.filter_normalization not in ("attached", "detached"):
             raise ValueError('"filter_normalization" must be attached or detached')
+        if self.sampling not in ("auto", "follow", "stay"):
+            raise ValueError('"attached_sampling" must be auto, follow or stay')
 
 
 def attach(plan: Plan, which: Differentiated, motion: Motion, sensor: mi.Sensor) -> Plan:
@@ -57,6 +60,7 @@ def attach(plan: Plan, which: Differentiated, motion: Motion, sensor: mi.Sensor)
     return replace(
         plan,
         attached=True,
+        stays=motion.sampling == "stay",
         moving_shapes=which.shapes,
         moving_emitters=which.emitters,
         attached_normalization=motion.filter_normalization == "attached",

@@ -25,6 +25,7 @@ class Reslrb(LightTracer):
         "freeze": False,
         "attached": "auto",
         "filter_normalization": "attached",
+        "attached_sampling": "auto",
     }
 
     def __init__(self, estimator: Estimator, **common: Any) -> None:
@@ -37,6 +38,7 @@ class Reslrb(LightTracer):
         estimator: str = "reservoir",
         attached: bool | str = "auto",
         filter_normalization: str = "attached",
+        attached_sampling: str = "auto",
         **options: Any,
     ) -> Reslrb:
         """From the estimator's name and all options. Raises ValueError where one is wrong."""
@@ -49,7 +51,7 @@ class Reslrb(LightTracer):
             raise ValueError(f'"estimator" must be one of {", ".join(ESTIMATORS)}, not "{estimator}"')
         kind = ESTIMATORS[estimator]
         own = {name: options.pop(name) for name in kind.OPTIONS if name in options}
-        motion = Motion(attached, filter_normalization, None if kind.attaches else _no_attached(estimator))
+        motion = Motion(attached, filter_normalization, None if kind.attaches else _no_attached(estimator), attached_sampling)
         return cls(kind(**own), motion=motion, **options)
 
     def image_estimator(self) -> Estimator | None:

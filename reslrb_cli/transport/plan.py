@@ -35,6 +35,10 @@ class Plan:
     # Whether directions, hit points and film positions have derivatives too, and what moves by itself: shapes, and the
     # rays that emitters send out.
     attached: bool = False
+    # Whether, behind a vertex that is not specular, the next one stays where it is on its surface; else directions turn
+    # with the surface that they leave. `glossy_follows`: they do so at BSDFs with glossy lobes all the same.
+    stays: bool = False
+    glossy_follows: bool = False
     moving_shapes: tuple[mi.Shape, ...] = ()
     moving_emitters: tuple[mi.Emitter, ...] = ()
     # Whether the normalisation of the reconstruction filter's weights has its derivative, and the correction for

@@ -121,7 +121,9 @@ def scatter(
             )
         if plan.needs.has_perturbed_normals:
             wo, pdf, eta, lobe = _mixed(si, bsdf, sample_2, defensive, active, wo, pdf, eta, lobe)
-        if attached:
+        if attached and plan.stays:
+            wo, pdf, weight = staying(plan, si, bsdf, active, wo, pdf, lobe, weight)
+        elif attached:
             wo, pdf, weight = following(plan, si, bsdf, active, wo, pdf, lobe, weight)
         d = si.to_world(wo)
         correction, valid = shading_correction(plan, si, -ray.d, d, wo)
@@ -180,6 +182,41 @@ def following(
     wo, pdf = dr.select(fixed, dr.detach(wo), wo), dr.select(fixed, kept, pdf)
     f = evaluate(plan, si, bsdf, wo, fixed)
     return wo, pdf, dr.select(fixed, dr.replace_grad(weight, f / kept), weight)
+
+
+def stays_behind(plan: Plan, bsdf: mi.BSDFPtr, is_delta: mi.Bool) -> mi.Bool:
+    """Lanes in which the vertex behind a scattering event stays where it is on its surface.
+
+    Where glossy BSDFs follow, one that has such a lobe beside a diffuse one follows with both.
+    """
+    if not plan.glossy_follows:
+        return ~is_delta
+    return ~is_delta & ~mi.has_flag(bsdf.flags(), mi.BSDFFlags.Glossy)
+
+
+def staying(
+    plan: Plan,
+    si: mi.SurfaceInteraction3f,
+    bsdf: mi.BSDFPtr,
+    active: mi.Bool,
+    wo: mi.Vector3f,
+    pdf: mi.Float,
+    lobe: mi.UInt32,
+    weight: mi.Spectrum,
+) -> tuple[mi.Vector3f, mi.Float, mi.Spectrum]:
+    """The same where a smooth lobe's direction goes to a point that does not move with this vertex.
+
+    That the direction changes with either end is left to the vertex at its far end (`estimators.attached`): here it stands
+    still in the world, and f / pdf changes by f alone. Delta lobes are as in `following`.
+    """
+    followed = following(plan, si, bsdf, active, wo, pdf, lobe, weight)
+    kept = dr.detach(pdf)
+    smooth = active & stays_behind(plan, bsdf, mi.has_flag(lobe, mi.BSDFFlags.Delta)) & (kept > 0)
+    there = si.to_local(dr.detach(si.to_world(wo)))
+    f = evaluate(plan, si, bsdf, there, smooth)
+    stayed = there, kept, dr.replace_grad(weight, f / kept)
+    wo, pdf, weight = (dr.select(smooth, a, b) for a, b in zip(stayed, followed, strict=True))
+    return wo, pdf, weight
 
 
 def _mixed(

@@ -41,6 +41,25 @@ def find_vertex(
     return si, si.bsdf()
 
 
+def find_following_vertex(
+    ray: mi.Ray3f, pi: mi.PreliminaryIntersection3f, active: mi.Bool
+) -> tuple[mi.SurfaceInteraction3f, mi.Ray3f, mi.Float]:
+    """The surface interaction of a vertex that stays where it is on its surface, and moves with that alone.
+
+    Also the ray that reaches it, whose direction turns with both ends, and by what factor (1, with a derivative) a measure
+    of directions at its origin becomes one of places on the surface: |cos| / distance^2 times the surface's own stretching.
+    """
+    si = pi.compute_surface_interaction(ray, mi.RayFlags.All | mi.RayFlags.FollowShape, active)
+    there = si.p - ray.o
+    distance = dr.norm(there)
+    reaching = mi.Ray3f(ray)
+    reaching.d = there / distance
+    si.t = distance
+    si.wi = si.to_local(-reaching.d)
+    measure = dr.abs(dr.dot(si.n, reaching.d)) / dr.square(distance) * dr.norm(dr.cross(si.dp_du, si.dp_dv))
+    return si, reaching, dr.select(active & (measure > 0), measure / dr.detach(measure), 1)
+
+
 def segment(
     plan: Plan,
     sensor: mi.Sensor,

@@ -1,7 +1,8 @@
 """How one segment of a light path answers when the ray that reaches it is shifted and turned: its Jacobians.
 
 A ray has four coordinates, p = (q, w): q shifts its origin across it, w turns its direction, both in the two axes s, t of
-a frame about the ray. A segment maps p_i of the ray that reaches vertex i to p_{i+1} of the next one, to its scattering
+a frame about the ray. Of one that leads to a vertex that stays where it is (`staying`) the direction is of no account, and
+that its origin is shifted along it is: the third coordinate is that shift, and the fourth is not used. A segment maps p_i of the ray that reaches vertex i to p_{i+1} of the next one, to its scattering
 factor s_i, and to its connection, c_i at film position u_i. (The ResLRB paper, Section 2.5, takes the coordinates of both
 ends of a segment. Where these stand on planes that do not move, they are a change of coordinates, which the chain of
 Jacobians and its inverse cancel.)
@@ -17,10 +18,11 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
+from reslrb_cli.estimators.staying import Before, is_staying, reach
 from reslrb_cli.transport.hooks import Vertex
 from reslrb_cli.transport.numbers import Numbers
 from reslrb_cli.transport.plan import Plan
-from reslrb_cli.transport.segment import find_vertex, segment
+from reslrb_cli.transport.segment import segment
 
 AXES = 4
 
@@ -45,23 +47,30 @@ def row_times(row: mi.Vector4d, matrix: mi.Matrix4d) -> mi.Vector4d:
     return mi.Vector4d(matrix.T @ row)
 
 
-def coordinates(d: mi.Vector3f, change: mi.Vector3f) -> tuple[mi.Float, mi.Float]:
-    """A small change of a ray's origin, or of its direction, in the axes across the ray's direction `d`."""
+def coordinates(d: mi.Vector3f, o_change: mi.Vector3f, d_change: mi.Vector3f, stays: mi.Bool) -> list[mi.Float]:
+    """The coordinates of a small change of a ray's origin and direction, `d` being its direction."""
     frame = mi.Frame3f(d)
-    return dr.dot(frame.s, change), dr.dot(frame.t, change)
+    return [
+        dr.dot(frame.s, o_change),
+        dr.dot(frame.t, o_change),
+        dr.select(stays, dr.dot(d, o_change), dr.dot(frame.s, d_change)),
+        dr.select(stays, 0, dr.dot(frame.t, d_change)),
+    ]
 
 
-def spread(d: mi.Vector3f, row: mi.Vector4d) -> tuple[mi.Vector3f, mi.Vector3f]:
+def spread(d: mi.Vector3f, row: mi.Vector4d, stays: mi.Bool) -> tuple[mi.Vector3f, mi.Vector3f]:
     """The derivatives by a ray's origin and by its direction `d` that a row of derivatives by p stands for."""
     frame = mi.Frame3f(d)
-    q_s, q_t, w_s, w_t = (mi.Float(value) for value in row)
-    return frame.s * q_s + frame.t * q_t, frame.s * w_s + frame.t * w_t
+    q_s, q_t, third, fourth = (mi.Float(value) for value in row)
+    along = d * dr.select(stays, third, 0)
+    return frame.s * q_s + frame.t * q_t + along, dr.select(stays, 0, frame.s * third + frame.t * fourth)
 
 
 def segment_jacobian(
     plan: Plan,
     sensor: mi.Sensor,
     vertex: Vertex,
+    before: list[Before],
     numbers: Numbers,
     connected: mi.Bool | None,
     scattered: mi.Bool,
@@ -70,39 +79,42 @@ def segment_jacobian(
     """The Jacobians of a vertex's segment; without `connected` (a mask) none of the connection's.
 
     Where a diffuse surface scatters, the next ray does not depend on the direction of the one before, so that the Jacobian
-    has no inverse. `damping` makes one of it: at each vertex that is not specular the next ray turns by `damping` with the
-    one before, to either side with probability 1/2. What stands in a chain before its inverse depends on each of these
-    terms linearly, and its mean is that without them.
+    has no inverse; and nor has that of a vertex that stays on its surface. `damping` makes one of it: behind a vertex that
+    is not specular the ray turns by `damping` with the one before, and behind one that stays it is also shifted with it, to
+    either side with probability 1/2. What stands in a chain before its inverse depends on each of these terms linearly, so
+    that its mean is what it is without them.
     """
     p = [mi.Float(0) for _ in range(AXES)]
-    frame = mi.Frame3f(vertex.ray.d)
+    frame, stays = mi.Frame3f(vertex.ray.d), is_staying(before)
     evaluates = connected is not None
     if connected is None:
         connected = mi.Bool(False)
     with dr.resume_grad(*p):
         dr.enable_grad(p)
         ray = mi.Ray3f(vertex.ray)
-        ray.o = ray.o + frame.s * p[0] + frame.t * p[1]
-        ray.d = dr.normalize(ray.d + frame.s * p[2] + frame.t * p[3])
-        si, bsdf = find_vertex(ray, vertex.pi, connected | scattered)
+        ray.o = ray.o + frame.s * p[0] + frame.t * p[1] + vertex.ray.d * dr.select(stays, p[2], 0)
+        ray.d = dr.normalize(ray.d + dr.select(stays, 0, frame.s * p[2] + frame.t * p[3]))
+        si, bsdf, ray, reached = reach(plan, before, ray, vertex.pi, connected | scattered, parameters=False)
         this = segment(plan, sensor, ray, si, bsdf, numbers, connected, scattered, evaluates, attached=True)
         following, scattering, connection = this.next_ray(attached=True), this.scattering, this.connection
-        factors = [scattering.weight, connection.f * connection.weight] if evaluates else [scattering.weight]
+        factors = [reached * scattering.weight]
+        if evaluates:
+            factors.append(reached * connection.f * connection.weight)
         outputs = [following.o, following.d, *factors, *([connection.u] if evaluates else [])]
         changes = []
         for axis in p:
             dr.forward_from(axis, flags=dr.ADFlag.ClearInterior | dr.ADFlag.AllowNoGrad)
             changes.append([dr.detach(dr.grad(value)) for value in outputs])
             dr.clear_grad([axis, *outputs])
-    damped = scattered & ~scattering.is_delta
+    after = Before.of(plan, vertex, scattering)
+    damped = scattered & (stays | ~scattering.is_delta)
     turned = dr.select(damped, damping * sign(numbers), 0)
     columns = []
     for axis, change in enumerate(changes):
-        column = [*coordinates(dr.detach(following.d), change[0]), *coordinates(dr.detach(following.d), change[1])]
-        if axis >= 2:
-            column[axis] = column[axis] + turned
+        column = coordinates(dr.detach(following.d), change[0], change[1], is_staying(after))
+        column[axis] = column[axis] + (turned if axis >= 2 else dr.select(stays, turned, 0))
         columns.append([mi.Float64(dr.select(scattered, value, 0)) for value in column])
-    log_s = _logarithmic(scattering.weight, [change[2] for change in changes], scattered)
+    log_s = _logarithmic(factors[0], [change[2] for change in changes], scattered)
     if not evaluates:
         return SegmentJacobian(_matrix(columns), damped, log_s, [], [])
     log_c = _logarithmic(factors[1], [change[3] for change in changes], connected)
