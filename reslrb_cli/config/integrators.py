@@ -59,7 +59,7 @@ class AttachingTracer(LightTracer):
 #: The options of `reslrb` that belong to an estimator, by its name; the others have no use for them.
 ESTIMATOR_OPTIONS: dict[str, tuple[str, ...]] = {
     "auto": (),
-    "reservoir": ("capacity", "weight", "image"),
+    "reservoir": ("capacity", "weight", "image", "jacobian_damping"),
     "gather": (),
     "event": ("capacity", "weight"),
     "stack": ("stack_size",),
@@ -96,6 +96,19 @@ class Reslrb(AttachingTracer):
         default="all",
         description="Which connections the image shows: `all`, or the `retained` ones alone, weighted (noisier). "
         "Only with estimator `reservoir`.",
+    )
+    jacobian_damping: Annotated[float, Field(gt=0, le=1, allow_inf_nan=False)] = Field(
+        default=0.1,
+        description="Where light is followed: by how much the ray behind a surface that is not specular is taken to "
+        "turn with the one before it, to either side at random, so that its Jacobian has an inverse. It makes no bias; "
+        "below 0.01 digits are lost, above 0.5 noise grows. Only with estimator `reservoir`.",
+    )
+    attached_sampling: Literal["auto", "follow", "stay"] = Field(
+        default="auto",
+        description="Where light is followed: what becomes of it behind a surface that is not specular. `follow`: its "
+        "direction turns with the surface, as `ptracer` has it, and sweeps over edges at rest, whose part is then "
+        "missing; `stay`: it goes on to the same place; `auto`: `stay` behind diffuse surfaces, `follow` behind glossy "
+        "ones, where `stay` is noisy.",
     )
     stack_size: Count = Field(
         default=64,

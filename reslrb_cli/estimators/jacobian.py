@@ -1,11 +1,12 @@
 """How one segment of a light path answers when the ray that reaches it is shifted and turned: its Jacobians.
 
-A ray has four coordinates, p = (q, w): q shifts its origin across it, w turns its direction, both in the two axes s, t of
-a frame about the ray. Of one that leads to a vertex that stays where it is (`staying`) the direction is of no account, and
-that its origin is shifted along it is: the third coordinate is that shift, and the fourth is not used. A segment maps p_i of the ray that reaches vertex i to p_{i+1} of the next one, to its scattering
-factor s_i, and to its connection, c_i at film position u_i. (The ResLRB paper, Section 2.5, takes the coordinates of both
-ends of a segment. Where these stand on planes that do not move, they are a change of coordinates, which the chain of
-Jacobians and its inverse cancel.)
+A ray has four coordinates, p = (q, w): q shifts its origin across it, w turns its direction, both in the two axes s,
+t of a frame about the ray. Of one that leads to a vertex that stays where it is (`staying`) the direction is of no
+account, and that its origin is shifted along it is: the third coordinate is that shift, and the fourth is not used. A
+segment maps p_i of the ray that reaches vertex i to p_{i+1} of the next one, to its scattering factor s_i, and to its
+connection, c_i at film position u_i. (The ResLRB paper, Section 2.5, takes the coordinates of both ends of a segment.
+Where these stand on planes that do not move, they are a change of coordinates, which the chain of Jacobians and its
+inverse cancel.)
 
 Derivatives are taken in forward mode, one propagation for each of the four, with gradients resumed for p alone: where
 those of the scene's parameters are resumed too, Dr.Jit 1.5 cannot propagate through the indirect calls of a loop.
@@ -31,8 +32,8 @@ AXES = 4
 class SegmentJacobian:
     """Derivatives by p_i, in double precision: products of many of them have to be inverted.
 
-    `ray` is dp_{i+1}/dp_i, and `damped` says where `damping` has a part in it; `log_s` and `log_c` have a row for each channel, 0 where the factor is 0, and `u` one for each
-    film coordinate (in pixels).
+    `ray` is dp_{i+1}/dp_i, and `damped` says where `damping` has a part in it; `log_s` and `log_c` have a row for
+    each channel, 0 where the factor is 0, and `u` one for each film coordinate (in pixels).
     """
 
     ray: mi.Matrix4d
@@ -78,11 +79,11 @@ def segment_jacobian(
 ) -> SegmentJacobian:
     """The Jacobians of a vertex's segment; without `connected` (a mask) none of the connection's.
 
-    Where a diffuse surface scatters, the next ray does not depend on the direction of the one before, so that the Jacobian
-    has no inverse; and nor has that of a vertex that stays on its surface. `damping` makes one of it: behind a vertex that
-    is not specular the ray turns by `damping` with the one before, and behind one that stays it is also shifted with it, to
-    either side with probability 1/2. What stands in a chain before its inverse depends on each of these terms linearly, so
-    that its mean is what it is without them.
+    Where a diffuse surface scatters, the next ray does not depend on the direction of the one before, so that the
+    Jacobian has no inverse; and nor has that of a vertex that stays on its surface. `damping` makes one of it: behind
+    a vertex that is not specular the ray turns by `damping` with the one before, and behind one that stays it is also
+    shifted with it, to either side with probability 1/2. What stands in a chain before its inverse depends on each of
+    these terms linearly, so that its mean is what it is without them.
     """
     p = [mi.Float(0) for _ in range(AXES)]
     frame, stays = mi.Frame3f(vertex.ray.d), is_staying(before)

@@ -20,7 +20,7 @@ from typing import Any, ClassVar, Protocol
 import drjit as dr
 import mitsuba as mi
 
-from reslrb_cli.estimators import chain
+from reslrb_cli.estimators import chain, chain_replay
 from reslrb_cli.estimators.base import (
     Estimator,
     Pass,
@@ -39,7 +39,7 @@ from reslrb_cli.transport.hooks import Vertex
 from reslrb_cli.transport.plan import Plan
 from reslrb_cli.transport.scattering import Scattering, tracked_factor
 
-JACOBIAN_DAMPING = 0.1
+JACOBIAN_DAMPING = 0.1  # of attached derivatives: `estimators.jacobian`
 SHARE = 0.01  # the least share of a candidate in the weights up to it
 
 
@@ -248,8 +248,8 @@ class Reservoir(Estimator):
     def backward(self, p: Pass, state: ReservoirState | chain.ChainState) -> None:
         if isinstance(state, chain.ChainState):
             shares = [unselected(state.W, slot, self.capacity) for slot in state.slots]
-            kept = [chain.Kept.of(p, slot, share) for slot, share in zip(state.slots, shares, strict=True)]
-            chain.differentiate(p, kept, self.damping)
+            kept = [chain_replay.Kept.of(p, slot, share) for slot, share in zip(state.slots, shares, strict=True)]
+            chain_replay.differentiate(p, kept, self.damping)
             return
         adjoints = [slot_adjoint(p, state.W, slot, self.capacity) for slot in state.slots]
 

@@ -9,8 +9,9 @@ alone, and the factor of the scattering carries what that changes,
 with dA_i the area that a piece of surface i takes. All of it but what f_{i-1} changes with x_{i-1} is differentiated at
 vertex i, whose adjoint then hands to i-1 a derivative by its place and none by its direction.
 
-Source: Worchel et al. 2025, "Radiative Backpropagation with Non-Static Geometry", whose surface-integral form this is. Edges
-at rest are not swept over, so that their part in the derivative is not lost; visibility's part is, in either form.
+Source: Worchel et al. 2025, "Radiative Backpropagation with Non-Static Geometry", whose surface-integral form this
+is. Edges at rest are not swept over, so that their part in the derivative is not lost; visibility's part is, in
+either form.
 """
 
 from __future__ import annotations
@@ -72,17 +73,18 @@ def reach(
     """The vertex where `ray` hits what `pi` says, its BSDF, the ray that reaches it, and a factor (C,) of value 1 that
     carries the derivatives of s_{i-1} which belong to it.
 
-    Call under `dr.resume_grad()`, the ray being differentiable; without `parameters`, where it is resumed for the ray alone.
+    Call under `dr.resume_grad()`, the ray being differentiable; without `parameters`, where it is resumed for the ray
+    alone.
     """
     if not before:
         return *find_vertex(ray, pi, active), ray, mi.Spectrum(1)
     stays = active & is_staying(before)
-    slid, bsdf = find_vertex(ray, pi, active & ~stays)
+    slid, _ = find_vertex(ray, pi, active & ~stays)
     stayed, reaching, factor = find_following_vertex(ray, pi, stays)
     with dr.suspend_grad():
         other, other_bsdf = before[0].point.interaction(plan, stays)
-    # What f changes by its own parameters belongs to the vertex before: where they are resumed, the direction alone is. (A
-    # variable that is made under one selective scope counts as suspended under another.)
+    # What f changes by its own parameters belongs to the vertex before: where they are resumed, the direction alone
+    # is. (A variable that is made under one selective scope counts as suspended under another.)
     with dr.suspend_grad(when=parameters), dr.resume_grad(reaching.d, when=parameters):
         f = evaluate(plan, other, other_bsdf, other.to_local(reaching.d), stays)
     changed = dr.select(stays & (f != 0), dr.replace_grad(mi.Spectrum(1), f / dr.detach(f)), 1) * factor

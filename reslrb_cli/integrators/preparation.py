@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import mitsuba as mi
@@ -21,7 +22,8 @@ class Motion:
     """How derivatives of what moves light are taken.
 
     `attached` is `auto` (where a parameter moves anything), or says so; `filter_normalization` is `attached` or
-    `detached`. Raises ValueError for anything else. `obstacle` is the reason where an integrator has none.
+    `detached`, `sampling` one of `auto`, `follow` and `stay`. Raises ValueError for anything else. `obstacle` is the
+    reason where an integrator has none.
     """
 
     attached: bool | str = "auto"
@@ -38,7 +40,16 @@ class Motion:
             raise ValueError('"attached_sampling" must be auto, follow or stay')
 
 
-def attach(plan: Plan, which: Differentiated, motion: Motion, sensor: mi.Sensor) -> Plan:
+def stays(plan: Plan, sampling: str, bsdfs: Sequence[mi.BSDF]) -> tuple[bool, bool]:
+    """`Plan.stays` and `Plan.glossy_follows`, for the BSDFs of a scene's surfaces."""
+    smooth = [bsdf.flags() for bsdf in bsdfs if mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)]
+    glossy = [mi.has_flag(flags, mi.BSDFFlags.Glossy) for flags in smooth]
+    if sampling == "follow" or plan.max_depth <= 2 or not glossy:
+        return False, False  # no light goes on behind a vertex that is not specular
+    return (True, False) if sampling == "stay" else (not all(glossy), any(glossy))
+
+
+def attach(plan: Plan, which: Differentiated, motion: Motion, sensor: mi.Sensor, bsdfs: Sequence[mi.BSDF]) -> Plan:
     """The plan with attached derivatives, where they are asked for. Raises UnsupportedScene where there are none."""
     if motion.attached is False and which.moves:
         raise UnsupportedScene(
@@ -57,10 +68,12 @@ def attach(plan: Plan, which: Differentiated, motion: Motion, sensor: mi.Sensor)
         )
     if any(interpolates_normals(shape) for shape in which.shapes):
         plan = with_shading_normals(plan)  # a flat mesh is about to bend
+    staying, glossy_follows = stays(plan, motion.sampling, bsdfs)
     return replace(
         plan,
         attached=True,
-        stays=motion.sampling == "stay",
+        stays=staying,
+        glossy_follows=glossy_follows,
         moving_shapes=which.shapes,
         moving_emitters=which.emitters,
         attached_normalization=motion.filter_normalization == "attached",
@@ -101,7 +114,7 @@ class Preparation:
         self._track_zeros |= which.zeros
         only = self._bsdfs(scene, which.bsdf_nodes)
         plan = plan.differentiating(bool(which.bsdf_nodes), which.emission, self._track_zeros, only)
-        return attach(plan, which, self._motion, sensor)
+        return attach(plan, which, self._motion, sensor, SceneGraph.of(scene).surface_bsdfs())
 
     def _turn_to(self, scene: mi.Scene) -> None:
         """Forget what was found out about another scene."""

@@ -51,7 +51,8 @@ class Reslrb(LightTracer):
             raise ValueError(f'"estimator" must be one of {", ".join(ESTIMATORS)}, not "{estimator}"')
         kind = ESTIMATORS[estimator]
         own = {name: options.pop(name) for name in kind.OPTIONS if name in options}
-        motion = Motion(attached, filter_normalization, None if kind.attaches else _no_attached(estimator), attached_sampling)
+        obstacle = None if kind.attaches else _no_attached(estimator)
+        motion = Motion(attached, filter_normalization, obstacle, attached_sampling)
         return cls(kind(**own), motion=motion, **options)
 
     def image_estimator(self) -> Estimator | None:

@@ -42,8 +42,13 @@ DIRECTIONS = 2
 MOVING_DIRECTIONS = 3
 #: A depth at which roulette never begins.
 NEVER = 1_000_000
-#: Values of `filter_normalization`: what differences have, and what `ptracer` has.
-WAYS = ("attached", "detached")
+#: What attached derivatives that are compared with each reference have, where that is not as the user has it. Naive AD
+#: follows everywhere, and `ptracer` does not differentiate the filter's normalisation, as differences do.
+ALIKE: dict[Reference, dict[str, str]] = {
+    Reference.WALK_AD: {"attached_sampling": "follow"},
+    Reference.PTRACER: {"attached_sampling": "follow", "filter_normalization": "detached"},
+    Reference.FINITE_DIFFERENCE: {"filter_normalization": "attached"},
+}
 #: The integrator whose images are differenced: ours, without roulette where paths end without.
 DIFFERENCED = "differenced"
 #: Seeds that the step of finite differences is chosen with.
@@ -103,10 +108,9 @@ class Participants:
         self.attached = options.get("attached") is True or bool(moved)
         self.listed = self._able(settings)
         shared = {name: options[name] for name in ("max_depth", "rr_depth", "hide_emitters")}
-        self._way = options.get("filter_normalization", WAYS[0])
         naive = {"samples_per_pass": options.get("samples_per_pass")}
         if self.attached:
-            naive |= {"attached": True, "filter_normalization": self._way}
+            naive |= {"attached": True, "filter_normalization": options.get("filter_normalization", "attached")}
         self.integrators = self._configured({case.label: configs[case.label] for case in self.listed})
         self.integrators |= {
             "walk_ad": make_integrator("walk_ad", **shared, **naive),
@@ -141,24 +145,20 @@ class Participants:
         return able
 
     def _configured(self, configs: dict[str, Config]) -> dict[str, StepIntegrator]:
-        """The integrators by label, and, where derivatives are attached, with each way to take those of the film."""
+        """The integrators by label, and, where derivatives are attached, with what references ask for."""
         made = {}
         for label, config in configs.items():
             kind, options = config.integrator.type, config.integrator.options()
             made[label] = make_integrator(kind, **options)
-            for way in WAYS if self.attached else ():
-                if way != self._way:
-                    made[f"{label}, {way}"] = make_integrator(kind, **options | {"filter_normalization": way})
+            for reference, alike in ALIKE.items() if self.attached else ():
+                if options | alike != options:
+                    made[_alike(label, reference)] = make_integrator(kind, **options | alike)
         return made
 
     def sampled(self, label: str, reference: Reference) -> str:
-        """The integrator whose gradients stand for those of `label` beside this reference.
-
-        Where light moves over the film, differences have derivatives of the filter's normalisation, and `ptracer` none.
-        """
-        way = WAYS[1] if reference is Reference.PTRACER else WAYS[0]
-        own = not self.attached or reference is Reference.WALK_AD or way == self._way
-        return label if own else f"{label}, {way}"
+        """The integrator whose gradients stand for those of `label` beside this reference (`ALIKE`)."""
+        alike = _alike(label, reference)
+        return alike if alike in self.integrators else label
 
     def _choose_references(self) -> None:
         at = self._situation
@@ -250,6 +250,10 @@ class Participants:
     def picture(self, label: str, seed: int) -> np.ndarray:
         """The image in a row."""
         return self.case.image(self.integrators[label], seed, self.spp).ravel()
+
+
+def _alike(label: str, reference: Reference) -> str:
+    return f"{label}, as {reference.value}"
 
 
 def _samples(film: tuple[int, int], most: int, multiple: int | None) -> int:

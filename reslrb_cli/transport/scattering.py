@@ -206,8 +206,8 @@ def staying(
 ) -> tuple[mi.Vector3f, mi.Float, mi.Spectrum]:
     """The same where a smooth lobe's direction goes to a point that does not move with this vertex.
 
-    That the direction changes with either end is left to the vertex at its far end (`estimators.attached`): here it stands
-    still in the world, and f / pdf changes by f alone. Delta lobes are as in `following`.
+    That the direction changes with either end is left to the vertex at its far end (`estimators.attached`): here it
+    stands still in the world, and f / pdf changes by f alone. Delta lobes are as in `following`.
     """
     followed = following(plan, si, bsdf, active, wo, pdf, lobe, weight)
     kept = dr.detach(pdf)

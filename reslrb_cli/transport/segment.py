@@ -46,8 +46,9 @@ def find_following_vertex(
 ) -> tuple[mi.SurfaceInteraction3f, mi.Ray3f, mi.Float]:
     """The surface interaction of a vertex that stays where it is on its surface, and moves with that alone.
 
-    Also the ray that reaches it, whose direction turns with both ends, and by what factor (1, with a derivative) a measure
-    of directions at its origin becomes one of places on the surface: |cos| / distance^2 times the surface's own stretching.
+    Also the ray that reaches it, whose direction turns with both ends, and by what factor (1, with a derivative) a
+    measure of directions at its origin becomes one of places on the surface: |cos| / distance^2 times the surface's
+    own stretching.
     """
     si = pi.compute_surface_interaction(ray, mi.RayFlags.All | mi.RayFlags.FollowShape, active)
     there = si.p - ray.o

@@ -48,12 +48,11 @@ def moved(scene: Any) -> list[Move]:
 
 #: A path from the lamp through both surfaces of the slab to the floor, a wall, and the camera.
 OPTIONS = {"max_depth": 5}
-STAYING = OPTIONS | {"attached_sampling": "stay"}
 SCENES = [
-    AttachedScene("bounce", "a slab that lights a wall by way of the floor", lambda: room(wall=wall(diffuse(0.8, 0.7, 0.6))),
-                  moved, spp=512, seeds=32, options=OPTIONS),
-    AttachedScene("bounce_steps", "the same onto a texture with steps", lambda: room(wall=wall(steps())),
-                  moved, spp=512, seeds=32, options=STAYING),
-    AttachedScene("bounce_corner", "the same into a corner of two walls", corner,
-                  moved, spp=512, seeds=32, options=STAYING),
+    AttachedScene("bounce", "a slab that lights a wall by way of the floor",
+                  lambda: room(wall=wall(diffuse(0.8, 0.7, 0.6))), moved, spp=512, seeds=32, options=OPTIONS),
+    AttachedScene("bounce_steps", "the same onto a texture with steps", lambda: room(wall=wall(steps())), moved,
+                  spp=512, seeds=32, options=OPTIONS),
+    AttachedScene("bounce_corner", "the same into a corner of two walls", corner, moved,
+                  spp=512, seeds=32, options=OPTIONS),
 ]  # fmt: skip
