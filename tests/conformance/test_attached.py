@@ -41,7 +41,7 @@ def tracer(case: AttachedCase, name: str) -> StepIntegrator:
     if name == "walk_ad":
         options |= {"attached": True}
     if name == "reslrb":
-        options |= {"estimator": "stack"} | case.ours
+        options |= {"estimator": "stack", "attached_sampling": "follow"} | case.ours
     return integrator(name, case.depth, **options)
 
 

@@ -41,6 +41,18 @@ def corner() -> dict[str, Any]:
     return room(light=wall(diffuse(0.9, 0.9, 0.9), -50), dark=wall(diffuse(0.15, 0.15, 0.15), -130))
 
 
+def shelf() -> dict[str, Any]:
+    """A panel that faces the wall and fills the view: each path to it has two diffuse vertices and one connection.
+
+    It hangs above the floor: light passes below it to the wall, and comes back. Its shadow's edge is missing.
+    """
+    seen = camera([0.95, 0.8, 0], [0, 0.8, 0], [0, 1, 0], 50, SIZE)
+    seen["film"]["rfilter"] = FILTER
+    panel = {"type": "rectangle", "bsdf": diffuse(0.7, 0.8, 0.9),
+             "to_world": transform(translate=[0.45, 0.8, 0], rotate=([0, 1, 0], 90), scale=0.3)}  # fmt: skip
+    return slab(lamp=spot(cutoff=8), camera=seen, wall=wall(diffuse(0.8, 0.7, 0.6)), panel=panel)
+
+
 def moved(scene: Any) -> list[Move]:
     """The waves of the slab by their size, and a few smooth displacements."""
     return waving(scene, count=2)

@@ -1,0 +1,182 @@
+"""`reservoir` where light moves: against naive AD and `stack` at equal seeds, and in expectation.
+
+On specular chains with one connection a path nothing is selected, and nothing damped: rounding alone is between them.
+With diffuse vertices in the chain, and still one connection, damping adds noise of its own and must add no bias.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import pytest
+from conformance.attached_cases import CASES
+from measure.test_mutations import plant
+
+from reslrb_cli.estimators import chain, jacobian
+from reslrb_cli.integrators import gradient_step
+from reslrb_cli.measure.attached import AttachedScene
+from reslrb_cli.measure.attached.rooms import moved, room, shelf, wall
+from reslrb_cli.measure.gradients import integrator, relative, seeds
+from reslrb_cli.measure.small_scenes import diffuse
+
+pytestmark = pytest.mark.usefixtures("llvm")
+
+#: Relative L2 distance from naive AD on specular chains, at equal seeds.
+SPECULAR = 1e-4
+#: Cases of test_attached.py in which every path has one connection, behind specular vertices alone.
+SINGLE = ("slab", "latents", "passes", "thin_lens", "second_sensor", "crop", "lanczos", "mirror")
+BY_NAME = {case.name: case for case in CASES}
+ONE = AttachedScene("one", "one diffuse vertex in the chain", lambda: room(wall=wall(diffuse(0.8, 0.7, 0.6))), moved,
+                    spp=64, options={"max_depth": 5})  # fmt: skip
+TWO = AttachedScene("two", "two diffuse vertices in the chain", shelf, moved, spp=64, options={"max_depth": 6})
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=() if name in ("slab", "passes") else pytest.mark.long) for name in SINGLE]
+)
+def test_specular_chains_equal_naive_ad(name: str):
+    case = BY_NAME[name]
+    moving = case.moving()
+    shared = {"hide_emitters": True} | case.both
+    ours = moving.gradient(integrator("reslrb", case.depth, estimator="reservoir", **shared), 1, case.spp)
+    naive = moving.gradient(integrator("walk_ad", case.depth, attached=True, **shared), 1, case.spp)
+    for key, value in naive.items():
+        print(name, key, relative(ours[key], value))
+        assert value.any()
+        assert relative(ours[key], value) < SPECULAR
+
+
+@dataclass
+class Bias:
+    """Of N gradients, as a fraction of that of `stack` along itself: mean difference and its standard error."""
+
+    value: float
+    error: float
+    noise: float  # variance beyond that of `stack`, as a share of it
+
+    def __str__(self) -> str:
+        return f"bias {self.value:.2%} +- {self.error:.2%}, variance {1 + self.noise:.2f} of that of stack"
+
+
+def bias(scene: AttachedScene, sampling: str, count: int, **options: Any) -> Bias:
+    """That of `reservoir` at equal seeds."""
+    case, both = scene.case(), dict(scene.options) | {"attached_sampling": sampling}
+    exact = case.gradients(integrator("reslrb", **both, estimator="stack"), seeds(count), scene.spp)
+    ours = case.gradients(integrator("reslrb", **both, estimator="reservoir", **options), seeds(count), scene.spp)
+    mean = exact.mean(0)
+    along = (ours - exact) @ mean / (mean @ mean)
+    noise = (ours - exact).var(0, ddof=1).sum() / exact.var(0, ddof=1).sum()
+    return Bias(float(along.mean()), float(along.std(ddof=1) / np.sqrt(count)), float(noise))
+
+
+@pytest.mark.parametrize("scene", [ONE, TWO], ids=lambda scene: scene.name)
+def test_no_bias_behind_diffuse_vertices(scene: AttachedScene):
+    found = bias(scene, "stay", 12)
+    print(scene.name, found)
+    assert abs(found.value) < 4 * found.error
+    assert found.error < 0.01
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("sampling", ["follow", "stay"])
+@pytest.mark.parametrize("damping", [0.003, 0.01, 0.03, 0.1, 0.3, 1.0])
+@pytest.mark.parametrize("scene", [ONE, TWO], ids=lambda scene: scene.name)
+def test_no_bias_whatever_the_damping(scene: AttachedScene, damping: float, sampling: str):
+    found = bias(scene, sampling, 64, jacobian_damping=damping)
+    print(scene.name, sampling, damping, found)
+    assert abs(found.value) < 4 * found.error
+    assert found.error < 0.03
+
+
+def test_no_bias_in_blocks(monkeypatch: pytest.MonkeyPatch):
+    """As long paths are taken, of which one block alone counts, times their number."""
+    monkeypatch.setattr(chain, "BLOCK", 1)
+    found = bias(ONE, "stay", 24)
+    print(found)
+    assert abs(found.value) < 4 * found.error
+    assert found.error < 0.02
+
+
+def test_without_a_random_sign_there_is_bias(monkeypatch: pytest.MonkeyPatch):
+    """Else that there is none would show nothing."""
+    monkeypatch.setattr(jacobian, "sign", lambda numbers: 1)
+    found = bias(ONE, "follow", 12, jacobian_damping=0.5)
+    print(found)
+    assert abs(found.value) > 10 * found.error
+
+
+@pytest.mark.parametrize("options", [{}, {"capacity": 3}, {"weight": "adjoint"}, {"image": "retained"}], ids=str)
+def test_bounces_with_several_connections(options: dict[str, Any]):
+    """Selection adds its noise; parameters of emission and of BSDFs beside those that move."""
+    case = BY_NAME["bounces"]
+    moving = case.moving()
+    shared = {"hide_emitters": True} | case.both
+    exact, ours = (
+        [moving.gradient(integrator("reslrb", case.depth, estimator=name, **shared, **own), seed) for seed in seeds(16)]
+        for name, own in (("stack", {}), ("reservoir", options))
+    )
+    for key in exact[0]:
+        a, b = (np.stack([gradient[key] for gradient in side]) for side in (exact, ours))
+        along = (b - a) @ a.mean(0) / np.square(a.mean(0)).sum()
+        print(key, along.mean(), along.std(ddof=1) / 4)
+        assert abs(along.mean()) < 4 * along.std(ddof=1) / 4
+        assert along.std(ddof=1) / 4 < 0.05
+
+
+@pytest.mark.parametrize("name", ["bounces", pytest.param("rough_slab", marks=pytest.mark.long)])
+def test_two_kernels_equal_one(name: str):
+    """Where dL/dI is known before, chain and replay are one kernel; else what is kept goes through memory."""
+    scene = replace(ONE, spp=16)
+    case = scene.case()
+    tracer = integrator("reslrb", **scene.options, estimator="reservoir", jacobian_damping=0.01)
+    apart = case.gradient(tracer, 1, scene.spp, step=gradient_step)
+    tracer.correlated, whole = None, case.gradients(tracer, [1], scene.spp)[0]
+    assert relative(apart, whole) < 1e-5
+
+
+# ---- The code broken on purpose ----
+
+
+@dataclass(frozen=True)
+class Fault:
+    where: str
+    right: str
+    wrong: str
+
+
+SELECTION, REPLAY = "estimators.chain:ChainSelection", "estimators.chain_replay:ChainReplay"
+FAULTS = {
+    "no_G": Fault(f"{SELECTION}.scattering",
+                  "row_times(row, J) + before for row, before in zip(jacobian.log_c",
+                  "row_times(row, J) for row, before in zip(jacobian.log_c"),
+    "factors_passed_stay": Fault(f"{REPLAY}.scattering", "ahead = row - sum", "ahead = row + 0 * sum"),
+    "no_inverse": Fault(f"{REPLAY}.scattering", "row_times(ahead, inverse)", "ahead"),
+    "film_position_stays": Fault("estimators.chain_replay:Kept.of", "[*by_u, *A]", "[*(0 * by_u), *A]"),
+    "own_vertex_left_out": Fault(f"{REPLAY}._differentiate", "own_part + later", "later"),
+    "rays_left_out": Fault(f"{REPLAY}._differentiate", "moved + dr.dot(by_s", "0 * moved + dr.dot(by_s"),
+}  # fmt: skip
+
+
+def distance(name: str) -> float:
+    """Of `reservoir` from `stack` at equal seeds, where rounding alone is to be between them."""
+    case = BY_NAME[name]
+    depth = 4 if name == "receiver" else case.depth  # one connection a path
+    moving = case.moving()
+    exact, ours = (
+        moving.gradient(integrator("reslrb", depth, estimator=estimator, hide_emitters=True), 1, case.spp)
+        for estimator in ("stack", "reservoir")
+    )
+    return max(relative(ours[key], value) for key, value in exact.items())
+
+
+@pytest.mark.parametrize("name", FAULTS)
+def test_fault(name: str, monkeypatch: pytest.MonkeyPatch):
+    plant(FAULTS[name], monkeypatch)
+    if name in ("no_G", "factors_passed_stay"):  # what is specular has hardly any
+        found = bias(TWO, "stay", 6)
+        print(found)
+        assert abs(found.value) > max(0.1, 10 * found.error)
+        return
+    assert distance("receiver" if name == "own_vertex_left_out" else "slab") > 10 * SPECULAR
