@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from reslrb_cli.measure.attached import glass, mirrors, places
+from reslrb_cli.measure.attached import glass, mirrors, places, rooms
 from reslrb_cli.measure.attached.scene import AttachedScene, Differenced, compare_with_differences
 
 __all__ = ["SCENES", "AttachedScene", "Differenced", "compare_with_differences"]
 
-SCENES: dict[str, AttachedScene] = {scene.name: scene for topic in (glass, mirrors, places) for scene in topic.SCENES}
+SCENES: dict[str, AttachedScene] = {
+    scene.name: scene for topic in (glass, mirrors, places, rooms) for scene in topic.SCENES
+}

@@ -23,11 +23,14 @@ def wall(bsdf: dict[str, Any], turn: float = -90, x: float = 1.0) -> dict[str, A
             "to_world": transform(translate=[x, 1, 0], rotate=([0, 1, 0], turn), scale=3)}  # fmt: skip
 
 
-def room(**walls: Any) -> dict[str, Any]:
-    """A slab with waves over the floor of a room with these walls, at which a camera over the caustic looks."""
+def room(**changes: Any) -> dict[str, Any]:
+    """A slab with waves over the floor of a room, and a camera over the caustic that looks at what is at x = 1.
+
+    `changes` are objects beside these, or in place of them.
+    """
     seen = camera([-0.6, 0.8, 0], [1, 0.8, 0], [0, 1, 0], 40, SIZE)
     seen["film"]["rfilter"] = FILTER
-    return slab(lamp=spot(cutoff=8), camera=seen, **walls)
+    return slab(lamp=spot(cutoff=8), camera=seen) | changes
 
 
 def steps() -> dict[str, Any]:
