@@ -101,7 +101,10 @@ def segment_jacobian(
         factors = [reached * scattering.weight]
         if evaluates:
             factors.append(reached * connection.f * connection.weight)
-        outputs = [following.o, following.d, *factors, *([connection.u] if evaluates else [])]
+        # Selected: no other of these hangs on what that makes, which would be cleared on the way.
+        outputs = [dr.select(scattered, value, 0) for value in (following.o, following.d, factors[0])]
+        if evaluates:
+            outputs += [dr.select(connected, value, 0) for value in (factors[1], connection.u)]
         changes = []
         for axis in p:
             dr.forward_from(axis, flags=dr.ADFlag.ClearInterior | dr.ADFlag.AllowNoGrad)
@@ -114,14 +117,12 @@ def segment_jacobian(
     for axis, change in enumerate(changes):
         column = coordinates(dr.detach(following.d), change[0], change[1], is_staying(after))
         column[axis] = column[axis] + (turned if axis >= 2 else dr.select(stays, turned, 0))
-        columns.append([mi.Float64(dr.select(scattered, value, 0)) for value in column])
+        columns.append([mi.Float64(value) for value in column])
     log_s = _logarithmic(factors[0], [change[2] for change in changes], scattered)
     if not evaluates:
         return SegmentJacobian(_matrix(columns), damped, log_s, [], [])
     log_c = _logarithmic(factors[1], [change[3] for change in changes], connected)
-    u = [
-        mi.Vector4d(*(mi.Float64(dr.select(connected, change[4][axis], 0)) for change in changes)) for axis in range(2)
-    ]
+    u = [mi.Vector4d(*(mi.Float64(change[4][axis]) for change in changes)) for axis in range(2)]
     return SegmentJacobian(_matrix(columns), damped, log_s, u, log_c)
 
 

@@ -12,6 +12,7 @@ from reslrb_cli.errors import UnsupportedScene
 from reslrb_cli.estimators import Estimator
 from reslrb_cli.estimators.base import Pass
 from reslrb_cli.integrators.hooks import RecordedObjective, TangentSplat, TrackedSplat
+from reslrb_cli.integrators.tangents import AttachedTangentSplat
 from reslrb_cli.scene.graph import SceneGraph
 from reslrb_cli.transport.accumulation import finish_pass, in_passes
 from reslrb_cli.transport.emission import sample_emission
@@ -201,7 +202,8 @@ def splat_tangents(samples: Samples, block: mi.ImageBlock) -> None:
             primary = samples.primary_ray()
             tangent = visible_tangent(plan, samples.scene, primary)
             samples.film.put(block, primary.u, tangent * primary.weight * samples.fraction, primary.active)
-    walk(samples, TangentSplat(samples, block, dE))
+    hooks = AttachedTangentSplat if plan.attached else TangentSplat
+    walk(samples, hooks(samples, block, dE))
 
 
 def splat_tracked(samples: Samples, block: mi.ImageBlock) -> None:

@@ -102,8 +102,8 @@ class LightTracer:
         """The derivative (H, W, C) of the image along the tangents of the job's parameters (forward mode)."""
         with dr.suspend_grad():
             parts = self.passes(job)
-            if parts[0].plan.attached:
-                raise UnsupportedScene("forward mode has no derivatives of what moves light; take reverse mode")
+            if parts[0].plan.moving_emission:
+                raise UnsupportedScene("forward mode has no derivatives of emitters that move; take reverse mode")
             film = parts[0].film
             block = film.block()
             in_passes(parts, lt.splat_tangents, block)

@@ -80,7 +80,7 @@ class Gradcheck:
                 stock = parts.stock[key]
                 references = [] if stock is None else [stock]
                 references += [Reference.ANALYTIC] if key in parts.exact else []
-                references += [Reference.FINITE_DIFFERENCE] + ([] if parts.attached else [Reference.FORWARD_MODE])
+                references += [Reference.FINITE_DIFFERENCE] + ([Reference.FORWARD_MODE] if parts.forward_mode else [])
                 found += [Row(key, listed.label, reference, Kind.EXPECTATION) for reference in references]
         return sorted(found, key=lambda row: row.key is not None and row.reference.value in NAIVE)
 

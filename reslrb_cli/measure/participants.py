@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import mitsuba as mi
 import numpy as np
 
 from reslrb_cli.config import Config
@@ -106,6 +107,8 @@ class Participants:
         depth = config.integrator.max_depth
         moved = tuple(key for key in problem.selection.scene_keys if moves_light(self.case.params, key))
         self.attached = options.get("attached") is True or bool(moved)
+        #: Whether there is a forward mode: of emitters that move there is none.
+        self.forward_mode = not any(_emits(self.case.params.properties[key][2]) for key in moved)
         self.listed = self._able(settings)
         shared = {name: options[name] for name in ("max_depth", "rr_depth", "hide_emitters")}
         naive = {"samples_per_pass": options.get("samples_per_pass")}
@@ -250,6 +253,10 @@ class Participants:
     def picture(self, label: str, seed: int) -> np.ndarray:
         """The image in a row."""
         return self.case.image(self.integrators[label], seed, self.spp).ravel()
+
+
+def _emits(node: mi.Object) -> bool:
+    return isinstance(node, mi.Emitter) or (isinstance(node, mi.Shape) and node.is_emitter())
 
 
 def _alike(label: str, reference: Reference) -> str:

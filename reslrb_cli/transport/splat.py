@@ -46,6 +46,26 @@ class Film:
             color = [showing(c) for c in color]  # they are added up one by one, not as a packet
         block.put(u + mi.Vector2f(self.offset), color + [mi.Float(0)] * (block.channel_count() - N_COLOR), active)
 
+    def taps(self, u: mi.Point2f, normalization: bool) -> list[tuple[mi.Point2u, mi.Float]]:
+        """The pixels that a splat at film position `u` touches, some of them off the film, and the weight of each."""
+        first, (weights_x, weights_y), total = filter_weights(self.film.rfilter(), u)
+        if not normalization:
+            total = dr.detach(total)
+        scale = dr.select(total != 0, dr.rcp(total), 0)
+        return [
+            (mi.Point2u(mi.Point2i(first.x + x, first.y + y)), weights_x[x] * weights_y[y] * scale)
+            for y in range(len(weights_y))
+            for x in range(len(weights_x))
+        ]
+
+    def add(self, block: mi.ImageBlock, pixel: mi.Point2u, value: mi.Spectrum, active: mi.Bool) -> None:
+        """Add `value` (C,) to one pixel, where that is on the film."""
+        inside = active & (pixel.x < self.size.x) & (pixel.y < self.size.y)
+        index, channels = dr.fma(pixel.y, mi.UInt32(self.size.x), pixel.x), block.channel_count()
+        for c in range(N_COLOR):
+            at, one = index * channels + c, showing(value[c % len(value)])
+            dr.scatter_reduce(dr.ReduceOp.Add, block.tensor().array, one, at, inside)
+
     def develop(self, block: mi.ImageBlock) -> mi.TensorXf:
         """The image (H, W, channels) in the film's own pixel format; differentiable with respect to the block."""
         self.film.prepare([])

@@ -108,7 +108,17 @@ def test_without_a_random_sign_there_is_bias(monkeypatch: pytest.MonkeyPatch):
     assert abs(found.value) > 10 * found.error
 
 
-@pytest.mark.parametrize("options", [{}, {"capacity": 3}, {"weight": "adjoint"}, {"image": "retained"}], ids=str)
+@pytest.mark.parametrize(
+    "options",
+    [
+        {},
+        *(
+            pytest.param(o, marks=pytest.mark.long)
+            for o in ({"capacity": 3}, {"weight": "adjoint"}, {"image": "retained"})
+        ),
+    ],
+    ids=str,
+)
 def test_bounces_with_several_connections(options: dict[str, Any]):
     """Selection adds its noise; parameters of emission and of BSDFs beside those that move."""
     case = BY_NAME["bounces"]

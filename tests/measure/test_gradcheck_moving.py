@@ -35,25 +35,26 @@ def test_a_lamp_that_moves():
 def test_who_takes_part():
     config = room("lamp_over_floor.xml", "lamp.position")
     some = Gradcheck(Settings(config, all_estimators(config), 0, 3, named=False))
-    assert [case.label for case in some.participants.listed] == ["reslrb:stack"]
-    assert {row.label for row in some.rows if row.key is not None} == {"reslrb:stack"}
-    with pytest.raises(ConfigError, match="reservoir has no derivatives of what moves light; take stack"):
-        Gradcheck(Settings(config, parse_estimators("reservoir,stack"), 0, 3))
+    assert [case.label for case in some.participants.listed] == ["reslrb:reservoir", "reslrb:stack"]
+    assert {row.label for row in some.rows if row.key is not None} == {"reslrb:reservoir", "reslrb:stack"}
+    with pytest.raises(ConfigError, match="gather has no derivatives of what moves light; take reservoir, stack"):
+        Gradcheck(Settings(config, parse_estimators("gather,stack"), 0, 3))
     still = room("lamp_over_floor.xml", "floor.bsdf.reflectance.value")
     all_of_them = Gradcheck(Settings(still, all_estimators(still), 0, 3, named=False))
     assert len(all_of_them.participants.listed) == 4
 
 
 def test_ways_to_differentiate_the_film():
-    """Beside differences the filter's normalisation has its derivative, beside `ptracer` it has none."""
+    """Beside differences the filter's normalisation has its derivative, beside `ptracer` none; naive AD follows."""
     parts = Gradcheck(
         Settings(room("wavy_glass.xml", "top.vertex_positions"), parse_estimators("stack"), 0, 3)
     ).participants
     assert parts.stock == {"top.vertex_positions": Reference.PTRACER}
-    assert parts.sampled("reslrb:stack", Reference.WALK_AD) == "reslrb:stack"
+    assert parts.sampled("reslrb:stack", Reference.WALK_AD) == "reslrb:stack, as walk_ad"
     assert parts.sampled("reslrb:stack", Reference.FINITE_DIFFERENCE) == "reslrb:stack"
-    assert parts.sampled("reslrb:stack", Reference.PTRACER) == "reslrb:stack, detached"
-    assert set(parts.integrators) >= {"reslrb:stack", "reslrb:stack, detached"}
+    assert parts.sampled("reslrb:stack", Reference.PTRACER) == "reslrb:stack, as ptracer"
+    assert set(parts.integrators) >= {"reslrb:stack", "reslrb:stack, as walk_ad", "reslrb:stack, as ptracer"}
+    assert parts.forward_mode
 
 
 def test_references_of_what_moves():

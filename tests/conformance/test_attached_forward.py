@@ -1,0 +1,107 @@
+"""Forward mode where light moves, against the gradient at equal seeds: <weights, J v> = <J^T weights, v>."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from conformance.moving import rippled, under_glass
+from measure.test_mutations import plant
+
+from reslrb_cli import register
+from reslrb_cli.errors import UnsupportedScene
+from reslrb_cli.measure.attached import SCENES
+from reslrb_cli.measure.gradients import integrator, relative
+
+pytestmark = pytest.mark.usefixtures("llvm")
+
+ROUNDING = 3e-5
+QUICK = ("slab", "bounce")
+
+
+def distance(name: str, sampling: str) -> float:
+    """The largest deviation of all derivatives, relative to the largest of them."""
+    case, options = SCENES[name].case(), dict(SCENES[name].options)
+    options |= {"attached_sampling": sampling}
+    tracer = integrator("reslrb", **options, estimator="stack")
+    gradient = case.gradient(tracer, 100, 16)
+    tangents = np.array([case.tangent(tracer, direction, 100, 16) for direction in np.eye(len(gradient))[:3]])
+    assert np.abs(gradient[:3]).min() > 0
+    return float(np.abs(tangents - gradient[:3]).max() / np.abs(gradient).max())
+
+
+@pytest.mark.parametrize("sampling", ["follow", "stay"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=() if name in QUICK else pytest.mark.long)
+        for name in (
+            "slab",
+            "bounce",
+            "rough_surface",
+            "mirror",
+            "sphere_lens",
+            "moved_receiver",
+            "rough_surface_alpha",
+        )
+    ],
+)
+def test_forward_against_backward(name: str, sampling: str):
+    found = distance(name, sampling)
+    print(name, sampling, found)
+    assert found < ROUNDING
+
+
+@dataclass(frozen=True)
+class Fault:
+    """As `plant` takes it."""
+
+    right: str
+    wrong: str
+    where: str = "integrators.tangents:AttachedTangentSplat.scattering"
+
+
+FAULTS = {
+    "slab": Fault("dr.set_grad(ray.d, state.d_direction)", "pass"),
+    "mirror": Fault(" + dk * C", ""),
+    "rough_surface": Fault("state.d_product * c + P * dc", "P * dc"),
+}
+
+
+@pytest.mark.parametrize("name", FAULTS)
+def test_fault(name: str, monkeypatch: pytest.MonkeyPatch):
+    plant(FAULTS[name], monkeypatch)
+    assert distance(name, "stay") > 30 * ROUNDING
+
+
+@pytest.mark.parametrize("normalization", ["attached", pytest.param("detached", marks=pytest.mark.long)])
+def test_as_a_plugin(normalization: str):
+    """`dr.forward` of a script: every pixel, against naive AD of the same paths."""
+    register()
+    scene = mi.load_dict(under_glass())
+    params = mi.traverse(scene)
+    positions, rest = (mi.Float(rippled(2.0, 12, ripples).astype(np.float32).ravel()) for ripples in (1.0, 0.0))
+    shared = {"max_depth": 5, "hide_emitters": True, "filter_normalization": normalization}
+
+    def tangent(**plugin: Any) -> np.ndarray:
+        amplitude = mi.Float(1)
+        dr.enable_grad(amplitude)
+        params["slab.vertex_positions"] = rest + (positions - rest) * amplitude
+        params.update()
+        image = mi.render(scene, params, integrator=mi.load_dict(plugin | shared), spp=16, seed=1)
+        dr.forward(amplitude)
+        return np.array(dr.grad(image))
+
+    ours, naive = tangent(type="reslrb", estimator="stack"), tangent(type="walk_ad", attached=True)
+    assert np.abs(naive).max() > 0
+    assert relative(ours, naive) < ROUNDING
+
+
+def test_a_lamp_that_moves_is_refused():
+    case = SCENES["moved_point"].case()
+    with pytest.raises(UnsupportedScene, match="forward mode has no derivatives of emitters that move"):
+        case.tangent(integrator("reslrb", 2, estimator="stack"), np.array([1.0, 0, 0]), 1, 4)
