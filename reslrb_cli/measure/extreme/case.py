@@ -157,6 +157,7 @@ class ExtremeCase:
     have derivatives of either sign; in the others nothing may be negative. `equal` limits the relative L2 distance at
     equal seeds, and from exact values where there is one seed only. `residual`: what `gather`'s replay leaves of its
     sum is looked at. `open_ended` names the parameters that no z-test can decide, and why; equal seeds decide there.
+    `elsewhere` names those that another case decides, and which: equal seeds alone are compared.
     `moves` are what moves light, by amplitudes that are then the one parameter (`keys` is empty): estimators that do
     not follow it are left out, and dL/dI is smooth.
     """
@@ -177,6 +178,7 @@ class ExtremeCase:
     residual: bool = False
     equal: float = 1e-4
     open_ended: Mapping[str, str] = field(default_factory=dict)
+    elsewhere: Mapping[str, str] = field(default_factory=dict)
     moves: Callable[[Any], Sequence[Move]] | None = None
 
     def setup(self) -> Case:

@@ -9,7 +9,9 @@ from __future__ import annotations
 from typing import Any
 
 from reslrb_cli.measure.analytic_scenes import camera
-from reslrb_cli.measure.extreme.case import ExtremeCase, Stock
+from reslrb_cli.measure.attached.amplitudes import Number
+from reslrb_cli.measure.attached.scene import FILTER
+from reslrb_cli.measure.extreme.case import Extrapolated, ExtremeCase, Stock
 from reslrb_cli.measure.small_scenes import diffuse, rgb, transform
 
 FLOOR = "floor.bsdf.reflectance.value"
@@ -41,6 +43,15 @@ def transmitted(bsdf: dict) -> dict:
     }  # fmt: skip
 
 
+def close() -> dict:
+    """A narrow beam that falls on the floor, and a camera that looks at nothing else."""
+    return {
+        "camera": camera([0, 0.9, 0], [0, 0, 0], [0, 0, -1], 4),
+        "lamp": {"type": "rectangle", "bsdf": diffuse(0, 0, 0), "to_world": _horizontal(1.8, 0.01, 90),
+                 "emitter": {"type": "directionalarea", "radiance": rgb(5, 6, 4)}},
+    }  # fmt: skip
+
+
 def conductor(alpha: float) -> dict:
     return reflected({"type": "roughconductor", "alpha": alpha, "specular_reflectance": rgb(0.9, 0.7, 0.5)})
 
@@ -66,16 +77,25 @@ KINDS = {
     "principled": (principled, "base_color", "roughness"),
 }
 ROUGHNESS = ("1", "0.1", "1e-2", "1e-4")
+#: Roughnesses whose derivative is decided where light follows them. `principled` chooses a lobe: it has none such.
+FOLLOWED = [(kind, roughness) for kind in ("roughconductor", "roughdielectric") for roughness in ("0.1", "1e-2")]
 NOISE = "the noise of a roughness's derivative grows as 1 / roughness: equal seeds decide"
+
+
+def followed(kind: str, roughness: str) -> str:
+    """Name of the case in which light follows a roughness."""
+    return f"{kind}_{roughness}_followed"
 
 
 def _case(kind: str, roughness: str) -> ExtremeCase:
     make, colour, own = KINDS[kind]
     colour, keys = f"plate.bsdf.{colour}.value", [FLOOR]
-    open_ended = {}
+    open_ended, elsewhere = {}, {}
     if own is not None:
         keys.append(f"plate.bsdf.{own}.value")
-        if float(roughness) <= 0.1:
+        if (kind, roughness) in FOLLOWED:
+            elsewhere[keys[-1]] = followed(kind, roughness)
+        elif float(roughness) <= 0.1:
             open_ended[keys[-1]] = NOISE
     return ExtremeCase(
         f"{kind}_{roughness}",
@@ -86,7 +106,40 @@ def _case(kind: str, roughness: str) -> ExtremeCase:
         spp=256,
         signed=own is not None,
         open_ended=open_ended,
+        elsewhere=elsewhere,
+    )
+
+
+def _followed(kind: str, roughness: str) -> ExtremeCase:
+    """The derivative by the roughness, of light that follows it: quiet, and known by finite differences.
+
+    What nearly smooth glass blurs is less than a pixel of the camera above, and next to nothing of its derivative is
+    left: a closer one looks at a narrow beam.
+    """
+    make, _, own = KINDS[kind]
+
+    def scene() -> dict:
+        made = make(float(roughness))
+        if (kind, roughness) == ("roughdielectric", "1e-2"):
+            made |= close()
+        made["camera"]["film"]["rfilter"] = FILTER  # a box filter has no derivative by where light lands
+        return made
+
+    return ExtremeCase(
+        followed(kind, roughness),
+        f"how light follows the roughness {roughness} of a {kind}",
+        scene,
+        (),
+        Extrapolated(0.05 * float(roughness), 2e-3),
+        image="",
+        spp=256,
+        signed=True,
+        options={"max_depth": 3},  # from the plate to the floor, and no farther: beyond it are edges at rest
+        ours={"attached": True},
+        equal=5e-4,
+        moves=lambda scene: [Number(f"plate.bsdf.{own}.value")],
     )
 
 
 CASES = [_case(kind, roughness) for kind in KINDS for roughness in ROUGHNESS]
+CASES += [_followed(kind, roughness) for kind, roughness in FOLLOWED]
