@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import click
 
 from reslrb_cli.cli.experiment import COUNT, check_writable, optional_experiment_arguments
+from reslrb_cli.cli.missing import refuse_comparisons, run_missing
 from reslrb_cli.cli.output import echo
 from reslrb_cli.cli.suite import refuse_foreign, run_suite_command
 from reslrb_cli.errors import ConfigError, ExitCode
@@ -36,6 +37,11 @@ logger = logging.getLogger(__name__)
               help="Number of seeds, whatever time they take.")  # fmt: skip
 @click.option("--spp", type=COUNT,
               help="Samples per pixel of one gradient. Default: 65536 light paths, no more than run.spp.")  # fmt: skip
+@click.option("--missing", is_flag=True,
+              help="Measure instead what no gradient of this kind has: the share of each parameter's derivative that "
+                   "silhouettes, edges of shadows and light that leaves the film make up.")  # fmt: skip
+@click.option("--directions", type=click.IntRange(min=1, max=64), metavar="N",
+              help="With --missing: along how many directions of each parameter. Default: 3.")  # fmt: skip
 @click.option("--json", "json_file", type=click.Path(path_type=Path, dir_okay=False),
               help="Write one object a line, one for each comparison.")  # fmt: skip
 @click.option("--markdown", "markdown_file", type=click.Path(path_type=Path, dir_okay=False),
@@ -53,6 +59,8 @@ def command(
     budget: float,
     seeds: int | None,
     spp: int | None,
+    missing: bool,
+    directions: int | None,
     json_file: Path | None,
     markdown_file: Path | None,
     folder: Path | None,
@@ -76,6 +84,10 @@ def command(
     from reslrb_cli.measure.participants import Settings
     from reslrb_cli.records.gradcheck import Verdict
 
+    if missing:
+        refuse_comparisons(context)
+    elif directions is not None:
+        raise ConfigError("--directions", "", "goes with --missing alone")
     check_writable("--json", json_file)
     check_writable("--markdown", markdown_file)
     if suite is not None:
@@ -87,6 +99,10 @@ def command(
         config = loads(cornell_box.CONFIG, cornell_box.SOURCE, overrides)
     else:
         config = load(config_file, overrides)
+    if missing:
+        variant = set_variant(config.variant)
+        echo(f"{device_name(variant)}, {variant}")
+        return run_missing(config, budget, seeds, spp, directions, json_file)
     listed = all_estimators(config) if estimators is None else parse_estimators(estimators)
     _check_folder(folder)
     settings = Settings(config, listed, budget, seeds, spp, named=estimators is not None)

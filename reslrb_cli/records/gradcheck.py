@@ -8,7 +8,7 @@ import math
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import Any
+from typing import Any, Protocol
 
 
 class Reference(str, enum.Enum):
@@ -99,13 +99,19 @@ def _finite(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
+class Line(Protocol):
+    """What is a line of JSON."""
+
+    def to_json(self) -> str: ...
+
+
 class GradcheckWriter:
     """Writes records to a file of their own; each line is on disk once `write` returns."""
 
     def __init__(self, path: Path) -> None:
         self._file = path.open("w", encoding="utf-8")
 
-    def write(self, record: GradcheckRecord) -> None:
+    def write(self, record: Line) -> None:
         """Append one record."""
         self._file.write(record.to_json() + "\n")
         self._file.flush()
