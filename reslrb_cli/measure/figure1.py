@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from reslrb_cli.backend.python import python_command
-from reslrb_cli.config import Config, dump
+from reslrb_cli.config import Config, Reslrb, dump
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.measure.comparison import Comparison, Family, compare_expectations
 from reslrb_cli.measure.entries import entry_count
@@ -117,10 +117,7 @@ def measure(config: Config, plan: Plan, folder: Path, say: Callable[[str], None]
 
     Raises ConfigError, processes.Refused, and Ended where a gradient that has to be there is not.
     """
-    if config.variant not in ("auto", VARIANT):
-        raise ConfigError(config.source, "variant", f"must be auto or {VARIANT}: the limit bounds address space alone")
-    if config.parameters[0].heightmap is None:
-        raise ConfigError(config.source, "parameters[0]", "must be a heightmap, whose gradient is shown")
+    _check_config(config)
     say(f"target and initial image, {plan.reference_spp} spp")
     pictures = _take_pictures(config, plan, folder)
     np.save(folder / "adjoint.npy", pictures["adjoint"])
@@ -156,6 +153,19 @@ def check(result: Result) -> None:
             one.rows, other.rows, family, shape=shape, paired=False
         )
     result.fall = fall(ours.rows, many.rows, float(np.sqrt(many.spp / ours.spp)))
+
+
+def _check_config(config: Config) -> None:
+    """Raise ConfigError where the gradients could not be compared, or shown."""
+    integrator = config.integrator
+    if config.variant not in ("auto", VARIANT):
+        raise ConfigError(config.source, "variant", f"must be auto or {VARIANT}: the limit bounds address space alone")
+    if not isinstance(integrator, Reslrb) or integrator.estimator == "auto":
+        raise ConfigError(config.source, "integrator.estimator", "must name an estimator of `reslrb`")
+    if integrator.max_depth < 0:
+        raise ConfigError(config.source, "integrator.max_depth", "must be a limit: paths are traced without roulette")
+    if config.parameters[0].heightmap is None:
+        raise ConfigError(config.source, "parameters[0]", "must be a heightmap, whose gradient is shown")
 
 
 def _start(config: Config, limit: int | None, naive: bool, adjoint: Path | None) -> Process:

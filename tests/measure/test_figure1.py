@@ -146,19 +146,14 @@ def test_a_process_ends_by_its_limit(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("setting", "key"),
-    [("variant=cuda_ad_rgb", "variant"), ("parameters=[{key: face.vertex_positions}]", "parameters")],
+    [
+        ("variant=cuda_ad_rgb", "variant"),
+        ("integrator.estimator=auto", "integrator.estimator"),
+        ("integrator={type: prb}", "integrator.estimator"),
+        ("integrator.max_depth=-1", "integrator.max_depth"),
+        ("parameters=[{key: face.vertex_positions}]", "parameters"),
+    ],
 )
 def test_what_it_cannot_show_is_refused(tmp_path: Path, setting: str, key: str) -> None:
     with pytest.raises(ConfigError, match=key):
         measure(load(CONFIG, [setting]), Plan(), tmp_path, lambda line: None)
-
-
-@pytest.mark.usefixtures("llvm")
-@pytest.mark.parametrize(
-    ("setting", "key"), [("integrator.estimator=auto", "estimator"), ("integrator.max_depth=-1", "max_depth")]
-)
-def test_what_cannot_be_compared_is_refused(setting: str, key: str) -> None:
-    from reslrb_cli.measure.held import comparable
-
-    with pytest.raises(ConfigError, match=key):
-        comparable(load(CONFIG, [setting]), naive=False)
