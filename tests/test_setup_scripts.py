@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
-SCRIPTS = ["scripts/setup", "scripts/demo", "scripts/test", ".ci/run"]
+SCRIPTS = ["scripts/setup", "scripts/demo", "scripts/test", "scripts/paper", ".ci/run"]
 
 
 @pytest.mark.parametrize("name", SCRIPTS)
@@ -25,6 +25,12 @@ def test_setup_refuses_an_unknown_option() -> None:
     done = subprocess.run([ROOT / "scripts/setup", "--tset"], capture_output=True, text=True, check=False)
     assert done.returncode == 2
     assert done.stderr.startswith("usage: scripts/setup")
+
+
+def test_paper_refuses_an_unknown_figure() -> None:
+    done = subprocess.run([ROOT / "scripts/paper", "figure0"], capture_output=True, text=True, check=False)
+    assert done.returncode == 2
+    assert done.stderr.startswith("usage: scripts/paper")
 
 
 #: Stands in for Python: makes an environment of itself, and finds everything there.

@@ -10,17 +10,43 @@ import json
 import logging
 import os
 import sys
+from collections.abc import Callable
 from typing import IO, Any
 
 from reslrb_cli.errors import BackendError, ConfigError, is_out_of_memory, mentions_memory
 
+#: A case that has begun: what it says first, and what answers each question.
+Begun = tuple[dict[str, Any], Callable[[dict[str, Any]], dict[str, Any]]]
+#: Begins a case, by the message that describes it.
+Begin = Callable[[dict[str, Any]], Begun]
 
-def main() -> int:
+
+def measured_steps() -> Begin:
+    """Steps as `bench` measures them. Whatever is imported for it is, here and in the function below."""
+    from reslrb_cli.config import loads
+    from reslrb_cli.measure.stepper import Stepper
+
+    def begin(first: dict[str, Any]) -> Begun:
+        stepper = Stepper(loads(first["config"], first["source"]), first["objective"])
+        size = {"width": stepper.size[0], "height": stepper.size[1]}
+        return size, lambda question: stepper.step(question["round"], question["cold"], question["release"])
+
+    return begin
+
+
+def held_gradients() -> Begin:
+    """Gradients with dL/dI held, and what they are taken at."""
+    from reslrb_cli.measure.held import begin
+
+    return begin
+
+
+def main(load: Callable[[], Begin] = measured_steps) -> int:
     """Answer until standard input ends, or until something fails: the last answer then says what."""
     answers = os.fdopen(os.dup(sys.stdout.fileno()), "w", encoding="utf-8")
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
     try:
-        _serve(json.loads(sys.stdin.readline()), sys.stdin, answers)
+        _serve(json.loads(sys.stdin.readline()), load, sys.stdin, answers)
     except Exception as error:
         _answer(answers, _failure(error))
         return 1
@@ -39,7 +65,7 @@ class Warnings(logging.Handler):
         self.lines.append(record.getMessage())
 
 
-def _serve(first: dict[str, Any], questions: IO[str], answers: IO[str]) -> None:
+def _serve(first: dict[str, Any], load: Callable[[], Begin], questions: IO[str], answers: IO[str]) -> None:
     os.environ |= {
         "HOME": first["cache"],  # where Dr.Jit keeps compiled kernels: a cold step is to find none
         "OPTIX_CACHE_PATH": first["cache"],
@@ -49,18 +75,15 @@ def _serve(first: dict[str, Any], questions: IO[str], answers: IO[str]) -> None:
 
     set_variant(first["variant"])
 
-    from reslrb_cli.config import loads
-    from reslrb_cli.measure.stepper import Stepper
-
+    begin = load()
     # Only now: a library that finds no room looks like one that is not there.
     _limit(first["memory_limit"])
     warnings = Warnings()
     logging.getLogger("reslrb_cli").addHandler(warnings)
-    stepper = Stepper(loads(first["config"], first["source"]), first["objective"])
-    _answer(answers, {"width": stepper.size[0], "height": stepper.size[1], "warnings": warnings.lines})
+    opening, answer_to = begin(first)
+    _answer(answers, opening | {"warnings": warnings.lines})
     for line in questions:
-        question = json.loads(line)
-        _answer(answers, stepper.step(question["round"], question["cold"], question["release"]))
+        _answer(answers, answer_to(json.loads(line)))
 
 
 def _limit(memory_limit: int | None) -> None:
@@ -89,8 +112,8 @@ def _answer(answers: IO[str], message: dict[str, Any]) -> None:
     answers.flush()
 
 
-def run() -> None:
+def run(load: Callable[[], Begin] = measured_steps) -> None:
     """Answer, and end the process."""
-    code = main()
+    code = main(load)
     sys.stderr.flush()
     os._exit(code)  # what is left to tidy up may take long, or fail where memory is out

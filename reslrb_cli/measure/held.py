@@ -1,0 +1,99 @@
+"""Gradients of an experiment with dL/dI held at a reference image's, one by one, at the parameters' initial values.
+
+From their own images gradients of different noise, or of different numbers of samples, have different expectations:
+noise in the image biases each by its own amount. With one dL/dI for all they have the same, and can be compared.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from reslrb_cli.config import Config, Ptracer, Reslrb, loads
+from reslrb_cli.integrators import known_step
+from reslrb_cli.measure.participants import ALIKE, NEVER
+from reslrb_cli.measure.worker import Begun
+from reslrb_cli.optimization.problem import assemble, assemble_scene
+from reslrb_cli.records.clock import peak_mib, reset_peak
+from reslrb_cli.records.gradcheck import Reference
+
+#: The purpose, and the seed's part in it, of the samples of the image that dL/dI is held at.
+_REFERENCE = "reference"
+
+
+def comparable(config: Config, naive: bool) -> Config:
+    """The experiment with `ptracer` under naive AD, or with its own `reslrb`: both estimate the same gradient.
+
+    Neither has roulette, whose decision naive AD does not differentiate; ours leaves out what `ptracer` does not have.
+    """
+    own = config.integrator
+    assert isinstance(own, Reslrb), "checked by whoever compares"
+    integrator: Any = own.model_copy(update={**ALIKE[Reference.PTRACER], "rr_depth": NEVER})
+    if naive:
+        integrator = Ptracer(
+            type="ptracer", max_depth=own.max_depth, rr_depth=NEVER, hide_emitters=own.hide_emitters
+        )  # fmt: skip
+    return config.model_copy(update={"integrator": integrator})
+
+
+def pictures(config: Config, spp: int) -> dict[str, np.ndarray]:
+    """Target and initial image (H, W, C) of the first sensor, the latter with `spp` samples, and dL/dI at it."""
+    problem = assemble(config)
+    sensor, target = problem.sensors[0], problem.targets[0]
+    initial = problem.render(sensor, spp, 0, _REFERENCE)
+    image = mi.TensorXf(initial)
+    dr.enable_grad(image)
+    dr.backward(problem.compare(image, target))
+    return {"target": np.array(target), "initial": initial, "adjoint": np.array(dr.grad(image))}
+
+
+class Held:
+    """Takes gradients with respect to the first parameter, through the first sensor; `adjoint` is dL/dI (H, W, C)."""
+
+    def __init__(self, config: Config, adjoint: np.ndarray) -> None:
+        self.problem = assemble_scene(config)
+        self.key = self.problem.selection.keys[0]
+        # A sum, since NumPy's own memory would be used as it is: kernels depend on its alignment, which is random.
+        self.adjoint = mi.TensorXf(np.ascontiguousarray(adjoint, np.float32)) + dr.opaque(mi.Float, 0)
+        dr.eval(self.adjoint)
+
+    def gradient(self, seed: int, spp: int) -> np.ndarray:
+        """One gradient, of the parameter's shape."""
+        problem = self.problem
+        problem.apply()
+        for key in problem.selection.keys:
+            dr.clear_grad(problem.optimizer[key])
+        params = problem.selection.params
+        step = known_step(
+            problem.integrator, problem.scene, problem.sensors[0], self.adjoint, seed=seed, spp=spp, params=params
+        )
+        gradients = problem.gradients()
+        dr.eval(step.image, gradients)
+        return np.array(gradients[self.key], np.float32).reshape(problem.selection.array(self.key).shape)
+
+
+def begin(first: dict[str, Any]) -> Begun:
+    """Begin a process (`worker.py`): with an `adjoint`, a file, one of gradients, else of pictures.
+
+    A question names the file that its answer's arrays are written to, `out`, the samples `spp` and, of gradients, the
+    `seed`; answers to those have `peak_mib`, Dr.Jit's arrays at their most. `naive` says by what they are.
+    """
+    config = loads(first["config"], first["source"])
+    if first["adjoint"] is None:
+
+        def picture(question: dict[str, Any]) -> dict[str, Any]:
+            np.savez(question["out"], **pictures(config, question["spp"]))  # type: ignore[arg-type]
+            return {}
+
+        return {}, picture
+    held = Held(comparable(config, first["naive"]), np.load(first["adjoint"]))
+
+    def gradient(question: dict[str, Any]) -> dict[str, Any]:
+        reset_peak()
+        np.save(question["out"], held.gradient(question["seed"], question["spp"]))
+        return {"peak_mib": peak_mib(dr.backend_v(mi.Float))}
+
+    return {"key": held.key}, gradient

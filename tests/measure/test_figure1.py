@@ -1,0 +1,159 @@
+"""Figure 1: its checks see what they are to see, its gradients agree, and its table says what came of it."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from reslrb_cli.config import Config, load
+from reslrb_cli.errors import ConfigError
+from reslrb_cli.measure.comparison import Family, compare_expectations
+from reslrb_cli.measure.entries import entry_count
+from reslrb_cli.measure.figure1 import Kind, Plan, Result, _sample, check, measure
+from reslrb_cli.measure.noise import fall, relative_noise
+from reslrb_cli.measure.processes import Ended
+from reslrb_cli.records.bench import BenchStatus
+from reslrb_cli.records.gradcheck import Verdict
+from reslrb_cli.report.figure1 import draw, table, to_json
+
+CONFIG = Path(__file__).resolve().parents[2] / "configs" / "paper" / "figure1.yaml"
+SMALL = [
+    "scene.options={resx: 16, resy: 16, blur: 1.0}",
+    "parameters=[{heightmap: {mesh: face, resolution: [8, 8]}}]",
+    "target.render.spp=16",
+]
+
+
+@pytest.fixture(scope="module")
+def config() -> Config:
+    return load(CONFIG, SMALL)
+
+
+def pretended(config: Config, *, naive_factor: float = 1.0, many_factor: float = 1.0, fits: bool = False) -> Result:
+    """A result of normal noise around one gradient; `many_factor` is on the noise of many samples."""
+    random, plan = np.random.default_rng(1), Plan(seeds=32, many_seeds=8)
+    mean = random.normal(size=(16, 16, 1))
+
+    def kind(spp: int, naive: bool, count: int, factor: float, noise: float) -> Kind:
+        samples = factor * mean + noise * random.normal(size=(count, 16, 16, 1))
+        return Kind("naive AD" if naive else "reslrb:stack", spp, naive, samples.astype(np.float32), 10.0, 500.0)
+
+    many = kind(1024, False, 8, 1.0, many_factor * 0.5 / np.sqrt(32))
+    failing = Kind("naive AD", 1024, True, end=Ended(BenchStatus.OUT_OF_MEMORY, "jit_malloc(): out of memory"))
+    if fits:
+        failing = kind(1024, True, 1, 1.0, 0.1)
+    image = np.random.default_rng(2).uniform(size=(16, 16, 3)).astype(np.float32)
+    pictures = {"target": image, "initial": image, "adjoint": image}
+    naive, ours = kind(32, True, 32, naive_factor, 0.5), kind(32, False, 32, 1.0, 0.5)
+    result = Result(config, plan, "face.heightmap", pictures, naive, ours, many, failing, 6000.0)
+    check(result)
+    return result
+
+
+def test_all_holds_where_it_does(config: Config) -> None:
+    result = pretended(config)
+    assert result.holds, table(result)
+    assert len(result.comparisons) == 3
+
+
+@pytest.mark.parametrize(("planted", "seen"), [(1.2, 2), (0.8, 2)])
+def test_a_planted_difference_of_naive_ad_is_seen(config: Config, planted: float, seen: int) -> None:
+    """In both comparisons with it, and not in that of ours with ours."""
+    result = pretended(config, naive_factor=planted)
+    verdicts = [figures.verdict for figures in result.comparisons.values()]
+    assert verdicts.count(Verdict.FAILS) == seen
+    assert verdicts[-1] is Verdict.HOLDS
+    assert not result.holds
+
+
+def test_noise_that_does_not_fall_is_seen(config: Config) -> None:
+    result = pretended(config, many_factor=1.3)
+    assert result.fall is not None
+    assert result.fall.verdict is Verdict.FAILS
+    assert not result.holds
+
+
+def test_naive_ad_that_fits_is_seen(config: Config) -> None:
+    result = pretended(config, fits=True)
+    assert not result.does_not_fit
+    assert not result.holds
+    assert "fits under the limit: fails" in table(result)
+
+
+def test_the_interval_covers_the_ratio() -> None:
+    """95 of 100 times or so."""
+    random, inside = np.random.default_rng(3), 0
+    for _ in range(200):
+        found = fall(random.normal(size=(16, 40)), random.normal(size=(8, 40)) / 4, 4.0)
+        inside += found.low <= 4 <= found.high
+    assert 0.9 <= inside / 200 <= 0.99
+
+
+def test_a_ratio_of_few_samples_says_nothing() -> None:
+    random = np.random.default_rng(4)
+    assert fall(random.normal(size=(4, 5)), random.normal(size=(4, 5)), 1.0).verdict is Verdict.UNRESOLVED
+
+
+def test_relative_noise_of_known_noise() -> None:
+    samples = 3 + np.random.default_rng(5).normal(size=(400, 300))
+    assert relative_noise(samples) == pytest.approx(1 / 3, rel=0.02)
+    assert relative_noise(samples, np.full(300, 6.0)) == pytest.approx(1 / 6, rel=0.02)
+
+
+def test_what_is_written(config: Config, tmp_path: Path) -> None:
+    result = pretended(config)
+    draw(result, tmp_path / "figure1.png")
+    assert (tmp_path / "figure1.png").read_bytes().startswith(b"\x89PNG")
+    written = json.loads(json.dumps(to_json(result), allow_nan=False))
+    assert written["holds"] is True
+    assert [one["status"] for one in written["gradients"]] == ["ok", "ok", "ok", "out_of_memory"]
+    assert "about 5.9 GiB at 1024 spp" in table(result)
+
+
+@pytest.mark.usefixtures("llvm")
+def test_what_is_compared_has_one_expectation(config: Config) -> None:
+    """Whatever of ours naive AD does not have is left out."""
+    from reslrb_cli.measure.held import Held, comparable
+
+    y, x = np.mgrid[0:16, 0:16] / 16
+    adjoint = np.repeat((np.sin(5 * x) * np.cos(4 * y) + 1.5)[:, :, None], 3, 2).astype(np.float32)
+
+    def samples(config: Config, first: int) -> np.ndarray:
+        held = Held(config, adjoint)
+        return np.stack([held.gradient(first + k, 64).ravel() for k in range(16)]).astype(np.float64)
+
+    options = comparable(config, False).integrator.options()
+    assert (options["filter_normalization"], options["attached_sampling"]) == ("detached", "follow")
+    ours, naive = samples(comparable(config, False), 100), samples(comparable(config, True), 200)
+    family = Family(1, entry_count((8, 8, 1)))
+    figures = compare_expectations(ours, naive, family, shape=(8, 8, 1), paired=False)
+    assert figures.verdict is Verdict.HOLDS, figures
+
+
+@pytest.mark.usefixtures("llvm")
+def test_a_process_ends_by_its_limit(tmp_path: Path) -> None:
+    """It loads the scene, and has no room for the paths of a sample count that naive AD keeps."""
+    np.save(tmp_path / "adjoint.npy", np.ones((16, 16, 3), np.float32))
+    kind = Kind("naive AD", 2**16, True)
+    assert _sample(kind, 1, load(CONFIG, SMALL), Plan(limit=3 << 29), tmp_path) == "face.heightmap"
+    assert kind.end is not None
+    assert kind.end.status is BenchStatus.OUT_OF_MEMORY
+    assert kind.samples is None
+
+
+@pytest.mark.parametrize(
+    ("setting", "key"),
+    [
+        ("variant=cuda_ad_rgb", "variant"),
+        ("integrator.estimator=auto", "integrator.estimator"),
+        ("integrator={type: prb}", "integrator.estimator"),
+        ("integrator.max_depth=-1", "integrator.max_depth"),
+        ("parameters=[{key: face.vertex_positions}]", "parameters"),
+    ],
+)
+def test_what_it_cannot_show_is_refused(tmp_path: Path, setting: str, key: str) -> None:
+    with pytest.raises(ConfigError, match=key):
+        measure(load(CONFIG, [setting]), Plan(), tmp_path, lambda line: None)
