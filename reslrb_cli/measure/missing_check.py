@@ -72,8 +72,8 @@ class MissingCheck:
             if enough:
                 break
             found.take(self.case, self._tracer, self._differenced, seed, self.spp, self._step)
-        share = found.share() or (None, None)
-        return MissingRecord(self.source, key, *share, len(found.directions), found.count)
+        share, error = found.share() or (None, None)
+        return MissingRecord(self.source, key, share, error, len(found.directions), found.count)
 
     def _step(self, integrator: Any, scene: Any, sensor: Any, _objective: Any, **options: Any) -> Any:
         return known_step(integrator, scene, sensor, self.case.adjoint, **options)
