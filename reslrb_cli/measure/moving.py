@@ -11,8 +11,10 @@ from reslrb_cli.scene.catalog import parameter_kind
 
 #: How far the largest step of finite differences moves things, relative to their size, in units of the step.
 REACH = 0.1
-#: The same of a turn, in degrees, and of a heightmap, relative to the scene's size.
-TURN, RELIEF = 10.0, 0.02
+#: The same of a heightmap, relative to the scene's size.
+RELIEF = 0.02
+#: The same of what makes up a motion: a turn is in degrees; None stands for `REACH` of the scene's size.
+UNITS = {"translation": None, "rotation": 10.0, "scale": REACH}
 #: Waves that have room in what is displaced, at most.
 WAVES = 1.5
 
@@ -55,12 +57,12 @@ def smooth_rows(key: str, value: Any, extent: float, count: int, seed: int = 3) 
             wave = _waves(points / (size or 1.0), random)
             towards = random.normal(size=3)
             row = REACH * size * wave[:, None] * towards / np.linalg.norm(towards)
-        elif len(shape) >= 2:
+        elif name not in UNITS and len(shape) >= 2:
             grid = np.stack(np.meshgrid(*(np.linspace(0, 1, n) for n in shape[:2]), indexing="ij"), -1)
             wave = _waves(grid.reshape(-1, 2), random).reshape(shape[:2])
             row = RELIEF * extent * np.broadcast_to(wave.reshape(*shape[:2], *(1 for _ in shape[2:])), shape)
         else:
-            unit = {"rotation": TURN, "scale": REACH}.get(name, REACH * extent)
+            unit = UNITS.get(name) or REACH * extent
             row = unit * random.uniform(0.5, 1, shape) * random.choice([-1.0, 1.0], shape)
         found.append(np.ravel(row))
     return found

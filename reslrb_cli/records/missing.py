@@ -8,6 +8,8 @@ from dataclasses import asdict, dataclass
 
 #: Standard errors within which a share counts as none.
 NOTHING = 3
+#: A share that single precision may have made.
+LEAST = 1e-4
 
 
 @dataclass(frozen=True)
@@ -35,7 +37,7 @@ class MissingRecord:
         if self.share is None or self.standard_error is None:
             return f"{self.parameter}: the derivative itself is less than what {self.seeds} seeds could see"
         figures = f"{_percent(self.share)} +- {_percent(self.standard_error)}"
-        if self.share < NOTHING * self.standard_error:
+        if self.share <= max(NOTHING * self.standard_error, LEAST):
             return f"{self.parameter}: nothing is missing that {self.seeds} seeds could see ({figures})"
         return (
             f"{self.parameter}: {figures} of the derivative is missing (silhouettes, edges of shadows, light that "

@@ -241,6 +241,18 @@ def test_a_step_has_the_truncation_error_that_it_says():
             assert chosen.truncation < 1e-3 * abs(exact)
 
 
+def test_a_step_that_is_lost_in_rounding_is_not_taken():
+    """Rounding of the scene, the same for all seeds, is no truncation: it grows as the step shrinks."""
+
+    class Rounded:
+        def difference(self, _integrator, _vector, seed, _spp, step, _sides):
+            return 1 + step**2 + 1e-5 / step + 1e-6 * np.random.default_rng(seed).normal()
+
+    [first] = directions(Case(room(), ["side.brdf_0.reflectance.value"]), "side.brdf_0.reflectance.value", (0, 1), 1)
+    chosen = choose_step(Rounded(), None, first, (1, 2, 3), 64)  # type: ignore[arg-type]
+    assert chosen.step == 0.01
+
+
 def test_directions_stay_within_the_bounds():
     key = "floor.brdf_0.reflectance.value"
     scene = Case(room(floor={"type": "twosided", "bsdf": diffuse(0, 0.5, 1)}), [key])

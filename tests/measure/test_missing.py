@@ -1,0 +1,226 @@
+"""The share of a derivative that attached gradients lack, where it is known."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import drjit as dr
+import numpy as np
+import pytest
+from measure.faults import room
+
+from reslrb_cli.cli import main
+from reslrb_cli.errors import ConfigError
+from reslrb_cli.integrators import gradient_step
+from reslrb_cli.measure.analytic import fresnel
+from reslrb_cli.measure.analytic_motion import centre_of_gravity, parallel
+from reslrb_cli.measure.attached.amplitudes import Pose
+from reslrb_cli.measure.attached.glass import setting
+from reslrb_cli.measure.attached.scene import AttachedScene
+from reslrb_cli.measure.differences import Direction
+from reslrb_cli.measure.gradients import Case, integrator, seeds
+from reslrb_cli.measure.missing import Missing
+from reslrb_cli.measure.missing_check import MissingCheck
+from reslrb_cli.measure.small_scenes import transform
+from reslrb_cli.records.missing import LEAST, NOTHING, MissingRecord
+from reslrb_cli.transport.splat import AdjointImage
+
+HALF, EDGE, HEIGHT, TILT, IOR, SLAB = 0.6, 0.2, 1.4, 0.5, 1.5, 0.3
+SPP, SEEDS = 64, 24
+
+
+@pytest.fixture(autouse=True)
+def _quiet(llvm: str) -> None:
+    import mitsuba as mi
+
+    mi.set_log_level(mi.LogLevel.Error)
+
+
+def missing(case: Case, along: list[Direction], options: dict, count: int = SEEDS) -> Missing:
+    found = Missing.of(case, integrator("walk_ad", **options), along, SPP)
+    tracer = integrator("reslrb", **options, estimator="stack")
+    for seed in seeds(count):
+        found.take(case, tracer, integrator("walk_ad", **options), seed, SPP, gradient_step)
+    return found
+
+
+def share(scene: AttachedScene) -> tuple[float, float]:
+    """Along the scene's one amplitude, of the centre of gravity of the light that lands."""
+    case = scene.case()
+    case.weigh(centre_of_gravity())
+    found = missing(case, [Direction(np.ones(1), "both")], dict(scene.options)).share()
+    assert found is not None
+    print(scene.name, found)
+    return found
+
+
+def half_covered(moved: str) -> AttachedScene:
+    """A black sheet over one part of a parallel beam, from x = -HALF to EDGE of -HALF to HALF; either can move."""
+    cover = {"type": "rectangle", "bsdf": {"type": "diffuse", "reflectance": 0.0},
+             "to_world": transform(translate=[EDGE - 1, HEIGHT, 0], rotate=([1, 0, 0], -90), scale=1)}  # fmt: skip
+    return AttachedScene(
+        f"half_covered, {moved}", "a black sheet in a parallel beam",
+        lambda: setting(lamp=parallel(HALF, 0, 3, 10.0), cover=cover),
+        lambda scene: [Pose(f"{moved}.to_world", ("tx",), (0, 0, 0))], options={"max_depth": 2},
+    )  # fmt: skip
+
+
+def slab_in_a_beam() -> AttachedScene:
+    """A tilted surface of glass narrower than the beam, over a receiver in the glass: light passes by its edges."""
+    glass = {"type": "dielectric", "int_ior": IOR, "ext_ior": 1.0}
+    place = transform(translate=[0, HEIGHT, 0]) @ transform(rotate=([0, 0, 1], float(np.rad2deg(TILT))))
+    size = transform(rotate=([1, 0, 0], -90), scale=[SLAB, 2, 1])
+    return AttachedScene(
+        "slab_in_a_beam", "a beam on a narrower surface of glass",
+        lambda: setting(lamp=parallel(HALF, 0, 3, 10.0),
+                        top={"type": "rectangle", "bsdf": glass, "to_world": place @ size}),
+        lambda scene: [Pose("top.to_world", ("rz",), (0, HEIGHT, 0))], options={"max_depth": 3},
+    )  # fmt: skip
+
+
+def slab_share() -> float:
+    """Of what falls on the surface, SLAB cos(tilt) each way of its middle, (1 - R) passes, displaced by H tan(a)."""
+
+    def displaced(tilt: float) -> float:
+        away = tilt - np.arcsin(np.sin(tilt) / IOR)
+        return float((1 - fresnel(np.array(tilt), IOR)) * HEIGHT * np.tan(away))
+
+    h = 1e-5
+    inside = np.cos(TILT) * (displaced(TILT + h) - displaced(TILT - h)) / (2 * h)
+    border = -np.sin(TILT) * displaced(TILT)
+    return float(abs(border / (inside + border)))
+
+
+def test_a_texture_lacks_nothing():
+    """Neither do colours: nothing moves."""
+    config = room("lamp_over_floor.xml", "floor.bsdf.reflectance.value")
+    check = MissingCheck(config, 0, 6, 16, 2)
+    [record] = check.run(lambda: False)
+    print(record)
+    assert record.share is not None
+    assert record.standard_error is not None
+    assert record.share <= max(NOTHING * record.standard_error, LEAST)
+    assert record.standard_error < 1e-3
+    assert "nothing is missing" in record.line()
+
+
+@pytest.mark.parametrize(
+    ("scene", "known"),
+    [
+        # The beam's right end brings HALF, of which what lands already brings its own width.
+        (lambda: half_covered("lamp"), EDGE / HALF),
+        (lambda: half_covered("cover"), 1.0),
+        (slab_in_a_beam, slab_share()),
+    ],
+    ids=["lamp", "cover", "slab"],
+)
+def test_known_shares(scene: Callable[[], AttachedScene], known: float):
+    found, error = share(scene())
+    assert error < 0.03 * known, "too noisy to see a fault"
+    assert abs(found - known) < 4 * error + 1e-9
+
+
+def test_a_fault_is_seen(monkeypatch: pytest.MonkeyPatch):
+    """Of a gradient without what lands elsewhere, that is missing too."""
+    right = AdjointImage.lookup
+    monkeypatch.setattr(AdjointImage, "lookup", lambda self, u, *a, **k: right(self, dr.detach(u), *a, **k))
+    found, error = share(half_covered("lamp"))
+    assert abs(found - EDGE / HALF) > 10 * error
+
+
+def test_steps_that_are_lost_in_rounding():
+    """Rounding that is the same for all seeds is seen in how the extrapolation changes."""
+
+    class Rounded:
+        """A smooth objective, wrong by 1e-4 at random, though the same for all seeds."""
+
+        def difference(self, _integrator, vector, seed, _spp, step, _sides):
+            noise = np.random.default_rng(seed).normal(scale=1e-5)
+            at = [np.sin(3 * s) + 2 * s + 1e-4 * np.sin(1e6 * s) for s in (step, -step)]
+            return (at[0] - at[1]) / (2 * step) + noise
+
+    found = Missing.of(Rounded(), None, [Direction(np.ones(1), "both")], 1)  # type: ignore[arg-type]
+    assert 0.005 < found.directions[0].step < 0.05
+
+
+def test_what_is_lost_in_noise_has_no_share():
+    random = np.random.default_rng(0)
+    found = Missing([Direction(np.ones(2), "both")] * 2)
+    for _ in range(16):
+        found.ours.append(random.normal(size=2))
+        found.differences.append(random.normal(size=(3, 2)))
+    assert found.share() is None
+    line = MissingRecord("a.yaml", "lamp.position", None, None, 2, 16).line()
+    assert line == "lamp.position: the derivative itself is less than what 16 seeds could see"
+
+
+def test_errors_are_right():
+    """Over many made measurements, the deviation from the known share is of the size of the stated error."""
+    random, z = np.random.default_rng(1), []
+    for _ in range(300):
+        found = Missing([Direction(np.ones(3), "both")] * 3)
+        for _ in range(12):
+            common = random.normal(scale=0.3, size=3)
+            found.ours.append(np.array([1.0, 2.0, 0.5]) + common)
+            exact = np.array([1.5, 2.0, 1.0]) + common + random.normal(scale=0.05, size=3)
+            found.differences.append(np.tile(exact, (3, 1)))
+        share, error = found.share() or (0, 1)
+        z.append((share - np.sqrt(0.5 / 7.25)) / error)
+    assert abs(np.mean(z)) < 0.3
+    assert 0.8 < np.std(z) < 1.3
+
+
+def call(*args: str) -> int:
+    with pytest.raises(SystemExit) as ended:
+        main(["gradcheck", *args], prog_name="reslrb")
+    return int(ended.value.code or 0)
+
+
+LAMP = """
+scene: {{file: {folder}/lamp_over_floor.xml}}
+target: {{render: {{spp: 64, parameters: {{lamp.position: [0.2, 0.9, 0.1]}}}}}}
+parameters: [{{key: lamp.position}}]
+integrator: {{type: reslrb, max_depth: 2}}
+optimizer: {{type: adam, learning_rate: 0.01}}
+run: {{iterations: 3, spp: 16}}
+"""
+
+
+def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    config = tmp_path / "lamp.yaml"
+    config.write_text(LAMP.format(folder=Path(__file__).parent))
+    lines = tmp_path / "missing.jsonl"
+    assert call(str(config), "--missing", "--seeds", "6", "--directions", "2", "--json", str(lines)) == 0
+    [row] = [json.loads(line) for line in lines.read_text().splitlines()]
+    assert (row["kind"], row["parameter"], row["directions"], row["seeds"]) == ("missing", "lamp.position", 2, 6)
+    shown = capsys.readouterr().out.splitlines()
+    assert shown[-1].startswith("lamp.position: ")
+    assert "dL/dI of the loss at the initial values" in shown[-2]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--missing"], "--missing: needs a CONFIG"),
+        (["CONFIG", "--missing", "--estimators", "stack"], "--estimators: does not go with --missing"),
+        (["CONFIG", "--missing", "--markdown", "a.md"], "--markdown: does not go with --missing"),
+        (["CONFIG", "--directions", "2"], "--directions: goes with --missing alone"),
+    ],
+)
+def test_what_does_not_go_together(
+    arguments: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    config = tmp_path / "lamp.yaml"
+    config.write_text(LAMP.format(folder=Path(__file__).parent))
+    assert call(*[str(config) if argument == "CONFIG" else argument for argument in arguments]) == 2
+    assert message in capsys.readouterr().err
+
+
+def test_a_loss_without_a_derivative():
+    """Without a segment to the floor all images are black."""
+    config = room("lamp_over_floor.xml", "floor.bsdf.reflectance.value")
+    config = config.model_copy(update={"integrator": config.integrator.model_copy(update={"max_depth": 1})})
+    with pytest.raises(ConfigError, match="no derivative"):
+        MissingCheck(config, 0, 2, 16, 1)
