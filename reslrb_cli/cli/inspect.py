@@ -74,7 +74,8 @@ def command(
     --conditioning says how far apart the parameters' sensitivities lie, where they start: of each the root mean square
     of its values, its gradient and the noise of one step's gradient, the relative change of the image and the curvature
     of the loss per unit of the parameter, and the length by which it would have to change to make up the image where it
-    has an effect. `optimizer.scale: auto` makes up for what it shows.
+    has an effect. `optimizer.scale: auto` makes up for what it shows. Where parameters move light, condition numbers of
+    the Jacobians along paths come with it.
     """
     if samples is not None and not conditioning:
         raise click.UsageError("--samples has no effect without --conditioning")
@@ -124,11 +125,15 @@ def command(
     for name in edges:
         echo(f"  silhouettes and shadow edges of {name} are not in its derivatives")
     if measured is not None:
-        from reslrb_cli.report.conditioning_table import conditioning_lines
+        from reslrb_cli.report.conditioning_table import chain_lines, conditioning_lines
 
         echo(f"conditioning ({measured.samples} gradients of {measured.spp} spp, seed {measured.seed})")
         for line in conditioning_lines(measured):
             echo(f"  {line}")
+        if measured.chains:
+            echo("chains of Jacobians, as estimator reservoir inverts them: condition numbers by number of vertices")
+            for line in chain_lines(measured):
+                echo(f"  {line}")
     else:
         echo(f"next: {next_step(subject, summary)}")
     return None
