@@ -104,6 +104,14 @@ def _normalization(plan: Plan) -> Plan | str:
     return replace(plan, attached_normalization=not plan.attached_normalization)
 
 
+def _staying(plan: Plan) -> Plan | str:
+    if not plan.attached:
+        return "nothing moves"
+    if plan.stays:
+        return replace(plan, stays=False, glossy_follows=False)
+    return "all follow" if plan.max_depth <= 2 else replace(plan, stays=True)
+
+
 def _several(plan: Plan) -> Plan | str:
     return "follows from the number of emitters, in Mitsuba itself"
 
@@ -161,6 +169,9 @@ FEATURES = (
             "no BSDF with parameters is", _null),
     Feature("attached derivatives", lambda p: p.attached, "a parameter moves what light leaves from or meets",
             "nothing moves: directions and film positions are constants", _attached),
+    Feature("vertices that stay", lambda p: p.attached and p.stays,
+            "behind diffuse bounces light goes on to the same place, so that edges at rest count",
+            "all follow: nothing that moves is seen behind a diffuse bounce, or attached_sampling: follow", _staying),
     Feature("moving emitters", lambda p: p.moving_emission, "rays have the derivative of where they start",
             "emitters are at rest", _at_rest),
     Feature("moving lamps in view", lambda p: bool(p.visible_moving_lamps),

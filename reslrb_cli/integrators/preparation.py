@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import mitsuba as mi
 
 from reslrb_cli.errors import UnsupportedScene
+from reslrb_cli.integrators.bounces import bounces
 from reslrb_cli.integrators.differentiated import Differentiated, differentiated
 from reslrb_cli.integrators.freezing import Recordings
 from reslrb_cli.integrators.light_tracer import settle
@@ -89,6 +90,7 @@ class Preparation:
         self._plans: dict[int, Plan] = {}
         # BSDFs of its surfaces that use a node, and under None all of them.
         self._owners: dict[mi.Object | None, list[mi.BSDF]] = {}
+        self._bounce: dict[int, bool] = {}  # by sensor
         self._track_zeros = False
         self._renewal: Renewal | None = None
         self.recordings = Recordings()
@@ -114,7 +116,16 @@ class Preparation:
         self._track_zeros |= which.zeros
         only = self._bsdfs(scene, which.bsdf_nodes)
         plan = plan.differentiating(bool(which.bsdf_nodes), which.emission, self._track_zeros, only)
-        return attach(plan, which, self._motion, sensor, SceneGraph.of(scene).surface_bsdfs())
+        plan = attach(plan, which, self._motion, sensor, SceneGraph.of(scene).surface_bsdfs())
+        if plan.stays and self._motion.sampling == "auto" and not self._bounces_in(plan, scene, sensor):
+            return replace(plan, stays=False, glossy_follows=False)
+        return plan
+
+    def _bounces_in(self, plan: Plan, scene: mi.Scene, sensor: mi.Sensor) -> bool:
+        """Whether vertices have to stay. Asked once, since kernels would be compiled anew for another answer."""
+        if sensor.ptr not in self._bounce:
+            self._bounce[sensor.ptr] = bounces(plan, scene, sensor)
+        return self._bounce[sensor.ptr]
 
     def _turn_to(self, scene: mi.Scene) -> None:
         """Forget what was found out about another scene."""
@@ -125,6 +136,7 @@ class Preparation:
             self._scene = (scene.ptr, None if own else scene)
             self._plans.clear()
             self._owners.clear()
+            self._bounce.clear()
             self._renewal = None
             self.recordings.clear()
 

@@ -116,6 +116,6 @@ class Reslrb(LightTracer):
 def _no_attached(estimator: str) -> str:
     able = ", ".join(name for name, kind in ESTIMATORS.items() if kind.attaches)
     return (
-        f"estimator {estimator} has no derivatives of what moves light, which a replay would have to chain through "
-        f"every vertex; take {able}"
+        f"estimator {estimator} has no derivatives of what moves light: it would need the Jacobians that reservoir "
+        f"takes at every vertex, and gain nothing by them; take {able}"
     )

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from reslrb_cli.integrators.preparation import stays
 from reslrb_cli.measure.attached import SCENES, AttachedScene, compare_with_differences
 from reslrb_cli.measure.attached.amplitudes import Move, Pose
 from reslrb_cli.measure.attached.glass import smooth_texture
@@ -116,21 +117,25 @@ def test_where_auto_stays_finite_differences_agree(name: str):
 
 
 @pytest.mark.parametrize(
-    ("bsdf", "sampling", "expected"),
+    ("bsdf", "sampling", "max_depth", "expected"),
     [
-        (WHITE, "auto", (True, False)),
-        (WHITE, "follow", (False, False)),
-        (BRUSHED, "auto", (True, True)),  # the wall is diffuse
-        (BRUSHED, "stay", (True, False)),
+        (WHITE, "auto", 3, (True, False)),
+        (WHITE, "auto", 2, (False, False)),
+        (WHITE, "follow", 3, (False, False)),
+        (BRUSHED, "auto", 3, (False, False)),  # behind the wall, which is diffuse, nothing is seen
+        (BRUSHED, "stay", 3, (True, False)),
     ],
     ids=str,
 )
-def test_what_auto_takes(bsdf: dict[str, Any], sampling: str, expected: tuple[bool, bool]):
+def test_what_auto_takes(bsdf: dict[str, Any], sampling: str, max_depth: int, expected: tuple[bool, bool]):
     import drjit as dr
+    import mitsuba as mi
 
     case = AttachedScene("", "", lambda: lit_wall(bsdf), tilted).case()
-    tracer = integrator("reslrb", 3, estimator="stack", attached_sampling=sampling)
+    tracer = integrator("reslrb", max_depth, estimator="stack", attached_sampling=sampling)
     leaves = case.leaves()
     assert any(dr.grad_enabled(leaf) for leaf in leaves.values())
     plan = tracer.plan(case.scene, case.scene.sensors()[0], case.params)
     assert (plan.stays, plan.glossy_follows) == expected
+    bsdfs = [mi.load_dict(each) for each in (WHITE, BRUSHED)]
+    assert stays(plan, "auto", bsdfs) == (max_depth > 2, max_depth > 2)
