@@ -89,7 +89,7 @@ def test_at_the_edge(name: str):
     edge = EDGES[name]
     moving = Moving(edge.scene(), edge.start, edge.place)
     options = {"hide_emitters": True}
-    ours = moving.gradient(integrator("reslrb", edge.depth, estimator="stack", **options))
+    ours = moving.gradient(integrator("reslrb", edge.depth, estimator="stack", attached_sampling="follow", **options))
     naive = moving.gradient(integrator("walk_ad", edge.depth, attached=True, **options))
     for key, value in ours.items():
         assert np.isfinite(value).all(), key
@@ -135,6 +135,6 @@ def test_the_derivative_of_a_flat_mesh_knows_that_it_will_bend(size: float):
     moving = bending(glass(1.5))
     moving.start["size"] = np.float64(size)
     ours = moving.gradient(integrator("reslrb", 5, estimator="stack", filter_normalization="detached",
-                                      hide_emitters=True))  # fmt: skip
+                                      attached_sampling="follow", hide_emitters=True))  # fmt: skip
     stock = moving.gradient(integrator("ptracer", 5, hide_emitters=True))
     assert relative(ours["size"], stock["size"]) < 1e-3

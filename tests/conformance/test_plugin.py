@@ -211,7 +211,9 @@ def test_one_latent_for_several_sensors(llvm: str):
 
 
 @pytest.mark.parametrize("key", ["floor_shape.to_world", "lamp.to_world", "camera.to_world"])
-@pytest.mark.parametrize(("name", "options"), [("reslrb", {}), ("reslrb", {"estimator": "stack"}), ("walk_ad", {})])
+@pytest.mark.parametrize(
+    ("name", "options"), [("reslrb", {"estimator": "event"}), ("reslrb", {"estimator": "stack"}), ("walk_ad", {})]
+)
 def test_what_moves_is_refused_with_the_reason(name: str, options: dict[str, str], key: str):
     import drjit as dr
 
@@ -220,12 +222,8 @@ def test_what_moves_is_refused_with_the_reason(name: str, options: dict[str, str
     case = Case(_textured(), (FLOOR,))  # its sensor has a box filter
     dr.enable_grad(case.params[key])
     case.params.update()
-    reasons = {"walk_ad": "leave it at auto", "stack": "box filter", "reservoir": "estimator reservoir has no"}
-    reason = (
-        "not of the sensor"
-        if "camera" in key
-        else reasons[options.get("estimator", "reservoir") if name == "reslrb" else name]
-    )
+    reasons = {"walk_ad": "leave it at auto", "stack": "box filter", "event": "estimator event has no"}
+    reason = "not of the sensor" if "camera" in key else reasons[options.get("estimator", name)]
     with pytest.raises(UnsupportedScene, match=reason):
         gradient_step(integrator(name, **options), case.scene, 0, case.objective, seed=1, spp=4)
 

@@ -219,7 +219,7 @@ FAULTS = [
           "dr.dot(following.o, adjoint.origin) + dr.dot(following.d, adjoint.direction)",
           "dr.dot(following.o, adjoint.origin)", by("stack", *MOVED)),
     Fault("throughput_forgotten_on_the_way_back", "wavy_glass", BACK,
-          "dr.backward_from(dr.dot(P, own + later)", "dr.backward_from(dr.dot(mi.Spectrum(1), own + later)",
+          "dr.dot(P, reached * (own + later))", "dr.dot(mi.Spectrum(1), reached * (own + later))",
           by("stack", *MOVED)),
     Fault("film_position_detached", "wavy_glass", BACK,
           "image.lookup(there.u,", "image.lookup(dr.detach(there.u),", by("stack", *MOVED)),

@@ -151,7 +151,7 @@ def test_roughness_alone_stays_detached_unless_asked(tmp_path):
 
 #: Settings, and where the error is and what it holds.
 REFUSED = {
-    "estimator": (["integrator.estimator=reservoir"], "integrator.estimator", "take stack"),
+    "estimator": (["integrator.estimator=event"], "integrator.estimator", "take reservoir, stack"),
     "detached": (["integrator.attached=false"], "integrator.attached", "leave it at auto"),
     "prb": (["integrator={type: prb}"], "integrator.type", "prb has no derivatives of what moves light"),
     "trajectory": (["integrator={type: trajectory}"], "integrator.type", "trajectory has no derivatives"),
@@ -161,7 +161,7 @@ REFUSED = {
     ),
     "alpha by gather": (
         [FLOOR, NO_TRUTH, "integrator={estimator: gather, attached: true}"],
-        "integrator.estimator", "take stack",
+        "integrator.estimator", "take reservoir, stack",
     ),
 }  # fmt: skip
 
