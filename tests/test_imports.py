@@ -27,6 +27,7 @@ ROWS = [
     "measure",
     "report",
     "cli",
+    "__main__",
 ]
 # What a row must not know at all.
 FOREIGN = {
