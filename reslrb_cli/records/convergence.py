@@ -25,9 +25,9 @@ class Range:
 class Method:
     """What was measured: an integrator, and how its steps take their samples.
 
-    `estimator` is None where the integrator has none, `capacity` where the estimator has none; `adjoint` is `run.adjoint`,
-    None where dL/dI is held or nothing is differentiated. `label` is how the user wrote it, `spp` samples per pixel of a
-    step.
+    `estimator` is None where the integrator has none, `capacity` where the estimator has none; `adjoint` is
+    `run.adjoint`, None where dL/dI is held or nothing is differentiated. `label` is how the user wrote it, `spp` are
+    samples per pixel of a step.
     """
 
     label: str
@@ -64,14 +64,14 @@ class PointRecord:
 class MethodRecord:
     """What the points of one method and parameter come to; `repeats` is the number of steps.
 
-    `relative_rmse` is that of one step, from their variance, which takes `step_s` seconds; `cold_s` is the first step in
-    a new process, which compiles. `slope` is d log error / d log seconds. `efficiency` is 1 / (relative variance *
+    `relative_rmse` is that of one step, from their variance, which takes `step_s` seconds; `cold_s` is the first step
+    in a new process, which compiles. `slope` is d log error / d log seconds. `efficiency` is 1 / (relative variance *
     seconds), of a `biased` method with squared bias + variance. `bias_z` is the largest deviation from
     `bias_reference`, in standard errors, `bias_z_limit` what it exceeds by chance with probability 1e-4 anywhere in the
-    table; `bias` its size, relative, where there is one; `biased` is None where the question is open, as `message` says.
-    `independent` says whether that reference shares no code with what it judges. `seconds_to` has for each error (`0.1`,
-    `0.03`, `0.01`) the time until averages are as good, None where a bias keeps them from it; those in `extrapolated` lie
-    beyond the steps that were taken, or below the reference's error. What was not measured is None.
+    table; `bias` its relative size, where there is one; `biased` is None where the question is open, as `message`
+    says. `independent` says whether that reference shares no code with what it judges. `seconds_to` has for each error
+    (`0.1`, `0.03`, `0.01`) the time until averages are as good, None where a bias keeps them from it; those in
+    `extrapolated` lie beyond the steps that were taken, or below the reference's error. What was not measured is None.
     """
 
     method: Method
@@ -103,7 +103,8 @@ class MethodRecord:
 class ReferenceRecord:
     """What errors are taken from: the mean of `repeats` steps, with the relative standard error `reference_rmse`.
 
-    `bias_z` is its own largest deviation from an independent reference, as of a `MethodRecord`; None where there is none.
+    `bias_z` is its own largest deviation from an independent reference, as of a `MethodRecord`; None where there is
+    none.
     """
 
     method: Method

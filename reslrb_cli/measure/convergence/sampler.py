@@ -27,7 +27,8 @@ class Sampler:
     def __init__(self, config: Any, mode: str, arrays: dict[str, np.ndarray]) -> None:
         self.problem, self.mode, self.clock = assemble_scene(config), mode, StepClock()
         self.sensor = self.problem.sensors[0]
-        self.tensors = {name: _tensor(array) for name, array in arrays.items() if name in ("mask", "target")}
+        self.target = _tensor(arrays["target"]) if "target" in arrays else None
+        self.mask = None if arrays["mask"].all() else _tensor(arrays["mask"])
         self.adjoints = [_tensor(array) for array in arrays.get("adjoints", ())]
         self.inside = arrays["mask"] != 0
 
@@ -57,7 +58,7 @@ class Sampler:
             return known_step(problem.integrator, problem.scene, self.sensor, adjoint, spp=spp, **common)
 
         def loss(picture: mi.TensorXf) -> mi.Float:
-            return masked_loss(problem, picture, self.tensors["target"], self.tensors["mask"])
+            return masked_loss(problem, picture, self.target, self.mask)
 
         options = problem.config.step_options() | {"spp": spp}
         return gradient_step(problem.integrator, problem.scene, self.sensor, loss, **options, **common)

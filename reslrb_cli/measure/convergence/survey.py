@@ -12,6 +12,8 @@ import mitsuba as mi
 import numpy as np
 
 from reslrb_cli.config import Config, loads
+from reslrb_cli.integrators import first_channels
+from reslrb_cli.measure.convergence.plan import IMAGES
 from reslrb_cli.measure.moving import moves_light
 from reslrb_cli.measure.participants import ALIKE
 from reslrb_cli.measure.references import Situation, interior, prb_gradient, prb_image, ptracer_gradient, ptracer_image
@@ -22,44 +24,43 @@ from reslrb_cli.scene.catalog import value_shape
 
 #: Light paths of the target, and of all images that dL/dI is held at together.
 PATHS = 2**23
-#: Images of other samples, each with a dL/dI of its own, where the noise of a single one would count as bias.
-IMAGES = 8
 #: The purpose of those images' samples.
 _PURPOSE = "convergence, dL/dI"
 
 
 def begin(first: dict[str, Any]) -> Begun:
-    """Begin the process. The one question names the file that arrays are written to, `out`; its answer is `survey`'s."""
+    """Begin the process. The one question names the file for arrays, `out`; its answer is `survey`'s facts."""
     problem = assemble_scene(loads(first["config"], first["source"]))
 
     def answer(question: dict[str, Any]) -> dict[str, Any]:
-        facts, arrays = survey(problem, first["objective"], question["camera"])
+        facts, arrays = survey(problem, first["objective"], question["camera"], question["named"])
         np.savez(question["out"], **arrays)  # type: ignore[arg-type]
         return facts
 
     return {}, answer
 
 
-def survey(problem: Problem, objective: str, camera: bool) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+def survey(problem: Problem, objective: str, camera: bool, named: bool) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """What is known of a problem, targets not made yet, and arrays that its samples are taken with.
 
     The facts: `keys`, `shapes` of what is estimated (of the parameters, or `image`), `independent` (key to the name of
     a stock integrator, or None), `why` (key to what keeps others from it), `without` (stock integrators that are right
-    for nothing here, with the reason), `masked` (whether pixels along the border are left out), and in words what was
-    rendered, `pictures`. The arrays: `mask` (H, W, 1), and unless the image is the objective `target` (H, W, C) and
-    `adjoints` (B, H, W, C). `camera`: paths from the camera take part, which lose nothing by the film's border.
+    for nothing here, with the reason), `masked` (whether pixels along the border are left out), `pixels`, and in words
+    what was rendered, `pictures`. The arrays: `mask` (H, W, 1), and unless the image is the objective `target` (H, W, C)
+    and `adjoints` (B, H, W, C). `camera`: paths from the camera take part, where they are right or `named`,
+    which lose nothing by the film's border.
     """
     film = problem.scene.sensors()[problem.sensors[0]].film()
     width, height = (int(n) for n in film.crop_size())
     facts = _references(problem, objective)
     inside = np.ones((height, width), bool)
-    if camera or Reference.PRB.value in facts["independent"].values():
+    pixels = width * height
+    if (camera and (named or "prb" not in facts["without"])) or Reference.PRB.value in facts["independent"].values():
         inside = interior((height, width), problem.scene.sensors()[problem.sensors[0]])
     mask = inside[:, :, None].astype(np.float32)
-    facts |= {"masked": not inside.all(), "pictures": ""}
+    facts |= {"masked": not inside.all(), "pictures": "", "pixels": pixels}
     if objective == "image":
         return facts | {"shapes": {"image": [height, width, int(film.base_channels_count())]}}, {"mask": mask}
-    pixels = width * height
     shortened = _shorten_target(problem, pixels)
     make_targets(problem, lambda line: None)
     target = np.array(problem.targets[0])
@@ -77,14 +78,15 @@ def adjoint(problem: Problem, image: np.ndarray, mask: np.ndarray) -> np.ndarray
     """dL/dI (H, W, C) at an image of that shape, the pixels that `mask` (H, W, 1) has as 0 left out of the loss."""
     leaf = mi.TensorXf(image)
     dr.enable_grad(leaf)
-    dr.backward(masked_loss(problem, leaf, problem.targets[0], mi.TensorXf(mask)))
+    dr.backward(masked_loss(problem, leaf, problem.targets[0], None if mask.all() else mi.TensorXf(mask)))
     return np.array(dr.grad(leaf))
 
 
-def masked_loss(problem: Problem, image: mi.TensorXf, target: mi.TensorXf, mask: mi.TensorXf) -> mi.Float:
+def masked_loss(problem: Problem, image: mi.TensorXf, target: mi.TensorXf, mask: mi.TensorXf | None) -> mi.Float:
     """The loss of an attached image (H, W, C): what `mask` (H, W, 1) has as 0 is as the target has it."""
-    channels = int(target.shape[2])
-    return problem.loss(image[:, :, :channels] * mask + target * (1 - mask), target)
+    if mask is None:
+        return problem.compare(image, target)
+    return problem.loss(first_channels(image, target.shape[2]) * mask + target * (1 - mask), target)
 
 
 def _references(problem: Problem, objective: str) -> dict[str, Any]:

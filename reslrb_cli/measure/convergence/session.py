@@ -1,0 +1,235 @@
+"""The processes of a `convergence`, side by side: each compiles, then they take turns, one computing at a time.
+
+A drift of the machine so hits all alike. What errors are taken from takes its turns too, and so does what biases are
+judged by, where it is not among what is compared. All have seeds of their own: no two share noise.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from reslrb_cli.backend.python import python_command
+from reslrb_cli.config import Config, dump
+from reslrb_cli.measure.cases import Case
+from reslrb_cli.measure.contestant import Contestant
+from reslrb_cli.measure.convergence.curves import FEWEST
+from reslrb_cli.measure.convergence.members import Member, Role, share_turns
+from reslrb_cli.measure.convergence.plan import Plan
+from reslrb_cli.measure.pace import Pace
+from reslrb_cli.measure.processes import Process, Stopped
+
+#: What the samples of all together may take in memory, in bytes.
+MEMORY = 2**30
+#: The most rounds.
+MOST_ROUNDS = 256
+#: Share of the budget that is left for the statistics and the picture.
+AFTERWARDS = 0.03
+#: Where all together hold more than this share of the memory, each releases its own after a step.
+MEMORY_SHARE = 0.7
+MIB = 2**20
+#: Light paths of a step of an independent reference, whose samples per pixel are its own: naive AD keeps all paths.
+INDEPENDENT_PATHS = 2**18
+
+#: Starts a process by its first message and the name of what it does, a function of `worker.py`.
+Start = Callable[[dict[str, Any], str], Any]
+
+
+def start_process(first: dict[str, Any], does: str) -> Process:
+    """A process that does what the function `does` of `worker.py` returns."""
+    return Process(first, python_command(f"from reslrb_cli.measure.worker import {does}, run\nrun({does})"))
+
+
+class Session:
+    """Processes under way and what they have sampled; arrays go by way of `folder`, which is the caller's to remove.
+
+    `facts` are the survey's. `judges` has the members that stand for an independent stock integrator, by its name.
+    """
+
+    def __init__(
+        self,
+        plan: Plan,
+        folder: Path,
+        stop: Callable[[], bool],
+        say: Callable[[str], None],
+        start: Start = start_process,
+        now: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self.plan, self.folder, self.members, self.rounds = plan, folder, list[Member](), 0
+        self.facts: dict[str, Any] = {}
+        self.judges: dict[str, Member] = {}
+        self._stop, self._say, self._start, self._now, self._began = stop, say, start, now, now()
+        self._pace = Pace((1 - AFTERWARDS) * plan.budget_s, 1, plan.rounds, now, MOST_ROUNDS)
+        self._warned: set[str] = set()
+
+    def slices(self) -> dict[str, slice]:
+        """Where each parameter (or the image) stands in a sample."""
+        found, at = {}, 0
+        for key, shape in self.facts["shapes"].items():
+            size = int(np.prod(shape, dtype=int))
+            found[key] = slice(at, at + size)
+            at += size
+        return found
+
+    def of(self, role: Role) -> list[Member]:
+        """The members of one role."""
+        return [member for member in self.members if member.role is role]
+
+    def run(self) -> Iterator[int]:
+        """Measure; yield the number of rounds whenever it has doubled. Ends early, with what is done, once `stop()`.
+
+        Raises Refused where what may not be left out cannot begin, and Ended where the survey does.
+        """
+        self._pace.begin_depth()
+        try:
+            if self._survey():
+                self._begin()
+                self._warm_up()
+                yield from self._take_turns()
+        except Stopped:
+            return
+        finally:
+            for member in self.members:
+                member.process.close()
+        self._say_what_it_takes()
+
+    # --- before the rounds --------------------------------------------------------------------------------------------
+
+    def _first(self, config: Config) -> dict[str, Any]:
+        return {"config": dump(config), "source": str(config.source), "variant": self.plan.variant,
+                "memory_limit": self.plan.memory_limit, "arrays": str(self.folder / "arrays.npz")}  # fmt: skip
+
+    def _survey(self) -> bool:
+        """Ask what stands as a reference, and have dL/dI made; False where time is up over it."""
+        plan = self.plan
+        first = self._first(plan.reference_config) | {"objective": plan.objective}
+        surveyor = Contestant(self._start(first, "surveyed"), False)
+        try:
+            opening = surveyor.answer(self._stop, self._pace.over)
+            self._warn(opening)
+            camera = any(case.type == "prb" for case in plan.cases)
+            question = {"out": first["arrays"], "camera": camera, "named": not plan.default}
+            answer = None if opening is None else surveyor.ask(question, self._stop, self._pace.over)
+        finally:
+            surveyor.process.close()
+        if surveyor.end is not None:
+            raise surveyor.end
+        self.facts = answer or {}
+        if answer is None:
+            self._say(
+                f"the budget of {plan.budget_s:g} s was spent before dL/dI was known; allow several times as much"
+            )
+        return answer is not None
+
+    def _begin(self) -> None:
+        plan, facts = self.plan, self.facts
+        for case in plan.cases:
+            reason = facts["without"].get(case.type)
+            if plan.default and reason is not None:
+                self._say(f"left out: {case.label}: {reason}")
+                continue
+            self._add(Role.CASE, case, plan.config_of(case), plan.objective)
+        self._add(Role.REFERENCE, plan.reference, plan.reference_config, self._noise_free)
+        for name in dict.fromkeys(name for name in facts["independent"].values() if name is not None):
+            config = plan.independent_config(name)
+            same = [] if plan.objective == "loss" else [m for m in self.of(Role.CASE) if m.config == config]
+            self.judges[name] = (
+                same[0] if same else self._add(Role.INDEPENDENT, Case(name, name, {}), config, self._noise_free)
+            )
+        for key, reason in facts["why"].items():
+            if facts["independent"][key] is None:
+                self._say(f"{key}: no independent reference ({reason}); biases are judged by {plan.reference.label}")
+
+    @property
+    def _noise_free(self) -> str:
+        return "image" if self.plan.objective == "image" else "fixed"
+
+    def _add(self, role: Role, case: Case, config: Config, objective: str) -> Member:
+        plan, number, spp = self.plan, len(self.members), config.run.spp
+        if role is Role.INDEPENDENT and config.integrator.options().get("samples_per_pass") is None:
+            spp = min(spp, max(INDEPENDENT_PATHS // self.facts["pixels"], 1))
+        first = self._first(config) | {
+            "mode": {"fixed": "known"}.get(objective, objective),
+            "purpose": f"convergence, {role.value} {case.label}",
+        }
+        member = Member(
+            process=self._start(first, "sampled_steps"),
+            may_refuse=role is Role.INDEPENDENT or (role is Role.CASE and plan.default),
+            role=role,
+            method=plan.method(case, config, spp, objective != "loss"),
+            config=config,
+            spp=spp,
+            out=self.folder / f"steps-{number}.npy",
+        )
+        self.members.append(member)
+        return member
+
+    def _warm_up(self) -> None:
+        for member in self.members:
+            self._warn(member.answer(self._stop, self._pace.over))
+        for member in self.members:
+            warm = member.alive and member.warm_up(self._tight(), self._stop, self._pace.over)
+            if member.refusal is not None:
+                self._say(f"left out: {member.label}: {member.refusal}")
+            elif member.end is not None:
+                self._say(f"{member.label}: {member.end.status.value}: {member.end.reason}")
+            elif warm and member.cold is not None:
+                what = "" if member.role is Role.CASE else f" ({member.role.value})"
+                took = (
+                    f"first step {member.cold_s:.1f} s, then {member.step_s:.3g} s, {member.cold['peak_mib']:.0f} MiB"
+                )
+                self._say(f"{member.label}{what}: {took}")
+        share_turns([member for member in self.members if member.alive])
+
+    def _tight(self) -> bool:
+        held = sum(member.cold["peak_mib"] for member in self.members if member.cold is not None and member.alive) * MIB
+        return held > MEMORY_SHARE * self.plan.memory
+
+    def _warn(self, opening: dict[str, Any] | None) -> None:
+        for line in (opening or {}).get("warnings", ()):
+            if line not in self._warned:  # every process loads the same scene
+                self._warned.add(line)
+                self._say(line)
+
+    # --- the rounds ---------------------------------------------------------------------------------------------------
+
+    def _take_turns(self) -> Iterator[int]:
+        alive = [member for member in self.members if member.alive]
+        if not any(member.role is Role.CASE for member in alive) or not any(
+            member.role is Role.REFERENCE for member in alive
+        ):
+            return
+        size = sum(int(np.prod(shape, dtype=int)) for shape in self.facts["shapes"].values())
+        most = max(MEMORY // (4 * size * sum(member.count for member in alive)), FEWEST + 1)
+        tight = self._tight()
+        self._pace.begin_rounds()
+        while alive and self.rounds < most and self._pace.another(self.rounds):
+            start = self.rounds % len(alive)
+            for member in alive[start:] + alive[:start]:
+                member.turn(self.rounds, tight, self._stop)
+            self.rounds += 1
+            alive = [member for member in self.members if member.alive]
+            if self.rounds >= 4 and self.rounds & (self.rounds - 1) == 0:
+                yield self.rounds
+
+    def _say_what_it_takes(self) -> None:
+        """Where the budget did not suffice for figures: what it would take."""
+        late = [member.label for member in self.members if member.late]
+        if self.rounds >= FEWEST and not late:
+            return
+        spent = self._now() - self._began
+        if late:
+            self._say(f"not measured: {', '.join(late)}: the budget of {self.plan.budget_s:g} s was spent")
+        elif self.rounds == 0:
+            return
+        begun = [member.cold_s for member in self.members if member.cold_s is not None]
+        if not begun or (self.plan.rounds is not None and not late):
+            return
+        round_s = sum(member.count * member.step_s for member in self.members if member.step_s)
+        share = len(self.members) / (len(self.members) - len(late)) if len(late) < len(self.members) else 2.0
+        needed = share * (spent - self.rounds * round_s + FEWEST * round_s) / (1 - AFTERWARDS)
+        self._say(f"{self.rounds} rounds were taken, figures need {FEWEST}; allow about {needed:.0f} s with --budget")
