@@ -22,8 +22,8 @@ DEFAULTS = {
 REFERENCE = "reslrb:stack"
 #: A depth at which roulette never begins.
 NEVER = 1_000_000
-#: Images that dL/dI is held at in turn where the loss is the configuration's: the noise of a single one would look like a
-#: bias of those that take dL/dI from images of their own.
+#: Images that dL/dI is held at in turn where the loss is the configuration's: the noise of a single one would look like
+#: a bias of those that take dL/dI from images of their own.
 IMAGES = 8
 #: All parameters together.
 ALL = "all"

@@ -46,9 +46,9 @@ def survey(problem: Problem, objective: str, camera: bool, named: bool) -> tuple
     The facts: `keys`, `shapes` of what is estimated (of the parameters, or `image`), `independent` (key to the name of
     a stock integrator, or None), `why` (key to what keeps others from it), `without` (stock integrators that are right
     for nothing here, with the reason), `masked` (whether pixels along the border are left out), `pixels`, and in words
-    what was rendered, `pictures`. The arrays: `mask` (H, W, 1), and unless the image is the objective `target` (H, W, C)
-    and `adjoints` (B, H, W, C). `camera`: paths from the camera take part, where they are right or `named`,
-    which lose nothing by the film's border.
+    what was rendered, `pictures`. The arrays: `mask` (H, W, 1), and unless the image is the objective `target` (of
+    shape (H, W, C)) and `adjoints` (B, H, W, C). `camera`: paths from the camera take part, where they are right or
+    `named`, which lose nothing by the film's border.
     """
     film = problem.scene.sensors()[problem.sensors[0]].film()
     width, height = (int(n) for n in film.crop_size())
