@@ -128,7 +128,7 @@ def closing_sentence(records: Sequence[MethodRecord]) -> str:
             sentence += f"; not told apart from it: {names}"
         beaten = next((record for record in sound[1:] if record not in level), None)
         if beaten is not None:
-            sentence += f", {_times(best, beaten)} times as efficient as {beaten.method.label}"
+            sentence += f"; {_times(best, beaten)} times as efficient as {beaten.method.label}"
     sentence += "."
     if biased and _efficiency(biased[0]) > _efficiency(best):
         first = biased[0]

@@ -15,13 +15,15 @@ import numpy as np
 
 from reslrb_cli.backend.python import python_command
 from reslrb_cli.config import Config, dump
+from reslrb_cli.errors import ExitCode
 from reslrb_cli.measure.cases import Case
 from reslrb_cli.measure.contestant import Contestant
 from reslrb_cli.measure.convergence.curves import FEWEST
 from reslrb_cli.measure.convergence.members import Member, Role, share_turns
 from reslrb_cli.measure.convergence.plan import Plan
 from reslrb_cli.measure.pace import Pace
-from reslrb_cli.measure.processes import Process, Stopped
+from reslrb_cli.measure.processes import Process, Refused, Stopped
+from reslrb_cli.records.bench import BenchStatus
 
 #: What the samples of all together may take in memory, in bytes.
 MEMORY = 2**30
@@ -82,7 +84,7 @@ class Session:
     def run(self) -> Iterator[int]:
         """Measure; yield the number of rounds whenever it has doubled. Ends early, with what is done, once `stop()`.
 
-        Raises Refused where what may not be left out cannot begin, and Ended where the survey does.
+        Raises Refused where what may not be left out cannot begin.
         """
         self._pace.begin_depth()
         try:
@@ -112,12 +114,19 @@ class Session:
             opening = surveyor.answer(self._stop, self._pace.over)
             self._warn(opening)
             camera = any(case.type == "prb" for case in plan.cases)
-            question = {"out": first["arrays"], "camera": camera, "named": not plan.default}
+            ask = {
+                "camera": camera,
+                "named": not plan.default,
+                "budget_s": plan.budget_s if plan.rounds is None else None,
+            }
+            question = {"out": first["arrays"], "ask": ask}
             answer = None if opening is None else surveyor.ask(question, self._stop, self._pace.over)
         finally:
             surveyor.process.close()
         if surveyor.end is not None:
-            raise surveyor.end
+            memory = surveyor.end.status is BenchStatus.OUT_OF_MEMORY
+            line = f"--reference {plan.reference.label}: {surveyor.end.reason}"
+            raise Refused(line, ExitCode.OUT_OF_MEMORY if memory else ExitCode.CHECK_FAILED)
         self.facts = answer or {}
         if answer is None:
             self._say(

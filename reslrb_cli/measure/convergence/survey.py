@@ -5,6 +5,7 @@ Runs in a process of its own (`worker.py`), with the integrator that errors are 
 
 from __future__ import annotations
 
+import time
 from typing import Any
 
 import drjit as dr
@@ -22,8 +23,14 @@ from reslrb_cli.optimization.problem import Problem, assemble_scene, make_target
 from reslrb_cli.records.gradcheck import Reference
 from reslrb_cli.scene.catalog import value_shape
 
-#: Light paths of the target, and of all images that dL/dI is held at together.
-PATHS = 2**23
+#: Light paths of the target, and of all images that dL/dI is held at together, where time does not count.
+PATHS = {"fixed": 2**21, "loss": 2**23}
+#: The most of them where it does.
+MOST_PATHS = 2**24
+#: Share of the time that they may take, target and images.
+SHARE = {"fixed": 0.1, "loss": 0.25}
+#: Light paths that their speed is measured with.
+TRIAL = 2**16
 #: The purpose of those images' samples.
 _PURPOSE = "convergence, dL/dI"
 
@@ -33,14 +40,16 @@ def begin(first: dict[str, Any]) -> Begun:
     problem = assemble_scene(loads(first["config"], first["source"]))
 
     def answer(question: dict[str, Any]) -> dict[str, Any]:
-        facts, arrays = survey(problem, first["objective"], question["camera"], question["named"])
+        facts, arrays = survey(problem, first["objective"], **question["ask"])
         np.savez(question["out"], **arrays)  # type: ignore[arg-type]
         return facts
 
     return {}, answer
 
 
-def survey(problem: Problem, objective: str, camera: bool, named: bool) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+def survey(
+    problem: Problem, objective: str, camera: bool, named: bool, budget_s: float | None
+) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """What is known of a problem, targets not made yet, and arrays that its samples are taken with.
 
     The facts: `keys`, `shapes` of what is estimated (of the parameters, or `image`), `independent` (key to the name of
@@ -48,7 +57,7 @@ def survey(problem: Problem, objective: str, camera: bool, named: bool) -> tuple
     for nothing here, with the reason), `masked` (whether pixels along the border are left out), `pixels`, and in words
     what was rendered, `pictures`. The arrays: `mask` (H, W, 1), and unless the image is the objective `target` (of
     shape (H, W, C)) and `adjoints` (B, H, W, C). `camera`: paths from the camera take part, where they are right or
-    `named`, which lose nothing by the film's border.
+    `named`, which lose nothing by the film's border; `budget_s` is the time of the whole measurement, if it counts.
     """
     film = problem.scene.sensors()[problem.sensors[0]].film()
     width, height = (int(n) for n in film.crop_size())
@@ -61,11 +70,12 @@ def survey(problem: Problem, objective: str, camera: bool, named: bool) -> tuple
     facts |= {"masked": not inside.all(), "pictures": "", "pixels": pixels}
     if objective == "image":
         return facts | {"shapes": {"image": [height, width, int(film.base_channels_count())]}}, {"mask": mask}
-    shortened = _shorten_target(problem, pixels)
+    paths = PATHS[objective] if budget_s is None else _affordable(problem, pixels, SHARE[objective] * budget_s / 2)
+    shortened = _shorten_target(problem, paths // pixels)
     make_targets(problem, lambda line: None)
     target = np.array(problem.targets[0])
     count = IMAGES if objective == "loss" else 1
-    spp = _multiple(PATHS // (count * pixels), problem.samples_per_pass)
+    spp = _multiple(paths // (count * pixels), problem.samples_per_pass)
     adjoints = []
     for number in range(count):
         image = problem.render(problem.sensors[0], spp, number, _PURPOSE)
@@ -127,13 +137,24 @@ def _unlike(config: Config) -> str | None:
     return "its attached derivatives are those of " + ", ".join(f"{name}: {value}" for name, value in alike.items())
 
 
-def _shorten_target(problem: Problem, pixels: int) -> str:
-    """Bound the samples of a target that has to be rendered; returns what to say of it."""
+def _affordable(problem: Problem, pixels: int, seconds: float) -> int:
+    """So many light paths take so long: a power of 2, so that machines of about the same speed have the same images."""
+    spp = _multiple(TRIAL // pixels, problem.samples_per_pass)
+    for _ in range(2):  # the first one compiles
+        began = time.perf_counter()
+        problem.render(problem.sensors[0], spp, 0, "convergence, trial")
+        taken = time.perf_counter() - began
+    paths = pixels * spp * seconds / max(taken, 1e-6)
+    return 2 ** int(np.log2(np.clip(paths, TRIAL, MOST_PATHS)))
+
+
+def _shorten_target(problem: Problem, most: int) -> str:
+    """Bound the samples per pixel of a target that has to be rendered; returns what to say of it."""
     render = problem.config.target.render
     if render is None:
         return ""
     own = (render.integrator or problem.config.integrator).options().get("samples_per_pass")
-    spp = _multiple(PATHS // pixels, own)
+    spp = _multiple(most, own)
     if spp >= render.spp:
         return ""
     target = problem.config.target.model_copy(update={"render": render.model_copy(update={"spp": spp})})
