@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -61,6 +62,7 @@ def command(
     the size of what is estimated; a slope of -1/2 is what independent samples have. Efficiency is 1 / (relative
     variance * seconds). Ctrl-C keeps what is done. docs/convergence.md explains the columns.
     """
+    began = time.monotonic()
     from reslrb_cli.backend.device import device_name, memory_bytes
     from reslrb_cli.backend.installation import load_packages
     from reslrb_cli.backend.variant import choose
@@ -98,7 +100,7 @@ def command(
     plan.check()
     where = f"{device_name(variant)}, {variant}"
     echo(where)
-    results, conditions, interrupted = _run(plan, json_file)
+    results, conditions, interrupted = _run(plan, json_file, began)
     if plot_file is not None and results.points:
         from reslrb_cli.report.convergence_plot import plot_convergence
 
@@ -107,7 +109,7 @@ def command(
     return ExitCode.INTERRUPTED if interrupted else _exit_code(results)
 
 
-def _run(plan: Plan, json_file: Path | None) -> tuple[Results, str, bool]:
+def _run(plan: Plan, json_file: Path | None, began: float) -> tuple[Results, str, bool]:
     """Measure, print and write; returns the results, the conditions in words, and whether the user interrupted."""
     import shutil
     import tempfile
@@ -130,7 +132,7 @@ def _run(plan: Plan, json_file: Path | None) -> tuple[Results, str, bool]:
             shutil.rmtree(folder, ignore_errors=True)
 
         interrupts = stack.enter_context(Interrupts(last_act=tidy))
-        session = Session(plan, folder, lambda: interrupts.requested, echo)
+        session = Session(plan, folder, lambda: interrupts.requested, echo, spent_s=time.monotonic() - began)
         table: Table | None = None
         for rounds in session.run():
             if table is None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -92,6 +92,10 @@ class Judgement:
             if member.refusal is not None:
                 continue
             for key, place in self._places().items():
+                if key == ALL and len(self._slices) == 1:  # all there is
+                    methods.append(replace(methods[-1], parameter=ALL))
+                    points += [replace(point, parameter=ALL) for point in points if point.method == member.method]
+                    continue
                 methods.append(self._method(member, key, place, judged.get(member.label, {}).get(key, _Bias()), own))
                 points += self._points(member, key, place)
         stood = [self._stood(references[0], key, own[key]) for key in self._places()] if self.ready else []

@@ -29,8 +29,8 @@ from reslrb_cli.records.bench import BenchStatus
 MEMORY = 2**30
 #: The most rounds.
 MOST_ROUNDS = 256
-#: Share of the budget that is left for the statistics and the picture.
-AFTERWARDS = 0.03
+#: Share of the budget, and seconds beside it, that are left for the statistics and the picture.
+AFTERWARDS, AFTERWARDS_S = 0.03, 2.0
 #: Where all together hold more than this share of the memory, each releases its own after a step.
 MEMORY_SHARE = 0.7
 MIB = 2**20
@@ -49,7 +49,8 @@ def start_process(first: dict[str, Any], does: str) -> Process:
 class Session:
     """Processes under way and what they have sampled; arrays go by way of `folder`, which is the caller's to remove.
 
-    `facts` are the survey's. `judges` has the members that stand for an independent stock integrator, by its name.
+    `facts` are the survey's; of the budget `spent_s` have gone before. `judges` has the members that stand for an
+    independent stock integrator, by its name.
     """
 
     def __init__(
@@ -60,12 +61,14 @@ class Session:
         say: Callable[[str], None],
         start: Start = start_process,
         now: Callable[[], float] = time.monotonic,
+        spent_s: float = 0.0,
     ) -> None:
         self.plan, self.folder, self.members, self.rounds = plan, folder, list[Member](), 0
         self.facts: dict[str, Any] = {}
         self.judges: dict[str, Member] = {}
-        self._stop, self._say, self._start, self._now, self._began = stop, say, start, now, now()
-        self._pace = Pace((1 - AFTERWARDS) * plan.budget_s, 1, plan.rounds, now, MOST_ROUNDS)
+        self._stop, self._say, self._start, self._now, self._began = stop, say, start, now, now() - spent_s
+        budget_s = max((1 - AFTERWARDS) * plan.budget_s - AFTERWARDS_S - spent_s, 0.0)
+        self._pace = Pace(budget_s, 1, plan.rounds, now, MOST_ROUNDS)
         self._warned: set[str] = set()
 
     def slices(self) -> dict[str, slice]:
@@ -240,5 +243,5 @@ class Session:
             return
         round_s = sum(member.count * member.step_s for member in self.members if member.step_s)
         share = len(self.members) / (len(self.members) - len(late)) if len(late) < len(self.members) else 2.0
-        needed = share * (spent - self.rounds * round_s + FEWEST * round_s) / (1 - AFTERWARDS)
+        needed = share * (spent - self.rounds * round_s + FEWEST * round_s + AFTERWARDS_S) / (1 - AFTERWARDS)
         self._say(f"{self.rounds} rounds were taken, figures need {FEWEST}; allow about {needed:.0f} s with --budget")
