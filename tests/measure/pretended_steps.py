@@ -1,0 +1,126 @@
+"""Methods of known cost, noise and bias in place of processes, for tests of what `convergence` makes of them."""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from reslrb_cli.measure.processes import Ended, Refused, Stopped
+from reslrb_cli.records.bench import BenchStatus
+
+#: What all unbiased methods estimate: two parameters, one of them of colours.
+SHAPES = {"a": [4, 5, 3], "b": [3]}
+TRUTH = np.concatenate([np.random.default_rng(3).uniform(0.5, 1.5, 60), [2.0, -1.0, 0.5]])
+
+
+@dataclass
+class Pretence:
+    """One method: seconds of a step, and of the first; standard deviation of each entry, and bias, both relative to it.
+
+    `image_noise` is shared by all steps with one dL/dI. It ends at question number `ends`, if that is given.
+    """
+
+    step_s: float = 0.1
+    noise: float = 1.0
+    bias: float = 0.0
+    cold_s: float = 1.0
+    image_noise: float = 0.0
+    ends: int | None = None
+    refuses: bool = False
+    nan_at: int | None = None
+    steps: list[int] = field(default_factory=list)
+
+    def sample(self, purpose: str, number: int, image: int) -> np.ndarray:
+        """One step, (63,) float32."""
+        random = np.random.default_rng([zlib.crc32(purpose.encode()), number])
+        shared = np.random.default_rng([7, image]).standard_normal(len(TRUTH)) * self.image_noise
+        row = TRUTH * (1 + self.bias + shared + self.noise * random.standard_normal(len(TRUTH)))
+        return row.astype(np.float32)
+
+
+class Stage:
+    """All methods, by `role label` (or `label`), with a clock that only they move; `start` starts their processes."""
+
+    def __init__(self, facts: dict[str, Any] | None = None, **methods: Pretence) -> None:
+        self.now, self.alive, self.survey_s = 0.0, 0, 2.0
+        self.methods = methods
+        self.turns: list[str] = []
+        self.asked: list[dict[str, Any]] = []
+        keys = list(SHAPES)
+        self.facts = {
+            "keys": keys, "shapes": SHAPES, "independent": dict.fromkeys(keys, "ptracer"),
+            "why": dict.fromkeys(keys, ""), "without": {}, "masked": False, "pixels": 64, "pictures": "",
+        } | (facts or {})  # fmt: skip
+
+    def clock(self) -> float:
+        return self.now
+
+    def start(self, first: dict[str, Any], does: str) -> Player:
+        self.alive += 1
+        return Player(self, first, does)
+
+    def pretence(self, name: str) -> Pretence:
+        """That of `case reslrb:stack`, say: by role and label, by label, or the plain one."""
+        short = name.partition(" ")[2]
+        found = self.methods.get(_plain(name)) or self.methods.get(_plain(short))
+        return found or self.methods.setdefault(_plain(name), Pretence())
+
+
+def _plain(name: str) -> str:
+    return "".join(c if c.isalnum() else "_" for c in name)
+
+
+class Player:
+    """Stands in for a `Process`."""
+
+    def __init__(self, stage: Stage, first: dict[str, Any], does: str) -> None:
+        self.stage, self.first, self.does, self.closed, self.questions = stage, first, does, False, 0
+        self.question: dict[str, Any] | None = None
+        self.name = first.get("purpose", "").removeprefix("convergence, ")
+        self.played = None if does == "surveyed" else stage.pretence(self.name)
+
+    def ask(self, question: dict[str, Any]) -> None:
+        self.question, self.questions = question, self.questions + 1
+        self.stage.asked.append({"of": self.name} | question)
+
+    def answer(self, stop: Callable[[], bool]) -> dict[str, Any]:
+        if stop():
+            raise Stopped
+        if self.played is None:
+            return {"warnings": ["old"]} if self.question is None else self._wait(self.stage.survey_s, stop) or (
+                self.stage.facts
+            )  # fmt: skip
+        if self.question is None:
+            if self.played.refuses:
+                raise Refused("cannot be done here", 2)
+            return {"warnings": ["old"]}
+        if self.played.ends == self.questions:
+            raise Ended(BenchStatus.OUT_OF_MEMORY, "ended by SIGKILL")
+        return self._steps(self.played, self.question, stop)
+
+    def _steps(self, played: Pretence, question: dict[str, Any], stop: Callable[[], bool]) -> dict[str, Any]:
+        cold, numbers = question["cold"], range(question["start"], question["start"] + question["count"])
+        self._wait(played.cold_s if cold else len(numbers) * played.step_s, stop)
+        played.steps += numbers
+        if not cold:
+            self.stage.turns.append(self.name)
+        rows = np.stack([played.sample(self.first["purpose"], n, question["image"] % 8) for n in numbers])
+        if played.nan_at in numbers:
+            rows[0, 1] = np.nan
+        np.save(question["out"], rows)
+        ms = 1e3 * (played.cold_s if cold else played.step_s)
+        return {"step_ms": [ms] * len(numbers), "new_kernels": int(cold), "peak_mib": 2.0}
+
+    def _wait(self, seconds: float, stop: Callable[[], bool]) -> None:
+        for _ in range(max(round(seconds / 0.05), 1)):
+            self.stage.now += seconds / max(round(seconds / 0.05), 1)
+            if stop():
+                raise Stopped
+
+    def close(self) -> None:
+        self.stage.alive -= not self.closed
+        self.closed = True
