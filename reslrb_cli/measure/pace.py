@@ -35,6 +35,10 @@ class Pace:
         """Whether the time is up."""
         return self._rounds is None and self._now() >= self._end
 
+    def fits(self, seconds: float) -> bool:
+        """Whether there is so much time left."""
+        return self._rounds is not None or self._now() + seconds <= self._end
+
     def begin_depth(self) -> None:
         """A depth begins."""
         now = self._now()

@@ -49,6 +49,7 @@ class Stage:
         self.now, self.alive, self.survey_s = 0.0, 0, 2.0
         self.methods = methods
         self.turns: list[str] = []
+        self.purposes: list[str] = []
         self.asked: list[dict[str, Any]] = []
         keys = list(SHAPES)
         self.facts = {
@@ -61,6 +62,7 @@ class Stage:
 
     def start(self, first: dict[str, Any], does: str) -> Player:
         self.alive += 1
+        self.purposes += [first["purpose"]] if "purpose" in first else []
         return Player(self, first, does)
 
     def pretence(self, name: str) -> Pretence:

@@ -35,7 +35,7 @@ def make(seed: int, steps: int = 48, rows: int = 24, per_row: int = 6, per_turn:
 
 
 def test_errors_are_those_of_averages_and_the_references_own_is_subtracted() -> None:
-    """Of a reference as noisy as averages of 6 steps: unsubtracted, averages of 32 would seem more than twice as bad."""
+    """Of a reference as noisy as averages of 6 steps, which unsubtracted makes averages of 32 look twice as bad."""
     made = [make(seed, steps=64, rows=6, per_row=1) for seed in range(REPETITIONS)]
     for level in range(6):
         found = [samples.points()[level] for samples in made]

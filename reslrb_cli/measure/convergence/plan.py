@@ -64,8 +64,12 @@ class Plan:
 
     def independent_config(self, name: str) -> Config:
         """The experiment with a stock integrator: without roulette, which naive AD does not differentiate rightly."""
-        case = Case(name, name, {"rr_depth": NEVER} if name == "ptracer" else {}, "the independent reference")
-        return case.at(self.config, self.config.integrator.max_depth, True)
+        depth = self.config.integrator.max_depth
+        roulette = depth < 0 or self.config.integrator.rr_depth <= depth
+        case = Case(
+            name, name, {"rr_depth": NEVER} if name == "ptracer" and roulette else {}, "the independent reference"
+        )
+        return case.at(self.config, depth, True)
 
     def check(self) -> None:
         """Raise ConfigError where an integrator of the list, or the reference, cannot be."""

@@ -215,6 +215,8 @@ class Session:
             member.role is Role.REFERENCE for member in alive
         ):
             return
+        if not self._pace.fits(FEWEST * self._round_s):
+            return
         size = sum(int(np.prod(shape, dtype=int)) for shape in self.facts["shapes"].values())
         most = max(MEMORY // (4 * size * sum(member.count for member in alive)), FEWEST + 1)
         tight = self._tight()
@@ -228,20 +230,24 @@ class Session:
             if self.rounds >= 4 and self.rounds & (self.rounds - 1) == 0:
                 yield self.rounds
 
+    @property
+    def _round_s(self) -> float:
+        """Seconds of a round, by what each took when it was warm."""
+        return sum(member.count * member.step_s for member in self.members if member.alive)
+
     def _say_what_it_takes(self) -> None:
         """Where the budget did not suffice for figures: what it would take."""
-        late = [member.label for member in self.members if member.late]
+        late = [member for member in self.members if member.late]
         if self.rounds >= FEWEST and not late:
             return
-        spent = self._now() - self._began
         if late:
-            self._say(f"not measured: {', '.join(late)}: the budget of {self.plan.budget_s:g} s was spent")
-        elif self.rounds == 0:
+            names = ", ".join(member.label for member in late)
+            self._say(f"not measured: {names}: the budget of {self.plan.budget_s:g} s was spent")
+        warm = [member for member in self.members if member.alive]
+        if not warm or self.plan.rounds is not None:
             return
-        begun = [member.cold_s for member in self.members if member.cold_s is not None]
-        if not begun or (self.plan.rounds is not None and not late):
-            return
-        round_s = sum(member.count * member.step_s for member in self.members if member.step_s)
-        share = len(self.members) / (len(self.members) - len(late)) if len(late) < len(self.members) else 2.0
-        needed = share * (spent - self.rounds * round_s + FEWEST * round_s + AFTERWARDS_S) / (1 - AFTERWARDS)
-        self._say(f"{self.rounds} rounds were taken, figures need {FEWEST}; allow about {needed:.0f} s with --budget")
+        # What has not compiled is taken to take as long as what has.
+        share = 1 + len(late) / len(warm)
+        before = self._now() - self._began - self.rounds * self._round_s
+        needed = (share * (before + FEWEST * self._round_s) + AFTERWARDS_S) / (1 - AFTERWARDS)
+        self._say(f"figures need {FEWEST} rounds; allow about {needed:.0f} s with --budget")
