@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 @click.option("--budget", type=click.FloatRange(min=0), default=240.0, show_default=True, metavar="SECONDS",
               help="Time for the whole, compiling included.")  # fmt: skip
 @click.option("--rounds", type=click.IntRange(min=1, max=COUNT.max), metavar="N",
-              help="Number of turns of each, whatever time they take.")  # fmt: skip
+              help="Number of turns of each, whatever time they take: the same steps on every machine.")  # fmt: skip
 @click.option("--reference", metavar="METHOD", default="reslrb:stack", show_default=True,
               help="What errors are taken from: the mean of many steps of this one.")  # fmt: skip
 @click.option("--memory-limit", type=Size(),

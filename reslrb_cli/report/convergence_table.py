@@ -120,7 +120,7 @@ def closing_sentence(records: Sequence[MethodRecord]) -> str:
     if best.biased is None:
         sentence += " (whether it is biased is open)"
     if len(sound) == 1:
-        sentence += ", the only one that is not biased" if biased else ", the only one that was measured"
+        sentence += "; of all others a bias was found" if biased else ", the only one that was measured"
     else:
         level = [record for record in sound[1:] if _ratio(best, record)[1] <= 1]
         if level:

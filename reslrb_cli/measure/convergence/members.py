@@ -24,6 +24,8 @@ SHORT_S = 1.0
 MOST_STEPS = 8
 #: Turns of references, in those of all that are compared together.
 SHARES = {"reference": 0.5, "independent": 0.35}
+#: Steps of a turn where their number is not to depend on time.
+FIXED = {"case": 2, "reference": 8, "independent": 4}
 #: The most steps of a reference's turn.
 MOST_REFERENCE_STEPS = 64
 
@@ -111,8 +113,15 @@ class Member(Contestant):
         return np.stack([rows[turns == turn].mean(0) for turn in np.unique(turns)])
 
 
-def share_turns(members: list[Member]) -> None:
-    """Set how many steps each takes in a turn: about equal times, since what is fast has steps to spare."""
+def share_turns(members: list[Member], fixed: bool) -> None:
+    """Set how many steps each takes in a turn: about equal times, since what is fast has steps to spare.
+
+    With `fixed`, so many whatever time they take.
+    """
+    for member in members if fixed else ():
+        member.count = FIXED[member.role.value]
+    if fixed:
+        return
     cases = [member for member in members if member.role is Role.CASE]
     turn_s = min(max((member.step_s for member in cases), default=0.0), TURN_S)
     for member in cases:

@@ -195,7 +195,7 @@ class Session:
                     f"first step {member.cold_s:.1f} s, then {member.step_s:.3g} s, {member.cold['peak_mib']:.0f} MiB"
                 )
                 self._say(f"{member.label}{what}: {took}")
-        share_turns([member for member in self.members if member.alive])
+        share_turns([member for member in self.members if member.alive], self.plan.rounds is not None)
 
     def _tight(self) -> bool:
         held = sum(member.cold["peak_mib"] for member in self.members if member.cold is not None and member.alive) * MIB
