@@ -5,10 +5,14 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
+from cli.tiny import write_experiment
 from scipy import stats
 
 from reslrb_cli.cli import main
+from reslrb_cli.config import load
+from reslrb_cli.measure.convergence.curves import Reference, Samples
 
 pytestmark = [pytest.mark.usefixtures("llvm"), pytest.mark.long]
 
@@ -69,3 +73,32 @@ def test_what_correlated_samples_do_to_the_loss(tmp_path: Path) -> None:
         "independent": False,
         "batched": False,
     }
+
+
+def test_the_intervals_cover_what_they_say_on_a_scene(tmp_path: Path) -> None:
+    """200 repetitions with the noise of real steps; the truth is that of all steps together. No clock takes part."""
+    from reslrb_cli.measure.convergence.sampler import Sampler
+    from reslrb_cli.measure.convergence.survey import survey
+    from reslrb_cli.optimization.problem import assemble_scene
+
+    write_experiment(tmp_path)
+    config = load(tmp_path / "tiny.yaml")
+    _, arrays = survey(assemble_scene(config), "fixed", camera=False, named=False, budget_s=None)
+    sampler = Sampler(config, "known", arrays)
+    repetitions, steps, rows, per_row = 200, 24, 12, 4
+    taken = steps + rows * per_row
+    pool = np.stack([sampler.step(seed, 16, 0)[0] for seed in range(repetitions * taken)]).astype(np.float64)
+    everything = Reference(pool)
+    truth = everything.signal / pool.var(0, ddof=1).sum()
+    covered = {"efficiency": 0, "slope": 0}
+    for part in pool.reshape(repetitions, taken, -1):
+        reference = Reference(part[steps:].reshape(rows, per_row, -1).mean(1))
+        samples = Samples(part[:steps], np.arange(steps) // 2, np.ones(steps // 2), reference)
+        efficiency, slope = samples.efficiency(), samples.slope()
+        assert efficiency is not None
+        assert slope is not None
+        covered["efficiency"] += efficiency.exponential().low <= truth <= efficiency.exponential().high
+        covered["slope"] += slope.interval().low <= -0.5 <= slope.interval().high
+    least, most = (stats.binom.ppf(p, repetitions, 0.95) for p in (0.0005, 0.9995))
+    print(covered)
+    assert all(least <= count <= most for count in covered.values()), covered
