@@ -19,9 +19,10 @@ TRUTH = np.concatenate([np.random.default_rng(3).uniform(0.5, 1.5, 60), [2.0, -1
 
 @dataclass
 class Pretence:
-    """One method: seconds of a step, and of the first; standard deviation of each entry, and bias, both relative to it.
+    """One method: seconds of a step, and of the first; standard deviation of each entry, and bias, relative to it.
 
-    `image_noise` is shared by all steps with one dL/dI. It ends at question number `ends`, if that is given.
+    `image_noise` is shared by all steps with one dL/dI. The first step of a turn takes `late_s` more. It ends at
+    question number `ends`, if that is given.
     """
 
     step_s: float = 0.1
@@ -29,6 +30,7 @@ class Pretence:
     bias: float = 0.0
     cold_s: float = 1.0
     image_noise: float = 0.0
+    late_s: float = 0.0
     ends: int | None = None
     refuses: bool = False
     nan_at: int | None = None
@@ -115,7 +117,8 @@ class Player:
             rows[0, 1] = np.nan
         np.save(question["out"], rows)
         ms = 1e3 * (played.cold_s if cold else played.step_s)
-        return {"step_ms": [ms] * len(numbers), "new_kernels": int(cold), "peak_mib": 2.0}
+        times = [ms + 1e3 * played.late_s, *[ms] * (len(numbers) - 1)]
+        return {"step_ms": times, "new_kernels": int(cold), "peak_mib": 2.0}
 
     def _wait(self, seconds: float, stop: Callable[[], bool]) -> None:
         for _ in range(max(round(seconds / 0.05), 1)):

@@ -101,6 +101,11 @@ def test_turns_are_interleaved_and_about_as_long(tmp_path: Path) -> None:
     assert session.of(Role.REFERENCE)[0].count == min(round(together / 2 / 0.1), MOST_REFERENCE_STEPS)
 
 
+def test_what_others_did_to_the_caches_costs_nothing(tmp_path: Path) -> None:
+    _, results, _ = play(tmp_path, Stage(case_ptracer=Pretence(0.1, late_s=0.3)), plan(rounds=4))
+    assert of(results, "ptracer").step_s == pytest.approx(0.1)
+
+
 def test_a_number_of_rounds_makes_the_steps_the_same_everywhere(tmp_path: Path) -> None:
     stage = Stage(case_ptracer=Pretence(0.4), independent_prb=Pretence(0.1))
     stage.facts["independent"] = {"a": "prb", "b": "prb"}
