@@ -247,7 +247,9 @@ def test_a_stop_keeps_what_is_done(tmp_path: Path, after: int) -> None:
     assert len(results.methods) in (0, 9)
 
 
-@pytest.mark.parametrize(("budget_s", "measured"), [(60.0, True), (11.0, False), (6.0, False), (2.0, False)])
+@pytest.mark.parametrize(
+    ("budget_s", "measured"), [(60.0, True), (14.0, False), (11.0, False), (6.0, False), (2.0, False)]
+)
 def test_the_budget_covers_compilation_and_one_too_small_says_what_it_would_take(
     tmp_path: Path, budget_s: float, measured: bool
 ) -> None:
@@ -263,6 +265,14 @@ def test_the_budget_covers_compilation_and_one_too_small_says_what_it_would_take
         _, results, _ = play(tmp_path, again, plan(rounds=None, budget_s=1.05 * enough))
         assert any(record.relative_rmse is not None for record in results.methods)
         assert enough > budget_s
+
+
+def test_no_budget_is_overrun(tmp_path: Path) -> None:
+    """Steps of seconds: a round would take longer than what some of these leave after compiling."""
+    for budget_s in range(8, 60, 4):
+        stage = Stage(case_ptracer=Pretence(3.0, cold_s=3.0))
+        play(tmp_path, stage, plan(rounds=None, budget_s=float(budget_s)))
+        assert stage.now <= budget_s
 
 
 def test_the_budget_is_kept_and_used(tmp_path: Path) -> None:
