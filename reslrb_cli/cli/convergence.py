@@ -6,7 +6,7 @@ import os
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -23,6 +23,19 @@ if TYPE_CHECKING:
     from reslrb_cli.report.convergence_table import Table
 
 
+class Counts(click.ParamType):
+    """Different numbers of samples, such as `4,16,64`."""
+
+    name = "list"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[int, ...]:
+        parts: list[Any] = str(value).split(",")
+        counts = [COUNT.convert(part, param, ctx) for part in parts]
+        if len(set(counts)) < len(counts):
+            self.fail(f"`{value}` names a number twice", param, ctx)
+        return tuple(counts)
+
+
 @click.command("convergence")
 @experiment_arguments
 @click.option("--integrators", metavar="LIST",
@@ -36,6 +49,8 @@ if TYPE_CHECKING:
               help="Time for the whole, compiling included.")  # fmt: skip
 @click.option("--rounds", type=click.IntRange(min=1, max=COUNT.max), metavar="N",
               help="Number of turns of each, whatever time they take: the same steps on every machine.")  # fmt: skip
+@click.option("--spp", "spps", type=Counts(), metavar="LIST",
+              help="Samples per pixel of a step, several to compare, e.g. 4,16,64; default: run.spp.")  # fmt: skip
 @click.option("--reference", metavar="METHOD", default="reslrb:stack", show_default=True,
               help="What errors are taken from: the mean of many steps of this one.")  # fmt: skip
 @click.option("--memory-limit", type=Size(),
@@ -51,6 +66,7 @@ def command(
     objective: str,
     budget: float,
     rounds: int | None,
+    spps: tuple[int, ...] | None,
     reference: str,
     memory_limit: int | None,
     json_file: Path | None,
@@ -96,6 +112,7 @@ def command(
         budget_s=budget,
         rounds=rounds,
         default=integrators is None,
+        spps=spps or (),
     )
     plan.check()
     where = f"{device_name(variant)}, {variant}"
@@ -182,7 +199,8 @@ def _conditions(plan: Plan, session: Session) -> str:
     depth, rr_depth = config.integrator.max_depth, config.integrator.rr_depth
     roulette = "no roulette" if 0 <= depth < rr_depth else f"roulette from depth {rr_depth}"
     what = {"fixed": "dL/dI held", "loss": f"loss {config.loss.type}", "image": "the image"}[plan.objective]
-    parts = [str(config.source), f"{config.run.spp} spp", roulette, what, facts.get("pictures", "")]
+    spp = ", ".join(str(count) for count in plan.spps or [config.run.spp])
+    parts = [str(config.source), f"{spp} spp", roulette, what, facts.get("pictures", "")]
     parts.append(
         "without the film's border, where light paths lose what camera paths see" if facts.get("masked") else ""
     )

@@ -108,6 +108,10 @@ def test_a_budget_that_is_too_small_says_so(folder: Path, capsys: pytest.Capture
         (("--json", "no/such/folder.jsonl"), "--json: cannot write no/such/folder.jsonl"),
         (("--objective", "gradient"), "'gradient' is not one of 'fixed', 'loss', 'image'"),
         (("--set", "run.spp=0"), "run.spp"),
+        (("--spp", "4,x"), "'x' is not a valid integer range"),
+        (("--spp", "4,0"), "0 is not in the range"),
+        (("--spp", "4,4"), "`4,4` names a number twice"),
+        (("--spp", "3", "--set", "integrator.samples_per_pass=2"), "integrator.samples_per_pass: 2 does not divide"),
         (("--integrators", "prb(rr_depth=x)"), "integrator.rr_depth"),
     ],
 )

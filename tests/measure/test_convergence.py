@@ -192,6 +192,21 @@ def test_the_noise_of_one_image_is_no_bias(tmp_path: Path) -> None:
     assert of(results, "reslrb:stack(adjoint=batched)").method.estimator == "stack"
 
 
+def test_a_sweep_of_samples(tmp_path: Path) -> None:
+    """Each number of samples is a method of its own; the reference has those of the configuration."""
+    four, sixteen = Pretence(0.1, 1.0), Pretence(0.3, 0.5)
+    stage = Stage(case_reslrb_stack__4_spp=four, case_reslrb_stack__16_spp=sixteen)
+    session, results, _ = play(tmp_path, stage, plan("reslrb:stack", spps=(4, 16)))
+    assert [(m.label, m.spp, m.config.run.spp) for m in session.members] == [
+        ("reslrb:stack, 4 spp", 4, 4), ("reslrb:stack, 16 spp", 16, 16), ("reslrb:stack", 4, 4), ("ptracer", 4, 4)
+    ]  # fmt: skip
+    assert of(results, "reslrb:stack, 16 spp").relative_rmse == pytest.approx(0.5, rel=0.1)
+    assert of(results, "reslrb:stack, 16 spp").method.spp == 16
+    assert closing_sentence(results.methods).startswith("Best for this scene: reslrb:stack, 16 spp; 1.3 [")
+    spps = {question["of"]: question["spp"] for question in stage.asked if question["of"]}
+    assert spps["case reslrb:stack, 16 spp"] == 16
+
+
 def test_a_method_that_ends_or_breaks_is_recorded_and_the_rest_goes_on(tmp_path: Path) -> None:
     stage = Stage(case_reslrb_stack=Pretence(ends=5), case_reslrb_event=Pretence(nan_at=20))
     _, results, said = play(tmp_path, stage, plan())

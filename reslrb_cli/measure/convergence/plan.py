@@ -34,7 +34,7 @@ class Plan:
     """What is measured; `memory_limit` is of each process, None: none; `memory` is what the machine has, in bytes.
 
     Of the `cases` those that cannot do what the scene asks for are left out where they are the `default` ones. `rounds`
-    is None where `budget_s` decides their number.
+    is None where `budget_s` decides their number; `spps` are samples per pixel of a step, nothing for those of `run`.
     """
 
     config: Config
@@ -47,15 +47,23 @@ class Plan:
     budget_s: float
     rounds: int | None = None
     default: bool = False
+    spps: Sequence[int] = ()
 
     @property
     def known(self) -> bool:
         """Whether dL/dI is known before the image, or not asked for."""
         return self.objective != "loss"
 
-    def config_of(self, case: Case) -> Config:
-        """The experiment with the integrator of a case. Raises ConfigError."""
-        return case.at(self.config, self.config.integrator.max_depth, self.known)
+    @property
+    def entries(self) -> list[tuple[Case, int]]:
+        """What is compared: cases, each with its samples per pixel."""
+        return [(case, spp) for case in self.cases for spp in self.spps or [self.config.run.spp]]
+
+    def config_of(self, case: Case, spp: int) -> Config:
+        """The experiment with the integrator of a case, and so many samples per pixel. Raises ConfigError."""
+        run = self.config.run.model_copy(update={"spp": spp})
+        config = self.config.model_copy(update={"run": run})
+        return case.at(config, config.integrator.max_depth, self.known)
 
     @property
     def reference_config(self) -> Config:
@@ -73,14 +81,15 @@ class Plan:
 
     def check(self) -> None:
         """Raise ConfigError where an integrator of the list, or the reference, cannot be."""
-        for case in self.cases:
-            self.config_of(case)
+        for case, spp in self.entries:
+            self.config_of(case, spp)
         _ = self.reference_config
 
-    def method(self, case: Case, config: Config, spp: int, known: bool) -> Method:
-        """How a case stands in records."""
+    def method(self, case: Case, config: Config, spp: int, known: bool, reference: bool) -> Method:
+        """How a case, or a `reference`, stands in records."""
         options: dict[str, Any] = config.integrator.options()
         adjoint = None if known else config.adjoint
         own = {name: value for name, value in case.options.items() if name not in ADJOINT}
         estimator = replace(case, options=own).estimator
-        return Method(case.label, case.type, estimator, options.get("capacity"), adjoint, spp)
+        label = f"{case.label}, {spp} spp" if self.spps and not reference else case.label
+        return Method(label, case.type, estimator, options.get("capacity"), adjoint, spp)

@@ -143,8 +143,9 @@ class Session:
             reason = facts["without"].get(case.type)
             if plan.default and reason is not None:
                 self._say(f"left out: {case.label}: {reason}")
-                continue
-            self._add(Role.CASE, case, plan.config_of(case), plan.objective)
+        for case, spp in plan.entries:
+            if not plan.default or case.type not in facts["without"]:
+                self._add(Role.CASE, case, plan.config_of(case, spp), plan.objective)
         self._add(Role.REFERENCE, plan.reference, plan.reference_config, self._noise_free)
         for name in dict.fromkeys(name for name in facts["independent"].values() if name is not None):
             config = plan.independent_config(name)
@@ -164,15 +165,16 @@ class Session:
         plan, number, spp = self.plan, len(self.members), config.run.spp
         if role is Role.INDEPENDENT and config.integrator.options().get("samples_per_pass") is None:
             spp = min(spp, max(INDEPENDENT_PATHS // self.facts["pixels"], 1))
+        method = plan.method(case, config, spp, objective != "loss", role is not Role.CASE)
         first = self._first(config) | {
             "mode": {"fixed": "known"}.get(objective, objective),
-            "purpose": f"convergence, {role.value} {case.label}",
+            "purpose": f"convergence, {role.value} {method.label}",
         }
         member = Member(
             process=self._start(first, "sampled_steps"),
             may_refuse=role is Role.INDEPENDENT or (role is Role.CASE and plan.default),
             role=role,
-            method=plan.method(case, config, spp, objective != "loss"),
+            method=method,
             config=config,
             spp=spp,
             out=self.folder / f"steps-{number}.npy",
