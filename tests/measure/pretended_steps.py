@@ -5,12 +5,19 @@ from __future__ import annotations
 import zlib
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from reslrb_cli.config import loads
+from reslrb_cli.measure.cases import parse_cases
+from reslrb_cli.measure.convergence.judgement import Judgement, Results
+from reslrb_cli.measure.convergence.plan import Plan
+from reslrb_cli.measure.convergence.session import Session
 from reslrb_cli.measure.processes import Ended, Refused, Stopped
 from reslrb_cli.records.bench import BenchStatus
+from reslrb_cli.records.convergence import MethodRecord
 
 #: What all unbiased methods estimate: two parameters, one of them of colours.
 SHAPES = {"a": [4, 5, 3], "b": [3]}
@@ -129,3 +136,40 @@ class Player:
     def close(self) -> None:
         self.stage.alive -= not self.closed
         self.closed = True
+
+
+# --- playing ---------------------------------------------------------------------------------------------------------
+
+CONFIG = """\
+scene: {file: scene.xml}
+target: {render: {}}
+parameters: [{key: a}, {key: b}]
+integrator: {max_depth: 4, rr_depth: 9}
+run: {spp: 4}
+"""
+LIST = "ptracer,reslrb:stack,reslrb:event"
+SIGNAL = float(TRUTH @ TRUTH)
+
+
+def plan(cases: str = LIST, **changes: Any) -> Plan:
+    values: dict[str, Any] = {
+        "config": loads(CONFIG, Path("x.yaml")), "variant": "llvm_ad_rgb", "cases": parse_cases(cases, deep=False),
+        "reference": parse_cases("reslrb:stack")[0], "objective": "fixed", "memory_limit": None, "memory": 2**40,
+        "budget_s": 0.0, "rounds": 32,
+    }  # fmt: skip
+    return Plan(**(values | changes))
+
+
+def play(
+    folder: Path, stage: Stage, what: Plan, stop: Callable[[], bool] = lambda: False
+) -> tuple[Session, Results, list[str]]:
+    said: list[str] = []
+    session = Session(what, folder, stop, said.append, stage.start, stage.clock)
+    for _ in session.run():
+        pass
+    assert stage.alive == 0
+    return session, Judgement(session).results(), said
+
+
+def of(results: Results, label: str, parameter: str = "all") -> MethodRecord:
+    return next(r for r in results.methods if (r.method.label, r.parameter) == (label, parameter))
