@@ -18,6 +18,7 @@ from reslrb_cli.errors import ConfigError, ExitCode
 if TYPE_CHECKING:
     from reslrb_cli.measure.convergence.judgement import Results
     from reslrb_cli.measure.convergence.plan import Plan
+    from reslrb_cli.measure.convergence.resuming import Earlier
     from reslrb_cli.measure.convergence.session import Session
     from reslrb_cli.records.convergence import MethodRecord
     from reslrb_cli.report.convergence_table import Table
@@ -53,6 +54,8 @@ class Counts(click.ParamType):
               help="Samples per pixel of a step, several to compare, e.g. 4,16,64; default: run.spp.")  # fmt: skip
 @click.option("--reference", metavar="METHOD", default="reslrb:stack", show_default=True,
               help="What errors are taken from: the mean of many steps of this one.")  # fmt: skip
+@click.option("--resume", "resumed", type=click.Path(path_type=Path, dir_okay=False), metavar="FILE",
+              help="Go on from what another call has written with --json FILE; all else as it was.")  # fmt: skip
 @click.option("--memory-limit", type=Size(),
               help="Address space of each process, e.g. 2GiB (CPU only); default: the machine's memory.")  # fmt: skip
 @click.option("--json", "json_file", type=click.Path(path_type=Path, dir_okay=False),
@@ -68,6 +71,7 @@ def command(
     rounds: int | None,
     spps: tuple[int, ...] | None,
     reference: str,
+    resumed: Path | None,
     memory_limit: int | None,
     json_file: Path | None,
     plot_file: Path | None,
@@ -93,6 +97,7 @@ def command(
     stands = parse_cases(reference, "--reference", deep=False)
     if len(stands) != 1:
         raise ConfigError("--reference", "", "errors are taken from one method; name one")
+    json_file = json_file or resumed
     if json_file is not None and plot_file is None:
         plot_file = json_file.with_suffix(".png")
     for option, path in (("--json", json_file), ("--plot", plot_file)):
@@ -117,7 +122,8 @@ def command(
     plan.check()
     where = f"{device_name(variant)}, {variant}"
     echo(where)
-    results, conditions, interrupted = _run(plan, json_file, began)
+    earlier = None if resumed is None else _earlier(resumed)
+    results, conditions, interrupted = _run(plan, json_file, began, earlier)
     if plot_file is not None and results.points:
         from reslrb_cli.report.convergence_plot import plot_convergence
 
@@ -126,7 +132,7 @@ def command(
     return ExitCode.INTERRUPTED if interrupted else _exit_code(results)
 
 
-def _run(plan: Plan, json_file: Path | None, began: float) -> tuple[Results, str, bool]:
+def _run(plan: Plan, json_file: Path | None, began: float, earlier: Earlier | None) -> tuple[Results, str, bool]:
     """Measure, print and write; returns the results, the conditions in words, and whether the user interrupted."""
     import shutil
     import tempfile
@@ -142,14 +148,14 @@ def _run(plan: Plan, json_file: Path | None, began: float) -> tuple[Results, str
 
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="reslrb-convergence-")))
-        writer = None if json_file is None else stack.enter_context(LineWriter(json_file))
 
         def tidy() -> None:
             abandon_all()
             shutil.rmtree(folder, ignore_errors=True)
 
         interrupts = stack.enter_context(Interrupts(last_act=tidy))
-        session = Session(plan, folder, lambda: interrupts.requested, echo, spent_s=time.monotonic() - began)
+        spent_s = time.monotonic() - began
+        session = Session(plan, folder, lambda: interrupts.requested, echo, spent_s=spent_s, earlier=earlier)
         table: Table | None = None
         for rounds in session.run():
             if table is None:
@@ -161,9 +167,11 @@ def _run(plan: Plan, json_file: Path | None, began: float) -> tuple[Results, str
                 if judgement.ready and member.refusal is None:
                     echo(table.line(judgement.overall(member), f"{rounds} rounds"))
         results = Judgement(session).results()
-        lines: list[Line] = [*results.points, *results.methods, *results.references]
-        for line in lines if writer is not None else ():
-            writer.write(line)  # type: ignore[union-attr]
+        if json_file is not None:  # only now: what is gone on from may be the same file
+            lines: list[Line] = [*results.points, *results.methods, *results.references]
+            with LineWriter(json_file) as writer:
+                for line in lines:
+                    writer.write(line)
         table = _table(session)
         echo(table.head())
         shown = _shown(results.methods)
@@ -176,7 +184,26 @@ def _run(plan: Plan, json_file: Path | None, began: float) -> tuple[Results, str
         for note in notes([record for record in results.methods if record.parameter in shown]):
             echo(note)
         echo(closing_sentence(results.methods))
+        if json_file is not None:
+            _keep(session, json_file)
         return results, _conditions(plan, session), interrupts.requested
+
+
+def _earlier(file: Path) -> Earlier:
+    """What lies beside a JSON file. Raises ConfigError."""
+    from reslrb_cli.measure.convergence.resuming import Earlier
+    from reslrb_cli.records.convergence_samples import read_samples, samples_file
+
+    return Earlier(file, *read_samples(samples_file(file)))
+
+
+def _keep(session: Session, json_file: Path) -> None:
+    """Write what a later call can go on from, where that is not too large."""
+    from reslrb_cli.records.convergence_samples import MOST_BYTES, samples_file, write_samples
+
+    kept = session.keep() if json_file.is_file() else None
+    if kept is not None and sum(array.nbytes for array in kept[1].values()) <= MOST_BYTES:
+        write_samples(samples_file(json_file), *kept)
 
 
 def _table(session: Session) -> Table:

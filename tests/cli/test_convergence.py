@@ -10,6 +10,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 from cli.tiny import KEY, ROOT, write_experiment
 
@@ -123,6 +124,30 @@ def test_bad_input_is_one_located_line(
     assert printed.out == ""
     assert line in printed.err
     assert len(printed.err.splitlines()) == 1
+
+
+@pytest.mark.parametrize("content", [None, b"", b"PK\x03\x04 cut off", "compressed"])
+def test_steps_that_cannot_be_gone_on_from(
+    folder: Path, content: bytes | str | None, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (folder / "c.jsonl").write_text("kept\n")
+    if isinstance(content, bytes):
+        (folder / "c.samples.npz").write_bytes(content)
+    elif content is not None:
+        np.savez_compressed(folder / "c.samples.npz", head=np.array("{}"))
+    assert call("tiny.yaml", "--resume", "c.jsonl") == 2
+    assert "c.samples.npz: " in capsys.readouterr().err
+    assert (folder / "c.jsonl").read_text() == "kept\n"
+
+
+@pytest.mark.long
+def test_going_on(folder: Path) -> None:
+    args = ["--integrators", "reslrb:stack", "--rounds", "4"]
+    assert call("tiny.yaml", *args, "--json", "c.jsonl") == 0
+    assert call("tiny.yaml", *args, "--resume", "c.jsonl") == 0
+    assert {line["repeats"] for line in read(folder / "c.jsonl") if line["kind"] == "method"} == {16}
+    assert call("tiny.yaml", *args, "--resume", "c.jsonl", "--set", "run.spp=8") == 2
+    assert len(read(folder / "c.jsonl")) > 2  # as it was
 
 
 @pytest.mark.long

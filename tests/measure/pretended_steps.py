@@ -102,9 +102,11 @@ class Player:
         if stop():
             raise Stopped
         if self.played is None:
-            return {"warnings": ["old"]} if self.question is None else self._wait(self.stage.survey_s, stop) or (
-                self.stage.facts
-            )  # fmt: skip
+            if self.question is None:
+                return {"warnings": ["old"]}
+            self._wait(self.stage.survey_s, stop)
+            np.savez(self.question["out"], mask=np.ones((2, 2, 1), np.float32))
+            return self.stage.facts
         if self.question is None:
             if self.played.refuses:
                 raise Refused("cannot be done here", 2)
@@ -161,10 +163,10 @@ def plan(cases: str = LIST, **changes: Any) -> Plan:
 
 
 def play(
-    folder: Path, stage: Stage, what: Plan, stop: Callable[[], bool] = lambda: False
+    folder: Path, stage: Stage, what: Plan, stop: Callable[[], bool] = lambda: False, earlier: Any = None
 ) -> tuple[Session, Results, list[str]]:
     said: list[str] = []
-    session = Session(what, folder, stop, said.append, stage.start, stage.clock)
+    session = Session(what, folder, stop, said.append, stage.start, stage.clock, earlier=earlier)
     for _ in session.run():
         pass
     assert stage.alive == 0

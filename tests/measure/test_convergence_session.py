@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
-from measure.pretended_steps import CONFIG, Pretence, Stage, of, plan, play
+from measure.pretended_steps import CONFIG, LIST, Pretence, Stage, of, plan, play
 
 from reslrb_cli.config import loads
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.measure.convergence.members import MOST_REFERENCE_STEPS, MOST_STEPS, Role
+from reslrb_cli.measure.convergence.resuming import Earlier
 from reslrb_cli.records.bench import BenchStatus
+from reslrb_cli.records.convergence_samples import read_samples, write_samples
 from reslrb_cli.report.convergence_table import closing_sentence, notes
 
 
@@ -112,6 +116,50 @@ def test_only_what_nobody_named_is_left_out(tmp_path: Path, default: bool) -> No
     session, _, said = play(tmp_path, stage, plan(default=default, rounds=4))
     assert ("left out: ptracer: it emits wrongly" in said) is default
     assert ("ptracer" in [m.label for m in session.of(Role.CASE)]) is not default
+
+
+def test_going_on(tmp_path: Path) -> None:
+    """Steps of both calls count, dL/dI is made once, and no seed comes twice."""
+    stage = Stage()
+    session, _, _ = play(tmp_path, stage, plan(rounds=4))
+    kept = session.keep()
+    assert kept is not None
+    write_samples(tmp_path / "c.samples.npz", *kept)
+    stage.asked.clear()
+    earlier = Earlier(Path("c.jsonl"), *read_samples(tmp_path / "c.samples.npz"))
+    more, results, _ = play(tmp_path, stage, plan(rounds=8), earlier=earlier)
+    assert {question["of"] for question in stage.asked} == {"case " + c for c in LIST.split(",")} | {
+        "reference reslrb:stack"
+    }
+    assert (more.rounds, of(results, "ptracer").repeats) == (12, 24)
+    for before, member in zip(session.members, more.members, strict=True):
+        assert member.turns == [turn for turn in range(12) for _ in range(member.count)]
+        assert len(member.seconds) == 12
+        np.testing.assert_array_equal(member.rows[: len(before.rows)], before.rows)
+        assert len({row.tobytes() for row in member.rows}) == len(member.rows)
+
+
+@pytest.mark.parametrize(
+    ("change", "line"),
+    [
+        ({"cases": "ptracer"}, "its methods are others: case ptracer, case reslrb:stack"),
+        (
+            {"config": loads(CONFIG, Path("x.yaml"), ["integrator.max_depth=5"])},
+            "its settings are not those of ptracer",
+        ),
+        ({"objective": "image"}, "its objective is fixed"),
+    ],
+)
+def test_only_the_same_is_gone_on_from(tmp_path: Path, change: dict[str, Any], line: str) -> None:
+    session, _, _ = play(tmp_path, Stage(), plan(rounds=4))
+    kept = session.keep()
+    assert kept is not None
+    stage = Stage()
+    with pytest.raises(ConfigError, match=f"--resume: c.jsonl is of another measurement: {line}"):
+        play(tmp_path, stage, plan(**({"rounds": 4} | change)), earlier=Earlier(Path("c.jsonl"), *kept))
+    assert stage.alive == 0
+    with pytest.raises(ConfigError, match="by another version"):
+        Earlier(Path("c.jsonl"), kept[0] | {"version": 0}, kept[1])
 
 
 @pytest.mark.parametrize("after", [0, 5, 12, 40, 120])

@@ -21,6 +21,7 @@ from reslrb_cli.measure.contestant import Contestant
 from reslrb_cli.measure.convergence.curves import FEWEST
 from reslrb_cli.measure.convergence.members import Member, Role, share_turns
 from reslrb_cli.measure.convergence.plan import Plan
+from reslrb_cli.measure.convergence.resuming import Earlier, kept
 from reslrb_cli.measure.pace import Pace
 from reslrb_cli.measure.processes import Process, Refused, Stopped
 from reslrb_cli.records.bench import BenchStatus
@@ -50,7 +51,7 @@ class Session:
     """Processes under way and what they have sampled; arrays go by way of `folder`, which is the caller's to remove.
 
     `facts` are the survey's; of the budget `spent_s` have gone before. `judges` has the members that stand for an
-    independent stock integrator, by its name.
+    independent stock integrator, by its name. What an `earlier` session has sampled counts, and is gone on from.
     """
 
     def __init__(
@@ -62,7 +63,9 @@ class Session:
         start: Start = start_process,
         now: Callable[[], float] = time.monotonic,
         spent_s: float = 0.0,
+        earlier: Earlier | None = None,
     ) -> None:
+        self._earlier, self._before = earlier, 0
         self.plan, self.folder, self.members, self.rounds = plan, folder, list[Member](), 0
         self.facts: dict[str, Any] = {}
         self.judges: dict[str, Member] = {}
@@ -102,6 +105,12 @@ class Session:
                 member.process.close()
         self._say_what_it_takes()
 
+    def keep(self) -> tuple[dict[str, Any], dict[str, np.ndarray]] | None:
+        """What a later session needs to go on; None where nothing has been sampled, or a process has come to an end."""
+        if not self.rounds or not all(member.alive and member.rows for member in self.members):
+            return None
+        return kept(self.plan.objective, self.facts, self.folder / "arrays.npz", self.members, self.rounds)
+
     # --- before the rounds --------------------------------------------------------------------------------------------
 
     def _first(self, config: Config) -> dict[str, Any]:
@@ -111,6 +120,9 @@ class Session:
     def _survey(self) -> bool:
         """Ask what stands as a reference, and have dL/dI made; False where time is up over it."""
         plan = self.plan
+        if self._earlier is not None:
+            self.facts = self._earlier.facts(plan.objective, self.folder / "arrays.npz")
+            return True
         first = self._first(plan.reference_config) | {"objective": plan.objective}
         surveyor = Contestant(self._start(first, "surveyed"), False)
         try:
@@ -153,6 +165,8 @@ class Session:
             self.judges[name] = (
                 same[0] if same else self._add(Role.INDEPENDENT, Case(name, name, {}), config, self._noise_free)
             )
+        if self._earlier is not None:
+            self.rounds = self._before = self._earlier.restore(self.members)
         for key, reason in facts["why"].items():
             if facts["independent"][key] is None:
                 self._say(f"{key}: no independent reference ({reason}); biases are judged by {plan.reference.label}")
@@ -223,7 +237,7 @@ class Session:
         most = max(MEMORY // (4 * size * sum(member.count for member in alive)), FEWEST + 1)
         tight = self._tight()
         self._pace.begin_rounds()
-        while alive and self.rounds < most and self._pace.another(self.rounds):
+        while alive and self.rounds < most and self._pace.another(self.rounds - self._before):
             start = self.rounds % len(alive)
             for member in alive[start:] + alive[:start]:
                 member.turn(self.rounds, tight, self._stop)
