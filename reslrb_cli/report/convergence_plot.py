@@ -13,6 +13,8 @@ _MARKERS = "osD^vPX*<>"
 #: Panels at most: all together, and the first parameters.
 PANELS = 6
 COLUMNS = 3
+#: Points of fewer averages are hollow: they scatter.
+FEW = 4
 
 
 def plot_convergence(
@@ -62,6 +64,9 @@ def _draw(
         style = {"color": f"C{k % 10}", "marker": _MARKERS[k % len(_MARKERS)], "markersize": 5, "linewidth": 1.3}
         axis.plot([p.elapsed_s for p in curve], [p.relative_rmse for p in curve], label=name,
                   linestyle="--" if record.biased else "-", **style)  # fmt: skip
+        few = [p for p in curve if p.repeats < FEW]
+        axis.plot([p.elapsed_s for p in few], [p.relative_rmse for p in few], color=style["color"], linestyle="",
+                  marker=style["marker"], markersize=5, markerfacecolor="white")  # fmt: skip
         # Where the variance of single steps says that averages lead, without a bias.
         if record.relative_rmse is not None and record.step_s is not None:
             ends = [curve[0].elapsed_s, curve[-1].elapsed_s]

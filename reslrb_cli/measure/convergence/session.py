@@ -266,4 +266,5 @@ class Session:
         share = 1 + len(late) / len(warm)
         before = self._now() - self._began - self.rounds * self._round_s
         needed = (share * (before + FEWEST * self._round_s) + AFTERWARDS_S) / (1 - AFTERWARDS)
-        self._say(f"figures need {FEWEST} rounds; allow about {needed:.0f} s with --budget")
+        advice = f"allow about {needed:.0f} s with --budget, or name fewer --integrators, or take a smaller film"
+        self._say(f"figures need {FEWEST} rounds; {advice}")
