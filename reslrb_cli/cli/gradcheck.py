@@ -125,13 +125,14 @@ def _run(check: Gradcheck, json_file: Path | None, folder: Path | None) -> tuple
     from contextlib import ExitStack
 
     from reslrb_cli.cli.interrupts import Interrupts
-    from reslrb_cli.records.gradcheck import GradcheckWriter, Verdict
+    from reslrb_cli.records.gradcheck import Verdict
+    from reslrb_cli.records.lines import LineWriter
     from reslrb_cli.report.gradcheck_table import Table
 
     records: list[GradcheckRecord] = []
     drawn = False
     with ExitStack() as stack:
-        writer = None if json_file is None else stack.enter_context(GradcheckWriter(json_file))
+        writer = None if json_file is None else stack.enter_context(LineWriter(json_file))
         interrupts = stack.enter_context(Interrupts())
         table = Table(check.expected())
         echo(table.head())

@@ -34,12 +34,12 @@ def run_missing(
     """Measure, print and write; returns the exit code. A variant must be set."""
     from reslrb_cli.cli.interrupts import Interrupts
     from reslrb_cli.measure.missing_check import MissingCheck
-    from reslrb_cli.records.gradcheck import GradcheckWriter
+    from reslrb_cli.records.lines import LineWriter
 
     check = MissingCheck(config, budget, seeds, spp, along)
     echo(check.conditions())
     with ExitStack() as stack:
-        writer = None if json_file is None else stack.enter_context(GradcheckWriter(json_file))
+        writer = None if json_file is None else stack.enter_context(LineWriter(json_file))
         interrupts = stack.enter_context(Interrupts())
         for record in check.run(lambda: interrupts.requested):
             if writer is not None:

@@ -22,8 +22,9 @@ from typing import Any
 
 from reslrb_cli.config import Config, dump
 from reslrb_cli.measure.cases import Case
+from reslrb_cli.measure.contestant import Contestant
 from reslrb_cli.measure.pace import NO_TIME, Pace
-from reslrb_cli.measure.processes import Ended, Process, Refused, Stopped
+from reslrb_cli.measure.processes import Process, Stopped
 from reslrb_cli.records.bench import BenchRecord, BenchStatus, Spread
 
 #: Steps after the cold one until no new kernel comes, at most.
@@ -85,49 +86,21 @@ class Result:
     reason: str
 
 
-@dataclass
-class _Run:
+@dataclass(kw_only=True)
+class _Run(Contestant):
     """One case at one depth, under way."""
 
     case: Case
     config: Config
-    process: Any
-    may_refuse: bool
     size: tuple[int, int] | None = None
     cold: dict[str, Any] | None = None
     steps: dict[int, dict[str, Any]] = field(default_factory=dict)  # by round
-    end: Ended | None = None
-    refusal: Refused | None = None
-    late: bool = False
 
-    @property
-    def alive(self) -> bool:
-        """Whether it can be asked for a step."""
-        return self.end is None and self.refusal is None and not self.late
-
-    def ask(
+    def step(
         self, round: int, cold: bool, release: bool, stop: Callable[[], bool], over: Callable[[], bool] = lambda: False
     ) -> dict[str, Any] | None:
         """One step; None where the process ended over it, or time was up. Raises Stopped once `stop()`."""
-        self.process.ask({"round": round, "cold": cold, "release": release})
-        return self.answer(stop, over)
-
-    def answer(self, stop: Callable[[], bool], over: Callable[[], bool]) -> dict[str, Any] | None:
-        try:
-            result: dict[str, Any] = self.process.answer(lambda: stop() or over())
-            return result
-        except Ended as end:
-            self.end = end
-        except Refused as refusal:
-            if not self.may_refuse:
-                raise
-            self.refusal = refusal
-        except Stopped:
-            if stop():
-                raise
-            self.late = True
-        self.process.close()  # what it held is for the others
-        return None
+        return self.ask({"round": round, "cold": cold, "release": release}, stop, over)
 
 
 def bench(
@@ -181,7 +154,7 @@ def _begin(sweep: Sweep, case: Case, depth: int, start: Callable[[dict[str, Any]
         "objective": sweep.objective,
         "memory_limit": sweep.memory_limit,
     }
-    return _Run(case, config, start(first), sweep.may_refuse(case))
+    return _Run(start(first), sweep.may_refuse(case), case=case, config=config)
 
 
 def _measure(
@@ -205,11 +178,11 @@ def _measure(
                     warned.add(line)
                     say(line)
     for run in alive():
-        run.cold = run.ask(0, True, False, stop, pace.over)
+        run.cold = run.step(0, True, False, stop, pace.over)
         if run.cold is not None and run.cold["step_ms"] > 1e3 * SLOW:
             say(f"depth {depth}, {run.case.label}: the first step took {run.cold['step_ms'] / 1e3:.0f} s")
         for _ in range(MAX_WARM_UPS):
-            answer = run.ask(0, False, _tight(sweep, runs), stop, pace.over) if run.alive else None
+            answer = run.step(0, False, _tight(sweep, runs), stop, pace.over) if run.alive else None
             if answer is None or not answer["new_kernels"]:
                 break
     tight = _tight(sweep, runs)
@@ -220,7 +193,7 @@ def _measure(
     while alive() and pace.another(done):
         turn = alive()
         for run in turn[done % len(turn) :] + turn[: done % len(turn)]:
-            answer = run.ask(done + 1, False, tight, stop)
+            answer = run.step(done + 1, False, tight, stop)
             if answer is not None:
                 run.steps[done] = answer
         done += 1

@@ -41,7 +41,7 @@ class Case:
         blame = f"{self.source} {self.label}"
         adjoint = {name: value for name, value in self.options.items() if name in ADJOINT}
         if known and adjoint:
-            raise ConfigError(blame, next(iter(adjoint)), "has no effect where dL/dI is known; take --objective l2")
+            raise ConfigError(blame, next(iter(adjoint)), "has no effect where dL/dI is known; change --objective")
         if known:
             adjoint = {"adjoint": "independent"}  # which goes with any weight
         shared, own = config.integrator.options(), _TYPES[self.type].model_fields if self.type in _TYPES else {}
@@ -65,17 +65,18 @@ class Case:
         return f"{name}({','.join(other)})" if other else name
 
 
-def parse_cases(text: str) -> list[Case]:
+def parse_cases(text: str, source: str = _OPTION, deep: bool = True) -> list[Case]:
     """The cases in a list. Raises ConfigError where one is not written as it must be, or stands there twice.
 
-    What an option means is not looked at here, but in `Case.at`.
+    `source` is the option that the list was given by; `deep`: depths are what is varied. What an option means is not
+    looked at here, but in `Case.at`.
     """
-    return _parse(_split(text), _OPTION, "", "integrator; write TYPE[:ESTIMATOR][(OPTION=VALUE,...)]")
+    return _parse(_split(text), source, "", "integrator; write TYPE[:ESTIMATOR][(OPTION=VALUE,...)]", deep)
 
 
 def parse_estimators(text: str) -> list[Case]:
     """The cases in a list of estimators of `reslrb`, such as `stack,reservoir(capacity=4)`; raises as `parse_cases`."""
-    return _parse(_split(text), "--estimators", "reslrb:", "estimator; write ESTIMATOR[(OPTION=VALUE,...)]")
+    return _parse(_split(text), "--estimators", "reslrb:", "estimator; write ESTIMATOR[(OPTION=VALUE,...)]", False)
 
 
 def all_estimators(config: Config) -> list[Case]:
@@ -92,7 +93,7 @@ def all_estimators(config: Config) -> list[Case]:
     return cases
 
 
-def _parse(items: list[str], source: str, prefix: str, wanted: str) -> list[Case]:
+def _parse(items: list[str], source: str, prefix: str, wanted: str, deep: bool) -> list[Case]:
     cases: list[Case] = []
     for item in items:
         match = _ITEM.fullmatch(prefix + item)
@@ -103,9 +104,9 @@ def _parse(items: list[str], source: str, prefix: str, wanted: str) -> list[Case
             name, equals, value = pair.partition("=")
             if not equals or not name.strip():
                 raise ConfigError(source, item, f"`{pair}` must be OPTION=VALUE")
-            if name.strip() == "max_depth" and not prefix:
+            if name.strip() == "max_depth" and deep:
                 raise ConfigError(source, item, "max_depth is what is varied; --max-depth says how far")
-            if name.strip() in ("max_depth", *ADJOINT) and prefix:
+            if name.strip() == "max_depth" or (name.strip() in ADJOINT and prefix):
                 section = "run" if name.strip() in ADJOINT else "integrator"
                 raise ConfigError(source, item, f"all share one {name.strip()}; take --set {section}.{pair}")
             options[name.strip()] = parse(value, f"{source} {item}", name_line=False)

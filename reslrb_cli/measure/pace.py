@@ -17,18 +17,27 @@ class Pace:
     """Divides the time among depths, each of which gets GROWTH times as much as the one before it.
 
     What a depth leaves is for the others. None gets fewer than MIN_ROUNDS rounds while there is time at all, whatever
-    its own share. With `rounds` time does not count.
+    its own share, nor more than `most`. With `rounds` time does not count.
     """
 
     def __init__(
-        self, budget_s: float, depths: int, rounds: int | None = None, now: Callable[[], float] = time.monotonic
+        self,
+        budget_s: float,
+        depths: int,
+        rounds: int | None = None,
+        now: Callable[[], float] = time.monotonic,
+        most: int = MAX_ROUNDS,
     ) -> None:
-        self._now, self._end, self._left, self._rounds = now, now() + budget_s, depths, rounds
+        self._now, self._end, self._left, self._rounds, self._most = now, now() + budget_s, depths, rounds, most
         self._rounds_start = self._depth_end = now()
 
     def over(self) -> bool:
         """Whether the time is up."""
         return self._rounds is None and self._now() >= self._end
+
+    def fits(self, seconds: float) -> bool:
+        """Whether there is so much time left."""
+        return self._rounds is not None or self._now() + seconds <= self._end
 
     def begin_depth(self) -> None:
         """A depth begins."""
@@ -44,7 +53,7 @@ class Pace:
         """Whether there is time for another round after `done` of them."""
         if self._rounds is not None:
             return done < self._rounds
-        if done == 0 or done >= MAX_ROUNDS:
+        if done == 0 or done >= self._most:
             return done == 0
         now = self._now()
         return now + (now - self._rounds_start) / done <= (self._end if done < MIN_ROUNDS else self._depth_end)

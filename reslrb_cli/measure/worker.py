@@ -41,6 +41,20 @@ def held_gradients() -> Begin:
     return begin
 
 
+def surveyed() -> Begin:
+    """What `convergence` asks before it measures."""
+    from reslrb_cli.measure.convergence.survey import begin
+
+    return begin
+
+
+def sampled_steps() -> Begin:
+    """Steps as `convergence` measures them, with what they estimate."""
+    from reslrb_cli.measure.convergence.sampler import begin
+
+    return begin
+
+
 def main(load: Callable[[], Begin] = measured_steps) -> int:
     """Answer until standard input ends, or until something fails: the last answer then says what."""
     answers = os.fdopen(os.dup(sys.stdout.fileno()), "w", encoding="utf-8")

@@ -120,12 +120,13 @@ def assemble(config: Config, say: Callable[[str], None] = lambda line: None, cac
     """
     problem = assemble_scene(config)
     options = find_options(problem)
-    _make_targets(problem, say)
+    make_targets(problem, say)
     settle_integrator(problem, options, say, cache)
     return problem
 
 
-def _make_targets(problem: Problem, say: Callable[[str], None]) -> None:
+def make_targets(problem: Problem, say: Callable[[str], None]) -> None:
+    """Read or render the targets, with what is known of the parameters then; `say` is told what takes long."""
     config = problem.config
     render = config.target.render
     if render is None:

@@ -7,9 +7,6 @@ import json
 import statistics
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from pathlib import Path
-from types import TracebackType
-from typing import Any
 
 
 class BenchStatus(str, enum.Enum):
@@ -69,28 +66,3 @@ class BenchRecord:
     def to_json(self) -> str:
         """The record as one line of JSON."""
         return json.dumps(asdict(self), allow_nan=False)
-
-
-class BenchWriter:
-    """Writes records to a file of their own; each line is on disk once `write` returns."""
-
-    def __init__(self, path: Path) -> None:
-        self._file = path.open("w", encoding="utf-8")
-
-    def write(self, record: BenchRecord) -> None:
-        """Append one record."""
-        self._file.write(record.to_json() + "\n")
-        self._file.flush()
-
-    def __enter__(self) -> BenchWriter:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._file.close()
-
-
-def read_bench(path: Path) -> list[dict[str, Any]]:
-    """The objects in a file that `BenchWriter` wrote."""
-    return [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]

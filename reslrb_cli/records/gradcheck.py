@@ -6,9 +6,7 @@ import enum
 import json
 import math
 from dataclasses import asdict, dataclass
-from pathlib import Path
-from types import TracebackType
-from typing import Any, Protocol
+from typing import Any
 
 
 class Reference(str, enum.Enum):
@@ -97,29 +95,3 @@ class GradcheckRecord:
 
 def _finite(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
-
-
-class Line(Protocol):
-    """What is a line of JSON."""
-
-    def to_json(self) -> str: ...
-
-
-class GradcheckWriter:
-    """Writes records to a file of their own; each line is on disk once `write` returns."""
-
-    def __init__(self, path: Path) -> None:
-        self._file = path.open("w", encoding="utf-8")
-
-    def write(self, record: Line) -> None:
-        """Append one record."""
-        self._file.write(record.to_json() + "\n")
-        self._file.flush()
-
-    def __enter__(self) -> GradcheckWriter:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._file.close()

@@ -14,7 +14,8 @@ from reslrb_cli.measure.comparison import (
     tail_weight,
 )
 from reslrb_cli.measure.entries import divisions, entry_count, overall, parts
-from reslrb_cli.records.gradcheck import GradcheckRecord, GradcheckWriter, Kind, Reference, Verdict
+from reslrb_cli.records.gradcheck import GradcheckRecord, Kind, Reference, Verdict
+from reslrb_cli.records.lines import LineWriter
 from reslrb_cli.report.gradcheck_table import Table, failure_line, markdown_table
 
 FAMILY = Family(rows=20, entries=400, alpha=1e-4)
@@ -159,7 +160,7 @@ def record(**changes) -> GradcheckRecord:
 
 
 def test_records_are_written_one_a_line(tmp_path):
-    with GradcheckWriter(tmp_path / "a.jsonl") as writer:
+    with LineWriter(tmp_path / "a.jsonl") as writer:
         writer.write(record())
         writer.write(record(verdict=Verdict.UNRESOLVED, relative_l2=float("inf"), parameter=None))
     first, second = map(json.loads, (tmp_path / "a.jsonl").read_text().splitlines())

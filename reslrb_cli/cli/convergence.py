@@ -1,0 +1,244 @@
+"""`reslrb convergence`: error of the gradient, or of the image, against run time."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from reslrb_cli.cli.bench import Size
+from reslrb_cli.cli.experiment import COUNT, check_writable, experiment_arguments
+from reslrb_cli.cli.output import echo
+from reslrb_cli.errors import ConfigError, ExitCode
+
+if TYPE_CHECKING:
+    from reslrb_cli.measure.convergence.judgement import Results
+    from reslrb_cli.measure.convergence.plan import Plan
+    from reslrb_cli.measure.convergence.resuming import Earlier
+    from reslrb_cli.measure.convergence.session import Session
+    from reslrb_cli.records.convergence import MethodRecord
+    from reslrb_cli.report.convergence_table import Table
+
+
+class Counts(click.ParamType):
+    """Different numbers of samples, such as `4,16,64`."""
+
+    name = "list"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[int, ...]:
+        parts: list[Any] = str(value).split(",")
+        counts = [COUNT.convert(part, param, ctx) for part in parts]
+        if len(set(counts)) < len(counts):
+            self.fail(f"`{value}` names a number twice", param, ctx)
+        return tuple(counts)
+
+
+@click.command("convergence")
+@experiment_arguments
+@click.option("--integrators", metavar="LIST",
+              help="What to compare: TYPE[:ESTIMATOR][(OPTION=VALUE,...)], separated by commas; OPTION is one of the "
+                   "integrator's, or, with --objective loss, adjoint. Default: ptracer, prb and the estimators, as far "
+                   "as they can do CONFIG; with loss the ways to take adjoint.")  # fmt: skip
+@click.option("--objective", type=click.Choice(["fixed", "loss", "image"]), default="fixed", show_default=True,
+              help="fixed: the gradient with dL/dI held at that of a reference image; loss: the gradient of CONFIG's "
+                   "loss, by run.adjoint; image: the image.")  # fmt: skip
+@click.option("--budget", type=click.FloatRange(min=0), default=240.0, show_default=True, metavar="SECONDS",
+              help="Time for the whole, compiling included.")  # fmt: skip
+@click.option("--rounds", type=click.IntRange(min=1, max=COUNT.max), metavar="N",
+              help="Number of turns of each, whatever time they take: the same steps on every machine.")  # fmt: skip
+@click.option("--spp", "spps", type=Counts(), metavar="LIST",
+              help="Samples per pixel of a step, several to compare, e.g. 4,16,64; default: run.spp.")  # fmt: skip
+@click.option("--reference", metavar="METHOD", default="reslrb:stack", show_default=True,
+              help="What errors are taken from: the mean of many steps of this one.")  # fmt: skip
+@click.option("--resume", "resumed", type=click.Path(path_type=Path, dir_okay=False), metavar="FILE",
+              help="Go on from what another call has written with --json FILE; all else as it was.")  # fmt: skip
+@click.option("--memory-limit", type=Size(),
+              help="Address space of each process, e.g. 2GiB (CPU only); default: the machine's memory.")  # fmt: skip
+@click.option("--json", "json_file", type=click.Path(path_type=Path, dir_okay=False),
+              help="Write one object a line: points, methods and references.")  # fmt: skip
+@click.option("--plot", "plot_file", type=click.Path(path_type=Path, dir_okay=False),
+              help="PNG of error against run time; default: beside the JSON file.")  # fmt: skip
+def command(
+    config_file: Path,
+    overrides: tuple[str, ...],
+    integrators: str | None,
+    objective: str,
+    budget: float,
+    rounds: int | None,
+    spps: tuple[int, ...] | None,
+    reference: str,
+    resumed: Path | None,
+    memory_limit: int | None,
+    json_file: Path | None,
+    plot_file: Path | None,
+) -> int:
+    """Measure how fast the error of each method falls on CONFIG, at its initial values, seen through its first sensor.
+
+    Each method takes steps of run.spp samples per pixel in a process of its own, all in turn. Errors are relative to
+    the size of what is estimated; a slope of -1/2 is what independent samples have. Efficiency is 1 / (relative
+    variance * seconds). Ctrl-C keeps what is done. docs/convergence.md explains the columns.
+    """
+    began = time.monotonic()
+    from reslrb_cli.backend.device import device_name, memory_bytes
+    from reslrb_cli.backend.installation import load_packages
+    from reslrb_cli.backend.variant import choose
+    from reslrb_cli.config import load
+
+    load_packages()  # before what follows asks for them
+    from reslrb_cli.measure.cases import parse_cases
+    from reslrb_cli.measure.convergence.plan import DEFAULTS, Plan
+
+    config = load(config_file, overrides)
+    cases = parse_cases(integrators or DEFAULTS[objective], deep=False)
+    stands = parse_cases(reference, "--reference", deep=False)
+    if len(stands) != 1:
+        raise ConfigError("--reference", "", "errors are taken from one method; name one")
+    json_file = json_file or resumed
+    if json_file is not None and plot_file is None:
+        plot_file = json_file.with_suffix(".png")
+    for option, path in (("--json", json_file), ("--plot", plot_file)):
+        check_writable(option, path)
+    variant, _ = choose(config.variant)
+    if variant.startswith("cuda") and memory_limit is not None:
+        raise ConfigError("--memory-limit", "", f"bounds address space, which says nothing of {variant}'s memory")
+    memory = memory_bytes(variant)
+    plan = Plan(
+        config=config,
+        variant=variant,
+        cases=cases,
+        reference=stands[0],
+        objective=objective,
+        memory_limit=memory_limit or (None if variant.startswith("cuda") else memory),
+        memory=memory,
+        budget_s=budget,
+        rounds=rounds,
+        default=integrators is None,
+        spps=spps or (),
+    )
+    plan.check()
+    where = f"{device_name(variant)}, {variant}"
+    echo(where)
+    earlier = None if resumed is None else _earlier(resumed)
+    results, conditions, interrupted = _run(plan, json_file, began, earlier)
+    if plot_file is not None and results.points:
+        from reslrb_cli.report.convergence_plot import plot_convergence
+
+        plot_convergence(results.points, results.methods, plot_file, f"{where}\n{conditions}")
+        echo(f"look at {os.path.relpath(plot_file)}")
+    return ExitCode.INTERRUPTED if interrupted else _exit_code(results)
+
+
+def _run(plan: Plan, json_file: Path | None, began: float, earlier: Earlier | None) -> tuple[Results, str, bool]:
+    """Measure, print and write; returns the results, the conditions in words, and whether the user interrupted."""
+    import shutil
+    import tempfile
+    from contextlib import ExitStack
+
+    from reslrb_cli.cli.interrupts import Interrupts
+    from reslrb_cli.measure.convergence.judgement import Judgement
+    from reslrb_cli.measure.convergence.members import Role
+    from reslrb_cli.measure.convergence.session import Session
+    from reslrb_cli.measure.processes import abandon_all
+    from reslrb_cli.records.lines import Line, LineWriter
+    from reslrb_cli.report.convergence_table import closing_sentence, notes, reference_line
+
+    with ExitStack() as stack:
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="reslrb-convergence-")))
+
+        def tidy() -> None:
+            abandon_all()
+            shutil.rmtree(folder, ignore_errors=True)
+
+        interrupts = stack.enter_context(Interrupts(last_act=tidy))
+        spent_s = time.monotonic() - began
+        session = Session(plan, folder, lambda: interrupts.requested, echo, spent_s=spent_s, earlier=earlier)
+        table: Table | None = None
+        for rounds in session.run():
+            if table is None:
+                echo(_conditions(plan, session))
+                table = _table(session)
+                echo(table.head())
+            judgement = Judgement(session)
+            for member in session.of(Role.CASE):
+                if judgement.ready and member.refusal is None:
+                    echo(table.line(judgement.overall(member), f"{rounds} rounds"))
+        results = Judgement(session).results()
+        if json_file is not None:  # only now: what is gone on from may be the same file
+            lines: list[Line] = [*results.points, *results.methods, *results.references]
+            with LineWriter(json_file) as writer:
+                for line in lines:
+                    writer.write(line)
+        table = _table(session)
+        echo(table.head())
+        shown = _shown(results.methods)
+        for record in results.methods:
+            if record.parameter in shown:
+                echo(table.line(record))
+        for stood in results.references:
+            if stood.parameter in shown:
+                echo(reference_line(stood))
+        for note in notes([record for record in results.methods if record.parameter in shown]):
+            echo(note)
+        echo(closing_sentence(results.methods))
+        if json_file is not None:
+            _keep(session, json_file)
+        return results, _conditions(plan, session), interrupts.requested
+
+
+def _earlier(file: Path) -> Earlier:
+    """What lies beside a JSON file. Raises ConfigError."""
+    from reslrb_cli.measure.convergence.resuming import Earlier
+    from reslrb_cli.records.convergence_samples import read_samples, samples_file
+
+    return Earlier(file, *read_samples(samples_file(file)))
+
+
+def _keep(session: Session, json_file: Path) -> None:
+    """Write what a later call can go on from, where that is not too large."""
+    from reslrb_cli.records.convergence_samples import MOST_BYTES, samples_file, write_samples
+
+    kept = session.keep() if json_file.is_file() else None
+    if kept is not None and sum(array.nbytes for array in kept[1].values()) <= MOST_BYTES:
+        write_samples(samples_file(json_file), *kept)
+
+
+def _table(session: Session) -> Table:
+    """A table whose columns fit what the session has measured, or is about to."""
+    from reslrb_cli.measure.convergence.members import Role
+    from reslrb_cli.report.convergence_table import Table
+
+    return Table([member.label for member in session.of(Role.CASE)], [*session.facts.get("shapes", ()), "999 rounds"])
+
+
+def _shown(records: Sequence[MethodRecord]) -> list[str]:
+    """The parameters that have lines: a single one is all there is."""
+    keys = list(dict.fromkeys(record.parameter for record in records))
+    return [key for key in keys if key != "all"] if len(keys) == 2 else keys
+
+
+def _conditions(plan: Plan, session: Session) -> str:
+    """What was measured, in one line."""
+    config, facts = plan.config, session.facts
+    depth, rr_depth = config.integrator.max_depth, config.integrator.rr_depth
+    roulette = "no roulette" if 0 <= depth < rr_depth else f"roulette from depth {rr_depth}"
+    what = {"fixed": "dL/dI held", "loss": f"loss {config.loss.type}", "image": "the image"}[plan.objective]
+    spp = ", ".join(str(count) for count in plan.spps or [config.run.spp])
+    parts = [str(config.source), f"{spp} spp", roulette, what, facts.get("pictures", "")]
+    parts.append(
+        "without the film's border, where light paths lose what camera paths see" if facts.get("masked") else ""
+    )
+    return ", ".join(part for part in parts if part)
+
+
+def _exit_code(results: Results) -> ExitCode:
+    """A comparison in which something could be measured is done; else what kept it from that decides."""
+    from reslrb_cli.records.bench import BenchStatus
+
+    if any(record.relative_rmse is not None for record in results.methods):
+        return ExitCode.DONE
+    states = {record.status for record in results.methods}
+    return ExitCode.OUT_OF_MEMORY if states == {BenchStatus.OUT_OF_MEMORY} else ExitCode.CHECK_FAILED

@@ -1,0 +1,237 @@
+"""What the samples of a session come to: errors, slopes, efficiencies, and who is biased."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from reslrb_cli.measure.comparison import ROUNDING, TAIL, Comparison, Family, compare_expectations, tail_weight
+from reslrb_cli.measure.convergence.curves import FEWEST, Estimate, Reference, Samples
+from reslrb_cli.measure.convergence.members import Member, Role
+from reslrb_cli.measure.convergence.plan import ALL, IMAGES
+from reslrb_cli.measure.convergence.session import Session
+from reslrb_cli.measure.entries import entry_count
+from reslrb_cli.records.bench import BenchStatus
+from reslrb_cli.records.convergence import TARGETS, MethodRecord, PointRecord, Range, ReferenceRecord
+from reslrb_cli.records.gradcheck import Verdict
+
+#: What a stock integrator differs by on the same paths, relative to the entries: whether a point is visible is another
+#: matter of rounding to each.
+STOCK_ROUNDING = 1e-3
+#: What is said of noise with heavy tails.
+HEAVY = "single steps carry the variance: intervals are too narrow, and more steps may show more"
+
+
+@dataclass(frozen=True)
+class Results:
+    """All records of a session."""
+
+    points: list[PointRecord]
+    methods: list[MethodRecord]
+    references: list[ReferenceRecord]
+
+
+@dataclass(frozen=True)
+class _Bias:
+    """What is known of a bias: of one parameter, or the worst of all of them."""
+
+    biased: bool | None = None
+    z: float | None = None
+    limit: float | None = None
+    judge: str | None = None
+    independent: bool = False
+    message: str = ""
+
+
+class Judgement:
+    """Judges what a session has sampled, as far as it came."""
+
+    def __init__(self, session: Session) -> None:
+        self._session = session
+        self._slices = session.slices() if session.facts else {}
+        self._whole = {key: Reference(rows) for key, rows in self._reference_rows().items()}
+
+    def _reference_rows(self) -> dict[str, np.ndarray]:
+        """Rows of what errors are taken from, by parameter and of all; nothing where there are too few."""
+        found = self._session.of(Role.REFERENCE)
+        if not found or len(set(found[0].turns)) < FEWEST or found[0].message:
+            return {}
+        return {key: self._rows(found[0], place) for key, place in self._places().items()}
+
+    def _places(self) -> dict[str, slice]:
+        """Where each parameter stands, and all together, unless the image is what is estimated."""
+        if "image" in self._slices:
+            return self._slices
+        return self._slices | {ALL: slice(None)}
+
+    def _rows(self, member: Member, place: slice) -> np.ndarray:
+        """Independent estimates by a reference; steps that share one dL/dI where there are several are one."""
+        several = self._session.plan.objective == "loss" and len(set(member.turns)) > IMAGES
+        return member.means(place, IMAGES if several else None)
+
+    @property
+    def ready(self) -> bool:
+        """Whether there is anything to say."""
+        return bool(self._whole)
+
+    def overall(self, member: Member) -> MethodRecord:
+        """Figures of all parameters together (or the image), biases not looked at."""
+        key = next(reversed(self._places()))
+        return self._method(member, key, self._places()[key], _Bias())
+
+    def results(self) -> Results:
+        """Everything."""
+        session = self._session
+        cases, references = session.of(Role.CASE), session.of(Role.REFERENCE)
+        points: list[PointRecord] = []
+        methods: list[MethodRecord] = []
+        judged = {member.label: self._biases(member) for member in cases if self._measured(member)}
+        own = self._biases(references[0]) if self.ready else {}
+        for member in cases:
+            if member.refusal is not None:
+                continue
+            for key, place in self._places().items():
+                if key == ALL and len(self._slices) == 1:  # all there is
+                    methods.append(replace(methods[-1], parameter=ALL))
+                    points += [replace(point, parameter=ALL) for point in points if point.method == member.method]
+                    continue
+                methods.append(self._method(member, key, place, judged.get(member.label, {}).get(key, _Bias()), own))
+                points += self._points(member, key, place)
+        stood = [self._stood(references[0], key, own[key]) for key in self._places()] if self.ready else []
+        return Results(points, methods, stood)
+
+    def _measured(self, member: Member) -> bool:
+        """Whether there are figures of a member."""
+        return self.ready and member.end is None and not member.message and len(member.rows) >= FEWEST
+
+    # --- bias ---------------------------------------------------------------------------------------------------------
+
+    def _judge(self, member: Member, key: str) -> Member | None:
+        """Who a member's bias is judged by: an independent stock integrator, else what errors are taken from."""
+        session = self._session
+        reference = session.of(Role.REFERENCE)[0]
+        stock = session.judges.get(session.facts["independent"][key] or "")
+        usable = stock is not None and stock.end is None and not stock.message and len(set(stock.turns)) >= FEWEST
+        if usable and stock is not member and stock.method.integrator != member.method.integrator:  # type: ignore[union-attr]
+            return stock
+        return None if member is reference else reference
+
+    def _biases(self, member: Member) -> dict[str, _Bias]:
+        """By parameter, and of all."""
+        found = {key: self._bias(member, key) for key in self._slices}
+        if "image" in found:
+            return found
+        biases = list(found.values())
+        worst = max(biases, key=lambda bias: -1.0 if bias.z is None else bias.z)
+        biased = True if any(b.biased for b in biases) else None if any(b.biased is None for b in biases) else False
+        judges = ", ".join(dict.fromkeys(bias.judge for bias in biases if bias.judge is not None)) or None
+        message = next((bias.message for bias in biases if bias.message), "")
+        found[ALL] = _Bias(biased, worst.z, worst.limit, judges, all(b.independent for b in biases), message)
+        return found
+
+    def _bias(self, member: Member, key: str) -> _Bias:
+        judge, place = self._judge(member, key), self._slices[key]
+        if judge is None:
+            return _Bias(message="there is no independent reference")
+        independent = _kin(judge) != _kin(member)
+        ours, theirs = np.stack(member.rows)[:, place].astype(np.float64), self._rows(judge, place)
+        if member.role is not Role.CASE:
+            ours = self._rows(member, place)
+        figures = compare_expectations(
+            ours,
+            theirs,
+            self._family(),
+            shape=tuple(self._session.facts["shapes"][key]),
+            paired=False,
+            rounding=STOCK_ROUNDING if independent else ROUNDING,
+        )
+        biased = {Verdict.HOLDS: False, Verdict.FAILS: True}.get(figures.verdict)
+        return _Bias(biased, figures.z_max, figures.z_max_limit, judge.label, independent, _words(figures))
+
+    def _family(self) -> Family:
+        """All comparisons of the session, which are corrected for together."""
+        members = len(self._session.of(Role.CASE)) + 1
+        shapes = self._session.facts["shapes"].values()
+        return Family(members * len(shapes), members * sum(entry_count(tuple(shape)) for shape in shapes))
+
+    # --- records ------------------------------------------------------------------------------------------------------
+
+    def _samples(self, member: Member, key: str, place: slice) -> Samples:
+        rows = np.stack(member.rows)[:, place]
+        return Samples(rows, np.array(member.turns), np.array(member.seconds), self._whole[key])
+
+    def _points(self, member: Member, key: str, place: slice) -> list[PointRecord]:
+        if not self._measured(member) or self._whole[key].floor is None:
+            return []
+        floor = self._whole[key].floor
+        return [
+            PointRecord(member.method, key, p.steps, p.elapsed_s, p.relative_rmse, floor, p.repeats)
+            for p in self._samples(member, key, place).points()
+        ]
+
+    def _method(
+        self, member: Member, key: str, place: slice, bias: _Bias, references: dict[str, _Bias] | None = None
+    ) -> MethodRecord:
+        status = BenchStatus.OK if member.end is None else member.end.status
+        if not self._measured(member) or self._whole[key].floor is None:
+            reason = member.message or ("" if member.end is None else member.end.reason)
+            reason = reason or ("the budget was spent" if member.late or not self._measured(member) else _UNSEEN)
+            return MethodRecord(member.method, key, status, len(member.rows), cold_s=member.cold_s, message=reason)
+        samples, biased = self._samples(member, key, place), bias.biased is True
+        magnitude = samples
+        if biased and references is not None and references[key].biased and key != ALL:
+            judge = self._judge(member, key)
+            if judge is not None:  # what errors are taken from is biased itself
+                magnitude = Samples(samples.deviations + samples.reference.mean, samples.turns, samples.seconds,
+                                    Reference(self._rows(judge, place)))  # fmt: skip
+        message = bias.message
+        if not message and tail_weight(samples.deviations) > TAIL:
+            message = HEAVY
+        times = {f"{target:g}": magnitude.seconds_to(target, biased) for target in TARGETS}
+        slope = samples.slope()
+        return MethodRecord(
+            method=member.method,
+            parameter=key,
+            status=status,
+            repeats=samples.count,
+            step_s=samples.step_s,
+            cold_s=member.cold_s,
+            relative_rmse=float(np.sqrt(samples.variance)),
+            reference_rmse=samples.reference.floor,
+            slope=None if slope is None else Range(**vars(slope.interval())),
+            efficiency=_efficiency(magnitude.efficiency(biased)),
+            bias_z=bias.z,
+            bias_z_limit=bias.limit,
+            bias=float(np.sqrt(magnitude.squared_bias)) if biased else None,
+            bias_reference=bias.judge,
+            independent=bias.independent,
+            biased=bias.biased,
+            seconds_to={name: seconds for name, (seconds, _) in times.items()},
+            extrapolated=[name for name, (_, beyond) in times.items() if beyond],
+            message=message,
+        )
+
+    def _stood(self, member: Member, key: str, bias: _Bias) -> ReferenceRecord:
+        floor = self._whole[key].floor
+        message = bias.message if floor is not None else _UNSEEN
+        return ReferenceRecord(
+            member.method, key, len(member.rows), floor, bias.z, bias.limit, bias.judge, bias.biased, message
+        )
+
+
+_UNSEEN = "nothing of it stands out of the reference's noise"
+
+
+def _kin(member: Member) -> str:
+    """Whose code a member's light paths are: ours, or a stock integrator's."""
+    name = member.method.integrator
+    return name if name in ("ptracer", "prb") else "ours"
+
+
+def _words(figures: Comparison) -> str:
+    return figures.message or ("gradient and reference differ" if figures.verdict is Verdict.FAILS else "")
+
+
+def _efficiency(estimate: Estimate | None) -> Range | None:
+    return None if estimate is None else Range(**vars(estimate.exponential()))

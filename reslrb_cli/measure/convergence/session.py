@@ -1,0 +1,270 @@
+"""The processes of a `convergence`, side by side: each compiles, then they take turns, one computing at a time.
+
+A drift of the machine so hits all alike. What errors are taken from takes its turns too, and so does what biases are
+judged by, where it is not among what is compared. All have seeds of their own: no two share noise.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from reslrb_cli.backend.python import python_command
+from reslrb_cli.config import Config, dump
+from reslrb_cli.errors import ExitCode
+from reslrb_cli.measure.cases import Case
+from reslrb_cli.measure.contestant import Contestant
+from reslrb_cli.measure.convergence.curves import FEWEST
+from reslrb_cli.measure.convergence.members import Member, Role, share_turns
+from reslrb_cli.measure.convergence.plan import Plan
+from reslrb_cli.measure.convergence.resuming import Earlier, kept
+from reslrb_cli.measure.pace import Pace
+from reslrb_cli.measure.processes import Process, Refused, Stopped
+from reslrb_cli.records.bench import BenchStatus
+
+#: What the samples of all together may take in memory, in bytes.
+MEMORY = 2**30
+#: The most rounds.
+MOST_ROUNDS = 256
+#: Share of the budget, and seconds beside it, that are left for the statistics and the picture.
+AFTERWARDS, AFTERWARDS_S = 0.03, 2.0
+#: Where all together hold more than this share of the memory, each releases its own after a step.
+MEMORY_SHARE = 0.7
+MIB = 2**20
+#: Light paths of a step of an independent reference, whose samples per pixel are its own: naive AD keeps all paths.
+INDEPENDENT_PATHS = 2**18
+
+#: Starts a process by its first message and the name of what it does, a function of `worker.py`.
+Start = Callable[[dict[str, Any], str], Any]
+
+
+def start_process(first: dict[str, Any], does: str) -> Process:
+    """A process that does what the function `does` of `worker.py` returns."""
+    return Process(first, python_command(f"from reslrb_cli.measure.worker import {does}, run\nrun({does})"))
+
+
+class Session:
+    """Processes under way and what they have sampled; arrays go by way of `folder`, which is the caller's to remove.
+
+    `facts` are the survey's; of the budget `spent_s` have gone before. `judges` has the members that stand for an
+    independent stock integrator, by its name. What an `earlier` session has sampled counts, and is gone on from.
+    """
+
+    def __init__(
+        self,
+        plan: Plan,
+        folder: Path,
+        stop: Callable[[], bool],
+        say: Callable[[str], None],
+        start: Start = start_process,
+        now: Callable[[], float] = time.monotonic,
+        spent_s: float = 0.0,
+        earlier: Earlier | None = None,
+    ) -> None:
+        self._earlier, self._before = earlier, 0
+        self.plan, self.folder, self.members, self.rounds = plan, folder, list[Member](), 0
+        self.facts: dict[str, Any] = {}
+        self.judges: dict[str, Member] = {}
+        self._stop, self._say, self._start, self._now, self._began = stop, say, start, now, now() - spent_s
+        budget_s = max((1 - AFTERWARDS) * plan.budget_s - AFTERWARDS_S - spent_s, 0.0)
+        self._pace = Pace(budget_s, 1, plan.rounds, now, MOST_ROUNDS)
+        self._warned: set[str] = set()
+
+    def slices(self) -> dict[str, slice]:
+        """Where each parameter (or the image) stands in a sample."""
+        found, at = {}, 0
+        for key, shape in self.facts["shapes"].items():
+            size = int(np.prod(shape, dtype=int))
+            found[key] = slice(at, at + size)
+            at += size
+        return found
+
+    def of(self, role: Role) -> list[Member]:
+        """The members of one role."""
+        return [member for member in self.members if member.role is role]
+
+    def run(self) -> Iterator[int]:
+        """Measure; yield the number of rounds whenever it has doubled. Ends early, with what is done, once `stop()`.
+
+        Raises Refused where what may not be left out cannot begin.
+        """
+        self._pace.begin_depth()
+        try:
+            if self._survey():
+                self._begin()
+                self._warm_up()
+                yield from self._take_turns()
+        except Stopped:
+            return
+        finally:
+            for member in self.members:
+                member.process.close()
+        self._say_what_it_takes()
+
+    def keep(self) -> tuple[dict[str, Any], dict[str, np.ndarray]] | None:
+        """What a later session needs to go on; None where nothing has been sampled, or a process has come to an end."""
+        if not self.rounds or not all(member.alive and member.rows for member in self.members):
+            return None
+        return kept(self.plan.objective, self.facts, self.folder / "arrays.npz", self.members, self.rounds)
+
+    # --- before the rounds --------------------------------------------------------------------------------------------
+
+    def _first(self, config: Config) -> dict[str, Any]:
+        return {"config": dump(config), "source": str(config.source), "variant": self.plan.variant,
+                "memory_limit": self.plan.memory_limit, "arrays": str(self.folder / "arrays.npz")}  # fmt: skip
+
+    def _survey(self) -> bool:
+        """Ask what stands as a reference, and have dL/dI made; False where time is up over it."""
+        plan = self.plan
+        if self._earlier is not None:
+            self.facts = self._earlier.facts(plan.objective, self.folder / "arrays.npz")
+            return True
+        first = self._first(plan.reference_config) | {"objective": plan.objective}
+        surveyor = Contestant(self._start(first, "surveyed"), False)
+        try:
+            opening = surveyor.answer(self._stop, self._pace.over)
+            self._warn(opening)
+            camera = any(case.type == "prb" for case in plan.cases)
+            ask = {
+                "camera": camera,
+                "named": not plan.default,
+                "budget_s": plan.budget_s if plan.rounds is None else None,
+            }
+            question = {"out": first["arrays"], "ask": ask}
+            answer = None if opening is None else surveyor.ask(question, self._stop, self._pace.over)
+        finally:
+            surveyor.process.close()
+        if surveyor.end is not None:
+            memory = surveyor.end.status is BenchStatus.OUT_OF_MEMORY
+            line = f"--reference {plan.reference.label}: {surveyor.end.reason}"
+            raise Refused(line, ExitCode.OUT_OF_MEMORY if memory else ExitCode.CHECK_FAILED)
+        self.facts = answer or {}
+        if answer is None:
+            self._say(
+                f"the budget of {plan.budget_s:g} s was spent before dL/dI was known; allow several times as much"
+            )
+        return answer is not None
+
+    def _begin(self) -> None:
+        plan, facts = self.plan, self.facts
+        for case in plan.cases:
+            reason = facts["without"].get(case.type)
+            if plan.default and reason is not None:
+                self._say(f"left out: {case.label}: {reason}")
+        for case, spp in plan.entries:
+            if not plan.default or case.type not in facts["without"]:
+                self._add(Role.CASE, case, plan.config_of(case, spp), plan.objective)
+        self._add(Role.REFERENCE, plan.reference, plan.reference_config, self._noise_free)
+        for name in dict.fromkeys(name for name in facts["independent"].values() if name is not None):
+            config = plan.independent_config(name)
+            same = [] if plan.objective == "loss" else [m for m in self.of(Role.CASE) if m.config == config]
+            self.judges[name] = (
+                same[0] if same else self._add(Role.INDEPENDENT, Case(name, name, {}), config, self._noise_free)
+            )
+        if self._earlier is not None:
+            self.rounds = self._before = self._earlier.restore(self.members)
+        for key, reason in facts["why"].items():
+            if facts["independent"][key] is None:
+                self._say(f"{key}: no independent reference ({reason}); biases are judged by {plan.reference.label}")
+
+    @property
+    def _noise_free(self) -> str:
+        return "image" if self.plan.objective == "image" else "fixed"
+
+    def _add(self, role: Role, case: Case, config: Config, objective: str) -> Member:
+        plan, number, spp = self.plan, len(self.members), config.run.spp
+        if role is Role.INDEPENDENT and config.integrator.options().get("samples_per_pass") is None:
+            spp = min(spp, max(INDEPENDENT_PATHS // self.facts["pixels"], 1))
+        method = plan.method(case, config, spp, objective != "loss", role is not Role.CASE)
+        first = self._first(config) | {
+            "mode": {"fixed": "known"}.get(objective, objective),
+            "purpose": f"convergence, {role.value} {method.label}",
+        }
+        member = Member(
+            process=self._start(first, "sampled_steps"),
+            may_refuse=role is Role.INDEPENDENT or (role is Role.CASE and plan.default),
+            role=role,
+            method=method,
+            config=config,
+            spp=spp,
+            out=self.folder / f"steps-{number}.npy",
+        )
+        self.members.append(member)
+        return member
+
+    def _warm_up(self) -> None:
+        for member in self.members:
+            self._warn(member.answer(self._stop, self._pace.over))
+        for member in self.members:
+            warm = member.alive and member.warm_up(self._tight(), self._stop, self._pace.over)
+            if member.refusal is not None:
+                self._say(f"left out: {member.label}: {member.refusal}")
+            elif member.end is not None:
+                self._say(f"{member.label}: {member.end.status.value}: {member.end.reason}")
+            elif warm and member.cold is not None:
+                what = "" if member.role is Role.CASE else f" ({member.role.value})"
+                took = (
+                    f"first step {member.cold_s:.1f} s, then {member.step_s:.3g} s, {member.cold['peak_mib']:.0f} MiB"
+                )
+                self._say(f"{member.label}{what}: {took}")
+        share_turns([member for member in self.members if member.alive], self.plan.rounds is not None)
+
+    def _tight(self) -> bool:
+        held = sum(member.cold["peak_mib"] for member in self.members if member.cold is not None and member.alive) * MIB
+        return held > MEMORY_SHARE * self.plan.memory
+
+    def _warn(self, opening: dict[str, Any] | None) -> None:
+        for line in (opening or {}).get("warnings", ()):
+            if line not in self._warned:  # every process loads the same scene
+                self._warned.add(line)
+                self._say(line)
+
+    # --- the rounds ---------------------------------------------------------------------------------------------------
+
+    def _take_turns(self) -> Iterator[int]:
+        alive = [member for member in self.members if member.alive]
+        if not any(member.role is Role.CASE for member in alive) or not any(
+            member.role is Role.REFERENCE for member in alive
+        ):
+            return
+        if not self._pace.fits(FEWEST * self._round_s):
+            return
+        size = sum(int(np.prod(shape, dtype=int)) for shape in self.facts["shapes"].values())
+        most = max(MEMORY // (4 * size * sum(member.count for member in alive)), FEWEST + 1)
+        tight = self._tight()
+        self._pace.begin_rounds()
+        while alive and self.rounds < most and self._pace.another(self.rounds - self._before):
+            start = self.rounds % len(alive)
+            for member in alive[start:] + alive[:start]:
+                member.turn(self.rounds, tight, self._stop)
+            self.rounds += 1
+            alive = [member for member in self.members if member.alive]
+            if self.rounds >= 4 and self.rounds & (self.rounds - 1) == 0:
+                yield self.rounds
+
+    @property
+    def _round_s(self) -> float:
+        """Seconds of a round, by what each took when it was warm."""
+        return sum(member.count * member.step_s for member in self.members if member.alive)
+
+    def _say_what_it_takes(self) -> None:
+        """Where the budget did not suffice for figures: what it would take."""
+        late = [member for member in self.members if member.late]
+        if self.rounds >= FEWEST and not late:
+            return
+        if late:
+            names = ", ".join(member.label for member in late)
+            self._say(f"not measured: {names}: the budget of {self.plan.budget_s:g} s was spent")
+        warm = [member for member in self.members if member.alive]
+        if not warm or self.plan.rounds is not None:
+            return
+        # What has not compiled is taken to take as long as what has.
+        share = 1 + len(late) / len(warm)
+        before = self._now() - self._began - self.rounds * self._round_s
+        needed = (share * (before + FEWEST * self._round_s) + AFTERWARDS_S) / (1 - AFTERWARDS)
+        advice = f"allow about {needed:.0f} s with --budget, or name fewer --integrators, or take a smaller film"
+        self._say(f"figures need {FEWEST} rounds; {advice}")

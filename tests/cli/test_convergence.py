@@ -1,0 +1,177 @@
+"""`reslrb convergence` from the command line, on a poster of 8x8 pixels."""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from cli.tiny import KEY, ROOT, write_experiment
+
+from reslrb_cli.cli import main
+from reslrb_cli.records.convergence import TARGETS
+
+pytestmark = pytest.mark.usefixtures("llvm")
+
+
+def call(*args: str) -> int:
+    logging.getLogger("reslrb_cli").handlers.clear()
+    with pytest.raises(SystemExit) as ended:
+        main(["convergence", *args], prog_name="reslrb")
+    return int(ended.value.code or 0)
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    write_experiment(tmp_path)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def read(path: Path) -> list[dict]:
+    return [json.loads(line) for line in path.read_text().splitlines()]
+
+
+def test_a_scene_from_end_to_end(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Each exact method agrees with ptracer, and the error of averages falls as it should."""
+    names = ["ptracer", "reslrb:stack", "reslrb:reservoir(capacity=2)"]
+    args = ["--integrators", ",".join(names), "--rounds", "16", "--json", "out/c.jsonl", "--set", "run.spp=16"]
+    (folder / "out").mkdir()
+    assert call("tiny.yaml", *args) == 0
+    lines = read(folder / "out/c.jsonl")
+    methods = [line for line in lines if line["kind"] == "method"]
+    assert [(line["label"], line["parameter"]) for line in methods] == [(n, k) for n in names for k in (KEY, "all")]
+    assert [line["capacity"] for line in methods[::2]] == [None, None, 2]
+    for line in methods:
+        assert (line["status"], line["spp"], line["adjoint"], line["biased"]) == ("ok", 16, None, False)
+        assert abs(line["bias_z"]) < line["bias_z_limit"]
+        assert line["efficiency"]["low"] < line["efficiency"]["value"] < line["efficiency"]["high"]
+        assert line["efficiency"]["value"] == pytest.approx(1 / (line["relative_rmse"] ** 2 * line["step_s"]))
+        assert abs(line["slope"]["value"] + 0.5) < 2 * (line["slope"]["high"] - line["slope"]["low"])
+        assert list(line["seconds_to"]) == [f"{target:g}" for target in TARGETS]
+        assert line["cold_s"] > line["step_s"] > 0
+    points = [line for line in lines if line["kind"] == "point" and line["label"] == "ptracer"]
+    assert {(line["parameter"], line["reference_rmse"] > 0) for line in points} == {(KEY, True), ("all", True)}
+    assert [line["steps"] for line in points[: len(points) // 2]] == [2**k for k in range(len(points) // 2)]
+    for line in points:
+        assert line["elapsed_s"] == pytest.approx(line["steps"] * points[0]["elapsed_s"])
+    reference = next(line for line in lines if line["kind"] == "reference")
+    assert (reference["label"], reference["bias_reference"], reference["biased"]) == ("reslrb:stack", "ptracer", False)
+    assert (folder / "out/c.png").read_bytes().startswith(b"\x89PNG")
+    printed = capsys.readouterr().out.splitlines()
+    assert printed[-2].startswith("Best for this scene: ")
+    assert "ptracer" in printed[-2]
+    assert sum("16 rounds" in line for line in printed) == len(names)  # rows as they come
+    assert any(line.startswith("ptracer: first step") for line in printed)  # and what was compiled, apart
+
+
+@pytest.mark.long
+def test_the_loss_catches_what_is_correlated(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    args = ["--objective", "loss", "--rounds", "64", "--json", "c.jsonl", "--set", "run.spp=4", "--set", "loss.type=l2"]
+    cases = "reslrb:stack(adjoint=correlated),reslrb:stack(adjoint=independent)"
+    assert call("tiny.yaml", *args, "--integrators", cases) == 0
+    methods = [line for line in read(folder / "c.jsonl") if line["kind"] == "method" and line["parameter"] == "all"]
+    assert [(line["adjoint"], line["biased"]) for line in methods] == [("correlated", True), ("independent", False)]
+    assert methods[0]["slope"]["low"] > -0.4
+    assert methods[1]["slope"]["low"] < -0.5 < methods[1]["slope"]["high"]
+    assert methods[0]["bias"] > 0.1
+    sentence = capsys.readouterr().out.splitlines()[-2]
+    assert "Best for this scene: reslrb:stack(adjoint=independent); of all others a bias was found." in sentence
+
+
+@pytest.mark.long
+def test_the_image(folder: Path) -> None:
+    assert call("tiny.yaml", "--objective", "image", "--rounds", "4", "--json", "c.jsonl", "--integrators", "prb") == 0
+    methods = [line for line in read(folder / "c.jsonl") if line["kind"] == "method"]
+    assert [(line["label"], line["parameter"], line["biased"]) for line in methods] == [("prb", "image", False)]
+
+
+def test_a_budget_that_is_too_small_says_so(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert call("tiny.yaml", "--budget", "1", "--integrators", "reslrb:stack") == 1
+    printed = capsys.readouterr()
+    assert "the budget of 1 s was spent before dL/dI was known" in printed.out
+    assert "Traceback" not in printed.err
+
+
+@pytest.mark.parametrize(
+    ("args", "line"),
+    [
+        (("--integrators", "ptracer,ptracer"), "--integrators: `ptracer` is named twice"),
+        (("--integrators", "reslrb:stack(adjoint=batched)"), "adjoint: has no effect where dL/dI is known"),
+        (("--reference", "ptracer,prb"), "--reference: errors are taken from one method; name one"),
+        (("--reference", "walk"), "--reference walk: integrator.type: must be one of"),
+        (("--json", "no/such/folder.jsonl"), "--json: cannot write no/such/folder.jsonl"),
+        (("--objective", "gradient"), "'gradient' is not one of 'fixed', 'loss', 'image'"),
+        (("--set", "run.spp=0"), "run.spp"),
+        (("--spp", "4,x"), "'x' is not a valid integer range"),
+        (("--spp", "4,0"), "0 is not in the range"),
+        (("--spp", "4,4"), "`4,4` names a number twice"),
+        (("--spp", "3", "--set", "integrator.samples_per_pass=2"), "integrator.samples_per_pass: 2 does not divide"),
+        (("--integrators", "prb(rr_depth=x)"), "integrator.rr_depth"),
+    ],
+)
+def test_bad_input_is_one_located_line(
+    folder: Path, args: tuple[str, ...], line: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert call("tiny.yaml", *args) == 2
+    printed = capsys.readouterr()
+    assert printed.out == ""
+    assert line in printed.err
+    assert len(printed.err.splitlines()) == 1
+
+
+@pytest.mark.parametrize("content", [None, b"", b"PK\x03\x04 cut off", "compressed"])
+def test_steps_that_cannot_be_gone_on_from(
+    folder: Path, content: bytes | str | None, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (folder / "c.jsonl").write_text("kept\n")
+    if isinstance(content, bytes):
+        (folder / "c.samples.npz").write_bytes(content)
+    elif content is not None:
+        np.savez_compressed(folder / "c.samples.npz", head=np.array("{}"))
+    assert call("tiny.yaml", "--resume", "c.jsonl") == 2
+    assert "c.samples.npz: " in capsys.readouterr().err
+    assert (folder / "c.jsonl").read_text() == "kept\n"
+
+
+@pytest.mark.long
+def test_going_on(folder: Path) -> None:
+    args = ["--integrators", "reslrb:stack", "--rounds", "4"]
+    assert call("tiny.yaml", *args, "--json", "c.jsonl") == 0
+    assert call("tiny.yaml", *args, "--resume", "c.jsonl") == 0
+    assert {line["repeats"] for line in read(folder / "c.jsonl") if line["kind"] == "method"} == {16}
+    assert call("tiny.yaml", *args, "--resume", "c.jsonl", "--set", "run.spp=8") == 2
+    assert len(read(folder / "c.jsonl")) > 2  # as it was
+
+
+@pytest.mark.long
+def test_a_method_that_cannot_do_the_scene_is_located(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    text = (folder / "scene.xml").read_text().replace('type="area"', 'type="directionalarea"')
+    (folder / "scene.xml").write_text(text)
+    assert call("tiny.yaml", "--rounds", "3", "--integrators", "prb") == 2
+    assert "directionalarea" in capsys.readouterr().err
+
+
+@pytest.mark.long
+def test_an_interrupt_keeps_what_is_done(folder: Path) -> None:
+    script = "import sys; sys.argv[0] = 'reslrb'; from reslrb_cli.cli import run; run()"
+    args = ["convergence", "tiny.yaml", "--integrators", "reslrb:stack", "--rounds", "100000", "--json", "c.jsonl"]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "PYTHONUNBUFFERED": "1"}
+    process = subprocess.Popen(
+        [sys.executable, "-c", script, *args], cwd=folder, env=environment, stdout=subprocess.PIPE, text=True
+    )
+    assert process.stdout is not None
+    for line in process.stdout:
+        if "16 rounds" in line:
+            process.send_signal(signal.SIGINT)
+            break
+    rest = process.stdout.read()
+    assert process.wait() == 130
+    assert "the only one that was measured" in rest
+    assert {line["kind"] for line in read(folder / "c.jsonl")} == {"point", "method", "reference"}

@@ -1,0 +1,177 @@
+"""Methods of known cost, noise and bias in place of processes, for tests of what `convergence` makes of them."""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from reslrb_cli.config import loads
+from reslrb_cli.measure.cases import parse_cases
+from reslrb_cli.measure.convergence.judgement import Judgement, Results
+from reslrb_cli.measure.convergence.plan import Plan
+from reslrb_cli.measure.convergence.session import Session
+from reslrb_cli.measure.processes import Ended, Refused, Stopped
+from reslrb_cli.records.bench import BenchStatus
+from reslrb_cli.records.convergence import MethodRecord
+
+#: What all unbiased methods estimate: two parameters, one of them of colours.
+SHAPES = {"a": [4, 5, 3], "b": [3]}
+TRUTH = np.concatenate([np.random.default_rng(3).uniform(0.5, 1.5, 60), [2.0, -1.0, 0.5]])
+
+
+@dataclass
+class Pretence:
+    """One method: seconds of a step, and of the first; standard deviation of each entry, and bias, relative to it.
+
+    `image_noise` is shared by all steps with one dL/dI. The first step of a turn takes `late_s` more. It ends at
+    question number `ends`, if that is given.
+    """
+
+    step_s: float = 0.1
+    noise: float = 1.0
+    bias: float = 0.0
+    cold_s: float = 1.0
+    image_noise: float = 0.0
+    late_s: float = 0.0
+    ends: int | None = None
+    refuses: bool = False
+    nan_at: int | None = None
+    steps: list[int] = field(default_factory=list)
+
+    def sample(self, purpose: str, number: int, image: int) -> np.ndarray:
+        """One step, (63,) float32."""
+        random = np.random.default_rng([zlib.crc32(purpose.encode()), number])
+        shared = np.random.default_rng([7, image]).standard_normal(len(TRUTH)) * self.image_noise
+        row = TRUTH * (1 + self.bias + shared + self.noise * random.standard_normal(len(TRUTH)))
+        return row.astype(np.float32)
+
+
+class Stage:
+    """All methods, by `role label` (or `label`), with a clock that only they move; `start` starts their processes."""
+
+    def __init__(self, facts: dict[str, Any] | None = None, **methods: Pretence) -> None:
+        self.now, self.alive, self.survey_s = 0.0, 0, 2.0
+        self.methods = methods
+        self.turns: list[str] = []
+        self.purposes: list[str] = []
+        self.asked: list[dict[str, Any]] = []
+        keys = list(SHAPES)
+        self.facts = {
+            "keys": keys, "shapes": SHAPES, "independent": dict.fromkeys(keys, "ptracer"),
+            "why": dict.fromkeys(keys, ""), "without": {}, "masked": False, "pixels": 64, "pictures": "",
+        } | (facts or {})  # fmt: skip
+
+    def clock(self) -> float:
+        return self.now
+
+    def start(self, first: dict[str, Any], does: str) -> Player:
+        self.alive += 1
+        self.purposes += [first["purpose"]] if "purpose" in first else []
+        return Player(self, first, does)
+
+    def pretence(self, name: str) -> Pretence:
+        """That of `case reslrb:stack`, say: by role and label, by label, or the plain one."""
+        short = name.partition(" ")[2]
+        found = self.methods.get(_plain(name)) or self.methods.get(_plain(short))
+        return found or self.methods.setdefault(_plain(name), Pretence())
+
+
+def _plain(name: str) -> str:
+    return "".join(c if c.isalnum() else "_" for c in name)
+
+
+class Player:
+    """Stands in for a `Process`."""
+
+    def __init__(self, stage: Stage, first: dict[str, Any], does: str) -> None:
+        self.stage, self.first, self.does, self.closed, self.questions = stage, first, does, False, 0
+        self.question: dict[str, Any] | None = None
+        self.name = first.get("purpose", "").removeprefix("convergence, ")
+        self.played = None if does == "surveyed" else stage.pretence(self.name)
+
+    def ask(self, question: dict[str, Any]) -> None:
+        self.question, self.questions = question, self.questions + 1
+        self.stage.asked.append({"of": self.name} | question)
+
+    def answer(self, stop: Callable[[], bool]) -> dict[str, Any]:
+        if stop():
+            raise Stopped
+        if self.played is None:
+            if self.question is None:
+                return {"warnings": ["old"]}
+            self._wait(self.stage.survey_s, stop)
+            np.savez(self.question["out"], mask=np.ones((2, 2, 1), np.float32))
+            return self.stage.facts
+        if self.question is None:
+            if self.played.refuses:
+                raise Refused("cannot be done here", 2)
+            return {"warnings": ["old"]}
+        if self.played.ends == self.questions:
+            raise Ended(BenchStatus.OUT_OF_MEMORY, "ended by SIGKILL")
+        return self._steps(self.played, self.question, stop)
+
+    def _steps(self, played: Pretence, question: dict[str, Any], stop: Callable[[], bool]) -> dict[str, Any]:
+        cold, numbers = question["cold"], range(question["start"], question["start"] + question["count"])
+        self._wait(played.cold_s if cold else len(numbers) * played.step_s, stop)
+        played.steps += numbers
+        if not cold:
+            self.stage.turns.append(self.name)
+        rows = np.stack([played.sample(self.first["purpose"], n, question["image"] % 8) for n in numbers])
+        if played.nan_at in numbers:
+            rows[0, 1] = np.nan
+        np.save(question["out"], rows)
+        ms = 1e3 * (played.cold_s if cold else played.step_s)
+        times = [ms + 1e3 * played.late_s, *[ms] * (len(numbers) - 1)]
+        return {"step_ms": times, "new_kernels": int(cold), "peak_mib": 2.0}
+
+    def _wait(self, seconds: float, stop: Callable[[], bool]) -> None:
+        for _ in range(max(round(seconds / 0.05), 1)):
+            self.stage.now += seconds / max(round(seconds / 0.05), 1)
+            if stop():
+                raise Stopped
+
+    def close(self) -> None:
+        self.stage.alive -= not self.closed
+        self.closed = True
+
+
+# --- playing ---------------------------------------------------------------------------------------------------------
+
+CONFIG = """\
+scene: {file: scene.xml}
+target: {render: {}}
+parameters: [{key: a}, {key: b}]
+integrator: {max_depth: 4, rr_depth: 9}
+run: {spp: 4}
+"""
+LIST = "ptracer,reslrb:stack,reslrb:event"
+SIGNAL = float(TRUTH @ TRUTH)
+
+
+def plan(cases: str = LIST, **changes: Any) -> Plan:
+    values: dict[str, Any] = {
+        "config": loads(CONFIG, Path("x.yaml")), "variant": "llvm_ad_rgb", "cases": parse_cases(cases, deep=False),
+        "reference": parse_cases("reslrb:stack")[0], "objective": "fixed", "memory_limit": None, "memory": 2**40,
+        "budget_s": 0.0, "rounds": 32,
+    }  # fmt: skip
+    return Plan(**(values | changes))
+
+
+def play(
+    folder: Path, stage: Stage, what: Plan, stop: Callable[[], bool] = lambda: False, earlier: Any = None
+) -> tuple[Session, Results, list[str]]:
+    said: list[str] = []
+    session = Session(what, folder, stop, said.append, stage.start, stage.clock, earlier=earlier)
+    for _ in session.run():
+        pass
+    assert stage.alive == 0
+    return session, Judgement(session).results(), said
+
+
+def of(results: Results, label: str, parameter: str = "all") -> MethodRecord:
+    return next(r for r in results.methods if (r.method.label, r.parameter) == (label, parameter))

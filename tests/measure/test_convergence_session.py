@@ -1,0 +1,223 @@
+"""Who takes turns in a `convergence`, for how long, and what becomes of those that end: with pretended processes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from measure.pretended_steps import CONFIG, LIST, Pretence, Stage, of, plan, play
+
+from reslrb_cli.config import loads
+from reslrb_cli.errors import ConfigError
+from reslrb_cli.measure.convergence.members import MOST_REFERENCE_STEPS, MOST_STEPS, Role
+from reslrb_cli.measure.convergence.resuming import Earlier
+from reslrb_cli.records.bench import BenchStatus
+from reslrb_cli.records.convergence_samples import read_samples, write_samples
+from reslrb_cli.report.convergence_table import closing_sentence, notes
+
+
+def test_steps_go_on_from_those_that_compiled_and_no_two_share_seeds(tmp_path: Path) -> None:
+    stage = Stage(case_ptracer=Pretence(0.4))
+    session, _, _ = play(tmp_path, stage, plan(rounds=4))
+    names = ["case ptracer", "case reslrb:stack", "case reslrb:event", "reference reslrb:stack"]
+    assert list(dict.fromkeys(question["of"] for question in stage.asked if question["of"])) == names
+    for member in session.members:
+        assert member.taken == 2 + 4 * member.count  # one cold, one without a new kernel, then turns
+    for method in stage.methods.values():
+        assert method.steps == list(range(len(method.steps)))
+    purposes = {player.first["purpose"] for player in ()}  # the names, by which seeds differ, are the players' own
+    assert purposes == set()
+    assert stage.purposes == [f"convergence, {name}" for name in names]
+
+
+def test_turns_are_interleaved_and_about_as_long(tmp_path: Path) -> None:
+    stage = Stage(case_ptracer=Pretence(0.4), case_reslrb_stack=Pretence(0.1), case_reslrb_event=Pretence(0.01))
+    session, _, _ = play(tmp_path, stage, plan(rounds=None, budget_s=20.0))
+    names = ["case ptracer", "case reslrb:stack", "case reslrb:event", "reference reslrb:stack"]
+    turns = [names[(r + k) % 4] for r in range(session.rounds) for k in range(4)]
+    assert stage.turns == names + turns
+    assert [m.count for m in session.of(Role.CASE)] == [2, 4, MOST_STEPS]
+    together = 2 * 0.4 + 4 * 0.1 + MOST_STEPS * 0.01
+    assert session.of(Role.REFERENCE)[0].count == min(round(together / 2 / 0.1), MOST_REFERENCE_STEPS)
+
+
+def test_what_others_did_to_the_caches_costs_nothing(tmp_path: Path) -> None:
+    _, results, _ = play(tmp_path, Stage(case_ptracer=Pretence(0.1, late_s=0.3)), plan(rounds=4))
+    assert of(results, "ptracer").step_s == pytest.approx(0.1)
+
+
+def test_a_number_of_rounds_makes_the_steps_the_same_everywhere(tmp_path: Path) -> None:
+    stage = Stage(case_ptracer=Pretence(0.4), independent_prb=Pretence(0.1))
+    stage.facts["independent"] = {"a": "prb", "b": "prb"}
+    session, _, _ = play(tmp_path, stage, plan(rounds=3))
+    assert [(m.role, m.count, len(m.rows)) for m in session.members] == [
+        (Role.CASE, 2, 6), (Role.CASE, 2, 6), (Role.CASE, 2, 6), (Role.REFERENCE, 8, 24), (Role.INDEPENDENT, 4, 12)
+    ]  # fmt: skip
+
+
+def test_ptracer_among_the_methods_stands_for_itself(tmp_path: Path) -> None:
+    session, results, _ = play(tmp_path, Stage(), plan(rounds=8))
+    assert not session.of(Role.INDEPENDENT)  # no roulette at this depth: the same integrator
+    assert of(results, "ptracer").bias_reference == "reslrb:stack"
+    assert of(results, "reslrb:event").bias_reference == "ptracer"
+
+
+@pytest.mark.parametrize("cases", ["reslrb:stack", "ptracer,reslrb:stack"])
+def test_else_an_independent_reference_takes_turns_of_its_own(tmp_path: Path, cases: str) -> None:
+    stage = Stage(independent_ptracer=Pretence(0.01))
+    roulette = loads(CONFIG, Path("x.yaml"), ["integrator.rr_depth=3"])
+    session, results, _ = play(tmp_path, stage, plan(cases, rounds=8, config=roulette))
+    [judge] = session.of(Role.INDEPENDENT)
+    assert judge.config.integrator.options()["rr_depth"] == 1_000_000
+    assert of(results, "reslrb:stack").bias_reference == "ptracer"
+
+
+def test_a_method_that_ends_or_breaks_is_recorded_and_the_rest_goes_on(tmp_path: Path) -> None:
+    stage = Stage(case_reslrb_stack=Pretence(ends=5), case_reslrb_event=Pretence(nan_at=20))
+    _, results, said = play(tmp_path, stage, plan())
+    ended, broken, sound = (of(results, label) for label in ("reslrb:stack", "reslrb:event", "ptracer"))
+    assert (ended.status, ended.efficiency, ended.seconds_to["0.1"]) == (BenchStatus.OUT_OF_MEMORY, None, None)
+    assert "not finite" in broken.message
+    assert broken.relative_rmse is None
+    assert sound.biased is False
+    assert closing_sentence(results.methods) == "Best for this scene: ptracer, the only one that was measured."
+    assert "reslrb:stack, all: ended by SIGKILL" in notes(results.methods)
+    assert said[0] == "old"  # what every process warns of is said once
+    assert said.count("old") == 1
+
+
+def test_an_end_while_it_compiles_is_said(tmp_path: Path) -> None:
+    stage = Stage(case_reslrb_stack=Pretence(ends=1))
+    _, results, said = play(tmp_path, stage, plan())
+    assert "reslrb:stack: out_of_memory: ended by SIGKILL" in said
+    assert of(results, "reslrb:stack").status is BenchStatus.OUT_OF_MEMORY
+
+
+def test_without_what_errors_are_taken_from_there_are_none(tmp_path: Path) -> None:
+    _, results, said = play(tmp_path, Stage(reference_reslrb_stack=Pretence(ends=1)), plan())
+    assert "reslrb:stack: out_of_memory: ended by SIGKILL" in said
+    assert {record.relative_rmse for record in results.methods} == {None}
+    assert results.points == results.references == []
+    assert "Nothing can be said" in closing_sentence(results.methods)
+
+
+def test_an_independent_reference_that_ends_is_replaced(tmp_path: Path) -> None:
+    stage = Stage(independent_ptracer=Pretence(ends=1))
+    _, results, _ = play(tmp_path, stage, plan("reslrb:event"))
+    assert of(results, "reslrb:event").bias_reference == "reslrb:stack"
+    assert of(results, "reslrb:event").independent is False
+
+
+@pytest.mark.parametrize("default", [True, False])
+def test_only_what_nobody_named_is_left_out(tmp_path: Path, default: bool) -> None:
+    stage = Stage({"without": {"ptracer": "it emits wrongly"}})
+    session, _, said = play(tmp_path, stage, plan(default=default, rounds=4))
+    assert ("left out: ptracer: it emits wrongly" in said) is default
+    assert ("ptracer" in [m.label for m in session.of(Role.CASE)]) is not default
+
+
+def test_going_on(tmp_path: Path) -> None:
+    """Steps of both calls count, dL/dI is made once, and no seed comes twice."""
+    stage = Stage()
+    session, _, _ = play(tmp_path, stage, plan(rounds=4))
+    kept = session.keep()
+    assert kept is not None
+    write_samples(tmp_path / "c.samples.npz", *kept)
+    stage.asked.clear()
+    earlier = Earlier(Path("c.jsonl"), *read_samples(tmp_path / "c.samples.npz"))
+    more, results, _ = play(tmp_path, stage, plan(rounds=8), earlier=earlier)
+    assert {question["of"] for question in stage.asked} == {"case " + c for c in LIST.split(",")} | {
+        "reference reslrb:stack"
+    }
+    assert (more.rounds, of(results, "ptracer").repeats) == (12, 24)
+    for before, member in zip(session.members, more.members, strict=True):
+        assert member.turns == [turn for turn in range(12) for _ in range(member.count)]
+        assert len(member.seconds) == 12
+        np.testing.assert_array_equal(member.rows[: len(before.rows)], before.rows)
+        assert len({row.tobytes() for row in member.rows}) == len(member.rows)
+
+
+@pytest.mark.parametrize(
+    ("change", "line"),
+    [
+        ({"cases": "ptracer"}, "its methods are others: case ptracer, case reslrb:stack"),
+        (
+            {"config": loads(CONFIG, Path("x.yaml"), ["integrator.max_depth=5"])},
+            "its settings are not those of ptracer",
+        ),
+        ({"objective": "image"}, "its objective is fixed"),
+    ],
+)
+def test_only_the_same_is_gone_on_from(tmp_path: Path, change: dict[str, Any], line: str) -> None:
+    session, _, _ = play(tmp_path, Stage(), plan(rounds=4))
+    kept = session.keep()
+    assert kept is not None
+    stage = Stage()
+    with pytest.raises(ConfigError, match=f"--resume: c.jsonl is of another measurement: {line}"):
+        play(tmp_path, stage, plan(**({"rounds": 4} | change)), earlier=Earlier(Path("c.jsonl"), *kept))
+    assert stage.alive == 0
+    with pytest.raises(ConfigError, match="by another version"):
+        Earlier(Path("c.jsonl"), kept[0] | {"version": 0}, kept[1])
+
+
+@pytest.mark.parametrize("after", [0, 5, 12, 40, 120])
+def test_a_stop_keeps_what_is_done(tmp_path: Path, after: int) -> None:
+    answers = iter(range(10**6))
+    stage = Stage(case_ptracer=Pretence(0.4))
+    session, results, _ = play(tmp_path, stage, plan(), stop=lambda: next(answers) > after)
+    for member in session.members:
+        assert len(member.rows) == len(member.turns)
+        assert len(set(member.turns)) == len(member.seconds)
+    assert len(results.methods) in (0, 9)
+
+
+@pytest.mark.parametrize(
+    ("budget_s", "measured"), [(60.0, True), (14.0, False), (11.0, False), (6.0, False), (2.0, False)]
+)
+def test_the_budget_covers_compilation_and_one_too_small_says_what_it_would_take(
+    tmp_path: Path, budget_s: float, measured: bool
+) -> None:
+    stage = Stage(case_ptracer=Pretence(0.4, cold_s=2.0))
+    _, results, said = play(tmp_path, stage, plan(rounds=None, budget_s=budget_s))
+    assert stage.now <= max(budget_s, 1.0)
+    assert any(record.relative_rmse is not None for record in results.methods) is measured
+    assert any("budget" in line for line in said) is not measured
+    advice = [line for line in said if "allow about" in line]
+    if advice:
+        enough = float(advice[-1].split("allow about ")[1].split(" s")[0])
+        again = Stage(case_ptracer=Pretence(0.4, cold_s=2.0))
+        _, results, _ = play(tmp_path, again, plan(rounds=None, budget_s=1.05 * enough))
+        assert any(record.relative_rmse is not None for record in results.methods)
+        assert enough > budget_s
+
+
+def test_no_budget_is_overrun(tmp_path: Path) -> None:
+    """Steps of seconds: a round would take longer than what some of these leave after compiling."""
+    for budget_s in range(8, 60, 4):
+        stage = Stage(case_ptracer=Pretence(3.0, cold_s=3.0))
+        play(tmp_path, stage, plan(rounds=None, budget_s=float(budget_s)))
+        assert stage.now <= budget_s
+
+
+def test_the_budget_is_kept_and_used(tmp_path: Path) -> None:
+    stage = Stage(case_ptracer=Pretence(0.4, cold_s=2.0))
+    play(tmp_path, stage, plan(rounds=None, budget_s=100.0))
+    assert 88 < stage.now < 100
+
+
+@pytest.mark.parametrize(
+    ("text", "line"),
+    [
+        ("reslrb:stack(max_depth=3)", "all share one max_depth; take --set integrator.max_depth=3"),
+        ("reslrb:stack(adjoint=batched)", "has no effect where dL/dI is known; change --objective"),
+        ("reslrb:auto", "`auto` measures which to take"),
+        ("path", "integrator.type: must be one of"),
+    ],
+)
+def test_wrong_lists_are_located(text: str, line: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        plan(text).check()
+    assert str(caught.value).startswith("--integrators")
+    assert line in str(caught.value)
