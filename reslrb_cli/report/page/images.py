@@ -9,9 +9,11 @@ from typing import Any
 
 import numpy as np
 
+from reslrb_cli.records.images import load_image
 from reslrb_cli.report.error_map import color_stops, colored
 from reslrb_cli.report.page.markup import figure, figures, text
-from reslrb_cli.report.page.pictures import Array, embed, exposure_for, exposure_words, fit, load_image, show
+from reslrb_cli.report.page.pictures import Array, embed, fit, show
+from reslrb_cli.report.tone import exposure_for, exposure_words
 from reslrb_cli.report.words import number
 
 #: Images between the first and the last that are shown of a sensor, at most.
