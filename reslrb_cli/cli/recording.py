@@ -209,8 +209,10 @@ class Recording:
             write_image(self.folder.images / self._image_name(name, sensor), image)
             self.results.see(name, image, target)
             if name == "final":
-                error = self._image_name("error", sensor)
-                self.error_maps[error] = write_error_map(self.folder.images / error, image, np.array(target))
+                suffix = self._image_name("", sensor)
+                towards = self.problem.image_gradient(image, target)
+                about = write_error_map(self.folder.images, suffix, image, np.array(target), towards)
+                self.error_maps[f"error{suffix}"] = about
 
     def _image_name(self, name: str, sensor: int) -> str:
         return name if len(self.problem.sensors) == 1 else f"{name}-{sensor}"

@@ -79,7 +79,7 @@ def test_pictures_and_curves_are_there_without_script_and_network(chromium, page
     assert all(address.startswith("data:") for address in chromium.requests()[1:])
     broken = "[...document.images].filter(i => !i.complete || i.naturalWidth == 0).length"
     assert chromium.evaluate(broken) == 0
-    assert chromium.evaluate("document.images.length") == 8
+    assert chromium.evaluate("document.images.length") == 9
     drawn = "[...document.querySelectorAll('svg')].map(s => s.getBoundingClientRect().height)"
     heights = chromium.evaluate(drawn)
     assert len(heights) == 4

@@ -57,7 +57,7 @@ tbody th { font-weight: 500 }
   display: inline-block; width: 1.05em; height: 1.05em; border: 1px solid var(--edge); border-radius: .2em;
   vertical-align: -.17em; margin-right: .45em; print-color-adjust: exact; -webkit-print-color-adjust: exact;
 }
-.figures { display: grid; grid-template-columns: repeat(4, minmax(0, 1fr)); gap: 1rem 1.1rem }
+.figures { display: grid; grid-template-columns: repeat(auto-fill, minmax(13rem, 1fr)); gap: 1rem 1.1rem }
 figure { margin: 0; min-width: 0; break-inside: avoid }
 figure img {
   display: block; width: 100%; height: auto; border: 1px solid var(--line); background: #000; border-radius: .25rem;
