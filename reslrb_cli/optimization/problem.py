@@ -84,7 +84,7 @@ class Problem:
         return self.loss(first_channels(image, target.shape[2]), target)
 
     def image_gradient(self, image: Array, target: Any) -> Array:
-        """The derivative dL/dI of one view's loss at an (H, W, C) image, in the target's channels; as it is, if not finite."""
+        """The derivative dL/dI of one view's loss at an image (H, W, C), in the target's channels; finite or not."""
         leaf = mi.TensorXf(np.ascontiguousarray(image[:, :, : target.shape[2]], dtype=np.float32))
         dr.enable_grad(leaf)
         dr.backward(self.compare(leaf, target))

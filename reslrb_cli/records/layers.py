@@ -64,3 +64,14 @@ def _place(letter: str) -> tuple[int, int, str]:
     if letter in "RGBA":
         return 0, "RGBA".index(letter), ""
     return 1, int(letter) if letter.isdecimal() else 0, letter
+
+
+def read_layer_names(path: Path) -> set[str]:
+    """The names of the layers of an EXR, from its head alone; none where there is no file, or it is no EXR."""
+    import OpenEXR
+
+    try:
+        head = OpenEXR.File(str(path), header_only=True).header()
+        return {channel.name.rpartition(".")[0] for channel in head["channels"]}
+    except Exception:  # of many kinds, for files that are damaged
+        return set()

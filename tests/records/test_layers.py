@@ -55,7 +55,7 @@ def test_damaged_files_are_said_to_be(tmp_path):
     whole = (tmp_path / "a.exr").read_bytes()
     for damaged in (b"", b"no image", whole[:60], whole[: len(whole) // 2]):
         (tmp_path / "b.exr").write_bytes(damaged)
-        with pytest.raises(ValueError, match="b.exr"):
+        with pytest.raises(ValueError, match=r"b\.exr"):
             read_layers(tmp_path / "b.exr")
     with pytest.raises(OSError, match="gone"):
         read_layers(tmp_path / "gone.exr")

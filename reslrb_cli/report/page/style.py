@@ -53,6 +53,7 @@ tbody th { font-weight: 500 }
 .facts th { color: var(--soft); font-weight: 500; white-space: nowrap; overflow-wrap: normal }
 .facts td { overflow-wrap: anywhere }
 .number { white-space: nowrap }
+.dense { font-size: .85rem } .dense th, .dense td { padding-right: .8rem }
 .swatch {
   display: inline-block; width: 1.05em; height: 1.05em; border: 1px solid var(--edge); border-radius: .2em;
   vertical-align: -.17em; margin-right: .45em; print-color-adjust: exact; -webkit-print-color-adjust: exact;
@@ -74,8 +75,14 @@ figcaption b { color: var(--ink); font-weight: 600 }
 .curves text { font-family: inherit }
 .legend { list-style: none; display: flex; flex-wrap: wrap; gap: .15rem 1.2rem; margin: .2rem 0 .8rem; padding: 0;
   font-size: .875rem }
-.legend i { display: inline-block; width: 1.4em; height: 0; border-top: 3px solid; vertical-align: .25em;
+.mark { display: inline-block; width: 1.4em; height: 0; border-top: 3px solid; vertical-align: .25em;
   margin-right: .45em; print-color-adjust: exact; -webkit-print-color-adjust: exact }
+.bars { list-style: none; padding: 0; margin: 0 0 .6rem }
+.bar { display: flex; height: 1.1rem; margin: .1rem 0 .5rem; background: var(--box) }
+.bar i { display: block; print-color-adjust: exact; -webkit-print-color-adjust: exact }
+details { margin: .7rem 0 }
+summary { cursor: pointer; font-weight: 600 }
+summary + * { margin-top: .5rem }
 footer { margin-top: 2.5rem; color: var(--soft); font-size: .85rem }
 
 @media (max-width: 46rem) {

@@ -42,13 +42,16 @@ def parameter_table(results: Mapping[str, Any]) -> str:
     return table(head, rows, "parameters")
 
 
-def texture_pictures(folder: Path, results: Mapping[str, Any]) -> str:
+def texture_pictures(folder: Path, results: Mapping[str, Any], current: Mapping[str, Array] | None = None) -> str:
     """Each texture at the start and at the end, the true one where it is known, and what of it light and sensor reach.
 
-    `folder` is a run's `parameters/`.
+    `folder` is a run's `parameters/`; `current` are the values now, by key, of a run that has no end yet.
     """
     parts = []
     archives = {moment: read_parameters(folder / sub) for moment, sub in _FOLDERS.items()}
+    if current is not None:
+        archives["final"] = dict(current)
+    titles = {moment: "now" if moment == "final" and current is not None else title for title, moment in MOMENTS}
     for key, about in (results.get("parameters") or {}).items():
         arrays = {moment: _texture(archive, key) for moment, archive in archives.items()}
         exposure, words = _exposure(arrays), ""
@@ -56,8 +59,8 @@ def texture_pictures(folder: Path, results: Mapping[str, Any]) -> str:
             arrays, words = _as_relief(arrays)
             exposure = 1.0
         shown = [
-            _figure(title, f"{title}: {key}", array, about.get(moment), exposure)
-            for title, moment in MOMENTS
+            _figure(titles[moment], f"{titles[moment]}: {key}", array, about.get(moment), exposure)
+            for _, moment in MOMENTS
             if (array := arrays[moment]) is not None
         ]
         mask = _texture_mask(folder, key)
