@@ -36,6 +36,11 @@ class Run:
     damaged: Sequence[int] = ()
 
     @property
+    def at_work(self) -> bool:
+        """Whether it had no end when this was taken down."""
+        return self.manifest.get("status") == "running"
+
+    @property
     def results(self) -> Mapping[str, Any]:
         """What it came to, so far."""
         results = self.manifest.get("results")

@@ -69,7 +69,7 @@ def plan_table(plan: Mapping[str, Any] | None) -> str:
         return ""
     rows = sorted(plan["rows"], key=lambda row: not row["needed"])
     cells = [[text(row["feature"]), "yes" if row["needed"] else "left out", text(row["reason"])] for row in rows]
-    return f"<p>Estimator {text(plan['estimator'])}.</p>" + table(("part of a step", "needed", "why"), cells)
+    return table(("part of a step", "needed", "why"), cells)
 
 
 def pilot_table(pilot: Mapping[str, Any] | None) -> str:

@@ -51,7 +51,7 @@ def run_parts(run: Run) -> dict[str, str]:
     """By title, what there is to show of a run beside its header, in order; what it does not have is empty."""
     results, images = run.results, run.path / "images"
     parts: dict[str, Callable[[], str]] = {
-        "Parameters": lambda: parameter_table(results) + _over_what(results),
+        "Parameters": lambda: parameter_table(results, "now" if run.at_work else "end") + _over_what(results),
         "Images": lambda: image_rows(images, results),
         "Errors as people see them": lambda: seen_tables([run]),
         "Textures": lambda: texture_pictures(run.path / "parameters", results, run.current),

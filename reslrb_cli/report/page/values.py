@@ -22,12 +22,12 @@ MOMENTS = (("start", "initial"), ("end", "final"), ("true", "true"))
 _FOLDERS = {"initial": "initial", "final": "", "true": "true"}
 
 
-def parameter_table(results: Mapping[str, Any]) -> str:
+def parameter_table(results: Mapping[str, Any], end: str = "end") -> str:
     """Value and error of each parameter at the start and at the end, and the true value where it is known."""
     parameters = results.get("parameters") or {}
     has_truth = any(about.get("true") for about in parameters.values())
     relative = units_differ(results)
-    head = ["parameter", "start", "end"] + ["true"] * has_truth + ["RMSE"] * has_truth
+    head = ["parameter", "start", end] + ["true"] * has_truth + ["RMSE"] * has_truth
     head += ["relative error"] * (has_truth and relative)
     rows = []
     for key, about in parameters.items():
