@@ -90,7 +90,7 @@ class Manifest:
 
     def content(self) -> dict[str, Any]:
         """What the file says once it is written."""
-        return {"program": PROGRAM, **asdict(self)}
+        return {"program": PROGRAM, **asdict(self), "status": self.status.value}
 
 
 def read_manifest(folder: Path) -> dict[str, Any] | None:

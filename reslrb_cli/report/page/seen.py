@@ -45,18 +45,25 @@ def _moments(about: Mapping[str, Any]) -> list[tuple[str, str]]:
 
 def _image_row(markup: str, errors: Mapping[str, Any]) -> list[str]:
     ratio = errors.get("psnr_db")
-    psnr = f"{number(ratio, 4)} dB" if ratio is not None else "∞, no difference"
+    psnr = f"{number(ratio, 4)} dB" if ratio is not None else "∞"
     bad = errors.get("not_finite")
     note = f'<br><span class="worse small">{text(bad)} pixels not finite</span>' if bad else ""
     ssim = errors.get("ssim")
     spreads = [_spread(errors.get(name)) for name in ("ciede2000", "itp", "flip", "absolute")]
-    return [markup + note, text(psnr), "too small" if ssim is None else text(number(ssim, 4)), *spreads]
+    return [
+        markup + note,
+        f'<span class="number">{text(psnr)}</span>',
+        "too small" if ssim is None else text(number(ssim, 4)),
+        *spreads,
+    ]
 
 
 def _spread(told: Mapping[str, float] | None) -> str:
-    """Mean, percentiles and maximum, in two lines."""
+    """Mean, percentiles and maximum, in two lines; where all are the same, that."""
     if not told:
         return ""
+    if told["mean"] == told["max"]:
+        return text(number(told["max"], 3))
     shown = {name: f'<span class="number">{text(number(value, 3))}</span>' for name, value in told.items()}
     rest = " ".join(shown[name] for name in ("p50", "p95", "p99", "max") if name in shown)
     return f'{shown["mean"]}<br><span class="soft small">{rest}</span>'
