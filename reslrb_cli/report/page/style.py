@@ -2,7 +2,16 @@
 
 from __future__ import annotations
 
-STYLE = """
+#: A table on a screen that is too narrow for its columns: each row is a block, with a line for each column.
+_BLOCKS = """
+  .rows, .rows tbody, .rows tr, .rows th, .rows td { display: block; border: 0; padding: 0 }
+  .rows thead { display: none }
+  .rows tr { border-bottom: 1px solid var(--line); padding: .55rem 0 }
+  .rows td { display: grid; grid-template-columns: 7.5rem minmax(0, 1fr); gap: .6rem; padding: .08rem 0 }
+  .rows td::before { content: attr(data-label); color: var(--soft); font-size: .85rem }
+  .rows td:empty { display: none }
+"""
+_STYLE = """
 :root {
   color-scheme: light dark;
   --page: #fff; --ink: #1c1f23; --soft: #5d6570; --line: #dde1e6; --box: #f5f6f8; --edge: #c9ced6;
@@ -85,14 +94,12 @@ summary { cursor: pointer; font-weight: 600 }
 summary + * { margin-top: .5rem }
 footer { margin-top: 2.5rem; color: var(--soft); font-size: .85rem }
 
+@media (max-width: 68rem) {
+  @DENSE@
+}
 @media (max-width: 46rem) {
   .figures { grid-template-columns: repeat(2, minmax(0, 1fr)); gap: .8rem }
-  .rows, .rows tbody, .rows tr, .rows th, .rows td { display: block; border: 0; padding: 0 }
-  .rows thead { display: none }
-  .rows tr { border-bottom: 1px solid var(--line); padding: .55rem 0 }
-  .rows td { display: grid; grid-template-columns: 7.5rem minmax(0, 1fr); gap: .6rem; padding: .08rem 0 }
-  .rows td::before { content: attr(data-label); color: var(--soft); font-size: .85rem }
-  .rows td:empty { display: none }
+  @BLOCKS@
   .facts th { white-space: normal; padding-right: .9rem }
   .facts td { padding-right: 0 }
 }
@@ -106,3 +113,4 @@ footer { margin-top: 2.5rem; color: var(--soft); font-size: .85rem }
   tr, .curves > * { break-inside: avoid }
 }
 """
+STYLE = _STYLE.replace("@BLOCKS@", _BLOCKS).replace("@DENSE@", _BLOCKS.replace(".rows", ".dense"))
