@@ -124,9 +124,9 @@ def test_a_bench(tmp_path):
     markup = render(read_sources([tmp_path / "x.jsonl"]))
     page = Page(markup)
     title = "Cost of a step: x.jsonl"
-    assert page.cells[title][0][:3] == ["path depth", "integrator", "step"]
-    assert page.row(title, "8")[1:3] == ["ptracer", "out of memory"]
-    assert page.cells[title][-1][1:3] == ["reslrb:reservoir", "8 ms [7.2, 9.6]"]
+    assert page.cells[title][0][:3] == ["integrator", "path depth", "step"]
+    assert page.cells[title][-2][:3] == ["ptracer", "8", "out of memory"]
+    assert page.cells[title][-1][:3] == ["reslrb:reservoir", "8", "8 ms [7.2, 9.6]"]
     assert lines_drawn(markup) == [list(COLORS[:2])] * 2
     assert "samples per pixel 4" in page.sections[title]
 

@@ -79,10 +79,12 @@ def _conditions(entries: Sequence[Entry], varied: Sequence[str]) -> str:
 
 
 def _table(entries: Sequence[Entry], labels: Sequence[str], varied: Sequence[str]) -> str:
-    head = [SWEPT[name] for name in varied] + ["integrator", "step", "kernels", "first step", "peak memory", "scratch"]
+    head = (
+        ["integrator"] + [SWEPT[name] for name in varied] + ["step", "kernels", "first step", "peak memory", "scratch"]
+    )
     rows = []
     for entry in sorted(entries, key=lambda entry: [entry.get(name) or 0 for name in varied]):
-        cells = [text(number(entry.get(name), 6)) for name in varied] + [breakable(label(entry))]
+        cells = [breakable(label(entry)), *(text(number(entry.get(name), 6)) for name in varied)]
         if entry["status"] in _ENDED:
             rows.append([*cells, f'<span class="worse">{_ENDED[entry["status"]]}</span>', "", "", "", ""])
             continue

@@ -92,12 +92,15 @@ def diagram(
         for floor in floors:
             axis.axhline(floor, color=_INK, linewidth=1.0, linestyle=":")
         if low[1] > 0 and high[1] > LEAST_LOG * low[1]:
-            _scale_by_decades(axis, high[1] / low[1])
+            axis.set_yscale("log")
+            _mark_decades(axis.yaxis, high[1] / low[1])
         if log_x is not None and low[0] > 0 and high[0] > low[0]:
             axis.set_xscale("log", base=log_x)
-            axis.xaxis.set_major_formatter("{x:g}")
             if log_x == 2:
+                axis.xaxis.set_major_formatter("{x:g}")
                 axis.set_xticks(sorted(set(values[:, 0])))
+            else:
+                _mark_decades(axis.xaxis, high[0] / low[0])
         axis.set_xlabel(caption)
         axis.set_ylabel(label)
         axis.grid(True, which="both", axis="y", alpha=0.16, linewidth=0.6)
@@ -138,15 +141,14 @@ def _draw(axis: Any, curve: Curve, points: Array) -> None:
         axis.fill_between(places, low, high, color=curve.color, alpha=0.18, linewidth=0)
 
 
-def _scale_by_decades(axis: Any, span: float) -> None:
-    """A logarithmic y axis whose ticks are plain text, which takes a fraction of the time of formulas."""
+def _mark_decades(axis: Any, span: float) -> None:
+    """Mark a logarithmic axis in plain text, which takes a fraction of the time of formulas."""
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
     plain = FuncFormatter(lambda value, _: f"{value:g}")
-    axis.set_yscale("log")
-    axis.yaxis.set_major_formatter(plain)
-    axis.yaxis.set_minor_locator(LogLocator(subs=(2.0, 5.0)))
-    axis.yaxis.set_minor_formatter(plain if span < MOST_LABELLED else NullFormatter())
+    axis.set_major_formatter(plain)
+    axis.set_minor_locator(LogLocator(subs=(2.0, 5.0)))
+    axis.set_minor_formatter(plain if span < MOST_LABELLED else NullFormatter())
 
 
 def _thinned(points: Array, together: int) -> tuple[Any, Any]:

@@ -62,11 +62,14 @@ def soft(words: str) -> str:
 def table(head: Sequence[str], markup: Iterable[Sequence[str]], kind: str = "") -> str:
     """A table whose cells are markup, with a heading for each column; nothing where it has no rows.
 
-    Each cell also carries its column's heading, for narrow screens, on which a row becomes a block. `kind` is a class.
+    Each cell also carries its column's heading, for narrow screens, on which a row becomes a block; there a cell lies
+    beside its heading as one piece. `kind` is a class.
     """
     rows = [
         "".join(
-            f'<td data-label="{text(title)}">{cell}</td>' if column else f'<th scope="row">{cell}</th>'
+            f'<td data-label="{text(title)}">{cell and f"<div>{cell}</div>"}</td>'
+            if column
+            else f'<th scope="row">{cell}</th>'
             for column, (title, cell) in enumerate(zip(head, row, strict=True))
         )
         for row in markup

@@ -10,7 +10,7 @@ from reslrb_cli.report.sources import Run
 from reslrb_cli.report.words import number
 
 _HEAD = ("image", "PSNR", "SSIM", "CIEDE2000", "ΔE ITP", "HDR-FLIP", "|image − target|")
-_TOLD = "Each line: mean; median, 95 %, 99 % of the pixels are below; the greatest."
+_TOLD = "Each line: mean; median, 95 %, 99 % of the pixels or texels are below; the greatest."
 _MEASURES = {"ciede2000": "CIEDE2000", "itp": "ΔE ITP"}
 
 

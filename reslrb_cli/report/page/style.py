@@ -80,6 +80,7 @@ figcaption b { color: var(--ink); font-weight: 600 }
 .ends { display: flex; justify-content: space-between }
 
 .curves { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(100%, 22rem), 1fr)); gap: .4rem 1.5rem }
+.curves > * { max-width: 40rem }
 .curves svg { display: block; width: 100%; height: auto }
 .curves text { font-family: inherit }
 .legend { list-style: none; display: flex; flex-wrap: wrap; gap: .15rem 1.2rem; margin: .2rem 0 .8rem; padding: 0;
