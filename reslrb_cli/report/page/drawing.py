@@ -18,6 +18,9 @@ MOST_POINTS = 600
 LEAST_LOG, MOST_LABELLED = 5.0, 300.0
 #: Colours that can be told apart, on light and on dark. Further curves have them again, in dashes.
 COLORS = ("#3b7ddd", "#e07b39", "#2f9e62", "#d0517e", "#8b6fd6", "#b08900", "#1f9eb3", "#9c6b4f")
+#: Inches of a diagram; at its left, those of the axis's label and of a letter at its marks. Matplotlib would find out
+#: by drawing everything twice.
+WIDTH, HEIGHT, LABEL, LETTER = 5.2, 2.9, 0.34, 0.078
 #: What matplotlib is told to draw text and lines in, and is then replaced by the page's own colour.
 _INK = "#010203"
 _STYLE = {
@@ -82,7 +85,7 @@ def diagram(
         return ""
     with matplotlib.rc_context(_STYLE):
         # A figure and canvas of our own: pyplot would pick a backend for the whole process.
-        figure = Figure(figsize=(5.2, 2.9), layout="constrained")
+        figure = Figure(figsize=(WIDTH, HEIGHT))
         FigureCanvasSVG(figure)
         axis = figure.subplots()
         for curve, points in known:
@@ -106,6 +109,8 @@ def diagram(
         axis.grid(True, which="both", axis="y", alpha=0.16, linewidth=0.6)
         axis.grid(True, axis="x", alpha=0.16, linewidth=0.6)
         axis.spines[["top", "right"]].set_visible(False)
+        room = LABEL + LETTER * max(map(len, _labels(axis.yaxis)), default=0)
+        figure.subplots_adjust(left=room / WIDTH, right=1 - LETTER / WIDTH, bottom=0.46 / HEIGHT, top=1 - 0.2 / HEIGHT)
         buffer = io.StringIO()
         figure.savefig(buffer, format="svg", metadata={"Date": None})
     drawing = buffer.getvalue()
@@ -128,6 +133,18 @@ def mark(place: int) -> str:
 def points_together(count: int) -> int:
     """How many of `count` points make one that is drawn."""
     return -(-count // MOST_POINTS)
+
+
+def _labels(axis: Any) -> list[str]:
+    """What stands at the marks of an axis."""
+    low, high = sorted(axis.get_view_interval())
+    found: list[str] = []
+    for formatter, places in (
+        (axis.get_major_formatter(), axis.get_majorticklocs()),
+        (axis.get_minor_formatter(), axis.get_minorticklocs()),
+    ):
+        found += formatter.format_ticks([place for place in places if low <= place <= high])
+    return found
 
 
 def _draw(axis: Any, curve: Curve, points: Array) -> None:
