@@ -173,7 +173,8 @@ class Recording:
         ending.part("parameters", lambda: write_parameters(self.folder.parameters, self.problem.values()))
         if failure is None:
             ending.part("final images", self._write_final_images)
-            self._note_seen_errors()
+            if status is Status.FINISHED:  # who interrupts does not want to wait; `reslrb report` finds them as well
+                self._note_seen_errors()
         else:
             ending.leave_out("final images", "the run failed")
         return ending.finish(self._write_page)
