@@ -69,6 +69,14 @@ def test_the_ratio_of_signal_to_noise():
     assert psnr(np.full((4, 4, 3), 0.5), np.full((4, 4, 3), 0.6)) == pytest.approx(20)
 
 
+def test_images_are_compared_as_a_screen_shows_them():
+    """In sRGB, where a linear 0.5 is 0.735357 and 0.214041 is 0.5, and where nothing is brighter than 1."""
+    half, dark = np.full((4, 4, 3), 0.5), np.full((4, 4, 3), 0.214041)
+    assert image_errors(half, dark, 1.0)["psnr_db"] == pytest.approx(-20 * np.log10(0.735357 - 0.5), rel=1e-4)
+    assert image_errors(dark, 2 * dark, 20.0)["psnr_db"] is None
+    assert image_errors(dark, 2 * dark, 20.0)["itp"]["mean"] > 10
+
+
 def test_structural_similarity():
     """Of two even images it is (2 a b + C) / (a² + b² + C), with C = 0.01²; small images have none."""
     first, second = np.full((16, 16, 1), 0.5), np.full((16, 16, 1), 0.7)
