@@ -5,8 +5,7 @@ from __future__ import annotations
 import enum
 import json
 import math
-from collections.abc import Mapping
-from dataclasses import MISSING, asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Protocol
@@ -94,29 +93,6 @@ class GradcheckRecord:
         """The record as one line of JSON; figures that are not finite become null."""
         values = {key: _finite(value) for key, value in asdict(self).items()}
         return json.dumps(values | {"holds": self.holds}, allow_nan=False)
-
-
-def gradcheck_record(entry: Mapping[str, Any]) -> GradcheckRecord | None:
-    """The record that a line holds; None where it holds none."""
-    kinds: dict[str, tuple[type, ...]] = {"int": (int,), "str": (str,)}
-    found: dict[str, Any] = {}
-    try:
-        for field in fields(GradcheckRecord):
-            if field.name not in entry and field.default is not MISSING:
-                continue
-            value = entry[field.name]
-            enums: dict[str, Any] = {"reference": Reference, "kind": Kind, "verdict": Verdict}
-            optional = "None" in str(field.type)
-            if field.name in enums:
-                value = enums[field.name](value)
-            elif not (optional and value is None):
-                name = str(field.type).partition(" ")[0]
-                if not isinstance(value, kinds.get(name, (int, float))):
-                    return None
-            found[field.name] = value
-    except (KeyError, ValueError):
-        return None
-    return GradcheckRecord(**found)
 
 
 def _finite(value: Any) -> Any:

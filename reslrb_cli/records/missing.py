@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping
 from dataclasses import asdict, dataclass
-from typing import Any
 
 #: Standard errors within which a share counts as none.
 NOTHING = 3
@@ -45,19 +43,6 @@ class MissingRecord:
             f"{self.parameter}: {figures} of the derivative is missing (silhouettes, edges of shadows, light that "
             "leaves the film)"
         )
-
-
-def missing_record(entry: Mapping[str, Any]) -> MissingRecord | None:
-    """The record that a line holds; None where it holds none."""
-    if entry.get("kind") != "missing":
-        return None
-    texts = [entry.get(name) for name in ("case", "parameter")]
-    figures = [entry.get(name) for name in ("share", "standard_error")]
-    counts = [entry.get(name) for name in ("directions", "seeds")]
-    whole = all(isinstance(text, str) for text in texts) and all(isinstance(count, int) for count in counts)
-    if not whole or any(not isinstance(figure, int | float | None) for figure in figures):
-        return None
-    return MissingRecord(*texts, *figures, *counts)  # type: ignore[arg-type]
 
 
 def _percent(share: float) -> str:

@@ -9,8 +9,8 @@ from typing import Any
 
 from reslrb_cli.errors import ConfigError, one_line
 from reslrb_cli.records import metrics
-from reslrb_cli.records.lines import read_lines
 from reslrb_cli.records.manifest import read_manifest
+from reslrb_cli.records.reading import read_lines
 from reslrb_cli.report.tone import Array
 
 #: Figures that a record of a run has, or it is none; and those that it may have.

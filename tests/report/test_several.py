@@ -154,13 +154,18 @@ def test_a_gradcheck(tmp_path):
 
 def test_a_convergence(tmp_path):
     lines = [*convergence_lines(), {"kind": "summary", "line": "best: reslrb:stack"}, {"kind": "news"}]
-    lines[-3]["biased"] = True
+    lines[-4] |= {"biased": True, "message": "too few <steps>", "slope": -0.5}
+    failed = {"kind": "method", "label": "prb", "integrator": "prb", "parameter": "all", "status": "out_of_memory"}
+    lines.append(failed)
     (tmp_path / "c.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines) + '{"kind": "poi')
     markup = render(read_sources([tmp_path / "c.jsonl"]))
     page = Page(markup)
     title = "Error against run time: c.jsonl"
-    assert page.row(title, "ptracer, independent")[1:] == ["-0.5", "4 [3, 5]", "0.7", "3.5 s", "2 min 0 s", "—"]
-    assert page.row(title, "reslrb:stack")[0] == "reslrb:stack, independent biased"
+    assert page.row(title, "ptracer, independent")[1:] == [
+        "-0.5 [-0.55, -0.45]", "4 [3, 5]", "0.7 < 4.5", "3.5 s", "2 min 0 s extrapolated", "—"]  # fmt: skip
+    assert page.row(title, "reslrb:stack")[:2] == ["reslrb:stack, independent biased", "-0.5"]
+    assert page.row(title, "prb")[1:3] == ["out of memory", ""]
+    assert "reslrb:stack, independent: too few <steps>" in page.sections[title]
     assert "best: reslrb:stack" in page.sections[title]
     assert "1 line of other kinds" in page.sections[title]
     assert lines_drawn(markup) == [list(COLORS[:2])]

@@ -21,11 +21,12 @@ def convergence(objects: Sequence[Entry]) -> tuple[str, int]:
     """A diagram for each quantity, a table of the methods, what was said in words; and how many lines are neither."""
     points = [entry for entry in objects if entry.get("kind") == "point"]
     methods = [entry for entry in objects if entry.get("kind") == "method"]
+    others = sum(entry.get("kind") == "reference" for entry in objects)
     said = [entry["line"] for entry in objects if isinstance(entry.get("line"), str)]
     labels = list(dict.fromkeys(map(method_label, [*methods, *points])))
-    quantities = list(dict.fromkeys(str(entry.get("parameter") or "all") for entry in [*points, *methods]))
+    quantities = list(dict.fromkeys(map(quantity, [*points, *methods])))
     quantities.sort(key=lambda name: {"all": 0, "image": 1}.get(name, 2))
-    drawn = [_diagram(points, labels, quantity) for quantity in quantities[:MOST_DRAWN]]
+    drawn = [_diagram(points, labels, name) for name in quantities[:MOST_DRAWN]]
     parts = [f"<p>{text(line)}</p>" for line in said]
     parts += [legend([Curve(name, (), (), place) for place, name in enumerate(labels)]), diagrams(*drawn)]
     if points:
@@ -33,17 +34,23 @@ def convergence(objects: Sequence[Entry]) -> tuple[str, int]:
     if len(quantities) > MOST_DRAWN:
         parts.append(soft(f"{len(quantities) - MOST_DRAWN} more parameters are in the table alone."))
     parts.append(_table(methods, quantities))
-    return "".join(parts), len(objects) - len(points) - len(methods) - len(said)
+    parts += [soft(f"{method_label(entry)}: {entry['message']}") for entry in methods if entry.get("message")]
+    return "".join(parts), len(objects) - len(points) - len(methods) - len(said) - others
+
+
+def quantity(entry: Entry) -> str:
+    """What the error is of: a parameter's key, `all` or `image`."""
+    return str(entry.get("parameter") or "all")
 
 
 def method_label(entry: Entry) -> str:
-    """A method's name: integrator, estimator, and how image and gradient share their samples, where that is said."""
+    """A method's name as the user wrote it, or its integrator and estimator; and how it takes its samples, if known."""
     adjoint = entry.get("adjoint")
-    return label(entry) + (f", {adjoint}" if adjoint else "")
+    return str(entry.get("label") or label(entry)) + (f", {adjoint}" if adjoint else "")
 
 
-def _diagram(points: Sequence[Entry], labels: Sequence[str], quantity: str) -> str:
-    of_it = [entry for entry in points if str(entry.get("parameter") or "all") == quantity]
+def _diagram(points: Sequence[Entry], labels: Sequence[str], what: str) -> str:
+    of_it = [entry for entry in points if quantity(entry) == what]
     curves = []
     for place, name in enumerate(labels):
         rows = sorted((entry for entry in of_it if method_label(entry) == name and _time(entry)), key=_time)
@@ -51,8 +58,8 @@ def _diagram(points: Sequence[Entry], labels: Sequence[str], quantity: str) -> s
                             place, points=True))  # fmt: skip
     floors = [value for entry in of_it if isinstance(value := entry.get("reference_rmse"), int | float) and value > 0]
     markup = diagram(curves, "time (s)", "relative error", 10, sorted(floors)[len(floors) // 2 :][:1])
-    words = {"all": "all parameters", "image": "the image"}.get(quantity)
-    title = text(words) if words else breakable(quantity)
+    words = {"all": "all parameters", "image": "the image"}.get(what)
+    title = text(words) if words else breakable(what)
     return f"<div><h3>{title}</h3>{markup}</div>" if markup else ""
 
 
@@ -64,14 +71,27 @@ def _table(methods: Sequence[Entry], quantities: Sequence[str]) -> str:
     several = len(quantities) > 1
     head = ["method", *["of"] * several, "slope", "efficiency", "bias, z", *_SHARES.values()]
     rows = []
-    for entry in sorted(methods, key=lambda entry: quantities.index(str(entry.get("parameter") or "all"))):
+    for entry in sorted(methods, key=lambda entry: quantities.index(quantity(entry))):
         biased = ' <span class="worse">biased</span>' if entry.get("biased") else ""
-        of = [breakable(entry.get("parameter") or "all")] * several
-        figures = [figure_of(entry.get(name)) for name in ("slope", "efficiency", "bias_z")]
-        seconds = entry.get("seconds_to") or {}
-        rows.append([breakable(method_label(entry)) + biased, *of, *figures,
-                     *(seconds_of(seconds.get(share)) for share in _SHARES)])  # fmt: skip
+        name = [breakable(method_label(entry)) + biased, *[breakable(quantity(entry))] * several]
+        if entry.get("status", "ok") != "ok":
+            ended = f'<span class="worse">{text(str(entry["status"]).replace("_", " "))}</span>'
+            rows.append([*name, ended, *[""] * (len(head) - len(name) - 1)])
+            continue
+        seconds, beyond = entry.get("seconds_to") or {}, entry.get("extrapolated") or ()
+        rows.append([
+            *name, figure_of(entry.get("slope")), figure_of(entry.get("efficiency")), _bias(entry),
+            *(seconds_of(seconds.get(share), share in beyond) for share in _SHARES),
+        ])  # fmt: skip
     return table(head, rows, "dense")
+
+
+def _bias(entry: Entry) -> str:
+    """The largest deviation in standard errors, and the limit that it keeps or exceeds."""
+    z, limit = entry.get("bias_z"), entry.get("bias_z_limit")
+    if not isinstance(z, int | float) or not isinstance(limit, int | float):
+        return figure_of(z)
+    return text(f"{abs(z):.2g} {'<' if abs(z) < limit else '>'} {limit:.2g}")
 
 
 def figure_of(value: Any) -> str:
@@ -83,10 +103,8 @@ def figure_of(value: Any) -> str:
     return text(number(value, 3)) if isinstance(value, int | float) else ""
 
 
-def seconds_of(value: Any) -> str:
+def seconds_of(value: Any, extrapolated: bool) -> str:
     """A time; one that was extrapolated is marked, one that is never reached is a dash."""
-    if isinstance(value, Mapping):
-        found = next((value[name] for name in ("value", "seconds") if value.get(name) is not None), None)
-        mark = ' <span class="soft small">extrapolated</span>' if value.get("extrapolated") else ""
-        return seconds_of(found) + (mark if found is not None else "")
-    return text(duration(value)) if isinstance(value, int | float) else "—"
+    if not isinstance(value, int | float):
+        return "—"
+    return text(duration(value)) + (' <span class="soft small">extrapolated</span>' if extrapolated else "")

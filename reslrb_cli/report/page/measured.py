@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-from reslrb_cli.records.gradcheck import Verdict, gradcheck_record
-from reslrb_cli.records.missing import missing_record
+from reslrb_cli.records.gradcheck import Verdict
+from reslrb_cli.records.measured import gradcheck_record, missing_record
 from reslrb_cli.report.gradcheck_table import HEAD, cells, failure_line, summary_lines
 from reslrb_cli.report.page.bench import bench
 from reslrb_cli.report.page.convergence import convergence
