@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import os
 import sys
 from collections.abc import Iterator
 
@@ -15,9 +16,9 @@ from reslrb_cli.errors import BackendError
 
 @pytest.fixture(scope="session")
 def llvm() -> str:
-    """Sets the variant `llvm_ad_rgb`, once; skips where there is no usable libLLVM."""
+    """Sets the variant, once: `llvm_ad_rgb`, or that of RESLRB_TEST_VARIANT; skips where its backend is missing."""
     try:
-        return set_variant("llvm_ad_rgb")
+        return set_variant(os.environ.get("RESLRB_TEST_VARIANT", "llvm_ad_rgb"))
     except BackendError as error:
         pytest.skip(str(error))
 

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
-SCRIPTS = ["scripts/setup", "scripts/demo", "scripts/test", "scripts/paper", ".ci/run"]
+SCRIPTS = ["scripts/setup", "scripts/demo", "scripts/test", "scripts/paper", "scripts/gpu_check", ".ci/run"]
 
 
 @pytest.mark.parametrize("name", SCRIPTS)

@@ -152,6 +152,7 @@ class Case:
             dr.enqueue(dr.ADMode.Forward, leaf)
             at += size
         dr.traverse(dr.ADMode.Forward, dr.ADFlag.ClearEdges)
+        self.values.push()
         image = np.array(tangent(), dtype=np.float64)
         self.release(leaves)
         return image

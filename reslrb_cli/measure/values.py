@@ -31,6 +31,10 @@ class Values(Protocol):
         """Bring the gradients of what is in the scene on to the values that were handed over."""
         ...
 
+    def push(self) -> None:
+        """Bring tangents of the values that were handed over, once propagated, on to what is in the scene."""
+        ...
+
 
 class SceneValues:
     """A scene's own parameters."""
@@ -50,4 +54,7 @@ class SceneValues:
         dr.eval([self.params[key] for key in values], settle(self.params, values))
 
     def collect(self) -> None:
+        """They are in the scene: nothing is to be done."""
+
+    def push(self) -> None:
         """They are in the scene: nothing is to be done."""

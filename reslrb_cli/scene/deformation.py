@@ -7,7 +7,8 @@ vertex's texture coordinates, and M the motion where it has one,
 
 An analytic shape, and an emitter without a surface, is placed by M after its own `to_world`; of emitters s scales the
 place alone. What the scene gets are values without a graph (leaves): a step adds its gradient to these, and `collect`
-brings it on to what is recovered, once, however many views, batches and passes the step has.
+brings it on to what is recovered, once, however many views, batches and passes the step has. In forward mode `push`
+takes tangents the other way.
 """
 
 from __future__ import annotations
@@ -144,6 +145,15 @@ class Deformation:
         if tracked:
             # Edges stay, for the next step from the same values.
             dr.traverse(dr.ADMode.Backward, dr.ADFlag.ClearVertices)
+
+    def push(self) -> None:
+        """Give the scene's parameters, and what follows from them, the tangents that have reached what they are."""
+        tracked = [moved for moved in self._moved.values() if moved.leaf is not None and dr.grad_enabled(moved.leaf)]
+        for moved in tracked:
+            dr.set_grad(moved.leaf, dr.grad(moved.tracked))
+            dr.enqueue(dr.ADMode.Forward, moved.leaf)
+        if tracked:
+            dr.traverse(dr.ADMode.Forward, dr.ADFlag.ClearEdges)
 
     def _place(self, item: Movable) -> _Moved:
         if item.key not in self._moved:

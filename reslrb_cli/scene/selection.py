@@ -79,6 +79,10 @@ class Selection:
         """Bring what steps added to the gradients of moved things on to that of the values that move them."""
         self.deformation.collect()
 
+    def push(self) -> None:
+        """Bring tangents of the values that move things, once propagated, on to what is moved in the scene."""
+        self.deformation.push()
+
     def set_arrays(self, values: Mapping[str, np.ndarray[Any, Any]]) -> None:
         """Set parameters in the scene, from arrays as `array` returns them."""
         for key, value in values.items():

@@ -88,7 +88,8 @@ def test_no_bias_whatever_the_damping(scene: AttachedScene, damping: float, samp
     found = bias(scene, sampling, 64, jacobian_damping=damping)
     print(scene.name, sampling, damping, found)
     assert abs(found.value) < 4 * found.error
-    assert found.error < 0.03
+    # What damping adds is proportional to it: its noise, and the bias that these seeds are to see.
+    assert found.error < max(0.15 * damping, 0.001)
 
 
 def test_no_bias_in_blocks(monkeypatch: pytest.MonkeyPatch):

@@ -27,7 +27,9 @@ def case(llvm: str) -> Case:
 def peak(case: Case, name: str, max_depth: int, estimator: str | None = None, **step: str) -> int:
     """Most bytes that the allocator gave out at any time of a second step, above what stood before it."""
     import drjit as dr
+    import mitsuba as mi
 
+    backend = dr.backend_v(mi.Float)
     # rr_depth beyond any depth: no roulette
     tracer = integrator(name, max_depth, 1000, **({"estimator": estimator} if estimator else {}))
     case.gradient(tracer, 1, SPP, **step)
@@ -35,10 +37,10 @@ def peak(case: Case, name: str, max_depth: int, estimator: str | None = None, **
     dr.sync_thread()
     dr.flush_malloc_cache()
     dr.detail.malloc_clear_statistics()
-    before = dr.detail.malloc_watermark(dr.JitBackend.LLVM)
+    before = dr.detail.malloc_watermark(backend)
     case.gradient(tracer, 2, SPP, **step)
     dr.sync_thread()
-    return dr.detail.malloc_watermark(dr.JitBackend.LLVM) - before
+    return dr.detail.malloc_watermark(backend) - before
 
 
 def test_reservoir_is_flat(case: Case):

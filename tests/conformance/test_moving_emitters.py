@@ -29,10 +29,10 @@ CLOSE = 0.005
 FAMILY = Family(len(CASES), 5 * len(CASES))
 
 
-def tracer(case: LampCase, name: str = "reslrb") -> StepIntegrator:
+def tracer(case: LampCase, name: str = "reslrb", **options: Any) -> StepIntegrator:
     """`stack`, or naive AD of the same walk."""
     own: dict[str, Any] = {"estimator": "stack"} if name == "reslrb" else {"attached": True}
-    return integrator(name, **{"max_depth": 2, "hide_emitters": True} | own | case.options)
+    return integrator(name, **{"max_depth": 2, "hide_emitters": True} | own | case.options | options)
 
 
 def compare(case: LampCase, count: int) -> Any:
@@ -68,7 +68,8 @@ def test_finite_differences(case: LampCase):
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
 def test_naive_ad(case: LampCase):
     moving = case.moving()
-    ours, naive = (moving.gradient(tracer(case, name), 1, case.spp) for name in ("reslrb", "walk_ad"))
+    ours = moving.gradient(tracer(case, attached_sampling="follow"), 1, case.spp)
+    naive = moving.gradient(tracer(case, "walk_ad"), 1, case.spp)
     for name, value in ours.items():
         size = np.sqrt(np.mean([float(other @ other) for other in naive.values()]))
         assert abs(value - naive[name])[0] <= 5e-5 * max(size, abs(naive[name][0])), name

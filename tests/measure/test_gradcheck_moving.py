@@ -2,22 +2,27 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from measure.faults import checked, room
 
+from reslrb_cli.config import load
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.measure.cases import all_estimators, parse_estimators
 from reslrb_cli.measure.gradcheck import Gradcheck
 from reslrb_cli.measure.gradients import Case
 from reslrb_cli.measure.moving import moves_light, smooth_rows, smooth_weights
-from reslrb_cli.measure.participants import Settings
+from reslrb_cli.measure.participants import Participants, Settings
 from reslrb_cli.measure.references import Situation, prb_gradient, ptracer_gradient
 from reslrb_cli.measure.small_scenes import camera, diffuse, lamp
 from reslrb_cli.measure.small_scenes import room as corner
 from reslrb_cli.records.gradcheck import Kind, Reference, Verdict
 
 pytestmark = pytest.mark.usefixtures("llvm")
+
+CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 
 
 def test_a_lamp_that_moves():
@@ -55,6 +60,20 @@ def test_ways_to_differentiate_the_film():
     assert parts.sampled("reslrb:stack", Reference.PTRACER) == "reslrb:stack, as ptracer"
     assert set(parts.integrators) >= {"reslrb:stack", "reslrb:stack, as walk_ad", "reslrb:stack, as ptracer"}
     assert parts.forward_mode
+
+
+@pytest.mark.parametrize("name", ["caustic_heightmap", pytest.param("lens_pose", marks=pytest.mark.long)])
+def test_forward_mode_of_what_is_a_function(name: str):
+    """Heights and motions are not in the scene: tangents have to reach what is, as gradients come back from there."""
+    small = ["scene.options={resx: 16, resy: 16}", "run.spp=4", "target.render.spp=4"]
+    parts = Participants(Settings(load(CONFIGS / f"{name}.yaml", small), parse_estimators("stack"), 0, 3))
+    [label] = (case.label for case in parts.listed)
+    gradient, slices = parts.gradient(label, 1), parts.slices()
+    for key in parts.case.keys:
+        along = [gradient @ direction.vector for direction in parts.directions[key]]
+        print(key, along, parts.tangents(label, key, 1))
+        assert gradient[slices[key]].any()
+        np.testing.assert_allclose(parts.tangents(label, key, 1), along, rtol=1e-3, atol=1e-4 * np.abs(along).max())
 
 
 def test_references_of_what_moves():

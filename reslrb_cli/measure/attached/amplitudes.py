@@ -133,6 +133,9 @@ class Displaced:
     def collect(self) -> None:
         """Gradients of one step find their way back by themselves."""
 
+    def push(self) -> None:
+        """So do tangents."""
+
 
 def _copy(value: Any) -> Any:
     result = type(value)(dr.detach(value))
