@@ -171,6 +171,19 @@ def test_a_convergence(tmp_path):
     assert lines_drawn(markup) == [list(COLORS[:2])]
 
 
+def test_a_convergence_over_samples_and_of_a_single_parameter(tmp_path):
+    """Each number of samples is a method of its own; what all parameters come to is left out where there is one."""
+    lines = [line for what in ("all", LAMP) for line in convergence_lines(what)]
+    lines += [line | {"spp": 16} for line in lines if line["kind"] == "point"]
+    (tmp_path / "c.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    markup = render(read_sources([tmp_path / "c.jsonl"]))
+    title = "Error against run time: c.jsonl"
+    assert lines_drawn(markup) == [list(COLORS[:4])]
+    assert [row[0] for row in Page(markup).cells[title][1:]] == [
+        "ptracer, independent, 4 spp", "reslrb:stack, independent, 4 spp"]  # fmt: skip
+    assert LAMP in Page(markup).sections[title]
+
+
 def test_maps(tmp_path):
     write_maps(tmp_path / "maps")
     (tmp_path / "maps" / "other.exr").write_bytes(b"no image")

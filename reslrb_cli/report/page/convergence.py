@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Any
 
 from reslrb_cli.report.page.bench import label
@@ -11,6 +12,7 @@ from reslrb_cli.report.page.markup import breakable, soft, table, text
 from reslrb_cli.report.words import duration, number
 
 Entry = Mapping[str, Any]
+Naming = Callable[[Entry], str]
 
 #: Quantities that are drawn, at most: all parameters together, the image, then single ones.
 MOST_DRAWN = 8
@@ -23,18 +25,23 @@ def convergence(objects: Sequence[Entry]) -> tuple[str, int]:
     methods = [entry for entry in objects if entry.get("kind") == "method"]
     others = sum(entry.get("kind") == "reference" for entry in objects)
     said = [entry["line"] for entry in objects if isinstance(entry.get("line"), str)]
-    labels = list(dict.fromkeys(map(method_label, [*methods, *points])))
+    spps = len({entry.get("spp") for entry in [*points, *methods] if entry.get("status", "ok") == "ok"})
+    name = partial(method_label, with_spp=spps > 1)
+    labels = list(dict.fromkeys(map(name, [*methods, *points])))
     quantities = list(dict.fromkeys(map(quantity, [*points, *methods])))
-    quantities.sort(key=lambda name: {"all": 0, "image": 1}.get(name, 2))
-    drawn = [_diagram(points, labels, name) for name in quantities[:MOST_DRAWN]]
+    quantities.sort(key=lambda what: {"all": 0, "image": 1}.get(what, 2))
+    if len(quantities) == 2 and quantities[0] == "all":  # the only parameter is all of them
+        del quantities[0]
+    drawn = [_diagram(points, labels, what, name) for what in quantities[:MOST_DRAWN]]
     parts = [f"<p>{text(line)}</p>" for line in said]
-    parts += [legend([Curve(name, (), (), place) for place, name in enumerate(labels)]), diagrams(*drawn)]
+    parts += [legend([Curve(title, (), (), place) for place, title in enumerate(labels)]), diagrams(*drawn)]
     if points:
         parts.append(soft("Dots across: the standard error of the reference itself, below which nothing can be told."))
     if len(quantities) > MOST_DRAWN:
         parts.append(soft(f"{len(quantities) - MOST_DRAWN} more parameters are in the table alone."))
-    parts.append(_table(methods, quantities))
-    parts += [soft(f"{method_label(entry)}: {entry['message']}") for entry in methods if entry.get("message")]
+    told = [entry for entry in methods if quantity(entry) in quantities]
+    parts.append(_table(told, quantities, name))
+    parts += [soft(f"{name(entry)}: {entry['message']}") for entry in told if entry.get("message")]
     return "".join(parts), len(objects) - len(points) - len(methods) - len(said) - others
 
 
@@ -43,17 +50,18 @@ def quantity(entry: Entry) -> str:
     return str(entry.get("parameter") or "all")
 
 
-def method_label(entry: Entry) -> str:
+def method_label(entry: Entry, with_spp: bool = False) -> str:
     """A method's name as the user wrote it, or its integrator and estimator; and how it takes its samples, if known."""
-    adjoint = entry.get("adjoint")
-    return str(entry.get("label") or label(entry)) + (f", {adjoint}" if adjoint else "")
+    parts = [str(entry.get("label") or label(entry)), str(entry.get("adjoint") or "")]
+    parts += [f"{entry['spp']} spp"] if with_spp and entry.get("spp") else []
+    return ", ".join(part for part in parts if part)
 
 
-def _diagram(points: Sequence[Entry], labels: Sequence[str], what: str) -> str:
+def _diagram(points: Sequence[Entry], labels: Sequence[str], what: str, naming: Naming) -> str:
     of_it = [entry for entry in points if quantity(entry) == what]
     curves = []
     for place, name in enumerate(labels):
-        rows = sorted((entry for entry in of_it if method_label(entry) == name and _time(entry)), key=_time)
+        rows = sorted((entry for entry in of_it if naming(entry) == name and _time(entry)), key=_time)
         curves.append(Curve(name, [_time(entry) for entry in rows], [entry.get("relative_rmse") for entry in rows],
                             place, points=True))  # fmt: skip
     floors = [value for entry in of_it if isinstance(value := entry.get("reference_rmse"), int | float) and value > 0]
@@ -67,13 +75,13 @@ def _time(entry: Entry) -> float:
     return float(entry.get("elapsed_s") or 0.0)
 
 
-def _table(methods: Sequence[Entry], quantities: Sequence[str]) -> str:
+def _table(methods: Sequence[Entry], quantities: Sequence[str], naming: Naming) -> str:
     several = len(quantities) > 1
     head = ["method", *["of"] * several, "slope", "efficiency", "bias, z", *_SHARES.values()]
     rows = []
     for entry in sorted(methods, key=lambda entry: quantities.index(quantity(entry))):
         biased = ' <span class="worse">biased</span>' if entry.get("biased") else ""
-        name = [breakable(method_label(entry)) + biased, *[breakable(quantity(entry))] * several]
+        name = [breakable(naming(entry)) + biased, *[breakable(quantity(entry))] * several]
         if entry.get("status", "ok") != "ok":
             ended = f'<span class="worse">{text(str(entry["status"]).replace("_", " "))}</span>'
             rows.append([*name, ended, *[""] * (len(head) - len(name) - 1)])
