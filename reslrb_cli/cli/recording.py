@@ -39,6 +39,8 @@ logger = logging.getLogger(__name__)
 
 #: Seconds between two checkpoints.
 CHECKPOINT_SECONDS = 30.0
+#: Images with more pixels take some seconds to be compared, and that is said.
+MANY_PIXELS = 5e5
 #: What the end of a run writes beside checkpoint and parameters, for which room is kept: a manifest, and lists.
 RESERVE_BYTES = 1 << 16
 
@@ -193,6 +195,9 @@ class Recording:
 
     def _note_seen_errors(self) -> None:
         """Add errors as people see them to the results. The run is what it is without them."""
+        pixels = sum(target.shape[0] * target.shape[1] for target in self.problem.targets)
+        if pixels > MANY_PIXELS:
+            logger.info(f"comparing images of {pixels / 1e6:.2g} million pixels as people see them")
         try:
             self.seen = finite(seen_errors(self.folder.path, self.manifest.results))
         except Exception as error:
