@@ -34,4 +34,5 @@ class LivePage:
             self._next = None
         else:
             end = time.monotonic()
-            self._next = end + max(PAGE_SECONDS, PAGE_SHARE * (end - start))
+            # The first page also loads what draws it: what it took says nothing of the others.
+            self._next = end + max(PAGE_SECONDS, 0.0 if self._next == 0.0 else PAGE_SHARE * (end - start))

@@ -23,7 +23,12 @@ Record = Mapping[str, Any]
 def convergence(run: Run) -> str:
     """Loss, and errors by parameter where they are known, against iterations and against time."""
     if not run.records:
-        return "<p>No iteration was completed.</p>"
+        when = (
+            "has been completed yet; the first one also compiles what the others use"
+            if run.at_work
+            else "was completed"
+        )
+        return f"<p>No iteration {when}.</p>"
     scales, relative = run.scales, units_differ(run.results)
     last = run.records[-1]["parameter_errors"]
     ends = {
