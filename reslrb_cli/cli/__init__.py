@@ -32,7 +32,7 @@ _SUMMARIES = {
     "bench": "Measure time and memory of gradient steps.",
     "gradcheck": "Compare gradients with references.",
     "convergence": "Measure error against run time.",
-    "report": "Write the HTML page of finished runs.",
+    "report": "Write one page about runs and measurements.",
     "doctor": "Say which backend is in use, and what is missing.",
 }
 

@@ -47,7 +47,8 @@ logger = logging.getLogger(__name__)
 @click.option("--markdown", "markdown_file", type=click.Path(path_type=Path, dir_okay=False),
               help="Write the table as Markdown.")  # fmt: skip
 @click.option("--images", "folder", type=click.Path(path_type=Path, file_okay=False),
-              help="Write PNG maps of the gradients of textures, their references and z into this folder.")  # fmt: skip
+              help="Write maps of the gradients of textures, their references and z into this folder, as PNG and as "
+                   "layers of EXR files.")  # fmt: skip
 @click.pass_context
 def command(
     context: click.Context,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import os
 import shlex
@@ -13,6 +14,8 @@ from typing import Any
 import numpy as np
 
 from reslrb_cli.cli.ending import Ending
+from reslrb_cli.cli.live import LivePage
+from reslrb_cli.cli.telling import describe
 from reslrb_cli.errors import NonFinite
 from reslrb_cli.optimization import Problem, optimize
 from reslrb_cli.optimization.nonfinite import Findings
@@ -22,19 +25,22 @@ from reslrb_cli.optimization.scaling import Scaled, step_line
 from reslrb_cli.records.checkpoint import save_checkpoint, save_nonfinite
 from reslrb_cli.records.images import write_image
 from reslrb_cli.records.manifest import Manifest, Status
-from reslrb_cli.records.metrics import MetricsWriter, Record
+from reslrb_cli.records.metrics import MetricsWriter, Record, finite
 from reslrb_cli.records.parameters import write_mask, write_parameters
 from reslrb_cli.records.reserve import Reserve, size_of
 from reslrb_cli.records.run_folder import RunFolder
 from reslrb_cli.records.tally import ClampTally, NonFiniteTally
 from reslrb_cli.report import write_report
 from reslrb_cli.report.error_map import write_error_map
+from reslrb_cli.report.seen import seen_errors
 from reslrb_cli.report.verdict import warnings
 
 logger = logging.getLogger(__name__)
 
 #: Seconds between two checkpoints.
 CHECKPOINT_SECONDS = 30.0
+#: Images with more pixels take some seconds to be compared, and that is said.
+MANY_PIXELS = 5e5
 #: What the end of a run writes beside checkpoint and parameters, for which room is kept: a manifest, and lists.
 RESERVE_BYTES = 1 << 16
 
@@ -50,6 +56,7 @@ class Recording:
     last: Record | None = None
     results: Results = field(init=False)
     error_maps: dict[str, Any] = field(default_factory=dict)
+    seen: dict[str, Any] = field(default_factory=dict)
     nonfinite: NonFiniteTally = field(default_factory=NonFiniteTally)
     clamped: ClampTally = field(default_factory=ClampTally)
     _saved_nonfinite: bool = False
@@ -111,6 +118,8 @@ class Recording:
         every, saved = self.problem.config.run.images_every, time.monotonic()
         if stop():
             return
+        page = LivePage(self._write_live_page)
+        page.refresh()
         with MetricsWriter(self.folder.path) as metrics:
             for record in optimize(self.problem, self._on_nonfinite):
                 if self.first is None and self.problem.sensitivities is not None:
@@ -129,6 +138,7 @@ class Recording:
                 if time.monotonic() - saved > CHECKPOINT_SECONDS:
                     self._save_checkpoint()
                     saved = time.monotonic()
+                page.refresh()
 
     def _note_scaling(self, measured: list[Scaled]) -> None:
         self.manifest.scaling = [row.to_json() for row in measured]
@@ -165,24 +175,55 @@ class Recording:
         ending.part("parameters", lambda: write_parameters(self.folder.parameters, self.problem.values()))
         if failure is None:
             ending.part("final images", self._write_final_images)
+            if status is Status.FINISHED:  # who interrupts does not want to wait; `reslrb report` finds them as well
+                self._note_seen_errors()
         else:
             ending.leave_out("final images", "the run failed")
-        return ending.finish(lambda: write_report(self.folder.path))
+        return ending.finish(self._write_page)
+
+    def _write_page(self) -> None:
+        """Write the page for the last time; where that fails, none is left that says the run is at work."""
+        try:
+            write_report(self.folder.path)
+        except Exception:
+            with contextlib.suppress(OSError):
+                (self.folder.path / "report.html").unlink(missing_ok=True)
+            raise
+
+    def _write_live_page(self) -> None:
+        write_report(self.folder.path, self.manifest.content() | {"results": self._found()}, self.problem.values())
+
+    def _note_seen_errors(self) -> None:
+        """Add errors as people see them to the results. The run is what it is without them."""
+        pixels = sum(target.shape[0] * target.shape[1] for target in self.problem.targets)
+        if pixels > MANY_PIXELS:
+            logger.info(f"comparing images of {pixels / 1e6:.2g} million pixels as people see them")
+        try:
+            self.seen = finite(seen_errors(self.folder.path, self.manifest.results))
+        except Exception as error:
+            logger.warning("errors as people see them were not measured: %s", describe(error))
+        else:
+            self._note_results()
 
     def _write_final_images(self) -> None:
         self._write_images("final")
         self._note_results()
 
     def _note_results(self) -> None:
+        self.manifest.results = self._found()
+
+    def _found(self) -> dict[str, Any]:
+        """What the run came to, or has come to by now."""
         self.results.end()
         found = self.results.to_json()
-        self.manifest.results = {
+        return {
             "iterations": self.done,
             "loss": self.last and _json_number(self.last.loss),
             "elapsed_s": self.last and self.last.elapsed_s,
             **found,
             "warnings": warnings(found),
             "error_maps": self.error_maps,
+            **({"seen": self.seen} if self.seen else {}),
             "nonfinite": self.nonfinite.to_json(),
             "clamped": self.clamped.to_json(),
         }
@@ -209,8 +250,10 @@ class Recording:
             write_image(self.folder.images / self._image_name(name, sensor), image)
             self.results.see(name, image, target)
             if name == "final":
-                error = self._image_name("error", sensor)
-                self.error_maps[error] = write_error_map(self.folder.images / error, image, np.array(target))
+                suffix = self._image_name("", sensor)
+                towards = self.problem.image_gradient(image, target)
+                about = write_error_map(self.folder.images, suffix, image, np.array(target), towards)
+                self.error_maps[f"error{suffix}"] = about
 
     def _image_name(self, name: str, sensor: int) -> str:
         return name if len(self.problem.sensors) == 1 else f"{name}-{sensor}"

@@ -58,7 +58,7 @@ def report_plan(integrator: Reslrb, scene: mi.Scene, sensor: mi.Sensor, params: 
         plan = integrator.plan(scene, sensor, params)
         estimator = type(integrator.estimator).__name__.removesuffix("Estimator").lower()
         if not counts:
-            return PlanReport(estimator, None, [_row(feature, plan) for feature in FEATURES])
+            return PlanReport(estimator, None, plan_rows(plan))
         kernels = count(integrator, plan, scene, sensor, known)
     rows = []
     for feature in FEATURES:
@@ -74,6 +74,11 @@ def report_plan(integrator: Reslrb, scene: mi.Scene, sensor: mi.Sensor, params: 
         both = (here, there) if row.needed else (there, here)
         rows.append(replace(row, operations_with=both[0], operations_without=both[1]))
     return PlanReport(estimator, kernels, rows)
+
+
+def plan_rows(plan: Plan) -> list[PlanRow]:
+    """The features of a plan, without counts."""
+    return [_row(feature, plan) for feature in FEATURES]
 
 
 def count(integrator: Reslrb, plan: Plan, scene: mi.Scene, sensor: mi.Sensor, known: bool) -> list[int]:

@@ -83,6 +83,13 @@ class Problem:
         """The loss of an (H, W, C) image, attached; alpha is left out."""
         return self.loss(first_channels(image, target.shape[2]), target)
 
+    def image_gradient(self, image: Array, target: Any) -> Array:
+        """The derivative dL/dI of one view's loss at an image (H, W, C), in the target's channels; finite or not."""
+        leaf = mi.TensorXf(np.ascontiguousarray(image[:, :, : target.shape[2]], dtype=np.float32))
+        dr.enable_grad(leaf)
+        dr.backward(self.compare(leaf, target))
+        return np.array(dr.grad(leaf))
+
     def values(self) -> dict[str, Array]:
         """The parameters' current values."""
         return {key: self.selection.array(key) for key in self.selection.keys}

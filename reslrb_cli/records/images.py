@@ -63,3 +63,11 @@ def read_exr(path: Path) -> np.ndarray[Any, Any]:
         pass
     array = np.array(mi.Bitmap(str(path)), dtype=np.float32)
     return array if array.ndim == 3 else array[:, :, None]
+
+
+def load_image(path: Path) -> np.ndarray[Any, Any] | None:
+    """The same; None where there is no image, or what is there is damaged."""
+    try:
+        return read_exr(path)
+    except (OSError, RuntimeError, ValueError):
+        return None

@@ -44,12 +44,12 @@ def versions() -> dict[str, str]:
 class Manifest:
     """Provenance and outcome of one run.
 
-    `process` is who works in the folder. `pilot` is the table by which an estimator was chosen, `memory` how a memory
-    budget is kept, `scaling` what was measured of each parameter for `scale: auto`, `correlated_bias` what of the bias
-    of `adjoint: correlated`; each is None where that was not asked for. `results` holds what the run found
-    (`iterations`, values and errors by key, `warnings`, ...); `error` is the line that the user saw where the run
-    failed. `missing` names the parts of the folder that are not there (not yet, where the process ended among them),
-    and says why.
+    `process` is who works in the folder. `plan` is what a step consists of, `pilot` the table by which an estimator was
+    chosen, `memory` how a memory budget is kept, `scaling` what was measured of each parameter for `scale: auto`,
+    `correlated_bias` what of the bias of `adjoint: correlated`; each is None where that was not asked for. `results`
+    is what the run found (`iterations`, values and errors by key, `warnings`, `seen`, errors as people see them, ...);
+    `error` is the line that the user saw where the run failed. `missing` names the parts of the folder that are not
+    there (not yet, where the process ended among them), and says why.
     """
 
     variant: str
@@ -65,6 +65,7 @@ class Manifest:
     ended: str | None = None
     error: str | None = None
     missing: dict[str, str] = field(default_factory=dict)
+    plan: dict[str, Any] | None = None
     pilot: dict[str, Any] | None = None
     memory: dict[str, Any] | None = None
     scaling: list[dict[str, Any]] | None = None
@@ -74,7 +75,7 @@ class Manifest:
     def write(self, folder: Path) -> None:
         """Write `manifest.json` into `folder`, atomically where the disk has room. Raises OSError."""
         with _WRITING:
-            write_content(folder, self._content())
+            write_content(folder, self.content())
 
     def end(self, folder: Path, status: Status, error: str | None = None) -> None:
         """Set the final status and the time, and write the file. Raises OSError."""
@@ -85,10 +86,11 @@ class Manifest:
         """The same in a process that is about to end, by a thread beside the one that works: that writes no more."""
         _WRITING.acquire(timeout=LAST_WAIT_SECONDS)  # and never released
         self.status, self.error, self.ended = status, None, now()
-        write_content(folder, self._content())
+        write_content(folder, self.content())
 
-    def _content(self) -> dict[str, Any]:
-        return {"program": PROGRAM, **asdict(self)}
+    def content(self) -> dict[str, Any]:
+        """What the file says once it is written."""
+        return {"program": PROGRAM, **asdict(self), "status": self.status.value}
 
 
 def read_manifest(folder: Path) -> dict[str, Any] | None:

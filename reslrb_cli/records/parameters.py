@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -52,6 +53,24 @@ def write_mask(folder: Path, key: str, mask: Array) -> None:
     if mask.ndim == 2:
         bitmap = mi.Bitmap(np.ascontiguousarray(mask[:, :, None] * np.uint8(255)))
         write_bitmap(folder / f"{stem}.png", bitmap)
+
+
+def read_parameters(folder: Path) -> dict[str, Array]:
+    """The values that `write_parameters` wrote into `folder`, by key; nothing where they are missing or damaged."""
+    try:
+        with np.load(folder / "parameters.npz") as arrays:
+            return {key: arrays[key] for key in arrays.files}
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
+        return {}
+
+
+def read_mask(folder: Path, key: str) -> Array | None:
+    """The mask that `write_mask` wrote for the parameter `key`; None where there is none, or it is damaged."""
+    try:
+        mask: Array = np.load(folder / f"{file_stem(key)}.mask.npy")
+    except (OSError, ValueError, EOFError):
+        return None
+    return mask if mask.dtype == bool else None
 
 
 def _relief(heights: Array) -> Array:

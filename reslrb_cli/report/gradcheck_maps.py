@@ -11,10 +11,10 @@ import numpy as np
 from reslrb_cli.errors import one_line
 from reslrb_cli.records.file_names import bounded, file_stem
 from reslrb_cli.records.gradcheck import GradcheckRecord
+from reslrb_cli.records.layers import write_layers
+from reslrb_cli.report.error_map import color_map
 from reslrb_cli.report.gradcheck_table import integrator_name, reference_name
 
-#: Grey at zero, red where positive, blue where negative.
-_COLORS = ("#053061", "#4393c3", "#bdbdbd", "#d6604d", "#67001f")
 #: z at the ends of the scale.
 _MOST_Z = 5.0
 
@@ -23,13 +23,13 @@ def plot_maps(record: GradcheckRecord, gradient: np.ndarray, reference: np.ndarr
               ) -> Path:  # fmt: skip
     """Write a PNG of `gradient` and `reference` (H, W, C), summed over channels, and `z` (H, W); return its path.
 
-    Both gradients have one scale, whose ends 1 % of the texels go beyond.
+    Both gradients have one scale, whose ends 1 % of the texels go beyond. An EXR of the same name has them as they
+    are: the layers `gradient`, `reference`, `difference` (of the two) and `z`.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.colors import LinearSegmentedColormap
     from matplotlib.figure import Figure
 
-    colors = LinearSegmentedColormap.from_list("gradient", _COLORS)
+    colors = color_map(signed=True)
     sums = gradient.sum(-1), reference.sum(-1)
     end = float(np.quantile(np.abs(np.stack(sums)), 0.99)) or 1.0
     figure = Figure(figsize=(13, 4.2), layout="constrained")
@@ -45,6 +45,8 @@ def plot_maps(record: GradcheckRecord, gradient: np.ndarray, reference: np.ndarr
     figure.suptitle(one_line(title, 150), fontsize=10, parse_math=False)  # a key may hold a $
     path = folder / f"{map_name(record)}.png"
     figure.savefig(path, dpi=110)
+    layers = {"gradient": gradient, "reference": reference, "difference": gradient - reference, "z": z}
+    write_layers(folder / f"{map_name(record)}.exr", layers)
     return path
 
 

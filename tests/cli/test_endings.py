@@ -28,7 +28,9 @@ def optimize(llvm, tmp_path, monkeypatch, capsys, request):
     write_experiment(tmp_path)
     monkeypatch.chdir(tmp_path)
     if getattr(request, "param", None) != "real page":  # which takes longer than the run
-        monkeypatch.setattr(recording, "write_report", lambda folder: (folder / "report.html").write_text("<html>"))
+        monkeypatch.setattr(
+            recording, "write_report", lambda folder, *now: (folder / "report.html").write_text("<html>")
+        )
 
     def call(*args):
         with pytest.raises(SystemExit) as end:
@@ -219,7 +221,7 @@ def test_without_its_page_a_run_is_finished(optimize, monkeypatch):
 
 
 def test_a_page_that_we_cannot_draw_is_no_reason_either(optimize, monkeypatch):
-    def draw(folder):
+    def draw(folder, *now):
         raise KeyError("initial")
 
     monkeypatch.setattr(recording, "write_report", draw)

@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 from cli.test_optimize import CONFIG, KEY, SCENE, read_manifest, read_metrics, reslrb
 
+from reslrb_cli.records.layers import read_layers
+
 LAMP, WALL = "lamp.emitter.radiance.value", "wall.reflectance.value"
 
 
@@ -165,8 +167,14 @@ def test_the_error_map_is_that_of_the_final_image(capsys, sensors):
     _, _, results = optimize(capsys, f"scene.sensors={sensors}", "run.iterations=1", "run.final_spp=16")
     images = Path("runs/box/images")
     for suffix in ("",) if sensors == "[0]" else ("-0", "-1"):
-        error, final, target = (read(images / f"{name}{suffix}.exr") for name in ("error", "final", "target"))
-        np.testing.assert_allclose(error, np.abs(final - target), rtol=1e-4, atol=1e-6)
+        final, target = (read(images / f"{name}{suffix}.exr") for name in ("final", "target"))
+        layers = read_layers(images / f"comparison{suffix}.exr")
+        assert set(layers) == {"image", "target", "difference", "gradient"}
+        np.testing.assert_array_equal(layers["image"], final[:, :, :3])
+        np.testing.assert_array_equal(layers["target"], target)
+        np.testing.assert_allclose(layers["difference"], final - target, rtol=1e-4, atol=1e-6)
+        np.testing.assert_allclose(layers["gradient"], 2 * (final - target) / final.size, rtol=1e-3, atol=1e-9)  # l2
+        error = np.abs(layers["difference"])
         about = results["error_maps"][f"error{suffix}"]
         assert about["mean"] == pytest.approx(error.mean(), rel=1e-5)
         beyond = np.sum(error.mean(axis=2) > about["end"])
@@ -199,5 +207,6 @@ def test_an_environment_map_has_an_error_and_a_picture(capsys):
     assert results["parameter_rmse"]["sky.data"]["initial"] > 2
     assert out.splitlines()[1].startswith("sky.data")
     assert read("runs/box/images/final.exr").shape == (8, 12, 4)
-    assert read("runs/box/images/error.exr").shape == (8, 12, 3)
+    layers = read_layers(Path("runs/box/images/comparison.exr"))
+    assert {array.shape for array in layers.values()} == {(8, 12, 3)}
     assert 'alt="true: sky.data"' in Path("runs/box/report.html").read_text()

@@ -71,6 +71,15 @@ class Chromium:
         assert "exceptionDetails" not in result, result
         return result["result"].get("value")
 
+    def wait_for(self, expression: str, seconds: float) -> bool:
+        """Wait until a JavaScript expression is true; whether it was before so many seconds were over."""
+        deadline = time.monotonic() + seconds
+        while time.monotonic() < deadline:
+            if self.evaluate(expression):
+                return True
+            time.sleep(0.1)
+        return False
+
     def screenshot(self, path: Path) -> None:
         """Write all of the page as a PNG."""
         size = self._call("Page.getLayoutMetrics")["cssContentSize"]

@@ -64,7 +64,8 @@ def make_run(folder, keys=(FLOOR, LAMP), sensors=1, truth=True, iterations=30, s
         target = texture(*size, seed=sensor)
         for name, part in (("initial", 0.5), ("final", 0.9), ("target", 1.0)):
             write_image(folder / "images" / f"{name}{suffix}", target * np.float32(part))
-        maps[f"error{suffix}"] = write_error_map(folder / "images" / f"error{suffix}", target * np.float32(0.9), target)
+        image = target * np.float32(0.9)
+        maps[f"error{suffix}"] = write_error_map(folder / "images", suffix, image, target, image - target)
     errors = {key: {"initial": 0.5, "final": 0.1} for key in keys} if truth else {}
     results = {
         "iterations": iterations, "loss": 0.0123, "elapsed_s": 95.0, "rmse": {"initial": None, "final": None},

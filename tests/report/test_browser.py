@@ -4,13 +4,19 @@ from __future__ import annotations
 
 import pytest
 from report.chromium import Chromium, find_chromium
+from report.measured import write_bench, write_convergence, write_gradcheck, write_maps
 from report.run_folder import MEMORY, PILOT, SCALING, make_run
 
-from reslrb_cli.records.manifest import Status
+import reslrb_cli.report.page as page_module
+from reslrb_cli.records.manifest import Status, read_manifest
 from reslrb_cli.report import write_report
+from reslrb_cli.report.page import write_page
+from reslrb_cli.report.seen.fill import with_seen_errors
+from reslrb_cli.report.sources import read_sources
 
 LONG = "wall_of_the_north_western_corridor_behind_the_second_door_0123456789_" * 3 + ".brdf_0.reflectance.value"
 NOISY = {"start": {"mean": 1.31e-7, "error": 4e-9}, "end": {"mean": 1.33e-7, "error": 4e-9}, "change": "flat"}
+EVERYTHING = "all of them, and measurements"
 RUNS = {
     "textures and colours": {"pilot": PILOT, "memory": MEMORY, "scaling": SCALING},
     "three sensors": {"sensors": 3, "size": (240, 320)},
@@ -38,7 +44,17 @@ def pages(llvm, tmp_path_factory):
     folders = {name: make_run(folder / name, **options) for name, options in RUNS.items()}
     for made in folders.values():
         (made / "config.yaml").write_text(f"scene:\n  file: {'/a/long/path' * 30}\n  name: {'x' * 300}\n")
-    return {name: write_report(made) for name, made in folders.items()}
+    written = {name: write_report(made) for name, made in folders.items()}
+    write_bench(folder / "bench.jsonl", spps=(4, 16))
+    write_gradcheck(folder / "check <script>.jsonl", LONG)
+    write_convergence(folder / "convergence.jsonl")
+    write_maps(folder / "maps")
+    files = ("bench.jsonl", "check <script>.jsonl", "convergence.jsonl", "maps")
+    some = [made for name, made in folders.items() if name not in ("three sensors", "no truth")]
+    sources = read_sources([*some, *(folder / name for name in files)])
+    written[EVERYTHING] = folder / "everything.html"
+    write_page([with_seen_errors(source) for source in sources], written[EVERYTHING])
+    return written
 
 
 #: The text of elements that stick out of the window, or are cut off by the one that holds them.
@@ -50,7 +66,7 @@ OUTSIDE = """[...document.querySelectorAll('body *')].filter(e => {
 
 
 @pytest.mark.parametrize("width", [320, 400, 750, 1400])
-@pytest.mark.parametrize("name", RUNS)
+@pytest.mark.parametrize("name", [*RUNS, EVERYTHING])
 def test_nothing_scrolls_sideways(chromium, pages, name, width):
     chromium.open(pages[name], width)
     assert chromium.evaluate("document.documentElement.scrollWidth") <= width
@@ -68,8 +84,9 @@ def test_no_number_is_broken(chromium, pages, width):
                 if (new Set([...range.getClientRects()].map(r => r.top)).size > 1) return true;
             }
         return false }).map(cell => cell.textContent)"""
-    chromium.open(pages["textures and colours"], width)
-    assert chromium.evaluate(broken) == []
+    for name in ("textures and colours", EVERYTHING):
+        chromium.open(pages[name], width)
+        assert chromium.evaluate(broken) == []
 
 
 def test_pictures_and_curves_are_there_without_script_and_network(chromium, pages):
@@ -79,12 +96,35 @@ def test_pictures_and_curves_are_there_without_script_and_network(chromium, page
     assert all(address.startswith("data:") for address in chromium.requests()[1:])
     broken = "[...document.images].filter(i => !i.complete || i.naturalWidth == 0).length"
     assert chromium.evaluate(broken) == 0
-    assert chromium.evaluate("document.images.length") == 8
+    assert chromium.evaluate("document.images.length") == 9
     drawn = "[...document.querySelectorAll('svg')].map(s => s.getBoundingClientRect().height)"
     heights = chromium.evaluate(drawn)
     assert len(heights) == 4
     assert min(heights) > 100
     assert [event for event in chromium.events if event["method"] == "Log.entryAdded"] == []
+
+
+def test_a_page_of_everything_is_complete_in_itself(chromium, pages):
+    chromium.open(pages[EVERYTHING], 1400)
+    assert all(address.startswith("data:") for address in chromium.requests()[1:])
+    assert chromium.evaluate("[...document.images].filter(i => !i.complete || i.naturalWidth == 0).length") == 0
+    assert chromium.evaluate("document.images.length") > 25
+    assert chromium.evaluate("document.scripts.length") == 0
+    assert [event for event in chromium.events if event["method"] == "Log.entryAdded"] == []
+    assert chromium.evaluate("[...document.querySelectorAll('.bar i')].some(i => i.offsetWidth > 100)")
+
+
+def test_the_page_of_a_run_at_work_loads_itself_again_until_it_is_over(chromium, pages, tmp_path, monkeypatch):
+    monkeypatch.setattr(page_module, "REFRESH_SECONDS", 1)
+    folder = make_run(tmp_path / "run", iterations=3, truth=False)
+    path = write_report(folder, read_manifest(folder) | {"status": "running"}, {})
+    chromium.open(path, 1400)
+    assert chromium.evaluate("document.querySelector('.status').textContent") == "running"
+    write_report(folder)
+    assert chromium.wait_for("document.querySelector('.status')?.textContent == 'finished'", 10)
+    chromium.events.clear()
+    assert not chromium.wait_for("false", 2)
+    assert chromium.requests() == []
 
 
 def test_markup_in_names_does_nothing(chromium, pages):
@@ -108,7 +148,7 @@ def test_text_stands_out_from_what_is_behind_it(chromium, pages, dark):
             const a = light(getComputedStyle(e).color), b = light(behind(e));
             return [(Math.max(a, b) + 0.05) / (Math.min(a, b) + 0.05), e.textContent.slice(0, 40)] })
             .filter(([ratio]) => ratio < 4.5) })()"""
-    for name in ("textures and colours", "failed", "long-" * 40 + "name"):
+    for name in ("textures and colours", "failed", "long-" * 40 + "name", EVERYTHING):
         chromium.open(pages[name], 1400, dark=dark)
         assert chromium.evaluate(contrast) == []
         background = chromium.evaluate("getComputedStyle(document.body).backgroundColor")

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from report.run_folder import FLOOR, LAMP, MEMORY, PILOT, SCALING, make_run
 
+from reslrb_cli.records.layers import read_layers
 from reslrb_cli.records.manifest import Status
 from reslrb_cli.report.page import render_page, write_report
 from reslrb_cli.report.page.values import parameter_table, texture_pictures
@@ -134,9 +135,9 @@ def test_a_place_has_no_colour():
 def test_every_sensor_has_its_images_and_error_map(tmp_path, sensors):
     page = page_of(make_run(tmp_path / "lamp", sensors=sensors))
     alts = [alt for alt, _ in page.pictures if FLOOR not in alt]
-    assert len(alts) == 4 * sensors
-    assert sum("error map" in alt for alt in alts) == sensors
-    assert page.sections["Images"].count("or more") == sensors
+    assert len(alts) == 5 * sensors
+    assert sum("error map" in alt for alt in alts) == sum("derivative" in alt for alt in alts) == sensors
+    assert page.sections["Images"].count("or more") == 2 * sensors
     assert ("Sensor 2" in page.sections["Images"]) == (sensors == 3)
 
 
@@ -147,9 +148,7 @@ def test_the_colours_of_an_error_map_end_where_it_says(tmp_path):
     end = float(re.search(r"to (\S+)$", alt)[1])
     from matplotlib import colormaps
 
-    from reslrb_cli.records.images import read_exr
-
-    error = read_exr(folder / "images" / "error.exr").mean(axis=2)
+    error = np.abs(read_layers(folder / "images" / "comparison.exr")["difference"]).mean(axis=2)
     assert np.mean(error > end) <= 0.01
     assert error.max() > 0.5 * end
     np.testing.assert_allclose(pixels(uri), colormaps["inferno"](np.minimum(error / end, 1))[:, :, :3], atol=0.01)
@@ -236,7 +235,7 @@ def test_names_stay_text(tmp_path):
     markup = render_page(folder)
     page = Page(markup)
     assert "script" not in page.tags
-    assert page.tags.count("img") == len(page.pictures) == 8
+    assert page.tags.count("img") == len(page.pictures) == 9
     assert page.row("Parameters", EVIL)
     assert "\x1b" not in markup
     assert "\u202e" not in markup
@@ -267,7 +266,7 @@ def test_a_folder_with_hardly_anything_in_it_has_a_page(tmp_path):
 
 def test_what_is_there_is_shown_without_what_is_missing(tmp_path):
     folder = make_run(tmp_path / "interrupted")
-    for name in ("final", "target", "error"):
+    for name in ("final", "target", "comparison"):
         (folder / "images" / f"{name}.exr").unlink()
     assert [alt for alt, _ in page_of(folder).pictures if FLOOR not in alt] == ["start"]
 

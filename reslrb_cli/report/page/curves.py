@@ -1,146 +1,127 @@
-"""Curves of a run against iterations and time, as SVG in the page's own colours."""
+"""Loss and errors of one run, or of several in one picture, against iterations and time."""
 
 from __future__ import annotations
 
-import io
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-import numpy as np
+from reslrb_cli.report.page.drawing import COLORS, MOST_POINTS, Curve, diagram, diagrams, legend, points_together
+from reslrb_cli.report.page.markup import breakable, soft
+from reslrb_cli.report.run_table import units_differ
+from reslrb_cli.report.sources import Run
 
-from reslrb_cli.report.page.markup import breakable, text
-
-#: Curves in one diagram, at most: those of the parameters that are the farthest off at the end.
-MOST_CURVES = 8
-#: Points of a curve, at most; of a longer run each is the mean of some iterations.
-MOST_POINTS = 600
-#: An axis is logarithmic where its values span more than this factor, and has ticks between its decades up to that one.
-LEAST_LOG, MOST_LABELLED = 5.0, 300.0
-#: Colours that can be told apart, on light and on dark.
-COLORS = ("#3b7ddd", "#e07b39", "#2f9e62", "#d0517e", "#8b6fd6", "#b08900", "#1f9eb3", "#9c6b4f")
+#: Curves in one diagram of one run, at most: those of the parameters that are the farthest off at the end.
+MOST_CURVES = len(COLORS)
+#: Parameters of several runs that have diagrams of their own, at most.
+MOST_SHARED = 6
 ABSCISSAE = (("iteration", "iteration"), ("elapsed_s", "time in steps and updates (s)"))
-#: What matplotlib is told to draw text and lines in, and is then replaced by the page's own colour.
-_INK = "#010203"
-_STYLE = {
-    "svg.fonttype": "none", "svg.hashsalt": "reslrb", "font.size": 10, "axes.linewidth": 0.6,
-    "text.color": _INK, "axes.edgecolor": _INK, "axes.labelcolor": _INK, "xtick.color": _INK, "ytick.color": _INK,
-    "grid.color": _INK, "figure.facecolor": "none", "axes.facecolor": "none", "savefig.facecolor": "none",
-}  # fmt: skip
+
+Record = Mapping[str, Any]
 
 
-@dataclass(frozen=True)
-class Curve:
-    """One quantity over the iterations; None where it is not known."""
-
-    name: str
-    values: list[float | None]
-    color: str
-
-
-def convergence(records: Sequence[Mapping[str, Any]], scales: Mapping[str, float | None], relative: bool) -> str:
-    """Loss, and errors by parameter where they are known, against iterations and against time.
-
-    `records` are the lines of `metrics.jsonl`; errors are divided by `scales` where they are to be `relative`.
-    """
-    if not records:
-        return "<p>No iteration was completed.</p>"
-    loss = Curve("loss", [record.get("loss") for record in records], COLORS[0])
-    errors = _errors(records, scales if relative else {})
-    if relative:
-        errors = [curve for curve in errors if scales.get(curve.name)]
+def convergence(run: Run) -> str:
+    """Loss, and errors by parameter where they are known, against iterations and against time."""
+    if not run.records:
+        when = (
+            "has been completed yet; the first one also compiles what the others use"
+            if run.at_work
+            else "was completed"
+        )
+        return f"<p>No iteration {when}.</p>"
+    scales, relative = run.scales, units_differ(run.results)
+    last = run.records[-1]["parameter_errors"]
+    ends = {
+        key: error / (scales.get(key) or 1.0 if relative else 1.0) for key, error in last.items() if error is not None
+    }
+    keys = [key for key in sorted(ends, key=lambda key: -ends[key]) if not relative or scales.get(key)]
+    drawn = keys[:MOST_CURVES]
+    errors = [(key, place, _error(key, scales.get(key) if relative else None)) for place, key in enumerate(drawn)]
     what = "relative error" if relative else "RMSE"
-    left_out = len(errors) - MOST_CURVES
-    errors = errors[:MOST_CURVES]
-    parts = [_diagrams(records, [loss], "loss"), _diagrams(records, errors, f"{what} by parameter"), _legend(errors)]
-    if left_out > 0:
-        parts.append(f'<p class="soft small">The {MOST_CURVES} parameters that are the farthest off at the end; '
-                     f"{left_out} more are not drawn.</p>")  # fmt: skip
-    count = _points_together(len(records))
-    if count > 1:
-        parts.append(f'<p class="soft small">Each point is the mean of {count} iterations.</p>')
-    return "".join(parts)
+    parts = [
+        _both([(run, "loss", 0, _loss)], "loss"),
+        _both([(run, key, place, error) for key, place, error in errors], f"{what} by parameter"),
+        legend([Curve(key, (), (), place) for key, place, _ in errors]),
+    ]
+    if len(keys) > len(drawn):
+        words = f"The {MOST_CURVES} parameters that are the farthest off at the end; "
+        parts.append(soft(f"{words}{len(keys) - len(drawn)} more are not drawn."))
+    return "".join(parts) + _thinning([run])
 
 
-def _errors(records: Sequence[Mapping[str, Any]], scales: Mapping[str, float | None]) -> list[Curve]:
-    """The errors of each parameter, over its scale where it has one, the largest at the end first."""
-    last = records[-1].get("parameter_errors") or {}
-    ends = {key: error / (scales.get(key) or 1.0) for key, error in last.items() if error is not None}
-    keys = sorted(ends, key=lambda key: -ends[key])
-    curves = []
-    for place, key in enumerate(keys):
-        values = [(record.get("parameter_errors") or {}).get(key) for record in records]
-        scale = scales.get(key) or 1.0
-        scaled = [None if value is None else value / scale for value in values]
-        curves.append(Curve(key, scaled, COLORS[place % len(COLORS)]))
-    return curves
+def convergence_of_all(runs: Sequence[Run]) -> str:
+    """Loss and error of several runs in one picture; of parameters that several have, each in a picture of its own."""
+    begun = [(place, run) for place, run in enumerate(runs) if run.records]
+    if not begun:
+        return "<p>No iteration was completed.</p>"
+    parts = [legend([Curve(run.name, (), (), place) for place, run in begun])]
+    parts.append(_both([(run, run.name, place, _loss) for place, run in begun], "loss"))
+    absolute = not any(units_differ(run.results) for run in runs)
+    total = _total_rmse if absolute else _total_relative
+    label = "parameter RMSE" if absolute else "relative error"
+    parts.append(_both([(run, run.name, place, total(run)) for place, run in begun], f"{label}, all parameters"))
+    counts: dict[str, int] = {}
+    for _, run in begun:
+        for key in run.records[-1]["parameter_errors"]:
+            counts[key] = counts.get(key, 0) + 1
+    shared = [key for key, count in counts.items() if count > 1] if len(counts) > 1 else []
+    for key in shared[:MOST_SHARED]:
+        curves = [(run, run.name, place, _error(key, None)) for place, run in begun]
+        drawn = _both(curves, "RMSE")
+        parts.append(f"<h3>{breakable(key)}</h3>{drawn}" if drawn else "")
+    if len(shared) > MOST_SHARED:
+        parts.append(soft(f"{len(shared) - MOST_SHARED} more parameters that several runs have are not drawn."))
+    missing = [run.name for run in runs if not run.records]
+    parts.append(soft(f"No iteration was completed by: {', '.join(missing)}." if missing else ""))
+    return "".join(parts) + _thinning(runs)
 
 
-def _diagrams(records: Sequence[Mapping[str, Any]], curves: Sequence[Curve], label: str) -> str:
+def _both(curves: Sequence[tuple[Run, str, int, Callable[[Record], float | None]]], label: str) -> str:
     """The same curves in two diagrams beside each other, against iterations and against time."""
-    known = [curve for curve in curves if any(value is not None for value in curve.values)]
-    if not known:
+    drawn = []
+    for name, caption in ABSCISSAE:
+        made = [
+            Curve(title, [record[name] for record in run.records], [value(record) for record in run.records], place)
+            for run, title, place, value in curves
+        ]
+        drawn.append(diagram(made, caption, label))
+    return diagrams(*drawn)
+
+
+def _thinning(runs: Sequence[Run]) -> str:
+    most = max((points_together(len(run.records)) for run in runs), default=1)
+    if most <= 1:
         return ""
-    drawn = [_diagram([record[name] for record in records], caption, known, label) for name, caption in ABSCISSAE]
-    return f'<div class="curves">{"".join(drawn)}</div>'
+    if len(runs) == 1:
+        return soft(f"Each point is the mean of {most} iterations.")
+    return soft(f"Of runs with more than {MOST_POINTS} iterations each point is the mean of some, at most {most}.")
 
 
-def _diagram(abscissa: Sequence[float], caption: str, curves: Sequence[Curve], label: str) -> str:
-    import matplotlib
-    from matplotlib.backends.backend_svg import FigureCanvasSVG
-    from matplotlib.figure import Figure
-
-    with matplotlib.rc_context(_STYLE):
-        # A figure and canvas of our own: pyplot would pick a backend for the whole process.
-        figure = Figure(figsize=(5.2, 2.9), layout="constrained")
-        FigureCanvasSVG(figure)
-        axis = figure.subplots()
-        low, high = math.inf, -math.inf
-        for curve in curves:
-            points = [(x, y) for x, y in zip(abscissa, curve.values, strict=True) if y is not None]
-            xs, ys = _thinned(np.array(points, dtype=np.float64), _points_together(len(abscissa)))
-            low, high = min(low, float(ys.min())), max(high, float(ys.max()))
-            axis.plot(xs, ys, linewidth=1.5, color=curve.color, marker="o" if len(xs) == 1 else "")
-        if low > 0 and high > LEAST_LOG * low:
-            _scale_by_decades(axis, high / low)
-        axis.set_xlabel(caption)
-        axis.set_ylabel(label)
-        axis.grid(True, which="both", axis="y", alpha=0.16, linewidth=0.6)
-        axis.grid(True, axis="x", alpha=0.16, linewidth=0.6)
-        axis.spines[["top", "right"]].set_visible(False)
-        buffer = io.StringIO()
-        figure.savefig(buffer, format="svg", metadata={"Date": None})
-    drawing = buffer.getvalue()
-    drawing = drawing[drawing.index("<svg") :].replace(_INK, "currentColor")
-    return drawing.replace("<svg ", f'<svg role="img" aria-label="{text(f"{label} against {caption}")}" ', 1)
+def _loss(record: Record) -> float | None:
+    return record["loss"]
 
 
-def _scale_by_decades(axis: Any, span: float) -> None:
-    """A logarithmic y axis whose ticks are plain text, which takes a fraction of the time of formulas."""
-    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+def _error(key: str, scale: float | None) -> Callable[[Record], float | None]:
+    """The error of one parameter, over `scale` where that is given."""
 
-    plain = FuncFormatter(lambda value, _: f"{value:g}")
-    axis.set_yscale("log")
-    axis.yaxis.set_major_formatter(plain)
-    axis.yaxis.set_minor_locator(LogLocator(subs=(2.0, 5.0)))
-    axis.yaxis.set_minor_formatter(plain if span < MOST_LABELLED else NullFormatter())
+    def error(record: Record) -> float | None:
+        value = record["parameter_errors"].get(key)
+        return None if value is None else value / (scale or 1.0)
 
-
-def _points_together(count: int) -> int:
-    """How many iterations make one point of a curve."""
-    return -(-count // MOST_POINTS)
+    return error
 
 
-def _thinned(points: np.ndarray[Any, Any], together: int) -> tuple[Any, Any]:
-    """Means of so many points each; the last is of what is left."""
-    starts = np.arange(0, len(points), together)
-    sums = np.add.reduceat(points, starts, axis=0)
-    counts = np.diff([*starts, len(points)])
-    xs, ys = (sums / counts[:, None]).T
-    return xs, ys
+def _total_rmse(run: Run) -> Callable[[Record], float | None]:
+    return lambda record: record["parameter_rmse"]
 
 
-def _legend(curves: Sequence[Curve]) -> str:
-    rows = "".join(f'<li><i style="border-color:{curve.color}"></i>{breakable(curve.name)}</li>' for curve in curves)
-    return f'<ul class="legend">{rows}</ul>' if rows else ""
+def _total_relative(run: Run) -> Callable[[Record], float | None]:
+    """The root mean square over the parameters of their errors as shares of the truth."""
+    scales = run.scales
+
+    def total(record: Record) -> float | None:
+        errors = record["parameter_errors"].items()
+        shares = [value / scale for key, value in errors if value is not None and (scale := scales.get(key))]
+        return math.sqrt(sum(share**2 for share in shares) / len(shares)) if shares else None
+
+    return total

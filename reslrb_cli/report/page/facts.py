@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shlex
-import statistics
 from collections.abc import Mapping, Sequence
 from datetime import datetime
 from typing import Any
@@ -11,25 +10,26 @@ from typing import Any
 from reslrb_cli.optimization.correlated_bias import CorrelatedBias, share_words
 from reslrb_cli.optimization.pilot_records import Outcome
 from reslrb_cli.report.page.markup import breakable, facts, table, text
+from reslrb_cli.report.page.steps import StepParts
+from reslrb_cli.report.sources import Run
 from reslrb_cli.report.words import duration, number
 
-#: Steps that are left out of medians: the first ones compile kernels.
-WARM_UP = 5
 
-
-def run_facts(manifest: Mapping[str, Any], records: Sequence[Mapping[str, Any]]) -> str:
-    """When, on what and how the run was, what it took, and what it came to."""
+def run_facts(run: Run) -> str:
+    """When, on what and how the run was, what it took, what it came to, and the commands that do it again."""
+    manifest, records = run.manifest, run.records
     losses = (manifest.get("results") or {}).get("image_loss") or {}
     versions = ", ".join(f"{name} {version}" for name, version in (manifest.get("versions") or {}).items())
     spp = f"{records[-1]['spp']} samples per pixel" if records else ""
-    command = manifest.get("command_line") or []
+    command, step = manifest.get("command_line") or [], StepParts.of(records)
+    again = ["reslrb", "optimize", str(run.path.absolute() / "config.yaml")] if manifest.get("config") else []
     return facts(
         {
             "started": _moment(manifest.get("started")),
             "took": _wall(manifest),
             "iterations": text(", ".join(part for part in (str(len(records)), spp) if part)),
             "time in iterations": _total(records),
-            "an iteration": _step(records),
+            "an iteration": "" if step is None else text(step.words()),
             "loss of the saved images": text(" → ".join(number(loss) for loss in losses.values() if loss is not None)),
             "peak memory": text(f"{max(record['peak_mib'] for record in records):.4g} MiB") if records else "",
             "device": text(manifest.get("device") or ""),
@@ -37,6 +37,7 @@ def run_facts(manifest: Mapping[str, Any], records: Sequence[Mapping[str, Any]])
             "seed": text(manifest.get("seed", "")),
             "configuration": breakable(manifest.get("config") or ""),
             "command line": breakable(shlex.join(map(str, command))) if command else "",
+            "to do it again": breakable(shlex.join(again)) if again else "",
             "versions": text(versions),
             "platform": text(manifest.get("platform") or ""),
         }
@@ -62,18 +63,13 @@ def _total(records: Sequence[Mapping[str, Any]]) -> str:
     return text(f"{duration(records[-1]['elapsed_s'])}, of which {duration(codegen)} to generate and compile kernels")
 
 
-def _step(records: Sequence[Mapping[str, Any]]) -> str:
-    """The median step, without the first ones, and its parts where they are known."""
-    steady = records[WARM_UP:] or records
-    if not steady:
+def plan_table(plan: Mapping[str, Any] | None) -> str:
+    """What a step is made of, and what the scene does not need of it."""
+    if not plan:
         return ""
-    words = f"{duration(statistics.median(record['step_ms'] for record in steady) / 1e3)} (median)"
-    parts = [
-        f"{duration(statistics.median(known) / 1e3)} {what}"
-        for name, what in (("primal_ms", "up to image and loss"), ("adjoint_ms", "for the gradient"))
-        if (known := [record[name] for record in steady if record.get(name) is not None])
-    ]
-    return text(f"{words}: {', '.join(parts)}" if parts else words)
+    rows = sorted(plan["rows"], key=lambda row: not row["needed"])
+    cells = [[text(row["feature"]), "yes" if row["needed"] else "left out", text(row["reason"])] for row in rows]
+    return table(("part of a step", "needed", "why"), cells)
 
 
 def pilot_table(pilot: Mapping[str, Any] | None) -> str:

@@ -1,4 +1,4 @@
-"""The images on the page: start, end, target and error map of every sensor."""
+"""The images on the page: start, end, target and maps of every sensor."""
 
 from __future__ import annotations
 
@@ -9,9 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from reslrb_cli.report.error_map import color_stops, colored
+from reslrb_cli.records.images import load_image
+from reslrb_cli.report.error_map import color_stops, colored, read_comparison, signed_end
 from reslrb_cli.report.page.markup import figure, figures, text
-from reslrb_cli.report.page.pictures import Array, embed, exposure_for, exposure_words, fit, load_image, show
+from reslrb_cli.report.page.pictures import Array, embed, fit, show
+from reslrb_cli.report.tone import exposure_for, exposure_words
 from reslrb_cli.report.words import number
 
 #: Images between the first and the last that are shown of a sensor, at most.
@@ -20,9 +22,9 @@ _OF_A_SENSOR = re.compile(r"(?:initial|final|target)(-\d+)?\.exr")
 
 
 def image_rows(folder: Path, results: Mapping[str, Any]) -> str:
-    """Of every sensor a row: the initial image, the final one, the target, and the error map; `folder` is `images/`.
+    """Of every sensor a row: the initial image, the final one, the target, and maps of error and dL/dI.
 
-    A sensor's images have one exposure. What is missing is left out.
+    `folder` is `images/`. A sensor's images have one exposure. What is missing is left out.
     """
     suffixes = {match[1] or "" for path in folder.glob("*.exr") if (match := _OF_A_SENSOR.fullmatch(path.name))}
     return "".join(
@@ -40,7 +42,7 @@ def _row(folder: Path, suffix: str, results: Mapping[str, Any]) -> str:
         for title, image in loaded.items()
         if image is not None
     ]
-    shown.append(_error_figure(folder, suffix, results))
+    shown += _error_figures(folder, suffix, results)
     title = f"<h3>Sensor {text(suffix[1:])}</h3>" if suffix else ""
     words = exposure_words(exposure)
     title += f'<p class="soft small">{text(words)}</p>' if words else ""
@@ -52,21 +54,34 @@ def _figure(image: Array, alt: str, markup: str) -> str:
     return figure(picture.uri, picture.size, alt, markup, picture.smooth)
 
 
-def _error_figure(folder: Path, suffix: str, results: Mapping[str, Any]) -> str:
-    """The map of |I - T|, with its scale; nothing where it, or its scale, is missing."""
+def _error_figures(folder: Path, suffix: str, results: Mapping[str, Any]) -> list[str]:
+    """The maps of |I - T| and of dL/dI, with their scales; without the first where it, or its scale, is missing."""
     about = (results.get("error_maps") or {}).get(f"error{suffix}")
-    error = load_image(folder / f"error{suffix}.exr")
-    if about is None or error is None or not about.get("end"):
-        return ""
-    grey = fit(error.astype(np.float64).mean(axis=2, keepdims=True))[:, :, 0]
-    picture = embed(colored(grey / about["end"]), grey.shape)
-    end = text(number(about["end"]))
-    caption = (
-        f"<b>|image − target|</b> at the end, mean {text(number(about['mean'], 3))}"
-        f'<div class="scale" style="background:linear-gradient(to right,{",".join(color_stops(9))})"></div>'
-        f'<div class="ends"><span>0</span><span>{end} or more</span></div>'
+    layers = read_comparison(folder, suffix)
+    shown = []
+    if about is not None and about.get("end") and "difference" in layers:
+        grey = np.abs(layers["difference"].astype(np.float64)).mean(axis=2, keepdims=True)
+        caption = f"<b>|image − target|</b> at the end, mean {text(number(about['mean'], 3))}"
+        shown.append(map_figure(grey, about["end"], "error map", caption))
+    if "gradient" in layers:
+        total = np.nan_to_num(layers["gradient"].astype(np.float64)).sum(axis=2, keepdims=True)
+        caption = "<b>∂loss/∂image</b> at the end, sum over channels"
+        shown.append(map_figure(total, signed_end(total), "derivative of the loss", caption, signed=True))
+    return shown
+
+
+def map_figure(values: Array, end: float, alt: str, markup: str, signed: bool = False) -> str:
+    """Values (H, W, 1) in colours, from 0 to `end`, or if `signed` from -`end`, with the scale below the caption."""
+    grey = fit(values)[:, :, 0]
+    picture = embed(colored(grey / end, signed), grey.shape)
+    last = text(number(end))
+    low, middle = (f"−{last}", "<span>0</span>") if signed else ("0", "")
+    stops = ",".join(color_stops(9, signed))
+    scale = (
+        f'<div class="scale" style="background:linear-gradient(to right,{stops})"></div>'
+        f'<div class="ends"><span>{low}</span>{middle}<span>{last} or more</span></div>'
     )
-    return figure(picture.uri, picture.size, f"error map, from 0 to {end}", caption, picture.smooth)
+    return figure(picture.uri, picture.size, f"{alt}, from {low} to {last}", markup + scale, picture.smooth)
 
 
 def _between(folder: Path, suffix: str, exposure: float) -> str:

@@ -6,8 +6,24 @@ from __future__ import annotations
 import html
 from collections.abc import Iterable, Mapping, Sequence
 
+from reslrb_cli.report.page.style import STYLE
+
+#: What the page may load: nothing but what it holds. Were markup to slip in by a name, it could do nothing.
+POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
 #: Characters after which a key may go on in the next line.
 _BREAKS = "._-/"
+
+
+def document(title: str, markup: str, refresh_s: int | None = None) -> str:
+    """A whole page; with `refresh_s` it loads itself again after so many seconds."""
+    again = "" if refresh_s is None else f'<meta http-equiv="refresh" content="{refresh_s}">'
+    return (
+        '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">'
+        f'<meta http-equiv="Content-Security-Policy" content="{POLICY}">{again}'
+        f"<title>{text(title)}</title><style>{STYLE}</style></head>\n"
+        f"<body>{markup}</body></html>\n"
+    )
 
 
 def text(value: object) -> str:
@@ -32,14 +48,28 @@ def section(title: str, *markup: str) -> str:
     return f"<section><h2>{text(title)}</h2>{body}</section>\n" if body else ""
 
 
+def folded(title: str, *markup: str) -> str:
+    """A part that is shown when its title is clicked; nothing where all of its content is empty."""
+    body = "".join(markup)
+    return f"<details><summary>{text(title)}</summary>{body}</details>\n" if body else ""
+
+
+def soft(words: str) -> str:
+    """A remark in plain text; nothing where it is empty."""
+    return f'<p class="soft small">{text(words)}</p>' if words else ""
+
+
 def table(head: Sequence[str], markup: Iterable[Sequence[str]], kind: str = "") -> str:
     """A table whose cells are markup, with a heading for each column; nothing where it has no rows.
 
-    Each cell also carries its column's heading, for narrow screens, on which a row becomes a block. `kind` is a class.
+    Each cell also carries its column's heading, for narrow screens, on which a row becomes a block; there a cell lies
+    beside its heading as one piece. `kind` is a class.
     """
     rows = [
         "".join(
-            f'<td data-label="{text(title)}">{cell}</td>' if column else f'<th scope="row">{cell}</th>'
+            f'<td data-label="{text(title)}">{cell and f"<div>{cell}</div>"}</td>'
+            if column
+            else f'<th scope="row">{cell}</th>'
             for column, (title, cell) in enumerate(zip(head, row, strict=True))
         )
         for row in markup

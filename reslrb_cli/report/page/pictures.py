@@ -4,15 +4,12 @@ from __future__ import annotations
 
 import base64
 import io
-import math
-from collections.abc import Iterable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from reslrb_cli.records.images import read_exr
+from reslrb_cli.report.tone import encode
 
 Array = np.ndarray[Any, Any]
 
@@ -20,8 +17,6 @@ Array = np.ndarray[Any, Any]
 MOST_PIXELS = 640
 #: A picture with fewer pixels at its longer side is shown with squares for pixels.
 FEW_PIXELS = 256
-#: What 99 % of the values are below is shown as it is where it lies in this range, else brought to `BRIGHT`.
-LEAST_BRIGHT, MOST_BRIGHT, BRIGHT = 0.25, 1.6, 0.8
 
 
 @dataclass(frozen=True)
@@ -35,14 +30,6 @@ class Picture:
     def smooth(self) -> bool:
         """Whether it has pixels enough to be enlarged smoothly."""
         return max(self.size) >= FEW_PIXELS
-
-
-def load_image(path: Path) -> Array | None:
-    """An EXR as (H, W, C); None where there is none, or what is there is damaged."""
-    try:
-        return read_exr(path)
-    except (OSError, RuntimeError, ValueError):
-        return None
 
 
 def show(values: Array, exposure: float = 1.0) -> Picture:
@@ -71,28 +58,6 @@ def fit(values: Array) -> Array:
 
     height, width = (max(round(size * MOST_PIXELS / longest), 1) for size in values.shape[:2])
     return resample(values, (width, height))
-
-
-def exposure_for(arrays: Iterable[Array | None]) -> float:
-    """The factor, of two digits, that makes linear values visible; 1 where they are, or there is none."""
-    brightest = [float(np.quantile(np.nan_to_num(array[:, :, :3].max(axis=2)), 0.99)) for array in arrays
-                 if array is not None and array.size]  # fmt: skip
-    level = max(brightest, default=0.0)
-    if not 0 < level < math.inf or LEAST_BRIGHT <= level <= MOST_BRIGHT:
-        return 1.0
-    return float(f"{BRIGHT / level:.1e}")
-
-
-def exposure_words(exposure: float) -> str:
-    """What has to be said of an exposure; nothing of 1."""
-    if exposure == 1:
-        return ""
-    return f"shown {exposure:.2g} times brighter" if exposure > 1 else f"shown {1 / exposure:.2g} times darker"
-
-
-def encode(values: Array) -> Array:
-    """Linear values in [0, 1] as sRGB."""
-    return np.where(values <= 0.0031308, 12.92 * values, 1.055 * np.maximum(values, 1e-9) ** (1 / 2.4) - 0.055)
 
 
 def _png(pixels: Array) -> bytes:

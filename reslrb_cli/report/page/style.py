@@ -2,7 +2,16 @@
 
 from __future__ import annotations
 
-STYLE = """
+#: A table on a screen that is too narrow for its columns: each row is a block, with a line for each column.
+_BLOCKS = """
+  .rows, .rows tbody, .rows tr, .rows th, .rows td { display: block; border: 0; padding: 0 }
+  .rows thead { display: none }
+  .rows tr { border-bottom: 1px solid var(--line); padding: .55rem 0 }
+  .rows td { display: grid; grid-template-columns: 7.5rem minmax(0, 1fr); gap: .6rem; padding: .08rem 0 }
+  .rows td::before { content: attr(data-label); color: var(--soft); font-size: .85rem }
+  .rows td:empty { display: none }
+"""
+_STYLE = """
 :root {
   color-scheme: light dark;
   --page: #fff; --ink: #1c1f23; --soft: #5d6570; --line: #dde1e6; --box: #f5f6f8; --edge: #c9ced6;
@@ -53,11 +62,12 @@ tbody th { font-weight: 500 }
 .facts th { color: var(--soft); font-weight: 500; white-space: nowrap; overflow-wrap: normal }
 .facts td { overflow-wrap: anywhere }
 .number { white-space: nowrap }
+.dense { font-size: .85rem } .dense th, .dense td { padding-right: .8rem }
 .swatch {
   display: inline-block; width: 1.05em; height: 1.05em; border: 1px solid var(--edge); border-radius: .2em;
   vertical-align: -.17em; margin-right: .45em; print-color-adjust: exact; -webkit-print-color-adjust: exact;
 }
-.figures { display: grid; grid-template-columns: repeat(4, minmax(0, 1fr)); gap: 1rem 1.1rem }
+.figures { display: grid; grid-template-columns: repeat(auto-fill, minmax(13rem, 1fr)); gap: 1rem 1.1rem }
 figure { margin: 0; min-width: 0; break-inside: avoid }
 figure img {
   display: block; width: 100%; height: auto; border: 1px solid var(--line); background: #000; border-radius: .25rem;
@@ -70,22 +80,27 @@ figcaption b { color: var(--ink); font-weight: 600 }
 .ends { display: flex; justify-content: space-between }
 
 .curves { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(100%, 22rem), 1fr)); gap: .4rem 1.5rem }
+.curves > * { max-width: 40rem }
 .curves svg { display: block; width: 100%; height: auto }
 .curves text { font-family: inherit }
 .legend { list-style: none; display: flex; flex-wrap: wrap; gap: .15rem 1.2rem; margin: .2rem 0 .8rem; padding: 0;
   font-size: .875rem }
-.legend i { display: inline-block; width: 1.4em; height: 0; border-top: 3px solid; vertical-align: .25em;
+.mark { display: inline-block; width: 1.4em; height: 0; border-top: 3px solid; vertical-align: .25em;
   margin-right: .45em; print-color-adjust: exact; -webkit-print-color-adjust: exact }
+.bars { list-style: none; padding: 0; margin: 0 0 .6rem }
+.bar { display: flex; height: 1.1rem; margin: .1rem 0 .5rem; background: var(--box) }
+.bar i { display: block; print-color-adjust: exact; -webkit-print-color-adjust: exact }
+details { margin: .7rem 0 }
+summary { cursor: pointer; font-weight: 600 }
+summary + * { margin-top: .5rem }
 footer { margin-top: 2.5rem; color: var(--soft); font-size: .85rem }
 
+@media (max-width: 68rem) {
+  @DENSE@
+}
 @media (max-width: 46rem) {
   .figures { grid-template-columns: repeat(2, minmax(0, 1fr)); gap: .8rem }
-  .rows, .rows tbody, .rows tr, .rows th, .rows td { display: block; border: 0; padding: 0 }
-  .rows thead { display: none }
-  .rows tr { border-bottom: 1px solid var(--line); padding: .55rem 0 }
-  .rows td { display: grid; grid-template-columns: 7.5rem minmax(0, 1fr); gap: .6rem; padding: .08rem 0 }
-  .rows td::before { content: attr(data-label); color: var(--soft); font-size: .85rem }
-  .rows td:empty { display: none }
+  @BLOCKS@
   .facts th { white-space: normal; padding-right: .9rem }
   .facts td { padding-right: 0 }
 }
@@ -99,3 +114,4 @@ footer { margin-top: 2.5rem; color: var(--soft); font-size: .85rem }
   tr, .curves > * { break-inside: avoid }
 }
 """
+STYLE = _STYLE.replace("@BLOCKS@", _BLOCKS).replace("@DENSE@", _BLOCKS.replace(".rows", ".dense"))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import zipfile
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
@@ -10,26 +9,25 @@ from typing import Any
 import numpy as np
 
 from reslrb_cli.records.images import finite_range
+from reslrb_cli.records.parameters import read_mask, read_parameters
 from reslrb_cli.report.page.markup import breakable, figure, figures, table, text
-from reslrb_cli.report.page.pictures import Array, encode, exposure_for, exposure_words, show
+from reslrb_cli.report.page.pictures import Array, show
 from reslrb_cli.report.run_table import units_differ
+from reslrb_cli.report.seen.colors import PLACES, is_color
+from reslrb_cli.report.tone import encode, exposure_for, exposure_words
 from reslrb_cli.report.words import number
 
 #: Where a run folder has the values of a moment, below `parameters/`.
 MOMENTS = (("start", "initial"), ("end", "final"), ("true", "true"))
 _FOLDERS = {"initial": "initial", "final": "", "true": "true"}
-#: Parameters of three numbers that are no colours to look at.
-_NO_COLORS = ("eta", "k")
-#: What is no light and no colour, but where something is.
-_PLACES = ("length", "degrees", "scale")
 
 
-def parameter_table(results: Mapping[str, Any]) -> str:
+def parameter_table(results: Mapping[str, Any], end: str = "end") -> str:
     """Value and error of each parameter at the start and at the end, and the true value where it is known."""
     parameters = results.get("parameters") or {}
     has_truth = any(about.get("true") for about in parameters.values())
     relative = units_differ(results)
-    head = ["parameter", "start", "end"] + ["true"] * has_truth + ["RMSE"] * has_truth
+    head = ["parameter", "start", end] + ["true"] * has_truth + ["RMSE"] * has_truth
     head += ["relative error"] * (has_truth and relative)
     rows = []
     for key, about in parameters.items():
@@ -44,25 +42,28 @@ def parameter_table(results: Mapping[str, Any]) -> str:
     return table(head, rows, "parameters")
 
 
-def texture_pictures(folder: Path, results: Mapping[str, Any]) -> str:
+def texture_pictures(folder: Path, results: Mapping[str, Any], current: Mapping[str, Array] | None = None) -> str:
     """Each texture at the start and at the end, the true one where it is known, and what of it light and sensor reach.
 
-    `folder` is a run's `parameters/`.
+    `folder` is a run's `parameters/`; `current` are the values now, by key, of a run that has no end yet.
     """
     parts = []
-    archives = {moment: _archive(folder / sub / "parameters.npz") for moment, sub in _FOLDERS.items()}
+    archives = {moment: read_parameters(folder / sub) for moment, sub in _FOLDERS.items()}
+    if current is not None:
+        archives["final"] = dict(current)
+    titles = {moment: "now" if moment == "final" and current is not None else title for title, moment in MOMENTS}
     for key, about in (results.get("parameters") or {}).items():
         arrays = {moment: _texture(archive, key) for moment, archive in archives.items()}
         exposure, words = _exposure(arrays), ""
-        if about.get("quantity") in _PLACES:
+        if about.get("quantity") in PLACES:
             arrays, words = _as_relief(arrays)
             exposure = 1.0
         shown = [
-            _figure(title, f"{title}: {key}", array, about.get(moment), exposure)
-            for title, moment in MOMENTS
+            _figure(titles[moment], f"{titles[moment]}: {key}", array, about.get(moment), exposure)
+            for _, moment in MOMENTS
             if (array := arrays[moment]) is not None
         ]
-        mask = _mask(folder, key)
+        mask = _texture_mask(folder, key)
         if shown and mask is not None and not mask.all():
             share = f"<b>reached</b> by light and sensor (white): {100 * mask.mean():.3g} %"
             shown.append(_picture(mask[:, :, None].astype(np.float32), f"reached: {key}", share))
@@ -145,8 +146,7 @@ def _swatches(key: str, about: Mapping[str, Any]) -> dict[str, str]:
         values = found.get("mean", found.get("value"))
         if isinstance(values, list) and len(values) == 3 and None not in values:
             colors[moment] = np.array(values, dtype=np.float64)
-    parts = key.split(".")
-    if any(part in _NO_COLORS for part in parts[-2:]) or about.get("quantity") in _PLACES or not colors:
+    if not is_color(key, about.get("quantity") or "") or not colors:
         return {}
     brightest = max(float(color.max()) for color in colors.values())
     unit = brightest if brightest > 1 or (about.get("quantity") and brightest > 0) else 1.0
@@ -157,25 +157,11 @@ def _swatches(key: str, about: Mapping[str, Any]) -> dict[str, str]:
     }
 
 
-def _archive(path: Path) -> dict[str, Array]:
-    """The textures in a `parameters.npz`; nothing where it is missing or damaged."""
-    try:
-        with np.load(path) as arrays:
-            return {key: arrays[key] for key in arrays.files}
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
-        return {}
-
-
 def _texture(archive: Mapping[str, Array], key: str) -> Array | None:
     array = archive.get(key)
     return array if array is not None and array.ndim == 3 and array.size else None
 
 
-def _mask(folder: Path, key: str) -> Array | None:
-    from reslrb_cli.records.parameters import file_stem
-
-    try:
-        mask: Array = np.load(folder / f"{file_stem(key)}.mask.npy")
-    except (OSError, ValueError, EOFError):
-        return None
-    return mask if mask.ndim == 2 else None
+def _texture_mask(folder: Path, key: str) -> Array | None:
+    mask = read_mask(folder, key)
+    return mask if mask is not None and mask.ndim == 2 else None

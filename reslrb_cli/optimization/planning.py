@@ -1,0 +1,25 @@
+"""What a run's manifest says of the plan of its step."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from reslrb_cli.config import Reslrb as ReslrbConfig
+from reslrb_cli.integrators import Reslrb
+from reslrb_cli.integrators.plan_report import plan_rows
+from reslrb_cli.optimization.problem import Problem
+
+
+def plan_record(problem: Problem) -> dict[str, Any]:
+    """The integrator, its estimator, and for the first view what its kernels contain and leave out, and why.
+
+    `rows` is empty for integrators that plan nothing, and `estimator` None for those that have none.
+    """
+    config, integrator = problem.config.integrator, problem.integrator
+    if not isinstance(integrator, Reslrb):
+        return {"integrator": config.type, "estimator": None, "rows": []}
+    plan = integrator.plan(problem.scene, problem.scene.sensors()[problem.sensors[0]], problem.selection.params)
+    rows = [{"feature": row.feature, "needed": row.needed, "reason": row.reason} for row in plan_rows(plan)]
+    estimator = type(integrator.estimator).__name__.removesuffix("Estimator").lower()
+    assert isinstance(config, ReslrbConfig)
+    return {"integrator": config.type, "estimator": estimator, "rows": rows}

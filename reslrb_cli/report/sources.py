@@ -1,0 +1,159 @@
+"""What a page is made of: run folders, and the files that measuring commands write, told apart by what is in them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from reslrb_cli.errors import ConfigError, one_line
+from reslrb_cli.records import metrics
+from reslrb_cli.records.manifest import read_manifest
+from reslrb_cli.records.reading import read_lines
+from reslrb_cli.report.tone import Array
+
+#: Figures that a record of a run has, or it is none; and those that it may have.
+_FIGURES = ("iteration", "elapsed_s", "step_ms", "codegen_ms", "peak_mib", "spp")
+_MORE = ("loss", "primal_ms", "adjoint_ms", "parameter_rmse")
+#: Layers of a map of a gradient, as `gradcheck --images` writes them.
+MAP_LAYERS = ("gradient", "reference", "z")
+
+
+@dataclass(frozen=True)
+class Run:
+    """A run: its folder, its name on the page, what its manifest says, and its metrics, an iteration each.
+
+    `current` are the parameters' values by key while it is at work, else None. `damaged` are lines that could not be
+    read.
+    """
+
+    path: Path
+    name: str
+    manifest: Mapping[str, Any]
+    records: Sequence[Mapping[str, Any]]
+    current: Mapping[str, Array] | None = None
+    damaged: Sequence[int] = ()
+
+    @property
+    def at_work(self) -> bool:
+        """Whether it had no end when this was taken down."""
+        return self.manifest.get("status") == "running"
+
+    @property
+    def results(self) -> Mapping[str, Any]:
+        """What it came to, so far."""
+        results = self.manifest.get("results")
+        return results if isinstance(results, dict) else {}
+
+    @property
+    def scales(self) -> dict[str, float | None]:
+        """The root mean square of each parameter's true value, by key; None where it is not known."""
+        about = self.results.get("parameters")
+        if not isinstance(about, dict):
+            return {}
+        return {key: entry.get("scale") for key, entry in about.items() if isinstance(entry, dict)}
+
+
+@dataclass(frozen=True)
+class Measurements:
+    """The objects in a file of `bench`, `gradcheck` or `convergence`, which `kind` is the name of."""
+
+    path: Path
+    name: str
+    kind: str
+    objects: Sequence[Mapping[str, Any]]
+    damaged: Sequence[int] = ()
+
+
+@dataclass(frozen=True)
+class Maps:
+    """A folder of maps of gradients, and the files in it that are such."""
+
+    path: Path
+    name: str
+    files: Sequence[Path] = ()
+    kind = "maps"
+
+
+Source = Run | Measurements | Maps
+
+
+def read_sources(paths: Sequence[Path]) -> list[Source]:
+    """What lies at each path. Raises ConfigError, located in the first that is nothing of what a page can show."""
+    found: list[Source] = []
+    for path, name in zip(paths, _names(paths), strict=True):
+        try:
+            is_folder = path.is_dir()
+        except (OSError, ValueError):  # a null character
+            is_folder = False
+        found.append(_read_folder(path, name) if is_folder else _read_file(path, name))
+    return found
+
+
+def read_run(folder: Path, name: str | None = None) -> Run:
+    """The run in `folder`, as far as it can be read; of another folder, one that says nothing."""
+    try:
+        lines = read_lines(folder / metrics.FILE_NAME)
+        damaged = lines.damaged
+        records = [record for entry in lines.objects if (record := _record(entry)) is not None]
+    except ConfigError:  # there are none yet
+        records, damaged = [], []
+    return Run(folder, name or folder.absolute().name, read_manifest(folder) or {}, records, damaged=damaged)
+
+
+def _read_folder(path: Path, name: str) -> Source:
+    if read_manifest(path) is not None:
+        return read_run(path, name)
+    from reslrb_cli.records.layers import read_layer_names
+
+    try:
+        maps = [file for file in sorted(path.glob("*.exr")) if set(MAP_LAYERS) <= read_layer_names(file)]
+    except OSError as error:
+        raise ConfigError(path, "", f"cannot be read: {error.strerror}") from None
+    if maps:
+        return Maps(path, name, maps)
+    reason = "is no run folder, and no folder of maps; give the folder of a run, or a file that --json wrote"
+    raise ConfigError(path, "", reason)
+
+
+def _read_file(path: Path, name: str) -> Measurements:
+    lines = read_lines(path)
+    kinds = [kind for entry in lines.objects if (kind := _kind(entry)) is not None]
+    if not kinds:
+        reason = (
+            "holds no line that bench, gradcheck or convergence wrote; give a file that --json wrote, or a run folder"
+        )
+        raise ConfigError(path, f"line {lines.damaged[0]}" if lines.damaged else "", reason)
+    kind = max(dict.fromkeys(kinds), key=kinds.count)
+    return Measurements(path, name, kind, lines.objects, lines.damaged)
+
+
+def _kind(entry: Mapping[str, Any]) -> str | None:
+    """Which command wrote a line; None where that cannot be told."""
+    if entry.get("kind") in ("point", "method"):
+        return "convergence"
+    if entry.get("kind") == "missing" or {"reference", "verdict"} <= set(entry):
+        return "gradcheck"
+    return "bench" if {"integrator", "status", "step_ms"} <= set(entry) else None
+
+
+def _record(entry: Mapping[str, Any]) -> dict[str, Any] | None:
+    """A line of `metrics.jsonl` whose figures are figures; None where what each has is missing."""
+    if not all(_is_number(entry.get(key)) for key in _FIGURES):
+        return None
+    record = dict(entry) | {key: entry.get(key) if _is_number(entry.get(key)) else None for key in _MORE}
+    errors = entry.get("parameter_errors")
+    known = errors.items() if isinstance(errors, dict) else ()
+    record["parameter_errors"] = {key: value if _is_number(value) else None for key, value in known}
+    return record
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1e300
+
+
+def _names(paths: Sequence[Path]) -> list[str]:
+    """A name of each, without its folders where that tells them apart."""
+    short = [path.absolute().name for path in paths]
+    return [name if short.count(name) == 1 else one_line(path, 200) for name, path in zip(short, paths, strict=True)]

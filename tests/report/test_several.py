@@ -1,0 +1,299 @@
+"""One page about several runs and measurements: what stands on it, and what is damaged or hostile in it."""
+
+from __future__ import annotations
+
+import json
+import re
+
+import pytest
+from report.measured import convergence_lines, write_bench, write_convergence, write_gradcheck, write_maps
+from report.run_folder import FLOOR, LAMP, MEMORY, PILOT, SCALING, make_run
+from report.test_page import EVIL, Page, pixels
+
+from reslrb_cli.errors import ConfigError
+from reslrb_cli.records.manifest import Status
+from reslrb_cli.report.page import render
+from reslrb_cli.report.page.drawing import COLORS
+from reslrb_cli.report.page.run import DAMAGED
+from reslrb_cli.report.sources import Maps, Measurements, Run, read_sources
+
+PLAN = {"integrator": "reslrb", "estimator": "stack", "rows": [
+    {"feature": "roulette", "needed": False, "reason": "paths are short"},
+    {"feature": "masks", "needed": True, "reason": "the scene has masks"},
+]}  # fmt: skip
+
+
+def page_of(*paths):
+    return Page(render(read_sources(paths)))
+
+
+def lines_drawn(markup):
+    """The colours of the curves in each diagram, in order."""
+    diagrams = re.findall(r"<svg .*?</svg>", markup, re.S)
+    return [[c for c in COLORS if f"stroke: {c}" in diagram] for diagram in diagrams]
+
+
+def test_all_runs_are_in_one_picture(tmp_path):
+    runs = [make_run(tmp_path / name, iterations=count) for name, count in (("a", 30), ("b", 20), ("c", 10))]
+    markup = render(read_sources(runs))
+    page = Page(markup)
+    # loss, error of all parameters, and of each of two: against iterations and time
+    assert lines_drawn(markup)[:8] == [list(COLORS[:3])] * 8
+    assert [row[0] for row in page.cells["Runs"][1:]] == ["a", "b", "c"]
+    assert page.row("Runs", "b")[3] == "20"
+    assert page.row("Runs", "b")[7] == "90 ms"
+    assert re.findall(r"(\w) [\d.]+ ms", page.sections["Time of an iteration"]) == ["a", "b", "c"]
+    for name in ("a", "b", "c"):
+        assert "started" in page.sections[f"Run {name}"]
+    assert len([alt for alt, _ in page.pictures if alt == "target"]) == 3
+    assert DAMAGED not in markup
+
+
+def test_the_errors_of_runs_with_different_units_are_relative(tmp_path):
+    page = page_of(make_run(tmp_path / "a"), make_run(tmp_path / "b"))
+    assert "relative error" in "".join(
+        re.findall(r'aria-label="([^"]*)"', render(read_sources([tmp_path / "a", tmp_path / "b"])))
+    )
+    assert "0.1 of the truth at worst" in page.row("Runs", "a")[6]
+
+
+def test_every_record_of_each_run_is_there(tmp_path):
+    records = {"pilot": PILOT, "memory": MEMORY, "scaling": SCALING, "plan": PLAN}
+    page = page_of(
+        make_run(tmp_path / "a", iterations=0, **records),
+        make_run(tmp_path / "b", iterations=0, command_line=["reslrb", "optimize", "b"]),
+    )
+    own = page.sections["Run a"]
+    for words in ("Plan", "the scene has masks", "Choice of the estimator", "not measured", "Memory budget",
+                  "Scale of the parameters", "Configuration", "versions", "mitsuba"):  # fmt: skip
+        assert words in own
+    assert page.row("Run b", "command line")[1] == "reslrb optimize b"
+    assert page.row("Run b", "to do it again")[1] == f"reslrb optimize {tmp_path / 'b' / 'config.yaml'}"
+    assert page.row("Runs", "a")[2] == "event, capacity 4"
+
+
+def test_the_plan_stands_on_the_page_of_one_run(tmp_path):
+    page = page_of(make_run(tmp_path / "a", plan=PLAN, iterations=0))
+    assert page.cells["Plan"][1:] == [
+        ["masks", "yes", "the scene has masks"],
+        ["roulette", "left out", "paths are short"],
+    ]
+
+
+def test_errors_as_people_see_them(tmp_path):
+    told = {"mean": 2.5, "p50": 1.0, "p95": 4.0, "p99": 6.0, "max": 9.0}
+    errors = {"psnr_db": 31.25, "ssim": 0.9, "ciede2000": told, "itp": told, "absolute": told}
+    same = errors | {"psnr_db": None, "ssim": None, "not_finite": 3}
+    colors = {FLOOR: {"measure": "ciede2000", "initial": told, "final": told}}
+    seen = {"images": {"": {"exposure": 1.0, "initial": errors, "final": same}}, "colors": colors, "note": "no <b>FLIP"}
+    folder = make_run(tmp_path / "a", results={"seen": seen}, iterations=0)
+    page = page_of(folder)
+    title = "Errors as people see them"
+    assert page.cells[title][0] == ["image", "PSNR", "SSIM", "CIEDE2000", "ΔE ITP", "|image − target|"]
+    assert page.row(title, "start")[:4] == ["start", "31.25 dB", "0.9", "2.51 4 6 9"]
+    assert page.row(title, "end")[1:3] == ["∞", "too small"]
+    assert "3 pixels not finite" in page.row(title, "end")[0]
+    assert page.row(title, FLOOR)[1] == "CIEDE2000"
+    assert "no <b>FLIP" in page.sections[title]
+    seen["images"][""]["final"]["flip"] = told
+    both = page_of(make_run(tmp_path / "b", results={"seen": seen}, iterations=0), folder)
+    assert both.cells[title][0][5] == "HDR-FLIP"
+    assert [row[0] for row in both.cells[title][1:3]] == ["b start", "b end3 pixels not finite"]
+
+
+def test_measurements_are_known_by_what_is_in_them(tmp_path):
+    write_bench(tmp_path / "x.jsonl")
+    write_gradcheck(tmp_path / "y.txt")
+    write_convergence(tmp_path / "z")
+    write_maps(tmp_path / "maps")
+    make_run(tmp_path / "run")
+    found = read_sources([tmp_path / name for name in ("x.jsonl", "y.txt", "z", "maps", "run")])
+    assert [type(source) for source in found] == [Measurements, Measurements, Measurements, Maps, Run]
+    assert [source.kind for source in found[:4]] == ["bench", "gradcheck", "convergence", "maps"]
+    markup = render(found)
+    page = Page(markup)
+    assert DAMAGED not in markup
+    assert "left out" not in "".join(page.sections[title] for title in page.sections if "x.jsonl" in title)
+    assert list(page.sections)[-5:-1] == [
+        "Cost of a step: x.jsonl", "Gradients against references: y.txt", "Error against run time: z",
+        "Maps of gradients: maps"]  # fmt: skip
+
+
+def test_a_bench(tmp_path):
+    write_bench(tmp_path / "x.jsonl")
+    markup = render(read_sources([tmp_path / "x.jsonl"]))
+    page = Page(markup)
+    title = "Cost of a step: x.jsonl"
+    assert page.cells[title][0][:3] == ["integrator", "path depth", "step"]
+    assert page.cells[title][-2][:3] == ["ptracer", "8", "out of memory"]
+    assert page.cells[title][-1][:3] == ["reslrb:reservoir", "8", "8 ms [7.2, 9.6]"]
+    assert lines_drawn(markup) == [list(COLORS[:2])] * 2
+    assert "samples per pixel 4" in page.sections[title]
+
+
+def test_a_bench_of_two_sweeps_has_a_diagram_for_each(tmp_path):
+    write_bench(tmp_path / "x.jsonl", spps=(4, 16, 64))
+    labels = re.findall(r'aria-label="([^"]*)"', render(read_sources([tmp_path / "x.jsonl"])))
+    assert labels == [
+        "time of a step (ms) against path depth", "peak memory (MiB) against path depth",
+        "time of a step (ms) against samples per pixel", "peak memory (MiB) against samples per pixel",
+    ]  # fmt: skip
+
+
+def test_a_gradcheck(tmp_path):
+    write_gradcheck(tmp_path / "check.jsonl")
+    page = page_of(tmp_path / "check.jsonl")
+    text, cells = page.sections["Gradients against references: check.jsonl"], page.cells[
+        "Gradients against references: check.jsonl"]  # fmt: skip
+    assert cells[1][1] == "reslrb:gather"  # what fails comes first
+    assert (cells[1][-1], cells[2][-1]) == ("fails", "holds")
+    assert "reslrb:gather against ptracer: max |z| 9, limit 4" in text
+    assert "1 of 2 comparisons hold, 1 fail" in text
+    assert "25% +- 1.0% of the derivative is missing" in text
+
+
+def test_a_convergence(tmp_path):
+    lines = [*convergence_lines(), {"kind": "summary", "line": "best: reslrb:stack"}, {"kind": "news"}]
+    lines[-4] |= {"biased": True, "message": "too few <steps>", "slope": -0.5}
+    failed = {"kind": "method", "label": "prb", "integrator": "prb", "parameter": "all", "status": "out_of_memory"}
+    lines.append(failed)
+    (tmp_path / "c.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines) + '{"kind": "poi')
+    markup = render(read_sources([tmp_path / "c.jsonl"]))
+    page = Page(markup)
+    title = "Error against run time: c.jsonl"
+    assert page.row(title, "ptracer, independent")[1:] == [
+        "-0.5 [-0.55, -0.45]", "4 [3, 5]", "0.7 < 4.5", "3.5 s", "2 min 0 s extrapolated", "—"]  # fmt: skip
+    assert page.row(title, "reslrb:stack")[:2] == ["reslrb:stack, independent biased", "-0.5"]
+    assert page.row(title, "prb")[1:3] == ["out of memory", ""]
+    assert "reslrb:stack, independent: too few <steps>" in page.sections[title]
+    assert "best: reslrb:stack" in page.sections[title]
+    assert "1 line of other kinds" in page.sections[title]
+    assert lines_drawn(markup) == [list(COLORS[:2])]
+
+
+def test_a_convergence_over_samples_and_of_a_single_parameter(tmp_path):
+    """Each number of samples is a method of its own; what all parameters come to is left out where there is one."""
+    lines = [line for what in ("all", LAMP) for line in convergence_lines(what)]
+    lines += [line | {"spp": 16} for line in lines if line["kind"] == "point"]
+    (tmp_path / "c.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    markup = render(read_sources([tmp_path / "c.jsonl"]))
+    title = "Error against run time: c.jsonl"
+    assert lines_drawn(markup) == [list(COLORS[:4])]
+    assert [row[0] for row in Page(markup).cells[title][1:]] == [
+        "ptracer, independent, 4 spp", "reslrb:stack, independent, 4 spp"]  # fmt: skip
+    assert LAMP in Page(markup).sections[title]
+
+
+def test_maps(tmp_path):
+    write_maps(tmp_path / "maps")
+    (tmp_path / "maps" / "other.exr").write_bytes(b"no image")
+    page = page_of(tmp_path / "maps")
+    assert [alt.partition(",")[0] for alt, _ in page.pictures] == ["gradient", "reference", "z"]
+    assert pixels(page.pictures[0][1]).shape == (8, 12, 3)
+
+
+def test_names_stay_text(tmp_path):
+    folder = make_run(tmp_path / "<img src=x onerror=alert(1)>", keys=(EVIL, "\x1b[31m</pre>\u202e.value"))
+    write_bench(tmp_path / "<script>alert(2)<>.jsonl")
+    lines = (tmp_path / "<script>alert(2)<>.jsonl").read_text().replace("reservoir", "<script>$\\\\frac$")
+    (tmp_path / "<script>alert(2)<>.jsonl").write_text(lines)
+    write_gradcheck(tmp_path / "g", EVIL)
+    write_convergence(tmp_path / "c", EVIL)
+    write_maps(tmp_path / "m", "<script>")
+    markup = render(read_sources([folder, *(tmp_path / name for name in ("<script>alert(2)<>.jsonl", "g", "c", "m"))]))
+    page = Page(markup)
+    assert "script" not in page.tags
+    assert "\x1b" not in markup
+    assert DAMAGED not in markup
+    assert "<script>alert(2)" in page.sections[""]
+    assert re.findall(r'(?:src|href)="(?!data:|#)[^"]*"', markup) == []
+
+
+def test_the_same_name_twice_is_told_apart(tmp_path):
+    runs = [make_run(tmp_path / parent / "lamp") for parent in ("a", "b")]
+    names = [source.name for source in read_sources(runs)]
+    assert names == [str(run) for run in runs]
+
+
+@pytest.mark.parametrize(
+    ("content", "line"),
+    [
+        (None, "no such file"),
+        (b"", "holds no line"),
+        (b"\x00\xff not json\n\n", "line 1: holds no line"),
+        (b'[1, 2]\n{"a": 1}\n', "line 1: holds no line"),
+        (b"[" * 100_000 + b"\n", "line 1: holds no line"),
+        (b'{"kind": "bench"}\n', "holds no line"),
+    ],
+)
+def test_what_is_nothing_of_the_kind_is_one_located_line(tmp_path, content, line):
+    path = tmp_path / "x.jsonl"
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(ConfigError) as caught:
+        read_sources([path])
+    assert re.match(rf"{re.escape(str(path))}: {line}", str(caught.value))
+    assert "\n" not in str(caught.value)
+
+
+def test_a_folder_that_is_nothing_of_the_kind(tmp_path):
+    (tmp_path / "picture.exr").write_bytes(b"no image")
+    with pytest.raises(ConfigError, match="is no run folder, and no folder of maps"):
+        read_sources([tmp_path])
+
+
+def damage(folder, change):
+    """Change the manifest in a run folder."""
+    manifest = json.loads((folder / "manifest.json").read_text())
+    change(manifest)
+    (folder / "manifest.json").write_text(json.dumps(manifest))
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda manifest: manifest.update(results=None),
+        lambda manifest: manifest.update(results=[1, 2]),
+        lambda manifest: manifest.update(results={"parameters": {"a": 3}, "seen": {"images": {"": 7}}}),
+        lambda manifest: manifest.update(results={"parameters": 5, "rmse": 3}),
+        lambda manifest: manifest.update(pilot={"rows": 3}, memory={"budget": "x"}, scaling=[{}], plan={"rows": "no"}),
+        lambda manifest: manifest.update(status=["x"], versions=7, command_line=5, started=3),
+    ],
+)
+def test_a_damaged_manifest_leaves_the_rest(tmp_path, change):
+    good, bad = (make_run(tmp_path / name, iterations=0) for name in ("good", "bad"))
+    damage(bad, change)
+    for page in (page_of(bad), page_of(good, bad)):
+        assert "Convergence" in page.sections
+    assert page_of(good, bad).row("Run good", "device")[1] == "a machine"
+
+
+def test_damaged_metrics_are_named_and_the_rest_is_drawn(tmp_path):
+    folder = make_run(tmp_path / "a")
+    lines = (folder / "metrics.jsonl").read_text().splitlines()
+    lines[3], lines[5] = "{torn", json.dumps({"iteration": 5, "elapsed_s": "soon"})
+    lines[7] = lines[7].replace('"loss": 0.', '"loss": "0.').replace(', "step_ms"', '", "step_ms"')
+    lines[9] = re.sub(r'"loss": [^,]*', '"loss": NaN', lines[9])
+    (folder / "metrics.jsonl").write_text("\n".join(lines) + '\n{"iteration": 30, "loss"')
+    page = page_of(folder)
+    assert "1 line of metrics.jsonl (the first is line 4) could not be read" in page.sections[""]
+    assert "28 iterations in" in page.sections[""]
+    assert "svg" in page.tags
+
+
+def test_runs_that_have_hardly_begun(tmp_path):
+    begun = make_run(tmp_path / "begun", iterations=0, status=Status.RUNNING, results={"parameters": {}})
+    for path in begun.glob("images/*"):
+        path.unlink()
+    page = page_of(begun, make_run(tmp_path / "whole"))
+    assert page.row("Runs", "begun")[1:4] == ["running", "", "0"]
+    assert "No iteration was completed by: begun" in page.sections["Convergence"]
+    assert "No iteration was completed" in page_of(begun, begun).sections["Convergence"]
+
+
+def test_many_runs_have_colours_and_dashes(tmp_path):
+    runs = [make_run(tmp_path / f"run{number:02}", keys=(LAMP,), iterations=3, truth=False) for number in range(10)]
+    markup = render(read_sources(runs))
+    assert lines_drawn(markup)[0] == list(COLORS)
+    assert markup.count("border-top-style:dashed") >= 2
+    assert "run00, run01, run02 and 7 more" in Page(markup).sections[""]
