@@ -12,7 +12,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from reslrb_cli.config import Config, Ptracer, Reslrb, loads
+from reslrb_cli.config import Config, Ptracer, Reslrb, WalkAd, loads
 from reslrb_cli.integrators import known_step
 from reslrb_cli.measure.participants import ALIKE, NEVER
 from reslrb_cli.measure.worker import Begun
@@ -24,18 +24,22 @@ from reslrb_cli.records.gradcheck import Reference
 _REFERENCE = "reference"
 
 
-def comparable(config: Config, naive: bool) -> Config:
-    """The experiment with `ptracer` under naive AD, or with its own `reslrb`: both estimate the same gradient.
+def comparable(config: Config, by: str) -> Config:
+    """The experiment with gradients `by` one that all estimate the same: nobody has roulette, nor what `ptracer` lacks.
 
-    Neither has roulette, whose decision naive AD does not differentiate; ours leaves out what `ptracer` does not have.
+    `own` is the experiment's `reslrb`, `ptracer` and `walk_ad` are naive AD, of the stock walk and of ours, and any
+    other name is that of an estimator. Naive AD does not differentiate roulette's decision.
     """
     own = config.integrator
     assert isinstance(own, Reslrb), "checked by whoever compares"
-    integrator: Any = own.model_copy(update={**ALIKE[Reference.PTRACER], "rr_depth": NEVER})
-    if naive:
-        integrator = Ptracer(
-            type="ptracer", max_depth=own.max_depth, rr_depth=NEVER, hide_emitters=own.hide_emitters
-        )  # fmt: skip
+    alike: dict[str, Any] = {**ALIKE[Reference.PTRACER], "rr_depth": NEVER}
+    shared: dict[str, Any] = {"max_depth": own.max_depth, "rr_depth": NEVER, "hide_emitters": own.hide_emitters}
+    integrator: Ptracer | Reslrb | WalkAd = own.model_copy(update=alike if by == "own" else alike | {"estimator": by})
+    if by == "ptracer":
+        integrator = Ptracer(type="ptracer", **shared)
+    elif by == "walk_ad":
+        detached: Any = {"filter_normalization": "detached"}
+        integrator = WalkAd(type="walk_ad", attached=own.attached, **shared | detached)
     return config.model_copy(update={"integrator": integrator})
 
 
@@ -79,7 +83,7 @@ def begin(first: dict[str, Any]) -> Begun:
     """Begin a process (`worker.py`): with an `adjoint`, a file, one of gradients, else of pictures.
 
     A question names the file that its answer's arrays are written to, `out`, the samples `spp` and, of gradients, the
-    `seed`; answers to those have `peak_mib`, Dr.Jit's arrays at their most. `naive` says by what they are.
+    `seed`; answers to those have `peak_mib`, Dr.Jit's arrays at their most. `by` says by what they are.
     """
     config = loads(first["config"], first["source"])
     if first["adjoint"] is None:
@@ -89,7 +93,7 @@ def begin(first: dict[str, Any]) -> Begun:
             return {}
 
         return {}, picture
-    held = Held(comparable(config, first["naive"]), np.load(first["adjoint"]))
+    held = Held(comparable(config, first["by"]), np.load(first["adjoint"]))
 
     def gradient(question: dict[str, Any]) -> dict[str, Any]:
         reset_peak()

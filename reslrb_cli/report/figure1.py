@@ -9,7 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from reslrb_cli.measure.figure1 import MIB, Kind, Result
+from reslrb_cli.measure.figure1 import Result
+from reslrb_cli.measure.held_kinds import MIB, Kind
 from reslrb_cli.measure.noise import CONFIDENCE
 
 #: Inches: a panel's side, what is between two, and above one.
@@ -72,10 +73,10 @@ def to_json(result: Result) -> dict[str, Any]:
         "gradients": [_kind_json(result, kind) for kind in result.kinds],
         "naive_at_many_spp_mib": result.asked_mib,
         "comparisons": [
-            {"gradient": one, "reference": other, **_finite(figures.figures)}
+            {"gradient": one, "reference": other, **finite(figures.figures)}
             for (one, other), figures in result.comparisons.items()
         ],
-        "noise": None if result.fall is None else _finite(dataclasses.asdict(result.fall)),
+        "noise": None if result.fall is None else finite(dataclasses.asdict(result.fall)),
         "holds": result.holds,
     }
 
@@ -102,7 +103,7 @@ def draw(result: Result, path: Path) -> None:
         return made
 
     for row, (name, title) in enumerate((("target", "target"), ("initial", "caustic at the start"))):
-        image = _encode(result.pictures[name] / white)
+        image = encode(result.pictures[name] / white)
         axes(row, 0, title).imshow(image if image.shape[2] == 3 else image[:, :, 0], cmap="gray", vmin=0, vmax=1)
     places = {(0, 1): result.naive, (1, 1): result.ours, (0, 2): result.failing, (1, 2): result.many}
     for (row, column), kind in places.items():
@@ -117,17 +118,17 @@ def draw(result: Result, path: Path) -> None:
             panel.set_facecolor("#eeeeee")
             panel.text(0.5, 0.5, words, fontsize=9, ha="center", va="center", transform=panel.transAxes)
     canvas.draw()
-    _write(np.asarray(canvas.buffer_rgba())[:, :, :3].copy(), path)
+    write(np.asarray(canvas.buffer_rgba())[:, :, :3].copy(), path)
 
 
-def _write(pixels: np.ndarray, path: Path) -> None:
+def write(pixels: np.ndarray, path: Path) -> None:
     """In 256 colours: noise compresses badly, and the repository is to stay small."""
     from PIL import Image as Picture
 
     Picture.fromarray(pixels).quantize(256).save(path, format="png", optimize=True)
 
 
-def _encode(image: np.ndarray) -> np.ndarray:
+def encode(image: np.ndarray) -> np.ndarray:
     """Linear values as sRGB in [0, 1]."""
     image = np.clip(image, 0, 1)
     return np.where(image <= 0.0031308, 12.92 * image, 1.055 * image ** (1 / 2.4) - 0.055)
@@ -156,6 +157,6 @@ def _kind_json(result: Result, kind: Kind) -> dict[str, Any]:
     }
 
 
-def _finite(values: dict[str, Any]) -> dict[str, Any]:
+def finite(values: dict[str, Any]) -> dict[str, Any]:
     """What JSON has no word for as null."""
     return {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in values.items()}

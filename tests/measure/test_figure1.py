@@ -12,7 +12,8 @@ from reslrb_cli.config import Config, load
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.measure.comparison import Family, compare_expectations
 from reslrb_cli.measure.entries import entry_count
-from reslrb_cli.measure.figure1 import Kind, Plan, Result, _sample, check, measure
+from reslrb_cli.measure.figure1 import Plan, Result, check, measure
+from reslrb_cli.measure.held_kinds import OWN, Kind, sample
 from reslrb_cli.measure.noise import fall, relative_noise
 from reslrb_cli.measure.processes import Ended
 from reslrb_cli.records.bench import BenchStatus
@@ -37,17 +38,18 @@ def pretended(config: Config, *, naive_factor: float = 1.0, many_factor: float =
     random, plan = np.random.default_rng(1), Plan(seeds=32, many_seeds=8)
     mean = random.normal(size=(16, 16, 1))
 
-    def kind(spp: int, naive: bool, count: int, factor: float, noise: float) -> Kind:
+    def kind(spp: int, by: str, count: int, factor: float, noise: float) -> Kind:
         samples = factor * mean + noise * random.normal(size=(count, 16, 16, 1))
-        return Kind("naive AD" if naive else "reslrb:stack", spp, naive, samples.astype(np.float32), 10.0, 500.0)
+        name = "reslrb:stack" if by == OWN else "naive AD"
+        return Kind(name, spp, by, samples.astype(np.float32), 10.0, 500.0)
 
-    many = kind(1024, False, 8, 1.0, many_factor * 0.5 / np.sqrt(32))
-    failing = Kind("naive AD", 1024, True, end=Ended(BenchStatus.OUT_OF_MEMORY, "jit_malloc(): out of memory"))
+    many = kind(1024, OWN, 8, 1.0, many_factor * 0.5 / np.sqrt(32))
+    failing = Kind("naive AD", 1024, "ptracer", end=Ended(BenchStatus.OUT_OF_MEMORY, "jit_malloc(): out of memory"))
     if fits:
-        failing = kind(1024, True, 1, 1.0, 0.1)
+        failing = kind(1024, "ptracer", 1, 1.0, 0.1)
     image = np.random.default_rng(2).uniform(size=(16, 16, 3)).astype(np.float32)
     pictures = {"target": image, "initial": image, "adjoint": image}
-    naive, ours = kind(32, True, 32, naive_factor, 0.5), kind(32, False, 32, 1.0, 0.5)
+    naive, ours = kind(32, "ptracer", 32, naive_factor, 0.5), kind(32, OWN, 32, 1.0, 0.5)
     result = Result(config, plan, "face.heightmap", pictures, naive, ours, many, failing, 6000.0)
     check(result)
     return result
@@ -125,9 +127,9 @@ def test_what_is_compared_has_one_expectation(config: Config) -> None:
         held = Held(config, adjoint)
         return np.stack([held.gradient(first + k, 64).ravel() for k in range(16)]).astype(np.float64)
 
-    options = comparable(config, False).integrator.options()
+    options = comparable(config, OWN).integrator.options()
     assert (options["filter_normalization"], options["attached_sampling"]) == ("detached", "follow")
-    ours, naive = samples(comparable(config, False), 100), samples(comparable(config, True), 200)
+    ours, naive = samples(comparable(config, OWN), 100), samples(comparable(config, "ptracer"), 200)
     family = Family(1, entry_count((8, 8, 1)))
     figures = compare_expectations(ours, naive, family, shape=(8, 8, 1), paired=False)
     assert figures.verdict is Verdict.HOLDS, figures
@@ -137,8 +139,8 @@ def test_what_is_compared_has_one_expectation(config: Config) -> None:
 def test_a_process_ends_by_its_limit(tmp_path: Path) -> None:
     """It loads the scene, and has no room for the paths of a sample count that naive AD keeps."""
     np.save(tmp_path / "adjoint.npy", np.ones((16, 16, 3), np.float32))
-    kind = Kind("naive AD", 2**16, True)
-    assert _sample(kind, 1, load(CONFIG, SMALL), Plan(limit=3 << 29), tmp_path) == "face.heightmap"
+    kind = Kind("naive AD", 2**16, "ptracer")
+    assert sample(kind, 1, load(CONFIG, SMALL), tmp_path, "test", 3 << 29) == "face.heightmap"
     assert kind.end is not None
     assert kind.end.status is BenchStatus.OUT_OF_MEMORY
     assert kind.samples is None

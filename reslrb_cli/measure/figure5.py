@@ -1,0 +1,120 @@
+"""Figure 5: the gradient of an image's loss with respect to a room's floor, by naive AD and by ours, and their z map.
+
+All have one dL/dI (`held_kinds.py`). The experiment's own estimator is compared with naive AD of stock `ptracer` at
+other seeds, in standard errors, and the exact estimators with naive AD of our own walk at equal seeds.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from reslrb_cli.config import Config, Reslrb
+from reslrb_cli.errors import ConfigError
+from reslrb_cli.measure.comparison import Comparison, Family, compare_equal_seeds, compare_expectations
+from reslrb_cli.measure.entries import entry_count
+from reslrb_cli.measure.held_kinds import OWN, VARIANT, Kind, sample, take_pictures
+from reslrb_cli.measure.statistics import z_scores
+from reslrb_cli.records.gradcheck import Verdict
+
+#: Estimators that equal naive AD of the same paths but for rounding; and how far they may be from it, in relative L2.
+EXACT, CLOSE = ("stack", "gather"), 1e-4
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Samples per pixel of a gradient and of dL/dI's image, seeds, and tiles of the z map across the texture."""
+
+    spp: int = 32
+    reference_spp: int = 1024
+    seeds: int = 24
+    tiles: int = 32
+
+
+@dataclass
+class Result:
+    """What was measured. `comparisons` are by the names of the two gradients; `z` is of tiles (rows, columns)."""
+
+    config: Config
+    plan: Plan
+    key: str
+    pictures: dict[str, np.ndarray]
+    naive: Kind
+    ours: Kind
+    comparisons: dict[tuple[str, str], Comparison] = field(default_factory=dict)
+    z: np.ndarray | None = None
+
+    @property
+    def holds(self) -> bool:
+        """Whether all gradients agree."""
+        return all(figures.verdict is Verdict.HOLDS for figures in self.comparisons.values())
+
+
+def measure(config: Config, plan: Plan, folder: Path, say: Callable[[str], None]) -> Result:
+    """Sample everything and check it; arrays go by way of `folder`, which is the caller's to remove.
+
+    Raises ConfigError, processes.Refused, and Ended where a gradient that has to be there is not.
+    """
+    _check_config(config)
+    say(f"image and dL/dI, {plan.reference_spp} spp")
+    pictures = take_pictures(config, plan.reference_spp, folder)
+    naive, ours = Kind("naive AD", plan.spp, "ptracer"), Kind(f"reslrb:{_estimator(config)}", plan.spp, OWN)
+    key = ""
+    for kind in (naive, ours):
+        say(f"{kind.label}: {plan.seeds} seeds")
+        key = _taken(kind, plan.seeds, config, folder, f"figure5, {kind.by}")
+    result = Result(config, plan, key, pictures, naive, ours)
+    check(result)
+    walk = Kind("walk_ad", plan.spp, "walk_ad")
+    say(f"at equal seeds: walk_ad, {', '.join(EXACT)}")
+    _taken(walk, 1, config, folder, "figure5, equal")
+    for name in EXACT:
+        kind = Kind(f"reslrb:{name}", plan.spp, name)
+        _taken(kind, 1, config, folder, "figure5, equal")
+        result.comparisons[kind.name, walk.name] = compare_equal_seeds(kind.rows, walk.rows, CLOSE)
+    return result
+
+
+def check(result: Result) -> None:
+    """Compare the means of the two kinds in the tiles of `gradcheck`, and make the z map."""
+    ours, naive = result.ours, result.naive
+    assert ours.samples is not None
+    assert naive.samples is not None
+    shape = ours.samples.shape[1:]
+    result.comparisons[ours.name, naive.name] = compare_expectations(
+        ours.rows, naive.rows, Family(1, entry_count(shape)), shape=shape, paired=False
+    )
+    side = max(-(-shape[1] // result.plan.tiles), 1)
+    result.z = z_scores(tile_sums(ours.samples, side), tile_sums(naive.samples, side))
+
+
+def tile_sums(samples: np.ndarray, side: int) -> np.ndarray:
+    """Sums over squares of `side` texels and over channels of (N, H, W, C) samples: (N, rows, columns)."""
+    gray = samples.astype(np.float64).sum(-1)
+    rows = np.add.reduceat(gray, np.arange(0, gray.shape[1], side), axis=1)
+    return np.asarray(np.add.reduceat(rows, np.arange(0, gray.shape[2], side), axis=2))
+
+
+def _taken(kind: Kind, count: int, config: Config, folder: Path, series: str) -> str:
+    key = sample(kind, count, config, folder, series)
+    if kind.end is not None:
+        raise kind.end
+    return key
+
+
+def _estimator(config: Config) -> str:
+    return str(config.integrator.options().get("estimator"))
+
+
+def _check_config(config: Config) -> None:
+    """Raise ConfigError where the gradients could not be compared."""
+    integrator = config.integrator
+    if config.variant not in ("auto", VARIANT):
+        raise ConfigError(config.source, "variant", f"must be auto or {VARIANT}, which the processes set")
+    if not isinstance(integrator, Reslrb) or integrator.estimator == "auto":
+        raise ConfigError(config.source, "integrator.estimator", "must name an estimator of `reslrb`")
+    if integrator.max_depth < 0:
+        raise ConfigError(config.source, "integrator.max_depth", "must be a limit: paths are traced without roulette")

@@ -1,0 +1,108 @@
+"""Kinds of gradients that have one dL/dI, each sampled in a process of its own: what figures of the paper compare.
+
+The processes load `held.py`, which holds dL/dI at a reference image's; this module knows no Mitsuba. Seeds differ
+between kinds, but for those that are asked to share them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from reslrb_cli.backend.python import python_command
+from reslrb_cli.config import Config, dump
+from reslrb_cli.measure.processes import Ended, Process
+from reslrb_cli.seeds import seed
+
+MIB = 2**20
+#: On a GPU address space says nothing of the memory that arrays take.
+VARIANT = "llvm_ad_rgb"
+#: Who takes gradients: the experiment's own integrator.
+OWN = "own"
+_ADJOINT = "adjoint.npy"
+_COMMAND = "from reslrb_cli.measure.worker import held_gradients, run\nrun(held_gradients)"
+
+
+@dataclass
+class Kind:
+    """One kind of gradient: `samples` (N, H, W, C), the peak of Dr.Jit's arrays, and of the process's address space.
+
+    `by` is who takes them, as `held.comparable` has it. `end` is how a process ended that did not come to its first
+    gradient.
+    """
+
+    name: str
+    spp: int
+    by: str
+    samples: np.ndarray | None = None
+    arrays_mib: float | None = None
+    address_mib: float = 0.0
+    end: Ended | None = None
+
+    @property
+    def label(self) -> str:
+        """Its name and samples."""
+        return f"{self.name}, {self.spp} spp"
+
+    @property
+    def rows(self) -> np.ndarray:
+        """The samples in rows, (N, P), in double precision."""
+        assert self.samples is not None, "asked of kinds that have been sampled"
+        return self.samples.reshape(len(self.samples), -1).astype(np.float64)
+
+
+def take_pictures(config: Config, spp: int, folder: Path) -> dict[str, np.ndarray]:
+    """Target, initial image and dL/dI of `held.pictures`; what `sample` does in this folder has that dL/dI."""
+    process = _start(config, None, OWN, None)
+    try:
+        process.answer(_never)
+        process.ask({"spp": spp, "out": str(folder / "pictures.npz")})
+        process.answer(_never)
+    finally:
+        process.close()
+    with np.load(folder / "pictures.npz") as arrays:
+        pictures = {name: arrays[name] for name in arrays.files}
+    np.save(folder / _ADJOINT, pictures["adjoint"])
+    return pictures
+
+
+def sample(kind: Kind, count: int, config: Config, folder: Path, series: str, limit: int | None = None) -> str:
+    """Take `count` gradients of a kind; what ends their process is the kind's end. Returns the parameter's key.
+
+    `limit` is of the process's address space, in bytes. Kinds of one `series` have the same seeds.
+    """
+    process, out, taken = _start(config, limit, kind.by, folder / _ADJOINT), folder / "gradient.npy", []
+    key = ""
+    try:
+        key = str(process.answer(_never)["key"])
+        for number in range(count):
+            process.ask({"seed": seed(config.run.seed, number, 0, series), "spp": kind.spp, "out": str(out)})
+            answer: dict[str, Any] = process.answer(_never)
+            kind.arrays_mib = max(kind.arrays_mib or 0.0, float(answer["peak_mib"]))
+            taken.append(np.load(out))
+        kind.samples = np.stack(taken)
+    except Ended as end:
+        kind.end = end
+    finally:
+        process.close()
+        kind.address_mib = process.peak_bytes / MIB
+    return key
+
+
+def _start(config: Config, limit: int | None, by: str, adjoint: Path | None) -> Process:
+    first = {
+        "config": dump(config),
+        "source": str(config.source),
+        "variant": VARIANT,
+        "memory_limit": limit,
+        "by": by,
+        "adjoint": None if adjoint is None else str(adjoint),
+    }
+    return Process(first, python_command(_COMMAND))
+
+
+def _never() -> bool:
+    return False
