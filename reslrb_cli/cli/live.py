@@ -13,7 +13,7 @@ PAGE_SECONDS, PAGE_SHARE = 5.0, 20.0
 
 
 class LivePage:
-    """Has `write` write the page anew, at once and then now and then. It is called between two iterations.
+    """Has `write` write the page anew, at once and then now and then. It is called outside of iterations.
 
     A page that cannot be written ends no run, and is not tried again: the last one, at the run's end, says why.
     """
@@ -34,5 +34,4 @@ class LivePage:
             self._next = None
         else:
             end = time.monotonic()
-            # The first page also loads what draws it: what it took says nothing of the others.
-            self._next = end + max(PAGE_SECONDS, 0.0 if self._next == 0.0 else PAGE_SHARE * (end - start))
+            self._next = end + max(PAGE_SECONDS, PAGE_SHARE * (end - start))

@@ -55,6 +55,7 @@ class Recording:
     first: Record | None = None
     last: Record | None = None
     results: Results = field(init=False)
+    page: LivePage = field(init=False)
     error_maps: dict[str, Any] = field(default_factory=dict)
     seen: dict[str, Any] = field(default_factory=dict)
     nonfinite: NonFiniteTally = field(default_factory=NonFiniteTally)
@@ -65,6 +66,7 @@ class Recording:
 
     def __post_init__(self) -> None:
         self.results = Results(self.problem)
+        self.page = LivePage(self._write_live_page)
 
     @property
     def done(self) -> int:
@@ -102,6 +104,7 @@ class Recording:
 
     def _begin(self, reserve: Reserve) -> None:
         problem, parameters = self.problem, self.folder.parameters
+        self.page.refresh()
         self.results.begin()
         self._save_checkpoint()
         for sensor, target in zip(problem.sensors, problem.targets, strict=True):
@@ -118,8 +121,6 @@ class Recording:
         every, saved = self.problem.config.run.images_every, time.monotonic()
         if stop():
             return
-        page = LivePage(self._write_live_page)
-        page.refresh()
         with MetricsWriter(self.folder.path) as metrics:
             for record in optimize(self.problem, self._on_nonfinite):
                 if self.first is None and self.problem.sensitivities is not None:
@@ -138,7 +139,7 @@ class Recording:
                 if time.monotonic() - saved > CHECKPOINT_SECONDS:
                     self._save_checkpoint()
                     saved = time.monotonic()
-                page.refresh()
+                self.page.refresh()
 
     def _note_scaling(self, measured: list[Scaled]) -> None:
         self.manifest.scaling = [row.to_json() for row in measured]
@@ -191,7 +192,10 @@ class Recording:
             raise
 
     def _write_live_page(self) -> None:
-        write_report(self.folder.path, self.manifest.content() | {"results": self._found()}, self.problem.values())
+        if self.last is None:  # nothing is there to be drawn, so that this takes no time
+            write_report(self.folder.path, self.manifest.content(), {})
+        else:
+            write_report(self.folder.path, self.manifest.content() | {"results": self._found()}, self.problem.values())
 
     def _note_seen_errors(self) -> None:
         """Add errors as people see them to the results. The run is what it is without them."""

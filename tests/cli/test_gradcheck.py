@@ -59,9 +59,10 @@ def test_a_table_and_its_files(tmp_path: Path, capsys: pytest.CaptureFixture[str
     assert lines[-1] == "9 of 9 comparisons hold, 0 fail"
     assert len(markdown.read_text().splitlines()) == 11
     assert sorted(path.name for path in maps.iterdir()) == [
-        f"white.reflectance.data-reslrb-{estimator}-{reference}.png"
+        f"white.reflectance.data-reslrb-{estimator}-{reference}.{suffix}"
         for estimator in ("event_capacity=2", "stack")
         for reference in ("ptracer", "walk_ad")
+        for suffix in ("exr", "png")
     ]
 
 

@@ -132,8 +132,8 @@ def test_a_texture_is_recovered(experiment, capsys, type):
     recovered = np.array(mi.Bitmap(f"runs/box/parameters/{KEY}.exr"))
     rmse = np.sqrt(np.mean((recovered - experiment)[mask] ** 2))
     assert rmse == pytest.approx(errors["final"], rel=1e-4)
-    images = ("error", "final", "initial", "target")
-    assert names("runs/box/images") == [f"{name}.{suffix}" for name in images for suffix in ("exr", "png")]
+    images = [f"{name}.{suffix}" for name in ("final", "initial", "target") for suffix in ("exr", "png")]
+    assert names("runs/box/images") == ["comparison.exr", "error.png", *images]
     assert np.array(mi.Bitmap("runs/box/images/final.exr")).shape == (16, 16, 3)
 
 
