@@ -122,6 +122,17 @@ class ReferenceRecord:
         return _line("reference", self)
 
 
+@dataclass(frozen=True)
+class SummaryRecord:
+    """Which method is the best, in words."""
+
+    line: str
+
+    def to_json(self) -> str:
+        """The record as one line of JSON."""
+        return json.dumps({"kind": "summary", "line": self.line})
+
+
 def _line(kind: str, record: PointRecord | MethodRecord | ReferenceRecord) -> str:
     """One line: the method's fields beside the others; figures that are not finite become null."""
     values = asdict(record)

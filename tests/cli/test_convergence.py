@@ -173,4 +173,4 @@ def test_an_interrupt_keeps_what_is_done(folder: Path) -> None:
     rest = process.stdout.read()
     assert process.wait() == 130
     assert "the only one that was measured" in rest
-    assert {line["kind"] for line in read(folder / "c.jsonl")} == {"point", "method", "reference"}
+    assert {line["kind"] for line in read(folder / "c.jsonl")} == {"point", "method", "reference", "summary"}
