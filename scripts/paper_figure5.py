@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """Figure 5: the gradient of an image's loss with respect to the floor of the Grey & White Room, paths of length 32.
 
-Naive AD (Mitsuba's `ptracer`) and ResLRB at 32 spp, at one dL/dI that is held at a reference image's: red positive,
+Naive AD (of our walk) and ResLRB at 32 spp, at one dL/dI that is held at a reference image's: red positive,
 blue negative, grey zero, and the z map of their means. Writes figure5.png, figure5.txt (what is printed) and
 figure5.json. Exit code 1 where the means do not agree in standard errors, or the exact estimators are not naive AD of
 the same paths.

@@ -1,7 +1,9 @@
 """Figure 5: the gradient of an image's loss with respect to a room's floor, by naive AD and by ours, and their z map.
 
-All have one dL/dI (`held_kinds.py`). The experiment's own estimator is compared with naive AD of stock `ptracer` at
-other seeds, in standard errors, and the exact estimators with naive AD of our own walk at equal seeds.
+All have one dL/dI (`held_kinds.py`). Naive AD is that of our own walk: stock `ptracer` emits wrongly from the room's
+environment map, which is turned, and stock `prb` sees glass and mirrors, where light paths cannot connect. The
+experiment's own estimator is compared with it at other seeds, in standard errors, and the exact estimators at equal
+seeds.
 """
 
 from __future__ import annotations
@@ -61,7 +63,7 @@ def measure(config: Config, plan: Plan, folder: Path, say: Callable[[str], None]
     _check_config(config)
     say(f"image and dL/dI, {plan.reference_spp} spp")
     pictures = take_pictures(config, plan.reference_spp, folder)
-    naive, ours = Kind("naive AD", plan.spp, "ptracer"), Kind(f"reslrb:{_estimator(config)}", plan.spp, OWN)
+    naive, ours = Kind("naive AD", plan.spp, "walk_ad"), Kind(f"reslrb:{_estimator(config)}", plan.spp, OWN)
     key = ""
     for kind in (naive, ours):
         say(f"{kind.label}: {plan.seeds} seeds")

@@ -38,7 +38,7 @@ def pretended(config: Config, factor: float = 1.0) -> Result:
 
     picture = random.uniform(size=(9, 16, 3)).astype(np.float32)
     pictures = {"target": picture, "initial": picture, "adjoint": picture}
-    naive, ours = kind("naive AD", "ptracer", factor), kind("reslrb:reservoir", OWN, 1.0)
+    naive, ours = kind("naive AD", "walk_ad", factor), kind("reslrb:reservoir", OWN, 1.0)
     result = Result(config, Plan(seeds=16), "floor.reflectance.data", pictures, naive, ours)
     check(result)
     return result
