@@ -11,20 +11,17 @@ do not agree in standard errors, noise does not fall with the root of the sample
 from __future__ import annotations
 
 import argparse
-import json
 import os
-import signal
 import sys
-import tempfile
+from collections.abc import Callable
 from pathlib import Path
 
-from reslrb_cli.config import load
-from reslrb_cli.errors import ExitCode, ReslrbError, one_line
-from reslrb_cli.measure.figure1 import Plan, measure
-from reslrb_cli.measure.processes import Ended
-from reslrb_cli.report.figure1 import draw, table, to_json
+from paper_command import ROOT, add_sampling, figure_parser, run
 
-ROOT = Path(__file__).resolve().parent.parent
+import reslrb_cli.report.figure1 as report
+from reslrb_cli.config import load
+from reslrb_cli.measure.figure1 import Plan, Result, measure
+
 CONFIG = ROOT / "configs" / "paper" / "figure1.yaml"
 #: Seeds with few samples for each of those with many; and the fewest, of which the spread of few can be told.
 MANY, LEAST = 4, 12
@@ -32,36 +29,14 @@ MANY, LEAST = 4, 12
 
 def main(arguments: list[str]) -> int:
     """Measure, check, and write what the command line asks for; the exit code."""
-    parser = argparse.ArgumentParser(prog="scripts/paper figure1", description=__doc__.split("\n\n")[1])
-    parser.add_argument("-o", dest="folder", type=Path, default=ROOT / "build" / "paper", help="default: build/paper")
-    parser.add_argument("--seeds", type=int, default=Plan.seeds, help=f"with few samples; default: {Plan.seeds}")
-    parser.add_argument("--set", dest="sets", action="append", default=[], metavar="KEY=VALUE", help="change a setting")
-    options = parser.parse_args(arguments)
-    if options.seeds < LEAST:
-        parser.error(f"--seeds must be at least {LEAST}")
-    for number in (signal.SIGTERM, signal.SIGHUP):
-        signal.signal(number, signal.default_int_handler)  # so that nothing stays behind
-    try:
-        options.folder.mkdir(parents=True, exist_ok=True)
-        plan = Plan(seeds=options.seeds, many_seeds=options.seeds // MANY)
-        with tempfile.TemporaryDirectory(prefix="reslrb-figure1-") as folder:
-            result = measure(load(os.path.relpath(CONFIG), options.sets), plan, Path(folder), _say)
-        text = table(result)
-        print(text)
-        (options.folder / "figure1.txt").write_text(text + "\n", encoding="utf-8")
-        (options.folder / "figure1.json").write_text(json.dumps(to_json(result), indent=1) + "\n", encoding="utf-8")
-        draw(result, options.folder / "figure1.png")
-        _say(f"figure1.png, figure1.txt and figure1.json are in {options.folder}")
-    except KeyboardInterrupt:
-        return ExitCode.INTERRUPTED
-    except (ReslrbError, Ended, OSError) as error:
-        print(one_line(f"figure1: {error}"), file=sys.stderr)
-        return int(getattr(error, "exit_code", ExitCode.CHECK_FAILED))
-    return ExitCode.DONE if result.holds else ExitCode.CHECK_FAILED
+    parser = figure_parser("figure1", __doc__)
+    add_sampling(parser, Plan.seeds, "with few samples")
+    return run("figure1", parser, arguments, LEAST, _measure, report)
 
 
-def _say(line: str) -> None:
-    print(f"figure1: {line}", file=sys.stderr, flush=True)
+def _measure(options: argparse.Namespace, folder: Path, say: Callable[[str], None]) -> Result:
+    plan = Plan(seeds=options.seeds, many_seeds=options.seeds // MANY)
+    return measure(load(os.path.relpath(CONFIG), options.sets), plan, folder, say)
 
 
 if __name__ == "__main__":

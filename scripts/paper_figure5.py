@@ -12,57 +12,31 @@ the same paths.
 from __future__ import annotations
 
 import argparse
-import json
-import signal
 import sys
-import tempfile
+from collections.abc import Callable
 from pathlib import Path
 
-from paper_room import room_config
+from paper_command import add_sampling, figure_parser, run
+from paper_room import ROOM, room_config
 
-from reslrb_cli.errors import ExitCode, ReslrbError, one_line
-from reslrb_cli.measure.figure5 import Plan, measure
-from reslrb_cli.measure.processes import Ended
-from reslrb_cli.report.figure5 import draw, table, to_json
+import reslrb_cli.report.figure5 as report
+from reslrb_cli.measure.figure5 import Plan, Result, measure
 
-ROOT = Path(__file__).resolve().parent.parent
 #: The fewest seeds of which tails can be told.
 LEAST = 8
 
 
 def main(arguments: list[str]) -> int:
     """Measure, check, and write what the command line asks for; the exit code."""
-    parser = argparse.ArgumentParser(prog="scripts/paper figure5", description=__doc__.split("\n\n")[1])
-    parser.add_argument("room", type=Path, help="folder of the Grey & White Room (Mitsuba's gallery)")
-    parser.add_argument("-o", dest="folder", type=Path, default=ROOT / "build" / "paper", help="default: build/paper")
-    parser.add_argument("--seeds", type=int, default=Plan.seeds, help=f"of each; default: {Plan.seeds}")
-    parser.add_argument("--set", dest="sets", action="append", default=[], metavar="KEY=VALUE", help="change a setting")
-    options = parser.parse_args(arguments)
-    if options.seeds < LEAST:
-        parser.error(f"--seeds must be at least {LEAST}")
-    for number in (signal.SIGTERM, signal.SIGHUP):
-        signal.signal(number, signal.default_int_handler)  # so that nothing stays behind
-    try:
-        options.folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(prefix="reslrb-figure5-") as folder:
-            config = room_config(options.room, Path(folder), options.sets)
-            result = measure(config, Plan(spp=config.run.spp, seeds=options.seeds), Path(folder), _say)
-        text = table(result)
-        print(text)
-        (options.folder / "figure5.txt").write_text(text + "\n", encoding="utf-8")
-        (options.folder / "figure5.json").write_text(json.dumps(to_json(result), indent=1) + "\n", encoding="utf-8")
-        draw(result, options.folder / "figure5.png")
-        _say(f"figure5.png, figure5.txt and figure5.json are in {options.folder}")
-    except KeyboardInterrupt:
-        return ExitCode.INTERRUPTED
-    except (ReslrbError, Ended, OSError) as error:
-        print(one_line(f"figure5: {error}"), file=sys.stderr)
-        return int(getattr(error, "exit_code", ExitCode.CHECK_FAILED))
-    return ExitCode.DONE if result.holds else ExitCode.CHECK_FAILED
+    parser = figure_parser("figure5", __doc__)
+    parser.add_argument("room", type=Path, help=ROOM)
+    add_sampling(parser, Plan.seeds, "of each")
+    return run("figure5", parser, arguments, LEAST, _measure, report)
 
 
-def _say(line: str) -> None:
-    print(f"figure5: {line}", file=sys.stderr, flush=True)
+def _measure(options: argparse.Namespace, folder: Path, say: Callable[[str], None]) -> Result:
+    config = room_config(options.room, folder, options.sets)
+    return measure(config, Plan(spp=config.run.spp, seeds=options.seeds), folder, say)
 
 
 if __name__ == "__main__":

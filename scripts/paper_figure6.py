@@ -9,40 +9,32 @@ options go to `reslrb bench`.
 
 from __future__ import annotations
 
-import argparse
 import subprocess
 import sys
 import tempfile
 from pathlib import Path
 
-from paper_room import room_config
+from paper_command import figure_parser
+from paper_room import ROOM, room_config
 
 from reslrb_cli.errors import ReslrbError, one_line
 
-ROOT = Path(__file__).resolve().parent.parent
+#: What is asked of `reslrb bench`, unless further options say otherwise.
+BENCH = "--max-depth 128 --budget 300 --integrators ptracer,reslrb:reservoir,reslrb:stack"
 
 
 def main(arguments: list[str]) -> int:
     """Run the sweep; its exit code."""
-    parser = argparse.ArgumentParser(prog="scripts/paper figure6", description=__doc__.split("\n\n")[1])
-    parser.add_argument("room", type=Path, help="folder of the Grey & White Room (Mitsuba's gallery)")
-    parser.add_argument("-o", dest="folder", type=Path, default=ROOT / "build" / "paper", help="default: build/paper")
+    parser = figure_parser("figure6", __doc__)
+    parser.add_argument("room", type=Path, help=ROOM)
     options, others = parser.parse_known_args(arguments)
     try:
         options.folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(prefix="reslrb-figure6-") as folder:
             source = room_config(options.room, Path(folder), []).source
             command = [sys.executable, "-m", "reslrb_cli", "bench", str(source), "--set", "integrator.rr_depth=100000"]
-            command += [
-                "--max-depth",
-                "128",
-                "--budget",
-                "300",
-                "--integrators",
-                "ptracer,reslrb:reservoir,reslrb:stack",
-            ]
-            command += ["--json", str(options.folder / "figure6.jsonl"), *others]
-            return subprocess.run(command, check=False, cwd=ROOT).returncode
+            command += [*BENCH.split(), "--json", str(options.folder / "figure6.jsonl"), *others]
+            return subprocess.run(command, check=False).returncode
     except (ReslrbError, OSError) as error:
         print(one_line(f"figure6: {error}"), file=sys.stderr)
         return int(getattr(error, "exit_code", 1))

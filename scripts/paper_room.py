@@ -10,6 +10,8 @@ from pathlib import Path
 from reslrb_cli.config import Config, load
 from reslrb_cli.errors import ConfigError
 
+#: What commands say of the argument that names it.
+ROOM = "folder of the Grey & White Room (Mitsuba's gallery)"
 FLOOR = "Floor.brdf_0.diffuse_reflectance.data"
 #: What the floor's texture stands in, and with what it has derivatives: 8 bits a channel have none.
 _BEFORE = '<string name="filename" value="textures/wood.jpg" />'

@@ -12,11 +12,11 @@ from pathlib import Path
 
 import numpy as np
 
-from reslrb_cli.config import Config, Reslrb
+from reslrb_cli.config import Config
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.measure.comparison import Comparison, Family, compare_expectations
 from reslrb_cli.measure.entries import entry_count
-from reslrb_cli.measure.held_kinds import OWN, VARIANT, Kind, sample, take_pictures
+from reslrb_cli.measure.held_kinds import OWN, Kind, check_config, sample, take_pictures
 from reslrb_cli.measure.noise import Fall, fall, relative_noise
 from reslrb_cli.records.bench import BenchStatus
 from reslrb_cli.records.gradcheck import Verdict
@@ -81,10 +81,11 @@ def measure(config: Config, plan: Plan, folder: Path, say: Callable[[str], None]
 
     Raises ConfigError, processes.Refused, and Ended where a gradient that has to be there is not.
     """
-    _check_config(config)
+    estimator = check_config(config)
+    if config.parameters[0].heightmap is None:
+        raise ConfigError(config.source, "parameters[0]", "must be a heightmap, whose gradient is shown")
     say(f"target and initial image, {plan.reference_spp} spp")
     pictures = take_pictures(config, plan.reference_spp, folder)
-    estimator = f"reslrb:{config.integrator.options().get('estimator')}"
     naive, failing = (Kind("naive AD", spp, "ptracer") for spp in (plan.few_spp, plan.many_spp))
     ours, many = (Kind(estimator, spp, OWN) for spp in (plan.few_spp, plan.many_spp))
     # Twice the samples take so much more memory: what does not depend on samples drops out.
@@ -117,16 +118,3 @@ def check(result: Result) -> None:
             one.rows, other.rows, family, shape=shape, paired=False
         )
     result.fall = fall(ours.rows, many.rows, float(np.sqrt(many.spp / ours.spp)))
-
-
-def _check_config(config: Config) -> None:
-    """Raise ConfigError where the gradients could not be compared, or shown."""
-    integrator = config.integrator
-    if config.variant not in ("auto", VARIANT):
-        raise ConfigError(config.source, "variant", f"must be auto or {VARIANT}: the limit bounds address space alone")
-    if not isinstance(integrator, Reslrb) or integrator.estimator == "auto":
-        raise ConfigError(config.source, "integrator.estimator", "must name an estimator of `reslrb`")
-    if integrator.max_depth < 0:
-        raise ConfigError(config.source, "integrator.max_depth", "must be a limit: paths are traced without roulette")
-    if config.parameters[0].heightmap is None:
-        raise ConfigError(config.source, "parameters[0]", "must be a heightmap, whose gradient is shown")

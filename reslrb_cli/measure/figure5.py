@@ -14,11 +14,10 @@ from pathlib import Path
 
 import numpy as np
 
-from reslrb_cli.config import Config, Reslrb
-from reslrb_cli.errors import ConfigError
+from reslrb_cli.config import Config
 from reslrb_cli.measure.comparison import Comparison, Family, compare_equal_seeds, compare_expectations
 from reslrb_cli.measure.entries import entry_count
-from reslrb_cli.measure.held_kinds import OWN, VARIANT, Kind, sample, take_pictures
+from reslrb_cli.measure.held_kinds import OWN, Kind, check_config, sample, take_pictures
 from reslrb_cli.measure.statistics import z_scores
 from reslrb_cli.records.gradcheck import Verdict
 
@@ -60,23 +59,21 @@ def measure(config: Config, plan: Plan, folder: Path, say: Callable[[str], None]
 
     Raises ConfigError, processes.Refused, and Ended where a gradient that has to be there is not.
     """
-    _check_config(config)
+    estimator = check_config(config)
     say(f"image and dL/dI, {plan.reference_spp} spp")
     pictures = take_pictures(config, plan.reference_spp, folder)
-    naive, ours = Kind("naive AD", plan.spp, "walk_ad"), Kind(f"reslrb:{_estimator(config)}", plan.spp, OWN)
+    naive, ours = Kind("naive AD", plan.spp, "walk_ad"), Kind(estimator, plan.spp, OWN)
     key = ""
     for kind in (naive, ours):
         say(f"{kind.label}: {plan.seeds} seeds")
         key = _taken(kind, plan.seeds, config, folder, f"figure5, {kind.by}")
     result = Result(config, plan, key, pictures, naive, ours)
     check(result)
-    walk = Kind("walk_ad", plan.spp, "walk_ad")
-    say(f"at equal seeds: walk_ad, {', '.join(EXACT)}")
-    _taken(walk, 1, config, folder, "figure5, equal")
+    say(f"at naive AD's first seed: {', '.join(EXACT)}")
     for name in EXACT:
         kind = Kind(f"reslrb:{name}", plan.spp, name)
-        _taken(kind, 1, config, folder, "figure5, equal")
-        result.comparisons[kind.name, walk.name] = compare_equal_seeds(kind.rows, walk.rows, CLOSE)
+        _taken(kind, 1, config, folder, f"figure5, {naive.by}")
+        result.comparisons[kind.name, naive.by] = compare_equal_seeds(kind.rows, naive.rows[:1], CLOSE)
     return result
 
 
@@ -105,18 +102,3 @@ def _taken(kind: Kind, count: int, config: Config, folder: Path, series: str) ->
     if kind.end is not None:
         raise kind.end
     return key
-
-
-def _estimator(config: Config) -> str:
-    return str(config.integrator.options().get("estimator"))
-
-
-def _check_config(config: Config) -> None:
-    """Raise ConfigError where the gradients could not be compared."""
-    integrator = config.integrator
-    if config.variant not in ("auto", VARIANT):
-        raise ConfigError(config.source, "variant", f"must be auto or {VARIANT}, which the processes set")
-    if not isinstance(integrator, Reslrb) or integrator.estimator == "auto":
-        raise ConfigError(config.source, "integrator.estimator", "must name an estimator of `reslrb`")
-    if integrator.max_depth < 0:
-        raise ConfigError(config.source, "integrator.max_depth", "must be a limit: paths are traced without roulette")

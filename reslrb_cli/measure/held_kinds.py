@@ -13,7 +13,8 @@ from typing import Any
 import numpy as np
 
 from reslrb_cli.backend.python import python_command
-from reslrb_cli.config import Config, dump
+from reslrb_cli.config import Config, Reslrb, dump
+from reslrb_cli.errors import ConfigError
 from reslrb_cli.measure.processes import Ended, Process
 from reslrb_cli.seeds import seed
 
@@ -52,6 +53,18 @@ class Kind:
         """The samples in rows, (N, P), in double precision."""
         assert self.samples is not None, "asked of kinds that have been sampled"
         return self.samples.reshape(len(self.samples), -1).astype(np.float64)
+
+
+def check_config(config: Config) -> str:
+    """The label of the experiment's own estimator. Raises ConfigError where gradients could not be compared."""
+    integrator = config.integrator
+    if config.variant not in ("auto", VARIANT):
+        raise ConfigError(config.source, "variant", f"must be auto or {VARIANT}: the limit bounds address space alone")
+    if not isinstance(integrator, Reslrb) or integrator.estimator == "auto":
+        raise ConfigError(config.source, "integrator.estimator", "must name an estimator of `reslrb`")
+    if integrator.max_depth < 0:
+        raise ConfigError(config.source, "integrator.max_depth", "must be a limit: paths are traced without roulette")
+    return f"reslrb:{integrator.estimator}"
 
 
 def take_pictures(config: Config, spp: int, folder: Path) -> dict[str, np.ndarray]:

@@ -12,6 +12,8 @@ import numpy as np
 from reslrb_cli.measure.figure1 import Result
 from reslrb_cli.measure.held_kinds import MIB, Kind
 from reslrb_cli.measure.noise import CONFIDENCE
+from reslrb_cli.records.metrics import finite
+from reslrb_cli.report.tone import encode
 
 #: Inches: a panel's side, what is between two, and above one.
 PANEL, GAP, TITLE = 2.1, 0.08, 0.24
@@ -103,7 +105,7 @@ def draw(result: Result, path: Path) -> None:
         return made
 
     for row, (name, title) in enumerate((("target", "target"), ("initial", "caustic at the start"))):
-        image = encode(result.pictures[name] / white)
+        image = encode(np.clip(result.pictures[name] / white, 0, 1))
         axes(row, 0, title).imshow(image if image.shape[2] == 3 else image[:, :, 0], cmap="gray", vmin=0, vmax=1)
     places = {(0, 1): result.naive, (1, 1): result.ours, (0, 2): result.failing, (1, 2): result.many}
     for (row, column), kind in places.items():
@@ -128,12 +130,6 @@ def write(pixels: np.ndarray, path: Path) -> None:
     Picture.fromarray(pixels).quantize(256).save(path, format="png", optimize=True)
 
 
-def encode(image: np.ndarray) -> np.ndarray:
-    """Linear values as sRGB in [0, 1]."""
-    image = np.clip(image, 0, 1)
-    return np.where(image <= 0.0031308, 12.92 * image, 1.055 * image ** (1 / 2.4) - 0.055)
-
-
 def _asked(result: Result) -> str:
     return f"about {result.asked_mib * MIB / 2**30:.1f} GiB at {result.plan.many_spp} spp"
 
@@ -155,8 +151,3 @@ def _kind_json(result: Result, kind: Kind) -> dict[str, Any]:
         "status": "ok" if kind.end is None else kind.end.status.value,
         "reason": None if kind.end is None else kind.end.reason,
     }
-
-
-def finite(values: dict[str, Any]) -> dict[str, Any]:
-    """What JSON has no word for as null."""
-    return {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in values.items()}

@@ -11,7 +11,9 @@ import numpy as np
 
 from reslrb_cli.measure.figure5 import Result
 from reslrb_cli.measure.noise import relative_noise
-from reslrb_cli.report.figure1 import encode, finite, write
+from reslrb_cli.records.metrics import finite
+from reslrb_cli.report.figure1 import write
+from reslrb_cli.report.tone import encode
 
 #: Inches: a panel's width, what is between two, and above one.
 PANEL, GAP, TITLE = 3.6, 0.08, 0.24
@@ -99,7 +101,7 @@ def draw(result: Result, path: Path) -> None:
         return made
 
     depth = result.config.integrator.max_depth
-    panel(0, 0, f"the room, paths of length {depth}").imshow(encode(image / white))
+    panel(0, 0, f"the room, paths of length {depth}").imshow(encode(np.clip(image / white, 0, 1)))
     limits = {"cmap": colors, "interpolation": "nearest"}
     worst = result.comparisons[result.ours.name, result.naive.name]
     words = f"z of their means, {result.plan.seeds} seeds each: rms {worst.z_rms or math.nan:.2f} in gradcheck's tiles"
