@@ -55,6 +55,20 @@ def sampled_steps() -> Begin:
     return begin
 
 
+def judged_runs() -> Begin:
+    """What whole optimisations are judged by."""
+    from reslrb_cli.measure.whole_runs.judge import begin
+
+    return begin
+
+
+def whole_runs() -> Begin:
+    """A whole optimisation, bit by bit."""
+    from reslrb_cli.measure.whole_runs.runner import begin
+
+    return begin
+
+
 def main(load: Callable[[], Begin] = measured_steps) -> int:
     """Answer until standard input ends, or until something fails: the last answer then says what."""
     answers = os.fdopen(os.dup(sys.stdout.fileno()), "w", encoding="utf-8")
