@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from reslrb_cli.cli.bench import Size
-from reslrb_cli.cli.experiment import COUNT, check_writable, experiment_arguments
+from reslrb_cli.cli.experiment import COUNT, Counts, check_writable, experiment_arguments, is_given
 from reslrb_cli.cli.output import echo
 from reslrb_cli.errors import ConfigError, ExitCode
 
@@ -25,19 +25,6 @@ if TYPE_CHECKING:
 
 #: The most seeds of --runs.
 MOST_RUNS = 100
-
-
-class Counts(click.ParamType):
-    """Different numbers of samples, such as `4,16,64`."""
-
-    name = "list"
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[int, ...]:
-        parts: list[Any] = str(value).split(",")
-        counts = [COUNT.convert(part, param, ctx) for part in parts]
-        if len(set(counts)) < len(counts):
-            self.fail(f"`{value}` names a number twice", param, ctx)
-        return tuple(counts)
 
 
 @click.command("convergence")
@@ -152,14 +139,13 @@ def command(
 
 def _refuse_with_runs() -> None:
     """Raise ConfigError where an option was given that whole runs have no use for."""
-    given = click.get_current_context().get_parameter_source
     why = {
         "objective": "runs have the configuration's own loss",
         "rounds": "runs have a time, not a number of turns; take --budget",
         "resumed": "runs are not gone on from",
     }
     for name, reason in why.items():
-        if given(name) is click.core.ParameterSource.COMMANDLINE:
+        if is_given(name):
             option = "--resume" if name == "resumed" else f"--{name}"
             raise ConfigError(option, "", f"does not go with --runs: {reason}")
 

@@ -27,8 +27,9 @@ def measured_steps() -> Begin:
     from reslrb_cli.measure.stepper import Stepper
 
     def begin(first: dict[str, Any]) -> Begun:
-        stepper = Stepper(loads(first["config"], first["source"]), first["objective"])
-        size = {"width": stepper.size[0], "height": stepper.size[1]}
+        config = loads(first["config"], first["source"])
+        stepper = Stepper(config, first["objective"], first.get("film_width"), first.get("texture_width"))
+        size = {"width": stepper.size[0], "height": stepper.size[1], "texels": stepper.texels}
         return size, lambda question: stepper.step(question["round"], question["cold"], question["release"])
 
     return begin
