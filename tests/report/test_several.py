@@ -198,6 +198,18 @@ def test_whole_runs(tmp_path):
     assert lines_drawn(markup) == [list(COLORS[:2])] * 2  # loss, and the parameters' error
 
 
+def test_curves_of_whole_runs_are_medians_with_bands_from_the_least_to_the_greatest(tmp_path, monkeypatch):
+    drawn = []
+    monkeypatch.setattr("reslrb_cli.report.page.whole_runs.diagram", lambda curves, *_: drawn.append(curves) or "")
+    (tmp_path / "c.jsonl").write_text("".join(json.dumps(line) + "\n" for line in runs_lines()))
+    render(read_sources([tmp_path / "c.jsonl"]))
+    losses, errors = drawn
+    assert [curve.name for curve in losses] == ["ptracer, batched", "reslrb:stack, batched"]
+    assert (losses[0].xs, losses[0].ys) == ([1.0, 2.0, 4.0], [10.0, 5.0, 2.5])
+    assert losses[0].band == ([5.0, 2.5, 1.25], [15.0, 7.5, 3.75])
+    assert errors[1].ys == pytest.approx([0.2, 0.1, 0.05])
+
+
 def test_whole_runs_beside_gradients_and_runs_without_figures(tmp_path):
     lines = [*convergence_lines(), *runs_lines(finite=False), {"kind": "run_point"}, {"kind": "run_method"}]
     (tmp_path / "c.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))

@@ -75,8 +75,8 @@ def finals(runs: Sequence[Run], limit_s: float, of: str) -> dict[str, list[float
 def find_best(values: dict[str, list[float]]) -> Verdict | None:
     """Which method has the lowest median, and who is tied with it; None where there is nothing to compare.
 
-    Those are tied with it whose values the Mann-Whitney test (two-sided, exact for few values of which no two are equal) does not
-    tell from its own, at ALPHA over the number of the others.
+    Those are tied with it whose values the Mann-Whitney test does not tell from its own: two-sided, exact for few
+    values of which no two are equal, at ALPHA over the number of the others.
     """
     if not values:
         return None
