@@ -77,7 +77,7 @@ class Player:
         self.played = stage.methods.get(name) or stage.methods.get(config.integrator.type) or Pretence()
         self.question: dict[str, Any] | None = None
         self.done = 0
-        self.advance = Advance(self._iterations(), self._value, self.played.loading_s)
+        self.advance = Advance(self._iterations(), self._value, self.played.loading_s, stage.clock)
 
     def ask(self, question: dict[str, Any]) -> None:
         self.question = question
@@ -114,13 +114,11 @@ class Player:
         return {"loss": value**2, "error": value}
 
     def _iterations(self) -> Any:
-        elapsed_s = 0.0
         for iteration in range(self.played.iterations):
             step_s = self.played.step_s + (self.played.first_s if iteration == 0 else 0)
             self.stage.wait(step_s, self.stop)
-            elapsed_s += step_s
             self.done = iteration + 1
-            yield Record(iteration, 0.0, 0.0, None, None, 0.0, elapsed_s, 2.0, 4, 0.1, 0.0, 0, None)
+            yield Record(iteration, 0.0, 0.0, None, None, 0.0, 0.0, 2.0, 4, 0.1, 0.0, 0, None)
 
     def _value(self) -> dict[str, np.ndarray]:
         return {"a": np.array([self.played.gain**self.done * (1 + self.seed / 100 * (self.done > 0))])}

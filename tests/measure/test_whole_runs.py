@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -106,7 +107,7 @@ def test_a_method_that_ends_is_recorded_and_the_rest_goes_on(tmp_path: Path) -> 
     assert len([line for line in said if line.startswith("ptracer")]) == 1  # another seed would need as much
     ended, sound = method_records(session.runs, session.limit_s)
     assert (ended.status, ended.runs, ended.loss) == (BenchStatus.OUT_OF_MEMORY, 0, None)
-    assert notes([ended, sound]) == ["ptracer: seed 0: ended by SIGKILL"]
+    assert notes([ended, sound]) == ["ptracer: 1 of 1 ended before their time: ended by SIGKILL"]
     assert sound.runs == 3
     verdict = find_best(finals(session.runs, session.limit_s, "loss"))
     assert "reslrb:stack, the only one that was measured" in closing_sentence(verdict, None, session.limit_s)
@@ -168,20 +169,21 @@ def test_seeds_follow_that_of_the_configuration() -> None:
 # --- time -------------------------------------------------------------------------------------------------------------
 
 
-class _Timed:
-    def __init__(self, iteration: int, elapsed_s: float) -> None:
-        self.iteration, self.elapsed_s = iteration, elapsed_s
-
-
-def test_a_state_stands_from_its_end_on() -> None:
-    done: list[float] = []
+def test_a_state_stands_from_its_end_on_and_copies_of_values_take_no_time() -> None:
+    """Iterations end 3, 4, 5, 6 and 10 s after the start, of which loading takes 1; each copy would take 5 more."""
+    now, done = [100.0], [0]
 
     def records() -> Any:
-        for iteration, elapsed_s in enumerate([2.0, 3.0, 4.0, 5.0, 9.0]):
-            done.append(elapsed_s)
-            yield _Timed(iteration, elapsed_s)
+        for iteration, taken_s in enumerate([2.0, 1.0, 1.0, 1.0, 4.0]):
+            now[0] += taken_s
+            done[0] += 1
+            yield SimpleNamespace(iteration=iteration)
 
-    advance = Advance(records(), lambda: {"a": np.array(float(len(done)))}, 1.0)
+    def take() -> dict[str, np.ndarray]:
+        now[0] += 5.0
+        return {"a": np.array(float(done[0]))}
+
+    advance = Advance(records(), take, 1.0, lambda: now[0])
     assert [advance.until(time, 9.5).iteration for time in (0.5, 2.9, 3.0, 4.5, 4.9, 5.0)] == [0, 0, 1, 2, 2, 3]
     state = advance.until(9.5, 9.5)
     assert (state.iteration, state.elapsed_s, float(state.values["a"])) == (4, 6.0, 4.0)

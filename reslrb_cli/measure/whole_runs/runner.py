@@ -7,7 +7,7 @@ updates. Starting Python is not in it, nor is the target, which all methods have
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -40,11 +40,18 @@ class State:
 class Advance:
     """An optimisation that is brought forward bit by bit; `now` is its newest state, `before` the one before that.
 
-    `loading_s` is counted time that has gone before the first iteration; `first_s` is the time of the first state.
+    All of its time counts, what it spends between its steps too; what `take` does, which copies the values, does not.
+    `loading_s` has gone before the first iteration; `first_s` is the time of the first state.
     """
 
-    def __init__(self, records: Iterator[Record], take: Any, loading_s: float) -> None:
-        self._records, self._take, self._loading_s = records, take, loading_s
+    def __init__(
+        self,
+        records: Iterator[Record],
+        take: Callable[[], dict[str, Array]],
+        loading_s: float,
+        clock: Callable[[], float] = time.perf_counter,
+    ) -> None:
+        self._records, self._take, self._spent_s, self._clock = records, take, loading_s, clock
         self.before = self.now = State(0.0, 0, take())
         self.first_s: float | None = None
         self.finished = False
@@ -58,12 +65,13 @@ class Advance:
         while not self.finished and self.now.elapsed_s <= elapsed_s:
             if self.now.elapsed_s + self._quickest_s > limit_s:
                 break
+            began = self._clock()
             record = next(self._records, None)
             if record is None:
                 self.finished = True
                 break
-            self.before = self.now
-            done_s = self._loading_s + record.elapsed_s
+            self._spent_s += self._clock() - began
+            self.before, done_s = self.now, self._spent_s
             if self.first_s is None:
                 self.first_s = done_s
             else:

@@ -29,8 +29,12 @@ from reslrb_cli.records.whole_runs import RunPointRecord
 JUDGED = 0.15
 #: No run has less time than this, in seconds.
 LEAST_S = 0.5
-#: What a run may be late by before it is cut off: a share of its time, and seconds beside it.
+#: What is left for a run's being late: a share of its time, and seconds beside it. One that has not come to its first
+#: iteration by then is cut off.
 GRACE, GRACE_S = 0.05, 0.5
+#: The share of its time by which any other run may be late before it is cut off: it ends by itself, and copies of its
+#: values, which take none of its time, take some of ours.
+CUT = 0.5
 
 
 class RunsSession:
@@ -190,10 +194,10 @@ class RunsSession:
         if opening["chose"]:
             self._once(f"{run.method.label}: {opening['chose']}")
 
-    def _late(self, allowed_s: float) -> Callable[[], bool]:
-        """Whether the whole is over, or a run has been asked for longer than its time allows."""
-        began = self._now()
-        return lambda: self._pace.over() or self._now() - began > allowed_s * (1 + GRACE) + GRACE_S
+    def _late(self, left_s: float, grace: float = GRACE) -> Callable[[], bool]:
+        """Whether the whole is over, or a run has been waited for longer than what is left of its time."""
+        allowed_s, began = left_s + grace * self.limit_s + GRACE_S, self._now()
+        return lambda: self._pace.over() or self._now() - began > allowed_s
 
     def _advance(self, run: Run, until_s: float, wave: list[Run]) -> RunPointRecord | None:
         """Where a run stands at some time; None where that cannot be known any more."""
@@ -201,7 +205,8 @@ class RunsSession:
             held = sum(other.peak_mib for other in wave if other.alive) * MIB
             question = {"until_s": until_s, "limit_s": self.limit_s, "out": str(run.out),
                         "release": held > MEMORY_SHARE * self.plan.memory}  # fmt: skip
-            late = self._late(max(self.limit_s - run.counted_s, 0.0))
+            left_s = max(self.limit_s - run.counted_s, 0.0)
+            late = self._late(left_s, GRACE if run.first_s is None else CUT)
             answer = run.ask(question, self._stop, late)
             if answer is not None:
                 run.counted_s = max(run.counted_s, until_s)

@@ -52,7 +52,7 @@ def _record(runs: Sequence[Run], method: Method, limit_s: float) -> RunMethodRec
         first_s=Band.of([run.first_s for run in done if run.first_s is not None]),
         loss=Band.of([point.loss for point in last]),
         parameter_error=Band.of(errors),
-        message="; ".join(f"seed {run.seed}: {end.reason}" for run, end in ends) or refused,
+        message=f"{len(ends)} of {len(runs)} ended before their time: {ends[0][1].reason}" if ends else refused,
     )
 
 
