@@ -84,8 +84,8 @@ def _conditions(plan: RunsPlan, session: RunsSession) -> str:
 
 
 def _exit_code(records: list[RunMethodRecord]) -> ExitCode:
-    """A comparison in which something came to its end is done; else what kept it from that decides."""
-    if any(record.runs for record in records):
+    """A comparison in which something was optimised is done; else what kept it from that decides."""
+    if any(record.iterations is not None and record.iterations.high > 0 for record in records):
         return ExitCode.DONE
     states = {record.status for record in records}
     return ExitCode.OUT_OF_MEMORY if states == {BenchStatus.OUT_OF_MEMORY} else ExitCode.CHECK_FAILED

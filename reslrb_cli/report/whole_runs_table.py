@@ -57,7 +57,7 @@ def notes(records: Sequence[RunMethodRecord]) -> list[str]:
 def closing_sentence(loss: Verdict | None, error: Verdict | None, limit_s: float) -> str:
     """Which method is the best for this scene at the end of the time of a run, by the loss and by the error."""
     if loss is None:
-        return "Nothing can be said of which method is the best: none came to the end of its time."
+        return "Nothing can be said of which method is the best: none came to an iteration and to the end of its time."
     sentence = f"After {number(limit_s, 3)} s of each run, all costs counted: " + _of(loss, "the loss")
     if error is not None:
         sentence += "; " + _of(error, "the error of the parameters")

@@ -107,7 +107,8 @@ class Player:
             return {"loading_s": 0.3, "warnings": ["old"]}
         if "prepare" in question:
             self.stage.wait(self.stage.target_s, stop)
-            return {"without": self.stage.without, "loss": 1.0, "error": 1.0, "error_of": "RMSE", "pictures": ""}
+            return {"without": self.stage.without, "loss": 1.0, "error": 1.0, "judge_s": self.stage.judge_s,
+                    "error_of": "RMSE", "pictures": ""}  # fmt: skip
         self.stage.wait(self.stage.judge_s, stop)
         self.stage.judged += 1
         value = float(load(question["values"], ["a"])["a"][0])

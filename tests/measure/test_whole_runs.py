@@ -9,11 +9,14 @@ from typing import Any
 
 import numpy as np
 import pytest
-from measure.pretended_runs import CONFIG, Pretence, Stage, plan, play
+from measure.pretended_runs import CONFIG, STARTUP_S, Pretence, Stage, plan, play
 
+from reslrb_cli.cli.whole_runs import _exit_code
 from reslrb_cli.config import loads
+from reslrb_cli.errors import ExitCode
 from reslrb_cli.measure.whole_runs.run import POINTS, times
 from reslrb_cli.measure.whole_runs.runner import Advance
+from reslrb_cli.measure.whole_runs.session import GRACE, GRACE_S
 from reslrb_cli.measure.whole_runs.verdict import finals, find_best, method_records
 from reslrb_cli.records.bench import BenchStatus
 from reslrb_cli.report.whole_runs_plot import curve, plot_runs
@@ -50,15 +53,17 @@ def test_known_curves_have_known_medians_and_bands(tmp_path: Path) -> None:
 
 
 def test_the_time_is_equal_and_the_budget_kept_and_used(tmp_path: Path) -> None:
-    """Compiling counts, judging does not: neither the cost of an image nor that of another method changes a curve."""
-    found = []
+    """Compiling counts, judging does not: what an image takes changes how long runs are, and nothing else."""
     for judge_s in (0.01, 0.3):
-        stage = Stage(judge_s, ptracer=Pretence(step_s=0.7), reslrb_stack=Pretence(step_s=0.1))
-        _, points, said = play(tmp_path, stage, plan(budget_s=90.0))
-        assert 60 < stage.now < 90
+        fast, slow = Pretence(step_s=0.1), Pretence(step_s=0.7)
+        stage = Stage(judge_s, ptracer=slow, reslrb_stack=fast)
+        session, points, said = play(tmp_path, stage, plan(budget_s=90.0))
+        assert 65 < stage.now < 90
         assert said == ["old"]
-        found.append([(point.elapsed_s, point.iteration) for point in points])
-    assert found[0] == found[1]
+        each_s = (0.97 * 90 - 2 - STARTUP_S - 0.3 - stage.target_s) / 6
+        assert session.limit_s == pytest.approx((each_s - POINTS * judge_s - STARTUP_S - GRACE_S) / (1 + GRACE))
+        for point in points:
+            assert point.iteration == iterations_by(point.elapsed_s, slow if point.method.label == "ptracer" else fast)
 
 
 @pytest.mark.parametrize("budget_s", [20, 25, 32, 40, 60])
@@ -148,8 +153,10 @@ def test_a_budget_that_is_too_small_says_what_it_would_take(tmp_path: Path, budg
 
 def test_runs_that_all_compile_for_too_long_end_after_the_first_seed(tmp_path: Path) -> None:
     played = Pretence(first_s=500.0)
-    _, points, said = play(tmp_path, Stage(ptracer=played, reslrb_stack=played), plan())
+    session, points, said = play(tmp_path, Stage(ptracer=played, reslrb_stack=played), plan())
     assert {point.seed for point in points} == {0}
+    assert find_best(finals(session.runs, session.limit_s, "loss")) is None
+    assert _exit_code(method_records(session.runs, session.limit_s)) == ExitCode.CHECK_FAILED
     assert said[-1].startswith("no method came to an iteration in the")
 
 

@@ -27,6 +27,8 @@ Array = np.ndarray[Any, Any]
 _PURPOSE = "convergence, runs"
 #: The share of the time that the target may take.
 TARGET_SHARE = 0.1
+#: The fewest samples per pixel of the images, whatever they take: the noise of fewer would be all that losses show.
+LEAST_SPP = 16
 
 
 class Judge:
@@ -85,7 +87,7 @@ def prepare(problem: Problem, out: str, budget_s: float, image_s: float) -> tupl
     """Make the targets, and write them to `out`; `budget_s` is the time of the whole, `image_s` that of one judgement.
 
     The facts: `without` (stock integrators that are right for nothing here, with the reason), `loss` and `error` of the
-    initial values, `pictures` and `error_of` in words.
+    initial values, the seconds that a judgement takes (`judge_s`), and in words `pictures` and `error_of`.
     """
     without = find_references(problem, "loss")["without"]
     initial = copies(problem)
@@ -98,15 +100,19 @@ def prepare(problem: Problem, out: str, budget_s: float, image_s: float) -> tupl
     with open(out, "wb") as file:
         arrays = {f"target-{number}": np.array(target) for number, target in enumerate(problem.targets)}
         np.savez(file, **arrays)  # type: ignore[arg-type]
-    spp = multiple_of(affordable_paths(problem, pixels, image_s) // pixels, problem.samples_per_pass)
+    affordable = affordable_paths(problem, pixels, image_s) // pixels
+    spp = multiple_of(max(affordable, LEAST_SPP), problem.samples_per_pass)
     judge = Judge(problem, spp)
     error = judge.error(initial)
     kind = (
         "" if error is None else "RMSE of the parameters" if judge.meter.one_unit else "relative RMSE of the parameters"
     )
+    start = time.perf_counter()
+    loss = judge.loss(initial)
     facts = {
         "without": without,
-        "loss": judge.loss(initial),
+        "loss": loss,
+        "judge_s": time.perf_counter() - start,
         "error": error,
         "error_of": "" if error is None else kind,
         "pictures": f"losses of images of {spp} spp{shortened}",

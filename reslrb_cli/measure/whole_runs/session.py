@@ -25,7 +25,7 @@ from reslrb_cli.measure.whole_runs.run import POINTS, Run, times
 from reslrb_cli.records.bench import BenchStatus
 from reslrb_cli.records.whole_runs import RunPointRecord
 
-#: The share of the time that judging may take.
+#: The share of the time that judging is to take, unless that leaves images with too few samples.
 JUDGED = 0.15
 #: No run has less time than this, in seconds.
 LEAST_S = 0.5
@@ -130,12 +130,12 @@ class RunsSession:
         if count == 0:
             return False
         each = max(self._end - self._now(), 0.0) / count
-        self.limit_s = ((1 - JUDGED) * each - self._startup_s - GRACE_S) / (1 + GRACE)
+        apart_s = POINTS * self.facts["judge_s"] + self._startup_s + GRACE_S  # what of its share a run cannot have
+        self.limit_s = (each - apart_s) / (1 + GRACE)
         if self.limit_s >= LEAST_S:
             return True
         before = self._now() - self._began
-        least = (LEAST_S * (1 + GRACE) + self._startup_s + GRACE_S) / (1 - JUDGED)
-        needed = (before + count * least + AFTERWARDS_S) / (1 - AFTERWARDS)
+        needed = (before + count * (LEAST_S * (1 + GRACE) + apart_s) + AFTERWARDS_S) / (1 - AFTERWARDS)
         self._say(
             f"the budget of {self.plan.budget_s:g} s leaves no time for {count} runs: allow more than {needed:.0f} s "
             "with --budget, or fewer --runs or --integrators"

@@ -62,8 +62,10 @@ def _methods(runs: Sequence[Run]) -> list[Method]:
 
 def finals(runs: Sequence[Run], limit_s: float, of: str) -> dict[str, list[float]]:
     """Losses, or errors, at the end of their time (`of` a record's field), by method; those with a run that ended
-    before are left out: what is left of their runs are the lucky ones."""
+    before are left out: what is left of their runs are the lucky ones. Nothing where nobody came to an iteration."""
     found: dict[str, list[float]] = {}
+    if not any(run.state.iteration for run in runs):
+        return found
     for method in _methods(runs):
         own = [run for run in runs if run.method == method]
         values = [getattr(run.points[-1], of) for run in own if run.complete(limit_s)]
