@@ -107,6 +107,7 @@ def prepare(problem: Problem, out: str, budget_s: float, image_s: float) -> tupl
     kind = (
         "" if error is None else "RMSE of the parameters" if judge.meter.one_unit else "relative RMSE of the parameters"
     )
+    judge.loss(initial)  # which compiles
     start = time.perf_counter()
     loss = judge.loss(initial)
     facts = {
