@@ -10,13 +10,14 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from reslrb_cli.cli.experiment import COUNT, check_writable, optional_experiment_arguments
+from reslrb_cli.cli.experiment import COUNT, Counts, check_writable, is_given, optional_experiment_arguments
 from reslrb_cli.cli.output import echo
 from reslrb_cli.errors import ConfigError, ExitCode
 
 if TYPE_CHECKING:
     from reslrb_cli.config import Config
-    from reslrb_cli.measure.bench import Result, Sweep
+    from reslrb_cli.measure.bench import Result
+    from reslrb_cli.measure.sweep import Sweep
 
 #: What is compared where the user names nothing.
 INTEGRATORS = "ptracer,reslrb:reservoir,reslrb:event,reslrb:gather,reslrb:stack,trajectory"
@@ -38,6 +39,13 @@ class Size(click.ParamType):
 
 @click.command("bench")
 @optional_experiment_arguments
+@click.option("--sweep", "swept", type=click.Choice(["depth", "spp", "film", "texture"]), default="depth",
+              show_default=True,
+              help="What is varied: path depth, samples per pixel, or the width of the film or of textures that are "
+                   "parameters; path depth is CONFIG's where another one is.")  # fmt: skip
+@click.option("--values", type=Counts(), metavar="LIST",
+              help="What it is varied over, e.g. 4,16,64. Default: depths by --max-depth, a quarter to four times "
+                   "run.spp, film widths 32 to 256, texture widths 16 to 1024.")  # fmt: skip
 @click.option("--max-depth", type=click.IntRange(min=2, max=COUNT.max), default=32, show_default=True,
               help="Greatest path depth; measured are 2, 4, 8, ... and this one.")  # fmt: skip
 @click.option("--integrators", metavar="LIST",
@@ -56,10 +64,12 @@ class Size(click.ParamType):
 @click.option("--json", "json_file", type=click.Path(path_type=Path, dir_okay=False),
               help="Write one object a line, as results come.")  # fmt: skip
 @click.option("--plot", "plot_file", type=click.Path(path_type=Path, dir_okay=False),
-              help="PNG of time and memory against depth; default: beside the JSON file.")  # fmt: skip
+              help="PNG of time and memory against what is varied; default: beside the JSON file.")  # fmt: skip
 def command(
     config_file: Path | None,
     overrides: tuple[str, ...],
+    swept: str,
+    values: tuple[int, ...] | None,
     max_depth: int,
     integrators: str | None,
     baseline: str | None,
@@ -70,7 +80,7 @@ def command(
     json_file: Path | None,
     plot_file: Path | None,
 ) -> int:
-    """Measure time and peak memory of gradient steps against path depth.
+    """Measure time and peak memory of gradient steps against path depth, or what else --sweep names.
 
     A step is image, loss and gradient of every parameter of CONFIG, seen through its first sensor. Without CONFIG the
     scene is a Cornell box (--set scene.options.size=64, run.spp=4, ...). Each integrator runs in processes of its own;
@@ -83,14 +93,17 @@ def command(
 
     load_packages()  # before what follows asks for them
     from reslrb_cli.measure import cornell_box
-    from reslrb_cli.measure.bench import Sweep
     from reslrb_cli.measure.cases import choose_baseline, depths, parse_cases
+    from reslrb_cli.measure.sweep import SWEPT, Sweep, usual_values
 
     if config_file is None:
         config = loads(cornell_box.CONFIG, cornell_box.SOURCE, overrides)
     else:
         config = load(config_file, overrides)
-    cases = parse_cases(integrators or INTEGRATORS)
+    if (swept != "depth" or values is not None) and is_given("max_depth"):
+        reason = "goes with --sweep depth" if values is None else "does not go with --values"
+        raise ConfigError("--max-depth", "", f"{reason}; take --set integrator.max_depth={max_depth}")
+    cases = parse_cases(integrators or INTEGRATORS, deep=swept == "depth")
     if json_file is not None and plot_file is None:
         plot_file = json_file.with_suffix(".png")
     for option, path in (("--json", json_file), ("--plot", plot_file)):
@@ -104,13 +117,14 @@ def command(
         variant=variant,
         cases=cases,
         baseline=choose_baseline(cases, baseline),
-        depths=depths(max_depth),
+        values=sorted(values or (depths(max_depth) if swept == "depth" else usual_values(swept, config))),
         objective=objective,
         memory_limit=memory_limit or (None if variant.startswith("cuda") else memory),
         memory=memory,
         budget_s=budget,
         rounds=rounds,
         default=integrators is None,
+        swept=swept,
     )
     sweep.check()
     echo(f"{device_name(variant)}, {variant}")
@@ -119,8 +133,9 @@ def command(
     if plot_file is not None and results:
         from reslrb_cli.report.bench_plot import plot_bench
 
-        series = [(case.label, [r.record for r in results if r.case == case]) for case in cases]
-        plot_bench(series, plot_file, f"{device_name(variant)}\n{_conditions(config, sweep)}")
+        series = [(case.label, [(r.value, r.record) for r in results if r.case == case]) for case in cases]
+        abscissa = "path depth" if swept == "depth" else SWEPT[swept]
+        plot_bench(series, plot_file, f"{device_name(variant)}\n{_conditions(config, sweep)}", abscissa)
         echo(f"look at {os.path.relpath(plot_file)}")
     return ExitCode.INTERRUPTED if interrupted else _exit_code(results)
 
@@ -139,14 +154,14 @@ def _run(sweep: Sweep, json_file: Path | None) -> tuple[list[Result], bool]:
     with ExitStack() as stack:
         writer = None if json_file is None else stack.enter_context(LineWriter(json_file))
         interrupts = stack.enter_context(Interrupts(last_act=abandon_all))
-        echo(table_head(labels))
+        echo(table_head(labels, sweep.swept))
         for rows in bench(sweep, lambda: interrupts.requested, logging.getLogger(__name__).info):
             for row in rows:
                 if writer is not None:
                     writer.write(row.record)
-                echo(table_line(row.case.label, row.record, row.step_ratio, row.kernel_ratio, labels))
+                echo(table_line(row.case.label, row.value, row.record, row.step_ratio, row.kernel_ratio, labels))
                 if row.reason:
-                    notes.append(f"depth {row.record.max_depth}, {row.case.label}: {row.reason}")
+                    notes.append(f"{sweep.name(row.value)}, {row.case.label}: {row.reason}")
             results += rows
         for note in notes:
             echo(note)
@@ -155,11 +170,15 @@ def _run(sweep: Sweep, json_file: Path | None) -> tuple[list[Result], bool]:
 
 def _conditions(config: Config, sweep: Sweep) -> str:
     """What was measured, in one line."""
-    rr_depth = config.integrator.rr_depth
-    roulette = "no roulette" if rr_depth > max(sweep.depths) else f"roulette from depth {rr_depth}"
+    rr_depth, own = config.integrator.rr_depth, config.integrator.max_depth
+    deepest = max(sweep.values) if sweep.swept == "depth" else own
+    roulette = "no roulette" if 0 <= deepest < rr_depth else f"roulette from depth {rr_depth}"
+    parts = [str(config.source)]
+    parts += [] if sweep.swept == "depth" else [f"depth {own}"]
+    parts += [] if sweep.swept == "spp" else [f"{config.run.spp} spp"]
     delta = "dL/dI known before" if sweep.objective == "fixed" else f"l2, adjoint {config.adjoint}"
     limit = "" if sweep.memory_limit is None else f", {sweep.memory_limit / 2**30:.2f} GiB each"
-    return f"{config.source}, {config.run.spp} spp, {roulette}, {delta}, ratios over {sweep.baseline.label}{limit}"
+    return ", ".join([*parts, roulette, delta, f"ratios over {sweep.baseline.label}{limit}"])
 
 
 def _exit_code(results: list[Result]) -> ExitCode:

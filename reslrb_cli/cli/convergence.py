@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from reslrb_cli.cli.bench import Size
-from reslrb_cli.cli.experiment import COUNT, check_writable, experiment_arguments
+from reslrb_cli.cli.experiment import COUNT, Counts, check_writable, experiment_arguments, is_given
 from reslrb_cli.cli.output import echo
 from reslrb_cli.errors import ConfigError, ExitCode
 
@@ -23,18 +23,8 @@ if TYPE_CHECKING:
     from reslrb_cli.records.convergence import MethodRecord
     from reslrb_cli.report.convergence_table import Table
 
-
-class Counts(click.ParamType):
-    """Different numbers of samples, such as `4,16,64`."""
-
-    name = "list"
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[int, ...]:
-        parts: list[Any] = str(value).split(",")
-        counts = [COUNT.convert(part, param, ctx) for part in parts]
-        if len(set(counts)) < len(counts):
-            self.fail(f"`{value}` names a number twice", param, ctx)
-        return tuple(counts)
+#: The most seeds of --runs.
+MOST_RUNS = 100
 
 
 @click.command("convergence")
@@ -46,6 +36,9 @@ class Counts(click.ParamType):
 @click.option("--objective", type=click.Choice(["fixed", "loss", "image"]), default="fixed", show_default=True,
               help="fixed: the gradient with dL/dI held at that of a reference image; loss: the gradient of CONFIG's "
                    "loss, by run.adjoint; image: the image.")  # fmt: skip
+@click.option("--runs", type=click.IntRange(min=1, max=MOST_RUNS), metavar="N",
+              help="Whole optimisations in place of gradients: N seeds by each method, at equal wall time, all costs "
+                   "counted. Default list: ptracer, prb, reslrb:stack and reslrb:auto.")  # fmt: skip
 @click.option("--budget", type=click.FloatRange(min=0), default=240.0, show_default=True, metavar="SECONDS",
               help="Time for the whole, compiling included.")  # fmt: skip
 @click.option("--rounds", type=click.IntRange(min=1, max=COUNT.max), metavar="N",
@@ -67,6 +60,7 @@ def command(
     overrides: tuple[str, ...],
     integrators: str | None,
     objective: str,
+    runs: int | None,
     budget: float,
     rounds: int | None,
     spps: tuple[int, ...] | None,
@@ -91,9 +85,12 @@ def command(
     load_packages()  # before what follows asks for them
     from reslrb_cli.measure.cases import parse_cases
     from reslrb_cli.measure.convergence.plan import DEFAULTS, Plan
+    from reslrb_cli.measure.whole_runs.plan import DEFAULT, RunsPlan
 
     config = load(config_file, overrides)
-    cases = parse_cases(integrators or DEFAULTS[objective], deep=False)
+    if runs is not None:
+        _refuse_with_runs()
+    cases = parse_cases(integrators or (DEFAULTS[objective] if runs is None else DEFAULT), deep=False)
     stands = parse_cases(reference, "--reference", deep=False)
     if len(stands) != 1:
         raise ConfigError("--reference", "", "errors are taken from one method; name one")
@@ -106,21 +103,29 @@ def command(
     if variant.startswith("cuda") and memory_limit is not None:
         raise ConfigError("--memory-limit", "", f"bounds address space, which says nothing of {variant}'s memory")
     memory = memory_bytes(variant)
-    plan = Plan(
-        config=config,
-        variant=variant,
-        cases=cases,
-        reference=stands[0],
-        objective=objective,
-        memory_limit=memory_limit or (None if variant.startswith("cuda") else memory),
-        memory=memory,
-        budget_s=budget,
-        rounds=rounds,
-        default=integrators is None,
-        spps=spps or (),
-    )
-    plan.check()
+    settings: dict[str, Any] = {
+        "config": config,
+        "variant": variant,
+        "cases": cases,
+        "reference": stands[0],
+        "objective": objective if runs is None else "loss",
+        "memory_limit": memory_limit or (None if variant.startswith("cuda") else memory),
+        "memory": memory,
+        "budget_s": budget,
+        "rounds": rounds,
+        "default": integrators is None,
+        "spps": spps or (),
+    }
     where = f"{device_name(variant)}, {variant}"
+    if runs is not None:
+        from reslrb_cli.cli.whole_runs import measure_runs
+
+        whole = RunsPlan(**settings, runs=runs)
+        whole.check()
+        echo(where)
+        return measure_runs(whole, json_file, plot_file, began, where)
+    plan = Plan(**settings)
+    plan.check()
     echo(where)
     earlier = None if resumed is None else _earlier(resumed)
     results, conditions, interrupted = _run(plan, json_file, began, earlier)
@@ -130,6 +135,19 @@ def command(
         plot_convergence(results.points, results.methods, plot_file, f"{where}\n{conditions}")
         echo(f"look at {os.path.relpath(plot_file)}")
     return ExitCode.INTERRUPTED if interrupted else _exit_code(results)
+
+
+def _refuse_with_runs() -> None:
+    """Raise ConfigError where an option was given that whole runs have no use for."""
+    why = {
+        "objective": "runs have the configuration's own loss",
+        "rounds": "runs have a time, not a number of turns; take --budget",
+        "resumed": "runs are not gone on from",
+    }
+    for name, reason in why.items():
+        if is_given(name):
+            option = "--resume" if name == "resumed" else f"--{name}"
+            raise ConfigError(option, "", f"does not go with --runs: {reason}")
 
 
 def _run(plan: Plan, json_file: Path | None, began: float, earlier: Earlier | None) -> tuple[Results, str, bool]:

@@ -20,6 +20,19 @@ logger = logging.getLogger(__name__)
 COUNT = click.IntRange(min=1, max=2**31 - 1)
 
 
+class Counts(click.ParamType):
+    """Different numbers of samples, such as `4,16,64`."""
+
+    name = "list"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[int, ...]:
+        parts: list[Any] = str(value).split(",")
+        counts = [COUNT.convert(part, param, ctx) for part in parts]
+        if len(set(counts)) < len(counts):
+            self.fail(f"`{value}` names a number twice", param, ctx)
+        return tuple(counts)
+
+
 def experiment_arguments(function: Callable[..., Any]) -> Callable[..., Any]:
     """Add CONFIG (`config_file`) and `--set` (`overrides`) to a command."""
     return _arguments(function, required=True)
@@ -45,6 +58,11 @@ def _arguments(function: Callable[..., Any], required: bool) -> Callable[..., An
     metavar = "CONFIG" if required else "[CONFIG]"
     argument = click.argument("config_file", metavar=metavar, required=required, type=click.Path(path_type=Path))
     return argument(overrides_option(function))
+
+
+def is_given(name: str) -> bool:
+    """Whether the user gave an option of the command that runs, by its parameter's name."""
+    return click.get_current_context().get_parameter_source(name) is click.core.ParameterSource.COMMANDLINE
 
 
 def read_config(config_file: Path, overrides: tuple[str, ...]) -> Config:

@@ -51,12 +51,13 @@ class NaiveAD(Replayed):
     image_apart = False
 
     def backward(self, job: Job, gradient: mi.TensorXf) -> None:
-        with dr.scoped_set_flag(dr.JitFlag.SymbolicLoops, False):
-            super().backward(job, gradient)
+        self.correlated(job, lambda image: gradient)  # as Mitsuba does, which raises where no path meets anything
 
     def correlated(self, job: Job, derivative: Derivative) -> mi.TensorXf:
         self.surroundings.follow(job.scene)
         with dr.scoped_set_flag(dr.JitFlag.SymbolicLoops, False), dr.isolate_grad():
             image = self.plugin.render(job.scene, job.sensor, job.seed, job.spp, develop=True, evaluate=False)
-            dr.backward_from(image * derivative(dr.detach(image)))
+            # Where no path of a few meets anything, evaluated loops end before the image depends on a parameter.
+            flags = dr.ADFlag.Default | dr.ADFlag.AllowNoGrad
+            dr.backward_from(image * derivative(dr.detach(image)), flags=flags)
         return dr.detach(image)

@@ -1,9 +1,10 @@
-"""Time and memory of a step against path depth, for several integrators side by side.
+"""Time and memory of a step against path depth, for several integrators side by side; or against something else.
 
-At each depth every case has a process of its own, and all live at once. They load the scene, take a cold step each,
-then as many as it takes until no new kernel comes (stock integrators need a few), and then steps in rounds, one each in
-turn, so that a drift of the machine hits all alike; only one computes at a time. Ratios are taken within a round, whose
-steps also share a seed. The order turns from round to round.
+At each depth (or number of samples, or size of the film or of textures: `sweep` says which) every case has a process
+of its own, and all live at once. They load the scene, take a cold step each, then as many as it takes until no new
+kernel comes (stock integrators need a few), and then steps in rounds, one each in turn, so that a drift of the machine
+hits all alike; only one computes at a time. Ratios are taken within a round, whose steps also share a seed. The order
+turns from round to round.
 
 A case that runs out of memory is tried again at greater depths: what is recorded was seen, and a failure costs no more
 time than it takes to fill the memory once.
@@ -16,7 +17,7 @@ round, if it had none.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -25,6 +26,7 @@ from reslrb_cli.measure.cases import Case
 from reslrb_cli.measure.contestant import Contestant
 from reslrb_cli.measure.pace import NO_TIME, Pace
 from reslrb_cli.measure.processes import Process, Stopped
+from reslrb_cli.measure.sweep import WIDTHS, Sweep
 from reslrb_cli.records.bench import BenchRecord, BenchStatus, Spread
 
 #: Steps after the cold one until no new kernel comes, at most.
@@ -39,47 +41,15 @@ SLOW = 10.0
 
 
 @dataclass(frozen=True)
-class Sweep:
-    """What is measured. `memory_limit` is of each process, None: none; `memory` is what the machine has, in bytes.
-
-    `rounds` is None where `budget_s` decides their number; else there are so many, whatever time they take. Of the
-    `cases`, those that cannot do what the scene asks for are left out where they are the `default` ones.
-    """
-
-    config: Config
-    variant: str
-    cases: Sequence[Case]
-    baseline: Case
-    depths: Sequence[int]
-    objective: str
-    memory_limit: int | None
-    memory: int
-    budget_s: float
-    rounds: int | None = None
-    default: bool = False
-
-    def may_refuse(self, case: Case) -> bool:
-        """Whether the rest goes on without this case, where it refuses the scene."""
-        return self.default and case != self.baseline
-
-    def at(self, case: Case, depth: int) -> Config:
-        """The experiment of one case. Raises ConfigError."""
-        return case.at(self.config, depth, known=self.objective == "fixed")
-
-    def check(self) -> None:
-        """Raise ConfigError where an integrator of the list cannot be."""
-        for case in self.cases:
-            self.at(case, self.depths[0])
-
-
-@dataclass(frozen=True)
 class Result:
     """A record, what it is compared with, and what the record has no room for.
 
+    `value` is that of what is swept.
     `kernel_ratio` and `step_ratio` are times over those of the baseline, round by round; None where either has none.
     """
 
     case: Case
+    value: int
     record: BenchRecord
     kernel_ratio: Spread | None
     step_ratio: Spread | None
@@ -93,6 +63,7 @@ class _Run(Contestant):
     case: Case
     config: Config
     size: tuple[int, int] | None = None
+    texels: int | None = None
     cold: dict[str, Any] | None = None
     steps: dict[int, dict[str, Any]] = field(default_factory=dict)  # by round
 
@@ -114,18 +85,17 @@ def bench(
     `say` is told what the budget did not suffice for, and, once, what the scene's loading warned of. Raises Refused
     where a case that may not be left out cannot begin.
     """
-    pace = Pace(sweep.budget_s, len(sweep.depths), sweep.rounds)
+    pace = Pace(sweep.budget_s, len(sweep.values), sweep.rounds)
     warned: set[str] = set()
     cases = list(sweep.cases)
-    for number, depth in enumerate(sweep.depths):
+    for number, value in enumerate(sweep.values):
         if pace.over():
-            left = ", ".join(str(depth) for depth in sweep.depths[number:])
-            say(f"not measured: depth {left}: {NO_TIME}")
+            say(f"not measured: {sweep.name(*sweep.values[number:])}: {NO_TIME}")
             return
         pace.begin_depth()
-        runs = [_begin(sweep, case, depth, start) for case in cases]
+        runs = [_begin(sweep, case, value, start) for case in cases]
         try:
-            _measure(sweep, runs, depth, pace, stop, say, warned)
+            _measure(sweep, runs, sweep.name(value), pace, stop, say, warned)
             stopped = False
         except Stopped:
             stopped = True
@@ -138,29 +108,31 @@ def bench(
                 cases.remove(run.case)
         late = ", ".join(run.case.label for run in runs if run.late and not run.steps)
         if late:
-            say(f"not measured: depth {depth}, {late}: {NO_TIME}")
+            say(f"not measured: {sweep.name(value)}, {late}: {NO_TIME}")
         done = [run for run in runs if run.end is not None or run.steps]
-        yield [_result(run, depth, sweep, runs) for run in done]
+        yield [_result(run, value, sweep, runs) for run in done]
         if stopped:
             return
 
 
-def _begin(sweep: Sweep, case: Case, depth: int, start: Callable[[dict[str, Any]], Any]) -> _Run:
-    config = sweep.at(case, depth)
-    first = {
+def _begin(sweep: Sweep, case: Case, value: int, start: Callable[[dict[str, Any]], Any]) -> _Run:
+    config = sweep.at(case, value)
+    first: dict[str, Any] = {
         "config": dump(config),
         "source": str(config.source),
         "variant": sweep.variant,
         "objective": sweep.objective,
         "memory_limit": sweep.memory_limit,
     }
+    if sweep.swept in WIDTHS:
+        first[f"{sweep.swept}_width"] = value
     return _Run(start(first), sweep.may_refuse(case), case=case, config=config)
 
 
 def _measure(
     sweep: Sweep,
     runs: list[_Run],
-    depth: int,
+    name: str,
     pace: Pace,
     stop: Callable[[], bool],
     say: Callable[[str], None],
@@ -172,7 +144,7 @@ def _measure(
     for run in runs:
         answer = run.answer(stop, pace.over)
         if answer is not None:
-            run.size = (answer["width"], answer["height"])
+            run.size, run.texels = (answer["width"], answer["height"]), answer.get("texels")
             for line in answer.get("warnings", ()):
                 if line not in warned:  # every process loads the same scene
                     warned.add(line)
@@ -180,14 +152,14 @@ def _measure(
     for run in alive():
         run.cold = run.step(0, True, False, stop, pace.over)
         if run.cold is not None and run.cold["step_ms"] > 1e3 * SLOW:
-            say(f"depth {depth}, {run.case.label}: the first step took {run.cold['step_ms'] / 1e3:.0f} s")
+            say(f"{name}, {run.case.label}: the first step took {run.cold['step_ms'] / 1e3:.0f} s")
         for _ in range(MAX_WARM_UPS):
             answer = run.step(0, False, _tight(sweep, runs), stop, pace.over) if run.alive else None
             if answer is None or not answer["new_kernels"]:
                 break
     tight = _tight(sweep, runs)
     if tight:
-        say(f"depth {depth}: together the cases need more than the memory; each releases its own after a step")
+        say(f"{name}: together the cases need more than the memory; each releases its own after a step")
     pace.begin_rounds()
     done = 0
     while alive() and pace.another(done):
@@ -204,7 +176,7 @@ def _tight(sweep: Sweep, runs: list[_Run]) -> bool:
     return held > MEMORY_SHARE * sweep.memory
 
 
-def _result(run: _Run, depth: int, sweep: Sweep, runs: list[_Run]) -> Result:
+def _result(run: _Run, value: int, sweep: Sweep, runs: list[_Run]) -> Result:
     options, ok = run.config.integrator.options(), run.end is None
     baseline = next(other for other in runs if other.case == sweep.baseline)
     width, height = next((other.size for other in runs if other.size is not None), (None, None))
@@ -212,7 +184,7 @@ def _result(run: _Run, depth: int, sweep: Sweep, runs: list[_Run]) -> Result:
         integrator=run.case.type,
         estimator=run.case.estimator,
         capacity=options.get("capacity"),
-        max_depth=depth,
+        max_depth=run.config.integrator.max_depth,
         rr_depth=options["rr_depth"],
         spp=run.config.run.spp,
         width=width,
@@ -224,10 +196,12 @@ def _result(run: _Run, depth: int, sweep: Sweep, runs: list[_Run]) -> Result:
         peak_mib=run.cold["peak_mib"] if ok and run.cold else None,
         scratch_bytes=run.cold["scratch_bytes"] if ok and run.cold else None,
         repeats=len(run.steps) if ok else 0,
+        texels=next((other.texels for other in runs if other.texels is not None), None),
     )
     comparable = ok and baseline.end is None
     return Result(
         run.case,
+        value,
         record,
         _ratio(run, baseline, "kernel_ms") if comparable else None,
         _ratio(run, baseline, "step_ms") if comparable else None,

@@ -33,10 +33,11 @@ class Case:
     options: dict[str, Any]
     source: str = _OPTION
 
-    def at(self, config: Config, max_depth: int, known: bool) -> Config:
+    def at(self, config: Config, max_depth: int, known: bool, auto: bool = False) -> Config:
         """The experiment with this integrator at this depth. Raises ConfigError where the integrator cannot be.
 
-        `known`: dL/dI is, before the image, so that `run.adjoint` has no part in it.
+        `known`: dL/dI is, before the image, so that `run.adjoint` has no part in it. `auto`: the estimator may be left
+        to a pilot, as what is measured has one.
         """
         blame = f"{self.source} {self.label}"
         adjoint = {name: value for name, value in self.options.items() if name in ADJOINT}
@@ -47,7 +48,7 @@ class Case:
         shared, own = config.integrator.options(), _TYPES[self.type].model_fields if self.type in _TYPES else {}
         values = {"type": self.type} | {name: shared[name] for name in SHARED if name in shared and name in own}
         values |= {name: value for name, value in self.options.items() if name not in ADJOINT}
-        if self.type == "reslrb" and values.setdefault("estimator", PLUGIN_ESTIMATOR) == "auto":
+        if self.type == "reslrb" and values.setdefault("estimator", PLUGIN_ESTIMATOR) == "auto" and not auto:
             raise ConfigError(blame, "estimator", "`auto` measures which to take; name those to compare")
         return with_integrator(config, values | {"max_depth": max_depth}, blame, adjoint)
 

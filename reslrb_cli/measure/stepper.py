@@ -11,8 +11,9 @@ import numpy as np
 from reslrb_cli.config import Config
 from reslrb_cli.integrators import gradient_step, known_step
 from reslrb_cli.measure import cornell_box
+from reslrb_cli.measure.film import texture_shapes, widen, with_textures
 from reslrb_cli.measure.scratch import scratch_bytes
-from reslrb_cli.optimization.problem import assemble_scene
+from reslrb_cli.optimization.problem import assemble_scene, choose_sensors, load_configured
 from reslrb_cli.records.clock import StepClock, StepTimes, peak_mib, reset_peak
 from reslrb_cli.seeds import seed
 
@@ -21,18 +22,25 @@ class Stepper:
     """Takes steps of an experiment through its first sensor; the parameters keep their initial values.
 
     `objective` is `fixed`, sum(G * I) with a fixed image G, known before the image I, or `l2`, the mean of (I - G)^2
-    with `run.adjoint`. G is noise: what it shows costs nothing.
+    with `run.adjoint`. G is noise: what it shows costs nothing. `film_width` and `texture_width`, in pixels and texels,
+    are those of the film and of all textures that are parameters, where they are not to be the scene's own.
     """
 
-    def __init__(self, config: Config, objective: str) -> None:
-        built_in = config.scene.file == cornell_box.FILE
-        scene = cornell_box.build(config.scene.options) if built_in else None
+    def __init__(
+        self, config: Config, objective: str, film_width: int | None = None, texture_width: int | None = None
+    ) -> None:
+        if texture_width is not None:
+            config = with_textures(assemble_scene(config, _load(config)), texture_width)
+        scene = _load(config)
+        if film_width is not None:
+            widen(scene, choose_sensors(config, scene)[0], film_width)
         self.problem = assemble_scene(config, scene)
         self.sensor = self.problem.sensors[0]
         self.known = objective == "fixed"
         film = self.problem.scene.sensors()[self.sensor].film()
         width, height = film.crop_size()
         self.size = (int(width), int(height))
+        self.texels = sum(shape[0] * shape[1] for shape in texture_shapes(self.problem).values())
         self.image = _noise(*self.size, int(film.base_channels_count()))
         self.clock = StepClock()
 
@@ -86,6 +94,13 @@ class Stepper:
         return gradient_step(
             problem.integrator, problem.scene, self.sensor, loss, **problem.config.step_options(), **common
         )
+
+
+def _load(config: Config) -> Any:
+    """The scene of an experiment, which may be the built-in one."""
+    if config.scene.file == cornell_box.FILE:
+        return cornell_box.build(config.scene.options)
+    return load_configured(config)
 
 
 def _noise(width: int, height: int, channels: int) -> Any:

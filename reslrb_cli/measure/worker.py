@@ -27,8 +27,9 @@ def measured_steps() -> Begin:
     from reslrb_cli.measure.stepper import Stepper
 
     def begin(first: dict[str, Any]) -> Begun:
-        stepper = Stepper(loads(first["config"], first["source"]), first["objective"])
-        size = {"width": stepper.size[0], "height": stepper.size[1]}
+        config = loads(first["config"], first["source"])
+        stepper = Stepper(config, first["objective"], first.get("film_width"), first.get("texture_width"))
+        size = {"width": stepper.size[0], "height": stepper.size[1], "texels": stepper.texels}
         return size, lambda question: stepper.step(question["round"], question["cold"], question["release"])
 
     return begin
@@ -51,6 +52,20 @@ def surveyed() -> Begin:
 def sampled_steps() -> Begin:
     """Steps as `convergence` measures them, with what they estimate."""
     from reslrb_cli.measure.convergence.sampler import begin
+
+    return begin
+
+
+def judged_runs() -> Begin:
+    """What whole optimisations are judged by."""
+    from reslrb_cli.measure.whole_runs.judge import begin
+
+    return begin
+
+
+def whole_runs() -> Begin:
+    """A whole optimisation, bit by bit."""
+    from reslrb_cli.measure.whole_runs.runner import begin
 
     return begin
 

@@ -1,4 +1,4 @@
-"""Step time and peak memory against path depth: the paper's Figure 6."""
+"""Step time and peak memory against path depth, as in the paper's Figure 6, or against what else was swept."""
 
 from __future__ import annotations
 
@@ -11,10 +11,14 @@ from reslrb_cli.records.bench import BenchRecord, BenchStatus
 _MARKERS = "osD^vPX*<>"
 
 
-def plot_bench(series: Sequence[tuple[str, Sequence[BenchRecord]]], path: Path, title: str) -> None:
-    """Write a PNG with one curve for each (label, records); bars span from the least to the greatest step time.
+#: What one curve is drawn from: a label, and records by the value of what was swept.
+Series = tuple[str, Sequence[tuple[int, BenchRecord]]]
 
-    Where a case ran out of memory or failed, a cross stands above the diagram of memory at that depth.
+
+def plot_bench(series: Sequence[Series], path: Path, title: str, abscissa: str = "path depth") -> None:
+    """Write a PNG with one curve for each of the series; bars span from the least to the greatest step time.
+
+    Where a case ran out of memory or failed, a cross stands above the diagram of memory at that value.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -24,20 +28,20 @@ def plot_bench(series: Sequence[tuple[str, Sequence[BenchRecord]]], path: Path, 
     time_axis, memory_axis = figure.subplots(1, 2)
     for k, (label, records) in enumerate(series):
         style = {"color": f"C{k % 10}", "marker": _MARKERS[k % len(_MARKERS)], "markersize": 5, "linewidth": 1.3}
-        done = [record for record in records if record.step_ms is not None and record.peak_mib is not None]
-        depths = [record.max_depth for record in done]
-        steps = [record.step_ms for record in done if record.step_ms is not None]
+        done = [(x, record) for x, record in records if record.step_ms is not None and record.peak_mib is not None]
+        values = [x for x, _ in done]
+        steps = [record.step_ms for _, record in done if record.step_ms is not None]
         errors = [[s.median - s.min for s in steps], [s.max - s.median for s in steps]]
-        time_axis.errorbar(depths, [s.median for s in steps], yerr=errors, label=label, capsize=2, **style)
-        memory_axis.plot(depths, [max(record.peak_mib or 0, 1e-3) for record in done], label=label, **style)
-        _mark_ends(memory_axis, [r.max_depth for r in records if r.status is not BenchStatus.OK], style["color"], k)
-    finished = any(record.status is BenchStatus.OK for _, records in series for record in records)
-    ends = {record.status for _, records in series for record in records} - {BenchStatus.OK}
+        time_axis.errorbar(values, [s.median for s in steps], yerr=errors, label=label, capsize=2, **style)
+        memory_axis.plot(values, [max(record.peak_mib or 0, 1e-3) for _, record in done], label=label, **style)
+        _mark_ends(memory_axis, [x for x, r in records if r.status is not BenchStatus.OK], style["color"], k)
+    finished = any(record.status is BenchStatus.OK for _, records in series for _, record in records)
+    ends = {record.status for _, records in series for _, record in records} - {BenchStatus.OK}
     words = {BenchStatus.OUT_OF_MEMORY: "out of memory", BenchStatus.FAILED: "failed"}
     for axis, label in ((time_axis, "time of a step (ms)"), (memory_axis, "peak memory (MiB)")):
-        axis.set(yscale="log" if finished else "linear", xlabel="path depth", ylabel=label)
+        axis.set(yscale="log" if finished else "linear", xlabel=abscissa, ylabel=label)
         axis.set_xscale("log", base=2)
-        axis.set_xticks(sorted({record.max_depth for _, records in series for record in records}))
+        axis.set_xticks(sorted({x for _, records in series for x, _ in records}))
         axis.xaxis.set_major_formatter("{x:.0f}")
         axis.grid(True, which="both", alpha=0.25)
     if ends:

@@ -8,27 +8,28 @@ _HEAD = (
     "depth", "", "step ms", "over baseline", "kernel ms", "over baseline", "codegen", "tracing", "cold ms", "peak MiB",
     "scratch B", "n",
 )  # fmt: skip
-_WIDTHS = (5, 0, 9, 19, 9, 19, 7, 7, 8, 9, 9, 3)
+_WIDTHS = (7, 0, 9, 19, 9, 19, 7, 7, 8, 9, 9, 3)
 
 
-def table_head(labels: list[str]) -> str:
-    """The first line; `labels` are all that will stand in the second column."""
-    return _line(_HEAD, max(map(len, labels)))
+def table_head(labels: list[str], swept: str = "depth") -> str:
+    """The first line; `labels` are all that will stand in the second column, what is `swept` stands in the first."""
+    return _line((swept, *_HEAD[1:]), max(map(len, labels)))
 
 
 def table_line(
     label: str,
+    value: int,
     record: BenchRecord,
     step_ratio: Spread | None,
     kernel_ratio: Spread | None,
     labels: list[str],
 ) -> str:
-    """The line of one result: medians, and ratios to the baseline with their least and greatest."""
+    """The line of one result, at a value of what is swept: medians, and ratios with their least and greatest."""
     width = max(map(len, labels))
     if record.step_ms is None or record.kernel_ms is None:
-        return _line((str(record.max_depth), label, record.status.value), width)
+        return _line((str(value), label, record.status.value), width)
     cells = (
-        str(record.max_depth),
+        str(value),
         label,
         f"{record.step_ms.median:.1f}",
         _ratio(step_ratio),

@@ -131,7 +131,7 @@ def _read_file(path: Path, name: str) -> Measurements:
 
 def _kind(entry: Mapping[str, Any]) -> str | None:
     """Which command wrote a line; None where that cannot be told."""
-    if entry.get("kind") in ("point", "method"):
+    if entry.get("kind") in ("point", "method", "run_point", "run_method"):
         return "convergence"
     if entry.get("kind") == "missing" or {"reference", "verdict"} <= set(entry):
         return "gradcheck"

@@ -18,7 +18,7 @@ pytestmark = pytest.mark.usefixtures("llvm")
 
 KEYS = ["integrator", "estimator", "capacity", "max_depth", "rr_depth", "spp", "width", "height", "status", "step_ms",
         "kernel_ms", "codegen_ms", "tracing_ms", "cold_ms", "cold_codegen_ms", "peak_mib", "scratch_bytes",
-        "repeats"]  # fmt: skip
+        "repeats", "texels"]  # fmt: skip
 SMALL = ["--set", "scene.options.size=16", "--set", "run.spp=1", "--rounds", "3"]
 
 

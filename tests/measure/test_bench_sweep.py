@@ -11,10 +11,11 @@ from measure.pretended import Pretended
 
 from reslrb_cli.config import loads
 from reslrb_cli.errors import ConfigError
-from reslrb_cli.measure.bench import Result, Sweep, bench
+from reslrb_cli.measure.bench import Result, bench
 from reslrb_cli.measure.cases import choose_baseline, depths, parse_cases
 from reslrb_cli.measure.pace import MAX_ROUNDS, MIN_ROUNDS, Pace
 from reslrb_cli.measure.processes import Refused, Stopped
+from reslrb_cli.measure.sweep import Sweep
 from reslrb_cli.records.bench import BenchStatus, Spread
 
 CONFIG = """\
@@ -36,7 +37,7 @@ def sweep(list_of: str = LIST, baseline: str | None = None, **changes: Any) -> S
     cases = parse_cases(list_of)
     values: dict[str, Any] = {
         "config": loads(CONFIG, Path("x.yaml")), "variant": "llvm_ad_rgb", "cases": cases,
-        "baseline": choose_baseline(cases, baseline), "depths": [2, 4], "objective": "fixed", "memory_limit": None,
+        "baseline": choose_baseline(cases, baseline), "values": [2, 4], "objective": "fixed", "memory_limit": None,
         "memory": 2**40, "budget_s": 0.0, "rounds": MIN_ROUNDS,
     }  # fmt: skip
     return Sweep(**(values | changes))
@@ -50,7 +51,7 @@ def run(what: Sweep, stop: Callable[[], bool] = lambda: False) -> list[Result]:
 
 
 def test_steps_are_interleaved_and_the_order_turns() -> None:
-    run(sweep(depths=[2]))
+    run(sweep(values=[2]))
     types = ["ptracer", "reslrb", "walk_ad"]
     warm = [(2, name, 0) for name in types for _ in range(3)]  # one cold step, two until no kernel is new
     rounds = [(2, types[(r + k) % 3], r + 1) for r in range(MIN_ROUNDS) for k in range(3)]
@@ -94,13 +95,13 @@ def test_without_a_baseline_there_are_no_ratios() -> None:
 
 
 def test_another_baseline() -> None:
-    rows = run(sweep(baseline="reslrb:stack", depths=[2]))
+    rows = run(sweep(baseline="reslrb:stack", values=[2]))
     assert [row.step_ratio and row.step_ratio.median for row in rows] == [2.0, 1.0, 2.5]
 
 
 def test_all_may_end() -> None:
     Pretended.ends = {(name, 2): 1 for name in ("ptracer", "reslrb", "walk_ad")}
-    assert {row.record.status for row in run(sweep(depths=[2]))} == {BenchStatus.OUT_OF_MEMORY}
+    assert {row.record.status for row in run(sweep(values=[2]))} == {BenchStatus.OUT_OF_MEMORY}
 
 
 @pytest.mark.parametrize(("after", "kept"), [(5, []), (14, [1, 1, 1]), (13, [1, 1]), (33, [3, 3, 3, 1])])
@@ -120,7 +121,7 @@ def test_cases_that_need_the_memory_of_each_other_release_it() -> None:
             super().ask(question)
 
     said: list[str] = []
-    list(bench(sweep(depths=[2], memory=5 * 2**20), lambda: False, said.append, Noting))
+    list(bench(sweep(values=[2], memory=5 * 2**20), lambda: False, said.append, Noting))
     assert asked[-1]
     assert "memory" in said[0]
 
@@ -257,7 +258,7 @@ def test_what_nobody_named_is_left_out_where_it_refuses():
     lines: list[str] = []
     results = [r for rows in bench(sweep(default=True), lambda: False, lines.append, Pretended) for r in rows]
     assert {result.record.integrator for result in results} == {"ptracer", "walk_ad"}
-    assert {result.record.max_depth for result in results} == set(sweep().depths)
+    assert {result.record.max_depth for result in results} == set(sweep().values)
     assert lines == ["left out: reslrb:stack: no derivatives of what moves light"]
     assert Pretended.alive == 0
 

@@ -27,9 +27,9 @@ class Sampler:
     def __init__(self, config: Any, mode: str, arrays: dict[str, np.ndarray]) -> None:
         self.problem, self.mode, self.clock = assemble_scene(config), mode, StepClock()
         self.sensor = self.problem.sensors[0]
-        self.target = _tensor(arrays["target"]) if "target" in arrays else None
-        self.mask = None if arrays["mask"].all() else _tensor(arrays["mask"])
-        self.adjoints = [_tensor(array) for array in arrays.get("adjoints", ())]
+        self.target = to_tensor(arrays["target"]) if "target" in arrays else None
+        self.mask = None if arrays["mask"].all() else to_tensor(arrays["mask"])
+        self.adjoints = [to_tensor(array) for array in arrays.get("adjoints", ())]
         self.inside = arrays["mask"] != 0
 
     def step(self, seed: int, spp: int, image: int) -> tuple[np.ndarray, StepTimes]:
@@ -98,7 +98,7 @@ def begin(first: dict[str, Any]) -> Begun:
     return {}, answer
 
 
-def _tensor(array: np.ndarray) -> mi.TensorXf:
+def to_tensor(array: np.ndarray) -> mi.TensorXf:
     """A sum, since NumPy's own memory would be used as it is: kernels depend on its alignment, which is random."""
     tensor = mi.TensorXf(np.ascontiguousarray(array, np.float32)) + dr.opaque(mi.Float, 0)
     dr.eval(tensor)

@@ -61,7 +61,7 @@ def survey(
     """
     film = problem.scene.sensors()[problem.sensors[0]].film()
     width, height = (int(n) for n in film.crop_size())
-    facts = _references(problem, objective)
+    facts = find_references(problem, objective)
     inside = np.ones((height, width), bool)
     pixels = width * height
     if (camera and (named or "prb" not in facts["without"])) or Reference.PRB.value in facts["independent"].values():
@@ -70,12 +70,12 @@ def survey(
     facts |= {"masked": not inside.all(), "pictures": "", "pixels": pixels}
     if objective == "image":
         return facts | {"shapes": {"image": [height, width, int(film.base_channels_count())]}}, {"mask": mask}
-    paths = PATHS[objective] if budget_s is None else _affordable(problem, pixels, SHARE[objective] * budget_s / 2)
-    shortened = _shorten_target(problem, paths // pixels)
+    paths = PATHS[objective] if budget_s is None else affordable_paths(problem, pixels, SHARE[objective] * budget_s / 2)
+    shortened = shorten_target(problem, paths // pixels)
     make_targets(problem, lambda line: None)
     target = np.array(problem.targets[0])
     count = IMAGES if objective == "loss" else 1
-    spp = _multiple(paths // (count * pixels), problem.samples_per_pass)
+    spp = multiple_of(paths // (count * pixels), problem.samples_per_pass)
     adjoints = []
     for number in range(count):
         image = problem.render(problem.sensors[0], spp, number, _PURPOSE)
@@ -99,7 +99,7 @@ def masked_loss(problem: Problem, image: mi.TensorXf, target: mi.TensorXf, mask:
     return problem.loss(first_channels(image, target.shape[2]) * mask + target * (1 - mask), target)
 
 
-def _references(problem: Problem, objective: str) -> dict[str, Any]:
+def find_references(problem: Problem, objective: str) -> dict[str, Any]:
     """Keys, shapes, and which stock integrator counts for each."""
     params, config = problem.selection.params, problem.config
     moved = tuple(key for key in problem.selection.scene_keys if moves_light(params, key))
@@ -137,9 +137,9 @@ def _unlike(config: Config) -> str | None:
     return "its attached derivatives are those of " + ", ".join(f"{name}: {value}" for name, value in alike.items())
 
 
-def _affordable(problem: Problem, pixels: int, seconds: float) -> int:
+def affordable_paths(problem: Problem, pixels: int, seconds: float) -> int:
     """So many light paths take so long: a power of 2, so that machines of about the same speed have the same images."""
-    spp = _multiple(TRIAL // pixels, problem.samples_per_pass)
+    spp = multiple_of(TRIAL // pixels, problem.samples_per_pass)
     for _ in range(2):  # the first one compiles
         began = time.perf_counter()
         problem.render(problem.sensors[0], spp, 0, "convergence, trial")
@@ -148,13 +148,13 @@ def _affordable(problem: Problem, pixels: int, seconds: float) -> int:
     return 2 ** int(np.log2(np.clip(paths, TRIAL, MOST_PATHS)))
 
 
-def _shorten_target(problem: Problem, most: int) -> str:
+def shorten_target(problem: Problem, most: int) -> str:
     """Bound the samples per pixel of a target that has to be rendered; returns what to say of it."""
     render = problem.config.target.render
     if render is None:
         return ""
     own = (render.integrator or problem.config.integrator).options().get("samples_per_pass")
-    spp = _multiple(most, own)
+    spp = multiple_of(most, own)
     if spp >= render.spp:
         return ""
     target = problem.config.target.model_copy(update={"render": render.model_copy(update={"spp": spp})})
@@ -162,7 +162,7 @@ def _shorten_target(problem: Problem, most: int) -> str:
     return f", the target of {spp}, not {render.spp}"
 
 
-def _multiple(spp: int, unit: int | None) -> int:
+def multiple_of(spp: int, unit: int | None) -> int:
     """The greatest multiple of a pass's samples up to `spp`, at least one."""
     unit = unit or 1
     return max(spp // unit, 1) * unit

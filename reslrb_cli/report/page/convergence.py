@@ -9,6 +9,7 @@ from typing import Any
 from reslrb_cli.report.page.bench import label
 from reslrb_cli.report.page.drawing import Curve, diagram, diagrams, legend
 from reslrb_cli.report.page.markup import breakable, soft, table, text
+from reslrb_cli.report.page.whole_runs import whole_runs
 from reslrb_cli.report.words import duration, number
 
 Entry = Mapping[str, Any]
@@ -20,21 +21,32 @@ _SHARES = {"0.1": "to 10 %", "0.03": "to 3 %", "0.01": "to 1 %"}
 
 
 def convergence(objects: Sequence[Entry]) -> tuple[str, int]:
-    """A diagram for each quantity, a table of the methods, what was said in words; and how many lines are neither."""
-    points = [entry for entry in objects if entry.get("kind") == "point"]
-    methods = [entry for entry in objects if entry.get("kind") == "method"]
-    others = sum(entry.get("kind") == "reference" for entry in objects)
-    said = [entry["line"] for entry in objects if isinstance(entry.get("line"), str)]
-    spps = len({entry.get("spp") for entry in [*points, *methods] if entry.get("status", "ok") == "ok"})
+    """All that was measured of gradients, of whole runs, and in words; and how many lines are none of that."""
+    kinds = {kind: [entry for entry in objects if entry.get("kind") == kind]
+             for kind in ("point", "method", "reference", "run_point", "run_method")}  # fmt: skip
+    said = [entry for entry in objects if entry.get("kind") not in kinds and isinstance(entry.get("line"), str)]
+    known = [entry for entries in kinds.values() for entry in entries]
+    spps = len({entry.get("spp") for entry in known if entry.get("status", "ok") == "ok"})
     name = partial(method_label, with_spp=spps > 1)
+    markup = "".join(f"<p>{text(entry['line'])}</p>" for entry in said)
+    if kinds["point"] or kinds["method"]:
+        markup += _steps(kinds["point"], kinds["method"], name)
+    if kinds["run_point"] or kinds["run_method"]:
+        markup += whole_runs(kinds["run_point"], kinds["run_method"], name)
+        markup += "".join(soft(f"{name(entry)}: {entry['message']}") for entry in kinds["run_method"]
+                          if entry.get("message"))  # fmt: skip
+    return markup, len(objects) - len(known) - len(said)
+
+
+def _steps(points: Sequence[Entry], methods: Sequence[Entry], name: Naming) -> str:
+    """A diagram for each quantity, and a table of the methods."""
     labels = list(dict.fromkeys(map(name, [*methods, *points])))
     quantities = list(dict.fromkeys(map(quantity, [*points, *methods])))
     quantities.sort(key=lambda what: {"all": 0, "image": 1}.get(what, 2))
     if len(quantities) == 2 and quantities[0] == "all":  # the only parameter is all of them
         del quantities[0]
     drawn = [_diagram(points, labels, what, name) for what in quantities[:MOST_DRAWN]]
-    parts = [f"<p>{text(line)}</p>" for line in said]
-    parts += [legend([Curve(title, (), (), place) for place, title in enumerate(labels)]), diagrams(*drawn)]
+    parts = [legend([Curve(title, (), (), place) for place, title in enumerate(labels)]), diagrams(*drawn)]
     if points:
         parts.append(soft("Dots across: the standard error of the reference itself, below which nothing can be told."))
     if len(quantities) > MOST_DRAWN:
@@ -42,7 +54,7 @@ def convergence(objects: Sequence[Entry]) -> tuple[str, int]:
     told = [entry for entry in methods if quantity(entry) in quantities]
     parts.append(_table(told, quantities, name))
     parts += [soft(f"{name(entry)}: {entry['message']}") for entry in told if entry.get("message")]
-    return "".join(parts), len(objects) - len(points) - len(methods) - len(said) - others
+    return "".join(parts)
 
 
 def quantity(entry: Entry) -> str:

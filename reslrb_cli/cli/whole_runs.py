@@ -1,0 +1,91 @@
+"""What `reslrb convergence --runs` does: whole optimisations, printed and written as they come."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import tempfile
+import time
+from contextlib import ExitStack
+from pathlib import Path
+
+from reslrb_cli.cli.interrupts import Interrupts
+from reslrb_cli.cli.output import echo
+from reslrb_cli.errors import ExitCode
+from reslrb_cli.measure.processes import abandon_all
+from reslrb_cli.measure.whole_runs.plan import RunsPlan
+from reslrb_cli.measure.whole_runs.session import RunsSession
+from reslrb_cli.measure.whole_runs.verdict import finals, find_best, method_records
+from reslrb_cli.records.bench import BenchStatus
+from reslrb_cli.records.convergence import SummaryRecord
+from reslrb_cli.records.lines import LineWriter
+from reslrb_cli.records.whole_runs import RunMethodRecord, RunPointRecord
+from reslrb_cli.report.whole_runs_plot import plot_runs
+from reslrb_cli.report.whole_runs_table import RunsTable, closing_sentence, notes
+from reslrb_cli.report.words import count
+
+
+def measure_runs(plan: RunsPlan, json_file: Path | None, plot_file: Path | None, began: float, where: str) -> int:
+    """Measure, print, write and draw; returns the exit code. `began` is when the command was called, by `monotonic`."""
+    points: list[RunPointRecord] = []
+    with ExitStack() as stack:
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="reslrb-convergence-")))
+
+        def tidy() -> None:
+            abandon_all()
+            shutil.rmtree(folder, ignore_errors=True)
+
+        interrupts = stack.enter_context(Interrupts(last_act=tidy))
+        writer = None if json_file is None else stack.enter_context(LineWriter(json_file))
+        table = RunsTable([plan.method_of(case, spp).label for case, spp in plan.entries])
+        spent_s = time.monotonic() - began
+        session = RunsSession(plan, folder, lambda: interrupts.requested, echo, spent_s=spent_s)
+        for point in session.run():
+            if not points:
+                echo(_conditions(plan, session))
+                echo(table.head())
+            points.append(point)
+            if writer is not None:
+                writer.write(point)
+            if point.elapsed_s == session.limit_s:
+                echo(table.point(point, session.run_of(point).first_s))
+        records = method_records(session.runs, session.limit_s)
+        loss, error = (find_best(finals(session.runs, session.limit_s, of)) for of in ("loss", "parameter_error"))
+        sentence = closing_sentence(loss, error, session.limit_s)
+        if writer is not None:
+            for record in records:
+                writer.write(record)
+            writer.write(SummaryRecord(sentence))
+        echo(table.head())
+        for record in records:
+            echo(table.line(record))
+        for note in notes(records):
+            echo(note)
+        echo(sentence)
+        conditions = _conditions(plan, session)
+    if plot_file is not None and points:
+        plot_runs(points, session.facts.get("error_of", ""), plot_file, f"{where}\n{conditions}")
+        echo(f"look at {os.path.relpath(plot_file)}")
+    return ExitCode.INTERRUPTED if interrupts.requested else _exit_code(records)
+
+
+def _conditions(plan: RunsPlan, session: RunsSession) -> str:
+    """What was measured, in one line."""
+    optimizer, facts = plan.config.optimizer, session.facts
+    parts = [
+        str(plan.config.source),
+        f"{count(plan.runs, 'seed')}, {session.limit_s:.3g} s each",
+        f"loss {plan.config.loss.type}",
+        f"{optimizer.type} at {optimizer.learning_rate:g}",
+        facts.get("pictures", ""),
+        facts.get("error_of", ""),
+    ]
+    return ", ".join(part for part in parts if part)
+
+
+def _exit_code(records: list[RunMethodRecord]) -> ExitCode:
+    """A comparison in which something was optimised is done; else what kept it from that decides."""
+    if any(record.iterations is not None and record.iterations.high > 0 for record in records):
+        return ExitCode.DONE
+    states = {record.status for record in records}
+    return ExitCode.OUT_OF_MEMORY if states == {BenchStatus.OUT_OF_MEMORY} else ExitCode.CHECK_FAILED

@@ -1,0 +1,121 @@
+"""What all runs are judged by, in a process of its own (`worker.py`): one target, and images of the same samples.
+
+A method's own loss is of the image that it renders itself: its noise, and where `run.adjoint` takes it from, are part
+of it. So losses are taken here, of images by one integrator with the same seeds for all values; none of it is in the
+time of any method.
+"""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+
+from reslrb_cli.config import loads
+from reslrb_cli.measure.convergence.survey import affordable_paths, find_references, multiple_of, shorten_target
+from reslrb_cli.measure.whole_runs.runner import copies, load
+from reslrb_cli.measure.worker import Begun
+from reslrb_cli.optimization import find_reached
+from reslrb_cli.optimization.errors import ErrorMeter
+from reslrb_cli.optimization.problem import Problem, assemble_scene, make_targets
+
+Array = np.ndarray[Any, Any]
+
+#: The purpose of the samples of the images.
+_PURPOSE = "convergence, runs"
+#: The share of the time that the target may take.
+TARGET_SHARE = 0.1
+#: The fewest samples per pixel of the images, whatever they take: the noise of fewer would be all that losses show.
+LEAST_SPP = 16
+
+
+class Judge:
+    """Losses and errors of the parameters of `problem`, whose targets are made; `spp` are those of an image."""
+
+    def __init__(self, problem: Problem, spp: int) -> None:
+        self.problem, self.spp, self.meter = problem, spp, problem.error_meter()
+
+    def loss(self, values: dict[str, Array]) -> float:
+        """The mean over the views of the loss of an image with `values`, by key."""
+        problem = self.problem
+        problem.selection.set_arrays(values)
+        losses = []
+        for sensor, target in zip(problem.sensors, problem.targets, strict=True):
+            image = problem.render(sensor, self.spp, 0, _PURPOSE)
+            losses.append(float(problem.compare(mi.TensorXf(np.ascontiguousarray(image)), target)[0]))
+        return float(np.mean(losses))
+
+    def error(self, values: dict[str, Array]) -> float | None:
+        """The error of all parameters together; None where no true value is known."""
+        return joint_error(self.meter, values)
+
+
+def joint_error(meter: ErrorMeter, values: dict[str, Array]) -> float | None:
+    """The root mean square error of all parameters, or, where they have no common unit, of their relative errors."""
+    errors = meter.errors(lambda key: values[key])
+    total = meter.total(errors)
+    if total is not None:
+        return total
+    relative = list(meter.relative(errors).values())
+    return float(np.sqrt(np.mean(np.square(relative)))) if relative else None
+
+
+def begin(first: dict[str, Any]) -> Begun:
+    """Begin the process. The first question is to `prepare`: it names the file for the targets, `out`; see `prepare`.
+
+    Each other one names a file of `values`; its answer has their `loss` and `error`.
+    """
+    start = time.perf_counter()
+    problem = assemble_scene(loads(first["config"], first["source"]))
+    loading_s = time.perf_counter() - start
+    judges: list[Judge] = []
+
+    def answer(question: dict[str, Any]) -> dict[str, Any]:
+        if "prepare" in question:
+            judge, facts = prepare(problem, question["out"], **question["prepare"])
+            judges.append(judge)
+            return facts
+        values = load(question["values"], problem.selection.keys)
+        return {"loss": judges[0].loss(values), "error": judges[0].error(values)}
+
+    return {"loading_s": loading_s}, answer
+
+
+def prepare(problem: Problem, out: str, budget_s: float, image_s: float) -> tuple[Judge, dict[str, Any]]:
+    """Make the targets, and write them to `out`; `budget_s` is the time of the whole, `image_s` that of one judgement.
+
+    The facts: `without` (stock integrators that are right for nothing here, with the reason), `loss` and `error` of the
+    initial values, the seconds that a judgement takes (`judge_s`), and in words `pictures` and `error_of`.
+    """
+    without = find_references(problem, "loss")["without"]
+    initial = copies(problem)
+    films = [problem.scene.sensors()[sensor].film() for sensor in problem.sensors]
+    pixels = sum(int(np.prod(film.crop_size())) for film in films)
+    paths = affordable_paths(problem, pixels, TARGET_SHARE * budget_s)
+    shortened = shorten_target(problem, paths // pixels)
+    make_targets(problem, lambda line: None)
+    find_reached(problem)
+    with open(out, "wb") as file:
+        arrays = {f"target-{number}": np.array(target) for number, target in enumerate(problem.targets)}
+        np.savez(file, **arrays)  # type: ignore[arg-type]
+    affordable = affordable_paths(problem, pixels, image_s) // pixels
+    spp = multiple_of(max(affordable, LEAST_SPP), problem.samples_per_pass)
+    judge = Judge(problem, spp)
+    error = judge.error(initial)
+    kind = (
+        "" if error is None else "RMSE of the parameters" if judge.meter.one_unit else "relative RMSE of the parameters"
+    )
+    judge.loss(initial)  # which compiles
+    start = time.perf_counter()
+    loss = judge.loss(initial)
+    facts = {
+        "without": without,
+        "loss": loss,
+        "judge_s": time.perf_counter() - start,
+        "error": error,
+        "error_of": "" if error is None else kind,
+        "pictures": f"losses of images of {spp} spp{shortened}",
+    }
+    return judge, facts

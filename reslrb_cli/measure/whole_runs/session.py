@@ -1,0 +1,252 @@
+"""The processes of whole optimisations: seed after seed, the methods of one seed take turns, one computing at a time.
+
+A drift of the machine so hits all methods of a seed alike. Each run starts from an empty cache of kernels, and has the
+same time as every other; where it stands at some times, which all have in common, is judged by another process
+meanwhile. That the others wait for this costs them nothing but what it does to the caches.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from reslrb_cli.config import Config, dump
+from reslrb_cli.errors import ExitCode
+from reslrb_cli.measure.cases import Case
+from reslrb_cli.measure.contestant import Contestant
+from reslrb_cli.measure.convergence.session import AFTERWARDS, AFTERWARDS_S, MEMORY_SHARE, MIB, Start, start_process
+from reslrb_cli.measure.pace import NO_TIME, Pace
+from reslrb_cli.measure.processes import Refused, Stopped
+from reslrb_cli.measure.whole_runs.plan import RunsPlan
+from reslrb_cli.measure.whole_runs.run import POINTS, Run, times
+from reslrb_cli.records.bench import BenchStatus
+from reslrb_cli.records.whole_runs import RunPointRecord
+
+#: The share of the time that judging is to take, unless that leaves images with too few samples.
+JUDGED = 0.15
+#: No run has less time than this, in seconds.
+LEAST_S = 0.5
+#: What is left for a run's being late: a share of its time, and seconds beside it. One that has not come to its first
+#: iteration by then is cut off.
+GRACE, GRACE_S = 0.05, 0.5
+#: The share of its time by which any other run may be late before it is cut off: it ends by itself, and copies of its
+#: values, which take none of its time, take some of ours.
+CUT = 0.5
+
+
+class RunsSession:
+    """Runs under way, and where they stood; what they write goes to `folder`, which is the caller's to remove.
+
+    `facts` are the judge's, `limit_s` is the time of each run, once it is known; of the budget `spent_s` have gone
+    before.
+    """
+
+    def __init__(
+        self,
+        plan: RunsPlan,
+        folder: Path,
+        stop: Callable[[], bool],
+        say: Callable[[str], None],
+        start: Start = start_process,
+        now: Callable[[], float] = time.monotonic,
+        spent_s: float = 0.0,
+    ) -> None:
+        self.plan, self.folder, self.runs, self.limit_s = plan, folder, list[Run](), 0.0
+        self.facts: dict[str, Any] = {}
+        self._stop, self._say, self._start, self._now, self._began = stop, say, start, now, now() - spent_s
+        self._budget_s = max((1 - AFTERWARDS) * plan.budget_s - AFTERWARDS_S - spent_s, 0.0)
+        self._pace, self._end = Pace(self._budget_s, 1, None, now), now() + self._budget_s
+        self._judge: Contestant | None = None
+        self._startup_s = 0.0
+        self._said: set[str] = set()
+
+    def run(self) -> Iterator[RunPointRecord]:
+        """Measure; yield where runs stand as it is known. Ends early, with what is done, once `stop()`.
+
+        Raises Refused where what may not be left out cannot begin.
+        """
+        try:
+            if self._prepare():
+                entries = self._entries()
+                if self._divide(len(entries)):
+                    yield from self._waves(entries)
+        except Stopped:
+            return
+        finally:
+            for contestant in [*self.runs, *([] if self._judge is None else [self._judge])]:
+                contestant.process.close()
+
+    def run_of(self, point: RunPointRecord) -> Run:
+        """The run that a point is of."""
+        return next(run for run in self.runs if (run.method, run.seed) == (point.method, point.seed))
+
+    # --- before the runs ----------------------------------------------------------------------------------------------
+
+    def _first(self, config: Config) -> dict[str, Any]:
+        return {"config": dump(config), "source": str(config.source), "variant": self.plan.variant,
+                "memory_limit": self.plan.memory_limit, "targets": str(self.folder / "targets.npz")}  # fmt: skip
+
+    def _prepare(self) -> bool:
+        """Start what judges, and have it make the target; False where time is up over it."""
+        plan, began = self.plan, self._now()
+        first = self._first(plan.reference_config)
+        judge = self._judge = Contestant(self._start(first, "judged_runs"), False)
+        opening = judge.answer(self._stop, self._pace.over)
+        if opening is not None:
+            self._warn(opening)
+            self._startup_s = max(self._now() - began - opening["loading_s"], 0.0)
+            image_s = JUDGED * self._budget_s / (len(plan.entries) * plan.runs * POINTS)
+            ask = {"budget_s": self._budget_s, "image_s": image_s}
+            self.facts = self._ask_judge({"prepare": ask, "out": first["targets"]}) or {}
+        if judge.late:
+            self._say(f"the budget of {plan.budget_s:g} s was spent before there was a target; allow several times it")
+        return not judge.late
+
+    def _ask_judge(self, question: dict[str, Any]) -> dict[str, Any] | None:
+        """An answer of what judges; None where the budget was spent over it. Raises Refused where it ended."""
+        judge = self._judge
+        assert judge is not None, "it is started first"
+        answer = judge.ask(question, self._stop, self._pace.over)
+        if judge.end is not None:
+            memory = judge.end.status is BenchStatus.OUT_OF_MEMORY
+            line = f"--reference {self.plan.reference.label}: {judge.end.reason}"
+            raise Refused(line, ExitCode.OUT_OF_MEMORY if memory else ExitCode.CHECK_FAILED)
+        return answer
+
+    def _entries(self) -> list[tuple[Case, int]]:
+        """What is compared: of the default list, what cannot do the scene is left out, and named."""
+        plan, without = self.plan, self.facts["without"] if self.plan.default else {}
+        for case in plan.cases:
+            if case.type in without:
+                self._say(f"left out: {case.label}: {without[case.type]}")
+        return [(case, spp) for case, spp in plan.entries if case.type not in without]
+
+    def _divide(self, methods: int) -> bool:
+        """Give each run its time; False where there is too little."""
+        count = methods * self.plan.runs
+        if count == 0:
+            return False
+        each = max(self._end - self._now(), 0.0) / count
+        apart_s = POINTS * self.facts["judge_s"] + self._startup_s + GRACE_S  # what of its share a run cannot have
+        self.limit_s = (each - apart_s) / (1 + GRACE)
+        if self.limit_s >= LEAST_S:
+            return True
+        before = self._now() - self._began
+        needed = (before + count * (LEAST_S * (1 + GRACE) + apart_s) + AFTERWARDS_S) / (1 - AFTERWARDS)
+        self._say(
+            f"the budget of {self.plan.budget_s:g} s leaves no time for {count} runs: allow more than {needed:.0f} s "
+            "with --budget, or fewer --runs or --integrators"
+        )
+        return False
+
+    # --- the runs -----------------------------------------------------------------------------------------------------
+
+    def _waves(self, entries: list[tuple[Case, int]]) -> Iterator[RunPointRecord]:
+        for number, seed in enumerate(self.plan.seeds):
+            wave = []
+            for case, spp in entries:
+                run = self._begin(case, spp, seed)
+                wave.append(run)
+                self._open(run)
+            for turn, until_s in enumerate(times(self.limit_s)):
+                start = turn % max(len(wave), 1)
+                for run in wave[start:] + wave[:start]:
+                    point = self._advance(run, until_s, wave)
+                    if point is not None:
+                        run.points.append(point)
+                        yield point
+            for run in wave:
+                run.process.close()
+            if self._pace.over() and any(not run.complete(self.limit_s) and run.end is None for run in wave):
+                self._say(f"not measured: runs from seed {seed} on: {NO_TIME}")
+                return
+            if number == 0 and not any(run.state.iteration for run in wave):
+                self._say(f"no method came to an iteration in the {self.limit_s:.3g} s of a run; allow several times "
+                          "as much with --budget, or fewer --runs or --integrators")  # fmt: skip
+                return
+            gone = [run for run in wave if run.refusal or (run.end and run.end.status is BenchStatus.OUT_OF_MEMORY)]
+            entries = [entry for entry, run in zip(entries, wave, strict=True) if run not in gone]
+
+    def _begin(self, case: Case, spp: int, seed: int) -> Run:
+        plan, config = self.plan, self.plan.seeded(self.plan.config_of(case, spp), seed)
+        run = Run(
+            process=self._start(self._first(config), "whole_runs"),
+            may_refuse=plan.default,
+            method=plan.method_of(case, spp),
+            seed=seed,
+            out=self.folder / f"values-{len(self.runs)}.npz",
+            state=RunPointRecord(plan.method_of(case, spp), seed, 0.0, 0, self.facts["loss"], self.facts["error"]),
+        )
+        self.runs.append(run)
+        return run
+
+    def _open(self, run: Run) -> None:
+        """Have it load the scene, and measure where there is a pilot: before the next one starts, for that is timed."""
+        opening = run.answer(self._stop, self._late(2 * self._startup_s + self.limit_s))
+        if opening is None:
+            self._say_end(run)
+            return
+        self._warn(opening)
+        run.counted_s = opening["loading_s"]
+        if opening["chose"]:
+            self._once(f"{run.method.label}: {opening['chose']}")
+
+    def _late(self, left_s: float, grace: float = GRACE) -> Callable[[], bool]:
+        """Whether the whole is over, or a run has been waited for longer than what is left of its time."""
+        allowed_s, began = left_s + grace * self.limit_s + GRACE_S, self._now()
+        return lambda: self._pace.over() or self._now() - began > allowed_s
+
+    def _advance(self, run: Run, until_s: float, wave: list[Run]) -> RunPointRecord | None:
+        """Where a run stands at some time; None where that cannot be known any more."""
+        if run.alive:
+            held = sum(other.peak_mib for other in wave if other.alive) * MIB
+            question = {"until_s": until_s, "limit_s": self.limit_s, "out": str(run.out),
+                        "release": held > MEMORY_SHARE * self.plan.memory}  # fmt: skip
+            left_s = max(self.limit_s - run.counted_s, 0.0)
+            late = self._late(left_s, GRACE if run.first_s is None else CUT)
+            answer = run.ask(question, self._stop, late)
+            if answer is not None:
+                run.counted_s = max(run.counted_s, until_s)
+                taken = self._take(run, answer)
+                return replace(run.state, elapsed_s=until_s) if taken else None
+            self._say_end(run)
+        if run.end is not None or run.refusal is not None or self._pace.over():
+            return None
+        # One that was cut off has not come any further: what it was at was not done by the end of its time.
+        return replace(run.state, elapsed_s=until_s)
+
+    def _take(self, run: Run, answer: dict[str, Any]) -> bool:
+        """Keep an answer, and have new values judged; False where the budget was spent over that."""
+        run.first_s, run.peak_mib = answer["first_s"], answer["peak_mib"]
+        if answer["finished_s"] is not None:
+            self._once(f"{run.method.label}: all iterations were done after {answer['finished_s']:.3g} s; "
+                       "raise run.iterations to have it go on")  # fmt: skip
+        if answer["iteration"] == run.state.iteration:
+            return True
+        judged = self._ask_judge({"values": str(run.out)})
+        if judged is None:
+            return False
+        run.state = replace(
+            run.state, iteration=answer["iteration"], loss=judged["loss"], parameter_error=judged["error"]
+        )
+        return True
+
+    def _say_end(self, run: Run) -> None:
+        if run.refusal is not None:
+            self._say(f"left out: {run.method.label}: {run.refusal}")
+        elif run.end is not None:
+            self._say(f"{run.method.label}, seed {run.seed}: {run.end.status.value}: {run.end.reason}")
+        elif not self._pace.over():
+            self._say(f"{run.method.label}, seed {run.seed}: cut off in iteration {run.state.iteration + 1}")
+
+    def _warn(self, opening: dict[str, Any]) -> None:
+        for line in opening.get("warnings", ()):
+            self._once(line)
+
+    def _once(self, line: str) -> None:
+        if line not in self._said:
+            self._said.add(line)
+            self._say(line)
