@@ -21,6 +21,8 @@ from conformance.scenes import (
     transform,
 )
 
+pytestmark = pytest.mark.usefixtures("samples")
+
 
 def normals():
     """A normal map, tilted by up to 30 degrees."""

@@ -21,6 +21,8 @@ from conformance.scenes import (
 
 from reslrb_cli.errors import UnsupportedScene
 
+pytestmark = pytest.mark.usefixtures("samples")
+
 #: A lamp that the camera sees.
 VISIBLE = {"position": (0, 1.6, -0.8), "target": (0, 0.3, 2)}
 

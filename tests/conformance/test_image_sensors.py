@@ -18,6 +18,8 @@ from conformance.scenes import (
     transform,
 )
 
+pytestmark = pytest.mark.usefixtures("samples")
+
 CROP = {"crop_offset_x": 7, "crop_offset_y": 5, "crop_width": 17, "crop_height": 13}
 FILTERS = ("box", "tent", "gaussian", "mitchell", "catmullrom", "lanczos")
 FORMATS = ("rgba", "luminance", "luminance_alpha", "xyz", "xyza")

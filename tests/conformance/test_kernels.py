@@ -62,6 +62,9 @@ def steps_compile_nothing(scene: Case, step: Callable[[int], Any]) -> None:
 
 #: The cases that are run with independent samples too, unless `-m long` asks for all.
 INDEPENDENT = ("texture", "passes", "glass", "mask", "area_texture", "envmap", "visible_lamp")
+#: Of the others, those that the default suite runs: each has objects of a kind that the rest does not have.
+CORRELATED = ("roulette", "retained", "crop", "thin_lens", "roughconductor_texture", "plastic", "principled", "blend",
+              "normalmap", "mesh_attribute", "mask_texture_in_view", "point", "projector", "two_emitters")  # fmt: skip
 
 
 @pytest.mark.parametrize("adjoint", ["correlated", "independent"])
@@ -70,7 +73,14 @@ def test_second_step_compiles_nothing(name: str, adjoint: str):
     case_compiles_nothing(name, adjoint)
 
 
-@pytest.mark.parametrize("name", [case.name for case in CASES if case.name not in INDEPENDENT])
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(case.name, marks=() if case.name in CORRELATED else pytest.mark.long)
+        for case in CASES
+        if case.name not in INDEPENDENT
+    ],
+)
 def test_second_step_of_other_cases_compiles_nothing(name: str):
     case_compiles_nothing(name, "correlated")
 
