@@ -40,7 +40,7 @@ CONFORMANCE = [
 QUICK_CONFORMANCE = [
     "test_replay.py::test_replay_meets_the_same_vertices[mask]",
     "test_replay.py::test_no_light_no_replay",
-    "test_freezing.py::test_a_recorded_step_is_the_step[texture]",
+    "test_freezing.py::test_a_recorded_step_is_the_step[texture-reservoir]",
 ]
 #: Cases of the extreme suite; the rest is the CPU's to try.
 EXTREME = ("furnace", "albedo_0_in_one_channel", "opacity_texture_0_and_1", "emission_1e-25_and_1e+25", "slope_0.3")
