@@ -11,7 +11,7 @@ from typing import Any
 import mitsuba as mi
 
 from ..errors import ConfigError
-from .description import build, check, mend, name_objects, notes, read_description
+from .description import Description, build, check, mend, name_objects, notes, place_textures, read_description
 from .extent import lost_light
 from .thin_glass import thin_glass
 
@@ -30,6 +30,13 @@ def load_scene(file: Path, options: Mapping[str, Any] | None = None, strict: boo
     Raises ConfigError, located in the scene file, where it is missing or wrong, has nothing in it, or no light. Warns,
     too, of a scene that is too far from the origin, or too small, and of glass that is too thin.
     """
+    return load_described(file, options, strict)[0]
+
+
+def load_described(
+    file: Path, options: Mapping[str, Any] | None = None, strict: bool = False
+) -> tuple[mi.Scene, Description]:
+    """The same, and the description that the scene was built from, of which Mitsuba has a use for every element."""
     file = Path(file)
     description = read_description(file, {name: _as_text(value) for name, value in (options or {}).items()})
     root = description.root
@@ -37,6 +44,7 @@ def load_scene(file: Path, options: Mapping[str, Any] | None = None, strict: boo
     if strict:
         notes.refuse(found)
     check(description)
+    place_textures(root)
     scene, unused = build(description)
     if strict:
         notes.refuse(unused)
@@ -55,7 +63,10 @@ def load_scene(file: Path, options: Mapping[str, Any] | None = None, strict: boo
     for loss in (lost_light(scene), thin_glass(scene)):
         if loss is not None:
             _warn(f"{file}: {loss}")
-    return scene
+    for note in unused:
+        if note.owner is not None:
+            note.owner.children.remove(note.element)
+    return scene, description
 
 
 @functools.cache
