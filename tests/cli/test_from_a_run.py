@@ -11,8 +11,10 @@ from cli import tiny
 from click.testing import CliRunner, Result
 
 from reslrb_cli.cli import main
+from reslrb_cli.cli.recovered import read_recovered
 from reslrb_cli.config import ParameterSpec, RunValue, load
 from reslrb_cli.errors import ConfigError
+from reslrb_cli.measure.statistics import compare
 from reslrb_cli.optimization.problem import assemble_scene
 from reslrb_cli.records.checkpoint import FILE_NAME, save_checkpoint
 from reslrb_cli.records.images import read_exr
@@ -98,6 +100,27 @@ def test_rendering_a_run_is_rendering_what_it_recovered(folder: Path) -> None:
     initial = reslrb("render", folder / "runs/tiny/config.yaml", *common, folder / "c.exr")
     assert initial.exit_code == 0
     assert not np.array_equal(read_exr(folder / "a.exr"), read_exr(folder / "c.exr"))
+
+
+def test_mitsuba_renders_what_was_exported_as_the_run_does(folder: Path) -> None:
+    result = reslrb("export", folder / "runs/tiny", "-o", folder / "exported")
+    assert result.exit_code == 0, result.output
+    assert "rendered by ptracer" in result.output
+    theirs = mi.load_file(str(folder / "exported/scene.xml"))
+    problem = assemble_scene(read_recovered(folder / "runs/tiny", ("integrator.rr_depth=9",)))
+    result = compare(
+        np.stack([problem.render(0, 64, seed, "test") for seed in range(16)]),
+        np.stack([np.array(mi.render(theirs, spp=64, seed=seed)) for seed in range(16)]),
+    )
+    assert result, result
+    begun = assemble_scene(load(folder / "runs/tiny/config.yaml"))
+    assert not compare(
+        np.stack([begun.render(0, 64, seed, "test") for seed in range(16)]),
+        np.stack([np.array(mi.render(theirs, spp=64, seed=seed)) for seed in range(16)]),
+    )
+    again = reslrb("export", folder / "runs/tiny", "-o", folder / "exported")
+    assert again.exit_code == 2
+    assert "exported exists" in again.output
 
 
 @pytest.mark.parametrize(

@@ -7,6 +7,7 @@ from .mending import mend
 from .naming import name_objects
 from .notes import Note
 from .placing import place_textures
+from .sizing import resize_films
 from .writing import tag_lines
 
 __all__ = [
@@ -18,5 +19,6 @@ __all__ = [
     "name_objects",
     "place_textures",
     "read_description",
+    "resize_films",
     "tag_lines",
 ]

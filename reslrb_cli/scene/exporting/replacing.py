@@ -27,6 +27,11 @@ _OTHER_PLACES = {
 _RELATIVE_INDEX = ("dielectric", "roughdielectric", "thindielectric", "plastic", "roughplastic")
 #: Elements, by what Mitsuba makes of them.
 _KINDS = {"bsdf": "BSDF", "emitter": "Emitter", "shape": "Shape", "texture": "Texture"}
+#: What Mitsuba leaves out of a `principled` BSDF for good where it begins at 0.
+LOBES = (
+    *("anisotropic", "clearcoat", "diff_trans", "flatness", "metallic"),
+    *("sheen", "sheen_tint", "spec_tint", "spec_trans"),
+)
 _CONDUCTORS = ("conductor", "roughconductor")
 
 
@@ -89,6 +94,11 @@ class Replacing:
             for each in ("eta", "k"):
                 replace(owner, colour(owner, each, self._array(f"{stem}.{each}.value"), bounded=False), "material")
             return
+        if owner.type in ("principled", "principledthin") and name in LOBES and self._array(key).any():
+            given = next((item for item in owner.children if item.name == name), None)
+            if given is None or (given.tag == "float" and float(given.attributes["value"]) == 0):
+                why = f"a {owner.type} has no such lobe where its file has no {name}, or 0, and so it had no effect"
+                raise self._fail(key, why)
         bounded = parameter_kind(self.params, key) == "bsdf"
         replace(owner, colour(owner, name, self._array(key), bounded))
 
