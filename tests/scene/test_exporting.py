@@ -49,7 +49,9 @@ SCENE = f"""<scene version="3.0.0">
     <transform name="to_world"><translate y="1.5" z="-2"/></transform><bsdf type="twosided"><bsdf type="diffuse">
     <texture type="mesh_attribute" name="reflectance"><string name="name" value="vertex_color"/></texture></bsdf></bsdf>
 </shape>
-<shape type="shapegroup" id="pair"><shape type="ply"><string name="filename" value="quilt.ply"/></shape></shape>
+<shape type="shapegroup" id="pair"><shape type="ply"><string name="filename" value="quilt.ply"/></shape>
+    <shape type="sphere" id="bead"><float name="radius" value="0.2"/></shape>
+    <shape type="ply"><string name="filename" value="quilt.ply"/></shape></shape>
 <shape type="instance"><ref id="pair"/><transform name="to_world"><scale value="0.5"/><translate x="-2" y="2"/>
     </transform></shape>
 <shape type="rectangle"><transform name="to_world"><scale value="0.6"/><translate x="-3" y="1" z="-1"/></transform>
@@ -91,6 +93,7 @@ KINDS: dict[str, tuple[dict[str, object], float]] = {
     "scale of the sky": ({"key": "Envmap_1.scale"}, 0.5),
     "intensity": ({"key": ["Point_1.intensity.value", "Spot_1.intensity.value"]}, 9),
     "slide": ({"key": "Projector_1.irradiance.data"}, 0.6),
+    "vertices of a group": ({"key": "pair.shape_1.vertex_positions"}, 0.2),
     "vertices": ({"key": "quilt.vertex_positions"}, 0.2),
     "heightmap": ({"heightmap": {"mesh": "hill", "resolution": [5, 4]}}, 0.5),
     "mesh in motion": ({"motion": {"of": ["hill", "pane"], "free": ["translation", "scale"]}}, 0.4),
@@ -171,10 +174,10 @@ def images(scene: mi.Scene, seeds: range, spp: int) -> np.ndarray:
     return np.stack([np.array(mi.render(scene, integrator=integrator, spp=spp, seed=seed)) for seed in seeds])
 
 
-@pytest.mark.parametrize("name", KINDS)
-def test_mitsuba_reads_back_what_was_recovered(name: str, file: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("names", [TOGETHER, *([name] for name in KINDS if name not in TOGETHER)], ids="/".join)
+def test_mitsuba_reads_back_what_was_recovered(names: list[str], file: Path, tmp_path: Path) -> None:
     before = mi.traverse(load_described(file, {"elsewhere": str(file.parent.parent)})[0])
-    _, description, selection = changed(file, [name])
+    _, description, selection = changed(file, names)
     export(description, selection, tmp_path / "out")
     found = mi.traverse(mi.load_file(str(tmp_path / "out/scene.xml"), optimize=False))
     for key in selection.scene_keys:

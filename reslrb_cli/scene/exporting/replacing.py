@@ -144,7 +144,8 @@ class Replacing:
         unnamed: list[Element] = []
         for item in owner.children:
             meant = self._owners.get(item.attributes["id"], item) if item.tag == "ref" else item
-            if meant.tag == tag and item.name in (name, ""):
+            has_own_id = owner.type == "shapegroup" and "id" in meant.attributes  # by which it is found
+            if meant.tag == tag and item.name in (name, "") and not has_own_id:
                 (named if item.name else unnamed).append(meant)
         if named or not unnamed:
             return named[0] if named else None
