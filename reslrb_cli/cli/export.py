@@ -48,7 +48,7 @@ def command(run: Path, overrides: tuple[str, ...], output: Path) -> None:
     except OSError as error:
         if is_machine_fault(error):
             raise
-        raise ConfigError("--output", "", f"cannot write {output}: {error.strerror}") from None
+        raise ConfigError("--output", "", f"{error.filename or output}: {error.strerror}") from None
     echo(f"{output / 'scene.xml'}: {', '.join(selection.keys)}; rendered by {integrator['type']}{why}")
 
 

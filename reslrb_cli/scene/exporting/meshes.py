@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import mitsuba as mi
 
 from ...records.file_names import file_stem
 from ..description.element import Element
-from .elements import child, replace
 from .parts import Parts
 
 #: Parameters of a mesh that a PLY file does not hold.
@@ -22,9 +19,4 @@ def put_mesh(owner: Element, mesh: mi.Mesh, parts: Parts, key: str) -> None:
     """
     owner.children[:] = [item for item in owner.children if not item.is_value or item.name in _KEPT]
     owner.attributes["type"] = "ply"
-    name = parts.add(file_stem(key.rpartition(".")[0]), ".ply", lambda path: _write(mesh, path))
-    replace(owner, child(owner, "string", name="filename", value=name))
-
-
-def _write(mesh: mi.Mesh, path: Path) -> None:
-    mesh.write_ply(str(path))
+    parts.add(owner, file_stem(key.rpartition(".")[0]), ".ply", lambda path: mesh.write_ply(str(path)))

@@ -9,6 +9,7 @@ from pathlib import Path, PurePosixPath
 
 from ..description import Description
 from ..description.element import Element
+from .elements import child, replace
 
 #: The exported scene, in its folder.
 SCENE = "scene.xml"
@@ -22,12 +23,15 @@ class Parts:
 
     writers: dict[str, Callable[[Path], object]] = field(default_factory=dict)
     _copies: dict[Path, str] = field(default_factory=dict)
+    _made: set[Element] = field(default_factory=set)
 
-    def add(self, stem: str, suffix: str, write: Callable[[Path], object]) -> str:
-        """A file of recovered values, and its path in the exported folder."""
+    def add(self, owner: Element, stem: str, suffix: str, write: Callable[[Path], object]) -> None:
+        """Have `owner` name a file of recovered values in place of the one that it names."""
         name = f"{RECOVERED}/{stem}{suffix}"
         self.writers[name] = write
-        return name
+        element = child(owner, "string", name="filename", value=name)
+        self._made.add(element)
+        replace(owner, element)
 
     def copy_assets(self, description: Description) -> None:
         """Have every file that elements name copied, and named by where its copy is.
@@ -38,7 +42,7 @@ class Parts:
         home = description.root.source.file.absolute().parent
         for element in description.root.walk():
             attribute = _file_attribute(element)
-            if attribute is None or element.attributes[attribute] in self.writers:
+            if attribute is None or element in self._made:
                 continue
             source = _found(element.attributes[attribute], description.folders)
             if source is not None:
@@ -65,7 +69,9 @@ def _file_attribute(element: Element) -> str | None:
     """The attribute of an element that names a file; None of one that names none."""
     if element.tag == "spectrum" and "filename" in element.attributes:
         return "filename"
-    return "value" if element.tag == "string" and element.name == "filename" and element.attributes["value"] else None
+    return (
+        "value" if element.tag == "string" and element.name == "filename" and element.attributes.get("value") else None
+    )
 
 
 def _found(name: str, folders: list[Path]) -> Path | None:

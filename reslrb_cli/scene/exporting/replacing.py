@@ -104,8 +104,7 @@ class Replacing:
 
     def _put_image(self, owner: Element, key: str) -> None:
         image = self._array(key)
-        name = self.parts.add(file_stem(key), ".exr", lambda path: write_file(path, image, linear=True))
-        replace(owner, child(owner, "string", name="filename", value=name))
+        self.parts.add(owner, file_stem(key), ".exr", lambda path: write_file(path, image, linear=True))
         if owner.tag == "texture":
             # Its values are linear as they stand, in a file of floats, and not to be rounded to fewer bits.
             replace(owner, child(owner, "string", name="format", value="variant"))
