@@ -114,7 +114,9 @@ def _value(value: Value | None) -> str:
 
 
 def _path(path: Path, folder: Path) -> str:
-    return _text(os.path.relpath(path, folder))
+    relative = os.path.relpath(path, folder)
+    # What lies elsewhere altogether does not move with the configuration.
+    return _text(str(path.absolute()) if relative.startswith(os.path.join("..", "..", "..")) else relative)
 
 
 def _text(text: str) -> str:

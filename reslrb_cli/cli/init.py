@@ -72,7 +72,7 @@ def command(scene_file: Path, target: Path | None, output: Path | None, force: b
     is_integer = photo is not None and photo.is_integer
     first = FirstConfig(scene_file, image, is_integer, size, own, _integrator(scene), proposals)
     text = first.text(path)
-    select_parameters(load_scene(scene_file), loads(text, path).parameters, path)  # before anything is written
+    select_parameters(scene, loads(text, path).parameters, path)  # what is wrong is to show before anything is written
     try:
         if copied and photo is not None and image is not None:
             write_smaller(photo, size, image)
