@@ -118,7 +118,7 @@ def _bounds(info: ParameterInfo) -> str | None:
     text = next((bounds for pattern, bounds in _BOUNDS if re.search(pattern, info.key)), None)
     if text is None or info.value is None:
         return text
-    low, high = (float(word.strip(" []").replace(".inf", "inf")) for word in text.split(","))
+    low, high = (np.float32(word.strip(" []").replace(".inf", "inf")) for word in text.split(","))
     return text if low <= info.value.low and info.value.high <= high else None
 
 
