@@ -204,8 +204,8 @@ def test_the_image_of_all_together_is_that_of_the_scene(file: Path, tmp_path: Pa
 def test_the_image_is_that_of_the_scene(name: str, file: Path, tmp_path: Path) -> None:
     scene, description, selection = changed(file, [name])
     export(description, selection, tmp_path / "out")
-    theirs = images(mi.load_file(str(tmp_path / "out/scene.xml")), range(100, 112), 256)
-    result = compare(images(scene, range(12), 256), theirs)
+    theirs = images(mi.load_file(str(tmp_path / "out/scene.xml")), range(100, 112), 64)
+    result = compare(images(scene, range(12), 64), theirs)
     assert result, result
 
 
