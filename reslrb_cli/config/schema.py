@@ -23,7 +23,7 @@ from typing_extensions import Self
 
 from .base import ConfigPath, Count, Section, Seed, WorkPath, by_kind, located, mark, wrong
 from .integrators import AnyIntegrator, Integrator, Reslrb
-from .limits import KEY_LENGTH
+from .limits import KEY_LENGTH, PIXELS
 from .losses import L2, AnyLoss
 from .names import check_name, folder_name
 from .optimizers import Adam, AnyOptimizer
@@ -53,11 +53,23 @@ class SceneConfig(Section):
         description="Refuse a scene file in which anything has to be mended or left out before Mitsuba 3 can load it, "
         "in place of warning of it.",
     )
+    size: Annotated[tuple[Count, Count], Field(strict=False)] | None = Field(
+        default=None,
+        description="[width, height] of the film of every sensor in pixels, without crop window; null: as the scene "
+        "file has it. What is seen stays the same where the ratio does.",
+    )
     sensors: Annotated[
         Annotated[Annotated[list[Annotated[int, Field(ge=0)]], Field(min_length=1)], mark("list")]
         | Annotated[Literal["all"], mark("text")],
         by_kind("a list of sensor indices, or `all`", "all"),
     ] = Field(default=[0], description="Indices of the scene's sensors that are used, or `all`.")
+
+    @field_validator("size")
+    @classmethod
+    def _check_size(cls, value: tuple[int, int] | None) -> tuple[int, int] | None:
+        if value is not None and value[0] * value[1] > PIXELS:
+            raise wrong(f"must have at most {PIXELS} pixels, not {value[0] * value[1]}")
+        return value
 
     @field_validator("sensors")
     @classmethod

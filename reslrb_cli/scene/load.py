@@ -11,25 +11,51 @@ from typing import Any
 import mitsuba as mi
 
 from ..errors import ConfigError
-from .description import build, check, mend, name_objects, notes, read_description
+from .description import (
+    Description,
+    build,
+    check,
+    mend,
+    name_objects,
+    notes,
+    place_textures,
+    read_description,
+    resize_films,
+)
 from .extent import lost_light
 from .thin_glass import thin_glass
 
 logger = logging.getLogger(__name__)
 
 
-def load_scene(file: Path, options: Mapping[str, Any] | None = None, strict: bool = False) -> mi.Scene:
+def load_scene(
+    file: Path,
+    options: Mapping[str, Any] | None = None,
+    strict: bool = False,
+    size: tuple[int, int] | None = None,
+) -> mi.Scene:
     """Load a Mitsuba scene (XML, versions 0.4 to 3); a variant must be set.
 
     `options` are the values of the file's `$name` variables. Shapes are not merged, so that all parameters keep their
     names, and an object without an id is named by its kind and its number among all of that kind in the file, such as
     `Sphere_3`. What Mitsuba's parser would refuse because another version or an exporter wrote it is mended or left
     out, with a warning in the log; `strict` has it refused. The scene's integrator is not loaded: an experiment has its
-    own. Plugins are loaded from Mitsuba's own folder alone.
+    own. Plugins are loaded from Mitsuba's own folder alone. `size` is the (width, height) of all films in pixels, in
+    place of what the file says.
 
     Raises ConfigError, located in the scene file, where it is missing or wrong, has nothing in it, or no light. Warns,
     too, of a scene that is too far from the origin, or too small, and of glass that is too thin.
     """
+    return load_described(file, options, strict, size)[0]
+
+
+def load_described(
+    file: Path,
+    options: Mapping[str, Any] | None = None,
+    strict: bool = False,
+    size: tuple[int, int] | None = None,
+) -> tuple[mi.Scene, Description]:
+    """The same, and the description that the scene was built from, of which Mitsuba has a use for every element."""
     file = Path(file)
     description = read_description(file, {name: _as_text(value) for name, value in (options or {}).items()})
     root = description.root
@@ -37,6 +63,9 @@ def load_scene(file: Path, options: Mapping[str, Any] | None = None, strict: boo
     if strict:
         notes.refuse(found)
     check(description)
+    place_textures(root)
+    if size is not None:
+        resize_films(root, size)
     scene, unused = build(description)
     if strict:
         notes.refuse(unused)
@@ -55,7 +84,10 @@ def load_scene(file: Path, options: Mapping[str, Any] | None = None, strict: boo
     for loss in (lost_light(scene), thin_glass(scene)):
         if loss is not None:
             _warn(f"{file}: {loss}")
-    return scene
+    for note in unused:
+        if note.owner is not None:
+            note.owner.children.remove(note.element)
+    return scene, description
 
 
 @functools.cache
