@@ -6,13 +6,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from reslrb_cli.config import Config, Reslrb, with_integrator
 from reslrb_cli.errors import ConfigError
-from reslrb_cli.optimization.problem import Problem, assemble_scene, color_channels
+from reslrb_cli.optimization.problem import Problem, assemble_scene
+from reslrb_cli.optimization.targets import color_channels
+from reslrb_cli.optimization.views import to_tensor
 from reslrb_cli.records.checkpoint import NONFINITE_FILE_NAME, load_nonfinite
 from reslrb_cli.records.manifest import FILE_NAME as MANIFEST
 from reslrb_cli.records.manifest import read_manifest
@@ -57,9 +58,9 @@ def load_replay(config: Config) -> Replay:
         problem.integrator = problem.integrator.with_options(
             samples_per_pass=problem.samples_per_pass, freeze=problem.integrator.freeze
         )
-    for sensor in problem.sensors:
-        name = "target" if len(problem.sensors) == 1 else f"target-{sensor}"
-        problem.targets.append(_read_target(folder.images / f"{name}.exr", problem, sensor))
+    for view in problem.views:
+        name = "target" if len(problem.views) == 1 else f"target-{view.sensor}"
+        view.made = _read_target(folder.images / f"{name}.exr", problem, view.sensor)
     return Replay(problem, iteration)
 
 
@@ -81,7 +82,7 @@ def _samples_per_pass(memory: Any, path: Path) -> int:
     return count
 
 
-def _read_target(path: Path, problem: Problem, sensor: int) -> Any:
+def _read_target(path: Path, problem: Problem, sensor: int) -> mi.TensorXf:
     """The target image that a run wrote, as a tensor. Raises ConfigError where it is not one for this sensor."""
     film = problem.scene.sensors()[sensor].film()
     width, height = film.crop_size()
@@ -90,6 +91,4 @@ def _read_target(path: Path, problem: Problem, sensor: int) -> Any:
     colors = color_channels(film)
     if array.shape[2] != colors:
         raise ConfigError(path, "", f"must have the film's channels; its own: {array.shape[2]}, the film's: {colors}")
-    target = mi.TensorXf(np.ascontiguousarray(array))
-    dr.make_opaque(target)
-    return target
+    return to_tensor(array)

@@ -46,12 +46,12 @@ def comparable(config: Config, by: str) -> Config:
 def pictures(config: Config, spp: int) -> dict[str, np.ndarray]:
     """Target and initial image (H, W, C) of the first sensor, the latter with `spp` samples, and dL/dI at it."""
     problem = assemble(config)
-    sensor, target = problem.sensors[0], problem.targets[0]
-    initial = problem.render(sensor, spp, 0, _REFERENCE)
+    view = problem.views[0]
+    initial = problem.render(view.sensor, spp, 0, _REFERENCE)
     image = mi.TensorXf(initial)
     dr.enable_grad(image)
-    dr.backward(problem.compare(image, target))
-    return {"target": np.array(target), "initial": initial, "adjoint": np.array(dr.grad(image))}
+    dr.backward(view.compare(image))
+    return {"target": np.array(view.target), "initial": initial, "adjoint": np.array(dr.grad(image))}
 
 
 class Held:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import math
 import time
 from collections.abc import Callable, Iterator
@@ -128,21 +127,16 @@ def gradient(
     refused.
     """
     config = problem.config
-    views = len(problem.sensors)
-
-    def view_loss(target: Any, image: Any) -> Any:
-        return problem.compare(image, target) / views
-
     total: Any = 0.0
     refused = []
-    for sensor, target in zip(problem.sensors, problem.targets, strict=True):
+    for view in problem.views:
         split.start()
         step = gradient_step(
             problem.integrator,
             problem.scene,
-            sensor,
-            functools.partial(view_loss, target),
-            seed=seed(config.run.seed, iteration, sensor, "image"),
+            view.sensor,
+            view.objective,
+            seed=seed(config.run.seed, iteration, view.sensor, "image"),
             **config.step_options(),
             params=problem.selection.params,
             on_image=split.image,

@@ -10,7 +10,8 @@ import mitsuba as mi
 import numpy as np
 
 from reslrb_cli.integrators import known_step
-from reslrb_cli.optimization.problem import Problem, samples_per_pass
+from reslrb_cli.optimization.loading import samples_per_pass
+from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.rendering import passes
 from reslrb_cli.scene import visible_texels
 from reslrb_cli.seeds import seed

@@ -10,6 +10,7 @@ import numpy as np
 from reslrb_cli.optimization.errors import nearest
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.trend import find_trend, got_worse
+from reslrb_cli.optimization.views import View
 from reslrb_cli.records.metrics import Record, finite
 
 Array = np.ndarray[Any, Any]
@@ -51,10 +52,10 @@ class Results:
         self._last = self.meter.errors(self.problem.selection.array)
         self._take("final")
 
-    def see(self, moment: str, image: Array, target: Any) -> None:
-        """Take the saved image (H, W, C) of a sensor, at `initial` or `final`; every sensor in turn."""
+    def see(self, moment: str, view: View, image: Array) -> None:
+        """Take the saved image (H, W, C) of a view, at `initial` or `final`; every view in turn."""
         if moment in self._image_losses:
-            loss = self.problem.compare(mi.TensorXf(np.ascontiguousarray(image, dtype=np.float32)), target)
+            loss = view.objective(mi.TensorXf(np.ascontiguousarray(image, dtype=np.float32)))
             self._image_losses[moment].append(float(loss[0]))
 
     def _take(self, moment: str) -> None:
@@ -81,7 +82,7 @@ class Results:
             "relative_error": {key: _pair(key, *relative) for key in relative[0] | relative[1]},
             "parameters": {key: self._about(key) | values for key, values in self._values.items()},
             "image_loss": {
-                moment: float(np.mean(losses)) if len(losses) == len(self.problem.sensors) else None
+                moment: float(np.sum(losses)) if len(losses) == len(self.problem.views) else None
                 for moment, losses in self._image_losses.items()
             },
             "loss_trend": None if trend is None else trend.to_json(),

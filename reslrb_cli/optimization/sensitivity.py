@@ -79,7 +79,7 @@ def measure_sensitivities(problem: Problem, samples: int) -> list[Sensitivity]:
         for key, gradient in take_gradient(problem).items():
             rows[key].append(gradient.astype(np.float64))
     base = _images(problem)
-    targets = [np.array(target, dtype=np.float64) for target in problem.targets]
+    targets = [np.array(view.target, dtype=np.float64) for view in problem.views]
     reference = [np.maximum(np.abs(a), np.abs(b)) for a, b in zip(base, targets, strict=True)]
     found = []
     for key, gradients in rows.items():
@@ -128,12 +128,12 @@ def _probe(
 
 
 def _second_difference(problem: Problem, base: Sequence[Array], difference: Sequence[Array], factor: float) -> float:
-    """L(I + D) - 2 L(I) + L(I - D), the mean over the views, D `factor` times the difference."""
+    """L(I + D) - 2 L(I) + L(I - D), over the views by their shares, D `factor` times the difference."""
     total = 0.0
-    for image, change, target in zip(base, difference, problem.targets, strict=True):
+    for image, change, view in zip(base, difference, problem.views, strict=True):
         for side, weight in ((1, 1), (0, -2), (-1, 1)):
             at = mi.TensorXf((image + side * factor * change).astype(np.float32))
-            total += weight * float(problem.compare(at, target)[0]) / len(base)
+            total += weight * float(view.objective(at)[0])
     return total
 
 
@@ -145,9 +145,10 @@ def _downhill(gradient: Any) -> Any:
 def _images(problem: Problem) -> list[Array]:
     """Every view as the scene stands, without alpha, always from the same seeds."""
     run, images = problem.config.run, []
-    for sensor, target in zip(problem.sensors, problem.targets, strict=True):
-        image = render_image(problem.integrator, problem.scene, sensor, seed(run.seed, 0, sensor, _PURPOSE), run.spp)
-        images.append(np.array(image, dtype=np.float64)[:, :, : target.shape[2]])
+    for view in problem.views:
+        at = seed(run.seed, 0, view.sensor, _PURPOSE)
+        image = render_image(problem.integrator, problem.scene, view.sensor, at, run.spp)
+        images.append(np.array(image, dtype=np.float64)[:, :, : view.target.shape[2]])
     return images
 
 

@@ -19,7 +19,9 @@ from reslrb_cli.measure.moving import moves_light
 from reslrb_cli.measure.participants import ALIKE
 from reslrb_cli.measure.references import Situation, interior, prb_gradient, prb_image, ptracer_gradient, ptracer_image
 from reslrb_cli.measure.worker import Begun
-from reslrb_cli.optimization.problem import Problem, assemble_scene, make_targets
+from reslrb_cli.optimization.problem import Problem, assemble_scene
+from reslrb_cli.optimization.targets import make_targets
+from reslrb_cli.optimization.views import View
 from reslrb_cli.records.gradcheck import Reference
 from reslrb_cli.scene.catalog import value_shape
 
@@ -73,7 +75,7 @@ def survey(
     paths = PATHS[objective] if budget_s is None else affordable_paths(problem, pixels, SHARE[objective] * budget_s / 2)
     shortened = shorten_target(problem, paths // pixels)
     make_targets(problem, lambda line: None)
-    target = np.array(problem.targets[0])
+    target = np.array(problem.views[0].target)
     count = IMAGES if objective == "loss" else 1
     spp = multiple_of(paths // (count * pixels), problem.samples_per_pass)
     adjoints = []
@@ -88,15 +90,16 @@ def adjoint(problem: Problem, image: np.ndarray, mask: np.ndarray) -> np.ndarray
     """dL/dI (H, W, C) at an image of that shape, the pixels that `mask` (H, W, 1) has as 0 left out of the loss."""
     leaf = mi.TensorXf(image)
     dr.enable_grad(leaf)
-    dr.backward(masked_loss(problem, leaf, problem.targets[0], None if mask.all() else mi.TensorXf(mask)))
+    dr.backward(masked_loss(problem.views[0], leaf, None if mask.all() else mi.TensorXf(mask)))
     return np.array(dr.grad(leaf))
 
 
-def masked_loss(problem: Problem, image: mi.TensorXf, target: mi.TensorXf, mask: mi.TensorXf | None) -> mi.Float:
-    """The loss of an attached image (H, W, C): what `mask` (H, W, 1) has as 0 is as the target has it."""
+def masked_loss(view: View, image: mi.TensorXf, mask: mi.TensorXf | None) -> mi.Float:
+    """The view's loss of an attached image (H, W, C): what `mask` (H, W, 1) has as 0 is as the target has it."""
     if mask is None:
-        return problem.compare(image, target)
-    return problem.loss(first_channels(image, target.shape[2]) * mask + target * (1 - mask), target)
+        return view.compare(image)
+    target = view.target
+    return view.compare(first_channels(image, target.shape[2]) * mask + target * (1 - mask))
 
 
 def find_references(problem: Problem, objective: str) -> dict[str, Any]:
