@@ -1,8 +1,9 @@
 """Figure 5: the gradient of an image's loss with respect to a room's floor, by naive AD and by ours, and their z map.
 
-All have one dL/dI (`held_kinds.py`). Naive AD is that of our own walk: stock `ptracer` emits wrongly from the room's
-environment map, which is turned, and stock `prb` sees glass and mirrors, where light paths cannot connect. The
-experiment's own estimator is compared with it at other seeds, in standard errors, and the exact estimators at equal
+All have one dL/dI (`held_kinds.py`), which is 0 where light paths find less than paths from the sensor do: where the
+sensor sees glass, mirrors or coats, and at the film's border. Naive AD is that of our own walk: stock `ptracer` emits
+wrongly from the room's environment map, which is turned. The experiment's own estimator is compared at other seeds, in
+standard errors, with naive AD and with `prb`, which shares nothing with us; the exact estimators with naive AD at equal
 seeds.
 """
 
@@ -45,8 +46,19 @@ class Result:
     pictures: dict[str, np.ndarray]
     naive: Kind
     ours: Kind
+    prb: Kind
     comparisons: dict[tuple[str, str], Comparison] = field(default_factory=dict)
     z: np.ndarray | None = None
+
+    @property
+    def kinds(self) -> tuple[Kind, Kind, Kind]:
+        """What was sampled at seeds of its own."""
+        return self.naive, self.ours, self.prb
+
+    @property
+    def left_out(self) -> float:
+        """The share of pixels in which dL/dI is 0."""
+        return float(np.mean(~self.pictures["adjoint"].any(-1)))
 
     @property
     def holds(self) -> bool:
@@ -61,13 +73,12 @@ def measure(config: Config, plan: Plan, folder: Path, say: Callable[[str], None]
     """
     estimator = check_config(config)
     say(f"image and dL/dI, {plan.reference_spp} spp")
-    pictures = take_pictures(config, plan.reference_spp, folder)
+    pictures = take_pictures(config, plan.reference_spp, folder, masked=True)
     naive, ours = Kind("naive AD", plan.spp, "walk_ad"), Kind(estimator, plan.spp, OWN)
-    key = ""
-    for kind in (naive, ours):
+    result = Result(config, plan, "", pictures, naive, ours, Kind("prb", plan.spp, "prb"))
+    for kind in result.kinds:
         say(f"{kind.label}: {plan.seeds} seeds")
-        key = _taken(kind, plan.seeds, config, folder, f"figure5, {kind.by}")
-    result = Result(config, plan, key, pictures, naive, ours)
+        result.key = _taken(kind, plan.seeds, config, folder, f"figure5, {kind.by}")
     check(result)
     say(f"at naive AD's first seed: {', '.join(EXACT)}")
     for name in EXACT:
@@ -78,14 +89,16 @@ def measure(config: Config, plan: Plan, folder: Path, say: Callable[[str], None]
 
 
 def check(result: Result) -> None:
-    """Compare the means of the two kinds in the tiles of `gradcheck`, and make the z map."""
-    ours, naive = result.ours, result.naive
+    """Compare our mean with the others' in the tiles of `gradcheck`, and make the z map of ours and naive AD's."""
+    ours, naive, prb = result.ours, result.naive, result.prb
     assert ours.samples is not None
     assert naive.samples is not None
     shape = ours.samples.shape[1:]
-    result.comparisons[ours.name, naive.name] = compare_expectations(
-        ours.rows, naive.rows, Family(1, entry_count(shape)), shape=shape, paired=False
-    )
+    family = Family(2, 2 * entry_count(shape))
+    for other in (naive, prb):
+        result.comparisons[ours.name, other.name] = compare_expectations(
+            ours.rows, other.rows, family, shape=shape, paired=False
+        )
     side = max(-(-shape[1] // result.plan.tiles), 1)
     result.z = z_scores(tile_sums(ours.samples, side), tile_sums(naive.samples, side))
 

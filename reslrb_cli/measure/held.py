@@ -12,13 +12,15 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from reslrb_cli.config import Config, Ptracer, Reslrb, WalkAd, loads
+from reslrb_cli.config import Config, Prb, Ptracer, Reslrb, WalkAd, loads
 from reslrb_cli.integrators import known_step
 from reslrb_cli.measure.participants import ALIKE, NEVER
+from reslrb_cli.measure.references import interior
 from reslrb_cli.measure.worker import Begun
 from reslrb_cli.optimization.problem import assemble, assemble_scene
 from reslrb_cli.records.clock import peak_mib, reset_peak
 from reslrb_cli.records.gradcheck import Reference
+from reslrb_cli.scene.seen import sees_specular
 
 #: The purpose, and the seed's part in it, of the samples of the image that dL/dI is held at.
 _REFERENCE = "reference"
@@ -27,31 +29,49 @@ _REFERENCE = "reference"
 def comparable(config: Config, by: str) -> Config:
     """The experiment with gradients `by` one that all estimate the same: nobody has roulette, nor what `ptracer` lacks.
 
-    `own` is the experiment's `reslrb`, `ptracer` and `walk_ad` are naive AD, of the stock walk and of ours, and any
-    other name is that of an estimator. Naive AD does not differentiate roulette's decision.
+    `own` is the experiment's `reslrb`, `ptracer` and `walk_ad` are naive AD, of the stock walk and of ours, `prb`
+    replays paths from the sensor, and any other name is that of an estimator. Naive AD does not differentiate
+    roulette's decision.
     """
     own = config.integrator
     assert isinstance(own, Reslrb), "checked by whoever compares"
     alike: dict[str, Any] = {**ALIKE[Reference.PTRACER], "rr_depth": NEVER}
     shared: dict[str, Any] = {"max_depth": own.max_depth, "rr_depth": NEVER, "hide_emitters": own.hide_emitters}
-    integrator: Ptracer | Reslrb | WalkAd = own.model_copy(update=alike if by == "own" else alike | {"estimator": by})
+    integrator: Prb | Ptracer | Reslrb | WalkAd = own.model_copy(
+        update=alike if by == "own" else alike | {"estimator": by}
+    )
     if by == "ptracer":
         integrator = Ptracer(type="ptracer", **shared)
+    elif by == "prb":
+        integrator = Prb(type="prb", **shared)
     elif by == "walk_ad":
         detached: Any = {"filter_normalization": "detached"}
         integrator = WalkAd(type="walk_ad", attached=own.attached, **shared | detached)
     return config.model_copy(update={"integrator": integrator})
 
 
-def pictures(config: Config, spp: int) -> dict[str, np.ndarray]:
-    """Target and initial image (H, W, C) of the first sensor, the latter with `spp` samples, and dL/dI at it."""
+def pictures(config: Config, spp: int, masked: bool = False) -> dict[str, np.ndarray]:
+    """Target and initial image (H, W, C) of the first sensor, the latter with `spp` samples, and dL/dI at it.
+
+    If `masked`, dL/dI is 0 where light paths find less than paths from the sensor do: in pixels that see smooth
+    specular lobes, and at the film's border.
+    """
     problem = assemble(config)
     view = problem.views[0]
     initial = problem.render(view.sensor, spp, 0, _REFERENCE)
     image = mi.TensorXf(initial)
     dr.enable_grad(image)
+    view = problem.views[0]
+    initial = problem.render(view.sensor, spp, 0, _REFERENCE)
+    image = mi.TensorXf(initial)
+    dr.enable_grad(image)
     dr.backward(view.compare(image))
-    return {"target": np.array(view.target), "initial": initial, "adjoint": np.array(dr.grad(image))}
+    adjoint = np.array(dr.grad(image))
+    if masked:
+        at = problem.scene.sensors()[view.sensor]
+        seen = sees_specular(problem.scene, at)
+        adjoint *= (interior(adjoint.shape, at) & ~(seen.alone | seen.mixed))[:, :, None]
+    return {"target": np.array(view.target), "initial": initial, "adjoint": adjoint}
 
 
 class Held:
@@ -89,7 +109,7 @@ def begin(first: dict[str, Any]) -> Begun:
     if first["adjoint"] is None:
 
         def picture(question: dict[str, Any]) -> dict[str, Any]:
-            np.savez(question["out"], **pictures(config, question["spp"]))  # type: ignore[arg-type]
+            np.savez(question["out"], **pictures(config, question["spp"], question["masked"]))  # type: ignore[arg-type]
             return {}
 
         return {}, picture

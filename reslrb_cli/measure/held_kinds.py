@@ -67,12 +67,12 @@ def check_config(config: Config) -> str:
     return f"reslrb:{integrator.estimator}"
 
 
-def take_pictures(config: Config, spp: int, folder: Path) -> dict[str, np.ndarray]:
+def take_pictures(config: Config, spp: int, folder: Path, masked: bool = False) -> dict[str, np.ndarray]:
     """Target, initial image and dL/dI of `held.pictures`; what `sample` does in this folder has that dL/dI."""
     process = _start(config, None, OWN, None)
     try:
         process.answer(_never)
-        process.ask({"spp": spp, "out": str(folder / "pictures.npz")})
+        process.ask({"spp": spp, "out": str(folder / "pictures.npz"), "masked": masked})
         process.answer(_never)
     finally:
         process.close()

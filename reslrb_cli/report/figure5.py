@@ -32,10 +32,11 @@ def table(result: Result) -> str:
     lines = [
         f"{config.source}: film {width}x{height}, {result.key} {columns}x{rows}, max_depth "
         f"{config.integrator.max_depth}, {plan.spp} spp, dL/dI held at an image of {plan.reference_spp} spp",
+        f"left out: {result.left_out:.1%} of the pixels: they see glass, mirrors or coats, or lie at the film's border",
         "",
         f"{'gradient':24} {'seeds':>6} {'relative noise':>15} {'arrays MiB':>11}",
     ]
-    for kind in (result.naive, result.ours):
+    for kind in result.kinds:
         noise = relative_noise(kind.rows, _mean(result))
         lines.append(f"{kind.name:24} {len(kind.rows):6} {noise:15.3f} {kind.arrays_mib:11.1f}")
     lines += ["", f"{'compared':34} {'rel. L2':>9} {'z rms':>6} {'limit':>6} {'max |z|':>8} {'limit':>6}"]
@@ -57,6 +58,7 @@ def to_json(result: Result) -> dict[str, Any]:
         "plan": dataclasses.asdict(result.plan),
         "film": list(result.pictures["initial"].shape[1::-1]),
         "max_depth": result.config.integrator.max_depth,
+        "left_out": result.left_out,
         "gradients": [
             {
                 "gradient": kind.name,
@@ -64,7 +66,7 @@ def to_json(result: Result) -> dict[str, Any]:
                 "relative_noise": relative_noise(kind.rows, _mean(result)),
                 "arrays_mib": kind.arrays_mib,
             }
-            for kind in (result.naive, result.ours)
+            for kind in result.kinds
         ],
         "comparisons": [
             {"gradient": one, "reference": other, **finite(figures.figures)}

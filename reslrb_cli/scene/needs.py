@@ -29,7 +29,7 @@ _FOLLOWED_BSDFS = (
     *("TwoSidedBRDF", "BumpMap", "NormalMap", "Null"),
 )
 #: How many see-through surfaces a primary ray is followed through.
-_CROSSINGS = 32
+CROSSINGS = 32
 
 
 @dataclass(frozen=True)
@@ -152,7 +152,7 @@ def look(scene: Any, sensor: Any, resolution: int = 128) -> View:
     ray, _ = sensor.sample_ray(sensor.shutter_open(), 0.5, position, mi.Point2f(0.5), True)
     active = dr.full(mi.Mask, True, count)
     smooth, specular, emission = (dr.zeros(mi.Mask, count) for _ in range(3))
-    for _ in range(_CROSSINGS):
+    for _ in range(CROSSINGS):
         si = scene.ray_intersect(ray, active)
         emission |= active & dr.any(si.emitter(scene, active).eval(si, active) > 0)
         hit = active & si.is_valid()

@@ -27,8 +27,8 @@ def config() -> Config:
     return load(CONFIGS / "cornell_floor.yaml", SMALL)
 
 
-def pretended(config: Config, factor: float = 1.0) -> Result:
-    """A result of normal noise around one gradient, naive AD's `factor` times as large."""
+def pretended(config: Config, naive_factor: float = 1.0, prb_factor: float = 1.0) -> Result:
+    """A result of normal noise around one gradient, those of naive AD and `prb` so many times as large."""
     random = np.random.default_rng(1)
     mean = random.normal(1.0, 1.0, size=(16, 36, 3))
 
@@ -38,8 +38,9 @@ def pretended(config: Config, factor: float = 1.0) -> Result:
 
     picture = random.uniform(size=(9, 16, 3)).astype(np.float32)
     pictures = {"target": picture, "initial": picture, "adjoint": picture}
-    naive, ours = kind("naive AD", "walk_ad", factor), kind("reslrb:reservoir", OWN, 1.0)
-    result = Result(config, Plan(seeds=16), "floor.reflectance.data", pictures, naive, ours)
+    naive, ours = kind("naive AD", "walk_ad", naive_factor), kind("reslrb:reservoir", OWN, 1.0)
+    prb = kind("prb", "prb", prb_factor)
+    result = Result(config, Plan(seeds=16), "floor.reflectance.data", pictures, naive, ours, prb)
     check(result)
     return result
 
@@ -54,12 +55,14 @@ def test_what_agrees_holds(config: Config, tmp_path: Path) -> None:
     assert (tmp_path / "figure5.png").read_bytes().startswith(b"\x89PNG")
     written = json.loads(json.dumps(to_json(result), allow_nan=False))
     assert written["holds"] is True
-    assert [one["gradient"] for one in written["gradients"]] == ["naive AD", "reslrb:reservoir"]
+    assert [one["gradient"] for one in written["gradients"]] == ["naive AD", "reslrb:reservoir", "prb"]
 
 
-def test_a_planted_difference_is_seen(config: Config) -> None:
-    result = pretended(config, 1.1)
-    assert [figures.verdict for figures in result.comparisons.values()] == [Verdict.FAILS]
+@pytest.mark.parametrize("of", [0, 1])
+def test_a_planted_difference_is_seen(config: Config, of: int) -> None:
+    result = pretended(config, *((1.1, 1.0), (1.0, 1.1))[of])
+    verdicts = [figures.verdict for figures in result.comparisons.values()]
+    assert verdicts == [Verdict.FAILS if index == of else Verdict.HOLDS for index in range(2)]
     assert not result.holds
     assert "fails" in table(result)
 
@@ -84,7 +87,11 @@ def test_tiles_add_up() -> None:
 def test_of_a_small_box(config: Config, tmp_path: Path) -> None:
     result = measure(config, Plan(spp=16, reference_spp=256, seeds=16), tmp_path, print)
     print(table(result))
-    assert list(result.comparisons)[1:] == [("reslrb:stack", "walk_ad"), ("reslrb:gather", "walk_ad")]
+    assert list(result.comparisons)[1:] == [
+        ("reslrb:reservoir", "prb"),
+        ("reslrb:stack", "walk_ad"),
+        ("reslrb:gather", "walk_ad"),
+    ]
     assert result.holds, table(result)
 
 
