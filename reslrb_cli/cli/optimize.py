@@ -42,6 +42,7 @@ def command(config_file: Path, overrides: tuple[str, ...], force: bool, quiet: b
     from reslrb_cli.optimization.border import warn_of_border
     from reslrb_cli.optimization.correlated_rounds import measure_correlated_bias
     from reslrb_cli.optimization.planning import plan_record
+    from reslrb_cli.optimization.views import view_records
     from reslrb_cli.records.pilot_cache import PilotCache
     from reslrb_cli.report.run_table import parameter_lines, terminal_width
     from reslrb_cli.report.verdict import last_line
@@ -58,6 +59,7 @@ def command(config_file: Path, overrides: tuple[str, ...], force: bool, quiet: b
         variant=variant, device=device_name(variant), seed=config.run.seed, config=printable(config_file)
     )
     manifest.plan = plan_record(problem)
+    manifest.views = view_records(problem.views)
     manifest.pilot = None if problem.pilot is None else problem.pilot.to_json()
     manifest.correlated_bias = None if bias is None else bias.to_json()
     manifest.memory = None if problem.memory is None else problem.memory.to_json()

@@ -109,6 +109,8 @@ class Recording:
         self._save_checkpoint()
         for view in problem.views:
             write_image(self.folder.images / self._image_name("target", view.sensor), np.array(view.target))
+            if view.weights is not None:
+                write_image(self.folder.images / self._image_name("weights", view.sensor), np.array(view.weights))
         self._write_images("initial")
         write_parameters(parameters / "initial", problem.values())
         if problem.truth:

@@ -59,8 +59,10 @@ def load_replay(config: Config) -> Replay:
             samples_per_pass=problem.samples_per_pass, freeze=problem.integrator.freeze
         )
     for view in problem.views:
-        name = "target" if len(problem.views) == 1 else f"target-{view.sensor}"
-        view.made = _read_target(folder.images / f"{name}.exr", problem, view.sensor)
+        suffix = "" if len(problem.views) == 1 else f"-{view.sensor}"
+        view.made = _read_image(folder.images / f"target{suffix}.exr", problem, view.sensor)
+        weights = folder.images / f"weights{suffix}.exr"
+        view.weights = _read_image(weights, problem, view.sensor) if weights.exists() else None
     return Replay(problem, iteration)
 
 
@@ -82,8 +84,8 @@ def _samples_per_pass(memory: Any, path: Path) -> int:
     return count
 
 
-def _read_target(path: Path, problem: Problem, sensor: int) -> mi.TensorXf:
-    """The target image that a run wrote, as a tensor. Raises ConfigError where it is not one for this sensor."""
+def _read_image(path: Path, problem: Problem, sensor: int) -> mi.TensorXf:
+    """The target, or its weights, that a run wrote. Raises ConfigError where it is not one for this sensor."""
     film = problem.scene.sensors()[sensor].film()
     width, height = film.crop_size()
     array = np.array(read_bitmap(path, (int(width), int(height))), dtype=np.float32)

@@ -21,7 +21,7 @@ from pydantic import (
 )
 from typing_extensions import Self
 
-from .base import ConfigPath, Count, Section, Seed, WorkPath, by_kind, located, mark, wrong
+from .base import ConfigPath, Count, Positive, Section, Seed, WorkPath, by_kind, located, mark, wrong
 from .integrators import AnyIntegrator, Integrator, Reslrb
 from .limits import KEY_LENGTH
 from .losses import L2, AnyLoss
@@ -29,6 +29,7 @@ from .names import check_name, folder_name
 from .optimizers import Adam, AnyOptimizer
 from .parameters import COLOR_SPACE, ColorSpace, ParameterSpec, Value
 from .sizes import Memory, memory_bytes
+from .views import MASK, MASK_MIXED, AnyMask, Mask
 
 
 def _list_of_one(value: Any) -> Any:
@@ -107,7 +108,13 @@ class TargetConfig(Section):
         "relative to the config file.",
     )
     color_space: ColorSpace = Field(default="auto", description=f"{COLOR_SPACE} Only with `file`.")
+    gamma: Positive | None = Field(
+        default=None,
+        description="Decode values of 8 and 16 bit files by this power, in place of `color_space`. Only with `file`.",
+    )
     render: Rendering | None = Field(default=None, description="Render the target from the scene.")
+    mask: AnyMask = Field(default=Mask(), description=MASK)
+    mask_mixed: bool = Field(default=False, description=MASK_MIXED)
 
     @model_validator(mode="after")
     def _check_one(self) -> Self:
@@ -116,6 +123,10 @@ class TargetConfig(Section):
             raise located("", f"must have exactly one of `file` and `render`, and has {has}")
         if self.render is not None and self.color_space != "auto":
             raise located("color_space", "has no effect on a rendered target; it goes with `file`")
+        if self.render is not None and self.gamma is not None:
+            raise located("gamma", "has no effect on a rendered target; it goes with `file`")
+        if self.gamma is not None and self.color_space != "auto":
+            raise located("gamma", "decodes the file in place of color_space; give one of the two")
         return self
 
     @model_serializer(mode="wrap")

@@ -61,10 +61,6 @@ def pictures(config: Config, spp: int, masked: bool = False) -> dict[str, np.nda
     initial = problem.render(view.sensor, spp, 0, _REFERENCE)
     image = mi.TensorXf(initial)
     dr.enable_grad(image)
-    view = problem.views[0]
-    initial = problem.render(view.sensor, spp, 0, _REFERENCE)
-    image = mi.TensorXf(initial)
-    dr.enable_grad(image)
     dr.backward(view.compare(image))
     adjoint = np.array(dr.grad(image))
     if masked:

@@ -12,9 +12,10 @@ from reslrb_cli.config import Config
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.optimization.errors import comparison_grid
 from reslrb_cli.optimization.loading import check_integrator, load_configured, make_configured
+from reslrb_cli.optimization.masking import mask_line, mask_of
 from reslrb_cli.optimization.rendering import render_in_passes
-from reslrb_cli.optimization.views import to_tensor
-from reslrb_cli.scene import Selection, read_image, set_values
+from reslrb_cli.optimization.views import View
+from reslrb_cli.scene import Photo, Selection, check_photo, read_photo, set_values
 
 if TYPE_CHECKING:
     from reslrb_cli.optimization.problem import Problem
@@ -28,13 +29,33 @@ LUMINANCE = np.array([0.212671, 0.715160, 0.072169], dtype=np.float32)
 def make_targets(problem: Problem, say: Callable[[str], None]) -> None:
     """Read or render every view's target, and with it what is known of the parameters, `problem.truth`.
 
-    `say` is told what takes long. Raises ConfigError.
+    `say` is told what takes long, and what of the targets is left out. Raises ConfigError.
     """
     if problem.config.target.render is not None:
         _render_targets(problem, say)
         return
-    for index, view in enumerate(problem.views):
-        view.made = _fit(problem, _read_target(problem, index), view.sensor)
+    _check_count(problem)
+    for view in problem.views:
+        photo = _read_photo(problem, view)
+        _see(problem, view, photo.image, photo, say)
+
+
+def _see(problem: Problem, view: View, image: Array, photo: Photo | None, say: Callable[[str], None]) -> None:
+    """Give a view its target, (H, W, C), and leave out what its mask does; `photo` is what was read, if it was."""
+    wanted, config = view.wanted, problem.config
+    target = _fit(problem, image, view.sensor)
+    view.masked = mask_of(config, wanted.mask, wanted.mask_mixed, wanted.mask_key, problem.scene, view.sensor, photo)
+    weights = view.masked.total(target.shape[:2])
+    line = mask_line(f"view {view.sensor}", view.masked, weights)
+    if not weights.any():
+        raise ConfigError(
+            config.source,
+            wanted.mask_key,
+            f"leaves nothing to compare ({line}); switch kinds off, such as {{specular: false}}, or set it to none",
+        )
+    if line is not None:
+        say(line)
+    view.see(target, weights)
 
 
 def _render_targets(problem: Problem, say: Callable[[str], None]) -> None:
@@ -54,7 +75,7 @@ def _render_targets(problem: Problem, say: Callable[[str], None]) -> None:
     for view in problem.views:
         say(f"rendering the target of sensor {view.sensor}: {render.spp} spp")
         image = render_in_passes(integrator, true_scene, view.sensor, render.spp, render.seed, 0, "target", multiple)
-        view.made = _fit(problem, image, view.sensor)
+        _see(problem, view, image, None, say)
 
 
 def set_true_values(config: Config, scene: mi.Scene) -> Selection:
@@ -67,31 +88,35 @@ def set_true_values(config: Config, scene: mi.Scene) -> Selection:
     return set_values(scene, config.parameters, render.parameters, config.source, "target.render.parameters")
 
 
-def _read_target(problem: Problem, index: int) -> Array:
-    """Read the target image (H, W, 3) of the `index`-th view. Raises ConfigError."""
-    config, sensors = problem.config, problem.sensors
-    files = config.target.file
-    assert files is not None, "called for target files only"
-    key = "target.file" if len(files) == 1 else f"target.file[{index}]"
+def _check_count(problem: Problem) -> None:
+    files, sensors = problem.config.target.file or [], problem.sensors
     if len(files) != len(sensors):
         raise ConfigError(
-            config.source,
+            problem.config.source,
             "target.file",
             f"must name one image for each sensor; images: {len(files)}, sensors: {len(sensors)}",
         )
-    width, height = problem.scene.sensors()[sensors[index]].film().crop_size()
+
+
+def _read_photo(problem: Problem, view: View) -> Photo:
+    """Read the target file of a view. Raises ConfigError."""
+    config, wanted = problem.config, view.wanted
+    assert wanted.file is not None, "called for target files only"
+    width, height = problem.scene.sensors()[view.sensor].film().crop_size()
     try:
-        return read_image(files[index], config.target.color_space, (int(width), int(height)))
+        photo = read_photo(wanted.file, config.target.color_space, (int(width), int(height)), config.target.gamma)
+        check_photo(wanted.file, photo, allow_nonfinite=wanted.mask.nonfinite)
     except ConfigError as error:
-        raise ConfigError(config.source, key, error.message) from None
+        raise ConfigError(config.source, wanted.file_key, error.message) from None
+    return photo
 
 
-def _fit(problem: Problem, image: Array, sensor: int) -> mi.TensorXf:
-    """`image` as a tensor with as many channels as the film of `sensor` has without its alpha."""
+def _fit(problem: Problem, image: Array, sensor: int) -> Array:
+    """`image` with as many channels as the film of `sensor` has without its alpha."""
     colors = color_channels(problem.scene.sensors()[sensor].film())
     if colors == 1 and image.shape[2] >= 3:
         image = image[:, :, :3] @ LUMINANCE[:, None]
-    return to_tensor(image[:, :, :colors])
+    return image[:, :, :colors]
 
 
 def color_channels(film: mi.Film) -> int:

@@ -3,19 +3,35 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from reslrb_cli.config import Config
+from reslrb_cli.config import Config, Mask
 from reslrb_cli.integrators import first_channels
 from reslrb_cli.optimization.loading import choose_sensors
 from reslrb_cli.optimization.losses import Loss, make_loss
+from reslrb_cli.optimization.masking import Masked
 
 Array = np.ndarray[Any, Any]
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """What an experiment says of one view's target: its file, None of one that is rendered, and its mask.
+
+    `file_key` and `mask_key` are where they stand in the configuration.
+    """
+
+    file: Path | None = None
+    file_key: str = "target.file"
+    mask: Mask = field(default_factory=Mask)
+    mask_mixed: bool = False
+    mask_key: str = "target.mask"
 
 
 @dataclass
@@ -23,12 +39,17 @@ class View:
     """What the scene's sensor of index `sensor` is to see, of which `share` (all of them sum to 1) is the loss.
 
     `made` is the target (H, W, C), without alpha; None until there is one, which `target` raises LookupError for.
+    `weights`, of the same shape with a mean of 1, say what its entries count, 0 of those that `masked` leaves out;
+    None where all are the same.
     """
 
     sensor: int
     loss: Loss
     share: float = 1.0
     made: mi.TensorXf | None = None
+    weights: mi.TensorXf | None = None
+    wanted: Wanted = field(default_factory=Wanted)
+    masked: Masked = field(default_factory=Masked)
 
     @property
     def target(self) -> mi.TensorXf:
@@ -37,20 +58,62 @@ class View:
             raise LookupError(f"view {self.sensor} has no target yet")
         return self.made
 
+    def see(self, target: Array, weights: Array | None = None) -> None:
+        """Take a target (H, W, C), finite where its weights (H, W) are not 0: what they leave out is 0 otherwise."""
+        self.weights = None
+        if weights is not None and not np.all(weights == 1):
+            target = np.where(np.isfinite(target), target, 0)
+            share = weights / weights.mean(dtype=np.float64)
+            self.weights = to_tensor(np.broadcast_to(share[:, :, None], target.shape))
+        self.made = to_tensor(target)
+
     def compare(self, image: mi.TensorXf) -> mi.Float:
         """The loss of an (H, W, C) image, of width 1, attached; alpha is left out."""
-        return self.loss(first_channels(image, self.target.shape[2]), self.target)
+        image, target = first_channels(image, self.target.shape[2]), self.target
+        if self.weights is None:
+            return self.loss(image, target)
+        # Whatever stands in a pixel that is left out, also if it is not finite, has neither loss nor derivative.
+        return self.loss(dr.select(self.weights > 0, image, target), target, self.weights)
 
     def objective(self, image: mi.TensorXf) -> mi.Float:
         """What the view adds to the loss of all views."""
         return self.compare(image) * self.share
 
 
+def view_records(views: list[View]) -> list[dict[str, Any]]:
+    """What a run's manifest says of its views: share of the loss, pixels, how many are left out, and of which kinds."""
+    found = []
+    for view in views:
+        height, width, channels = view.target.shape
+        left_out = 0 if view.weights is None else int((np.array(view.weights) == 0).sum()) // channels
+        found.append(
+            {
+                "sensor": view.sensor,
+                "share": view.share,
+                "pixels": height * width,
+                "left_out": left_out,
+                "kinds": view.masked.counts(),
+                "counted": view.masked.stay,
+            }
+        )
+    return found
+
+
 def make_views(config: Config, scene: mi.Scene) -> list[View]:
     """The views of an experiment, without their targets. Raises ConfigError for a sensor that is not there."""
-    sensors = choose_sensors(config, scene)
+    sensors, target = choose_sensors(config, scene), config.target
     loss = make_loss(config.loss.type, **config.loss.options())
-    return [View(sensor, loss, 1 / len(sensors)) for sensor in sensors]
+    views = []
+    for number, sensor in enumerate(sensors):
+        files = target.file or []
+        wanted = Wanted(
+            file=files[number] if number < len(files) else None,
+            file_key="target.file" if len(files) == 1 else f"target.file[{number}]",
+            mask=target.mask,
+            mask_mixed=target.mask_mixed,
+        )
+        views.append(View(sensor, loss, 1 / len(sensors), wanted=wanted))
+    return views
 
 
 def to_tensor(array: Array) -> mi.TensorXf:
@@ -61,11 +124,18 @@ def to_tensor(array: Array) -> mi.TensorXf:
 
 
 def target_arrays(views: list[View]) -> dict[str, Array]:
-    """The views' targets, to be handed to another process, which `set_targets` sets them in."""
-    return {f"target-{number}": np.array(view.target) for number, view in enumerate(views)}
+    """The views' targets and weights, to be handed to another process, which `set_targets` sets them in."""
+    arrays = {}
+    for number, view in enumerate(views):
+        arrays[f"target-{number}"] = np.array(view.target)
+        if view.weights is not None:
+            arrays[f"weights-{number}"] = np.array(view.weights)
+    return arrays
 
 
 def set_targets(views: list[View], arrays: Mapping[str, Array]) -> None:
-    """Give views the targets of `target_arrays`."""
+    """Give views the targets and weights of `target_arrays`."""
     for number, view in enumerate(views):
         view.made = to_tensor(arrays[f"target-{number}"])
+        weights = f"weights-{number}"
+        view.weights = to_tensor(arrays[weights]) if weights in arrays else None

@@ -13,7 +13,7 @@ from reslrb_cli.integrators import gradient_step, known_step, render_image
 from reslrb_cli.measure.convergence.survey import masked_loss
 from reslrb_cli.measure.worker import Begun
 from reslrb_cli.optimization.problem import assemble_scene
-from reslrb_cli.optimization.views import to_tensor
+from reslrb_cli.optimization.views import set_targets, to_tensor
 from reslrb_cli.records.clock import StepClock, StepTimes, peak_mib, reset_peak
 from reslrb_cli.seeds import seed
 
@@ -29,8 +29,8 @@ class Sampler:
         self.problem, self.mode, self.clock = assemble_scene(config), mode, StepClock()
         self.sensor = self.problem.sensors[0]
         self.view = self.problem.views[0]
-        if "target" in arrays:
-            self.view.made = to_tensor(arrays["target"])
+        if "adjoints" in arrays:
+            set_targets([self.view], arrays)
         self.mask = None if arrays["mask"].all() else to_tensor(arrays["mask"])
         self.adjoints = [to_tensor(array) for array in arrays.get("adjoints", ())]
         self.inside = arrays["mask"] != 0

@@ -21,7 +21,7 @@ from reslrb_cli.measure.references import Situation, interior, prb_gradient, prb
 from reslrb_cli.measure.worker import Begun
 from reslrb_cli.optimization.problem import Problem, assemble_scene
 from reslrb_cli.optimization.targets import make_targets
-from reslrb_cli.optimization.views import View
+from reslrb_cli.optimization.views import View, target_arrays
 from reslrb_cli.records.gradcheck import Reference
 from reslrb_cli.scene.catalog import value_shape
 
@@ -57,9 +57,10 @@ def survey(
     The facts: `keys`, `shapes` of what is estimated (of the parameters, or `image`), `independent` (key to the name of
     a stock integrator, or None), `why` (key to what keeps others from it), `without` (stock integrators that are right
     for nothing here, with the reason), `masked` (whether pixels along the border are left out), `pixels`, and in words
-    what was rendered, `pictures`. The arrays: `mask` (H, W, 1), and unless the image is the objective `target` (of
-    shape (H, W, C)) and `adjoints` (B, H, W, C). `camera`: paths from the camera take part, where they are right or
-    `named`, which lose nothing by the film's border; `budget_s` is the time of the whole measurement, if it counts.
+    what was rendered, `pictures`. The arrays: `mask` (H, W, 1), and unless the image is the objective the first
+    view's `target_arrays` and `adjoints` (B, H, W, C). `camera`: paths from the camera take part, where they are right
+    or `named`, which lose nothing by the film's border; `budget_s` is the time of the whole measurement, if it
+    counts.
     """
     film = problem.scene.sensors()[problem.sensors[0]].film()
     width, height = (int(n) for n in film.crop_size())
@@ -75,7 +76,6 @@ def survey(
     paths = PATHS[objective] if budget_s is None else affordable_paths(problem, pixels, SHARE[objective] * budget_s / 2)
     shortened = shorten_target(problem, paths // pixels)
     make_targets(problem, lambda line: None)
-    target = np.array(problem.views[0].target)
     count = IMAGES if objective == "loss" else 1
     spp = multiple_of(paths // (count * pixels), problem.samples_per_pass)
     adjoints = []
@@ -83,7 +83,7 @@ def survey(
         image = problem.render(problem.sensors[0], spp, number, _PURPOSE)
         adjoints.append(adjoint(problem, image, mask))
     facts["pictures"] = f"dL/dI at {'an image' if count == 1 else f'{count} images'} of {spp} spp{shortened}"
-    return facts, {"mask": mask, "target": target, "adjoints": np.stack(adjoints)}
+    return facts, {"mask": mask, "adjoints": np.stack(adjoints), **target_arrays(problem.views[:1])}
 
 
 def adjoint(problem: Problem, image: np.ndarray, mask: np.ndarray) -> np.ndarray:

@@ -1,0 +1,80 @@
+"""What of a target counts: the mask that leaves pixels out."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+from pydantic import BeforeValidator, Field, GetJsonSchemaHandler
+from pydantic_core import CoreSchema
+
+from .base import ConfigPath, Section, wrong
+
+_KINDS = ("specular", "border", "clipped", "alpha", "nonfinite")
+
+
+class Mask(Section):
+    """Which pixels of a target are left out, and what the others weigh.
+
+    Kinds act on a target that is read from a file. `specular` and `border` are what light tracing lacks: they act where
+    one of the run's integrator and the target's traces from the light and the other does not, also on a rendered one.
+    """
+
+    file: ConfigPath | None = Field(
+        default=None,
+        description="Image of weights, of the target's size, relative to the config file: 0 leaves a pixel out. Values "
+        "are taken as they stand in it, of 8 and 16 bits as shares of the greatest; of several channels the mean.",
+    )
+    specular: bool = Field(
+        default=True,
+        description="Leave out pixels that see smooth glass or mirrors directly, which light tracing cannot render.",
+    )
+    border: bool = Field(
+        default=True,
+        description="Leave out pixels within the reconstruction filter's radius of the film's border, where light "
+        "tracing is darker.",
+    )
+    clipped: bool = Field(
+        default=True,
+        description="Leave out pixels of 8 and 16 bit files that are at the greatest value in any channel.",
+    )
+    alpha: bool = Field(default=True, description="Leave out pixels whose alpha is 0.")
+    nonfinite: bool = Field(
+        default=True, description="Leave out pixels that are not finite; false: a file that has any is refused."
+    )
+
+    @property
+    def is_empty(self) -> bool:
+        """Whether it leaves nothing out, and weighs nothing."""
+        return self.file is None and not any(getattr(self, kind) for kind in _KINDS)
+
+
+def _mask(value: Any) -> Any:
+    if value == "auto":
+        return {}
+    if value == "none":
+        return dict.fromkeys(_KINDS, False)
+    if isinstance(value, (str, Path)):
+        return dict.fromkeys(_KINDS, False) | {"file": value}
+    if not isinstance(value, (dict, Mask)):
+        raise wrong("must be `auto`, `none`, the path of an image of weights, or a section such as {clipped: false}")
+    return value
+
+
+class _OrText:
+    """For JSON Schema: a section, or text that stands for one."""
+
+    def __get_pydantic_json_schema__(self, core: CoreSchema, handler: GetJsonSchemaHandler) -> dict[str, Any]:
+        return {"anyOf": [handler(core), {"type": "string"}]}
+
+
+#: `auto`, `none`, an image of weights, or a section that says what is left out.
+AnyMask = Annotated[Mask, BeforeValidator(_mask), _OrText()]
+MASK = (
+    "Pixels that are left out of the loss, and what the others weigh: `auto` (all kinds are left out), `none`, the "
+    "path of an image of weights, alone, or a section that switches kinds off and may add weights."
+)
+MASK_MIXED = (
+    "Leave out, with `specular`, the pixels that see a coat, a blend or a thin pane directly, of whose light light "
+    "tracing lacks a part; else they stay, and are counted."
+)
