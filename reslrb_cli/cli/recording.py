@@ -253,12 +253,13 @@ class Recording:
             logger.info(f"rendering the final image: {spp} spp")
         for view in self.problem.views:
             image = self.problem.render(view.sensor, spp, self.done, "saved image")
-            write_image(self.folder.images / self._image_name(name, view.sensor), image)
+            exposed = view.exposure.of_array(image)  # as the target is
+            write_image(self.folder.images / self._image_name(name, view.sensor), exposed)
             self.results.see(name, view, image)
             if name == "final":
                 suffix = self._image_name("", view.sensor)
                 towards = self.problem.image_gradient(view, image)
-                about = write_error_map(self.folder.images, suffix, image, np.array(view.target), towards)
+                about = write_error_map(self.folder.images, suffix, exposed, np.array(view.target), towards)
                 self.error_maps[f"error{suffix}"] = about
 
     def _image_name(self, name: str, sensor: int) -> str:

@@ -12,8 +12,7 @@ import numpy as np
 from reslrb_cli.config import Config, Reslrb, with_integrator
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.optimization.problem import Problem, assemble_scene
-from reslrb_cli.optimization.targets import color_channels
-from reslrb_cli.optimization.views import to_tensor
+from reslrb_cli.optimization.views import color_channels, to_tensor
 from reslrb_cli.records.checkpoint import NONFINITE_FILE_NAME, load_nonfinite
 from reslrb_cli.records.manifest import FILE_NAME as MANIFEST
 from reslrb_cli.records.manifest import read_manifest

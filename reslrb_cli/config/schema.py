@@ -29,7 +29,7 @@ from .names import check_name, folder_name
 from .optimizers import Adam, AnyOptimizer
 from .parameters import COLOR_SPACE, ColorSpace, ParameterSpec, Value
 from .sizes import Memory, memory_bytes
-from .views import MASK, MASK_MIXED, AnyMask, Mask
+from .views import EXPOSURE, MASK, MASK_MIXED, AnyMask, Exposures, Mask
 
 
 def _list_of_one(value: Any) -> Any:
@@ -115,6 +115,11 @@ class TargetConfig(Section):
     render: Rendering | None = Field(default=None, description="Render the target from the scene.")
     mask: AnyMask = Field(default=Mask(), description=MASK)
     mask_mixed: bool = Field(default=False, description=MASK_MIXED)
+    exposure: Exposures = Field(
+        default=1.0,
+        description=f"{EXPOSURE}, all views having the same; or a list of these with one for each view, which are then "
+        "recovered apart.",
+    )
 
     @model_validator(mode="after")
     def _check_one(self) -> Self:
@@ -251,6 +256,13 @@ class Config(Section):
             return run.adjoint
         fits = run.spp % run.batches == 0 and _passes_divide(self.integrator, run.spp // run.batches)
         return "batched" if fits else "independent"
+
+    def with_exposures_fixed(self) -> Config:
+        """The experiment with exposures of 1 in place of recovered ones, for what looks at the scene alone."""
+        given = self.target.exposure
+        fixed = [1.0 if isinstance(each, str) else each for each in (given if isinstance(given, list) else [given])]
+        target = self.target.model_copy(update={"exposure": fixed if isinstance(given, list) else fixed[0]})
+        return self.model_copy(update={"target": target})
 
     def step_options(self) -> dict[str, Any]:
         """What a gradient step is told of its samples."""

@@ -1,11 +1,12 @@
-"""What of a target counts: the mask that leaves pixels out."""
+"""How a target is compared with: the mask that leaves pixels out of it, and its exposure."""
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
-from pydantic import BeforeValidator, Field, GetJsonSchemaHandler
+from pydantic import BeforeValidator, Field, GetJsonSchemaHandler, WithJsonSchema
 from pydantic_core import CoreSchema
 
 from .base import ConfigPath, Section, wrong
@@ -77,4 +78,43 @@ MASK = (
 MASK_MIXED = (
     "Leave out, with `specular`, the pixels that see a coat, a blend or a thin pane directly, of whose light light "
     "tracing lacks a part; else they stay, and are counted."
+)
+
+
+def _exposure(value: Any) -> Any:
+    is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
+    if (is_number and math.isfinite(value) and value > 0) or value in ("auto", "per_channel"):
+        return value
+    raise wrong("must be a positive number, `auto` or `per_channel`")
+
+
+#: One view's exposure: a number, `auto` (recovered, one factor), or `per_channel` (recovered, one factor a channel).
+Exposure = Annotated[
+    float | Literal["auto", "per_channel"],
+    BeforeValidator(_exposure),
+    WithJsonSchema({"anyOf": [{"type": "number", "exclusiveMinimum": 0}, {"enum": ["auto", "per_channel"]}]}),
+]
+
+
+def _exposures(value: Any) -> Any:
+    return [_exposure(item) for item in value] if isinstance(value, list) else _exposure(value)
+
+
+#: One exposure that all views share, or a list with one for each.
+Exposures = Annotated[
+    float | Literal["auto", "per_channel"] | list[Exposure],
+    BeforeValidator(_exposures),
+    WithJsonSchema(
+        {
+            "anyOf": [
+                {"type": "number", "exclusiveMinimum": 0},
+                {"enum": ["auto", "per_channel"]},
+                {"type": "array", "items": {"anyOf": [{"type": "number"}, {"enum": ["auto", "per_channel"]}]}},
+            ]
+        }
+    ),
+]
+EXPOSURE = (
+    "What the image is multiplied by before it is compared, target = exposure * image: a number, `auto` (recovered "
+    "with the parameters, one factor), or `per_channel` (recovered, one for each channel, which is white balance)"
 )

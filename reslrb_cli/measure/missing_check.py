@@ -38,7 +38,7 @@ class MissingCheck:
         self._budget, self._count, self._start = budget_s, count, time.perf_counter()
         depth = config.integrator.max_depth
         [listed] = parse_estimators(ESTIMATOR)
-        problem = assemble(listed.at(config, depth, True))
+        problem = assemble(listed.at(config, depth, True).with_exposures_fixed())
         self.source, sensor = str(config.source), problem.sensors[0]
         self.case = Case.of(problem.scene, problem.selection.keys, sensor, problem.selection)
         height, width, _ = self.case.weights.shape

@@ -75,6 +75,7 @@ def _parts(problem: Problem, sensor: int, step_seed: int) -> Iterator[tuple[Samp
 def _set_tangents(problem: Problem) -> None:
     """Give every entry of every parameter the tangent 1, as far as what of the scene holds it."""
     params, keys = problem.selection.params, problem.selection.keys
+    keys = [key for key in keys if key in params]  # an exposure is no part of any path
     for key in keys:
         leaf = problem.optimizer[key]
         dr.set_grad(leaf, 1.0)
@@ -105,6 +106,7 @@ def _take_step(problem: Problem, view: View, step_seed: int) -> Step:
     step = gradient_step(
         problem.integrator, problem.scene, view.sensor, view.objective,
         seed=step_seed, **problem.config.step_options(), params=problem.selection.params,
+        on_samples=problem.on_samples(view),
     )  # fmt: skip
     gradients = {key: np.array(gradient) for key, gradient in problem.gradients().items()}
     for key in keys:

@@ -35,7 +35,7 @@ class Stepper:
         scene = _load(config)
         if film_width is not None:
             widen(scene, choose_sensors(config, scene)[0], film_width)
-        self.problem = assemble_scene(config, scene)
+        self.problem = assemble_scene(config.with_exposures_fixed(), scene)
         self.sensor = self.problem.sensors[0]
         self.known = objective == "fixed"
         film = self.problem.scene.sensors()[self.sensor].film()

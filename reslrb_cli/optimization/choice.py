@@ -191,6 +191,7 @@ def _situation(problem: Problem) -> dict[str, Any]:
         "scene": hashlib.blake2b(Path(config.scene.file).read_bytes()).hexdigest(),
         "options": dump["scene"]["options"],
         "sensors": problem.sensors,
+        "views": [view.situation() for view in problem.views],
         "parameters": {key: list(problem.selection.array(key).shape) for key in problem.selection.keys},
         "integrator": dump["integrator"],
         "loss": dump["loss"],

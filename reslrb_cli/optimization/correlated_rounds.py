@@ -65,5 +65,6 @@ def _gradient(problem: Problem, number: int, image: str, spp: int) -> dict[str, 
             integrator, problem.scene, view.sensor, view.objective,
             seed=seed(run.seed, number, view.sensor, "bias"),
             image_seed=seed(run.seed, number, view.sensor, image), spp=spp, params=problem.selection.params,
+            on_samples=problem.on_samples(view),
         )  # fmt: skip
     return take_gradient(problem)

@@ -140,6 +140,7 @@ def gradient(
             **config.step_options(),
             params=problem.selection.params,
             on_image=split.image,
+            on_samples=problem.on_samples(view),
         )
         # One view's kernels are not to wait for the next one's: memory would grow with the number of views.
         gradients = problem.gradients()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -11,6 +12,7 @@ import mitsuba as mi
 import numpy as np
 
 from reslrb_cli.config import Config
+from reslrb_cli.integrators import OnSamples
 from reslrb_cli.optimization.budget import MemoryPlan
 from reslrb_cli.optimization.choice import Cache, find_options, settle_integrator
 from reslrb_cli.optimization.errors import ErrorMeter, quantity
@@ -28,7 +30,7 @@ from reslrb_cli.optimization.rendering import render_in_passes
 from reslrb_cli.optimization.scaling import Scaled
 from reslrb_cli.optimization.targets import make_targets
 from reslrb_cli.optimization.transforms import make_transform
-from reslrb_cli.optimization.views import View, make_views
+from reslrb_cli.optimization.views import View, expose, make_views
 from reslrb_cli.scene import Selection, select_parameters
 
 Array = np.ndarray[Any, Any]
@@ -74,6 +76,13 @@ class Problem:
     def sensors(self) -> list[int]:
         """The index of each view's sensor."""
         return [view.sensor for view in self.views]
+
+    def on_samples(self, view: View) -> OnSamples | None:
+        """What has to see the samples of a view's step: a recovered exposure, which has its gradient from them."""
+        key = view.exposure.key
+        if not key:
+            return None
+        return functools.partial(view.exposure.add_gradient, self.optimizer[key], view.target.shape[2])
 
     def image_gradient(self, view: View, image: Array) -> Array:
         """The derivative dL/dI of a view's loss at an image (H, W, C), in the target's channels; finite or not."""
@@ -136,6 +145,7 @@ def assemble_scene(config: Config, scene: Any = None, values: Mapping[str, Array
     views = make_views(config, scene)
     check_integrator(config, config.integrator, scene, [view.sensor for view in views])
     selection = select_parameters(scene, config.parameters, config.source)
+    expose(views, scene, selection)
     if values is not None:
         _check_values(selection, values)
         selection.set_arrays(values)
@@ -157,11 +167,17 @@ def assemble_scene(config: Config, scene: Any = None, values: Mapping[str, Array
         integrator=make_configured(config.integrator),
         optimizer=optimizer,
         samples_per_pass=samples_per_pass(config),
-        quantities={key: selection.quantity(key) or quantity(selection.params, key) for key in selection.keys},
+        quantities={key: _quantity(selection, key) for key in selection.keys},
     )
     problem.apply()
     check_moving(problem)
     return problem
+
+
+def _quantity(selection: Selection, key: str) -> str:
+    if key in selection.factors:
+        return ""
+    return selection.quantity(key) or quantity(selection.params, key)
 
 
 def _check_values(selection: Selection, values: Mapping[str, Array]) -> None:

@@ -34,7 +34,7 @@ def find_reached(problem: Problem, say: Callable[[str], None] = lambda line: Non
     say(f"finding what light and sensor reach: {problem.config.run.reach_spp} spp")
     sensitive = sensitivity(problem)
     for key in problem.truth:
-        mask: Array = sensitive[key]
+        mask: Array = sensitive[key] | (key in problem.selection.factors)  # every image shows its exposure
         if mask.ndim == 3:
             mask = np.any(mask, axis=2)
             if key in problem.selection.params:  # a heightmap is no texture to be seen

@@ -24,6 +24,7 @@ def sample_gradient(problem: Problem, integrator: Any, round: int, purpose: str,
         step = gradient_step(
             integrator, problem.scene, view.sensor, view.objective, seed=seed(run.seed, round, view.sensor, purpose),
             **{**problem.config.step_options(), "spp": spp}, params=problem.selection.params,
+            on_samples=problem.on_samples(view),
         )  # fmt: skip
         gradients = problem.gradients()
         dr.eval(step.loss, gradients)

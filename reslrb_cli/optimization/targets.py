@@ -14,7 +14,7 @@ from reslrb_cli.optimization.errors import comparison_grid
 from reslrb_cli.optimization.loading import check_integrator, load_configured, make_configured
 from reslrb_cli.optimization.masking import mask_line, mask_of
 from reslrb_cli.optimization.rendering import render_in_passes
-from reslrb_cli.optimization.views import View
+from reslrb_cli.optimization.views import View, color_channels
 from reslrb_cli.scene import Photo, Selection, check_photo, read_photo, set_values
 
 if TYPE_CHECKING:
@@ -64,6 +64,9 @@ def _render_targets(problem: Problem, say: Callable[[str], None]) -> None:
     true_scene = load_configured(config)
     true_values = set_true_values(config, true_scene)
     for key in problem.selection.keys:
+        if key in problem.selection.factors:  # the scene's own images are the target
+            problem.truth[key] = np.ones_like(problem.selection.array(key))
+            continue
         problem.truth[key] = true_values.array(key)
         grid = comparison_grid(problem.selection.array(key).shape, problem.truth[key].shape)
         if grid is not None:
@@ -117,8 +120,3 @@ def _fit(problem: Problem, image: Array, sensor: int) -> Array:
     if colors == 1 and image.shape[2] >= 3:
         image = image[:, :, :3] @ LUMINANCE[:, None]
     return image[:, :, :colors]
-
-
-def color_channels(film: mi.Film) -> int:
-    """How many channels an image of `film` has without alpha."""
-    return 1 if int(film.base_channels_count()) <= 2 else 3

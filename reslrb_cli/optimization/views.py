@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -12,10 +13,13 @@ import mitsuba as mi
 import numpy as np
 
 from reslrb_cli.config import Config, Mask
+from reslrb_cli.errors import ConfigError
 from reslrb_cli.integrators import first_channels
+from reslrb_cli.optimization.exposure import SHARED, Exposure, add_exposure
 from reslrb_cli.optimization.loading import choose_sensors
 from reslrb_cli.optimization.losses import Loss, make_loss
 from reslrb_cli.optimization.masking import Masked
+from reslrb_cli.scene import Selection
 
 Array = np.ndarray[Any, Any]
 
@@ -24,7 +28,8 @@ Array = np.ndarray[Any, Any]
 class Wanted:
     """What an experiment says of one view's target: its file, None of one that is rendered, and its mask.
 
-    `file_key` and `mask_key` are where they stand in the configuration.
+    `file_key` and `mask_key` are where they stand in the configuration. `exposure` is a number, or how it is recovered,
+    by which key.
     """
 
     file: Path | None = None
@@ -32,6 +37,8 @@ class Wanted:
     mask: Mask = field(default_factory=Mask)
     mask_mixed: bool = False
     mask_key: str = "target.mask"
+    exposure: float | str = 1.0
+    exposure_key: str = SHARED
 
 
 @dataclass
@@ -48,6 +55,7 @@ class View:
     share: float = 1.0
     made: mi.TensorXf | None = None
     weights: mi.TensorXf | None = None
+    exposure: Exposure = field(default_factory=Exposure)
     wanted: Wanted = field(default_factory=Wanted)
     masked: Masked = field(default_factory=Masked)
 
@@ -68,12 +76,25 @@ class View:
         self.made = to_tensor(target)
 
     def compare(self, image: mi.TensorXf) -> mi.Float:
-        """The loss of an (H, W, C) image, of width 1, attached; alpha is left out."""
-        image, target = first_channels(image, self.target.shape[2]), self.target
+        """The loss of an (H, W, C) image, of width 1, attached; alpha is left out, the view's exposure applied."""
+        return self.judge(self.exposure.applied(first_channels(image, self.target.shape[2])))
+
+    def judge(self, image: mi.TensorXf) -> mi.Float:
+        """The same of an image that has its exposure, and the target's channels."""
+        target = self.target
         if self.weights is None:
             return self.loss(image, target)
         # Whatever stands in a pixel that is left out, also if it is not finite, has neither loss nor derivative.
         return self.loss(dr.select(self.weights > 0, image, target), target, self.weights)
+
+    def kept(self, image: Array) -> Array:
+        """An image of the target's shape, 0 where pixels are left out."""
+        return image if self.weights is None else np.where(np.array(self.weights) > 0, image, 0)
+
+    def situation(self) -> list[Any]:
+        """Share, exposure and weights in short, as plain values: two views that have the same count the same."""
+        weights = None if self.weights is None else hashlib.blake2b(np.array(self.weights).tobytes()).hexdigest()
+        return [self.share, self.wanted.exposure, weights]
 
     def objective(self, image: mi.TensorXf) -> mi.Float:
         """What the view adds to the loss of all views."""
@@ -90,6 +111,7 @@ def view_records(views: list[View]) -> list[dict[str, Any]]:
             {
                 "sensor": view.sensor,
                 "share": view.share,
+                "exposure": view.exposure.key or view.exposure.fixed,
                 "pixels": height * width,
                 "left_out": left_out,
                 "kinds": view.masked.counts(),
@@ -103,6 +125,13 @@ def make_views(config: Config, scene: mi.Scene) -> list[View]:
     """The views of an experiment, without their targets. Raises ConfigError for a sensor that is not there."""
     sensors, target = choose_sensors(config, scene), config.target
     loss = make_loss(config.loss.type, **config.loss.options())
+    exposures = target.exposure if isinstance(target.exposure, list) else [target.exposure] * len(sensors)
+    if len(exposures) != len(sensors):
+        raise ConfigError(
+            config.source,
+            "target.exposure",
+            f"must have one entry for each sensor; entries: {len(exposures)}, sensors: {len(sensors)}",
+        )
     views = []
     for number, sensor in enumerate(sensors):
         files = target.file or []
@@ -111,9 +140,28 @@ def make_views(config: Config, scene: mi.Scene) -> list[View]:
             file_key="target.file" if len(files) == 1 else f"target.file[{number}]",
             mask=target.mask,
             mask_mixed=target.mask_mixed,
+            exposure=exposures[number],
+            exposure_key=f"exposure.{sensor}" if isinstance(target.exposure, list) else SHARED,
         )
         views.append(View(sensor, loss, 1 / len(sensors), wanted=wanted))
     return views
+
+
+def expose(views: list[View], scene: mi.Scene, selection: Selection) -> None:
+    """Give views their exposures, and have `selection` recover those that are not known."""
+    for view in views:
+        wanted = view.wanted
+        if isinstance(wanted.exposure, str):
+            colors = color_channels(scene.sensors()[view.sensor].film())
+            add_exposure(selection, wanted.exposure_key, wanted.exposure, colors)
+            view.exposure = Exposure(key=wanted.exposure_key, values=selection.factors)
+        else:
+            view.exposure = Exposure(fixed=wanted.exposure)
+
+
+def color_channels(film: mi.Film) -> int:
+    """How many channels an image of `film` has without alpha."""
+    return 1 if int(film.base_channels_count()) <= 2 else 3
 
 
 def to_tensor(array: Array) -> mi.TensorXf:

@@ -26,7 +26,7 @@ class Sampler:
     """
 
     def __init__(self, config: Any, mode: str, arrays: dict[str, np.ndarray]) -> None:
-        self.problem, self.mode, self.clock = assemble_scene(config), mode, StepClock()
+        self.problem, self.mode, self.clock = assemble_scene(config.with_exposures_fixed()), mode, StepClock()
         self.sensor = self.problem.sensors[0]
         self.view = self.problem.views[0]
         if "adjoints" in arrays:

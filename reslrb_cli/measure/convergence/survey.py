@@ -39,7 +39,7 @@ _PURPOSE = "convergence, dL/dI"
 
 def begin(first: dict[str, Any]) -> Begun:
     """Begin the process. The one question names the file for arrays, `out`; its answer is `survey`'s facts."""
-    problem = assemble_scene(loads(first["config"], first["source"]))
+    problem = assemble_scene(loads(first["config"], first["source"]).with_exposures_fixed())
 
     def answer(question: dict[str, Any]) -> dict[str, Any]:
         facts, arrays = survey(problem, first["objective"], **question["ask"])
