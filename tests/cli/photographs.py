@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -20,20 +19,48 @@ parameters:
   - {key: red.reflectance.value, initial: 0.5, bounds: [0, 1]}
   - {key: green.reflectance.value, initial: 0.5, bounds: [0, 1]}
 """
+SENSOR = """<sensor type="perspective">
+        <string name="fov_axis" value="smaller"/> <float name="fov" value="39.3077"/>
+        <transform name="to_world"><lookat origin="{}" target="0, 0, 0" up="0, 1, 0"/></transform>
+        <film type="hdrfilm">
+            <integer name="width" value="{size}"/> <integer name="height" value="{size}"/>
+            <string name="pixel_format" value="rgb"/> <rfilter type="gaussian"/>
+        </film>
+    </sensor>"""
 
 
-def write_photograph(folder: Path, size: int, spp: int, exposure: float = 1.0, **changes: Any) -> None:
-    """Put scene, photograph and `photo.yaml` into `folder`; a variant must be set.
-
-    `changes` are objects of the scene by id, in place of its own.
-    """
+def cornell_box(size: int, extra: str = "", eyes: tuple[str, ...] = ("0, 0, 3.9",)) -> str:
+    """Mitsuba's Cornell box as XML, with a film of `size` squared for each eye, and `extra` elements."""
     import mitsuba as mi
 
-    box = mi.cornell_box() | changes
-    del box["integrator"]
-    box["sensor"]["film"] |= {"width": size, "height": size}
-    mi.xml.dict_to_xml(box, str(folder / "scene.xml"))
-    image = mi.render(mi.load_dict(box), integrator=mi.load_dict({"type": "path", "max_depth": -1}), spp=spp)
+    lines = [SENSOR.format(eye, size=size) for eye in eyes]
+    shapes = []
+    for key, item in mi.cornell_box().items():
+        if not isinstance(item, dict) or item["type"] not in ("diffuse", "rectangle", "cube"):
+            continue
+        if item["type"] == "diffuse":
+            color = ", ".join(map(str, item["reflectance"]["value"]))
+            lines.append(f'<bsdf type="diffuse" id="{key}"><rgb name="reflectance" value="{color}"/></bsdf>')
+            continue
+        matrix = " ".join(map(str, np.array(item["to_world"].matrix).reshape(4, 4).ravel()))
+        emitter = ""
+        if "emitter" in item:
+            color = ", ".join(map(str, item["emitter"]["radiance"]["value"]))
+            emitter = f'<emitter type="area"><rgb name="radiance" value="{color}"/></emitter>'
+        shapes.append(
+            f'<shape type="{item["type"]}" id="{key}"><transform name="to_world"><matrix value="{matrix}"/></transform>'
+            f'<ref id="{item["bsdf"]["id"]}"/>{emitter}</shape>'
+        )
+    return "\n".join(['<scene version="3.0.0">', *lines, *shapes, extra, "</scene>"])
+
+
+def write_photograph(folder: Path, size: int, spp: int, exposure: float = 1.0, extra: str = "") -> None:
+    """Put scene, photograph and `photo.yaml` into `folder`; a variant must be set."""
+    import mitsuba as mi
+
+    (folder / "scene.xml").write_text(cornell_box(size, extra))
+    scene = mi.load_file(str(folder / "scene.xml"))
+    image = mi.render(scene, integrator=mi.load_dict({"type": "path", "max_depth": -1}), spp=spp)
     bitmap = mi.Bitmap(np.array(image) * exposure)
     bitmap.convert(component_format=mi.Struct.Type.UInt8, srgb_gamma=True).write(str(folder / "photo.png"))
     (folder / "photo.yaml").write_text(CONFIG)
