@@ -38,8 +38,7 @@ def command(config_file: Path, overrides: tuple[str, ...], force: bool, quiet: b
     from reslrb_cli.cli.interrupts import Interrupts
     from reslrb_cli.cli.progress import Progress
     from reslrb_cli.cli.recording import Recording
-    from reslrb_cli.optimization import assemble, find_reached
-    from reslrb_cli.optimization.ambiguity import check_exposures
+    from reslrb_cli.optimization import assemble
     from reslrb_cli.optimization.border import warn_of_border
     from reslrb_cli.optimization.correlated_rounds import measure_correlated_bias
     from reslrb_cli.optimization.planning import plan_record
@@ -50,9 +49,7 @@ def command(config_file: Path, overrides: tuple[str, ...], force: bool, quiet: b
 
     logger = logging.getLogger(__name__)
     say = logger.info
-    problem = assemble(config, say, PilotCache())
-    check_exposures(problem)
-    find_reached(problem, say)
+    problem = assemble(config, say, PilotCache(), to_run=True)
     bias = measure_correlated_bias(problem, say)
     if bias is not None and bias.line() is not None:
         logger.warning(bias.line())

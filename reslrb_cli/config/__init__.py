@@ -7,7 +7,7 @@ from .moving import HEIGHTMAP, WORDS, HeightmapSpec, MotionSpec
 from .optimizers import SGD, Adam, AdamW, Optimizer, RMSProp
 from .parameters import ColorSpace, ImageFile, ParameterSpec, Settings
 from .schema import Config, Rendering, RunConfig, SceneConfig, TargetConfig
-from .views import Mask
+from .views import Mask, ViewSpec
 
 __all__ = [
     "HEIGHTMAP",
@@ -39,6 +39,7 @@ __all__ = [
     "Settings",
     "TargetConfig",
     "Trajectory",
+    "ViewSpec",
     "WalkAd",
     "dump",
     "load",

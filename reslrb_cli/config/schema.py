@@ -29,7 +29,7 @@ from .names import check_name, folder_name
 from .optimizers import Adam, AnyOptimizer
 from .parameters import COLOR_SPACE, ColorSpace, ParameterSpec, Value
 from .sizes import Memory, memory_bytes
-from .views import EXPOSURE, MASK, MASK_MIXED, AnyMask, Exposures, Mask
+from .views import EXPOSURE, MASK, MASK_MIXED, AnyMask, Exposures, Mask, ViewSpec, check_views
 
 
 def _list_of_one(value: Any) -> Any:
@@ -100,7 +100,7 @@ _Files = Annotated[
 
 
 class TargetConfig(Section):
-    """What the image is compared with: exactly one of `file` and `render`."""
+    """What the image is compared with: exactly one of `file` and `render`; views with own targets need none."""
 
     file: _Files | None = Field(
         default=None,
@@ -123,9 +123,8 @@ class TargetConfig(Section):
 
     @model_validator(mode="after")
     def _check_one(self) -> Self:
-        if (self.file is None) == (self.render is None):
-            has = "none" if self.file is None else "both"
-            raise located("", f"must have exactly one of `file` and `render`, and has {has}")
+        if self.file is not None and self.render is not None:
+            raise located("", "must have exactly one of `file` and `render`, and has both")
         if self.render is not None and self.color_space != "auto":
             raise located("color_space", "has no effect on a rendered target; it goes with `file`")
         if self.render is not None and self.gamma is not None:
@@ -206,6 +205,16 @@ class RunConfig(Section):
         description="Samples per pixel of the saved initial and final image, rounded up to whole passes of "
         "`samples_per_pass`.",
     )
+    views_per_iteration: Count | None = Field(
+        default=None,
+        description="Views that an iteration renders, drawn anew each time by the run's seed; their loss is scaled so "
+        "that its mean is that of all. null: all of them.",
+    )
+    held_out: list[Annotated[int, Field(ge=0)]] = Field(
+        default=[],
+        description="Sensors whose views are not trained on; their loss is recorded every 10 iterations (`held_out`), "
+        "and of the first and the last image.",
+    )
     reach_spp: Count = Field(default=64, description="Samples for the mask of the texels that light and sensor reach.")
 
     @field_validator("name")
@@ -240,6 +249,11 @@ class Config(Section):
     )
     scene: SceneConfig = Field(description="The scene and its sensors.")
     target: TargetConfig = Field(description="What the image is compared with.")
+    views: Annotated[list[ViewSpec], Field(min_length=1)] | None = Field(
+        default=None,
+        description="Sensors, each with its target, in place of `scene.sensors` and `target.file`; what a view does "
+        "not say is as `target` and `loss` have it.",
+    )
     parameters: Annotated[list[ParameterSpec], Field(min_length=1)] = Field(description="What is recovered.")
     integrator: AnyIntegrator = Field(default=Reslrb(), description="How image and gradient are computed.")
     loss: AnyLoss = Field(default=L2(), description="How image and target are compared.")
@@ -262,7 +276,10 @@ class Config(Section):
         given = self.target.exposure
         fixed = [1.0 if isinstance(each, str) else each for each in (given if isinstance(given, list) else [given])]
         target = self.target.model_copy(update={"exposure": fixed if isinstance(given, list) else fixed[0]})
-        return self.model_copy(update={"target": target})
+        views = self.views and [
+            view.model_copy(update={"exposure": 1.0}) if isinstance(view.exposure, str) else view for view in self.views
+        ]
+        return self.model_copy(update={"target": target, "views": views})
 
     def step_options(self) -> dict[str, Any]:
         """What a gradient step is told of its samples."""
@@ -282,9 +299,21 @@ class Config(Section):
 
     __hash__ = None  # type: ignore[assignment]
 
+    @model_validator(mode="before")
+    @classmethod
+    def _target_of_views(cls, data: Any) -> Any:
+        """Views may have all that there is to say of targets."""
+        if isinstance(data, dict) and data.get("views") is not None and data.get("target") is None:
+            return {**data, "target": {}}
+        return data
+
     @model_validator(mode="after")
     def _check_together(self) -> Self:
         sensors, files = self.scene.sensors, self.target.file
+        if self.views is not None:
+            check_views(self.views, sensors, self.target)
+        elif files is None and self.target.render is None:
+            raise located("target", "must have exactly one of `file` and `render`, and has none")
         if files is not None and sensors != "all" and len(files) != len(sensors):
             raise located(
                 "target.file", f"must name one image for each sensor; images: {len(files)}, sensors: {len(sensors)}"

@@ -9,7 +9,8 @@ from typing import Annotated, Any, Literal
 from pydantic import BeforeValidator, Field, GetJsonSchemaHandler, WithJsonSchema
 from pydantic_core import CoreSchema
 
-from .base import ConfigPath, Section, wrong
+from .base import ConfigPath, Positive, Section, located, wrong
+from .losses import AnyLoss
 
 _KINDS = ("specular", "border", "clipped", "alpha", "nonfinite")
 
@@ -118,3 +119,37 @@ EXPOSURE = (
     "What the image is multiplied by before it is compared, target = exposure * image: a number, `auto` (recovered "
     "with the parameters, one factor), or `per_channel` (recovered, one for each channel, which is white balance)"
 )
+
+
+class ViewSpec(Section):
+    """One view: a sensor of the scene, and what it is to see."""
+
+    sensor: Annotated[int, Field(ge=0)] = Field(description="Index of the scene's sensor.")
+    target: ConfigPath | None = Field(
+        default=None, description="Target image, relative to the config file; null: rendered, as `target.render` says."
+    )
+    mask: AnyMask | None = Field(default=None, description="As `target.mask`, which it stands in place of.")
+    mask_mixed: bool | None = Field(default=None, description="As `target.mask_mixed`, which it stands in place of.")
+    weight: Positive = Field(default=1.0, description="The view's part of the loss, relative to the other views'.")
+    exposure: Exposure | None = Field(
+        default=None, description="As `target.exposure`, but recovered for this view alone where it is not a number."
+    )
+    loss: AnyLoss | None = Field(default=None, description="How this view is compared; null: as `loss` says.")
+
+
+def check_views(views: list[ViewSpec], sensors: Any, target: Any) -> None:
+    """Raise an error, located, where views and the short forms, `scene.sensors` and `target`, contradict each other."""
+    places: dict[int, int] = {}
+    for number, view in enumerate(views):
+        if places.setdefault(view.sensor, number) < number:
+            raise located(f"views[{number}].sensor", f"{view.sensor} stands in views[{places[view.sensor]}] already")
+        if view.target is None and target.render is None:
+            raise located(f"views[{number}].target", "missing; name an image, or have all rendered by target.render")
+    if sensors != [0]:
+        raise located("scene.sensors", "has no effect beside `views`, which name their sensors")
+    if target.file is not None:
+        raise located("target.file", "has no effect beside `views`; give each view its own target")
+    if isinstance(target.exposure, list):
+        raise located("target.exposure", "is a list, but there are `views`: give each view its own exposure")
+    if target.render is not None and all(view.target is not None for view in views):
+        raise located("target.render", "has no effect: every view has a target of its own")

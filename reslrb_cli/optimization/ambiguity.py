@@ -13,13 +13,16 @@ has an eigenvalue near 0; its eigenvector says which values are in the combinati
 from __future__ import annotations
 
 import dataclasses
+from typing import TYPE_CHECKING
 
 import drjit as dr
 import numpy as np
 
 from reslrb_cli.errors import ConfigError
-from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.sensitivity import see_images
+
+if TYPE_CHECKING:
+    from reslrb_cli.optimization.problem import Problem
 
 #: The relative step h.
 STEP = 0.02
@@ -86,5 +89,5 @@ def _row(problem: Problem) -> np.ndarray:
     """The images of all views in a row, each by the root of its share of the loss."""
     images = see_images(problem)
     return np.concatenate(
-        [np.sqrt(view.share) * image.ravel() for view, image in zip(problem.views, images, strict=True)]
+        [np.sqrt(view.share) * image.ravel() for view, image in zip(problem.trained, images, strict=True)]
     )

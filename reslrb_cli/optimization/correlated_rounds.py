@@ -60,7 +60,7 @@ def _gradient(problem: Problem, number: int, image: str, spp: int) -> dict[str, 
     if isinstance(integrator, LightTracer):  # a recording would cost more than so few steps save
         integrator = integrator.with_options(samples_per_pass=integrator.samples_per_pass, freeze=False)
     problem.apply()
-    for view in problem.views:
+    for view in problem.trained:
         cross_step(
             integrator, problem.scene, view.sensor, view.objective,
             seed=seed(run.seed, number, view.sensor, "bias"),

@@ -21,15 +21,19 @@ def load_configured(config: Config) -> mi.Scene:
 
 
 def choose_sensors(config: Config, scene: mi.Scene) -> list[int]:
-    """Return the indices of the sensors that `scene.sensors` names. Raises ConfigError for one that is not there."""
+    """Return the index of each view's sensor. Raises ConfigError for one that is not there."""
     count = len(scene.sensors())
-    if config.scene.sensors == "all":
+    if config.views is not None:
+        named = {f"views[{place}].sensor": view.sensor for place, view in enumerate(config.views)}
+    elif config.scene.sensors == "all":
         return list(range(count))
-    for place, sensor in enumerate(config.scene.sensors):
+    else:
+        named = {f"scene.sensors[{place}]": sensor for place, sensor in enumerate(config.scene.sensors)}
+    for key, sensor in named.items():
         if sensor >= count:
             has = "one sensor, index 0" if count == 1 else f"{count} sensors, indices 0 to {count - 1}"
-            raise ConfigError(config.source, f"scene.sensors[{place}]", f"is {sensor}, but the scene has {has}")
-    return list(config.scene.sensors)
+            raise ConfigError(config.source, key, f"is {sensor}, but the scene has {has}")
+    return list(named.values())
 
 
 def check_integrator(config: Config, integrator: Integrator, scene: mi.Scene, sensors: list[int]) -> None:

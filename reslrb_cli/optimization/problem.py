@@ -13,6 +13,7 @@ import numpy as np
 
 from reslrb_cli.config import Config
 from reslrb_cli.integrators import OnSamples
+from reslrb_cli.optimization.ambiguity import check_exposures
 from reslrb_cli.optimization.budget import MemoryPlan
 from reslrb_cli.optimization.choice import Cache, find_options, settle_integrator
 from reslrb_cli.optimization.errors import ErrorMeter, quantity
@@ -26,12 +27,14 @@ from reslrb_cli.optimization.loading import (
 from reslrb_cli.optimization.moving import check_moving
 from reslrb_cli.optimization.optimizers import Optimizer
 from reslrb_cli.optimization.pilot_records import Outcome
-from reslrb_cli.optimization.rendering import render_in_passes
+from reslrb_cli.optimization.reach import find_reached
+from reslrb_cli.optimization.rendering import render_in_passes, saved_spp
 from reslrb_cli.optimization.scaling import Scaled
 from reslrb_cli.optimization.targets import make_targets
 from reslrb_cli.optimization.transforms import make_transform
-from reslrb_cli.optimization.views import View, expose, make_views
+from reslrb_cli.optimization.views import View, expose, make_views, to_tensor
 from reslrb_cli.scene import Selection, select_parameters
+from reslrb_cli.seeds import seed
 
 Array = np.ndarray[Any, Any]
 
@@ -77,6 +80,30 @@ class Problem:
         """The index of each view's sensor."""
         return [view.sensor for view in self.views]
 
+    @property
+    def trained(self) -> list[View]:
+        """The views that are not held out."""
+        return [view for view in self.views if not view.held_out]
+
+    def drawn(self, iteration: int) -> list[tuple[View, float]]:
+        """The views of an iteration, by `run.views_per_iteration`, each with what its loss is to be scaled by."""
+        trained, count = self.trained, self.config.run.views_per_iteration
+        if count is None or count >= len(trained):
+            return [(view, 1.0) for view in trained]
+        rng = np.random.default_rng(seed(self.config.run.seed, iteration, 0, "views"))
+        chosen = sorted(rng.choice(len(trained), count, replace=False))
+        return [(trained[number], len(trained) / count) for number in chosen]
+
+    def held_out_loss(self) -> float | None:
+        """The loss of the views that are held out, the mean over them, always of the same samples; None without any."""
+        views = [view for view in self.views if view.held_out]
+        if not views:
+            return None
+        spp = saved_spp(self, between=True)
+        images = (self.render(view.sensor, spp, 0, "held out") for view in views)
+        losses = [float(view.compare(to_tensor(image))[0]) for view, image in zip(views, images, strict=True)]
+        return float(np.mean(losses))
+
     def on_samples(self, view: View) -> OnSamples | None:
         """What has to see the samples of a view's step: a recovered exposure, which has its gradient from them."""
         key = view.exposure.key
@@ -107,16 +134,22 @@ class Problem:
         return ErrorMeter(self.truth, self.masks, self.quantities)
 
 
-def assemble(config: Config, say: Callable[[str], None] = lambda line: None, cache: Cache | None = None) -> Problem:
+def assemble(
+    config: Config, say: Callable[[str], None] = lambda line: None, cache: Cache | None = None, to_run: bool = False
+) -> Problem:
     """Load and check what `config` names, make the targets, and settle the integrator; a variant must be set.
 
     Everything that can be checked is, before anything is rendered. `say` is told what takes long, `cache` holds what
-    earlier pilots learned (None: nothing is kept). Raises ConfigError and UnsupportedScene.
+    earlier pilots learned (None: nothing is kept). With `to_run` all that an optimisation needs is there: exposures
+    are checked, and what light and sensor reach is known. Raises ConfigError and UnsupportedScene.
     """
     problem = assemble_scene(config)
     options = find_options(problem)
     make_targets(problem, say)
     settle_integrator(problem, options, say, cache)
+    if to_run:
+        check_exposures(problem)
+        find_reached(problem, say)
     return problem
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 import mitsuba as mi
@@ -11,10 +11,12 @@ import numpy as np
 
 from reslrb_cli.integrators import known_step
 from reslrb_cli.optimization.loading import samples_per_pass
-from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.rendering import passes
 from reslrb_cli.scene import visible_texels
 from reslrb_cli.seeds import seed
+
+if TYPE_CHECKING:
+    from reslrb_cli.optimization.problem import Problem
 
 Array = np.ndarray[Any, Any]
 
@@ -38,7 +40,7 @@ def find_reached(problem: Problem, say: Callable[[str], None] = lambda line: Non
         if mask.ndim == 3:
             mask = np.any(mask, axis=2)
             if key in problem.selection.params:  # a heightmap is no texture to be seen
-                sensors = [problem.scene.sensors()[index] for index in problem.sensors]
+                sensors = [problem.scene.sensors()[view.sensor] for view in problem.trained]
                 mask = mask & _without_halo(visible_texels(problem.scene, sensors, key), mask.shape[1])
         problem.masks[key] = mask
 
@@ -47,7 +49,7 @@ def sensitivity(problem: Problem) -> dict[str, Array]:
     """For each parameter whether the mean image depends on an entry, boolean, of the parameter's shape."""
     run, optimizer = problem.config.run, problem.optimizer
     found: dict[str, Array] = {}
-    for sensor in problem.sensors:
+    for sensor in [view.sensor for view in problem.trained]:
         film = problem.scene.sensors()[sensor].film()
         width, height = (int(n) for n in film.crop_size())
         # dL/dI of the mean image: known before any path is traced, which some estimators ask for.

@@ -20,7 +20,7 @@ def sample_gradient(problem: Problem, integrator: Any, round: int, purpose: str,
     Returns the gradient of each parameter as it is accumulated in `problem.optimizer`; `take_gradient` has to follow.
     """
     run = problem.config.run
-    for view in problem.views:
+    for view in problem.trained:
         step = gradient_step(
             integrator, problem.scene, view.sensor, view.objective, seed=seed(run.seed, round, view.sensor, purpose),
             **{**problem.config.step_options(), "spp": spp}, params=problem.selection.params,

@@ -79,7 +79,7 @@ def measure_sensitivities(problem: Problem, samples: int) -> list[Sensitivity]:
         for key, gradient in take_gradient(problem).items():
             rows[key].append(gradient.astype(np.float64))
     base = see_images(problem)
-    targets = [view.kept(np.array(view.target, dtype=np.float64)) for view in problem.views]
+    targets = [view.kept(np.array(view.target, dtype=np.float64)) for view in problem.trained]
     reference = [np.maximum(np.abs(a), np.abs(b)) for a, b in zip(base, targets, strict=True)]
     found = []
     for key, gradients in rows.items():
@@ -130,7 +130,7 @@ def _probe(
 def _second_difference(problem: Problem, base: Sequence[Array], difference: Sequence[Array], factor: float) -> float:
     """L(I + D) - 2 L(I) + L(I - D), over the views by their shares, D `factor` times the difference."""
     total = 0.0
-    for image, change, view in zip(base, difference, problem.views, strict=True):
+    for image, change, view in zip(base, difference, problem.trained, strict=True):
         for side, weight in ((1, 1), (0, -2), (-1, 1)):
             at = mi.TensorXf((image + side * factor * change).astype(np.float32))
             total += weight * float(view.judge(at)[0]) * view.share
@@ -143,9 +143,9 @@ def _downhill(gradient: Any) -> Any:
 
 
 def see_images(problem: Problem) -> list[Array]:
-    """Every view as the scene stands, exposed, without alpha, 0 where it is left out; always from the same seeds."""
+    """Every view that is trained on, exposed, without alpha, 0 where it is left out, always from the same seeds."""
     run, images = problem.config.run, []
-    for view in problem.views:
+    for view in problem.trained:
         at = seed(run.seed, 0, view.sensor, _PURPOSE)
         image = render_image(problem.integrator, problem.scene, view.sensor, at, run.spp)
         exposed = view.exposure.applied(first_channels(image, view.target.shape[2]))

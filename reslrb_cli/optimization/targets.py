@@ -31,13 +31,14 @@ def make_targets(problem: Problem, say: Callable[[str], None]) -> None:
 
     `say` is told what takes long, and what of the targets is left out. Raises ConfigError.
     """
+    if problem.config.target.file is not None:
+        _check_count(problem)
+    for view in problem.views:
+        if view.wanted.file is not None:
+            photo = _read_photo(problem, view)
+            _see(problem, view, photo.image, photo, say)
     if problem.config.target.render is not None:
         _render_targets(problem, say)
-        return
-    _check_count(problem)
-    for view in problem.views:
-        photo = _read_photo(problem, view)
-        _see(problem, view, photo.image, photo, say)
 
 
 def _see(problem: Problem, view: View, image: Array, photo: Photo | None, say: Callable[[str], None]) -> None:
@@ -76,6 +77,8 @@ def _render_targets(problem: Problem, say: Callable[[str], None]) -> None:
     integrator = make_configured(chosen)
     multiple = chosen.options().get("samples_per_pass")
     for view in problem.views:
+        if view.wanted.file is not None:
+            continue
         say(f"rendering the target of sensor {view.sensor}: {render.spp} spp")
         image = render_in_passes(integrator, true_scene, view.sensor, render.spp, render.seed, 0, "target", multiple)
         _see(problem, view, image, None, say)

@@ -13,6 +13,7 @@ import mitsuba as mi
 import numpy as np
 
 from reslrb_cli.config import Config, Mask
+from reslrb_cli.config import Loss as LossConfig
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.integrators import first_channels
 from reslrb_cli.optimization.exposure import SHARED, Exposure, add_exposure
@@ -29,7 +30,7 @@ class Wanted:
     """What an experiment says of one view's target: its file, None of one that is rendered, and its mask.
 
     `file_key` and `mask_key` are where they stand in the configuration. `exposure` is a number, or how it is recovered,
-    by which key.
+    by which key; `weight` is the view's part of the loss, relative to the others', and `loss` its own, if it has one.
     """
 
     file: Path | None = None
@@ -39,15 +40,17 @@ class Wanted:
     mask_key: str = "target.mask"
     exposure: float | str = 1.0
     exposure_key: str = SHARED
+    weight: float = 1.0
+    loss: LossConfig | None = None
 
 
 @dataclass
 class View:
-    """What the scene's sensor of index `sensor` is to see, of which `share` (all of them sum to 1) is the loss.
+    """What the scene's sensor of index `sensor` is to see, of which `share` (those trained on sum to 1) is the loss.
 
     `made` is the target (H, W, C), without alpha; None until there is one, which `target` raises LookupError for.
     `weights`, of the same shape with a mean of 1, say what its entries count, 0 of those that `masked` leaves out;
-    None where all are the same.
+    None where all are the same. What is `held_out` is not trained on, and has a loss of its own.
     """
 
     sensor: int
@@ -56,6 +59,7 @@ class View:
     made: mi.TensorXf | None = None
     weights: mi.TensorXf | None = None
     exposure: Exposure = field(default_factory=Exposure)
+    held_out: bool = False
     wanted: Wanted = field(default_factory=Wanted)
     masked: Masked = field(default_factory=Masked)
 
@@ -94,7 +98,8 @@ class View:
     def situation(self) -> list[Any]:
         """Share, exposure and weights in short, as plain values: two views that have the same count the same."""
         weights = None if self.weights is None else hashlib.blake2b(np.array(self.weights).tobytes()).hexdigest()
-        return [self.share, self.wanted.exposure, weights]
+        loss = self.wanted.loss
+        return [self.share, self.held_out, self.wanted.exposure, loss and loss.model_dump(), weights]
 
     def objective(self, image: mi.TensorXf) -> mi.Float:
         """What the view adds to the loss of all views."""
@@ -111,6 +116,7 @@ def view_records(views: list[View]) -> list[dict[str, Any]]:
             {
                 "sensor": view.sensor,
                 "share": view.share,
+                "held_out": view.held_out,
                 "exposure": view.exposure.key or view.exposure.fixed,
                 "pixels": height * width,
                 "left_out": left_out,
@@ -122,29 +128,85 @@ def view_records(views: list[View]) -> list[dict[str, Any]]:
 
 
 def make_views(config: Config, scene: mi.Scene) -> list[View]:
-    """The views of an experiment, without their targets. Raises ConfigError for a sensor that is not there."""
-    sensors, target = choose_sensors(config, scene), config.target
-    loss = make_loss(config.loss.type, **config.loss.options())
-    exposures = target.exposure if isinstance(target.exposure, list) else [target.exposure] * len(sensors)
-    if len(exposures) != len(sensors):
+    """The views of an experiment, without their targets.
+
+    Raises ConfigError for a sensor that is not there, and for what is held out and cannot be.
+    """
+    sensors = choose_sensors(config, scene)
+    wanted = _of_views(config) if config.views is not None else _of_sensors(config, sensors)
+    held_out = set(config.run.held_out)
+    for place, sensor in enumerate(config.run.held_out):
+        if sensor not in sensors:
+            raise ConfigError(config.source, f"run.held_out[{place}]", f"is {sensor}, which is the sensor of no view")
+    if held_out == set(sensors):
+        raise ConfigError(config.source, "run.held_out", "leaves no view to train on")
+    trained = [one.weight for sensor, one in zip(sensors, wanted, strict=True) if sensor not in held_out]
+    views = []
+    for sensor, one in zip(sensors, wanted, strict=True):
+        held = sensor in held_out
+        if held and isinstance(one.exposure, str) and one.exposure_key != SHARED:
+            raise ConfigError(
+                config.source,
+                "run.held_out",
+                f"has sensor {sensor}, whose own exposure nothing else tells; give it a number, or all views one",
+            )
+        kind = one.loss or config.loss
+        loss = make_loss(kind.type, **kind.options())
+        share = one.weight / (one.weight if held else sum(trained))
+        views.append(View(sensor, loss, share, held_out=held, wanted=one))
+    if (config.run.views_per_iteration or 1) > len(trained):
+        raise ConfigError(
+            config.source,
+            "run.views_per_iteration",
+            f"is {config.run.views_per_iteration}; views that are trained on: {len(trained)}",
+        )
+    return views
+
+
+def _of_sensors(config: Config, sensors: list[int]) -> list[Wanted]:
+    """What the short forms, `scene.sensors` and `target`, say of each view."""
+    target = config.target
+    files, exposures = target.file or [], target.exposure
+    if isinstance(exposures, list) and len(exposures) != len(sensors):
         raise ConfigError(
             config.source,
             "target.exposure",
             f"must have one entry for each sensor; entries: {len(exposures)}, sensors: {len(sensors)}",
         )
-    views = []
-    for number, sensor in enumerate(sensors):
-        files = target.file or []
-        wanted = Wanted(
+    return [
+        Wanted(
             file=files[number] if number < len(files) else None,
             file_key="target.file" if len(files) == 1 else f"target.file[{number}]",
             mask=target.mask,
             mask_mixed=target.mask_mixed,
-            exposure=exposures[number],
-            exposure_key=f"exposure.{sensor}" if isinstance(target.exposure, list) else SHARED,
+            exposure=exposures[number] if isinstance(exposures, list) else exposures,
+            exposure_key=f"{SHARED}.{sensor}" if isinstance(exposures, list) else SHARED,
         )
-        views.append(View(sensor, loss, 1 / len(sensors), wanted=wanted))
-    return views
+        for number, sensor in enumerate(sensors)
+    ]
+
+
+def _of_views(config: Config) -> list[Wanted]:
+    """What `views` say of each view, and `target` of what they leave open."""
+    assert config.views is not None
+    assert not isinstance(config.target.exposure, list), "checked with the configuration"
+    target, found = config.target, []
+    for number, spec in enumerate(config.views):
+        own = spec.exposure is not None
+        found.append(
+            Wanted(
+                file=spec.target,
+                file_key=f"views[{number}].target",
+                mask=target.mask if spec.mask is None else spec.mask,
+                mask_mixed=target.mask_mixed if spec.mask_mixed is None else spec.mask_mixed,
+                mask_key="target.mask" if spec.mask is None else f"views[{number}].mask",
+                exposure=config.target.exposure if spec.exposure is None else spec.exposure,
+                exposure_key=f"{SHARED}.{spec.sensor}" if own else SHARED,
+                weight=spec.weight,
+                loss=spec.loss,
+            )
+        )
+    return found
 
 
 def expose(views: list[View], scene: mi.Scene, selection: Selection) -> None:

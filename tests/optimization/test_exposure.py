@@ -87,10 +87,10 @@ def test_a_colour_beside_a_known_one_is_recovered_with_the_exposure(folder):
     side = "side.bsdf.reflectance.value"
     mi.Bitmap(image.astype(np.float32)).write(str(folder / "photo.exr"))
     problem = make(
-        folder, "target={file: photo.exr, exposure: auto}", f"parameters=[{{key: {side}, initial: 0.3, bounds: [0, 1]}}]",
+        folder, "target={file: photo.exr, exposure: auto}",
+        f"parameters=[{{key: {side}, initial: 0.3, bounds: [0, 1]}}]",
         "run.iterations=100", "run.spp=256", "optimizer.schedule=cosine", "integrator.max_depth=3",
     )  # fmt: skip
-    check_exposures(problem)
     values = [problem.selection.array("exposure").copy() for _ in optimize(problem)]
     assert abs(float(values[-1]) - 0.6) < 0.02
     np.testing.assert_allclose(problem.selection.array(side), [0.1, 0.6, 0.3], atol=0.04)

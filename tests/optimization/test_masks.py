@@ -145,7 +145,7 @@ def test_what_light_tracing_cannot_see(folder, bsdf, kind):
 
 def test_an_empty_mask_is_refused(folder):
     mi.Bitmap(np.zeros((8, 8, 3), np.float32)).write(str(folder / "nothing.exr"))
-    with pytest.raises(ConfigError, match="leaves nothing to compare .*64 have weight 0 in the mask's file") as error:
+    with pytest.raises(ConfigError, match=r"leaves nothing to compare .*64 have weight 0 in the mask's file") as error:
         make(folder, "target.file=photo.png", "target.mask=nothing.exr")
     assert error.value.key == "target.mask"
 

@@ -44,7 +44,7 @@ class Judge:
         problem = self.problem
         problem.selection.set_arrays(values)
         total = 0.0
-        for view in problem.views:
+        for view in problem.trained:
             image = problem.render(view.sensor, self.spp, 0, _PURPOSE)
             total += float(view.objective(mi.TensorXf(np.ascontiguousarray(image)))[0])
         return total
