@@ -126,7 +126,9 @@ def test_held_out_views_are_recorded_and_not_trained_on(folder):
     problem.views[1].see(np.zeros((8, 8, 3), np.float32))
     np.testing.assert_array_equal(gradient(problem), before)
     sets = ["scene.sensors=all", "run.held_out=[1]", "run.iterations=22", "run.spp=64", "optimizer.learning_rate=0.05"]
-    problem = assemble(load(folder / "tiny.yaml", [*sets, "target.render.spp=1024"]), to_run=True)
+    problem = assemble(
+        load(folder / "tiny.yaml", [*sets, "target.render.spp=1024", "parameters[0].initial=0.1"]), to_run=True
+    )
     records = list(optimize(problem))
     seen = [record.iteration for record in records if record.held_out is not None]
     assert seen == list(range(0, 22, loop.HELD_OUT_EVERY))
