@@ -54,7 +54,7 @@ def run_parts(run: Run) -> dict[str, str]:
     parts: dict[str, Callable[[], str]] = {
         "Parameters": lambda: parameter_table(results, "now" if run.at_work else "end") + _over_what(results),
         "Images": lambda: image_rows(images, results),
-        "Views": lambda: view_table(run.manifest.get("views")),
+        "Views": lambda: view_table(run.manifest.get("views"), results),
         "Errors as people see them": lambda: seen_tables([run]),
         "Textures": lambda: texture_pictures(run.path / "parameters", results, run.current),
         "Convergence": lambda: convergence(run),
