@@ -54,6 +54,12 @@ class SceneConfig(Section):
         description="Refuse a scene file in which anything has to be mended or left out before Mitsuba 3 can load it, "
         "in place of warning of it.",
     )
+    cameras: ConfigPath | None = Field(
+        default=None,
+        description="Cameras in place of the scene's own sensors: NeRF's `transforms.json`, or COLMAP's `images.txt` "
+        "with `cameras.txt` beside it; relative to the config file. Their images, relative to that file, are the "
+        "targets of views for which no other is named.",
+    )
     sensors: Annotated[
         Annotated[Annotated[list[Annotated[int, Field(ge=0)]], Field(min_length=1)], mark("list")]
         | Annotated[Literal["all"], mark("text")],
@@ -302,17 +308,19 @@ class Config(Section):
     @model_validator(mode="before")
     @classmethod
     def _target_of_views(cls, data: Any) -> Any:
-        """Views may have all that there is to say of targets."""
-        if isinstance(data, dict) and data.get("views") is not None and data.get("target") is None:
-            return {**data, "target": {}}
+        """Views, and cameras of a file, may have all that there is to say of targets."""
+        if isinstance(data, dict) and data.get("target") is None:
+            scene = data.get("scene")
+            if data.get("views") is not None or (isinstance(scene, dict) and scene.get("cameras") is not None):
+                return {**data, "target": {}}
         return data
 
     @model_validator(mode="after")
     def _check_together(self) -> Self:
         sensors, files = self.scene.sensors, self.target.file
         if self.views is not None:
-            check_views(self.views, sensors, self.target)
-        elif files is None and self.target.render is None:
+            check_views(self.views, self.scene, self.target)
+        elif files is None and self.target.render is None and self.scene.cameras is None:
             raise located("target", "must have exactly one of `file` and `render`, and has none")
         if files is not None and sensors != "all" and len(files) != len(sensors):
             raise located(

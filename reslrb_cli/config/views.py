@@ -137,15 +137,15 @@ class ViewSpec(Section):
     loss: AnyLoss | None = Field(default=None, description="How this view is compared; null: as `loss` says.")
 
 
-def check_views(views: list[ViewSpec], sensors: Any, target: Any) -> None:
+def check_views(views: list[ViewSpec], scene: Any, target: Any) -> None:
     """Raise an error, located, where views and the short forms, `scene.sensors` and `target`, contradict each other."""
     places: dict[int, int] = {}
     for number, view in enumerate(views):
         if places.setdefault(view.sensor, number) < number:
             raise located(f"views[{number}].sensor", f"{view.sensor} stands in views[{places[view.sensor]}] already")
-        if view.target is None and target.render is None:
+        if view.target is None and target.render is None and scene.cameras is None:
             raise located(f"views[{number}].target", "missing; name an image, or have all rendered by target.render")
-    if sensors != [0]:
+    if scene.sensors != [0]:
         raise located("scene.sensors", "has no effect beside `views`, which name their sensors")
     if target.file is not None:
         raise located("target.file", "has no effect beside `views`; give each view its own target")

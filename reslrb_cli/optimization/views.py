@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +21,7 @@ from reslrb_cli.optimization.loading import choose_sensors
 from reslrb_cli.optimization.losses import Loss, make_loss
 from reslrb_cli.optimization.masking import Masked
 from reslrb_cli.scene import Selection
+from reslrb_cli.scene.cameras import read_cameras
 
 Array = np.ndarray[Any, Any]
 
@@ -134,6 +135,12 @@ def make_views(config: Config, scene: mi.Scene) -> list[View]:
     """
     sensors = choose_sensors(config, scene)
     wanted = _of_views(config) if config.views is not None else _of_sensors(config, sensors)
+    if config.scene.cameras is not None and config.target.render is None:
+        images = [camera.image for camera in read_cameras(config.scene.cameras)]
+        wanted = [
+            replace(one, file=images[sensor], file_key="scene.cameras") if one.file is None else one
+            for sensor, one in zip(sensors, wanted, strict=True)
+        ]
     held_out = set(config.run.held_out)
     for place, sensor in enumerate(config.run.held_out):
         if sensor not in sensors:

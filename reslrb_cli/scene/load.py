@@ -11,6 +11,7 @@ from typing import Any
 import mitsuba as mi
 
 from ..errors import ConfigError
+from .cameras import read_cameras, replace_sensors
 from .description import build, check, mend, name_objects, notes, read_description
 from .extent import lost_light
 from .thin_glass import thin_glass
@@ -18,14 +19,17 @@ from .thin_glass import thin_glass
 logger = logging.getLogger(__name__)
 
 
-def load_scene(file: Path, options: Mapping[str, Any] | None = None, strict: bool = False) -> mi.Scene:
+def load_scene(
+    file: Path, options: Mapping[str, Any] | None = None, strict: bool = False, cameras: Path | None = None
+) -> mi.Scene:
     """Load a Mitsuba scene (XML, versions 0.4 to 3); a variant must be set.
 
     `options` are the values of the file's `$name` variables. Shapes are not merged, so that all parameters keep their
     names, and an object without an id is named by its kind and its number among all of that kind in the file, such as
     `Sphere_3`. What Mitsuba's parser would refuse because another version or an exporter wrote it is mended or left
-    out, with a warning in the log; `strict` has it refused. The scene's integrator is not loaded: an experiment has its
-    own. Plugins are loaded from Mitsuba's own folder alone.
+    out, with a warning in the log; `strict` has it refused. Those of `cameras`, a file, stand in place of the scene's
+    sensors. The scene's integrator is not loaded: an experiment has its own. Plugins are loaded from Mitsuba's own
+    folder alone.
 
     Raises ConfigError, located in the scene file, where it is missing or wrong, has nothing in it, or no light. Warns,
     too, of a scene that is too far from the origin, or too small, and of glass that is too thin.
@@ -33,6 +37,8 @@ def load_scene(file: Path, options: Mapping[str, Any] | None = None, strict: boo
     file = Path(file)
     description = read_description(file, {name: _as_text(value) for name, value in (options or {}).items()})
     root = description.root
+    if cameras is not None:
+        replace_sensors(description, read_cameras(cameras))
     found = notes.in_order([*name_objects(root), *mend(description)], root)
     if strict:
         notes.refuse(found)
