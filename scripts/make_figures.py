@@ -89,7 +89,7 @@ def scene_panels() -> list[tuple[str, Image]]:
     for name, (spp, exposure) in EXPERIMENTS.items():
         size = [f"scene.options.{side}={HEIGHT}" for side in ("resx", "resy")]
         problem = assemble(load(ROOT / "configs" / f"{name}.yaml", [*size, f"target.render.spp={spp}"]))
-        panels.append((name, encode(np.array(problem.targets[0]) * exposure)))
+        panels.append((name, encode(np.array(problem.views[0].target) * exposure)))
     return panels
 
 

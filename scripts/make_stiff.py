@@ -83,7 +83,7 @@ class Experiment:
 
     def _problem(self, sets: tuple[str, ...]) -> Problem:
         problem = assemble_scene(load(self.path, list(sets)))
-        problem.targets, problem.truth, problem.masks = self.model.targets, self.model.truth, self.model.masks
+        problem.views, problem.truth, problem.masks = self.model.views, self.model.truth, self.model.masks
         return problem
 
 

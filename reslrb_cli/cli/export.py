@@ -40,7 +40,8 @@ def command(run: Path, overrides: tuple[str, ...], output: Path) -> None:
     from reslrb_cli.scene.exporting import export_scene
     from reslrb_cli.scene.load import load_described
 
-    scene, description = load_described(config.scene.file, config.scene.options, config.scene.strict, config.scene.size)
+    at = config.scene
+    scene, description = load_described(at.file, at.options, at.strict, at.size, at.cameras)
     selection = select_parameters(scene, config.parameters, config.source)
     integrator, why = choose_integrator(config, scene, selection.params)
     try:
@@ -64,7 +65,7 @@ def choose_integrator(config: Config, scene: mi.Scene, params: mi.SceneParameter
     Light paths are traced by `ptracer`, and where that is wrong by `path`, which also sees glass and mirrors.
     """
     from reslrb_cli.measure.references import DEEPEST, Situation, ptracer_image
-    from reslrb_cli.optimization.problem import LIGHT_TRACERS, choose_sensors
+    from reslrb_cli.optimization.loading import LIGHT_TRACERS, choose_sensors
 
     own = config.integrator.options()
     options: dict[str, object] = {name: own[name] for name in ("max_depth", "rr_depth", "hide_emitters") if name in own}

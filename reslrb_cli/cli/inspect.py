@@ -87,7 +87,7 @@ def command(
     if nonfinite:
         return show_offenders(config, as_json)
 
-    from reslrb_cli.optimization.problem import load_configured
+    from reslrb_cli.optimization.loading import load_configured
     from reslrb_cli.scene import summarise
 
     scene = load_configured(config)
@@ -198,7 +198,7 @@ def make_plan_report(config: Config, scene: Any, selection: Selection | str, cou
     """The plan of a step for the first sensor that is used, or why there is none."""
     from reslrb_cli.integrators import Reslrb
     from reslrb_cli.integrators.plan_report import report_plan
-    from reslrb_cli.optimization.problem import choose_sensors
+    from reslrb_cli.optimization.loading import choose_sensors
 
     if isinstance(selection, str):
         return selection

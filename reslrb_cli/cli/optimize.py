@@ -38,18 +38,18 @@ def command(config_file: Path, overrides: tuple[str, ...], force: bool, quiet: b
     from reslrb_cli.cli.interrupts import Interrupts
     from reslrb_cli.cli.progress import Progress
     from reslrb_cli.cli.recording import Recording
-    from reslrb_cli.optimization import assemble, find_reached
+    from reslrb_cli.optimization import assemble
     from reslrb_cli.optimization.border import warn_of_border
     from reslrb_cli.optimization.correlated_rounds import measure_correlated_bias
     from reslrb_cli.optimization.planning import plan_record
+    from reslrb_cli.optimization.views import view_records
     from reslrb_cli.records.pilot_cache import PilotCache
     from reslrb_cli.report.run_table import parameter_lines, terminal_width
     from reslrb_cli.report.verdict import last_line
 
     logger = logging.getLogger(__name__)
     say = logger.info
-    problem = assemble(config, say, PilotCache())
-    find_reached(problem, say)
+    problem = assemble(config, say, PilotCache(), to_run=True)
     bias = measure_correlated_bias(problem, say)
     if bias is not None and bias.line() is not None:
         logger.warning(bias.line())
@@ -58,6 +58,7 @@ def command(config_file: Path, overrides: tuple[str, ...], force: bool, quiet: b
         variant=variant, device=device_name(variant), seed=config.run.seed, config=printable(config_file)
     )
     manifest.plan = plan_record(problem)
+    manifest.views = view_records(problem.views)
     manifest.pilot = None if problem.pilot is None else problem.pilot.to_json()
     manifest.correlated_bias = None if bias is None else bias.to_json()
     manifest.memory = None if problem.memory is None else problem.memory.to_json()

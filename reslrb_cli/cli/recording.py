@@ -107,8 +107,10 @@ class Recording:
         self.page.refresh()
         self.results.begin()
         self._save_checkpoint()
-        for sensor, target in zip(problem.sensors, problem.targets, strict=True):
-            write_image(self.folder.images / self._image_name("target", sensor), np.array(target))
+        for view in problem.views:
+            write_image(self.folder.images / self._image_name("target", view.sensor), np.array(view.target))
+            if view.weights is not None:
+                write_image(self.folder.images / self._image_name("weights", view.sensor), np.array(view.weights))
         self._write_images("initial")
         write_parameters(parameters / "initial", problem.values())
         if problem.truth:
@@ -199,7 +201,7 @@ class Recording:
 
     def _note_seen_errors(self) -> None:
         """Add errors as people see them to the results. The run is what it is without them."""
-        pixels = sum(target.shape[0] * target.shape[1] for target in self.problem.targets)
+        pixels = sum(view.target.shape[0] * view.target.shape[1] for view in self.problem.views)
         if pixels > MANY_PIXELS:
             logger.info(f"comparing images of {pixels / 1e6:.2g} million pixels as people see them")
         try:
@@ -249,18 +251,19 @@ class Recording:
         spp = saved_spp(self.problem, between=name.startswith("iteration"))
         if name == "final":
             logger.info(f"rendering the final image: {spp} spp")
-        for sensor, target in zip(self.problem.sensors, self.problem.targets, strict=True):
-            image = self.problem.render(sensor, spp, self.done, "saved image")
-            write_image(self.folder.images / self._image_name(name, sensor), image)
-            self.results.see(name, image, target)
+        for view in self.problem.views:
+            image = self.problem.render(view.sensor, spp, self.done, "saved image")
+            exposed = view.exposure.of_array(image)  # as the target is
+            write_image(self.folder.images / self._image_name(name, view.sensor), exposed)
+            self.results.see(name, view, image)
             if name == "final":
-                suffix = self._image_name("", sensor)
-                towards = self.problem.image_gradient(image, target)
-                about = write_error_map(self.folder.images, suffix, image, np.array(target), towards)
+                suffix = self._image_name("", view.sensor)
+                towards = self.problem.image_gradient(view, image)
+                about = write_error_map(self.folder.images, suffix, exposed, np.array(view.target), towards)
                 self.error_maps[f"error{suffix}"] = about
 
     def _image_name(self, name: str, sensor: int) -> str:
-        return name if len(self.problem.sensors) == 1 else f"{name}-{sensor}"
+        return name if len(self.problem.views) == 1 else f"{name}-{sensor}"
 
 
 def _json_number(value: float) -> Any:

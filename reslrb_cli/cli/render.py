@@ -70,7 +70,9 @@ def command(
     from reslrb_cli.records.images import write_file
 
     if sensor is not None:
-        config = config.model_copy(update={"scene": config.scene.model_copy(update={"sensors": [sensor]})})
+        config = config.model_copy(
+            update={"scene": config.scene.model_copy(update={"sensors": [sensor]}), "views": None}
+        )
     scene, sensors, integrator, multiple = load_for_rendering(config, initial)
     if spp is not None and multiple is not None and spp % min(multiple, spp):
         raise ConfigError("--spp", "", f"{spp} is not a multiple of integrator.samples_per_pass, which is {multiple}")

@@ -6,13 +6,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from reslrb_cli.config import Config, Reslrb, with_integrator
 from reslrb_cli.errors import ConfigError
-from reslrb_cli.optimization.problem import Problem, assemble_scene, color_channels
+from reslrb_cli.optimization.problem import Problem, assemble_scene
+from reslrb_cli.optimization.views import color_channels, to_tensor
 from reslrb_cli.records.checkpoint import NONFINITE_FILE_NAME, load_nonfinite
 from reslrb_cli.records.manifest import FILE_NAME as MANIFEST
 from reslrb_cli.records.manifest import read_manifest
@@ -57,9 +57,11 @@ def load_replay(config: Config) -> Replay:
         problem.integrator = problem.integrator.with_options(
             samples_per_pass=problem.samples_per_pass, freeze=problem.integrator.freeze
         )
-    for sensor in problem.sensors:
-        name = "target" if len(problem.sensors) == 1 else f"target-{sensor}"
-        problem.targets.append(_read_target(folder.images / f"{name}.exr", problem, sensor))
+    for view in problem.views:
+        suffix = "" if len(problem.views) == 1 else f"-{view.sensor}"
+        view.made = _read_image(folder.images / f"target{suffix}.exr", problem, view.sensor)
+        weights = folder.images / f"weights{suffix}.exr"
+        view.weights = _read_image(weights, problem, view.sensor) if weights.exists() else None
     return Replay(problem, iteration)
 
 
@@ -81,8 +83,8 @@ def _samples_per_pass(memory: Any, path: Path) -> int:
     return count
 
 
-def _read_target(path: Path, problem: Problem, sensor: int) -> Any:
-    """The target image that a run wrote, as a tensor. Raises ConfigError where it is not one for this sensor."""
+def _read_image(path: Path, problem: Problem, sensor: int) -> mi.TensorXf:
+    """The target, or its weights, that a run wrote. Raises ConfigError where it is not one for this sensor."""
     film = problem.scene.sensors()[sensor].film()
     width, height = film.crop_size()
     array = np.array(read_bitmap(path, (int(width), int(height))), dtype=np.float32)
@@ -90,6 +92,4 @@ def _read_target(path: Path, problem: Problem, sensor: int) -> Any:
     colors = color_channels(film)
     if array.shape[2] != colors:
         raise ConfigError(path, "", f"must have the film's channels; its own: {array.shape[2]}, the film's: {colors}")
-    target = mi.TensorXf(np.ascontiguousarray(array))
-    dr.make_opaque(target)
-    return target
+    return to_tensor(array)

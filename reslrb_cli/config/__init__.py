@@ -7,6 +7,7 @@ from .moving import HEIGHTMAP, WORDS, HeightmapSpec, MotionSpec
 from .optimizers import SGD, Adam, AdamW, Optimizer, RMSProp
 from .parameters import ColorSpace, ImageFile, ParameterSpec, RunValue, Settings
 from .schema import Config, Rendering, RunConfig, SceneConfig, TargetConfig
+from .views import Mask, ViewSpec
 
 __all__ = [
     "HEIGHTMAP",
@@ -23,6 +24,7 @@ __all__ = [
     "Integrator",
     "LogL2",
     "Loss",
+    "Mask",
     "MotionSpec",
     "Optimizer",
     "ParameterSpec",
@@ -38,6 +40,7 @@ __all__ = [
     "Settings",
     "TargetConfig",
     "Trajectory",
+    "ViewSpec",
     "WalkAd",
     "dump",
     "load",

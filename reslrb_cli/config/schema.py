@@ -21,7 +21,7 @@ from pydantic import (
 )
 from typing_extensions import Self
 
-from .base import ConfigPath, Count, Section, Seed, WorkPath, by_kind, located, mark, wrong
+from .base import ConfigPath, Count, Positive, Section, Seed, WorkPath, by_kind, located, mark, wrong
 from .integrators import AnyIntegrator, Integrator, Reslrb
 from .limits import KEY_LENGTH, PIXELS
 from .losses import L2, AnyLoss
@@ -29,6 +29,7 @@ from .names import check_name, folder_name
 from .optimizers import Adam, AnyOptimizer
 from .parameters import COLOR_SPACE, ColorSpace, ParameterSpec, Value
 from .sizes import Memory, memory_bytes
+from .views import EXPOSURE, MASK, MASK_MIXED, AnyMask, Exposures, Mask, ViewSpec, check_views
 
 
 def _list_of_one(value: Any) -> Any:
@@ -57,6 +58,12 @@ class SceneConfig(Section):
         default=None,
         description="[width, height] of the film of every sensor in pixels, without crop window; null: as the scene "
         "file has it. What is seen stays the same where the ratio does.",
+    )
+    cameras: ConfigPath | None = Field(
+        default=None,
+        description="Cameras in place of the scene's own sensors: NeRF's `transforms.json`, or COLMAP's `images.txt` "
+        "with `cameras.txt` beside it; relative to the config file. Their images, relative to that file, are the "
+        "targets of views for which no other is named.",
     )
     sensors: Annotated[
         Annotated[Annotated[list[Annotated[int, Field(ge=0)]], Field(min_length=1)], mark("list")]
@@ -111,7 +118,7 @@ _Files = Annotated[
 
 
 class TargetConfig(Section):
-    """What the image is compared with: exactly one of `file` and `render`."""
+    """What the image is compared with: exactly one of `file` and `render`; views with own targets need none."""
 
     file: _Files | None = Field(
         default=None,
@@ -119,15 +126,29 @@ class TargetConfig(Section):
         "relative to the config file.",
     )
     color_space: ColorSpace = Field(default="auto", description=f"{COLOR_SPACE} Only with `file`.")
+    gamma: Positive | None = Field(
+        default=None,
+        description="Decode values of 8 and 16 bit files by this power, in place of `color_space`. Only with `file`.",
+    )
     render: Rendering | None = Field(default=None, description="Render the target from the scene.")
+    mask: AnyMask = Field(default=Mask(), description=MASK)
+    mask_mixed: bool = Field(default=False, description=MASK_MIXED)
+    exposure: Exposures = Field(
+        default=1.0,
+        description=f"{EXPOSURE}, all views having the same; or a list of these with one for each view, which are then "
+        "recovered apart.",
+    )
 
     @model_validator(mode="after")
     def _check_one(self) -> Self:
-        if (self.file is None) == (self.render is None):
-            has = "none" if self.file is None else "both"
-            raise located("", f"must have exactly one of `file` and `render`, and has {has}")
+        if self.file is not None and self.render is not None:
+            raise located("", "must have exactly one of `file` and `render`, and has both")
         if self.render is not None and self.color_space != "auto":
             raise located("color_space", "has no effect on a rendered target; it goes with `file`")
+        if self.render is not None and self.gamma is not None:
+            raise located("gamma", "has no effect on a rendered target; it goes with `file`")
+        if self.gamma is not None and self.color_space != "auto":
+            raise located("gamma", "decodes the file in place of color_space; give one of the two")
         return self
 
     @model_serializer(mode="wrap")
@@ -202,6 +223,16 @@ class RunConfig(Section):
         description="Samples per pixel of the saved initial and final image, rounded up to whole passes of "
         "`samples_per_pass`.",
     )
+    views_per_iteration: Count | None = Field(
+        default=None,
+        description="Views that an iteration renders, drawn anew each time by the run's seed; their loss is scaled so "
+        "that its mean is that of all. null: all of them.",
+    )
+    held_out: list[Annotated[int, Field(ge=0)]] = Field(
+        default=[],
+        description="Sensors whose views are not trained on; their loss is recorded every 10 iterations (`held_out`), "
+        "and of the first and the last image.",
+    )
     reach_spp: Count = Field(default=64, description="Samples for the mask of the texels that light and sensor reach.")
 
     @field_validator("name")
@@ -236,6 +267,11 @@ class Config(Section):
     )
     scene: SceneConfig = Field(description="The scene and its sensors.")
     target: TargetConfig = Field(description="What the image is compared with.")
+    views: Annotated[list[ViewSpec], Field(min_length=1)] | None = Field(
+        default=None,
+        description="Sensors, each with its target, in place of `scene.sensors` and `target.file`; what a view does "
+        "not say is as `target` and `loss` have it.",
+    )
     parameters: Annotated[list[ParameterSpec], Field(min_length=1)] = Field(description="What is recovered.")
     integrator: AnyIntegrator = Field(default=Reslrb(), description="How image and gradient are computed.")
     loss: AnyLoss = Field(default=L2(), description="How image and target are compared.")
@@ -252,6 +288,16 @@ class Config(Section):
             return run.adjoint
         fits = run.spp % run.batches == 0 and _passes_divide(self.integrator, run.spp // run.batches)
         return "batched" if fits else "independent"
+
+    def with_exposures_fixed(self) -> Config:
+        """The experiment with exposures of 1 in place of recovered ones, for what looks at the scene alone."""
+        given = self.target.exposure
+        fixed = [1.0 if isinstance(each, str) else each for each in (given if isinstance(given, list) else [given])]
+        target = self.target.model_copy(update={"exposure": fixed if isinstance(given, list) else fixed[0]})
+        views = self.views and [
+            view.model_copy(update={"exposure": 1.0}) if isinstance(view.exposure, str) else view for view in self.views
+        ]
+        return self.model_copy(update={"target": target, "views": views})
 
     def step_options(self) -> dict[str, Any]:
         """What a gradient step is told of its samples."""
@@ -271,9 +317,23 @@ class Config(Section):
 
     __hash__ = None  # type: ignore[assignment]
 
+    @model_validator(mode="before")
+    @classmethod
+    def _target_of_views(cls, data: Any) -> Any:
+        """Views, and cameras of a file, may have all that there is to say of targets."""
+        if isinstance(data, dict) and data.get("target") is None:
+            scene = data.get("scene")
+            if data.get("views") is not None or (isinstance(scene, dict) and scene.get("cameras") is not None):
+                return {**data, "target": {}}
+        return data
+
     @model_validator(mode="after")
     def _check_together(self) -> Self:
         sensors, files = self.scene.sensors, self.target.file
+        if self.views is not None:
+            check_views(self.views, self.scene, self.target)
+        elif files is None and self.target.render is None and self.scene.cameras is None:
+            raise located("target", "must have exactly one of `file` and `render`, and has none")
         if files is not None and sensors != "all" and len(files) != len(sensors):
             raise located(
                 "target.file", f"must name one image for each sensor; images: {len(files)}, sensors: {len(sensors)}"

@@ -5,6 +5,7 @@ from reslrb_cli.integrators.interface import Job, StepIntegrator
 from reslrb_cli.integrators.refusal import Refused, first_channels
 from reslrb_cli.integrators.reslrb import Reslrb
 from reslrb_cli.integrators.step import (
+    OnSamples,
     StepResult,
     cross_step,
     gradient_step,
@@ -16,6 +17,7 @@ from reslrb_cli.integrators.step import (
 
 __all__ = [
     "Job",
+    "OnSamples",
     "Refused",
     "Reslrb",
     "StepIntegrator",

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal
+from typing import Any, Literal, TypeAlias
 
 import drjit as dr
 import mitsuba as mi
@@ -21,6 +21,8 @@ from reslrb_cli.integrators.refusal import Refused
 Adjoint = Literal["correlated", "independent", "batched"]
 FirstBatch = Literal["image", "again"]
 Objective = Callable[[Any], Any]
+#: Told of an image and of the dL/dI that its samples were differentiated with.
+OnSamples: TypeAlias = "Callable[[mi.TensorXf, mi.TensorXf], None]"
 
 
 BATCH_STREAM = 0xBA7C4E5  # keeps the batches' seeds apart from those of passes and of the second samples
@@ -76,31 +78,38 @@ def gradient_step(
     on_image: Callable[[], None] | None = None,
     batches: int = 4,
     first_batch: FirstBatch = "image",
+    on_samples: OnSamples | None = None,
 ) -> StepResult:
     """Render, evaluate `objective(image)`, and add its gradient to every parameter of the scene that tracks one.
 
     `objective` maps the image, a tensor (H, W, C) that tracks derivatives, to a scalar; `sensor` is one of the scene's
     or its index; `params` are the scene's parameters where the caller has them at hand (`mi.traverse` otherwise).
     `on_image` is called once the image and the loss are evaluated, where a step has such a moment. `batches` and
-    `first_batch` belong to `adjoint="batched"`, whose loss is that of all samples' image.
+    `first_batch` belong to `adjoint="batched"`, whose loss is that of all samples' image. `on_samples` is called with
+    the image of each set of samples that is differentiated, and with the dL/dI that it is differentiated with: what
+    the image alone is multiplied by has its derivative from the same samples.
     """
     work, job = interface_of(integrator), _job(scene, sensor, seed, spp, params)
     if adjoint == "batched":
-        return _batched(work, job, objective, batches, first_batch)
+        return _batched(work, job, objective, batches, first_batch, on_samples)
     losses: list[mi.Float | mi.TensorXf] = []
+    gradients: list[mi.TensorXf] = []
     refused = Refused()
 
     def derivative(image: mi.TensorXf) -> mi.TensorXf:
         together = adjoint == "correlated" and not work.image_apart
         loss, gradient = _derivative(objective, image, refused, None if together else on_image)
         losses.append(loss)
+        gradients.append(gradient)
         return gradient
 
     if adjoint == "correlated":
         image = work.correlated(job, derivative)
+        if on_samples is not None:
+            on_samples(image, gradients[0])
     else:
         image = work.image(job)
-        work.backward(replace(job, seed=second_seed(job.seed)), derivative(image))
+        _differentiate(work, replace(job, seed=second_seed(job.seed)), derivative(image), on_samples)
     return StepResult(image, losses[0], refused)
 
 
@@ -135,6 +144,7 @@ def cross_step(
     seed: int,
     spp: int,
     params: mi.SceneParameters | None = None,
+    on_samples: OnSamples | None = None,
 ) -> None:
     """Add the gradient by the samples of `seed`, with dL/dI from the image of those of `image_seed`.
 
@@ -143,7 +153,15 @@ def cross_step(
     work, job = interface_of(integrator), _job(scene, sensor, seed, spp, params)
     image = work.image(replace(job, seed=dr.opaque(mi.UInt32, image_seed)))
     _, gradient = _derivative(objective, image, Refused())
-    work.backward(job, gradient)
+    _differentiate(work, job, gradient, on_samples)
+
+
+def _differentiate(work: StepIntegrator, job: Job, gradient: mi.TensorXf, on_samples: OnSamples | None) -> None:
+    """Add the gradient of samples with a known dL/dI; their image is made only where somebody wants it."""
+    if on_samples is None:
+        work.backward(job, gradient)
+    else:
+        on_samples(work.known(job, gradient), gradient)
 
 
 def _job(scene: mi.Scene, sensor: mi.Sensor | int, seed: int, spp: int, params: mi.SceneParameters | None) -> Job:
@@ -155,7 +173,12 @@ def _job(scene: mi.Scene, sensor: mi.Sensor | int, seed: int, spp: int, params: 
 
 
 def _batched(
-    integrator: StepIntegrator, job: Job, objective: Objective, batches: int, first_batch: FirstBatch
+    integrator: StepIntegrator,
+    job: Job,
+    objective: Objective,
+    batches: int,
+    first_batch: FirstBatch,
+    on_samples: OnSamples | None,
 ) -> StepResult:
     """A step in batches (design of Deng et al. 2022's dual buffer): batch b takes delta from the image of those before.
 
@@ -170,12 +193,15 @@ def _batched(
     image, refused = first, Refused()
     for b in range(1, batches):
         _, gradient = _derivative(objective, image, refused)
-        image = image + (integrator.known(parts[b], gradient * share) - image) / (b + 1)
+        own = integrator.known(parts[b], gradient * share)
+        if on_samples is not None:
+            on_samples(own, gradient * share)
+        image = image + (own - image) / (b + 1)
         dr.eval(image)
     if first_batch == "again":
         others = (image * batches - first) / (batches - 1)
         _, gradient = _derivative(objective, others, refused)
-        integrator.backward(parts[0], gradient * share)
+        _differentiate(integrator, parts[0], gradient * share, on_samples)
     return StepResult(image, dr.detach(objective(image)), refused)
 
 

@@ -56,25 +56,25 @@ def pictures(config: Config, spp: int, masked: bool = False) -> dict[str, np.nda
     If `masked`, dL/dI is 0 where light paths find less than paths from the sensor do: in pixels that see smooth
     specular lobes, and at the film's border.
     """
-    problem = assemble(config)
-    sensor, target = problem.sensors[0], problem.targets[0]
-    initial = problem.render(sensor, spp, 0, _REFERENCE)
+    problem = assemble(config.with_exposures_fixed())
+    view = problem.views[0]
+    initial = problem.render(view.sensor, spp, 0, _REFERENCE)
     image = mi.TensorXf(initial)
     dr.enable_grad(image)
-    dr.backward(problem.compare(image, target))
+    dr.backward(view.compare(image))
     adjoint = np.array(dr.grad(image))
     if masked:
-        at = problem.scene.sensors()[sensor]
+        at = problem.scene.sensors()[view.sensor]
         seen = sees_specular(problem.scene, at)
         adjoint *= (interior(adjoint.shape, at) & ~(seen.alone | seen.mixed))[:, :, None]
-    return {"target": np.array(target), "initial": initial, "adjoint": adjoint}
+    return {"target": np.array(view.target), "initial": initial, "adjoint": adjoint}
 
 
 class Held:
     """Takes gradients with respect to the first parameter, through the first sensor; `adjoint` is dL/dI (H, W, C)."""
 
     def __init__(self, config: Config, adjoint: np.ndarray) -> None:
-        self.problem = assemble_scene(config)
+        self.problem = assemble_scene(config.with_exposures_fixed())
         self.key = self.problem.selection.keys[0]
         # A sum, since NumPy's own memory would be used as it is: kernels depend on its alignment, which is random.
         self.adjoint = mi.TensorXf(np.ascontiguousarray(adjoint, np.float32)) + dr.opaque(mi.Float, 0)

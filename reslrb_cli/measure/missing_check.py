@@ -6,7 +6,6 @@ import time
 from collections.abc import Callable, Iterator
 from typing import Any
 
-import drjit as dr
 import numpy as np
 
 from reslrb_cli.config import Config
@@ -39,7 +38,7 @@ class MissingCheck:
         self._budget, self._count, self._start = budget_s, count, time.perf_counter()
         depth = config.integrator.max_depth
         [listed] = parse_estimators(ESTIMATOR)
-        problem = assemble(listed.at(config, depth, True))
+        problem = assemble(listed.at(config, depth, True).with_exposures_fixed())
         self.source, sensor = str(config.source), problem.sensors[0]
         self.case = Case.of(problem.scene, problem.selection.keys, sensor, problem.selection)
         height, width, _ = self.case.weights.shape
@@ -79,11 +78,9 @@ class MissingCheck:
         return known_step(integrator, scene, sensor, self.case.adjoint, **options)
 
     def _weigh(self, problem: Problem, sensor: int, spp: int) -> None:
-        target = problem.targets[0]
-        image = type(target)(np.ascontiguousarray(problem.render(sensor, spp, 0, "missing")))
-        dr.enable_grad(image)
-        dr.backward(problem.compare(image, target))
-        weights = np.array(dr.grad(image), np.float64)[:, :, : self.case.weights.shape[2]]
+        view = problem.views[0]
+        gradient = problem.image_gradient(view, problem.render(sensor, spp, 0, "missing"))
+        weights = gradient.astype(np.float64)[:, :, : self.case.weights.shape[2]]
         if not np.any(weights):
             raise ConfigError(
                 self.source, "loss", "has no derivative at the initial values, which are the target's own"

@@ -15,8 +15,10 @@ import numpy as np
 
 from reslrb_cli.integrators import Job, Reslrb, gradient_step, sample_sets
 from reslrb_cli.measure.offender_paths import search_paths
+from reslrb_cli.optimization.loading import LIGHT_TRACERS
 from reslrb_cli.optimization.moving import is_attached
-from reslrb_cli.optimization.problem import LIGHT_TRACERS, Problem
+from reslrb_cli.optimization.problem import Problem
+from reslrb_cli.optimization.views import View
 from reslrb_cli.records.offender import Offender
 from reslrb_cli.seeds import seed
 from reslrb_cli.transport.samples import Samples
@@ -32,27 +34,28 @@ GRADIENT = "gradient (of this integrator no paths are looked at) of"
 def find_offenders(problem: Problem, iteration: int) -> list[Offender]:
     """The first value that is not finite of each view in which there is any; the parameters are those of `problem`."""
     found = []
-    for sensor, target in zip(problem.sensors, problem.targets, strict=True):
-        offender = _of_view(problem, iteration, sensor, target)
+    for view in problem.views:
+        offender = _of_view(problem, iteration, view)
         if offender is not None:
             found.append(offender)
     return found
 
 
-def _of_view(problem: Problem, iteration: int, sensor: int, target: Any) -> Offender | None:
-    step_seed = seed(problem.config.run.seed, iteration, sensor, "image")
-    step = _take_step(problem, sensor, target, step_seed)
+def _of_view(problem: Problem, iteration: int, view: View) -> Offender | None:
+    step_seed = seed(problem.config.run.seed, iteration, view.sensor, "image")
+    step = _take_step(problem, view, step_seed)
     if problem.config.integrator.type not in LIGHT_TRACERS:
-        return _of_step(step, sensor, target, None)
+        return _of_step(step, view.sensor, view.target, None)
     if not is_attached(problem):
         _set_tangents(problem)
-    found = [search_paths(*part, step.pixel) for part in _parts(problem, sensor, step_seed)]
+    found = [search_paths(*part, step.pixel) for part in _parts(problem, view.sensor, step_seed)]
     problem.apply()
     offenders = sorted((part for part in found if part.offender is not None), key=lambda part: not part.there)
     if offenders:
         return offenders[0].offender
     largest = [part.largest for part in found if part.largest is not None]
-    return _of_step(step, sensor, target, max(largest, key=lambda entry: max(map(abs, entry.value)), default=None))
+    most = max(largest, key=lambda entry: max(map(abs, entry.value)), default=None)
+    return _of_step(step, view.sensor, view.target, most)
 
 
 def _parts(problem: Problem, sensor: int, step_seed: int) -> Iterator[tuple[Samples, int, str]]:
@@ -72,6 +75,7 @@ def _parts(problem: Problem, sensor: int, step_seed: int) -> Iterator[tuple[Samp
 def _set_tangents(problem: Problem) -> None:
     """Give every entry of every parameter the tangent 1, as far as what of the scene holds it."""
     params, keys = problem.selection.params, problem.selection.keys
+    keys = [key for key in keys if key in params]  # an exposure is no part of any path
     for key in keys:
         leaf = problem.optimizer[key]
         dr.set_grad(leaf, 1.0)
@@ -96,12 +100,13 @@ class Step:
         return None if self.refused is None else self.refused[:2]
 
 
-def _take_step(problem: Problem, sensor: int, target: Any, step_seed: int) -> Step:
+def _take_step(problem: Problem, view: View, step_seed: int) -> Step:
     """The view's step, as the run took it; leaves no gradient behind."""
     optimizer, keys = problem.optimizer, problem.selection.keys
     step = gradient_step(
-        problem.integrator, problem.scene, sensor, lambda image: problem.compare(image, target) / len(problem.sensors),
+        problem.integrator, problem.scene, view.sensor, view.objective,
         seed=step_seed, **problem.config.step_options(), params=problem.selection.params,
+        on_samples=problem.on_samples(view),
     )  # fmt: skip
     gradients = {key: np.array(gradient) for key, gradient in problem.gradients().items()}
     for key in keys:

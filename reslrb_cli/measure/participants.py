@@ -94,7 +94,7 @@ class Participants:
         config, configs, self.known = settings.config, settings.configs(), settings.known
         # Whatever moves, an estimator that follows it can be made.
         able = [case.label for case in settings.integrators if ESTIMATORS[case.options["estimator"]].attaches]
-        first = configs[able[0]] if able else next(iter(configs.values()))
+        first = (configs[able[0]] if able else next(iter(configs.values()))).with_exposures_fixed()
         built_in = config.scene.file == cornell_box.FILE
         problem = assemble_scene(first, cornell_box.build(config.scene.options) if built_in else None)
         scene, sensor = problem.scene, problem.sensors[0]

@@ -15,6 +15,17 @@ from reslrb_cli.errors import UnsupportedScene
 from reslrb_cli.measure.moving import moves_light
 from reslrb_cli.scene import SceneGraph, SceneNeeds, View, check_camera_paths, look, scene_needs
 from reslrb_cli.scene.catalog import parameter_kind
+from reslrb_cli.scene.seen import interior
+
+__all__ = [
+    "Situation",
+    "ends",
+    "interior",
+    "prb_gradient",
+    "prb_image",
+    "ptracer_gradient",
+    "ptracer_image",
+]
 
 #: Longest paths that are traced without roulette; naive AD of stock integrators keeps all of them.
 DEEPEST = 64
@@ -174,15 +185,3 @@ def _all_zero_somewhere(value: Any) -> bool:
     array = np.array(value)
     texels = array.reshape(-1, array.shape[-1]) if array.ndim == 3 else array.reshape(1, -1)
     return bool(np.any(np.all(texels == 0, axis=1)))
-
-
-def interior(shape: tuple[int, ...], sensor: Any) -> np.ndarray:
-    """Where light tracing loses nothing by the film's border: boolean (H, W), for a sensor whose film is so large.
-
-    Samples just outside of the film are lost, so that pixels within the filter's radius of its border lack what they
-    would have added; paths from the sensor lose none.
-    """
-    margin = int(np.ceil(float(sensor.film().rfilter().radius()) - 0.5))
-    inside = np.zeros(shape[:2], dtype=bool)
-    inside[margin : shape[0] - margin, margin : shape[1] - margin] = True
-    return inside

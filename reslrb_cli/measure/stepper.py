@@ -13,7 +13,8 @@ from reslrb_cli.integrators import gradient_step, known_step
 from reslrb_cli.measure import cornell_box
 from reslrb_cli.measure.film import texture_shapes, widen, with_textures
 from reslrb_cli.measure.scratch import scratch_bytes
-from reslrb_cli.optimization.problem import assemble_scene, choose_sensors, load_configured
+from reslrb_cli.optimization.loading import choose_sensors, load_configured
+from reslrb_cli.optimization.problem import assemble_scene
 from reslrb_cli.records.clock import StepClock, StepTimes, peak_mib, reset_peak
 from reslrb_cli.seeds import seed
 
@@ -34,7 +35,7 @@ class Stepper:
         scene = _load(config)
         if film_width is not None:
             widen(scene, choose_sensors(config, scene)[0], film_width)
-        self.problem = assemble_scene(config, scene)
+        self.problem = assemble_scene(config.with_exposures_fixed(), scene)
         self.sensor = self.problem.sensors[0]
         self.known = objective == "fixed"
         film = self.problem.scene.sensors()[self.sensor].film()

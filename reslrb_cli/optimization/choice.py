@@ -190,7 +190,9 @@ def _situation(problem: Problem) -> dict[str, Any]:
     return {
         "scene": hashlib.blake2b(Path(config.scene.file).read_bytes()).hexdigest(),
         "options": dump["scene"]["options"],
+        "cameras": config.scene.cameras and hashlib.blake2b(config.scene.cameras.read_bytes()).hexdigest(),
         "sensors": problem.sensors,
+        "views": [view.situation() for view in problem.views],
         "parameters": {key: list(problem.selection.array(key).shape) for key in problem.selection.keys},
         "integrator": dump["integrator"],
         "loss": dump["loss"],

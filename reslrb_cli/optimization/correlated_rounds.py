@@ -8,7 +8,7 @@ brought back to those of the run.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from reslrb_cli.integrators import cross_step
 from reslrb_cli.integrators.tracer import LightTracer
@@ -60,13 +60,11 @@ def _gradient(problem: Problem, number: int, image: str, spp: int) -> dict[str, 
     if isinstance(integrator, LightTracer):  # a recording would cost more than so few steps save
         integrator = integrator.with_options(samples_per_pass=integrator.samples_per_pass, freeze=False)
     problem.apply()
-    for sensor, target in zip(problem.sensors, problem.targets, strict=True):
-
-        def loss(image: Any, target: Any = target) -> Any:
-            return problem.compare(image, target) / len(problem.sensors)
-
+    for view in problem.trained:
         cross_step(
-            integrator, problem.scene, sensor, loss, seed=seed(run.seed, number, sensor, "bias"),
-            image_seed=seed(run.seed, number, sensor, image), spp=spp, params=problem.selection.params,
+            integrator, problem.scene, view.sensor, view.objective,
+            seed=seed(run.seed, number, view.sensor, "bias"),
+            image_seed=seed(run.seed, number, view.sensor, image), spp=spp, params=problem.selection.params,
+            on_samples=problem.on_samples(view),
         )  # fmt: skip
     return take_gradient(problem)

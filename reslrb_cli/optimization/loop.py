@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 import drjit as dr
+import mitsuba as mi
 
 from reslrb_cli.integrators import Refused, gradient_step
 from reslrb_cli.optimization.clamping import GradientClamp
@@ -17,9 +18,13 @@ from reslrb_cli.optimization.nonfinite import Findings, NonFinitePolicy, Refused
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.scaling import rescale
 from reslrb_cli.optimization.schedules import learning_rate_factor
+from reslrb_cli.optimization.views import View
 from reslrb_cli.records.clock import StepClock, peak_mib, reset_peak
 from reslrb_cli.records.metrics import Record
 from reslrb_cli.seeds import seed
+
+#: Iterations between two looks at what is held out.
+HELD_OUT_EVERY = 10
 
 
 def optimize(problem: Problem, on_nonfinite: Callable[[Findings], None] = lambda found: None) -> Iterator[Record]:
@@ -41,6 +46,7 @@ def optimize(problem: Problem, on_nonfinite: Callable[[Findings], None] = lambda
     meter = problem.error_meter()
     for iteration in range(config.run.iterations):
         errors = meter.errors(problem.selection.array)
+        held_out = problem.held_out_loss() if iteration % HELD_OUT_EVERY == 0 else None
         with clock.step() as times:
             split = Split()
             loss, squares, counts, refused = gradient(problem, iteration, split)
@@ -77,19 +83,28 @@ def optimize(problem: Problem, on_nonfinite: Callable[[Findings], None] = lambda
             parameter_errors=errors,
             nonfinite_by_parameter=found.by_parameter,
             clamped=clamped,
+            held_out=held_out,
         )
         policy.see(found, held)
 
 
-def _findings(problem: Problem, iteration: int, loss: float, counts: dict[str, Any], refused: list[Any]) -> Findings:
-    """What of a step was not finite; `refused` are the steps' counts, one a view."""
+def _findings(
+    problem: Problem, iteration: int, loss: float, counts: dict[str, Any], refused: list[tuple[int, Refused]]
+) -> Findings:
+    """What of a step was not finite; `refused` are the steps' counts, by sensor."""
     found = Findings(iteration, loss=not math.isfinite(loss))
     found.gradients = {key: int(count[0]) for key, count in counts.items() if count[0]}
     found.lost = [key for key, bad in found.gradients.items() if bad == dr.prod(dr.shape(problem.optimizer[key]))]
-    for sensor, view in zip(problem.sensors, refused, strict=True):
-        if view.count[0]:
-            found.refused[sensor] = RefusedAt(int(view.count[0]), view.entry())
+    for sensor, view in refused:
+        first = view.entry()
+        if first is not None:
+            found.refused[sensor] = RefusedAt(int(view.count[0]), first)
     return found
+
+
+def _scaled(view: View, scale: float, image: mi.TensorXf) -> mi.Float:
+    """A view's part of the loss, `scale` times."""
+    return view.objective(image) if scale == 1 else view.objective(image) * scale
 
 
 class Split:
@@ -120,38 +135,33 @@ class Split:
 
 def gradient(
     problem: Problem, iteration: int, split: Split
-) -> tuple[Any, dict[str, Any], dict[str, Any], list[Refused]]:
+) -> tuple[Any, dict[str, Any], dict[str, Any], list[tuple[int, Refused]]]:
     """Accumulate the gradient of the loss into the parameters.
 
     `split` is told of each view's parts. Returns width-1 arrays: the loss, for each parameter the gradient's sum
-    of squares (of its finite entries) and the number of entries that are not finite, and for each view what was
-    refused.
+    of squares (of its finite entries) and the number of entries that are not finite, and by sensor what was refused.
     """
     config = problem.config
-    views = len(problem.sensors)
-
-    def view_loss(target: Any, image: Any) -> Any:
-        return problem.compare(image, target) / views
-
     total: Any = 0.0
     refused = []
-    for sensor, target in zip(problem.sensors, problem.targets, strict=True):
+    for view, scale in problem.drawn(iteration):
         split.start()
         step = gradient_step(
             problem.integrator,
             problem.scene,
-            sensor,
-            functools.partial(view_loss, target),
-            seed=seed(config.run.seed, iteration, sensor, "image"),
+            view.sensor,
+            functools.partial(_scaled, view, scale),
+            seed=seed(config.run.seed, iteration, view.sensor, "image"),
             **config.step_options(),
             params=problem.selection.params,
             on_image=split.image,
+            on_samples=problem.on_samples(view),
         )
         # One view's kernels are not to wait for the next one's: memory would grow with the number of views.
         gradients = problem.gradients()
         dr.eval(step.loss, gradients)
         total = total + step.loss
-        refused.append(step.refused)
+        refused.append((view.sensor, step.refused))
     split.end()
     squares = {key: finite_square_norm(value) for key, value in gradients.items()}
     return total, squares, {key: count_nonfinite(value) for key, value in gradients.items()}, refused

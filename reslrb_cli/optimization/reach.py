@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from reslrb_cli.integrators import known_step
-from reslrb_cli.optimization.problem import Problem, samples_per_pass
+from reslrb_cli.optimization.loading import samples_per_pass
 from reslrb_cli.optimization.rendering import passes
 from reslrb_cli.scene import visible_texels
 from reslrb_cli.seeds import seed
+
+if TYPE_CHECKING:
+    from reslrb_cli.optimization.problem import Problem
 
 Array = np.ndarray[Any, Any]
 
@@ -33,11 +36,11 @@ def find_reached(problem: Problem, say: Callable[[str], None] = lambda line: Non
     say(f"finding what light and sensor reach: {problem.config.run.reach_spp} spp")
     sensitive = sensitivity(problem)
     for key in problem.truth:
-        mask: Array = sensitive[key]
+        mask: Array = sensitive[key] | (key in problem.selection.factors)  # every image shows its exposure
         if mask.ndim == 3:
             mask = np.any(mask, axis=2)
             if key in problem.selection.params:  # a heightmap is no texture to be seen
-                sensors = [problem.scene.sensors()[index] for index in problem.sensors]
+                sensors = [problem.scene.sensors()[view.sensor] for view in problem.trained]
                 mask = mask & _without_halo(visible_texels(problem.scene, sensors, key), mask.shape[1])
         problem.masks[key] = mask
 
@@ -46,7 +49,7 @@ def sensitivity(problem: Problem) -> dict[str, Array]:
     """For each parameter whether the mean image depends on an entry, boolean, of the parameter's shape."""
     run, optimizer = problem.config.run, problem.optimizer
     found: dict[str, Array] = {}
-    for sensor in problem.sensors:
+    for sensor in [view.sensor for view in problem.trained]:
         film = problem.scene.sensors()[sensor].film()
         width, height = (int(n) for n in film.crop_size())
         # dL/dI of the mean image: known before any path is traced, which some estimators ask for.

@@ -10,6 +10,7 @@ import numpy as np
 from reslrb_cli.optimization.errors import nearest
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.trend import find_trend, got_worse
+from reslrb_cli.optimization.views import View
 from reslrb_cli.records.metrics import Record, finite
 
 Array = np.ndarray[Any, Any]
@@ -31,6 +32,7 @@ class Results:
         self._values: dict[str, dict[str, Any]] = {key: {} for key in problem.selection.keys}
         self._losses: list[float] = []
         self._image_losses: dict[str, list[float]] = {"initial": [], "final": []}
+        self._held_out: dict[str, list[float]] = {"initial": [], "final": []}
         self._errors: dict[str, list[float]] = {}
 
     def begin(self) -> None:
@@ -51,11 +53,11 @@ class Results:
         self._last = self.meter.errors(self.problem.selection.array)
         self._take("final")
 
-    def see(self, moment: str, image: Array, target: Any) -> None:
-        """Take the saved image (H, W, C) of a sensor, at `initial` or `final`; every sensor in turn."""
+    def see(self, moment: str, view: View, image: Array) -> None:
+        """Take the saved image (H, W, C) of a view, at `initial` or `final`; every view in turn."""
         if moment in self._image_losses:
-            loss = self.problem.compare(mi.TensorXf(np.ascontiguousarray(image, dtype=np.float32)), target)
-            self._image_losses[moment].append(float(loss[0]))
+            loss = view.objective(mi.TensorXf(np.ascontiguousarray(image, dtype=np.float32)))
+            (self._held_out if view.held_out else self._image_losses)[moment].append(float(loss[0]))
 
     def _take(self, moment: str) -> None:
         for key, value in self.problem.values().items():
@@ -68,8 +70,9 @@ class Results:
         final; `rmse` is that of all parameters together, null where their units differ. `parameters` are, by key,
         quantity and shape, the share of entries that light and sensor reach, the root mean square of the truth over
         those (`scale`), and `initial`, `final` and `true` values (`summary`). `loss_trend` says how loss and noise were
-        at the start and the end, null for a short run; `image_loss` is that of the saved images, which have less noise;
-        `worse` are the keys whose error ended above its start.
+        at the start and the end, null for a short run; `image_loss` is that of the saved images, which have less noise,
+        of views that are trained on, and `held_out` the mean of those that are not; `worse` are the keys whose error
+        ended above its start.
         """
         trend = find_trend(self._losses)
         first, last = self._first, self._last
@@ -81,9 +84,10 @@ class Results:
             "relative_error": {key: _pair(key, *relative) for key in relative[0] | relative[1]},
             "parameters": {key: self._about(key) | values for key, values in self._values.items()},
             "image_loss": {
-                moment: float(np.mean(losses)) if len(losses) == len(self.problem.sensors) else None
+                moment: float(np.sum(losses)) if len(losses) == len(self.problem.trained) else None
                 for moment, losses in self._image_losses.items()
             },
+            "held_out": {moment: float(np.mean(losses)) for moment, losses in self._held_out.items() if losses},
             "loss_trend": None if trend is None else trend.to_json(),
             "worse": worse,
         }

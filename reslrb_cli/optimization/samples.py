@@ -20,14 +20,11 @@ def sample_gradient(problem: Problem, integrator: Any, round: int, purpose: str,
     Returns the gradient of each parameter as it is accumulated in `problem.optimizer`; `take_gradient` has to follow.
     """
     run = problem.config.run
-    for sensor, target in zip(problem.sensors, problem.targets, strict=True):
-
-        def loss(image: Any, target: Any = target) -> Any:
-            return problem.compare(image, target) / len(problem.sensors)
-
+    for view in problem.trained:
         step = gradient_step(
-            integrator, problem.scene, sensor, loss, seed=seed(run.seed, round, sensor, purpose),
+            integrator, problem.scene, view.sensor, view.objective, seed=seed(run.seed, round, view.sensor, purpose),
             **{**problem.config.step_options(), "spp": spp}, params=problem.selection.params,
+            on_samples=problem.on_samples(view),
         )  # fmt: skip
         gradients = problem.gradients()
         dr.eval(step.loss, gradients)

@@ -25,7 +25,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from reslrb_cli.integrators import render_image
+from reslrb_cli.integrators import first_channels, render_image
 from reslrb_cli.optimization.samples import sample_gradient, take_gradient
 from reslrb_cli.seeds import seed
 
@@ -78,8 +78,8 @@ def measure_sensitivities(problem: Problem, samples: int) -> list[Sensitivity]:
             total[key] = finite if round == 0 else total[key] + finite
         for key, gradient in take_gradient(problem).items():
             rows[key].append(gradient.astype(np.float64))
-    base = _images(problem)
-    targets = [np.array(target, dtype=np.float64) for target in problem.targets]
+    base = see_images(problem)
+    targets = [view.kept(np.array(view.target, dtype=np.float64)) for view in problem.trained]
     reference = [np.maximum(np.abs(a), np.abs(b)) for a, b in zip(base, targets, strict=True)]
     found = []
     for key, gradients in rows.items():
@@ -108,7 +108,7 @@ def _probe(
         moved = dr.select((moved < low) | (moved > high), value - direction * step, moved)
         dr.make_opaque(moved)
         problem.apply({key: moved})
-        difference = [a - b for a, b in zip(_images(problem), base, strict=True)]
+        difference = [a - b for a, b in zip(see_images(problem), base, strict=True)]
         squares = sum(float(np.square(d).sum()) for d in difference)
         shared = sum(float((np.abs(d) * r).sum()) for d, r in zip(difference, reference, strict=True))
         if not (0 < squares < math.inf and 0 < shared < math.inf):
@@ -128,12 +128,12 @@ def _probe(
 
 
 def _second_difference(problem: Problem, base: Sequence[Array], difference: Sequence[Array], factor: float) -> float:
-    """L(I + D) - 2 L(I) + L(I - D), the mean over the views, D `factor` times the difference."""
+    """L(I + D) - 2 L(I) + L(I - D), over the views by their shares, D `factor` times the difference."""
     total = 0.0
-    for image, change, target in zip(base, difference, problem.targets, strict=True):
+    for image, change, view in zip(base, difference, problem.trained, strict=True):
         for side, weight in ((1, 1), (0, -2), (-1, 1)):
             at = mi.TensorXf((image + side * factor * change).astype(np.float32))
-            total += weight * float(problem.compare(at, target)[0]) / len(base)
+            total += weight * float(view.judge(at)[0]) * view.share
     return total
 
 
@@ -142,12 +142,14 @@ def _downhill(gradient: Any) -> Any:
     return dr.select(gradient == 0, 0, -dr.sign(gradient))
 
 
-def _images(problem: Problem) -> list[Array]:
-    """Every view as the scene stands, without alpha, always from the same seeds."""
+def see_images(problem: Problem) -> list[Array]:
+    """Every view that is trained on, exposed, without alpha, 0 where it is left out, always from the same seeds."""
     run, images = problem.config.run, []
-    for sensor, target in zip(problem.sensors, problem.targets, strict=True):
-        image = render_image(problem.integrator, problem.scene, sensor, seed(run.seed, 0, sensor, _PURPOSE), run.spp)
-        images.append(np.array(image, dtype=np.float64)[:, :, : target.shape[2]])
+    for view in problem.trained:
+        at = seed(run.seed, 0, view.sensor, _PURPOSE)
+        image = render_image(problem.integrator, problem.scene, view.sensor, at, run.spp)
+        exposed = view.exposure.applied(first_channels(image, view.target.shape[2]))
+        images.append(view.kept(np.array(exposed, dtype=np.float64)))
     return images
 
 

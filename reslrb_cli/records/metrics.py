@@ -37,7 +37,8 @@ class Record:
     the reading of `parameter_errors` are not in it. `peak_mib` is the allocator's high-water mark since the start.
     `nonfinite` counts the entries of loss, of its derivative by the image and of gradients that were not finite;
     `grad_norm` leaves them out. `nonfinite_by_parameter` holds those of gradients and updates, of parameters with any.
-    `clamped` is None where gradients are not clamped; `grad_norm` is that before.
+    `clamped` is None where gradients are not clamped; `grad_norm` is that before. `held_out` is the loss of views that
+    are held out, None without any, and of iterations that did not look.
     `parameter_errors` are root mean square errors by key, each in its parameter's unit, over the entries that light and
     sensor reach, of the parameters whose true value is known; `parameter_rmse` is that over the entries of all of them,
     None where they have no common unit, or no true value is known.
@@ -59,6 +60,7 @@ class Record:
     parameter_errors: dict[str, float] = field(default_factory=dict)
     nonfinite_by_parameter: dict[str, int] = field(default_factory=dict)
     clamped: Clamped | None = None
+    held_out: float | None = None
 
     def to_json(self) -> str:
         """The record as one line of JSON, non-finite numbers as null (JSON has none)."""

@@ -8,10 +8,11 @@ from .needs import SceneNeeds, View, check_camera_paths, check_supported, look, 
 from .parameters import select_parameters, set_values
 from .reach import visible_texels
 from .selection import Selection
-from .target import read_image
+from .target import Photo, check_photo, read_image, read_photo, read_weights
 
 __all__ = [
     "ParameterInfo",
+    "Photo",
     "SceneGraph",
     "SceneNeeds",
     "SceneSummary",
@@ -19,11 +20,14 @@ __all__ = [
     "SensorSummary",
     "View",
     "check_camera_paths",
+    "check_photo",
     "check_supported",
     "list_parameters",
     "load_scene",
     "look",
     "read_image",
+    "read_photo",
+    "read_weights",
     "scene_needs",
     "select_parameters",
     "set_values",

@@ -73,6 +73,18 @@ def read_bitmap(path: Path, size: Size | None = None) -> mi.Bitmap:
     return bitmap
 
 
+def image_size(path: Path) -> Size:
+    """The (width, height) that an image file says it has. Raises ConfigError, located in the file, where it is none."""
+    with open_file(path, IMAGE_BYTES) as file:
+        try:
+            says, _ = _examine(file)
+        except _CutOff:
+            says = None
+    if says is None or min(says) < 1:
+        raise ConfigError(path, "", f"is not an image that can be read ({FORMATS})")
+    return says
+
+
 def _examine(file: BinaryIO) -> tuple[Size | None, bool]:
     """The (width, height) that a file says its image has, None where it is no image; and whether it is a JPEG.
 

@@ -11,6 +11,7 @@ from typing import Any
 import mitsuba as mi
 
 from ..errors import ConfigError
+from .cameras import read_cameras, replace_sensors
 from .description import (
     Description,
     build,
@@ -33,20 +34,21 @@ def load_scene(
     options: Mapping[str, Any] | None = None,
     strict: bool = False,
     size: tuple[int, int] | None = None,
+    cameras: Path | None = None,
 ) -> mi.Scene:
     """Load a Mitsuba scene (XML, versions 0.4 to 3); a variant must be set.
 
     `options` are the values of the file's `$name` variables. Shapes are not merged, so that all parameters keep their
     names, and an object without an id is named by its kind and its number among all of that kind in the file, such as
     `Sphere_3`. What Mitsuba's parser would refuse because another version or an exporter wrote it is mended or left
-    out, with a warning in the log; `strict` has it refused. The scene's integrator is not loaded: an experiment has its
-    own. Plugins are loaded from Mitsuba's own folder alone. `size` is the (width, height) of all films in pixels, in
-    place of what the file says.
+    out, with a warning in the log; `strict` has it refused. Those of `cameras`, a file, stand in place of the scene's
+    sensors. The scene's integrator is not loaded: an experiment has its own. Plugins are loaded from Mitsuba's own
+    folder alone. `size` is the (width, height) of all films in pixels, in place of what the files say.
 
     Raises ConfigError, located in the scene file, where it is missing or wrong, has nothing in it, or no light. Warns,
     too, of a scene that is too far from the origin, or too small, and of glass that is too thin.
     """
-    return load_described(file, options, strict, size)[0]
+    return load_described(file, options, strict, size, cameras)[0]
 
 
 def load_described(
@@ -54,11 +56,14 @@ def load_described(
     options: Mapping[str, Any] | None = None,
     strict: bool = False,
     size: tuple[int, int] | None = None,
+    cameras: Path | None = None,
 ) -> tuple[mi.Scene, Description]:
     """The same, and the description that the scene was built from, of which Mitsuba has a use for every element."""
     file = Path(file)
     description = read_description(file, {name: _as_text(value) for name, value in (options or {}).items()})
     root = description.root
+    if cameras is not None:
+        replace_sensors(description, read_cameras(cameras))
     found = notes.in_order([*name_objects(root), *mend(description)], root)
     if strict:
         notes.refuse(found)

@@ -1,4 +1,7 @@
-"""Pixels in which the sensor sees glass, mirrors or coats: light paths cannot connect to it from their smooth lobes."""
+"""Pixels of which light tracing lacks something: at the film's border, and where the sensor sees glass, mirrors, coats.
+
+From the smooth lobes of those light paths cannot connect to the sensor.
+"""
 
 from __future__ import annotations
 
@@ -13,6 +16,18 @@ from .needs import CROSSINGS
 
 #: Primary rays are spread over a pixel in so many rows and columns of cells.
 CELLS = 4
+
+
+def interior(shape: tuple[int, ...], sensor: mi.Sensor) -> np.ndarray:
+    """Where light tracing loses nothing by the film's border: boolean (H, W), for a sensor whose film is so large.
+
+    Samples just outside of the film are lost, so that pixels within the filter's radius of its border lack what they
+    would have added; paths from the sensor lose none.
+    """
+    margin = int(np.ceil(float(sensor.film().rfilter().radius()) - 0.5))
+    inside = np.zeros(shape[:2], dtype=bool)
+    inside[margin : shape[0] - margin, margin : shape[1] - margin] = True
+    return inside
 
 
 @dataclass(frozen=True)

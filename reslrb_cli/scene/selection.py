@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import drjit as dr
@@ -22,12 +22,18 @@ class Selection:
     `params` is all of the scene's `mi.traverse`; `specs` holds the settings of each key, in the order of the
     configuration and, for a glob, of the scene. A key is one of `params`, or a value of `deformation`: a motion's
     `ID.translation`, or a heightmap. `tied` has, by such a key, the others of `params` that have the same value.
+    `factors` are values that are none of the scene's: what its images are multiplied by (`add_factor`).
     """
 
     params: mi.SceneParameters
     specs: dict[str, Settings]
     tied: dict[str, list[str]]
     deformation: Deformation
+    factors: dict[str, Any] = field(default_factory=dict)
+
+    def add_factor(self, key: str, value: Any, settings: Settings) -> None:
+        """Recover a value that is none of the scene's along with what is."""
+        self.specs[key], self.factors[key] = settings, value
 
     @property
     def keys(self) -> list[str]:
@@ -37,7 +43,7 @@ class Selection:
     @property
     def scene_keys(self) -> list[str]:
         """The entries of `params` that what is recovered determines."""
-        own = [key for key in self.keys if key not in self.deformation.values]
+        own = [key for key in self.keys if key not in self.deformation.values and key not in self.factors]
         return [*own, *(other for key in own for other in self.tied.get(key, ())), *self.deformation.keys]
 
     def spec(self, key: str) -> Settings:
@@ -46,7 +52,7 @@ class Selection:
 
     def value(self, key: str) -> Any:
         """The current value of `key`, as Dr.Jit has it."""
-        return self.deformation.values[key] if key in self.deformation.values else self.params[key]
+        return self._holder(key)[key]
 
     def quantity(self, key: str) -> str | None:
         """What `key` measures: `length`, `degrees` or `scale` of what moves; None of what is the scene's own."""
@@ -65,15 +71,16 @@ class Selection:
         All is evaluated, so that a step's kernels are the same from the first one on.
         """
         for key, value in values.items():
-            if key in self.deformation.values:
-                self.deformation.values[key] = value
+            if key in self.deformation.values or key in self.factors:
+                self._holder(key)[key] = value
             else:
                 for each in (key, *self.tied.get(key, ())):
                     self.params[each] = value
         moved = self.deformation.place()
         self.params.update()
-        own = [each for key in values for each in (key, *self.tied.get(key, ())) if key not in self.deformation.values]
-        dr.eval([self.params[key] for key in own], moved, settle(self.params, (*own, *self.deformation.keys)))
+        own = [each for key in values for each in (key, *self.tied.get(key, ())) if self._holder(key) is self.params]
+        settled = settle(self.params, (*own, *self.deformation.keys))
+        dr.eval([self.params[key] for key in own], moved, settled, self.factors)
 
     def collect(self) -> None:
         """Bring what steps added to the gradients of moved things on to that of the values that move them."""
@@ -99,4 +106,10 @@ class Selection:
 
     def slot(self, key: str) -> Slot:
         """The value of `key`, to be read and set; `update` has to follow."""
-        return Slot(self.deformation.values if key in self.deformation.values else self.params, key)
+        return Slot(self._holder(key), key)
+
+    def _holder(self, key: str) -> Any:
+        """What has the value of `key` under that name."""
+        if key in self.factors:
+            return self.factors
+        return self.deformation.values if key in self.deformation.values else self.params

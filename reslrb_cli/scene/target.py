@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,20 @@ from .image_file import read_bitmap
 Image = np.ndarray[Any, Any]
 
 
+@dataclass(frozen=True)
+class Photo:
+    """An image file as linear Rec. 709, (H, W, 3) float32, and what is wrong with its pixels, each boolean (H, W).
+
+    `clipped`: at the greatest value that a file of 8 or 16 bits holds, in any channel; `transparent`: of alpha 0;
+    `nonfinite`: not finite in some channel.
+    """
+
+    image: Image
+    clipped: np.ndarray
+    transparent: np.ndarray
+    nonfinite: np.ndarray
+
+
 def read_image(
     path: Path, color_space: str = "auto", size: tuple[int, int] | None = None, signed: bool = False
 ) -> Image:
@@ -24,23 +39,58 @@ def read_image(
     ConfigError, located in the file, where it is missing or no image, damaged, cut off, too large or of another size,
     or holds a value that is not finite or, unless `signed`, negative.
     """
+    photo = read_photo(path, color_space, size)
+    _check_values(Path(path), photo.image, signed)
+    return photo.image
+
+
+def read_photo(
+    path: Path, color_space: str = "auto", size: tuple[int, int] | None = None, gamma: float | None = None
+) -> Photo:
+    """Read an image file like `read_image`, and mark pixels that are not to be trusted; values are not checked.
+
+    `gamma`, if any, decodes integers in place of `color_space`. Raises ConfigError, located in the file, also where
+    that is given for a file of floats.
+    """
     path = Path(path)
     bitmap = read_bitmap(path, size)
     if bitmap.pixel_format() == mi.Bitmap.PixelFormat.MultiChannel:
         raise ConfigError(path, "", f"has {bitmap.channel_count()} channels; give one with R, G, B or Y only")
     width, height = (int(n) for n in bitmap.size())
-
-    is_float = bitmap.component_format() in (
-        mi.Struct.Type.Float16,
-        mi.Struct.Type.Float32,
-        mi.Struct.Type.Float64,
-    )
-    decode = color_space == "srgb" or (color_space == "auto" and not is_float)
+    raw = np.array(bitmap).reshape(height, width, -1)
+    alpha = raw[:, :, -1] if bitmap.has_alpha() else None
+    colors = raw if alpha is None else raw[:, :, :-1]
+    is_integer = raw.dtype.kind in "ui"
+    if gamma is not None and not is_integer:
+        raise ConfigError(path, "", "holds floats, which are linear: gamma decodes files of 8 and 16 bits")
     bitmap.set_srgb_gamma(False)  # values as they stand in the file; decoded below
     bitmap = bitmap.convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.Float32, False)
     image = np.array(bitmap, dtype=np.float32).reshape(height, width, 3)
-    _check_values(path, image, signed)
-    return decode_srgb(image) if decode else image
+    if gamma is not None:
+        image = image**gamma
+    elif color_space == "srgb" or (color_space == "auto" and is_integer):
+        image = decode_srgb(image)
+    nothing = np.zeros((height, width), dtype=bool)
+    return Photo(
+        image,
+        clipped=(colors == np.iinfo(raw.dtype).max).any(axis=2) if is_integer else nothing,
+        transparent=nothing if alpha is None else alpha == 0,
+        nonfinite=np.logical_not(np.isfinite(image).all(axis=2)),
+    )
+
+
+def check_photo(path: Path, photo: Photo, allow_nonfinite: bool) -> None:
+    """Raise ConfigError, located in the file, where a photo holds negative values, or such that are not finite."""
+    _check_values(path, np.nan_to_num(photo.image, posinf=0, neginf=0) if allow_nonfinite else photo.image, False)
+
+
+def read_weights(path: Path, size: tuple[int, int]) -> Image:
+    """Read an image of weights, float32 (H, W): values as they stand in the file, the mean of several channels.
+
+    Those of 8 and 16 bits are shares of the greatest; alpha is dropped. Raises ConfigError, located in the file, like
+    `read_image`.
+    """
+    return read_image(path, "linear", size).mean(axis=2)
 
 
 def decode_srgb(image: Image) -> Image:

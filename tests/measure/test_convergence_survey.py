@@ -38,7 +38,7 @@ def test_facts(tmp_path: Path) -> None:
     assert (facts["keys"], facts["shapes"]) == ([KEY], {KEY: [4, 4, 3]})
     assert (facts["independent"], facts["why"], facts["without"]) == ({KEY: "ptracer"}, {KEY: ""}, {})
     assert (facts["pixels"], facts["masked"]) == (64, False)
-    assert (arrays["adjoints"].shape, arrays["target"].shape) == ((1, 8, 8, 3), (8, 8, 3))
+    assert (arrays["adjoints"].shape, arrays["target-0"].shape) == ((1, 8, 8, 3), (8, 8, 3))
     assert arrays["mask"].all()
 
 

@@ -28,7 +28,7 @@ def steps(monkeypatch, request):
     state.loss = lambda call: 0.0
     state.derivative = lambda call: dr.zeros(dr.llvm.ad.TensorXf, (2, 2, 3))
 
-    def gradient_step(integrator, scene, sensor, objective, *, seed, spp, adjoint, params, on_image):
+    def gradient_step(integrator, scene, sensor, objective, *, seed, spp, adjoint, params, on_image, on_samples):
         number = len(calls)
         calls.append(types.SimpleNamespace(sensor=sensor, seed=seed, spp=spp, adjoint=adjoint))
         factors = {key: state.spoil(number, key) for key in params}

@@ -149,9 +149,8 @@ def test_batched_has_none(problem) -> None:
 
     def gradient(number: int, adjoint: str, purpose: str) -> np.ndarray:
         problem.apply()
-        target = problem.targets[0]
         gradient_step(
-            problem.integrator, problem.scene, 0, lambda image: problem.compare(image, target), spp=8, adjoint=adjoint,
+            problem.integrator, problem.scene, 0, problem.views[0].compare, spp=8, adjoint=adjoint,
             seed=seed(0, number, 0, purpose), params=problem.selection.params,
         )  # fmt: skip
         return take_gradient(problem)["floor.reflectance.data"]

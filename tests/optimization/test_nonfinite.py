@@ -32,7 +32,7 @@ def test_a_gradient_that_is_not_finite_reaches_no_parameter(tmp_path, steps, bad
 
 def test_a_loss_that_is_not_finite_stops_every_update(tmp_path, steps):
     problem = steps.problem = make_problem(tmp_path, sets=["run.iterations=3"])
-    problem.targets = [dr.full(mi.TensorXf, np.nan, (2, 2, 3))]
+    problem.views[0].made = dr.full(mi.TensorXf, np.nan, (2, 2, 3))
     records = list(loop.optimize(problem))
     assert all(record.nonfinite == 13 for record in records)
     np.testing.assert_array_equal(np.array(problem.optimizer["albedo"]), 0.5)
@@ -149,7 +149,7 @@ def test_a_derivative_of_the_loss_is_refused_by_each_policy(tmp_path, steps, kin
 @pytest.mark.parametrize("kind", ["skip", "zero"])
 def test_a_run_that_stands_still_ends(tmp_path, steps, kind):
     problem = make_problem(tmp_path, sets=[f"run.on_nonfinite={kind}"])
-    problem.targets = [dr.full(mi.TensorXf, np.nan, (2, 2, 3))]
+    problem.views[0].made = dr.full(mi.TensorXf, np.nan, (2, 2, 3))
     records, values, error = run(problem)
     assert len(records) == PATIENCE
     assert "the loss was not finite in 10 iterations in a row" in error

@@ -47,8 +47,8 @@ def test_results_of_a_run(tmp_path, steps):
     assert found["worse"] == []
     assert found["image_loss"] == {"initial": None, "final": None}
     image = np.full((2, 2, 4), 0.6, dtype=np.float32)
-    results.see("final", image, problem.targets[0])
-    results.see("iteration-000002", image, problem.targets[0])
+    results.see("final", problem.views[0], image)
+    results.see("iteration-000002", problem.views[0], image)
     assert results.to_json()["image_loss"] == {"initial": None, "final": pytest.approx(0.04, rel=1e-4)}
     assert json.dumps(found, allow_nan=False)
 
@@ -68,7 +68,7 @@ def test_an_image_of_each_sensor_is_asked_for(tmp_path):
     problem = make_problem(tmp_path, views=2)
     results = Results(problem)
     image = np.full((2, 2, 3), 0.6, dtype=np.float32)
-    results.see("final", image, problem.targets[0])
+    results.see("final", problem.views[0], image)
     assert results.to_json()["image_loss"]["final"] is None
-    results.see("final", image, problem.targets[1])
+    results.see("final", problem.views[1], image)
     assert results.to_json()["image_loss"]["final"] == pytest.approx(0.04, rel=1e-4)

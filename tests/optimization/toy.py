@@ -12,6 +12,7 @@ from reslrb_cli.config import load
 from reslrb_cli.optimization.losses import make_loss
 from reslrb_cli.optimization.optimizers import Optimizer
 from reslrb_cli.optimization.problem import Problem
+from reslrb_cli.optimization.views import View
 
 CONFIG = """
 scene: {file: scene.xml}
@@ -45,12 +46,10 @@ def make_problem(tmp_path, views=1, sets=(), keys=("albedo",)):
     problem = Problem(
         config=config,
         scene=None,
-        sensors=list(range(views)),
+        views=[View(n, make_loss("l2"), 1 / views, dr.full(mi.TensorXf, 0.8, (2, 2, 3))) for n in range(views)],
         selection=selection,
         integrator=None,
-        loss=make_loss("l2"),
         optimizer=optimizer,
-        targets=[dr.full(mi.TensorXf, 0.8, (2, 2, 3))] * views,
         truth={key: np.full((2, 2, 3), 0.8) for key in keys},
         masks={key: np.array([[True, False], [True, True]]) for key in keys},
     )

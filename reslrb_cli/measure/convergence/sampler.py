@@ -13,6 +13,7 @@ from reslrb_cli.integrators import gradient_step, known_step, render_image
 from reslrb_cli.measure.convergence.survey import masked_loss
 from reslrb_cli.measure.worker import Begun
 from reslrb_cli.optimization.problem import assemble_scene
+from reslrb_cli.optimization.views import set_targets, to_tensor
 from reslrb_cli.records.clock import StepClock, StepTimes, peak_mib, reset_peak
 from reslrb_cli.seeds import seed
 
@@ -25,9 +26,11 @@ class Sampler:
     """
 
     def __init__(self, config: Any, mode: str, arrays: dict[str, np.ndarray]) -> None:
-        self.problem, self.mode, self.clock = assemble_scene(config), mode, StepClock()
+        self.problem, self.mode, self.clock = assemble_scene(config.with_exposures_fixed()), mode, StepClock()
         self.sensor = self.problem.sensors[0]
-        self.target = to_tensor(arrays["target"]) if "target" in arrays else None
+        self.view = self.problem.views[0]
+        if "adjoints" in arrays:
+            set_targets([self.view], arrays)
         self.mask = None if arrays["mask"].all() else to_tensor(arrays["mask"])
         self.adjoints = [to_tensor(array) for array in arrays.get("adjoints", ())]
         self.inside = arrays["mask"] != 0
@@ -58,7 +61,7 @@ class Sampler:
             return known_step(problem.integrator, problem.scene, self.sensor, adjoint, spp=spp, **common)
 
         def loss(picture: mi.TensorXf) -> mi.Float:
-            return masked_loss(problem, picture, self.target, self.mask)
+            return masked_loss(self.view, picture, self.mask)
 
         options = problem.config.step_options() | {"spp": spp}
         return gradient_step(problem.integrator, problem.scene, self.sensor, loss, **options, **common)
@@ -96,10 +99,3 @@ def begin(first: dict[str, Any]) -> Begun:
         return reply
 
     return {}, answer
-
-
-def to_tensor(array: np.ndarray) -> mi.TensorXf:
-    """A sum, since NumPy's own memory would be used as it is: kernels depend on its alignment, which is random."""
-    tensor = mi.TensorXf(np.ascontiguousarray(array, np.float32)) + dr.opaque(mi.Float, 0)
-    dr.eval(tensor)
-    return tensor

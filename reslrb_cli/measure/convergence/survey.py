@@ -19,7 +19,9 @@ from reslrb_cli.measure.moving import moves_light
 from reslrb_cli.measure.participants import ALIKE
 from reslrb_cli.measure.references import Situation, interior, prb_gradient, prb_image, ptracer_gradient, ptracer_image
 from reslrb_cli.measure.worker import Begun
-from reslrb_cli.optimization.problem import Problem, assemble_scene, make_targets
+from reslrb_cli.optimization.problem import Problem, assemble_scene
+from reslrb_cli.optimization.targets import make_targets
+from reslrb_cli.optimization.views import View, target_arrays
 from reslrb_cli.records.gradcheck import Reference
 from reslrb_cli.scene.catalog import value_shape
 
@@ -37,7 +39,7 @@ _PURPOSE = "convergence, dL/dI"
 
 def begin(first: dict[str, Any]) -> Begun:
     """Begin the process. The one question names the file for arrays, `out`; its answer is `survey`'s facts."""
-    problem = assemble_scene(loads(first["config"], first["source"]))
+    problem = assemble_scene(loads(first["config"], first["source"]).with_exposures_fixed())
 
     def answer(question: dict[str, Any]) -> dict[str, Any]:
         facts, arrays = survey(problem, first["objective"], **question["ask"])
@@ -55,9 +57,10 @@ def survey(
     The facts: `keys`, `shapes` of what is estimated (of the parameters, or `image`), `independent` (key to the name of
     a stock integrator, or None), `why` (key to what keeps others from it), `without` (stock integrators that are right
     for nothing here, with the reason), `masked` (whether pixels along the border are left out), `pixels`, and in words
-    what was rendered, `pictures`. The arrays: `mask` (H, W, 1), and unless the image is the objective `target` (of
-    shape (H, W, C)) and `adjoints` (B, H, W, C). `camera`: paths from the camera take part, where they are right or
-    `named`, which lose nothing by the film's border; `budget_s` is the time of the whole measurement, if it counts.
+    what was rendered, `pictures`. The arrays: `mask` (H, W, 1), and unless the image is the objective the first
+    view's `target_arrays` and `adjoints` (B, H, W, C). `camera`: paths from the camera take part, where they are right
+    or `named`, which lose nothing by the film's border; `budget_s` is the time of the whole measurement, if it
+    counts.
     """
     film = problem.scene.sensors()[problem.sensors[0]].film()
     width, height = (int(n) for n in film.crop_size())
@@ -73,7 +76,6 @@ def survey(
     paths = PATHS[objective] if budget_s is None else affordable_paths(problem, pixels, SHARE[objective] * budget_s / 2)
     shortened = shorten_target(problem, paths // pixels)
     make_targets(problem, lambda line: None)
-    target = np.array(problem.targets[0])
     count = IMAGES if objective == "loss" else 1
     spp = multiple_of(paths // (count * pixels), problem.samples_per_pass)
     adjoints = []
@@ -81,22 +83,23 @@ def survey(
         image = problem.render(problem.sensors[0], spp, number, _PURPOSE)
         adjoints.append(adjoint(problem, image, mask))
     facts["pictures"] = f"dL/dI at {'an image' if count == 1 else f'{count} images'} of {spp} spp{shortened}"
-    return facts, {"mask": mask, "target": target, "adjoints": np.stack(adjoints)}
+    return facts, {"mask": mask, "adjoints": np.stack(adjoints), **target_arrays(problem.views[:1])}
 
 
 def adjoint(problem: Problem, image: np.ndarray, mask: np.ndarray) -> np.ndarray:
     """dL/dI (H, W, C) at an image of that shape, the pixels that `mask` (H, W, 1) has as 0 left out of the loss."""
     leaf = mi.TensorXf(image)
     dr.enable_grad(leaf)
-    dr.backward(masked_loss(problem, leaf, problem.targets[0], None if mask.all() else mi.TensorXf(mask)))
+    dr.backward(masked_loss(problem.views[0], leaf, None if mask.all() else mi.TensorXf(mask)))
     return np.array(dr.grad(leaf))
 
 
-def masked_loss(problem: Problem, image: mi.TensorXf, target: mi.TensorXf, mask: mi.TensorXf | None) -> mi.Float:
-    """The loss of an attached image (H, W, C): what `mask` (H, W, 1) has as 0 is as the target has it."""
+def masked_loss(view: View, image: mi.TensorXf, mask: mi.TensorXf | None) -> mi.Float:
+    """The view's loss of an attached image (H, W, C): what `mask` (H, W, 1) has as 0 is as the target has it."""
     if mask is None:
-        return problem.compare(image, target)
-    return problem.loss(first_channels(image, target.shape[2]) * mask + target * (1 - mask), target)
+        return view.compare(image)
+    target = view.target
+    return view.compare(first_channels(image, target.shape[2]) * mask + target * (1 - mask))
 
 
 def find_references(problem: Problem, objective: str) -> dict[str, Any]:

@@ -19,7 +19,9 @@ from reslrb_cli.measure.whole_runs.runner import copies, load
 from reslrb_cli.measure.worker import Begun
 from reslrb_cli.optimization import find_reached
 from reslrb_cli.optimization.errors import ErrorMeter
-from reslrb_cli.optimization.problem import Problem, assemble_scene, make_targets
+from reslrb_cli.optimization.problem import Problem, assemble_scene
+from reslrb_cli.optimization.targets import make_targets
+from reslrb_cli.optimization.views import target_arrays
 
 Array = np.ndarray[Any, Any]
 
@@ -38,14 +40,14 @@ class Judge:
         self.problem, self.spp, self.meter = problem, spp, problem.error_meter()
 
     def loss(self, values: dict[str, Array]) -> float:
-        """The mean over the views of the loss of an image with `values`, by key."""
+        """The loss of images with `values`, by key, of all views by their shares."""
         problem = self.problem
         problem.selection.set_arrays(values)
-        losses = []
-        for sensor, target in zip(problem.sensors, problem.targets, strict=True):
-            image = problem.render(sensor, self.spp, 0, _PURPOSE)
-            losses.append(float(problem.compare(mi.TensorXf(np.ascontiguousarray(image)), target)[0]))
-        return float(np.mean(losses))
+        total = 0.0
+        for view in problem.trained:
+            image = problem.render(view.sensor, self.spp, 0, _PURPOSE)
+            total += float(view.objective(mi.TensorXf(np.ascontiguousarray(image)))[0])
+        return total
 
     def error(self, values: dict[str, Array]) -> float | None:
         """The error of all parameters together; None where no true value is known."""
@@ -98,8 +100,7 @@ def prepare(problem: Problem, out: str, budget_s: float, image_s: float) -> tupl
     make_targets(problem, lambda line: None)
     find_reached(problem)
     with open(out, "wb") as file:
-        arrays = {f"target-{number}": np.array(target) for number, target in enumerate(problem.targets)}
-        np.savez(file, **arrays)  # type: ignore[arg-type]
+        np.savez(file, **target_arrays(problem.views))  # type: ignore[arg-type]
     affordable = affordable_paths(problem, pixels, image_s) // pixels
     spp = multiple_of(max(affordable, LEAST_SPP), problem.samples_per_pass)
     judge = Judge(problem, spp)

@@ -17,11 +17,11 @@ import mitsuba as mi
 import numpy as np
 
 from reslrb_cli.config import loads
-from reslrb_cli.measure.convergence.sampler import to_tensor
 from reslrb_cli.measure.worker import Begun
 from reslrb_cli.optimization.choice import find_options, settle_integrator
 from reslrb_cli.optimization.loop import optimize
 from reslrb_cli.optimization.problem import Problem, assemble_scene
+from reslrb_cli.optimization.views import set_targets
 from reslrb_cli.records.clock import peak_mib
 from reslrb_cli.records.metrics import Record
 
@@ -91,7 +91,7 @@ def begin(first: dict[str, Any]) -> Begun:
     problem = assemble_scene(loads(first["config"], first["source"]))
     options = find_options(problem)
     with np.load(first["targets"]) as targets:
-        problem.targets = [to_tensor(targets[f"target-{number}"]) for number in range(len(problem.sensors))]
+        set_targets(problem.views, targets)
     # Nothing is remembered of earlier pilots: what a pilot costs is to be seen.
     said: list[str] = []
     settle_integrator(problem, options, said.append, None)

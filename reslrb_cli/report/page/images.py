@@ -42,7 +42,7 @@ def _row(folder: Path, suffix: str, results: Mapping[str, Any]) -> str:
         for title, image in loaded.items()
         if image is not None
     ]
-    shown += _error_figures(folder, suffix, results)
+    shown += _weight_figure(folder, suffix, sensor) + _error_figures(folder, suffix, results)
     title = f"<h3>Sensor {text(suffix[1:])}</h3>" if suffix else ""
     words = exposure_words(exposure)
     title += f'<p class="soft small">{text(words)}</p>' if words else ""
@@ -52,6 +52,15 @@ def _row(folder: Path, suffix: str, results: Mapping[str, Any]) -> str:
 def _figure(image: Array, alt: str, markup: str) -> str:
     picture = show(image)
     return figure(picture.uri, picture.size, alt, markup, picture.smooth)
+
+
+def _weight_figure(folder: Path, suffix: str, sensor: str) -> list[str]:
+    """What pixels weigh, where not all count alike: black is left out."""
+    weights = load_image(folder / f"weights{suffix}.exr")
+    if weights is None:
+        return []
+    share = weights[:, :, :1] / max(float(weights.max()), 1e-30)
+    return [_figure(share, f"mask{sensor}", "<b>mask</b>: black is left out of the loss")]
 
 
 def _error_figures(folder: Path, suffix: str, results: Mapping[str, Any]) -> list[str]:

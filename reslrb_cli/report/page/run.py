@@ -13,6 +13,7 @@ from reslrb_cli.report.page.images import image_rows
 from reslrb_cli.report.page.markup import note, soft, text
 from reslrb_cli.report.page.seen import seen_tables
 from reslrb_cli.report.page.values import parameter_table, texture_pictures
+from reslrb_cli.report.page.views import view_table
 from reslrb_cli.report.run_table import units_differ
 from reslrb_cli.report.sources import Run
 from reslrb_cli.report.verdict import error_line, warnings
@@ -53,6 +54,7 @@ def run_parts(run: Run) -> dict[str, str]:
     parts: dict[str, Callable[[], str]] = {
         "Parameters": lambda: parameter_table(results, "now" if run.at_work else "end") + _over_what(results),
         "Images": lambda: image_rows(images, results),
+        "Views": lambda: view_table(run.manifest.get("views"), results),
         "Errors as people see them": lambda: seen_tables([run]),
         "Textures": lambda: texture_pictures(run.path / "parameters", results, run.current),
         "Convergence": lambda: convergence(run),

@@ -1,0 +1,125 @@
+"""The images that views are to see: read from files, or rendered with the true values of the parameters."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+import mitsuba as mi
+import numpy as np
+
+from reslrb_cli.config import Config
+from reslrb_cli.errors import ConfigError
+from reslrb_cli.optimization.errors import comparison_grid
+from reslrb_cli.optimization.loading import check_integrator, load_configured, make_configured
+from reslrb_cli.optimization.masking import mask_line, mask_of
+from reslrb_cli.optimization.rendering import render_in_passes
+from reslrb_cli.optimization.views import View, color_channels
+from reslrb_cli.scene import Photo, Selection, check_photo, read_photo, set_values
+
+if TYPE_CHECKING:
+    from reslrb_cli.optimization.problem import Problem
+
+Array = np.ndarray[Any, Any]
+
+#: Weights of linear sRGB in luminance, as Mitsuba has them.
+LUMINANCE = np.array([0.212671, 0.715160, 0.072169], dtype=np.float32)
+
+
+def make_targets(problem: Problem, say: Callable[[str], None]) -> None:
+    """Read or render every view's target, and with it what is known of the parameters, `problem.truth`.
+
+    `say` is told what takes long, and what of the targets is left out. Raises ConfigError.
+    """
+    if problem.config.target.file is not None:
+        _check_count(problem)
+    for view in problem.views:
+        if view.wanted.file is not None:
+            photo = _read_photo(problem, view)
+            _see(problem, view, photo.image, photo, say)
+    if problem.config.target.render is not None:
+        _render_targets(problem, say)
+
+
+def _see(problem: Problem, view: View, image: Array, photo: Photo | None, say: Callable[[str], None]) -> None:
+    """Give a view its target, (H, W, C), and leave out what its mask does; `photo` is what was read, if it was."""
+    wanted, config = view.wanted, problem.config
+    target = _fit(problem, image, view.sensor)
+    view.masked = mask_of(config, wanted.mask, wanted.mask_mixed, wanted.mask_key, problem.scene, view.sensor, photo)
+    weights = view.masked.total(target.shape[:2])
+    line = mask_line(f"view {view.sensor}", view.masked, weights)
+    if not weights.any():
+        raise ConfigError(
+            config.source,
+            wanted.mask_key,
+            f"leaves nothing to compare ({line}); switch kinds off, such as {{specular: false}}, or set it to none",
+        )
+    if line is not None:
+        say(line)
+    view.see(target, weights)
+
+
+def _render_targets(problem: Problem, say: Callable[[str], None]) -> None:
+    config, render = problem.config, problem.config.target.render
+    assert render is not None, "called for rendered targets only"
+    true_scene = load_configured(config)
+    true_values = set_true_values(config, true_scene)
+    for key in problem.selection.keys:
+        if key in problem.selection.factors:  # the scene's own images are the target
+            problem.truth[key] = np.ones_like(problem.selection.array(key))
+            continue
+        problem.truth[key] = true_values.array(key)
+        grid = comparison_grid(problem.selection.array(key).shape, problem.truth[key].shape)
+        if grid is not None:
+            say(f"{key} has another resolution than its true value: compared, resampled, at {grid[1]}x{grid[0]}")
+    chosen = render.integrator or config.integrator
+    check_integrator(config, chosen, true_scene, problem.sensors)
+    integrator = make_configured(chosen)
+    multiple = chosen.options().get("samples_per_pass")
+    for view in problem.views:
+        if view.wanted.file is not None:
+            continue
+        say(f"rendering the target of sensor {view.sensor}: {render.spp} spp")
+        image = render_in_passes(integrator, true_scene, view.sensor, render.spp, render.seed, 0, "target", multiple)
+        _see(problem, view, image, None, say)
+
+
+def set_true_values(config: Config, scene: mi.Scene) -> Selection:
+    """Set the values of `target.render.parameters` in `scene`; return them, selected.
+
+    They are checked like initial values are; an error is located in the target.
+    """
+    render = config.target.render
+    assert render is not None, "called for rendered targets only"
+    return set_values(scene, config.parameters, render.parameters, config.source, "target.render.parameters")
+
+
+def _check_count(problem: Problem) -> None:
+    files, sensors = problem.config.target.file or [], problem.sensors
+    if len(files) != len(sensors):
+        raise ConfigError(
+            problem.config.source,
+            "target.file",
+            f"must name one image for each sensor; images: {len(files)}, sensors: {len(sensors)}",
+        )
+
+
+def _read_photo(problem: Problem, view: View) -> Photo:
+    """Read the target file of a view. Raises ConfigError."""
+    config, wanted = problem.config, view.wanted
+    assert wanted.file is not None, "called for target files only"
+    width, height = problem.scene.sensors()[view.sensor].film().crop_size()
+    try:
+        photo = read_photo(wanted.file, config.target.color_space, (int(width), int(height)), config.target.gamma)
+        check_photo(wanted.file, photo, allow_nonfinite=wanted.mask.nonfinite)
+    except ConfigError as error:
+        raise ConfigError(config.source, wanted.file_key, error.message) from None
+    return photo
+
+
+def _fit(problem: Problem, image: Array, sensor: int) -> Array:
+    """`image` with as many channels as the film of `sensor` has without its alpha."""
+    colors = color_channels(problem.scene.sensors()[sensor].film())
+    if colors == 1 and image.shape[2] >= 3:
+        image = image[:, :, :3] @ LUMINANCE[:, None]
+    return image[:, :, :colors]

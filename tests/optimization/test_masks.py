@@ -1,0 +1,165 @@
+"""Masks: which pixels they leave out, and that nothing of those counts."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from cli.tiny import write_experiment
+
+from reslrb_cli.config import load
+from reslrb_cli.errors import ConfigError
+from reslrb_cli.optimization import assemble
+from reslrb_cli.optimization.losses import LOSSES, make_loss
+from reslrb_cli.optimization.samples import sample_gradient, take_gradient
+from reslrb_cli.optimization.sensitivity import measure_sensitivities
+from reslrb_cli.optimization.views import View, view_records
+
+#: Pixels (y, x) of the target that are not to be trusted, one of each kind.
+CLIPPED, CLEAR, BROKEN = (1, 2), (3, 4), (5, 6)
+GLASS = """
+    <shape type="sphere" id="ball">
+        <float name="radius" value="0.4"/> <point name="center" x="0" y="0" z="1"/> <bsdf type="{}"/>
+    </shape>
+</scene>"""
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """The tiny experiment, with a PNG of 8 bits and an EXR as photographs."""
+    write_experiment(tmp_path)
+    rng = np.random.default_rng(1)
+    pixels = rng.integers(40, 200, (8, 8, 4), dtype=np.uint8)
+    pixels[:, :, 3] = 255
+    pixels[CLIPPED][1] = 255
+    pixels[CLEAR][3] = 0
+    mi.Bitmap(pixels).write(str(tmp_path / "photo.png"))
+    floats = rng.uniform(0.1, 2, (8, 8, 3)).astype(np.float32)
+    floats[BROKEN][2] = np.nan
+    mi.Bitmap(floats).write(str(tmp_path / "photo.exr"))
+    return tmp_path
+
+
+def make(folder, *sets):
+    said = []
+    problem = assemble(load(folder / "tiny.yaml", ["target.render=null", *sets]), said.append)
+    return problem, [line for line in said if line.startswith("view ")]
+
+
+def left_out(problem):
+    """The pixels (y, x) that have no weight."""
+    [view] = problem.views
+    return [] if view.weights is None else [tuple(at) for at in np.argwhere(np.array(view.weights)[:, :, 0] == 0)]
+
+
+@pytest.mark.parametrize("name", LOSSES)
+def test_a_masked_loss_is_that_of_what_is_left(name):
+    rng = np.random.default_rng(2)
+    image, target = (rng.uniform(0.1, 2, (4, 5, 3)).astype(np.float32) for _ in range(2))
+    weights = np.where(rng.uniform(size=(4, 5)) > 0.4, rng.uniform(0.5, 3, (4, 5)), 0)
+    image[weights == 0], target[weights == 0] = np.inf, np.nan
+    view = View(0, make_loss(name))
+    view.see(target, weights)
+    leaf = mi.TensorXf(image)
+    dr.enable_grad(leaf)
+    loss = view.compare(leaf)
+    dr.backward(loss)
+
+    kept, total = weights > 0, 0.0
+    for y, x in np.argwhere(kept):
+        pixel = (slice(y, y + 1), slice(x, x + 1))
+        one = make_loss(name)(mi.TensorXf(image[pixel].copy()), mi.TensorXf(target[pixel].copy()))
+        total += weights[y, x] * float(one[0])
+    np.testing.assert_allclose(float(loss[0]), total / weights.sum(), rtol=1e-5)
+    gradient = np.array(dr.grad(leaf))
+    assert np.isfinite(gradient).all()
+    assert not gradient[~kept].any()
+    assert gradient[kept].all()
+
+
+def test_kinds_of_a_file(folder):
+    problem, lines = make(folder, "target.file=photo.png")
+    assert left_out(problem) == [CLIPPED, CLEAR]
+    [record] = view_records(problem.views)
+    assert (record["kinds"], record["left_out"]) == ({"clipped": 1, "alpha": 1}, 2)
+    assert lines == ["view 0: 2 of 64 pixels (3.1%) are left out: 1 are clipped, 1 have alpha 0"]
+    assert left_out(make(folder, "target.file=photo.png", "target.mask={clipped: false}")[0]) == [CLEAR]
+    problem, lines = make(folder, "target.file=photo.png", "target.mask=none")
+    assert (left_out(problem), lines) == ([], [])
+
+
+def test_values_that_are_not_finite(folder):
+    problem, _ = make(folder, "target.file=photo.exr")
+    assert left_out(problem) == [BROKEN]
+    assert np.isfinite(np.array(problem.views[0].target)).all()
+    with pytest.raises(ConfigError, match="not finite") as error:
+        make(folder, "target.file=photo.exr", "target.mask={nonfinite: false}")
+    assert error.value.key == "target.file"
+
+
+def test_weights_of_a_file(folder):
+    weights = np.full((8, 8, 1), 128, np.uint8)
+    weights[0, 0], weights[7, 7] = 0, 255
+    mi.Bitmap(weights).write(str(folder / "weights.png"))
+    problem, _ = make(folder, "target.file=photo.png", "target.mask=weights.png")
+    found = np.array(problem.views[0].weights)[:, :, 0]
+    assert left_out(problem) == [(0, 0)]  # alone: what is clipped counts
+    np.testing.assert_allclose(found[7, 7] / found[1, 2], 255 / 128, rtol=1e-5)
+    np.testing.assert_allclose(found.mean(), 1, rtol=1e-5)
+    problem, _ = make(folder, "target.file=photo.png", "target.mask={file: weights.png}")
+    assert left_out(problem) == [(0, 0), CLIPPED, CLEAR]
+    with pytest.raises(ConfigError) as error:
+        make(folder, "target.file=photo.png", "target.mask=missing.png")
+    assert error.value.key == "target.mask.file"
+
+
+@pytest.mark.parametrize(("maker", "count"), [("prb", 48), ("reslrb", 0)])
+def test_the_border_is_left_out_where_one_is_not_light_traced(folder, maker, count):
+    scene = folder / "scene.xml"
+    scene.write_text(scene.read_text().replace('rfilter type="box"', 'rfilter type="gaussian"'))
+    render = f"target.render={{spp: 4, integrator: {{type: {maker}, max_depth: 3}}}}"
+    assert len(left_out(assemble(load(folder / "tiny.yaml", [render])))) == count
+    assert not left_out(assemble(load(folder / "tiny.yaml", [render, "target.mask={border: false}"])))
+    if maker == "prb":  # paths from the camera lose nothing there
+        same = ["integrator={type: prb, max_depth: 3}", render]
+        assert not left_out(assemble(load(folder / "tiny.yaml", same)))
+
+
+@pytest.mark.parametrize(("bsdf", "kind"), [("conductor", "specular"), ("plastic", "mixed")])
+def test_what_light_tracing_cannot_see(folder, bsdf, kind):
+    scene = folder / "scene.xml"
+    scene.write_text(scene.read_text().replace("</scene>", GLASS.format(bsdf)))
+    problem, lines = make(folder, "target.file=photo.png")
+    masked = problem.views[0].masked
+    if kind == "specular":
+        assert 0 < masked.counts()["specular"] < 40
+        assert (3, 3) in left_out(problem)
+        return
+    assert masked.counts().keys() == {"clipped", "alpha"}
+    assert masked.stay["mixed"] > 0
+    assert "see coats, blends or thin panes and stay (mask_mixed: true leaves them out)" in lines[0]
+    problem, _ = make(folder, "target.file=photo.png", "target.mask_mixed=true")
+    assert problem.views[0].masked.counts()["mixed"] == masked.stay["mixed"]
+
+
+def test_an_empty_mask_is_refused(folder):
+    mi.Bitmap(np.zeros((8, 8, 3), np.float32)).write(str(folder / "nothing.exr"))
+    with pytest.raises(ConfigError, match=r"leaves nothing to compare .*64 have weight 0 in the mask's file") as error:
+        make(folder, "target.file=photo.png", "target.mask=nothing.exr")
+    assert error.value.key == "target.mask"
+
+
+def test_nothing_of_what_is_left_out_counts(folder):
+    """Neither gradients, as the pilot takes them, nor sensitivities see what an alpha of 0 hides."""
+    found = []
+    for value in (60, 200):
+        pixels = np.array(mi.Bitmap(str(folder / "photo.png")))
+        pixels[CLEAR] = (value, value, value, 0)
+        mi.Bitmap(pixels).write(str(folder / "photo.png"))
+        problem, _ = make(folder, "target.file=photo.png")
+        sample_gradient(problem, problem.integrator, 0, "test", 4)
+        [gradient] = take_gradient(problem).values()
+        found.append((gradient, measure_sensitivities(problem, 2)))
+    np.testing.assert_array_equal(found[0][0], found[1][0])
+    assert found[0][1] == found[1][1]

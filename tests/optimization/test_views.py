@@ -1,0 +1,136 @@
+"""Views: what their section says, subsets of them, and those that are held out."""
+
+from __future__ import annotations
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from cli.tiny import KEY, SCENE, write_experiment
+from optimization.toy import make_problem
+
+from reslrb_cli.config import dump, load, loads
+from reslrb_cli.errors import ConfigError
+from reslrb_cli.optimization import assemble, loop, optimize
+from reslrb_cli.optimization.samples import sample_gradient, take_gradient
+
+SENSOR = SCENE[SCENE.index("    <sensor") : SCENE.index("    <bsdf")]
+EYES = ["0, 0, 4", "1, 0.5, 4", "-1, 1, 3"]
+#: The section that stands for all sensors with rendered targets.
+ALL = "views=[{sensor: 0}, {sensor: 1}, {sensor: 2}]"
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """The tiny experiment with three sensors."""
+    write_experiment(tmp_path)
+    sensors = "".join(SENSOR.replace("0, 0, 4", eye) for eye in EYES)
+    (tmp_path / "scene.xml").write_text(SCENE.replace(SENSOR, sensors))
+    return tmp_path
+
+
+def make(folder, *sets):
+    return assemble(load(folder / "tiny.yaml", list(sets)))
+
+
+def gradient(problem, round=0):
+    sample_gradient(problem, problem.integrator, round, "test", 4)
+    return take_gradient(problem)[KEY]
+
+
+def test_views_and_short_forms_are_the_same(folder):
+    np.testing.assert_array_equal(gradient(make(folder, "scene.sensors=all")), gradient(make(folder, ALL)))
+
+
+def test_a_weight_is_a_share_of_the_loss(folder):
+    alone = [gradient(make(folder, f"views=[{{sensor: {index}}}]")) for index in (0, 1)]
+    both = gradient(make(folder, "views=[{sensor: 0, weight: 3}, {sensor: 1}]"))
+    np.testing.assert_allclose(both, 0.75 * alone[0] + 0.25 * alone[1], rtol=1e-4, atol=1e-7)
+
+
+def test_what_a_view_says_stands_in_place_of_what_all_have(folder):
+    write = np.full((8, 8, 3), 0.5, np.float32)
+    mi.Bitmap(write).write(str(folder / "half.exr"))
+    views = (
+        "views=[{sensor: 1, target: half.exr, exposure: auto, loss: {type: l1}}, {sensor: 0, mask: none, exposure: 2}]"
+    )
+    problem = make(folder, views, "target.exposure=per_channel")
+    first, second = problem.views
+    assert (first.sensor, first.exposure.key, second.exposure.key, second.exposure.fixed) == (1, "exposure.1", "", 2)
+    assert problem.selection.keys == [KEY, "exposure.1"]
+    np.testing.assert_array_equal(np.array(first.target), write)
+    image = mi.TensorXf(np.full((8, 8, 3), 0.75, np.float32))
+    assert float(first.compare(image)[0]) == pytest.approx(0.25)
+    again = loads(dump(problem.config), str(folder / "tiny.yaml"))
+    assert again == problem.config
+
+
+BAD = [
+    ("views=[{sensor: 0}, {sensor: 0}]", "views[1].sensor", "stands in views[0] already"),
+    ("views=[{sensor: 7}]", "views[0].sensor", "3 sensors"),
+    ("views=[{sensor: 0, target: missing.exr}, {sensor: 1}]", "views[0].target", "no such file"),
+    ("views=[{sensor: 0, target: a.exr}]", "target.render", "every view has a target of its own"),
+    ("run.held_out=[2]", "run.held_out[0]", "the sensor of no view"),
+    ("run.held_out=[0]", "run.held_out", "no view to train on"),
+    ("run.views_per_iteration=2", "run.views_per_iteration", "views that are trained on: 1"),
+    ("target.exposure=[auto, 1]", "target.exposure", "entries: 2, sensors: 1"),
+    ("target.exposure=-1", "target.exposure", "must be a positive number, `auto` or `per_channel`"),
+    ("target.mask=3", "target.mask", "must be `auto`, `none`"),
+]
+
+
+@pytest.mark.parametrize(("setting", "key", "words"), BAD)
+def test_what_is_wrong_is_located(folder, setting, key, words):
+    with pytest.raises(ConfigError) as error:
+        make(folder, setting)
+    assert words in str(error.value)
+    assert key in str(error.value)
+
+
+def test_views_of_their_own_need_no_target_section(folder):
+    text = (folder / "tiny.yaml").read_text().replace("target: {render: {spp: 16}}\n", "")
+    mi.Bitmap(np.full((8, 8, 3), 0.5, np.float32)).write(str(folder / "half.exr"))
+    config = loads(text + "views: [{sensor: 0, target: half.exr}]\n", str(folder / "tiny.yaml"))
+    assert not assemble(config).truth
+    with pytest.raises(ConfigError, match="target: missing"):
+        loads(text, str(folder / "tiny.yaml"))
+
+
+def test_a_subset_of_the_views_is_unbiased(tmp_path):
+    """Every view is drawn as often, and counts as much in the mean, as if all were taken; seeds draw others."""
+    problem = make_problem(tmp_path, views=5, sets=["run.views_per_iteration=2"])
+    counts, total = np.zeros(5), 4000
+    for iteration in range(total):
+        drawn = problem.drawn(iteration)
+        assert len({view.sensor for view, _ in drawn}) == 2
+        for view, scale in drawn:
+            counts[view.sensor] += scale / 2.5
+            assert scale == 2.5
+    z = (counts - 0.4 * total) / np.sqrt(total * 0.4 * 0.6)
+    assert np.abs(z).max() < 4
+    assert [v.sensor for v, _ in problem.drawn(3)] == [v.sensor for v, _ in problem.drawn(3)]
+    other = make_problem(tmp_path, views=5, sets=["run.views_per_iteration=2", "run.seed=9"])
+    assert [problem.drawn(i)[0][0].sensor for i in range(20)] != [other.drawn(i)[0][0].sensor for i in range(20)]
+
+
+def test_an_iteration_takes_the_views_that_were_drawn(tmp_path, steps):
+    problem = make_problem(tmp_path, views=3, sets=["run.views_per_iteration=1", "run.iterations=6"])
+    losses = [record.loss for record in optimize(problem)]
+    assert [call.sensor for call in steps.calls] == [problem.drawn(iteration)[0][0].sensor for iteration in range(6)]
+    assert losses[0] == pytest.approx(0.3**2)  # not a third of it
+
+
+def test_held_out_views_are_recorded_and_not_trained_on(folder):
+    problem = make(folder, "scene.sensors=all", "run.held_out=[1]", "run.iterations=12")
+    assert [view.share for view in problem.trained] == [0.5, 0.5]
+    before = gradient(problem)
+    problem.views[1].see(np.zeros((8, 8, 3), np.float32))
+    np.testing.assert_array_equal(gradient(problem), before)
+    sets = ["scene.sensors=all", "run.held_out=[1]", "run.iterations=22", "run.spp=64", "optimizer.learning_rate=0.05"]
+    problem = assemble(
+        load(folder / "tiny.yaml", [*sets, "target.render.spp=1024", "parameters[0].initial=0.1"]), to_run=True
+    )
+    records = list(optimize(problem))
+    seen = [record.iteration for record in records if record.held_out is not None]
+    assert seen == list(range(0, 22, loop.HELD_OUT_EVERY))
+    assert records[20].held_out < 0.5 * records[0].held_out
+    assert make(folder).held_out_loss() is None

@@ -1,0 +1,145 @@
+"""Cameras of other programs' files: where they stand, what they see of a point, and what is refused."""
+
+from __future__ import annotations
+
+import json
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from cli.tiny import CONFIG, write_experiment
+
+from reslrb_cli.config import loads
+from reslrb_cli.errors import ConfigError
+from reslrb_cli.optimization import assemble
+from reslrb_cli.scene import load_scene
+from reslrb_cli.scene.cameras import read_cameras
+
+WIDTH, HEIGHT, FOCAL, CENTER = 40, 24, 50.0, (23.0, 9.0)
+#: A pose: from the axes x right, y down, z forward to the world.
+ROTATION = np.linalg.qr(np.random.default_rng(4).normal(size=(3, 3)))[0]
+ROTATION *= np.linalg.det(ROTATION)
+EYE = np.array([0.3, -0.2, 4.0])
+#: Pixels, and where the camera looks in them, in its own axes.
+PIXELS = np.array([[5.0, 4.0], [31.0, 20.0], [20.0, 12.0]])
+RAYS = np.column_stack([(PIXELS - CENTER) / FOCAL, np.ones(3)])
+
+
+@pytest.fixture
+def folder(llvm, tmp_path):
+    write_experiment(tmp_path)
+    for name in ("a", "b"):
+        mi.Bitmap(np.full((HEIGHT, WIDTH, 3), 0.5, np.float32)).write(str(tmp_path / f"{name}.exr"))
+    return tmp_path
+
+
+def write_nerf(folder, **changes):
+    to_world = np.eye(4)
+    to_world[:3, :3], to_world[:3, 3] = ROTATION @ np.diag([1, -1, -1]), EYE
+    shared = {"w": WIDTH, "h": HEIGHT, "fl_x": FOCAL, "fl_y": FOCAL, "cx": CENTER[0], "cy": CENTER[1], "k1": 0.0}
+    frames = [{"file_path": name, "transform_matrix": to_world.tolist()} for name in ("a.exr", "./b")]
+    path = folder / "transforms.json"
+    path.write_text(json.dumps({**shared, "frames": frames, **changes}))
+    return path
+
+
+def quaternion(rotation):
+    """Of a rotation, w first."""
+    values, vectors = np.linalg.eigh(
+        np.array(
+            [
+                [rotation[0, 0] - rotation[1, 1] - rotation[2, 2], 0, 0, 0],
+                [rotation[0, 1] + rotation[1, 0], rotation[1, 1] - rotation[0, 0] - rotation[2, 2], 0, 0],
+                [rotation[0, 2] + rotation[2, 0], rotation[1, 2] + rotation[2, 1],
+                 rotation[2, 2] - rotation[0, 0] - rotation[1, 1], 0],
+                [rotation[2, 1] - rotation[1, 2], rotation[0, 2] - rotation[2, 0], rotation[1, 0] - rotation[0, 1],
+                 np.trace(rotation)],
+            ]
+        )
+    )  # fmt: skip
+    x, y, z, w = vectors[:, np.argmax(values)]
+    return w, x, y, z
+
+
+def write_colmap(folder, model=f"PINHOLE {WIDTH} {HEIGHT} {FOCAL} {FOCAL} {CENTER[0]} {CENTER[1]}"):
+    w, x, y, z = quaternion(ROTATION.T)
+    t = -ROTATION.T @ EYE
+    pose = " ".join(repr(float(n)) for n in (w, x, y, z, *t))
+    (folder / "cameras.txt").write_text(f"# a comment\n7 {model}\n")
+    (folder / "images.txt").write_text(f"# a comment\n1 {pose} 7 a.exr\n0.5 0.5 -1\n2 {pose} 7 b.exr\n\n")
+    return folder / "images.txt"
+
+
+def directions(scene, number):
+    """Where the sensor looks in PIXELS."""
+    position = mi.Point2f(*(PIXELS / (WIDTH, HEIGHT)).T)
+    ray, _ = scene.sensors()[number].sample_ray(0, 0.5, position, mi.Point2f(0.5))
+    np.testing.assert_allclose(np.array(ray.o)[:, 0] + 0 * EYE, EYE, atol=0.02)  # on the near plane
+    return np.array(ray.d).T
+
+
+@pytest.mark.parametrize("write", [write_nerf, write_colmap])
+def test_a_point_is_seen_where_the_camera_has_it(folder, write):
+    scene = load_scene(folder / "scene.xml", cameras=write(folder))
+    assert [sensor.id() for sensor in scene.sensors()] == ["a", "b"]
+    film = scene.sensors()[1].film()
+    assert (list(film.size()), film.rfilter().is_box_filter()) == ([WIDTH, HEIGHT], True)
+    towards = RAYS @ ROTATION.T
+    towards /= np.linalg.norm(towards, axis=1, keepdims=True)
+    np.testing.assert_allclose(directions(scene, 1), towards, atol=1e-5)
+
+
+def make(folder, cameras):
+    text = CONFIG.replace("target: {render: {spp: 16}}\n", "")
+    text = text.replace("{file: scene.xml}", f"{{file: scene.xml, cameras: {cameras}, sensors: all}}")
+    return assemble(loads(text, str(folder / "tiny.yaml")))
+
+
+def test_the_cameras_images_are_the_targets(folder):
+    assert write_nerf(folder).name == "transforms.json"
+    problem = make(folder, "transforms.json")
+    assert [view.wanted.file.name for view in problem.views] == ["a.exr", "b.exr"]
+    assert all(np.array(view.target).max() == 0.5 for view in problem.views)
+    (folder / "b.exr").unlink()
+    with pytest.raises(ConfigError, match=r"tiny.yaml: scene.cameras: no such file"):
+        make(folder, "transforms.json")
+
+
+def test_a_size_that_is_not_said_is_the_images(folder):
+    path = write_nerf(folder, w=None, h=None, fl_x=None, fl_y=None, camera_angle_x=1.2)
+    [camera, _] = read_cameras(path)
+    assert camera.size == (WIDTH, HEIGHT)
+    assert camera.focal == pytest.approx(WIDTH / 2 / np.tan(0.6))
+
+
+BAD = [
+    ({"k1": 0.01}, r"transforms.json: frames\[0\]: has distortion \(k1 = 0.01\)"),
+    ({"camera_model": "OPENCV_FISHEYE"}, r"frames\[0\].camera_model: is a fisheye"),
+    ({"fl_y": 60.0}, r"frames\[0\]: has focal lengths 50 and 60"),
+    ({"fl_x": None}, r"frames\[0\].fl_x: missing"),
+    ({"fl_x": -3}, r"frames\[0\].fl_x: must be a positive number"),
+    ({"frames": []}, "has no cameras"),
+    ({"frames": 3}, "is not a transforms.json"),
+    ({"frames": [{"file_path": "a.exr", "transform_matrix": [1]}]}, r"transform_matrix: must be four rows"),
+]
+
+
+@pytest.mark.parametrize(("changes", "message"), BAD)
+def test_what_is_wrong_in_a_transforms_json(folder, changes, message):
+    with pytest.raises(ConfigError, match=message):
+        read_cameras(write_nerf(folder, **changes))
+
+
+@pytest.mark.parametrize(
+    ("model", "message"),
+    [
+        ("SIMPLE_RADIAL 40 24 50 20 12 0.02", r"cameras.txt:2: has distortion \(k1 = 0.02\)"),
+        ("OPENCV_FISHEYE 40 24 50 50 20 12 0 0 0 0", r"cameras.txt:2: has model OPENCV_FISHEYE"),
+        ("PINHOLE 40 24 50", "cameras.txt:2: is no camera"),
+        ("PINHOLE 40 24 50 51 20 12", "cameras.txt:2: has focal lengths 50 and 51"),
+    ],
+)
+def test_what_is_wrong_in_a_cameras_txt(folder, model, message):
+    with pytest.raises(ConfigError, match=message):
+        read_cameras(write_colmap(folder, model))
+    assert len(read_cameras(write_colmap(folder, "SIMPLE_RADIAL 40 24 50 20 12 0"))) == 2
