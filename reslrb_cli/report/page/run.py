@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from reslrb_cli.errors import ConfigError
+from reslrb_cli.report.certainty import certainty_words
 from reslrb_cli.report.page import facts
 from reslrb_cli.report.page.curves import convergence
 from reslrb_cli.report.page.images import image_rows
@@ -51,7 +52,11 @@ def run_parts(run: Run) -> dict[str, str]:
     """By title, what there is to show of a run beside its header, in order; what it does not have is empty."""
     results, images = run.results, run.path / "images"
     parts: dict[str, Callable[[], str]] = {
-        "Parameters": lambda: parameter_table(results, "now" if run.at_work else "end") + _over_what(results),
+        "Parameters": lambda: (
+            parameter_table(results, "now" if run.at_work else "end")
+            + _over_what(results)
+            + soft(certainty_words(results))
+        ),
         "Images": lambda: image_rows(images, results),
         "Errors as people see them": lambda: seen_tables([run]),
         "Textures": lambda: texture_pictures(run.path / "parameters", results, run.current),
