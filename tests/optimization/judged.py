@@ -52,7 +52,7 @@ SCENE = f"""<scene version="3.0.0">
         <transform name="to_world"><scale value="0.5"/><translate x="0.9" y="0.3"/></transform><ref id="metal"/>
     </shape>
     <shape type="rectangle" id="print">
-        <transform name="to_world"><scale value="0.6"/><translate x="-0.8"/></transform><ref id="poster"/>
+        <transform name="to_world"><scale value="0.9"/><translate x="-0.6"/></transform><ref id="poster"/>
     </shape>
     {lamp("left", -2, "9, 6, 4")} {lamp("right", 2, "3, 5, 8")} {lamp("hidden", 0, "2, 2, 2", facing=0)}
     {lamp("twin", 0.5, "4, 4, 4", 0.3)} {lamp("other_twin", 0.5001, "4, 4, 4", 0.3)}
@@ -97,7 +97,7 @@ def write_scene(folder: Path) -> None:
     """Scene and texture; a variant must be set."""
     import mitsuba as mi
 
-    texture = np.random.default_rng(2).uniform(0.2, 0.8, (8, 8, 3)).astype(np.float32)
+    texture = np.random.default_rng(2).uniform(0.2, 0.8, (4, 4, 3)).astype(np.float32)
     mi.Bitmap(texture).write(str(folder / "poster.exr"))
     (folder / "scene.xml").write_text(SCENE)
     (folder / "toy.yaml").write_text(CONFIG)

@@ -32,6 +32,8 @@ Array = np.ndarray[Any, Any]
 _PURPOSE = "curvature"
 #: Entries over which curvature is averaged, at least.
 GROUP = 64
+#: A pixel shows a texture where it changes by this share of the most that any does.
+SHOWN = 0.05
 #: Values of the images that enter H along directions: of more, so many at random, the same for all.
 MOST_VALUES = 2**18
 
@@ -43,6 +45,8 @@ class Curvature:
         self.problem, self.spp = problem, spp
         #: What was done so far.
         self.changes = self.probes = 0
+        #: By how many values of the images each texture is seen, of those that were changed as a whole.
+        self.pixels: dict[str, int] = {}
         self.integrator = problem.integrator
         if isinstance(self.integrator, LightTracer):  # a recording would cost more than so few images save
             per_pass = self.integrator.samples_per_pass
@@ -69,9 +73,10 @@ class Curvature:
                 directions.append(direction)
                 for half in (0, 1):
                     pairs = zip(images[half], self._base[half], strict=True)
-                    columns[half].append(
-                        self._in_a_row([_of_channel((a - b) / change.amount, direction.channel) for a, b in pairs])
-                    )
+                    slopes = [_of_channel((a - b) / change.amount, direction.channel) for a, b in pairs]
+                    columns[half].append(self._in_a_row(slopes))
+                if direction.entry is None:
+                    self.pixels[direction.key] = self.pixels.get(direction.key, 0) + _changed(slopes)
         if not directions:
             return [], np.zeros((0, 0))
         a, b = (np.nan_to_num(np.array(rows)) for rows in columns)
@@ -148,6 +153,11 @@ def _of_channel(image: Array, channel: int | None) -> Array:
     kept = np.zeros_like(image)
     kept[:, :, channel] = image[:, :, channel]
     return kept
+
+
+def _changed(slopes: Sequence[Array]) -> int:
+    most = max(float(np.abs(slope).max()) for slope in slopes)
+    return sum(int(np.sum(np.abs(slope) > SHOWN * most)) for slope in slopes) if most else 0
 
 
 def _rms(values: Array) -> float:

@@ -10,8 +10,9 @@ import numpy as np
 
 from reslrb_cli.optimization.certainty.curvature import Curvature
 from reslrb_cli.optimization.certainty.directions import MOST_ENTRIES, Direction, plan_changes, row_of
+from reslrb_cli.optimization.certainty.measured import Measured
 from reslrb_cli.optimization.certainty.records import CertaintyRecord
-from reslrb_cli.optimization.certainty.weighing import Gradients, Measured, weigh
+from reslrb_cli.optimization.certainty.weighing import Gradients, weigh
 from reslrb_cli.optimization.samples import sample_gradient, take_gradient
 from reslrb_cli.optimization.schedules import learning_rate_factor
 from reslrb_cli.optimization.sensitivity import rms
@@ -73,7 +74,7 @@ class Certainty:
             if stop():
                 return None
             directions, H, diagonal = found
-            parameters = weigh(self._measured(gradients, iterations), directions, H, diagonal)
+            parameters = weigh(self._measured(gradients, iterations), directions, H, diagonal, curvature.pixels)
             measure_s = max(clock.elapsed_s - compiled_ms / 1e3, 0.0)
             return CertaintyRecord(
                 parameters=parameters,

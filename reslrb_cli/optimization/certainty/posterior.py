@@ -27,9 +27,6 @@ import numpy as np
 
 Array = np.ndarray[Any, Any]
 
-#: What of its offset a single step may leave: more curvature than a step can bear is no slower convergence.
-_LEAST = 0.0
-
 
 @dataclass(frozen=True)
 class Posterior:
@@ -55,25 +52,17 @@ def joint(
 ) -> Posterior:  # fmt: skip
     """The offset of M entries together.
 
-    `curvature` is H (M, M), `response` the diagonal of P, `scale` the standard deviation of the offset at the start,
-    `noise` the variance of one gradient, `gradient` the mean of `samples` of them, all (M,), `rates` the eta of all
-    iterations. Each entry is taken in units of its scale, so that those of different units have well-conditioned
+    `curvature` is H (M, M), `noise` the covariance of one gradient (M, M), `gradient` the mean of `samples` of them,
+    `response` the diagonal of P, `scale` the standard deviation of the offset at the start, all (M,), `rates` the eta
+    of all iterations. Each entry is taken in units of its scale, so that those of different units have well-conditioned
     matrices.
     """
     H = curvature * scale[:, None] * scale[None, :]
     H = _positive(0.5 * (H + H.T))
-    p = np.sqrt(np.maximum(response, 0.0)) / scale
-    moved = p > 0
-    C = np.eye(len(scale))
-    if moved.any():
-        # An entry that no step moves stays where it was; the others' steps are symmetric in units of sqrt(p).
-        q = p[moved]
-        values, vectors = np.linalg.eigh(H[np.ix_(moved, moved)] * q[:, None] * q[None, :])
-        start = vectors.T @ np.diag(q**-2) @ vectors
-        shaken = vectors.T @ np.diag(noise[moved] * scale[moved] ** 2 * q**2) @ vectors
-        end = _steps(start, shaken, np.maximum(values, 0.0), rates)
-        C[np.ix_(moved, moved)] = (q[:, None] * vectors) @ end @ (q[:, None] * vectors).T
-    seen = H @ C @ H + np.diag(np.maximum(noise * scale**2 / samples, 1e-30))
+    Sigma = _positive(noise * scale[:, None] * scale[None, :])
+    C = _after(H, response / scale**2, Sigma, rates)
+    seen = H @ C @ H + Sigma / samples
+    seen = seen + np.eye(len(scale)) * max(1e-9 * float(np.trace(seen)), 1e-30)
     gain = np.linalg.solve(seen, H @ C).T
     to_go = gain @ (gradient * scale)
     return Posterior(to_go * scale, _positive(C - gain @ H @ C) * scale[:, None] * scale[None, :])
@@ -87,18 +76,27 @@ def alone(
     h = np.maximum(curvature, 0.0)
     C = scale**2
     for rate in rates:
-        left = np.clip(1 - rate * response * h, _LEAST, 1.0)
-        C = left**2 * C + (rate * response) ** 2 * noise
+        C = np.clip(1 - rate * response * h, 0, 1) ** 2 * C + (rate * response) ** 2 * noise
     seen = h**2 * C + np.maximum(noise / samples, 1e-300)
     gain = C * h / seen
     return gain * gradient, np.sqrt(np.maximum(C - gain * h * C, 0.0))
 
 
-def _steps(C: Array, shaken: Array, values: Array, rates: Sequence[float]) -> Array:
-    """The covariance after all steps, in the eigenvectors' coordinates; `values` are the eigenvalues."""
+def _after(H: Array, response: Array, noise: Array, rates: Sequence[float]) -> Array:
+    """The covariance after all steps from a start of unit variances; an entry that no step moves stays where it was."""
+    C, moved = np.eye(len(response)), response > 0
+    if not moved.any():
+        return C
+    # Steps are symmetric in units of the root of the response.
+    q, free = np.sqrt(response[moved]), np.ix_(moved, moved)
+    values, vectors = np.linalg.eigh(H[free] * q[:, None] * q[None, :])
+    now = vectors.T @ np.diag(q**-2) @ vectors
+    shaken = vectors.T @ (noise[free] * q[:, None] * q[None, :]) @ vectors
     for rate in rates:
-        left = np.clip(1 - rate * values, _LEAST, 1.0)
-        C = left[:, None] * C * left[None, :] + rate**2 * shaken
+        left = np.clip(1 - rate * np.maximum(values, 0.0), 0, 1)
+        now = left[:, None] * now * left[None, :] + rate**2 * shaken
+    back = q[:, None] * vectors
+    C[free] = back @ now @ back.T
     return C
 
 

@@ -39,7 +39,7 @@ AT_BOUND = 1e-3
 #: Steps that a value at its bound may have been driven off it by noise.
 STEPS_OFF = 3.0
 #: Of the entries that have an effect, so many have to be settled.
-SETTLED_SHARE = 0.9
+SETTLED_SHARE = 0.8
 
 
 class Verdict(str, enum.Enum):
