@@ -133,6 +133,7 @@ class Recording:
                 self.first, self.last = self.first or record, record
                 metrics.write(record)
                 self.results.add(record)
+                self._certainty.see(self.done)
                 self.nonfinite.add(record)
                 self.clamped.add(record)
                 show(record)

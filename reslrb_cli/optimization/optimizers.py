@@ -157,9 +157,23 @@ class Optimizer:
             steepness = np.full_like(value, 1 - own.momentum)
         if key not in self._variables:
             return 1 / steepness
-        variable, moved = self._variables[key], dr.detach(own[key])
-        chained = np.array(variable.chain(moved, type(moved)(1)), dtype=np.float64).ravel()
-        return chained**2 / variable.gain / steepness
+        result: np.ndarray[Any, Any] = self.slope(key) ** 2 / self._variables[key].gain / steepness
+        return result
+
+    def squares(self, key: str) -> tuple[Any, float] | None:
+        """The running mean of the squares of what the optimiser is handed, as it keeps it, and its decay; None of one
+        that keeps none."""
+        own, extra = self._own[key], self._own[key].state[key][3]
+        if isinstance(own, dropt.Adam):
+            return extra[2], own.beta_2
+        return (extra, own.alpha) if isinstance(own, dropt.RMSProp) else None
+
+    def slope(self, key: str) -> np.ndarray[Any, Any]:
+        """What the optimiser is handed per unit of gradient of the scene's value, in a row."""
+        variable, moved = self.variable(key), dr.detach(self._own[key][key])
+        if key not in self._variables:
+            return np.ones(int(np.array(moved).size))
+        return np.array(variable.chain(moved, type(moved)(1)), dtype=np.float64).ravel()
 
     def rate(self, key: str) -> float:
         """The learning rate of a parameter, before any schedule."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from reslrb_cli.records.rival import RivalRecord
 from reslrb_cli.report.words import count, duration, number, shorten
 
 #: The verdict on a value that can be relied on, as recorded; all others say what keeps it from that.
@@ -70,6 +71,14 @@ def certainty_words(results: Mapping[str, Any]) -> str:
         f"curvature of the loss, where it ended (of a texture that of a typical entry, the others known); from "
         f"{', '.join(parts)}, in {cost}."
     )
+
+
+def rival_line(measured: Mapping[str, Any] | None) -> str:
+    """How another integrator did beside the run's own; empty where none was tried."""
+    try:
+        return RivalRecord.from_json(dict(measured or {})).line()
+    except TypeError:  # there was none, or another version's
+        return ""
 
 
 def _parameters(results: Mapping[str, Any]) -> dict[str, Any]:

@@ -111,7 +111,8 @@ def run(folder: Path, toy: Toy, seed: int = 0) -> Outcome:
     true = {key: np.asarray(value, dtype=np.float64) for key, value in problem.truth.items()}
     problem.truth.clear()  # nothing is judged by it
     certainty = Certainty(problem)
-    *_, last = optimize(problem)
+    for last in optimize(problem):
+        certainty.see(last.iteration + 1)
     found = certainty.measure(last.iteration + 1, last.elapsed_s, lambda: False)
     assert found is not None
     return Outcome(found, {key: value.astype(np.float64) for key, value in problem.values().items()}, true)

@@ -5,8 +5,9 @@
     by entry            random signs v over the pixels: with p_s = J_s^T (sqrt(W) v), the mean of p_a p_b is the
                         diagonal of H (Hutchinson 1989; Bekas et al. 2007), again from two sets of samples
 
-The second kind is noise for the most part at each entry alone. Entries whose gradients have alike noise have alike
-curvature, so it is averaged over those: `smooth`.
+Of the first kind a standard error is taken off, by the terms of its sum over the pixels: too much curvature would make
+results look too sure. The second kind is noise for the most part at each entry alone. Entries whose gradients have
+alike noise have alike curvature, so it is averaged over those: `smooth`.
 """
 
 from __future__ import annotations
@@ -34,6 +35,8 @@ _PURPOSE = "curvature"
 GROUP = 64
 #: A pixel shows a texture where it changes by this share of the most that any does.
 SHOWN = 0.05
+#: So many standard errors are taken off.
+SURE = 1.0
 #: Values of the images that enter H along directions: of more, so many at random, the same for all.
 MOST_VALUES = 2**18
 
@@ -80,7 +83,9 @@ class Curvature:
         if not directions:
             return [], np.zeros((0, 0))
         a, b = (np.nan_to_num(np.array(rows)) for rows in columns)
-        product = (a * self._in_a_row(self._weights)) @ b.T * self._thinned
+        a = a * self._in_a_row(self._weights)
+        sure = _sure_share(a * b)
+        product = a @ b.T * self._thinned * np.sqrt(np.outer(sure, sure))
         return directions, 0.5 * (product + product.T)
 
     def by_entry(self, probes: int, go_on: Callable[[], bool]) -> dict[str, Array]:
@@ -153,6 +158,16 @@ def _of_channel(image: Array, channel: int | None) -> Array:
     kept = np.zeros_like(image)
     kept[:, :, channel] = image[:, :, channel]
     return kept
+
+
+def _sure_share(terms: Array) -> Array:
+    """What of the sums of (M, N) terms is left once SURE of their standard errors are taken off, as a share, (M,).
+
+    A few bright pixels may make up all of a curvature, and be an accident.
+    """
+    sums, errors = terms.sum(axis=1), np.sqrt(np.square(terms).sum(axis=1))
+    result: Array = np.clip(1 - SURE * errors / np.maximum(sums, 1e-300), 0, 1)
+    return result
 
 
 def _changed(slopes: Sequence[Array]) -> int:

@@ -28,6 +28,8 @@ class Measured:
     response: Array
     rates: Sequence[float]
     is_small: bool
+    #: The mean square of the gradients of the run's last iterations, (N,), where the optimiser kept it.
+    recent: Array | None = None
     mean: Array = field(init=False)
     noise: Array = field(init=False)
 
@@ -35,7 +37,10 @@ class Measured:
         noise = np.var(self.gradients, axis=0, ddof=1)
         if self.is_small:  # few samples: those of all entries
             noise = np.where(noise > 0, noise.mean(), 0.0)
-        object.__setattr__(self, "mean", self.gradients.mean(axis=0))
+        mean = self.gradients.mean(axis=0)
+        if self.recent is not None:  # more of them, which few samples of heavy-tailed ones understate
+            noise = np.maximum(noise, self.recent - mean**2)
+        object.__setattr__(self, "mean", mean)
         object.__setattr__(self, "noise", noise)
 
     @property

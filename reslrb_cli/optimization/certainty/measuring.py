@@ -27,14 +27,19 @@ Array = np.ndarray[Any, Any]
 LEAST_ITERATIONS = 20
 #: Gradients at the final values: one for so many iterations, within these.
 ITERATIONS_A_SAMPLE, LEAST_SAMPLES, MOST_SAMPLES = 20, 5, 16
-#: Random probes for parameters of many entries, and renderings along directions, at most.
-PROBES, MOST_CHANGES = 4, 48
-#: Share of the samples of a step that each of the two sets of samples has that curvature is measured with.
-PART = 4
+#: Random probes for parameters of many entries; renderings along directions, at most: so many, or one for so many
+#: iterations.
+PROBES, LEAST_CHANGES, ITERATIONS_A_CHANGE = 4, 20, 10
+#: Share of the samples of a step that each of the two sets of samples has that curvature is measured with, and
+#: samples per pixel that are enough to have all of them.
+PART, FEW = 4, 8
 #: Directions are differentiated over this share of a parameter's scale.
 STEP = 0.05
-#: Curvature is measured within this share of the run's time in iterations, or that of a handful of them.
-SHARE, HANDFUL = 0.05, 10
+#: Part of a run whose gradients, the last ones, are asked for their noise.
+RECENT = 0.2
+#: Where curvature takes longer than this share of the run's time in iterations, and than so many of them, the rest is
+#: left out.
+SHARE, HANDFUL = 0.1, 20
 _PURPOSE = "certainty"
 
 
@@ -44,6 +49,26 @@ class Certainty:
     def __init__(self, problem: Problem) -> None:
         self.problem = problem
         self._initial = {key: row_of(problem, key) for key in problem.selection.keys}
+        self._squares: dict[str, tuple[Any, float] | None] = {}
+        self._seen = 0
+
+    def see(self, iterations: int) -> None:
+        """Take note of a run that has done so many iterations; it costs nothing."""
+        if iterations == int((1 - RECENT) * self.problem.config.run.iterations):
+            self._seen = iterations
+            self._squares = {key: self.problem.optimizer.squares(key) for key in self._initial}
+
+    def _recent(self, key: str, iterations: int) -> Array | None:
+        """The mean square of the gradients since `see` took note, (N,); None where the optimiser keeps none."""
+        before, now = self._squares.get(key), self.problem.optimizer.squares(key)
+        if before is None or now is None or iterations <= self._seen:
+            return None
+        first, last = (np.array(mean, dtype=np.float64).ravel() for mean, _ in (before, now))
+        kept = now[1] ** (iterations - self._seen)
+        slope = self.problem.optimizer.slope(key)
+        squares = np.maximum(last - kept * first, 0) / max(1 - kept, 1e-300)
+        result: Array = squares / np.maximum(slope**2, 1e-300)
+        return result
 
     def measure(self, iterations: int, elapsed_s: float, stop: Callable[[], bool]) -> CertaintyRecord | None:
         """Measure after so many iterations, which took `elapsed_s`; None after too few, or where `stop()` says so.
@@ -67,9 +92,10 @@ class Certainty:
                 compiled_ms += times.codegen_ms
             gradients = {key: np.array(samples) for key, samples in rows.items()}
             budget = _Budget(max(SHARE * elapsed_s, HANDFUL * elapsed_s / iterations), stop)
+            most = max(LEAST_CHANGES, iterations // ITERATIONS_A_CHANGE)
             with clock.step() as times:
                 curvature = self._curvature()
-                found = self._measure_curvature(curvature, gradients, budget)
+                found = self._measure_curvature(curvature, gradients, most, budget)
             compiled_ms += times.codegen_ms
             if stop():
                 return None
@@ -91,14 +117,15 @@ class Certainty:
 
     def _curvature(self) -> Curvature:
         unit = self.problem.samples_per_pass or 1
-        return Curvature(self.problem, max(self.problem.config.run.spp // PART // unit, 1) * unit)
+        spp = self.problem.config.run.spp
+        return Curvature(self.problem, max(max(spp // PART, min(spp, FEW)) // unit, 1) * unit)
 
     def _measure_curvature(
-        self, curvature: Curvature, gradients: Gradients, budget: _Budget
+        self, curvature: Curvature, gradients: Gradients, most: int, budget: _Budget
     ) -> tuple[list[Direction], Array, Gradients]:
         """Directions and H along them; and, unsmoothed, its diagonal by entry, of parameters that have none of them."""
         scales = {key: self.scale(key) for key in self.problem.selection.keys}
-        directions, H = curvature.along(plan_changes(self.problem, scales, STEP, MOST_CHANGES), budget)
+        directions, H = curvature.along(plan_changes(self.problem, scales, STEP, most), budget)
         seen = {direction.key for direction in directions if direction.entry is not None}
         left = [key for key, rows in gradients.items() if np.any(rows) and key not in seen]
         diagonal = curvature.by_entry(PROBES, budget) if left else {}
@@ -135,6 +162,7 @@ class Certainty:
                 response=np.nan_to_num(optimizer.response(key) * optimizer.rate(key)),
                 rates=factors,
                 is_small=value.size <= MOST_ENTRIES,
+                recent=self._recent(key, iterations),
             )
         return found
 
