@@ -183,7 +183,7 @@ def measured_step(problem: Problem, integrator: Any, clock: StepClock, round: in
 
 
 def situation(problem: Problem) -> dict[str, Any]:
-    """All that the choice depends on, as plain values."""
+    """All that the choice of an estimator depends on, as plain values."""
     config = problem.config
     dump = config.model_dump(mode="json")
     run = config.step_options() | {"memory_budget": dump["run"]["memory_budget"]}

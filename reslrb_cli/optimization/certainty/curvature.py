@@ -51,7 +51,7 @@ class Curvature:
         #: By how many values of the images each texture is seen, of those that were changed as a whole.
         self.pixels: dict[str, int] = {}
         self.integrator = problem.integrator
-        if isinstance(self.integrator, LightTracer):  # a recording would cost more than so few images save
+        if isinstance(self.integrator, LightTracer):  # a recording would cost more than so few probes save
             per_pass = self.integrator.samples_per_pass
             self.integrator = self.integrator.with_options(samples_per_pass=per_pass, freeze=False)
         self._base = [self._images(half) for half in (0, 1)]
@@ -124,7 +124,8 @@ class Curvature:
         """Every view as the scene stands, without alpha, from the seeds of that set."""
         images = []
         for sensor, target in zip(self.problem.sensors, self.problem.targets, strict=True):
-            image = render_image(self.integrator, self.problem.scene, sensor, self._seed(sensor, -1 - half), self.spp)
+            number = self._seed(sensor, -1 - half)
+            image = render_image(self.problem.integrator, self.problem.scene, sensor, number, self.spp)
             images.append(np.array(image, dtype=np.float64)[:, :, : target.shape[2]])
         return images
 
