@@ -193,8 +193,8 @@ class RunConfig(Section):
     certainty: bool = Field(
         default=True,
         description="After the last iteration, measure how certain the values are: their spread, and a verdict on each "
-        "parameter. Takes about as long as 5 % of the iterations, or ten of them where those are more; runs of fewer "
-        "than 20 iterations, and interrupted ones, go without.",
+        "parameter. Takes as long as some iterations, ten or so where parameters are few; runs of fewer than 20 "
+        "iterations, and interrupted ones, go without.",
     )
     reach_spp: Count = Field(default=64, description="Samples for the mask of the texels that light and sensor reach.")
 
