@@ -233,6 +233,12 @@ class RunConfig(Section):
         description="Sensors whose views are not trained on; their loss is recorded every 10 iterations (`held_out`), "
         "and of the first and the last image.",
     )
+    certainty: bool = Field(
+        default=True,
+        description="After the last iteration, measure how certain the values are: their spread, and a verdict on each "
+        "parameter. Takes as long as some iterations, ten or so where parameters are few; runs of fewer than 20 "
+        "iterations, and interrupted ones, go without.",
+    )
     reach_spp: Count = Field(default=64, description="Samples for the mask of the texels that light and sensor reach.")
 
     @field_validator("name")
