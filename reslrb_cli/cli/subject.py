@@ -44,10 +44,18 @@ def read_subject(path: Path, overrides: tuple[str, ...]) -> Subject:
     data = parse(text, str(file))
     given = {str(parse_override(override).location[0]) for override in overrides}
     sections = {key for key, value in data.items() if value is not None} if isinstance(data, dict) else set(_STAND_INS)
+    if "views" in sections or "cameras" in _keys(data, "scene"):  # which bring targets along
+        sections |= {"target"}
     missing = tuple(section for section in _STAND_INS if section not in sections | given)
     stand_ins = [f"{section}={_STAND_INS[section]}" for section in missing]
     config = loads(text, file, [*stand_ins, *overrides])
     return Subject(path, config, is_scene, missing, manifest)
+
+
+def _keys(data: Any, section: str) -> set[str]:
+    """The keys of a section, of which nothing is known yet."""
+    inside = data.get(section) if isinstance(data, dict) else None
+    return set(inside) if isinstance(inside, dict) else set()
 
 
 def _is_scene(file: Path) -> bool:

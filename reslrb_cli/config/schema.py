@@ -29,7 +29,7 @@ from .names import check_name, folder_name
 from .optimizers import Adam, AnyOptimizer
 from .parameters import COLOR_SPACE, ColorSpace, ParameterSpec, Value
 from .sizes import Memory, memory_bytes
-from .views import EXPOSURE, MASK, MASK_MIXED, AnyMask, Exposures, Mask, ViewSpec, check_views
+from .views import EXPOSURE, MASK, MASK_MIXED, AnyMask, Exposures, Mask, SensorName, ViewSpec, check_views
 
 
 def _list_of_one(value: Any) -> Any:
@@ -228,10 +228,11 @@ class RunConfig(Section):
         description="Views that an iteration renders, drawn anew each time by the run's seed; their loss is scaled so "
         "that its mean is that of all. null: all of them.",
     )
-    held_out: list[Annotated[int, Field(ge=0)]] = Field(
+    held_out: list[SensorName] = Field(
         default=[],
-        description="Sensors whose views are not trained on; their loss is recorded every 10 iterations (`held_out`), "
-        "and of the first and the last image.",
+        description="Sensors whose views are not trained on, by index or id, which for those of `scene.cameras` is the "
+        "image's name without its suffix; their loss is recorded every 10 iterations (`held_out`), and of the first "
+        "and the last image.",
     )
     certainty: bool = Field(
         default=True,

@@ -121,6 +121,20 @@ EXPOSURE = (
 )
 
 
+def _sensor_name(value: Any) -> Any:
+    if (isinstance(value, int) and not isinstance(value, bool) and value >= 0) or (isinstance(value, str) and value):
+        return value
+    raise wrong("must be a sensor's index, or its id")
+
+
+#: A sensor, by its index or its id.
+SensorName = Annotated[
+    int | str,
+    BeforeValidator(_sensor_name),
+    WithJsonSchema({"anyOf": [{"type": "integer", "minimum": 0}, {"type": "string"}]}),
+]
+
+
 class ViewSpec(Section):
     """One view: a sensor of the scene, and what it is to see."""
 

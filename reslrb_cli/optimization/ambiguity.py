@@ -19,6 +19,7 @@ import drjit as dr
 import numpy as np
 
 from reslrb_cli.errors import ConfigError
+from reslrb_cli.optimization.exposure import SHARED
 from reslrb_cli.optimization.sensitivity import see_images
 
 if TYPE_CHECKING:
@@ -52,7 +53,7 @@ def check_exposures(problem: Problem) -> None:
     both = " and ".join(f"`{key}`" for key in found.exposures), ", ".join(f"`{key}`" for key in found.parameters)
     raise ConfigError(
         problem.config.source,
-        "target.exposure",
+        _place(problem, found.exposures[0]),
         f"the images cannot tell {both[0]} from {both[1]}: changed together, they look the same; give one of them a "
         "number, such as exposure: 1, or remove a parameter whose value is known",
     )
@@ -83,6 +84,14 @@ def find_ambiguous(problem: Problem) -> Ambiguous | None:
         if value < LEAST and exposures and parameters:
             return Ambiguous(exposures, parameters)
     return None
+
+
+def _place(problem: Problem, key: str) -> str:
+    """Where the exposure of that key stands in the configuration."""
+    for number, spec in enumerate(problem.config.views or ()):
+        if spec.exposure is not None and key == f"{SHARED}.{spec.sensor}":
+            return f"views[{number}].exposure"
+    return "target.exposure"
 
 
 def _row(problem: Problem) -> np.ndarray:

@@ -149,10 +149,7 @@ def make_views(config: Config, scene: mi.Scene) -> list[View]:
             replace(one, file=images[sensor], file_key="scene.cameras") if one.file is None else one
             for sensor, one in zip(sensors, wanted, strict=True)
         ]
-    held_out = set(config.run.held_out)
-    for place, sensor in enumerate(config.run.held_out):
-        if sensor not in sensors:
-            raise ConfigError(config.source, f"run.held_out[{place}]", f"is {sensor}, which is the sensor of no view")
+    held_out = _held_out(config, scene, sensors)
     if held_out == set(sensors):
         raise ConfigError(config.source, "run.held_out", "leaves no view to train on")
     trained = [one.weight for sensor, one in zip(sensors, wanted, strict=True) if sensor not in held_out]
@@ -176,6 +173,17 @@ def make_views(config: Config, scene: mi.Scene) -> list[View]:
             f"is {config.run.views_per_iteration}; views that are trained on: {len(trained)}",
         )
     return views
+
+
+def _held_out(config: Config, scene: mi.Scene, sensors: list[int]) -> set[int]:
+    """The indices of the sensors that `run.held_out` names. Raises ConfigError for one that has no view."""
+    names, found = {scene.sensors()[sensor].id(): sensor for sensor in sensors}, set()
+    for place, given in enumerate(config.run.held_out):
+        sensor = names.get(given, -1) if isinstance(given, str) else given
+        if sensor not in sensors:
+            raise ConfigError(config.source, f"run.held_out[{place}]", f"is {given}, which is the sensor of no view")
+        found.add(sensor)
+    return found
 
 
 def _of_sensors(config: Config, sensors: list[int]) -> list[Wanted]:

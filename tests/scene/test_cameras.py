@@ -89,9 +89,10 @@ def test_a_point_is_seen_where_the_camera_has_it(folder, write):
     np.testing.assert_allclose(directions(scene, 1), towards, atol=1e-5)
 
 
-def make(folder, cameras):
+def make(folder, cameras, run=""):
     text = CONFIG.replace("target: {render: {spp: 16}}\n", "")
     text = text.replace("{file: scene.xml}", f"{{file: scene.xml, cameras: {cameras}, sensors: all}}")
+    text = text.replace("run: {", "run: {" + run)
     return assemble(loads(text, str(folder / "tiny.yaml")))
 
 
@@ -100,6 +101,8 @@ def test_the_cameras_images_are_the_targets(folder):
     problem = make(folder, "transforms.json")
     assert [view.wanted.file.name for view in problem.views] == ["a.exr", "b.exr"]
     assert all(np.array(view.target).max() == 0.5 for view in problem.views)
+    problem = make(folder, "transforms.json", "held_out: [b], ")
+    assert [view.sensor for view in problem.trained] == [0]
     (folder / "b.exr").unlink()
     with pytest.raises(ConfigError, match=r"tiny.yaml: scene.cameras: no such file"):
         make(folder, "transforms.json")
