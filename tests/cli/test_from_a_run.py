@@ -11,6 +11,7 @@ from cli import tiny
 from click.testing import CliRunner, Result
 
 from reslrb_cli.cli import main
+from reslrb_cli.cli.export import choose_integrator
 from reslrb_cli.cli.recovered import read_recovered
 from reslrb_cli.config import ParameterSpec, RunValue, load
 from reslrb_cli.errors import ConfigError
@@ -164,3 +165,18 @@ def test_a_run_that_lacks_a_value_or_has_a_bad_one_is_refused_in_a_line(folder: 
     assert "exclude the initial value" in refusal()
     (run / "checkpoint" / FILE_NAME).write_bytes(b"PK\x03\x04 and then nothing")
     assert "is damaged, cut off, or not written by a run" in refusal()
+
+
+def test_an_exported_scene_is_rendered_by_path_where_ptracer_is_wrong(tmp_path: Path) -> None:
+    tiny.write_experiment(tmp_path)
+    sky = """<emitter type="envmap"><string name="filename" value="poster.exr"/><transform name="to_world">
+<rotate y="1" angle="40"/></transform></emitter></scene>"""
+    (tmp_path / "scene.xml").write_text(tiny.SCENE.replace("</scene>", sky))
+    config = load(tmp_path / "tiny.yaml")
+    scene = load_scene(config.scene.file)
+    integrator, why = choose_integrator(config, scene, mi.traverse(scene))
+    assert integrator == {"type": "path", "max_depth": 3, "rr_depth": 5, "hide_emitters": False}
+    assert why == ", since ptracer emits wrongly from a turned environment map"
+    by_prb = load(tmp_path / "tiny.yaml", ["integrator={type: prb, max_depth: 4}"])
+    integrator, why = choose_integrator(by_prb, scene, mi.traverse(scene))
+    assert (integrator["type"], integrator["max_depth"], why) == ("path", 4, "")
