@@ -107,8 +107,14 @@ class Player:
             return {"loading_s": 0.3, "warnings": ["old"]}
         if "prepare" in question:
             self.stage.wait(self.stage.target_s, stop)
+            np.savez(question["out"], **{"target-0": np.full((2, 2, 3), 0.25, np.float32)})
             return {"without": self.stage.without, "loss": 1.0, "error": 1.0, "judge_s": self.stage.judge_s,
-                    "error_of": "RMSE", "pictures": ""}  # fmt: skip
+                    "error_of": "RMSE", "pictures": "", "spp": 64}  # fmt: skip
+        if "restore" in question:
+            assert question["restore"] == {"spp": 64}
+            with np.load(question["targets"]) as targets:
+                np.testing.assert_array_equal(targets["target-0"], 0.25)
+            return {"loss": 1.0, "error": 1.0, "judge_s": self.stage.judge_s}
         self.stage.wait(self.stage.judge_s, stop)
         self.stage.judged += 1
         value = float(load(question["values"], ["a"])["a"][0])

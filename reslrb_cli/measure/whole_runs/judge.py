@@ -14,6 +14,7 @@ import mitsuba as mi
 import numpy as np
 
 from reslrb_cli.config import loads
+from reslrb_cli.measure.convergence.sampler import to_tensor
 from reslrb_cli.measure.convergence.survey import affordable_paths, find_references, multiple_of, shorten_target
 from reslrb_cli.measure.whole_runs.runner import copies, load
 from reslrb_cli.measure.worker import Begun
@@ -65,6 +66,7 @@ def joint_error(meter: ErrorMeter, values: dict[str, Array]) -> float | None:
 def begin(first: dict[str, Any]) -> Begun:
     """Begin the process. The first question is to `prepare`: it names the file for the targets, `out`; see `prepare`.
 
+    Or it is to `restore` what an earlier process has prepared: it names the file of its `targets`, and its `spp`.
     Each other one names a file of `values`; its answer has their `loss` and `error`.
     """
     start = time.perf_counter()
@@ -75,6 +77,10 @@ def begin(first: dict[str, Any]) -> Begun:
     def answer(question: dict[str, Any]) -> dict[str, Any]:
         if "prepare" in question:
             judge, facts = prepare(problem, question["out"], **question["prepare"])
+            judges.append(judge)
+            return facts
+        if "restore" in question:
+            judge, facts = restore(problem, question["targets"], question["restore"]["spp"])
             judges.append(judge)
             return facts
         values = load(question["values"], problem.selection.keys)
@@ -102,20 +108,33 @@ def prepare(problem: Problem, out: str, budget_s: float, image_s: float) -> tupl
         np.savez(file, **arrays)  # type: ignore[arg-type]
     affordable = affordable_paths(problem, pixels, image_s) // pixels
     spp = multiple_of(max(affordable, LEAST_SPP), problem.samples_per_pass)
-    judge = Judge(problem, spp)
-    error = judge.error(initial)
+    judge, facts = _judge(problem, spp, initial)
+    error = facts["error"]
     kind = (
         "" if error is None else "RMSE of the parameters" if judge.meter.one_unit else "relative RMSE of the parameters"
     )
+    pictures = f"losses of images of {spp} spp{shortened}"
+    return judge, facts | {"without": without, "error_of": kind, "pictures": pictures, "spp": spp}
+
+
+def restore(problem: Problem, targets: str, spp: int) -> tuple[Judge, dict[str, Any]]:
+    """What judges as another did, by the `targets` in a file that `prepare` wrote, and images of so many samples.
+
+    The facts: `loss` and `error` of the initial values, and `judge_s`.
+    """
+    initial = copies(problem)
+    shorten_target(problem, 1)
+    make_targets(problem, lambda line: None)  # for the sake of the true values
+    with np.load(targets) as found:
+        problem.targets = [to_tensor(found[f"target-{number}"]) for number in range(len(problem.sensors))]
+    find_reached(problem)
+    return _judge(problem, spp, initial)
+
+
+def _judge(problem: Problem, spp: int, initial: dict[str, Array]) -> tuple[Judge, dict[str, Any]]:
+    """What judges, warm, and what it says of the initial values."""
+    judge = Judge(problem, spp)
     judge.loss(initial)  # which compiles
     start = time.perf_counter()
     loss = judge.loss(initial)
-    facts = {
-        "without": without,
-        "loss": loss,
-        "judge_s": time.perf_counter() - start,
-        "error": error,
-        "error_of": "" if error is None else kind,
-        "pictures": f"losses of images of {spp} spp{shortened}",
-    }
-    return judge, facts
+    return judge, {"loss": loss, "judge_s": time.perf_counter() - start, "error": judge.error(initial)}
