@@ -198,6 +198,8 @@ class RunsSession:
                     point = self._advance(run, until_s, wave)
                     if point is not None:
                         run.points.append(point)
+                        if all(other.complete(self.limit_s) or other.end or other.refusal for other in wave):
+                            self._seeds = number + 1
                         yield point
             for run in wave:
                 run.process.close()
@@ -208,7 +210,6 @@ class RunsSession:
                 self._say(f"no method came to an iteration in the {self.limit_s:.3g} s of a run; allow several times "
                           "as much with --budget, or fewer --runs or --integrators")  # fmt: skip
                 return
-            self._seeds = number + 1
             entries = [entry for entry in entries if self.plan.method_of(*entry) not in self._gone(wave)]
 
     def _gone(self, runs: Sequence[Run]) -> set[Method]:
