@@ -244,15 +244,15 @@ def _shown(records: Sequence[MethodRecord]) -> list[str]:
 
 def _conditions(plan: Plan, session: Session) -> str:
     """What was measured, in one line."""
+    from reslrb_cli.report.words import WITHOUT_BORDER
+
     config, facts = plan.config, session.facts
     depth, rr_depth = config.integrator.max_depth, config.integrator.rr_depth
     roulette = "no roulette" if 0 <= depth < rr_depth else f"roulette from depth {rr_depth}"
     what = {"fixed": "dL/dI held", "loss": f"loss {config.loss.type}", "image": "the image"}[plan.objective]
     spp = ", ".join(str(count) for count in plan.spps or [config.run.spp])
     parts = [str(config.source), f"{spp} spp", roulette, what, facts.get("pictures", "")]
-    parts.append(
-        "without the film's border, where light paths lose what camera paths see" if facts.get("masked") else ""
-    )
+    parts.append(WITHOUT_BORDER if facts.get("masked") else "")
     return ", ".join(part for part in parts if part)
 
 

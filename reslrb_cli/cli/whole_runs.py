@@ -26,7 +26,7 @@ from reslrb_cli.records.lines import Line
 from reslrb_cli.records.whole_runs import RunMethodRecord, RunPointRecord
 from reslrb_cli.report.whole_runs_plot import plot_runs
 from reslrb_cli.report.whole_runs_table import RunsTable, closing_sentence, notes
-from reslrb_cli.report.words import count
+from reslrb_cli.report.words import WITHOUT_BORDER, count
 
 
 def measure_runs(
@@ -106,6 +106,7 @@ def _conditions(plan: RunsPlan, session: RunsSession) -> str:
         f"{optimizer.type} at {optimizer.learning_rate:g}",
         facts.get("pictures", ""),
         facts.get("error_of", ""),
+        WITHOUT_BORDER if facts.get("masked") else "",
     ]
     return ", ".join(part for part in parts if part)
 

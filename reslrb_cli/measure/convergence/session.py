@@ -134,10 +134,11 @@ class Session:
         try:
             opening = surveyor.answer(self._stop, self._pace.over)
             self._warn(opening)
-            camera = any(case.type == "prb" for case in plan.cases)
+            # What errors are taken from is a side too.
+            named = plan.reference.type == "prb"
             ask = {
-                "camera": camera,
-                "named": not plan.default,
+                "camera": named or any(case.type == "prb" for case in plan.cases),
+                "named": named or not plan.default,
                 "budget_s": plan.budget_s if plan.rounds is None else None,
             }
             question = {"out": first["arrays"], "ask": ask}
@@ -272,6 +273,9 @@ class Session:
             names = ", ".join(member.label for member in late)
             self._say(f"not measured: {names}: the budget of {self.plan.budget_s:g} s was spent")
         warm = [member for member in self.members if member.alive]
+        if late and not warm:
+            advice = "allow several times as much with --budget, or name fewer --integrators"
+            self._say(f"nothing had compiled by then: {advice}")
         if not warm or self.plan.rounds is not None:
             return
         # What has not compiled is taken to take as long as what has.

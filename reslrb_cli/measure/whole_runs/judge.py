@@ -14,6 +14,7 @@ import mitsuba as mi
 import numpy as np
 
 from reslrb_cli.config import loads
+from reslrb_cli.measure.border_mask import leave_out_border
 from reslrb_cli.measure.convergence.sampler import to_tensor
 from reslrb_cli.measure.convergence.survey import affordable_paths, find_references, multiple_of, shorten_target
 from reslrb_cli.measure.whole_runs.runner import copies, load
@@ -66,7 +67,7 @@ def joint_error(meter: ErrorMeter, values: dict[str, Array]) -> float | None:
 def begin(first: dict[str, Any]) -> Begun:
     """Begin the process. The first question is to `prepare`: it names the file for the targets, `out`; see `prepare`.
 
-    Or it is to `restore` what an earlier process has prepared: it names the file of its `targets`, and its `spp`.
+    Or it is to `restore` what an earlier process has prepared: it names the file of its `targets`; see `restore`.
     Each other one names a file of `values`; its answer has their `loss` and `error`.
     """
     start = time.perf_counter()
@@ -80,7 +81,7 @@ def begin(first: dict[str, Any]) -> Begun:
             judges.append(judge)
             return facts
         if "restore" in question:
-            judge, facts = restore(problem, question["targets"], question["restore"]["spp"])
+            judge, facts = restore(problem, question["targets"], **question["restore"])
             judges.append(judge)
             return facts
         values = load(question["values"], problem.selection.keys)
@@ -89,11 +90,15 @@ def begin(first: dict[str, Any]) -> Begun:
     return {"loading_s": loading_s}, answer
 
 
-def prepare(problem: Problem, out: str, budget_s: float, image_s: float) -> tuple[Judge, dict[str, Any]]:
+def prepare(
+    problem: Problem, out: str, budget_s: float, image_s: float, camera: bool, named: bool
+) -> tuple[Judge, dict[str, Any]]:
     """Make the targets, and write them to `out`; `budget_s` is the time of the whole, `image_s` that of one judgement.
 
-    The facts: `without` (stock integrators that are right for nothing here, with the reason), `loss` and `error` of the
-    initial values, the seconds that a judgement takes (`judge_s`), and in words `pictures` and `error_of`.
+    Where the `camera`'s paths take part, which may be left out unless they are `named`, all leave out the film's
+    border. The facts: `masked` (whether that is so), `without` (stock integrators that are right for nothing here, and
+    the reason), `loss` and `error` of the initial values, the seconds that a judgement takes (`judge_s`), the samples
+    of its images (`spp`), and in words `pictures` and `error_of`.
     """
     without = find_references(problem, "loss")["without"]
     initial = copies(problem)
@@ -106,6 +111,7 @@ def prepare(problem: Problem, out: str, budget_s: float, image_s: float) -> tupl
     with open(out, "wb") as file:
         arrays = {f"target-{number}": np.array(target) for number, target in enumerate(problem.targets)}
         np.savez(file, **arrays)  # type: ignore[arg-type]
+    masked = camera and (named or "prb" not in without) and leave_out_border(problem)
     affordable = affordable_paths(problem, pixels, image_s) // pixels
     spp = multiple_of(max(affordable, LEAST_SPP), problem.samples_per_pass)
     judge, facts = _judge(problem, spp, initial)
@@ -114,10 +120,10 @@ def prepare(problem: Problem, out: str, budget_s: float, image_s: float) -> tupl
         "" if error is None else "RMSE of the parameters" if judge.meter.one_unit else "relative RMSE of the parameters"
     )
     pictures = f"losses of images of {spp} spp{shortened}"
-    return judge, facts | {"without": without, "error_of": kind, "pictures": pictures, "spp": spp}
+    return judge, facts | {"without": without, "error_of": kind, "pictures": pictures, "spp": spp, "masked": masked}
 
 
-def restore(problem: Problem, targets: str, spp: int) -> tuple[Judge, dict[str, Any]]:
+def restore(problem: Problem, targets: str, spp: int, masked: bool) -> tuple[Judge, dict[str, Any]]:
     """What judges as another did, by the `targets` in a file that `prepare` wrote, and images of so many samples.
 
     The facts: `loss` and `error` of the initial values, and `judge_s`.
@@ -128,6 +134,8 @@ def restore(problem: Problem, targets: str, spp: int) -> tuple[Judge, dict[str, 
     with np.load(targets) as found:
         problem.targets = [to_tensor(found[f"target-{number}"]) for number in range(len(problem.sensors))]
     find_reached(problem)
+    if masked:
+        leave_out_border(problem)
     return _judge(problem, spp, initial)
 
 

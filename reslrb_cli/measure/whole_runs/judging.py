@@ -33,9 +33,11 @@ class Judging:
         """What it says first, its scene loaded; None where time was up."""
         return self._contestant.answer(self._stop, self._over)
 
-    def prepare(self, targets: Path, budget_s: float, image_s: float) -> dict[str, Any]:
-        """Have it make the targets, and write them; returns the facts of `judge.prepare`, none where time was up."""
-        ask = {"budget_s": budget_s, "image_s": image_s}
+    def prepare(self, targets: Path, **ask: float | bool) -> dict[str, Any]:
+        """Have it make the targets, and write them; `ask` and the facts that it returns are those of `judge.prepare`.
+
+        There are none where time was up.
+        """
         return self.ask({"prepare": ask, "out": str(targets)}) or {}
 
     def restore(self, targets: Path, earlier: Earlier) -> dict[str, Any]:
@@ -45,7 +47,8 @@ class Judging:
         """
         restore_targets(earlier, targets)
         facts: dict[str, Any] = earlier.head["facts"]
-        found = self.ask({"restore": {"spp": facts["spp"]}, "targets": str(targets)})
+        ask = {"spp": facts["spp"], "masked": facts["masked"]}
+        found = self.ask({"restore": ask, "targets": str(targets)})
         if found is None:
             return facts
         check_judge(earlier, found)

@@ -114,7 +114,8 @@ class RunsSession:
 
     def _first(self, config: Config) -> dict[str, Any]:
         return {"config": dump(config), "source": str(config.source), "variant": self.plan.variant,
-                "memory_limit": self.plan.memory_limit, "targets": str(self.folder / "targets.npz")}  # fmt: skip
+                "memory_limit": self.plan.memory_limit, "targets": str(self.folder / "targets.npz"),
+                "masked": self.facts.get("masked", False)}  # fmt: skip
 
     def _prepare(self) -> bool:
         """Start what judges, and have it make the target; False where time is up over it."""
@@ -129,7 +130,15 @@ class RunsSession:
                 self.facts = judge.restore(targets, self._earlier)
             else:
                 image_s = JUDGED * self._budget_s / (len(plan.entries) * plan.runs * POINTS)
-                self.facts = judge.prepare(targets, self._budget_s, image_s)
+                named = plan.reference.type == "prb"
+                camera = named or any(case.type == "prb" for case in plan.cases)
+                self.facts = judge.prepare(
+                    targets,
+                    budget_s=self._budget_s,
+                    image_s=image_s,
+                    camera=camera,
+                    named=named or not plan.default,
+                )
         if judge.late:
             self._say(f"the budget of {plan.budget_s:g} s was spent before there was a target; allow several times it")
         return not judge.late
