@@ -142,6 +142,44 @@ def test_going_on(tmp_path: Path) -> None:
         assert len({row.tobytes() for row in member.rows}) == len(member.rows)
 
 
+@pytest.mark.parametrize("after", [188, 212, 236])
+def test_a_round_that_was_broken_off_is_begun_anew(tmp_path: Path, after: int) -> None:
+    """With new seeds, and none of its steps twice: the figures are those of whole rounds."""
+    answers = iter(range(10**6))
+    session, _, _ = play(tmp_path, Stage(), plan(rounds=8), stop=lambda: next(answers) > after)
+    assert len({len(member.rows) // member.count for member in session.members}) == 2
+    kept = session.keep()
+    assert kept is not None
+    more, results, _ = play(tmp_path, Stage(), plan(rounds=8), earlier=Earlier(KIND, Path("c.jsonl"), *kept))
+    for member in more.members:
+        assert member.turns == [turn for turn in range(8) for _ in range(member.count)]
+        assert len(member.seconds) == 8
+        assert len({row.tobytes() for row in member.rows}) == len(member.rows)
+    assert of(results, "ptracer").efficiency is not None
+
+
+def test_what_has_ended_stays_as_it_was_and_the_rest_goes_on(tmp_path: Path) -> None:
+    first, _, _ = play(tmp_path, Stage(case_reslrb_stack=Pretence(ends=5)), plan(rounds=8))
+    kept = first.keep()
+    assert kept is not None
+    stage = Stage()
+    _, results, _ = play(tmp_path, stage, plan(rounds=12), earlier=Earlier(KIND, Path("c.jsonl"), *kept))
+    ended, sound = of(results, "reslrb:stack"), of(results, "ptracer")
+    assert (ended.status, ended.message, sound.repeats) == (BenchStatus.OUT_OF_MEMORY, "ended by SIGKILL", 24)
+    assert "case reslrb:stack" not in {question["of"] for question in stage.asked}
+
+
+def test_a_second_budget_without_room_for_a_round_says_so(tmp_path: Path) -> None:
+    first, _, _ = play(tmp_path, Stage(), plan(rounds=None, budget_s=30.0))
+    kept = first.keep()
+    assert kept is not None
+    earlier = Earlier(KIND, Path("c.jsonl"), *kept)
+    again, results, said = play(tmp_path, Stage(), plan(rounds=None, budget_s=7.5), earlier=earlier)
+    assert again.rounds == first.rounds
+    assert of(results, "ptracer").efficiency is not None  # by what there was
+    assert said[-1].startswith("no round was added; allow about ")
+
+
 @pytest.mark.parametrize(
     ("change", "line"),
     [
