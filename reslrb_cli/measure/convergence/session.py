@@ -134,13 +134,7 @@ class Session:
         try:
             opening = surveyor.answer(self._stop, self._pace.over)
             self._warn(opening)
-            # What errors are taken from is a side too.
-            named = plan.reference.type == "prb"
-            ask = {
-                "camera": named or any(case.type == "prb" for case in plan.cases),
-                "named": named or not plan.default,
-                "budget_s": plan.budget_s if plan.rounds is None else None,
-            }
+            ask = {**plan.camera, "budget_s": plan.budget_s if plan.rounds is None else None}
             question = {"out": first["arrays"], "ask": ask}
             answer = None if opening is None else surveyor.ask(question, self._stop, self._pace.over)
         finally:

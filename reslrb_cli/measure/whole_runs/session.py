@@ -130,15 +130,7 @@ class RunsSession:
                 self.facts = judge.restore(targets, self._earlier)
             else:
                 image_s = JUDGED * self._budget_s / (len(plan.entries) * plan.runs * POINTS)
-                named = plan.reference.type == "prb"
-                camera = named or any(case.type == "prb" for case in plan.cases)
-                self.facts = judge.prepare(
-                    targets,
-                    budget_s=self._budget_s,
-                    image_s=image_s,
-                    camera=camera,
-                    named=named or not plan.default,
-                )
+                self.facts = judge.prepare(targets, budget_s=self._budget_s, image_s=image_s, **plan.camera)
         if judge.late:
             self._say(f"the budget of {plan.budget_s:g} s was spent before there was a target; allow several times it")
         return not judge.late
