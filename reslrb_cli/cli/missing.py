@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 #: Options that say something about comparisons, of which there is none.
 FOREIGN = {"suite": "--suite", "cases": "--case", "estimators": "--estimators", "markdown_file": "--markdown",
-           "folder": "--images"}  # fmt: skip
+           "folder": "--images", "resumed": "--resume"}  # fmt: skip
 
 
 def refuse_comparisons(context: click.Context) -> None:

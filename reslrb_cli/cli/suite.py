@@ -17,7 +17,14 @@ if TYPE_CHECKING:
     from reslrb_cli.records.gradcheck import GradcheckRecord
 
 #: Options of `gradcheck` that mean nothing without a configuration, by their parameters' names.
-_FOREIGN = {"config_file": "CONFIG", "overrides": "--set", "budget": "--budget", "spp": "--spp", "folder": "--images"}
+_FOREIGN = {
+    "config_file": "CONFIG",
+    "overrides": "--set",
+    "budget": "--budget",
+    "spp": "--spp",
+    "folder": "--images",
+    "resumed": "--resume",
+}
 
 
 def refuse_foreign(context: click.Context) -> None:
