@@ -12,7 +12,7 @@ from reslrb_cli.records.gradcheck import GradcheckRecord
 
 #: One for each kind of extreme that no test below has: long sums and suns are there, with faults that they find.
 FEW = ("albedo_0", "albedo_1e-6_roulette", "emission_1e-25_roulette", "connection_1e8", "no_connection", "furnace",
-       "nan_loss", "scaled_1e-2", "index_3", "slope_0")  # fmt: skip
+       "nan_loss", "scaled_1e-2", "index_3", "roughconductor_1e-2", "slope_0")  # fmt: skip
 
 
 @pytest.fixture(autouse=True)
