@@ -145,14 +145,14 @@ def _run(sweep: Sweep, json_file: Path | None) -> tuple[list[Result], bool]:
     from contextlib import ExitStack
 
     from reslrb_cli.cli.interrupts import Interrupts
+    from reslrb_cli.cli.measured import measured_lines
     from reslrb_cli.measure.bench import bench
     from reslrb_cli.measure.processes import abandon_all
-    from reslrb_cli.records.lines import LineWriter
     from reslrb_cli.report.bench_table import table_head, table_line
 
     labels, results, notes = [case.label for case in sweep.cases], [], []
     with ExitStack() as stack:
-        writer = None if json_file is None else stack.enter_context(LineWriter(json_file))
+        writer = None if json_file is None else stack.enter_context(measured_lines(json_file, sweep.variant))
         interrupts = stack.enter_context(Interrupts(last_act=abandon_all))
         echo(table_head(labels, sweep.swept))
         for rows in bench(sweep, lambda: interrupts.requested, logging.getLogger(__name__).info):

@@ -157,12 +157,13 @@ def _run(plan: Plan, json_file: Path | None, began: float, earlier: Earlier | No
     from contextlib import ExitStack
 
     from reslrb_cli.cli.interrupts import Interrupts
+    from reslrb_cli.cli.measured import measured_lines
     from reslrb_cli.measure.convergence.judgement import Judgement
     from reslrb_cli.measure.convergence.members import Role
     from reslrb_cli.measure.convergence.session import Session
     from reslrb_cli.measure.processes import abandon_all
     from reslrb_cli.records.convergence import SummaryRecord
-    from reslrb_cli.records.lines import Line, LineWriter
+    from reslrb_cli.records.lines import Line
     from reslrb_cli.report.convergence_table import closing_sentence, notes, reference_line
 
     with ExitStack() as stack:
@@ -189,7 +190,7 @@ def _run(plan: Plan, json_file: Path | None, began: float, earlier: Earlier | No
         if json_file is not None:  # only now: what is gone on from may be the same file
             lines: list[Line] = [*results.points, *results.methods, *results.references]
             lines.append(SummaryRecord(closing_sentence(results.methods)))
-            with LineWriter(json_file) as writer:
+            with measured_lines(json_file, plan.variant) as writer:
                 for line in lines:
                     writer.write(line)
         table = _table(session)

@@ -103,7 +103,7 @@ def command(
     if missing:
         variant = set_variant(config.variant)
         echo(f"{device_name(variant)}, {variant}")
-        return run_missing(config, budget, seeds, spp, directions, json_file)
+        return run_missing(config, variant, budget, seeds, spp, directions, json_file)
     listed = all_estimators(config) if estimators is None else parse_estimators(estimators)
     _check_folder(folder)
     settings = Settings(config, listed, budget, seeds, spp, named=estimators is not None)
@@ -112,7 +112,7 @@ def command(
     check = Gradcheck(settings)
     echo(f"{device_name(variant)}, {variant}")
     echo(check.conditions())
-    records, interrupted = _run(check, json_file, folder)
+    records, interrupted = _run(check, variant, json_file, folder)
     _finish(records, markdown_file)
     if interrupted:
         return ExitCode.INTERRUPTED
@@ -121,19 +121,21 @@ def command(
     return ExitCode.CHECK_FAILED if failed else ExitCode.DONE
 
 
-def _run(check: Gradcheck, json_file: Path | None, folder: Path | None) -> tuple[list[GradcheckRecord], bool]:
+def _run(
+    check: Gradcheck, variant: str, json_file: Path | None, folder: Path | None
+) -> tuple[list[GradcheckRecord], bool]:
     """Measure, print and write; returns all records, and whether the user interrupted."""
     from contextlib import ExitStack
 
     from reslrb_cli.cli.interrupts import Interrupts
+    from reslrb_cli.cli.measured import measured_lines
     from reslrb_cli.records.gradcheck import Verdict
-    from reslrb_cli.records.lines import LineWriter
     from reslrb_cli.report.gradcheck_table import Table
 
     records: list[GradcheckRecord] = []
     drawn = False
     with ExitStack() as stack:
-        writer = None if json_file is None else stack.enter_context(LineWriter(json_file))
+        writer = None if json_file is None else stack.enter_context(measured_lines(json_file, variant))
         interrupts = stack.enter_context(Interrupts())
         table = Table(check.expected())
         echo(table.head())

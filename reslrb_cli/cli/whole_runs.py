@@ -10,6 +10,7 @@ from contextlib import ExitStack
 from pathlib import Path
 
 from reslrb_cli.cli.interrupts import Interrupts
+from reslrb_cli.cli.measured import measured_lines
 from reslrb_cli.cli.output import echo
 from reslrb_cli.errors import ExitCode
 from reslrb_cli.measure.processes import abandon_all
@@ -18,7 +19,6 @@ from reslrb_cli.measure.whole_runs.session import RunsSession
 from reslrb_cli.measure.whole_runs.verdict import finals, find_best, method_records
 from reslrb_cli.records.bench import BenchStatus
 from reslrb_cli.records.convergence import SummaryRecord
-from reslrb_cli.records.lines import LineWriter
 from reslrb_cli.records.whole_runs import RunMethodRecord, RunPointRecord
 from reslrb_cli.report.whole_runs_plot import plot_runs
 from reslrb_cli.report.whole_runs_table import RunsTable, closing_sentence, notes
@@ -36,7 +36,7 @@ def measure_runs(plan: RunsPlan, json_file: Path | None, plot_file: Path | None,
             shutil.rmtree(folder, ignore_errors=True)
 
         interrupts = stack.enter_context(Interrupts(last_act=tidy))
-        writer = None if json_file is None else stack.enter_context(LineWriter(json_file))
+        writer = None if json_file is None else stack.enter_context(measured_lines(json_file, plan.variant))
         table = RunsTable([plan.method_of(case, spp).label for case, spp in plan.entries])
         spent_s = time.monotonic() - began
         session = RunsSession(plan, folder, lambda: interrupts.requested, echo, spent_s=spent_s)
