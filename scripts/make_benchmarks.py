@@ -33,6 +33,13 @@ def main(arguments: list[str]) -> int:
 
         for name in names or MEASUREMENTS:
             measure(MEASUREMENTS[name])
+    from benchmarks_page import write
+
+    try:
+        write()
+    except FileNotFoundError as error:
+        print(f"benchmarks: {error.filename} is missing; `scripts/benchmarks measure` makes it", file=sys.stderr)
+        return 1
     return 0
 
 
