@@ -7,7 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import benchmarks_tables as tables
-from benchmarks_list import CHECKED, EXPERIMENTS, MEASUREMENTS, OTHERWISE, RECORDS, ROOT, experiment_record
+from benchmarks_list import CHECKED, EXPERIMENTS, MEASUREMENTS, RECORDS, ROOT, experiment_record
 from gpu_report import gpu_section
 from paper_page import figure1_summary
 
@@ -28,11 +28,6 @@ ABOUT = {
     "stiff/plate": "roughness, and radiance",
     "stiff/wall": "73,728 texels, and one number",
 }
-ABOUT_OTHERWISE = {
-    "ptracer": "by `ptracer` under naive AD",
-    "prb": "by `prb`",
-    "correlated": "150 iterations of 16 spp, correlated samples",
-}
 
 
 class Blocks:
@@ -51,7 +46,6 @@ class Blocks:
             "adjoints": lambda: f"{self.about('adjoints')}\n\n{tables.convergence_table(self.record('adjoints'))}",
             "gradcheck": self.gradcheck,
             "experiments": self.experiments,
-            "comparisons": self.comparisons,
             "runs": self.runs,
             "gpu": lambda: gpu_section(self.folder),
             "figure1": figure1_summary,
@@ -65,16 +59,16 @@ class Blocks:
         """The record of a measurement."""
         return tables.read(self.folder / MEASUREMENTS[name].file.name)
 
-    def about(self, name: str) -> str:
-        """The command that was measured, and how long it took."""
+    def about(self, name: str, conditions: str = "") -> str:
+        """The command that was measured, how long it took, and under what conditions."""
         record = self.record(name)
-        return f"    {record.command}\n\n{record.origin['seconds']:.0f} s in all:"
+        return f"    {record.command}\n\nThis took {record.origin['seconds']:.0f} s{conditions and f'; {conditions}'}:"
 
     def machine(self) -> str:
         """What all records were measured on."""
         found = []
-        for name in MEASUREMENTS:
-            origin = self.record(name).origin
+        for file in sorted(self.folder.glob("*.jsonl")):
+            origin = tables.read(file).origin
             versions = ", ".join(f"{package} {version}" for package, version in origin["versions"].items())
             found.append(f"{origin['device']}, {origin['variant']}; {versions}; {origin['platform']}")
         return "\n".join(f"- {words}" for words in dict.fromkeys(found))
@@ -101,37 +95,37 @@ class Blocks:
     def experiments(self) -> str:
         """The README's table of whole runs."""
         head = ("experiment", "parameter RMSE, start", "end", "time", "command that prints it")
-        return tables.table(head, [self._run(name, "", ABOUT[name]) for name in EXPERIMENTS])
-
-    def comparisons(self) -> str:
-        """The same experiment in other ways."""
-        head = ("comparison", "parameter RMSE, start", "end", "time", "command that prints it")
-        return tables.table(head, [self._run("cornell_floor", how, about) for how, about in ABOUT_OTHERWISE.items()])
+        rows = []
+        for name in self._recorded():
+            record = self.record(experiment_record(name))
+            errors = [tables.run_errors(record, moment) for moment in ("initial", "final")]
+            rows.append([f"`{name}`: {ABOUT[name]}", *errors, tables.took(record), f"`{record.command}`"])
+        return tables.table(head, rows)
 
     def runs(self) -> str:
         """Time and memory of whole runs, and what a pilot chose."""
         head = ("run", "iterations", "spp", "a step, ms", "iterations in all, s", "with everything, s", "peak, MiB",
                 "estimator", "chosen by a pilot, share of the run")  # fmt: skip
         rows = []
-        for name, how in [(name, "") for name in EXPERIMENTS] + [("cornell_floor", how) for how in OTHERWISE]:
-            record = self.record(experiment_record(name, how))
+        for name in self._recorded():
+            record = self.record(experiment_record(name))
             row = record.rows[0]
             pilot = "" if row["pilot"] is None else f"{row['pilot']['label']}, {row['pilot']['share']:.1%}"
             rows.append([
-                f"`{name}`" + (f", {how}" if how else ""), str(row["iterations"]), str(row["spp"]),
+                f"`{name}`", str(row["iterations"]), str(row["spp"]),
                 tables.figure(row["step_ms"]), tables.figure(row["elapsed_s"]), f"{record.origin['seconds']:.0f}",
                 f"{row['peak_mib']:.1f}", f"`{row['estimator']}`" if row["estimator"] else "", pilot,
             ])  # fmt: skip
         return tables.table(head, rows)
 
-    def _run(self, name: str, how: str, about: str) -> list[str]:
-        record = self.record(experiment_record(name, how))
-        errors = [tables.run_errors(record, moment) for moment in ("initial", "final")]
-        title = f"`{name}` {about}" if how else f"`{name}`: {about}"
-        return [title, *errors, tables.took(record), f"`{record.command}`"]
+    def _recorded(self) -> list[str]:
+        """The experiments that have been recorded: those of many minutes may come later."""
+        return [name for name in EXPERIMENTS if (self.folder / f"{experiment_record(name)}.jsonl").exists()]
 
     def _bench(self, name: str, swept: str) -> str:
-        return f"{self.about(name)}\n\n{tables.bench_details(self.record(name), swept)}"
+        record = self.record(name)
+        about = self.about(name, tables.bench_conditions(record, swept))
+        return f"{about}\n\n{tables.bench_details(record, swept)}"
 
     def _ratios(self, name: str, swept: str) -> str:
         return tables.bench_ratios(self.record(name), swept)

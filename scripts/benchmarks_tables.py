@@ -66,6 +66,16 @@ def bench_ratios(record: Record, swept: str, what: str = "kernel_ms") -> str:
     return table([words, *map(str, values), "peak memory, MiB"], lines)
 
 
+def bench_conditions(record: Record, swept: str) -> str:
+    """What all lines of a bench have in common, but for what is swept."""
+    row = next((row for row in record.rows if row["status"] == "ok"), record.rows[0])
+    parts = [f"film {row['width']}x{row['height']}"]
+    parts += [] if swept == "spp" else [f"{row['spp']} spp"]
+    parts += [] if swept == "max_depth" else [f"depth {row['max_depth']}"]
+    parts += [f"{row['texels']} texels"] if row.get("texels") else []
+    return ", ".join(parts)
+
+
 def bench_details(record: Record, swept: str) -> str:
     """Every line of a bench: times with their least and greatest, and memory."""
     head = ("depth" if swept == "max_depth" else swept, "", "step, ms", "kernels, ms", "first step, s", "peak, MiB",
@@ -117,7 +127,10 @@ def run_errors(record: Record, moment: str) -> str:
     errors = record.rows[0]["parameter_rmse"]
     if len(errors) == 1:
         return figure(next(iter(errors.values()))[moment])
-    return "; ".join(f"{key.partition('.')[0]} {figure(of[moment])}" for key, of in errors.items())
+    names = [key.split(".")[0] for key in errors]
+    if len(set(names)) < len(names):  # several of one object
+        names = [".".join(key.split(".")[:2]) for key in errors]
+    return "; ".join(f"{name} {figure(of[moment])}" for name, of in zip(names, errors.values(), strict=True))
 
 
 def took(record: Record) -> str:
