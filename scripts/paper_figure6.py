@@ -33,12 +33,12 @@ def main(arguments: list[str]) -> int:
     try:
         options.folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(prefix="reslrb-figure6-") as folder:
-            source = room_config(options.room, Path(folder), []).source
-            command = [sys.executable, "-m", "reslrb_cli", "bench", str(source), "--set", "integrator.rr_depth=100000"]
-            file = options.folder / "figure6.jsonl"
+            room_config(options.room, Path(folder), [])
+            command = [sys.executable, "-m", "reslrb_cli", "bench", "room.yaml", "--set", "integrator.rr_depth=100000"]
+            file = options.folder.absolute() / "figure6.jsonl"
             chosen = [] if any(word.partition("=")[0] == "--values" for word in others) else [*DEPTHS]
             command += [*BENCH.split(), *chosen, "--json", str(file), *others]
-            code = subprocess.run(command, check=False).returncode
+            code = subprocess.run(command, cwd=folder, check=False).returncode  # its pictures name room.yaml alone
         if file.exists():
             _name_the_command(file, others)
         return code

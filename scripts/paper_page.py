@@ -15,6 +15,8 @@ ROOT = Path(__file__).resolve().parent.parent
 RECORDS = ROOT / "docs" / "paper"
 #: Published for Figure 6, on an RTX 5080: milliseconds of a step by naive AD and by ResLRB, by depth.
 PUBLISHED_MS: dict[int, tuple[int | None, int | None]] = {4: (63, 93), 16: (260, 132), 128: (None, 197)}
+#: The depth at which both take the same time in the paper.
+PARITY = 8
 TEMPLATE, PLACE = "page.md", re.compile(r"^\{\{ (\w+) \}\}$", re.MULTILINE)
 
 
@@ -42,7 +44,10 @@ def _figure1(folder: Path) -> str:
 def _figure5(folder: Path) -> str:
     record = json.loads((folder / "figure5.json").read_text(encoding="utf-8"))
     width, height = record["film"]
-    about = f"Film {width}x{height}, paths of length {record['max_depth']}:"
+    about = f"Film {width}x{height}, paths of length {record['max_depth']}"
+    if record.get("left_out") is not None:
+        about += f"; dL/dI is 0 in {record['left_out']:.1%} of the pixels"
+    about += ":"
     means = "Means of the gradients, compared in standard errors; the exact estimators at equal seeds, in relative L2:"
     compared = _comparisons(record["comparisons"])
     return "\n\n".join([_command(record, "figure5 ROOM"), about, _gradients(record), means, compared])
@@ -61,11 +66,12 @@ def _figure6(folder: Path) -> str:
     names = list(dict.fromkeys(map(tables.name_of, rows)))
     found = {(tables.name_of(row), row["max_depth"]): row for row in rows}
     cells += [[name, *(_cell(found.get((name, depth))) for depth in depths)] for name in names]
-    over = [[name, *(_over(found, name, depth) for depth in depths)] for name in names[1:]]
+    over = [["published", *(_published_ratio(depth) for depth in depths)]]
+    over += [[name, *(_over(found, name, depth) for depth in depths)] for name in names[1:]]
     origins = list(dict.fromkeys(_origin(line) for line in lines if line.get("kind") == "origin"))
     head = ["depth", *map(str, depths)]
     about = f"Film {width}x{height}, {spp} spp, no roulette; milliseconds of a step, and MiB of arrays at their most:"
-    ratios = f"Kernel times over those of {names[0]}:"
+    ratios = f"A step over one of naive AD ({names[0]}):"
     return "\n\n".join([*origins, about, tables.table(head, cells), ratios, tables.table(head, over)])
 
 
@@ -74,8 +80,15 @@ def _over(found: Mapping[tuple[str, int], Mapping[str, Any]], name: str, depth: 
     pair = [found.get((which, depth)) for which in (name, first)]
     if any(row is None or row["status"] != "ok" for row in pair):
         return ""
-    ours, theirs = (row["kernel_ms"]["median"] for row in pair if row is not None)
+    ours, theirs = (row["step_ms"]["median"] for row in pair if row is not None)
     return f"{ours / theirs:.2f}"
+
+
+def _published_ratio(depth: int) -> str:
+    naive, ours = PUBLISHED_MS.get(depth, (None, None))
+    if depth == PARITY:
+        return "about 1"
+    return "" if naive is None or ours is None else f"{ours / naive:.2f}"
 
 
 def _command(record: Mapping[str, Any], figure: str) -> str:
@@ -105,8 +118,10 @@ def _comparisons(rows: Sequence[Mapping[str, Any]]) -> str:
                  (row["z_max"], row["z_max_limit"], ".2f")]  # fmt: skip
         cells = ["" if value is None else format(value, form) + ("" if limit is None else f" ({limit:{form}})")
                  for value, limit, form in pairs]  # fmt: skip
-        lines.append([f"{row['gradient']} - {row['reference']}", *cells, str(row["verdict"]).replace("_", " ")])
-    head = ["compared", "relative L2 (limit)", "z rms (limit)", "max abs z (limit)", "verdict"]
+        detectable = "" if row["detectable"] is None else tables.figure(row["detectable"], 2)
+        verdict = str(row["verdict"]).replace("_", " ")
+        lines.append([f"{row['gradient']} - {row['reference']}", *cells, detectable, verdict])
+    head = ["compared", "relative L2 (limit)", "z rms (limit)", "max abs z (limit)", "a fault seen", "verdict"]
     return tables.table(head, lines)
 
 
