@@ -35,7 +35,7 @@ def figure1_summary(folder: Path = RECORDS) -> str:
 def _figure1(folder: Path) -> str:
     record = json.loads((folder / "figure1.json").read_text(encoding="utf-8"))
     limit = record["plan"]["limit"] / 2**30
-    about = f"Each process under {limit:g} GiB of address space; gradients of one seed, and the noise of all:"
+    about = f"Each process under {limit:g} GiB of address space:"
     means = "Means of the gradients, compared in standard errors:"
     compared = _comparisons(record["comparisons"])
     return "\n\n".join([_command(record, "figure1"), about, _gradients(record), means, compared, _fall(record)])
