@@ -52,8 +52,11 @@ class Blocks:
         }
 
     def make(self, name: str) -> str:
-        """A piece, in Markdown. Raises KeyError where there is none of that name, OSError where a record is missing."""
-        return self.makers[name]()
+        """A piece, in Markdown; where nothing of it is recorded, a line that says so. Raises KeyError, OSError."""
+        try:
+            return self.makers[name]()
+        except FileNotFoundError as error:
+            return f"Not recorded so far; `scripts/benchmarks measure {Path(error.filename).stem}` does that."
 
     def record(self, name: str) -> tables.Record:
         """The record of a measurement."""
@@ -87,6 +90,8 @@ class Blocks:
         )
         rows = []
         for name in CHECKED:
+            if not (self.folder / f"gradcheck_{name}.jsonl").exists():
+                continue
             record = self.record(f"gradcheck_{name}")
             line = tables.gradcheck_line(record)
             rows.append([f"`{record.command}`", *line, f"{record.origin['seconds']:.0f}"])
@@ -96,7 +101,7 @@ class Blocks:
         """The README's table of whole runs."""
         head = ("experiment", "parameter RMSE, start", "end", "time", "command that prints it")
         rows = []
-        for name in self._recorded():
+        for name in self.recorded():
             record = self.record(experiment_record(name))
             errors = [tables.run_errors(record, moment) for moment in ("initial", "final")]
             rows.append([f"`{name}`: {ABOUT[name]}", *errors, tables.took(record), f"`{record.command}`"])
@@ -107,7 +112,7 @@ class Blocks:
         head = ("run", "iterations", "spp", "a step, ms", "iterations in all, s", "with everything, s", "peak, MiB",
                 "estimator", "chosen by a pilot, share of the run")  # fmt: skip
         rows = []
-        for name in self._recorded():
+        for name in self.recorded():
             record = self.record(experiment_record(name))
             row = record.rows[0]
             pilot = "" if row["pilot"] is None else f"{row['pilot']['label']}, {row['pilot']['share']:.1%}"
@@ -118,7 +123,7 @@ class Blocks:
             ])  # fmt: skip
         return tables.table(head, rows)
 
-    def _recorded(self) -> list[str]:
+    def recorded(self) -> list[str]:
         """The experiments that have been recorded: those of many minutes may come later."""
         return [name for name in EXPERIMENTS if (self.folder / f"{experiment_record(name)}.jsonl").exists()]
 
@@ -138,7 +143,9 @@ def page(blocks: Blocks) -> str:
 
 
 def readme(blocks: Blocks, text: str) -> str:
-    """The README with its tables made anew."""
+    """The README with its tables made anew, and without rows that were typed before there was a record."""
+    for name in blocks.recorded():
+        text = re.sub(rf"^\| `{re.escape(name)}`: .*\n", "", text, flags=re.MULTILINE)
 
     def made(match: re.Match[str]) -> str:
         return f"<!-- benchmarks: {match[1]} -->\n{blocks.make(match[1])}\n<!-- end -->"
@@ -147,7 +154,7 @@ def readme(blocks: Blocks, text: str) -> str:
 
 
 def write() -> None:
-    """Write the page and the README's tables. Raises OSError, where a record is missing too."""
+    """Write the page and the README's tables. Raises OSError."""
     blocks = Blocks()
     PAGE.write_text(page(blocks), encoding="utf-8")
     README.write_text(readme(blocks, README.read_text(encoding="utf-8")), encoding="utf-8")
