@@ -43,7 +43,6 @@ class Blocks:
             "spp_ratios": lambda: self._ratios("spp", "spp"),
             "moving": lambda: self._bench("moving", "max_depth"),
             "moving_ratios": lambda: self._ratios("moving", "max_depth"),
-            "adjoints": lambda: f"{self.about('adjoints')}\n\n{tables.convergence_table(self.record('adjoints'))}",
             "gradcheck": self.gradcheck,
             "experiments": self.experiments,
             "runs": self.runs,
@@ -78,23 +77,13 @@ class Blocks:
 
     def gradcheck(self) -> str:
         """A line for each scene whose gradients were compared."""
-        head = (
-            "command",
-            "seeds",
-            "hold",
-            "fail",
-            "z rms (limit)",
-            "max abs z (limit)",
-            "equal seeds, relative L2",
-            "s",
-        )
+        head = ("command", "seeds", "hold", "fail", "z rms (limit)", "max abs z (limit)", "equal seeds, relative L2")
         rows = []
         for name in CHECKED:
             if not (self.folder / f"gradcheck_{name}.jsonl").exists():
                 continue
             record = self.record(f"gradcheck_{name}")
-            line = tables.gradcheck_line(record)
-            rows.append([f"`{record.command}`", *line, f"{record.origin['seconds']:.0f}"])
+            rows.append([f"`{record.command}`", *tables.gradcheck_line(record)])
         return tables.table(head, rows)
 
     def experiments(self) -> str:

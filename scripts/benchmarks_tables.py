@@ -92,23 +92,6 @@ def bench_details(record: Record, swept: str) -> str:
     return table(head, lines)
 
 
-def convergence_table(record: Record) -> str:
-    """A line for each method, of all parameters together."""
-    head = ("method", "a step, ms", "its relative error", "slope", "efficiency", "bias, z (limit)", "to 10 %", "to 3 %",
-            "to 1 %")  # fmt: skip
-    methods = [row for row in record.rows if row["kind"] == "method"]
-    keys = {row["parameter"] for row in methods}
-    lines = []
-    for row in (row for row in methods if row["parameter"] == ("all" if "all" in keys else next(iter(keys)))):
-        name = f"`{row['label']}`" + (", biased" if row["biased"] else "")
-        bias = "" if row["bias_z"] is None else f"{abs(row['bias_z']):.1f} ({row['bias_z_limit']:.1f})"
-        seconds = [_seconds(row, share) for share in ("0.1", "0.03", "0.01")]
-        step = "" if row["step_s"] is None else figure(1e3 * row["step_s"])
-        error, slope = figure(row["relative_rmse"]), _range(row["slope"])
-        lines.append([name, step, error, slope, _range(row["efficiency"]), bias, *seconds])
-    return table(head, lines)
-
-
 def gradcheck_line(record: Record) -> list[str]:
     """What all comparisons of a gradcheck come to: verdicts, and the largest figures beside their limits."""
     rows = [row for row in record.rows if "verdict" in row]
@@ -160,14 +143,3 @@ def _peaks(rows: Sequence[Row]) -> str:
 
 def _spread(times: Row) -> str:
     return f"{times['median']:.1f} [{times['min']:.1f}, {times['max']:.1f}]"
-
-
-def _range(value: Row | None) -> str:
-    return "" if value is None else f"{figure(value['value'])} [{figure(value['low'])}, {figure(value['high'])}]"
-
-
-def _seconds(row: Row, share: str) -> str:
-    value = row["seconds_to"].get(share)
-    if value is None:
-        return "never" if row["biased"] else ""
-    return f"{figure(value, 2)} s" + (" \\*" if share in row["extrapolated"] else "")
