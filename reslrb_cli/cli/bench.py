@@ -166,6 +166,7 @@ def _run(sweep: Sweep, book: Book, json_file: Path | None, began: float) -> tupl
     """Measure, print and write; returns all results, and whether the user interrupted."""
     from reslrb_cli.cli.interrupts import Interrupts
     from reslrb_cli.cli.keeping import Keeper
+    from reslrb_cli.cli.measured import origin_of
     from reslrb_cli.measure.bench import bench
     from reslrb_cli.measure.processes import abandon_all
     from reslrb_cli.report.bench_table import table_head, table_line
@@ -181,7 +182,8 @@ def _run(sweep: Sweep, book: Book, json_file: Path | None, began: float) -> tupl
     def under_way() -> list[BenchRecord]:
         return [row.record for row in book.results(set(book.runs) - book.done)]
 
-    keeper = Keeper(json_file, lambda: [row.record for row in book.results(book.done)], under_way, book.kept)
+    origin = origin_of(sweep.variant)
+    keeper = Keeper(json_file, origin, lambda: [row.record for row in book.results(book.done)], under_way, book.kept)
     with Interrupts(last_act=abandon_all) as interrupts:
         echo(table_head(labels, sweep.swept))
         show(book.results(book.done))

@@ -173,6 +173,7 @@ def _run(
 
     from reslrb_cli.cli.interrupts import Interrupts
     from reslrb_cli.cli.keeping import Keeper
+    from reslrb_cli.cli.measured import origin_of
     from reslrb_cli.measure.convergence.judgement import Judgement
     from reslrb_cli.measure.convergence.members import Role
     from reslrb_cli.measure.convergence.session import Session
@@ -197,7 +198,8 @@ def _run(
         def lines(now: Results) -> list[Line]:
             return [*now.points, *now.methods, *now.references, SummaryRecord(closing_sentence(now.methods))]
 
-        keeper = Keeper(json_file, lambda: [], lambda: lines(Judgement(session).results()), session.keep)
+        origin = origin_of(plan.variant)
+        keeper = Keeper(json_file, origin, lambda: [], lambda: lines(Judgement(session).results()), session.keep)
         table: Table | None = None
         for rounds in session.run():
             keeper.refresh()

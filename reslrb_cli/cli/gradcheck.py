@@ -112,7 +112,7 @@ def command(
     if missing:
         variant = set_variant(config.variant)
         echo(f"{device_name(variant)}, {variant}")
-        return run_missing(config, budget, seeds, spp, directions, json_file)
+        return run_missing(config, variant, budget, seeds, spp, directions, json_file)
     listed = all_estimators(config) if estimators is None else parse_estimators(estimators)
     _check_folder(folder)
     settings = Settings(config, listed, budget, seeds, spp, estimators is not None, time.monotonic() - began)
@@ -125,7 +125,7 @@ def command(
     check = Gradcheck(settings, earlier=earlier)
     echo(f"{device_name(variant)}, {variant}; {allowance(budget, seeds, 'seed')}")
     echo(check.conditions())
-    records, interrupted = _run(check, to_keep, json_file, folder)
+    records, interrupted = _run(check, variant, to_keep, json_file, folder)
     _finish(records, markdown_file)
     if interrupted:
         return ExitCode.INTERRUPTED
@@ -135,17 +135,18 @@ def command(
 
 
 def _run(
-    check: Gradcheck, to_keep: dict[str, Any], json_file: Path | None, folder: Path | None
+    check: Gradcheck, variant: str, to_keep: dict[str, Any], json_file: Path | None, folder: Path | None
 ) -> tuple[list[GradcheckRecord], bool]:
     """Measure, print and write; returns all records, and whether the user interrupted."""
     from reslrb_cli.cli.interrupts import Interrupts
     from reslrb_cli.cli.keeping import Keeper
+    from reslrb_cli.cli.measured import origin_of
     from reslrb_cli.records.gradcheck import Verdict
     from reslrb_cli.report.gradcheck_table import Table
 
     records: list[GradcheckRecord] = []
     drawn = False
-    keeper = Keeper(json_file, lambda: records, lambda: [], lambda: check.kept(to_keep))
+    keeper = Keeper(json_file, origin_of(variant), lambda: records, lambda: [], lambda: check.kept(to_keep))
     with Interrupts() as interrupts:
         table = Table(check.expected())
         echo(table.head())

@@ -16,13 +16,14 @@ from reslrb_cli.records.samples import Kept, are_kept, read_samples, samples_fil
 class Keeper:
     """Keeps a JSON file, and beside it what can be gone on from, so that a process that is killed loses seconds.
 
-    `final` has the lines that no later one changes, `provisional` the others, as of now; `kept` what a later session
-    needs, None where there is nothing yet. Where no file is asked for nothing is done.
+    `origin` is the first line, `final` has the other ones that no later one changes, `provisional` the rest, as of now;
+    `kept` what a later session needs, None where there is nothing yet. Where no file is asked for nothing is done.
     """
 
     def __init__(
         self,
         json_file: Path | None,
+        origin: Line,
         final: Callable[[], Sequence[Line]],
         provisional: Callable[[], Sequence[Line]],
         kept: Callable[[], Kept | None],
@@ -32,7 +33,7 @@ class Keeper:
         if json_file is not None and self._file is not None and not self._file.is_stream:
             self._samples = samples_file(json_file)
             remove_parts_of(self._samples)
-        self._final, self._provisional, self._kept = final, provisional, kept
+        self._origin, self._final, self._provisional, self._kept = origin, final, provisional, kept
         self._live = LivePage(self._save, "the file of --json")
 
     def refresh(self) -> None:
@@ -40,7 +41,7 @@ class Keeper:
         if self._file is None:
             return
         if self._file.is_stream:  # which has lines as they come
-            self._file.write(self._final())
+            self._file.write([self._origin, *self._final()])
         else:
             self._live.refresh()
 
@@ -64,7 +65,7 @@ class Keeper:
                 write_samples(self._samples, *kept)
             else:  # what may lie there is not of these lines
                 self._samples.unlink(missing_ok=True)
-        file.write(final, provisional)
+        file.write([self._origin, *final], provisional)
         return fits
 
 

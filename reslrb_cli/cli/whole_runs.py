@@ -12,6 +12,7 @@ from pathlib import Path
 from reslrb_cli.cli.experiment import allowance
 from reslrb_cli.cli.interrupts import Interrupts
 from reslrb_cli.cli.keeping import Keeper, read_earlier
+from reslrb_cli.cli.measured import origin_of
 from reslrb_cli.cli.output import echo
 from reslrb_cli.errors import ExitCode
 from reslrb_cli.measure.earlier import Earlier
@@ -69,7 +70,7 @@ def measure_runs(
             records, sentence = outcome()
             return [*records, SummaryRecord(sentence)]
 
-        keeper = Keeper(json_file, lambda: points, outcome_lines, session.keep)
+        keeper = Keeper(json_file, origin_of(plan.variant), lambda: points, outcome_lines, session.keep)
         headed = False
         for point in session.run():
             if not headed:

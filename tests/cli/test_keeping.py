@@ -22,7 +22,10 @@ def lines(*words: str) -> list[SummaryRecord]:
 
 
 def read(path: Path) -> list[str]:
-    return [json.loads(line)["line"] for line in path.read_text().splitlines()]
+    """What stands in the lines after the first, which says what measured."""
+    origin, *others = [json.loads(line) for line in path.read_text().splitlines()]
+    assert origin == {"kind": "summary", "line": "here"}
+    return [line["line"] for line in others]
 
 
 class Measurement:
@@ -30,7 +33,7 @@ class Measurement:
 
     def __init__(self, file: Path) -> None:
         self.final, self.now, self.rows = lines(), lines(), np.zeros(0)
-        self.keeper = Keeper(file, lambda: self.final, lambda: self.now, self.kept)
+        self.keeper = Keeper(file, *lines("here"), lambda: self.final, lambda: self.now, self.kept)
 
     def kept(self) -> samples.Kept | None:
         return ({"rows": len(self.rows)}, {"rows": self.rows}) if len(self.rows) else None
@@ -123,6 +126,6 @@ def test_a_pipe_has_each_line_once_as_it_comes(tmp_path: Path) -> None:
 
 def test_what_a_link_points_to_is_written(tmp_path: Path) -> None:
     (tmp_path / "link").symlink_to(tmp_path / "c.jsonl")
-    LineFile(tmp_path / "link").write(lines("a"))
+    LineFile(tmp_path / "link").write(lines("here", "a"))
     assert (tmp_path / "link").is_symlink()
     assert read(tmp_path / "c.jsonl") == ["a"]
