@@ -148,10 +148,11 @@ def test_a_loss_that_is_nothing_but_noise_is_no_failure(capsys):
 
 
 def test_a_run_that_is_not_done_says_so_everywhere(capsys):
-    last, out, results = optimize(capsys, "run.adjoint=independent", "run.spp=128")
+    sets = ["run.adjoint=independent", "run.spp=128", "optimizer.learning_rate=0.002"]
+    last, out, results = optimize(capsys, *sets)
     about = results["certainty"]["parameters"][KEY]
     assert about["verdict"] == "still moving"
-    assert 0.1 < about["shares"]["still moving"] < 1
+    assert 0.5 < about["shares"]["still moving"] < 1
     assert f"; not converged, still moving: {KEY}; look at " in last
     assert "spread" in out.splitlines()[0]
     assert re.search(r"\+- 0\.\d+ +still moving \(\d\d", out.splitlines()[1])
@@ -163,8 +164,8 @@ def test_a_run_that_is_not_done_says_so_everywhere(capsys):
     assert results["certainty"]["gradients"] == 5
     # A run that says nothing of it ends with the same values.
     values = np.load("runs/box/parameters/parameters.npz")[KEY]
-    optimize(capsys, "run.adjoint=independent", "run.spp=128", "run.certainty=false")
-    np.testing.assert_array_equal(np.load("runs/box/parameters/parameters.npz")[KEY], values)
+    optimize(capsys, *sets, "run.certainty=false")
+    np.testing.assert_allclose(np.load("runs/box/parameters/parameters.npz")[KEY], values, rtol=1e-5)
     assert '<th scope="col">verdict</th>' not in Path("runs/box/report.html").read_text()
 
 

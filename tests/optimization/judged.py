@@ -113,6 +113,10 @@ def run(folder: Path, toy: Toy, seed: int = 0) -> Outcome:
     certainty = Certainty(problem)
     for last in optimize(problem):
         certainty.see(last.iteration + 1)
+    before = {key: value.copy() for key, value in problem.values().items()}
     found = certainty.measure(last.iteration + 1, last.elapsed_s, lambda: False)
     assert found is not None
+    for key, value in problem.values().items():  # it measures, and leaves all as it was
+        np.testing.assert_array_equal(value, before[key])
+        assert not np.any(np.array(problem.optimizer.gradient(key)))
     return Outcome(found, {key: value.astype(np.float64) for key, value in problem.values().items()}, true)
