@@ -40,9 +40,7 @@ def command(run: Path, overrides: tuple[str, ...], output: Path) -> None:
     from reslrb_cli.scene.exporting import export_scene
     from reslrb_cli.scene.load import load_described
 
-    scene, description = load_described(
-        config.scene.file, config.scene.options, config.scene.strict, size=config.scene.size
-    )
+    scene, description = load_described(config.scene.file, config.scene.options, config.scene.strict, config.scene.size)
     selection = select_parameters(scene, config.parameters, config.source)
     integrator, why = choose_integrator(config, scene, selection.params)
     try:

@@ -161,7 +161,7 @@ def make_targets(problem: Problem, say: Callable[[str], None]) -> None:
 
 def load_configured(config: Config) -> mi.Scene:
     """Load the scene that `config` names. Raises ConfigError."""
-    return load_scene(config.scene.file, config.scene.options, config.scene.strict, size=config.scene.size)
+    return load_scene(config.scene.file, config.scene.options, config.scene.strict, config.scene.size)
 
 
 def load_for_rendering(config: Config, initial: bool) -> tuple[Any, list[int], Any, int | None]:

@@ -32,7 +32,6 @@ def load_scene(
     file: Path,
     options: Mapping[str, Any] | None = None,
     strict: bool = False,
-    *,
     size: tuple[int, int] | None = None,
 ) -> mi.Scene:
     """Load a Mitsuba scene (XML, versions 0.4 to 3); a variant must be set.
@@ -47,14 +46,13 @@ def load_scene(
     Raises ConfigError, located in the scene file, where it is missing or wrong, has nothing in it, or no light. Warns,
     too, of a scene that is too far from the origin, or too small, and of glass that is too thin.
     """
-    return load_described(file, options, strict, size=size)[0]
+    return load_described(file, options, strict, size)[0]
 
 
 def load_described(
     file: Path,
     options: Mapping[str, Any] | None = None,
     strict: bool = False,
-    *,
     size: tuple[int, int] | None = None,
 ) -> tuple[mi.Scene, Description]:
     """The same, and the description that the scene was built from, of which Mitsuba has a use for every element."""
