@@ -18,7 +18,7 @@ from reslrb_cli.cli.live import LivePage
 from reslrb_cli.cli.telling import describe
 from reslrb_cli.errors import NonFinite
 from reslrb_cli.optimization import Problem, optimize
-from reslrb_cli.optimization.certainty import Certainty, CertaintyRecord
+from reslrb_cli.optimization.certainty import LEAST_ITERATIONS, Certainty, CertaintyRecord
 from reslrb_cli.optimization.nonfinite import Findings
 from reslrb_cli.optimization.rendering import saved_spp
 from reslrb_cli.optimization.results import Results
@@ -208,7 +208,7 @@ class Recording:
 
     def _note_certainty(self) -> None:
         """Add to the results how certain they are. The run is what it is without that."""
-        if self.last is None or not self.problem.config.run.certainty:
+        if self.last is None or self.done < LEAST_ITERATIONS or not self.problem.config.run.certainty:
             return
         logger.info("measuring how certain the values are")
         try:

@@ -97,10 +97,11 @@ def test_rendering_a_run_is_rendering_what_it_recovered(folder: Path) -> None:
     expected = reslrb("render", folder / "tiny.yaml", "--set", f"parameters={by_hand}", *common, folder / "a.exr")
     assert expected.exit_code == 0, expected.output
     assert reslrb("render", "--run", folder / "runs/tiny", *common, folder / "b.exr").exit_code == 0
-    assert np.array_equal(read_exr(folder / "a.exr"), read_exr(folder / "b.exr"))
+    # Of equal samples, whose sum a CPU takes in any order.
+    assert np.allclose(read_exr(folder / "a.exr"), read_exr(folder / "b.exr"), rtol=1e-5)
     initial = reslrb("render", folder / "runs/tiny/config.yaml", *common, folder / "c.exr")
     assert initial.exit_code == 0
-    assert not np.array_equal(read_exr(folder / "a.exr"), read_exr(folder / "c.exr"))
+    assert not np.allclose(read_exr(folder / "a.exr"), read_exr(folder / "c.exr"), rtol=1e-2)
 
 
 def test_mitsuba_renders_what_was_exported_as_the_run_does(folder: Path) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from reslrb_cli.optimization.certainty.measuring import Certainty
+from reslrb_cli.optimization.certainty.measuring import LEAST_ITERATIONS, Certainty
 from reslrb_cli.optimization.certainty.records import CertaintyRecord
 
-__all__ = ["Certainty", "CertaintyRecord"]
+__all__ = ["LEAST_ITERATIONS", "Certainty", "CertaintyRecord"]

@@ -39,7 +39,7 @@ STEP = 0.05
 RECENT = 0.2
 #: Where curvature takes longer than this share of the run's time in iterations, and than so many of them, the rest is
 #: left out.
-SHARE, HANDFUL = 0.1, 20
+SHARE, MOST_STEPS = 0.25, 50
 _PURPOSE = "certainty"
 
 
@@ -91,7 +91,7 @@ class Certainty:
                         rows[key].append(row.astype(np.float64))
                 compiled_ms += times.codegen_ms
             gradients = {key: np.array(samples) for key, samples in rows.items()}
-            budget = _Budget(max(SHARE * elapsed_s, HANDFUL * elapsed_s / iterations), stop)
+            budget = _Budget(max(SHARE * elapsed_s, MOST_STEPS * elapsed_s / iterations), stop)
             most = max(LEAST_CHANGES, iterations // ITERATIONS_A_CHANGE)
             with clock.step() as times:
                 curvature = self._curvature()
