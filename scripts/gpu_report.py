@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 ROOT = Path(__file__).resolve().parent.parent
-PAGE = "docs/benchmarks.md"
-BEGIN, END = "<!-- gpu_check: begin -->", "<!-- gpu_check: end -->"
+RECORDS, FILE_NAME = ROOT / "docs" / "benchmarks", "gpu.json"
+#: The parts whose results the section shows.
+SHOWN = ("steps", "figure 6")
 STEPS_HEAD = [
     "Single steps. Thread-local memory: bytes of one thread as its kernel declares them, and by what the device's free",
     "memory fell beyond what arrays take (code is in it too).",
@@ -83,12 +85,18 @@ def _cell(row: dict[str, Any]) -> str:
     return f"{row['kernel_ms']['median']:.2f}, {row['peak_mib']:.1f}"
 
 
-def record(text: str, page: Path = ROOT / PAGE) -> None:
-    """Put the section between its marks in the page, at its end where there are none."""
-    old = page.read_text(encoding="utf-8")
-    block = f"{BEGIN}\n{text}{END}\n"
-    if BEGIN in old and END in old:
-        before, after = old[: old.index(BEGIN)], old[old.index(END) + len(END) :].lstrip("\n")
-        page.write_text(before + block + after, encoding="utf-8")
-    else:
-        page.write_text(old.rstrip("\n") + "\n\n" + block, encoding="utf-8")
+def record(found: dict[str, Any], folder: Path = RECORDS) -> None:
+    """Keep what the section needs of what was found, for `scripts/benchmarks write`."""
+    parts = [
+        part | {"output": [], "results": part["results"] if part["name"] in SHOWN else None} for part in found["parts"]
+    ]
+    text = json.dumps(found | {"parts": parts}, indent=1) + "\n"
+    (folder / FILE_NAME).write_text(text, encoding="utf-8")
+
+
+def gpu_section(folder: Path = RECORDS) -> str:
+    """The section from the record that is kept; where there is none, a line that says so."""
+    file = folder / FILE_NAME
+    if not file.exists():
+        return "No figure on this page is from a GPU so far."
+    return section(json.loads(file.read_text(encoding="utf-8"))).rstrip("\n")

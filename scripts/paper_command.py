@@ -12,8 +12,11 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+from reslrb_cli.backend.device import device_name
+from reslrb_cli.backend.variant import choose
 from reslrb_cli.errors import ExitCode, ReslrbError, one_line
 from reslrb_cli.measure.processes import Ended
+from reslrb_cli.records.origin import Origin
 
 ROOT = Path(__file__).resolve().parent.parent
 #: Measures, given the options, a folder that is removed afterwards, and what tells the user of a line.
@@ -57,7 +60,8 @@ def run(name: str, parser: argparse.ArgumentParser, arguments: list[str], least:
         print(text)
         (options.folder / f"{name}.txt").write_text(text + "\n", encoding="utf-8")
         (options.folder / f"{name}.json").write_text(
-            json.dumps(report.to_json(result), indent=1) + "\n", encoding="utf-8"
+            json.dumps({"origin": _origin(name, options, result)} | report.to_json(result), indent=1) + "\n",
+            encoding="utf-8",
         )
         report.draw(result, options.folder / f"{name}.png")
         say(f"{name}.png, {name}.txt and {name}.json are in {options.folder}")
@@ -67,3 +71,11 @@ def run(name: str, parser: argparse.ArgumentParser, arguments: list[str], least:
         print(one_line(f"{name}: {error}"), file=sys.stderr)
         return int(getattr(error, "exit_code", ExitCode.CHECK_FAILED))
     return ExitCode.DONE if result.holds else ExitCode.CHECK_FAILED
+
+
+def _origin(name: str, options: argparse.Namespace, result: Any) -> dict[str, Any]:
+    """What measured, and the command that does it again, in which the room has no user's path."""
+    variant, _ = choose(result.config.variant)
+    words = ["scripts/paper", name, *(["ROOM"] if hasattr(options, "room") else []), "--seeds", str(options.seeds)]
+    words += [word for setting in options.sets for word in ("--set", setting)]
+    return json.loads(Origin(device_name(variant), variant, words).to_json())  # type: ignore[no-any-return]

@@ -2,13 +2,14 @@
 """Figure 6: time and peak memory of a gradient step against path depth, in the Grey & White Room.
 
 Runs `reslrb bench` on the experiment of Figure 5, without roulette, and writes figure6.jsonl and figure6.png. Further
-options go to `reslrb bench`.
+options go to `reslrb bench`; depths are 2, 4, 8, ... 128, or those of `--values`.
 
     scripts/paper figure6 ROOM [-o FOLDER] [OPTIONS OF BENCH]
 """
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
 import tempfile
@@ -20,7 +21,8 @@ from paper_room import ROOM, room_config
 from reslrb_cli.errors import ReslrbError, one_line
 
 #: What is asked of `reslrb bench`, unless further options say otherwise.
-BENCH = "--max-depth 128 --budget 300 --integrators ptracer,reslrb:reservoir,reslrb:stack"
+BENCH = "--budget 300 --integrators ptracer,reslrb:reservoir,reslrb:stack"
+DEPTHS = "--max-depth", "128"
 
 
 def main(arguments: list[str]) -> int:
@@ -31,13 +33,25 @@ def main(arguments: list[str]) -> int:
     try:
         options.folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(prefix="reslrb-figure6-") as folder:
-            source = room_config(options.room, Path(folder), []).source
-            command = [sys.executable, "-m", "reslrb_cli", "bench", str(source), "--set", "integrator.rr_depth=100000"]
-            command += [*BENCH.split(), "--json", str(options.folder / "figure6.jsonl"), *others]
-            return subprocess.run(command, check=False).returncode
+            room_config(options.room, Path(folder), [])
+            command = [sys.executable, "-m", "reslrb_cli", "bench", "room.yaml", "--set", "integrator.rr_depth=100000"]
+            file = options.folder.absolute() / "figure6.jsonl"
+            chosen = [] if any(word.partition("=")[0] == "--values" for word in others) else [*DEPTHS]
+            command += [*BENCH.split(), *chosen, "--json", str(file), *others]
+            code = subprocess.run(command, cwd=folder, check=False).returncode  # its pictures name room.yaml alone
+        if file.exists():
+            _name_the_command(file, others)
+        return code
     except (ReslrbError, OSError) as error:
         print(one_line(f"figure6: {error}"), file=sys.stderr)
         return int(getattr(error, "exit_code", 1))
+
+
+def _name_the_command(file: Path, others: list[str]) -> None:
+    """Have the record say what does it again: `reslrb bench` saw an experiment that is gone now."""
+    first, _, rest = file.read_text(encoding="utf-8").partition("\n")
+    origin = json.loads(first) | {"command": ["scripts/paper", "figure6", "ROOM", *others]}
+    file.write_text(f"{json.dumps(origin)}\n{rest}", encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -11,6 +11,7 @@ from pathlib import Path
 import gpu_check as check
 import gpu_steps
 import pytest
+from gpu_report import gpu_section
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -77,12 +78,13 @@ def test_steps_that_compile_or_grow_are_problems() -> None:
     assert "recorded" in gpu_steps._problems([row(4, 10.0, [0, 0, 0], float("nan"))])[0]
 
 
-def test_the_section_replaces_itself(tmp_path: Path) -> None:
-    page = tmp_path / "benchmarks.md"
-    page.write_text("# Benchmarks\n\nold text\n")
-    check.record("### One\n", page)
-    check.record("### Two\n", page)
-    text = page.read_text()
-    assert text.startswith("# Benchmarks\n\nold text\n")
-    assert "### Two" in text
-    assert "### One" not in text
+def test_the_section_is_made_of_what_was_kept_last(tmp_path: Path) -> None:
+    assert gpu_section(tmp_path).startswith("No figure")
+    for device in ("One", "Two"):
+        part = {"name": "doctor", "status": "failed", "seconds": 3.0, "reason": "why", "results": [1], "output": ["x"]}
+        found = {"variant": "cuda_ad_rgb", "device": device, "quick": False, "parts": [part]}
+        check.record(found, tmp_path)
+    assert gpu_section(tmp_path) == check.section(found).rstrip()
+    assert "### Two" in gpu_section(tmp_path)
+    assert "| doctor | failed: why | 3 |" in gpu_section(tmp_path)
+    assert '"x"' not in (tmp_path / "gpu.json").read_text()

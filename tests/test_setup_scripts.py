@@ -12,7 +12,8 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
-SCRIPTS = ["scripts/setup", "scripts/demo", "scripts/test", "scripts/paper", "scripts/gpu_check", ".ci/run"]
+SCRIPTS = ["scripts/setup", "scripts/demo", "scripts/test", "scripts/paper", "scripts/benchmarks", "scripts/gpu_check",
+           ".ci/run"]  # fmt: skip
 
 
 @pytest.mark.parametrize("name", SCRIPTS)

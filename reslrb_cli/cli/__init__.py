@@ -26,8 +26,10 @@ from reslrb_cli.errors import LINE_LENGTH, ExitCode, one_line
 
 # What `reslrb --help` says of each command, so that it need not load them; in the order of a user's work.
 _SUMMARIES = {
+    "init": "Write a configuration for a scene, to begin with.",
     "optimize": "Recover scene parameters from target images.",
     "render": "Render the scene of a configuration.",
+    "export": "Write a run's scene, with what it recovered, for Mitsuba alone.",
     "inspect": "List a scene's parameters and what it contains.",
     "bench": "Measure time and memory of gradient steps.",
     "gradcheck": "Compare gradients with references.",

@@ -5,19 +5,30 @@ from __future__ import annotations
 import logging
 import os
 import re
+import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from reslrb_cli.cli.experiment import COUNT, Counts, check_writable, is_given, optional_experiment_arguments
+from reslrb_cli.cli.experiment import (
+    COUNT,
+    Counts,
+    allowance,
+    check_writable,
+    is_given,
+    optional_experiment_arguments,
+    resume_option,
+)
 from reslrb_cli.cli.output import echo
 from reslrb_cli.errors import ConfigError, ExitCode
 
 if TYPE_CHECKING:
     from reslrb_cli.config import Config
-    from reslrb_cli.measure.bench import Result
+    from reslrb_cli.measure.bench_book import Book
+    from reslrb_cli.measure.bench_run import Result
     from reslrb_cli.measure.sweep import Sweep
+    from reslrb_cli.records.bench import BenchRecord
 
 #: What is compared where the user names nothing.
 INTEGRATORS = "ptracer,reslrb:reservoir,reslrb:event,reslrb:gather,reslrb:stack,trajectory"
@@ -58,9 +69,11 @@ class Size(click.ParamType):
 @click.option("--memory-limit", type=Size(),
               help="Address space of each process, e.g. 2GiB (CPU only); default: the machine's memory.")  # fmt: skip
 @click.option("--budget", type=click.FloatRange(min=0), default=240.0, show_default=True, metavar="SECONDS",
-              help="Time for the whole, compiling included; what it does not suffice for is named.")  # fmt: skip
+              help="Time for the whole, loading and compiling included; what it does not suffice for is named, with "
+                   "what it would take.")  # fmt: skip
 @click.option("--rounds", type=click.IntRange(min=1, max=COUNT.max), metavar="N",
-              help="Number of steps of each, whatever time they take.")  # fmt: skip
+              help="Number of steps of each, whatever time they take, those of --resume included.")  # fmt: skip
+@resume_option
 @click.option("--json", "json_file", type=click.Path(path_type=Path, dir_okay=False),
               help="Write one object a line, as results come.")  # fmt: skip
 @click.option("--plot", "plot_file", type=click.Path(path_type=Path, dir_okay=False),
@@ -77,6 +90,7 @@ def command(
     memory_limit: int | None,
     budget: float,
     rounds: int | None,
+    resumed: Path | None,
     json_file: Path | None,
     plot_file: Path | None,
 ) -> int:
@@ -84,16 +98,21 @@ def command(
 
     A step is image, loss and gradient of every parameter of CONFIG, seen through its first sensor. Without CONFIG the
     scene is a Cornell box (--set scene.options.size=64, run.spp=4, ...). Each integrator runs in processes of its own;
-    one that runs out of memory is recorded as out_of_memory, and the rest goes on. Ctrl-C keeps what is done.
+    one that runs out of memory is recorded as out_of_memory, and the rest goes on. Ctrl-C keeps what is done, and what
+    --json has written can be gone on from, however the process ended.
     """
+    began = time.monotonic()
     from reslrb_cli.backend.device import device_name, memory_bytes
     from reslrb_cli.backend.installation import load_packages
     from reslrb_cli.backend.variant import choose
     from reslrb_cli.config import load, loads
 
     load_packages()  # before what follows asks for them
+    from reslrb_cli.cli.keeping import read_earlier
     from reslrb_cli.measure import cornell_box
+    from reslrb_cli.measure.bench_book import KIND, Book
     from reslrb_cli.measure.cases import choose_baseline, depths, parse_cases
+    from reslrb_cli.measure.earlier import Earlier
     from reslrb_cli.measure.sweep import SWEPT, Sweep, usual_values
 
     if config_file is None:
@@ -104,6 +123,7 @@ def command(
         reason = "goes with --sweep depth" if values is None else "does not go with --values"
         raise ConfigError("--max-depth", "", f"{reason}; take --set integrator.max_depth={max_depth}")
     cases = parse_cases(integrators or INTEGRATORS, deep=swept == "depth")
+    json_file = json_file or resumed
     if json_file is not None and plot_file is None:
         plot_file = json_file.with_suffix(".png")
     for option, path in (("--json", json_file), ("--plot", plot_file)):
@@ -127,9 +147,11 @@ def command(
         swept=swept,
     )
     sweep.check()
-    echo(f"{device_name(variant)}, {variant}")
+    earlier = None if resumed is None else Earlier(KIND, resumed, *read_earlier(resumed))
+    book = Book(sweep, device_name(variant), earlier)
+    echo(f"{device_name(variant)}, {variant}; {allowance(budget, rounds, 'round')}")
     echo(_conditions(config, sweep))
-    results, interrupted = _run(sweep, json_file)
+    results, interrupted = _run(sweep, book, json_file, began)
     if plot_file is not None and results:
         from reslrb_cli.report.bench_plot import plot_bench
 
@@ -140,32 +162,40 @@ def command(
     return ExitCode.INTERRUPTED if interrupted else _exit_code(results)
 
 
-def _run(sweep: Sweep, json_file: Path | None) -> tuple[list[Result], bool]:
+def _run(sweep: Sweep, book: Book, json_file: Path | None, began: float) -> tuple[list[Result], bool]:
     """Measure, print and write; returns all results, and whether the user interrupted."""
-    from contextlib import ExitStack
-
     from reslrb_cli.cli.interrupts import Interrupts
+    from reslrb_cli.cli.keeping import Keeper
+    from reslrb_cli.cli.measured import origin_of
     from reslrb_cli.measure.bench import bench
     from reslrb_cli.measure.processes import abandon_all
-    from reslrb_cli.records.lines import LineWriter
     from reslrb_cli.report.bench_table import table_head, table_line
 
-    labels, results, notes = [case.label for case in sweep.cases], [], []
-    with ExitStack() as stack:
-        writer = None if json_file is None else stack.enter_context(LineWriter(json_file))
-        interrupts = stack.enter_context(Interrupts(last_act=abandon_all))
+    labels, notes = [case.label for case in sweep.cases], []
+
+    def show(rows: list[Result]) -> None:
+        for row in rows:
+            echo(table_line(row.case.label, row.value, row.record, row.step_ratio, row.kernel_ratio, labels))
+            if row.reason:
+                notes.append(f"{sweep.name(row.value)}, {row.case.label}: {row.reason}")
+
+    def under_way() -> list[BenchRecord]:
+        return [row.record for row in book.results(set(book.runs) - book.done)]
+
+    origin = origin_of(sweep.variant)
+    keeper = Keeper(json_file, origin, lambda: [row.record for row in book.results(book.done)], under_way, book.kept)
+    with Interrupts(last_act=abandon_all) as interrupts:
         echo(table_head(labels, sweep.swept))
-        for rows in bench(sweep, lambda: interrupts.requested, logging.getLogger(__name__).info):
-            for row in rows:
-                if writer is not None:
-                    writer.write(row.record)
-                echo(table_line(row.case.label, row.value, row.record, row.step_ratio, row.kernel_ratio, labels))
-                if row.reason:
-                    notes.append(f"{sweep.name(row.value)}, {row.case.label}: {row.reason}")
-            results += rows
+        show(book.results(book.done))
+        say = logging.getLogger(__name__).info
+        spent_s = time.monotonic() - began
+        for rows in bench(sweep, lambda: interrupts.requested, say, book=book, between=keeper.refresh, spent_s=spent_s):
+            show(rows)
+            keeper.refresh()
+        keeper.finish([row.record for row in book.results()])
         for note in notes:
             echo(note)
-        return results, interrupts.requested
+        return book.results(), interrupts.requested
 
 
 def _conditions(config: Config, sweep: Sweep) -> str:

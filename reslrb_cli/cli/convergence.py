@@ -11,15 +11,23 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from reslrb_cli.cli.bench import Size
-from reslrb_cli.cli.experiment import COUNT, Counts, check_writable, experiment_arguments, is_given
+from reslrb_cli.cli.experiment import (
+    COUNT,
+    Counts,
+    allowance,
+    check_writable,
+    experiment_arguments,
+    is_given,
+    resume_option,
+)
 from reslrb_cli.cli.output import echo
 from reslrb_cli.errors import ConfigError, ExitCode
 
 if TYPE_CHECKING:
     from reslrb_cli.measure.convergence.judgement import Results
     from reslrb_cli.measure.convergence.plan import Plan
-    from reslrb_cli.measure.convergence.resuming import Earlier
     from reslrb_cli.measure.convergence.session import Session
+    from reslrb_cli.measure.earlier import Earlier
     from reslrb_cli.records.convergence import MethodRecord
     from reslrb_cli.report.convergence_table import Table
 
@@ -40,15 +48,16 @@ MOST_RUNS = 100
               help="Whole optimisations in place of gradients: N seeds by each method, at equal wall time, all costs "
                    "counted. Default list: ptracer, prb, reslrb:stack and reslrb:auto.")  # fmt: skip
 @click.option("--budget", type=click.FloatRange(min=0), default=240.0, show_default=True, metavar="SECONDS",
-              help="Time for the whole, compiling included.")  # fmt: skip
+              help="Time for the whole, loading and compiling included; what it does not suffice for is named, with "
+                   "what it would take.")  # fmt: skip
 @click.option("--rounds", type=click.IntRange(min=1, max=COUNT.max), metavar="N",
-              help="Number of turns of each, whatever time they take: the same steps on every machine.")  # fmt: skip
+              help="Number of turns of each, whatever time they take, those of --resume included: the same steps on "
+                   "every machine.")  # fmt: skip
 @click.option("--spp", "spps", type=Counts(), metavar="LIST",
               help="Samples per pixel of a step, several to compare, e.g. 4,16,64; default: run.spp.")  # fmt: skip
 @click.option("--reference", metavar="METHOD", default="reslrb:stack", show_default=True,
               help="What errors are taken from: the mean of many steps of this one.")  # fmt: skip
-@click.option("--resume", "resumed", type=click.Path(path_type=Path, dir_okay=False), metavar="FILE",
-              help="Go on from what another call has written with --json FILE; all else as it was.")  # fmt: skip
+@resume_option
 @click.option("--memory-limit", type=Size(),
               help="Address space of each process, e.g. 2GiB (CPU only); default: the machine's memory.")  # fmt: skip
 @click.option("--json", "json_file", type=click.Path(path_type=Path, dir_okay=False),
@@ -74,7 +83,8 @@ def command(
 
     Each method takes steps of run.spp samples per pixel in a process of its own, all in turn. Errors are relative to
     the size of what is estimated; a slope of -1/2 is what independent samples have. Efficiency is 1 / (relative
-    variance * seconds). Ctrl-C keeps what is done. docs/convergence.md explains the columns.
+    variance * seconds). Ctrl-C keeps what is done, and what --json has written can be gone on from, however the process
+    ended. docs/convergence.md explains the columns.
     """
     began = time.monotonic()
     from reslrb_cli.backend.device import device_name, memory_bytes
@@ -83,8 +93,11 @@ def command(
     from reslrb_cli.config import load
 
     load_packages()  # before what follows asks for them
+    from reslrb_cli.cli.keeping import read_earlier
     from reslrb_cli.measure.cases import parse_cases
     from reslrb_cli.measure.convergence.plan import DEFAULTS, Plan
+    from reslrb_cli.measure.convergence.resuming import KIND, check
+    from reslrb_cli.measure.earlier import Earlier
     from reslrb_cli.measure.whole_runs.plan import DEFAULT, RunsPlan
 
     config = load(config_file, overrides)
@@ -122,13 +135,15 @@ def command(
 
         whole = RunsPlan(**settings, runs=runs)
         whole.check()
-        echo(where)
-        return measure_runs(whole, json_file, plot_file, began, where)
+        return measure_runs(whole, resumed, json_file, plot_file, began, where)
     plan = Plan(**settings)
     plan.check()
-    echo(where)
-    earlier = None if resumed is None else _earlier(resumed)
-    results, conditions, interrupted = _run(plan, json_file, began, earlier)
+    device = device_name(variant)
+    earlier = None if resumed is None else Earlier(KIND, resumed, *read_earlier(resumed))
+    if earlier is not None:
+        check(plan, earlier, device)
+    echo(f"{where}; {allowance(budget, rounds, 'round')}")
+    results, conditions, interrupted = _run(plan, json_file, began, earlier, device)
     if plot_file is not None and results.points:
         from reslrb_cli.report.convergence_plot import plot_convergence
 
@@ -142,27 +157,29 @@ def _refuse_with_runs() -> None:
     why = {
         "objective": "runs have the configuration's own loss",
         "rounds": "runs have a time, not a number of turns; take --budget",
-        "resumed": "runs are not gone on from",
     }
     for name, reason in why.items():
         if is_given(name):
-            option = "--resume" if name == "resumed" else f"--{name}"
-            raise ConfigError(option, "", f"does not go with --runs: {reason}")
+            raise ConfigError(f"--{name}", "", f"does not go with --runs: {reason}")
 
 
-def _run(plan: Plan, json_file: Path | None, began: float, earlier: Earlier | None) -> tuple[Results, str, bool]:
+def _run(
+    plan: Plan, json_file: Path | None, began: float, earlier: Earlier | None, device: str
+) -> tuple[Results, str, bool]:
     """Measure, print and write; returns the results, the conditions in words, and whether the user interrupted."""
     import shutil
     import tempfile
     from contextlib import ExitStack
 
     from reslrb_cli.cli.interrupts import Interrupts
+    from reslrb_cli.cli.keeping import Keeper
+    from reslrb_cli.cli.measured import origin_of
     from reslrb_cli.measure.convergence.judgement import Judgement
     from reslrb_cli.measure.convergence.members import Role
     from reslrb_cli.measure.convergence.session import Session
     from reslrb_cli.measure.processes import abandon_all
     from reslrb_cli.records.convergence import SummaryRecord
-    from reslrb_cli.records.lines import Line, LineWriter
+    from reslrb_cli.records.lines import Line
     from reslrb_cli.report.convergence_table import closing_sentence, notes, reference_line
 
     with ExitStack() as stack:
@@ -174,9 +191,20 @@ def _run(plan: Plan, json_file: Path | None, began: float, earlier: Earlier | No
 
         interrupts = stack.enter_context(Interrupts(last_act=tidy))
         spent_s = time.monotonic() - began
-        session = Session(plan, folder, lambda: interrupts.requested, echo, spent_s=spent_s, earlier=earlier)
+        session = Session(
+            plan, folder, lambda: interrupts.requested, echo, spent_s=spent_s, earlier=earlier, device=device
+        )
+
+        def lines(now: Results) -> list[Line]:
+            return [*now.points, *now.methods, *now.references, SummaryRecord(closing_sentence(now.methods))]
+
+        origin = origin_of(plan.variant)
+        keeper = Keeper(json_file, origin, lambda: [], lambda: lines(Judgement(session).results()), session.keep)
         table: Table | None = None
         for rounds in session.run():
+            keeper.refresh()
+            if rounds < 4 or rounds & (rounds - 1):
+                continue  # lines come whenever the number of rounds has doubled
             if table is None:
                 echo(_conditions(plan, session))
                 table = _table(session)
@@ -186,12 +214,7 @@ def _run(plan: Plan, json_file: Path | None, began: float, earlier: Earlier | No
                 if judgement.ready and member.refusal is None:
                     echo(table.line(judgement.overall(member), f"{rounds} rounds"))
         results = Judgement(session).results()
-        if json_file is not None:  # only now: what is gone on from may be the same file
-            lines: list[Line] = [*results.points, *results.methods, *results.references]
-            lines.append(SummaryRecord(closing_sentence(results.methods)))
-            with LineWriter(json_file) as writer:
-                for line in lines:
-                    writer.write(line)
+        keeper.finish(lines(results))
         table = _table(session)
         echo(table.head())
         shown = _shown(results.methods)
@@ -204,26 +227,7 @@ def _run(plan: Plan, json_file: Path | None, began: float, earlier: Earlier | No
         for note in notes([record for record in results.methods if record.parameter in shown]):
             echo(note)
         echo(closing_sentence(results.methods))
-        if json_file is not None:
-            _keep(session, json_file)
         return results, _conditions(plan, session), interrupts.requested
-
-
-def _earlier(file: Path) -> Earlier:
-    """What lies beside a JSON file. Raises ConfigError."""
-    from reslrb_cli.measure.convergence.resuming import Earlier
-    from reslrb_cli.records.convergence_samples import read_samples, samples_file
-
-    return Earlier(file, *read_samples(samples_file(file)))
-
-
-def _keep(session: Session, json_file: Path) -> None:
-    """Write what a later call can go on from, where that is not too large."""
-    from reslrb_cli.records.convergence_samples import MOST_BYTES, samples_file, write_samples
-
-    kept = session.keep() if json_file.is_file() else None
-    if kept is not None and sum(array.nbytes for array in kept[1].values()) <= MOST_BYTES:
-        write_samples(samples_file(json_file), *kept)
 
 
 def _table(session: Session) -> Table:
@@ -242,15 +246,15 @@ def _shown(records: Sequence[MethodRecord]) -> list[str]:
 
 def _conditions(plan: Plan, session: Session) -> str:
     """What was measured, in one line."""
+    from reslrb_cli.report.words import WITHOUT_BORDER
+
     config, facts = plan.config, session.facts
     depth, rr_depth = config.integrator.max_depth, config.integrator.rr_depth
     roulette = "no roulette" if 0 <= depth < rr_depth else f"roulette from depth {rr_depth}"
     what = {"fixed": "dL/dI held", "loss": f"loss {config.loss.type}", "image": "the image"}[plan.objective]
     spp = ", ".join(str(count) for count in plan.spps or [config.run.spp])
     parts = [str(config.source), f"{spp} spp", roulette, what, facts.get("pictures", "")]
-    parts.append(
-        "without the film's border, where light paths lose what camera paths see" if facts.get("masked") else ""
-    )
+    parts.append(WITHOUT_BORDER if facts.get("masked") else "")
     return ", ".join(part for part in parts if part)
 
 

@@ -54,6 +54,25 @@ def overrides_option(function: Callable[..., Any]) -> Callable[..., Any]:
     )(function)
 
 
+def resume_option(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Add `--resume` (`resumed`) to a command that measures."""
+    return click.option(
+        "--resume",
+        "resumed",
+        type=click.Path(path_type=Path, dir_okay=False),
+        metavar="FILE",
+        help="Go on from what another call has written with --json FILE, all else as it was; that call may also have "
+        "been killed. FILE is written anew unless --json names another.",
+    )(function)
+
+
+def allowance(budget_s: float, number: int | None, of: str) -> str:
+    """What ends a measurement, in words: its budget, or a `number` of what it is made `of`."""
+    if number is not None:
+        return f"{number} {of}{'' if number == 1 else 's'}, whatever time that takes"
+    return f"budget {budget_s:g} s for the whole, loading and compiling included"
+
+
 def _arguments(function: Callable[..., Any], required: bool) -> Callable[..., Any]:
     metavar = "CONFIG" if required else "[CONFIG]"
     argument = click.argument("config_file", metavar=metavar, required=required, type=click.Path(path_type=Path))

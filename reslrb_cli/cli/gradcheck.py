@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import logging
 import os
+import time
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
-from reslrb_cli.cli.experiment import COUNT, check_writable, optional_experiment_arguments
+from reslrb_cli.cli.experiment import COUNT, allowance, check_writable, optional_experiment_arguments, resume_option
 from reslrb_cli.cli.missing import refuse_comparisons, run_missing
 from reslrb_cli.cli.output import echo
 from reslrb_cli.cli.suite import refuse_foreign, run_suite_command
@@ -31,10 +32,11 @@ logger = logging.getLogger(__name__)
               help="What to check: ESTIMATOR[(OPTION=VALUE,...)], separated by commas. Default: all four, with the "
                    "options of CONFIG.")  # fmt: skip
 @click.option("--budget", type=click.FloatRange(min=0), default=45.0, show_default=True, metavar="SECONDS",
-              help="Time for the whole, compiling included; it decides how many seeds there are. What it does not "
-                   "suffice for is named.")  # fmt: skip
+              help="Time for the whole, loading and compiling included; it decides how many seeds there are. What it "
+                   "does not suffice for is named, with what it would take.")  # fmt: skip
 @click.option("--seeds", type=click.IntRange(min=3, max=COUNT.max), metavar="N",
-              help="Number of seeds, whatever time they take.")  # fmt: skip
+              help="Number of seeds, whatever time they take, those of --resume included.")  # fmt: skip
+@resume_option
 @click.option("--spp", type=COUNT,
               help="Samples per pixel of one gradient. Default: 65536 light paths, no more than run.spp.")  # fmt: skip
 @click.option("--missing", is_flag=True,
@@ -59,6 +61,7 @@ def command(
     estimators: str | None,
     budget: float,
     seeds: int | None,
+    resumed: Path | None,
     spp: int | None,
     missing: bool,
     directions: int | None,
@@ -73,15 +76,20 @@ def command(
     is known to have one. Without CONFIG the scene is a Cornell box (--set scene.options.size=64, ...). The exit code is
     1 where a comparison fails; the last lines say which, and by how much. docs/gradcheck.md explains the columns.
     """
+    began = time.monotonic()
     from reslrb_cli.backend.device import device_name
     from reslrb_cli.backend.installation import load_packages
     from reslrb_cli.backend.variant import set_variant
+    from reslrb_cli.cli.keeping import read_earlier
     from reslrb_cli.config import load, loads
 
     load_packages()  # before what follows asks for them
     from reslrb_cli.measure import cornell_box
     from reslrb_cli.measure.cases import all_estimators, parse_estimators
+    from reslrb_cli.measure.earlier import Earlier
     from reslrb_cli.measure.gradcheck import Gradcheck
+    from reslrb_cli.measure.gradcheck_resuming import KIND
+    from reslrb_cli.measure.gradcheck_resuming import settings as settings_to_keep
     from reslrb_cli.measure.participants import Settings
     from reslrb_cli.records.gradcheck import Verdict
 
@@ -89,6 +97,7 @@ def command(
         refuse_comparisons(context)
     elif directions is not None:
         raise ConfigError("--directions", "", "goes with --missing alone")
+    json_file = json_file or resumed
     check_writable("--json", json_file)
     check_writable("--markdown", markdown_file)
     if suite is not None:
@@ -103,16 +112,20 @@ def command(
     if missing:
         variant = set_variant(config.variant)
         echo(f"{device_name(variant)}, {variant}")
-        return run_missing(config, budget, seeds, spp, directions, json_file)
+        return run_missing(config, variant, budget, seeds, spp, directions, json_file)
     listed = all_estimators(config) if estimators is None else parse_estimators(estimators)
     _check_folder(folder)
-    settings = Settings(config, listed, budget, seeds, spp, named=estimators is not None)
+    settings = Settings(config, listed, budget, seeds, spp, estimators is not None, time.monotonic() - began)
     settings.configs()  # before anything is loaded
     variant = set_variant(config.variant)
-    check = Gradcheck(settings)
-    echo(f"{device_name(variant)}, {variant}")
+    to_keep = settings_to_keep(settings, variant, device_name(variant))
+    earlier = None if resumed is None else Earlier(KIND, resumed, *read_earlier(resumed))
+    if earlier is not None:
+        earlier.check(to_keep)
+    check = Gradcheck(settings, earlier=earlier)
+    echo(f"{device_name(variant)}, {variant}; {allowance(budget, seeds, 'seed')}")
     echo(check.conditions())
-    records, interrupted = _run(check, json_file, folder)
+    records, interrupted = _run(check, variant, to_keep, json_file, folder)
     _finish(records, markdown_file)
     if interrupted:
         return ExitCode.INTERRUPTED
@@ -121,30 +134,30 @@ def command(
     return ExitCode.CHECK_FAILED if failed else ExitCode.DONE
 
 
-def _run(check: Gradcheck, json_file: Path | None, folder: Path | None) -> tuple[list[GradcheckRecord], bool]:
+def _run(
+    check: Gradcheck, variant: str, to_keep: dict[str, Any], json_file: Path | None, folder: Path | None
+) -> tuple[list[GradcheckRecord], bool]:
     """Measure, print and write; returns all records, and whether the user interrupted."""
-    from contextlib import ExitStack
-
     from reslrb_cli.cli.interrupts import Interrupts
+    from reslrb_cli.cli.keeping import Keeper
+    from reslrb_cli.cli.measured import origin_of
     from reslrb_cli.records.gradcheck import Verdict
-    from reslrb_cli.records.lines import LineWriter
     from reslrb_cli.report.gradcheck_table import Table
 
     records: list[GradcheckRecord] = []
     drawn = False
-    with ExitStack() as stack:
-        writer = None if json_file is None else stack.enter_context(LineWriter(json_file))
-        interrupts = stack.enter_context(Interrupts())
+    keeper = Keeper(json_file, origin_of(variant), lambda: records, lambda: [], lambda: check.kept(to_keep))
+    with Interrupts() as interrupts:
         table = Table(check.expected())
         echo(table.head())
-        for result in check.run(lambda: interrupts.requested, logger.info):
-            if writer is not None:
-                writer.write(result.record)
+        for result in check.run(lambda: interrupts.requested, logger.info, keeper.refresh):
             records.append(result.record)
+            keeper.refresh()
             if result.record.verdict is not Verdict.NOT_MEASURED:  # the last lines say how many there are
                 echo(table.line(result.record))
             _draw(result, folder)
             drawn = drawn or result.maps is not None
+        keeper.finish(records)
     if folder is not None and drawn:
         echo(f"look at {os.path.relpath(folder)}")
     return records, interrupts.requested

@@ -159,7 +159,7 @@ def next_step(subject: Subject, summary: SceneSummary) -> str:
     sections = {"target": "target: {file: IMAGE}", "parameters": f"parameters: [{{key: {json.dumps(keys[0])}}}]"}
     missing = " and ".join(f"`{sections[section]}`" for section in subject.missing)
     if subject.is_scene:
-        return f"write `scene: {{file: {subject.path}}}`, {missing} into a YAML file, and run `reslrb optimize` with it"
+        return f"`reslrb init {subject.path} --target PHOTO` writes a configuration of it"
     if missing:
         return f"add {missing} to {subject.path}, and run `reslrb optimize {subject.path}`"
     return f"`reslrb optimize {subject.config.source}`" + (" runs it again" if subject.run else " runs it")

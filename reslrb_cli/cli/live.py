@@ -1,4 +1,4 @@
-"""The page of a run while it is at work."""
+"""What is written of a run or a measurement while it is at work: its page, its file."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ PAGE_SECONDS, PAGE_SHARE = 5.0, 20.0
 
 
 class LivePage:
-    """Has `write` write the page anew, at once and then now and then. It is called outside of iterations.
+    """Has `write` write the page, or `what` else, anew, at once and then now and then; called outside of iterations.
 
     A page that cannot be written ends no run, and is not tried again: the last one, at the run's end, says why.
     """
 
-    def __init__(self, write: Callable[[], object]) -> None:
-        self._write = write
+    def __init__(self, write: Callable[[], object], what: str = "the page of the run") -> None:
+        self._write, self._what = write, what
         self._next: float | None = 0.0
 
     def refresh(self) -> None:
@@ -30,7 +30,7 @@ class LivePage:
         try:
             self._write()
         except Exception as error:
-            logger.debug("the page of the run is not kept current: %s", error)
+            logger.debug("%s is not kept current: %s", self._what, error)
             self._next = None
         else:
             end = time.monotonic()

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 #: Options that say something about comparisons, of which there is none.
 FOREIGN = {"suite": "--suite", "cases": "--case", "estimators": "--estimators", "markdown_file": "--markdown",
-           "folder": "--images"}  # fmt: skip
+           "folder": "--images", "resumed": "--resume"}  # fmt: skip
 
 
 def refuse_comparisons(context: click.Context) -> None:
@@ -29,17 +29,23 @@ def refuse_comparisons(context: click.Context) -> None:
 
 
 def run_missing(
-    config: Config, budget: float, seeds: int | None, spp: int | None, along: int | None, json_file: Path | None
+    config: Config,
+    variant: str,
+    budget: float,
+    seeds: int | None,
+    spp: int | None,
+    along: int | None,
+    json_file: Path | None,
 ) -> int:
-    """Measure, print and write; returns the exit code. A variant must be set."""
+    """Measure, print and write; returns the exit code. `variant` must be set."""
     from reslrb_cli.cli.interrupts import Interrupts
+    from reslrb_cli.cli.measured import measured_lines
     from reslrb_cli.measure.missing_check import MissingCheck
-    from reslrb_cli.records.lines import LineWriter
 
     check = MissingCheck(config, budget, seeds, spp, along)
     echo(check.conditions())
     with ExitStack() as stack:
-        writer = None if json_file is None else stack.enter_context(LineWriter(json_file))
+        writer = None if json_file is None else stack.enter_context(measured_lines(json_file, variant))
         interrupts = stack.enter_context(Interrupts())
         for record in check.run(lambda: interrupts.requested):
             if writer is not None:

@@ -38,6 +38,7 @@ def command(config_file: Path, overrides: tuple[str, ...], force: bool, quiet: b
     from reslrb_cli.cli.interrupts import Interrupts
     from reslrb_cli.cli.progress import Progress
     from reslrb_cli.cli.recording import Recording
+    from reslrb_cli.measure.rival import measure_rival
     from reslrb_cli.optimization import assemble
     from reslrb_cli.optimization.border import warn_of_border
     from reslrb_cli.optimization.correlated_rounds import measure_correlated_bias
@@ -49,17 +50,22 @@ def command(config_file: Path, overrides: tuple[str, ...], force: bool, quiet: b
 
     logger = logging.getLogger(__name__)
     say = logger.info
-    problem = assemble(config, say, PilotCache(), to_run=True)
+    cache = PilotCache()
+    problem = assemble(config, say, cache, to_run=True)
     bias = measure_correlated_bias(problem, say)
     if bias is not None and bias.line() is not None:
         logger.warning(bias.line())
     warn_of_border(problem, logger.warning)
+    rival = measure_rival(problem, cache, say)
+    if rival is not None and rival.is_better:
+        logger.warning(f"{rival.line()}; --set integrator.type={rival.integrator}")
     manifest = Manifest(
         variant=variant, device=device_name(variant), seed=config.run.seed, config=printable(config_file)
     )
     manifest.plan = plan_record(problem)
     manifest.views = view_records(problem.views)
     manifest.pilot = None if problem.pilot is None else problem.pilot.to_json()
+    manifest.rival = None if rival is None else rival.to_json()
     manifest.correlated_bias = None if bias is None else bias.to_json()
     manifest.memory = None if problem.memory is None else problem.memory.to_json()
     run = config.run

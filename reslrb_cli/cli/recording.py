@@ -18,6 +18,7 @@ from reslrb_cli.cli.live import LivePage
 from reslrb_cli.cli.telling import describe
 from reslrb_cli.errors import NonFinite
 from reslrb_cli.optimization import Problem, optimize
+from reslrb_cli.optimization.certainty import Certainty, CertaintyRecord
 from reslrb_cli.optimization.nonfinite import Findings
 from reslrb_cli.optimization.rendering import saved_spp
 from reslrb_cli.optimization.results import Results
@@ -58,6 +59,7 @@ class Recording:
     page: LivePage = field(init=False)
     error_maps: dict[str, Any] = field(default_factory=dict)
     seen: dict[str, Any] = field(default_factory=dict)
+    certainty: CertaintyRecord | None = None
     nonfinite: NonFiniteTally = field(default_factory=NonFiniteTally)
     clamped: ClampTally = field(default_factory=ClampTally)
     _saved_nonfinite: bool = False
@@ -66,6 +68,8 @@ class Recording:
 
     def __post_init__(self) -> None:
         self.results = Results(self.problem)
+        self._certainty = Certainty(self.problem)
+        self._stop: Callable[[], bool] = lambda: False
         self.page = LivePage(self._write_live_page)
 
     @property
@@ -80,6 +84,7 @@ class Recording:
         final images where it did not fail; what could not be written is noted in the manifest. Raises what the run
         failed of, a MachineError where the folder could not be written to.
         """
+        self._stop = stop
         reserve = Reserve(self.folder.checkpoint)
         status: Status = Status.FAILED
         failure: BaseException | None = None
@@ -130,6 +135,7 @@ class Recording:
                 self.first, self.last = self.first or record, record
                 metrics.write(record)
                 self.results.add(record)
+                self._certainty.see(self.done)
                 self.nonfinite.add(record)
                 self.clamped.add(record)
                 show(record)
@@ -179,6 +185,7 @@ class Recording:
         if failure is None:
             ending.part("final images", self._write_final_images)
             if status is Status.FINISHED:  # who interrupts does not want to wait; `reslrb report` finds them as well
+                self._note_certainty()
                 self._note_seen_errors()
         else:
             ending.leave_out("final images", "the run failed")
@@ -198,6 +205,18 @@ class Recording:
             write_report(self.folder.path, self.manifest.content(), {})
         else:
             write_report(self.folder.path, self.manifest.content() | {"results": self._found()}, self.problem.values())
+
+    def _note_certainty(self) -> None:
+        """Add to the results how certain they are. The run is what it is without that."""
+        if self.last is None or not self.problem.config.run.certainty:
+            return
+        logger.info("measuring how certain the values are")
+        try:
+            self.certainty = self._certainty.measure(self.done, self.last.elapsed_s, self._stop)
+        except Exception as error:
+            logger.warning("how certain the values are was not measured: %s", describe(error))
+        else:
+            self._note_results()
 
     def _note_seen_errors(self) -> None:
         """Add errors as people see them to the results. The run is what it is without them."""
@@ -222,12 +241,14 @@ class Recording:
         """What the run came to, or has come to by now."""
         self.results.end()
         found = self.results.to_json()
+        if self.certainty is not None:
+            found["certainty"] = finite(self.certainty.to_json())
+        found["warnings"] = warnings(found)
         return {
             "iterations": self.done,
             "loss": self.last and _json_number(self.last.loss),
             "elapsed_s": self.last and self.last.elapsed_s,
             **found,
-            "warnings": warnings(found),
             "error_maps": self.error_maps,
             **({"seen": self.seen} if self.seen else {}),
             "nonfinite": self.nonfinite.to_json(),

@@ -8,8 +8,17 @@ from pathlib import Path
 
 import click
 
-from reslrb_cli.cli.experiment import COUNT, check_writable, experiment_arguments, read_config, start_variant
+from reslrb_cli.cli.experiment import (
+    COUNT,
+    check_writable,
+    is_given,
+    optional_experiment_arguments,
+    read_config,
+    start_variant,
+)
 from reslrb_cli.cli.output import echo
+from reslrb_cli.cli.recovered import read_recovered
+from reslrb_cli.config import Config
 from reslrb_cli.errors import ConfigError, is_machine_fault
 
 #: Formats that hold linear values; the others of `FORMATS` are written in 8-bit sRGB.
@@ -18,13 +27,19 @@ FORMATS = (*FLOAT_FORMATS, ".png", ".jpg", ".jpeg")
 
 
 @click.command("render")
-@experiment_arguments
+@optional_experiment_arguments
 @click.option(
     "-o",
     "--output",
     required=True,
     type=click.Path(path_type=Path),
     help="Image file to write; EXR, HDR and PFM are linear, PNG and JPG 8-bit sRGB.",
+)
+@click.option(
+    "--run",
+    metavar="RUN",
+    type=click.Path(path_type=Path),
+    help="Render the scene of the run in this folder with the values that it recovered, in place of CONFIG.",
 )
 @click.option("--spp", type=COUNT, help="Samples per pixel; default: run.spp.")
 @click.option("--sensor", type=click.IntRange(min=0), help="Index of the sensor; default: the experiment's first.")
@@ -35,10 +50,18 @@ FORMATS = (*FLOAT_FORMATS, ".png", ".jpg", ".jpeg")
     help="Give the parameters their initial values (default), or take the scene as it stands.",
 )
 def command(
-    config_file: Path, overrides: tuple[str, ...], output: Path, spp: int | None, sensor: int | None, initial: bool
+    config_file: Path | None,
+    overrides: tuple[str, ...],
+    output: Path,
+    run: Path | None,
+    spp: int | None,
+    sensor: int | None,
+    initial: bool,
 ) -> None:
-    """Render the scene of CONFIG with its integrator."""
-    config = read_config(config_file, overrides)
+    """Render the scene of CONFIG, or of a run (--run RUN), with its integrator."""
+    if run is not None and is_given("initial"):
+        raise click.UsageError("--run renders the values that the run recovered; leave out --initial and --scene")
+    config = _read(config_file, run, overrides)
     check_image_path(output)
     start_variant(config)
 
@@ -62,6 +85,17 @@ def command(
             raise
         raise ConfigError("--output", "", f"cannot write {output}: {getattr(error, 'strerror', error)}") from None
     echo(f"{output}: {image.shape[1]}x{image.shape[0]}, {samples} spp")
+
+
+def _read(config_file: Path | None, run: Path | None, overrides: tuple[str, ...]) -> Config:
+    """The configuration of the scene to render: that of a file, or of a run with what it recovered."""
+    if config_file is not None and run is not None:
+        raise click.UsageError("give CONFIG or --run RUN, not both")
+    if run is not None:
+        return read_recovered(run, overrides)
+    if config_file is None:
+        raise click.UsageError("Missing argument 'CONFIG' (or --run RUN)")
+    return read_config(config_file, overrides)
 
 
 def check_image_path(path: Path) -> None:

@@ -17,7 +17,14 @@ if TYPE_CHECKING:
     from reslrb_cli.records.gradcheck import GradcheckRecord
 
 #: Options of `gradcheck` that mean nothing without a configuration, by their parameters' names.
-_FOREIGN = {"config_file": "CONFIG", "overrides": "--set", "budget": "--budget", "spp": "--spp", "folder": "--images"}
+_FOREIGN = {
+    "config_file": "CONFIG",
+    "overrides": "--set",
+    "budget": "--budget",
+    "spp": "--spp",
+    "folder": "--images",
+    "resumed": "--resume",
+}
 
 
 def refuse_foreign(context: click.Context) -> None:
@@ -42,7 +49,7 @@ def run_suite_command(
     from reslrb_cli.backend.device import device_name
     from reslrb_cli.backend.variant import set_variant
     from reslrb_cli.cli.interrupts import Interrupts
-    from reslrb_cli.records.lines import LineWriter
+    from reslrb_cli.cli.measured import measured_lines
     from reslrb_cli.report.gradcheck_table import summary_lines
 
     chosen = _estimators(estimators)
@@ -57,7 +64,7 @@ def run_suite_command(
     echo(f"{device_name(variant)}, {variant}")
     records: list[GradcheckRecord] = []
     with ExitStack() as stack:
-        writer = None if json_file is None else stack.enter_context(LineWriter(json_file))
+        writer = None if json_file is None else stack.enter_context(measured_lines(json_file, variant))
         interrupts = stack.enter_context(Interrupts())
 
         def until_interrupted(found: Iterator[GradcheckRecord]) -> Iterator[GradcheckRecord]:

@@ -9,25 +9,39 @@ import time
 from contextlib import ExitStack
 from pathlib import Path
 
+from reslrb_cli.cli.experiment import allowance
 from reslrb_cli.cli.interrupts import Interrupts
+from reslrb_cli.cli.keeping import Keeper, read_earlier
+from reslrb_cli.cli.measured import origin_of
 from reslrb_cli.cli.output import echo
 from reslrb_cli.errors import ExitCode
+from reslrb_cli.measure.earlier import Earlier
 from reslrb_cli.measure.processes import abandon_all
 from reslrb_cli.measure.whole_runs.plan import RunsPlan
+from reslrb_cli.measure.whole_runs.resuming import KIND, check
 from reslrb_cli.measure.whole_runs.session import RunsSession
 from reslrb_cli.measure.whole_runs.verdict import finals, find_best, method_records
 from reslrb_cli.records.bench import BenchStatus
 from reslrb_cli.records.convergence import SummaryRecord
-from reslrb_cli.records.lines import LineWriter
+from reslrb_cli.records.lines import Line
 from reslrb_cli.records.whole_runs import RunMethodRecord, RunPointRecord
 from reslrb_cli.report.whole_runs_plot import plot_runs
 from reslrb_cli.report.whole_runs_table import RunsTable, closing_sentence, notes
-from reslrb_cli.report.words import count
+from reslrb_cli.report.words import WITHOUT_BORDER, count
 
 
-def measure_runs(plan: RunsPlan, json_file: Path | None, plot_file: Path | None, began: float, where: str) -> int:
-    """Measure, print, write and draw; returns the exit code. `began` is when the command was called, by `monotonic`."""
+def measure_runs(
+    plan: RunsPlan, resumed: Path | None, json_file: Path | None, plot_file: Path | None, began: float, where: str
+) -> int:
+    """Measure, print, write and draw; returns the exit code. `began` is when the command was called, by `monotonic`.
+
+    `resumed` is the JSON file that is gone on from, if any.
+    """
     points: list[RunPointRecord] = []
+    earlier = None if resumed is None else Earlier(KIND, resumed, *read_earlier(resumed))
+    if earlier is not None:
+        check(plan, earlier, where)
+    echo(f"{where}; {allowance(plan.budget_s, None, 'run')}")
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="reslrb-convergence-")))
 
@@ -36,26 +50,40 @@ def measure_runs(plan: RunsPlan, json_file: Path | None, plot_file: Path | None,
             shutil.rmtree(folder, ignore_errors=True)
 
         interrupts = stack.enter_context(Interrupts(last_act=tidy))
-        writer = None if json_file is None else stack.enter_context(LineWriter(json_file))
         table = RunsTable([plan.method_of(case, spp).label for case, spp in plan.entries])
         spent_s = time.monotonic() - began
-        session = RunsSession(plan, folder, lambda: interrupts.requested, echo, spent_s=spent_s)
-        for point in session.run():
-            if not points:
-                echo(_conditions(plan, session))
-                echo(table.head())
-            points.append(point)
-            if writer is not None:
-                writer.write(point)
+        session = RunsSession(
+            plan, folder, lambda: interrupts.requested, echo, spent_s=spent_s, earlier=earlier, device=where
+        )
+        points += [point for run in session.runs for point in run.points]  # of earlier sessions
+
+        def show(point: RunPointRecord) -> None:
             if point.elapsed_s == session.limit_s:
                 echo(table.point(point, session.run_of(point).first_s))
-        records = method_records(session.runs, session.limit_s)
-        loss, error = (find_best(finals(session.runs, session.limit_s, of)) for of in ("loss", "parameter_error"))
-        sentence = closing_sentence(loss, error, session.limit_s)
-        if writer is not None:
-            for record in records:
-                writer.write(record)
-            writer.write(SummaryRecord(sentence))
+
+        def outcome() -> tuple[list[RunMethodRecord], str]:
+            loss, error = (find_best(finals(session.runs, session.limit_s, of)) for of in ("loss", "parameter_error"))
+            sentence = closing_sentence(loss, error, session.limit_s)
+            return method_records(session.runs, session.limit_s), sentence
+
+        def outcome_lines() -> list[Line]:
+            records, sentence = outcome()
+            return [*records, SummaryRecord(sentence)]
+
+        keeper = Keeper(json_file, origin_of(plan.variant), lambda: points, outcome_lines, session.keep)
+        headed = False
+        for point in session.run():
+            if not headed:
+                headed = True
+                echo(_conditions(plan, session))
+                echo(table.head())
+                for other in points:
+                    show(other)
+            points.append(point)
+            show(point)
+            keeper.refresh()
+        keeper.finish([*points, *outcome_lines()])
+        records, sentence = outcome()
         echo(table.head())
         for record in records:
             echo(table.line(record))
@@ -79,6 +107,7 @@ def _conditions(plan: RunsPlan, session: RunsSession) -> str:
         f"{optimizer.type} at {optimizer.learning_rate:g}",
         facts.get("pictures", ""),
         facts.get("error_of", ""),
+        WITHOUT_BORDER if facts.get("masked") else "",
     ]
     return ", ".join(part for part in parts if part)
 

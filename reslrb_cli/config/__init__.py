@@ -5,7 +5,7 @@ from .loader import dump, load, loads, with_integrator
 from .losses import L1, L2, LogL2, Loss, RelativeL2
 from .moving import HEIGHTMAP, WORDS, HeightmapSpec, MotionSpec
 from .optimizers import SGD, Adam, AdamW, Optimizer, RMSProp
-from .parameters import ColorSpace, ImageFile, ParameterSpec, Settings
+from .parameters import ColorSpace, ImageFile, ParameterSpec, RunValue, Settings
 from .schema import Config, Rendering, RunConfig, SceneConfig, TargetConfig
 from .views import Mask, ViewSpec
 
@@ -35,6 +35,7 @@ __all__ = [
     "Rendering",
     "Reslrb",
     "RunConfig",
+    "RunValue",
     "SceneConfig",
     "Settings",
     "TargetConfig",

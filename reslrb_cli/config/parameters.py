@@ -6,7 +6,7 @@ import functools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import Discriminator, Field, field_validator, model_validator
 from typing_extensions import Self
@@ -41,6 +41,17 @@ class ImageFile(Section):
     color_space: ColorSpace = Field(default="auto", description=COLOR_SPACE)
 
 
+class RunValue(Section):
+    """Values to which a run brought parameters."""
+
+    TAG: ClassVar[str] = "run"
+
+    run: ConfigPath = Field(
+        description="Folder of a run, finished or interrupted, that recovered a parameter of the same key; relative to "
+        "the config file."
+    )
+
+
 #: A value for a scene parameter: one number, a list such as [r, g, b], or an image file.
 Value = Annotated[
     Annotated[float, mark("number")] | Annotated[Numbers, mark("list")] | Annotated[ImageFile, mark("mapping")],
@@ -49,6 +60,8 @@ Value = Annotated[
 
 
 def _initial_tag(value: Any) -> str | None:
+    if isinstance(value, RunValue) or (isinstance(value, dict) and "run" in value):
+        return MARK + RunValue.TAG
     if isinstance(value, ByWord) or (isinstance(value, dict) and not {"file", "color_space"} & value.keys()):
         return MARK + ByWord.TAG
     return kind_tag(value, "scene")
@@ -59,12 +72,13 @@ Initial = Annotated[
     Annotated[float, mark("number")]
     | Annotated[Numbers, mark("list")]
     | Annotated[ImageFile, mark("mapping")]
+    | Annotated[RunValue, mark(RunValue.TAG)]
     | Annotated[MotionInitial, mark(ByWord.TAG)]
     | Annotated[Literal["scene"], mark("text")],
     Discriminator(
         _initial_tag,
         custom_error_type="wrong",
-        custom_error_message="must be a number, a list of numbers, {file: IMAGE}, or `scene`",
+        custom_error_message="must be a number, a list of numbers, {file: IMAGE}, {run: RUN}, or `scene`",
     ),
 ]
 _AnyBounds = Annotated[Annotated[Bounds, mark("list")] | Annotated[MotionBounds, mark(ByWord.TAG)], or_words("list")]
@@ -117,7 +131,8 @@ class ParameterSpec(Section):
     initial: Initial = Field(
         default="scene",
         description="Value to start from: a number (all entries), a list of numbers (one per channel), an "
-        "image file, or `scene` (the scene's own value; a heightmap is flat there, and nothing is moved).",
+        "image file, the value to which a run brought the same key, or `scene` (the scene's own value; a heightmap is "
+        "flat there, and nothing is moved).",
     )
     bounds: _AnyBounds | None = Field(
         default=None,
@@ -219,7 +234,7 @@ class ParameterSpec(Section):
                         raise located(f"{option}.{word}", f"has no effect: `motion.free` has {', '.join(free)} alone")
             elif isinstance(value, ImageFile) and self.motion is not None:
                 raise located(option, "is an image file, and a motion is no texture; give numbers")
-            elif len(free) > 1 and option in ("initial", "bounds") and value not in (None, "scene"):
+            elif len(free) > 1 and option in ("initial", "bounds") and not _fits_all_words(value):
                 words = ", ".join(f"{word}: ..." for word in free)
                 raise located(option, f"must be a mapping by what is free, {{{words}}}: they have different units")
         return self
@@ -234,6 +249,11 @@ class ParameterSpec(Section):
             _check_transform(settings, at)
             _check_initial(settings, at)
         return self
+
+
+def _fits_all_words(value: Any) -> bool:
+    """Whether an `initial` or `bounds` says of each word of a motion what it is to be."""
+    return value is None or value == "scene" or isinstance(value, RunValue)
 
 
 def _check_bounds(settings: Settings, at: Callable[[str], str]) -> None:

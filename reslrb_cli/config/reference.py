@@ -158,6 +158,7 @@ def _default(value: dict[str, Any]) -> str:
 #: Sections that are written in the line of their key.
 _IN_A_LINE = {
     "ImageFile": "{file, color_space}",
+    "RunValue": "{run}",
     **dict.fromkeys(
         ("MotionInitial", "MotionBounds", "MotionTransform", "MotionRates"), "{translation, rotation, scale}"
     ),

@@ -23,7 +23,7 @@ from typing_extensions import Self
 
 from .base import ConfigPath, Count, Positive, Section, Seed, WorkPath, by_kind, located, mark, wrong
 from .integrators import AnyIntegrator, Integrator, Reslrb
-from .limits import KEY_LENGTH
+from .limits import KEY_LENGTH, PIXELS
 from .losses import L2, AnyLoss
 from .names import check_name, folder_name
 from .optimizers import Adam, AnyOptimizer
@@ -54,6 +54,11 @@ class SceneConfig(Section):
         description="Refuse a scene file in which anything has to be mended or left out before Mitsuba 3 can load it, "
         "in place of warning of it.",
     )
+    size: Annotated[tuple[Count, Count], Field(strict=False)] | None = Field(
+        default=None,
+        description="[width, height] of the film of every sensor in pixels, without crop window; null: as the scene "
+        "file has it. What is seen stays the same where the ratio does.",
+    )
     cameras: ConfigPath | None = Field(
         default=None,
         description="Cameras in place of the scene's own sensors: NeRF's `transforms.json`, or COLMAP's `images.txt` "
@@ -65,6 +70,13 @@ class SceneConfig(Section):
         | Annotated[Literal["all"], mark("text")],
         by_kind("a list of sensor indices, or `all`", "all"),
     ] = Field(default=[0], description="Indices of the scene's sensors that are used, or `all`.")
+
+    @field_validator("size")
+    @classmethod
+    def _check_size(cls, value: tuple[int, int] | None) -> tuple[int, int] | None:
+        if value is not None and value[0] * value[1] > PIXELS:
+            raise wrong(f"must have at most {PIXELS} pixels, not {value[0] * value[1]}")
+        return value
 
     @field_validator("sensors")
     @classmethod
@@ -221,6 +233,12 @@ class RunConfig(Section):
         description="Sensors whose views are not trained on, by index or id, which for those of `scene.cameras` is the "
         "image's name without its suffix; their loss is recorded every 10 iterations (`held_out`), and of the first "
         "and the last image.",
+    )
+    certainty: bool = Field(
+        default=True,
+        description="After the last iteration, measure how certain the values are: their spread, and a verdict on each "
+        "parameter. Takes as long as some iterations, ten or so where parameters are few; runs of fewer than 20 "
+        "iterations, and interrupted ones, go without.",
     )
     reach_spp: Count = Field(default=64, description="Samples for the mask of the texels that light and sensor reach.")
 

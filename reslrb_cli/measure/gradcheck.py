@@ -14,17 +14,20 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
 from reslrb_cli.estimators import ESTIMATORS
 from reslrb_cli.measure.comparison import ROUNDING, Comparison, Family, compare_equal_seeds, compare_expectations
+from reslrb_cli.measure.earlier import Earlier
 from reslrb_cli.measure.entries import entry_count
 from reslrb_cli.measure.pace import NO_TIME
 from reslrb_cli.measure.participants import Settings
 from reslrb_cli.measure.sampling import NAIVE, Name, Sampling
 from reslrb_cli.measure.statistics import paired_z_scores
 from reslrb_cli.records.gradcheck import GradcheckRecord, Kind, Reference, Verdict
+from reslrb_cli.records.samples import Kept
 
 #: What a stock integrator on the same paths differs by from this one, relative to the entries: whether a point is
 #: visible is another matter of rounding to each.
@@ -61,10 +64,12 @@ class Row:
 
 
 class Gradcheck:
-    """A check of one experiment; `participants` have its scene."""
+    """A check of one experiment, which goes on from an `earlier` one; `participants` have its scene."""
 
-    def __init__(self, settings: Settings, now: Callable[[], float] = time.monotonic) -> None:
-        self.settings, self._sampling = settings, Sampling(settings, now)
+    def __init__(
+        self, settings: Settings, now: Callable[[], float] = time.monotonic, earlier: Earlier | None = None
+    ) -> None:
+        self.settings, self._sampling = settings, Sampling(settings, now, earlier)
         self.participants = self._sampling.participants
 
     @cached_property
@@ -101,21 +106,34 @@ class Gradcheck:
             result.record for result in self._without_reference()
         ]
 
-    def run(self, stop: Callable[[], bool], say: Callable[[str], None]) -> Iterator[Result]:
+    def kept(self, settings: dict[str, Any]) -> Kept | None:
+        """What a later session, of the same `settings`, needs to go on; None where nothing has been sampled."""
+        return self._sampling.kept(settings)
+
+    def run(
+        self, stop: Callable[[], bool], say: Callable[[str], None], between: Callable[[], None] = lambda: None
+    ) -> Iterator[Result]:
         """Measure and compare, row by row; once `stop()`, only what has been measured is compared.
 
-        Of what the budget did not suffice for the records say so.
+        Of what the budget did not suffice for the records say so. `between` is called after each sample. Raises
+        ConfigError where an earlier session has all that is asked for.
         """
+        self._sampling.between = between
         self._sampling.expect(name for row in self.rows for name in self._needs(row))
-        family, compared = self._family(), False
+        family, compared, late = self._family(), False, False
         for row in self.rows:
             if all(self._sampling.take(name, stop, say) for name in self._needs(row)):
                 compared = True
                 yield self._result(row, family)
             elif not stop():
+                late = True
                 yield Result(self._record(row, Comparison(Verdict.NOT_MEASURED, None, message=NO_TIME), 0))
         if compared or not stop():
             yield from self._without_reference()
+        if late and not stop():
+            needed_s = self._sampling.needed_s()
+            enough = "several times as much" if needed_s is None else f"about {needed_s:.0f} s"
+            say(f"the fewest seeds of everything take {enough}; allow that with --budget")
 
     def _needs(self, row: Row) -> list[Name]:
         """The samples that a comparison is made of."""

@@ -17,7 +17,7 @@ class Pace:
     """Divides the time among depths, each of which gets GROWTH times as much as the one before it.
 
     What a depth leaves is for the others. None gets fewer than MIN_ROUNDS rounds while there is time at all, whatever
-    its own share, nor more than `most`. With `rounds` time does not count.
+    its own share, nor more than `most`. With `rounds` time does not count. Rounds of earlier sessions count.
     """
 
     def __init__(
@@ -29,7 +29,18 @@ class Pace:
         most: int = MAX_ROUNDS,
     ) -> None:
         self._now, self._end, self._left, self._rounds, self._most = now, now() + budget_s, depths, rounds, most
-        self._rounds_start = self._depth_end = now()
+        self._start = self._rounds_start = self._depth_start = self._depth_end = now()
+        self._before = 0
+
+    @property
+    def spent_s(self) -> float:
+        """Seconds since the beginning."""
+        return self._now() - self._start
+
+    @property
+    def depth_s(self) -> float:
+        """Seconds since the depth began."""
+        return self._now() - self._depth_start
 
     def over(self) -> bool:
         """Whether the time is up."""
@@ -41,19 +52,21 @@ class Pace:
 
     def begin_depth(self) -> None:
         """A depth begins."""
-        now = self._now()
+        now = self._depth_start = self._now()
         self._depth_end = now + (self._end - now) / sum(GROWTH**k for k in range(self._left))
         self._left -= 1
 
-    def begin_rounds(self) -> None:
-        """Its processes are warm."""
-        self._rounds_start = self._now()
+    def begin_rounds(self, before: int = 0) -> None:
+        """Its processes are warm; `before` rounds were done by earlier sessions."""
+        self._rounds_start, self._before = self._now(), before
 
     def another(self, done: int) -> bool:
-        """Whether there is time for another round after `done` of them."""
+        """Whether there is time for another round after `done` of them in this session."""
         if self._rounds is not None:
-            return done < self._rounds
-        if done == 0 or done >= self._most:
-            return done == 0
+            return self._before + done < self._rounds
+        if self._before + done >= self._most:
+            return False
+        if done == 0:
+            return True
         now = self._now()
         return now + (now - self._rounds_start) / done <= (self._end if done < MIN_ROUNDS else self._depth_end)

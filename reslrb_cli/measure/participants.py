@@ -60,7 +60,8 @@ PILOT_SEEDS = 2
 class Settings:
     """What is checked. `seeds` and `spp` are None where they are to be chosen.
 
-    `named`: the user named the integrators; otherwise those that cannot take part are left out.
+    `named`: the user named the integrators; otherwise those that cannot take part are left out. Of the budget `spent_s`
+    have gone before.
     """
 
     config: Config
@@ -69,6 +70,7 @@ class Settings:
     seeds: int | None = None
     spp: int | None = None
     named: bool = True
+    spent_s: float = 0.0
 
     @property
     def known(self) -> bool:

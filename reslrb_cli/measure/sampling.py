@@ -5,11 +5,17 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Iterable
+from typing import Any
 
 import numpy as np
 
+from reslrb_cli.errors import ConfigError
+from reslrb_cli.measure.differences import Direction
+from reslrb_cli.measure.earlier import Earlier
+from reslrb_cli.measure.gradcheck_resuming import Name, kept, restore, restore_steps
 from reslrb_cli.measure.gradients import seeds
 from reslrb_cli.measure.participants import Participants, Settings
+from reslrb_cli.records.samples import Kept
 
 #: Seeds, where no number is given: so many of everything, more of what is cheap, as the budget allows.
 LEAST_SEEDS, MOST_SEEDS = 8, 64
@@ -22,9 +28,6 @@ NAIVE = ("walk_ad", "ptracer")
 #: Bytes that samples may take.
 MEMORY = 2**30
 
-#: What samples are of: `gradient` or `image` and an integrator's label, `differences` or `tangents` and a parameter.
-Name = tuple[str, str]
-
 
 class Sampling:
     """Samples by kind and name; `now` is the clock that the budget is measured with, from the beginning.
@@ -32,27 +35,54 @@ class Sampling:
     The budget covers loading and compiling. Its rest is shared among what is still to be sampled, and what one leaves
     is for the others. Only what runs already is waited for: nothing is begun whose first sample, which compiles, would
     take longer than is left, by those of its kind so far, or, of the first of its kind, by the others'.
+
+    What an `earlier` session has sampled counts, and seeds go on behind its own.
     """
 
-    def __init__(self, settings: Settings, now: Callable[[], float] = time.monotonic) -> None:
-        self._now, self.settings = now, settings
-        self._end = now() + settings.budget_s
+    def __init__(
+        self, settings: Settings, now: Callable[[], float] = time.monotonic, earlier: Earlier | None = None
+    ) -> None:
+        self._now, self.settings, self._earlier = now, settings, earlier
+        self._start = now() - settings.spent_s
+        self._end = self._start + settings.budget_s
         self.participants = Participants(settings)
-        self._samples: dict[Name, list[np.ndarray]] = {}
-        self._to_do: list[Name] = []
+        self._samples: dict[Name, list[np.ndarray]] = {} if earlier is None else restore(earlier)
+        self._before = {name: len(samples) for name, samples in self._samples.items()}
+        self._chosen: dict[str, list[Direction]] = {}
+        if earlier is not None:
+            self._chosen = restore_steps(earlier, self.participants.directions)
+            self.participants.directions.update(self._chosen)
+        #: Called after each sample.
+        self.between: Callable[[], None] = lambda: None
+        self._taken: set[Name] = set()
+        self._to_do, self._expected = list[Name](), list[Name]()
+        self._later_s = 0.0  # how long any other sample took, at most
         self._first_s: dict[tuple[str, bool], float] = {}  # how long a first sample took, at most, by kind
 
     def expect(self, names: Iterable[Name]) -> None:
-        """Say what will be asked for, so that each has its share of the time."""
-        self._to_do = list(dict.fromkeys(names))
+        """Say what will be asked for, so that each has its share of the time.
+
+        Raises ConfigError where an earlier session has all of it.
+        """
+        self._expected = list(dict.fromkeys(names))
+        self._to_do = list(self._expected)
+        counts = [self._before.get(name, 0) for name in self._to_do]
+        if self._earlier is not None and counts and min(counts) >= (self.settings.seeds or math.inf):
+            reason = f"{self._earlier.source} has {min(counts)} seeds already; name more with --seeds"
+            raise ConfigError("--resume", "", reason)
+
+    def kept(self, settings: dict[str, Any]) -> Kept | None:
+        """What a later session, of the same `settings`, needs to go on; None where nothing has been sampled."""
+        return kept(settings, self._samples, self._chosen)
 
     def take(self, name: Name, stop: Callable[[], bool], say: Callable[[str], None]) -> bool:
         """Take the samples of `name`, where that was not done yet; whether there are enough to compare.
 
         Ends with what is done once `stop()`.
         """
-        if name not in self._samples and not stop():
-            self._samples[name] = []
+        if name not in self._taken and not stop():
+            self._taken.add(name)
+            self._samples.setdefault(name, [])
             self._measure(name, stop, say)
         return len(self._samples.get(name, [])) >= FEWEST
 
@@ -67,24 +97,38 @@ class Sampling:
         limited, begin = self.settings.seeds is None, self._now()
         if limited and begin + self._expected_s(name) >= self._end:
             return
-        if kind == "differences":
+        if kind == "differences" and name[1] not in self._chosen:
             self.participants.choose_steps(name[1])
+            self._chosen[name[1]] = self.participants.directions[name[1]]
         before = first_s = 0.0
-        for seed in seeds(self._most(name)):
+        begun = len(samples)
+        for seed in seeds(self._most(name))[begun:]:
             if stop():
                 break
             samples.append(self._sample(name, seed).astype(np.float32))
+            self.between()
             now = self._now()
             next_s = now - before
+            self._later_s = max(self._later_s, next_s if len(samples) > begun + 1 else 0.0)
             before = now
-            if len(samples) == 1:
+            if len(samples) == begun + 1:
                 first_s, next_s = now - begin, 0.0  # which says nothing of the next one
                 self._first_s[_kind(name)] = max(first_s, self._first_s.get(_kind(name), 0.0))
                 ends = self._ends(name, now)
             if limited and now + next_s >= next(end for least, end in ends if len(samples) < least):
                 break
-        if samples:
+        if len(samples) > begun:
             say(f"{kind} {name[1]}: seeds {len(samples)}, {now - begin:.1f} s, of which the first {first_s:.1f} s")
+
+    def needed_s(self) -> float | None:
+        """About how long the fewest samples of everything take, what has been sampled included; None if none has."""
+        if not self._first_s:
+            return None
+        lacking = [name for name in self._expected if len(self._samples.get(name, ())) < FEWEST]
+        later_s = (FEWEST - 1) * self._later_s
+        # The steps of differences are chosen first, which compiles too.
+        firsts_s = sum((1 + (name[0] == "differences")) * self._expected_s(name) for name in lacking)
+        return self._now() - self._start + firsts_s + len(lacking) * later_s
 
     def _expected_s(self, name: Name) -> float:
         """What a first sample may take, by those that were taken."""
@@ -109,15 +153,21 @@ class Sampling:
         return name[0] == "image" or (name[0] == "gradient" and name[1] != "walk_ad")
 
     def _most(self, name: Name) -> int:
-        """Seeds of `name`, at most."""
+        """Seeds of `name`, at most; within a budget, as many more as there would be without an earlier session."""
         if self.settings.seeds is not None:
             return self.settings.seeds
+        return self._before.get(name, 0) + self._most_more(name)
+
+    def _most_more(self, name: Name) -> int:
         if not self._is_cheap(name):
             return LEAST_SEEDS
         most = max(LEAST_SEEDS, min(MOST_SEEDS, self._seeds_in_memory()))
         if name[0] == "gradient" and not self.participants.exact:
             # More than the stock reference has are compared with nothing.
-            stock = [len(self._samples.get(("gradient", label), [])) for label in self.participants.stock_labels()]
+            labels = [label for label in self.participants.stock_labels() if ("gradient", label) in self._taken]
+            stock = [
+                len(self._samples["gradient", label]) - self._before.get(("gradient", label), 0) for label in labels
+            ]
             most = min(most, max(LEAST_SEEDS, *stock)) if any(stock) else most
         return most
 

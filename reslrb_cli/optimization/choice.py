@@ -121,7 +121,7 @@ def _fitting(problem: Problem, integrator: Reslrb, choices: list[dict[str, Any]]
 
 def _outcome(problem: Problem, options: list[Option], say: Say, cache: Cache | None) -> Outcome:
     """The cached outcome of an earlier pilot, or that of a new one."""
-    key = key_of(_situation(problem)) if cache is not None else ""
+    key = key_of(situation(problem)) if cache is not None else ""
     if cache is not None:
         try:
             outcome = Outcome.from_json(cache.get(key) or {})
@@ -182,8 +182,8 @@ def measured_step(problem: Problem, integrator: Any, clock: StepClock, round: in
     return Measured(gradients, times.kernel_ms, max(wall_ms - times.codegen_ms, times.kernel_ms), times.codegen_ms)
 
 
-def _situation(problem: Problem) -> dict[str, Any]:
-    """All that the choice depends on, as plain values."""
+def situation(problem: Problem) -> dict[str, Any]:
+    """All that the choice of an estimator depends on, as plain values."""
     config = problem.config
     dump = config.model_dump(mode="json")
     run = config.step_options() | {"memory_budget": dump["run"]["memory_budget"]}

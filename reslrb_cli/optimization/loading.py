@@ -17,7 +17,8 @@ LIGHT_TRACERS = ("reslrb", "ptracer", "walk_ad", "trajectory")
 
 def load_configured(config: Config) -> mi.Scene:
     """Load the scene that `config` names. Raises ConfigError."""
-    return load_scene(config.scene.file, config.scene.options, config.scene.strict, config.scene.cameras)
+    scene = config.scene
+    return load_scene(scene.file, scene.options, scene.strict, scene.size, scene.cameras)
 
 
 def choose_sensors(config: Config, scene: mi.Scene) -> list[int]:

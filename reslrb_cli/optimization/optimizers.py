@@ -139,6 +139,46 @@ class Optimizer:
         own[key] = variable.clamp(dr.detach(own[key]))
         self._scene[key] = _leaf(variable.to_scene(dr.detach(own[key])))
 
+    def response(self, key: str) -> np.ndarray[Any, Any]:
+        """How far a step with a rate of 1 moves each entry of the scene's value, in a row, per unit of its gradient.
+
+        As its moments are now, and over many steps, so that momentum shows as what it adds up to; the schedule's
+        factor times this and the parameter's rate (`rate`) is the next step. 0 where no step was taken.
+        """
+        own, extra = self._own[key], self._own[key].state[key][3]
+        value = np.array(dr.detach(own[key]), dtype=np.float64).ravel()
+        if isinstance(own, dropt.Adam):  # AdamW is one
+            steps = int(np.array(extra[0]).ravel()[0])
+            mean = np.array(extra[2], dtype=np.float64).ravel() / max(1 - own.beta_2**steps, 1e-300)
+            steepness = (np.sqrt(mean) + own.epsilon) if steps else np.full_like(value, np.inf)
+        elif isinstance(own, dropt.RMSProp):
+            steepness = np.sqrt(np.array(extra, dtype=np.float64).ravel()) + own.epsilon
+        else:
+            steepness = np.full_like(value, 1 - own.momentum)
+        if key not in self._variables:
+            return 1 / steepness
+        result: np.ndarray[Any, Any] = self.slope(key) ** 2 / self._variables[key].gain / steepness
+        return result
+
+    def squares(self, key: str) -> tuple[Any, float] | None:
+        """The running mean of the squares of what the optimiser is handed, as it keeps it, and its decay; None of one
+        that keeps none."""
+        own, extra = self._own[key], self._own[key].state[key][3]
+        if isinstance(own, dropt.Adam):
+            return extra[2], own.beta_2
+        return (extra, own.alpha) if isinstance(own, dropt.RMSProp) else None
+
+    def slope(self, key: str) -> np.ndarray[Any, Any]:
+        """What the optimiser is handed per unit of gradient of the scene's value, in a row."""
+        variable, moved = self.variable(key), dr.detach(self._own[key][key])
+        if key not in self._variables:
+            return np.ones(int(np.array(moved).size))
+        return np.array(variable.chain(moved, type(moved)(1)), dtype=np.float64).ravel()
+
+    def rate(self, key: str) -> float:
+        """The learning rate of a parameter, before any schedule."""
+        return self._rates[key]
+
     def state(self) -> dict[str, np.ndarray[Any, Any]]:
         """What the optimiser keeps for each parameter beside its value, as `<key>/<index>` (in Dr.Jit's order).
 

@@ -7,8 +7,6 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-import drjit as dr
-import mitsuba as mi
 import numpy as np
 
 from reslrb_cli.config import Config
@@ -32,7 +30,7 @@ from reslrb_cli.optimization.rendering import render_in_passes, saved_spp
 from reslrb_cli.optimization.scaling import Scaled
 from reslrb_cli.optimization.targets import make_targets
 from reslrb_cli.optimization.transforms import make_transform
-from reslrb_cli.optimization.views import View, expose, make_views, to_tensor
+from reslrb_cli.optimization.views import View, expose, make_views, slope, to_tensor
 from reslrb_cli.scene import Selection, select_parameters
 from reslrb_cli.seeds import seed
 
@@ -113,10 +111,7 @@ class Problem:
 
     def image_gradient(self, view: View, image: Array) -> Array:
         """The derivative dL/dI of a view's loss at an image (H, W, C), in the target's channels; finite or not."""
-        leaf = mi.TensorXf(np.ascontiguousarray(image[:, :, : view.target.shape[2]], dtype=np.float32))
-        dr.enable_grad(leaf)
-        dr.backward(view.compare(leaf))
-        return np.array(dr.grad(leaf))
+        return slope(view.compare, image[:, :, : view.target.shape[2]])
 
     def values(self) -> dict[str, Array]:
         """The parameters' current values."""

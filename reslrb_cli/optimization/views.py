@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -82,6 +82,14 @@ class View:
     def objective(self, image: mi.TensorXf) -> mi.Float:
         """What the view adds to the loss of all views."""
         return self.compare(image) * self.share
+
+
+def slope(loss: Callable[[mi.TensorXf], mi.Float], image: Array) -> Array:
+    """The derivative of a loss of images, of width 1, at one of them (H, W, C); finite or not."""
+    leaf = mi.TensorXf(np.ascontiguousarray(image, dtype=np.float32))
+    dr.enable_grad(leaf)
+    dr.backward(loss(leaf))
+    return np.array(dr.grad(leaf))
 
 
 def view_records(views: list[View]) -> list[dict[str, Any]]:

@@ -7,6 +7,7 @@ one that is ended at once does so by `remove_unfinished`, and what a killed proc
 from __future__ import annotations
 
 import contextlib
+import glob
 import os
 import re
 import shutil
@@ -78,6 +79,25 @@ def remove_parts(folder: Path) -> None:
             if _PART.fullmatch(name):
                 with contextlib.suppress(OSError):
                     os.unlink(os.path.join(parent, name))
+
+
+def remove_parts_of(path: Path) -> None:
+    """Remove what processes that are no more began to write in place of the file `path`, and never finished."""
+    for part in path.parent.glob(f".{glob.escape(path.name)}.*.part"):
+        if _PART.fullmatch(part.name) and not _is_alive(int(part.name.split(".")[-2])):
+            with contextlib.suppress(OSError):
+                part.unlink()
+
+
+def _is_alive(process: int) -> bool:
+    """Whether there is a process of this number."""
+    try:
+        os.kill(process, 0)
+    except (ProcessLookupError, OverflowError):
+        return False
+    except OSError:  # somebody else's
+        return True
+    return True
 
 
 def _sync_folder(folder: Path) -> None:

@@ -7,11 +7,13 @@ from __future__ import annotations
 
 import os
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.lib.npyio import NpzFile
 
 from reslrb_cli.config.files import open_file
 from reslrb_cli.errors import ConfigError
@@ -53,13 +55,24 @@ def load_nonfinite(folder: Path) -> tuple[int, dict[str, np.ndarray[Any, Any]]] 
     path = folder / NONFINITE_FILE_NAME
     if not os.path.lexists(path):
         return None
+    with open_archive(path) as arrays:
+        names = [name for name in arrays.files if name.startswith("parameter/")]
+        parameters = {name.removeprefix("parameter/"): arrays[name] for name in names}
+        return int(arrays["iteration"]), parameters
+
+
+@contextmanager
+def open_archive(path: Path) -> Iterator[NpzFile]:
+    """The arrays of a file that a run wrote, each read when it is asked for.
+
+    Raises ConfigError, located in the file, also for what the block raises of it: where it cannot be read, is damaged,
+    or is nothing that a run wrote.
+    """
     try:
         with open_file(path) as file, np.load(file, allow_pickle=False) as arrays:
             if any(entry.compress_type != zipfile.ZIP_STORED for entry in arrays.zip.infolist()):
                 raise ValueError("compressed, which no run writes, and small files may so stand for large arrays")
-            names = [name for name in arrays.files if name.startswith("parameter/")]
-            parameters = {name.removeprefix("parameter/"): arrays[name] for name in names}
-            return int(arrays["iteration"]), parameters
+            yield arrays
     except ConfigError:
         raise
     except Exception as error:  # of many kinds, from the readers of archives, arrays and their heads

@@ -45,12 +45,12 @@ class Manifest:
     """Provenance and outcome of one run.
 
     `process` is who works in the folder. `plan` is what a step consists of, `pilot` the table by which an estimator was
-    chosen, `memory` how a memory budget is kept, `scaling` what was measured of each parameter for `scale: auto`,
-    `correlated_bias` what of the bias of `adjoint: correlated`; each is None where that was not asked for. `views` has,
-    of each view, its share of the loss, and how many of its pixels are left out, by kind. `results` is what the run
-    found (`iterations`, values and errors by key, `warnings`, `seen`, errors as people see them, ...); `error` is the
-    line that the user saw where the run failed. `missing` names the parts of the folder that are not there (not yet,
-    where the process ended among them), and says why.
+    chosen, `rival` how `prb` did beside that, `memory` how a memory budget is kept, `scaling` what was measured of each
+    parameter for `scale: auto`, `correlated_bias` what of the bias of `adjoint: correlated`; each is None where that
+    was not asked for. `views` has, of each view, its share of the loss, and how many of its pixels are left out, by
+    kind. `results` is what the run found (`iterations`, values and errors by key, `certainty`, `warnings`, and `seen`,
+    errors as people see them, ...); `error` is the line that the user saw where the run failed. `missing` names the
+    parts of the folder that are not there (not yet, where the process ended among them), and says why.
     """
 
     variant: str
@@ -72,6 +72,7 @@ class Manifest:
     scaling: list[dict[str, Any]] | None = None
     correlated_bias: dict[str, Any] | None = None
     views: list[dict[str, Any]] | None = None
+    rival: dict[str, Any] | None = None
     results: dict[str, Any] = field(default_factory=dict)
 
     def write(self, folder: Path) -> None:

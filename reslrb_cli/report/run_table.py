@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from textwrap import wrap
 from typing import Any
 
+from reslrb_cli.report.certainty import spread_words, verdict_words
 from reslrb_cli.report.words import count, number, shorten
 
 #: Parameters that are listed; a run with more says so, and its page has them all.
@@ -28,7 +29,7 @@ def terminal_width() -> int:
 
 
 def parameter_lines(results: Mapping[str, Any], width: int) -> list[str]:
-    """Values at start and end, true values and errors of each parameter, in lines of at most `width` characters.
+    """Values at start and end, true values, errors, spreads and verdicts, in lines of at most `width` characters.
 
     Textures are told by mean and range. A table where that fits, else a block for each parameter. `results` is what
     `Results.to_json` made.
@@ -45,6 +46,10 @@ def parameter_lines(results: Mapping[str, Any], width: int) -> list[str]:
     if any(errors.values()):
         titles.append("relative error" if relative else "RMSE")
         rows = [[*row, errors[key]] for row, key in zip(rows, listed, strict=True)]
+    verdicts = {key: verdict_words(results, key) for key in listed}
+    if any(verdicts.values()):
+        titles += ["spread", "verdict"]
+        rows = [[*row, spread_words(results, key), verdicts[key]] for row, key in zip(rows, listed, strict=True)]
     lines = _table(listed, titles, rows, width) or _blocks(listed, titles, rows, width)
     if len(shown) > len(listed):
         lines.append(shorten(f"and {count(len(shown) - len(listed), 'more parameter')}, on the page", width))

@@ -10,6 +10,7 @@ from typing import Any
 from reslrb_cli.errors import ConfigError, one_line
 from reslrb_cli.records import metrics
 from reslrb_cli.records.manifest import read_manifest
+from reslrb_cli.records.origin import Origin, read_origin
 from reslrb_cli.records.reading import read_lines
 from reslrb_cli.report.tone import Array
 
@@ -57,13 +58,17 @@ class Run:
 
 @dataclass(frozen=True)
 class Measurements:
-    """The objects in a file of `bench`, `gradcheck` or `convergence`, which `kind` is the name of."""
+    """The objects in a file of `bench`, `gradcheck` or `convergence`, which `kind` is the name of.
+
+    `origins` are those that the file names, one where a single command wrote it: none in files of older versions.
+    """
 
     path: Path
     name: str
     kind: str
     objects: Sequence[Mapping[str, Any]]
     damaged: Sequence[int] = ()
+    origins: Sequence[Origin] = ()
 
 
 @dataclass(frozen=True)
@@ -126,7 +131,9 @@ def _read_file(path: Path, name: str) -> Measurements:
         )
         raise ConfigError(path, f"line {lines.damaged[0]}" if lines.damaged else "", reason)
     kind = max(dict.fromkeys(kinds), key=kinds.count)
-    return Measurements(path, name, kind, lines.objects, lines.damaged)
+    origins = [origin for entry in lines.objects if (origin := read_origin(entry)) is not None]
+    objects = [entry for entry in lines.objects if read_origin(entry) is None]
+    return Measurements(path, name, kind, objects, lines.damaged, origins)
 
 
 def _kind(entry: Mapping[str, Any]) -> str | None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from reslrb_cli.report.certainty import certainty_lines
 from reslrb_cli.report.words import count, number, shorten, with_error
 
 #: Parameters that got worse, named one by one.
@@ -48,7 +49,8 @@ def worst(results: Mapping[str, Any]) -> str | None:
 
 
 def warnings(results: Mapping[str, Any], sign: str = "+-") -> list[str]:
-    """What went wrong in a run that did not fail, plainly: a loss that did not fall, errors that rose."""
+    """What went wrong in a run that did not fail, plainly: a loss that did not fall, errors that rose, and values that
+    cannot be relied on."""
     lines = []
     trend = results.get("loss_trend") or {}
     if trend.get("change") in ("rose", "flat") and not _image_improved(results):
@@ -64,7 +66,7 @@ def warnings(results: Mapping[str, Any], sign: str = "+-") -> list[str]:
         lines.append(f"{shorten(key, KEY_WIDTH)} got worse (RMSE {_from_to(results['parameter_rmse'][key])})")
     if len(worse) > MOST_NAMED:
         lines.append(f"and so did {count(len(worse) - MOST_NAMED, 'more parameter')}")
-    return lines
+    return [*lines, *certainty_lines(results)]
 
 
 def _image_improved(results: Mapping[str, Any]) -> bool:

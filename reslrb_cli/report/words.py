@@ -8,6 +8,8 @@ from reslrb_cli.errors import printable
 
 #: What stands in place of the middle of a shortened key.
 ELLIPSIS = "..."
+#: What is said of a comparison of paths from the camera with paths from the lights.
+WITHOUT_BORDER = "without the film's border, where light paths lose what camera paths see"
 
 
 def number(value: float | None, digits: int = 4) -> str:

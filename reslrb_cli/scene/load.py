@@ -12,7 +12,17 @@ import mitsuba as mi
 
 from ..errors import ConfigError
 from .cameras import read_cameras, replace_sensors
-from .description import build, check, mend, name_objects, notes, read_description
+from .description import (
+    Description,
+    build,
+    check,
+    mend,
+    name_objects,
+    notes,
+    place_textures,
+    read_description,
+    resize_films,
+)
 from .extent import lost_light
 from .thin_glass import thin_glass
 
@@ -20,7 +30,11 @@ logger = logging.getLogger(__name__)
 
 
 def load_scene(
-    file: Path, options: Mapping[str, Any] | None = None, strict: bool = False, cameras: Path | None = None
+    file: Path,
+    options: Mapping[str, Any] | None = None,
+    strict: bool = False,
+    size: tuple[int, int] | None = None,
+    cameras: Path | None = None,
 ) -> mi.Scene:
     """Load a Mitsuba scene (XML, versions 0.4 to 3); a variant must be set.
 
@@ -29,11 +43,22 @@ def load_scene(
     `Sphere_3`. What Mitsuba's parser would refuse because another version or an exporter wrote it is mended or left
     out, with a warning in the log; `strict` has it refused. Those of `cameras`, a file, stand in place of the scene's
     sensors. The scene's integrator is not loaded: an experiment has its own. Plugins are loaded from Mitsuba's own
-    folder alone.
+    folder alone. `size` is the (width, height) of all films in pixels, in place of what the files say.
 
     Raises ConfigError, located in the scene file, where it is missing or wrong, has nothing in it, or no light. Warns,
     too, of a scene that is too far from the origin, or too small, and of glass that is too thin.
     """
+    return load_described(file, options, strict, size, cameras)[0]
+
+
+def load_described(
+    file: Path,
+    options: Mapping[str, Any] | None = None,
+    strict: bool = False,
+    size: tuple[int, int] | None = None,
+    cameras: Path | None = None,
+) -> tuple[mi.Scene, Description]:
+    """The same, and the description that the scene was built from, of which Mitsuba has a use for every element."""
     file = Path(file)
     description = read_description(file, {name: _as_text(value) for name, value in (options or {}).items()})
     root = description.root
@@ -43,6 +68,9 @@ def load_scene(
     if strict:
         notes.refuse(found)
     check(description)
+    place_textures(root)
+    if size is not None:
+        resize_films(root, size)
     scene, unused = build(description)
     if strict:
         notes.refuse(unused)
@@ -61,7 +89,10 @@ def load_scene(
     for loss in (lost_light(scene), thin_glass(scene)):
         if loss is not None:
             _warn(f"{file}: {loss}")
-    return scene
+    for note in unused:
+        if note.owner is not None:
+            note.owner.children.remove(note.element)
+    return scene, description
 
 
 @functools.cache

@@ -10,8 +10,9 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..config import Settings
+from ..config import RunValue, Settings
 from ..errors import ConfigError
+from ..records.run_values import read_value
 from .catalog import halo
 from .target import read_image
 
@@ -77,7 +78,7 @@ class Slot:
 def initial_array(
     slot: Slot, initial: Any, resolution: tuple[int, int] | None, place: Place, any_size: bool = False
 ) -> Array:
-    """The value that `initial` ("scene", a number, a list of numbers, or an image file) gives the parameter in `slot`.
+    """The value that `initial` ("scene", a number, a list, an image file or a run) gives the parameter in `slot`.
 
     `resolution` is the (width, height) to which a texture is resampled, or None; with `any_size` it may be that of the
     file. Raises ConfigError at `place`.
@@ -95,6 +96,8 @@ def initial_array(
         array = np.full_like(current, initial)
     elif isinstance(initial, (list, tuple)):
         array = _fill(slot, current, list(initial), place)
+    elif isinstance(initial, RunValue):
+        array = _from_run(slot, current, initial.run, any_size or resolution is not None, place)
     else:
         array = _from_file(slot, current, initial, any_size or resolution is not None, place)
     if resolution is not None and array.shape[:2] != resolution[::-1]:
@@ -119,6 +122,10 @@ def check_transform(slot: Slot, array: Array, spec: Settings, place: Place) -> N
         return
     low, high = (0.0, np.inf) if spec.transform != "sigmoid" else spec.bounds or (-np.inf, np.inf)
     outside = (array <= np.float32(low)) | (array >= np.float32(high))
+    if isinstance(spec.initial, RunValue) and spec.transform == "sigmoid":
+        # Between bounds that lie close beside each other rounding may have brought a run onto one; the optimiser
+        # begins at the nearest value that the transform yields.
+        outside = (array < np.float32(low)) | (array > np.float32(high))
     if outside.any():
         yields = (
             f"values between its bounds, {low:g} and {high:g}" if spec.transform == "sigmoid" else "positive values"
@@ -180,6 +187,26 @@ def _from_file(slot: Slot, current: Array, image_file: Any, any_size: bool, plac
     if slot.channels != 3:
         raise place.fail("initial.file", f"{path} has 3 channels, but `{slot.key}` has {slot.channels}")
     return image
+
+
+def _from_run(slot: Slot, current: Array, run: Path, any_size: bool, place: Place) -> Array:
+    try:
+        array = read_value(run, slot.key)
+    except ConfigError as error:
+        raise place.fail("initial.run", str(error)) from None
+    if slot.is_texture and array.ndim == 3 and array.shape[2] == current.shape[2]:
+        if any_size or array.shape == current.shape:
+            return np.asarray(array, dtype=np.float32)
+        sizes = [f"{value.shape[1]}x{value.shape[0]}" for value in (array, current)]
+        raise place.fail(
+            "initial.run",
+            f"{run} has `{slot.key}` with {sizes[0]} texels, the texture has {sizes[1]}; give `resolution: [width, "
+            "height]` to resample",
+        )
+    if array.shape != current.shape:
+        shapes = ["x".join(map(str, value.shape)) or "one number" for value in (array, current)]
+        raise place.fail("initial.run", f"{run} has `{slot.key}` of shape {shapes[0]}, the scene of shape {shapes[1]}")
+    return np.asarray(array, dtype=np.float32)
 
 
 def _check_finite(slot: Slot, array: Array, place: Place) -> None:

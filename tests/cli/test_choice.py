@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from cli.test_optimize import CONFIG, KEY, SCENE
+from turns import taking_turns
 
 from reslrb_cli.cli import main
 from reslrb_cli.records.manifest import read_manifest
@@ -169,8 +170,7 @@ def test_a_memory_budget_is_kept(experiment, capsys, estimator):
     assert memory["passes"] * memory["samples_per_pass"] == 256
 
 
-@pytest.mark.parametrize("adjoint", ["independent", "batched"])
-@pytest.mark.parametrize("estimator", ["reservoir", "event"])
+@taking_turns("estimator", ["reservoir", "event"], "adjoint", ["independent", "batched"])
 def test_paths_take_no_memory_where_the_adjoint_is_known_before(experiment, capsys, estimator, adjoint):
     settings = wide(f"integrator={{max_depth: 4, estimator: {estimator}}}", "run.spp=256", f"run.adjoint={adjoint}")
     peaks, memory = peaks_without_and_with(1.5, capsys, *settings)
@@ -220,7 +220,7 @@ def test_a_budget_that_nothing_can_keep_is_one_located_line(experiment, capsys):
         assert not Path("runs").exists()
 
 
-@pytest.mark.parametrize("adjoint", ["correlated", "independent", "batched"])
+@pytest.mark.parametrize("adjoint", ["correlated", pytest.param("independent", marks=pytest.mark.long), "batched"])
 def test_peak_memory_is_flat_in_samples_under_a_budget(experiment, adjoint):
     from reslrb_cli.config import load
     from reslrb_cli.optimization import assemble, optimize
@@ -239,8 +239,7 @@ def test_peak_memory_is_flat_in_samples_under_a_budget(experiment, adjoint):
     assert peaks[4096] <= 1.02 * peaks[1024], peaks
 
 
-@pytest.mark.parametrize("estimator", ["reservoir", "gather", "event", "stack"])
-@pytest.mark.parametrize("zeros", [False, True])
+@taking_turns("estimator", ["reservoir", "gather", "event", "stack"], "zeros", [True, False])
 def test_what_is_kept_of_a_path_is_what_is_counted(experiment, monkeypatch, estimator, zeros):
     from reslrb_cli.config import load
     from reslrb_cli.estimators.base import entry_bytes
@@ -267,8 +266,7 @@ def test_what_is_kept_of_a_path_is_what_is_counted(experiment, monkeypatch, esti
         assert (problem.integrator.estimator.scratch_bytes(plan) > 0) == (estimator == "stack")
 
 
-@pytest.mark.parametrize("adjoint", ["correlated", "batched"])
-@pytest.mark.parametrize("estimator", ["reservoir", "gather", "event", "stack"])
+@taking_turns("estimator", ["reservoir", "gather", "event", "stack"], "adjoint", ["batched", "correlated"])
 def test_all_sample_counts_have_the_same_kernels(experiment, estimator, adjoint):
     """The pilot's would otherwise be compiled for nothing."""
     from reslrb_cli.config import load

@@ -35,7 +35,9 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def read(path: Path) -> list[dict]:
-    return [json.loads(line) for line in path.read_text().splitlines()]
+    lines = [json.loads(line) for line in path.read_text().splitlines()]
+    assert lines[0]["kind"] == "origin"
+    return lines[1:]
 
 
 def test_a_scene_from_end_to_end(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -66,7 +68,7 @@ def test_a_scene_from_end_to_end(folder: Path, capsys: pytest.CaptureFixture[str
     assert (folder / "out/c.png").read_bytes().startswith(b"\x89PNG")
     printed = capsys.readouterr().out.splitlines()
     assert printed[-2].startswith("Best for this scene: ")
-    assert sum("16 rounds" in line for line in printed) == len(names)  # rows as they come
+    assert sum("16 rounds " in line for line in printed) == len(names)  # rows as they come
     assert any(line.startswith("ptracer: first step") for line in printed)  # and what was compiled, apart
 
 
@@ -140,12 +142,16 @@ def test_steps_that_cannot_be_gone_on_from(
 
 
 @pytest.mark.long
-def test_going_on(folder: Path) -> None:
+def test_going_on(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     args = ["--integrators", "reslrb:stack", "--rounds", "4"]
     assert call("tiny.yaml", *args, "--json", "c.jsonl") == 0
-    assert call("tiny.yaml", *args, "--resume", "c.jsonl") == 0
+    assert call("tiny.yaml", *args[:-1], "8", "--resume", "c.jsonl") == 0
     assert {line["repeats"] for line in read(folder / "c.jsonl") if line["kind"] == "method"} == {16}
-    assert call("tiny.yaml", *args, "--resume", "c.jsonl", "--set", "run.spp=8") == 2
+    capsys.readouterr()
+    assert call("tiny.yaml", *args[:-1], "9", "--resume", "c.jsonl", "--set", "run.spp=8") == 2
+    assert capsys.readouterr().err == ("--resume: c.jsonl is of another measurement: run.spp is 4 there, 8 here\n")
+    assert call("tiny.yaml", *args[:-1], "8", "--resume", "c.jsonl") == 2
+    assert "c.jsonl has 8 rounds already" in capsys.readouterr().err
     assert len(read(folder / "c.jsonl")) > 2  # as it was
 
 

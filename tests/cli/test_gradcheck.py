@@ -35,7 +35,9 @@ def call(*args: str) -> int:
 
 
 def read(path: Path) -> list[dict]:
-    return [json.loads(line) for line in path.read_text().splitlines()]
+    lines = [json.loads(line) for line in path.read_text().splitlines()]
+    assert lines[0]["kind"] == "origin"
+    return lines[1:]
 
 
 def test_a_table_and_its_files(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

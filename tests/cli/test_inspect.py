@@ -123,7 +123,7 @@ def test_a_scene_file_by_itself(scene):
     )
     assert others[at + 1] == "(wall.reflectance.data)"
     assert sum(int(line.split()[0]) for line in others[1:] if line[0] != "(") == 26
-    assert found[-1].startswith("next: write `scene: {file: scene.xml}`, `target: {file: IMAGE}` and `parameters: ")
+    assert found[-1] == "next: `reslrb init scene.xml --target PHOTO` writes a configuration of it"
     assert "plan" not in found
 
 

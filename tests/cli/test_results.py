@@ -125,24 +125,48 @@ def test_a_parameter_that_got_worse_is_said_plainly(capsys):
     assert pair["final"] > 2 * pair["initial"]
     assert f"; {WALL} got worse (RMSE {pair['initial']:.3g} to {pair['final']:.3g})" in last
     assert results["worse"] == [WALL]
-    assert out.splitlines()[1].endswith(", worse")
+    assert ", worse " in out.splitlines()[1]
+    assert out.splitlines()[1].endswith("at its bound")
 
 
 def test_a_run_that_works_or_is_short_has_nothing_to_complain_of(capsys):
-    last, _, results = optimize(capsys, "run.adjoint=independent", "run.spp=128")
+    last, _, results = optimize(capsys, "run.adjoint=independent", "run.spp=128", "run.certainty=false")
     assert results["loss_trend"]["change"] == "fell"
     assert results["warnings"] == []
     assert last.count(";") == 1
+    assert "certainty" not in results
     last, _, results = optimize(capsys, "optimizer.learning_rate=30", "run.iterations=5")
     assert (results["loss_trend"], results["warnings"]) == (None, [])
 
 
 def test_a_loss_that_is_nothing_but_noise_is_no_failure(capsys):
     """The images of the iterations are too noisy to tell, those of more samples are not."""
-    _, _, results = optimize(capsys, "run.adjoint=independent")
+    _, _, results = optimize(capsys, "run.adjoint=independent", "run.certainty=false")
     assert results["loss_trend"]["change"] == "flat"
     assert results["image_loss"]["final"] < 0.5 * results["image_loss"]["initial"]
     assert results["warnings"] == []
+
+
+def test_a_run_that_is_not_done_says_so_everywhere(capsys):
+    sets = ["run.adjoint=independent", "run.spp=128", "optimizer.learning_rate=0.002"]
+    last, out, results = optimize(capsys, *sets)
+    about = results["certainty"]["parameters"][KEY]
+    assert about["verdict"] == "still moving"
+    assert 0.5 < about["shares"]["still moving"] < 1
+    assert f"; not converged, still moving: {KEY}; look at " in last
+    assert "spread" in out.splitlines()[0]
+    assert re.search(r"\+- 0\.\d+ +still moving \(\d\d", out.splitlines()[1])
+    assert results["warnings"] == [f"not converged, still moving: {KEY}"]
+    page = Path("runs/box/report.html").read_text()
+    assert f"not converged, still moving: {KEY}" in page.partition("<section>")[0]
+    assert '<th scope="col">verdict</th>' in page
+    assert '<span class="worse">still moving (' in page
+    assert results["certainty"]["gradients"] == 5
+    # A run that says nothing of it ends with the same values.
+    values = np.load("runs/box/parameters/parameters.npz")[KEY]
+    optimize(capsys, *sets, "run.certainty=false")
+    np.testing.assert_allclose(np.load("runs/box/parameters/parameters.npz")[KEY], values, rtol=1e-5)
+    assert '<th scope="col">verdict</th>' not in Path("runs/box/report.html").read_text()
 
 
 @pytest.mark.parametrize("integrator", ["ptracer", "reslrb, estimator: event, samples_per_pass: 24"])

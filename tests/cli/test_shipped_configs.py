@@ -14,6 +14,8 @@ ROOT = Path(__file__).resolve().parents[2]
 CONFIGS = sorted((ROOT / "configs").rglob("*.yaml"))
 #: What may be left of a parameter's error at the start: over the texels that light and sensor reach.
 MOST = 0.2
+#: So much slower a machine may be than the README's.
+SLOWER = 4
 #: What the README says of single ones.
 MOST_OF = {"painting.reflectance.data": 0.5}
 
@@ -37,7 +39,7 @@ def test_the_readme_states_its_time(config: Path) -> None:
 @pytest.mark.long
 @pytest.mark.parametrize("config", CONFIGS, ids=name_of)
 def test_it_recovers_what_it_promises(config: Path, tmp_path: Path) -> None:
-    """The time is that of the iterations, twice what is stated at most: the README's machine is not this one."""
+    """The time is that of the iterations, four times what is stated at most: the README's machine is not this one."""
     main.main(
         ["optimize", str(config), "--set", f"run.output={tmp_path}", "--set", "run.name=it"], standalone_mode=False
     )
@@ -48,4 +50,4 @@ def test_it_recovers_what_it_promises(config: Path, tmp_path: Path) -> None:
     for key, error in errors.items():
         assert error["final"] <= MOST_OF.get(key, MOST) * error["initial"], key
     assert results["worse"] == []
-    assert results["elapsed_s"] <= 2 * stated_seconds(name_of(config))
+    assert results["elapsed_s"] <= SLOWER * stated_seconds(name_of(config))

@@ -31,7 +31,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     [
         (("--runs", "2", "--objective", "fixed"), "--objective: does not go with --runs"),
         (("--runs", "2", "--rounds", "3"), "--rounds: does not go with --runs: runs have a time"),
-        (("--runs", "2", "--resume", "c.jsonl"), "--resume: does not go with --runs"),
+        (("--runs", "2", "--resume", "c.jsonl"), "c.samples.npz: no such file"),
         (("--runs", "0"), "0 is not in the range"),
         (("--runs", "2", "--integrators", "reslrb:stack,path"), "--integrators path: integrator.type: must be one of"),
         (("--integrators", "reslrb:auto"), "`auto` measures which to take"),

@@ -21,7 +21,7 @@ def _memory(name: str) -> float:
     return int(next(line for line in status.splitlines() if line.startswith(name)).split()[1]) / 1024
 
 
-@pytest.mark.parametrize("count", [200, pytest.param(10_000, marks=pytest.mark.long)])
+@pytest.mark.parametrize("count", [100, pytest.param(10_000, marks=pytest.mark.long)])
 def test_mutated_configurations(count: int, tmp_path: Path) -> None:
     texts, path = mutations.good_texts(), tmp_path / "x.yaml"
     Path("/proc/self/clear_refs").write_text("5")  # the most so far begins anew

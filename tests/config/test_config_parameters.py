@@ -92,7 +92,10 @@ WRONG = {
         f"{{{LENS}, initial: 0}}",
         ("parameters[0].initial: must be a mapping by what is free",),
     ),
-    "start that is text": ("{key: a, initial: grey}", ("[0].initial: must be a number", "{file: IMAGE}, or `scene`")),
+    "start that is text": (
+        "{key: a, initial: grey}",
+        ("[0].initial: must be a number", "{file: IMAGE}, {run: RUN}, or `scene`"),
+    ),
     "file for a motion": (f"{{{LENS}, initial: {{file: a.png}}}}", ("parameters[0].initial: is an image file",)),
     "bounds of a word": (
         f"{{{LENS}, bounds: {{rotation: [1, 0]}}}}",

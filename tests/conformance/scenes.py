@@ -17,6 +17,8 @@ from reslrb_cli.measure.statistics import Agreement, compare
 
 #: Largest relative difference between images of the same random numbers.
 SAME = 3e-4
+#: How much of its samples `agreement` takes; less for the tests that use `samples` (conftest.py).
+SHARE = 1.0
 
 WHITE = {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.8, 0.7, 0.6]}}
 RED = {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.7, 0.3, 0.2]}}
@@ -115,6 +117,7 @@ def agreement(scene: Any, reference: str = "path", *, spp: int = 256, seeds: int
     a `border` of so many pixels is left out, and so is alpha, where light tracing has nothing to say.
     """
     options = {"max_depth": 5, "rr_depth": 100} | options
+    spp = round(SHARE * spp)
     ours = images(scene, "reslrb", range(seeds), spp, **options, **(reslrb or {}))
     theirs = images(scene, reference, range(1000, 1000 + seeds), spp, **options)
     inner = slice(border, -border or None)

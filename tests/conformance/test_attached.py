@@ -104,17 +104,18 @@ def deep(depth: int, stack_size: int, **options: Any) -> dict[str, np.ndarray]:
 
 
 @pytest.mark.parametrize(
-    ("depth", "options"),
+    ("depth", "sizes", "options"),
     [
-        (16, {"rr_depth": 4}),
-        pytest.param(16, {}, marks=pytest.mark.long),
-        pytest.param(128, {}, marks=pytest.mark.long),
-        pytest.param(128, {"rr_depth": 4}, marks=pytest.mark.long),
+        (16, (2,), {"rr_depth": 4}),
+        pytest.param(16, (1, 8), {"rr_depth": 4}, marks=pytest.mark.long),
+        pytest.param(16, (1, 2, 8), {}, marks=pytest.mark.long),
+        pytest.param(128, (1, 2, 8), {}, marks=pytest.mark.long),
+        pytest.param(128, (1, 2, 8), {"rr_depth": 4}, marks=pytest.mark.long),
     ],
 )
-def test_a_small_stack_equals_a_large_one(depth: int, options: dict[str, Any]):
+def test_a_small_stack_equals_a_large_one(depth: int, sizes: tuple[int, ...], options: dict[str, Any]):
     expected = deep(depth, 128, **options)
-    for size in (1, 2, 8):
+    for size in sizes:
         for key, value in deep(depth, size, **options).items():
             assert relative(value, expected[key]) < 1e-5, f"{key}, {size} places"
             assert value.any()

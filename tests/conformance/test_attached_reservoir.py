@@ -7,6 +7,7 @@ With diffuse vertices in the chain, and still one connection, damping adds noise
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -32,10 +33,11 @@ BY_NAME = {case.name: case for case in CASES}
 ONE = AttachedScene("one", "one diffuse vertex in the chain", lambda: room(wall=wall(diffuse(0.8, 0.7, 0.6))), moved,
                     spp=64, options={"max_depth": 5})  # fmt: skip
 TWO = AttachedScene("two", "two diffuse vertices in the chain", shelf, moved, spp=64, options={"max_depth": 6})
+BOTH = replace(TWO, name="both", moves=lambda _: [Pose("floor.to_world", ("ty",)), Pose("wall.to_world", ("tx",))])
 
 
 @pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=() if name in ("slab", "passes") else pytest.mark.long) for name in SINGLE]
+    "name", [pytest.param(name, marks=() if name == "slab" else pytest.mark.long) for name in SINGLE]
 )
 def test_specular_chains_equal_naive_ad(name: str):
     case = BY_NAME[name]
@@ -61,18 +63,26 @@ class Bias:
         return f"bias {self.value:.2%} +- {self.error:.2%}, variance {1 + self.noise:.2f} of that of stack"
 
 
+@cache
+def exact_gradients(name: str, sampling: str, count: int) -> np.ndarray:
+    """Those of `stack` in the scene of this name, once for all tests: nothing that they break takes part in it."""
+    [scene] = [scene for scene in (ONE, TWO, BOTH) if scene.name == name]
+    tracer = integrator("reslrb", **scene.options, attached_sampling=sampling, estimator="stack")
+    return scene.case().gradients(tracer, seeds(count), scene.spp)
+
+
 def bias(scene: AttachedScene, sampling: str, count: int, **options: Any) -> Bias:
     """That of `reservoir` at equal seeds."""
-    case, both = scene.case(), dict(scene.options) | {"attached_sampling": sampling}
-    exact = case.gradients(integrator("reslrb", **both, estimator="stack"), seeds(count), scene.spp)
-    ours = case.gradients(integrator("reslrb", **both, estimator="reservoir", **options), seeds(count), scene.spp)
+    exact = exact_gradients(scene.name, sampling, count)
+    tracer = integrator("reslrb", **scene.options, attached_sampling=sampling, estimator="reservoir", **options)
+    ours = scene.case().gradients(tracer, seeds(count), scene.spp)
     mean = exact.mean(0)
     along = (ours - exact) @ mean / (mean @ mean)
     noise = (ours - exact).var(0, ddof=1).sum() / exact.var(0, ddof=1).sum()
     return Bias(float(along.mean()), float(along.std(ddof=1) / np.sqrt(count)), float(noise))
 
 
-@pytest.mark.parametrize("scene", [ONE, TWO], ids=lambda scene: scene.name)
+@pytest.mark.parametrize("scene", [pytest.param(ONE, marks=pytest.mark.long), TWO], ids=lambda scene: scene.name)
 def test_no_bias_behind_diffuse_vertices(scene: AttachedScene):
     found = bias(scene, "stay", 12)
     print(scene.name, found)
@@ -183,14 +193,22 @@ def distance(name: str) -> float:
     return max(relative(ours[key], value) for key, value in exact.items())
 
 
-@pytest.mark.parametrize("name", FAULTS)
+@pytest.mark.parametrize("fault", FAULTS.values(), ids=FAULTS)
+def test_it_fits_the_code(fault: Fault, monkeypatch: pytest.MonkeyPatch):
+    plant(fault, monkeypatch)
+
+
+#: Of the default suite: one of the selection, one of the replay.
+QUICK = ("no_G", "own_vertex_left_out")
+
+
+@pytest.mark.parametrize("name", [pytest.param(n, marks=() if n in QUICK else pytest.mark.long) for n in FAULTS])
 def test_fault(name: str, monkeypatch: pytest.MonkeyPatch):
     plant(FAULTS[name], monkeypatch)
     if name == "no_G":  # specular factors hardly change
         assert abs(bias(TWO, "stay", 6).value) > 0.1
         return
     if name == "factors_passed_stay":  # what is left over is divided by the damping, of either sign
-        both = replace(TWO, moves=lambda scene: [Pose("floor.to_world", ("ty",)), Pose("wall.to_world", ("tx",))])
-        assert bias(both, "stay", 6).noise > 5
+        assert bias(BOTH, "stay", 6).noise > 5
         return
     assert distance("receiver" if name == "own_vertex_left_out" else "slab") > 10 * SPECULAR

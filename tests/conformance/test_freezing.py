@@ -8,6 +8,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 from conformance.gradient_cases import CASES, GradientCase
+from turns import taking_turns
 
 from reslrb_cli.errors import UnsupportedScene
 from reslrb_cli.integrators import freezing
@@ -44,34 +45,40 @@ def gradients(case: GradientCase, adjoint: str, **options: object) -> tuple[list
     return found, counts
 
 
-def _quick_or_long(case: GradientCase) -> object:
-    return pytest.param(case, id=case.name, marks=[] if case.name in QUICK else [pytest.mark.long])
+@taking_turns("case", [BY_NAME[name] for name in QUICK], "estimator", ESTIMATORS)
+def test_a_recorded_step_is_the_step(case: GradientCase, estimator: str) -> None:
+    recorded_step_is_the_step(case, estimator)
 
 
-@pytest.mark.parametrize("case", [_quick_or_long(case) for case in CASES if case.name not in NOT_RECORDED])
-def test_a_recorded_step_is_the_step(case: GradientCase) -> None:
-    for number, estimator in enumerate(ESTIMATORS):
-        adjoint = list(KINDS)[(number + len(case.name)) % len(KINDS)]
-        expected, none = gradients(case, adjoint, estimator=estimator, freeze=False)
-        gc.collect()  # the scene: none but its own may be alive
-        found, counts = gradients(case, adjoint, estimator=estimator, freeze=True)
-        for step, (a, b) in enumerate(zip(found, expected, strict=True)):
-            assert relative(a, b) < 1e-5, f"{estimator}, {adjoint}, step {step}"
-        # The last steps come from recordings, or else nothing was tested.
-        assert none[-1] == {}
-        assert set(counts[-1]) == KINDS[adjoint], f"{estimator}, {adjoint}"
-        assert counts[-1] == counts[-2], f"{estimator}, {adjoint}"
+@pytest.mark.long
+@pytest.mark.parametrize("estimator", ESTIMATORS)
+@pytest.mark.parametrize("name", [name for name in BY_NAME if name not in QUICK + NOT_RECORDED])
+def test_a_recorded_step_of_other_cases_is_the_step(name: str, estimator: str) -> None:
+    recorded_step_is_the_step(BY_NAME[name], estimator)
 
 
-@pytest.mark.parametrize("adjoint", KINDS)
-def test_what_cannot_be_recorded_is_computed_all_the_same(adjoint: str) -> None:
+def recorded_step_is_the_step(case: GradientCase, estimator: str) -> None:
+    """Of one way to come by dL/dI, which case and estimator choose."""
+    adjoint = list(KINDS)[(ESTIMATORS.index(estimator) + len(case.name)) % len(KINDS)]
+    expected, none = gradients(case, adjoint, estimator=estimator, freeze=False)
+    gc.collect()  # the scene: none but its own may be alive
+    found, counts = gradients(case, adjoint, estimator=estimator, freeze=True)
+    for step, (a, b) in enumerate(zip(found, expected, strict=True)):
+        assert relative(a, b) < 1e-5, f"step {step}, {adjoint}"
+    # The last steps come from recordings, or else nothing was tested.
+    assert none[-1] == {}
+    assert set(counts[-1]) == KINDS[adjoint]
+    assert counts[-1] == counts[-2]
+
+
+@taking_turns("estimator", ESTIMATORS, "adjoint", list(KINDS))
+def test_what_cannot_be_recorded_is_computed_all_the_same(estimator: str, adjoint: str) -> None:
     case = BY_NAME["thin_lens"]
-    for estimator in ESTIMATORS:
-        expected, _ = gradients(case, adjoint, estimator=estimator, freeze=False)
-        found, counts = gradients(case, adjoint, estimator=estimator, freeze=True)
-        for a, b in zip(found, expected, strict=True):
-            assert relative(a, b) < 1e-5, estimator
-        assert not KINDS[adjoint] & set(counts[-1]) & {"trace", "image", "fused"}, estimator
+    expected, _ = gradients(case, adjoint, estimator=estimator, freeze=False)
+    found, counts = gradients(case, adjoint, estimator=estimator, freeze=True)
+    for a, b in zip(found, expected, strict=True):
+        assert relative(a, b) < 1e-5
+    assert not KINDS[adjoint] & set(counts[-1]) & {"trace", "image", "fused"}
 
 
 def test_a_recording_that_no_longer_fits_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:

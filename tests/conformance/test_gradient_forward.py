@@ -43,7 +43,21 @@ def forward(scene: Case, integrator: Any, seed: int, spp: int) -> np.ndarray:
     return scene.along(scene.directions(1)[0], tangent)[:, :, :3]  # derivative of alpha: none
 
 
-@pytest.mark.parametrize("name", [case.name for case in CASES if case.name not in ("texture_prb", "retained")])
+#: Forward mode by default: what it does along a path (emission, factors, delta lobes, masks, what is seen), with
+#: films and sensors; the other cases hold other BSDFs and emitters, to which it is the same.
+QUICK = ("texture", "roulette", "passes", "gaussian", "crop", "rgba", "thin_lens", "roughplastic", "blend", "normalmap",
+         "glass", "mesh_attribute", "mask_texture_in_view", "masked_mirror", "area_texture", "constant",
+         "two_emitters", "visible_lamp")  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(case.name, marks=() if case.name in QUICK else pytest.mark.long)
+        for case in CASES
+        if case.name not in ("texture_prb", "retained")
+    ],
+)
 def test_forward_mode_is_walk_ad(name: str):
     case = BY_NAME[name]
     scene, options = Case(case.scene(), case.keys), case.both | case.options

@@ -99,7 +99,7 @@ CASES = [
 def directions(case: ZeroCase, scene: Case) -> np.ndarray:
     """The parameters' axes, or a few directions into the domain where there are many parameters: (K, P)."""
     size = sum(len(value) for value in scene.initial.values())
-    return np.eye(size) if case.fixed_paths or size <= 4 else np.abs(scene.directions(2))
+    return np.eye(size) if case.fixed_paths or size <= 2 else np.abs(scene.directions(2))
 
 
 def differences(case: ZeroCase, scene: Case, along: np.ndarray, count: int, block: int) -> np.ndarray:

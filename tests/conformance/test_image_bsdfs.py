@@ -21,6 +21,8 @@ from conformance.scenes import (
     transform,
 )
 
+pytestmark = pytest.mark.usefixtures("samples")
+
 
 def normals():
     """A normal map, tilted by up to 30 degrees."""
@@ -121,7 +123,12 @@ def scene_with(bsdf, holder: str, sensor=None):
     return stage({"lamp": lamp(side=1.5, radiance=rgb(2, 3, 4))}, sensor, ball=thing)
 
 
-@pytest.mark.parametrize("name", SEEN)
+#: Those that by default `ptracer` alone is a reference of: like one of the others they are there for.
+BY_PTRACER = ("roughconductor", "anisotropic roughconductor", "roughplastic", "transmitting principled",
+              "principledthin", "twosided")  # fmt: skip
+
+
+@pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.long if n in BY_PTRACER else ()) for n in SEEN])
 def test_ball(name):
     result = agreement(scene_with(SEEN[name](), "ball"))
     assert result, result

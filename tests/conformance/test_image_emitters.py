@@ -21,6 +21,8 @@ from conformance.scenes import (
 
 from reslrb_cli.errors import UnsupportedScene
 
+pytestmark = pytest.mark.usefixtures("samples")
+
 #: A lamp that the camera sees.
 VISIBLE = {"position": (0, 1.6, -0.8), "target": (0, 0.3, 2)}
 
@@ -75,13 +77,20 @@ ENVIRONMENTS = [name for name in EMITTERS if name.startswith(("constant", "envma
 NOT_PTRACER = [name for name in EMITTERS if name.startswith("envmap") or "mask" in name]
 
 
-@pytest.mark.parametrize("name", EMITTERS)
+#: Those that by default `ptracer` alone is a reference of: like one of the others they are there for.
+BY_PTRACER = ("area", "textured area", "spot", "textured spot", "directional", "sunsky")
+
+
+@pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.long if n in BY_PTRACER else ()) for n in EMITTERS])
 def test_emitter_against_path(name):
     result = agreement(stage({"emitter": EMITTERS[name]()}))
     assert result, result
 
 
-@pytest.mark.parametrize("name", ENVIRONMENTS)
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(n, marks=() if n in ("constant", "envmap, two axes") else pytest.mark.long) for n in ENVIRONMENTS],
+)
 def test_hidden_environment_against_path(name):
     # Hidden area lights are not compared: `path` looks through them, light paths are stopped by them.
     result = agreement(stage({"emitter": EMITTERS[name]()}), hide_emitters=True)

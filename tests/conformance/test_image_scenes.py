@@ -24,6 +24,7 @@ def shipped(name: str):
     return load_scene(ROOT / "scenes" / name / "scene.xml", {"resx": 32, "resy": 32})
 
 
+@pytest.mark.usefixtures("samples")
 @pytest.mark.parametrize("name", SCENES)
 def test_shipped_scene(name):
     reference, spp = SCENES[name]

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from conformance.gradient_cases import CASES
+from turns import taking_turns
 
 from reslrb_cli.measure.gradients import Case, integrator
 from reslrb_cli.scene import load_scene
@@ -62,15 +63,24 @@ def steps_compile_nothing(scene: Case, step: Callable[[int], Any]) -> None:
 
 #: The cases that are run with independent samples too, unless `-m long` asks for all.
 INDEPENDENT = ("texture", "passes", "glass", "mask", "area_texture", "envmap", "visible_lamp")
+#: Of the others, those that the default suite runs: each has objects of a kind that the rest does not have.
+CORRELATED = ("roulette", "retained", "crop", "thin_lens", "roughconductor_texture", "plastic", "principled", "blend",
+              "normalmap", "mesh_attribute", "mask_texture_in_view", "point", "projector", "two_emitters")  # fmt: skip
 
 
-@pytest.mark.parametrize("adjoint", ["correlated", "independent"])
-@pytest.mark.parametrize("name", INDEPENDENT)
+@taking_turns("name", INDEPENDENT, "adjoint", ("independent", "correlated"))
 def test_second_step_compiles_nothing(name: str, adjoint: str):
     case_compiles_nothing(name, adjoint)
 
 
-@pytest.mark.parametrize("name", [case.name for case in CASES if case.name not in INDEPENDENT])
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(case.name, marks=() if case.name in CORRELATED else pytest.mark.long)
+        for case in CASES
+        if case.name not in INDEPENDENT
+    ],
+)
 def test_second_step_of_other_cases_compiles_nothing(name: str):
     case_compiles_nothing(name, "correlated")
 
@@ -95,8 +105,7 @@ def case_compiles_nothing(name: str, adjoint: str) -> None:
     steps_compile_nothing(scene, lambda seed: scene.gradient(ours, seed, 16, loss, adjoint=adjoint))
 
 
-@pytest.mark.parametrize("adjoint", ["correlated", "independent"])
-@pytest.mark.parametrize("name", SHIPPED)
+@taking_turns("name", list(SHIPPED), "adjoint", ("correlated", "independent"))
 def test_second_step_compiles_nothing_on_shipped_scenes(name: str, adjoint: str):
     import drjit as dr
     import mitsuba as mi

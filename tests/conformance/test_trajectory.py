@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from conformance.gradient_cases import CASES, GradientCase
+from turns import taking_turns
 
 from reslrb_cli.errors import UnsupportedScene
 from reslrb_cli.integrators import gradient_step, known_step, make_integrator
@@ -22,8 +23,7 @@ def options(case: GradientCase) -> dict:
     return {name: value for name, value in {**case.options, **case.both}.items() if name != "image"}
 
 
-@pytest.mark.parametrize("adjoint", ["correlated", "independent"])
-@pytest.mark.parametrize("name", NAMES)
+@taking_turns("name", NAMES, "adjoint", ("correlated", "independent"))
 def test_equal_seeds_give_equal_gradients(name: str, adjoint: str) -> None:
     named = BY_NAME[name]
     case = Case(named.scene(), named.keys)

@@ -49,6 +49,7 @@ class Stage:
         self.judge_s, self.target_s, self.without, self.methods = judge_s, target_s, without or {}, methods
         self.turns: list[tuple[str, int]] = []
         self.most_alive = 0
+        self.prepared: dict[str, Any] = {}
 
     def clock(self) -> float:
         return self.now
@@ -106,9 +107,16 @@ class Player:
             self.stage.wait(STARTUP_S + 0.3, stop)
             return {"loading_s": 0.3, "warnings": ["old"]}
         if "prepare" in question:
+            self.stage.prepared = question["prepare"]
             self.stage.wait(self.stage.target_s, stop)
+            np.savez(question["out"], **{"target-0": np.full((2, 2, 3), 0.25, np.float32)})
             return {"without": self.stage.without, "loss": 1.0, "error": 1.0, "judge_s": self.stage.judge_s,
-                    "error_of": "RMSE", "pictures": ""}  # fmt: skip
+                    "error_of": "RMSE", "pictures": "", "spp": 64, "masked": False}  # fmt: skip
+        if "restore" in question:
+            assert question["restore"] == {"spp": 64, "masked": False}
+            with np.load(question["targets"]) as targets:
+                np.testing.assert_array_equal(targets["target-0"], 0.25)
+            return {"loss": 1.0, "error": 1.0, "judge_s": self.stage.judge_s}
         self.stage.wait(self.stage.judge_s, stop)
         self.stage.judged += 1
         value = float(load(question["values"], ["a"])["a"][0])

@@ -41,13 +41,17 @@ class Pretence:
     ends: int | None = None
     refuses: bool = False
     nan_at: int | None = None
+    #: Steps of which each is so many times as noisy as the others.
+    outliers: tuple[int, ...] = ()
+    outlier: float = 100.0
     steps: list[int] = field(default_factory=list)
 
     def sample(self, purpose: str, number: int, image: int) -> np.ndarray:
         """One step, (63,) float32."""
         random = np.random.default_rng([zlib.crc32(purpose.encode()), number])
         shared = np.random.default_rng([7, image]).standard_normal(len(TRUTH)) * self.image_noise
-        row = TRUTH * (1 + self.bias + shared + self.noise * random.standard_normal(len(TRUTH)))
+        noise = self.noise * (self.outlier if number in self.outliers else 1.0)
+        row = TRUTH * (1 + self.bias + shared + noise * random.standard_normal(len(TRUTH)))
         return row.astype(np.float32)
 
 

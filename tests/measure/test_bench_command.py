@@ -29,7 +29,9 @@ def call(*args: str) -> int:
 
 
 def read(path: Path) -> list[dict]:
-    return [json.loads(line) for line in path.read_text().splitlines()]
+    lines = [json.loads(line) for line in path.read_text().splitlines()]
+    assert lines[0]["kind"] == "origin"
+    return lines[1:]
 
 
 def test_two_depths(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -166,13 +168,15 @@ def test_ctrl_c_keeps_what_is_done(tmp_path: Path) -> None:
         stdout=subprocess.PIPE, text=True, env=os.environ | {"PYTHONUNBUFFERED": "1"},
     )  # fmt: skip
     end = time.monotonic() + 60
-    while not (file.exists() and file.read_text().count("\n") >= 1) and time.monotonic() < end:
+    while not (file.exists() and file.read_text().count("\n") >= 2) and time.monotonic() < end:
         time.sleep(0.05)
     process.send_signal(signal.SIGINT)
     output, _ = process.communicate(timeout=30)
     assert process.returncode == 130
     rows = read(file)
     assert rows
+    origin = json.loads(file.read_text().partition("\n")[0])
+    assert origin["command"] == ["reslrb", *command[3:], "--integrators", "reslrb:stack", "--json", str(file)]
     assert [list(row) for row in rows] == [KEYS] * len(rows)
     assert (tmp_path / "bench.png").exists()
     assert "look at" in output

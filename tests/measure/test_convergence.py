@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 from measure.pretended_steps import SHAPES, Pretence, Stage, of, plan, play
 
+from reslrb_cli.measure.convergence.judgement import HEAVY, Judgement
+from reslrb_cli.measure.convergence.members import Role
 from reslrb_cli.records.bench import BenchStatus
 from reslrb_cli.report.convergence_table import closing_sentence, notes
 
@@ -50,6 +52,36 @@ def test_a_planted_bias_of_three_percent_is_reported(tmp_path: Path) -> None:
     assert "The biased reslrb:event has" in sentence
     assert "but its error stays above 0.032." in sentence
     assert any(note.startswith("reslrb:event, all: biased by 0.032 of the whole") for note in notes(results.methods))
+
+
+def test_noise_whose_tails_are_too_heavy_for_intervals_is_reported(tmp_path: Path) -> None:
+    """One step in 64 that is a hundred times as noisy as the others: it has all of the variance.
+
+    A sample without it has a hundredth of the error, and an interval that says nothing of it.
+    """
+    heavy = Pretence(0.1, 0.1, outliers=(30,))
+    session, results, _ = play(tmp_path, Stage(case_reslrb_stack=heavy, case_reslrb_event=Pretence(0.1, 0.1)), plan())
+    for key in (*SHAPES, "all"):
+        flagged, sound = of(results, "reslrb:stack", key), of(results, "reslrb:event", key)
+        assert "carry the variance" in flagged.message, key
+        assert flagged.biased is None  # its z scores prove nothing either
+        assert (sound.message, sound.biased) == ("", False)
+    [member] = [member for member in session.of(Role.CASE) if member.label == "reslrb:stack"]
+    assert Judgement(session).overall(member).message == HEAVY  # also in the lines that come while it goes on
+    lucky = play(tmp_path, Stage(case_reslrb_stack=Pretence(0.1, 0.1)), plan())[1]
+    assert of(lucky, "reslrb:stack").efficiency.low > 10 * of(results, "reslrb:stack").efficiency.value
+    assert any(note.startswith("reslrb:stack, all: single") for note in notes(results.methods))
+    assert closing_sentence(results.methods).startswith("Best for this scene: reslrb:event")
+
+
+def test_tails_that_are_no_worse_than_usual_are_not_reported(tmp_path: Path) -> None:
+    """Every fourth step ten times as noisy: many steps carry the variance, and intervals hold."""
+    stage = Stage(case_reslrb_stack=Pretence(0.1, 0.05, outliers=tuple(range(0, 200, 4)), outlier=10.0))
+    _, results, _ = play(tmp_path, stage, plan())
+    record = of(results, "reslrb:stack")
+    assert (record.message, record.biased) == ("", False)
+    truth = 1 / (0.1 * 0.05**2 * (3 + 10**2) / 4)
+    assert record.efficiency.low < truth < record.efficiency.high
 
 
 def test_what_errors_are_taken_from_is_judged_too(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -12,9 +13,10 @@ from measure.pretended_steps import CONFIG, LIST, Pretence, Stage, of, plan, pla
 from reslrb_cli.config import loads
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.measure.convergence.members import MOST_REFERENCE_STEPS, MOST_STEPS, Role
-from reslrb_cli.measure.convergence.resuming import Earlier
+from reslrb_cli.measure.convergence.resuming import KIND, check
+from reslrb_cli.measure.earlier import Earlier
 from reslrb_cli.records.bench import BenchStatus
-from reslrb_cli.records.convergence_samples import read_samples, write_samples
+from reslrb_cli.records.samples import read_samples, write_samples
 from reslrb_cli.report.convergence_table import closing_sentence, notes
 
 
@@ -126,8 +128,9 @@ def test_going_on(tmp_path: Path) -> None:
     assert kept is not None
     write_samples(tmp_path / "c.samples.npz", *kept)
     stage.asked.clear()
-    earlier = Earlier(Path("c.jsonl"), *read_samples(tmp_path / "c.samples.npz"))
-    more, results, _ = play(tmp_path, stage, plan(rounds=8), earlier=earlier)
+    earlier = Earlier(KIND, Path("c.jsonl"), *read_samples(tmp_path / "c.samples.npz"))
+    check(plan(rounds=12), earlier)
+    more, results, _ = play(tmp_path, stage, plan(rounds=12), earlier=earlier)
     assert {question["of"] for question in stage.asked} == {"case " + c for c in LIST.split(",")} | {
         "reference reslrb:stack"
     }
@@ -139,27 +142,73 @@ def test_going_on(tmp_path: Path) -> None:
         assert len({row.tobytes() for row in member.rows}) == len(member.rows)
 
 
+@pytest.mark.parametrize("after", [188, 212, 236])
+def test_a_round_that_was_broken_off_is_begun_anew(tmp_path: Path, after: int) -> None:
+    """With new seeds, and none of its steps twice: the figures are those of whole rounds."""
+    answers = iter(range(10**6))
+    session, _, _ = play(tmp_path, Stage(), plan(rounds=8), stop=lambda: next(answers) > after)
+    assert len({len(member.rows) // member.count for member in session.members}) == 2
+    kept = session.keep()
+    assert kept is not None
+    more, results, _ = play(tmp_path, Stage(), plan(rounds=8), earlier=Earlier(KIND, Path("c.jsonl"), *kept))
+    for member in more.members:
+        assert member.turns == [turn for turn in range(8) for _ in range(member.count)]
+        assert len(member.seconds) == 8
+        assert len({row.tobytes() for row in member.rows}) == len(member.rows)
+    assert of(results, "ptracer").efficiency is not None
+
+
+def test_what_has_ended_stays_as_it_was_and_the_rest_goes_on(tmp_path: Path) -> None:
+    first, _, _ = play(tmp_path, Stage(case_reslrb_stack=Pretence(ends=5)), plan(rounds=8))
+    kept = first.keep()
+    assert kept is not None
+    stage = Stage()
+    _, results, _ = play(tmp_path, stage, plan(rounds=12), earlier=Earlier(KIND, Path("c.jsonl"), *kept))
+    ended, sound = of(results, "reslrb:stack"), of(results, "ptracer")
+    assert (ended.status, ended.message, sound.repeats) == (BenchStatus.OUT_OF_MEMORY, "ended by SIGKILL", 24)
+    assert "case reslrb:stack" not in {question["of"] for question in stage.asked}
+
+
+def test_a_second_budget_without_room_for_a_round_says_so(tmp_path: Path) -> None:
+    first, _, _ = play(tmp_path, Stage(), plan(rounds=None, budget_s=30.0))
+    kept = first.keep()
+    assert kept is not None
+    earlier = Earlier(KIND, Path("c.jsonl"), *kept)
+    again, results, said = play(tmp_path, Stage(), plan(rounds=None, budget_s=7.5), earlier=earlier)
+    assert again.rounds == first.rounds
+    assert of(results, "ptracer").efficiency is not None  # by what there was
+    assert said[-1].startswith("no round was added; allow about ")
+
+
 @pytest.mark.parametrize(
     ("change", "line"),
     [
-        ({"cases": "ptracer"}, "its methods are others: case ptracer, case reslrb:stack"),
+        (
+            {"cases": "ptracer"},
+            "integrators is ['ptracer', 'reslrb:stack', 'reslrb:event'] there, ['ptracer'] here",
+        ),
         (
             {"config": loads(CONFIG, Path("x.yaml"), ["integrator.max_depth=5"])},
-            "its settings are not those of ptracer",
+            "integrator.max_depth is 4 there, 5 here",
         ),
-        ({"objective": "image"}, "its objective is fixed"),
+        ({"objective": "image"}, "objective is fixed there, image here"),
+        ({"spps": (4, 8)}, "spp is [] there, [4, 8] here"),
     ],
 )
 def test_only_the_same_is_gone_on_from(tmp_path: Path, change: dict[str, Any], line: str) -> None:
     session, _, _ = play(tmp_path, Stage(), plan(rounds=4))
     kept = session.keep()
     assert kept is not None
-    stage = Stage()
-    with pytest.raises(ConfigError, match=f"--resume: c.jsonl is of another measurement: {line}"):
-        play(tmp_path, stage, plan(**({"rounds": 4} | change)), earlier=Earlier(Path("c.jsonl"), *kept))
-    assert stage.alive == 0
+    earlier = Earlier(KIND, Path("c.jsonl"), *kept)
+    with pytest.raises(ConfigError, match=re.escape(f"--resume: c.jsonl is of another measurement: {line}")):
+        check(plan(**({"rounds": 8} | change)), earlier)
+    check(plan(rounds=8), earlier)
+    with pytest.raises(ConfigError, match=r"c\.jsonl has 4 rounds already; name more with --rounds"):
+        check(plan(rounds=4), earlier)
     with pytest.raises(ConfigError, match="by another version"):
-        Earlier(Path("c.jsonl"), kept[0] | {"version": 0}, kept[1])
+        Earlier(KIND, Path("c.jsonl"), kept[0] | {"version": 0}, kept[1])
+    with pytest.raises(ConfigError, match="it is of `convergence`, this is `bench`"):
+        Earlier("bench", Path("c.jsonl"), *kept)
 
 
 @pytest.mark.parametrize("after", [0, 5, 12, 40, 120])

@@ -193,7 +193,8 @@ def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     config.write_text(LAMP.format(folder=Path(__file__).parent))
     lines = tmp_path / "missing.jsonl"
     assert call(str(config), "--missing", "--seeds", "6", "--directions", "2", "--json", str(lines)) == 0
-    [row] = [json.loads(line) for line in lines.read_text().splitlines()]
+    origin, row = map(json.loads, lines.read_text().splitlines())
+    assert origin["kind"] == "origin"
     assert (row["kind"], row["parameter"], row["directions"], row["seeds"]) == ("missing", "lamp.position", 2, 6)
     shown = capsys.readouterr().out.splitlines()
     assert shown[-1].startswith("lamp.position: ")

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from reslrb_cli.measure import sampling
+from reslrb_cli.measure.differences import Direction
 from reslrb_cli.measure.sampling import FEWEST, LEAST_SEEDS, MOST_SEEDS, Name, Sampling
 
 NAMES: list[Name] = [
@@ -27,6 +28,7 @@ class Pretended:
         self.case = SimpleNamespace(initial={"a": np.zeros(3)})
         self.listed = [SimpleNamespace(label="reslrb:event"), SimpleNamespace(label="reslrb:stack")]
         self.integrators = dict.fromkeys(label for _, label in NAMES)
+        self.directions = {"a": [Direction(np.ones(3), "both")]}
         self.now[0] += self.load_s
 
     def _sample(self, *name: str) -> np.ndarray:
@@ -62,7 +64,7 @@ def spent(budget_s: float, seeds: int | None = None) -> tuple[dict[Name, int], f
     """Samples by name of those that were enough, the time that it took, and what was said."""
     clock, said = [0.0], []
     listed = [SimpleNamespace(label="reslrb:event"), SimpleNamespace(label="reslrb:stack")]
-    settings: Any = SimpleNamespace(budget_s=budget_s, seeds=seeds, integrators=listed, clock=clock)
+    settings: Any = SimpleNamespace(budget_s=budget_s, seeds=seeds, integrators=listed, clock=clock, spent_s=0.0)
     made = Sampling(settings, now=lambda: clock[0])
     made.expect(NAMES)
     counts = {name: len(made.of(name)) for name in NAMES if made.take(name, lambda: False, said.append)}

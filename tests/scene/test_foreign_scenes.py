@@ -58,6 +58,10 @@ def assert_same(found: dict[str, Any], expected: dict[str, Any]) -> None:
         np.testing.assert_array_equal(value, reference, err_msg=key)
 
 
+#: Of the shipped scenes, those whose images are compared too.
+RENDERED = ("cornell_floor", "grey_room", "caustic_heightmap")
+
+
 @pytest.mark.parametrize("file", SHIPPED, ids=lambda file: str(file.relative_to(ROOT / "scenes")))
 def test_what_is_loaded_is_what_mitsuba_loads(file):
     import mitsuba as mi
@@ -65,6 +69,8 @@ def test_what_is_loaded_is_what_mitsuba_loads(file):
     size = {"resx": 24, "resy": 24} if 'name="resx"' in file.read_text() else {}
     stock, ours = mi.load_file(str(file), optimize=False, **size), load_scene(file, size, strict=True)
     assert_same(values(ours), values(stock))
+    if file.parent.name not in RENDERED:
+        return
     integrator = mi.load_dict({"type": "path", "max_depth": 4})
     images = [np.array(mi.render(scene, integrator=integrator, spp=2, seed=1)) for scene in (stock, ours)]
     np.testing.assert_allclose(*images, rtol=1e-4, atol=1e-6)

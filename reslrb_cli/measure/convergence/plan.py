@@ -55,6 +55,12 @@ class Plan:
         return self.objective != "loss"
 
     @property
+    def camera(self) -> dict[str, bool]:
+        """Whether paths from the `camera` take part, and whether that is so in any case, `named`, as `survey` asks."""
+        named = self.reference.type == "prb"  # what errors are taken from is a side too
+        return {"camera": named or any(case.type == "prb" for case in self.cases), "named": named or not self.default}
+
+    @property
     def entries(self) -> list[tuple[Case, int]]:
         """What is compared: cases, each with its samples per pixel."""
         return [(case, spp) for case in self.cases for spp in self.spps or [self.config.run.spp]]

@@ -1,7 +1,8 @@
-"""Going on from the steps that an earlier session has taken: the same experiment, the same methods, the same dL/dI."""
+"""Going on from the steps that an earlier session of a `convergence` has taken, with the same dL/dI."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -9,43 +10,67 @@ import numpy as np
 
 from reslrb_cli.config import dump
 from reslrb_cli.errors import ConfigError
+from reslrb_cli.measure import earlier
 from reslrb_cli.measure.convergence.members import Member
+from reslrb_cli.measure.convergence.plan import Plan
+from reslrb_cli.measure.earlier import Earlier
+from reslrb_cli.measure.processes import Ended
+from reslrb_cli.records.bench import BenchStatus
+from reslrb_cli.records.samples import Kept
 
-#: Of what is kept; another one is not gone on from.
-VERSION = 1
+#: What is kept says that it is of this.
+KIND = "convergence"
 
 
-class Earlier:
-    """What an earlier session has kept, by `head` and `arrays` as `kept` returned them; `source` is the file's name."""
+def settings(plan: Plan, device: str = "") -> dict[str, Any]:
+    """What has to be the same in all sessions."""
+    return earlier.settings(
+        plan.config,
+        plan.variant,
+        device,
+        objective=plan.objective,
+        integrators=[case.label for case in plan.cases],
+        reference=plan.reference.label,
+        spp=list(plan.spps),
+        **{"memory limit": plan.memory_limit},
+    )
 
-    def __init__(self, source: Path, head: dict[str, Any], arrays: dict[str, np.ndarray]) -> None:
-        self.source, self.head, self.arrays = source, head, arrays
-        if head.get("version") != VERSION:
-            raise ConfigError("--resume", "", f"{source} was written by another version")
 
-    def facts(self, objective: str, arrays_file: Path) -> dict[str, Any]:
-        """The survey's facts; its arrays are written to `arrays_file`. Raises ConfigError for another objective."""
-        if self.head["objective"] != objective:
-            raise self._other(f"its objective is {self.head['objective']}")
-        found = {name.removeprefix("survey/"): a for name, a in self.arrays.items() if name.startswith("survey/")}
-        np.savez(arrays_file, **found)  # type: ignore[arg-type]
-        facts: dict[str, Any] = self.head["facts"]
-        return facts
+def check(plan: Plan, before: Earlier, device: str = "") -> None:
+    """Raise ConfigError where a session cannot go on from an earlier one, or has nothing to add to it."""
+    before.check(settings(plan, device))
+    if plan.rounds is not None and before.head["rounds"] >= plan.rounds:
+        rounds = before.head["rounds"]
+        raise ConfigError("--resume", "", f"{before.source} has {rounds} rounds already; name more with --rounds")
 
-    def restore(self, members: list[Member]) -> int:
-        """Hand the members their steps; returns the number of rounds. Raises ConfigError where they are others."""
-        if [name_of(member) for member in members] != [entry["name"] for entry in self.head["members"]]:
-            raise self._other("its methods are others: " + ", ".join(e["name"] for e in self.head["members"]))
-        for number, (member, entry) in enumerate(zip(members, self.head["members"], strict=True)):
-            if entry["config"] != dump(member.config):
-                raise self._other(f"its settings are not those of {member.label} here")
-            member.taken, member.turns, member.seconds = entry["taken"], entry["turns"], entry["seconds"]
-            member.rows = list(self.arrays[f"rows/{number}"])
-        rounds: int = self.head["rounds"]
-        return rounds
 
-    def _other(self, reason: str) -> ConfigError:
-        return ConfigError("--resume", "", f"{self.source} is of another measurement: {reason}")
+def restore_facts(before: Earlier, arrays_file: Path) -> dict[str, Any]:
+    """The survey's facts; its arrays are written to `arrays_file`."""
+    found = {name.removeprefix("survey/"): a for name, a in before.arrays.items() if name.startswith("survey/")}
+    np.savez(arrays_file, **found)  # type: ignore[arg-type]
+    facts: dict[str, Any] = before.head["facts"]
+    return facts
+
+
+def restore(before: Earlier, members: list[Member]) -> int:
+    """Hand the members their steps; returns the number of rounds. Raises ConfigError where they are others.
+
+    One whose process has ended, or refused, is not asked again.
+    """
+    entries = before.head["members"]
+    if [name_of(member) for member in members] != [entry["name"] for entry in entries]:
+        raise before.other("its methods are others: " + ", ".join(entry["name"] for entry in entries))
+    for number, (member, entry) in enumerate(zip(members, entries, strict=True)):
+        if entry["config"] != dump(member.config):
+            raise before.other(f"its settings are not those of {member.label} here")
+        member.taken, member.turns, member.seconds = entry["taken"], entry["turns"], entry["seconds"]
+        member.message, member.cold = entry["message"], entry["cold"]
+        member.rows = list(before.arrays[f"rows/{number}"])
+        if entry["end"] is not None:
+            member.end = Ended(BenchStatus(entry["end"]["status"]), entry["end"]["reason"])
+            member.process.close()
+    rounds: int = before.head["rounds"]
+    return rounds
 
 
 def name_of(member: Member) -> str:
@@ -54,15 +79,18 @@ def name_of(member: Member) -> str:
 
 
 def kept(
-    objective: str, facts: dict[str, Any], arrays_file: Path, members: list[Member], rounds: int
-) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    settings: Mapping[str, Any], facts: dict[str, Any], arrays_file: Path, members: list[Member], rounds: int
+) -> Kept:
     """What a later session needs to go on: a head that JSON can hold, and arrays."""
     with np.load(arrays_file) as survey:
         arrays = {f"survey/{name}": survey[name] for name in survey.files}
     entries = []
     for number, member in enumerate(members):
+        end = None if member.end is None else {"status": member.end.status.value, "reason": member.end.reason}
+        # A round that was broken off is not: the next session begins it anew, with other seeds.
+        turns = [turn for turn in member.turns if turn < rounds]
         entries.append({"name": name_of(member), "config": dump(member.config), "taken": member.taken,
-                        "turns": member.turns, "seconds": member.seconds})  # fmt: skip
-        arrays[f"rows/{number}"] = np.array(member.rows, np.float32)
-    head = {"version": VERSION, "objective": objective, "facts": facts, "rounds": rounds, "members": entries}
-    return head, arrays
+                        "turns": turns, "seconds": member.seconds[: len(set(turns))], "message": member.message,
+                        "cold": member.cold, "end": end})  # fmt: skip
+        arrays[f"rows/{number}"] = np.array(member.rows[: len(turns)], np.float32)
+    return earlier.head(KIND, settings, facts=facts, rounds=rounds, members=entries), arrays

@@ -21,7 +21,8 @@ from reslrb_cli.measure.contestant import Contestant
 from reslrb_cli.measure.convergence.curves import FEWEST
 from reslrb_cli.measure.convergence.members import Member, Role, share_turns
 from reslrb_cli.measure.convergence.plan import Plan
-from reslrb_cli.measure.convergence.resuming import Earlier, kept
+from reslrb_cli.measure.convergence.resuming import kept, restore, restore_facts, settings
+from reslrb_cli.measure.earlier import Earlier
 from reslrb_cli.measure.pace import Pace
 from reslrb_cli.measure.processes import Process, Refused, Stopped
 from reslrb_cli.records.bench import BenchStatus
@@ -51,7 +52,8 @@ class Session:
     """Processes under way and what they have sampled; arrays go by way of `folder`, which is the caller's to remove.
 
     `facts` are the survey's; of the budget `spent_s` have gone before. `judges` has the members that stand for an
-    independent stock integrator, by its name. What an `earlier` session has sampled counts, and is gone on from.
+    independent stock integrator, by its name. What an `earlier` session, which `resuming.check` has accepted, has
+    sampled counts, and is gone on from. `device` is what computes, in words.
     """
 
     def __init__(
@@ -64,8 +66,9 @@ class Session:
         now: Callable[[], float] = time.monotonic,
         spent_s: float = 0.0,
         earlier: Earlier | None = None,
+        device: str = "",
     ) -> None:
-        self._earlier, self._before = earlier, 0
+        self._earlier, self._before, self.device = earlier, 0, device
         self.plan, self.folder, self.members, self.rounds = plan, folder, list[Member](), 0
         self.facts: dict[str, Any] = {}
         self.judges: dict[str, Member] = {}
@@ -88,7 +91,7 @@ class Session:
         return [member for member in self.members if member.role is role]
 
     def run(self) -> Iterator[int]:
-        """Measure; yield the number of rounds whenever it has doubled. Ends early, with what is done, once `stop()`.
+        """Measure; yield the number of rounds after each of them. Ends early, with what is done, once `stop()`.
 
         Raises Refused where what may not be left out cannot begin.
         """
@@ -106,10 +109,13 @@ class Session:
         self._say_what_it_takes()
 
     def keep(self) -> tuple[dict[str, Any], dict[str, np.ndarray]] | None:
-        """What a later session needs to go on; None where nothing has been sampled, or a process has come to an end."""
-        if not self.rounds or not all(member.alive and member.rows for member in self.members):
+        """What a later session needs to go on; None where nothing has been sampled.
+
+        A method that was left out, or never came to a step, has none there: what it is kept for is to be asked again.
+        """
+        if not self.rounds or not any(member.rows for member in self.members):
             return None
-        return kept(self.plan.objective, self.facts, self.folder / "arrays.npz", self.members, self.rounds)
+        return kept(settings(self.plan, self.device), self.facts, self.folder / "arrays.npz", self.members, self.rounds)
 
     # --- before the rounds --------------------------------------------------------------------------------------------
 
@@ -121,19 +127,14 @@ class Session:
         """Ask what stands as a reference, and have dL/dI made; False where time is up over it."""
         plan = self.plan
         if self._earlier is not None:
-            self.facts = self._earlier.facts(plan.objective, self.folder / "arrays.npz")
+            self.facts = restore_facts(self._earlier, self.folder / "arrays.npz")
             return True
         first = self._first(plan.reference_config) | {"objective": plan.objective}
         surveyor = Contestant(self._start(first, "surveyed"), False)
         try:
             opening = surveyor.answer(self._stop, self._pace.over)
             self._warn(opening)
-            camera = any(case.type == "prb" for case in plan.cases)
-            ask = {
-                "camera": camera,
-                "named": not plan.default,
-                "budget_s": plan.budget_s if plan.rounds is None else None,
-            }
+            ask = {**plan.camera, "budget_s": plan.budget_s if plan.rounds is None else None}
             question = {"out": first["arrays"], "ask": ask}
             answer = None if opening is None else surveyor.ask(question, self._stop, self._pace.over)
         finally:
@@ -166,7 +167,7 @@ class Session:
                 same[0] if same else self._add(Role.INDEPENDENT, Case(name, name, {}), config, self._noise_free)
             )
         if self._earlier is not None:
-            self.rounds = self._before = self._earlier.restore(self.members)
+            self.rounds = self._before = restore(self._earlier, self.members)
         for key, reason in facts["why"].items():
             if facts["independent"][key] is None:
                 self._say(f"{key}: no independent reference ({reason}); biases are judged by {plan.reference.label}")
@@ -198,7 +199,8 @@ class Session:
 
     def _warm_up(self) -> None:
         for member in self.members:
-            self._warn(member.answer(self._stop, self._pace.over))
+            if member.alive:
+                self._warn(member.answer(self._stop, self._pace.over))
         for member in self.members:
             warm = member.alive and member.warm_up(self._tight(), self._stop, self._pace.over)
             if member.refusal is not None:
@@ -231,20 +233,24 @@ class Session:
             member.role is Role.REFERENCE for member in alive
         ):
             return
-        if not self._pace.fits(FEWEST * self._round_s):
+        if not self._pace.fits(self._fewest * self._round_s):
             return
         size = sum(int(np.prod(shape, dtype=int)) for shape in self.facts["shapes"].values())
         most = max(MEMORY // (4 * size * sum(member.count for member in alive)), FEWEST + 1)
         tight = self._tight()
-        self._pace.begin_rounds()
+        self._pace.begin_rounds(self._before)
         while alive and self.rounds < most and self._pace.another(self.rounds - self._before):
             start = self.rounds % len(alive)
             for member in alive[start:] + alive[:start]:
                 member.turn(self.rounds, tight, self._stop)
             self.rounds += 1
             alive = [member for member in self.members if member.alive]
-            if self.rounds >= 4 and self.rounds & (self.rounds - 1) == 0:
-                yield self.rounds
+            yield self.rounds
+
+    @property
+    def _fewest(self) -> int:
+        """The rounds that this session has to take, or it could as well take none."""
+        return max(FEWEST - self._before, 1)
 
     @property
     def _round_s(self) -> float:
@@ -254,17 +260,22 @@ class Session:
     def _say_what_it_takes(self) -> None:
         """Where the budget did not suffice for figures: what it would take."""
         late = [member for member in self.members if member.late]
-        if self.rounds >= FEWEST and not late:
+        taken = self.rounds - self._before
+        if taken >= self._fewest and not late:
             return
         if late:
             names = ", ".join(member.label for member in late)
             self._say(f"not measured: {names}: the budget of {self.plan.budget_s:g} s was spent")
         warm = [member for member in self.members if member.alive]
+        if late and not warm:
+            advice = "allow several times as much with --budget, or name fewer --integrators"
+            self._say(f"nothing had compiled by then: {advice}")
         if not warm or self.plan.rounds is not None:
             return
         # What has not compiled is taken to take as long as what has.
         share = 1 + len(late) / len(warm)
-        before = self._now() - self._began - self.rounds * self._round_s
-        needed = (share * (before + FEWEST * self._round_s) + AFTERWARDS_S) / (1 - AFTERWARDS)
+        before = self._now() - self._began - taken * self._round_s
+        needed = (share * (before + self._fewest * self._round_s) + AFTERWARDS_S) / (1 - AFTERWARDS)
         advice = f"allow about {needed:.0f} s with --budget, or name fewer --integrators, or take a smaller film"
-        self._say(f"figures need {FEWEST} rounds; {advice}")
+        fact = f"figures need {FEWEST} rounds" if self._before < FEWEST else "no round was added"
+        self._say(f"{fact}; {advice}")

@@ -17,6 +17,7 @@ import mitsuba as mi
 import numpy as np
 
 from reslrb_cli.config import loads
+from reslrb_cli.measure.border_mask import leave_out_border
 from reslrb_cli.measure.worker import Begun
 from reslrb_cli.optimization.choice import find_options, settle_integrator
 from reslrb_cli.optimization.loop import optimize
@@ -92,6 +93,8 @@ def begin(first: dict[str, Any]) -> Begun:
     options = find_options(problem)
     with np.load(first["targets"]) as targets:
         set_targets(problem.views, targets)
+    if first["masked"]:
+        leave_out_border(problem)
     # Nothing is remembered of earlier pilots: what a pilot costs is to be seen.
     said: list[str] = []
     settle_integrator(problem, options, said.append, None)

@@ -8,21 +8,24 @@ meanwhile. That the others wait for this costs them nothing but what it does to 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from reslrb_cli.config import Config, dump
-from reslrb_cli.errors import ExitCode
 from reslrb_cli.measure.cases import Case
-from reslrb_cli.measure.contestant import Contestant
 from reslrb_cli.measure.convergence.session import AFTERWARDS, AFTERWARDS_S, MEMORY_SHARE, MIB, Start, start_process
+from reslrb_cli.measure.earlier import Earlier
 from reslrb_cli.measure.pace import NO_TIME, Pace
-from reslrb_cli.measure.processes import Refused, Stopped
+from reslrb_cli.measure.processes import Stopped
+from reslrb_cli.measure.whole_runs.judging import Judging
 from reslrb_cli.measure.whole_runs.plan import RunsPlan
+from reslrb_cli.measure.whole_runs.resuming import kept, restore, settings
 from reslrb_cli.measure.whole_runs.run import POINTS, Run, times
 from reslrb_cli.records.bench import BenchStatus
+from reslrb_cli.records.convergence import Method
+from reslrb_cli.records.samples import Kept
 from reslrb_cli.records.whole_runs import RunPointRecord
 
 #: The share of the time that judging is to take, unless that leaves images with too few samples.
@@ -41,7 +44,8 @@ class RunsSession:
     """Runs under way, and where they stood; what they write goes to `folder`, which is the caller's to remove.
 
     `facts` are the judge's, `limit_s` is the time of each run, once it is known; of the budget `spent_s` have gone
-    before.
+    before. What an `earlier` session, which `resuming.check` has accepted, has made counts, and is gone on from; each
+    run has as much time as there. `device` is what computes, in words.
     """
 
     def __init__(
@@ -53,15 +57,35 @@ class RunsSession:
         start: Start = start_process,
         now: Callable[[], float] = time.monotonic,
         spent_s: float = 0.0,
+        earlier: Earlier | None = None,
+        device: str = "",
     ) -> None:
+        self._earlier, self.device = earlier, device
         self.plan, self.folder, self.runs, self.limit_s = plan, folder, list[Run](), 0.0
         self.facts: dict[str, Any] = {}
         self._stop, self._say, self._start, self._now, self._began = stop, say, start, now, now() - spent_s
         self._budget_s = max((1 - AFTERWARDS) * plan.budget_s - AFTERWARDS_S - spent_s, 0.0)
         self._pace, self._end = Pace(self._budget_s, 1, None, now), now() + self._budget_s
-        self._judge: Contestant | None = None
-        self._startup_s = 0.0
+        self._judge: Judging | None = None
+        self._startup_s = self._wave_s = 0.0
         self._said: set[str] = set()
+        self._seeds = 0  # those of which all runs are over
+        if earlier is not None:
+            self.facts, self.limit_s, self._seeds = (
+                earlier.head["facts"],
+                earlier.head["limit_s"],
+                earlier.head["seeds"],
+            )
+            self.runs = restore(earlier, plan)
+
+    def keep(self) -> Kept | None:
+        """What a later session needs to go on; None where no seed is over."""
+        if self._earlier is None and not self._seeds:
+            return None
+        targets = self.folder / "targets.npz"
+        if self._earlier is not None and not targets.exists():
+            return self._earlier.head, self._earlier.arrays
+        return kept(settings(self.plan, self.device), self.facts, targets, self.limit_s, self.runs, self._seeds)
 
     def run(self) -> Iterator[RunPointRecord]:
         """Measure; yield where runs stand as it is known. Ends early, with what is done, once `stop()`.
@@ -76,8 +100,11 @@ class RunsSession:
         except Stopped:
             return
         finally:
-            for contestant in [*self.runs, *([] if self._judge is None else [self._judge])]:
-                contestant.process.close()
+            for run in self.runs:
+                if run.process is not None:
+                    run.process.close()
+            if self._judge is not None:
+                self._judge.close()
 
     def run_of(self, point: RunPointRecord) -> Run:
         """The run that a point is of."""
@@ -87,34 +114,26 @@ class RunsSession:
 
     def _first(self, config: Config) -> dict[str, Any]:
         return {"config": dump(config), "source": str(config.source), "variant": self.plan.variant,
-                "memory_limit": self.plan.memory_limit, "targets": str(self.folder / "targets.npz")}  # fmt: skip
+                "memory_limit": self.plan.memory_limit, "targets": str(self.folder / "targets.npz"),
+                "masked": self.facts.get("masked", False)}  # fmt: skip
 
     def _prepare(self) -> bool:
         """Start what judges, and have it make the target; False where time is up over it."""
-        plan, began = self.plan, self._now()
-        first = self._first(plan.reference_config)
-        judge = self._judge = Contestant(self._start(first, "judged_runs"), False)
-        opening = judge.answer(self._stop, self._pace.over)
+        plan, began, targets = self.plan, self._now(), self.folder / "targets.npz"
+        process = self._start(self._first(plan.reference_config), "judged_runs")
+        judge = self._judge = Judging(process, plan.reference.label, self._stop, self._pace.over)
+        opening = judge.open()
         if opening is not None:
             self._warn(opening)
             self._startup_s = max(self._now() - began - opening["loading_s"], 0.0)
-            image_s = JUDGED * self._budget_s / (len(plan.entries) * plan.runs * POINTS)
-            ask = {"budget_s": self._budget_s, "image_s": image_s}
-            self.facts = self._ask_judge({"prepare": ask, "out": first["targets"]}) or {}
+            if self._earlier is not None:
+                self.facts = judge.restore(targets, self._earlier)
+            else:
+                image_s = JUDGED * self._budget_s / (len(plan.entries) * plan.runs * POINTS)
+                self.facts = judge.prepare(targets, budget_s=self._budget_s, image_s=image_s, **plan.camera)
         if judge.late:
             self._say(f"the budget of {plan.budget_s:g} s was spent before there was a target; allow several times it")
         return not judge.late
-
-    def _ask_judge(self, question: dict[str, Any]) -> dict[str, Any] | None:
-        """An answer of what judges; None where the budget was spent over it. Raises Refused where it ended."""
-        judge = self._judge
-        assert judge is not None, "it is started first"
-        answer = judge.ask(question, self._stop, self._pace.over)
-        if judge.end is not None:
-            memory = judge.end.status is BenchStatus.OUT_OF_MEMORY
-            line = f"--reference {self.plan.reference.label}: {judge.end.reason}"
-            raise Refused(line, ExitCode.OUT_OF_MEMORY if memory else ExitCode.CHECK_FAILED)
-        return answer
 
     def _entries(self) -> list[tuple[Case, int]]:
         """What is compared: of the default list, what cannot do the scene is left out, and named."""
@@ -129,23 +148,46 @@ class RunsSession:
         count = methods * self.plan.runs
         if count == 0:
             return False
-        each = max(self._end - self._now(), 0.0) / count
         apart_s = POINTS * self.facts["judge_s"] + self._startup_s + GRACE_S  # what of its share a run cannot have
+        if self._earlier is not None:
+            return self._has_room(methods * ((1 + GRACE) * self.limit_s + apart_s))
+        each = max(self._end - self._now(), 0.0) / count
         self.limit_s = (each - apart_s) / (1 + GRACE)
         if self.limit_s >= LEAST_S:
             return True
-        before = self._now() - self._began
-        needed = (before + count * (LEAST_S * (1 + GRACE) + apart_s) + AFTERWARDS_S) / (1 - AFTERWARDS)
+        needed = self._needed(count * (LEAST_S * (1 + GRACE) + apart_s))
         self._say(
             f"the budget of {self.plan.budget_s:g} s leaves no time for {count} runs: allow more than {needed:.0f} s "
             "with --budget, or fewer --runs or --integrators"
         )
         return False
 
+    def _needed(self, seconds: float) -> float:
+        """The budget that leaves so many seconds from now on."""
+        return (self._now() - self._began + seconds + AFTERWARDS_S) / (1 - AFTERWARDS)
+
+    def _has_room(self, wave_s: float) -> bool:
+        """Whether all runs of one seed, which have the time of those before them, are done within the budget."""
+        self._wave_s = wave_s
+        if self._pace.fits(wave_s):
+            return True
+        self._say(
+            f"the budget of {self.plan.budget_s:g} s leaves no time for runs of {self.limit_s:.3g} s, as the earlier "
+            f"ones: allow more than {self._needed(wave_s):.0f} s with --budget"
+        )
+        return False
+
     # --- the runs -----------------------------------------------------------------------------------------------------
 
     def _waves(self, entries: list[tuple[Case, int]]) -> Iterator[RunPointRecord]:
+        if self._earlier is not None:
+            entries = [entry for entry in entries if self.plan.method_of(*entry) not in self._gone(self.runs)]
         for number, seed in enumerate(self.plan.seeds):
+            if number < self._seeds:
+                continue
+            if self._earlier is not None and not self._pace.fits(self._wave_s):
+                self._say(f"not measured: runs from seed {seed} on: {NO_TIME}")
+                return
             wave = []
             for case, spp in entries:
                 run = self._begin(case, spp, seed)
@@ -157,6 +199,8 @@ class RunsSession:
                     point = self._advance(run, until_s, wave)
                     if point is not None:
                         run.points.append(point)
+                        if all(other.complete(self.limit_s) or other.end or other.refusal for other in wave):
+                            self._seeds = number + 1
                         yield point
             for run in wave:
                 run.process.close()
@@ -167,8 +211,11 @@ class RunsSession:
                 self._say(f"no method came to an iteration in the {self.limit_s:.3g} s of a run; allow several times "
                           "as much with --budget, or fewer --runs or --integrators")  # fmt: skip
                 return
-            gone = [run for run in wave if run.refusal or (run.end and run.end.status is BenchStatus.OUT_OF_MEMORY)]
-            entries = [entry for entry, run in zip(entries, wave, strict=True) if run not in gone]
+            entries = [entry for entry in entries if self.plan.method_of(*entry) not in self._gone(wave)]
+
+    def _gone(self, runs: Sequence[Run]) -> set[Method]:
+        """The methods that need not be tried with another seed: they refused, or need more memory than there is."""
+        return {run.method for run in runs if run.refusal or (run.end and run.end.status is BenchStatus.OUT_OF_MEMORY)}
 
     def _begin(self, case: Case, spp: int, seed: int) -> Run:
         plan, config = self.plan, self.plan.seeded(self.plan.config_of(case, spp), seed)
@@ -226,7 +273,8 @@ class RunsSession:
                        "raise run.iterations to have it go on")  # fmt: skip
         if answer["iteration"] == run.state.iteration:
             return True
-        judged = self._ask_judge({"values": str(run.out)})
+        assert self._judge is not None, "it is started first"
+        judged = self._judge.ask({"values": str(run.out)})
         if judged is None:
             return False
         run.state = replace(

@@ -9,6 +9,7 @@ from typing import Any
 
 from reslrb_cli.optimization.correlated_bias import CorrelatedBias, share_words
 from reslrb_cli.optimization.pilot_records import Outcome
+from reslrb_cli.records.origin import Origin
 from reslrb_cli.report.page.markup import breakable, facts, table, text
 from reslrb_cli.report.page.steps import StepParts
 from reslrb_cli.report.sources import Run
@@ -19,7 +20,6 @@ def run_facts(run: Run) -> str:
     """When, on what and how the run was, what it took, what it came to, and the commands that do it again."""
     manifest, records = run.manifest, run.records
     losses = (manifest.get("results") or {}).get("image_loss") or {}
-    versions = ", ".join(f"{name} {version}" for name, version in (manifest.get("versions") or {}).items())
     spp = f"{records[-1]['spp']} samples per pixel" if records else ""
     command, step = manifest.get("command_line") or [], StepParts.of(records)
     again = ["reslrb", "optimize", str(run.path.absolute() / "config.yaml")] if manifest.get("config") else []
@@ -32,16 +32,39 @@ def run_facts(run: Run) -> str:
             "an iteration": "" if step is None else text(step.words()),
             "loss of the saved images": text(" → ".join(number(loss) for loss in losses.values() if loss is not None)),
             "peak memory": text(f"{max(record['peak_mib'] for record in records):.4g} MiB") if records else "",
-            "device": text(manifest.get("device") or ""),
-            "variant": text(manifest.get("variant") or ""),
+            **_hardware(manifest.get("device"), manifest.get("variant")),
             "seed": text(manifest.get("seed", "")),
             "configuration": breakable(manifest.get("config") or ""),
             "command line": breakable(shlex.join(map(str, command))) if command else "",
-            "to do it again": breakable(shlex.join(again)) if again else "",
-            "versions": text(versions),
-            "platform": text(manifest.get("platform") or ""),
+            **_again(again),
+            **_software(manifest.get("versions") or {}, manifest.get("platform")),
         }
     )
+
+
+def origin_facts(origin: Origin) -> str:
+    """When and on what a file of measurements was made, the command that does it again, and versions."""
+    return facts(
+        {
+            "written": _moment(origin.written),
+            **_hardware(origin.device, origin.variant),
+            **_again(origin.command),
+            **_software(origin.versions, origin.platform),
+        }
+    )
+
+
+def _hardware(device: object, variant: object) -> dict[str, str]:
+    return {"device": text(device or ""), "variant": text(variant or "")}
+
+
+def _again(command: Sequence[str]) -> dict[str, str]:
+    return {"to do it again": breakable(shlex.join(command)) if command else ""}
+
+
+def _software(versions: Mapping[str, str], platform: object) -> dict[str, str]:
+    named = ", ".join(f"{name} {version}" for name, version in versions.items())
+    return {"versions": text(named), "platform": text(platform or "")}
 
 
 def _moment(started: Any) -> str:

@@ -10,6 +10,7 @@ from reslrb_cli.records.measured import gradcheck_record, missing_record
 from reslrb_cli.report.gradcheck_table import HEAD, cells, failure_line, summary_lines
 from reslrb_cli.report.page.bench import bench
 from reslrb_cli.report.page.convergence import convergence
+from reslrb_cli.report.page.facts import origin_facts
 from reslrb_cli.report.page.maps import gradient_maps
 from reslrb_cli.report.page.markup import breakable, note, soft, table, text
 from reslrb_cli.report.sources import Maps, Measurements
@@ -33,7 +34,7 @@ def measured(source: Measurements | Maps) -> str:
     words = [f"{count(len(source.damaged), 'line')} could not be read (the first is line {source.damaged[0]})."] if (
         source.damaged) else []  # fmt: skip
     words += [f"{count(unknown, 'line')} of other kinds, or damaged, left out."] if unknown else []
-    return markup + "".join(map(soft, words))
+    return markup + "".join(map(soft, words)) + "".join(map(origin_facts, source.origins))
 
 
 def gradcheck(objects: Sequence[Mapping[str, Any]]) -> tuple[str, int]:

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from reslrb_cli.errors import ConfigError
+from reslrb_cli.report.certainty import certainty_words, rival_line
 from reslrb_cli.report.page import facts
 from reslrb_cli.report.page.curves import convergence
 from reslrb_cli.report.page.images import image_rows
@@ -52,7 +53,11 @@ def run_parts(run: Run) -> dict[str, str]:
     """By title, what there is to show of a run beside its header, in order; what it does not have is empty."""
     results, images = run.results, run.path / "images"
     parts: dict[str, Callable[[], str]] = {
-        "Parameters": lambda: parameter_table(results, "now" if run.at_work else "end") + _over_what(results),
+        "Parameters": lambda: (
+            parameter_table(results, "now" if run.at_work else "end")
+            + _over_what(results)
+            + soft(certainty_words(results))
+        ),
         "Images": lambda: image_rows(images, results),
         "Views": lambda: view_table(run.manifest.get("views"), results),
         "Errors as people see them": lambda: seen_tables([run]),
@@ -70,7 +75,9 @@ def record_parts(run: Run) -> dict[str, str]:
         "Clamped gradients": lambda: facts.clamped(results.get("clamped")),
         "Run": lambda: facts.run_facts(run),
         "Plan": lambda: facts.plan_table(manifest.get("plan")),
-        "Choice of the estimator": lambda: facts.pilot_table(manifest.get("pilot")),
+        "Choice of the estimator": lambda: (
+            facts.pilot_table(manifest.get("pilot")) + soft(rival_line(manifest.get("rival")))
+        ),
         "Bias of correlated samples": lambda: facts.correlated_bias_table(manifest.get("correlated_bias")),
         "Scale of the parameters": lambda: facts.scaling_table(manifest.get("scaling")),
         "Memory budget": lambda: facts.memory_table(manifest.get("memory")),

@@ -10,6 +10,7 @@ import numpy as np
 
 from reslrb_cli.records.images import finite_range
 from reslrb_cli.records.parameters import read_mask, read_parameters
+from reslrb_cli.report.certainty import is_settled, spread_words, verdict_words
 from reslrb_cli.report.page.markup import breakable, figure, figures, table, text
 from reslrb_cli.report.page.pictures import Array, show
 from reslrb_cli.report.run_table import units_differ
@@ -29,6 +30,8 @@ def parameter_table(results: Mapping[str, Any], end: str = "end") -> str:
     relative = units_differ(results)
     head = ["parameter", "start", end] + ["true"] * has_truth + ["RMSE"] * has_truth
     head += ["relative error"] * (has_truth and relative)
+    judged = any(verdict_words(results, key) for key in parameters)
+    head += ["spread", "verdict"] * judged
     rows = []
     for key, about in parameters.items():
         swatches = _swatches(key, about)
@@ -38,6 +41,7 @@ def parameter_table(results: Mapping[str, Any], end: str = "end") -> str:
             row.append(_error(results, "parameter_rmse", key))
         if has_truth and relative:
             row.append(_error(results, "relative_error", key))
+        row += [_spread(results, key), _verdict(results, key)] if judged else []
         rows.append(row)
     return table(head, rows, "parameters")
 
@@ -136,6 +140,16 @@ def _error(results: Mapping[str, Any], kind: str, key: str) -> str:
     words = " → ".join(_number(pair.get(moment)) for moment in ("initial", "final") if pair.get(moment) is not None)
     worse = key in (results.get("worse") or ())
     return f'<span class="worse">{words}, worse</span>' if worse else f"<span>{words}</span>"
+
+
+def _spread(results: Mapping[str, Any], key: str) -> str:
+    words = spread_words(results, key, "±")
+    return f'<span class="number">{text(words)}</span>' if words else ""
+
+
+def _verdict(results: Mapping[str, Any], key: str) -> str:
+    words = text(verdict_words(results, key))
+    return words if not words or is_settled(results, key) else f'<span class="worse">{words}</span>'
 
 
 def _swatches(key: str, about: Mapping[str, Any]) -> dict[str, str]:

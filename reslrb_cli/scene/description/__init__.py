@@ -6,5 +6,19 @@ from .including import Description, read_description
 from .mending import mend
 from .naming import name_objects
 from .notes import Note
+from .placing import place_textures
+from .sizing import resize_films
+from .writing import tag_lines
 
-__all__ = ["Description", "Note", "build", "check", "mend", "name_objects", "read_description"]
+__all__ = [
+    "Description",
+    "Note",
+    "build",
+    "check",
+    "mend",
+    "name_objects",
+    "place_textures",
+    "read_description",
+    "resize_films",
+    "tag_lines",
+]

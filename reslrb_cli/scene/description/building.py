@@ -6,7 +6,6 @@ import bisect
 import difflib
 import re
 from typing import Any
-from xml.sax.saxutils import quoteattr
 
 import mitsuba as mi
 
@@ -15,6 +14,7 @@ from ...errors import ConfigError
 from .element import Element, quoted
 from .including import Description
 from .notes import Note
+from .writing import tag_lines
 
 #: "[parser.cpp:482] " and "[PluginManager] ": where in Mitsuba's sources a message comes from.
 _ORIGIN = re.compile(r"\[[\w.]+(:\d+)?\]\s*")
@@ -50,27 +50,13 @@ class _Text:
 
     def __init__(self, root: Element) -> None:
         self._root = root
-        self._lines: list[str] = []
-        self._elements: list[Element] = []
-        self._write(root)
+        lines, elements = zip(*tag_lines(root), strict=True)
+        self._elements: tuple[Element, ...] = elements
         #: Kept for as long as the parser's state, which refers to it.
-        self.xml = "\n".join(self._lines)
+        self.xml = "\n".join(lines)
         self._starts = [0]
-        for line in self._lines:
+        for line in lines:
             self._starts.append(self._starts[-1] + len(line.encode("utf-8")) + 1)
-
-    def _write(self, element: Element) -> None:
-        # `$` begins a variable for Mitsuba's parser; here all are put in already.
-        attributes = "".join(f" {key}={quoteattr(value)}" for key, value in element.attributes.items())
-        self._line(f"<{element.tag}{attributes.replace('$', chr(92) + '$')}{'' if element.children else '/'}>", element)
-        for child in element.children:
-            self._write(child)
-        if element.children:
-            self._line(f"</{element.tag}>", element)
-
-    def _line(self, text: str, element: Element) -> None:
-        self._lines.append(text)
-        self._elements.append(element)
 
     def element_at(self, offset: int) -> Element:
         """The element at that byte of `xml`."""
@@ -96,12 +82,13 @@ def _unused(props: mi.Properties, element: Element) -> list[Note]:
         number = re.match(r"_arg_(\d+)", name)
         if number and int(number[1]) < len(unnamed):
             child = unnamed[int(number[1])]
-            notes.append(Note(child, f"{element.type} has no use for a <{child.tag}> in Mitsuba 3", "left out"))
+            wrong = f"{element.type} has no use for a <{child.tag}> in Mitsuba 3"
+            notes.append(Note(child, wrong, "left out", element))
         else:
             likely = likely_parameters(element.type) if len(notes) < _HINTS else []
             near = difflib.get_close_matches(name, likely, n=1, cutoff=0.75)
             hint = f" (did you mean `{near[0]}`?)" if near else ""
             child = children.get(name, element)
             wrong = f"{element.type} has no parameter {quoted(child.written or name)} in Mitsuba 3{hint}"
-            notes.append(Note(child, wrong, "left out"))
+            notes.append(Note(child, wrong, "left out", None if child is element else element))
     return notes

@@ -14,11 +14,15 @@ _LINES, _WARNINGS = 5, 30
 
 @dataclass(frozen=True)
 class Note:
-    """One thing in a scene's files that Mitsuba would refuse: `wrong` says what, `done` what was made of it."""
+    """One thing in a scene's files that Mitsuba would refuse: `wrong` says what, `done` what was made of it.
+
+    `owner` is the object that has the element among its children and no use for it, where that is what is wrong.
+    """
 
     element: Element
     wrong: str
     done: str
+    owner: Element | None = None
 
 
 def in_order(notes: Iterable[Note], root: Element) -> list[Note]:

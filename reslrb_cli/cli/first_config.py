@@ -1,0 +1,123 @@
+"""The text of a configuration for a scene, to begin with: what is set, what could be, and why, in comments."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from reslrb_cli.config import TargetConfig
+from reslrb_cli.scene.catalog import Value
+from reslrb_cli.scene.proposal import Proposal
+
+#: Pixels with which a run takes minutes on two cores, at the samples below.
+PIXELS = 2**14
+SPP, ITERATIONS, MAX_DEPTH = 16, 100, 8
+#: Commented lines of parameters; a scene can have thousands.
+_MOST_OTHERS = 60
+_PLAIN = re.compile(r"(\.\./)*[A-Za-z_][\w.\-]*(/[\w.\-]+)*")
+
+
+@dataclass(frozen=True)
+class FirstConfig:
+    """What a configuration is written from; `target` is the image that exists, or None. Sizes are (width, height)."""
+
+    scene: Path
+    target: Path | None
+    is_integer: bool
+    size: tuple[int, int]
+    film: tuple[int, int]
+    integrator: str
+    proposals: Sequence[Proposal]
+
+    def text(self, path: Path) -> str:
+        """The YAML of the configuration in the file `path`."""
+        folder = path.absolute().parent
+        lines = [
+            "# Every setting and its default: docs/config.md. Begin with",
+            f"#     reslrb optimize {path.name}",
+            "scene:",
+            f"  file: {_path(self.scene, folder)}",
+            *self._size_lines(),
+            "target:",
+            *self._target_lines(folder),
+            "parameters:  # by their share of the picture; bounds are the usual ones",
+            *self._parameter_lines(),
+            "integrator:",
+            f"  type: {self.integrator}",
+            f"  max_depth: {MAX_DEPTH}  # more where light bounces on and on; it costs time alone, no memory",
+            "run:",
+            f"  iterations: {ITERATIONS}",
+            f"  spp: {SPP}",
+        ]
+        return "\n".join(lines) + "\n"
+
+    def _size_lines(self) -> list[str]:
+        if self.size == self.film:
+            return []
+        width, height = self.film
+        note = f"runs in minutes; the scene's own film has {width}x{height}"
+        return [f"  size: {list(self.size)}  # {note}"]
+
+    def _target_lines(self, folder: Path) -> list[str]:
+        if self.target is not None:
+            return [f"  file: {_path(self.target, folder)}", *photo_settings(self.is_integer)]
+        width, height = self.size
+        return [
+            f"  file: photo.png  # put your photograph there, of {width}x{height} pixels, or have it made by",
+            "  # reslrb init --target PHOTO from one of any size in that ratio. To try without, in place of `file`:",
+            "  # render: {spp: 256, parameters: {KEY: VALUE}}  # the scene itself with other values",
+        ]
+
+    def _parameter_lines(self) -> list[str]:
+        first = [proposal for proposal in self.proposals if proposal.first]
+        others = [proposal for proposal in self.proposals if not proposal.first]
+        lines = [f"  - {_entry(proposal)}  # {_note(proposal)}" for proposal in first]
+        if others:
+            lines.append("  # What else can be recovered; take away the # of what is to be:")
+        lines += [f"  # - {_entry(proposal)}  # {_note(proposal)}" for proposal in others[:_MOST_OTHERS]]
+        if len(others) > _MOST_OTHERS:
+            lines.append(f"  # and {len(others) - _MOST_OTHERS} more, as reslrb inspect --all lists them")
+        return lines
+
+
+def photo_settings(is_integer: bool) -> list[str]:
+    """Lines of `target` for a photograph: of 8 or 16 bits its exposure is not known. `mask: auto` is the default."""
+    if is_integer and "exposure" in TargetConfig.model_fields:
+        return ["  exposure: auto  # one factor for the whole image, recovered beside the parameters"]
+    return []
+
+
+def _entry(proposal: Proposal) -> str:
+    parts = [f"key: {_text(proposal.info.key)}"]
+    parts += [f"bounds: {proposal.bounds}"] if proposal.bounds is not None else []
+    parts += [f"resolution: {list(proposal.resolution)}"] if proposal.resolution is not None else []
+    return "{" + ", ".join(parts) + "}"
+
+
+def _note(proposal: Proposal) -> str:
+    info = proposal.info
+    seen = f"{100 * proposal.share:.0f} % of the picture" if proposal.share >= 0.005 else "not seen itself"
+    size = f", {info.shape[1]}x{info.shape[0]} texels" if len(info.shape) == 3 else ""
+    return f"{seen}{size}{_value(info.value)}"
+
+
+def _value(value: Value | None) -> str:
+    if value is None:
+        return ""
+    if value.numbers is not None:
+        return f", {'now ' + ' '.join(f'{number:.3g}' for number in value.numbers)}"
+    return f", {value.low:.3g} to {value.high:.3g}"
+
+
+def _path(path: Path, folder: Path) -> str:
+    relative = os.path.relpath(path, folder)
+    # What lies elsewhere altogether does not move with the configuration.
+    return _text(str(path.absolute()) if relative.startswith(os.path.join("..", "..", "..")) else relative)
+
+
+def _text(text: str) -> str:
+    return text if _PLAIN.fullmatch(text) else json.dumps(text, ensure_ascii=False)

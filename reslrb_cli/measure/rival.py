@@ -1,0 +1,159 @@
+"""Whether `prb` would have been the better choice: its gradients beside those of the run's integrator, in turns.
+
+    advantage = (variance * time of the run's own) / (variance * time of prb)
+
+Variance is summed over the parameters, each over its gradient's mean square, which is the same for both: steps of the
+run's own loss and adjoint. The interval is that of the logarithm of the variances' quotient by the jackknife over the
+rounds, and of times by what a single one may be off.
+"""
+
+from __future__ import annotations
+
+import math
+import statistics
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from scipy import stats
+
+from reslrb_cli.integrators import make_integrator
+from reslrb_cli.integrators.tracer import LightTracer
+from reslrb_cli.measure.moving import moves_light
+from reslrb_cli.measure.references import Situation, prb_gradient
+from reslrb_cli.optimization.choice import Cache, measured_step, situation
+from reslrb_cli.optimization.pilot import TIMING_NOISE
+from reslrb_cli.optimization.pilot_records import ITERATIONS, Gradients, square
+from reslrb_cli.optimization.problem import Problem
+from reslrb_cli.records.clock import StepClock
+from reslrb_cli.records.pilot_cache import key_of
+from reslrb_cli.records.rival import RivalRecord
+
+Array = np.ndarray[Any, Any]
+
+RIVAL = "prb"
+#: Rounds, at most, and fewer than which say nothing.
+MOST_ROUNDS, LEAST_ROUNDS = 12, 6
+#: Share of a run of ITERATIONS that the rounds may cost, and that LEAST_ROUNDS may where that is more.
+SHARE, MOST_SHARE = 0.05, 0.1
+CONFIDENCE = 0.95
+
+
+@dataclass
+class _Measured:
+    """Steps of one integrator: gradients by parameter, and milliseconds of kernels."""
+
+    gradients: list[Gradients] = field(default_factory=list)
+    kernel_ms: list[float] = field(default_factory=list)
+
+
+def measure_rival(problem: Problem, cache: Cache | None, say: Callable[[str], None]) -> RivalRecord | None:
+    """Measure `prb` beside the estimator that a pilot chose; None where no pilot did, or `prb` does not apply.
+
+    `say` is told what takes long, `cache` holds what earlier runs measured. Leaves neither gradient nor change behind.
+    """
+    # A budget of memory is kept by passes, of which `prb` has none.
+    if problem.pilot is None or problem.samples_per_pass is not None or why_not(problem) is not None:
+        return None
+    key = "" if cache is None else key_of({"rival": RIVAL, "beside": problem.pilot.chosen, **situation(problem)})
+    if cache is not None:
+        try:
+            return replace(RivalRecord.from_json(cache.get(key) or {}), cached=True)
+        except TypeError:
+            pass  # nothing there, or nothing that this version wrote
+    say(f"measuring {RIVAL} beside it")
+    record = _measure(problem)
+    if cache is not None:
+        cache.put(key, record.to_json())
+    return record
+
+
+def why_not(problem: Problem) -> str | None:
+    """Why `prb` has no such gradient of some parameter, or no such image of some view; None where it has all."""
+    options = problem.config.integrator.options()
+    params = problem.selection.params
+    moved = tuple(key for key in problem.selection.scene_keys if moves_light(params, key))
+    for index in problem.sensors:
+        sensor = problem.scene.sensors()[index]
+        at = Situation.of(
+            problem.scene, sensor, params, options["max_depth"], options["hide_emitters"], bool(moved), moved
+        )
+        for key in problem.selection.scene_keys:
+            reason = prb_gradient(at, key)
+            if reason is not None:
+                return reason
+    return None
+
+
+def _measure(problem: Problem) -> RivalRecord:
+    options, clock = problem.config.integrator.options(), StepClock()
+    shared = {name: options[name] for name in ("max_depth", "rr_depth", "hide_emitters")}
+    rival = make_integrator(RIVAL, **shared)
+    spp = problem.pilot.spp if problem.pilot is not None else problem.config.run.spp
+    own_integrator: Any = problem.integrator
+    if isinstance(own_integrator, LightTracer):  # a recording would cost more than so few steps save
+        own_integrator = own_integrator.with_options(samples_per_pass=None, freeze=False)
+    both = {RIVAL: (rival, _Measured()), "own": (own_integrator, _Measured())}
+    compile_ms = spent_ms = 0.0
+    budget_ms = math.inf
+    for round in range(-1, MOST_ROUNDS):
+        for name, (integrator, measured) in both.items():
+            step = measured_step(problem, integrator, clock, round + 1, spp)
+            compile_ms += step.compile_ms
+            if round < 0:  # it compiles; what it measures stays out
+                compile_ms += step.wall_ms
+                continue
+            spent_ms += step.wall_ms
+            measured.gradients.append(step.gradients)
+            measured.kernel_ms.append(step.kernel_ms)
+            if name == "own":
+                budget_ms = SHARE * ITERATIONS * step.wall_ms * problem.config.run.spp / spp
+        done = len(both["own"][1].gradients)
+        if done >= LEAST_ROUNDS and spent_ms * (done + 1) / done > budget_ms:
+            break
+        if done == 1 and spent_ms * LEAST_ROUNDS > budget_ms * MOST_SHARE / SHARE:
+            note = f"{LEAST_ROUNDS} steps of both would take {spent_ms * LEAST_ROUNDS / 1e3:.1f} s"
+            return RivalRecord(RIVAL, 1, spp, measure_s=spent_ms / 1e3, compile_s=compile_ms / 1e3, note=note)
+    own, other = both["own"][1], both[RIVAL][1]
+    advantage, low, high = compare(own.gradients, own.kernel_ms, other.gradients, other.kernel_ms)
+    rounds = len(own.gradients)
+    return RivalRecord(
+        RIVAL, rounds, spp, advantage, low, high, measure_s=spent_ms / 1e3, compile_s=compile_ms / 1e3,
+        note="" if advantage is not None else "its gradients, or those of the run, have no noise",
+    )  # fmt: skip
+
+
+def compare(
+    own: Sequence[Gradients], own_ms: Sequence[float], other: Sequence[Gradients], other_ms: Sequence[float]
+) -> tuple[float, float, float] | tuple[None, None, None]:
+    """The efficiency of the other over that of the own, and its interval; nothing where one has no noise."""
+    scales = {key: float(np.mean([square(g[key]) for g in (*own, *other)])) for key in own[0]}
+    scales = {key: scale for key, scale in scales.items() if scale > 0}
+    logs, variance = [], 0.0
+    for gradients in (own, other):
+        values = _log_variances(gradients, scales)
+        if values is None:
+            return None, None, None
+        whole, without = values
+        logs.append(whole)
+        count = len(gradients)
+        variance += (count - 1) / count * float(np.sum(np.square(without - without.mean())))
+    times = statistics.median(own_ms) / max(statistics.median(other_ms), 1e-6)
+    advantage = math.exp(logs[0] - logs[1]) * times
+    half = float(stats.t.isf((1 - CONFIDENCE) / 2, min(len(own), len(other)) - 1)) * math.sqrt(variance)
+    factor = math.exp(min(half, 50.0)) * TIMING_NOISE
+    return advantage, advantage / factor, advantage * factor
+
+
+def _log_variances(gradients: Sequence[Gradients], scales: dict[str, float]) -> tuple[float, Array] | None:
+    """The logarithm of the variance of all parameters, and that without each of the rounds in turn."""
+    rows = np.array([
+        np.concatenate([g[key].astype(np.float64) / math.sqrt(scale) for key, scale in scales.items()])
+        for g in gradients
+    ])  # fmt: skip
+    whole = float(rows.var(axis=0, ddof=1).sum()) if rows.size else 0.0
+    without = [float(np.delete(rows, number, axis=0).var(axis=0, ddof=1).sum()) for number in range(len(rows))]
+    if not min(whole, *without) > 0:
+        return None
+    return math.log(whole), np.log(without)

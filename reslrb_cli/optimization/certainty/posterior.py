@@ -1,0 +1,107 @@
+"""How far final values may be from the optimum: what the run's steps leave open, less what gradients at the end say.
+
+Near the optimum the loss is quadratic with curvature H, and the offset d = x - x* of the values x follows the steps
+
+    d <- d - eta_t P (H d + noise)        P: how far a step moves an entry per unit of gradient (`Optimizer.response`)
+
+so that the covariance C of the offset goes from that of the start, the square of each entry's scale (nothing is known
+of where the optimum is), to that of the end:
+
+    C <- (1 - eta_t P H) C (1 - eta_t P H)^T + eta_t^2 P Sigma P
+
+It holds what too few iterations have not forgotten of the start, what the view does not tell (H has no curvature there,
+and the start stays), and the noise of the steps. K gradients at the final values, of mean g, then measure H d (Kalman):
+
+    gain = C H (H C H + Sigma / K)^-1,   to go = gain g,   C <- C - gain H C
+
+Momentum is left out: over many steps it moves as far. P is that of the end.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+Array = np.ndarray[Any, Any]
+
+
+@dataclass(frozen=True)
+class Posterior:
+    """The offset of each of M entries from the optimum, as estimated: its mean (`to_go`, M), and covariance (M, M)."""
+
+    to_go: Array
+    covariance: Array
+
+    @property
+    def error(self) -> Array:
+        """The standard error of `to_go`, (M,)."""
+        return np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
+
+    @property
+    def spread(self) -> Array:
+        """The root mean square of the offset, (M,): one standard deviation of a final value about the optimum."""
+        return np.hypot(self.to_go, self.error)
+
+
+def joint(
+    curvature: Array, response: Array, scale: Array, noise: Array, gradient: Array, samples: int,
+    rates: Sequence[float],
+) -> Posterior:  # fmt: skip
+    """The offset of M entries together.
+
+    `curvature` is H (M, M), `noise` the covariance of one gradient (M, M), `gradient` the mean of `samples` of them,
+    `response` the diagonal of P, `scale` the standard deviation of the offset at the start, all (M,), `rates` the eta
+    of all iterations. Each entry is taken in units of its scale, so that those of different units have well-conditioned
+    matrices.
+    """
+    H = curvature * scale[:, None] * scale[None, :]
+    H = _positive(0.5 * (H + H.T))
+    Sigma = _positive(noise * scale[:, None] * scale[None, :])
+    C = _after(H, response / scale**2, Sigma, rates)
+    seen = H @ C @ H + Sigma / samples
+    seen = seen + np.eye(len(scale)) * max(1e-9 * float(np.trace(seen)), 1e-30)
+    gain = np.linalg.solve(seen, H @ C).T
+    to_go = gain @ (gradient * scale)
+    return Posterior(to_go * scale, _positive(C - gain @ H @ C) * scale[:, None] * scale[None, :])
+
+
+def alone(
+    curvature: Array, response: Array, scale: Array, noise: Array, gradient: Array, samples: int,
+    rates: Sequence[float],
+) -> tuple[Array, Array]:  # fmt: skip
+    """`to_go` and its standard error of each entry as if all others were known; everything is (M,), as in `joint`."""
+    h = np.maximum(curvature, 0.0)
+    C = scale**2
+    for rate in rates:
+        C = np.clip(1 - rate * response * h, 0, 1) ** 2 * C + (rate * response) ** 2 * noise
+    seen = h**2 * C + np.maximum(noise / samples, 1e-300)
+    gain = C * h / seen
+    return gain * gradient, np.sqrt(np.maximum(C - gain * h * C, 0.0))
+
+
+def _after(H: Array, response: Array, noise: Array, rates: Sequence[float]) -> Array:
+    """The covariance after all steps from a start of unit variances; an entry that no step moves stays where it was."""
+    C, moved = np.eye(len(response)), response > 0
+    if not moved.any():
+        return C
+    # Steps are symmetric in units of the root of the response.
+    q, free = np.sqrt(response[moved]), np.ix_(moved, moved)
+    values, vectors = np.linalg.eigh(H[free] * q[:, None] * q[None, :])
+    now = vectors.T @ np.diag(q**-2) @ vectors
+    shaken = vectors.T @ (noise[free] * q[:, None] * q[None, :]) @ vectors
+    for rate in rates:
+        left = np.clip(1 - rate * np.maximum(values, 0.0), 0, 1)
+        now = left[:, None] * now * left[None, :] + rate**2 * shaken
+    back = q[:, None] * vectors
+    C[free] = back @ now @ back.T
+    return C
+
+
+def _positive(matrix: Array) -> Array:
+    """The nearest symmetric matrix without negative eigenvalues: what noise made negative is nothing."""
+    values, vectors = np.linalg.eigh(0.5 * (matrix + matrix.T))
+    result: Array = (vectors * np.maximum(values, 0.0)) @ vectors.T
+    return result

@@ -1,0 +1,41 @@
+"""What is recorded of how certain final values are."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import Any
+
+
+@dataclass(frozen=True)
+class ParameterCertainty:
+    """Of one parameter: its verdict, and the share of its entries that each verdict has.
+
+    `spread` is one standard deviation of the final value about the optimum and `to_go` the estimated way there, in the
+    parameter's unit: one number for each entry of a small parameter, else one, the root mean square over the entries
+    that have an effect; None where none was measured, and of entries at their bounds. `partner` is the parameter that
+    makes up for this one, where one does.
+    """
+
+    verdict: str
+    shares: dict[str, float]
+    spread: list[float | None] | None
+    to_go: list[float | None] | None
+    partner: str | None = None
+
+
+@dataclass(frozen=True)
+class CertaintyRecord:
+    """All parameters, by key, and what it took: so many gradients, renderings along directions and random probes, in
+    `measure_s` seconds, compilation (`compile_s`) apart, and that over the time of the run's iterations (`share`)."""
+
+    parameters: dict[str, ParameterCertainty]
+    gradients: int
+    changes: int
+    probes: int
+    measure_s: float
+    compile_s: float
+    share: float
+
+    def to_json(self) -> dict[str, Any]:
+        """As a mapping for JSON."""
+        return asdict(self)

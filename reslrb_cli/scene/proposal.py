@@ -1,0 +1,130 @@
+"""Which parameters of a scene someone may want to recover from a photograph: what is large in view first."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from .catalog import ParameterInfo, list_parameters
+from .exporting.replacing import LOBES
+from .graph import SceneGraph
+
+#: Colours of materials, by which a photograph mostly differs from a scene.
+_COLOUR = re.compile(r"(reflectance|base_color|color\d|vertex_color)(\.(value|data))?$")
+#: Bounds by the end of a key, and what it is; the first that fits.
+_BOUNDS: tuple[tuple[str, str], ...] = (
+    (r"(reflectance|transmittance|base_color|color\d)\.(value|data)$", "[0, 1]"),
+    (r"\b(vertex|face)_\w*$", "[0, 1]"),
+    (r"\b(alpha\w*|roughness)(\.(value|data))?$", "[0.02, 1]"),
+    (r"\b(eta|k)\.(value|data)$", "[0, 10]"),
+    (r"\beta$", "[1.01, 3]"),
+    (r"\b(radiance|irradiance|intensity)\.(value|data)$", "[0, .inf]"),
+    (r"^[^.]*\.(data|scale|sun_scale|sky_scale)$", "[0, .inf]"),
+    (r"\bturbidity$", "[1, 10]"),
+    (r"\.value$|\.data$|\.specular$", "[0, 1]"),
+)
+#: Rays along each axis of the film, by which shares are taken.
+_RAYS = 64
+#: What takes less of the picture is left for later, and so are more parameters than these.
+LEAST_SHARE, MOST_FIRST = 0.02, 8
+#: Texels along an axis with which a texture begins to be recovered.
+TEXELS = 64
+
+
+@dataclass(frozen=True)
+class Proposal:
+    """A parameter that could be recovered: `share` of the picture that it colours, 0 where it is not seen itself.
+
+    `bounds` are YAML, or None; `resolution` is (width, height) of a texture that has many texels, else None; `first`
+    says whether to begin with it.
+    """
+
+    info: ParameterInfo
+    share: float
+    bounds: str | None
+    resolution: tuple[int, int] | None
+    first: bool
+
+
+def propose(scene: mi.Scene, sensor: int) -> list[Proposal]:
+    """What of `scene` can be recovered by key, through the sensor of this index, without vertices of meshes.
+
+    In the order of their shares. At least one is to begin with, where there is any.
+    """
+    params = mi.traverse(scene)
+    shares = _shares(scene, sensor)
+    found = []
+    for info in list_parameters(params, values=True):
+        wanted_kind = info.kind in ("bsdf", "emitter", "attribute")
+        if info.obstacle is None and wanted_kind and not _is_left_out(params, info):
+            chain = _above(params, info.key)
+            share = max((shares.get(item, 0.0) for item in chain), default=0.0)
+            found.append((info, share))
+    found.sort(key=lambda pair: -pair[1])
+    seen = [info for info, share in found if share >= LEAST_SHARE and _COLOUR.search(info.key)]
+    wanted = [info.key for info in seen if info.value is None or info.value.high > 0][:MOST_FIRST]  # a lamp is black
+    wanted = wanted or [info.key for info, _ in found if info.kind == "emitter"][:1] or [i.key for i, _ in found][:1]
+    return [Proposal(info, share, _bounds(info), _resolution(info), info.key in wanted) for info, share in found]
+
+
+def _is_left_out(params: mi.SceneParameters, info: ParameterInfo) -> bool:
+    """Whether Mitsuba has left out the lobe that a parameter is of, so that no value has any effect."""
+    owner, name = params.hierarchy[params.properties[info.key][2]][0], info.key.split(".")[-2]
+    is_principled = owner is not None and owner.class_name().startswith("Principled")
+    return is_principled and name in LOBES and info.value is not None and info.value.high == 0
+
+
+def _above(params: mi.SceneParameters, key: str) -> list[Any]:
+    """The object that has a parameter, and those above it, without the scene."""
+    node: Any = params.properties[key][2]
+    chain: list[Any] = []
+    while node is not None and not isinstance(node, mi.Scene):
+        # A material belongs to all shapes that have it, and has a share of its own.
+        if isinstance(node, (mi.BSDF, mi.Emitter)) or not any(isinstance(item, mi.BSDF) for item in chain):
+            chain.append(node)
+        node = params.hierarchy[node][0]
+    return chain
+
+
+def _shares(scene: mi.Scene, index: int) -> dict[Any, float]:
+    """The share of the picture that each BSDF, shape and emitter has, as the rays from the sensor meet it first."""
+    sensor, lane = scene.sensors()[index], dr.arange(mi.UInt32, _RAYS**2)
+    position = mi.Point2f(lane % _RAYS + 0.5, lane // _RAYS + 0.5) / _RAYS
+    ray, _ = sensor.sample_ray(sensor.shutter_open(), 0.5, position, mi.Point2f(0.5), True)
+    si = scene.ray_intersect(ray)
+    graph = SceneGraph.of(scene)
+    shares: dict[Any, float] = {}
+    for pointers, kind, items in (
+        (si.bsdf(), mi.BSDFPtr, graph.surface_bsdfs()),
+        (si.shape, mi.ShapePtr, graph.shapes()),
+        (si.emitter(scene), mi.EmitterPtr, scene.emitters()),
+    ):
+        numbers = np.bincount(np.array(dr.reinterpret_array(mi.UInt32, pointers)))
+        for item in items:
+            own = int(np.array(dr.reinterpret_array(mi.UInt32, kind(item)))[0])
+            shares[item] = float(numbers[own]) / _RAYS**2 if own < len(numbers) else 0.0
+    for bsdf in graph.of_type(mi.BSDF):  # what is nested is seen with what it is nested in
+        owners = graph.owning_bsdfs(bsdf)
+        shares[bsdf] = max([shares.get(owner, 0.0) for owner in owners], default=0.0)
+    return shares
+
+
+def _bounds(info: ParameterInfo) -> str | None:
+    text = next((bounds for pattern, bounds in _BOUNDS if re.search(pattern, info.key)), None)
+    if text is None or info.value is None:
+        return text
+    low, high = (np.float32(word.strip(" []").replace(".inf", "inf")) for word in text.split(","))
+    return text if low <= info.value.low and info.value.high <= high else None
+
+
+def _resolution(info: ParameterInfo) -> tuple[int, int] | None:
+    if len(info.shape) != 3 or max(info.shape[:2]) <= TEXELS:
+        return None
+    height, width = info.shape[:2]
+    scale = TEXELS / max(height, width)
+    return max(round(width * scale), 3), max(round(height * scale), 3)

@@ -1,0 +1,182 @@
+"""What goes on from a run: `initial: {run: RUN}` and `render --run RUN`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from cli import tiny
+from click.testing import CliRunner, Result
+
+from reslrb_cli.cli import main
+from reslrb_cli.cli.export import choose_integrator
+from reslrb_cli.cli.recovered import read_recovered
+from reslrb_cli.config import ParameterSpec, RunValue, load
+from reslrb_cli.errors import ConfigError
+from reslrb_cli.measure.statistics import compare
+from reslrb_cli.optimization.problem import assemble_scene
+from reslrb_cli.records.checkpoint import FILE_NAME, save_checkpoint
+from reslrb_cli.records.images import read_exr
+from reslrb_cli.records.parameters import read_parameters
+from reslrb_cli.records.run_values import read_value
+from reslrb_cli.scene import load_scene, select_parameters
+from reslrb_cli.scene.values import resample
+
+pytestmark = pytest.mark.usefixtures("llvm")
+
+LAMP = "lamp.emitter.radiance.value"
+#: A texture, a colour and a motion, which is what a value can be shaped like.
+PARAMETERS = f"""[{{key: {tiny.KEY}, initial: 0.5, bounds: [0, 1]}}, {{key: {LAMP}, initial: [3, 4, 5]}},
+  {{motion: {{of: wall, free: [translation, scale]}}, learning_rate: 0.01}}]"""
+
+
+def reslrb(*arguments: object) -> Result:
+    return CliRunner().invoke(main, [str(argument) for argument in arguments])
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory, llvm: str) -> Path:
+    """An experiment, and its run in `runs/tiny`."""
+    folder = tmp_path_factory.mktemp("from-a-run")
+    tiny.write_experiment(folder)
+    config = (folder / "tiny.yaml").read_text()
+    scene = (folder / "scene.xml").read_text().replace('<rfilter type="box"/>', '<rfilter type="gaussian"/>')
+    (folder / "scene.xml").write_text(scene)
+    (folder / "tiny.yaml").write_text(config + "optimizer: {learning_rate: 0.05}\n")
+    result = reslrb(
+        "optimize", folder / "tiny.yaml", "--set", f"parameters={PARAMETERS}", "--set", f"run.output={folder}/runs"
+    )
+    assert result.exit_code == 0, result.output
+    return folder
+
+
+def start(folder: Path, parameters: str) -> dict[str, np.ndarray]:
+    """The values with which an optimisation of these `parameters` would begin."""
+    return assemble_scene(load(folder / "tiny.yaml", [f"parameters={parameters}"])).values()
+
+
+def test_every_kind_of_value_begins_where_the_run_left_it(folder: Path) -> None:
+    warm = PARAMETERS.replace("initial: 0.5", "initial: {run: runs/tiny}").replace("[3, 4, 5]", "{run: runs/tiny}")
+    warm = warm.replace("scale]}", "scale]}, initial: {run: runs/tiny}")
+    left, begun = (read_parameters(folder / "runs/tiny/parameters" / place) for place in ("", "initial"))
+    taken = start(folder, warm)
+    assert set(left) == set(taken) == {tiny.KEY, LAMP, "wall.translation", "wall.scale"}
+    for key, value in left.items():
+        assert not np.array_equal(value, begun[key]), f"{key} never moved, so this would show nothing"
+        assert np.array_equal(value, taken[key]), key
+
+
+def test_a_texture_of_another_size_is_resampled_where_that_is_asked_for(folder: Path) -> None:
+    spec = f"[{{key: {tiny.KEY}, initial: {{run: runs/tiny}}, resolution: [8, 6]}}]"
+    left = read_value(folder / "runs/tiny", tiny.KEY)
+    finer = start(folder, spec)[tiny.KEY]
+    assert np.array_equal(finer, resample(left, (8, 6)))
+    with pytest.raises(ConfigError, match=r"initial.run: .* has .* with 4x4 texels, the texture has 8x6"):
+        read_into(folder, "runs/tiny", finer)
+
+
+def read_into(folder: Path, run: str, texture: np.ndarray) -> None:
+    """Start a scene whose own texture is `texture` from a run."""
+    scene = load_scene(folder / "scene.xml")
+    params = mi.traverse(scene)
+    params[tiny.KEY] = mi.TensorXf(texture)
+    spec = ParameterSpec(key=tiny.KEY, initial=RunValue(run=folder / run))
+    select_parameters(scene, [spec], "c.yaml")
+
+
+def test_rendering_a_run_is_rendering_what_it_recovered(folder: Path) -> None:
+    left = read_parameters(folder / "runs/tiny/parameters")
+    by_hand = (
+        f"[{{key: {tiny.KEY}, initial: {{file: {folder}/runs/tiny/parameters/{tiny.KEY}.exr}}}},"
+        f"{{key: {LAMP}, initial: {left[LAMP].tolist()}}}, {{motion: {{of: wall, free: [translation, scale]}}, "
+        f"initial: {{translation: {left['wall.translation'].tolist()}, scale: {left['wall.scale']}}}}}]"
+    )
+    common = ("--spp", 16, "--sensor", 0, "--set", "run.seed=3", "-o")
+    expected = reslrb("render", folder / "tiny.yaml", "--set", f"parameters={by_hand}", *common, folder / "a.exr")
+    assert expected.exit_code == 0, expected.output
+    assert reslrb("render", "--run", folder / "runs/tiny", *common, folder / "b.exr").exit_code == 0
+    assert np.array_equal(read_exr(folder / "a.exr"), read_exr(folder / "b.exr"))
+    initial = reslrb("render", folder / "runs/tiny/config.yaml", *common, folder / "c.exr")
+    assert initial.exit_code == 0
+    assert not np.array_equal(read_exr(folder / "a.exr"), read_exr(folder / "c.exr"))
+
+
+def test_mitsuba_renders_what_was_exported_as_the_run_does(folder: Path) -> None:
+    result = reslrb("export", folder / "runs/tiny", "-o", folder / "exported")
+    assert result.exit_code == 0, result.output
+    assert "rendered by ptracer" in result.output
+    theirs = mi.load_file(str(folder / "exported/scene.xml"))
+    problem = assemble_scene(read_recovered(folder / "runs/tiny", ("integrator.rr_depth=9",)))
+    found = np.stack([np.array(mi.render(theirs, spp=64, seed=seed)) for seed in range(16)])
+    result = compare(np.stack([problem.render(0, 64, seed, "test") for seed in range(16)]), found)
+    assert result, result
+    begun = assemble_scene(load(folder / "runs/tiny/config.yaml"))
+    assert not compare(np.stack([begun.render(0, 64, seed, "test") for seed in range(16)]), found)
+    again = reslrb("export", folder / "runs/tiny", "-o", folder / "exported")
+    assert again.exit_code == 2
+    assert "exported exists" in again.output
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ((), "Missing argument 'CONFIG'"),
+        (("tiny.yaml", "--run", "runs/tiny"), "not both"),
+        (("--run", "runs/tiny", "--scene"), "leave out --initial and --scene"),
+        (("--run", "runs/none"), "no such folder"),
+        (("--run", "tiny.yaml"), "is a file, not the folder of a run"),
+        (("--run", "runs"), "has no manifest.json"),
+    ],
+)
+def test_what_is_no_run_is_refused(
+    folder: Path, arguments: tuple[str, ...], message: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(folder)
+    result = reslrb("render", *arguments, "-o", "x.exr")
+    assert result.exit_code == 2
+    assert message in result.output
+    assert not (folder / "x.exr").exists()
+
+
+def test_a_run_that_lacks_a_value_or_has_a_bad_one_is_refused_in_a_line(folder: Path, tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    (run / "checkpoint").mkdir(parents=True)
+    for name in ("manifest.json", "config.yaml"):
+        (run / name).write_bytes((folder / "runs/tiny" / name).read_bytes())
+
+    def refusal() -> str:
+        result = reslrb("render", "--run", run, "-o", tmp_path / "x.exr")
+        assert result.exit_code == 2, result.output
+        assert "Traceback" not in result.output
+        return result.output
+
+    assert "has no checkpoint/state.npz" in refusal()
+    values = {tiny.KEY: np.full((4, 4, 3), 0.5, np.float32), LAMP: np.ones(3, np.float32)}
+    save_checkpoint(run / "checkpoint", 1, values, {})
+    assert "did not recover `wall.translation`; it has" in refusal()
+    values |= {"wall.translation": np.zeros(3, np.float32), "wall.scale": np.array(1, np.float32)}
+    save_checkpoint(run / "checkpoint", 1, values | {LAMP: np.ones(2, np.float32)}, {})
+    assert f"`{LAMP}` of shape 2, the scene of shape 3" in refusal()
+    save_checkpoint(run / "checkpoint", 1, values | {LAMP: np.full(3, np.nan, np.float32)}, {})
+    assert "all values must be finite" in refusal()
+    save_checkpoint(run / "checkpoint", 1, values | {tiny.KEY: np.full((4, 4, 3), 2, np.float32)}, {})
+    assert "exclude the initial value" in refusal()
+    (run / "checkpoint" / FILE_NAME).write_bytes(b"PK\x03\x04 and then nothing")
+    assert "is damaged, cut off, or not written by a run" in refusal()
+
+
+def test_an_exported_scene_is_rendered_by_path_where_ptracer_is_wrong(tmp_path: Path) -> None:
+    tiny.write_experiment(tmp_path)
+    sky = """<emitter type="envmap"><string name="filename" value="poster.exr"/><transform name="to_world">
+<rotate y="1" angle="40"/></transform></emitter></scene>"""
+    (tmp_path / "scene.xml").write_text(tiny.SCENE.replace("</scene>", sky))
+    config = load(tmp_path / "tiny.yaml")
+    scene = load_scene(config.scene.file)
+    integrator, why = choose_integrator(config, scene, mi.traverse(scene))
+    assert integrator == {"type": "path", "max_depth": 3, "rr_depth": 5, "hide_emitters": False}
+    assert why == ", since ptracer emits wrongly from a turned environment map"
+    by_prb = load(tmp_path / "tiny.yaml", ["integrator={type: prb, max_depth: 4}"])
+    integrator, why = choose_integrator(by_prb, scene, mi.traverse(scene))
+    assert (integrator["type"], integrator["max_depth"], why) == ("path", 4, "")

@@ -1,0 +1,112 @@
+"""`prb` beside the estimator of a run: when it is tried, what is said of it, and what its interval is worth."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+
+import numpy as np
+import pytest
+from cli.test_optimize import CONFIG, KEY, SCENE
+
+from reslrb_cli.cli import main
+from reslrb_cli.config import load
+from reslrb_cli.measure import rival
+from reslrb_cli.records.manifest import read_manifest
+from reslrb_cli.records.rival import RivalRecord
+
+AUTO = CONFIG.replace("{type: ptracer, max_depth: 3}", "{max_depth: 3}").replace("iterations: 25", "iterations: 2")
+POINT = """<emitter type="point" id="bulb"><point name="position" x="0" y="0" z="2"/>
+    <rgb name="intensity" value="3, 3, 3"/></emitter>"""
+GLASS = """<shape type="sphere"><float name="radius" value="0.2"/><point name="center" x="0" y="0" z="1"/>
+    <bsdf type="dielectric"/></shape>"""
+
+
+@pytest.fixture
+def experiment(llvm, tmp_path, monkeypatch):
+    import mitsuba as mi
+
+    mi.Bitmap(np.full((4, 4, 3), 0.6, dtype=np.float32)).write(str(tmp_path / "poster.exr"))
+    (tmp_path / "scene.xml").write_text(SCENE)
+    (tmp_path / "box.yaml").write_text(AUTO)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("RESLRB_CACHE", str(tmp_path / "cache"))
+    logging.getLogger("reslrb_cli").setLevel(logging.INFO)
+
+
+def optimize(capsys, *settings):
+    capsys.readouterr()
+    with pytest.raises(SystemExit) as end:
+        main(["optimize", "box.yaml", "--force", *(word for setting in settings for word in ("--set", setting))])
+    assert not end.value.code
+    return capsys.readouterr().err, read_manifest(Path("runs/box"))
+
+
+def test_it_is_measured_once_and_remembered(experiment, capsys):
+    err, manifest = optimize(capsys)
+    found = RivalRecord.from_json(manifest["rival"])
+    assert found.integrator == "prb"
+    assert "measuring prb beside it" in err
+    if found.advantage is not None:
+        assert found.low < found.advantage < found.high
+        assert rival.LEAST_ROUNDS <= found.rounds <= rival.MOST_ROUNDS
+        assert (found.line() in err) == found.is_better
+        assert found.line().replace("&", "&amp;") in Path("runs/box/report.html").read_text()
+    err, again = optimize(capsys)
+    assert again["rival"] == {**manifest["rival"], "cached": True}
+    assert "measuring prb" not in err
+
+
+def test_it_is_not_tried_where_nobody_chose_an_estimator(experiment, capsys, monkeypatch):
+    """And a better one is one line, one that may be no better none."""
+    err, manifest = optimize(capsys, "integrator.estimator=stack")
+    assert manifest["rival"] is None
+    assert "prb" not in err
+    better = RivalRecord("prb", 8, 4, 5.0, 3.0, 8.0, 1.5, 2.0)
+    monkeypatch.setattr(rival, "measure_rival", lambda problem, cache, say: better)
+    err, manifest = optimize(capsys, "integrator.estimator=stack")
+    assert f"{better.line()}; --set integrator.type=prb" in err
+    assert "prb has 5 times the efficiency here (3 to 8; measured in 1.5 s" in better.line()
+    assert manifest["rival"] == better.to_json()
+    monkeypatch.setattr(rival, "measure_rival", lambda problem, cache, say: RivalRecord("prb", 8, 4, 1.5, 0.9, 2.5))
+    assert "prb" not in optimize(capsys, "integrator.estimator=stack")[0]
+
+
+@pytest.mark.parametrize(("extra", "applies"), [("", True), (GLASS + POINT, False)])
+def test_it_is_tried_where_it_finds_the_light(experiment, extra, applies):
+    from reslrb_cli.optimization.problem import assemble_scene
+
+    Path("scene.xml").write_text(SCENE.replace("</scene>", f"{extra}</scene>"))
+    assert (rival.why_not(assemble_scene(load("box.yaml", []))) is None) == applies
+
+
+def samples(sd, count, seed, entries=200):
+    random = np.random.default_rng(seed)
+    return [{KEY: (1 + sd * random.normal(size=entries)).astype(np.float32)} for _ in range(count)]
+
+
+@pytest.mark.parametrize("entries", [3, 200])
+def test_the_interval_holds_the_truth_as_often_as_it_says(entries):
+    """Four times the variance at half the time; without what single times may be off, the level is the nominal one."""
+    inside = 0
+    for seed in range(200):
+        own, other = samples(2.0, 8, 2 * seed, entries), samples(1.0, 8, 2 * seed + 1, entries)
+        value, low, high = rival.compare(own, [2.0] * 8, other, [4.0] * 8)
+        low, high = low * rival.TIMING_NOISE, high / rival.TIMING_NOISE
+        assert low < value < high
+        inside += low < 2.0 < high
+    # 190 of 200 are expected; fewer than 176 have a probability of 1e-4.
+    assert inside >= 176
+
+
+def test_equals_are_hardly_ever_called_better():
+    better = sum(
+        rival.compare(samples(1.0, 8, 2 * seed), [3.0] * 8, samples(1.0, 8, 2 * seed + 1), [3.0] * 8)[1] > 1
+        for seed in range(200)
+    )
+    assert better <= 13  # 5 are expected on this side without what times may be off
+
+
+def test_no_noise_is_no_comparison():
+    still = [{KEY: np.ones(4, np.float32)}] * 6
+    assert rival.compare(still, [1.0] * 6, samples(1.0, 6, 1, 4), [1.0] * 6) == (None, None, None)

@@ -1,0 +1,122 @@
+"""Small scenes whose truth is known, recovered with success or made to fail, and what is said of the results.
+
+A wall under lamps of their own colours, a rough mirror, a lamp that lights nothing, and two that light the wall alike.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from reslrb_cli.config import load
+from reslrb_cli.optimization import assemble, optimize
+from reslrb_cli.optimization.certainty import Certainty, CertaintyRecord
+
+LEFT, RIGHT, HIDDEN = (f"{name}.emitter.radiance.value" for name in ("left", "right", "hidden"))
+TWIN, OTHER_TWIN = (f"{name}.emitter.radiance.value" for name in ("twin", "other_twin"))
+WALL, ALPHA, POSTER = "wall.reflectance.value", "metal.alpha.value", "poster.reflectance.data"
+
+
+def lamp(name: str, x: float, radiance: str, size: float = 0.6, facing: float = 180) -> str:
+    return f"""<shape type="rectangle" id="{name}">
+        <transform name="to_world"><scale value="{size}"/><rotate x="1" angle="{facing}"/>
+            <translate x="{x}" y="0.8" z="3"/></transform>
+        <bsdf type="diffuse"><rgb name="reflectance" value="0, 0, 0"/></bsdf>
+        <emitter type="area"><rgb name="radiance" value="{radiance}"/></emitter>
+    </shape>"""
+
+
+SCENE = f"""<scene version="3.0.0">
+    <sensor type="perspective">
+        <float name="fov" value="42"/>
+        <transform name="to_world"><lookat origin="0, -0.5, 4" target="0, 0, 0" up="0, 1, 0"/></transform>
+        <film type="hdrfilm">
+            <integer name="width" value="16"/> <integer name="height" value="16"/>
+            <string name="pixel_format" value="rgb"/> <rfilter type="box"/>
+        </film>
+    </sensor>
+    <bsdf type="diffuse" id="wall"><rgb name="reflectance" value="0.6, 0.4, 0.25"/></bsdf>
+    <bsdf type="roughconductor" id="metal"><float name="alpha" value="0.25"/></bsdf>
+    <bsdf type="diffuse" id="poster">
+        <texture type="bitmap" name="reflectance">
+            <string name="filename" value="poster.exr"/> <boolean name="raw" value="true"/>
+            <string name="format" value="variant"/> <string name="filter_type" value="nearest"/>
+        </texture>
+    </bsdf>
+    <shape type="rectangle" id="back">
+        <transform name="to_world"><scale value="3"/><translate z="-0.5"/></transform><ref id="wall"/>
+    </shape>
+    <shape type="rectangle" id="plate">
+        <transform name="to_world"><scale value="0.5"/><translate x="0.9" y="0.3"/></transform><ref id="metal"/>
+    </shape>
+    <shape type="rectangle" id="print">
+        <transform name="to_world"><scale value="0.9"/><translate x="-0.6"/></transform><ref id="poster"/>
+    </shape>
+    {lamp("left", -2, "9, 6, 4")} {lamp("right", 2, "3, 5, 8")} {lamp("hidden", 0, "2, 2, 2", facing=0)}
+    {lamp("twin", 0.5, "4, 4, 4", 0.3)} {lamp("other_twin", 0.5001, "4, 4, 4", 0.3)}
+</scene>
+"""
+CONFIG = """
+variant: llvm_ad_rgb
+scene: {file: scene.xml}
+target: {render: {spp: 4096}}
+parameters: [{key: wall.reflectance.value}]
+integrator: {type: reslrb, max_depth: 3, estimator: stack}
+optimizer: {type: adam, learning_rate: 0.02}
+run: {iterations: 100, spp: 16}
+"""
+
+
+@dataclass(frozen=True)
+class Toy:
+    """One run: its parameters with their options, its settings, and the verdict that each parameter ought to have."""
+
+    name: str
+    parameters: dict[str, str]
+    right: dict[str, tuple[str, ...]]
+    settings: tuple[str, ...] = ()
+    fails: bool = False
+
+
+@dataclass
+class Outcome:
+    """What a run came to."""
+
+    certainty: CertaintyRecord
+    final: dict[str, np.ndarray]
+    true: dict[str, np.ndarray]
+    errors: dict[str, np.ndarray] = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.errors = {key: self.final[key] - self.true[key] for key in self.final}
+
+
+def write_scene(folder: Path) -> None:
+    """Scene and texture; a variant must be set."""
+    import mitsuba as mi
+
+    texture = np.random.default_rng(2).uniform(0.2, 0.8, (4, 4, 3)).astype(np.float32)
+    mi.Bitmap(texture).write(str(folder / "poster.exr"))
+    (folder / "scene.xml").write_text(SCENE)
+    (folder / "toy.yaml").write_text(CONFIG)
+
+
+def run(folder: Path, toy: Toy, seed: int = 0) -> Outcome:
+    """Recover, and measure how certain that is; the scene is in `folder`."""
+    parameters = ", ".join(f"{{key: {key}, {options}}}" for key, options in toy.parameters.items())
+    settings = [f"parameters=[{parameters}]", f"run.seed={seed}", *toy.settings]
+    problem = assemble(load(folder / "toy.yaml", settings))
+    true = {key: np.asarray(value, dtype=np.float64) for key, value in problem.truth.items()}
+    problem.truth.clear()  # nothing is judged by it
+    certainty = Certainty(problem)
+    for last in optimize(problem):
+        certainty.see(last.iteration + 1)
+    before = {key: value.copy() for key, value in problem.values().items()}
+    found = certainty.measure(last.iteration + 1, last.elapsed_s, lambda: False)
+    assert found is not None
+    for key, value in problem.values().items():  # it measures, and leaves all as it was
+        np.testing.assert_array_equal(value, before[key])
+        assert not np.any(np.array(problem.optimizer.gradient(key)))
+    return Outcome(found, {key: value.astype(np.float64) for key, value in problem.values().items()}, true)

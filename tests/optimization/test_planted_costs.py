@@ -1,0 +1,137 @@
+"""Clock and allocator's peak against costs that are planted: a kernel, a sleep, files that take long, a leak."""
+
+from __future__ import annotations
+
+import statistics
+import time
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from cli.tiny import write_experiment
+from optimization.toy import make_problem
+
+from reslrb_cli.cli import main, recording
+from reslrb_cli.optimization import loop
+from reslrb_cli.records.clock import MIB, StepClock, peak_mib, reset_peak
+from reslrb_cli.records.metrics import read_metrics
+
+#: Lanes of the kernels, and turns of the loop of the cheaper one: some ten milliseconds.
+LANES, TURNS = 2**16, 256
+SLEEP_S = 0.2
+
+
+def chain(turns: int) -> None:
+    """Launch a kernel whose only cost is a chain of so many dependent operations a lane."""
+
+    def turn(number: mi.UInt, value: mi.Float) -> tuple[mi.UInt, mi.Float]:
+        return number + 1, dr.fma(value, mi.Float(0.999), mi.Float(0.5))
+
+    end = dr.opaque(mi.UInt, turns)
+    state = (mi.UInt(0), dr.arange(mi.Float, LANES))
+    _, value = dr.while_loop(state, lambda number, value: number < end, turn, mode="symbolic")
+    dr.eval(value)
+
+
+def test_a_kernel_of_known_cost() -> None:
+    """As many times the operations are as many times the time, by the history as by the wall; and twice is twice.
+
+    The least of a few repetitions, so that what else the machine does is not in it; the same kernel is launched.
+    """
+    clock = StepClock()
+    found: dict[int, tuple[float, float]] = {}
+    for turns, launches in ((TURNS, 1), (16 * TURNS, 1), (16 * TURNS + 1, 2)):
+        times = []
+        for _ in range(8):
+            with clock.step() as step:
+                for _ in range(launches):
+                    chain(turns)
+            times.append(step)
+        assert [step.new_kernels for step in times[1:]] == [0] * 7
+        assert times[-1].codegen_ms < times[0].codegen_ms or turns != TURNS
+        found[turns] = (min(s.kernel_ms for s in times[1:]), min(s.wall_ms for s in times[1:]))
+        for step in times:
+            assert step.kernel_ms + step.codegen_ms <= 1.01 * step.wall_ms + 0.1
+    (short, _), (long, wall), (twice, _) = found.values()
+    assert long / short == pytest.approx(16, rel=0.35)
+    assert twice / long == pytest.approx(2, rel=0.25)
+    assert long == pytest.approx(wall, rel=0.25)  # there is hardly anything else
+
+
+def test_what_python_does_in_a_step_is_no_kernel() -> None:
+    clock = StepClock()
+    with clock.step():
+        chain(TURNS)
+    with clock.step() as times:
+        chain(TURNS)
+        time.sleep(SLEEP_S)
+    assert times.wall_ms > 1e3 * SLEEP_S
+    assert times.kernel_ms < 0.5e3 * SLEEP_S
+    before = clock.elapsed_s
+    time.sleep(SLEEP_S)  # between steps
+    with clock.counted():
+        pass
+    assert clock.elapsed_s - before < 0.5 * SLEEP_S
+
+
+@pytest.mark.parametrize("what", ["MetricsWriter.write", "save_checkpoint"])
+def test_files_that_take_long_are_in_no_time_of_a_run(
+    what: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A disk that takes 0.2 s for every line, or every checkpoint, which are written after each iteration here."""
+    write_experiment(tmp_path)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(recording, "CHECKPOINT_SECONDS", 0.0)
+    holder: Any = recording.MetricsWriter if what == "MetricsWriter.write" else recording
+    name = what.rpartition(".")[2]
+    written, slept = getattr(holder, name), []
+
+    def slowly(*arguments: Any, **options: Any) -> Any:
+        slept.append(SLEEP_S)
+        time.sleep(SLEEP_S)
+        return written(*arguments, **options)
+
+    monkeypatch.setattr(holder, name, slowly)
+    with pytest.raises(SystemExit) as ended:
+        main.main(["optimize", "tiny.yaml", "--set", "run.iterations=8"])
+    assert not ended.value.code
+    assert len(slept) >= 8
+    times = [record["elapsed_s"] for record in read_metrics(Path("runs/tiny"))]
+    warm = [after - before for before, after in pairwise(times[2:])]
+    assert statistics.median(warm) < 0.5 * SLEEP_S
+
+
+def test_arrays_that_a_step_holds_are_in_the_peak_also_when_it_lets_go_of_them() -> None:
+    backend = dr.backend_v(mi.Float)
+    reset_peak()
+    before = peak_mib(backend)
+    array = dr.full(mi.Float, 1, 4 * 2**20)
+    dr.make_opaque(array)
+    assert peak_mib(backend) - before == pytest.approx(4 * 4 * 2**20 / MIB, rel=0.01)
+    del array
+    assert peak_mib(backend) - before == pytest.approx(16, rel=0.01)
+    reset_peak()
+    assert peak_mib(backend) == pytest.approx(before, abs=0.1)
+
+
+def test_a_leak_shows_in_the_peak_of_a_run(tmp_path: Path, steps: Any) -> None:
+    """Two MiB that each iteration leaves behind; without them the peak is flat."""
+    peaks: dict[bool, list[float]] = {}
+    for leaks in (False, True):
+        reset_peak()
+        left = []
+        problem = steps.problem = make_problem(tmp_path, sets=["run.iterations=6"])
+        peaks[leaks] = []
+        for record in loop.optimize(problem):
+            peaks[leaks].append(record.peak_mib)
+            if leaks:
+                left.append(dr.full(mi.Float, 1, 2**19))
+                dr.make_opaque(left[-1])
+        del left
+    sound, leaking = (np.diff(peaks[leaks])[1:] for leaks in (False, True))
+    assert (np.abs(sound) < 0.1).all()
+    assert leaking == pytest.approx(np.full(len(leaking), 2.0), rel=0.05)

@@ -1,0 +1,155 @@
+"""The rules of verdicts, one by one, and the posterior that they rest on, against runs of the model itself."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from reslrb_cli.optimization.certainty.coordinates import noise_covariance
+from reslrb_cli.optimization.certainty.curvature import smooth
+from reslrb_cli.optimization.certainty.posterior import alone, joint
+from reslrb_cli.optimization.certainty.verdicts import Evidence, Verdict, judge, shares, summarise
+
+
+def evidence(**changes: float | bool) -> Evidence:
+    """One entry that is settled, with changes."""
+    own = {
+        "value": 0.5, "low": 0.0, "high": 1.0, "scale": 0.5, "touched": True, "gradient": 0.0, "error": 1.0,
+        "step": 0.01, "spread": 0.01, "alone": 0.01, "to_go": 0.0, "to_go_error": 0.01,
+    }  # fmt: skip
+    return Evidence(**{name: np.array([value]) for name, value in (own | changes).items()})
+
+
+@pytest.mark.parametrize(("changes", "verdict"), [
+    ({}, Verdict.SETTLED),
+    ({"spread": 0.049}, Verdict.SETTLED),
+    ({"spread": 0.051, "alone": 0.05}, Verdict.BELOW_NOISE),
+    ({"spread": 0.2, "alone": 0.2, "to_go": 0.19, "to_go_error": 0.05}, Verdict.STILL_MOVING),
+    ({"spread": 0.2, "alone": 0.2, "to_go": -0.19, "to_go_error": 0.05}, Verdict.STILL_MOVING),
+    ({"spread": 0.2, "alone": 0.2, "to_go": 0.09, "to_go_error": 0.05}, Verdict.BELOW_NOISE),
+    ({"spread": 0.2, "alone": 0.02, "to_go": 0.01, "to_go_error": 0.2}, Verdict.NOT_DETERMINED),
+    ({"touched": False, "spread": 0.2}, Verdict.NO_EFFECT),
+    # At a bound, where the gradient holds it there: L falls downwards where dL/dx > 0.
+    ({"value": 0.0, "gradient": 5.0, "spread": 0.2}, Verdict.AT_BOUND),
+    ({"value": 0.0, "gradient": 0.5, "spread": 0.2}, Verdict.AT_BOUND),
+    ({"value": 0.0, "gradient": -5.0}, Verdict.SETTLED),
+    ({"value": 1.0, "gradient": -5.0, "spread": 0.2}, Verdict.AT_BOUND),
+    ({"value": 1.0, "gradient": 5.0}, Verdict.SETTLED),
+    # Shaken off it by noise, by less than a few steps.
+    ({"value": 0.02, "gradient": 5.0, "spread": 0.2}, Verdict.AT_BOUND),
+    ({"value": 0.02, "gradient": 0.5}, Verdict.SETTLED),
+    ({"value": 0.2, "gradient": 5.0}, Verdict.SETTLED),
+    ({"value": 3.0, "low": -np.inf, "high": np.inf}, Verdict.SETTLED),
+])  # fmt: skip
+def test_the_rules(changes, verdict):
+    assert judge(evidence(**changes)) == [verdict]
+
+
+def test_entries_are_judged_one_by_one():
+    one, other = evidence(), evidence(touched=False)
+    both = replace(one, **{name: np.append(getattr(one, name), getattr(other, name)) for name in vars(one)})
+    assert judge(both) == [Verdict.SETTLED, Verdict.NO_EFFECT]
+
+
+@pytest.mark.parametrize(("entries", "verdict"), [
+    ("sssss", Verdict.SETTLED),
+    ("ssssm", Verdict.SETTLED),
+    ("sss", Verdict.SETTLED),
+    ("ssb", Verdict.AT_BOUND),
+    ("ssssssmmb", Verdict.STILL_MOVING),
+    ("ssbbm", Verdict.AT_BOUND),
+    ("nnn", Verdict.NO_EFFECT),
+    ("nnnnnnnns", Verdict.SETTLED),
+    ("nnnnnnnnm", Verdict.STILL_MOVING),
+])  # fmt: skip
+def test_a_parameter_is_what_its_entries_are(entries, verdict):
+    kinds = {"s": Verdict.SETTLED, "m": Verdict.STILL_MOVING, "b": Verdict.AT_BOUND, "n": Verdict.NO_EFFECT}
+    found = shares([kinds[entry] for entry in entries])
+    assert sum(found.values()) == pytest.approx(1)
+    assert summarise(found) is verdict
+
+
+def simulate(H, response, scale, noise, samples, rates, runs, random):
+    """Offsets (runs, M) at the end of the model itself, and the gradients (runs, M) that are measured there."""
+    root = np.linalg.cholesky(noise)
+    offset = random.normal(size=(runs, len(scale))) * scale
+    for rate in rates:
+        offset = offset - rate * response * (offset @ H + random.normal(size=offset.shape) @ root.T)
+    gradient = offset @ H + random.normal(size=offset.shape) @ root.T / np.sqrt(samples)
+    return offset, gradient
+
+
+@pytest.mark.parametrize("iterations", [5, 60, 600])
+def test_offsets_of_the_model_are_as_wide_as_they_are_said_to_be(iterations):
+    """Coverage: over many runs the way to go is right on the average, and its error is what is stated."""
+    H = np.array([[2.0, 1.2, 0.0], [1.2, 1.0, 0.3], [0.0, 0.3, 4.0]])
+    response, scale = np.array([0.02, 0.1, 0.01]), np.array([1.0, 3.0, 0.5])
+    sd = np.array([0.5, 0.8, 2.0])
+    noise = np.outer(sd, sd) * np.array([[1, 0.5, 0], [0.5, 1, 0], [0, 0, 1]])
+    rates = np.linspace(1, 0.2, iterations)
+    runs = 4000
+    offset, gradient = simulate(H, response, scale, noise, 5, rates, runs, np.random.default_rng(3))
+    found = [joint(H, response, scale, noise, unit, 5, rates) for unit in np.eye(3)]
+    to_go = gradient @ np.array([each.to_go for each in found])  # it is linear in the gradient
+    left = offset - to_go
+    # A standard deviation from n normal deviates has a relative standard error of 1 / sqrt(2 n).
+    z = (left.std(axis=0) / found[0].error - 1) * np.sqrt(2 * runs)
+    assert np.abs(z).max() < 4.5, z
+    z = left.mean(axis=0) / found[0].error * np.sqrt(runs)
+    assert np.abs(z).max() < 4.5, z
+    spread = np.sqrt(np.mean(np.square(to_go), axis=0) + np.square(found[0].error))
+    assert np.abs(np.sqrt(np.mean(np.square(offset), axis=0)) / spread - 1).max() < 0.05
+
+
+def test_alone_is_joint_where_nothing_is_shared():
+    H, rates = np.array([0.5, 2.0]), [1.0] * 40
+    given = np.array([0.03, 0.05]), np.array([2.0, 0.3])
+    noise, gradient = np.array([0.2, 0.5]), np.array([0.1, -0.4])
+    to_go, error = alone(H, *given, noise, gradient, 4, rates)
+    both = joint(np.diag(H), *given, np.diag(noise), gradient, 4, rates)
+    np.testing.assert_allclose(to_go, both.to_go, rtol=1e-5)
+    np.testing.assert_allclose(error, both.error, rtol=1e-5)
+
+
+def test_what_the_view_does_not_tell_stays_as_it_was():
+    """Two lamps that light the view alike: their sum is known, their difference is as open as at the start."""
+    H = np.full((2, 2), 5.0)
+    found = joint(H, np.full(2, 0.1), np.ones(2), np.eye(2) * 1e-4, np.zeros(2), 5, [1.0] * 200)
+    assert found.error == pytest.approx(np.full(2, np.sqrt(0.5)), rel=0.02)
+    total, difference = (np.sqrt(v @ found.covariance @ v) for v in (np.array([1, 1]), np.array([1, -1])))
+    assert total < 0.02
+    assert difference == pytest.approx(np.sqrt(2), rel=0.02)
+    assert (
+        alone(np.full(2, 5.0), np.full(2, 0.1), np.ones(2), np.full(2, 1e-4), np.zeros(2), 5, [1.0] * 200)[1][0] < 0.02
+    )
+
+
+def test_an_entry_that_no_step_moves_is_as_far_as_it_was():
+    found = joint(
+        np.diag([2.0, 0.0]), np.array([0.1, 0.0]), np.array([1.0, 7.0]), np.eye(2), np.zeros(2), 5, [1.0] * 50
+    )
+    assert found.error[1] == pytest.approx(7, rel=1e-3)
+    assert found.error[0] < 0.5
+
+
+def test_noise_takes_its_correlations_from_the_curvature():
+    random, H = np.random.default_rng(5), np.array([[4.0, 1.8], [1.8, 1.0]])
+    root = np.linalg.cholesky(H)
+    found = noise_covariance(root @ random.normal(size=(2, 400)), np.diag(H), H)
+    assert found[0, 1] == pytest.approx(1.8, rel=0.1)
+    apart = noise_covariance(random.normal(size=(2, 400)), np.ones(2), H)
+    assert abs(apart[0, 1]) < 0.15
+    np.testing.assert_array_equal(np.diag(apart), 1)
+
+
+def test_curvature_is_averaged_over_entries_of_alike_noise():
+    random = np.random.default_rng(6)
+    noise = np.concatenate([np.full(320, 1.0), np.full(320, 9.0)]) * random.uniform(0.9, 1.1, 640)
+    order = random.permutation(640)
+    truth = np.where(noise < 4, 2.0, 50.0)
+    measured = truth * random.normal(size=640) * random.normal(size=640) + truth
+    found = smooth(measured[order], noise[order])
+    assert np.abs(found / truth[order] - 1).max() < 0.6
+    assert smooth(np.full(3, -1.0), np.ones(3)).tolist() == [0, 0, 0]

@@ -1,0 +1,255 @@
+"""Exported scenes: Mitsuba alone reads recovered values back, and renders the same image, whatever was recovered."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from reslrb_cli.config import ParameterSpec
+from reslrb_cli.errors import ConfigError
+from reslrb_cli.measure.statistics import compare
+from reslrb_cli.scene import Selection, load, select_parameters
+from reslrb_cli.scene.description import Description
+from reslrb_cli.scene.exporting import export_scene
+from reslrb_cli.scene.load import load_described
+
+pytestmark = pytest.mark.usefixtures("llvm")
+
+BITMAP = '<string name="filename" value="{}"/><string name="format" value="variant"/>'
+#: Every way in which a scene says what can be recovered: by number, colour, image, index, mesh and place, with and
+#: without ids, referred to and included, in folders of its own and elsewhere.
+SCENE = f"""<scene version="3.0.0">
+<default name="resx" value="48"/> <default name="resy" value="32"/>
+<sensor type="perspective"><film type="hdrfilm"><integer name="width" value="$resx"/>
+<integer name="height" value="$resy"/><string name="pixel_format" value="rgb"/><rfilter type="gaussian"/></film>
+<transform name="to_world"><lookat origin="0, 5, 7" target="0, 0.3, 0" up="0, 1, 0"/></transform></sensor>
+<texture type="bitmap" id="wood">{BITMAP.format("images/wood.png")}</texture>
+<include filename="lights.xml"/>
+<shape type="rectangle" id="floor"><transform name="to_world"><rotate x="1" angle="-90"/><scale value="4"/></transform>
+    <bsdf type="diffuse"><ref id="wood" name="reflectance"/></bsdf></shape>
+<shape type="sphere"><point name="center" x="-2.4" y="0.6" z="0.5"/><float name="radius" value="0.6"/>
+    <bsdf type="roughconductor"><string name="material" value="Cu"/><float name="alpha" value="0.3"/></bsdf></shape>
+<shape type="sphere"><point name="center" x="-0.9" y="0.6" z="0.9"/><float name="radius" value="0.6"/>
+    <bsdf type="roughdielectric"><string name="int_ior" value="bk7"/><float name="alpha" value="0.2"/></bsdf></shape>
+<shape type="disk" id="pane"><transform name="to_world"><translate x="0.4" y="1" z="1"/></transform>
+    <bsdf type="thindielectric"/></shape>
+<shape type="cylinder"><transform name="to_world"><scale value="0.5"/><translate x="1.7"/></transform>
+    <bsdf type="twosided"><bsdf type="principled"><rgb name="base_color" value="0.6 0.3 0.2"/>
+    <float name="roughness" value="0.4"/></bsdf></bsdf></shape>
+<shape type="obj" id="hill"><string name="filename" value="hill.obj"/><boolean name="flip_normals" value="true"/>
+    <transform name="to_world"><translate x="2.6" y="0.4" z="0.5"/></transform>
+    <bsdf type="twosided"><bsdf type="roughplastic"><rgb name="diffuse_reflectance" value="0.2 0.5 0.3"/></bsdf>
+    </bsdf></shape>
+<shape type="ply" id="quilt"><string name="filename" value="quilt.ply"/>
+    <transform name="to_world"><translate y="1.5" z="-2"/></transform><bsdf type="twosided"><bsdf type="diffuse">
+    <texture type="mesh_attribute" name="reflectance"><string name="name" value="vertex_color"/></texture></bsdf></bsdf>
+</shape>
+<shape type="shapegroup" id="pair"><shape type="ply"><string name="filename" value="quilt.ply"/></shape>
+    <shape type="sphere" id="bead"><float name="radius" value="0.2"/></shape>
+    <shape type="ply"><string name="filename" value="quilt.ply"/></shape></shape>
+<shape type="instance"><ref id="pair"/><transform name="to_world"><scale value="0.5"/><translate x="-2" y="2"/>
+    </transform></shape>
+<shape type="rectangle"><transform name="to_world"><scale value="0.6"/><translate x="-3" y="1" z="-1"/></transform>
+    <bsdf type="blendbsdf"><texture type="bitmap" name="weight"><string name="filename" value="$elsewhere/grey.exr"/>
+    <boolean name="raw" value="true"/></texture><bsdf type="diffuse"/><bsdf type="conductor"/></bsdf>
+    <float name="unheard_of" value="3"/></shape>
+</scene>
+"""
+LIGHTS = f"""<scene version="3.0.0">
+<shape type="rectangle" id="lamp"><transform name="to_world"><rotate x="1" angle="90"/><translate y="4"/></transform>
+    <emitter type="area"><rgb name="radiance" value="5, 4, 3"/></emitter></shape>
+<emitter type="envmap"><string name="filename" value="images/sky.exr"/><float name="scale" value="0.5"/>
+    <transform name="to_world"><rotate y="1" angle="40"/></transform></emitter>
+<emitter type="point"><point name="position" x="2" y="3" z="2"/><rgb name="intensity" value="6"/></emitter>
+<emitter type="spot"><transform name="to_world"><lookat origin="-3, 4, 3" target="0, 0, 0" up="0, 1, 0"/></transform>
+    <rgb name="intensity" value="20"/></emitter>
+<emitter type="projector"><texture type="bitmap" name="irradiance">{BITMAP.format("$elsewhere/slide.exr")}</texture>
+    <float name="scale" value="4"/>
+    <transform name="to_world"><lookat origin="3, 4, 3" target="0, 0, 0" up="0, 1, 0"/></transform></emitter>
+</scene>
+"""
+#: What is recovered, and what is added to its values.
+KINDS: dict[str, tuple[dict[str, object], float]] = {
+    "texture": ({"key": "floor.bsdf.reflectance.data"}, 0.2),
+    "finer texture": ({"key": "floor.bsdf.reflectance.data", "resolution": [12, 10]}, 0.2),
+    "colour": ({"key": "hill.bsdf.brdf_0.diffuse_reflectance.value"}, 0.3),
+    "colour above 1": ({"key": "hill.bsdf.brdf_0.diffuse_reflectance.value"}, 0.9),
+    "colour of a group": ({"key": "pair.shape.bsdf.reflectance.value"}, 0.3),
+    "roughness": ({"key": "Sphere_1.bsdf.alpha.value"}, 0.3),
+    "roughness of plastic": ({"key": "hill.bsdf.brdf_0.alpha"}, 0.3),
+    "metal": ({"key": "Sphere_1.bsdf.eta.value"}, 0.8),
+    "index": ({"key": "Sphere_2.bsdf.eta"}, 0.4),
+    "thin glass": ({"key": "pane.bsdf.eta"}, 0.5),
+    "principled": ({"key": "Cylinder_1.bsdf.brdf_0.[!cmafs]*"}, 0.3),
+    "weights": ({"key": "Rectangle_3.bsdf.weight.data"}, 0.3),
+    "vertex colours": ({"key": "quilt.vertex_color"}, 0.3),
+    "radiance": ({"key": "lamp.emitter.radiance.value"}, 5),
+    "sky": ({"key": "Envmap_1.data"}, 0.5),
+    "scale of the sky": ({"key": "Envmap_1.scale"}, 0.5),
+    "intensity": ({"key": ["Point_1.intensity.value", "Spot_1.intensity.value"]}, 9),
+    "slide": ({"key": "Projector_1.irradiance.data"}, 0.6),
+    "vertices of a group": ({"key": "pair.shape_1.vertex_positions"}, 0.2),
+    "vertices": ({"key": "quilt.vertex_positions"}, 0.2),
+    "heightmap": ({"heightmap": {"mesh": "hill", "resolution": [5, 4]}}, 0.5),
+    "mesh in motion": ({"motion": {"of": ["hill", "pane"], "free": ["translation", "scale"]}}, 0.4),
+    "sphere in motion": ({"motion": {"of": "Sphere_1", "free": ["translation", "scale"]}}, 0.3),
+    "rectangle in motion": ({"motion": {"of": "lamp"}}, 1),
+    "cylinder in motion": ({"motion": {"of": "Cylinder_1"}}, 0.3),
+    "lights in motion": ({"motion": {"of": ["Point_1", "Spot_1", "Projector_1"], "free": ["translation"]}}, 0.8),
+}
+#: Those of `KINDS` that can be recovered beside one another.
+TOGETHER = [name for name in KINDS if name not in ("finer texture", "colour", "heightmap", "rectangle in motion")]
+
+
+@pytest.fixture(autouse=True)
+def _without_checks(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Leaves out what loading measures of a scene: with so many kinds of things in one it takes long to compile."""
+    for name in ("lost_light", "thin_glass"):
+        monkeypatch.setattr(load, name, lambda scene: None)
+
+
+@pytest.fixture(scope="module")
+def file(tmp_path_factory: pytest.TempPathFactory, llvm: str) -> Path:
+    """The scene, with what it names."""
+    folder = tmp_path_factory.mktemp("exporting")
+    (folder / "room/images").mkdir(parents=True)
+    random = np.random.default_rng(0)
+
+    def image(height: int, width: int, channels: int = 3) -> mi.Bitmap:
+        return mi.Bitmap(random.uniform(0.05, 0.6, (height, width, channels)).astype(np.float32))
+
+    wood = image(5, 6).convert(component_format=mi.Struct.Type.UInt8, srgb_gamma=True)
+    wood.write(str(folder / "room/images/wood.png"))
+    image(4, 8).write(str(folder / "room/images/sky.exr"))
+    image(3, 4).write(str(folder / "slide.exr"))
+    image(4, 4, 1).write(str(folder / "grey.exr"))
+    x, y = (axis.ravel() for axis in np.meshgrid(np.linspace(-0.5, 0.5, 6), np.linspace(-0.5, 0.5, 6)))
+    z = 0.1 * np.sin(6 * x) * np.cos(5 * y)
+    faces = [(a, a + 1, a + 6, a + 1, a + 7, a + 6) for a in range(30) if a % 6 < 5]
+    triangles = np.array(faces, dtype=np.uint32).reshape(-1, 3)
+    lines = [f"v {a:g} {b:g} {c:g}" for a, b, c in zip(x, y, z, strict=True)]
+    lines += [f"vt {a + 0.5:g} {b + 0.5:g}" for a, b in zip(x, y, strict=True)]
+    lines += ["f " + " ".join(f"{k + 1}/{k + 1}" for k in triangle) for triangle in triangles]
+    (folder / "room/hill.obj").write_text("\n".join(lines) + "\n")
+    quilt = mi.Mesh("quilt", len(x), len(triangles), has_vertex_texcoords=True)
+    params = mi.traverse(quilt)
+    params["vertex_positions"] = np.stack([2 * x, 2 * y, z], 1).astype(np.float32).ravel()
+    params["faces"] = triangles.ravel()
+    params["vertex_texcoords"] = np.stack([x + 0.5, y + 0.5], 1).astype(np.float32).ravel()
+    params.update()
+    quilt.add_attribute("vertex_color", 3, random.uniform(0.1, 0.5, 3 * len(x)).astype(np.float32))
+    quilt.write_ply(str(folder / "room/quilt.ply"))
+    (folder / "room/lights.xml").write_text(LIGHTS)
+    (folder / "room/scene.xml").write_text(SCENE)
+    return folder / "room/scene.xml"
+
+
+def changed(file: Path, names: list[str]) -> tuple[mi.Scene, Description, Selection]:
+    """The scene with other values of what `names` of `KINDS` recover."""
+    scene, description = load_described(file, {"elsewhere": str(file.parent.parent)})
+    selection = select_parameters(scene, [ParameterSpec(**KINDS[name][0]) for name in names], "c.yaml")
+    random = np.random.default_rng(1)
+    values = {key: selection.array(key) for key in selection.keys}
+    amounts = dict.fromkeys(values, KINDS[names[0]][1])
+    if len(names) > 1:  # each in its own unit
+        amounts = {key: 0.3 if "value" in key or "data" in key else 0.1 for key in values}
+    selection.set_arrays(
+        {key: value + amounts[key] * random.uniform(0.5, 1, value.shape) for key, value in values.items()}
+    )
+    return scene, description, selection
+
+
+def export(description: Description, selection: Selection, folder: Path) -> None:
+    export_scene(description, selection.params, selection.scene_keys, {"type": "path", "max_depth": 5}, folder, "RUN")
+
+
+def images(scene: mi.Scene, seeds: range, spp: int) -> np.ndarray:
+    """Images (N, H, W, 3) by Mitsuba's own `path`."""
+    integrator = mi.load_dict({"type": "path", "max_depth": 5})
+    return np.stack([np.array(mi.render(scene, integrator=integrator, spp=spp, seed=seed)) for seed in seeds])
+
+
+@pytest.mark.parametrize("names", [TOGETHER, *([name] for name in KINDS if name not in TOGETHER)], ids="/".join)
+def test_mitsuba_reads_back_what_was_recovered(names: list[str], file: Path, tmp_path: Path) -> None:
+    before = mi.traverse(load_described(file, {"elsewhere": str(file.parent.parent)})[0])
+    _, description, selection = changed(file, names)
+    export(description, selection, tmp_path / "out")
+    found = mi.traverse(mi.load_file(str(tmp_path / "out/scene.xml"), optimize=False))
+    for key in selection.scene_keys:
+        own, old, new = (np.array(getattr(params[key], "matrix", params[key]) if key.endswith("to_world")
+                                  else params[key]) for params in (selection.params, before, found))  # fmt: skip
+        assert np.allclose(own, new, rtol=1e-5, atol=1e-6), key
+        assert own.shape != old.shape or not np.allclose(own, old, rtol=1e-3), f"{key} was not changed"
+
+
+def test_the_image_of_all_together_is_that_of_the_scene(file: Path, tmp_path: Path) -> None:
+    scene, description, selection = changed(file, TOGETHER)
+    export(description, selection, tmp_path / "out")
+    ours, theirs = (
+        images(scene, range(8), 32), images(mi.load_file(str(tmp_path / "out/scene.xml")), range(100, 108), 32)
+    )  # fmt: skip
+    result = compare(ours, theirs)
+    assert result, result
+    original = images(load_described(file, {"elsewhere": str(file.parent.parent)})[0], range(8), 32)
+    assert not compare(original, theirs), "the values make no difference, so this would show nothing"
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", KINDS)
+def test_the_image_is_that_of_the_scene(name: str, file: Path, tmp_path: Path) -> None:
+    scene, description, selection = changed(file, [name])
+    export(description, selection, tmp_path / "out")
+    theirs = images(mi.load_file(str(tmp_path / "out/scene.xml")), range(100, 112), 64)
+    result = compare(images(scene, range(12), 64), theirs)
+    assert result, result
+
+
+def test_it_is_loaded_without_us_from_wherever_it_lies(file: Path, tmp_path: Path) -> None:
+    _, description, selection = changed(file, TOGETHER)
+    export(description, selection, tmp_path / "out")
+    moved = (tmp_path / "out").rename(tmp_path / "moved")
+    names = {str(path.relative_to(moved)) for path in moved.rglob("*") if path.is_file()}
+    assert {"scene.xml", "recovered/floor.bsdf.reflectance.data.exr", "recovered/hill.ply"} <= names
+    assert "images/wood.png" not in names, "what was recovered is copied as it was"
+    text = (moved / "scene.xml").read_text()
+    for word in ("$", str(tmp_path.parent), "unheard_of", "include"):
+        assert word not in text
+    script = f"""import mitsuba as mi
+mi.set_variant("scalar_rgb")
+print(mi.load_file({str(moved / "scene.xml")!r}))"""
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False, cwd="/")
+    assert done.returncode == 0, done.stderr
+    assert "PathIntegrator" in done.stdout
+
+
+@pytest.mark.parametrize(
+    ("key", "reason"),
+    [
+        ("Spot_1.texture.value", "an image for Mitsuba; recover its intensity"),
+        ("Cylinder_1.bsdf.brdf_0.clearcoat.value", "no such lobe .* had no effect"),
+    ],
+)
+def test_what_cannot_be_said_is_refused_and_nothing_is_left(key: str, reason: str, file: Path, tmp_path: Path) -> None:
+    scene, description = load_described(file, {"elsewhere": str(file.parent.parent)})
+    selection = select_parameters(scene, [ParameterSpec(key=key, initial=0.5)], "c.yaml")
+    with pytest.raises(ConfigError, match=rf"{key}: cannot be exported: .*{reason}"):
+        export(description, selection, tmp_path / "out")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_what_mitsuba_reads_otherwise_is_refused_and_nothing_is_left(
+    file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from reslrb_cli.scene.exporting import replacing
+
+    write = replacing.write_file
+    monkeypatch.setattr(replacing, "write_file", lambda path, image, linear: write(path, image[::-1], linear))
+    _, description, selection = changed(file, ["texture"])
+    with pytest.raises(ConfigError, match="reads another value"):
+        export(description, selection, tmp_path / "out")
+    assert list(tmp_path.iterdir()) == []

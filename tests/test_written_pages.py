@@ -1,0 +1,130 @@
+"""docs/benchmarks.md, docs/paper.md and the README's tables are what `scripts/` make of the records."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+from pathlib import Path
+
+import benchmarks_measure
+import benchmarks_page as pages
+import paper_page
+import pytest
+from benchmarks_list import MEASUREMENTS, RECORDS, ROOT, Measurement
+from benchmarks_tables import read
+from make_benchmarks import main
+
+TINY = ("bench", "--values", "2", "--integrators", "reslrb:stack", "--rounds", "1", "--set", "scene.options.size=8",
+        "--set", "run.spp=1")  # fmt: skip
+
+
+def test_the_pages_are_what_the_records_say() -> None:
+    blocks = pages.Blocks()
+    again = "`scripts/benchmarks write` makes it anew"
+    assert pages.PAGE.read_text(encoding="utf-8") == pages.page(blocks), again
+    text = pages.README.read_text(encoding="utf-8")
+    assert text == pages.readme(blocks, text), again
+    assert (ROOT / "docs" / "paper.md").read_text(encoding="utf-8") == paper_page.page(), "`scripts/paper write`"
+
+
+def test_every_measurement_is_recorded_by_its_own_command() -> None:
+    recorded = {file.stem for file in RECORDS.glob("*.jsonl")}
+    assert recorded <= set(MEASUREMENTS)
+    readme = pages.README.read_text(encoding="utf-8")
+    for name in pages.EXPERIMENTS:  # what a record shows is not typed beside it
+        assert readme.count(f"\n| `{name}`: ") == 1
+    for measurement in (MEASUREMENTS[name] for name in recorded):
+        origin = read(measurement.file).origin
+        assert origin["command"] == measurement.command
+        assert origin["versions"]["mitsuba"]
+        assert origin["device"]
+        assert origin["seconds"] > 0
+
+
+def test_no_figure_is_typed() -> None:
+    """Units with a figure before them stand in records alone; memory and time of the paper's machine are published."""
+    published = ("142 MB",)
+    for template in (RECORDS / pages.TEMPLATE, paper_page.RECORDS / paper_page.TEMPLATE):
+        text = template.read_text(encoding="utf-8")
+        for words in published:
+            text = text.replace(words, "")
+        assert re.findall(r"\d[\d.,]* ?(?:ms|s|%|[kMG]i?B)\b", text) == []
+        assert pages.PLACE.findall(text)
+
+
+def test_all_that_the_pages_name_is_there() -> None:
+    for page in (pages.PAGE, ROOT / "docs" / "paper.md"):
+        for name in re.findall(r"\]\(([^)#:]+)[^)]*\)", page.read_text(encoding="utf-8")):
+            assert (page.parent / name).exists(), f"{page.name} names {name}"
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """A copy of the records."""
+    return Path(shutil.copytree(RECORDS, tmp_path / "records"))
+
+
+def change(file: Path, key: str, value: object) -> None:
+    """Change a member of the last line."""
+    *others, last = file.read_text(encoding="utf-8").splitlines()
+    file.write_text("\n".join([*others, json.dumps(json.loads(last) | {key: value})]) + "\n", encoding="utf-8")
+
+
+@pytest.mark.parametrize(
+    ("name", "key", "value", "shown"),
+    [
+        ("depth", "peak_mib", 98765.4, "98765.4"),
+        ("depth", "status", "out_of_memory", "out of memory"),
+        ("spp", "step_ms", {"median": 91.25, "min": 81.0, "max": 99.0}, "91.2 [81.0, 99.0]"),
+        ("moving", "kernel_ms", {"median": 91.75, "min": 81.0, "max": 99.0}, "91.8 [81.0, 99.0]"),
+        ("gradcheck_furnace", "seeds", 987654, "987654"),
+        ("optimize_cornell_floor", "step_ms", 98765.0, "98765"),
+    ],
+)
+def test_a_figure_of_a_record_is_the_pages_figure(folder: Path, name: str, key: str, value: object, shown: str) -> None:
+    assert shown not in pages.page(pages.Blocks(folder))
+    change(folder / f"{name}.jsonl", key, value)
+    assert shown in pages.page(pages.Blocks(folder))
+
+
+def test_the_readme_takes_its_figures_from_records(folder: Path) -> None:
+    text = pages.README.read_text(encoding="utf-8")
+    key = "floor.reflectance.data"
+    change(folder / "optimize_cornell_floor.jsonl", "parameter_rmse", {key: {"initial": 0.987, "final": 0.0123}})
+    change(folder / "optimize_cornell_floor.jsonl", "elapsed_s", 1234.4)
+    row = "| `cornell_floor`: a carpet of 64 x 64 texels | 0.987 | 0.0123 | 1234 s |"
+    assert row in pages.readme(pages.Blocks(folder), text)
+    assert row not in text
+
+
+def test_ratios_are_of_medians() -> None:
+    def row(integrator: str, estimator: str | None, depth: int, time: float, status: str = "ok") -> dict:
+        times = {"median": time, "min": time, "max": time}
+        return {"integrator": integrator, "estimator": estimator, "capacity": None, "max_depth": depth,
+                "status": status, "kernel_ms": times, "peak_mib": float(depth)}  # fmt: skip
+
+    rows = [row("ptracer", None, 2, 8.0), row("reslrb", "stack", 2, 4.0), row("ptracer", None, 4, 1.0, "out_of_memory"),
+            row("reslrb", "stack", 4, 5.0)]  # fmt: skip
+    made = pages.tables.bench_ratios(pages.tables.Record({}, rows), "max_depth")
+    assert made.splitlines()[2:] == ["| `ptracer` | 1.00 | out of memory | 2.0 |", "| `stack` | 0.50 | | 2.0 to 4.0 |"]
+
+
+def test_a_measurement_is_recorded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, llvm: str) -> None:
+    monkeypatch.setattr(benchmarks_measure, "RECORDS", tmp_path)
+    monkeypatch.setattr("benchmarks_list.RECORDS", tmp_path)
+    tiny = Measurement("tiny", TINY)
+    benchmarks_measure.measure(tiny)
+    record = read(tmp_path / "tiny.jsonl")
+    assert record.origin["command"] == ["reslrb", *TINY]
+    assert record.origin["seconds"] > 0
+    assert [row["status"] for row in record.rows] == ["ok"]
+    with pytest.raises(SystemExit, match="exit code 2; its record is left as it was"):
+        benchmarks_measure.measure(Measurement("tiny", ("bench", "--nonsense")))
+    assert read(tmp_path / "tiny.jsonl") == record
+
+
+def test_wrong_names_are_told(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["measure", "dept"]) == 2
+    assert "there is no measurement `dept`; did you mean depth?" in capsys.readouterr().err
+    assert main(["write", "depth"]) == 2
