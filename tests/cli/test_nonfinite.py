@@ -192,7 +192,7 @@ def _register_root(function=None):
     mi.register_texture("root", Root)
 
 
-def root_of_pixel(image, target):
+def root_of_pixel(image, target, weights=None):
     """A loss whose value is finite and whose derivative is not, in one entry."""
     import drjit as dr
 
@@ -219,7 +219,7 @@ def test_what_was_done_is_kept(experiment, capsys, monkeypatch):
     """A fault in the second iteration: the run folder is whole, and the parameters are those of then."""
     calls = []
 
-    def sometimes(image, target):
+    def sometimes(image, target, weights=None):
         calls.append(1)
         # The first is that of the saved initial image.
         return root_of_pixel(image, target) if len(calls) == 3 else losses.l2(image, target)

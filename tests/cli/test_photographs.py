@@ -42,3 +42,18 @@ def test_walls_beside_a_lamp_that_clips(llvm, tmp_path, monkeypatch):
     unmasked, manifest = optimize("target.mask=none")
     assert manifest["views"][0]["left_out"] == 0
     assert max(errors(unmasked).values()) > 0.05, unmasked
+
+
+@pytest.mark.long
+def test_walls_of_a_photograph_whose_exposure_is_unknown(llvm, tmp_path, monkeypatch):
+    """At an exposure of 0.8 that is recovered with the walls; taken for 1, the same photograph makes them darker."""
+    write_photograph(tmp_path, 32, 1024, exposure=0.8)
+    monkeypatch.chdir(tmp_path)
+    values, manifest = optimize("target.exposure=auto", "integrator.estimator=stack")
+    assert manifest["views"][0]["exposure"] == "exposure"
+    assert values["exposure"] == pytest.approx(0.8, rel=0.05)
+    bright = {key: np.array(true) > 0.1 for key, true in WALLS.items()}
+    for key, true in WALLS.items():
+        np.testing.assert_allclose(values[key][bright[key]], np.array(true)[bright[key]], rtol=0.1)
+    given, _ = optimize("integrator.estimator=stack")
+    assert any(np.any(given[key][bright[key]] < 0.9 * np.array(WALLS[key])[bright[key]]) for key in WALLS), given

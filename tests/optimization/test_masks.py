@@ -13,7 +13,7 @@ from reslrb_cli.errors import ConfigError
 from reslrb_cli.optimization import assemble
 from reslrb_cli.optimization.losses import LOSSES, make_loss
 from reslrb_cli.optimization.samples import sample_gradient, take_gradient
-from reslrb_cli.optimization.sensitivity import measure_sensitivities
+from reslrb_cli.optimization.sensitivity import measure_sensitivities, see_images
 from reslrb_cli.optimization.views import View, view_records
 
 #: Pixels (y, x) of the target that are not to be trusted, one of each kind.
@@ -163,3 +163,7 @@ def test_nothing_of_what_is_left_out_counts(folder):
         found.append((gradient, measure_sensitivities(problem, 2)))
     np.testing.assert_array_equal(found[0][0], found[1][0])
     assert found[0][1] == found[1][1]
+    problem, _ = make(folder, "target.file=photo.png", "run.spp=256")
+    [image] = see_images(problem)
+    assert not image[CLEAR].any()
+    assert image[4, 4].all()

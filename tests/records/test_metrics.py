@@ -14,7 +14,7 @@ from reslrb_cli.records.metrics import MetricsWriter, Record, read_metrics
 KEYS = [
     "iteration", "loss", "step_ms", "primal_ms", "adjoint_ms", "codegen_ms", "elapsed_s", "peak_mib", "spp", "lr",
     "grad_norm", "nonfinite", "parameter_rmse", "parameter_errors", "nonfinite_by_parameter",
-    "clamped",
+    "clamped", "held_out",
 ]  # fmt: skip
 
 
