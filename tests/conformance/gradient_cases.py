@@ -228,3 +228,10 @@ CASES = [
                               | {"emitter": {"type": "area", "radiance": _tiles(0.5, 2)}}),
                  ("sign.emitter.radiance.data", "lamp.emitter.radiance.value"), "prb"),
 ]  # fmt: skip
+
+#: By default, the exact estimators are compared with naive AD in these (test_estimators.py), and the reservoir with
+#: stock integrators in the others, and in a few of these (test_gradient_reference.py).
+AT_EQUAL_SEEDS = ("texture", "roulette", "thin_lens", "roughplastic", "bumpmap", "glass", "roughdielectric",
+                  "mesh_attribute", "mask", "mask_texture_in_view", "masked_mirror", "area_texture", "envmap",
+                  "two_emitters", "visible_lamp")  # fmt: skip
+BY_BOTH = ("texture", "glass", "mask", "envmap")

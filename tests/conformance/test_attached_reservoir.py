@@ -102,6 +102,7 @@ def test_no_bias_whatever_the_damping(scene: AttachedScene, damping: float, samp
     assert found.error < max(0.15 * damping, 0.001)
 
 
+@pytest.mark.long
 def test_no_bias_in_blocks(monkeypatch: pytest.MonkeyPatch):
     """As long paths are taken, of which one block alone counts, times their number."""
     monkeypatch.setattr(chain, "BLOCK", 1)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from conformance.gradient_cases import CASES, GradientCase
+from conformance.gradient_cases import AT_EQUAL_SEEDS, CASES, GradientCase
 from turns import taking_turns
 
 from reslrb_cli.measure.gradients import Case, integrator, relative, seeds
@@ -37,7 +37,7 @@ def estimator(case: GradientCase, name: str, options: dict):
     return integrator("reslrb", **case.both | own | {"estimator": name} | options)
 
 
-@taking_turns("case", CASES, "adjoint", ("correlated", "independent"))
+@taking_turns("case", CASES, "adjoint", ("correlated", "independent"), AT_EQUAL_SEEDS)
 def test_exact_estimators_equal_naive_ad(case: GradientCase, adjoint: str):
     scene = Case(case.scene(), case.keys)
     own = {key: value for key, value in case.options.items() if key not in OF_RESERVOIR}
