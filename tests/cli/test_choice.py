@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from cli.test_optimize import CONFIG, KEY, SCENE
-from turns import taking_turns
+from turns import a_few, taking_turns
 
 from reslrb_cli.cli import main
 from reslrb_cli.records.manifest import read_manifest
@@ -131,6 +131,7 @@ def test_candidates_know_delta_where_it_is_known(experiment, adjoint):
     assert [entry["capacity"] for entry in options if entry.get("weight") == "adjoint"] == [1, 4]
 
 
+@pytest.mark.long
 def test_auto_works_with_batches_and_several_views(experiment, capsys):
     code, err = optimize(capsys, "run.adjoint=batched", "scene.sensors=all", "run.spp=8", "run.iterations=1")
     assert code == 0, err
@@ -162,7 +163,7 @@ def peaks_without_and_with(budget, capsys, *settings):
     return peaks, memory
 
 
-@pytest.mark.parametrize("estimator", ["reservoir", "event"])
+@pytest.mark.parametrize("estimator", a_few(["reservoir", "event"], ["event"]))
 def test_a_memory_budget_is_kept(experiment, capsys, estimator):
     settings = wide(f"integrator={{max_depth: 4, estimator: {estimator}}}", "run.spp=256", "run.adjoint=correlated")
     peaks, memory = peaks_without_and_with(3, capsys, *settings)
