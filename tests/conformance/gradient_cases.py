@@ -232,6 +232,6 @@ CASES = [
 #: By default, the exact estimators are compared with naive AD in these (test_estimators.py), and the reservoir with
 #: stock integrators in the others, and in a few of these (test_gradient_reference.py).
 AT_EQUAL_SEEDS = ("texture", "roulette", "thin_lens", "roughplastic", "bumpmap", "glass", "roughdielectric",
-                  "mesh_attribute", "mask", "mask_texture_in_view", "masked_mirror", "area_texture", "envmap",
-                  "two_emitters", "visible_lamp")  # fmt: skip
+                  "mesh_attribute", "mask", "mask_texture_in_view", "masked_mirror", "envmap", "two_emitters",
+                  "visible_lamp")  # fmt: skip
 BY_BOTH = ("texture", "glass", "mask", "envmap")
