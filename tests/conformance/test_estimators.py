@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from conformance.gradient_cases import AT_EQUAL_SEEDS, CASES, GradientCase
-from turns import taking_turns
+from turns import a_few, taking_turns
 
 from reslrb_cli.measure.gradients import Case, integrator, relative, seeds
 from reslrb_cli.measure.statistics import compare
@@ -62,14 +62,17 @@ def agree(case: GradientCase, count: int, candidates: dict[str, dict], adjoint: 
 
 
 FEW = ("texture", "roulette", "crop", "glass", "mask_texture_in_view", "area_texture", "two_emitters")
-#: Of these, by default: surfaces, and masks, which are neither connected nor passed without a choice.
-FEWEST = ("texture", "mask_texture_in_view")
 
 
-@pytest.mark.parametrize("case", [case for case in CASES if case.name in FEWEST], ids=lambda case: case.name)
+@pytest.mark.parametrize("case", a_few([case for case in CASES if case.name in FEW], ["texture"]))
 def test_random_estimators_agree(case: GradientCase):
     agree(case, 16, RANDOM, "correlated")
     agree(case, 16, BY_ADJOINT, "independent")
+
+
+def test_event_agrees_where_lobes_are_not_connected():
+    [case] = [case for case in CASES if case.name == "glass"]
+    agree(case, 16, {"event": {}}, "correlated")
 
 
 @pytest.mark.long
