@@ -112,6 +112,7 @@ def test_no_bias_in_blocks(monkeypatch: pytest.MonkeyPatch):
     assert found.error < 0.02
 
 
+@pytest.mark.long
 def test_without_a_random_sign_there_is_bias(monkeypatch: pytest.MonkeyPatch):
     """Else that there is none would show nothing."""
     monkeypatch.setattr(jacobian, "sign", lambda numbers: 1)
