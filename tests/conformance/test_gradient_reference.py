@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from conformance.gradient_cases import AT_EQUAL_SEEDS, BY_BOTH, CASES, GradientCase
+from conformance.gradient_cases import CASES, IN_EXPECTATION, GradientCase
 from turns import a_few
 
 from reslrb_cli.measure.gradients import Case, integrator, seeds
@@ -12,7 +12,6 @@ from reslrb_cli.measure.statistics import Agreement, compare
 
 pytestmark = pytest.mark.usefixtures("llvm")
 
-QUICK = {case.name for case in CASES} - set(AT_EQUAL_SEEDS) | set(BY_BOTH)
 #: The noise of a comparison may be so much of the gradient, else it could not see a wrong one.
 RESOLUTION = 0.1
 
@@ -37,7 +36,7 @@ def agreement(case: GradientCase, count: int) -> Agreement:
     return compare(ours, reference, block=None)
 
 
-@pytest.mark.parametrize("case", a_few(CASES, QUICK))
+@pytest.mark.parametrize("case", a_few(CASES, IN_EXPECTATION))
 def test_gradient(case: GradientCase):
     result = agreement(case, 16)
     print(case.name, case.reference, result)

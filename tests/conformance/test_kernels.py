@@ -63,11 +63,13 @@ def steps_compile_nothing(scene: Case, step: Callable[[int], Any]) -> None:
 
 #: The cases that are run with independent samples too, unless `-m long` asks for all.
 INDEPENDENT = ("texture", "passes", "glass", "mask", "area_texture", "envmap", "visible_lamp")
+#: Of these, by default.
+FEW = ("texture", "passes", "glass", "mask", "envmap")
 #: Of the others, those that the default suite runs: each has objects of a kind that the rest does not have.
-CORRELATED = ("retained", "thin_lens", "principled", "normalmap", "mesh_attribute", "two_emitters")
+CORRELATED = ("retained", "thin_lens", "principled", "two_emitters")
 
 
-@taking_turns("name", INDEPENDENT, "adjoint", ("independent", "correlated"))
+@taking_turns("name", INDEPENDENT, "adjoint", ("independent", "correlated"), FEW)
 def test_second_step_compiles_nothing(name: str, adjoint: str):
     case_compiles_nothing(name, adjoint)
 
