@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from cli.test_optimize import CONFIG, KEY, SCENE
-from turns import taking_turns
+from turns import a_few, taking_turns
 
 from reslrb_cli.cli import main
 from reslrb_cli.records.manifest import read_manifest
@@ -130,6 +130,7 @@ def test_candidates_know_delta_where_it_is_known(experiment, adjoint):
     assert [entry["capacity"] for entry in options if entry.get("weight") == "adjoint"] == [1, 4]
 
 
+@pytest.mark.long
 def test_auto_works_with_batches_and_several_views(experiment, capsys):
     code, err = optimize(capsys, "run.adjoint=batched", "scene.sensors=all", "run.spp=8", "run.iterations=1")
     assert code == 0, err
@@ -161,7 +162,7 @@ def peaks_without_and_with(budget, capsys, *settings):
     return peaks, memory
 
 
-@pytest.mark.parametrize("estimator", ["reservoir", "event"])
+@pytest.mark.parametrize("estimator", a_few(["reservoir", "event"], ["event"]))
 def test_a_memory_budget_is_kept(experiment, capsys, estimator):
     settings = wide(f"integrator={{max_depth: 4, estimator: {estimator}}}", "run.spp=256", "run.adjoint=correlated")
     peaks, memory = peaks_without_and_with(3, capsys, *settings)
@@ -170,7 +171,8 @@ def test_a_memory_budget_is_kept(experiment, capsys, estimator):
     assert memory["passes"] * memory["samples_per_pass"] == 256
 
 
-@taking_turns("estimator", ["reservoir", "event"], "adjoint", ["independent", "batched"])
+@pytest.mark.parametrize("adjoint", a_few(["independent", "batched"], ["batched"]))
+@pytest.mark.parametrize("estimator", a_few(["reservoir", "event"], ["event"]))
 def test_paths_take_no_memory_where_the_adjoint_is_known_before(experiment, capsys, estimator, adjoint):
     settings = wide(f"integrator={{max_depth: 4, estimator: {estimator}}}", "run.spp=256", f"run.adjoint={adjoint}")
     peaks, memory = peaks_without_and_with(1.5, capsys, *settings)
@@ -180,7 +182,7 @@ def test_paths_take_no_memory_where_the_adjoint_is_known_before(experiment, caps
     assert peaks[1] / 2 < sum(memory["expected_bytes"].values()) / 2**20 < 2 * peaks[1]
 
 
-@pytest.mark.parametrize("estimator", ["reservoir", "event"])
+@pytest.mark.parametrize("estimator", a_few(["reservoir", "event"], ["reservoir"]))
 def test_a_weight_that_needs_the_adjoint_goes_through_a_whole_run(experiment, capsys, estimator):
     """What is rendered or differentiated besides the steps (what light reaches, saved images) has to know it too."""
     code, err = optimize(capsys, f"integrator={{max_depth: 4, estimator: {estimator}, weight: adjoint}}")
@@ -220,7 +222,7 @@ def test_a_budget_that_nothing_can_keep_is_one_located_line(experiment, capsys):
         assert not Path("runs").exists()
 
 
-@pytest.mark.parametrize("adjoint", ["correlated", pytest.param("independent", marks=pytest.mark.long), "batched"])
+@pytest.mark.parametrize("adjoint", a_few(["correlated", "independent", "batched"], ["correlated"]))
 def test_peak_memory_is_flat_in_samples_under_a_budget(experiment, adjoint):
     from reslrb_cli.config import load
     from reslrb_cli.optimization import assemble, optimize

@@ -115,7 +115,7 @@ CASES = [
     AttachedCase("two_lenses", two_lenses, SLAB | {"x": 0.0, "size": 1.0}, move_ball, depth=9),
     AttachedCase("roulette", lambda: enclosed(albedo=0.9), SLAB, depth=10, stock=False, both={"rr_depth": 2}),
     AttachedCase("stack_of_2", lambda: enclosed(albedo=0.9), SLAB, depth=6, stock=False, ours={"stack_size": 2},
-                 both={"rr_depth": 3}, quick=True),
+                 both={"rr_depth": 3}),
     AttachedCase("passes", under_glass, SLAB, stock=False, both={"samples_per_pass": 8}, quick=True),
     AttachedCase("receiver", enclosed, {"angle": 5.0, "y": 0.1}, tilt_receiver, depth=6),
     AttachedCase("latents", under_glass, {"size": 1.0, "lift": 0.0}, stretch_slab),

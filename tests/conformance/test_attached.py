@@ -121,6 +121,7 @@ def test_a_small_stack_equals_a_large_one(depth: int, sizes: tuple[int, ...], op
             assert value.any()
 
 
+@pytest.mark.long
 def test_normalization_of_the_filter_makes_a_difference():
     """Else that it is attached or detached would not show in any of these tests."""
     case = BY_NAME["slab"]

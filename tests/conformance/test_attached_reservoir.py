@@ -102,6 +102,7 @@ def test_no_bias_whatever_the_damping(scene: AttachedScene, damping: float, samp
     assert found.error < max(0.15 * damping, 0.001)
 
 
+@pytest.mark.long
 def test_no_bias_in_blocks(monkeypatch: pytest.MonkeyPatch):
     """As long paths are taken, of which one block alone counts, times their number."""
     monkeypatch.setattr(chain, "BLOCK", 1)
@@ -111,6 +112,7 @@ def test_no_bias_in_blocks(monkeypatch: pytest.MonkeyPatch):
     assert found.error < 0.02
 
 
+@pytest.mark.long
 def test_without_a_random_sign_there_is_bias(monkeypatch: pytest.MonkeyPatch):
     """Else that there is none would show nothing."""
     monkeypatch.setattr(jacobian, "sign", lambda numbers: 1)

@@ -90,6 +90,7 @@ def test_both_agree(name: str):
     assert found.z_rms < found.z_rms_limit
 
 
+@pytest.mark.long
 def test_a_corner_at_rest():
     """Directions that turn sweep over it, which `auto` leaves alone: finite differences hold with it, and fail
     without."""

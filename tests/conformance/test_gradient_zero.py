@@ -111,12 +111,19 @@ def differences(case: ZeroCase, scene: Case, along: np.ndarray, count: int, bloc
     ])  # fmt: skip
 
 
+#: Of the default suite: every kind of zero once.
+QUICK = ("texel_zero_in_one_channel", "everything_black", "lamp_and_texel_zero", "lamp_texture_zero_in_all",
+         "opacity_1_in_view", "opacity_near_1", "blend_1", "mirror_zero")  # fmt: skip
+
+
 def parameters() -> list:
     """The cases; those whose derivative is known to be lost have to fail."""
     return [
-        pytest.param(case, id=case.name, marks=pytest.mark.xfail(reason=case.lost, strict=True) if case.lost else ())
+        pytest.param(case, id=case.name,
+                     marks=[*([pytest.mark.xfail(reason=case.lost, strict=True)] if case.lost else []),
+                            *([] if case.name in QUICK else [pytest.mark.long])])
         for case in CASES
-    ]
+    ]  # fmt: skip
 
 
 @pytest.mark.parametrize("case", parameters())

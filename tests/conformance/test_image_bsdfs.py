@@ -20,6 +20,7 @@ from conformance.scenes import (
     stage,
     transform,
 )
+from turns import a_few
 
 pytestmark = pytest.mark.usefixtures("samples")
 
@@ -111,9 +112,9 @@ SMOOTH = {
 }
 SEEN = ROUGH | SEE_THROUGH | HIDDEN_NORMALS
 #: A ball refracts light in and out again, which hides what is wrong with one of them; opaque sheets show nothing new.
-TRANSMITTING = {"roughdielectric", "transmitting principled", "principledthin", "twosided", "bumpmap of glass"}
-SHEETS = [name if name in TRANSMITTING | set(SEE_THROUGH) else pytest.param(name, marks=pytest.mark.long)
-          for name in SEEN]  # fmt: skip
+SHEETS = ("roughdielectric", "principledthin", "mask of glass")
+#: Of what throws light on the floor, one of each kind of lobe, and of normal maps.
+THROWN = ("conductor", "dielectric", "thindielectric", "plastic", "mask of dielectric", "normalmap of dielectric")
 
 
 def scene_with(bsdf, holder: str, sensor=None):
@@ -123,24 +124,23 @@ def scene_with(bsdf, holder: str, sensor=None):
     return stage({"lamp": lamp(side=1.5, radiance=rgb(2, 3, 4))}, sensor, ball=thing)
 
 
-#: Those that by default `ptracer` alone is a reference of: like one of the others they are there for.
-BY_PTRACER = ("roughconductor", "anisotropic roughconductor", "roughplastic", "transmitting principled",
-              "principledthin", "twosided")  # fmt: skip
+#: Of balls, by default: others have `ptracer` as their reference, or what they are made of is here.
+BALLS = ("diffuse", "roughdielectric", "principled", "blend", "mask", "null", "bumpmap", "normalmap")
 
 
-@pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.long if n in BY_PTRACER else ()) for n in SEEN])
+@pytest.mark.parametrize("name", a_few(SEEN, BALLS))
 def test_ball(name):
     result = agreement(scene_with(SEEN[name](), "ball"))
     assert result, result
 
 
-@pytest.mark.parametrize("name", SHEETS)
+@pytest.mark.parametrize("name", a_few(SEEN, SHEETS))
 def test_sheet(name):
     result = agreement(scene_with(SEEN[name](), "sheet"))
     assert result, result
 
 
-@pytest.mark.parametrize("name", SMOOTH | HIDDEN_SMOOTH)
+@pytest.mark.parametrize("name", a_few(SMOOTH | HIDDEN_SMOOTH, THROWN))
 def test_what_it_throws_on_the_floor(name):
     thing = ball((SMOOTH | HIDDEN_SMOOTH)[name](), center=(0, 0.9, 0))
     light = lamp(side=1.0, position=(0, 2.2, -1.2), target=(0, 0.9, 0), radiance=rgb(4, 3, 2))

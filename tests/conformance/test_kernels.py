@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from conformance.gradient_cases import CASES
-from turns import taking_turns
+from turns import a_few, taking_turns
 
 from reslrb_cli.measure.gradients import Case, integrator
 from reslrb_cli.scene import load_scene
@@ -63,24 +63,18 @@ def steps_compile_nothing(scene: Case, step: Callable[[int], Any]) -> None:
 
 #: The cases that are run with independent samples too, unless `-m long` asks for all.
 INDEPENDENT = ("texture", "passes", "glass", "mask", "area_texture", "envmap", "visible_lamp")
+#: Of these, by default.
+FEW = ("texture", "passes", "glass", "mask", "envmap")
 #: Of the others, those that the default suite runs: each has objects of a kind that the rest does not have.
-CORRELATED = ("roulette", "retained", "crop", "thin_lens", "roughconductor_texture", "plastic", "principled", "blend",
-              "normalmap", "mesh_attribute", "mask_texture_in_view", "point", "projector", "two_emitters")  # fmt: skip
+CORRELATED = ("retained", "thin_lens", "principled", "two_emitters")
 
 
-@taking_turns("name", INDEPENDENT, "adjoint", ("independent", "correlated"))
+@taking_turns("name", INDEPENDENT, "adjoint", ("independent", "correlated"), FEW)
 def test_second_step_compiles_nothing(name: str, adjoint: str):
     case_compiles_nothing(name, adjoint)
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        pytest.param(case.name, marks=() if case.name in CORRELATED else pytest.mark.long)
-        for case in CASES
-        if case.name not in INDEPENDENT
-    ],
-)
+@pytest.mark.parametrize("name", a_few([case.name for case in CASES if case.name not in INDEPENDENT], CORRELATED))
 def test_second_step_of_other_cases_compiles_nothing(name: str):
     case_compiles_nothing(name, "correlated")
 

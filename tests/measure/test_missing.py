@@ -112,7 +112,7 @@ def test_a_texture_lacks_nothing():
         # The beam's right end brings HALF, of which what lands already brings its own width.
         (lambda: half_covered("lamp"), EDGE / HALF),
         (lambda: half_covered("cover"), 1.0),
-        (slab_in_a_beam, slab_share()),
+        pytest.param(slab_in_a_beam, slab_share(), marks=pytest.mark.long),
     ],
     ids=["lamp", "cover", "slab"],
 )

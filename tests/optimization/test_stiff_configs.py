@@ -18,7 +18,13 @@ def test_each_is_known_here():
     assert {path.stem for path in CONFIGS.iterdir()} == {"lamp", "plate", "wall"}
 
 
-@pytest.mark.parametrize(("name", "quantity"), [("lamp", "change"), ("plate", "change"), ("wall", "gradient")])
+MORE = [("plate", "change"), ("wall", "gradient")]
+
+
+@pytest.mark.parametrize(
+    ("name", "quantity"),
+    [("lamp", "change"), *(pytest.param(*each, marks=pytest.mark.long) for each in MORE)],
+)
 def test_sensitivities_differ_by_a_million(name, quantity):
     """By the parameters' units, or, of single entries, by how many they are."""
     spp = "run.spp=1024" if name == "wall" else "run.spp=64"

@@ -62,7 +62,18 @@ def assert_same(found: dict[str, Any], expected: dict[str, Any]) -> None:
 RENDERED = ("cornell_floor", "grey_room", "caustic_heightmap")
 
 
-@pytest.mark.parametrize("file", SHIPPED, ids=lambda file: str(file.relative_to(ROOT / "scenes")))
+#: The others have nothing that these do not have; their textures take seconds.
+SIMILAR = ("lens_pose", "caustic_slab")
+
+
+@pytest.mark.parametrize(
+    "file",
+    [
+        pytest.param(file, id=str(file.relative_to(ROOT / "scenes")),
+                     marks=pytest.mark.long if file.parent.name in SIMILAR else ())
+        for file in SHIPPED
+    ],
+)  # fmt: skip
 def test_what_is_loaded_is_what_mitsuba_loads(file):
     import mitsuba as mi
 
