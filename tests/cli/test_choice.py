@@ -190,6 +190,7 @@ def test_a_weight_that_needs_the_adjoint_goes_through_a_whole_run(experiment, ca
     assert np.load(f"runs/box/parameters/{KEY}.mask.npy").all()
 
 
+@pytest.mark.long
 def test_auto_under_a_budget(experiment, capsys):
     code, err = optimize(capsys, *wide("run.spp=64", "run.memory_budget=2", "run.iterations=1"))
     assert code == 0, err

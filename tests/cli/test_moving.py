@@ -42,6 +42,7 @@ def test_what_moves_is_recorded_by_its_names(tmp_path, llvm, capsys):
     assert "lamp.<wbr>translation" in page or "lamp.translation" in page
 
 
+@pytest.mark.long
 def test_vertices_are_a_parameter_like_others(tmp_path, llvm):
     key = "slab.vertex_positions"
     sets = (f"parameters=[{{key: {key}}}]", "target.render.parameters={}", "optimizer.learning_rate=1e-3")

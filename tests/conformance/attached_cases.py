@@ -116,7 +116,7 @@ CASES = [
     AttachedCase("roulette", lambda: enclosed(albedo=0.9), SLAB, depth=10, stock=False, both={"rr_depth": 2}),
     AttachedCase("stack_of_2", lambda: enclosed(albedo=0.9), SLAB, depth=6, stock=False, ours={"stack_size": 2},
                  both={"rr_depth": 3}),
-    AttachedCase("passes", under_glass, SLAB, stock=False, both={"samples_per_pass": 8}, quick=True),
+    AttachedCase("passes", under_glass, SLAB, stock=False, both={"samples_per_pass": 8}),
     AttachedCase("receiver", enclosed, {"angle": 5.0, "y": 0.1}, tilt_receiver, depth=6),
     AttachedCase("latents", under_glass, {"size": 1.0, "lift": 0.0}, stretch_slab),
     # ---- Sensors and films ----

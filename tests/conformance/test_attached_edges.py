@@ -81,7 +81,7 @@ def _lift(params: mi.SceneParameters, latents: dict[str, Any]) -> None:
     params["slab.to_world"] = up @ mi.AffineTransform4f(transform(rotate=([1, 0, 0], -90)).matrix)
 
 
-QUICK = ("total_internal_reflection", "meets_nothing")
+QUICK = ("meets_nothing",)
 
 
 @pytest.mark.parametrize("name", [pytest.param(n, marks=() if n in QUICK else pytest.mark.long) for n in EDGES])

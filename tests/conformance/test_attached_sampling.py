@@ -70,6 +70,8 @@ AGREEING = {
     "brushed_floor": AttachedScene("", "", lambda: lit_wall(BRUSHED), tilted, spp=256, options={"max_depth": 3}),
 }  # fmt: skip
 QUICK = ("bounce", "moved_floor", "moved_wall")
+#: Of these, which take few seeds, by default.
+FEWEST = ("bounce", "moved_wall")
 
 
 def gradients(scene: AttachedScene, sampling: str, count: int, first: int = 1) -> np.ndarray:
@@ -78,7 +80,7 @@ def gradients(scene: AttachedScene, sampling: str, count: int, first: int = 1) -
     return scene.case().gradients(tracer, seeds(count, first), scene.spp)
 
 
-@pytest.mark.parametrize("name", [pytest.param(n, marks=() if n in QUICK else pytest.mark.long) for n in AGREEING])
+@pytest.mark.parametrize("name", [pytest.param(n, marks=() if n in FEWEST else pytest.mark.long) for n in AGREEING])
 def test_both_agree(name: str):
     count = 16 if name in QUICK else 64
     followed, stayed = (gradients(AGREEING[name], way, count, first) for way, first in (("follow", 1), ("stay", 100)))

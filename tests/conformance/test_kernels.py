@@ -99,7 +99,7 @@ def case_compiles_nothing(name: str, adjoint: str) -> None:
     steps_compile_nothing(scene, lambda seed: scene.gradient(ours, seed, 16, loss, adjoint=adjoint))
 
 
-@taking_turns("name", list(SHIPPED), "adjoint", ("correlated", "independent"))
+@taking_turns("name", list(SHIPPED), "adjoint", ("correlated", "independent"), ("caustic_slab", "furnace"))
 def test_second_step_compiles_nothing_on_shipped_scenes(name: str, adjoint: str):
     import drjit as dr
     import mitsuba as mi

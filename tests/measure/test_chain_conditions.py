@@ -34,6 +34,7 @@ def test_parallel_light_that_enters_glass():
     assert one.median <= one.percentile_99 <= one.largest < 1.1 * IOR
 
 
+@pytest.mark.long
 def test_two_faces_and_what_stands_still():
     """Of both faces of a lens, the second of which turns the directions back."""
     [two] = chains("lens_pose.yaml")

@@ -116,6 +116,7 @@ def test_what_is_written(config: Config, tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("llvm")
+@pytest.mark.long
 def test_what_is_compared_has_one_expectation(config: Config) -> None:
     """Whatever of ours naive AD does not have is left out."""
     from reslrb_cli.measure.held import Held, comparable

@@ -125,6 +125,7 @@ def problem(tmp_path_factory: pytest.TempPathFactory, llvm: str):
     return assemble(load(path, []))
 
 
+@pytest.mark.long
 def test_the_bias_of_a_scene_is_that_of_many_steps(problem, monkeypatch: pytest.MonkeyPatch) -> None:
     """Measured with a quarter of the samples; compared with the bias of many steps of all of them."""
     said: list[str] = []

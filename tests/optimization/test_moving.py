@@ -118,7 +118,7 @@ def norm_of_all_samples(llvm, tmp_path_factory) -> float:
     "options",
     a_few(
         ["run.adjoint=independent", "run.adjoint=batched", "integrator.samples_per_pass=4"],
-        ["run.adjoint=batched", "integrator.samples_per_pass=4"],
+        ["integrator.samples_per_pass=4"],
     ),
 )
 def test_steps_of_several_backward_passes_add_up(tmp_path, options, norm_of_all_samples):

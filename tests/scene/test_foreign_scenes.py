@@ -63,7 +63,7 @@ RENDERED = ("cornell_floor", "grey_room", "caustic_heightmap")
 
 
 #: The others have nothing that these do not have; their textures take seconds.
-SIMILAR = ("lens_pose", "caustic_slab")
+SIMILAR = ("lens_pose", "caustic_slab", "caustic_heightmap")
 
 
 @pytest.mark.parametrize(
