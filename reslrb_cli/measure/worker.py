@@ -74,10 +74,13 @@ def main(load: Callable[[], Begin] = measured_steps) -> int:
     """Answer until standard input ends, or until something fails: the last answer then says what."""
     answers = os.fdopen(os.dup(sys.stdout.fileno()), "w", encoding="utf-8")
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
+    limited = False
     try:
-        _serve(json.loads(sys.stdin.readline()), load, sys.stdin, answers)
+        first = json.loads(sys.stdin.readline())
+        limited = first["memory_limit"] is not None
+        _serve(first, load, sys.stdin, answers)
     except Exception as error:
-        _answer(answers, _failure(error))
+        _answer(answers, _failure(error, limited))
         return 1
     return 0
 
@@ -125,9 +128,14 @@ def _limit(memory_limit: int | None) -> None:
         resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
 
 
-def _failure(error: Exception) -> dict[str, Any]:
+#: What the C++ library says of a thread that cannot be made: under a limit, for want of address space for its stack.
+_NO_THREAD = "Resource temporarily unavailable"
+
+
+def _failure(error: Exception, limited: bool) -> dict[str, Any]:
     words = " ".join(str(error).split())
     memory = is_out_of_memory(error) or mentions_memory(words)  # also as the reason of another error
+    memory = memory or (limited and _NO_THREAD in words)
     refused = isinstance(error, ConfigError | BackendError) and not memory
     return {
         "failure": "refused" if refused else "out_of_memory" if memory else "failed",
