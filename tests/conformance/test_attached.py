@@ -29,6 +29,8 @@ pytestmark = pytest.mark.usefixtures("llvm")
 STOCK_ROUNDING = 1e-3
 #: What twice the distance of the two references may be: more is a fault of the walk that both of ours share.
 FARTHEST = 1e-3
+#: An odd number of them, so that the median is one of theirs.
+SEEDS = (1, 2, 3)
 BY_NAME = {case.name: case for case in CASES}
 DEEP = {"slab.vertex_positions": None, "shell.bsdf.reflectance.value": None}
 
@@ -46,19 +48,25 @@ def tracer(case: AttachedCase, name: str) -> StepIntegrator:
 
 
 def distances(case: AttachedCase) -> Iterator[tuple[str, float, float]]:
-    """Of each comparison: what it is, the distance, and the largest that may be."""
+    """Of each comparison: what it is, the distance, and the largest that may be.
+
+    Medians over seeds: rounding sends a path of rough glass another way now and then, on some processors more often
+    than on others, and its seed then says nothing. A fault of the code is there at every seed.
+    """
     moving = case.moving()
-    ours = moving.gradient(tracer(case, "reslrb"), 1, case.spp)
-    naive = moving.gradient(tracer(case, "walk_ad"), 1, case.spp)
-    stock = moving.gradient(tracer(case, "ptracer"), 1, case.spp) if case.stock else None
-    for name, value in naive.items():
-        assert value.any(), f"nothing to compare: {name}"
+    tracers = {name: tracer(case, name) for name in ("reslrb", "walk_ad", *(["ptracer"] if case.stock else []))}
+    found = [{name: moving.gradient(each, seed, case.spp) for name, each in tracers.items()} for seed in SEEDS]
+
+    def distance(name: str, left: str, right: str) -> float:
+        return float(np.median([relative(gradients[left][name], gradients[right][name]) for gradients in found]))
+
+    for name in found[0]["walk_ad"]:
+        assert all(gradients["walk_ad"][name].any() for gradients in found), f"nothing to compare: {name}"
         # What the references differ by is theirs, and much where terms cancel. If NaN stood anywhere it would show.
-        apart = 0.0 if stock is None else relative(value, stock[name])
+        apart = distance(name, "walk_ad", "ptracer") if case.stock else 0.0
         limit = max(case.limit, 2 * apart)
-        yield f"{name}, walk_ad", relative(ours[name], value), limit
-        if stock is not None:
-            yield f"{name}, ptracer", relative(ours[name], stock[name]), limit
+        for reference in list(tracers)[1:]:
+            yield f"{name}, {reference}", distance(name, "reslrb", reference), limit
 
 
 def check(case: AttachedCase) -> None:

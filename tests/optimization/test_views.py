@@ -38,7 +38,9 @@ def gradient(problem, round=0):
 
 
 def test_views_and_short_forms_are_the_same(folder):
-    np.testing.assert_array_equal(gradient(make(folder, "scene.sensors=all")), gradient(make(folder, ALL)))
+    short, long = gradient(make(folder, "scene.sensors=all")), gradient(make(folder, ALL))
+    # The order in which threads add to one texel is not fixed: sums of the same terms differ in their last bit.
+    np.testing.assert_allclose(short, long, rtol=1e-5, atol=1e-6 * np.abs(long).max())
 
 
 def test_a_weight_is_a_share_of_the_loss(folder):
