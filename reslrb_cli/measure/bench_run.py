@@ -65,19 +65,18 @@ class Run(Contestant):
 
     def kept(self) -> dict[str, Any]:
         """What a later session needs, as JSON has it."""
-        end = None if self.end is None else {"status": self.end.status.value, "reason": self.end.reason}
         steps = {str(round): step for round, step in self.steps.items()}
         return {"case": self.case.label, "size": self.size, "texels": self.texels, "cold": self.cold, "steps": steps,
-                "end": end}  # fmt: skip
+                "end": self.end and self.end.kept()}  # fmt: skip
 
     @classmethod
     def restored(cls, entry: Mapping[str, Any], case: Case, config: Config, may_refuse: bool) -> Run:
         """A run that `kept` returned, without a process."""
-        size, end = entry["size"], entry["end"]
+        size = entry["size"]
         return cls(
             process=None,
             may_refuse=may_refuse,
-            end=None if end is None else Ended(BenchStatus(end["status"]), end["reason"]),
+            end=Ended.restored(entry["end"]),
             case=case,
             config=config,
             size=None if size is None else (size[0], size[1]),

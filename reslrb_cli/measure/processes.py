@@ -12,7 +12,7 @@ import signal
 import subprocess
 import tempfile
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +35,15 @@ class Ended(Exception):
     def __init__(self, status: BenchStatus, reason: str) -> None:
         super().__init__(reason)
         self.status, self.reason = status, reason
+
+    def kept(self) -> dict[str, str]:
+        """What a later session needs, as JSON has it."""
+        return {"status": self.status.value, "reason": self.reason}
+
+    @classmethod
+    def restored(cls, entry: Mapping[str, str] | None) -> Ended | None:
+        """The end that `kept` returned; None where there was none."""
+        return None if entry is None else cls(BenchStatus(entry["status"]), entry["reason"])
 
 
 class Stopped(Exception):

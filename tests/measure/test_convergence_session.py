@@ -242,6 +242,21 @@ def test_the_budget_covers_compilation_and_one_too_small_says_what_it_would_take
         assert enough > budget_s
 
 
+def test_too_few_steps_for_a_slope_say_what_it_would_take(tmp_path: Path) -> None:
+    def slow() -> Stage:
+        return Stage(case_ptracer=Pretence(3.0, cold_s=3.0))
+
+    _, results, said = play(tmp_path, slow(), plan(rounds=None, budget_s=45.0))
+    lacking = {record.method.label for record in results.methods if record.slope is None}
+    assert lacking == {"ptracer"}
+    assert said[-1].startswith("no slope of ptracer: it takes 8 steps of each; allow about ")
+    enough = float(said[-1].split("allow about ")[1].split(" s")[0])
+    assert enough > 45
+    _, results, said = play(tmp_path, slow(), plan(rounds=None, budget_s=1.05 * enough))
+    assert all(record.slope is not None for record in results.methods)
+    assert not any("no slope" in line for line in said)
+
+
 def test_no_budget_is_overrun(tmp_path: Path) -> None:
     """Steps of seconds: a round would take longer than what some of these leave after compiling."""
     for budget_s in range(8, 60, 4):

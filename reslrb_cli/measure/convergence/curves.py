@@ -28,6 +28,8 @@ CONFIDENCE = 0.95
 FEWEST = 3
 #: Groups of steps that a slope's interval comes from, the more the better; the longest average is as long as a group.
 GROUPS = (8, 4)
+#: Fewer steps have no slope.
+FEWEST_FOR_SLOPE = 2 * GROUPS[-1]
 
 
 @dataclass(frozen=True)

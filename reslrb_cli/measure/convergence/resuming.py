@@ -15,7 +15,6 @@ from reslrb_cli.measure.convergence.members import Member
 from reslrb_cli.measure.convergence.plan import Plan
 from reslrb_cli.measure.earlier import Earlier
 from reslrb_cli.measure.processes import Ended
-from reslrb_cli.records.bench import BenchStatus
 from reslrb_cli.records.samples import Kept
 
 #: What is kept says that it is of this.
@@ -66,8 +65,8 @@ def restore(before: Earlier, members: list[Member]) -> int:
         member.taken, member.turns, member.seconds = entry["taken"], entry["turns"], entry["seconds"]
         member.message, member.cold = entry["message"], entry["cold"]
         member.rows = list(before.arrays[f"rows/{number}"])
-        if entry["end"] is not None:
-            member.end = Ended(BenchStatus(entry["end"]["status"]), entry["end"]["reason"])
+        member.end = Ended.restored(entry["end"])
+        if member.end is not None:
             member.process.close()
     rounds: int = before.head["rounds"]
     return rounds
@@ -86,11 +85,10 @@ def kept(
         arrays = {f"survey/{name}": survey[name] for name in survey.files}
     entries = []
     for number, member in enumerate(members):
-        end = None if member.end is None else {"status": member.end.status.value, "reason": member.end.reason}
         # A round that was broken off is not: the next session begins it anew, with other seeds.
         turns = [turn for turn in member.turns if turn < rounds]
         entries.append({"name": name_of(member), "config": dump(member.config), "taken": member.taken,
                         "turns": turns, "seconds": member.seconds[: len(set(turns))], "message": member.message,
-                        "cold": member.cold, "end": end})  # fmt: skip
+                        "cold": member.cold, "end": member.end and member.end.kept()})  # fmt: skip
         arrays[f"rows/{number}"] = np.array(member.rows[: len(turns)], np.float32)
     return earlier.head(KIND, settings, facts=facts, rounds=rounds, members=entries), arrays

@@ -18,7 +18,7 @@ from reslrb_cli.config import Config, dump
 from reslrb_cli.errors import ExitCode
 from reslrb_cli.measure.cases import Case
 from reslrb_cli.measure.contestant import Contestant
-from reslrb_cli.measure.convergence.curves import FEWEST
+from reslrb_cli.measure.convergence.curves import FEWEST, FEWEST_FOR_SLOPE
 from reslrb_cli.measure.convergence.members import Member, Role, share_turns
 from reslrb_cli.measure.convergence.plan import Plan
 from reslrb_cli.measure.convergence.resuming import kept, restore, restore_facts, settings
@@ -258,10 +258,11 @@ class Session:
         return sum(member.count * member.step_s for member in self.members if member.alive)
 
     def _say_what_it_takes(self) -> None:
-        """Where the budget did not suffice for figures: what it would take."""
+        """Where the budget did not suffice for figures, or for slopes: what it would take."""
         late = [member for member in self.members if member.late]
         taken = self.rounds - self._before
         if taken >= self._fewest and not late:
+            self._say_what_slopes_take()
             return
         if late:
             names = ", ".join(member.label for member in late)
@@ -273,9 +274,21 @@ class Session:
         if not warm or self.plan.rounds is not None:
             return
         # What has not compiled is taken to take as long as what has.
-        share = 1 + len(late) / len(warm)
-        before = self._now() - self._began - taken * self._round_s
-        needed = (share * (before + self._fewest * self._round_s) + AFTERWARDS_S) / (1 - AFTERWARDS)
+        needed = self._budget_for(self._fewest, share=1 + len(late) / len(warm))
         advice = f"allow about {needed:.0f} s with --budget, or name fewer --integrators, or take a smaller film"
         fact = f"figures need {FEWEST} rounds" if self._before < FEWEST else "no round was added"
         self._say(f"{fact}; {advice}")
+
+    def _say_what_slopes_take(self) -> None:
+        few = [m for m in self.of(Role.CASE) if m.alive and 0 < len(m.rows) < FEWEST_FOR_SLOPE]
+        if not few or self.plan.rounds is not None:
+            return
+        rounds = max(-(-FEWEST_FOR_SLOPE // m.count) for m in few) - self._before
+        names, needed = ", ".join(member.label for member in few), self._budget_for(rounds)
+        advice = f"allow about {needed:.0f} s with --budget, or take fewer samples per step with --spp"
+        self._say(f"no slope of {names}: it takes {FEWEST_FOR_SLOPE} steps of each; {advice}")
+
+    def _budget_for(self, rounds: int, share: float = 1.0) -> float:
+        """Seconds for so many rounds of this session, `share` times as much work as what has been measured."""
+        before = self._now() - self._began - (self.rounds - self._before) * self._round_s
+        return (share * (before + rounds * self._round_s) + AFTERWARDS_S) / (1 - AFTERWARDS)

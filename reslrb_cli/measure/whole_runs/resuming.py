@@ -15,7 +15,6 @@ from reslrb_cli.measure.earlier import Earlier
 from reslrb_cli.measure.processes import Ended, Refused
 from reslrb_cli.measure.whole_runs.plan import RunsPlan
 from reslrb_cli.measure.whole_runs.run import Run
-from reslrb_cli.records.bench import BenchStatus
 from reslrb_cli.records.samples import Kept
 from reslrb_cli.records.whole_runs import RunPointRecord
 
@@ -64,11 +63,10 @@ def kept(
 
 
 def _entry(run: Run) -> dict[str, Any]:
-    end = None if run.end is None else {"status": run.end.status.value, "reason": run.end.reason}
     refusal = None if run.refusal is None else {"line": str(run.refusal), "exit_code": int(run.refusal.exit_code)}
     points = [[p.elapsed_s, p.iteration, p.loss, p.parameter_error] for p in run.points]
-    return {"label": run.method.label, "seed": run.seed, "first_s": run.first_s, "end": end, "refusal": refusal,
-            "points": points}  # fmt: skip
+    return {"label": run.method.label, "seed": run.seed, "first_s": run.first_s, "refusal": refusal,
+            "points": points, "end": run.end and run.end.kept()}  # fmt: skip
 
 
 def restore(before: Earlier, plan: RunsPlan) -> list[Run]:
@@ -76,14 +74,14 @@ def restore(before: Earlier, plan: RunsPlan) -> list[Run]:
     methods = {method.label: method for method in (plan.method_of(case, spp) for case, spp in plan.entries)}
     runs = []
     for entry in before.head["runs"]:
-        method, seed, end, refusal = methods[entry["label"]], entry["seed"], entry["end"], entry["refusal"]
+        method, seed, refusal = methods[entry["label"]], entry["seed"], entry["refusal"]
         points = [RunPointRecord(method, seed, *point) for point in entry["points"]]
         facts = before.head["facts"]
         runs.append(
             Run(
                 process=None,
                 may_refuse=plan.default,
-                end=None if end is None else Ended(BenchStatus(end["status"]), end["reason"]),
+                end=Ended.restored(entry["end"]),
                 refusal=None if refusal is None else Refused(refusal["line"], refusal["exit_code"]),
                 method=method,
                 seed=seed,
