@@ -1,0 +1,68 @@
+"""What `compilation.py` leaves out changes code, not values, and shows nowhere but in the tests' own kernels."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import compilation
+import pytest
+
+from reslrb_cli.backend import llvm as library
+from reslrb_cli.backend import shared_library
+
+#: Prints the bits of sums of what rounding would change, were a pass to reassociate, fuse or approximate.
+SCRIPT = """
+import sys
+import reslrb_cli
+from compilation import leave_out_optimisations
+assert sys.argv[1] == "optimised" or leave_out_optimisations()
+import drjit as dr
+from drjit.llvm import Array3f, Float, UInt32
+x = dr.linspace(Float, 0.1, 3.0, 1000)
+table = dr.sin(x) * dr.exp(-x)
+dr.eval(table)
+v = dr.normalize(Array3f(x, dr.gather(Float, table, (UInt32(x * 331) * 7) % 1000), 1 / x))
+i, y = dr.while_loop((UInt32(0), Float(x)), lambda i, y: i < 20, lambda i, y: (i + 1, y * v.y + dr.sqrt(v.x) - v.z / 3))
+print(dr.reinterpret_array(UInt32, y * v.z + v.x * v.y).numpy().tobytes().hex())
+"""
+
+
+def compiled(way: str, home: Path) -> tuple[str, int]:
+    """What the script prints, and the size in bytes of the kernels that it left on the disk."""
+    home.mkdir()
+    tests = os.pathsep.join(str(Path(compilation.__file__).parents[level]) for level in (0, 1))
+    environment = {key: value for key, value in os.environ.items() if key != "DRJIT_CACHE_DIR"}
+    environment |= {"HOME": str(home), "PYTHONPATH": tests}
+    done = subprocess.run(
+        [sys.executable, "-c", SCRIPT, way], env=environment, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stderr == ""
+    folder = home / (".drjit" if way == "optimised" else compilation.CACHE.name)
+    return done.stdout, sum(file.stat().st_size for file in folder.iterdir())
+
+
+def test_values_are_those_of_optimised_kernels(tmp_path: Path, llvm: str) -> None:
+    if not compilation.is_silent(shared_library.load(Path(os.environ[library.VARIABLE]))):
+        pytest.skip("this libLLVM would name each pass that it leaves out")
+    values, size = compiled("optimised", tmp_path / "optimised")
+    ours, larger = compiled("quick", tmp_path / "quick")
+    assert ours == values
+    assert larger > size
+
+
+def test_a_library_that_would_name_each_pass_is_left_as_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Library:
+        def LLVMGetVersion(self, *parts: object) -> None:
+            for part, number in zip(parts, (19, 1, 7), strict=True):
+                part._obj.value = number
+
+    monkeypatch.setenv(library.VARIABLE, __file__)
+    monkeypatch.setattr(compilation.shared_library, "load", lambda path: Library())
+    monkeypatch.delenv("DRJIT_CACHE_DIR", raising=False)
+    monkeypatch.delenv("PYTHONPATH", raising=False)
+    assert not compilation.leave_out_optimisations()
+    assert not {"DRJIT_CACHE_DIR", "PYTHONPATH"} & set(os.environ)
