@@ -1,8 +1,8 @@
 """Kernels of the default suite are compiled without LLVM's optimisations: most of its time was spent on those.
 
-LLVM gets the same kernels; its optional passes are left out (`-opt-bisect-limit=0`, its documented way of doing so),
-and registers are given out the fast way. No pass may reassociate or approximate, so values are the same; the kernels
-run slower, which small ones do not feel. `-m long`, whose kernels run for minutes, has LLVM as users have it.
+LLVM gets the same kernels; its optional passes are left out, by `-opt-bisect-limit=0`, its documented way of doing so.
+No pass may reassociate or approximate, so values are the same; the kernels run slower, which small ones do not feel.
+`-m long`, whose kernels run for minutes, has LLVM as users have it.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from reslrb_cli.backend import llvm, shared_library
 
 #: Dr.Jit knows a kernel on the disk by what it computes, so those of users have to lie elsewhere.
 CACHE = Path("~/.drjit-tests")
-OPTIONS = ("-opt-bisect-limit=0", "-opt-bisect-verbose=0", "-optimize-regalloc=0")
+OPTIONS = ("-opt-bisect-limit=0", "-opt-bisect-verbose=0")
 #: What Python runs first in a process that a test starts.
 STARTED = Path(__file__).parent / "started"
 #: Older ones name each pass that they leave out.
