@@ -8,10 +8,18 @@ import sys
 from collections.abc import Iterator
 
 import pytest
+from compilation import leave_out_optimisations
 
 import reslrb_cli  # noqa: F401  # chooses libLLVM, so it comes before any test imports Mitsuba
 from reslrb_cli.backend.variant import set_variant
 from reslrb_cli.errors import BackendError
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Compiles quickly, unless it is the long runs that are asked for; RESLRB_TEST_OPTIMISED=1 compiles as users do."""
+    is_long = "long" in config.option.markexpr and "not long" not in config.option.markexpr
+    if not is_long and not os.environ.get("RESLRB_TEST_OPTIMISED"):
+        leave_out_optimisations()
 
 
 @pytest.fixture(scope="session")

@@ -99,7 +99,9 @@ class Warnings(logging.Handler):
 
 def _serve(first: dict[str, Any], load: Callable[[], Begin], questions: IO[str], answers: IO[str]) -> None:
     os.environ |= {
-        "HOME": first["cache"],  # where Dr.Jit keeps compiled kernels: a cold step is to find none
+        # Where Dr.Jit keeps compiled kernels, by default and if told: a cold step is to find none.
+        "HOME": first["cache"],
+        "DRJIT_CACHE_DIR": first["cache"],
         "OPTIX_CACHE_PATH": first["cache"],
         "CUDA_CACHE_DISABLE": "1",
     }

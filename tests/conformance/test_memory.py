@@ -5,7 +5,6 @@ from __future__ import annotations
 import gc
 
 import pytest
-from turns import a_few
 
 from reslrb_cli.measure.gradients import Case, integrator
 from reslrb_cli.measure.small_scenes import diffuse, room, texture
@@ -51,9 +50,16 @@ def test_reservoir_is_flat(case: Case):
     assert max(peaks.values()) <= 1.02 * min(peaks.values()), peaks
 
 
-@pytest.mark.parametrize("estimator", a_few(["reservoir", "event", "gather", "stack"], ("reservoir",)))
-def test_nothing_is_kept_of_paths_whose_adjoint_is_known_before(case: Case, estimator: str):
-    peaks = {depth: peak(case, "reslrb", depth, estimator, adjoint="independent") for depth in (2, 40, 80, 160)}
+@pytest.mark.parametrize(
+    ("estimator", "depths"),
+    [
+        ("reservoir", (2, 40)),
+        *(pytest.param(name, (2, 40, 80, 160), marks=pytest.mark.long)
+          for name in ("reservoir", "event", "gather", "stack")),
+    ],
+)  # fmt: skip
+def test_nothing_is_kept_of_paths_whose_adjoint_is_known_before(case: Case, estimator: str, depths: tuple[int, ...]):
+    peaks = {depth: peak(case, "reslrb", depth, estimator, adjoint="independent") for depth in depths}
     print(estimator, peaks)
     assert max(peaks.values()) < SPP * case.weights.shape[0] * case.weights.shape[1]  # a byte a path
     # What does not fit on the stack is traced again, and its gradient is another copy of the texture's.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from turns import taking_turns
 
 from reslrb_cli.integrators import render_image
 from reslrb_cli.measure.analytic import beam_through_slab, fresnel, furnace, plane_points, point_through_surface
@@ -103,8 +104,7 @@ def test_images(name: str, llvm: str):
         assert result.relative_error < 0.02
 
 
-@pytest.mark.parametrize("estimator", ["reservoir", "gather"])
-@pytest.mark.parametrize("name", SCENES)
+@taking_turns("name", list(SCENES), "estimator", ["reservoir", "gather"])
 def test_gradients(name: str, estimator: str, llvm: str):
     make, spp, _ = SCENES[name]
     known: KnownScene = make()

@@ -72,7 +72,9 @@ def test_two_depths(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     ]
 
 
-def test_l2(tmp_path: Path) -> None:
+def test_l2(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """And a cold step finds no kernel that was compiled before, wherever those are kept."""
+    monkeypatch.setenv("DRJIT_CACHE_DIR", str(tmp_path / "kernels"))
     file = tmp_path / "bench.json"
     names = "reslrb:stack,trajectory,prb"
     args = ["--max-depth", "2", "--integrators", names, "--objective", "l2", "--json", str(file)]
@@ -80,6 +82,7 @@ def test_l2(tmp_path: Path) -> None:
     assert [row["status"] for row in read(file)] == ["ok"] * 3
     assert (tmp_path / "other.png").exists()
     assert not (tmp_path / "bench.png").exists()
+    assert not (tmp_path / "kernels").exists()
 
 
 def test_a_budget_that_suffices_for_nothing_says_so(capsys: pytest.CaptureFixture[str]) -> None:
@@ -124,7 +127,10 @@ def test_what_ends_at_a_low_limit_ended_for_want_of_memory(limit: str, tmp_path:
     ("args", "line"),
     [
         (["none.yaml"], "none.yaml: no such file"),
-        (["--set", "scene.options.colour=3", "--max-depth", "2"], "scene.options.colour: the options are"),
+        (
+            ["--set", "scene.options.colour=3", "--max-depth", "2", "--integrators", "reslrb:stack"],
+            "scene.options.colour: the options are",
+        ),
         (["--memory-limit", "much"], "`much` is no size"),
         (["--max-depth", "1"], "--max-depth"),
         (["--integrators", "pt"], "--integrators pt: integrator.type"),

@@ -44,7 +44,9 @@ def test_two_faces_and_what_stands_still():
     assert chains("caustic_heightmap.yaml", "integrator={type: ptracer, max_depth: 4}") == []
 
 
-def test_they_are_shown():
+def test_they_are_shown(monkeypatch: pytest.MonkeyPatch):
+    """Of the conditioning of parameters, which tests/cli/test_inspect.py looks at, nothing is measured here."""
+    monkeypatch.setattr("reslrb_cli.measure.conditioning.measure_sensitivities", lambda problem, samples: [])
     config = str(CONFIGS / "caustic_heightmap.yaml")
     arguments = ["inspect", config, "--no-counts", "--conditioning", "--samples", "2"]
     arguments += [word for each in SMALL for word in ("--set", each)]

@@ -56,8 +56,8 @@ def lost(case: str, estimator: str) -> list[str]:
 
 def test_selection_by_contribution_alone_loses_what_follows_a_heavy_one(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr("reslrb_cli.estimators.reservoir.SHARE", 0.0)
-    assert lost("connection_1e8", "reservoir")
-    assert lost("connection_1e8", "event")
+    records = run_suite(["connection_1e8"], ["reservoir", "event"])
+    assert {record.estimator for record in records if record.holds is False} == {"reservoir", "event"}
 
 
 def test_roulette_by_throughput_alone_loses_what_follows_a_dark_surface(monkeypatch: pytest.MonkeyPatch):
@@ -72,7 +72,8 @@ def test_roulette_by_power_loses_dim_lamps(monkeypatch: pytest.MonkeyPatch):
 
 def test_sampling_by_radiance_alone_hardly_sees_the_sky_beside_a_sun(monkeypatch: pytest.MonkeyPatch):
     def variance() -> float:
-        rows = run_suite(["sun_1e6"], ["stack"])
+        # Half of the seeds: of eight, a variance is known to a half, and what is looked for is a factor of a hundred.
+        rows = run_suite(["sun_1e6"], ["stack"], seeds=8)
         [ratio] = [row.variance_ratio for row in rows if row.parameter == "sky.data" and row.reference == "prb"]
         assert ratio is not None
         return ratio

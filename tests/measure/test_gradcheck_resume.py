@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from measure.test_gradcheck import SMALL  # the same kernels
 from measure.test_sampling import NAMES, Pretended
 
 from reslrb_cli.config import loads
@@ -22,8 +23,6 @@ from reslrb_cli.measure.participants import Settings
 from reslrb_cli.measure.sampling import FEWEST, Sampling
 from reslrb_cli.records.gradcheck import GradcheckRecord, Reference, Verdict
 from reslrb_cli.records.samples import read_samples, write_samples
-
-SMALL = ["scene.options.size=16", "run.spp=4"]
 
 
 def check(
