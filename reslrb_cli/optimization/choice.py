@@ -20,6 +20,7 @@ from reslrb_cli.optimization.budget import MemoryPlan, choose_samples, standing
 from reslrb_cli.optimization.moving import ATTACHED, is_attached
 from reslrb_cli.optimization.pilot import Pilot
 from reslrb_cli.optimization.pilot_records import Candidate, Measured, Outcome
+from reslrb_cli.optimization.room import check_scratch
 from reslrb_cli.optimization.samples import sample_gradient, take_gradient
 from reslrb_cli.records.clock import MIB, StepClock
 from reslrb_cli.records.manifest import versions
@@ -59,7 +60,10 @@ def find_options(problem: Problem) -> list[Option]:
     if config.integrator.estimator == "auto":
         choices = [{"estimator": ATTACHED}] if is_attached(problem) else candidates(config)
         return _fitting(problem, config.integrator, choices)
-    return [] if config.run.memory_budget is None else _fitting(problem, config.integrator, [{}])
+    if config.run.memory_budget is None:
+        check_scratch(problem, Tracer.of(**config.integrator.options()))
+        return []
+    return _fitting(problem, config.integrator, [{}])
 
 
 def settle_integrator(problem: Problem, options: list[Option], say: Say, cache: Cache | None = None) -> None:
@@ -98,6 +102,7 @@ def _fitting(problem: Problem, integrator: Reslrb, choices: list[dict[str, Any]]
     for choice in choices:
         own = integrator.chosen(**choice).options() if choice else integrator.options()
         made = Tracer.of(**own)
+        check_scratch(problem, made)
         if budget is None:
             options.append(Option(choice, made, None))
             continue

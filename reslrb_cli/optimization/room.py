@@ -1,0 +1,84 @@
+"""Whether there is room for what a configuration asks for: said before anything is allocated, with the reason.
+
+Held against what is free are lower bounds, so that nothing is refused that the machine can hold.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import mitsuba as mi
+
+from reslrb_cli.backend.memory import free_bytes, local_bytes
+from reslrb_cli.config import Config
+from reslrb_cli.errors import ConfigError
+from reslrb_cli.integrators import Reslrb as Tracer
+
+if TYPE_CHECKING:
+    from reslrb_cli.optimization.problem import Problem
+
+GIB = 2**30
+#: Bytes that a pixel takes at the least: five images (block, image, dL/dI, its adjoint, target) of three floats.
+PIXEL_BYTES = 5 * 3 * 4
+#: Bytes that an entry of a parameter takes at the least: value, the optimiser's, gradient, and the array it is set by.
+ENTRY_BYTES = 4 * 4
+
+
+def check_config(config: Config) -> None:
+    """Raise ConfigError where film or parameters, as the configuration has them, need more memory than is free."""
+    free = free_bytes(mi.variant())
+    if config.scene.size is not None:
+        _check_film(config, "scene.size", config.scene.size, free)
+    for place, spec in enumerate(config.parameters):
+        resolution = spec.resolution if spec.heightmap is None else spec.heightmap.resolution
+        if resolution is None:
+            continue
+        needed = resolution[0] * resolution[1] * ENTRY_BYTES
+        if needed > free:
+            key = f"parameters[{place}].{'resolution' if spec.heightmap is None else 'heightmap.resolution'}"
+            texels = f"{resolution[0]}x{resolution[1]} texels"
+            raise ConfigError(config.source, key, _too_large(texels, needed, free, resolution))
+
+
+def check_films(config: Config, scene: mi.Scene, sensors: Sequence[int]) -> None:
+    """Raise ConfigError where a film is too large, or the samples of a step are too many for it."""
+    free = free_bytes(mi.variant())
+    for index in sensors:
+        film = scene.sensors()[index].film()
+        width, height = (int(n) for n in film.crop_size())
+        _check_film(config, "scene.file", (width, height), free)
+        full = film.size()  # light paths are counted by the film without its crop window
+        obstacle = config.samples_obstacle(int(full[0]) * int(full[1]))
+        if obstacle is not None:
+            raise ConfigError(config.source, "run.spp", obstacle)
+
+
+def check_scratch(problem: Problem, integrator: Tracer) -> None:
+    """Raise ConfigError where paths need more thread-local memory than a thread has on the CPU."""
+    if mi.variant().startswith("cuda"):
+        return  # the driver sees to that, and says so
+    for index in problem.sensors:
+        plan = integrator.plan(problem.scene, problem.scene.sensors()[index], problem.selection.params)
+        needed, most = integrator.estimator.scratch_bytes(plan), local_bytes()
+        if needed > most:
+            size = problem.config.integrator.options().get("stack_size", 0)
+            raise ConfigError(
+                problem.config.source,
+                "integrator.stack_size",
+                f"{size} vertices take {needed / 2**20:.1f} MiB of a thread's stack for each path, which has "
+                f"{most / 2**20:.1f} MiB; take at most {size * most // needed} (longer paths are traced a second time, "
+                "and nothing of them is lost), or raise `ulimit -s`",
+            )
+
+
+def _check_film(config: Config, key: str, size: tuple[int, int], free: int) -> None:
+    needed = size[0] * size[1] * PIXEL_BYTES
+    if needed > free:
+        raise ConfigError(config.source, key, _too_large(f"a film of {size[0]}x{size[1]} pixels", needed, free, size))
+
+
+def _too_large(what: str, needed: int, free: int, size: tuple[int, int]) -> str:
+    shrink = (free / needed) ** 0.5
+    fits = "x".join(str(max(int(n * shrink), 1)) for n in size)
+    return f"{what} takes at least {needed / GIB:.1f} GiB, and {free / GIB:.1f} GiB are free; take at most {fits}"
