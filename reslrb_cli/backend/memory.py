@@ -6,6 +6,7 @@ import contextlib
 import re
 import shutil
 import subprocess
+import sys
 from pathlib import Path
 
 from reslrb_cli.backend.device import memory_bytes
@@ -48,6 +49,16 @@ def _free_on_gpu(total: int) -> int:
     query = [] if command is None else [command, "--query-gpu=memory.free", "--format=csv,noheader,nounits"]
     output = subprocess.run(query, capture_output=True, text=True, check=False).stdout if query else ""
     return min([total, *(int(line) * 2**20 for line in output.split() if line.isdigit())])
+
+
+def resident_bytes() -> int | None:
+    """Bytes of memory that this process has had at the most, all that is in it counted; None where nothing tells."""
+    try:
+        import resource
+    except ImportError:
+        return None
+    most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return most if sys.platform == "darwin" else most * 1024
 
 
 def local_bytes() -> int:

@@ -1,0 +1,230 @@
+"""What a run will take, memory and time: measured on a few of its own steps, with a target of few samples.
+
+Where a step takes long, steps of fewer samples per pixel stand for it: time and memory are a constant and a part that
+is proportional to the samples, which two sizes tell apart.
+"""
+
+from __future__ import annotations
+
+import statistics
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import pairwise
+
+import drjit as dr
+import mitsuba as mi
+
+from reslrb_cli.backend.device import resident_paths
+from reslrb_cli.backend.memory import free_bytes
+from reslrb_cli.config import Config
+from reslrb_cli.integrators import Reslrb as Tracer
+from reslrb_cli.optimization.certainty import LEAST_ITERATIONS
+from reslrb_cli.optimization.choice import Cache, find_options, settle_integrator
+from reslrb_cli.optimization.loop import optimize
+from reslrb_cli.optimization.problem import Problem, assemble_scene
+from reslrb_cli.optimization.rendering import saved_spp
+from reslrb_cli.optimization.targets import make_targets
+from reslrb_cli.records.clock import MIB
+from reslrb_cli.records.metrics import Record
+
+#: Seconds of a step beyond which steps of fewer samples stand for it, and that those are to take.
+LONG_STEP, SHORT_STEP = 2.0, 0.7
+#: Steps until all is compiled and recorded; steps that are timed, at least, at most, and for so many seconds.
+WARM_UP, LEAST, MOST, SECONDS = 5, 4, 40, 5.0
+#: Steps, more or less, that the verdicts on the values take after the last one.
+VERDICTS = 30
+
+
+@dataclass(frozen=True)
+class Forecast:
+    """Bytes of the iterations, by part (`parts`; all that the allocator gives out adds up to `peak`), and beside them
+    `scratch`, thread-local; seconds of the run, by part. `iteration_s` is one iteration, `start_s` what the first ones
+    take longer when all kernels are there, `compile_s` what compiling them took now, `spp` the samples of the steps
+    that were measured."""
+
+    parts: dict[str, int]
+    scratch: int
+    free: int
+    iterations: int
+    iteration_s: float
+    start_s: float
+    compile_s: float
+    pilot_s: float
+    target_s: float
+    images_s: float
+    verdicts_s: float
+    spp: int
+
+    @property
+    def peak(self) -> int:
+        """Bytes of the allocator at the most, as `peak_mib` in `metrics.jsonl` has them."""
+        return sum(self.parts.values())
+
+    @property
+    def elapsed_s(self) -> float:
+        """Seconds of the iterations, as `elapsed_s` in `metrics.jsonl` counts them where no kernel is to be compiled."""
+        return self.iterations * self.iteration_s + self.start_s
+
+    @property
+    def whole_s(self) -> float:
+        """Seconds of the whole run, with kernels and pilot as they are kept now."""
+        return self.elapsed_s + self.target_s + self.images_s + self.verdicts_s
+
+
+@dataclass(frozen=True)
+class Steps:
+    """Steps of `spp` samples per pixel: seconds of one, what the first took longer, compiling apart, and the peak."""
+
+    spp: int
+    step_s: float
+    start_s: float
+    compile_s: float
+    peak: int
+
+
+def make_forecast(config: Config, say: Callable[[str], None], cache: Cache | None = None) -> Forecast:
+    """Measure a few steps of the run that `config` describes; a variant must be set.
+
+    `say` is told what takes long; what a pilot learns is kept in `cache`, for the run. Raises ConfigError and
+    UnsupportedScene as the run would, and what its steps raise.
+    """
+    problem = assemble_scene(_with_short_target(config))
+    options = find_options(problem)
+    buffers = _buffers(problem)
+    make_targets(problem, say)
+    problem.truth.clear()  # errors are no part of a step
+    settle_integrator(problem, options, say, cache)
+    image_s = _image_seconds(problem)
+    say("measuring a few steps")
+    steps, scratch = _steps(problem), _scratch(problem)
+    run, pilot = config.run, problem.pilot
+    targets = sum(4 * int(dr.prod(view.target.shape)) for view in problem.views)
+    parts = {
+        "geometry": buffers["geometry"],
+        "textures and other values of the scene": buffers["values"],
+        "targets": targets,
+        "optimiser's state": _state_bytes(problem),
+    }
+    parts["film, gradients and what is kept of paths"] = max(steps.peak - sum(parts.values()), 0)
+    between = run.iterations // run.images_every if run.images_every else 0
+    images = 2 * saved_spp(problem, between=False) + between * saved_spp(problem, between=True)
+    render = config.target.render
+    views = len(problem.views)
+    return Forecast(
+        parts=parts,
+        scratch=scratch,
+        free=free_bytes(mi.variant()),
+        iterations=run.iterations,
+        iteration_s=steps.step_s,
+        start_s=steps.start_s,
+        compile_s=steps.compile_s,
+        pilot_s=0.0 if pilot is None or pilot.cached else pilot.measure_s + pilot.compile_s,
+        target_s=0.0 if render is None else image_s * render.spp * views,
+        images_s=image_s * images * views,
+        verdicts_s=VERDICTS * steps.step_s if run.certainty and run.iterations >= LEAST_ITERATIONS else 0.0,
+        spp=steps.spp,
+    )
+
+
+def _with_short_target(config: Config) -> Config:
+    """The experiment with a target of no more samples than tell its noise from a step's: four steps' worth."""
+    render = config.target.render
+    if render is None:
+        return config
+    unit = (render.integrator or config.integrator).options().get("samples_per_pass") or 1
+    spp = min(render.spp, -(-4 * config.run.spp // unit) * unit)
+    target = config.target.model_copy(update={"render": render.model_copy(update={"spp": spp})})
+    return config.model_copy(update={"target": target})
+
+
+def _image_seconds(problem: Problem) -> float:
+    """Seconds that a sample per pixel of a saved image takes, of the first view."""
+    view, spp = problem.views[0], saved_spp(problem, between=True)
+    problem.render(view.sensor, problem.samples_per_pass or 1, 0, "forecast")  # compiles
+    begin = time.perf_counter()
+    problem.render(view.sensor, spp, 1, "forecast")
+    return (time.perf_counter() - begin) / spp
+
+
+def _steps(problem: Problem) -> Steps:
+    """What a step of the run takes, measured or by two smaller ones."""
+    config = problem.config
+    unit = config.run.batches if config.adjoint == "batched" else 1
+    unit *= problem.samples_per_pass or 1
+    whole = config.run.spp
+    if unit >= whole:
+        return _measure(problem, whole)
+    first = _measure(problem, unit)
+    if first.step_s * whole / unit <= LONG_STEP:
+        return _with_compilation(_measure(problem, whole), first)
+    small = max(min(int(SHORT_STEP / max(first.step_s, 1e-6)), whole // unit // 2), 1) * unit
+    one, two = _measure(problem, small), _measure(problem, 2 * small)
+    share = (whole - small) / small
+    return Steps(
+        two.spp,
+        one.step_s + share * max(two.step_s - one.step_s, 0.0),
+        two.start_s,
+        first.compile_s + one.compile_s + two.compile_s,
+        int(one.peak + share * max(two.peak - one.peak, 0)),
+    )
+
+
+def _with_compilation(steps: Steps, before: Steps) -> Steps:
+    return Steps(steps.spp, steps.step_s, steps.start_s, steps.compile_s + before.compile_s, steps.peak)
+
+
+def _measure(problem: Problem, spp: int) -> Steps:
+    """A few iterations of `spp` samples per pixel, by the loop itself; the parameters move."""
+    config = problem.config
+    problem.config = config.model_copy(update={"run": config.run.model_copy(update={"spp": spp})})
+    records: list[Record] = []
+    begin = time.perf_counter()
+    try:
+        for record in optimize(problem):
+            records.append(record)
+            if len(records) == WARM_UP:
+                begin = time.perf_counter()
+            timed = len(records) - WARM_UP
+            if timed >= MOST or (timed >= LEAST and time.perf_counter() - begin > SECONDS):
+                break
+    finally:
+        problem.config = config
+    times = [records[0].elapsed_s, *(b.elapsed_s - a.elapsed_s for a, b in pairwise(records))]
+    steady = statistics.median(times[WARM_UP:] or times)
+    extra = sum(max(seconds - steady, 0.0) for seconds in times[:WARM_UP])
+    compiled = min(sum(record.codegen_ms for record in records[:WARM_UP]) / 1e3, extra)
+    return Steps(spp, steady, extra - compiled, compiled, int(records[-1].peak_mib * MIB))
+
+
+# --- what memory is for -----------------------------------------------------------------------------------------------
+
+
+def _buffers(problem: Problem) -> dict[str, int]:
+    """Bytes of the scene's values that a script can reach, those of shapes apart."""
+    found = {"geometry": 0, "values": 0}
+    params = problem.selection.params
+    for key in params.properties:
+        value = params[key]
+        if isinstance(value, dr.ArrayBase):
+            name = key.rpartition(".")[2]
+            part = "geometry" if name.startswith(("vertex_", "faces", "to_world")) else "values"
+            found[part] += int(dr.prod(dr.shape(value))) * dr.itemsize_v(value)
+    return found
+
+
+def _state_bytes(problem: Problem) -> int:
+    """Bytes of the optimiser's state: values and moments."""
+    return sum(int(array.nbytes) for array in problem.optimizer.state().values())
+
+
+def _scratch(problem: Problem) -> int:
+    """Thread-local bytes of all paths that are traced at a time."""
+    integrator = problem.integrator
+    if not isinstance(integrator, Tracer):
+        return 0
+    plans = [
+        integrator.plan(problem.scene, problem.scene.sensors()[index], problem.selection.params)
+        for index in problem.sensors
+    ]
+    return max(integrator.estimator.scratch_bytes(plan) for plan in plans) * resident_paths()
