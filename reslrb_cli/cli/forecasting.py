@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 from reslrb_cli.backend.memory import resident_bytes
 from reslrb_cli.cli.output import echo
 from reslrb_cli.errors import printable
+from reslrb_cli.records.clock import duration
 
 if TYPE_CHECKING:
     from reslrb_cli.config import Config
@@ -62,11 +63,3 @@ def time_lines(forecast: Forecast) -> list[str]:
 def amount(size: int) -> str:
     """Bytes in words, as the manifest counts them: `1.5 MiB`, `2.0 GiB`."""
     return f"{size / 2**30:.1f} GiB" if size >= 2**30 else f"{size / 2**20:.1f} MiB"
-
-
-def duration(seconds: float) -> str:
-    """Seconds in words: `0.4 s`, `12 min`, `5.2 h`, `3.1 days`."""
-    for unit, name in ((86400, "days"), (3600, "h"), (60, "min")):
-        if seconds >= 2 * unit:
-            return f"{seconds / unit:.1f} {name}"
-    return f"{seconds:.2g} s" if seconds < 10 else f"{seconds:.0f} s"

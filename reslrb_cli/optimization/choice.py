@@ -20,7 +20,7 @@ from reslrb_cli.optimization.budget import MemoryPlan, choose_samples, standing
 from reslrb_cli.optimization.moving import ATTACHED, is_attached
 from reslrb_cli.optimization.pilot import Pilot
 from reslrb_cli.optimization.pilot_records import Candidate, Measured, Outcome
-from reslrb_cli.optimization.room import check_scratch
+from reslrb_cli.optimization.room import check_memory
 from reslrb_cli.optimization.samples import sample_gradient, take_gradient
 from reslrb_cli.records.clock import MIB, StepClock
 from reslrb_cli.records.manifest import versions
@@ -61,7 +61,7 @@ def find_options(problem: Problem) -> list[Option]:
         choices = [{"estimator": ATTACHED}] if is_attached(problem) else candidates(config)
         return _fitting(problem, config.integrator, choices)
     if config.run.memory_budget is None:
-        check_scratch(problem, Tracer.of(**config.integrator.options()))
+        check_memory(problem, Tracer.of(**config.integrator.options()))
         return []
     return _fitting(problem, config.integrator, [{}])
 
@@ -102,7 +102,7 @@ def _fitting(problem: Problem, integrator: Reslrb, choices: list[dict[str, Any]]
     for choice in choices:
         own = integrator.chosen(**choice).options() if choice else integrator.options()
         made = Tracer.of(**own)
-        check_scratch(problem, made)
+        check_memory(problem, made)
         if budget is None:
             options.append(Option(choice, made, None))
             continue

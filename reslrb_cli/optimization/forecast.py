@@ -63,7 +63,7 @@ class Forecast:
 
     @property
     def elapsed_s(self) -> float:
-        """Seconds of the iterations, as `elapsed_s` in `metrics.jsonl` counts them where no kernel is to be compiled."""
+        """Seconds of the iterations, as `elapsed_s` in `metrics.jsonl` counts them, with all kernels there."""
         return self.iterations * self.iteration_s + self.start_s
 
     @property

@@ -14,6 +14,8 @@ from reslrb_cli.backend.memory import free_bytes, local_bytes
 from reslrb_cli.config import Config
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.integrators import Reslrb as Tracer
+from reslrb_cli.optimization.budget import estimate
+from reslrb_cli.records.clock import duration
 
 if TYPE_CHECKING:
     from reslrb_cli.optimization.problem import Problem
@@ -21,6 +23,10 @@ if TYPE_CHECKING:
 GIB = 2**30
 #: Bytes that a pixel takes at the least: five images (block, image, dL/dI, its adjoint, target) of three floats.
 PIXEL_BYTES = 5 * 3 * 4
+#: A step takes so much of what is estimated, at the least.
+SURE = 0.8
+#: Light paths of a run beyond which a word is said of them, and how many a second that word reckons with.
+MANY_PATHS, RATE = 1e11, 1e7
 #: Bytes that an entry of a parameter takes at the least: value, the optimiser's, gradient, and the array it is set by.
 ENTRY_BYTES = 4 * 4
 
@@ -70,6 +76,56 @@ def check_scratch(problem: Problem, integrator: Tracer) -> None:
                 f"{most / 2**20:.1f} MiB; take at most {size * most // needed} (longer paths are traced a second time, "
                 "and nothing of them is lost), or raise `ulimit -s`",
             )
+
+
+def check_memory(problem: Problem, integrator: Tracer) -> None:
+    """Raise ConfigError where a step takes more memory than is free, its thread-local memory included.
+
+    With a `memory_budget` passes are chosen that keep it, and nothing is said here.
+    """
+    check_scratch(problem, integrator)
+    config = problem.config
+    if config.run.memory_budget is not None:
+        return
+    samples = _pass_samples(config)
+    # What stands is taken already.
+    expected, free = estimate(problem, integrator, samples, 0), free_bytes(mi.variant())
+    if expected.total * SURE <= free:
+        return
+    parts = {"images and parameters": expected.images, "targets": expected.fixed, "what is kept of paths":
+             expected.paths, "thread-local memory": expected.scratch}  # fmt: skip
+    largest = max(parts, key=lambda name: parts[name])
+    advice = "take a smaller film or coarser textures"
+    if expected.paths > expected.total // 2:
+        advice = "set run.memory_budget, or leave run.adjoint at auto, with which nothing is kept of paths"
+    key = "run.spp" if expected.paths > expected.total // 2 else "scene.file"
+    reason = f"a step takes about {expected.total / GIB:.1f} GiB ({largest} {parts[largest] / GIB:.1f} GiB), and "
+    raise ConfigError(config.source, key, f"{reason}{free / GIB:.1f} GiB are free; {advice}")
+
+
+def outlook(config: Config, scene: mi.Scene, sensors: Sequence[int]) -> str | None:
+    """A line on a run whose light paths are so many that it takes hours or more; None of others.
+
+    It is legal, and may be what is wanted.
+    """
+    run, pixels = config.run, 0
+    for index in sensors:
+        size = scene.sensors()[index].film().size()
+        pixels += int(size[0]) * int(size[1])
+    each = run.spp * pixels * (2 if config.adjoint == "independent" else 1)
+    if each * run.iterations < MANY_PATHS:
+        return None
+    return (
+        f"{each:.3g} light paths an iteration, {each * run.iterations:.3g} in all: the run takes "
+        f"{duration(each * run.iterations / RATE)} at {RATE / 1e6:.0f} million paths a second; --dry-run measures it"
+    )
+
+
+def _pass_samples(config: Config) -> int:
+    """Samples per pixel of the largest pass of a step."""
+    spp = config.run.spp // config.run.batches if config.adjoint == "batched" else config.run.spp
+    per_pass = config.integrator.options().get("samples_per_pass")
+    return spp if per_pass is None else min(spp, int(per_pass))
 
 
 def _check_film(config: Config, key: str, size: tuple[int, int], free: int) -> None:
