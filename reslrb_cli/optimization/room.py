@@ -23,8 +23,9 @@ if TYPE_CHECKING:
 GIB = 2**30
 #: Bytes that a pixel takes at the least: five images (block, image, dL/dI, its adjoint, target) of three floats.
 PIXEL_BYTES = 5 * 3 * 4
-#: A step takes so much of what is estimated, at the least.
-SURE = 0.8
+#: A step takes so much of what is estimated, at the least: 0.93 of it was seen with `batched`, 0.58 with `independent`,
+#: 0.44 with `correlated`.
+SURE = 0.4
 #: Light paths of a run beyond which a word is said of them, and how many a second that word reckons with.
 MANY_PATHS, RATE = 1e11, 1e7
 #: Bytes that an entry of a parameter takes at the least: value, the optimiser's, gradient, and the array it is set by.
