@@ -116,7 +116,8 @@ def _fitting(problem: Problem, integrator: Reslrb, choices: list[dict[str, Any]]
         options.append(Option(choice, made, MemoryPlan(budget, size, samples // size, expected)))
     if not options:
         mib = -(-min(least) // MIB)
-        reason = f"one sample per pixel takes about {mib:.0f} MiB; allow at least {mib:.0f} MiB"
+        reason = f"one sample per pixel takes about {mib:.0f} MiB (scene, targets, images of a step, parameters, paths)"
+        reason += f"; allow at least {mib:.0f} MiB, beside which Python, libraries and kernels are not counted"
         raise ConfigError(problem.config.source, "run.memory_budget", reason)
     return options
 

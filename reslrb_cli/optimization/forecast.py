@@ -1,16 +1,10 @@
-"""What a run will take, memory and time: measured on a few of its own steps, with a target of few samples.
-
-Where a step takes long, steps of fewer samples per pixel stand for it: time and memory are a constant and a part that
-is proportional to the samples, which two sizes tell apart.
-"""
+"""What a run will take, memory and time: measured on a few of its own steps, with a target of few samples."""
 
 from __future__ import annotations
 
-import statistics
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from itertools import pairwise
 
 import drjit as dr
 import mitsuba as mi
@@ -21,17 +15,11 @@ from reslrb_cli.config import Config
 from reslrb_cli.integrators import Reslrb as Tracer
 from reslrb_cli.optimization.certainty import LEAST_ITERATIONS
 from reslrb_cli.optimization.choice import Cache, find_options, settle_integrator
-from reslrb_cli.optimization.loop import optimize
 from reslrb_cli.optimization.problem import Problem, assemble_scene
 from reslrb_cli.optimization.rendering import saved_spp
 from reslrb_cli.optimization.targets import make_targets
-from reslrb_cli.records.clock import MIB
-from reslrb_cli.records.metrics import Record
+from reslrb_cli.optimization.trial import measure_steps
 
-#: Seconds of a step beyond which steps of fewer samples stand for it, and that those are to take.
-LONG_STEP, SHORT_STEP = 2.0, 0.7
-#: Steps until all is compiled and recorded; steps that are timed, at least, at most, and for so many seconds.
-WARM_UP, LEAST, MOST, SECONDS = 5, 4, 40, 5.0
 #: Steps, more or less, that the verdicts on the values take after the last one.
 VERDICTS = 30
 
@@ -72,17 +60,6 @@ class Forecast:
         return self.elapsed_s + self.target_s + self.images_s + self.verdicts_s
 
 
-@dataclass(frozen=True)
-class Steps:
-    """Steps of `spp` samples per pixel: seconds of one, what the first took longer, compiling apart, and the peak."""
-
-    spp: int
-    step_s: float
-    start_s: float
-    compile_s: float
-    peak: int
-
-
 def make_forecast(config: Config, say: Callable[[str], None], cache: Cache | None = None) -> Forecast:
     """Measure a few steps of the run that `config` describes; a variant must be set.
 
@@ -97,7 +74,7 @@ def make_forecast(config: Config, say: Callable[[str], None], cache: Cache | Non
     settle_integrator(problem, options, say, cache)
     image_s = _image_seconds(problem)
     say("measuring a few steps")
-    steps, scratch = _steps(problem), _scratch(problem)
+    steps, scratch = measure_steps(problem), _scratch(problem)
     run, pilot = config.run, problem.pilot
     targets = sum(4 * int(dr.prod(view.target.shape)) for view in problem.views)
     parts = {
@@ -145,56 +122,6 @@ def _image_seconds(problem: Problem) -> float:
     begin = time.perf_counter()
     problem.render(view.sensor, spp, 1, "forecast")
     return (time.perf_counter() - begin) / spp
-
-
-def _steps(problem: Problem) -> Steps:
-    """What a step of the run takes, measured or by two smaller ones."""
-    config = problem.config
-    unit = config.run.batches if config.adjoint == "batched" else 1
-    unit *= problem.samples_per_pass or 1
-    whole = config.run.spp
-    if unit >= whole:
-        return _measure(problem, whole)
-    first = _measure(problem, unit)
-    if first.step_s * whole / unit <= LONG_STEP:
-        return _with_compilation(_measure(problem, whole), first)
-    small = max(min(int(SHORT_STEP / max(first.step_s, 1e-6)), whole // unit // 2), 1) * unit
-    one, two = _measure(problem, small), _measure(problem, 2 * small)
-    share = (whole - small) / small
-    return Steps(
-        two.spp,
-        one.step_s + share * max(two.step_s - one.step_s, 0.0),
-        two.start_s,
-        first.compile_s + one.compile_s + two.compile_s,
-        int(one.peak + share * max(two.peak - one.peak, 0)),
-    )
-
-
-def _with_compilation(steps: Steps, before: Steps) -> Steps:
-    return Steps(steps.spp, steps.step_s, steps.start_s, steps.compile_s + before.compile_s, steps.peak)
-
-
-def _measure(problem: Problem, spp: int) -> Steps:
-    """A few iterations of `spp` samples per pixel, by the loop itself; the parameters move."""
-    config = problem.config
-    problem.config = config.model_copy(update={"run": config.run.model_copy(update={"spp": spp})})
-    records: list[Record] = []
-    begin = time.perf_counter()
-    try:
-        for record in optimize(problem):
-            records.append(record)
-            if len(records) == WARM_UP:
-                begin = time.perf_counter()
-            timed = len(records) - WARM_UP
-            if timed >= MOST or (timed >= LEAST and time.perf_counter() - begin > SECONDS):
-                break
-    finally:
-        problem.config = config
-    times = [records[0].elapsed_s, *(b.elapsed_s - a.elapsed_s for a, b in pairwise(records))]
-    steady = statistics.median(times[WARM_UP:] or times)
-    extra = sum(max(seconds - steady, 0.0) for seconds in times[:WARM_UP])
-    compiled = min(sum(record.codegen_ms for record in records[:WARM_UP]) / 1e3, extra)
-    return Steps(spp, steady, extra - compiled, compiled, int(records[-1].peak_mib * MIB))
 
 
 # --- what memory is for -----------------------------------------------------------------------------------------------
