@@ -210,10 +210,11 @@ class RunConfig(Section):
         default=None,
         description="Memory that the iterations may take, with what stands before them: a number of MiB, or text such "
         "as 512 MiB or 2GiB. The samples of a step are split into passes that fit. It covers what the backend's "
-        "allocator gives out (the scene's textures and buffers, targets, the images of a step, parameters and what the "
+        "allocator gives out (the scene's textures and buffers, targets, images of a step, parameters and what the "
         "optimiser keeps of them, what is kept of paths; `peak_mib` in `metrics.jsonl` is that) and thread-local "
-        "memory; not Python, libraries, the code of kernels and the structure that rays are traced in, nor what targets "
-        "and saved images take while they are rendered. null: no limit but what is free. Only with integrator `reslrb`.",
+        "memory; not Python, libraries, the code of kernels, the structure that rays are traced in, nor what targets "
+        "and saved images take while they are rendered. null: no limit but what is free. Only with integrator "
+        "`reslrb`.",
     )
     on_nonfinite: Literal["stop", "skip", "zero"] = Field(
         default="skip",
