@@ -23,9 +23,10 @@ if TYPE_CHECKING:
 GIB = 2**30
 #: Bytes that a pixel takes at the least: five images (block, image, dL/dI, its adjoint, target) of three floats.
 PIXEL_BYTES = 5 * 3 * 4
-#: A step takes so much of what is estimated, at the least: 0.93 of it was seen with `batched`, 0.58 with `independent`,
-#: 0.44 with `correlated`.
-SURE = 0.4
+#: What a step takes at the least of what is estimated, by `run.adjoint`: 0.93, 0.58 and 0.44 of it were seen.
+SURE = {"batched": 0.8, "independent": 0.5, "correlated": 0.4}
+#: Integrators whose loops are evaluated, and bytes of a path's state there at the least: ray, throughput, generator.
+NAIVE, PATH_BYTES = ("ptracer", "walk_ad"), 48
 #: Light paths of a run beyond which a word is said of them, and how many a second that word reckons with.
 MANY_PATHS, RATE = 1e11, 1e7
 #: Bytes that an entry of a parameter takes at the least: value, the optimiser's, gradient, and the array it is set by.
@@ -91,7 +92,7 @@ def check_memory(problem: Problem, integrator: Tracer) -> None:
     samples = _pass_samples(config)
     # What stands is taken already.
     expected, free = estimate(problem, integrator, samples, 0), free_bytes(mi.variant())
-    if expected.total * SURE <= free:
+    if expected.total * SURE[config.adjoint] <= free:
         return
     parts = {"images and parameters": expected.images, "targets": expected.fixed, "what is kept of paths":
              expected.paths, "thread-local memory": expected.scratch}  # fmt: skip
@@ -102,6 +103,25 @@ def check_memory(problem: Problem, integrator: Tracer) -> None:
     key = "run.spp" if expected.paths > expected.total // 2 else "scene.file"
     reason = f"a step takes about {expected.total / GIB:.1f} GiB ({largest} {parts[largest] / GIB:.1f} GiB), and "
     raise ConfigError(config.source, key, f"{reason}{free / GIB:.1f} GiB are free; {advice}")
+
+
+def check_paths(problem: Problem) -> None:
+    """Raise ConfigError where naive AD of evaluated loops keeps more of its paths than memory has room for."""
+    config = problem.config
+    if config.integrator.type not in NAIVE:
+        return
+    free, paths = free_bytes(mi.variant()), 0
+    for index in problem.sensors:
+        size = problem.scene.sensors()[index].film().size()
+        paths = max(paths, _pass_samples(config) * int(size[0]) * int(size[1]))
+    if paths * PATH_BYTES > free:
+        raise ConfigError(
+            config.source,
+            "run.spp",
+            f"{config.integrator.type} keeps the state of all {paths} light paths of a pass, at least "
+            f"{paths * PATH_BYTES / GIB:.1f} GiB, and {free / GIB:.1f} GiB are free; lower run.spp, set "
+            "integrator.samples_per_pass, or take reslrb, which keeps none",
+        )
 
 
 def outlook(config: Config, scene: mi.Scene, sensors: Sequence[int]) -> str | None:

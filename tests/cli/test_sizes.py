@@ -125,9 +125,40 @@ def test_what_needs_more_than_is_free(experiment: Path, little: int) -> None:
     assert line.endswith(said)
     line = obstacle(experiment, "parameters[0].resolution=[10000, 10000]")
     assert line.endswith("parameters[0].resolution: 10000x10000 texels takes at least 1.5 GiB, and 1.0 GiB are free; "
-                         "take at most 8191x8191")  # fmt: skip
+                         "take at most 8192x8192")  # fmt: skip
     (experiment / "scene.xml").write_text(SCENE.replace('value="8"', 'value="5000"'))
     assert "scene.file: a film of 5000x5000 pixels takes at least 1.4 GiB" in obstacle(experiment)
+
+
+def test_a_step_that_needs_more_than_is_free(experiment: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """By the estimate that `memory_budget` goes by, of which a step takes a part at the least."""
+    from reslrb_cli.optimization.choice import find_options
+
+    def find(*sets: str) -> None:
+        find_options(assemble_scene(load(experiment / "tiny.yaml", ["scene.size=[512, 512]", "run.spp=64", *sets])))
+
+    monkeypatch.setattr(room, "free_bytes", lambda variant: 2**25)
+    naive = "integrator={type: ptracer, max_depth: 3}"
+    for sets, said in (
+        (["parameters[0].resolution=[512, 512]"], "scene.file: a step takes about 0.1 GiB (images and param"),
+        (["run.adjoint=correlated"], "run.spp: a step takes about "),
+        ([naive], "run.spp: ptracer keeps the state of all 4194304 light paths of a pass, at least 0.2 GiB, and "),
+    ):  # fmt: skip
+        with pytest.raises(ConfigError) as error:
+            find(*sets)
+        assert said in str(error.value)
+    monkeypatch.setattr(room, "free_bytes", lambda variant: 2**28)
+    for sets in (["parameters[0].resolution=[512, 512]"], [naive]):
+        find(*sets)
+
+
+def test_a_long_run_is_told_of(experiment: Path) -> None:
+    config = load(experiment / "tiny.yaml", ["run.iterations=1000000", "run.spp=65536"])
+    problem = assemble_scene(config)
+    line = room.outlook(config, problem.scene, problem.sensors)
+    assert line is not None
+    assert line.startswith("4.19e+06 light paths an iteration, 4.19e+12 in all: the run takes 4.9 days at 10 million")
+    assert room.outlook(load(experiment / "tiny.yaml"), problem.scene, problem.sensors) is None
 
 
 def test_what_fits_is_not_refused(experiment: Path, little: int) -> None:
