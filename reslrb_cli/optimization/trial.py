@@ -60,7 +60,8 @@ def measure_steps(problem: Problem) -> Steps:
 def _measure(problem: Problem, spp: int) -> Steps:
     """A few iterations of `spp` samples per pixel, by the loop itself; the parameters move."""
     config = problem.config
-    problem.config = config.model_copy(update={"run": config.run.model_copy(update={"spp": spp})})
+    enough = {"spp": spp, "iterations": max(config.run.iterations, WARM_UP + MOST)}  # of a run of two, too
+    problem.config = config.model_copy(update={"run": config.run.model_copy(update=enough)})
     records: list[Record] = []
     begin = time.perf_counter()
     try:
@@ -74,7 +75,7 @@ def _measure(problem: Problem, spp: int) -> Steps:
     finally:
         problem.config = config
     times = [records[0].elapsed_s, *(b.elapsed_s - a.elapsed_s for a, b in pairwise(records))]
-    steady = statistics.median(times[WARM_UP:] or times)
+    steady = statistics.median(times[WARM_UP:])
     extra = sum(max(seconds - steady, 0.0) for seconds in times[:WARM_UP])
     compiled = min(sum(record.codegen_ms for record in records[:WARM_UP]) / 1e3, extra)
     return Steps(spp, steady, extra - compiled, compiled, int(records[-1].peak_mib * MIB))
