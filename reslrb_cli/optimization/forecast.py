@@ -83,9 +83,7 @@ def make_forecast(config: Config, say: Callable[[str], None], cache: Cache | Non
         "targets": targets,
         "optimiser's state": _state_bytes(problem),
     }
-    parts["images of a step, gradients, and what is kept of paths (reservoir)"] = max(
-        steps.peak - sum(parts.values()), 0
-    )
+    parts["images of a step, gradients, what is kept of paths (reservoir)"] = max(steps.peak - sum(parts.values()), 0)
     between = run.iterations // run.images_every if run.images_every else 0
     images = 2 * saved_spp(problem, between=False) + between * saved_spp(problem, between=True)
     render = config.target.render
