@@ -61,5 +61,8 @@ def time_lines(forecast: Forecast) -> list[str]:
 
 
 def amount(size: int) -> str:
-    """Bytes in words, as the manifest counts them: `1.5 MiB`, `2.0 GiB`."""
-    return f"{size / 2**30:.1f} GiB" if size >= 2**30 else f"{size / 2**20:.1f} MiB"
+    """Bytes in words, as the manifest counts them: `3.0 KiB`, `1.5 MiB`, `2.0 GiB`."""
+    for unit, name in ((2**30, "GiB"), (2**20, "MiB"), (2**10, "KiB")):
+        if size >= unit:
+            return f"{size / unit:.1f} {name}"
+    return f"{size} B"

@@ -20,7 +20,7 @@ from reslrb_cli.optimization.budget import MemoryPlan, choose_samples, standing
 from reslrb_cli.optimization.moving import ATTACHED, is_attached
 from reslrb_cli.optimization.pilot import Pilot
 from reslrb_cli.optimization.pilot_records import Candidate, Measured, Outcome
-from reslrb_cli.optimization.room import check_memory, check_paths
+from reslrb_cli.optimization.room import check_baseline, check_memory
 from reslrb_cli.optimization.samples import sample_gradient, take_gradient
 from reslrb_cli.records.clock import MIB, StepClock
 from reslrb_cli.records.manifest import versions
@@ -56,7 +56,7 @@ def find_options(problem: Problem) -> list[Option]:
     """
     config = problem.config
     if not isinstance(config.integrator, Reslrb):
-        check_paths(problem)
+        check_baseline(problem)
         return []
     if config.integrator.estimator == "auto":
         choices = [{"estimator": ATTACHED}] if is_attached(problem) else candidates(config)

@@ -27,6 +27,8 @@ PIXEL_BYTES = 5 * 3 * 4
 SURE = {"batched": 0.8, "independent": 0.5, "correlated": 0.4}
 #: Integrators whose loops are evaluated, and bytes of a path's state there at the least: ray, throughput, generator.
 NAIVE, PATH_BYTES = ("ptracer", "walk_ad"), 48
+#: Bytes of thread-local memory that `trajectory` records of a vertex, as `bench` measured it.
+RECORD_BYTES = 60
 #: Light paths of a run beyond which a word is said of them, and how many a second that word reckons with.
 MANY_PATHS, RATE = 1e11, 1e7
 #: Bytes that an entry of a parameter takes at the least: value, the optimiser's, gradient, and the array it is set by.
@@ -105,9 +107,18 @@ def check_memory(problem: Problem, integrator: Tracer) -> None:
     raise ConfigError(config.source, key, f"{reason}{free / GIB:.1f} GiB are free; {advice}")
 
 
-def check_paths(problem: Problem) -> None:
-    """Raise ConfigError where naive AD of evaluated loops keeps more of its paths than memory has room for."""
+def check_baseline(problem: Problem) -> None:
+    """Raise ConfigError where an integrator other than `reslrb` keeps more of its paths than there is room for."""
     config = problem.config
+    if config.integrator.type == "trajectory" and not mi.variant().startswith("cuda"):
+        most = local_bytes() // RECORD_BYTES
+        if config.integrator.max_depth > most:
+            raise ConfigError(
+                config.source,
+                "integrator.max_depth",
+                f"the record of {config.integrator.max_depth} segments does not fit on a thread's stack; take at most "
+                f"{most}, raise `ulimit -s`, or take reslrb, which needs no record",
+            )
     if config.integrator.type not in NAIVE:
         return
     free, paths = free_bytes(mi.variant()), 0

@@ -180,6 +180,9 @@ def test_a_stack_that_no_thread_has_room_for(experiment: Path, monkeypatch: pyte
     assert "integrator.stack_size: 8000 vertices take 0.6 MiB of a thread's stack for each path, which has" in said
     most = int(said.partition("take at most ")[2].split()[0])
     find(f"integrator.stack_size={most}")
+    find("integrator={type: trajectory, max_depth: 8000}")
+    with pytest.raises(ConfigError, match=r"integrator\.max_depth: the record of 9000 segments does not fit "):
+        find("integrator={type: trajectory, max_depth: 9000}")
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
