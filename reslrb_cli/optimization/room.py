@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     from reslrb_cli.optimization.problem import Problem
 
 GIB = 2**30
+#: Bytes that every machine has.
+SMALL = 2**28
 #: Bytes that a pixel takes at the least: five images (block, image, dL/dI, its adjoint, target) of three floats.
 PIXEL_BYTES = 5 * 3 * 4
 #: What a step takes at the least of what is estimated, by `run.adjoint`: 0.93, 0.58 and 0.44 of it were seen.
@@ -37,14 +39,14 @@ ENTRY_BYTES = 4 * 4
 
 def check_config(config: Config) -> None:
     """Raise ConfigError where film or parameters, as the configuration has them, need more memory than is free."""
-    free = free_bytes(mi.variant())
     if config.scene.size is not None:
-        _check_film(config, "scene.size", config.scene.size, free)
+        _check_film(config, "scene.size", config.scene.size)
     for place, spec in enumerate(config.parameters):
         resolution = spec.resolution if spec.heightmap is None else spec.heightmap.resolution
         if resolution is None:
             continue
         needed = resolution[0] * resolution[1] * ENTRY_BYTES
+        free = _free_for(needed)
         if needed > free:
             key = f"parameters[{place}].{'resolution' if spec.heightmap is None else 'heightmap.resolution'}"
             texels = f"{resolution[0]}x{resolution[1]} texels"
@@ -53,11 +55,10 @@ def check_config(config: Config) -> None:
 
 def check_films(config: Config, scene: mi.Scene, sensors: Sequence[int]) -> None:
     """Raise ConfigError where a film is too large, or the samples of a step are too many for it."""
-    free = free_bytes(mi.variant())
     for index in sensors:
         film = scene.sensors()[index].film()
         width, height = (int(n) for n in film.crop_size())
-        _check_film(config, "scene.file", (width, height), free)
+        _check_film(config, "scene.file", (width, height))
         full = film.size()  # light paths are counted by the film without its crop window
         obstacle = config.samples_obstacle(int(full[0]) * int(full[1]))
         if obstacle is not None:
@@ -93,8 +94,9 @@ def check_memory(problem: Problem, integrator: Tracer) -> None:
         return
     samples = _pass_samples(config)
     # What stands is taken already.
-    expected, free = estimate(problem, integrator, samples, 0), free_bytes(mi.variant())
-    if expected.total * SURE[config.adjoint] <= free:
+    expected = estimate(problem, integrator, samples, 0)
+    free, needed = _free_for(expected.total), expected.total * SURE[config.adjoint]
+    if needed <= free:
         return
     parts = {"images and parameters": expected.images, "targets": expected.fixed, "what is kept of paths":
              expected.paths, "thread-local memory": expected.scratch}  # fmt: skip
@@ -121,10 +123,11 @@ def check_baseline(problem: Problem) -> None:
             )
     if config.integrator.type not in NAIVE:
         return
-    free, paths = free_bytes(mi.variant()), 0
+    paths = 0
     for index in problem.sensors:
         size = problem.scene.sensors()[index].film().size()
         paths = max(paths, _pass_samples(config) * int(size[0]) * int(size[1]))
+    free = _free_for(paths * PATH_BYTES)
     if paths * PATH_BYTES > free:
         raise ConfigError(
             config.source,
@@ -160,8 +163,14 @@ def _pass_samples(config: Config) -> int:
     return spp if per_pass is None else min(spp, int(per_pass))
 
 
-def _check_film(config: Config, key: str, size: tuple[int, int], free: int) -> None:
+def _free_for(needed: int) -> int:
+    """Bytes that are free; of what is small nobody asks, since to ask a GPU's driver takes a while."""
+    return needed if needed < SMALL else free_bytes(mi.variant())
+
+
+def _check_film(config: Config, key: str, size: tuple[int, int]) -> None:
     needed = size[0] * size[1] * PIXEL_BYTES
+    free = _free_for(needed)
     if needed > free:
         raise ConfigError(config.source, key, _too_large(f"a film of {size[0]}x{size[1]} pixels", needed, free, size))
 

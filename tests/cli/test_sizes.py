@@ -137,6 +137,7 @@ def test_a_step_that_needs_more_than_is_free(experiment: Path, monkeypatch: pyte
     def find(*sets: str) -> None:
         find_options(assemble_scene(load(experiment / "tiny.yaml", ["scene.size=[512, 512]", "run.spp=64", *sets])))
 
+    monkeypatch.setattr(room, "SMALL", 0)
     monkeypatch.setattr(room, "free_bytes", lambda variant: 2**25)
     naive = "integrator={type: ptracer, max_depth: 3}"
     for sets, said in (

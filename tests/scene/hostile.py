@@ -9,7 +9,9 @@ from __future__ import annotations
 import contextlib
 import io
 import json
+import os
 import sys
+import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -50,10 +52,14 @@ def main_loop() -> None:
     import reslrb_cli  # noqa: F401
     from reslrb_cli.backend.variant import set_variant
 
+    answers = os.fdopen(os.dup(1), "w")
+    below = tempfile.TemporaryFile()  # noqa: SIM115  # what libraries print themselves, past Python
+    for stream in (1, 2):
+        os.dup2(below.fileno(), stream)
     set_variant("llvm_ad_rgb")
     limit_memory()
-    answers = sys.stdout
     for line in sys.stdin:
+        start = os.fstat(below.fileno()).st_size
         kind, _, name = line.strip().partition(" ")
         if kind == "scene":
             answer = call(["inspect", name, "--no-counts"])
@@ -61,6 +67,8 @@ def main_loop() -> None:
             answer = call(["optimize", name, "--quiet", "--force"])
         else:
             answer = call(["optimize", "photo.yaml", "--quiet", "--force", "--set", f"target.file={name}"])
+        below.seek(start)
+        answer["below"] = below.read().decode(errors="surrogateescape")
         answers.write(json.dumps(answer) + "\n")
         answers.flush()
 

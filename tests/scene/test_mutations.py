@@ -98,6 +98,9 @@ def judge(seed: int, answer: dict[str, object], seen: Counter[object]) -> list[s
         return [f"seed {seed}: {code}: {said}"]
     if code and (not said.strip() or not said.splitlines()[-1].isprintable()):
         return [f"seed {seed}: {code}, and no line: {said!r}"]
+    below = str(answer.get("below", ""))
+    if not all(character.isprintable() or character in "\n\t" for character in below):
+        return [f"seed {seed}: printed past us: {below!r}"]
     return []
 
 

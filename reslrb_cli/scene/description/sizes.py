@@ -12,11 +12,13 @@ from ...config.files import size
 from ...config.limits import PIXELS
 from ...errors import ConfigError
 from ..image_file import image_size
-from .element import Element
+from .element import Element, quoted
 from .including import Description
 
 #: Bytes of memory that a pixel of an image takes as a texture at the least: Mitsuba keeps three half floats of it.
 _TEXEL_BYTES = 6
+#: Bytes in which a mesh says what it consists of.
+_HEAD = 2**16
 
 
 def check_sizes(description: Description) -> None:
@@ -45,6 +47,18 @@ def _check_film(film: Element) -> None:
         )
 
 
+def _check_head(element: Element, path: Path) -> None:
+    """Refuse a PLY mesh whose elements have names that are no text: Mitsuba prints them as they come."""
+    with path.open("rb") as file:
+        head = file.read(_HEAD)
+    if not head.startswith(b"ply"):
+        return
+    for line in head.partition(b"end_header")[0].splitlines():
+        text = line.decode("ascii", errors="replace")
+        if not line.startswith((b"comment", b"obj_info")) and not all(c == "\t" or " " <= c <= "~" for c in text):
+            raise element.fail("filename", f"{path}: its head holds what is no text, {quoted(text)}; write it again")
+
+
 def _check_file(element: Element, folders: list[Path], free: int) -> None:
     """Refuse a file that takes more memory than is free, by its size or by what an image says of itself."""
     name = element.attributes.get("value", "")
@@ -53,6 +67,7 @@ def _check_file(element: Element, folders: list[Path], free: int) -> None:
         return  # which Mitsuba says
     if os.path.getsize(path) > free:
         raise element.fail("filename", f"{path} has {size(os.path.getsize(path))}, and {size(free)} of memory are free")
+    _check_head(element, path)
     try:
         width, height = image_size(path)
     except ConfigError:
