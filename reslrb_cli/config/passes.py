@@ -28,5 +28,10 @@ def passes_obstacle(spp: int, per_pass: int | None, pixels: int, splits: bool = 
 def largest_pass(spp: int, pixels: int) -> int | None:
     """The largest `samples_per_pass` that divides `spp` and makes no more paths than a pass can have; None without."""
     most = min(PASS_PATHS // pixels, PASS_SAMPLES, spp)
-    small = [n for n in range(1, int(spp**0.5) + 1) if spp % n == 0]
-    return max((n for n in {*small, *(spp // n for n in small)} if n <= most), default=None)
+    return max((n for n in divisors(spp) if n <= most), default=None)
+
+
+def divisors(number: int) -> list[int]:
+    """All divisors of a number, the smallest first; of one of 31 bits at once."""
+    small = [n for n in range(1, int(number**0.5) + 1) if number % n == 0]
+    return sorted({*small, *(number // n for n in small)})

@@ -28,7 +28,7 @@ from .losses import L2, AnyLoss
 from .names import check_name, folder_name
 from .optimizers import Adam, AnyOptimizer
 from .parameters import COLOR_SPACE, ColorSpace, ParameterSpec, Value
-from .passes import passes_obstacle
+from .passes import largest_pass, passes_obstacle
 from .sizes import Memory, memory_bytes
 from .views import EXPOSURE, MASK, MASK_MIXED, AnyMask, Exposures, Mask, SensorName, ViewSpec, check_views
 
@@ -307,12 +307,10 @@ class Config(Section):
     def samples_obstacle(self, pixels: int) -> str | None:
         """Why the samples of a step cannot be traced with films of so many `pixels`, and what would be right."""
         run, own = self.run, self.integrator.options().get("samples_per_pass")
-        # With a budget of memory, passes are chosen, and those of one sample are the smallest.
-        least = 1 if run.memory_budget is not None else own
         spp = run.spp // run.batches if self.adjoint == "batched" else run.spp
-        obstacle = passes_obstacle(
-            spp, least, pixels, splits=self.integrator.type in ("reslrb", "walk_ad", "trajectory")
-        )
+        if run.memory_budget is not None:
+            own = largest_pass(spp, pixels)  # passes are chosen
+        obstacle = passes_obstacle(spp, own, pixels, splits=self.integrator.type in ("reslrb", "walk_ad", "trajectory"))
         return None if obstacle is None else f"{run.spp} {obstacle}"
 
     def with_exposures_fixed(self) -> Config:

@@ -153,6 +153,15 @@ def test_a_step_that_needs_more_than_is_free(experiment: Path, monkeypatch: pyte
         find(*sets)
 
 
+def test_a_budget_chooses_passes_that_can_be(experiment: Path) -> None:
+    from reslrb_cli.optimization.choice import find_options
+
+    sets = ["scene.size=[256, 256]", "run.spp=1000000000", "run.memory_budget=640"]
+    [option] = find_options(assemble_scene(load(experiment / "tiny.yaml", sets)))
+    assert option.memory is not None
+    assert (option.memory.samples_per_pass, option.memory.passes) == (62500, 4000)
+
+
 def test_a_long_run_is_told_of(experiment: Path) -> None:
     config = load(experiment / "tiny.yaml", ["run.iterations=1000000", "run.spp=65536"])
     problem = assemble_scene(config)
@@ -207,6 +216,7 @@ def test_free_memory_is_no_more_than_a_limit(monkeypatch: pytest.MonkeyPatch) ->
         ["integrator.max_depth=8", "integrator.stack_size=1000000"],  # paths have no more than seven vertices
         ["scene.size=[256, 256]", "run.spp=1000000000", "integrator.samples_per_pass=62500"],
         ["scene.size=[8, 8]", "run.spp=1000000"],
+        ["scene.size=[256, 256]", "run.spp=1000000000", "run.memory_budget=64"],  # by which passes are chosen
         ["scene.size=[11000, 11000]"],
         ["run.iterations=2000000000", "run.final_spp=1000000"],
     ],
