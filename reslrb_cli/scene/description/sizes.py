@@ -62,7 +62,8 @@ def _check_head(element: Element, path: Path) -> None:
 def _check_file(element: Element, folders: list[Path], free: int) -> None:
     """Refuse a file that takes more memory than is free, by its size or by what an image says of itself."""
     name = element.attributes.get("value", "")
-    path = next((path for path in (*(folder / name for folder in folders), Path(name)) if path.is_file()), None)
+    places = [*(folder / name for folder in folders), Path(name)]
+    path = next((path for path in places if os.path.isfile(path)), None)  # False of names that are too long, too
     if path is None:
         return  # which Mitsuba says
     if os.path.getsize(path) > free:
