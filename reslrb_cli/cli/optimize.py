@@ -9,6 +9,7 @@ from pathlib import Path
 import click
 
 from reslrb_cli.cli.experiment import experiment_arguments, read_config, start_variant
+from reslrb_cli.cli.forecasting import show_forecast
 from reslrb_cli.cli.output import echo
 from reslrb_cli.config import dump
 from reslrb_cli.errors import ExitCode, printable
@@ -21,8 +22,13 @@ NOTICE = "stopping after this iteration; once more, and it ends at once"
 @click.command("optimize")
 @experiment_arguments
 @click.option("--force", is_flag=True, help="Replace the run folder of that name instead of making a numbered one.")
+@click.option(
+    "--dry-run",
+    is_flag=True,
+    help="Print what the run will take, memory and time, by a few small steps, and stop; no run folder is written.",
+)
 @click.option("--quiet", is_flag=True, help="Print the last line only.")
-def command(config_file: Path, overrides: tuple[str, ...], force: bool, quiet: bool) -> int:
+def command(config_file: Path, overrides: tuple[str, ...], force: bool, dry_run: bool, quiet: bool) -> int:
     """Recover the parameters that CONFIG names from its target images.
 
     Writes a run folder; the last line says where it is. Ctrl-C, SIGTERM and SIGHUP end the run after the current
@@ -33,6 +39,9 @@ def command(config_file: Path, overrides: tuple[str, ...], force: bool, quiet: b
     config = read_config(config_file, overrides)
     check_output(config_file, config.run.output, config.run.folder_name, force)
     variant = start_variant(config)
+    if dry_run:
+        show_forecast(config)
+        return ExitCode.DONE
 
     from reslrb_cli.backend.device import device_name
     from reslrb_cli.cli.interrupts import Interrupts

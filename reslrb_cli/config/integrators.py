@@ -4,20 +4,55 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Literal
 
-from pydantic import Discriminator, Field, SerializerFunctionWrapHandler, model_serializer, model_validator
+from pydantic import (
+    AfterValidator,
+    Discriminator,
+    Field,
+    SerializerFunctionWrapHandler,
+    model_serializer,
+    model_validator,
+)
 from typing_extensions import Self
 
-from .base import MARK, NEEDS_TYPE, Choice, Count, by_type, located, mark
+from .base import MARK, NEEDS_TYPE, Choice, Count, by_type, located, mark, wrong
+from .limits import CAPACITY, LOCAL_ENTRIES, PATH_LENGTH
+
+
+def _check_depth(value: int) -> int:
+    if value > PATH_LENGTH:
+        raise wrong(
+            f"must be at most {PATH_LENGTH} segments, or -1 for no limit, not {value}: Russian roulette ends a path "
+            "long before, so that this limits nothing"
+        )
+    return value
+
+
+def _check_record(value: int) -> int:
+    if value >= LOCAL_ENTRIES:
+        raise wrong(
+            f"must be less than {LOCAL_ENTRIES}, not {value}: the record of a path has room for as many vertices, and "
+            "thread-local memory has no more places; reslrb needs no such record"
+        )
+    return value
+
+
+def _check_capacity(value: int) -> int:
+    if value > CAPACITY:
+        raise wrong(
+            f"must be at most {CAPACITY}, not {value}: each connection that is kept is code of its own in the kernel, "
+            "which would take hours to compile; estimator gather keeps all of them"
+        )
+    return value
 
 
 class Integrator(Choice):
     """Options that all integrators share."""
 
     type: str
-    max_depth: int = Field(
+    max_depth: Annotated[int, AfterValidator(_check_depth)] = Field(
         default=8,
         ge=-1,
-        lt=2**31,
+        json_schema_extra={"maximum": PATH_LENGTH},
         description="Longest path in segments, from the emitter to the sensor: 1 shows only directly visible "
         "emitters, 2 adds direct light; -1: no limit (Russian roulette alone ends a path).",
     )
@@ -81,8 +116,9 @@ class Reslrb(AttachingTracer):
         "thread-local memory; `auto`: the one of these, with its options, that a short pilot measures to be the most "
         "efficient, 1 / (variance * time).",
     )
-    capacity: Count = Field(
+    capacity: Annotated[Count, AfterValidator(_check_capacity)] = Field(
         default=1,
+        json_schema_extra={"maximum": CAPACITY},
         description="How many connections, or events, are kept of each path. Only with estimators `reservoir` "
         "and `event`.",
     )
@@ -125,6 +161,12 @@ class Reslrb(AttachingTracer):
     def _check_options(self) -> Self:
         if self.image == "retained" and self.weight == "adjoint":
             raise located("weight", "`adjoint` does not go with image: retained, which is made before dL/dI is known")
+        if self.estimator == "stack" and self.max_depth == -1 and self.stack_size >= LOCAL_ENTRIES:
+            raise located(
+                "stack_size",
+                f"{self.stack_size} vertices need as many places of thread-local memory, which has no more than "
+                f"{LOCAL_ENTRIES}; leave it at 64: longer paths are traced a second time, and nothing of them is lost",
+            )
         for option in sorted(self._foreign() & self.model_fields_set):
             owners = " or ".join(f"`{name}`" for name, options in ESTIMATOR_OPTIONS.items() if option in options)
             raise located(option, f"has no effect with estimator `{self.estimator}`, but with {owners}; remove it")
@@ -171,10 +213,10 @@ class Trajectory(LightTracer):
 
     model_config = NEEDS_TYPE
     type: Literal["trajectory"] = Field(default="trajectory", description="The walk of `reslrb`, reversed by Dr.Jit.")
-    max_depth: int = Field(
+    max_depth: Annotated[int, AfterValidator(_check_record)] = Field(
         default=8,
         ge=0,
-        lt=2**31,
+        json_schema_extra={"exclusiveMaximum": LOCAL_ENTRIES},
         description="Longest path in segments, as above; the record has room for as many vertices, so that there must "
         "be a limit.",
     )

@@ -29,6 +29,24 @@ PATH_BYTES = 3000
 #: folder that is not whole yet.
 NAME_BYTES = 200
 
+# --- paths of light ---------------------------------------------------------------------------------------------------
+
+#: Segments of a path that a limit can name; beyond it -1 says the same. Roulette lets at most 95 % of the paths go on
+#: at each vertex: of 10^20 paths not one is a thousand vertices longer than `rr_depth`.
+PATH_LENGTH = 2**16 - 1
+#: Entries of an array in a kernel's thread-local memory: Dr.Jit's bound.
+LOCAL_ENTRIES = 2**16
+#: Connections, or events, that are kept of a path. Each is code of its own in the kernel, and the time to compile it
+#: grows faster than their number: on two cores 64 took seconds, 256 most of a minute.
+CAPACITY = 1024
+#: Light paths of one pass: their numbers have 32 bits.
+PASS_PATHS = 2**32 - 1
+#: Samples per pixel of one pass. In single precision a sum loses terms below a 2^24th of it, and thousands of such
+#: passes can be added to one another.
+PASS_SAMPLES = 2**18
+#: Passes of a step, each of which is launched by itself and has a seed that is made before the first of them.
+PASSES = 2**16
+
 # --- files that a configuration names ---------------------------------------------------------------------------------
 
 #: Pixels of an image: 16384 x 8192, the largest environment map in use. Decoded they take 1.5 GiB.

@@ -28,6 +28,7 @@ from .losses import L2, AnyLoss
 from .names import check_name, folder_name
 from .optimizers import Adam, AnyOptimizer
 from .parameters import COLOR_SPACE, ColorSpace, ParameterSpec, Value
+from .passes import largest_pass, passes_obstacle
 from .sizes import Memory, memory_bytes
 from .views import EXPOSURE, MASK, MASK_MIXED, AnyMask, Exposures, Mask, SensorName, ViewSpec, check_views
 
@@ -75,7 +76,10 @@ class SceneConfig(Section):
     @classmethod
     def _check_size(cls, value: tuple[int, int] | None) -> tuple[int, int] | None:
         if value is not None and value[0] * value[1] > PIXELS:
-            raise wrong(f"must have at most {PIXELS} pixels, not {value[0] * value[1]}")
+            raise wrong(
+                f"must have at most {PIXELS} pixels, not {value[0] * value[1]}: each image of a step takes 12 bytes or "
+                "more of every one"
+            )
         return value
 
     @field_validator("sensors")
@@ -205,8 +209,12 @@ class RunConfig(Section):
     memory_budget: Memory | None = Field(
         default=None,
         description="Memory that the iterations may take, with what stands before them: a number of MiB, or text such "
-        "as 512 MiB or 2GiB. The samples of a step are split into passes that fit. null: no limit. Only with "
-        "integrator `reslrb`.",
+        "as 512 MiB or 2GiB. The samples of a step are split into passes that fit. It covers what the backend's "
+        "allocator gives out (the scene's textures and buffers, targets, images of a step, parameters and what the "
+        "optimiser keeps of them, what is kept of paths; `peak_mib` in `metrics.jsonl` is that) and thread-local "
+        "memory; not Python, libraries, the code of kernels, the structure that rays are traced in, nor what targets "
+        "and saved images take while they are rendered. null: no limit but what is free. Only with integrator "
+        "`reslrb`.",
     )
     on_nonfinite: Literal["stop", "skip", "zero"] = Field(
         default="skip",
@@ -296,6 +304,15 @@ class Config(Section):
         fits = run.spp % run.batches == 0 and _passes_divide(self.integrator, run.spp // run.batches)
         return "batched" if fits else "independent"
 
+    def samples_obstacle(self, pixels: int) -> str | None:
+        """Why the samples of a step cannot be traced with films of so many `pixels`, and what would be right."""
+        run, own = self.run, self.integrator.options().get("samples_per_pass")
+        spp = run.spp // run.batches if self.adjoint == "batched" else run.spp
+        if run.memory_budget is not None:
+            own = largest_pass(spp, pixels)  # passes are chosen
+        obstacle = passes_obstacle(spp, own, pixels, splits=self.integrator.type in ("reslrb", "walk_ad", "trajectory"))
+        return None if obstacle is None else f"{run.spp} {obstacle}"
+
     def with_exposures_fixed(self) -> Config:
         """The experiment with exposures of 1 in place of recovered ones, for what looks at the scene alone."""
         given = self.target.exposure
@@ -354,6 +371,10 @@ class Config(Section):
                         f"parameters[{i}].{at}", f"`{name}` stands in parameters[{places[option, name]}] already"
                     )
         _check_passes(self.integrator, self.run.spp, "integrator", "run.spp")
+        if self.scene.size is not None:
+            obstacle = self.samples_obstacle(self.scene.size[0] * self.scene.size[1])
+            if obstacle is not None:
+                raise located("run.spp", obstacle)
         for option in sorted({"batches", "first_batch"} & self.run.model_fields_set):
             if self.run.adjoint not in ("auto", "batched"):
                 raise located(f"run.{option}", f"has no effect with run.adjoint: {self.run.adjoint}, but with batched")

@@ -9,6 +9,7 @@ import drjit as dr
 import mitsuba as mi
 
 from reslrb_cli.backend.device import resident_paths
+from reslrb_cli.config.passes import divisors, passes_obstacle
 from reslrb_cli.estimators.base import entry_bytes
 from reslrb_cli.integrators import Reslrb
 from reslrb_cli.records.clock import MIB, peak_mib, reset_peak
@@ -101,7 +102,8 @@ def choose_samples(problem: Problem, integrator: Reslrb, samples: int, budget: i
 
     `samples` are those of a batch, or of a step.
     """
-    for size in (size for size in range(samples, 0, -1) if samples % size == 0):
+    pixels = max(int(dr.prod(problem.scene.sensors()[index].film().size())) for index in problem.sensors)
+    for size in reversed([size for size in divisors(samples) if passes_obstacle(samples, size, pixels) is None]):
         expected = estimate(problem, integrator, size, fixed)
         if expected.total <= budget:
             return size, expected

@@ -20,6 +20,7 @@ from reslrb_cli.optimization.budget import MemoryPlan, choose_samples, standing
 from reslrb_cli.optimization.moving import ATTACHED, is_attached
 from reslrb_cli.optimization.pilot import Pilot
 from reslrb_cli.optimization.pilot_records import Candidate, Measured, Outcome
+from reslrb_cli.optimization.room import check_baseline, check_memory
 from reslrb_cli.optimization.samples import sample_gradient, take_gradient
 from reslrb_cli.records.clock import MIB, StepClock
 from reslrb_cli.records.manifest import versions
@@ -55,11 +56,15 @@ def find_options(problem: Problem) -> list[Option]:
     """
     config = problem.config
     if not isinstance(config.integrator, Reslrb):
+        check_baseline(problem)
         return []
     if config.integrator.estimator == "auto":
         choices = [{"estimator": ATTACHED}] if is_attached(problem) else candidates(config)
         return _fitting(problem, config.integrator, choices)
-    return [] if config.run.memory_budget is None else _fitting(problem, config.integrator, [{}])
+    if config.run.memory_budget is None:
+        check_memory(problem, problem.integrator)
+        return []
+    return _fitting(problem, config.integrator, [{}])
 
 
 def settle_integrator(problem: Problem, options: list[Option], say: Say, cache: Cache | None = None) -> None:
@@ -98,6 +103,7 @@ def _fitting(problem: Problem, integrator: Reslrb, choices: list[dict[str, Any]]
     for choice in choices:
         own = integrator.chosen(**choice).options() if choice else integrator.options()
         made = Tracer.of(**own)
+        check_memory(problem, made)
         if budget is None:
             options.append(Option(choice, made, None))
             continue
@@ -111,7 +117,8 @@ def _fitting(problem: Problem, integrator: Reslrb, choices: list[dict[str, Any]]
         options.append(Option(choice, made, MemoryPlan(budget, size, samples // size, expected)))
     if not options:
         mib = -(-min(least) // MIB)
-        reason = f"one sample per pixel takes about {mib:.0f} MiB; allow at least {mib:.0f} MiB"
+        reason = f"one sample per pixel takes about {mib:.0f} MiB (scene, targets, images of a step, parameters, paths)"
+        reason += f"; allow at least {mib:.0f} MiB, beside which Python, libraries and kernels are not counted"
         raise ConfigError(problem.config.source, "run.memory_budget", reason)
     return options
 

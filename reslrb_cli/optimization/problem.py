@@ -27,6 +27,7 @@ from reslrb_cli.optimization.optimizers import Optimizer
 from reslrb_cli.optimization.pilot_records import Outcome
 from reslrb_cli.optimization.reach import find_reached
 from reslrb_cli.optimization.rendering import render_in_passes, saved_spp
+from reslrb_cli.optimization.room import check_config, check_films, outlook
 from reslrb_cli.optimization.scaling import Scaled
 from reslrb_cli.optimization.targets import make_targets
 from reslrb_cli.optimization.transforms import make_transform
@@ -140,6 +141,9 @@ def assemble(
     """
     problem = assemble_scene(config)
     options = find_options(problem)
+    line = outlook(config, problem.scene, problem.sensors) if to_run else None
+    if line is not None:
+        say(line)
     make_targets(problem, say)
     settle_integrator(problem, options, say, cache)
     if to_run:
@@ -169,8 +173,10 @@ def assemble_scene(config: Config, scene: Any = None, values: Mapping[str, Array
     `scene` is used in place of `scene.file`, `values` in place of the parameters' initial ones. Raises ValueError where
     these are not one finite array for each parameter, of its shape.
     """
+    check_config(config)
     scene = load_configured(config) if scene is None else scene
     views = make_views(config, scene)
+    check_films(config, scene, [view.sensor for view in views])
     check_integrator(config, config.integrator, scene, [view.sensor for view in views])
     selection = select_parameters(scene, config.parameters, config.source)
     expose(views, scene, selection)

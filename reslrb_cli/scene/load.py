@@ -16,6 +16,7 @@ from .description import (
     Description,
     build,
     check,
+    check_sizes,
     mend,
     name_objects,
     notes,
@@ -71,6 +72,7 @@ def load_described(
     place_textures(root)
     if size is not None:
         resize_films(root, size)
+    check_sizes(description)
     scene, unused = build(description)
     if strict:
         notes.refuse(unused)

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 import drjit as dr
 import mitsuba as mi
 
+from reslrb_cli.config.limits import PASS_PATHS, PASS_SAMPLES
 from reslrb_cli.scene.lamps import Lamp
 from reslrb_cli.transport.emission import Numbered
 from reslrb_cli.transport.lamps import sums_of_areas
@@ -19,9 +20,6 @@ SELECTION_STREAM = 0x5E1EC7  # what hooks draw to select
 VISIBLE_STREAM = 0xD1EC7  # primary rays
 LAMP_STREAM = 0x1A3B5 << 12  # points of lamps; the lamp's number is added
 PASS_STREAM = 0x9A55E5  # seeds of the second pass and those after it
-#: Samples per pixel of one pass. In single precision a sum loses terms below a 2^24th of it, and thousands of such
-#: passes can be added to one another.
-LARGEST_PASS = 1 << 18
 
 
 @dataclass
@@ -99,7 +97,7 @@ def make_samples(plan: Plan, scene: mi.Scene, sensor: mi.Sensor, seed: mi.UInt32
     """
     film = Film(sensor)
     width = spp * int(dr.prod(sensor.film().size()))
-    if width > 0xFFFFFFFF:
+    if width > PASS_PATHS:
         raise ValueError(f"{width} paths in one pass are more than 2^32 - 1: set samples_per_pass below {spp}")
     # Opaque: as literals they would give every sample count kernels of its own.
     scale = dr.opaque(mi.Float, float(dr.prod(film.size)) / (float(dr.prod(sensor.film().size())) * total_spp))
@@ -126,6 +124,6 @@ def passes(
 
 
 def _parts(spp: int) -> list[int]:
-    """The fewest parts of at most LARGEST_PASS samples, of sizes that differ by 1 at most."""
-    count = -(-spp // LARGEST_PASS)
+    """The fewest parts of at most PASS_SAMPLES samples, of sizes that differ by 1 at most."""
+    count = -(-spp // PASS_SAMPLES)
     return [spp // count + (part < spp % count) for part in range(count)]

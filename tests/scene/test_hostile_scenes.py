@@ -125,6 +125,30 @@ def test_files_are_bounded_together(tmp_path, monkeypatch):
         load_scene(file)
 
 
+def test_a_name_that_no_file_can_have(tmp_path):
+    file = write(tmp_path, HEAD + f'<shape type="ply"><string name="filename" value="{"a" * 5000}"/></shape></scene>')
+    with pytest.raises(ConfigError) as error:
+        load_scene(file)
+    assert str(error.value).startswith(f"{file}:2: ")
+
+
+def test_names_in_a_mesh_do_not_reach_the_terminal(tmp_path, capfd):
+    mesh = (
+        b"ply\nformat ascii 1.0\ncomment M\xc3\xbcller\nelement vertex 0\nproperty float x\nelement %s 1\nend_header\n"
+    )
+    file = write(tmp_path, HEAD + '<shape type="ply"><string name="filename" value="m.ply"/></shape></scene>')
+    (tmp_path / "m.ply").write_bytes(mesh % b"\x1b[31mred")
+    with pytest.raises(ConfigError) as error:
+        load_scene(file)
+    assert str(error.value).startswith(f"{file}:2: filename: {tmp_path}/m.ply: its head holds what is no text, ")
+    assert str(error.value).isprintable()
+    assert capfd.readouterr() == ("", "")
+    (tmp_path / "m.ply").write_bytes(mesh % b"red")
+    with pytest.raises(ConfigError) as error:  # that of Mitsuba
+        load_scene(file)
+    assert "no text" not in str(error.value)
+
+
 def test_includes_are_counted(tmp_path):
     write(tmp_path, '<scene version="3.0.0"/>', "0.xml")
     for level in range(1, 6):

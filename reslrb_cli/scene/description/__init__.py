@@ -7,6 +7,7 @@ from .mending import mend
 from .naming import name_objects
 from .notes import Note
 from .placing import place_textures
+from .sizes import check_sizes
 from .sizing import resize_films
 from .writing import tag_lines
 
@@ -15,6 +16,7 @@ __all__ = [
     "Note",
     "build",
     "check",
+    "check_sizes",
     "mend",
     "name_objects",
     "place_textures",

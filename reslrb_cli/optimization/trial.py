@@ -1,0 +1,81 @@
+"""A few steps of a run, for a forecast: what one takes, and the memory of all.
+
+Where a step takes long, steps of fewer samples per pixel stand for it: time and memory are a constant and a part that
+is proportional to the samples, which two sizes tell apart.
+"""
+
+from __future__ import annotations
+
+import statistics
+import time
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+from reslrb_cli.optimization.loop import optimize
+from reslrb_cli.optimization.problem import Problem
+from reslrb_cli.records.clock import MIB
+from reslrb_cli.records.metrics import Record
+
+#: Seconds of a step beyond which steps of fewer samples stand for it, and that those are to take.
+LONG_STEP, SHORT_STEP = 2.0, 0.7
+#: Steps until all is compiled and recorded; steps that are timed, at least, at most, and for so many seconds.
+WARM_UP, LEAST, MOST, SECONDS = 5, 4, 40, 5.0
+
+
+@dataclass(frozen=True)
+class Steps:
+    """Steps of `spp` samples per pixel: seconds of one, what the first took longer, compiling apart, and the peak."""
+
+    spp: int
+    step_s: float
+    start_s: float
+    compile_s: float
+    peak: int
+
+
+def measure_steps(problem: Problem) -> Steps:
+    """What a step of the run takes, measured or by two smaller ones."""
+    config = problem.config
+    unit = config.run.batches if config.adjoint == "batched" else 1
+    unit *= problem.samples_per_pass or 1
+    whole = config.run.spp
+    if unit >= whole:
+        return _measure(problem, whole)
+    first = _measure(problem, unit)
+    if first.step_s * whole / unit <= LONG_STEP:
+        steps = _measure(problem, whole)
+        return replace(steps, compile_s=first.compile_s + steps.compile_s)
+    small = max(min(int(SHORT_STEP / max(first.step_s, 1e-6)), whole // unit // 2), 1) * unit
+    one, two = _measure(problem, small), _measure(problem, 2 * small)
+    share = (whole - small) / small
+    return Steps(
+        two.spp,
+        one.step_s + share * max(two.step_s - one.step_s, 0.0),
+        two.start_s,
+        first.compile_s + one.compile_s + two.compile_s,
+        int(one.peak + share * max(two.peak - one.peak, 0)),
+    )
+
+
+def _measure(problem: Problem, spp: int) -> Steps:
+    """A few iterations of `spp` samples per pixel, by the loop itself; the parameters move."""
+    config = problem.config
+    enough = {"spp": spp, "iterations": max(config.run.iterations, WARM_UP + MOST)}  # of a run of two, too
+    problem.config = config.model_copy(update={"run": config.run.model_copy(update=enough)})
+    records: list[Record] = []
+    begin = time.perf_counter()
+    try:
+        for record in optimize(problem):
+            records.append(record)
+            if len(records) == WARM_UP:
+                begin = time.perf_counter()
+            timed = len(records) - WARM_UP
+            if timed >= MOST or (timed >= LEAST and time.perf_counter() - begin > SECONDS):
+                break
+    finally:
+        problem.config = config
+    times = [records[0].elapsed_s, *(b.elapsed_s - a.elapsed_s for a, b in pairwise(records))]
+    steady = statistics.median(times[WARM_UP:])
+    extra = sum(max(seconds - steady, 0.0) for seconds in times[:WARM_UP])
+    compiled = min(sum(record.codegen_ms for record in records[:WARM_UP]) / 1e3, extra)
+    return Steps(spp, steady, extra - compiled, compiled, int(records[-1].peak_mib * MIB))

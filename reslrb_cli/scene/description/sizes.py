@@ -1,0 +1,80 @@
+"""What a scene's files say of their sizes: refused where no machine has room for it, before Mitsuba allocates any."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import mitsuba as mi
+
+from ...backend.memory import free_bytes
+from ...config.files import size
+from ...config.limits import PIXELS
+from ...errors import ConfigError
+from ..image_file import image_size
+from .element import Element, quoted
+from .including import Description
+
+#: Bytes of memory that a pixel of an image takes as a texture at the least: Mitsuba keeps three half floats of it.
+_TEXEL_BYTES = 6
+#: Bytes in which a mesh says what it consists of.
+_HEAD = 2**16
+
+
+def check_sizes(description: Description) -> None:
+    """Raise ConfigError, located by file and line, for films and files that are larger than can be held."""
+    free: int | None = None
+    for element in description.root.walk():
+        if element.tag == "film":
+            _check_film(element)
+        elif element.tag == "string" and element.name == "filename":
+            free = free_bytes(mi.variant()) if free is None else free
+            _check_file(element, description.folders, free)
+
+
+def _check_film(film: Element) -> None:
+    """Refuse a film of more pixels than an image may have; what is no number, Mitsuba refuses."""
+    sides = dict.fromkeys(("width", "height"), 0)
+    for child in film.children:
+        if child.name in sides and child.attributes.get("value", "").strip().isdecimal():
+            sides[child.name] = int(child.attributes["value"].strip()[:20])
+    pixels = sides["width"] * sides["height"]
+    if pixels > PIXELS:
+        raise film.fail(
+            "",
+            f"a film of {sides['width']}x{sides['height']} pixels; it must have at most {PIXELS}, since each image of "
+            "a step takes 12 bytes or more of every one",
+        )
+
+
+def _check_head(element: Element, path: Path) -> None:
+    """Refuse a PLY mesh whose elements have names that are no text: Mitsuba prints them as they come."""
+    with path.open("rb") as file:
+        head = file.read(_HEAD)
+    if not head.startswith(b"ply"):
+        return
+    for line in head.partition(b"end_header")[0].splitlines():
+        text = line.decode("ascii", errors="replace")
+        if not line.startswith((b"comment", b"obj_info")) and not all(c == "\t" or " " <= c <= "~" for c in text):
+            raise element.fail("filename", f"{path}: its head holds what is no text, {quoted(text)}; write it again")
+
+
+def _check_file(element: Element, folders: list[Path], free: int) -> None:
+    """Refuse a file that takes more memory than is free, by its size or by what an image says of itself."""
+    name = element.attributes.get("value", "")
+    places = [*(folder / name for folder in folders), Path(name)]
+    path = next((path for path in places if os.path.isfile(path)), None)  # False of names that are too long, too
+    if path is None:
+        return  # which Mitsuba says
+    if os.path.getsize(path) > free:
+        raise element.fail("filename", f"{path} has {size(os.path.getsize(path))}, and {size(free)} of memory are free")
+    _check_head(element, path)
+    try:
+        width, height = image_size(path)
+    except ConfigError:
+        return  # no image, or none that we know
+    if width * height > PIXELS:
+        raise element.fail("filename", f"{path} is {width}x{height} pixels; more than {PIXELS} are not read")
+    if width * height * _TEXEL_BYTES > free:
+        needed = size(width * height * _TEXEL_BYTES)
+        raise element.fail("filename", f"{path} is {width}x{height} pixels, which take {needed}; {size(free)} are free")

@@ -1,0 +1,109 @@
+"""`optimize --dry-run`: what it prints agrees with the run that follows, and it writes no folder."""
+
+from __future__ import annotations
+
+import os
+import re
+from pathlib import Path
+
+import pytest
+from cli.tiny import write_experiment
+
+from reslrb_cli.cli import main
+from reslrb_cli.cli.forecasting import amount
+from reslrb_cli.config import load
+from reslrb_cli.config.passes import largest_pass, passes_obstacle
+from reslrb_cli.optimization import trial
+from reslrb_cli.optimization.forecast import make_forecast
+from reslrb_cli.records.clock import MIB, duration
+from reslrb_cli.records.metrics import read_metrics
+
+pytestmark = pytest.mark.usefixtures("llvm")
+
+SETS = ["scene.size=[96, 64]", "run.iterations=8", "run.final_spp=4"]
+
+
+@pytest.fixture
+def experiment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    write_experiment(tmp_path)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def call(*words: str) -> None:
+    with pytest.raises(SystemExit) as end:
+        main(["optimize", "tiny.yaml", *words, *(word for text in SETS for word in ("--set", text))])
+    assert end.value.code == 0
+
+
+@pytest.mark.parametrize("adjoint", ["batched", pytest.param("correlated", marks=pytest.mark.long)])
+def test_memory_is_that_of_the_run(experiment: Path, capsys: pytest.CaptureFixture[str], adjoint: str) -> None:
+    before = sorted(os.listdir(experiment))
+    call("--dry-run", "--set", f"run.adjoint={adjoint}")
+    assert sorted(os.listdir(experiment)) == before
+    printed = capsys.readouterr().out
+    told = re.search(r"memory of the iterations: ([\d.]+) MiB at the most", printed)
+    assert told is not None, printed
+    sizes = re.findall(r"^ +([\d.]+) (MiB|KiB|B) ", printed, re.MULTILINE)[:-2]  # but for thread-local, and process
+    units = {"MiB": 1.0, "KiB": 2.0**-10, "B": 2.0**-20}
+    assert sum(float(size) * units[unit] for size, unit in sizes) == pytest.approx(float(told[1]), abs=0.2)
+    assert "time of the iterations: " in printed
+    assert "time of the whole run: about " in printed
+    call("--quiet", "--set", f"run.adjoint={adjoint}")
+    peak = read_metrics(experiment / "runs" / "tiny")[-1]["peak_mib"]
+    assert peak > 0.5
+    assert float(told[1]) == pytest.approx(peak, rel=0.15)
+
+
+def test_long_steps_are_measured_by_shorter_ones(experiment: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """By steps whose cost is known: as much as a constant and so much a sample."""
+    taken = []
+
+    def measure(problem: object, spp: int) -> trial.Steps:
+        taken.append(spp)
+        return trial.Steps(spp, 0.1 + 0.02 * spp, 0.3, 0.5, 1000 + 7 * spp)
+
+    monkeypatch.setattr(trial, "_measure", measure)
+    forecast = make_forecast(load(experiment / "tiny.yaml", ["run.spp=4000"]), lambda line: None)
+    assert taken == [4, 12, 24]
+    assert forecast.spp == 24
+    assert forecast.iteration_s == pytest.approx(80.1)
+    assert forecast.peak == 1000 + 7 * 4000
+    assert forecast.elapsed_s == pytest.approx(5 * 80.1 + 0.3)
+    taken.clear()
+    make_forecast(load(experiment / "tiny.yaml", ["run.spp=40"]), lambda line: None)
+    assert taken == [4, 40]
+
+
+def test_steps_are_timed_without_their_compilation(experiment: Path) -> None:
+    forecast = make_forecast(load(experiment / "tiny.yaml", SETS), lambda line: None)
+    assert 0 < forecast.iteration_s < forecast.elapsed_s
+    assert forecast.peak / MIB > 0.5
+    assert forecast.whole_s > forecast.elapsed_s
+
+
+@pytest.mark.parametrize(
+    ("spp", "per_pass", "pixels", "said"),
+    [
+        (2**20, None, 2**12, None),  # four passes of 2^18 samples
+        (2**20, None, 2**14 + 1, "set integrator.samples_per_pass to 131072"),
+        (2**20, 2**17, 2**15 + 1, "set integrator.samples_per_pass to 65536"),
+        (2**20, 4, 2**12, "makes 262144 passes of a step, and no step has more than 65536: set integrator.samples_per"),
+        (7, None, 2**32, "take a smaller film"),
+        (1_000_003, None, 2**15, "lower run.spp"),  # a prime number
+    ],
+)
+def test_passes(spp: int, per_pass: int | None, pixels: int, said: str | None) -> None:
+    obstacle = passes_obstacle(spp, per_pass, pixels)
+    assert (obstacle is None) if said is None else (obstacle is not None and said in obstacle)
+    most = largest_pass(spp, pixels) if said else None
+    if most is not None and spp // most <= 2**16:  # what is advised is not refused
+        assert spp % most == 0
+        assert passes_obstacle(spp, most, pixels) is None
+
+
+def test_words() -> None:
+    assert [amount(n) for n in (0, 2**19, 2**30, 3 * 2**31)] == ["0 B", "512.0 KiB", "1.0 GiB", "6.0 GiB"]
+    assert [duration(s) for s in (0.0123, 9.96, 45, 200, 9000, 2e6)] == [
+        "0.012 s", "10 s", "45 s", "3.3 min", "2.5 h", "23.1 days",
+    ]  # fmt: skip
