@@ -14,8 +14,9 @@ import numpy as np
 import pytest
 from cli.tiny import COMPLETE, KEY, faults, files, write_experiment
 
-from reslrb_cli.cli import main, progress, recording
+from reslrb_cli.cli import main, progress
 from reslrb_cli.cli.interrupts import SIGNALS
+from reslrb_cli.recording import run as recording
 from reslrb_cli.records import metrics
 from reslrb_cli.records.manifest_file import read_content
 

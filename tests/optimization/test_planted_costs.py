@@ -16,8 +16,9 @@ import pytest
 from cli.tiny import write_experiment
 from optimization.toy import make_problem
 
-from reslrb_cli.cli import main, recording
+from reslrb_cli.cli import main
 from reslrb_cli.optimization import loop
+from reslrb_cli.recording import run as recording
 from reslrb_cli.records.clock import MIB, StepClock, peak_mib, reset_peak
 from reslrb_cli.records.metrics import read_metrics
 
