@@ -135,7 +135,10 @@ def open_earlier(run: Path, config_file: Path | None, overrides: tuple[str, ...]
         began = loads(stored.text("config"), stored.path)
         config, source = _read_config(run, config_file, overrides, stored)
         elsewhere = config.run.output != source.run.output or config.run.name != source.run.name
-        changed = check_changes(changes(began, config), config.source, run)
+        found = changes(began, config)
+        asked = changes(source, config)
+        blame = "--set" if any(key in asked for key in found) else config.source
+        changed = check_changes(found, blame, run)
         iteration, last = stored.count("iteration", least=0), stored.value("last")
         if config.run.iterations < iteration:
             reason = f"is {config.run.iterations}; the run has done {iteration} already"
