@@ -24,7 +24,7 @@ from reslrb_cli.recording.course import Course
 from reslrb_cli.recording.ending import Ending
 from reslrb_cli.recording.live import LivePage
 from reslrb_cli.recording.telling import describe
-from reslrb_cli.records.checkpoint import NONFINITE_FILE_NAME, save_nonfinite
+from reslrb_cli.records.checkpoint import FILE_NAME, NONFINITE_FILE_NAME, save_nonfinite
 from reslrb_cli.records.images import write_image
 from reslrb_cli.records.manifest import Manifest, Status
 from reslrb_cli.records.metrics import MetricsWriter, Record, finite
@@ -195,7 +195,7 @@ class Recording:
         ending = Ending(self.folder.path, self.manifest, status, failure, self._kept)
         ending.part("results", self._note_results)
         ending.begin(["checkpoint", "parameters", "final images"])
-        ending.part("checkpoint", self._save_checkpoint)
+        ending.part("checkpoint", self._save_last_checkpoint)
         ending.part("parameters", self._write_parameters)
         if failure is None:
             ending.part("final images", self._write_final_images)
@@ -286,6 +286,11 @@ class Recording:
             return "nothing of the run was kept"
         state = f"the state after {self._saved} of {self.done} iterations" if self._saved else "the initial state"
         return f"kept: {state}, in {self.folder.checkpoint}"
+
+    def _save_last_checkpoint(self) -> None:
+        """Keep the state, unless it is there already: the one before it then is an earlier one."""
+        if self._saved != self.done or not (self.folder.checkpoint / FILE_NAME).exists():
+            self._save_checkpoint()
 
     def _save_checkpoint(self) -> None:
         self._saved = self.course.save(self.folder.checkpoint)

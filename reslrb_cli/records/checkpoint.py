@@ -78,7 +78,8 @@ def _keep(path: Path, previous: Path) -> None:
     except OSError as error:
         if error.errno not in _NO_LINKS:
             raise OSError(error.errno, error.strerror, str(path)) from None
-        os.replace(path, previous)  # for a moment there is that one alone, which readers know
+        with contextlib.suppress(FileNotFoundError):
+            os.replace(path, previous)  # for a moment there is that one alone, which readers know
     finally:
         with contextlib.suppress(OSError):
             second.unlink(missing_ok=True)
