@@ -244,7 +244,7 @@ class RunConfig(Section):
     checkpoint_every: CheckpointEvery = Field(
         default=CheckpointEvery(seconds=30.0),
         description="When the state of the run is kept, for `reslrb optimize --resume`: `iterations` or `seconds` "
-        "between two checkpoints. Besides, before the first iteration and at the end, whatever ends it, but for a kill.",
+        "between two checkpoints. Besides, before the first iteration and at the end, whatever ends it but a kill.",
     )
     reach_spp: Count = Field(default=64, description="Samples for the mask of the texels that light and sensor reach.")
 
