@@ -86,7 +86,7 @@ def _resume(run: Path, config_file: Path | None, overrides: tuple[str, ...], qui
         config = earlier.config
         if earlier.elsewhere:
             check_output(config.source, config.run.output, config.run.folder_name, False)
-        variant = start_variant(config.model_copy(update={"variant": earlier.stored.text("variant")}))
+        variant = start_variant(config.model_copy(update={"variant": earlier.variant}))
         course, manifest = earlier.prepare(variant, logger.info)
         for line in earlier.said:
             logger.warning(line)

@@ -117,6 +117,13 @@ class Stored:
             raise self.wrong(".".join(path), "is no text")
         return value
 
+    def texts(self, *path: str) -> list[str]:
+        """A list of texts."""
+        value = self.value(*path)
+        if not isinstance(value, list) or not all(isinstance(each, str) for each in value):
+            raise self.wrong(".".join(path), "is no list of texts")
+        return value
+
     def scaling(self, keys: Sequence[str]) -> list[dict[str, Any]] | None:
         """What `scale: auto` measured of each parameter; None where it has not."""
         rows = self.value("scaling")

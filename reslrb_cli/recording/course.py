@@ -36,7 +36,10 @@ class Course:
         self.nonfinite, self.clamped = NonFiniteTally(), ClampTally()
         self.last: Record | None = None
         self._snapshot = self.state.capture()
-        self._initial = self._snapshot.moved
+        #: The values of the start, in the host's memory.
+        self._initial: dict[str, Array] = {}
+        for key, value in self._snapshot.moved.items():
+            self._initial |= stored_value(problem, "initial", key, value)
         self.results.begin()
 
     @property
@@ -70,9 +73,7 @@ class Course:
     def save(self, folder: Path) -> int:
         """Keep it in `folder` as it was after its last whole iteration; return how many it had. Raises OSError."""
         problem, snapshot = self.problem, self._snapshot
-        others = snapshot.others(problem)
-        for key, value in self._initial.items():
-            others |= stored_value(problem, "initial", key, value)
+        others = snapshot.others(problem) | self._initial
         others |= {f"best/{key}": value for key, value in self.best_values().items()}
         others |= {f"mask/{key}": mask for key, mask in problem.masks.items()}
         seen, squares = self.certainty.state()
@@ -106,7 +107,7 @@ class Course:
             self.best.restore(stored.count("best", "iteration", least=0), stored.number("best", "loss"), values)
         self.results.recall({name: stored.numbers("images", name) for name in ("trained", "held_out")})
         squares = {}
-        for key in stored.value("certainty", "keys") or ():
+        for key in stored.texts("certainty", "keys"):
             kept = problem.optimizer.squares(key) if key in problem.selection.keys else None
             if kept is not None:
                 squares[key] = stored.take(f"squares/{key}", kept[0])

@@ -6,9 +6,10 @@ import contextlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 from reslrb_cli.config import Config, dump, load, loads
+from reslrb_cli.config.limits import CONFIG_BYTES
 from reslrb_cli.errors import ConfigError, MachineError, is_machine_fault
 from reslrb_cli.optimization import assemble
 from reslrb_cli.optimization.settled import Settled
@@ -24,6 +25,11 @@ from reslrb_cli.records.reopen import check_writable, copy_into, opened, write_b
 from reslrb_cli.records.run_folder import RunFolder
 
 Say = Callable[[str], None]
+
+#: The variants that `variant` may name, `auto` left out.
+VARIANTS = [name for name in get_args(Config.model_fields["variant"].annotation) if name != "auto"]
+#: Characters of the settings in a state, which has every default written out: those of a file are fewer.
+_MOST_CONFIG = 4 * CONFIG_BYTES
 
 
 @dataclass
@@ -48,6 +54,14 @@ class Earlier:
     def iteration(self) -> int:
         """The number of iterations that are done."""
         return len(self.records)
+
+    @property
+    def variant(self) -> str:
+        """The variant that the run began with, whatever `auto` would choose here. Raises ConfigError."""
+        variant = self.stored.text("variant")
+        if variant not in VARIANTS:
+            raise self.stored.wrong("variant", "is none of those that a run can have")
+        return variant
 
     @property
     def is_done(self) -> bool:
@@ -132,6 +146,8 @@ def open_earlier(run: Path, config_file: Path | None, overrides: tuple[str, ...]
         said: list[str] = []
         stored = _read_state(folder, said)
         stack.callback(stored.archive.close)
+        if len(stored.text("config")) > _MOST_CONFIG:
+            raise stored.wrong("config", "is too long")
         began = loads(stored.text("config"), stored.path)
         config, source = _read_config(run, config_file, overrides, stored)
         elsewhere = config.run.output != source.run.output or config.run.name != source.run.name
@@ -145,9 +161,10 @@ def open_earlier(run: Path, config_file: Path | None, overrides: tuple[str, ...]
             raise ConfigError(config.source, "run.iterations", reason)
         _check_files(stored, config, run)
         records, size = read_records(folder.path, iteration, last if isinstance(last, dict) else None)
-        if not elsewhere:
+        earlier = Earlier(folder, manifest, stored, config, changed, elsewhere, records, size, said)
+        if not (elsewhere or earlier.is_done):
             check_writable(folder)
-        yield Earlier(folder, manifest, stored, config, changed, elsewhere, records, size, said)
+        yield earlier
 
 
 def _read_state(folder: RunFolder, said: list[str]) -> Stored:
@@ -164,7 +181,7 @@ def _read_state(folder: RunFolder, said: list[str]) -> Stored:
             continue
         if failures or name == PREVIOUS_FILE_NAME:
             why = str(failures[0]) if failures else f"{folder.checkpoint / FILE_NAME}: is missing"
-            said.append(f"{why}; going on from the state before, after {stored.value('iteration')} iterations")
+            said.append(f"{why}; going on from the state before, after {stored.count('iteration', least=0)} iterations")
         return stored
     if failures:
         raise failures[0]
