@@ -12,6 +12,7 @@ from typing import Any
 
 from reslrb_cli.config.files import read_file
 from reslrb_cli.errors import ConfigError
+from reslrb_cli.records.atomic import write_atomically
 from reslrb_cli.records.metrics import FILE_NAME, Clamped, Record
 from reslrb_cli.records.reading import MOST_BYTES
 
@@ -51,7 +52,9 @@ def cut_back(folder: Path, records: list[Record], size: int) -> None:
     if not records:
         path.unlink(missing_ok=True)
         return
-    path.touch()
+    if size == 0:  # of a run of one iteration, whose line was lost: it is never seen empty
+        write_atomically(path, lambda file: file.write(records[-1].to_json().encode() + b"\n"), durable=True)
+        return
     with path.open("r+b") as file:
         file.truncate(size)
         file.seek(0)
