@@ -26,6 +26,7 @@ ROWS = [
     "optimization",
     "measure",
     "report",
+    "recording",
     "cli",
     "__main__",
 ]

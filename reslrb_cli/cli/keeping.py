@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from reslrb_cli.cli.live import LivePage
 from reslrb_cli.cli.output import echo
+from reslrb_cli.recording.live import LivePage
 from reslrb_cli.records.atomic import remove_parts_of
 from reslrb_cli.records.line_file import LineFile
 from reslrb_cli.records.lines import Line

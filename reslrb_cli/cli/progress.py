@@ -51,21 +51,24 @@ def descriptions(record: Record, meter: ErrorMeter) -> list[str]:
 class Progress:
     """Shows each record of `total` on standard error; as a context manager it tidies the terminal up at the end.
 
+    `done` of them were before, in a run that goes on.
     `meter` is what measured the parameters' errors. While a bar is shown, the log goes above it.
     """
 
-    def __init__(self, total: int, quiet: bool, meter: ErrorMeter) -> None:
+    def __init__(self, total: int, quiet: bool, meter: ErrorMeter, done: int = 0) -> None:
         self._total, self._quiet, self._meter = total, quiet, meter
         self._stream = sys.stderr
         self._bar: Any = None
         self._width: int | None = None
         self._choice = 0
         self._around = contextlib.ExitStack()
-        self._last_line, self._tenth = time.monotonic(), 0
+        self._last_line, self._tenth = time.monotonic(), 10 * done // total
         if not quiet and self._stream.isatty():
             from tqdm import tqdm
 
-            self._bar = tqdm(total=total, file=self._stream, unit="it", dynamic_ncols=True, bar_format=LEAST_FRAME)
+            self._bar = tqdm(
+                total=total, initial=done, file=self._stream, unit="it", dynamic_ncols=True, bar_format=LEAST_FRAME
+            )
 
     def show(self, record: Record) -> None:
         """Show that the iteration of `record` is done."""

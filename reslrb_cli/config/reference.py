@@ -148,7 +148,8 @@ def _table(members: list[dict[str, Any]]) -> Iterator[str]:
 def _default(value: dict[str, Any]) -> str:
     default = value.get("default")
     if isinstance(default, dict):
-        return f"type `{default['type']}`" if "type" in default else ""
+        words = ", ".join(f"{key}: {value:g}" for key, value in default.items() if type(value) in (int, float))
+        return f"type `{default['type']}`" if "type" in default else f"`{{{words}}}`" if words else ""
     return "" if "default" not in value else f"`{json.dumps(default) if not isinstance(default, str) else default}`"
 
 
@@ -159,6 +160,7 @@ def _default(value: dict[str, Any]) -> str:
 _IN_A_LINE = {
     "ImageFile": "{file, color_space}",
     "RunValue": "{run}",
+    "CheckpointEvery": "{iterations} or {seconds}",
     **dict.fromkeys(
         ("MotionInitial", "MotionBounds", "MotionTransform", "MotionRates"), "{translation, rotation, scale}"
     ),

@@ -22,6 +22,7 @@ from pydantic import (
 from typing_extensions import Self
 
 from .base import ConfigPath, Count, Positive, Section, Seed, WorkPath, by_kind, located, mark, wrong
+from .checkpoints import CheckpointEvery
 from .integrators import AnyIntegrator, Integrator, Reslrb
 from .limits import KEY_LENGTH, PIXELS
 from .losses import L2, AnyLoss
@@ -247,6 +248,11 @@ class RunConfig(Section):
         description="After the last iteration, measure how certain the values are: their spread, and a verdict on each "
         "parameter. Takes as long as some iterations, ten or so where parameters are few; runs of fewer than 20 "
         "iterations, and interrupted ones, go without.",
+    )
+    checkpoint_every: CheckpointEvery = Field(
+        default=CheckpointEvery(seconds=30.0),
+        description="When the state of the run is kept, for `reslrb optimize --resume`: `iterations` or `seconds` "
+        "between two checkpoints. Besides, before the first iteration and at the end, whatever ends it but a kill.",
     )
     reach_spp: Count = Field(default=64, description="Samples for the mask of the texels that light and sensor reach.")
 

@@ -19,8 +19,8 @@ if TYPE_CHECKING:
 
 #: Images of the film's size that a step has at once: block, image, loss's parts, gradient, adjoint; a batch's too.
 FILM_IMAGES = 12
-#: Copies of a parameter: gradients, the optimiser's moments, their next values.
-PARAMETER_COPIES = 8
+#: Copies of a parameter: gradients, the optimiser's moments, their next values, the best of a run.
+PARAMETER_COPIES = 9
 #: And those of a clamp: what is usual, the sums over the iterations, and their next values.
 CLAMP_COPIES = 7
 

@@ -22,6 +22,7 @@ import drjit as dr
 import mitsuba as mi
 
 from reslrb_cli.optimization.constraints import flat
+from reslrb_cli.optimization.optimizers import Take
 from reslrb_cli.records.metrics import Clamped
 
 DECAY = 0.95
@@ -34,6 +35,23 @@ class GradientClamp:
         self.factor = factor
         #: By parameter: iterations, m (which starts at 0, corrected for as in Adam), and the sums of R and g.
         self._state: dict[str, tuple[int, Any, Any, Any]] = {}
+
+    def state(self) -> tuple[dict[str, int], dict[str, Any]]:
+        """What it knows: the iterations of each parameter, and arrays by `<key>/<what>`."""
+        names = ("usual", "removed", "total")
+        arrays = {
+            f"{key}/{name}": value
+            for key, state in self._state.items()
+            for name, value in zip(names, state[1:], strict=True)
+        }
+        return {key: state[0] for key, state in self._state.items()}, arrays
+
+    def restore(self, iterations: Mapping[str, int], parameters: Mapping[str, Any], take: Take) -> None:
+        """Go on from what `state` said of these parameters; `take(name, like)` is the array of a name."""
+        for key, count in iterations.items():
+            like = dr.detach(parameters[key])
+            usual, removed, total = (take(f"{key}/{name}", like) for name in ("usual", "removed", "total"))
+            self._state[key] = count, usual, removed, total
 
     def apply(self, parameters: Mapping[str, Any]) -> Clamped:
         """Clamp the gradients of these parameters, which are finite, in place; what was done, and its bias so far."""

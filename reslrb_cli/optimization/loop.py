@@ -12,14 +12,14 @@ import drjit as dr
 import mitsuba as mi
 
 from reslrb_cli.integrators import Refused, gradient_step
-from reslrb_cli.optimization.clamping import GradientClamp
 from reslrb_cli.optimization.constraints import count_nonfinite, finite_square_norm
-from reslrb_cli.optimization.nonfinite import Findings, NonFinitePolicy, RefusedAt, zero_nonfinite
+from reslrb_cli.optimization.nonfinite import Findings, RefusedAt, zero_nonfinite
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.scaling import rescale
 from reslrb_cli.optimization.schedules import learning_rate_factor
+from reslrb_cli.optimization.state import State
 from reslrb_cli.optimization.views import View
-from reslrb_cli.records.clock import StepClock, peak_mib, reset_peak
+from reslrb_cli.records.clock import peak_mib, reset_peak
 from reslrb_cli.records.metrics import Record
 from reslrb_cli.seeds import seed
 
@@ -27,8 +27,12 @@ from reslrb_cli.seeds import seed
 HELD_OUT_EVERY = 10
 
 
-def optimize(problem: Problem, on_nonfinite: Callable[[Findings], None] = lambda found: None) -> Iterator[Record]:
+def optimize(
+    problem: Problem, on_nonfinite: Callable[[Findings], None] = lambda found: None, state: State | None = None
+) -> Iterator[Record]:
     """Run the iterations of `problem`, one record each; the parameters are updated when a record is yielded.
+
+    They go on from `state`, if one is given, and leave there what the next one goes on from.
 
     An iteration is a step (image, loss and gradient of every sensor; the loss is the mean over the sensors) and an
     update. What is not finite reaches no parameter; what happens instead, and when NonFinite is raised, is in
@@ -36,15 +40,15 @@ def optimize(problem: Problem, on_nonfinite: Callable[[Findings], None] = lambda
     `optimizer.scale: auto` measures before the first iteration, and `elapsed_s` counts that.
     """
     config = problem.config
-    clock, policy = StepClock(), NonFinitePolicy(config.run.on_nonfinite)
-    limit = config.optimizer.clamp_gradient
-    clamp = None if limit is None else GradientClamp(limit)
+    state = State(problem) if state is None else state
+    clock, policy, clamp, peak_before = state.clock, state.policy, state.clamp, state.peak_mib
     reset_peak()
-    if config.optimizer.scale == "auto":
+    if config.optimizer.scale == "auto" and not state.scaled:
         with clock.counted():
             problem.sensitivities = rescale(problem)
+        state.scaled = True
     meter = problem.error_meter()
-    for iteration in range(config.run.iterations):
+    for iteration in range(state.iteration, config.run.iterations):
         errors = meter.errors(problem.selection.array)
         held_out = problem.held_out_loss() if iteration % HELD_OUT_EVERY == 0 else None
         with clock.step() as times:
@@ -66,6 +70,9 @@ def optimize(problem: Problem, on_nonfinite: Callable[[Findings], None] = lambda
             clamped = None if clamp is None else clamp.apply({key: problem.optimizer[key] for key in moved})
             found.updates = problem.optimizer.step(factor, skip=held)
             problem.apply()
+        policy.see(found, held)
+        state.iteration = iteration + 1
+        state.peak_mib = max(peak_before, peak_mib(dr.backend_v(loss)))
         yield Record(
             iteration=iteration,
             loss=value,
@@ -74,7 +81,7 @@ def optimize(problem: Problem, on_nonfinite: Callable[[Findings], None] = lambda
             adjoint_ms=None if split.primal_ms is None else times.wall_ms - split.primal_ms,
             codegen_ms=times.codegen_ms,
             elapsed_s=clock.elapsed_s,
-            peak_mib=peak_mib(dr.backend_v(loss)),
+            peak_mib=state.peak_mib,
             spp=config.run.spp,
             lr=config.optimizer.learning_rate * factor,
             grad_norm=float(sum(float(square[0]) for square in squares.values()) ** 0.5),
@@ -85,7 +92,7 @@ def optimize(problem: Problem, on_nonfinite: Callable[[Findings], None] = lambda
             clamped=clamped,
             held_out=held_out,
         )
-        policy.see(found, held)
+        policy.check(found)
 
 
 def _findings(

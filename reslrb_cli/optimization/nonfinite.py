@@ -75,7 +75,8 @@ class NonFinitePolicy:
 
     def __init__(self, kind: OnNonFinite, patience: int = PATIENCE) -> None:
         self.kind, self.patience = kind, patience
-        self._run = 0
+        #: Iterations in a row, up to the last one, in which something sat out.
+        self.standstill = 0
 
     def held(self, found: Findings, keys: list[str]) -> list[str]:
         """Of all parameters, `keys`, those that are not to be updated."""
@@ -84,15 +85,18 @@ class NonFinitePolicy:
         return found.lost if self.kind == "zero" else list(found.gradients)
 
     def see(self, found: Findings, held: list[str]) -> None:
-        """Note one iteration, its update included. Raises NonFinite where the run is to end."""
+        """Note one iteration, its update included."""
+        self.standstill = self.standstill + 1 if held or found.updates else 0
+
+    def check(self, found: Findings) -> None:
+        """Raise NonFinite where the run is to end after the iteration that was noted last."""
         if found and self.kind == "stop":
             raise NonFinite(f"{found}; run.on_nonfinite: stop")
-        self._run = self._run + 1 if held or found.updates else 0
-        if self._run >= self.patience:
+        if self.standstill >= self.patience:
             where = "the loss" if found.loss else "dL/dI" if found.refused else ", ".join(found.by_parameter)
             raise NonFinite(
-                f"{where} was not finite in {self._run} iterations in a row (up to iteration {found.iteration}); no "
-                "parameter was given such a value; check the scene for extreme values, or lower the learning rate"
+                f"{where} was not finite in {self.standstill} iterations in a row (up to iteration {found.iteration}); "
+                "no parameter was given such a value; check the scene for extreme values, or lower the learning rate"
             )
 
 

@@ -43,6 +43,9 @@ def sgd(learning_rate: float, momentum: float = 0.0) -> Any:
     return dropt.SGD(lr=learning_rate, momentum=momentum)
 
 
+#: Yields a stored array, by its name, of the type and shape of another.
+Take = Callable[[str, Any], Any]
+
 OPTIMIZERS: dict[str, Callable[..., Any]] = {"adam": adam, "adamw": adamw, "rmsprop": rmsprop, "sgd": sgd}
 
 
@@ -87,6 +90,19 @@ class Optimizer:
     def variable(self, key: str) -> Variable:
         """How a parameter is moved."""
         return self._variables.get(key) or Variable(None, self._bounds[key])
+
+    def set_value(self, key: str, value: Any) -> None:
+        """Begin at another value of the scene's; to be called before the first step."""
+        variable = self._variables.get(key)
+        if variable is None:
+            self._own[key][key] = value
+        else:
+            self._scene[key] = _leaf(value)
+            self._own[key][key] = variable.from_scene(value)
+
+    def is_moved_apart(self, key: str) -> bool:
+        """Whether what is moved is not the parameter itself, but a variable that it follows from."""
+        return key in self._variables
 
     def set_variable(self, key: str, variable: Variable) -> None:
         """Move a parameter by way of `variable` from now on; to be called before the first step."""
@@ -179,21 +195,45 @@ class Optimizer:
         """The learning rate of a parameter, before any schedule."""
         return self._rates[key]
 
-    def state(self) -> dict[str, np.ndarray[Any, Any]]:
+    def state(self) -> dict[str, Any]:
         """What the optimiser keeps for each parameter beside its value, as `<key>/<index>` (in Dr.Jit's order).
 
-        `<key>/variable` is what it moves in place of the value, `<key>/length` its unit (`Variable`), where it does.
+        `<key>/variable` is what it moves in place of the value, `<key>/length` and `<key>/gain` its unit (`Variable`),
+        where it does. Arrays are Dr.Jit's own, which no step changes: to ask for them costs nothing.
         """
-        arrays = {}
+        found: dict[str, Any] = {}
         for key, variable in self._variables.items():
-            arrays[f"{key}/variable"] = np.array(self._own[key][key])
-            arrays[f"{key}/length"] = np.array(variable.length)
+            found[f"{key}/variable"] = dr.detach(self._own[key][key])
+            found |= {f"{key}/length": variable.length, f"{key}/gain": variable.gain}
         for key, own in self._own.items():
-            extra = own.state[key][3]
-            for index, entry in enumerate(extra if isinstance(extra, tuple) else (extra,)):
-                if entry is not None:
-                    arrays[f"{key}/{index}"] = np.array(entry)
-        return arrays
+            found |= {f"{key}/{index}": entry for index, entry in enumerate(_entries(own, key)) if entry is not None}
+        return found
+
+    def restore(self, values: Mapping[str, Any], units: Mapping[str, tuple[float, float]], take: Take) -> None:
+        """Go on from the scene's `values` and what `state` said; `units` are length and gain of each that had them.
+
+        `take(name, like)` is the array of that name, of the type and shape of `like`.
+        """
+        for key, own in self._own.items():
+            if key in units:
+                before = self.variable(key)
+                self._variables[key] = Variable(before.transform, before.bounds, *units[key])
+                self._scene[key] = _leaf(values[key])
+                own[key] = take(f"{key}/variable", dr.detach(own[key]))
+            else:
+                own[key] = values[key]
+            value, promoted, rate, extra = own.state[key]
+            entries = tuple(
+                None if entry is None else take(f"{key}/{index}", entry)
+                for index, entry in enumerate(_entries(own, key))
+            )
+            own.state[key] = value, promoted, rate, entries if isinstance(extra, tuple) else entries[0]
+
+
+def _entries(own: Any, key: str) -> tuple[Any, ...]:
+    """What one of Dr.Jit's optimisers keeps for its parameter beside the value."""
+    extra = own.state[key][3]
+    return extra if isinstance(extra, tuple) else (extra,)
 
 
 def _leaf(value: Any) -> Any:

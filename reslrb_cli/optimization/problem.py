@@ -29,6 +29,7 @@ from reslrb_cli.optimization.reach import find_reached
 from reslrb_cli.optimization.rendering import render_in_passes, saved_spp
 from reslrb_cli.optimization.room import check_config, check_films, outlook
 from reslrb_cli.optimization.scaling import Scaled
+from reslrb_cli.optimization.settled import Settled
 from reslrb_cli.optimization.targets import make_targets
 from reslrb_cli.optimization.transforms import make_transform
 from reslrb_cli.optimization.views import View, expose, make_views, slope, to_tensor
@@ -131,20 +132,31 @@ class Problem:
 
 
 def assemble(
-    config: Config, say: Callable[[str], None] = lambda line: None, cache: Cache | None = None, to_run: bool = False
+    config: Config,
+    say: Callable[[str], None] = lambda line: None,
+    cache: Cache | None = None,
+    to_run: bool = False,
+    settled: Settled | None = None,
 ) -> Problem:
     """Load and check what `config` names, make the targets, and settle the integrator; a variant must be set.
 
     Everything that can be checked is, before anything is rendered. `say` is told what takes long, `cache` holds what
     earlier pilots learned (None: nothing is kept). With `to_run` all that an optimisation needs is there: exposures
-    are checked, and what light and sensor reach is known. Raises ConfigError and UnsupportedScene.
+    are checked, and what light and sensor reach is known. With `settled` nothing is measured anew: it is the problem of
+    a run that goes on, as it was before its first iteration. Raises ConfigError and UnsupportedScene.
     """
     problem = assemble_scene(config)
+    if settled is not None:
+        settled.begin(problem)
     options = find_options(problem)
     line = outlook(config, problem.scene, problem.sensors) if to_run else None
     if line is not None:
         say(line)
     make_targets(problem, say)
+    if settled is not None:
+        settled.settle(problem, options)
+        settled.reach(problem)
+        return problem
     settle_integrator(problem, options, say, cache)
     if to_run:
         check_exposures(problem)

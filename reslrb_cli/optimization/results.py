@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import mitsuba as mi
@@ -41,6 +42,14 @@ class Results:
         self._take("initial")
         for key, true in self.problem.truth.items():
             self._values[key]["true"] = summary(true, self.problem.masks.get(key))
+
+    def recall(self, images: Mapping[str, list[float]]) -> None:
+        """Go on from what `images_seen` said of the start."""
+        self._image_losses["initial"], self._held_out["initial"] = images["trained"], images["held_out"]
+
+    def images_seen(self) -> dict[str, list[float]]:
+        """The losses of the images of the start: of views that are trained on, and of those held out."""
+        return {"trained": self._image_losses["initial"], "held_out": self._held_out["initial"]}
 
     def add(self, record: Record) -> None:
         """Take one iteration."""

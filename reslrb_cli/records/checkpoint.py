@@ -1,10 +1,16 @@
-"""`checkpoint/state.npz`: parameters and optimiser state after some iteration.
+"""`checkpoint/`: the state of a run after some iteration, and what it met that was not finite.
 
-`checkpoint/nonfinite.npz`: parameters in the first iteration with a value that was not finite.
+`state.npz`      the newest state; `iteration`, `parameter/<key>`, what else the iterations carry on as arrays, and
+                 `state`, the rest of it as JSON
+`previous.npz`   the state before that
+`nonfinite.npz`  parameters in the first iteration with a value that was not finite
 """
 
 from __future__ import annotations
 
+import contextlib
+import errno
+import json
 import os
 import zipfile
 from collections.abc import Iterator, Mapping
@@ -17,34 +23,104 @@ from numpy.lib.npyio import NpzFile
 
 from reslrb_cli.config.files import open_file
 from reslrb_cli.errors import ConfigError
-from reslrb_cli.records.atomic import write_atomically
+from reslrb_cli.records.archive import Archive, Array, write_archive
+from reslrb_cli.records.atomic import unfinished
 
-FILE_NAME = "state.npz"
+FILE_NAME, PREVIOUS_FILE_NAME = "state.npz", "previous.npz"
 NONFINITE_FILE_NAME = "nonfinite.npz"
+#: What the JSON of a state says that it is. Another number where the same words mean something else.
+FORMAT = 1
+#: What file systems say that have no second names of files.
+_NO_LINKS = {errno.EPERM, errno.EMLINK, errno.ENOSYS, errno.EOPNOTSUPP, errno.EXDEV, errno.EACCES}
+#: Bytes of that JSON; the largest part is a configuration, or a pilot's table.
+_MOST_JSON = 2**24
 
 
 def save_checkpoint(
     folder: Path,
     iteration: int,
-    parameters: Mapping[str, np.ndarray[Any, Any]],
-    optimizer: Mapping[str, np.ndarray[Any, Any]],
+    parameters: Mapping[str, Array],
+    others: Mapping[str, Array],
+    values: Mapping[str, Any] | None = None,
 ) -> None:
-    """Write the state after `iteration` updates into `folder`, in place of the one before, atomically and durably.
+    """Write the state after `iteration` updates into `folder`, atomically and durably.
 
-    The archive's entries are `iteration`, `parameter/<key>` and `optimizer/<key>/<name>`. Raises OSError, and then the
-    state before is still there.
+    Its entries are `iteration`, `parameter/<key>`, `others` by their names, and, as JSON, `values`, what there is
+    besides. The state before is kept as `previous.npz`; should the disk have no room for three, until the new one is
+    there. Raises OSError, and then the state before is still there.
     """
-    arrays: dict[str, Any] = {"iteration": np.array(iteration)}
-    arrays |= {f"parameter/{key}": value for key, value in parameters.items()}
-    arrays |= {f"optimizer/{key}": value for key, value in optimizer.items()}
-    write_atomically(folder / FILE_NAME, lambda file: np.savez(file, **arrays), durable=True)
+    entries: dict[str, Array] = {"iteration": np.array(iteration)}
+    entries |= {f"parameter/{key}": value for key, value in parameters.items()}
+    entries |= others
+    if values is not None:
+        text = json.dumps({"format": FORMAT, "iteration": iteration, **values}, allow_nan=False)
+        entries["state"] = np.frombuffer(text.encode(), np.uint8)
+    path, previous = folder / FILE_NAME, folder / PREVIOUS_FILE_NAME
+    _keep(path, previous)
+    try:
+        write_archive(path, entries, durable=True)
+    except OSError as error:
+        if error.errno not in (errno.ENOSPC, errno.EDQUOT) or not (path.exists() and previous.exists()):
+            raise
+        previous.unlink()
+        write_archive(path, entries, durable=True)
 
 
-def save_nonfinite(folder: Path, iteration: int, parameters: Mapping[str, np.ndarray[Any, Any]]) -> None:
+def _keep(path: Path, previous: Path) -> None:
+    """Give the state at `path` the name `previous` as well, so that there is one under its own name all the time."""
+    second = previous.with_name(f".{previous.name}.{os.getpid()}.part")
+    unfinished.add(second)
+    try:
+        os.link(path, second)
+        os.replace(second, previous)
+    except FileNotFoundError:  # the first one
+        pass
+    except OSError as error:
+        if error.errno not in _NO_LINKS:
+            raise OSError(error.errno, error.strerror, str(path)) from None
+        with contextlib.suppress(FileNotFoundError):
+            os.replace(path, previous)  # for a moment there is that one alone, which readers know
+    finally:
+        with contextlib.suppress(OSError):
+            second.unlink(missing_ok=True)
+        unfinished.discard(second)
+
+
+def open_state(path: Path) -> tuple[Archive, dict[str, Any]]:
+    """The arrays of a state, to be closed, and its other values. Raises ConfigError, located in the file."""
+    archive = Archive(path)
+    try:
+        head = archive.heads.get("state")
+        if head is None:
+            raise ConfigError(path, "", "holds values alone, not the state of a run; use it as `initial: {run: ...}`")
+        if head.dtype != np.uint8 or len(head.shape) != 1 or head.shape[0] > _MOST_JSON:
+            raise ConfigError(path, "state", f"is {head.dtype} of shape {head.shape}, not as a run writes it")
+        try:
+            values = json.loads(archive.array("state").tobytes(), parse_constant=_refuse)
+        except (ValueError, RecursionError) as error:
+            raise ConfigError(path, "state", f"is no JSON, as a run writes it ({error})") from None
+        if not isinstance(values, dict) or values.get("format") != FORMAT:
+            raise ConfigError(path, "state", "is of another version of reslrb; go on with that one")
+        return archive, values
+    except BaseException:
+        archive.close()
+        raise
+
+
+def _refuse(word: str) -> Any:
+    raise ValueError(f"{word} is no number")
+
+
+def newest_checkpoint(folder: Path) -> Path | None:
+    """The newest state in `folder`, which may be damaged; None where there is none."""
+    return next((path for name in (FILE_NAME, PREVIOUS_FILE_NAME) if (path := folder / name).exists()), None)
+
+
+def save_nonfinite(folder: Path, iteration: int, parameters: Mapping[str, Array]) -> None:
     """Write the parameters of the step of `iteration`, from 0, into `folder`: `iteration` and `parameter/<key>`."""
     arrays: dict[str, Any] = {"iteration": np.array(iteration)}
     arrays |= {f"parameter/{key}": value for key, value in parameters.items()}
-    write_atomically(folder / NONFINITE_FILE_NAME, lambda file: np.savez(file, **arrays))
+    write_archive(folder / NONFINITE_FILE_NAME, arrays)
 
 
 def load_nonfinite(folder: Path) -> tuple[int, dict[str, np.ndarray[Any, Any]]] | None:

@@ -49,8 +49,10 @@ class Manifest:
     parameter for `scale: auto`, `correlated_bias` what of the bias of `adjoint: correlated`; each is None where that
     was not asked for. `views` has, of each view, its share of the loss, and how many of its pixels are left out, by
     kind. `results` is what the run found (`iterations`, values and errors by key, `certainty`, `warnings`, and `seen`,
-    errors as people see them, ...); `error` is the line that the user saw where the run failed. `missing` names the
-    parts of the folder that are not there (not yet, where the process ended among them), and says why.
+    errors as people see them, ...); `error` is the line that the user saw where the run failed. `resumed` says of each
+    time that the run was gone on with after how many iterations, when, by what command, from which state, and what had
+    changed: settings, from and to, and versions. `missing` names the parts of the folder that are not there (not yet,
+    where the process ended among them), and says why.
     """
 
     variant: str
@@ -73,6 +75,7 @@ class Manifest:
     correlated_bias: dict[str, Any] | None = None
     views: list[dict[str, Any]] | None = None
     rival: dict[str, Any] | None = None
+    resumed: list[dict[str, Any]] = field(default_factory=list)
     results: dict[str, Any] = field(default_factory=dict)
 
     def write(self, folder: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import json
 import math
@@ -101,6 +102,12 @@ class MetricsWriter:
         except OSError as error:
             os.ftruncate(self._descriptor, state.st_size)
             raise OSError(error.errno, error.strerror, str(self._path)) from error
+
+    def sync(self) -> None:
+        """Have all that was written on the disk, so that no loss of power takes lines that a checkpoint counts on."""
+        if self._descriptor is not None:
+            with contextlib.suppress(OSError):  # of a disk that cannot: the lines are written all the same
+                os.fsync(self._descriptor)
 
     def __enter__(self) -> MetricsWriter:
         return self

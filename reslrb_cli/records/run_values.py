@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from reslrb_cli.errors import ConfigError
-from reslrb_cli.records.checkpoint import FILE_NAME, open_archive
+from reslrb_cli.records.checkpoint import FILE_NAME, newest_checkpoint, open_archive
 from reslrb_cli.records.manifest import read_manifest
 
 Array = np.ndarray[Any, Any]
@@ -46,7 +46,7 @@ def checkpoint_of(run: Path) -> Path:
         raise ConfigError(run, "", what)
     if read_manifest(run) is None:
         raise ConfigError(run, "", "is no run's folder: it has no manifest.json that a run wrote")
-    path = run / "checkpoint" / FILE_NAME
-    if not path.exists():
+    path = newest_checkpoint(run / "checkpoint")
+    if path is None:
         raise ConfigError(run, "", f"has no checkpoint/{FILE_NAME}: the run ended before it kept anything")
     return path

@@ -90,6 +90,10 @@ class Selection:
         """Bring tangents of the values that move things, once propagated, on to what is moved in the scene."""
         self.deformation.push()
 
+    def shown(self, key: str, value: Any) -> np.ndarray[Any, Any]:
+        """Another value of `key`, as Dr.Jit has it, as `array` returns it."""
+        return self.slot(key).shown(value)
+
     def set_arrays(self, values: Mapping[str, np.ndarray[Any, Any]]) -> None:
         """Set parameters in the scene, from arrays as `array` returns them."""
         for key, value in values.items():

@@ -56,7 +56,11 @@ class Slot:
 
     def get(self) -> Array:
         """The current value."""
-        value = dr.detach(self.holder[self.key])
+        return self.shown(self.holder[self.key])
+
+    def shown(self, value: Any) -> Array:
+        """Another value for the same place, as Dr.Jit has it, in the shape of `get`."""
+        value = dr.detach(value)
         array = np.array(value, dtype=np.float32)
         if not self.is_tensor and array.ndim and array.shape[-1] == 1:
             array = array[..., 0]

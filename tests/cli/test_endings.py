@@ -14,8 +14,10 @@ import numpy as np
 import pytest
 from cli.tiny import COMPLETE, KEY, faults, files, write_experiment
 
-from reslrb_cli.cli import main, progress, recording
+from reslrb_cli.cli import main, progress
 from reslrb_cli.cli.interrupts import SIGNALS
+from reslrb_cli.recording import course
+from reslrb_cli.recording import run as recording
 from reslrb_cli.records import metrics
 from reslrb_cli.records.manifest_file import read_content
 
@@ -135,7 +137,7 @@ def test_a_run_that_is_ended_at_once_is_interrupted(optimize, during, monkeypatc
 def test_there_is_a_checkpoint_before_the_first_iteration(optimize, monkeypatch):
     seen = []
 
-    def look(problem, on_nonfinite):
+    def look(problem, on_nonfinite, state):
         with np.load(RUN / "checkpoint" / "state.npz") as state:
             seen.append((int(state["iteration"]), state[f"parameter/{KEY}"].mean()))
         return iter(())
@@ -171,14 +173,15 @@ def test_a_run_in_progress_is_not_replaced(optimize, during):
 
 
 def failing_last(monkeypatch, name, failure=full, calls=1):
-    """Have `recording.<name>` fail, but for its first `calls` calls."""
-    real, seen = getattr(recording, name), []
+    """Have `recording.<name>`, or what keeps the state, fail, but for its first `calls` calls."""
+    holder = course if name == "save_checkpoint" else recording
+    real, seen = getattr(holder, name), []
 
     def sometimes(*args, **options):
         seen.append(args)
         return real(*args, **options) if len(seen) <= calls else failure()
 
-    monkeypatch.setattr(recording, name, sometimes)
+    monkeypatch.setattr(holder, name, sometimes)
 
 
 #: By the part that fails: what writes it, how often that is called before the end, and what is not there.

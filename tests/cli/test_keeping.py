@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from reslrb_cli.cli import live
 from reslrb_cli.cli.keeping import Keeper, read_earlier
 from reslrb_cli.errors import ConfigError
+from reslrb_cli.recording import live
 from reslrb_cli.records import samples
 from reslrb_cli.records.convergence import SummaryRecord
 from reslrb_cli.records.line_file import LineFile

@@ -10,8 +10,10 @@ from pathlib import Path
 import pytest
 from cli.tiny import KEY, write_experiment
 
-from reslrb_cli.cli import live, main, recording
-from reslrb_cli.cli.live import LivePage
+from reslrb_cli.cli import main
+from reslrb_cli.recording import live
+from reslrb_cli.recording import run as recording
+from reslrb_cli.recording.live import LivePage
 from reslrb_cli.records.manifest_file import read_content
 from reslrb_cli.records.metrics import read_metrics
 

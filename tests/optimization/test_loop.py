@@ -12,6 +12,7 @@ from optimization.toy import make_problem
 
 from reslrb_cli.optimization import loop
 from reslrb_cli.optimization.constraints import count_nonfinite, finite_square_norm
+from reslrb_cli.records.clock import StepClock
 
 
 def test_records_follow_gradient_descent(tmp_path, steps):
@@ -70,7 +71,7 @@ def test_the_loss_is_the_mean_over_the_views(tmp_path, steps):
 
 
 def test_a_clock_knows_new_kernels():
-    clock, new = loop.StepClock(), []
+    clock, new = StepClock(), []
     for factor in (2.0, 2.0, 3.0):
         with clock.step() as times:
             dr.eval(dr.arange(mi.Float, 7) * factor)

@@ -16,8 +16,10 @@ import pytest
 from cli.tiny import write_experiment
 from optimization.toy import make_problem
 
-from reslrb_cli.cli import main, recording
+from reslrb_cli.cli import main
 from reslrb_cli.optimization import loop
+from reslrb_cli.recording import course
+from reslrb_cli.recording import run as recording
 from reslrb_cli.records.clock import MIB, StepClock, peak_mib, reset_peak
 from reslrb_cli.records.metrics import read_metrics
 
@@ -96,8 +98,7 @@ def test_files_that_take_long_are_in_no_time_of_a_run(
     """A disk that takes 0.2 s for every line, or every checkpoint, which are written after each iteration here."""
     write_experiment(tmp_path)
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(recording, "CHECKPOINT_SECONDS", 0.0)
-    holder: Any = recording.MetricsWriter if what == "MetricsWriter.write" else recording
+    holder: Any = recording.MetricsWriter if what == "MetricsWriter.write" else course
     name = what.rpartition(".")[2]
     written, slept = getattr(holder, name), []
 
@@ -108,7 +109,7 @@ def test_files_that_take_long_are_in_no_time_of_a_run(
 
     monkeypatch.setattr(holder, name, slowly)
     with pytest.raises(SystemExit) as ended:
-        main.main(["optimize", "tiny.yaml", "--set", "run.iterations=8"])
+        main.main(["optimize", "tiny.yaml", "--set", "run={iterations: 8, spp: 4, checkpoint_every: {iterations: 1}}"])
     assert not ended.value.code
     assert len(slept) >= 8
     times = [record["elapsed_s"] for record in read_metrics(Path("runs/tiny"))]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -57,6 +57,17 @@ class Certainty:
         if iterations == int((1 - RECENT) * self.problem.config.run.iterations):
             self._seen = iterations
             self._squares = {key: self.problem.optimizer.squares(key) for key in self._initial}
+
+    def state(self) -> tuple[int, dict[str, Any]]:
+        """What it took note of: after how many iterations (0: not yet), and by key what the optimiser kept then."""
+        return self._seen, {key: found[0] for key, found in self._squares.items() if found is not None}
+
+    def restore(self, seen: int, squares: Mapping[str, Any]) -> None:
+        """Go on from what `state` said."""
+        self._seen = seen
+        for key, array in squares.items():
+            now = self.problem.optimizer.squares(key)
+            self._squares[key] = None if now is None else (array, now[1])
 
     def _recent(self, key: str, iterations: int) -> Array | None:
         """The mean square of the gradients since `see` took note, (N,); None where the optimiser keeps none."""

@@ -76,7 +76,8 @@ def _wall(manifest: Mapping[str, Any]) -> str:
         start, end = (datetime.fromisoformat(str(manifest[key])) for key in ("started", "ended"))
     except (KeyError, ValueError):
         return ""
-    return text(f"{duration((end - start).total_seconds())}, with its images and files")
+    pauses = ", and the time in which it was not at work" if manifest.get("resumed") else ""
+    return text(f"{duration((end - start).total_seconds())}, with its images and files{pauses}")
 
 
 def _total(records: Sequence[Mapping[str, Any]]) -> str:

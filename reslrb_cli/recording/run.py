@@ -1,4 +1,4 @@
-"""Runs an optimisation and writes its run folder."""
+"""Runs an optimisation and writes its run folder; one that is gone on with goes on where it was."""
 
 from __future__ import annotations
 
@@ -13,24 +13,24 @@ from typing import Any
 
 import numpy as np
 
-from reslrb_cli.cli.ending import Ending
-from reslrb_cli.cli.live import LivePage
-from reslrb_cli.cli.telling import describe
 from reslrb_cli.errors import NonFinite
 from reslrb_cli.optimization import Problem, optimize
-from reslrb_cli.optimization.certainty import LEAST_ITERATIONS, Certainty, CertaintyRecord
+from reslrb_cli.optimization.certainty import LEAST_ITERATIONS, CertaintyRecord
 from reslrb_cli.optimization.nonfinite import Findings
 from reslrb_cli.optimization.rendering import saved_spp
 from reslrb_cli.optimization.results import Results
 from reslrb_cli.optimization.scaling import Scaled, step_line
-from reslrb_cli.records.checkpoint import save_checkpoint, save_nonfinite
+from reslrb_cli.recording.course import Course
+from reslrb_cli.recording.ending import Ending
+from reslrb_cli.recording.live import LivePage
+from reslrb_cli.recording.telling import describe
+from reslrb_cli.records.checkpoint import FILE_NAME, NONFINITE_FILE_NAME, save_nonfinite
 from reslrb_cli.records.images import write_image
 from reslrb_cli.records.manifest import Manifest, Status
 from reslrb_cli.records.metrics import MetricsWriter, Record, finite
 from reslrb_cli.records.parameters import write_mask, write_parameters
 from reslrb_cli.records.reserve import Reserve, size_of
 from reslrb_cli.records.run_folder import RunFolder
-from reslrb_cli.records.tally import ClampTally, NonFiniteTally
 from reslrb_cli.report import write_report
 from reslrb_cli.report.error_map import write_error_map
 from reslrb_cli.report.seen import seen_errors
@@ -38,8 +38,6 @@ from reslrb_cli.report.verdict import warnings
 
 logger = logging.getLogger(__name__)
 
-#: Seconds between two checkpoints.
-CHECKPOINT_SECONDS = 30.0
 #: Images with more pixels take some seconds to be compared, and that is said.
 MANY_PIXELS = 5e5
 #: What the end of a run writes beside checkpoint and parameters, for which room is kept: a manifest, and lists.
@@ -48,34 +46,43 @@ RESERVE_BYTES = 1 << 16
 
 @dataclass
 class Recording:
-    """One run being recorded: `records_done` counts finished iterations, `last` is the newest record."""
+    """One run being recorded: `course` is what it has come to, from where it began or was gone on with."""
 
-    problem: Problem
+    course: Course
     folder: RunFolder
     manifest: Manifest
-    first: Record | None = None
-    last: Record | None = None
-    results: Results = field(init=False)
     page: LivePage = field(init=False)
     error_maps: dict[str, Any] = field(default_factory=dict)
     seen: dict[str, Any] = field(default_factory=dict)
     certainty: CertaintyRecord | None = None
-    nonfinite: NonFiniteTally = field(default_factory=NonFiniteTally)
-    clamped: ClampTally = field(default_factory=ClampTally)
-    _saved_nonfinite: bool = False
+    _saved_nonfinite: bool = field(init=False)
     #: Iterations that the newest checkpoint contains; None before the first one.
     _saved: int | None = None
 
     def __post_init__(self) -> None:
-        self.results = Results(self.problem)
-        self._certainty = Certainty(self.problem)
         self._stop: Callable[[], bool] = lambda: False
+        self._saved_nonfinite = (self.folder.checkpoint / NONFINITE_FILE_NAME).exists()
         self.page = LivePage(self._write_live_page)
+
+    @property
+    def problem(self) -> Problem:
+        """What is optimised."""
+        return self.course.problem
+
+    @property
+    def results(self) -> Results:
+        """What was found so far."""
+        return self.course.results
+
+    @property
+    def last(self) -> Record | None:
+        """The newest record."""
+        return self.course.last
 
     @property
     def done(self) -> int:
         """The number of finished iterations."""
-        return 0 if self.last is None else self.last.iteration + 1
+        return self.course.done
 
     def run(self, show: Callable[[Record], None], stop: Callable[[], bool]) -> Status:
         """Iterate until the end or until `stop()`, and complete the folder; return how it ended.
@@ -89,7 +96,10 @@ class Recording:
         status: Status = Status.FAILED
         failure: BaseException | None = None
         try:
-            self._begin(reserve)
+            if self.done:
+                self._go_on(reserve)
+            else:
+                self._begin(reserve)
             self._iterate(show, stop)
             status = Status.INTERRUPTED if self.done < self.problem.config.run.iterations else Status.FINISHED
         except KeyboardInterrupt:
@@ -110,7 +120,6 @@ class Recording:
     def _begin(self, reserve: Reserve) -> None:
         problem, parameters = self.problem, self.folder.parameters
         self.page.refresh()
-        self.results.begin()
         self._save_checkpoint()
         for view in problem.views:
             write_image(self.folder.images / self._image_name("target", view.sensor), np.array(view.target))
@@ -122,31 +131,37 @@ class Recording:
             write_parameters(parameters / "true", problem.truth)
         for key, mask in problem.masks.items():
             write_mask(parameters, key, mask)
-        reserve.hold(size_of(self.folder.checkpoint) + size_of(parameters / "initial") + RESERVE_BYTES)
+        # the state at the end has the best values too, and what the clamp and the optimiser then know
+        reserve.hold(2 * size_of(self.folder.checkpoint) + size_of(parameters / "initial") + RESERVE_BYTES)
+
+    def _go_on(self, reserve: Reserve) -> None:
+        """What `_begin` writes is there: a run has a state after an iteration only then."""
+        self._saved = self.done
+        self.page.refresh()
+        reserve.hold(2 * size_of(self.folder.checkpoint) + size_of(self.folder.parameters) + RESERVE_BYTES)
 
     def _iterate(self, show: Callable[[Record], None], stop: Callable[[], bool]) -> None:
-        every, saved = self.problem.config.run.images_every, time.monotonic()
+        run, saved, saved_at = self.problem.config.run, self.done, time.monotonic()
+        every, told = run.images_every, self.done > 0
         if stop():
             return
         with MetricsWriter(self.folder.path) as metrics:
-            for record in optimize(self.problem, self._on_nonfinite):
-                if self.first is None and self.problem.sensitivities is not None:
+            for record in optimize(self.problem, self._on_nonfinite, self.course.state):
+                if not told and self.problem.sensitivities is not None:
                     self._note_scaling(self.problem.sensitivities)
-                self.first, self.last = self.first or record, record
+                told = True
+                self.course.add(record)
                 metrics.write(record)
-                self.results.add(record)
-                self._certainty.see(self.done)
-                self.nonfinite.add(record)
-                self.clamped.add(record)
                 show(record)
                 self._check_memory(record)
                 if stop():
                     return
-                if every and self.done % every == 0 and self.done < self.problem.config.run.iterations:
+                if every and self.done % every == 0 and self.done < run.iterations:
                     self._write_images(f"iteration-{self.done:06d}")
-                if time.monotonic() - saved > CHECKPOINT_SECONDS:
+                if run.checkpoint_every.is_due(self.done - saved, time.monotonic() - saved_at):
+                    metrics.sync()  # first: a checkpoint counts on the lines of its iterations
                     self._save_checkpoint()
-                    saved = time.monotonic()
+                    saved, saved_at = self.done, time.monotonic()
                 self.page.refresh()
 
     def _note_scaling(self, measured: list[Scaled]) -> None:
@@ -180,8 +195,8 @@ class Recording:
         ending = Ending(self.folder.path, self.manifest, status, failure, self._kept)
         ending.part("results", self._note_results)
         ending.begin(["checkpoint", "parameters", "final images"])
-        ending.part("checkpoint", self._save_checkpoint)
-        ending.part("parameters", lambda: write_parameters(self.folder.parameters, self.problem.values()))
+        ending.part("checkpoint", self._save_last_checkpoint)
+        ending.part("parameters", self._write_parameters)
         if failure is None:
             ending.part("final images", self._write_final_images)
             if status is Status.FINISHED:  # who interrupts does not want to wait; `reslrb report` finds them as well
@@ -190,6 +205,13 @@ class Recording:
         else:
             ending.leave_out("final images", "the run failed")
         return ending.finish(self._write_page)
+
+    def _write_parameters(self) -> None:
+        """Write the last values, and beside them the best so far, where there are any."""
+        write_parameters(self.folder.parameters, self.problem.values())
+        best = self.course.best_values()
+        if best:
+            write_parameters(self.folder.parameters / "best", best)
 
     def _write_page(self) -> None:
         """Write the page for the last time; where that fails, none is left that says the run is at work."""
@@ -212,7 +234,7 @@ class Recording:
             return
         logger.info("measuring how certain the values are")
         try:
-            self.certainty = self._certainty.measure(self.done, self.last.elapsed_s, self._stop)
+            self.certainty = self.course.certainty.measure(self.done, self.last.elapsed_s, self._stop)
         except Exception as error:
             logger.warning("how certain the values are was not measured: %s", describe(error))
         else:
@@ -251,8 +273,9 @@ class Recording:
             **found,
             "error_maps": self.error_maps,
             **({"seen": self.seen} if self.seen else {}),
-            "nonfinite": self.nonfinite.to_json(),
-            "clamped": self.clamped.to_json(),
+            "nonfinite": self.course.nonfinite.to_json(),
+            "clamped": self.course.clamped.to_json(),
+            "best": finite(self.course.best.to_json()),
         }
 
     def _kept(self) -> str:
@@ -264,9 +287,13 @@ class Recording:
         state = f"the state after {self._saved} of {self.done} iterations" if self._saved else "the initial state"
         return f"kept: {state}, in {self.folder.checkpoint}"
 
+    def _save_last_checkpoint(self) -> None:
+        """Keep the state, unless it is there already: the one before it then is an earlier one."""
+        if self._saved != self.done or not (self.folder.checkpoint / FILE_NAME).exists():
+            self._save_checkpoint()
+
     def _save_checkpoint(self) -> None:
-        save_checkpoint(self.folder.checkpoint, self.done, self.problem.values(), self.problem.optimizer.state())
-        self._saved = self.done
+        self._saved = self.course.save(self.folder.checkpoint)
 
     def _write_images(self, name: str) -> None:
         spp = saved_spp(self.problem, between=name.startswith("iteration"))

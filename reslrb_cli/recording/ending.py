@@ -6,8 +6,8 @@ import logging
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from reslrb_cli.cli.telling import describe, tell
 from reslrb_cli.errors import MachineError, is_machine_fault
+from reslrb_cli.recording.telling import describe, tell
 from reslrb_cli.records.atomic import remove_parts
 from reslrb_cli.records.manifest import Manifest, Status
 

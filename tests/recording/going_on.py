@@ -1,0 +1,142 @@
+"""Runs, what a kill would have left of them in their midst, and whether both come to the same."""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import drjit as dr
+import numpy as np
+import pytest
+from cli import tiny
+
+from reslrb_cli.cli import main, progress
+from reslrb_cli.optimization import loop, optimizers, problem, sensitivity, targets
+from reslrb_cli.optimization.certainty import measuring
+from reslrb_cli.records.metrics import Record
+
+#: What two runs of one experiment do not share: times, and the allocator's peak.
+TIMES = ("step_ms", "primal_ms", "adjoint_ms", "codegen_ms", "elapsed_s", "peak_mib")
+#: A texture and a colour; and, to be added, a place and a size, and heights.
+LAMP = "lamp.emitter.radiance.value"
+PARAMETERS = (
+    f"[{{key: {tiny.KEY}, initial: 0.5, bounds: [0, 1]}}, {{key: {LAMP}, initial: [3, 4, 5], bounds: [0, 20]}}]"
+)
+MOTION = "{motion: {of: wall, free: [translation, scale]}, learning_rate: 0.01}"
+SENSOR = tiny.SCENE[tiny.SCENE.index("<sensor") : tiny.SCENE.index("</sensor>") + len("</sensor>")]
+
+
+def write_experiment(folder: Path) -> None:
+    """As `tiny` has it, with three sensors, a smooth filter, and parameters of two shapes."""
+    tiny.write_experiment(folder)
+    sensors = "\n".join(SENSOR.replace('origin="0, 0, 4"', f'origin="{x}, 0, 4"') for x in (0, 1, -1))
+    scene = tiny.SCENE.replace(SENSOR, sensors).replace('<rfilter type="box"/>', '<rfilter type="gaussian"/>')
+    (folder / "scene.xml").write_text(scene)
+    config = tiny.CONFIG.replace(f"\n  - {{key: {tiny.KEY}, initial: 0.5, bounds: [0, 1]}}", f" {PARAMETERS}")
+    (folder / "tiny.yaml").write_text(config)
+
+
+def work_alone(patch: pytest.MonkeyPatch) -> None:
+    """Have one thread compute what is measured before the first iteration, every step, and what follows from it.
+
+    Sums have one order then. Not all of the program: with one thread Mitsuba never comes to the end of reading, or
+    writing, an EXR file (so on a machine of one core too).
+    """
+
+    def alone(function: Callable[..., Any]) -> Callable[..., Any]:
+        def call(*args: Any, **options: Any) -> Any:
+            dr.sync_thread()
+            dr.set_thread_count(1)
+            try:
+                result = function(*args, **options)
+                dr.eval(result)
+                return result
+            finally:
+                dr.sync_thread()
+                dr.set_thread_count(max(os.cpu_count() or 2, 2))
+
+        return call
+
+    places = [(loop, "gradient"), (sensitivity, "sample_gradient"), (sensitivity, "see_images"),
+              (measuring, "sample_gradient"), (problem, "render_in_passes"), (targets, "render_in_passes")]  # fmt: skip
+    for module, name in places:
+        patch.setattr(module, name, alone(getattr(module, name)))
+    patch.setattr(optimizers.Optimizer, "step", alone(optimizers.Optimizer.step))
+
+
+def optimize(*args: str) -> int:
+    """`reslrb optimize` in this process; its exit code."""
+    with pytest.raises(SystemExit) as end:
+        main.main(["optimize", *args])
+    logging.getLogger("reslrb_cli").handlers.clear()
+    return int(end.value.code or 0)
+
+
+def run_and_kill(
+    monkeypatch: pytest.MonkeyPatch, at: int, *args: str, act: Callable[[Path], object] = lambda run: None
+) -> tuple[Path, Path]:
+    """A whole run, and a copy of what a process that was killed after iteration `at` would have left."""
+    show = progress.Progress.show
+    run, left = Path("runs/tiny"), Path("runs/killed")
+
+    def copying(self: progress.Progress, record: Record) -> None:
+        show(self, record)
+        if record.iteration + 1 == at and not left.exists():
+            shutil.copytree(run, left)
+            with (left / "metrics.jsonl").open("a") as file:
+                file.write('{"iteration": ')  # in the midst of a line
+
+    with monkeypatch.context() as patch:
+        patch.setattr(progress.Progress, "show", copying)
+        assert optimize("tiny.yaml", "--quiet", *args) == 0
+    act(left)
+    return run, left
+
+
+def state_of(run: Path) -> dict[str, np.ndarray[Any, Any]]:
+    """The arrays of the newest state."""
+    with np.load(run / "checkpoint/state.npz") as arrays:
+        return {name: arrays[name] for name in arrays.files if name != "state"}
+
+
+def records_of(run: Path) -> list[dict[str, Any]]:
+    """The metrics, without times."""
+    lines = (run / "metrics.jsonl").read_text().splitlines()
+    return [{key: value for key, value in json.loads(line).items() if key not in TIMES} for line in lines]
+
+
+def found_of(run: Path) -> dict[str, Any]:
+    """What the manifest says was found, without times, and what several threads measure after the last iteration."""
+    results = json.loads((run / "manifest.json").read_text())["results"]
+    return {key: value for key, value in results.items() if key not in ("elapsed_s", "certainty", "error_maps")}
+
+
+def differences(first: Path, second: Path) -> list[str]:
+    """Where two runs are not the same, bit by bit."""
+    one, other = state_of(first), state_of(second)
+    found = [f"entry {name}" for name in sorted(set(one) ^ set(other))]
+    found += [
+        name
+        for name in sorted(set(one) & set(other))
+        if one[name].dtype != other[name].dtype or one[name].tobytes() != other[name].tobytes()
+    ]
+    for what in (records_of, found_of):
+        if what(first) != what(second):
+            found.append(what.__name__)
+    for name in ("", "best"):
+        values = [(run / "parameters" / name / "parameters.npz") for run in (first, second)]
+        if [path.exists() for path in values] == [True, True]:
+            arrays = [np.load(path) for path in values]
+            found += [f"{name} {key}" for key in arrays[0] if arrays[0][key].tobytes() != arrays[1][key].tobytes()]
+    return found
+
+
+def left_over(run: Path) -> list[str]:
+    """Files of no bytes, and those that were never finished."""
+    names = [path for path in run.rglob("*") if path.is_file()]
+    return [os.fspath(path) for path in names if path.stat().st_size == 0 or path.name.startswith(".")]

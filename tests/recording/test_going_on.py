@@ -1,0 +1,187 @@
+"""A run that goes on ends where it would have ended: bit by bit, with one thread."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from cli import tiny
+from recording.going_on import (
+    MOTION,
+    differences,
+    left_over,
+    optimize,
+    records_of,
+    run_and_kill,
+    state_of,
+    work_alone,
+    write_experiment,
+)
+from turns import a_few
+
+from reslrb_cli.cli import main
+from reslrb_cli.optimization import loop, optimizers
+from reslrb_cli.recording import run as recording
+
+RUN = Path("runs/tiny")
+#: Enough for the best to be known when the run is killed.
+ITERATIONS = [
+    word
+    for setting in ("run.iterations=18", "run.checkpoint_every={iterations: 6}", "run.certainty=false")
+    for word in ("--set", setting)
+]
+BATCHED = ["run.spp=8", "run.adjoint=batched"]
+
+#: The texture alone.
+SIMPLE = ["--set", f"parameters=[{{key: {tiny.KEY}, initial: 0.5, bounds: [0, 1]}}]"]
+
+#: Settings by name. Every optimiser, schedule and transform; what is measured before the first iteration; views.
+CASES: dict[str, list[str]] = {
+    "adam": [],
+    "adamw, cosine": ["optimizer.type=adamw", "optimizer.schedule=cosine"],
+    "rmsprop, exponential": ["optimizer.type=rmsprop", "optimizer.schedule=exponential"],
+    "sgd": ["optimizer.type=sgd", "optimizer.learning_rate=0.5"],
+    "momentum, clamp": ["optimizer={type: sgd, momentum: 0.8, learning_rate: 0.1, clamp_gradient: 2}"],
+    "clamp": ["optimizer.clamp_gradient=1.5"],
+    "log": ["parameters[1].transform=log", "parameters[1].bounds=[0.1, 20]"],
+    "sigmoid, momentum": ["parameters[0].transform=sigmoid", "optimizer={type: sgd, momentum: 0.8}"],
+    "softplus": ["parameters[1].transform=softplus", "parameters[1].bounds=[0.1, 20]"],
+    "scale auto": ["optimizer.scale=auto"],
+    "scale auto, sigmoid, rmsprop": [
+        "optimizer={type: rmsprop, scale: auto, clamp_gradient: 3, schedule: cosine}",
+        "parameters[0].transform=sigmoid",
+    ],
+    "views": ["scene.sensors=all", "run.views_per_iteration=1"],
+    "held out": ["scene.sensors=all", "run.views_per_iteration=1", "run.held_out=[2]", "optimizer.scale=auto"],
+    "exposure": [
+        "parameters=[{key: poster.reflectance.data, initial: 0.5, bounds: [0.3, 0.7]}]",
+        "views=[{sensor: 0}, {sensor: 1, exposure: auto}]",
+    ],
+    "motion": [f"parameters[2]={MOTION}"],
+    "motion, scale auto": [f"parameters[2]={MOTION}", "optimizer.scale=auto", "scene.sensors=all"],
+    "certainty": ["run.certainty=true", "run.iterations=24"],
+    "correlated": ["run.adjoint=correlated"],
+    "independent, l1": ["run.adjoint=independent", "loss.type=l1"],
+    "batched": BATCHED,
+    "reservoir": [*BATCHED, "integrator.estimator=reservoir"],
+    "event": [*BATCHED, "integrator.estimator=event"],
+    "gather": [*BATCHED, "integrator.estimator=gather"],
+    "pilot": ["integrator.estimator=auto", "parameters=[{key: poster.reflectance.data, initial: 0.5, bounds: [0, 1]}]"],
+    "passes": [*BATCHED, "integrator.samples_per_pass=1"],
+    "budget": [*BATCHED, "run.memory_budget=8"],
+    "prb": ["integrator={type: prb, max_depth: 3}", "parameters=[{key: poster.reflectance.data, initial: 0.5}]"],
+}
+FEW = ("scale auto, sigmoid, rmsprop", "held out")
+
+
+@pytest.fixture
+def experiment(llvm: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """An experiment in the working directory, whose pages are not drawn: that takes longer than the run."""
+    write_experiment(tmp_path)
+    work_alone(monkeypatch)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("RESLRB_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setattr(recording, "write_report", lambda folder, *now: (folder / "report.html").write_text("<html>"))
+    monkeypatch.setattr(recording, "seen_errors", lambda folder, results: {})
+    return tmp_path
+
+
+@pytest.mark.parametrize("case", a_few(CASES, FEW))
+def test_a_killed_run_goes_on_as_if_nothing_had_been(
+    case: str, experiment: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It was killed three iterations after its newest state, which are done again."""
+    sets = [word for setting in CASES[case] for word in ("--set", setting)]
+    whole, left = run_and_kill(monkeypatch, 15, *ITERATIONS, *sets)
+    shutil.rmtree(experiment / "cache", ignore_errors=True)  # nor what an earlier pilot learned
+    assert int(state_of(left)["iteration"]) == 12
+    assert optimize("--resume", str(left), "--quiet") == 0
+    assert differences(whole, left) == []
+    assert left_over(left) == []
+    assert [record["iteration"] for record in records_of(left)] == list(range(len(records_of(whole))))
+    manifest = json.loads((left / "manifest.json").read_text())
+    assert manifest["status"] == "finished"
+    [resumed] = manifest["resumed"]
+    assert (resumed["iteration"], resumed["changed"]) == (12, {})
+
+
+def test_a_run_that_went_on_can_go_on_again(experiment: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """And a finished one has more iterations, as many as it would have had at once."""
+    assert optimize("tiny.yaml", "--quiet", *ITERATIONS, *SIMPLE, "--set", "run.name=whole") == 0
+    assert optimize("tiny.yaml", "--quiet", *ITERATIONS, "--set", "run.iterations=7", *SIMPLE) == 0
+    for iterations in (13, 18):
+        assert optimize("--resume", str(RUN), "--quiet", "--set", f"run.iterations={iterations}") == 0
+    assert differences(Path("runs/whole"), RUN) == []
+    resumed = json.loads((RUN / "manifest.json").read_text())["resumed"]
+    assert [(each["iteration"], each["changed"]) for each in resumed] == [
+        (7, {"run.iterations": [7, 13]}), (13, {"run.iterations": [13, 18]})
+    ]  # fmt: skip
+
+
+def _without_moments(self, values, units, take):
+    for key, own in self._own.items():
+        own[key] = values[key]
+
+
+def _another_seed(run_seed, iteration, view, purpose):
+    from reslrb_cli.seeds import seed
+
+    return seed(run_seed, iteration + 1, view, purpose)
+
+
+@pytest.mark.parametrize(
+    "fault",
+    a_few(["no moments", "no clamp", "another seed", "no best", "no squares", "metrics not cut back"], ["no moments"]),
+)
+def test_what_is_not_taken_up_is_missed(fault: str, experiment: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Planted: each part of the state is left out in turn."""
+    from reslrb_cli.optimization import best, clamping
+    from reslrb_cli.optimization.certainty import Certainty
+    from reslrb_cli.recording import resuming
+
+    whole, left = run_and_kill(monkeypatch, 15, *ITERATIONS, "--set", "optimizer.clamp_gradient=1.5", *SIMPLE)
+    places = {
+        "no moments": (optimizers.Optimizer, "restore", _without_moments),
+        "no clamp": (clamping.GradientClamp, "restore", lambda self, *given: None),
+        "another seed": (loop, "seed", _another_seed),
+        "no best": (best.Best, "recall", lambda self, records: None),
+        "no squares": (Certainty, "restore", lambda self, *given: None),
+        "metrics not cut back": (resuming, "cut_back", lambda folder, records, size: None),
+    }
+    monkeypatch.setattr(*places[fault])
+    assert optimize("--resume", str(left), "--quiet") == 0
+    assert differences(whole, left) != []
+
+
+def test_a_state_is_what_it_was_when_it_was_taken(experiment: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A failure in the midst of an update leaves the state of the last whole iteration to be kept."""
+    step, calls = optimizers.Optimizer.step, []
+
+    def failing(self, factor, skip=()):
+        calls.append(factor)
+        done = step(self, factor, skip)
+        if len(calls) == 6:
+            raise RuntimeError("in the midst")
+        return done
+
+    monkeypatch.setattr(optimizers.Optimizer, "step", failing)
+    with pytest.raises(RuntimeError, match="in the midst"):
+        main.main(["optimize", "tiny.yaml", "--quiet", *ITERATIONS, *SIMPLE])
+    monkeypatch.setattr(optimizers.Optimizer, "step", step)
+    assert int(state_of(RUN)["iteration"]) == len(records_of(RUN)) == 5
+    assert optimize("tiny.yaml", "--quiet", *ITERATIONS, *SIMPLE, "--set", "run.name=whole") == 0
+    assert optimize("--resume", str(RUN), "--quiet") == 0
+    assert differences(Path("runs/whole"), RUN) == []
+
+
+def test_the_best_values_are_those_of_the_least_mean(experiment: Path) -> None:
+    assert optimize("tiny.yaml", "--quiet", *ITERATIONS, *SIMPLE) == 0
+    losses = [record["loss"] for record in records_of(RUN)]
+    means = [np.mean(losses[end - 10 : end]) for end in range(10, 19)]
+    found = json.loads((RUN / "manifest.json").read_text())["results"]["best"]
+    assert found["iteration"] == int(np.argmin(means)) + 9
+    assert found["loss"] == pytest.approx(min(means), rel=1e-12)
+    assert (RUN / "parameters/best/parameters.npz").exists()
