@@ -11,11 +11,12 @@ from pathlib import Path
 
 from reslrb_cli.config import TargetConfig
 from reslrb_cli.scene.catalog import Value
+from reslrb_cli.scene.depth import Depth
 from reslrb_cli.scene.proposal import Proposal
 
 #: Pixels with which a run takes minutes on two cores, at the samples below.
 PIXELS = 2**14
-SPP, ITERATIONS, MAX_DEPTH = 16, 100, 8
+SPP, ITERATIONS, RATE = 16, 200, 0.03
 #: Commented lines of parameters; a scene can have thousands.
 _MOST_OTHERS = 60
 _PLAIN = re.compile(r"(\.\./)*[A-Za-z_][\w.\-]*(/[\w.\-]+)*")
@@ -31,6 +32,7 @@ class FirstConfig:
     size: tuple[int, int]
     film: tuple[int, int]
     integrator: str
+    depth: Depth
     proposals: Sequence[Proposal]
 
     def text(self, path: Path) -> str:
@@ -48,12 +50,21 @@ class FirstConfig:
             *self._parameter_lines(),
             "integrator:",
             f"  type: {self.integrator}",
-            f"  max_depth: {MAX_DEPTH}  # more where light bounces on and on; it costs time alone, no memory",
+            f"  max_depth: {self.depth.segments}  # {self._depth_words()}; depth costs time alone, no memory",
+            "loss:",
+            "  type: relative_l2  # by l2 the noise of the brightest parts would drown what the others say",
+            "optimizer:",
+            f"  learning_rate: {RATE}  # by so much a value moves in an iteration, at first",
+            "  schedule: cosine  # to next to nothing, so that the noise of the last iterations counts little",
             "run:",
             f"  iterations: {ITERATIONS}",
             f"  spp: {SPP}",
         ]
         return "\n".join(lines) + "\n"
+
+    def _depth_words(self) -> str:
+        missing = self.depth.missing
+        return "light bounces on and on" if missing is None else f"longer paths have {missing:.1%} of the light in view"
 
     def _size_lines(self) -> list[str]:
         if self.size == self.film:

@@ -53,6 +53,7 @@ def command(scene_file: Path, target: Path | None, output: Path | None, force: b
 
     from reslrb_cli.cli.first_config import FirstConfig
     from reslrb_cli.scene import load_scene, select_parameters
+    from reslrb_cli.scene.depth import find_depth
     from reslrb_cli.scene.photograph import open_photograph, write_smaller
     from reslrb_cli.scene.proposal import propose
 
@@ -70,7 +71,8 @@ def command(scene_file: Path, target: Path | None, output: Path | None, force: b
         copied = True
         _check_free(image, force)
     is_integer = photo is not None and photo.is_integer
-    first = FirstConfig(scene_file, image, is_integer, size, own, _integrator(scene), proposals)
+    integrator, depth = _integrator(scene), find_depth(scene, 0)
+    first = FirstConfig(scene_file, image, is_integer, size, own, integrator, depth, proposals)
     text = first.text(path)
     select_parameters(scene, loads(text, path).parameters, path)  # what is wrong is to show before anything is written
     try:

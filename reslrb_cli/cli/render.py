@@ -70,9 +70,7 @@ def command(
     from reslrb_cli.records.images import write_file
 
     if sensor is not None:
-        config = config.model_copy(
-            update={"scene": config.scene.model_copy(update={"sensors": [sensor]}), "views": None}
-        )
+        config = _of_sensor(config, sensor)
     scene, sensors, integrator, multiple = load_for_rendering(config, initial)
     if spp is not None and multiple is not None and spp % min(multiple, spp):
         raise ConfigError("--spp", "", f"{spp} is not a multiple of integrator.samples_per_pass, which is {multiple}")
@@ -96,6 +94,19 @@ def _read(config_file: Path | None, run: Path | None, overrides: tuple[str, ...]
     if config_file is None:
         raise click.UsageError("Missing argument 'CONFIG' (or --run RUN)")
     return read_config(config_file, overrides)
+
+
+def _of_sensor(config: Config, sensor: int) -> Config:
+    """The experiment seen by one sensor alone, whether its view was trained on or held out."""
+    return config.model_copy(
+        update={
+            "scene": config.scene.model_copy(update={"sensors": [sensor]}),
+            "views": None,
+            # What is said of several views: an image has no use for it.
+            "target": config.target.model_copy(update={"exposure": 1.0}),
+            "run": config.run.model_copy(update={"held_out": [], "views_per_iteration": None}),
+        }
+    )
 
 
 def check_image_path(path: Path) -> None:

@@ -58,15 +58,20 @@ def propose(scene: mi.Scene, sensor: int) -> list[Proposal]:
     """
     params = mi.traverse(scene)
     shares = _shares(scene, sensor)
-    found = []
+    found, smooth = [], set[str]()
     for info in list_parameters(params, values=True):
         wanted_kind = info.kind in ("bsdf", "emitter", "attribute")
         if info.obstacle is None and wanted_kind and not _is_left_out(params, info):
             chain = _above(params, info.key)
             share = max((shares.get(item, 0.0) for item in chain), default=0.0)
             found.append((info, share))
+            bsdfs = [item for item in chain if isinstance(item, mi.BSDF)]
+            if bsdfs and all(_is_delta(bsdf) for bsdf in bsdfs):
+                smooth.add(info.key)
     found.sort(key=lambda pair: -pair[1])
-    seen = [info for info, share in found if share >= LEAST_SHARE and _COLOUR.search(info.key)]
+    # A mask leaves out the pixels that see mirrors and smooth glass: only what these light shows their colours.
+    shown = [info for info, share in found if share >= LEAST_SHARE and info.key not in smooth]
+    seen = [info for info in shown if _COLOUR.search(info.key)]
     wanted = [info.key for info in seen if info.value is None or info.value.high > 0][:MOST_FIRST]  # a lamp is black
     wanted = wanted or [info.key for info, _ in found if info.kind == "emitter"][:1] or [i.key for i, _ in found][:1]
     return [Proposal(info, share, _bounds(info), _resolution(info), info.key in wanted) for info, share in found]
@@ -77,6 +82,10 @@ def _is_left_out(params: mi.SceneParameters, info: ParameterInfo) -> bool:
     owner, name = params.hierarchy[params.properties[info.key][2]][0], info.key.split(".")[-2]
     is_principled = owner is not None and owner.class_name().startswith("Principled")
     return is_principled and name in LOBES and info.value is not None and info.value.high == 0
+
+
+def _is_delta(bsdf: mi.BSDF) -> bool:
+    return int(bsdf.flags()) & int(mi.BSDFFlags.Smooth) == 0
 
 
 def _above(params: mi.SceneParameters, key: str) -> list[Any]:

@@ -54,6 +54,7 @@ def test_a_scene_alone_gets_a_configuration_that_lacks_its_photograph_only(folde
     config = load(folder / "room.yaml")
     assert [spec.keys for spec in config.parameters] == [[tiny.KEY]]
     assert config.parameters[0].bounds == (0, 1)
+    assert (config.loss.type, config.optimizer.schedule, config.integrator.max_depth) == ("relative_l2", "cosine", 8)
     assert "# - {key: lamp.emitter.radiance.value, bounds: [0, .inf]}" in (folder / "room.yaml").read_text()
     missing = reslrb("optimize", "room.yaml")
     assert missing.exit_code == 2
@@ -147,6 +148,7 @@ VIEW = """<scene version="3.0.0"><sensor type="perspective"><film type="hdrfilm"
 </shape>
 <shape type="rectangle"><transform name="to_world"><rotate x="1" angle="-90"/><scale value="8"/></transform>
 <bsdf type="twosided"><bsdf type="diffuse"><ref id="tiles" name="reflectance"/></bsdf></bsdf></shape>
+<shape type="cube"><transform name="to_world"><translate x="-2.5" y="1"/></transform><bsdf type="conductor"/></shape>
 <shape type="sphere"><point name="center" x="1.5" y="1" z="0"/><emitter type="area"/></shape></scene>"""
 
 
@@ -156,8 +158,9 @@ def test_what_is_large_in_view_comes_first(tmp_path: Path) -> None:
     tiles = [f"Rectangle_1.bsdf.brdf_0.reflectance.color{k}.value" for k in range(2)]
     assert [item.info.key for item in found[:2]] == tiles
     first = [item.info.key for item in found if item.first]
-    assert first == [*tiles, "Sphere_2.bsdf.brdf_0.base_color.value"]  # neither the lamp's black nor roughness
+    assert first == [*tiles, "Sphere_2.bsdf.brdf_0.base_color.value"]  # no lamp's black, roughness, or mirror
     shares = {item.info.key: item.share for item in found}
+    assert shares["Cube_1.bsdf.specular_reflectance.value"] > 0.02
     assert shares["hidden.reflectance.value"] == 0
     assert 0.02 < shares["Sphere_2.bsdf.brdf_0.roughness.value"] < shares[tiles[0]] < 1
     assert not any("clearcoat.value" in key for key in shares), "it is 0, by which Mitsuba leaves it out for good"

@@ -161,7 +161,7 @@ def test_a_run_that_is_not_done_says_so_everywhere(capsys):
     assert f"not converged, still moving: {KEY}" in page.partition("<section>")[0]
     assert '<th scope="col">verdict</th>' in page
     assert '<span class="worse">still moving (' in page
-    assert results["certainty"]["gradients"] == 5
+    assert results["certainty"]["gradients"] == 3
     # A run that says nothing of it ends with the same values.
     values = np.load("runs/box/parameters/parameters.npz")[KEY]
     optimize(capsys, *sets, "run.certainty=false")

@@ -9,6 +9,7 @@ import pytest
 
 from reslrb_cli.optimization.certainty.coordinates import noise_covariance
 from reslrb_cli.optimization.certainty.curvature import smooth
+from reslrb_cli.optimization.certainty.measured import Measured
 from reslrb_cli.optimization.certainty.posterior import alone, joint
 from reslrb_cli.optimization.certainty.verdicts import Evidence, Verdict, judge, shares, summarise
 
@@ -153,3 +154,13 @@ def test_curvature_is_averaged_over_entries_of_alike_noise():
     found = smooth(measured[order], noise[order])
     assert np.abs(found / truth[order] - 1).max() < 0.6
     assert smooth(np.full(3, -1.0), np.ones(3)).tolist() == [0, 0, 0]
+
+
+def test_entries_of_a_motion_have_noise_of_their_own():
+    """Across the light and along it a lens differs by orders of magnitude: a run's mean squares say so."""
+    sizes = np.array([1.0, 0.01, 0.3])
+    gradients = np.random.default_rng(0).normal(size=(3, 3)) * sizes
+    given = {"value": sizes, "bounds": (-np.inf, np.inf), "scale": 1.0, "gradients": gradients, "is_small": True}
+    own, shared = (Measured(**given, response=sizes, rates=[1.0], recent=each) for each in (sizes**2, None))
+    assert np.all(own.noise < 9 * sizes**2)
+    assert np.all(shared.noise > 0.05)  # nothing but three samples is known: those of all entries

@@ -35,7 +35,7 @@ class Measured:
 
     def __post_init__(self) -> None:
         noise = np.var(self.gradients, axis=0, ddof=1)
-        if self.is_small:  # few samples: those of all entries
+        if self.is_small and self.recent is None:  # few samples: those of all entries
             noise = np.where(noise > 0, noise.mean(), 0.0)
         mean = self.gradients.mean(axis=0)
         if self.recent is not None:  # more of them, which few samples of heavy-tailed ones understate

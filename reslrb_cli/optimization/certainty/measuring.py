@@ -25,14 +25,15 @@ Array = np.ndarray[Any, Any]
 
 #: A run of fewer iterations is not judged: what it would cost is no small part of it.
 LEAST_ITERATIONS = 20
-#: Gradients at the final values: one for so many iterations, within these.
-ITERATIONS_A_SAMPLE, LEAST_SAMPLES, MOST_SAMPLES = 20, 5, 16
+#: Gradients at the final values: one for so many iterations, within these. They have the samples of a step, so that no
+#: kernel is compiled for them.
+ITERATIONS_A_SAMPLE, LEAST_SAMPLES, MOST_SAMPLES = 40, 3, 16
 #: Random probes for parameters of many entries; renderings along directions, at most: so many, or one for so many
 #: iterations.
 PROBES, LEAST_CHANGES, ITERATIONS_A_CHANGE = 4, 20, 10
 #: Share of the samples of a step that each of the two sets of samples has that curvature is measured with, and
 #: samples per pixel that are enough to have all of them.
-PART, FEW = 4, 8
+PART, FEW = 4, 4
 #: Directions are differentiated over this share of a parameter's scale.
 STEP = 0.05
 #: Part of a run whose gradients, the last ones, are asked for their noise.
