@@ -18,11 +18,10 @@ from reslrb_cli.optimization import Problem, optimize
 from reslrb_cli.optimization.certainty import LEAST_ITERATIONS, CertaintyRecord
 from reslrb_cli.optimization.nonfinite import Findings
 from reslrb_cli.optimization.rendering import saved_spp
-from reslrb_cli.optimization.results import Results
-from reslrb_cli.optimization.scaling import Scaled, step_line
 from reslrb_cli.recording.course import Course
 from reslrb_cli.recording.ending import Ending
 from reslrb_cli.recording.live import LivePage
+from reslrb_cli.recording.notes import check_memory, note_scaling
 from reslrb_cli.recording.telling import describe
 from reslrb_cli.records.checkpoint import FILE_NAME, NONFINITE_FILE_NAME, save_nonfinite
 from reslrb_cli.records.images import write_image
@@ -68,11 +67,6 @@ class Recording:
     def problem(self) -> Problem:
         """What is optimised."""
         return self.course.problem
-
-    @property
-    def results(self) -> Results:
-        """What was found so far."""
-        return self.course.results
 
     @property
     def last(self) -> Record | None:
@@ -148,12 +142,12 @@ class Recording:
         with MetricsWriter(self.folder.path) as metrics:
             for record in optimize(self.problem, self._on_nonfinite, self.course.state):
                 if not told and self.problem.sensitivities is not None:
-                    self._note_scaling(self.problem.sensitivities)
+                    note_scaling(self.manifest, self.problem, self.problem.sensitivities)
                 told = True
                 self.course.add(record)
                 metrics.write(record)
                 show(record)
-                self._check_memory(record)
+                check_memory(self.manifest, self.problem, record)
                 if stop():
                     return
                 if every and self.done % every == 0 and self.done < run.iterations:
@@ -163,13 +157,6 @@ class Recording:
                     self._save_checkpoint()
                     saved, saved_at = self.done, time.monotonic()
                 self.page.refresh()
-
-    def _note_scaling(self, measured: list[Scaled]) -> None:
-        self.manifest.scaling = [row.to_json() for row in measured]
-        for row in measured:
-            spec = self.problem.selection.spec(row.key)
-            line = step_line(row, spec.transform, spec.learning_rate or self.problem.config.optimizer.learning_rate)
-            (logger.warning if row.own_length is None else logger.info)(f"scale auto: {line}")
 
     def _on_nonfinite(self, found: Findings) -> None:
         """Keep the parameters of the first step that met a value that is not finite, and say how to look into it."""
@@ -182,14 +169,6 @@ class Recording:
 
     def _inspection(self) -> str:
         return f"reslrb inspect {shlex.quote(os.path.relpath(self.folder.path / 'config.yaml'))} --nonfinite"
-
-    def _check_memory(self, record: Record) -> None:
-        memory = self.problem.memory
-        if memory is not None:
-            warning = memory.check(record.peak_mib)
-            if warning is not None:
-                logger.warning(warning)
-            self.manifest.memory = memory.to_json()
 
     def _end(self, status: Status, failure: BaseException | None) -> Status:
         ending = Ending(self.folder.path, self.manifest, status, failure, self._kept)
@@ -261,8 +240,8 @@ class Recording:
 
     def _found(self) -> dict[str, Any]:
         """What the run came to, or has come to by now."""
-        self.results.end()
-        found = self.results.to_json()
+        self.course.results.end()
+        found = self.course.results.to_json()
         if self.certainty is not None:
             found["certainty"] = finite(self.certainty.to_json())
         found["warnings"] = warnings(found)
@@ -303,7 +282,7 @@ class Recording:
             image = self.problem.render(view.sensor, spp, self.done, "saved image")
             exposed = view.exposure.of_array(image)  # as the target is
             write_image(self.folder.images / self._image_name(name, view.sensor), exposed)
-            self.results.see(name, view, image)
+            self.course.results.see(name, view, image)
             if name == "final":
                 suffix = self._image_name("", view.sensor)
                 towards = self.problem.image_gradient(view, image)
