@@ -22,6 +22,11 @@ STARTED = Path(__file__).parent / "started"
 SILENT_SINCE = (20, 0, 0)
 
 
+def search_path(*first: Path) -> str:
+    """PYTHONPATH of a process that looks in these folders first, and then where this one would."""
+    return os.pathsep.join([*map(str, first), *filter(None, [os.environ.get("PYTHONPATH")])])
+
+
 def is_silent(library: ctypes.CDLL) -> bool:
     """Whether this libLLVM leaves passes out without a word."""
     version = shared_library.llvm_version(library)

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import click
 import pytest
+from compilation import search_path
 
 from reslrb_cli.cli import _Main, main
 from reslrb_cli.cli.console import Forgiving, forgiving_output
@@ -101,7 +102,7 @@ def test_a_stream_without_a_terminal_is_none() -> None:
 @pytest.mark.parametrize(("arguments", "code"), [("--version", 0), ("--nope", 2)])
 def test_python_has_nothing_to_add_at_its_end(tmp_path: Path, streams: str, arguments: str, code: int) -> None:
     script = f'"{sys.executable}" -c "{PROGRAM}" {arguments} {streams}'
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    environment = {**os.environ, "PYTHONPATH": search_path(ROOT)}
     done = subprocess.run(["sh", "-c", script], capture_output=True, text=True, env=environment, check=False)
     assert done.returncode == code
     assert "Exception" not in done.stderr
@@ -113,7 +114,7 @@ def test_a_reader_that_has_gone_ends_nothing() -> None:
     script += (
         "with forgiving_output():\n  for number in range(10000): print(number)\n  print('error', file=sys.stderr)\n"
     )
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    environment = {**os.environ, "PYTHONPATH": search_path(ROOT)}
     run = subprocess.Popen([sys.executable, "-c", script], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
                            stderr=subprocess.PIPE, env=environment)  # fmt: skip
     assert run.stdout is not None
@@ -127,6 +128,6 @@ def test_no_file_takes_the_place_of_a_closed_stream(tmp_path: Path) -> None:
     script = "from reslrb_cli.cli.console import forgiving_output\n"
     script += f"with forgiving_output(): print(open({str(tmp_path / 'file')!r}, 'w').fileno() > 2)"
     command = f'"{sys.executable}" -c "{script}" 2>&- <&-'
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    environment = {**os.environ, "PYTHONPATH": search_path(ROOT)}
     done = subprocess.run(["sh", "-c", command], capture_output=True, text=True, env=environment, check=False)
     assert done.stdout == "True\n"

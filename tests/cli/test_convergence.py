@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from cli.tiny import KEY, ROOT, write_experiment
+from compilation import search_path
 
 from reslrb_cli.cli import main
 from reslrb_cli.records.convergence import TARGETS
@@ -167,7 +168,7 @@ def test_a_method_that_cannot_do_the_scene_is_located(folder: Path, capsys: pyte
 def test_an_interrupt_keeps_what_is_done(folder: Path) -> None:
     script = "import sys; sys.argv[0] = 'reslrb'; from reslrb_cli.cli import run; run()"
     args = ["convergence", "tiny.yaml", "--integrators", "reslrb:stack", "--rounds", "100000", "--json", "c.jsonl"]
-    environment = {**os.environ, "PYTHONPATH": str(ROOT), "PYTHONUNBUFFERED": "1"}
+    environment = {**os.environ, "PYTHONPATH": search_path(ROOT), "PYTHONUNBUFFERED": "1"}
     process = subprocess.Popen(
         [sys.executable, "-c", script, *args], cwd=folder, env=environment, stdout=subprocess.PIPE, text=True
     )

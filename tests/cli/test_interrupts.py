@@ -11,6 +11,7 @@ import time
 from pathlib import Path
 
 import pytest
+from compilation import search_path
 
 from reslrb_cli.cli.interrupts import SIGNALS, Interrupts
 
@@ -23,7 +24,7 @@ def start(script: str, *, shell: str = "", argv0: str = "") -> subprocess.Popen[
     command = [sys.executable, "-c", f"import os, signal, sys, threading, time\n{script}"]
     if shell:
         command = ["sh", "-c", f'{shell}; exec "$@"', "sh", *command]
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    environment = {**os.environ, "PYTHONPATH": search_path(ROOT)}
     process = subprocess.Popen(
         command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment, bufsize=0
     )

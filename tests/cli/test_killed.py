@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 from cli.tiny import ROOT, write_experiment
+from compilation import search_path
 
 pytestmark = [
     pytest.mark.usefixtures("llvm"),
@@ -23,7 +24,7 @@ CONVERGENCE = ["convergence", "tiny.yaml", "--integrators", "reslrb:stack"]
 
 def start(folder: Path, *args: str) -> subprocess.Popen[str]:
     script = "import sys; sys.argv[0] = 'reslrb'; from reslrb_cli.cli import run; run()"
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    environment = {**os.environ, "PYTHONPATH": search_path(ROOT)}
     return subprocess.Popen(
         [sys.executable, "-c", script, *args],
         cwd=folder, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 from cli.tiny import ROOT, SCENE, write_experiment
+from compilation import search_path
 
 from reslrb_cli.backend import memory
 from reslrb_cli.config import Config, load
@@ -66,7 +67,7 @@ def refused(folder: Path, *sets: str) -> tuple[str, float]:
 
     script = "import sys; sys.argv[0] = 'reslrb'; from reslrb_cli.cli import run; run()"
     overrides = [word for text in sets for word in ("--set", text)]
-    environment = {**os.environ, "PYTHONPATH": str(ROOT), "RESLRB_CACHE": str(folder / "cache")}
+    environment = {**os.environ, "PYTHONPATH": search_path(ROOT), "RESLRB_CACHE": str(folder / "cache")}
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
     done = subprocess.run(
         [sys.executable, "-c", script, "optimize", "tiny.yaml", "--quiet", *overrides],

@@ -20,6 +20,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from cli.tiny import COMPLETE, faults, files, start, write_experiment
+from compilation import search_path
 
 from reslrb_cli.cli.interrupts import SIGNALS
 from reslrb_cli.records.manifest import read_manifest
@@ -213,7 +214,7 @@ def test_a_disk_that_is_full_before_the_run(experiment: Path, disk: Path) -> Non
 @pytest.mark.parametrize("streams", ["2>&-", pytest.param("2>/dev/full >&-", marks=pytest.mark.long)])
 def test_a_run_without_a_terminal(experiment: Path, streams: str) -> None:
     script = "import sys; sys.argv = ['reslrb', 'optimize', 'tiny.yaml']; from reslrb_cli.cli import run; run()"
-    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).resolve().parents[2])}
+    environment = {**os.environ, "PYTHONPATH": search_path(Path(__file__).resolve().parents[2])}
     command = f'exec "$PYTHON" -c "{script}" {streams}'
     environment["PYTHON"] = sys.executable
     done = subprocess.run(["sh", "-c", command], cwd=experiment, env=environment, capture_output=True, check=False)

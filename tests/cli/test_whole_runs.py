@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 from cli.test_convergence import call, read
 from cli.tiny import ROOT, write_experiment
+from compilation import search_path
 
 from reslrb_cli.measure.whole_runs.run import POINTS
 
@@ -92,7 +93,7 @@ def test_an_interrupt_keeps_what_is_done(folder: Path) -> None:
     script = "import sys; sys.argv[0] = 'reslrb'; from reslrb_cli.cli import run; run()"
     args = ["convergence", "tiny.yaml", "--runs", "50", "--budget", "2000", "--integrators", "reslrb:stack", "--json",
             "c.jsonl"]  # fmt: skip
-    environment = {**os.environ, "PYTHONPATH": str(ROOT), "PYTHONUNBUFFERED": "1"}
+    environment = {**os.environ, "PYTHONPATH": search_path(ROOT), "PYTHONUNBUFFERED": "1"}
     process = subprocess.Popen(
         [sys.executable, "-c", script, *args], cwd=folder, env=environment, stdout=subprocess.PIPE, text=True
     )

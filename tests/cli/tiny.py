@@ -10,6 +10,8 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from compilation import search_path
+
 from reslrb_cli.records.manifest import read_manifest
 from reslrb_cli.records.manifest_file import read_content
 
@@ -71,7 +73,7 @@ def start(folder: Path, *args: str, **options: Any) -> subprocess.Popen[str]:
     # As the program is started, which is called `reslrb` from its first line on.
     script = "import sys; sys.argv[0] = 'reslrb'; from reslrb_cli.cli import run; run()"
     command = [sys.executable, "-c", script, "optimize", "tiny.yaml", *args]
-    environment = {**os.environ, "PYTHONPATH": str(ROOT), "RESLRB_CACHE": str(folder / "cache")}
+    environment = {**os.environ, "PYTHONPATH": search_path(ROOT), "RESLRB_CACHE": str(folder / "cache")}
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True, **options}
     return subprocess.Popen(command, cwd=folder, env=environment, **pipes)
 

@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 from cli import tiny
 from cli.test_storms import mount
+from compilation import search_path
 from recording.going_on import differences, left_over, optimize, records_of, state_of, work_alone
 
 from reslrb_cli.records.manifest import read_manifest
@@ -35,7 +36,7 @@ SETS = ["--set", "run.checkpoint_every={iterations: 1}", "--set", "run.certainty
 
 
 def start(folder: Path, *args: str, script: str = SCRIPT) -> subprocess.Popen[str]:
-    environment = {**os.environ, "RESLRB_CACHE": str(folder / "cache"), "PYTHONPATH": str(tiny.ROOT)}
+    environment = {**os.environ, "RESLRB_CACHE": str(folder / "cache"), "PYTHONPATH": search_path(tiny.ROOT)}
     return subprocess.Popen(
         [sys.executable, "-c", script, "optimize", *args],
         cwd=folder, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,

@@ -11,6 +11,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 
 import pytest
+from compilation import search_path
 
 from reslrb_cli.records import lock as locks
 from reslrb_cli.records.lock import FolderLock, Holder, InUse
@@ -47,7 +48,7 @@ def test_readers_do_not_disturb_each_other_and_nobody_gives_up_over_one(tmp_path
 
 def test_a_killed_process_holds_nothing(tmp_path: Path) -> None:
     command = [sys.executable, "-c", HOLD, str(tmp_path)]
-    holder = subprocess.Popen(command, stdout=subprocess.PIPE, env={**os.environ, "PYTHONPATH": str(ROOT)})
+    holder = subprocess.Popen(command, stdout=subprocess.PIPE, env={**os.environ, "PYTHONPATH": search_path(ROOT)})
     assert holder.stdout is not None
     assert holder.stdout.readline() == b"locked\n"
     with pytest.raises(InUse):

@@ -10,6 +10,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from compilation import search_path
 
 from reslrb_cli.config.limits import NAME_BYTES
 from reslrb_cli.config.names import check_name
@@ -253,7 +254,7 @@ for number in range(count):
 
 @pytest.mark.parametrize("each", [4, pytest.param(40, marks=pytest.mark.long)])
 def test_many_at_once_either_replace_or_are_refused(tmp_path, each):
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    environment = {**os.environ, "PYTHONPATH": search_path(ROOT)}
     command = [sys.executable, "-c", CONTEND, str(tmp_path), str(each)]
     runs = [subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment)
             for _ in range(8)]  # fmt: skip

@@ -17,6 +17,7 @@ from pathlib import Path
 
 import pytest
 from cli.tiny import CONFIG, ROOT, SCENE, write_experiment
+from compilation import search_path
 from scene.mutations import mutate_bytes, mutate_scene, write_images
 
 pytestmark = [
@@ -39,7 +40,7 @@ class Hostile:
 
     @staticmethod
     def _start(folder: Path) -> subprocess.Popen[str]:
-        environment = {**os.environ, "PYTHONPATH": os.pathsep.join((str(ROOT), str(ROOT / "tests")))}
+        environment = {**os.environ, "PYTHONPATH": search_path(ROOT, ROOT / "tests")}
         environment["RESLRB_CACHE"] = str(folder / "cache")
         command = [sys.executable, "-m", "scene.hostile"]
         pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL}
