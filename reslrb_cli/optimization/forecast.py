@@ -136,13 +136,18 @@ def _buffers(problem: Problem) -> dict[str, int]:
         if isinstance(value, dr.ArrayBase):
             name = key.rpartition(".")[2]
             part = "geometry" if name.startswith(("vertex_", "faces", "to_world")) else "values"
-            found[part] += int(dr.prod(dr.shape(value))) * dr.itemsize_v(value)
+            found[part] += _bytes(value)
     return found
+
+
+def _bytes(value: dr.ArrayBase) -> int:
+    """Bytes of an array of Dr.Jit."""
+    return int(dr.prod(dr.shape(value))) * int(dr.itemsize_v(value))
 
 
 def _state_bytes(problem: Problem) -> int:
     """Bytes of the optimiser's state: values and moments."""
-    return sum(int(array.nbytes) for array in problem.optimizer.state().values())
+    return sum(_bytes(value) for value in problem.optimizer.state().values() if isinstance(value, dr.ArrayBase))
 
 
 def _scratch(problem: Problem) -> int:

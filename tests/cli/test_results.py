@@ -41,11 +41,11 @@ def read(path):
 
 
 def test_correlated_samples_tell_of_their_bias(capsys, monkeypatch):
-    from reslrb_cli.optimization import correlated_rounds
     from reslrb_cli.optimization.correlated_bias import Bias, CorrelatedBias
+    from reslrb_cli.recording import preparing
 
     bias = CorrelatedBias(8, 4, [Bias(KEY, -0.38, 0.06, along=True, exceeds=False)])
-    monkeypatch.setattr(correlated_rounds, "measure_correlated_bias", lambda problem, say: bias)
+    monkeypatch.setattr(preparing, "measure_correlated_bias", lambda problem, say: bias)
     code, _, err = reslrb(capsys, "optimize", "box.yaml", "--quiet", "--set", "run.iterations=2")
     assert code == 0
     assert err.strip() == bias.line()
@@ -126,7 +126,7 @@ def test_a_parameter_that_got_worse_is_said_plainly(capsys):
     assert f"; {WALL} got worse (RMSE {pair['initial']:.3g} to {pair['final']:.3g})" in last
     assert results["worse"] == [WALL]
     assert ", worse " in out.splitlines()[1]
-    assert out.splitlines()[1].endswith("at its bound")
+    assert "  at its bound" in out.splitlines()[1]
 
 
 def test_a_run_that_works_or_is_short_has_nothing_to_complain_of(capsys):

@@ -59,16 +59,18 @@ def test_it_is_measured_once_and_remembered(experiment, capsys):
 
 def test_it_is_not_tried_where_nobody_chose_an_estimator(experiment, capsys, monkeypatch):
     """And a better one is one line, one that may be no better none."""
+    from reslrb_cli.recording import preparing
+
     err, manifest = optimize(capsys, "integrator.estimator=stack")
     assert manifest["rival"] is None
     assert "prb" not in err
     better = RivalRecord("prb", 8, 4, 5.0, 3.0, 8.0, 1.5, 2.0)
-    monkeypatch.setattr(rival, "measure_rival", lambda problem, cache, say: better)
+    monkeypatch.setattr(preparing, "measure_rival", lambda problem, cache, say: better)
     err, manifest = optimize(capsys, "integrator.estimator=stack")
     assert f"{better.line()}; --set integrator.type=prb" in err
     assert "prb has 5 times the efficiency here (3 to 8; measured in 1.5 s" in better.line()
     assert manifest["rival"] == better.to_json()
-    monkeypatch.setattr(rival, "measure_rival", lambda problem, cache, say: RivalRecord("prb", 8, 4, 1.5, 0.9, 2.5))
+    monkeypatch.setattr(preparing, "measure_rival", lambda problem, cache, say: RivalRecord("prb", 8, 4, 1.5, 0.9, 2.5))
     assert "prb" not in optimize(capsys, "integrator.estimator=stack")[0]
 
 
