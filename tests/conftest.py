@@ -15,6 +15,12 @@ from reslrb_cli.backend.variant import set_variant
 from reslrb_cli.errors import BackendError
 
 
+def pytest_collection_finish() -> None:
+    """What is there until the last test is not looked through again and again for what has become free."""
+    gc.collect()
+    gc.freeze()
+
+
 def pytest_configure(config: pytest.Config) -> None:
     """Compiles quickly, unless it is the long runs that are asked for; RESLRB_TEST_OPTIMISED=1 compiles as users do."""
     is_long = "long" in config.option.markexpr and "not long" not in config.option.markexpr

@@ -34,6 +34,7 @@ def peaks(name: str) -> list[float]:
     return [peak(name, depth) for depth in (4, 16)]
 
 
+@pytest.mark.long
 def test_memory_of_stack_does_not_grow_with_depth():
     shallow, deep = peaks("reslrb:stack")
     assert 0 < shallow  # else the watermark sees nothing

@@ -10,8 +10,8 @@ import pytest
 from reslrb_cli.measure.extreme import CASES, registry, run_suite
 from reslrb_cli.records.gradcheck import GradcheckRecord
 
-#: One for each kind of extreme that no test below has: long sums and suns are there, with faults that they find.
-FEW = ("connection_1e8", "no_connection", "nan_loss", "roughconductor_1e-2", "slope_0")
+#: By default: no path that connects, values that are not finite, a narrow lobe; roulette and its fault stand below.
+FEW = ("no_connection", "nan_loss", "roughconductor_1e-2")
 
 
 @pytest.fixture(autouse=True)
@@ -54,6 +54,7 @@ def lost(case: str, estimator: str) -> list[str]:
     return failures(run_suite([case], [estimator]))
 
 
+@pytest.mark.long
 def test_selection_by_contribution_alone_loses_what_follows_a_heavy_one(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr("reslrb_cli.estimators.reservoir.SHARE", 0.0)
     records = run_suite(["connection_1e8"], ["reservoir", "event"])
@@ -65,11 +66,13 @@ def test_roulette_by_throughput_alone_loses_what_follows_a_dark_surface(monkeypa
     assert lost("albedo_1e-6_roulette", "stack")
 
 
+@pytest.mark.long
 def test_roulette_by_power_loses_dim_lamps(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr("reslrb_cli.transport.walk.DIMMEST", 1.0)
     assert lost("emission_1e-25_roulette", "gather")
 
 
+@pytest.mark.long
 def test_sampling_by_radiance_alone_hardly_sees_the_sky_beside_a_sun(monkeypatch: pytest.MonkeyPatch):
     def variance() -> float:
         # Half of the seeds: of eight, a variance is known to a half, and what is looked for is a factor of a hundred.

@@ -93,6 +93,7 @@ def slab_share() -> float:
     return float(abs(border / (inside + border)))
 
 
+@pytest.mark.long
 def test_a_texture_lacks_nothing():
     """Neither do colours: nothing moves."""
     config = room("lamp_over_floor.xml", "floor.bsdf.reflectance.value")
@@ -111,7 +112,7 @@ def test_a_texture_lacks_nothing():
     [
         # The beam's right end brings HALF, of which what lands already brings its own width.
         (lambda: half_covered("lamp"), EDGE / HALF),
-        (lambda: half_covered("cover"), 1.0),
+        pytest.param(lambda: half_covered("cover"), 1.0, marks=pytest.mark.long),
         pytest.param(slab_in_a_beam, slab_share(), marks=pytest.mark.long),
     ],
     ids=["lamp", "cover", "slab"],
