@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import gc
 import os
+import subprocess
 import sys
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 from compilation import leave_out_optimisations
@@ -44,3 +46,13 @@ def _release_jit_memory() -> Iterator[None]:
     if "drjit" in sys.modules:
         gc.collect()
         sys.modules["drjit"].flush_malloc_cache()
+
+
+@pytest.fixture
+def disk(tmp_path: Path) -> Iterator[Path]:
+    """A place for a disk, which is taken away at the end."""
+    place = tmp_path / "disk"
+    place.mkdir()
+    yield place
+    while os.path.ismount(place):
+        subprocess.run(["umount", str(place)], check=True)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from reslrb_cli.backend.memory import resident_bytes
 from reslrb_cli.cli.output import echo
 from reslrb_cli.errors import printable
-from reslrb_cli.records.clock import duration
+from reslrb_cli.records.clock import rough_duration
 
 if TYPE_CHECKING:
     from reslrb_cli.config import Config
@@ -45,18 +45,20 @@ def memory_lines(forecast: Forecast, budget: int | None) -> list[str]:
 
 def time_lines(forecast: Forecast) -> list[str]:
     """What the parts of the run take."""
-    compiled = f"and {duration(forecast.compile_s)} of compiling, which is done now and kept"
-    pilot = f"{duration(forecast.pilot_s)}, done now and kept" if forecast.pilot_s else "none, or kept from before"
+    compiled = f"and {rough_duration(forecast.compile_s)} of compiling, which is done now and kept"
+    pilot = (
+        f"{rough_duration(forecast.pilot_s)}, done now and kept" if forecast.pilot_s else "none, or kept from before"
+    )
     sums = f"{forecast.iterations} x {1e3 * forecast.iteration_s:.3g} ms"
-    sums += f" + {duration(forecast.start_s)}" if forecast.start_s > 0.01 * forecast.elapsed_s else ""
+    sums += f" + {rough_duration(forecast.start_s)}" if forecast.start_s > 0.01 * forecast.elapsed_s else ""
     return [
-        f"time of the iterations: {duration(forecast.elapsed_s)} ({sums}), {compiled}",
+        f"time of the iterations: {rough_duration(forecast.elapsed_s)} ({sums}), {compiled}",
         f"  by steps of {forecast.spp} samples per pixel",
-        f"  {duration(forecast.target_s):>10}  rendering the target",
+        f"  {rough_duration(forecast.target_s):>10}  rendering the target",
         f"  {pilot:>10}  pilot",
-        f"  {duration(forecast.images_s):>10}  saved images",
-        f"  {duration(forecast.verdicts_s):>10}  verdicts on the values, or so",
-        f"time of the whole run: about {duration(forecast.whole_s)}",
+        f"  {rough_duration(forecast.images_s):>10}  saved images",
+        f"  {rough_duration(forecast.verdicts_s):>10}  verdicts on the values, or so",
+        f"time of the whole run: about {rough_duration(forecast.whole_s)}",
     ]
 
 

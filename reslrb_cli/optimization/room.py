@@ -15,7 +15,7 @@ from reslrb_cli.config import Config
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.integrators import Reslrb as Tracer
 from reslrb_cli.optimization.budget import estimate
-from reslrb_cli.records.clock import duration
+from reslrb_cli.records.clock import rough_duration
 
 if TYPE_CHECKING:
     from reslrb_cli.optimization.problem import Problem
@@ -152,7 +152,8 @@ def outlook(config: Config, scene: mi.Scene, sensors: Sequence[int]) -> str | No
         return None
     return (
         f"{each:.3g} light paths an iteration, {each * run.iterations:.3g} in all: the run takes "
-        f"{duration(each * run.iterations / RATE)} at {RATE / 1e6:.0f} million paths a second; --dry-run measures it"
+        f"{rough_duration(each * run.iterations / RATE)} at {RATE / 1e6:.0f} million paths a second; "
+        "--dry-run measures it"
     )
 
 

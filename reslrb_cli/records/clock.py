@@ -96,7 +96,7 @@ def peak_mib(backend: Any) -> float:
     return float(dr.detail.malloc_watermark(backend)) / MIB
 
 
-def duration(seconds: float) -> str:
+def rough_duration(seconds: float) -> str:
     """Seconds in words: `0.4 s`, `12 min`, `5.2 h`, `3.1 days`."""
     for unit, name in ((86400, "days"), (3600, "h"), (60, "min")):
         if seconds >= 2 * unit:

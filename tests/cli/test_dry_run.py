@@ -15,7 +15,7 @@ from reslrb_cli.config import load
 from reslrb_cli.config.passes import largest_pass, passes_obstacle
 from reslrb_cli.optimization import trial
 from reslrb_cli.optimization.forecast import make_forecast
-from reslrb_cli.records.clock import MIB, duration
+from reslrb_cli.records.clock import MIB, rough_duration
 from reslrb_cli.records.metrics import read_metrics
 
 pytestmark = pytest.mark.usefixtures("llvm")
@@ -104,6 +104,6 @@ def test_passes(spp: int, per_pass: int | None, pixels: int, said: str | None) -
 
 def test_words() -> None:
     assert [amount(n) for n in (0, 2**19, 2**30, 3 * 2**31)] == ["0 B", "512.0 KiB", "1.0 GiB", "6.0 GiB"]
-    assert [duration(s) for s in (0.0123, 9.96, 45, 200, 9000, 2e6)] == [
+    assert [rough_duration(s) for s in (0.0123, 9.96, 45, 200, 9000, 2e6)] == [
         "0.012 s", "10 s", "45 s", "3.3 min", "2.5 h", "23.1 days",
     ]  # fmt: skip

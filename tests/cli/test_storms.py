@@ -14,7 +14,6 @@ import subprocess
 import sys
 import time
 from collections import Counter
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -143,16 +142,6 @@ def test_a_storm_of_two(experiment: Path, number: int) -> None:
 
 
 # --- disks ------------------------------------------------------------------------------------------------------------
-
-
-@pytest.fixture
-def disk(tmp_path: Path) -> Iterator[Path]:
-    """A place for a disk, which is taken away at the end."""
-    place = tmp_path / "disk"
-    place.mkdir()
-    yield place
-    while os.path.ismount(place):
-        subprocess.run(["umount", str(place)], check=True)
 
 
 def mount(place: Path, kib: int) -> None:

@@ -9,7 +9,6 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -106,15 +105,6 @@ def test_a_run_that_is_killed_again_and_again_ends_where_the_other_does(
     assert differences(tmp_path / "runs/whole", run) == []
     assert [record["iteration"] for record in records_of(run)] == list(range(iterations))
     assert read_manifest(run)["status"] == "finished"  # type: ignore[index]
-
-
-@pytest.fixture
-def disk(tmp_path: Path) -> Iterator[Path]:
-    place = tmp_path / "disk"
-    place.mkdir()
-    yield place
-    while os.path.ismount(place):
-        subprocess.run(["umount", str(place)], check=True)
 
 
 SIZES = [8, 16, 32, 48, 64, 80, 96, 112, 128, 144, 160, 192, 256, 384, 512, 1024]
