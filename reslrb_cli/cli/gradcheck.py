@@ -102,7 +102,7 @@ def command(
     check_writable("--markdown", markdown_file)
     if suite is not None:
         refuse_foreign(context)
-        return run_suite_command(cases, estimators, seeds, json_file, markdown_file)
+        return run_suite_command(cases, estimators, seeds, json_file, markdown_file, resumed)
     if cases:
         raise ConfigError("--case", "", "names a case of a suite; take --suite extreme with it")
     if config_file is None:
@@ -112,7 +112,7 @@ def command(
     if missing:
         variant = set_variant(config.variant)
         echo(f"{device_name(variant)}, {variant}")
-        return run_missing(config, variant, budget, seeds, spp, directions, json_file)
+        return run_missing(config, variant, budget, seeds, spp, directions, json_file, resumed)
     listed = all_estimators(config) if estimators is None else parse_estimators(estimators)
     _check_folder(folder)
     settings = Settings(config, listed, budget, seeds, spp, estimators is not None, time.monotonic() - began)

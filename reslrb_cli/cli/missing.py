@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,10 +12,11 @@ from reslrb_cli.errors import ConfigError, ExitCode
 
 if TYPE_CHECKING:
     from reslrb_cli.config import Config
+    from reslrb_cli.records.missing import MissingRecord
 
 #: Options that say something about comparisons, of which there is none.
 FOREIGN = {"suite": "--suite", "cases": "--case", "estimators": "--estimators", "markdown_file": "--markdown",
-           "folder": "--images", "resumed": "--resume"}  # fmt: skip
+           "folder": "--images"}  # fmt: skip
 
 
 def refuse_comparisons(context: click.Context) -> None:
@@ -36,19 +36,34 @@ def run_missing(
     spp: int | None,
     along: int | None,
     json_file: Path | None,
+    resumed: Path | None,
 ) -> int:
     """Measure, print and write; returns the exit code. `variant` must be set."""
+    from reslrb_cli.backend.device import device_name
     from reslrb_cli.cli.interrupts import Interrupts
-    from reslrb_cli.cli.measured import measured_lines
-    from reslrb_cli.measure.missing_check import MissingCheck
+    from reslrb_cli.cli.keeping import Keeper, read_earlier
+    from reslrb_cli.cli.measured import origin_of
+    from reslrb_cli.measure.earlier import Earlier, settings
+    from reslrb_cli.measure.missing_check import KIND, MissingCheck
 
-    check = MissingCheck(config, budget, seeds, spp, along)
+    to_keep = settings(config, variant, device_name(variant), spp=spp, directions=along)
+    earlier = None
+    if resumed is not None:
+        earlier = Earlier(KIND, resumed, *read_earlier(resumed))
+        earlier.check(to_keep)
+    check = MissingCheck(config, budget, seeds, spp, along, earlier)
     echo(check.conditions())
-    with ExitStack() as stack:
-        writer = None if json_file is None else stack.enter_context(measured_lines(json_file, variant))
-        interrupts = stack.enter_context(Interrupts())
-        for record in check.run(lambda: interrupts.requested):
-            if writer is not None:
-                writer.write(record)
+    records: list[MissingRecord] = []
+    keeper = Keeper(
+        json_file,
+        origin_of(variant),
+        lambda: records,
+        lambda: check.known()[len(records) :],
+        lambda: check.kept(to_keep),
+    )
+    with Interrupts() as interrupts:
+        for record in check.run(lambda: interrupts.requested, keeper.refresh):
+            records.append(record)
             echo(record.line())
+        keeper.finish(check.known())
         return ExitCode.INTERRUPTED if interrupts.requested else ExitCode.DONE

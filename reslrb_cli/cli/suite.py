@@ -23,7 +23,6 @@ _FOREIGN = {
     "budget": "--budget",
     "spp": "--spp",
     "folder": "--images",
-    "resumed": "--resume",
 }
 
 
@@ -42,30 +41,47 @@ def run_suite_command(
     seeds: int | None,
     json_file: Path | None,
     markdown_file: Path | None,
+    resumed: Path | None,
 ) -> int:
-    """Run the cases of these names, all where there is none; print a line for each, write the files."""
-    from contextlib import ExitStack
+    """Run the cases of these names, all where there is none; print a line for each, write the files.
 
+    Cases that the file `resumed` has are not run again.
+    """
     from reslrb_cli.backend.device import device_name
     from reslrb_cli.backend.variant import set_variant
     from reslrb_cli.cli.interrupts import Interrupts
-    from reslrb_cli.cli.measured import measured_lines
+    from reslrb_cli.cli.keeping import Keeper, read_earlier
+    from reslrb_cli.cli.measured import origin_of
     from reslrb_cli.report.gradcheck_table import summary_lines
 
     chosen = _estimators(estimators)
     variant = set_variant("auto")
 
-    from reslrb_cli.measure.extreme import CASES, run_suite
+    from reslrb_cli.measure.earlier import Earlier
+    from reslrb_cli.measure.extreme import CASES, resuming, run_suite
 
     for name in names:
         if name not in CASES:
             near = difflib.get_close_matches(name, list(CASES), n=1, cutoff=0)
             raise ConfigError("--case", "", f"there is no case `{name}`; did you mean {near[0]}?")
+    settings = resuming.settings(chosen, seeds, variant, device_name(variant))
+    done: dict[str, list[GradcheckRecord]] = {}
+    if resumed is not None:
+        earlier = Earlier(resuming.KIND, resumed, *read_earlier(resumed))
+        earlier.check(settings)
+        done = resuming.restore(earlier)
+    to_do = [name for name in names or CASES if name not in done]
+    if not to_do:
+        raise ConfigError("--resume", "", f"{resumed} has all these cases already; name others with --case")
     echo(f"{device_name(variant)}, {variant}")
-    records: list[GradcheckRecord] = []
-    with ExitStack() as stack:
-        writer = None if json_file is None else stack.enter_context(measured_lines(json_file, variant))
-        interrupts = stack.enter_context(Interrupts())
+    for case, rows in done.items():
+        echo(_case_line(case, rows))
+
+    def lines() -> list[GradcheckRecord]:
+        return [record for rows in done.values() for record in rows]
+
+    keeper = Keeper(json_file, origin_of(variant), lines, lambda: [], lambda: resuming.kept(settings, done))
+    with Interrupts() as interrupts:
 
         def until_interrupted(found: Iterator[GradcheckRecord]) -> Iterator[GradcheckRecord]:
             for record in found:
@@ -73,14 +89,15 @@ def run_suite_command(
                     return
                 yield record
 
-        for case, group in groupby(until_interrupted(run_suite(names or None, chosen, seeds)), lambda r: r.case):
+        for case, group in groupby(until_interrupted(run_suite(to_do, chosen, seeds)), lambda r: r.case):
             rows = list(group)
-            records += rows
-            for record in rows:
-                if writer is not None:
-                    writer.write(record)
+            if interrupts.requested:  # there may be more of this one
+                break
+            done[case] = rows
+            keeper.refresh()
             echo(_case_line(case, rows))
-        interrupted = interrupts.requested
+        records, interrupted = lines(), interrupts.requested
+        keeper.finish(records)
     for line in summary_lines(records):
         echo(line)
     if markdown_file is not None:

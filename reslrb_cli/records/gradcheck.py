@@ -5,6 +5,7 @@ from __future__ import annotations
 import enum
 import json
 import math
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -86,6 +87,12 @@ class GradcheckRecord:
     def holds(self) -> bool | None:
         """True or False where the comparison decides; None where it does not."""
         return {Verdict.HOLDS: True, Verdict.FAILS: False}.get(self.verdict)
+
+    @classmethod
+    def of(cls, values: Mapping[str, Any]) -> GradcheckRecord:
+        """The record of these values, by name. Raises TypeError and ValueError where they are none of a record."""
+        names = {"reference": Reference, "kind": Kind, "verdict": Verdict}
+        return cls(**{key: names[key](value) if key in names else value for key, value in values.items()})
 
     def to_json(self) -> str:
         """The record as one line of JSON; figures that are not finite become null."""

@@ -9,11 +9,13 @@ import re
 import signal
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 from reslrb_cli.cli import main
+from reslrb_cli.records.gradcheck import GradcheckRecord, Kind, Reference, Verdict
 
 pytestmark = pytest.mark.usefixtures("llvm")
 
@@ -122,6 +124,39 @@ def test_a_case_of_the_suite(tmp_path: Path, capsys: pytest.CaptureFixture[str])
     assert "| `furnace` |" in markdown.read_text()
     assert call("--suite", "extreme", "--case", "furnac") == 2
     assert "there is no case `furnac`; did you mean furnace?" in capsys.readouterr().err
+
+
+def test_cases_that_are_done_are_not_run_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from reslrb_cli.measure import extreme
+
+    row = {"parameter": None, "integrator": "reslrb", "estimator": "stack", "reference": Reference.ANALYTIC,
+           "kind": Kind.EXPECTATION, "seeds": 3, "verdict": Verdict.HOLDS}  # fmt: skip
+    run: list[str] = []
+
+    def pretended(names: list[str], *_others: object) -> Iterator[GradcheckRecord]:
+        for name in names:
+            run.append(name)
+            yield GradcheckRecord(case=name, **row)
+            if name == "stopped":
+                os.kill(os.getpid(), signal.SIGINT)
+            yield GradcheckRecord(case=name, **row)
+
+    monkeypatch.setattr(extreme, "run_suite", pretended)
+    monkeypatch.setattr(extreme, "CASES", dict.fromkeys(["first", "stopped", "last"]))
+    file = tmp_path / "a.jsonl"
+    assert call("--suite", "extreme", "--json", str(file)) == 130
+    assert [row["case"] for row in read(file)] == ["first"] * 2
+    monkeypatch.setattr(os, "kill", lambda *_: None)
+    assert call("--suite", "extreme", "--resume", str(file)) == 0
+    assert [row["case"] for row in read(file)] == ["first"] * 2 + ["stopped"] * 2 + ["last"] * 2
+    assert run == ["first", "stopped", "stopped", "last"]
+    assert "6 of 6 comparisons hold" in capsys.readouterr().out
+    assert call("--suite", "extreme", "--resume", str(file)) == 2
+    assert "a.jsonl has all these cases already; name others with --case" in capsys.readouterr().err
+    assert call("--suite", "extreme", "--seeds", "5", "--resume", str(file)) == 2
+    assert "--seeds is as the cases have it there, 5 here" in capsys.readouterr().err
 
 
 def test_ctrl_c_prints_what_is_done() -> None:

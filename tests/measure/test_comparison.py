@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import asdict
 
 import numpy as np
 import pytest
@@ -15,7 +16,6 @@ from reslrb_cli.measure.comparison import (
 )
 from reslrb_cli.measure.entries import divisions, entry_count, overall, parts
 from reslrb_cli.records.gradcheck import GradcheckRecord, Kind, Reference, Verdict
-from reslrb_cli.records.lines import LineWriter
 from reslrb_cli.report.gradcheck_table import Table, failure_line, markdown_table
 
 FAMILY = Family(rows=20, entries=400, alpha=1e-4)
@@ -159,15 +159,17 @@ def record(**changes) -> GradcheckRecord:
     return GradcheckRecord(**values | changes)
 
 
-def test_records_are_written_one_a_line(tmp_path):
-    with LineWriter(tmp_path / "a.jsonl") as writer:
-        writer.write(record())
-        writer.write(record(verdict=Verdict.UNRESOLVED, relative_l2=float("inf"), parameter=None))
-    first, second = map(json.loads, (tmp_path / "a.jsonl").read_text().splitlines())
+def test_a_record_is_a_line_and_comes_back() -> None:
+    found = record(verdict=Verdict.UNRESOLVED, parameter=None)
+    line = json.loads(found.to_json())
     assert {"case", "parameter", "integrator", "estimator", "reference", "seeds", "relative_l2", "z_rms", "z_max",
-            "cosine", "variance_ratio", "holds"} <= set(first)  # fmt: skip
-    assert (first["reference"], first["verdict"], first["holds"]) == ("ptracer", "fails", False)
-    assert (second["holds"], second["relative_l2"], second["parameter"]) == (None, None, None)
+            "cosine", "variance_ratio", "holds"} <= set(line)  # fmt: skip
+    assert (line["reference"], line["verdict"], line["holds"]) == ("ptracer", "unresolved", None)
+    assert json.loads(record(relative_l2=float("inf")).to_json())["relative_l2"] is None
+    assert json.loads(record().to_json())["holds"] is False
+    assert GradcheckRecord.of(json.loads(json.dumps(asdict(found)))) == found
+    with pytest.raises(TypeError):
+        GradcheckRecord.of({"case": "a", "colour": 3})
 
 
 def test_table_and_the_line_of_a_failure():

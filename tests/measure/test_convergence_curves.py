@@ -89,6 +89,23 @@ def test_the_intervals_cover_what_they_say(steps: int, rows: int) -> None:
     assert LEAST <= slopes <= MOST
 
 
+@pytest.mark.parametrize("steps", [16, 32, 64])
+def test_the_intervals_of_a_single_colour_cover_too(steps: int) -> None:
+    """Its three channels deviate together, so that every error is the square of one normal number."""
+    covered, slopes = 0, 0
+    for seed in range(REPETITIONS):
+        random = np.random.default_rng(seed)
+        own, others = (1 + 0.1 * random.standard_normal((count, 1)) * np.ones(3) for count in (steps, 400))
+        samples = Samples(own, np.arange(steps) // 2, np.ones(steps // 2), Reference(others.reshape(40, 10, 3).mean(1)))
+        efficiency, slope = samples.efficiency(), samples.slope()
+        assert efficiency is not None
+        assert slope is not None
+        covered += efficiency.exponential().low <= 100 <= efficiency.exponential().high
+        slopes += slope.interval().low <= -0.5 <= slope.interval().high
+    assert LEAST <= covered <= MOST
+    assert LEAST <= slopes <= MOST
+
+
 def test_the_interval_of_a_biased_method_covers_too() -> None:
     bias = 0.6
     truth, covered = SIGNAL / (VARIANCE + bias**2 * SIGNAL) / SECONDS, 0
@@ -145,5 +162,5 @@ def test_times_that_a_bias_forbids() -> None:
 def test_too_few_steps_have_no_intervals() -> None:
     assert make(7, steps=4, per_turn=2).efficiency() is None
     assert make(7, steps=6, per_turn=2).efficiency() is not None
-    assert make(7, steps=7, per_turn=1).slope() is None
-    assert make(7, steps=8, per_turn=1).slope() is not None
+    assert make(7, steps=15, per_turn=1).slope() is None
+    assert make(7, steps=16, per_turn=1).slope() is not None

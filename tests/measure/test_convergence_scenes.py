@@ -12,7 +12,7 @@ from scipy import stats
 
 from reslrb_cli.cli import main
 from reslrb_cli.config import load
-from reslrb_cli.measure.convergence.curves import Reference, Samples
+from reslrb_cli.measure.convergence.curves import GROUPS, Reference, Samples
 
 pytestmark = [pytest.mark.usefixtures("llvm"), pytest.mark.long]
 
@@ -22,7 +22,6 @@ OURS = "reslrb:reservoir,reslrb:event,reslrb:gather,reslrb:stack"
 PTRACER = "ptracer(rr_depth=1000000)"
 #: Probability that all slopes of a scene are within their intervals, widened for their number.
 CONFIDENCE = 0.99
-GROUPS = 8
 
 
 def methods(folder: Path, scene: str, size: tuple[int, int], *args: str) -> list[dict]:
@@ -55,8 +54,9 @@ def test_unbiased_methods(tmp_path: Path, scene: str, size: tuple[int, int], spp
     keys = {line["parameter"] for line in found}
     count = len({line["label"] for line in found}) * max(len(keys) - 1, 1)
     # The intervals are of 95 %, by Student's t with as many degrees of freedom as there are groups of steps less one.
-    wider = stats.t.isf((1 - CONFIDENCE) / 2 / count, GROUPS - 1) / stats.t.isf(0.025, GROUPS - 1)
     for line in found:
+        freedom = next(groups for steps, groups in GROUPS.items() if line["steps"] >= steps) - 1
+        wider = stats.t.isf((1 - CONFIDENCE) / 2 / count, freedom) / stats.t.isf(0.025, freedom)
         assert line["biased"] is not True, line
         assert abs(line["bias_z"]) < line["bias_z_limit"], line
         slope = line["slope"]

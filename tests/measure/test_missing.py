@@ -14,6 +14,7 @@ from measure.faults import room
 from reslrb_cli.cli import main
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.integrators import gradient_step
+from reslrb_cli.measure import missing_check
 from reslrb_cli.measure.analytic import fresnel
 from reslrb_cli.measure.analytic_motion import centre_of_gravity, parallel
 from reslrb_cli.measure.attached.amplitudes import Pose
@@ -189,17 +190,33 @@ run: {{iterations: 3, spp: 16}}
 """
 
 
-def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+def test_the_command_and_more_seeds(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    """Two calls come to what one call comes to, around the same steps; another measurement is not gone on from."""
+    monkeypatch.setattr(missing_check, "IMAGE_PATHS", 2**16)  # of noise in dL/dI, which is the same for all
     config = tmp_path / "lamp.yaml"
     config.write_text(LAMP.format(folder=Path(__file__).parent))
-    lines = tmp_path / "missing.jsonl"
-    assert call(str(config), "--missing", "--seeds", "6", "--directions", "2", "--json", str(lines)) == 0
-    origin, row = map(json.loads, lines.read_text().splitlines())
+    whole, part, more = (tmp_path / f"{name}.jsonl" for name in ("whole", "part", "more"))
+    again = ["--missing", "--directions", "2", "--spp", "4"]
+    assert call(str(config), *again, "--seeds", "6", "--json", str(whole)) == 0
+    origin, row = map(json.loads, whole.read_text().splitlines())
     assert origin["kind"] == "origin"
     assert (row["kind"], row["parameter"], row["directions"], row["seeds"]) == ("missing", "lamp.position", 2, 6)
     shown = capsys.readouterr().out.splitlines()
     assert shown[-1].startswith("lamp.position: ")
     assert "dL/dI of the loss at the initial values" in shown[-2]
+    assert call(str(config), *again, "--seeds", "3", "--json", str(part)) == 0
+    assert call(str(config), *again, "--seeds", "6", "--resume", str(part), "--json", str(more)) == 0
+    other = json.loads(more.read_text().splitlines()[-1])
+    assert other["seeds"] == 6
+    for name in ("share", "standard_error"):  # threads add up in any order
+        assert other[name] == pytest.approx(row[name], rel=1e-3, abs=1e-5)
+    capsys.readouterr()
+    assert call(str(config), *again, "--seeds", "6", "--resume", str(more)) == 2
+    assert "more.jsonl has 6 seeds already; name more with --seeds" in capsys.readouterr().err
+    assert call(str(config), "--missing", "--seeds", "9", "--spp", "4", "--resume", str(more)) == 2
+    assert "is of another measurement: directions is 2 there, None here" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

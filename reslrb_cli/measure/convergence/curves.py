@@ -26,10 +26,12 @@ from scipy import stats
 CONFIDENCE = 0.95
 #: Fewer turns, or rows of a reference, have no standard error worth the name.
 FEWEST = 3
-#: Groups of steps that a slope's interval comes from, the more the better; the longest average is as long as a group.
-GROUPS = (8, 4)
+#: Steps from which on there are so many groups of them, which a slope's interval comes from; the longest average is as
+#: long as a group. The errors of shorter averages than these, of a single colour say, have logarithms so skewed that
+#: intervals are too narrow.
+GROUPS = {32: 8, 16: 4}
 #: Fewer steps have no slope.
-FEWEST_FOR_SLOPE = 2 * GROUPS[-1]
+FEWEST_FOR_SLOPE = min(GROUPS)
 
 
 @dataclass(frozen=True)
@@ -141,7 +143,7 @@ class Samples:
 
         Averages are over steps of one group. Their errors are weighted by how many averages there are of each length.
         """
-        groups = next((count for count in GROUPS if self.count >= 2 * count), None)
+        groups = next((groups for steps, groups in GROUPS.items() if self.count >= steps), None)
         if groups is None:
             return None
         size = self.count // groups
