@@ -128,6 +128,7 @@ def _tasks(variant: str, quick: bool, folder: Path) -> list[Task]:
         moving += [*small, "--estimators", "stack", "--seeds", "4"]
         sweep += [*small, "--max-depth", "4", "--integrators", "ptracer,reslrb:reservoir", "--rounds", "3"]
         demo += [*small, "--set", "run.iterations=12", "--set", "integrator.estimator=reservoir"]
+        extreme += ["--estimators", "stack", "--seeds", "4"]
         cases, tests = EXTREME[:1], QUICK_CONFORMANCE
     extreme += [word for case in cases for word in ("--case", case)]
     workers = ["-n", str(min(8, os.cpu_count() or 1))] if find_spec("xdist") and not quick else []
