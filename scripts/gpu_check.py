@@ -124,10 +124,11 @@ def _tasks(variant: str, quick: bool, folder: Path) -> list[Task]:
     cases, tests = EXTREME, CONFORMANCE
     if quick:
         steps += ["--quick"]
-        gradients += [*small, "--estimators", "reservoir,stack", "--seeds", "4"]
+        gradients += [*small, "--estimators", "reservoir", "--seeds", "4"]
         moving += [*small, "--estimators", "stack", "--seeds", "4"]
         sweep += [*small, "--max-depth", "4", "--integrators", "ptracer,reslrb:reservoir", "--rounds", "3"]
         demo += [*small, "--set", "run.iterations=12", "--set", "integrator.estimator=reservoir"]
+        extreme += ["--estimators", "stack", "--seeds", "4"]
         cases, tests = EXTREME[:1], QUICK_CONFORMANCE
     extreme += [word for case in cases for word in ("--case", case)]
     workers = ["-n", str(min(8, os.cpu_count() or 1))] if find_spec("xdist") and not quick else []

@@ -82,8 +82,8 @@ def main(arguments: list[str]) -> int:
 
 
 def _overrides(variant: str, quick: bool) -> list[str]:
-    spp = 4 if quick else 64
-    return [f"variant={variant}", f"run.spp={spp}", "target.render.spp=16"]
+    size = ["run.spp=4", "scene.options={resx: 24, resy: 24}"] if quick else ["run.spp=64"]
+    return [f"variant={variant}", *size, "target.render.spp=16"]
 
 
 def _steps(config: Config, estimator: str, depth: int, compare: bool) -> Steps:

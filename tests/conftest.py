@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 from compilation import leave_out_optimisations
+from threads import compute_alone
 
 import reslrb_cli  # noqa: F401  # chooses libLLVM, so it comes before any test imports Mitsuba
 from reslrb_cli.backend.variant import set_variant
@@ -23,20 +24,28 @@ def pytest_collection_finish() -> None:
     gc.freeze()
 
 
-def pytest_configure(config: pytest.Config) -> None:
-    """Compiles quickly, unless it is the long runs that are asked for; RESLRB_TEST_OPTIMISED=1 compiles as users do."""
+def is_quick(config: pytest.Config) -> bool:
+    """Whether it is not the long runs that are asked for; RESLRB_TEST_OPTIMISED=1 has all tests run as users do."""
     is_long = "long" in config.option.markexpr and "not long" not in config.option.markexpr
-    if not is_long and not os.environ.get("RESLRB_TEST_OPTIMISED"):
+    return not is_long and not os.environ.get("RESLRB_TEST_OPTIMISED")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Compiles quickly, where that is worth it."""
+    if is_quick(config):
         leave_out_optimisations()
 
 
 @pytest.fixture(scope="session")
-def llvm() -> str:
+def llvm(pytestconfig: pytest.Config) -> str:
     """Sets the variant, once: `llvm_ad_rgb`, or that of RESLRB_TEST_VARIANT; skips where its backend is missing."""
     try:
-        return set_variant(os.environ.get("RESLRB_TEST_VARIANT", "llvm_ad_rgb"))
+        variant = set_variant(os.environ.get("RESLRB_TEST_VARIANT", "llvm_ad_rgb"))
     except BackendError as error:
         pytest.skip(str(error))
+    if variant.startswith("llvm") and is_quick(pytestconfig):
+        compute_alone()
+    return variant
 
 
 @pytest.fixture(autouse=True, scope="module")

@@ -16,7 +16,6 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from scipy import stats
 
 from reslrb_cli.integrators import make_integrator
 from reslrb_cli.integrators.tracer import LightTracer
@@ -139,9 +138,12 @@ def compare(
         logs.append(whole)
         count = len(gradients)
         variance += (count - 1) / count * float(np.sum(np.square(without - without.mean())))
+    from scipy.special import stdtrit  # late: every run imports this module, and few come here
+
     times = statistics.median(own_ms) / max(statistics.median(other_ms), 1e-6)
     advantage = math.exp(logs[0] - logs[1]) * times
-    half = float(stats.t.isf((1 - CONFIDENCE) / 2, min(len(own), len(other)) - 1)) * math.sqrt(variance)
+    quantile = float(stdtrit(min(len(own), len(other)) - 1, (1 + CONFIDENCE) / 2))
+    half = quantile * math.sqrt(variance)
     factor = math.exp(min(half, 50.0)) * TIMING_NOISE
     return advantage, advantage / factor, advantage * factor
 

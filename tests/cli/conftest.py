@@ -3,11 +3,25 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import pytest
 
+from reslrb_cli.report.page import curves
+from reslrb_cli.report.page.drawing import Curve, diagram
 from reslrb_cli.report.seen import flip
+
+#: What was drawn before, by labels.
+DRAWN: dict[tuple[str, str], str] = {}
+
+
+def drawn_once(made: Sequence[Curve], caption: str, label: str) -> str:
+    """The first diagram of its kind, for all that have something to show: to draw takes longer than these runs."""
+    if not any(len(curve.known()) for curve in made):
+        return diagram(made, caption, label)
+    if (caption, label) not in DRAWN:
+        DRAWN[caption, label] = diagram(made, caption, label)
+    return DRAWN[caption, label]
 
 
 @pytest.fixture(autouse=True)
@@ -16,6 +30,8 @@ def _own_log_and_cache(tmp_path_factory: pytest.TempPathFactory, monkeypatch: py
     monkeypatch.setenv("RESLRB_CACHE", str(tmp_path_factory.mktemp("cache")))
     # HDR-FLIP takes longer than all else that these runs do at their end; tests/report looks at it.
     monkeypatch.setattr(flip, "is_installed", lambda: False)
+    # Neither are diagrams looked at here, but in tests/report too.
+    monkeypatch.setattr(curves, "diagram", drawn_once)
     logger = logging.getLogger("reslrb_cli")
     logger.handlers.clear()
     yield

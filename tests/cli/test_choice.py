@@ -72,7 +72,29 @@ def test_auto_measures_once_and_remembers(experiment, capsys):
     # The pilot changed neither parameters nor random numbers.
     np.testing.assert_allclose([record["loss"] for record in read_metrics(Path("runs/box"))], first, rtol=1e-4)
 
-    assert "measuring" in optimize(capsys, "run.spp=8")[1]  # another situation
+
+def test_other_settings_are_another_situation(experiment):
+    """And what changes neither a step's samples nor what it differentiates is none."""
+    from reslrb_cli.config import load
+    from reslrb_cli.optimization.choice import situation
+    from reslrb_cli.optimization.problem import assemble_scene
+    from reslrb_cli.records.pilot_cache import key_of
+
+    def key(*settings):
+        return key_of(situation(assemble_scene(load("box.yaml", settings))))
+
+    first = key()
+    assert key("run.name=other", "run.iterations=3") == first
+    others = ["run.spp=8", "integrator.max_depth=3", "parameters[0].resolution=[2, 2]", "run.adjoint=correlated"]
+    assert len({first, *map(key, others)}) == 1 + len(others)
+
+
+@pytest.mark.long
+def test_auto_measures_anew_in_another_situation(experiment, capsys):
+    for settings in ([], ["run.spp=8"]):
+        code, err = optimize(capsys, *settings)
+        assert code == 0, err
+        assert "measuring" in err
 
 
 def test_the_pilot_leaves_the_run_as_it_was(experiment):

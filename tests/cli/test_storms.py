@@ -126,7 +126,6 @@ def storm(experiment: Path, number: int, count: int, times: int = 1) -> Counter[
 @pytest.mark.parametrize(
     ("number", "count"),
     [
-        (signal.SIGKILL, 5),
         pytest.param(signal.SIGKILL, 30, marks=pytest.mark.long),
         *(pytest.param(number, 10, marks=pytest.mark.long) for number in SIGNALS),
     ],

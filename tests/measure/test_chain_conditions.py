@@ -11,7 +11,7 @@ from click.testing import CliRunner
 from reslrb_cli.cli import main
 from reslrb_cli.config import load
 from reslrb_cli.measure.chain_conditions import ChainConditions, measure_chains
-from reslrb_cli.optimization.problem import assemble
+from reslrb_cli.optimization.problem import Problem, assemble
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 SMALL = ["scene.options={resx: 24, resy: 24}", "target.render.spp=16", "run.spp=16"]
@@ -47,6 +47,15 @@ def test_two_faces_and_what_stands_still():
 def test_they_are_shown(monkeypatch: pytest.MonkeyPatch):
     """Of the conditioning of parameters, which tests/cli/test_inspect.py looks at, nothing is measured here."""
     monkeypatch.setattr("reslrb_cli.measure.conditioning.measure_sensitivities", lambda problem, samples: [])
+    measured: list[list[ChainConditions]] = []
+
+    def once(problem: Problem) -> list[ChainConditions]:
+        """As a table and as JSON the same measurement."""
+        if not measured:
+            measured.append(measure_chains(problem))
+        return measured[0]
+
+    monkeypatch.setattr("reslrb_cli.measure.conditioning.measure_chains", once)
     config = str(CONFIGS / "caustic_heightmap.yaml")
     arguments = ["inspect", config, "--no-counts", "--conditioning", "--samples", "2"]
     arguments += [word for each in SMALL for word in ("--set", each)]

@@ -47,11 +47,11 @@ def missing(case: Case, along: list[Direction], options: dict, count: int = SEED
     return found
 
 
-def share(scene: AttachedScene) -> tuple[float, float]:
+def share(scene: AttachedScene, count: int = SEEDS) -> tuple[float, float]:
     """Along the scene's one amplitude, of the centre of gravity of the light that lands."""
     case = scene.case()
     case.weigh(centre_of_gravity())
-    found = missing(case, [Direction(np.ones(1), "both")], dict(scene.options)).share()
+    found = missing(case, [Direction(np.ones(1), "both")], dict(scene.options), count).share()
     assert found is not None
     print(scene.name, found)
     return found
@@ -128,7 +128,7 @@ def test_a_fault_is_seen(monkeypatch: pytest.MonkeyPatch):
     """Of a gradient without what lands elsewhere, that is missing too."""
     right = AdjointImage.lookup
     monkeypatch.setattr(AdjointImage, "lookup", lambda self, u, *a, **k: right(self, dr.detach(u), *a, **k))
-    found, error = share(half_covered("lamp"))
+    found, error = share(half_covered("lamp"), SEEDS // 3)
     assert abs(found - EDGE / HALF) > 10 * error
 
 

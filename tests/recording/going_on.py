@@ -51,6 +51,7 @@ def work_alone(patch: pytest.MonkeyPatch) -> None:
     def alone(function: Callable[..., Any]) -> Callable[..., Any]:
         def call(*args: Any, **options: Any) -> Any:
             dr.sync_thread()
+            before = dr.thread_count()
             dr.set_thread_count(1)
             try:
                 result = function(*args, **options)
@@ -58,7 +59,7 @@ def work_alone(patch: pytest.MonkeyPatch) -> None:
                 return result
             finally:
                 dr.sync_thread()
-                dr.set_thread_count(max(os.cpu_count() or 2, 2))
+                dr.set_thread_count(before)
 
         return call
 

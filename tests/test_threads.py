@@ -1,0 +1,50 @@
+"""Tests compute with one thread, and files are read and written all the same."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from compilation import search_path
+
+ROOT = Path(__file__).resolve().parents[1]
+SCRIPT = """
+import sys
+from pathlib import Path
+from reslrb_cli.backend.variant import set_variant
+set_variant("llvm_ad_rgb")
+from threads import compute_alone
+import drjit as dr, mitsuba as mi, numpy as np
+from reslrb_cli.scene import load_scene
+print(compute_alone(), dr.thread_count(), flush=True)
+image = np.random.default_rng(1).uniform(size=(40, 30, 3)).astype(np.float32)
+file = sys.argv[1] + "/image.exr"
+mi.Bitmap(image).write(file)
+assert (np.array(mi.Bitmap(file)) == image).all()
+load_scene(Path(sys.argv[2]), {"resx": 16, "resy": 16})
+dr.set_thread_count(2)
+mi.Bitmap(image[:20]).write(file)
+assert (np.array(mi.Bitmap(file)) == image[:20]).all()
+"""
+
+
+@pytest.mark.usefixtures("llvm")
+def test_one_thread_reads_and_writes_images(tmp_path: Path) -> None:
+    """And several, if a test has them."""
+    scene = ROOT / "scenes" / "grey_room" / "scene.xml"
+    done = subprocess.run(
+        [sys.executable, "-c", SCRIPT, str(tmp_path), str(scene)], capture_output=True, text=True, check=False,
+        timeout=120, env={"PYTHONPATH": search_path(ROOT, ROOT / "tests"), "HOME": str(tmp_path)},
+    )  # fmt: skip
+    assert (done.returncode, done.stdout) == (0, "True 1\n"), done.stderr
+
+
+def test_tests_have_one(llvm: str, pytestconfig: pytest.Config) -> None:
+    import drjit as dr
+
+    if os.environ.get("RESLRB_TEST_OPTIMISED") or "not long" not in pytestconfig.option.markexpr:
+        pytest.skip("these tests run as users do")
+    assert not llvm.startswith("llvm") or dr.thread_count() == 1
