@@ -8,9 +8,10 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from cli import tiny
-from click.testing import CliRunner, Result
+from cli.calling import reslrb
+from cli.photographs import write_noise
+from click.testing import Result
 
-from reslrb_cli.cli import main
 from reslrb_cli.cli.first_config import PIXELS
 from reslrb_cli.config import Config, TargetConfig, load
 from reslrb_cli.optimization.problem import assemble_scene
@@ -31,18 +32,8 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-def reslrb(*arguments: object) -> Result:
-    return CliRunner().invoke(main, [str(argument) for argument in arguments])
-
-
-def photograph(path: Path, width: int, height: int) -> Path:
-    image = np.random.default_rng(3).uniform(0, 0.9, (height, width, 3)).astype(np.float32)
-    mi.Bitmap(image).convert(component_format=mi.Struct.Type.UInt8, srgb_gamma=True).write(str(path))
-    return path
-
-
 def of_photograph(folder: Path, width: int, height: int) -> tuple[Config, Result]:
-    result = reslrb("init", "room/scene.xml", "--target", photograph(folder / "photo.png", width, height))
+    result = reslrb("init", "room/scene.xml", "--target", write_noise(folder / "photo.png", width, height))
     assert result.exit_code == 0, result.output
     return load(folder / "room.yaml"), result
 
@@ -59,7 +50,7 @@ def test_a_scene_alone_gets_a_configuration_that_lacks_its_photograph_only(folde
     missing = reslrb("optimize", "room.yaml")
     assert missing.exit_code == 2
     assert "target.file: no such file" in missing.output
-    photograph(folder / "photo.png", 8, 8)
+    write_noise(folder / "photo.png", 8, 8)
     done = reslrb("optimize", "room.yaml", "--set", "run.iterations=2", "--set", "integrator.estimator=stack")
     assert done.exit_code == 0, done.output
     assert read_manifest(folder / "runs/room")["status"] == "finished"
@@ -82,7 +73,7 @@ def test_nothing_is_replaced_unless_that_is_asked_for(folder: Path) -> None:
     assert reslrb("init", "room/scene.xml", "--force").exit_code == 0
     copy = f"photo-{int(PIXELS**0.5)}x{int(PIXELS**0.5)}.png"
     (folder / copy).write_text("mine, too")
-    target = photograph(folder / "photo.png", 300, 300)
+    target = write_noise(folder / "photo.png", 300, 300)
     refused = reslrb("init", "room/scene.xml", "-o", "other.yaml", "--target", target)
     assert refused.exit_code == 2
     assert f"{copy}: exists" in refused.output
@@ -130,72 +121,11 @@ def test_exposure_is_recovered_where_the_photograph_clips(folder: Path) -> None:
     ],
 )
 def test_what_is_wrong_is_said_in_a_line(folder: Path, arguments: tuple[str, ...], message: str) -> None:
-    photograph(folder / "wide.png", 16, 8)
+    write_noise(folder / "wide.png", 16, 8)
     result = reslrb("init", *arguments)
     assert result.exit_code == 2
     assert message in result.output
     assert {path.name for path in folder.iterdir()} == {"room", "wide.png"}
-
-
-#: Two sensors, the second of which sees the ball alone, on a film that the file leaves open.
-CHOICES = """<scene version="3.0.0"><default name="side" value="16"/><default name="note" value="a &quot;b&quot;"/>
-<sensor type="perspective" id="floor"><film type="hdrfilm"><integer name="width" value="$side"/>
-<integer name="height" value="$side"/></film>
-<transform name="to_world"><lookat origin="0, 5, 0" target="0, 0, 0" up="0, 0, 1"/></transform></sensor>
-<sensor type="perspective" id="ball"><film type="hdrfilm"><integer name="width" value="12"/>
-<integer name="height" value="8"/></film><float name="fov" value="10"/>
-<transform name="to_world"><lookat origin="9, 1, 9" target="9, 1, 0" up="0, 1, 0"/></transform></sensor>
-<shape type="rectangle"><transform name="to_world"><rotate x="1" angle="-90"/><scale value="4"/></transform>
-<bsdf type="diffuse"><rgb name="reflectance" value="0.4"/></bsdf></shape>
-<shape type="sphere"><point name="center" x="9" y="1" z="0"/>
-<bsdf type="diffuse"><rgb name="reflectance" value="0.4"/></bsdf></shape>
-<emitter type="constant"/></scene>"""
-
-
-@pytest.fixture
-def choices(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    (tmp_path / "hall.xml").write_text(CHOICES)
-    monkeypatch.chdir(tmp_path)
-    return tmp_path
-
-
-def test_of_several_sensors_one_is_named(choices: Path) -> None:
-    first = reslrb("init", "hall.xml")
-    assert "sensor 0 (floor); --sensor takes another: 1 (ball)" in first.output
-    config = load(choices / "hall.yaml")
-    assert (config.scene.sensors, config.parameters[0].keys) == ([0], ["Rectangle_1.bsdf.reflectance.value"])
-    other = reslrb("init", "hall.xml", "--sensor", 1, "--target", photograph(choices / "photo.png", 12, 8), "--force")
-    assert "sensor 1 (ball); --sensor takes another: 0 (floor)" in other.output
-    config = load(choices / "hall.yaml")
-    assert (config.scene.sensors, config.scene.size) == ([1], None)  # that one's film is as large as the photograph
-    assert [spec.keys for spec in config.parameters] == [["Sphere_1.bsdf.reflectance.value"]]
-    # A ball of one colour under a light of one colour: its exposure cannot be told from it.
-    settings = ("run.iterations=2", "integrator.estimator=stack", "target.exposure=1")
-    done = reslrb("optimize", "hall.yaml", *(word for setting in settings for word in ("--set", setting)))
-    assert done.exit_code == 0, done.output
-    missing = reslrb("init", "hall.xml", "--sensor", 2, "--force")
-    assert missing.exit_code == 2
-    assert "--sensor: is 2; the scene has 0 (floor), 1 (ball)" in missing.output
-
-
-def test_what_a_scene_leaves_open_is_named_and_can_be_set(choices: Path) -> None:
-    made = reslrb("init", "hall.xml")
-    assert "at 16x16 pixels" in made.output
-    assert '  # options: {side: 16, note: "a \\"b\\""}  # ' in (choices / "hall.yaml").read_text()
-    made = reslrb("init", "hall.xml", "--set", "scene.options.side=20", "--force")
-    assert "at 20x20 pixels" in made.output
-    assert load(choices / "hall.yaml").scene.options == {"side": 20}
-    for setting, message in (("scene.options.width=3", "$width: is set in scene.options, but the scene file does not"),
-                             ("run.spp=4", "--set run.spp=4: init takes scene.options.NAME=VALUE alone"),
-                             ("scene.options.side=[3]", "scene.options.side")):  # fmt: skip
-        refused = reslrb("init", "hall.xml", "--set", setting, "--force")
-        assert refused.exit_code == 2
-        assert message in refused.output
-    (choices / "hall.xml").write_text(CHOICES.replace('<default name="side" value="16"/>', ""))
-    refused = reslrb("init", "hall.xml", "--force")
-    assert refused.exit_code == 2
-    assert "set scene.options.side" in refused.output
-    assert reslrb("init", "hall.xml", "--force", "--set", "scene.options.side=8").exit_code == 0
 
 
 #: A floor that fills most of the picture, with a texture of its own; a ball; what is not seen; what has no effect.
