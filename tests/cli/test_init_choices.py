@@ -71,3 +71,25 @@ def test_what_a_scene_leaves_open_is_named_and_can_be_set(choices: Path) -> None
     assert refused.exit_code == 2
     assert "set scene.options.side" in refused.output
     assert reslrb("init", "hall.xml", "--force", "--set", "scene.options.side=8").exit_code == 0
+
+
+#: A lamp whose rays Mitsuba cannot sample, behind glass; paths from the camera find its light.
+CHECKED = """<scene version="3.0.0"><sensor type="perspective"><film type="hdrfilm"><integer name="width" value="8"/>
+<integer name="height" value="8"/></film>
+<transform name="to_world"><lookat origin="0, 0, 4" target="0, 0, 0" up="0, 1, 0"/></transform></sensor>
+<shape type="rectangle"><bsdf type="diffuse"/></shape>
+<shape type="rectangle"><transform name="to_world"><translate x="9" z="1"/></transform>
+<bsdf type="thindielectric"/></shape>
+<shape type="rectangle"><transform name="to_world"><rotate x="1" angle="180"/><translate z="5"/></transform>
+<emitter type="area" id="lamp"><texture type="checkerboard" name="radiance"/></emitter></shape></scene>"""
+
+
+def test_light_that_cannot_be_sampled_is_left_to_camera_paths(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "shop.xml").write_text(CHECKED)
+    monkeypatch.chdir(tmp_path)
+    assert reslrb("inspect", "shop.xml").exit_code == 0
+    assert reslrb("init", "shop.xml", "--target", write_noise(tmp_path / "photo.png", 8, 8)).exit_code == 0
+    assert load(tmp_path / "shop.yaml").integrator.type == "prb"
+    refused = reslrb("optimize", "shop.yaml", *settings("integrator.type=reslrb"))
+    assert refused.exit_code == 2
+    assert "scene.file: Mitsuba cannot sample the rays of emitter lamp" in refused.output
