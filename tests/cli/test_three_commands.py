@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from collections.abc import Mapping
 from pathlib import Path
 
 import mitsuba as mi
@@ -90,15 +91,16 @@ def keep(file: Path, keys: list[str]) -> None:
     file.write_text("\n".join(kept) + "\n")
 
 
-def misses(run: Path, most: float = COLOUR) -> list[str]:
-    """What a run missed: colours by more than `most`, and the exposure, relative to the truth."""
+def misses(run: Path, most: float = COLOUR, colours: Mapping[str, list[float]] = TRUE) -> list[str]:
+    """What a run missed: true `colours` by more than `most`, and the exposure, relative to the truth."""
     recovered = json.loads((run / "parameters/parameters.json").read_text())
     found = []
-    for key, true in TRUE.items():
+    for key, true in colours.items():
         color = np.array(recovered[key]["value"])
         bright = np.array(true) > BRIGHT
-        worst = float(np.max(np.abs(color / true - 1)[bright]))
-        print(f"{key}: {color.round(3)}, {worst:.1%} off")
+        off = color / true - 1
+        worst = float(np.max(np.abs(off)[bright]))
+        print(f"{key}: {color.round(3)}, off by {', '.join(f'{share:+.1%}' for share in off)}")
         found += [key] if worst > most else []
     exposure = np.array(recovered["exposure"]["value"]).item() if "exposure" in recovered else 1.0
     print(f"exposure {exposure:.4f}")
