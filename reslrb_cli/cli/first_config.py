@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -19,14 +19,25 @@ PIXELS = 2**14
 SPP, ITERATIONS, RATE = 16, 200, 0.03
 #: Commented lines of parameters; a scene can have thousands.
 _MOST_OTHERS = 60
+#: Variables and sensors that a comment names, and characters of a variable there.
+_MOST_VARIABLES, _MOST_SENSORS, _LONGEST = 8, 6, 40
+_NUMBER = re.compile(r"-?\d{1,15}(\.\d{1,15})?")
 _PLAIN = re.compile(r"(\.\./)*[A-Za-z_][\w.\-]*(/[\w.\-]+)*")
 
 
 @dataclass(frozen=True)
 class FirstConfig:
-    """What a configuration is written from; `target` is the image that exists, or None. Sizes are (width, height)."""
+    """What a configuration is written from; `target` is the image that exists, or None. Sizes are (width, height).
+
+    `options` are the scene file's variables that the user has set, `variables` all that it has, as text; `sensors` the
+    ids of its sensors, of which the one with the index `sensor` is used.
+    """
 
     scene: Path
+    options: Mapping[str, bool | int | float | str]
+    variables: Mapping[str, str]
+    sensors: Sequence[str]
+    sensor: int
     target: Path | None
     is_integer: bool
     size: tuple[int, int]
@@ -43,7 +54,9 @@ class FirstConfig:
             f"#     reslrb optimize {path.name}",
             "scene:",
             f"  file: {_path(self.scene, folder)}",
+            *self._option_lines(),
             *self._size_lines(),
+            *self._sensor_lines(),
             "target:",
             *self._target_lines(folder),
             "parameters:  # by their share of the picture; bounds are the usual ones",
@@ -65,6 +78,26 @@ class FirstConfig:
     def _depth_words(self) -> str:
         missing = self.depth.missing
         return "light bounces on and on" if missing is None else f"longer paths have {missing:.1%} of the light in view"
+
+    def _option_lines(self) -> list[str]:
+        given = ", ".join(f"{_word(name)}: {json.dumps(value)}" for name, value in self.options.items())
+        others = [
+            f"{_word(name)}: {_word(self.variables[name])}" for name in self.variables if name not in self.options
+        ]
+        listed = [text for text in others if len(text) <= _LONGEST][:_MOST_VARIABLES]
+        rest = ", ".join([*listed, "..."] if len(listed) < len(others) else listed)
+        if given:
+            return [f"  options: {{{given}}}" + (f"  # the scene file also has {rest}" if rest else "")]
+        return [f"  # options: {{{rest}}}  # variables of the scene file, and what they are there"] if rest else []
+
+    def _sensor_lines(self) -> list[str]:
+        if len(self.sensors) == 1:
+            return []
+        listed = [f"{number} is {_word(name)}" for number, name in enumerate(self.sensors[:_MOST_SENSORS])]
+        more = " ..." if len(self.sensors) > _MOST_SENSORS else ""
+        return [
+            f"  sensors: [{self.sensor}]  # {', '.join(listed)}{more}; `views` take several, each with its photograph"
+        ]
 
     def _size_lines(self) -> list[str]:
         if self.size == self.film:
@@ -128,6 +161,11 @@ def _path(path: Path, folder: Path) -> str:
     relative = os.path.relpath(path, folder)
     # What lies elsewhere altogether does not move with the configuration.
     return _text(str(path.absolute()) if relative.startswith(os.path.join("..", "..", "..")) else relative)
+
+
+def _word(text: str) -> str:
+    """A name or a value of the scene file within a comment, where no character may end the line."""
+    return text if _PLAIN.fullmatch(text) or _NUMBER.fullmatch(text) else json.dumps(text)
 
 
 def _text(text: str) -> str:

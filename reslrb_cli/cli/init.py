@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
 from reslrb_cli.cli.experiment import check_writable
+from reslrb_cli.cli.listing import LISTED_SENSORS
 from reslrb_cli.cli.output import echo
 from reslrb_cli.config import loads
+from reslrb_cli.config.overrides import parse_override
+from reslrb_cli.config.text import write
 from reslrb_cli.errors import ConfigError, UnsupportedScene, is_machine_fault
 from reslrb_cli.records.atomic import write_atomically
 
@@ -33,13 +37,31 @@ _RATIO = 0.01
     type=click.Path(path_type=Path),
     help="Configuration to write; default: the scene's name with .yaml, in the working directory.",
 )
+@click.option(
+    "--sensor",
+    "index",
+    type=click.IntRange(min=0),
+    default=0,
+    show_default=True,
+    help="Index of the sensor that sees what the photograph shows.",
+)
+@click.option(
+    "--set",
+    "overrides",
+    multiple=True,
+    metavar="scene.options.NAME=VALUE",
+    help="Value of a $NAME of the scene file, in place of its own; stands in the configuration, too. May be repeated.",
+)
 @click.option("--force", is_flag=True, help="Replace files that exist.")
-def command(scene_file: Path, target: Path | None, output: Path | None, force: bool) -> None:
+def command(
+    scene_file: Path, target: Path | None, output: Path | None, index: int, overrides: tuple[str, ...], force: bool
+) -> None:
     """Write a commented configuration for the scene in the file SCENE, which `reslrb optimize` takes.
 
     It recovers the colours of the materials that are largest in view; what else can be recovered stands there as
     comments, with bounds and present values. With --target the film gets the photograph's ratio of sides, at a size
-    with which a run takes minutes, and a copy of the photograph of that size is written beside the configuration.
+    with which a run takes minutes, and a copy of the photograph of that size is written beside the configuration. Of
+    several sensors it is the first that saw the photograph, unless --sensor names another.
     """
     from reslrb_cli.backend.variant import set_variant
 
@@ -49,20 +71,25 @@ def command(scene_file: Path, target: Path | None, output: Path | None, force: b
         raise ConfigError("--output", "", f"{path} must end in .yaml, as configurations do")
     _check_free(path, force)
     check_writable("--output", path)
+    options = _read_options(scene_file, overrides)
     set_variant("auto")
 
     from reslrb_cli.cli.first_config import FirstConfig
-    from reslrb_cli.scene import load_scene, select_parameters
+    from reslrb_cli.scene import select_parameters
     from reslrb_cli.scene.depth import find_depth
+    from reslrb_cli.scene.load import load_described
     from reslrb_cli.scene.photograph import open_photograph, write_smaller
     from reslrb_cli.scene.proposal import propose
 
     photo = None if target is None else open_photograph(target)
-    scene = load_scene(scene_file)
-    film = scene.sensors()[0].film()
+    scene, description = load_described(scene_file, options)
+    sensors = [str(sensor.id()) for sensor in scene.sensors()]
+    _tell_sensor(index, sensors)
+    sensor = scene.sensors()[index]
+    film = sensor.film()
     own, whole = ((int(size[0]), int(size[1])) for size in (film.crop_size(), film.size()))
     size = choose_size(own, photo, fixed=own != whole)
-    proposals = propose(scene, 0)
+    proposals = propose(scene, index)
     if not proposals:
         raise ConfigError(scene_file, "", "nothing in it can be recovered; reslrb inspect --all says why")
     image, copied = target, False
@@ -71,8 +98,20 @@ def command(scene_file: Path, target: Path | None, output: Path | None, force: b
         copied = True
         _check_free(image, force)
     is_integer = photo is not None and photo.is_integer
-    integrator, depth = _integrator(scene), find_depth(scene, 0)
-    first = FirstConfig(scene_file, image, is_integer, size, own, integrator, depth, proposals)
+    first = FirstConfig(
+        scene=scene_file,
+        options=options,
+        variables=description.variables,
+        sensors=sensors,
+        sensor=index,
+        target=image,
+        is_integer=is_integer,
+        size=size,
+        film=own,
+        integrator=_integrator(scene, sensor),
+        depth=find_depth(scene, index),
+        proposals=proposals,
+    )
     text = first.text(path)
     select_parameters(scene, loads(text, path).parameters, path)  # what is wrong is to show before anything is written
     try:
@@ -113,12 +152,36 @@ def choose_size(film: Size, photo: Photograph | None, fixed: bool = False) -> Si
     return max(round(width * scale), 1), max(round(height * scale), 1)
 
 
-def _integrator(scene: mi.Scene) -> str:
+def _read_options(scene_file: Path, overrides: tuple[str, ...]) -> Mapping[str, bool | int | float | str]:
+    """The values of the scene file's variables that `--set` gives. Raises ConfigError for another setting."""
+    for override in map(parse_override, overrides):
+        if override.location[:2] != ("scene", "options"):
+            raise ConfigError(
+                override.label, "", "init takes scene.options.NAME=VALUE alone; other settings go into what it writes"
+            )
+    stand_ins = {"target": {"render": {}}, "parameters": [{"key": "*"}]}
+    text = write({"scene": {"file": str(scene_file.absolute())}, **stand_ins})
+    return loads(text, scene_file, overrides).scene.options
+
+
+def _tell_sensor(index: int, sensors: Sequence[str]) -> None:
+    """Say which sensor is taken where there are several. Raises ConfigError for one that is not there."""
+    named = [f"{number} ({name})" for number, name in enumerate(sensors)]
+    if index >= len(sensors):
+        more = "" if len(named) <= LISTED_SENSORS else " ..."
+        raise ConfigError("--sensor", "", f"is {index}; the scene has {', '.join(named[:LISTED_SENSORS])}{more}")
+    if len(sensors) > 1:
+        others = [name for number, name in enumerate(named) if number != index]
+        more = "" if len(others) <= LISTED_SENSORS else f" and {len(others) - LISTED_SENSORS} more"
+        echo(f"sensor {named[index]}; --sensor takes another: {', '.join(others[:LISTED_SENSORS])}{more}")
+
+
+def _integrator(scene: mi.Scene, sensor: mi.Sensor) -> str:
     """The integrator that can render the scene: paths from the light, or where these cannot, from the sensor."""
     from reslrb_cli.scene import check_camera_paths, check_supported
 
     try:
-        check_supported(scene, scene.sensors()[0], False)
+        check_supported(scene, sensor, False)
     except UnsupportedScene as error:
         try:
             check_camera_paths(scene)

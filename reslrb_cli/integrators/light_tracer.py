@@ -8,11 +8,11 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from reslrb_cli.errors import UnsupportedScene
 from reslrb_cli.estimators import Estimator
 from reslrb_cli.estimators.base import Pass
 from reslrb_cli.integrators.hooks import RecordedObjective, TangentSplat, TrackedSplat
 from reslrb_cli.integrators.tangents import AttachedTangentSplat
+from reslrb_cli.scene.emitted import emitted_rays
 from reslrb_cli.scene.graph import SceneGraph
 from reslrb_cli.transport.accumulation import finish_pass, in_passes
 from reslrb_cli.transport.emission import sample_emission
@@ -35,14 +35,7 @@ def settle(scene: mi.Scene) -> None:
         for texture in SceneGraph.of(scene).of_type(mi.Texture):
             if texture.class_name().startswith("BitmapTexture"):
                 texture.eval(dr.zeros(mi.SurfaceInteraction3f))
-        try:
-            _, weight, _ = scene.sample_emitter_ray(0, 0.5, mi.Point2f(0.5), mi.Point2f(0.5), True)
-        except RuntimeError as error:
-            if "not implemented" not in str(error):
-                raise
-            raise UnsupportedScene(
-                f"Mitsuba cannot sample the rays of an emitter: {' '.join(str(error).split())}"
-            ) from None
+        _, weight = emitted_rays(scene, mi.Float(0.5), mi.Point2f(0.5), mi.Point2f(0.5))
         dr.eval(weight)
 
 

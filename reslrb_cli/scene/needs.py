@@ -10,6 +10,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..errors import UnsupportedScene
+from .emitted import emitted_rays
 from .graph import SceneGraph
 from .lamps import Lamp, find_lamps
 
@@ -105,6 +106,7 @@ def check_supported(scene: Any, sensor: Any, hide_emitters: bool = False) -> Non
     obstacle = unsupported_part(scene, sensor)
     if obstacle is not None:
         raise UnsupportedScene(obstacle)
+    emitted_rays(scene, mi.Float(0.5), mi.Point2f(0.5), mi.Point2f(0.5))
     view, name = look(scene, sensor), sensor.id()
     if view.specular > 0 and view.smooth == 0 and (hide_emitters or view.emission == 0):
         raise UnsupportedScene(

@@ -6,6 +6,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..errors import UnsupportedScene
+from .emitted import emitted_rays
 from .graph import SceneGraph
 
 #: Rays start so many offsets before the next surface, at least, where nothing is said.
@@ -29,7 +31,10 @@ def thin_glass(scene: mi.Scene) -> str | None:
         return None
     index = dr.arange(mi.UInt32, _PATHS)
     numbers = [mi.Float(mi.sample_tea_float32(index, mi.UInt32(k))) for k in range(5)]
-    ray, _, _ = scene.sample_emitter_ray(0, numbers[0], mi.Point2f(*numbers[1:3]), mi.Point2f(*numbers[3:5]), True)
+    try:
+        ray, _ = emitted_rays(scene, numbers[0], mi.Point2f(*numbers[1:3]), mi.Point2f(*numbers[3:5]))
+    except UnsupportedScene:  # which is said where paths from the light are wanted
+        return None
     si = scene.ray_intersect(ray)
     active = si.is_valid()
     gaps: list[np.ndarray] = []

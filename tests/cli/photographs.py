@@ -54,6 +54,15 @@ def cornell_box(size: int, extra: str = "", eyes: tuple[str, ...] = ("0, 0, 3.9"
     return "\n".join(['<scene version="3.0.0">', *lines, *shapes, extra, "</scene>"])
 
 
+def write_noise(path: Path, width: int, height: int) -> Path:
+    """8 bits of nothing in particular; a variant must be set."""
+    import mitsuba as mi
+
+    image = np.random.default_rng(3).uniform(0, 0.9, (height, width, 3)).astype(np.float32)
+    mi.Bitmap(image).convert(component_format=mi.Struct.Type.UInt8, srgb_gamma=True).write(str(path))
+    return path
+
+
 def write_photograph(folder: Path, size: int, spp: int, exposure: float = 1.0, extra: str = "") -> None:
     """Put scene, photograph and `photo.yaml` into `folder`; a variant must be set."""
     import mitsuba as mi

@@ -8,9 +8,10 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from cli import tiny
-from click.testing import CliRunner, Result
+from cli.calling import reslrb
+from cli.photographs import write_noise
+from click.testing import Result
 
-from reslrb_cli.cli import main
 from reslrb_cli.cli.first_config import PIXELS
 from reslrb_cli.config import Config, TargetConfig, load
 from reslrb_cli.optimization.problem import assemble_scene
@@ -31,18 +32,8 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-def reslrb(*arguments: object) -> Result:
-    return CliRunner().invoke(main, [str(argument) for argument in arguments])
-
-
-def photograph(path: Path, width: int, height: int) -> Path:
-    image = np.random.default_rng(3).uniform(0, 0.9, (height, width, 3)).astype(np.float32)
-    mi.Bitmap(image).convert(component_format=mi.Struct.Type.UInt8, srgb_gamma=True).write(str(path))
-    return path
-
-
 def of_photograph(folder: Path, width: int, height: int) -> tuple[Config, Result]:
-    result = reslrb("init", "room/scene.xml", "--target", photograph(folder / "photo.png", width, height))
+    result = reslrb("init", "room/scene.xml", "--target", write_noise(folder / "photo.png", width, height))
     assert result.exit_code == 0, result.output
     return load(folder / "room.yaml"), result
 
@@ -59,7 +50,7 @@ def test_a_scene_alone_gets_a_configuration_that_lacks_its_photograph_only(folde
     missing = reslrb("optimize", "room.yaml")
     assert missing.exit_code == 2
     assert "target.file: no such file" in missing.output
-    photograph(folder / "photo.png", 8, 8)
+    write_noise(folder / "photo.png", 8, 8)
     done = reslrb("optimize", "room.yaml", "--set", "run.iterations=2", "--set", "integrator.estimator=stack")
     assert done.exit_code == 0, done.output
     assert read_manifest(folder / "runs/room")["status"] == "finished"
@@ -82,7 +73,7 @@ def test_nothing_is_replaced_unless_that_is_asked_for(folder: Path) -> None:
     assert reslrb("init", "room/scene.xml", "--force").exit_code == 0
     copy = f"photo-{int(PIXELS**0.5)}x{int(PIXELS**0.5)}.png"
     (folder / copy).write_text("mine, too")
-    target = photograph(folder / "photo.png", 300, 300)
+    target = write_noise(folder / "photo.png", 300, 300)
     refused = reslrb("init", "room/scene.xml", "-o", "other.yaml", "--target", target)
     assert refused.exit_code == 2
     assert f"{copy}: exists" in refused.output
@@ -130,7 +121,7 @@ def test_exposure_is_recovered_where_the_photograph_clips(folder: Path) -> None:
     ],
 )
 def test_what_is_wrong_is_said_in_a_line(folder: Path, arguments: tuple[str, ...], message: str) -> None:
-    photograph(folder / "wide.png", 16, 8)
+    write_noise(folder / "wide.png", 16, 8)
     result = reslrb("init", *arguments)
     assert result.exit_code == 2
     assert message in result.output

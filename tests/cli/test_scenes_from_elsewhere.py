@@ -7,10 +7,9 @@ from pathlib import Path
 import mitsuba as mi
 import numpy as np
 import pytest
+from cli.calling import reslrb
 from cli.elsewhere import write_studio, write_terrace
-from click.testing import CliRunner, Result
 
-from reslrb_cli.cli import main
 from reslrb_cli.config import load
 from reslrb_cli.optimization.problem import assemble_scene
 from reslrb_cli.scene import load_scene
@@ -36,10 +35,6 @@ COMMANDS = {
     "bench": (("room.yaml", "--max-depth", 16, "--budget", 40), "ptracer"),
     "export": (("runs/room", "-o", "exported"), "exported/scene.xml"),
 }
-
-
-def reslrb(*arguments: object) -> Result:
-    return CliRunner().invoke(main, [str(argument) for argument in arguments])
 
 
 @pytest.fixture(params=SCENES)

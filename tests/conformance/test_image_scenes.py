@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 import numpy as np
 import pytest
 from conformance.scenes import SAME, agreement, difference_from_ptracer, images
+from rooms import real_room
 from turns import a_few
 
 from reslrb_cli.measure.references import interior
@@ -56,16 +56,6 @@ def test_furnace_against_the_analytic_answer(depth):
     result = compare(found, np.broadcast_to(expected, found.shape))
     assert result, result
     assert np.allclose(found.mean((0, 1, 2)), expected, rtol=2e-3)
-
-
-def real_room() -> Path:
-    """The room's file: in the folder that RESLRB_GREY_WHITE_ROOM names, or beside the repository."""
-    folder = Path(os.environ.get("RESLRB_GREY_WHITE_ROOM") or ROOT.parent / "shared" / "scenes" / "grey-white-room")
-    if not (folder / "scene.xml").exists():
-        pytest.skip(
-            f"The Grey & White Room (Wig42, CC BY 3.0) is not in {folder}; set RESLRB_GREY_WHITE_ROOM to its folder"
-        )
-    return folder / "scene.xml"
 
 
 @pytest.mark.long

@@ -92,10 +92,11 @@ def test_what_fails_is_told_for_what_it_is(folder, toy):
 
 
 @pytest.mark.long
-def test_verdicts_of_twenty_runs(folder):
+@pytest.mark.parametrize("seed", range(5))
+def test_verdicts_of_twenty_runs(folder, seed):
     right, kind, ratios = [], [], []
     for toy in WORK + FAIL:
-        found = run(folder, toy)
+        found = run(folder, toy, seed)
         print(told(toy, found))
         right.append(verdicts(toy, found) == toy.right)
         if toy in FAIL:

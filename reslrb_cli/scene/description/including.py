@@ -22,11 +22,13 @@ MAX_INCLUDE_DEPTH = 15
 class Description:
     """A scene as its files describe it, with nothing left to include or to put in.
 
-    `folders` are those in which the files that it names are looked for, first to last.
+    `folders` are those in which the files that it names are looked for, first to last; `variables` are the values of
+    its `$name` variables, those that it has itself among them.
     """
 
     root: Element
     folders: list[Path]
+    variables: dict[str, str]
 
 
 def read_description(file: Path, options: Mapping[str, str]) -> Description:
@@ -39,7 +41,7 @@ def read_description(file: Path, options: Mapping[str, str]) -> Description:
     folders = [file.absolute().parent]
     root = reader.read(file, folders, None)
     reader.variables.check_used(file)
-    return Description(root, folders)
+    return Description(root, folders, reader.variables.values())
 
 
 @dataclass

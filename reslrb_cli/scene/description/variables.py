@@ -25,6 +25,10 @@ class Variables:
         """Set the value of `name` where it has none yet."""
         self._values.setdefault(name, value)
 
+    def values(self) -> dict[str, str]:
+        """All values so far, those of the user first."""
+        return dict(self._values)
+
     def put_into(self, element: Element) -> None:
         """Replace the variables in the attributes of `element`. Raises ConfigError for one without a value."""
         for key, text in element.attributes.items():

@@ -1,0 +1,95 @@
+"""`init` where there is something to choose: among sensors, and values of what a scene file leaves open."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from cli.calling import reslrb, settings
+from cli.photographs import write_noise
+
+from reslrb_cli.config import load
+
+pytestmark = pytest.mark.usefixtures("llvm")
+
+#: Two sensors, the second of which sees the ball alone, on a film that the file leaves open.
+CHOICES = """<scene version="3.0.0"><default name="side" value="16"/><default name="note" value="a &quot;b&quot;"/>
+<sensor type="perspective" id="floor"><film type="hdrfilm"><integer name="width" value="$side"/>
+<integer name="height" value="$side"/></film>
+<transform name="to_world"><lookat origin="0, 5, 0" target="0, 0, 0" up="0, 0, 1"/></transform></sensor>
+<sensor type="perspective" id="ball"><film type="hdrfilm"><integer name="width" value="12"/>
+<integer name="height" value="8"/></film><float name="fov" value="10"/>
+<transform name="to_world"><lookat origin="9, 1, 9" target="9, 1, 0" up="0, 1, 0"/></transform></sensor>
+<shape type="rectangle"><transform name="to_world"><rotate x="1" angle="-90"/><scale value="4"/></transform>
+<bsdf type="diffuse"><rgb name="reflectance" value="0.4"/></bsdf></shape>
+<shape type="sphere"><point name="center" x="9" y="1" z="0"/>
+<bsdf type="diffuse"><rgb name="reflectance" value="0.4"/></bsdf></shape>
+<emitter type="constant"/></scene>"""
+
+
+@pytest.fixture
+def choices(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    (tmp_path / "hall.xml").write_text(CHOICES)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def test_of_several_sensors_one_is_named(choices: Path) -> None:
+    first = reslrb("init", "hall.xml")
+    assert "sensor 0 (floor); --sensor takes another: 1 (ball)" in first.output
+    config = load(choices / "hall.yaml")
+    assert (config.scene.sensors, config.parameters[0].keys) == ([0], ["Rectangle_1.bsdf.reflectance.value"])
+    other = reslrb("init", "hall.xml", "--sensor", 1, "--target", write_noise(choices / "photo.png", 12, 8), "--force")
+    assert "sensor 1 (ball); --sensor takes another: 0 (floor)" in other.output
+    config = load(choices / "hall.yaml")
+    assert (config.scene.sensors, config.scene.size) == ([1], None)  # that one's film is as large as the photograph
+    assert [spec.keys for spec in config.parameters] == [["Sphere_1.bsdf.reflectance.value"]]
+    # A ball of one colour under a light of one colour: its exposure cannot be told from it.
+    few = settings("run.iterations=2", "integrator.estimator=stack", "target.exposure=1")
+    done = reslrb("optimize", "hall.yaml", *few)
+    assert done.exit_code == 0, done.output
+    missing = reslrb("init", "hall.xml", "--sensor", 2, "--force")
+    assert missing.exit_code == 2
+    assert "--sensor: is 2; the scene has 0 (floor), 1 (ball)" in missing.output
+
+
+def test_what_a_scene_leaves_open_is_named_and_can_be_set(choices: Path) -> None:
+    made = reslrb("init", "hall.xml")
+    assert "at 16x16 pixels" in made.output
+    assert '  # options: {side: 16, note: "a \\"b\\""}  # ' in (choices / "hall.yaml").read_text()
+    made = reslrb("init", "hall.xml", "--set", "scene.options.side=20", "--force")
+    assert "at 20x20 pixels" in made.output
+    assert load(choices / "hall.yaml").scene.options == {"side": 20}
+    for setting, message in (("scene.options.width=3", "$width: is set in scene.options, but the scene file does not"),
+                             ("run.spp=4", "--set run.spp=4: init takes scene.options.NAME=VALUE alone"),
+                             ("scene.options.side=[3]", "scene.options.side")):  # fmt: skip
+        refused = reslrb("init", "hall.xml", "--set", setting, "--force")
+        assert refused.exit_code == 2
+        assert message in refused.output
+    (choices / "hall.xml").write_text(CHOICES.replace('<default name="side" value="16"/>', ""))
+    refused = reslrb("init", "hall.xml", "--force")
+    assert refused.exit_code == 2
+    assert "set scene.options.side" in refused.output
+    assert reslrb("init", "hall.xml", "--force", "--set", "scene.options.side=8").exit_code == 0
+
+
+#: A lamp whose rays Mitsuba cannot sample, behind glass; paths from the camera find its light.
+CHECKED = """<scene version="3.0.0"><sensor type="perspective"><film type="hdrfilm"><integer name="width" value="8"/>
+<integer name="height" value="8"/></film>
+<transform name="to_world"><lookat origin="0, 0, 4" target="0, 0, 0" up="0, 1, 0"/></transform></sensor>
+<shape type="rectangle"><bsdf type="diffuse"/></shape>
+<shape type="rectangle"><transform name="to_world"><translate x="9" z="1"/></transform>
+<bsdf type="thindielectric"/></shape>
+<shape type="rectangle"><transform name="to_world"><rotate x="1" angle="180"/><translate z="5"/></transform>
+<emitter type="area" id="lamp"><texture type="checkerboard" name="radiance"/></emitter></shape></scene>"""
+
+
+def test_light_that_cannot_be_sampled_is_left_to_camera_paths(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "shop.xml").write_text(CHECKED)
+    monkeypatch.chdir(tmp_path)
+    assert reslrb("inspect", "shop.xml").exit_code == 0
+    assert reslrb("init", "shop.xml", "--target", write_noise(tmp_path / "photo.png", 8, 8)).exit_code == 0
+    assert load(tmp_path / "shop.yaml").integrator.type == "prb"
+    refused = reslrb("optimize", "shop.yaml", *settings("integrator.type=reslrb"))
+    assert refused.exit_code == 2
+    assert "scene.file: Mitsuba cannot sample the rays of emitter lamp" in refused.output
