@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from reslrb_cli.backend.memory import resident_bytes
 from reslrb_cli.cli.output import echo
+from reslrb_cli.config.files import in_words
 from reslrb_cli.errors import printable
 from reslrb_cli.records.clock import rough_duration
 
@@ -29,16 +30,16 @@ def show_forecast(config: Config) -> None:
 
 def memory_lines(forecast: Forecast, budget: int | None) -> list[str]:
     """What the iterations take, by part, beside what is free, and what `memory_budget` allows."""
-    allowed = "" if budget is None else f", run.memory_budget allows {amount(budget)}"
+    allowed = "" if budget is None else f", run.memory_budget allows {in_words(budget)}"
     lines = [
-        f"memory of the iterations: {amount(forecast.peak)} at the most; {amount(forecast.free)} are free{allowed}"
+        f"memory of the iterations: {in_words(forecast.peak)} at the most; {in_words(forecast.free)} are free{allowed}"
     ]
-    lines += [f"  {amount(size):>10}  {part}" for part, size in forecast.parts.items()]
-    lines.append(f"  {amount(forecast.scratch):>10}  thread-local memory of paths (stack), beside it")
+    lines += [f"  {in_words(size):>10}  {part}" for part, size in forecast.parts.items()]
+    lines.append(f"  {in_words(forecast.scratch):>10}  thread-local memory of paths (stack), beside it")
     resident = resident_bytes()
     if resident:
         lines.append(
-            f"  {amount(resident):>10}  this process as a whole: Python, libraries, kernels' code, and all above"
+            f"  {in_words(resident):>10}  this process as a whole: Python, libraries, kernels' code, and all above"
         )
     return lines
 
@@ -60,11 +61,3 @@ def time_lines(forecast: Forecast) -> list[str]:
         f"  {rough_duration(forecast.verdicts_s):>10}  verdicts on the values, or so",
         f"time of the whole run: about {rough_duration(forecast.whole_s)}",
     ]
-
-
-def amount(size: int) -> str:
-    """Bytes in words, as the manifest counts them: `3.0 KiB`, `1.5 MiB`, `2.0 GiB`."""
-    for unit, name in ((2**30, "GiB"), (2**20, "MiB"), (2**10, "KiB")):
-        if size >= unit:
-            return f"{size / unit:.1f} {name}"
-    return f"{size} B"

@@ -42,16 +42,16 @@ def read_file(path: Path, most: int) -> bytes:
         except OSError as error:
             raise ConfigError(path, "", f"cannot be read: {error.strerror}") from None
     if len(data) > most:
-        raise ConfigError(path, "", f"has more than {size(most)}")
+        raise ConfigError(path, "", f"has more than {in_words(most)}")
     return data
 
 
-def size(count: int) -> str:
-    """A number of bytes in words: `256 kB`, `2.0 GB`."""
-    for unit, name in ((10**9, "GB"), (10**6, "MB"), (10**3, "kB")):
+def in_words(count: float) -> str:
+    """A number of bytes in words, in the units of `peak_mib`: `300 B`, `256 KiB`, `1.5 MiB`, `2 GiB`."""
+    for unit, name in ((2**40, "TiB"), (2**30, "GiB"), (2**20, "MiB"), (2**10, "KiB")):
         if count >= unit:
-            return f"{count / unit:.0f} {name}" if count >= 10 * unit else f"{count / unit:.1f} {name}"
-    return f"{count} bytes"
+            return f"{count / unit:.1f}".removesuffix(".0") + f" {name}"
+    return f"{count:.0f} B"
 
 
 def _check(path: Path, status: os.stat_result, most: int | None) -> None:
@@ -62,4 +62,4 @@ def _check(path: Path, status: os.stat_result, most: int | None) -> None:
         names = {stat.S_IFIFO: "a pipe", stat.S_IFSOCK: "a socket", stat.S_IFCHR: "a device", stat.S_IFBLK: "a device"}
         raise ConfigError(path, "", f"is {names.get(kind, 'something else')}, not a regular file")
     if most is not None and status.st_size > most:
-        raise ConfigError(path, "", f"has {size(status.st_size)}; more than {size(most)} are not read")
+        raise ConfigError(path, "", f"has {in_words(status.st_size)}; more than {in_words(most)} are not read")

@@ -85,15 +85,15 @@ def estimate(problem: Problem, integrator: Reslrb, samples: int, fixed: int) -> 
         width = samples * int(dr.prod(sensor.film().size()))
         if problem.config.adjoint == "correlated" and samples == problem.config.run.spp:
             # Else dL/dI is known before the paths are traced, and nothing of them outlives the kernel.
-            paths = max(paths, sum(_allocated(size * width) for size in entry_bytes(integrator.estimator.kept(plan))))
+            paths = max(paths, sum(allocated(size * width) for size in entry_bytes(integrator.estimator.kept(plan))))
         block = int(dr.prod(sensor.film().crop_size())) * (sensor.film().base_channels_count() + 1)
-        images = max(images, FILM_IMAGES * _allocated(4 * block), 2 * _allocated(4 * block) + _replicas(block))
-        targets += _allocated(4 * block)
+        images = max(images, FILM_IMAGES * allocated(4 * block), 2 * allocated(4 * block) + _replicas(block))
+        targets += allocated(4 * block)
         scratch = max(scratch, integrator.estimator.scratch_bytes(plan))
     copies = PARAMETER_COPIES + (0 if problem.config.optimizer.clamp_gradient is None else CLAMP_COPIES)
     for key in problem.selection.keys:
         size = int(dr.prod(dr.shape(problem.selection.value(key))))
-        images += copies * _allocated(4 * size) + _replicas(size)
+        images += copies * allocated(4 * size) + _replicas(size)
     return Estimate(fixed + targets, images, scratch * resident_paths(), paths)
 
 
@@ -110,7 +110,7 @@ def choose_samples(problem: Problem, integrator: Reslrb, samples: int, budget: i
     return 0, expected
 
 
-def _allocated(size: int) -> int:
+def allocated(size: int) -> int:
     """Bytes that the allocator takes for an array: a power of two."""
     return max(1 << (size - 1).bit_length(), 64) if size else 0
 
@@ -120,4 +120,4 @@ def _replicas(entries: int) -> int:
     threads = dr.thread_count() + 1
     if dr.backend_v(mi.Float) != dr.JitBackend.LLVM or entries * threads > dr.expand_threshold():
         return 0
-    return _allocated(4 * entries * threads)
+    return allocated(4 * entries * threads)

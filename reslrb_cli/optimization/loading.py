@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import mitsuba as mi
@@ -10,15 +11,16 @@ from reslrb_cli.config import Config, Integrator, Reslrb
 from reslrb_cli.errors import ConfigError, UnsupportedScene
 from reslrb_cli.integrators import StepIntegrator, make_integrator
 from reslrb_cli.scene import check_camera_paths, check_supported, load_scene
+from reslrb_cli.scene.description import Description
 
 #: Types of integrators that trace from the light, and so cannot render every scene.
 LIGHT_TRACERS = ("reslrb", "ptracer", "walk_ad", "trajectory")
 
 
-def load_configured(config: Config) -> mi.Scene:
-    """Load the scene that `config` names. Raises ConfigError."""
+def load_configured(config: Config, look: Callable[[Description], object] | None = None) -> mi.Scene:
+    """Load the scene that `config` names; `look` sees its description before it is built. Raises ConfigError."""
     scene = config.scene
-    return load_scene(scene.file, scene.options, scene.strict, scene.size, scene.cameras)
+    return load_scene(scene.file, scene.options, scene.strict, scene.size, scene.cameras, look)
 
 
 def choose_sensors(config: Config, scene: mi.Scene) -> list[int]:

@@ -12,6 +12,7 @@ import numpy as np
 from reslrb_cli.config import Config
 from reslrb_cli.integrators import OnSamples
 from reslrb_cli.optimization.ambiguity import check_exposures
+from reslrb_cli.optimization.announced import check_announced, check_described
 from reslrb_cli.optimization.budget import MemoryPlan
 from reslrb_cli.optimization.choice import Cache, find_options, settle_integrator
 from reslrb_cli.optimization.errors import ErrorMeter, quantity
@@ -27,7 +28,7 @@ from reslrb_cli.optimization.optimizers import Optimizer
 from reslrb_cli.optimization.pilot_records import Outcome
 from reslrb_cli.optimization.reach import find_reached
 from reslrb_cli.optimization.rendering import render_in_passes, saved_spp
-from reslrb_cli.optimization.room import check_config, check_films, outlook
+from reslrb_cli.optimization.room import check_films, outlook
 from reslrb_cli.optimization.scaling import Scaled
 from reslrb_cli.optimization.settled import Settled
 from reslrb_cli.optimization.targets import make_targets
@@ -185,8 +186,8 @@ def assemble_scene(config: Config, scene: Any = None, values: Mapping[str, Array
     `scene` is used in place of `scene.file`, `values` in place of the parameters' initial ones. Raises ValueError where
     these are not one finite array for each parameter, of its shape.
     """
-    check_config(config)
-    scene = load_configured(config) if scene is None else scene
+    check_announced(config)
+    scene = load_configured(config, functools.partial(check_described, config)) if scene is None else scene
     views = make_views(config, scene)
     check_films(config, scene, [view.sensor for view in views])
     check_integrator(config, config.integrator, scene, [view.sensor for view in views])

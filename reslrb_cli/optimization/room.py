@@ -12,6 +12,7 @@ import mitsuba as mi
 
 from reslrb_cli.backend.memory import free_bytes, local_bytes
 from reslrb_cli.config import Config
+from reslrb_cli.config.files import in_words
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.integrators import Reslrb as Tracer
 from reslrb_cli.optimization.budget import estimate
@@ -20,7 +21,6 @@ from reslrb_cli.records.clock import rough_duration
 if TYPE_CHECKING:
     from reslrb_cli.optimization.problem import Problem
 
-GIB = 2**30
 #: Bytes that every machine has.
 SMALL = 2**28
 #: Bytes that a pixel takes at the least: five images (block, image, dL/dI, its adjoint, target) of three floats.
@@ -33,24 +33,6 @@ NAIVE, PATH_BYTES = ("ptracer", "walk_ad"), 48
 RECORD_BYTES = 60
 #: Light paths of a run beyond which a word is said of them, and how many a second that word reckons with.
 MANY_PATHS, RATE = 1e11, 1e7
-#: Bytes that an entry of a parameter takes at the least: value, the optimiser's, gradient, and the array it is set by.
-ENTRY_BYTES = 4 * 4
-
-
-def check_config(config: Config) -> None:
-    """Raise ConfigError where film or parameters, as the configuration has them, need more memory than is free."""
-    if config.scene.size is not None:
-        _check_film(config, "scene.size", config.scene.size)
-    for place, spec in enumerate(config.parameters):
-        resolution = spec.resolution if spec.heightmap is None else spec.heightmap.resolution
-        if resolution is None:
-            continue
-        needed = resolution[0] * resolution[1] * ENTRY_BYTES
-        free = _free_for(needed)
-        if needed > free:
-            key = f"parameters[{place}].{'resolution' if spec.heightmap is None else 'heightmap.resolution'}"
-            texels = f"{resolution[0]}x{resolution[1]} texels"
-            raise ConfigError(config.source, key, _too_large(texels, needed, free, resolution))
 
 
 def check_films(config: Config, scene: mi.Scene, sensors: Sequence[int]) -> None:
@@ -58,7 +40,7 @@ def check_films(config: Config, scene: mi.Scene, sensors: Sequence[int]) -> None
     for index in sensors:
         film = scene.sensors()[index].film()
         width, height = (int(n) for n in film.crop_size())
-        _check_film(config, "scene.file", (width, height))
+        check_film(config, "scene.file", (width, height))
         full = film.size()  # light paths are counted by the film without its crop window
         obstacle = config.samples_obstacle(int(full[0]) * int(full[1]))
         if obstacle is not None:
@@ -77,8 +59,8 @@ def check_scratch(problem: Problem, integrator: Tracer) -> None:
             raise ConfigError(
                 problem.config.source,
                 "integrator.stack_size",
-                f"{size} vertices take {needed / 2**20:.1f} MiB of a thread's stack for each path, which has "
-                f"{most / 2**20:.1f} MiB; take at most {size * most // needed} (longer paths are traced a second time, "
+                f"{size} vertices take {in_words(needed)} of a thread's stack for each path, which has "
+                f"{in_words(most)}; take at most {size * most // needed} (longer paths are traced a second time, "
                 "and nothing of them is lost), or raise `ulimit -s`",
             )
 
@@ -95,7 +77,7 @@ def check_memory(problem: Problem, integrator: Tracer) -> None:
     samples = _pass_samples(config)
     # What stands is taken already.
     expected = estimate(problem, integrator, samples, 0)
-    free, needed = _free_for(expected.total), expected.total * SURE[config.adjoint]
+    free, needed = free_for(expected.total), expected.total * SURE[config.adjoint]
     if needed <= free:
         return
     parts = {"images and parameters": expected.images, "targets": expected.fixed, "what is kept of paths":
@@ -105,8 +87,8 @@ def check_memory(problem: Problem, integrator: Tracer) -> None:
     if expected.paths > expected.total // 2:
         advice = "set run.memory_budget, or leave run.adjoint at auto, with which nothing is kept of paths"
     key = "run.spp" if expected.paths > expected.total // 2 else "scene.file"
-    reason = f"a step takes about {expected.total / GIB:.1f} GiB ({largest} {parts[largest] / GIB:.1f} GiB), and "
-    raise ConfigError(config.source, key, f"{reason}{free / GIB:.1f} GiB are free; {advice}")
+    reason = f"a step takes about {in_words(expected.total)} ({largest} {in_words(parts[largest])}), and "
+    raise ConfigError(config.source, key, f"{reason}{in_words(free)} are free; {advice}")
 
 
 def check_baseline(problem: Problem) -> None:
@@ -127,13 +109,13 @@ def check_baseline(problem: Problem) -> None:
     for index in problem.sensors:
         size = problem.scene.sensors()[index].film().size()
         paths = max(paths, _pass_samples(config) * int(size[0]) * int(size[1]))
-    free = _free_for(paths * PATH_BYTES)
+    free = free_for(paths * PATH_BYTES)
     if paths * PATH_BYTES > free:
         raise ConfigError(
             config.source,
             "run.spp",
             f"{config.integrator.type} keeps the state of all {paths} light paths of a pass, at least "
-            f"{paths * PATH_BYTES / GIB:.1f} GiB, and {free / GIB:.1f} GiB are free; lower run.spp, set "
+            f"{in_words(paths * PATH_BYTES)}, and {in_words(free)} are free; lower run.spp, set "
             "integrator.samples_per_pass, or take reslrb, which keeps none",
         )
 
@@ -164,19 +146,21 @@ def _pass_samples(config: Config) -> int:
     return spp if per_pass is None else min(spp, int(per_pass))
 
 
-def _free_for(needed: int) -> int:
+def free_for(needed: int) -> int:
     """Bytes that are free; of what is small nobody asks, since to ask a GPU's driver takes a while."""
     return needed if needed < SMALL else free_bytes(mi.variant())
 
 
-def _check_film(config: Config, key: str, size: tuple[int, int]) -> None:
+def check_film(config: Config, key: str, size: tuple[int, int]) -> None:
+    """Raise ConfigError at `key` where the images of a film of this (width, height) need more memory than is free."""
     needed = size[0] * size[1] * PIXEL_BYTES
-    free = _free_for(needed)
+    free = free_for(needed)
     if needed > free:
-        raise ConfigError(config.source, key, _too_large(f"a film of {size[0]}x{size[1]} pixels", needed, free, size))
+        raise ConfigError(config.source, key, too_large(f"a film of {size[0]}x{size[1]} pixels", needed, free, size))
 
 
-def _too_large(what: str, needed: int, free: int, size: tuple[int, int]) -> str:
+def too_large(what: str, needed: int, free: int, size: tuple[int, int]) -> str:
+    """The message on what needs more bytes than are free, and the largest (width, height) of its shape that fits."""
     shrink = (free / needed) ** 0.5
     fits = "x".join(str(max(int(n * shrink), 1)) for n in size)
-    return f"{what} takes at least {needed / GIB:.1f} GiB, and {free / GIB:.1f} GiB are free; take at most {fits}"
+    return f"{what} takes at least {in_words(needed)}, and {in_words(free)} are free; take at most {fits}"

@@ -49,7 +49,7 @@ class Stored:
         head = self.archive.heads.get(name)
         if head is not None and head.dtype != wanted:
             raise self.wrong(name, f"is {head.dtype} in place of {wanted}")
-        result: T = like(other, self.archive.array(name, tuple(dr.shape(other)), infinite=True))
+        result: T = like(other, self.archive.array(name, tuple(dr.shape(other)), values="no NaN"))
         return result
 
     def scene_value(self, problem: Problem, prefix: str, key: str) -> Any:

@@ -14,13 +14,12 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
-from typing import IO, Any
+from typing import IO, Any, Literal
 
 import numpy as np
 from numpy.lib import format as npy
 
-from reslrb_cli.config.files import open_file
-from reslrb_cli.config.files import size as in_words
+from reslrb_cli.config.files import in_words, open_file
 from reslrb_cli.errors import ConfigError, is_machine_fault, is_out_of_memory
 from reslrb_cli.records.atomic import write_atomically
 
@@ -30,8 +29,12 @@ Array = np.ndarray[Any, Any]
 MOST_BYTES = 2**34
 #: Entries of an archive, some twenty for each parameter.
 MOST_ENTRIES = 100_000
+_DAMAGED = "an entry has another checksum than was written"
 #: Kinds of numbers that a run writes: floats, integers, truth values.
 _KINDS = "fiub"
+#: What the values of an array have to be: what is added up may be infinite, and some callers say themselves, and where,
+#: what is wrong with a value.
+Values = Literal["finite", "no NaN", "any"]
 
 
 def write_archive(path: Path, arrays: Mapping[str, Array], durable: bool = False) -> None:
@@ -52,11 +55,13 @@ class Head:
 class Archive:
     """The arrays of a file; as a context manager it closes that at the end.
 
-    Opening it reads every byte once, in pieces, so that damage is seen before anything is made of it. Raises
-    ConfigError, located in the file, where it cannot be read, is damaged, or is nothing that a run wrote.
+    Opening it reads every byte once, in pieces, so that damage is seen before anything is made of it; without `whole`,
+    for who takes one array of many, those of an array are looked at when it is asked for. Raises ConfigError, located
+    in the file, where it cannot be read, is damaged, or is nothing that a run wrote.
     """
 
     path: Path
+    whole: bool = True
     heads: dict[str, Head] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -80,17 +85,16 @@ class Archive:
                 raise ValueError("compressed, or no arrays, neither of which a run writes")
             with self._zip.open(entry) as stream:
                 self.heads[entry.filename[: -len(".npy")]] = _read_head(stream, entry.file_size)
-        damaged = self._zip.testzip()
-        if damaged is not None:
-            raise ValueError("an entry has another checksum than was written")
+        if self.whole and self._zip.testzip() is not None:
+            raise ValueError(_DAMAGED)
 
     def array(
-        self, name: str, shape: tuple[int, ...] | None = None, kind: str | None = None, infinite: bool = False
+        self, name: str, shape: tuple[int, ...] | None = None, kind: str | None = None, values: Values = "finite"
     ) -> Array:
-        """The array of an entry, finite, and where they are given of this shape and kind of number (`f`, `u`, ...).
+        """The array of an entry, with such `values`, and where they are given of this shape and kind of number (`f`,
+        `u`, ...).
 
-        Sums of squares may be `infinite`, never NaN. Raises ConfigError, located in the file, where it is not so, or
-        there is none.
+        Raises ConfigError, located in the file, where it is not so, or there is none.
         """
         head = self.heads.get(name)
         if head is None:
@@ -104,7 +108,7 @@ class Archive:
             _read_head(stream, None)
             data = stream.read()
             array: Array = np.frombuffer(bytearray(data), dtype=head.dtype).reshape(head.shape)
-        if (np.isnan(array) if infinite else ~np.isfinite(array)).any():
+        if values != "any" and (np.isnan(array) if values == "no NaN" else ~np.isfinite(array)).any():
             raise ConfigError(self.path, "", f"`{name}` holds a value that is not finite")
         return array
 
@@ -121,7 +125,7 @@ class Archive:
         except Exception as error:  # of many kinds, from the readers of archives and of arrays' heads
             if is_out_of_memory(error) or is_machine_fault(error):
                 raise
-            reason = str(error) or type(error).__name__
+            reason = _DAMAGED if "CRC" in str(error) else str(error) or type(error).__name__
             raise ConfigError(self.path, "", f"is damaged, cut off, or not written by a run ({reason})") from None
 
     def close(self) -> None:

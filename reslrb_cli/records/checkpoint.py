@@ -12,16 +12,12 @@ import contextlib
 import errno
 import json
 import os
-import zipfile
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.lib.npyio import NpzFile
 
-from reslrb_cli.config.files import open_file
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.records.archive import Archive, Array, write_archive
 from reslrb_cli.records.atomic import unfinished
@@ -123,34 +119,15 @@ def save_nonfinite(folder: Path, iteration: int, parameters: Mapping[str, Array]
     write_archive(folder / NONFINITE_FILE_NAME, arrays)
 
 
-def load_nonfinite(folder: Path) -> tuple[int, dict[str, np.ndarray[Any, Any]]] | None:
-    """What `save_nonfinite` wrote into `folder`, iteration and parameters; None where there is nothing.
+def load_nonfinite(folder: Path) -> tuple[int, dict[str, Array]] | None:
+    """What `save_nonfinite` wrote into `folder`, iteration and parameters, finite or not; None where there is nothing.
 
     Raises ConfigError, located in the file, where it cannot be read, is damaged, or is nothing that a run wrote.
     """
     path = folder / NONFINITE_FILE_NAME
     if not os.path.lexists(path):
         return None
-    with open_archive(path) as arrays:
-        names = [name for name in arrays.files if name.startswith("parameter/")]
-        parameters = {name.removeprefix("parameter/"): arrays[name] for name in names}
-        return int(arrays["iteration"]), parameters
-
-
-@contextmanager
-def open_archive(path: Path) -> Iterator[NpzFile]:
-    """The arrays of a file that a run wrote, each read when it is asked for.
-
-    Raises ConfigError, located in the file, also for what the block raises of it: where it cannot be read, is damaged,
-    or is nothing that a run wrote.
-    """
-    try:
-        with open_file(path) as file, np.load(file, allow_pickle=False) as arrays:
-            if any(entry.compress_type != zipfile.ZIP_STORED for entry in arrays.zip.infolist()):
-                raise ValueError("compressed, which no run writes, and small files may so stand for large arrays")
-            yield arrays
-    except ConfigError:
-        raise
-    except Exception as error:  # of many kinds, from the readers of archives, arrays and their heads
-        reason = str(error) or type(error).__name__
-        raise ConfigError(path, "", f"is damaged, cut off, or not written by a run ({reason})") from None
+    with Archive(path, whole=False) as archive:
+        keys = archive.names("parameter/")
+        iteration = int(archive.array("iteration", (), "i"))
+        return iteration, {key: archive.array(f"parameter/{key}", values="any") for key in keys}

@@ -5,15 +5,11 @@ from __future__ import annotations
 import difflib
 import os
 from pathlib import Path
-from typing import Any
-
-import numpy as np
 
 from reslrb_cli.errors import ConfigError
-from reslrb_cli.records.checkpoint import FILE_NAME, newest_checkpoint, open_archive
+from reslrb_cli.records.archive import Archive, Array
+from reslrb_cli.records.checkpoint import FILE_NAME, newest_checkpoint
 from reslrb_cli.records.manifest import read_manifest
-
-Array = np.ndarray[Any, Any]
 
 #: Keys that an error names.
 _SHOWN = 3
@@ -22,18 +18,16 @@ _SHOWN = 3
 def read_value(run: Path, key: str) -> Array:
     """The value of `key` in the newest checkpoint of the run folder `run`.
 
-    Shapes as in `parameters.npz`: a texture (H, W, C), a colour (C,), a buffer (N,), a number (). Raises ConfigError,
-    located in the folder or a file of it, where it is no run's, damaged, or the run did not recover `key`.
+    Shapes as in `parameters.npz`: a texture (H, W, C), a colour (C,), a buffer (N,), a number (). It may hold
+    values that are not finite: who uses it says where. Raises ConfigError, located in the folder or a file of it, where
+    it is no run's, damaged, or the run did not recover `key`.
     """
     path = checkpoint_of(run)
-    with open_archive(path) as arrays:
-        known = {name.removeprefix("parameter/"): name for name in arrays.files if name.startswith("parameter/")}
+    with Archive(path, whole=False) as archive:
+        known = archive.names("parameter/")
         if key in known:
-            value: Array = arrays[known[key]]
-            if value.dtype.kind != "f":
-                raise ConfigError(path, "", f"`{key}` is no array of numbers, as a run writes it ({value.dtype})")
-            return value
-    near = difflib.get_close_matches(key, known, n=_SHOWN, cutoff=0.5) or list(known)[:_SHOWN]
+            return archive.array(f"parameter/{key}", kind="f", values="any")
+    near = difflib.get_close_matches(key, known, n=_SHOWN, cutoff=0.5) or known[:_SHOWN]
     has = " and ".join(f"`{name}`" for name in near) or "nothing"
     more = f" and {len(known) - len(near)} more" if len(known) > len(near) else ""
     raise ConfigError(run, "", f"did not recover `{key}`; it has {has}{more}")

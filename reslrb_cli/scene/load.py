@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import logging
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -36,6 +36,7 @@ def load_scene(
     strict: bool = False,
     size: tuple[int, int] | None = None,
     cameras: Path | None = None,
+    look: Callable[[Description], object] | None = None,
 ) -> mi.Scene:
     """Load a Mitsuba scene (XML, versions 0.4 to 3); a variant must be set.
 
@@ -44,12 +45,13 @@ def load_scene(
     `Sphere_3`. What Mitsuba's parser would refuse because another version or an exporter wrote it is mended or left
     out, with a warning in the log; `strict` has it refused. Those of `cameras`, a file, stand in place of the scene's
     sensors. The scene's integrator is not loaded: an experiment has its own. Plugins are loaded from Mitsuba's own
-    folder alone. `size` is the (width, height) of all films in pixels, in place of what the files say.
+    folder alone. `size` is the (width, height) of all films in pixels, in place of what the files say. `look` sees what
+    is to be built before anything of it is, and may raise.
 
     Raises ConfigError, located in the scene file, where it is missing or wrong, has nothing in it, or no light. Warns,
     too, of a scene that is too far from the origin, or too small, and of glass that is too thin.
     """
-    return load_described(file, options, strict, size, cameras)[0]
+    return load_described(file, options, strict, size, cameras, look)[0]
 
 
 def load_described(
@@ -58,6 +60,7 @@ def load_described(
     strict: bool = False,
     size: tuple[int, int] | None = None,
     cameras: Path | None = None,
+    look: Callable[[Description], object] | None = None,
 ) -> tuple[mi.Scene, Description]:
     """The same, and the description that the scene was built from, of which Mitsuba has a use for every element."""
     file = Path(file)
@@ -73,6 +76,8 @@ def load_described(
     if size is not None:
         resize_films(root, size)
     check_sizes(description)
+    if look is not None:
+        look(description)
     scene, unused = build(description)
     if strict:
         notes.refuse(unused)

@@ -10,7 +10,6 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from scipy.ndimage import maximum_filter
 
 from .needs import CROSSINGS
 
@@ -64,6 +63,8 @@ def sees_specular(scene: mi.Scene, sensor: mi.Sensor) -> SeenSpecular:
         only, beside = _first_surfaces(scene, ray, count)
         alone, mixed = alone | only, mixed | beside
         dr.eval(alone, mixed, random)
+    from scipy.ndimage import maximum_filter  # here: a run that is refused does not wait for it
+
     # A sample that lies within the radius of a pixel's centre is at most so many pixels away.
     size = 2 * int(np.ceil(float(film.rfilter().radius()) - 0.5)) + 1
 

@@ -225,7 +225,7 @@ def test_auto_under_a_budget(experiment, capsys):
 def test_a_budget_that_is_exceeded_is_a_warning(experiment, capsys, monkeypatch):
     from reslrb_cli.optimization import budget
 
-    monkeypatch.setattr(budget, "_allocated", lambda size: 0)
+    monkeypatch.setattr(budget, "allocated", lambda size: 0)
     settings = wide("integrator={max_depth: 4, estimator: event}", "run.spp=256", "run.memory_budget=3")
     settings += ("run.adjoint=correlated",)  # else nothing is kept of paths
     code, err = optimize(capsys, *settings)

@@ -98,13 +98,11 @@ DAMAGED = {
     "no archive": b"no archive",
     "an array": b"\x93NUMPY\x01\x00v\x00",
     "of zeros": bytes(5000),
-    "another archive": archive()[:0] + b"PK\x05\x06" + bytes(18),
     "pickled": archive(iteration=np.array([Evil()], dtype=object)),
     "compressed": archive(np.savez_compressed),
     "huge": huge(),
-    "no iteration": archive(iteration=None),
     "iteration of text": archive(iteration=np.array("x")),
-    "iteration of several": archive(iteration=np.arange(3)),
+    "parameter of text": archive(**{f"parameter/{KEY}": np.array("x")}),
 }
 
 
@@ -127,16 +125,18 @@ def test_bytes_that_changed_are_told(run, capsys):
     place = data.index(np.float32(0.5).tobytes())
     data[place : place + 4] = np.float32(0.75).tobytes()
     (run / ARCHIVE).write_bytes(data)
-    assert "Bad CRC-32" in told(capsys, run)
+    assert "another checksum than was written" in told(capsys, run)
 
 
 FOREIGN = {
     "another shape": ({f"parameter/{KEY}": np.zeros((3, 1), np.float32)}, "is float32 of shape (3, 1), not numbers of"),
     "another type": ({f"parameter/{KEY}": np.zeros(3, np.int64)}, "is int64 of shape (3,), not numbers of shape (3,)"),
-    "text": ({f"parameter/{KEY}": np.array("x")}, "is <U1 of shape ()"),
     "not finite": ({f"parameter/{KEY}": np.full(3, np.nan, np.float32)}, "holds a value that is not finite"),
     "another key": ({f"parameter/{KEY}": None, "parameter/a": np.zeros(3, np.float32)}, "it has `a`"),
     "no key": ({f"parameter/{KEY}": None}, f"it lacks `{KEY}`"),
+    "no iteration": ({"iteration": None}, "lacks `iteration`"),
+    "several iterations": ({"iteration": np.arange(3)}, "has `iteration` of shape 3; it must be one number"),
+    "half an iteration": ({"iteration": np.array(0.5)}, "`iteration` is no array of numbers"),
     "a later iteration": ({"iteration": np.array(7)}, "iteration: is 7; the run has 3 iterations"),
     "a negative iteration": ({"iteration": np.array(-1)}, "iteration: is -1; the run has"),
 }

@@ -34,7 +34,7 @@ LARGE = {
     "depth": ("a: " + "[" * 1000, "nested too deeply"),
     "unknown keys": (GOOD + "".join(f"k{i}: 1\n" for i in range(9_000)), "unknown key; known here: variant"),
     "a word": (GOOD + f"? {'x' * 100_000}\n: 1\n", "unknown key; known here: variant"),
-    "bytes": (GOOD + "#" * 300_000, "has 300 kB; more than 262 kB are not read"),
+    "bytes": (GOOD + "#" * 300_000, "has 293.1 KiB; more than 256 KiB are not read"),
 }
 
 
@@ -88,7 +88,7 @@ def test_what_is_no_regular_file_is_not_read(kind: str, tmp_path: Path) -> None:
         os.truncate(path, 2**40)
     else:
         path = Path("/dev/zero" if kind == "device" else "/proc/self/pagemap")  # the latter says that it is empty
-    what = {"sparse": "has 1100 GB; more than 262 kB", "endless": "has more than 262 kB"}.get(
+    what = {"sparse": "has 1 TiB; more than 256 KiB", "endless": "has more than 256 KiB"}.get(
         kind, f"is a {kind}, not a"
     )
     with pytest.raises(ConfigError) as caught:

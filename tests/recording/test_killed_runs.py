@@ -144,7 +144,7 @@ def test_with_several_threads_it_is_no_farther_off_than_runs_are_from_each_other
     script = "import sys; sys.argv[0] = 'reslrb'; from reslrb_cli.cli import run; run()"
     sets = [*SETS, "--set", "run.iterations=80", "--set", "run.spp=1024", "--set", "run.adjoint=batched"]
     for number in range(5):
-        assert end(start(tmp_path, "tiny.yaml", *sets, "--set", f"run.name={number}", script=script))[0] == 0
+        assert end(start(tmp_path, "tiny.yaml", *sets, "--set", f"run.name=whole-{number}", script=script))[0] == 0
     process = start(tmp_path, "tiny.yaml", *sets, script=script)
     run = tmp_path / "runs/tiny"
     for _ in range(3):
@@ -155,7 +155,10 @@ def test_with_several_threads_it_is_no_farther_off_than_runs_are_from_each_other
         process.communicate()
         process = start(tmp_path, "--resume", str(run), "--quiet", script=script)
     assert end(process)[0] == 0
-    values = [state_of(tmp_path / "runs" / name)[f"parameter/{tiny.KEY}"] for name in (*"01234", "tiny")]
+    values = [
+        state_of(tmp_path / "runs" / name)[f"parameter/{tiny.KEY}"]
+        for name in (*(f"whole-{number}" for number in range(5)), "tiny")
+    ]
     *whole, resumed = [value.astype(np.float64) for value in values]
     farthest = max(float(np.abs(a - b).max()) for a in whole for b in whole)
     distance = min(float(np.abs(resumed - each).max()) for each in whole)

@@ -1,7 +1,8 @@
 """A process that is handed scenes and images that may be wrong, one a line, and says what came of each.
 
-It works in a folder of its own, under a limit of memory. Each line names a command (`scene FILE`, `photo FILE`), each
-answer is one JSON object. What ends the process in the midst of a case is seen by whoever waits for the answer.
+It works in a folder of its own, under a limit of memory. Each line names a command (`scene FILE`, `photo FILE`,
+`run FILE`, `resume RUN`), each answer is one JSON object. What ends the process in the midst of a case is seen by who
+waits for the answer.
 """
 
 from __future__ import annotations
@@ -47,6 +48,16 @@ def call(arguments: Sequence[str]) -> dict[str, object]:
     return {"code": code, "said": said.getvalue()[-3000:]}
 
 
+def resume(run: str) -> dict[str, object]:
+    """Go on with a run, whose page is not drawn: that takes longer than all else."""
+    from unittest.mock import patch
+
+    from reslrb_cli.recording import run as recording
+
+    with patch.object(recording, "write_report", lambda folder, *now: None):
+        return call(["optimize", "--resume", run, "--quiet"])
+
+
 def main_loop() -> None:
     """Answer until there are no more questions."""
     import reslrb_cli  # noqa: F401
@@ -65,6 +76,8 @@ def main_loop() -> None:
             answer = call(["inspect", name, "--no-counts"])
         elif kind == "run":
             answer = call(["optimize", name, "--quiet", "--force"])
+        elif kind == "resume":
+            answer = resume(name)
         else:
             answer = call(["optimize", "photo.yaml", "--quiet", "--force", "--set", f"target.file={name}"])
         below.seek(start)

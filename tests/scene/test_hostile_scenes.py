@@ -121,7 +121,7 @@ def test_files_are_bounded_together(tmp_path, monkeypatch):
     with pytest.raises(ConfigError, match=f"{file}:4: includes {tmp_path}/part.xml, which is too large: a scene"):
         load_scene(file)
     monkeypatch.setattr(reading, "MAX_BYTES", 10)
-    with pytest.raises(ConfigError, match=f"{file}: has .* bytes are not read"):
+    with pytest.raises(ConfigError, match=f"{file}: has .* B are not read"):
         load_scene(file)
 
 

@@ -7,16 +7,18 @@ from .mending import mend
 from .naming import name_objects
 from .notes import Note
 from .placing import place_textures
-from .sizes import check_sizes
+from .sizes import FilmSize, check_sizes, film_sizes
 from .sizing import resize_films
 from .writing import tag_lines
 
 __all__ = [
     "Description",
+    "FilmSize",
     "Note",
     "build",
     "check",
     "check_sizes",
+    "film_sizes",
     "mend",
     "name_objects",
     "place_textures",

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import os
+from dataclasses import dataclass
 from pathlib import Path
 
 import mitsuba as mi
 
 from ...backend.memory import free_bytes
-from ...config.files import size
+from ...config.files import in_words
 from ...config.limits import PIXELS
 from ...errors import ConfigError
 from ..image_file import image_size
@@ -19,6 +20,17 @@ from .including import Description
 _TEXEL_BYTES = 6
 #: Bytes in which a mesh says what it consists of.
 _HEAD = 2**16
+
+
+@dataclass(frozen=True)
+class FilmSize:
+    """Width and height of a film in pixels, how many of them its crop window has, and channels of a pixel; 0 pixels
+    where the file does not say."""
+
+    width: int
+    height: int
+    cropped: int
+    channels: int
 
 
 def check_sizes(description: Description) -> None:
@@ -34,17 +46,27 @@ def check_sizes(description: Description) -> None:
 
 def _check_film(film: Element) -> None:
     """Refuse a film of more pixels than an image may have; what is no number, Mitsuba refuses."""
-    sides = dict.fromkeys(("width", "height"), 0)
-    for child in film.children:
-        if child.name in sides and child.attributes.get("value", "").strip().isdecimal():
-            sides[child.name] = int(child.attributes["value"].strip()[:20])
-    pixels = sides["width"] * sides["height"]
-    if pixels > PIXELS:
+    size = _size_of(film)
+    if size.width * size.height > PIXELS:
         raise film.fail(
             "",
-            f"a film of {sides['width']}x{sides['height']} pixels; it must have at most {PIXELS}, since each image of "
-            "a step takes 12 bytes or more of every one",
+            f"a film of {size.width}x{size.height} pixels; it must have at most {PIXELS}, since each image of a step "
+            "takes 12 bytes or more of every one",
         )
+
+
+def film_sizes(description: Description) -> list[FilmSize]:
+    """What the scene's films say of their sizes."""
+    return [_size_of(element) for element in description.root.walk() if element.tag == "film"]
+
+
+def _size_of(film: Element) -> FilmSize:
+    values = {child.name: child.attributes.get("value", "").strip() for child in film.children}
+    numbers = {name: int(value[:20]) for name, value in values.items() if value.isdecimal()}
+    width, height = numbers.get("width", 0), numbers.get("height", 0)
+    cropped = numbers.get("crop_width", width) * numbers.get("crop_height", height)
+    channels = 1 if values.get("pixel_format", "rgb").lower().startswith("luminance") else 3
+    return FilmSize(width, height, cropped, channels)
 
 
 def _check_head(element: Element, path: Path) -> None:
@@ -67,7 +89,9 @@ def _check_file(element: Element, folders: list[Path], free: int) -> None:
     if path is None:
         return  # which Mitsuba says
     if os.path.getsize(path) > free:
-        raise element.fail("filename", f"{path} has {size(os.path.getsize(path))}, and {size(free)} of memory are free")
+        raise element.fail(
+            "filename", f"{path} has {in_words(os.path.getsize(path))}, and {in_words(free)} of memory are free"
+        )
     _check_head(element, path)
     try:
         width, height = image_size(path)
@@ -76,5 +100,7 @@ def _check_file(element: Element, folders: list[Path], free: int) -> None:
     if width * height > PIXELS:
         raise element.fail("filename", f"{path} is {width}x{height} pixels; more than {PIXELS} are not read")
     if width * height * _TEXEL_BYTES > free:
-        needed = size(width * height * _TEXEL_BYTES)
-        raise element.fail("filename", f"{path} is {width}x{height} pixels, which take {needed}; {size(free)} are free")
+        needed = in_words(width * height * _TEXEL_BYTES)
+        raise element.fail(
+            "filename", f"{path} is {width}x{height} pixels, which take {needed}; {in_words(free)} are free"
+        )
