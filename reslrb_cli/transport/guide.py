@@ -112,6 +112,11 @@ class Table:
         return table
 
 
+def even_table(grid: Grid) -> Table:
+    """The table of somebody who has learned nothing."""
+    return Table.of(grid, apportion(grid, grid.measures()))
+
+
 def _own(kind: Any, array: Array) -> Any:
     """In Dr.Jit's own memory: kernels depend on the alignment of NumPy's."""
     return dr.gather(kind, kind(array), dr.arange(mi.UInt32, len(array)))
