@@ -17,7 +17,7 @@ import mitsuba as mi
 import numpy as np
 from scipy import ndimage
 
-from reslrb_cli.integrators.hearing import hear, voices
+from reslrb_cli.integrators.hearing import MOST_VOICES, hear, voices
 from reslrb_cli.transport.emission import emission_of
 from reslrb_cli.transport.guide import Grid, Table, apportion, make_grid
 from reslrb_cli.transport.samples import Samples
@@ -130,10 +130,17 @@ class Guiding:
 
     def _shared(self, number: int) -> int:
         """The number of the sensor that the tables are kept under."""
+        return number % max(MOST_BYTES // self._each, 1)
+
+    @property
+    def _each(self) -> int:
+        """Bytes for one sensor: a table for each purpose, and what has been learned."""
         assert self.grid is not None
-        # Three tables, and what was learned, of six voices as a rule.
-        each = 3 * 4 * (self.grid.slots + self.grid.cells) + 7 * 4 * self.grid.cells
-        return number % max(MOST_BYTES // each, 1)
+        return 4 * (len(Purpose) * (self.grid.slots + self.grid.cells) + (MOST_VOICES + 1) * self.grid.cells)
+
+    def bytes(self, sensors: int) -> int:
+        """What the tables for so many sensors take."""
+        return min(sensors, max(MOST_BYTES // self._each, 1)) * self._each
 
     def state(self) -> tuple[dict[str, int], dict[str, Array]]:
         """What has been learned: the number of gradients of each sensor, and arrays by `<sensor>/<what>`."""
