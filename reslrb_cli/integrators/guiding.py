@@ -18,7 +18,7 @@ import numpy as np
 from scipy import ndimage
 
 from reslrb_cli.integrators.hearing import MOST_VOICES, hear, voices
-from reslrb_cli.transport.emission import emission_of
+from reslrb_cli.integrators.probing import used_numbers
 from reslrb_cli.transport.guide import Grid, Table, apportion, make_grid
 from reslrb_cli.transport.samples import Samples
 from reslrb_cli.transport.splat import AdjointImage
@@ -30,7 +30,6 @@ EVERY = 7  # after every so many
 KEEP = 0.5  # what of the past counts beside the newest, each time that a table learns
 BLUR = (0.25, 0.5, 0.25)  # along each number, of neighbouring cells
 MOST_BYTES = 2**26  # of all tables together; sensors for which there is no room share
-PROBES = 1024  # light paths by which it is found out which numbers emission uses
 LEARNING_STREAM = 0x1EA2  # seeds of the samples that tables learn from
 
 
@@ -188,23 +187,8 @@ class Guiding:
             self._tables.pop((number, purpose), None)
 
 
-def used_numbers(samples: Samples) -> list[bool]:
-    """Which of the four numbers (place, direction) the emission of any emitter depends on."""
-    random = np.random.default_rng(1)
-    first, other = (random.random((4, PROBES), np.float32) for _ in range(2))
-    choice, results = mi.Float(random.random(PROBES, np.float32)), []
-    with dr.suspend_grad():
-        for changed in range(-1, 4):
-            x = [mi.Float(other[k] if k == changed else first[k]) for k in range(4)]
-            e = emission_of(samples, mi.Float(0), choice, mi.Point2f(x[0], x[1]), mi.Point2f(x[2], x[3]))
-            results.append([e.ray.o, e.ray.d, e.weight])
-        dr.eval(results)
-    found = [np.concatenate([np.array(part) for part in parts]) for parts in results]
-    return [not np.array_equal(found[0], varied, equal_nan=True) for varied in found[1:]]
-
-
-def learning_seed(seed: mi.UInt32) -> mi.UInt32:
+def learning_seed(seed: mi.UInt32 | int) -> mi.UInt32:
     """The seed of the samples that are learned from, beside those of a gradient."""
-    result = mi.sample_tea_32(seed, mi.UInt32(LEARNING_STREAM))[0]
+    result = mi.sample_tea_32(mi.UInt32(seed), mi.UInt32(LEARNING_STREAM))[0]
     dr.make_opaque(result)
     return result

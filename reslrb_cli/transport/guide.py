@@ -68,6 +68,8 @@ class Grid:
 
 def make_grid(used: Sequence[bool], weights: Sequence[float]) -> Grid:
     """A grid for emitters of these sampling weights, cut along those of the four numbers that are used."""
+    if not sum(weights) > 0:
+        weights = [1.0] * max(len(weights), 1)  # nothing shines; the grid is of no use, and does no harm
     total = np.append(0.0, np.cumsum(np.asarray(weights, np.float64)))
     groups = min(len(weights), MOST_EMITTERS)
     edges = (total / total[-1])[np.round(np.linspace(0, len(weights), groups + 1)).astype(int)]

@@ -5,14 +5,15 @@ What a table says is a matter of variance alone; what could bias is planted, and
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 from conformance.gradient_cases import CASES
+from conformance.guiding_faults import FAULTS, learned_in_its_midst, same_numbers
 from turns import a_few
 
+import reslrb_cli
 from reslrb_cli.estimators import ESTIMATORS
 from reslrb_cli.integrators import known_step, render_image
 from reslrb_cli.integrators.features import FEATURES
@@ -23,7 +24,6 @@ from reslrb_cli.measure.statistics import compare
 pytestmark = pytest.mark.usefixtures("llvm")
 
 BY_NAME = {case.name: case for case in CASES}
-#: Of several kinds: emitters of every sort, zero factors, roulette, passes, filters.
 NAMES = ("texture", "two_emitters", "envmap", "roulette", "passes", "gaussian", "area_texture", "glass", "mask", "rgba")
 FEW = ["two_emitters"]
 SPP = 64
@@ -157,108 +157,27 @@ def test_a_recorded_step_is_the_step() -> None:
     assert frozen.preparation.recordings.counts()["fused"] > 0
 
 
-# ---- Faults ----------------------------------------------------------------------------------------------------------
-
-
-def hole(patch: pytest.MonkeyPatch) -> None:
-    """The cells of a hundredth that would be drawn most are never drawn; others have their slots."""
-    from reslrb_cli.integrators import guiding
-
-    whole = guiding.apportion
-
-    def holed(grid: Any, density: np.ndarray) -> np.ndarray:
-        counts = whole(grid, density)
-        order = np.argsort(-counts, kind="stable")
-        lost = order[: len(order) // 100]
-        counts[order[-1]] += counts[lost].sum()
-        counts[lost] = 0
-        return counts
-
-    patch.setattr(guiding, "apportion", holed)
-
-
-def without_weight(patch: pytest.MonkeyPatch) -> None:
-    """The density does not enter the weight."""
-    _weigh(patch, lambda grid, counts, weights: weights * 0 + 1)
-
-
-def not_normalised(patch: pytest.MonkeyPatch) -> None:
-    """The weight is that of the density before a quarter was shared out evenly."""
-    _weigh(patch, lambda grid, counts, weights: 0.75 / np.maximum(1 / weights - 0.25, 0.01))
-
-
-def of_the_neighbour(patch: pytest.MonkeyPatch) -> None:
-    """The weight is that of another cell."""
-    _weigh(patch, lambda grid, counts, weights: np.roll(weights, 1))
-
-
-def _weigh(patch: pytest.MonkeyPatch, change: Any) -> None:
-    from reslrb_cli.transport import guide
-
-    right = guide.Table.of
-
-    def wrong(grid: Any, counts: np.ndarray) -> Any:
-        import mitsuba as mi
-
-        table = right(grid, counts)
-        weights = change(grid, counts, np.array(table.weights, np.float64))
-        return replace(table, weights=mi.Float(weights.astype(np.float32)))
-
-    patch.setattr(guide.Table, "of", staticmethod(wrong))
-
-
-def half_of_the_strata(patch: pytest.MonkeyPatch) -> None:
-    """Lanes share the slots as if there were twice as many of them."""
-    from reslrb_cli.transport import guide
-
-    right = guide.Guide.of
-    patch.setattr(guide.Guide, "of", staticmethod(lambda table, width: right(table, 2 * width)))
-
-
-def of_another_emitter(patch: pytest.MonkeyPatch) -> None:
-    """The choosing number lies where emitters of other shares have it."""
-    from reslrb_cli.transport import guide
-
-    right = guide.Table.of
-
-    def wrong(grid: Any, counts: np.ndarray) -> Any:
-        import mitsuba as mi
-
-        table = right(grid, counts)
-        return replace(table, edges=mi.Float(np.sqrt(np.array(table.edges))))
-
-    patch.setattr(guide.Table, "of", staticmethod(wrong))
-
-
-def in_one_corner(patch: pytest.MonkeyPatch) -> None:
-    """Numbers within a cell are not evenly spread."""
-    _redraw(patch, lambda drawn: replace(drawn, direction=drawn.direction * drawn.direction))
-
-
-def with_its_own_weight(patch: pytest.MonkeyPatch) -> None:
-    """The weight is that of a table which the path has helped to make: what is dear is drawn more often by it."""
+def test_a_script_s_renders_learn_from_one_to_the_next() -> None:
+    """`mi.render`, forward and backward: the tables live in the integrator."""
     import drjit as dr
+    import mitsuba as mi
 
-    _redraw(patch, lambda drawn: replace(drawn, weight=drawn.weight * dr.minimum(1, 0.5 + drawn.direction.x)))
+    reslrb_cli.register()
+    scene = Case(BY_NAME["two_emitters"].scene(), BY_NAME["two_emitters"].keys)
+    plugin = mi.load_dict({"type": "reslrb", "estimator": "stack", "max_depth": 4, "guiding": "on"})
+    for seed in range(3):
+        leaves = scene.leaves()
+        image = mi.render(scene.scene, scene.params, integrator=plugin, spp=4, seed=seed)
+        dr.backward(scene.objective(image))
+        assert all(np.isfinite(np.array(dr.grad(leaf))).all() for leaf in leaves.values())
+        scene.release(leaves)
+    assert plugin.tracer.preparation.guiding.learned[0].calls == 3
+    assert strength(plugin.tracer) > 1.2
+    with pytest.raises(RuntimeError, match='"guiding" must be one of on, off, not "maybe"'):
+        mi.load_dict({"type": "reslrb", "guiding": "maybe"})
 
 
-def _redraw(patch: pytest.MonkeyPatch, change: Any) -> None:
-    from reslrb_cli.transport import guide
-
-    right = guide.Guide.draw
-    patch.setattr(guide.Guide, "draw", lambda self, *given: change(right(self, *given)))
-
-
-FAULTS = (
-    hole,
-    without_weight,
-    not_normalised,
-    of_the_neighbour,
-    half_of_the_strata,
-    of_another_emitter,
-    in_one_corner,
-    with_its_own_weight,
-)
+# ---- Faults ----------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("fault", [None, *FAULTS])
@@ -303,35 +222,6 @@ def histogram(numbers: list[Any], weights: np.ndarray) -> np.ndarray:
     halves = (values * 2).astype(int)
     pairs = [np.bincount(2 * a + b, weights, 4) for k, a in enumerate(halves) for b in halves[:k]]
     return np.concatenate([*single, *pairs])
-
-
-def same_numbers(patch: pytest.MonkeyPatch) -> None:
-    """Tables learn from the numbers of the step itself."""
-    from reslrb_cli.integrators import tracer
-
-    patch.setattr(tracer, "learning_seed", lambda seed: seed)
-
-
-def learned_in_its_midst(patch: pytest.MonkeyPatch) -> None:
-    """Tables learn from an image's samples before these are replayed, and so with another table."""
-    from reslrb_cli.integrators import light_tracer as lt
-    from reslrb_cli.integrators.guiding import Purpose
-    from reslrb_cli.integrators.reslrb import Reslrb
-
-    right = Reslrb._replay
-
-    def wrong(self: Reslrb, trace: Any, gradient: Any, params: Any) -> None:
-        import drjit as dr
-
-        guiding = self.preparation.guiding
-        assert guiding is not None
-        [samples] = trace.samples
-        with dr.suspend_grad():
-            guiding.learn(0, samples, samples.film.adjoint(gradient))
-        again = replace(samples, guide=replace(samples.guide, table=guiding.table(0, Purpose.BOTH)))
-        right(self, lt.Trace([again], trace.image, trace.state), gradient, params)
-
-    patch.setattr(Reslrb, "_replay", wrong)
 
 
 @pytest.mark.parametrize("fault", [None, same_numbers, learned_in_its_midst])

@@ -58,6 +58,17 @@ def test_numbers_that_emission_does_not_use_are_not_cut(name: str, bits: tuple[i
     assert grid.emitters == len(scene.scene.emitters())
 
 
+def test_emitters_that_nobody_draws_have_a_grid() -> None:
+    for weights in ([], [0.0, 0.0]):
+        grid = make_grid([True] * 4, weights)
+        assert apportion(grid, grid.measures()).sum() == grid.slots
+
+
+def test_scenes_without_emitters_are_traced() -> None:
+    scene = Case({key: value for key, value in SCENES["texture"]().items() if key != "lamp"}, [])
+    assert not scene.image(integrator("reslrb", guiding="on"), 1, 4).any()
+
+
 SMALL = Grid((1, 1, 1, 1), (0.0, 0.25, 1.0))
 
 
