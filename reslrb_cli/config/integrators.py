@@ -151,6 +151,13 @@ class Reslrb(AttachingTracer):
         description="Vertices of a path that fit into thread-local memory; longer paths are traced a second time. "
         "Only with estimator `stack`.",
     )
+    guiding: Literal["on", "off"] = Field(
+        default="off",
+        description="Whether light paths start where those of earlier steps had something to say about gradient and "
+        "image, at least a quarter of them anywhere. `on`: less noise where few paths say anything (a room lit "
+        "through windows, a caustic), from the second step on; the first, and one in seven of those that follow, "
+        "trace as many paths again to learn where that is.",
+    )
     freeze: bool = Field(
         default=True,
         description="Record what a step launches and launch that again, so that its Python runs once, not in every "

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
+from reslrb_cli.transport.guide import make_grid
 from reslrb_cli.transport.plan import UNBOUNDED, Plan
 
 #: Kinds of parameters that features come with.
@@ -112,6 +113,12 @@ def _staying(plan: Plan) -> Plan | str:
     return "all follow" if plan.max_depth <= 2 else replace(plan, stays=True)
 
 
+def _guided(plan: Plan) -> Plan:
+    if plan.grid is not None:
+        return replace(plan, grid=None)
+    return replace(plan, grid=make_grid([True] * 4, [1.0] * len(plan.needs.emitters)))
+
+
 def _several(plan: Plan) -> Plan | str:
     return "follows from the number of emitters, in Mitsuba itself"
 
@@ -179,6 +186,8 @@ FEATURES = (
             _seen_moving),
     Feature("placed lamps", lambda p: bool(p.placed_lamps), "spheres, parallel lamps, meshes that move: by the walk",
             "Mitsuba samples all emitters", _placed),
+    Feature("guided emission", lambda p: p.grid is not None,
+            "light paths start where earlier ones had something to say", "guiding: off", _guided),
     Feature("derivative of the filter's normalization", lambda p: p.attached and p.attached_normalization,
             "as finite differences have it", "nothing moves, or it is detached", _normalization),
     Feature("zero-factor bookkeeping", lambda p: p.track_zeros, "a parameter is zero somewhere, or nearly so",

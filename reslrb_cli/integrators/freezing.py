@@ -16,6 +16,7 @@ import drjit as dr
 import mitsuba as mi
 
 from reslrb_cli.errors import UnsupportedScene, is_machine_fault, is_out_of_memory
+from reslrb_cli.transport.guide import Guide
 from reslrb_cli.transport.samples import Samples
 from reslrb_cli.transport.splat import Film
 
@@ -57,7 +58,7 @@ class Recordings:
         # Sensors that share a recording have it made anew whenever another one's turn comes.
         key = (kind, s.plan, s.spp, s.width, tuple(s.film.size), s.sensor.ptr)
         plain = _on_samples(samples, function)
-        common = (s.scene, s.sensor, s.seed, s.scale, s.fraction)
+        common = (s.scene, s.sensor, s.seed, s.scale, s.fraction, s.guide)
         if key not in self._functions and len(self._functions) < MOST_CALLS:
             self._functions[key] = _record(kind, plain, common, inputs)
         recorded = self._functions.get(key)
@@ -90,7 +91,7 @@ class Recordings:
 def _record(
     kind: str,
     plain: Callable[..., Any],
-    common: tuple[mi.Scene, mi.Sensor, mi.UInt32, mi.Float, mi.Float],
+    common: tuple[mi.Scene, mi.Sensor, mi.UInt32, mi.Float, mi.Float, Guide | None],
     inputs: tuple[Any, ...],
 ) -> Any:
     """A recording, or None where there cannot be one.
@@ -136,8 +137,9 @@ def _on_samples(samples: Samples, function: Callable[..., Any]) -> Callable[...,
     plan, spp, width = samples.plan, samples.spp, samples.width
 
     def on_samples(
-        scene: mi.Scene, sensor: mi.Sensor, seed: mi.UInt32, scale: mi.Float, fraction: mi.Float, *inputs: Any
-    ) -> Any:
-        return function(Samples(scene, sensor, plan, Film(sensor), seed, spp, width, scale, fraction), *inputs)
+        scene: mi.Scene, sensor: mi.Sensor, seed: mi.UInt32, scale: mi.Float, fraction: mi.Float, guide: Guide | None,
+        *inputs: Any,
+    ) -> Any:  # fmt: skip
+        return function(Samples(scene, sensor, plan, Film(sensor), seed, spp, width, scale, fraction, guide), *inputs)
 
     return on_samples

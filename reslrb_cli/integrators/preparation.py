@@ -5,17 +5,20 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+import drjit as dr
 import mitsuba as mi
 
 from reslrb_cli.errors import UnsupportedScene
 from reslrb_cli.integrators.bounces import bounces
 from reslrb_cli.integrators.differentiated import Differentiated, differentiated
 from reslrb_cli.integrators.freezing import Recordings
+from reslrb_cli.integrators.guiding import Guiding
 from reslrb_cli.integrators.light_tracer import settle
 from reslrb_cli.integrators.renewal import Renewal, with_shading_normals
 from reslrb_cli.scene.graph import SceneGraph
 from reslrb_cli.scene.needs import check_supported, interpolates_normals, scene_needs
 from reslrb_cli.transport.plan import Plan, make_plan
+from reslrb_cli.transport.samples import passes
 
 
 @dataclass(frozen=True)
@@ -84,7 +87,10 @@ def attach(plan: Plan, which: Differentiated, motion: Motion, sensor: mi.Sensor,
 class Preparation:
     """Plans by sensor, owners of parameters, and recordings of one scene: the last that was asked for."""
 
-    def __init__(self, max_depth: int, rr_depth: int, hide_emitters: bool, motion: Motion) -> None:
+    def __init__(
+        self, max_depth: int, rr_depth: int, hide_emitters: bool, motion: Motion, guided: bool = False
+    ) -> None:
+        self.guiding = Guiding() if guided else None
         self._depths, self._hide_emitters, self._motion = (max_depth, rr_depth), hide_emitters, motion
         self._scene: tuple[int, mi.Scene | None] | None = None  # its address, and, so that it is not used again, itself
         self._plans: dict[int, Plan] = {}
@@ -107,6 +113,10 @@ class Preparation:
             self._renewal = self._renewal or Renewal(scene)
             settle(scene)
             self._plans[sensor.ptr] = make_plan(needs, *self._depths, self._hide_emitters)
+            if self.guiding is not None:
+                made = self._renewal.renew(self._plans[sensor.ptr], scene)
+                [samples] = passes(made, scene, sensor, dr.opaque(mi.UInt32, 0), 1, None)
+                self._plans[sensor.ptr] = replace(self._plans[sensor.ptr], grid=self.guiding.grid_of(samples))
         assert self._renewal is not None
         plan = self._renewal.renew(self._plans[sensor.ptr], scene)
         if params is None:
@@ -139,6 +149,8 @@ class Preparation:
             self._bounce.clear()
             self._renewal = None
             self.recordings.clear()
+            if self.guiding is not None:
+                self.guiding.clear()
 
     def _bsdfs(self, scene: mi.Scene, nodes: tuple[mi.Object, ...]) -> tuple[mi.BSDF, ...]:
         """The surfaces' BSDFs that use any of these nodes; empty where that is all of them."""

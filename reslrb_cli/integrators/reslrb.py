@@ -9,7 +9,9 @@ import drjit as dr
 import mitsuba as mi
 
 from reslrb_cli.estimators import ESTIMATORS, Estimator
+from reslrb_cli.estimators.base import one_of
 from reslrb_cli.integrators import light_tracer as lt
+from reslrb_cli.integrators.guiding import Purpose
 from reslrb_cli.integrators.interface import Derivative, Job
 from reslrb_cli.integrators.preparation import Motion
 from reslrb_cli.integrators.tracer import LightTracer
@@ -26,6 +28,7 @@ class Reslrb(LightTracer):
         "attached": "auto",
         "filter_normalization": "attached",
         "attached_sampling": "auto",
+        "guiding": "off",
     }
 
     def __init__(self, estimator: Estimator, **common: Any) -> None:
@@ -39,6 +42,7 @@ class Reslrb(LightTracer):
         attached: bool | str = "auto",
         filter_normalization: str = "attached",
         attached_sampling: str = "auto",
+        guiding: str = "off",
         **options: Any,
     ) -> Reslrb:
         """From the estimator's name and all options. Raises ValueError where one is wrong."""
@@ -53,7 +57,8 @@ class Reslrb(LightTracer):
         own = {name: options.pop(name) for name in kind.OPTIONS if name in options}
         obstacle = None if kind.attaches else _no_attached(estimator)
         motion = Motion(attached, filter_normalization, obstacle, attached_sampling)
-        return cls(kind(**own), motion=motion, **options)
+        one_of("guiding", guiding, ("on", "off"))
+        return cls(kind(**own), motion=motion, guided=guiding == "on", **options)
 
     def image_estimator(self) -> Estimator | None:
         return None if self.estimator.splats_all else self.estimator
@@ -67,12 +72,14 @@ class Reslrb(LightTracer):
             return result.image, result.state
 
         with dr.suspend_grad():
-            parts = self.passes(job)
+            parts = self.passes(job, Purpose.BOTH)
             if self.freezes(parts):
                 traced = lt.Trace(parts, *self.preparation.recordings.call("trace", parts[0], trace))
             else:
                 traced = lt.trace_image(parts, estimator)
-        self._replay(traced, derivative(traced.image), job.params)
+        gradient = derivative(traced.image)
+        self._replay(traced, gradient, job.params)
+        self.learn(job, gradient)
         return traced.image
 
     def backward(self, job: Job, gradient: mi.TensorXf) -> None:
@@ -80,6 +87,7 @@ class Reslrb(LightTracer):
         with dr.suspend_grad():
             trace = lt.Trace(self.passes(job))
         self._replay(trace, gradient, job.params)
+        self.learn(job, gradient)
 
     def known(self, job: Job, gradient: mi.TensorXf) -> mi.TensorXf:
         """The image, and the gradient of the objective with dL/dI `gradient` (H, W, C), known before either.
@@ -92,10 +100,13 @@ class Reslrb(LightTracer):
             return lt.fused([samples], estimator, gradient)
 
         with dr.suspend_grad():
-            parts = self.passes(job)
-            if not self.freezes(parts):
-                return lt.fused(parts, estimator, gradient, job.params)
-            return self.preparation.recordings.call("fused", parts[0], fused, gradient)
+            parts = self.passes(job, Purpose.BOTH)
+            if self.freezes(parts):
+                image = self.preparation.recordings.call("fused", parts[0], fused, gradient)
+            else:
+                image = lt.fused(parts, estimator, gradient, job.params)
+        self.learn(job, gradient)
+        return image
 
     def _replay(self, trace: lt.Trace, gradient: mi.TensorXf, params: mi.SceneParameters | None) -> None:
         estimator = self.estimator

@@ -18,6 +18,7 @@ from reslrb_cli.errors import UnsupportedScene
 from reslrb_cli.estimators import Estimator
 from reslrb_cli.integrators import freezing
 from reslrb_cli.integrators import light_tracer as lt
+from reslrb_cli.integrators.guiding import Purpose, learning_seed
 from reslrb_cli.integrators.interface import Derivative, Job
 from reslrb_cli.integrators.preparation import Motion, Preparation
 from reslrb_cli.transport.accumulation import in_passes
@@ -44,10 +45,12 @@ class LightTracer:
         samples_per_pass: int | None = None,
         freeze: bool = False,
         motion: Motion | None = None,
+        guided: bool = False,
     ) -> None:
         """Raises ValueError, which names the option, where one has a value that it cannot have.
 
-        `freeze` says whether launches are recorded (`freezing.py`), `motion` how derivatives of what moves are taken.
+        `freeze` says whether launches are recorded (`freezing.py`), `motion` how derivatives of what moves are taken,
+        `guided` whether emission is drawn from what earlier paths said (`guiding.py`).
         """
         if max_depth < -1:
             raise ValueError('"max_depth" must be -1 (no limit) or a value >= 0')
@@ -57,7 +60,7 @@ class LightTracer:
             raise ValueError('"samples_per_pass" must be greater than zero')
         self.max_depth, self.rr_depth, self.hide_emitters = max_depth, rr_depth, hide_emitters
         self.samples_per_pass, self.freeze = samples_per_pass, freeze
-        self.preparation = Preparation(max_depth, rr_depth, hide_emitters, motion or Motion())
+        self.preparation = Preparation(max_depth, rr_depth, hide_emitters, motion or Motion(), guided)
 
     def with_options(self, *, samples_per_pass: int | None, freeze: bool) -> Self:
         """The same with other passes, or without recordings; both share what they find out about a scene."""
@@ -72,11 +75,29 @@ class LightTracer:
         """
         return self.preparation.plan(scene, sensor, params)
 
-    def passes(self, job: Job) -> list[Samples]:
-        """The samples of a job; where its `spp` is 0, the sensor's own number of them."""
+    def passes(self, job: Job, purpose: Purpose | None = None) -> list[Samples]:
+        """The samples of a job; where its `spp` is 0, the sensor's own number of them.
+
+        The `purpose` says what guided samples are drawn by; None: for the gradient, or the image where there is none.
+        """
         spp = job.spp or job.sensor.sampler().sample_count()
-        plan = self.plan(job.scene, job.sensor, job.params)
-        return passes(plan, job.scene, job.sensor, job.seed, spp, self.samples_per_pass)
+        plan, table = self.plan(job.scene, job.sensor, job.params), None
+        if self.preparation.guiding is not None:
+            purpose = purpose or (Purpose.IMAGE if job.params is None else Purpose.GRADIENT)
+            table = self.preparation.guiding.table(_number(job), purpose)
+        return passes(plan, job.scene, job.sensor, job.seed, spp, self.samples_per_pass, table)
+
+    def learn(self, job: Job, gradient: mi.TensorXf) -> None:
+        """Have the tables learn, where they are due to, from other samples than those of the job; dL/dI is known.
+
+        After a gradient: what has been learned counts from the next one on.
+        """
+        guiding = self.preparation.guiding
+        if guiding is None or not guiding.due(_number(job)):
+            return
+        with dr.suspend_grad():
+            samples = self.passes(replace(job, seed=learning_seed(job.seed)), Purpose.BOTH)[0]
+            guiding.learn(_number(job), samples, samples.film.adjoint(gradient))
 
     def image_estimator(self) -> Estimator | None:
         """The estimator that makes images of its own; None where they show every connection."""
@@ -112,6 +133,12 @@ class LightTracer:
     def freezes(self, parts: list[Samples]) -> bool:
         """Whether these samples are traced from a recording; large ones, and so several passes, gain little."""
         return self.freeze and len(parts) == 1 and parts[0].width <= freezing.MOST_PATHS
+
+
+def _number(job: Job) -> int:
+    """The number of a job's sensor among those of its scene; of one that is none of them, the number after theirs."""
+    sensors = [sensor.ptr for sensor in job.scene.sensors()]
+    return sensors.index(job.sensor.ptr) if job.sensor.ptr in sensors else len(sensors)
 
 
 class Reversed(LightTracer):

@@ -13,7 +13,10 @@ from reslrb_cli.config.text import parse
 from reslrb_cli.errors import ConfigError
 
 #: Options that a case takes over from the configuration's integrator, where it knows them.
-SHARED = ("rr_depth", "hide_emitters", "samples_per_pass", "attached", "filter_normalization", "attached_sampling")
+SHARED = (
+    *("rr_depth", "hide_emitters", "samples_per_pass", "attached", "filter_normalization", "attached_sampling"),
+    "guiding",
+)
 #: The estimator of a case that names none, as that of the plugin.
 PLUGIN_ESTIMATOR = "reservoir"
 #: Options of a case that are those of `run`, for itself alone.

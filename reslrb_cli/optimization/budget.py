@@ -94,7 +94,9 @@ def estimate(problem: Problem, integrator: Reslrb, samples: int, fixed: int) -> 
     for key in problem.selection.keys:
         size = int(dr.prod(dr.shape(problem.selection.value(key))))
         images += copies * allocated(4 * size) + _replicas(size)
-    return Estimate(fixed + targets, images, scratch * resident_paths(), paths)
+    guiding = integrator.preparation.guiding
+    tables = 0 if guiding is None else guiding.bytes(len(problem.sensors))
+    return Estimate(fixed + targets + tables, images, scratch * resident_paths(), paths)
 
 
 def choose_samples(problem: Problem, integrator: Reslrb, samples: int, budget: int, fixed: int) -> tuple[int, Estimate]:

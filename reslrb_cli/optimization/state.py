@@ -2,8 +2,9 @@
 
 It is this: the values of the parameters; of the optimiser its moments, and of each parameter what is moved in its
 place, with its unit and gain (transforms, `scale: auto`); what the clamp knows of gradients; how long something has not
-been finite; the number of iterations done, from which seeds, views and the schedule's factor follow; the clock and the
-memory's peak. Nothing else decides what the next iteration does: from equal states equal ones follow.
+been finite; what guided emission has learned; the number of iterations done, from which seeds, views and the schedule's
+factor follow; the clock and the memory's peak. Nothing else decides what the next iteration does: from equal states
+equal ones follow.
 """
 
 from __future__ import annotations
@@ -14,6 +15,8 @@ from typing import TYPE_CHECKING, Any
 import drjit as dr
 import numpy as np
 
+from reslrb_cli.integrators import Reslrb
+from reslrb_cli.integrators.guiding import Guiding
 from reslrb_cli.optimization.arrays import to_array
 from reslrb_cli.optimization.clamping import GradientClamp
 from reslrb_cli.optimization.nonfinite import NonFinitePolicy
@@ -64,6 +67,9 @@ class State:
             for key, variable in zip(optimizer.keys(), variables, strict=True)
             if f"optimizer/{key}/variable" in arrays
         }
+        guiding = guiding_of(problem)
+        gradients, heard = ({}, {}) if guiding is None else guiding.state()
+        arrays |= {f"guiding/{name}": value for name, value in heard.items()}
         measured = problem.sensitivities if self.scaled else None
         values = {
             "elapsed_s": self.clock.elapsed_s,
@@ -73,6 +79,8 @@ class State:
             "units": units,
             "scaling": None if measured is None else [row.to_json() for row in measured],
         }
+        if guiding is not None:
+            values["guiding"] = gradients
         moved = {key: dr.detach(optimizer[key]) for key in optimizer.keys()}  # noqa: SIM118 (not a mapping)
         return Snapshot(self.iteration, moved, arrays, values)
 
@@ -91,10 +99,30 @@ class State:
         self.iteration = stored.count("iteration", least=0)
         self.clock.elapsed_s, self.peak_mib = stored.number("elapsed_s"), stored.number("peak_mib")
         self.policy.standstill = stored.count("standstill", least=0)
+        guiding = guiding_of(problem)
+        if guiding is not None:
+            _restore_guiding(problem, guiding, stored)
         rows = stored.scaling(list(values))
         problem.sensitivities = None if rows is None else [Scaled(**row) for row in rows]
         self.scaled = rows is not None
         problem.apply()
+
+
+def guiding_of(problem: Problem) -> Guiding | None:
+    """What the run's integrator has learned of where light paths are to start; None where it does not."""
+    return problem.integrator.preparation.guiding if isinstance(problem.integrator, Reslrb) else None
+
+
+def _restore_guiding(problem: Problem, guiding: Guiding, stored: Stored) -> None:
+    names = [str(number) for number in range(len(problem.scene.sensors()))]
+    gradients = stored.value("guiding")
+    if not isinstance(gradients, dict) or not all(name in names for name in gradients):
+        raise stored.wrong("guiding", "does not have the gradients of sensors by their numbers")
+    problem.integrator.plan(problem.scene, problem.scene.sensors()[problem.sensors[0]])  # makes the grid
+    counts = {name: stored.count("guiding", name) for name in gradients}
+    wrong = guiding.restore(counts, lambda name: stored.archive.array(f"guiding/{name}", kind="f"))
+    if wrong is not None:
+        raise stored.wrong(f"guiding/{wrong}", "is not what was learned of this scene")
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Protocol
 
 import drjit as dr
@@ -30,11 +30,13 @@ class Emission:
     """A ray that leaves an emitter. `weight` is E of the design notes: radiance over the density of the ray, (C,).
 
     `weight` tracks derivatives of emission where they are enabled; ray and density do where emitters move.
+    `guided` is the part of `weight` that a guide has brought in; None without one.
     """
 
     ray: mi.Ray3f
     weight: mi.Spectrum
     emitter: mi.EmitterPtr
+    guided: mi.Float | None = None
 
 
 def sample_time(plan: Plan, sensor: mi.Sensor, sampler: Numbered) -> mi.Float:
@@ -47,9 +49,20 @@ def sample_time(plan: Plan, sensor: mi.Sensor, sampler: Numbered) -> mi.Float:
 
 def sample_emission(samples: Samples, sampler: mi.Sampler) -> Emission:
     """Sample a ray from a random emitter of the scene. Draws as many numbers, in the same order, as `ptracer`."""
-    plan, scene = samples.plan, samples.scene
-    time = sample_time(plan, samples.sensor, sampler)
+    time = sample_time(samples.plan, samples.sensor, sampler)
     wavelength_sample, sample_2, sample_3 = sampler.next_1d(), sampler.next_2d(), sampler.next_2d()
+    drawn = samples.drawn(wavelength_sample, sample_2, sample_3)
+    if drawn is None:
+        return emission_of(samples, time, wavelength_sample, sample_2, sample_3)
+    emission = emission_of(samples, time, drawn.choice, drawn.position, drawn.direction)
+    return replace(emission, weight=emission.weight * drawn.weight, guided=drawn.weight)
+
+
+def emission_of(
+    samples: Samples, time: mi.Float, wavelength_sample: mi.Float, sample_2: mi.Point2f, sample_3: mi.Point2f
+) -> Emission:
+    """The ray that these numbers stand for."""
+    plan, scene = samples.plan, samples.scene
     if not (plan.environment_map or plan.placed_lamps):
         ray, weight, emitter = scene.sample_emitter_ray(time, wavelength_sample, sample_2, sample_3, True)
         return Emission(ray if plan.moving_emission else dr.detach(ray), weight, emitter)

@@ -9,6 +9,7 @@ import mitsuba as mi
 from reslrb_cli.scene.horizon import Horizon
 from reslrb_cli.scene.lamps import Lamp
 from reslrb_cli.scene.needs import SceneNeeds
+from reslrb_cli.transport.guide import Grid
 
 UNBOUNDED = 0xFFFFFFFF
 
@@ -46,6 +47,8 @@ class Plan:
     attached_normalization: bool = True
     # The sphere that infinite emitters light.
     horizon: Horizon | None = None
+    # The cells that emission is guided by, where it is.
+    grid: Grid | None = None
 
     @property
     def moving_emission(self) -> bool:

@@ -10,6 +10,7 @@ import mitsuba as mi
 from reslrb_cli.config.limits import PASS_PATHS, PASS_SAMPLES
 from reslrb_cli.scene.lamps import Lamp
 from reslrb_cli.transport.emission import Numbered
+from reslrb_cli.transport.guide import Drawn, Guide, Table
 from reslrb_cli.transport.lamps import sums_of_areas
 from reslrb_cli.transport.plan import Plan
 from reslrb_cli.transport.splat import Film
@@ -20,6 +21,7 @@ SELECTION_STREAM = 0x5E1EC7  # what hooks draw to select
 VISIBLE_STREAM = 0xD1EC7  # primary rays
 LAMP_STREAM = 0x1A3B5 << 12  # points of lamps; the lamp's number is added
 PASS_STREAM = 0x9A55E5  # seeds of the second pass and those after it
+GUIDE_STREAM = 0x6D1DE  # cells of emission
 
 
 @dataclass
@@ -27,7 +29,7 @@ class Samples:
     """The samples of one pass. `seed` is an opaque UInt32; `width` is the number of light paths.
 
     `scale` (width 1) brings a sum over light paths to an image; of all samples of that image, these are the part
-    `fraction` (width 1).
+    `fraction` (width 1). With a `guide` emission is drawn from its table.
     """
 
     scene: mi.Scene
@@ -39,6 +41,7 @@ class Samples:
     width: int
     scale: mi.Float
     fraction: mi.Float
+    guide: Guide | None = None
     _areas: list[mi.Float] = field(init=False)  # of the lamps that are reshaped: `sums_of_areas`
 
     def __post_init__(self) -> None:
@@ -67,6 +70,14 @@ class Samples:
         seed = mi.sample_tea_32(self.seed, mi.UInt32(name))[0]
         state, sequence = mi.sample_tea_32(seed, dr.arange(mi.UInt32, self.width))
         return mi.PCG32(1, mi.UInt64(state), mi.UInt64(sequence))
+
+    def drawn(self, choice: mi.Float, position: mi.Point2f, direction: mi.Point2f) -> Drawn | None:
+        """Where the guide has each path start, of emission's own numbers; None without a guide."""
+        if self.guide is None:
+            return None
+        assert self.plan.grid is not None
+        stream = self.stream(GUIDE_STREAM)
+        return self.guide.draw(self.plan.grid, self.width, stream, choice, position, direction)
 
     def primary_ray(self) -> PrimaryRay:
         """Rays for C_0, from a stream of their own: the light paths are those of `ptracer` with or without them."""
@@ -105,11 +116,18 @@ def make_samples(plan: Plan, scene: mi.Scene, sensor: mi.Sensor, seed: mi.UInt32
 
 
 def passes(
-    plan: Plan, scene: mi.Scene, sensor: mi.Sensor, seed: mi.UInt32, spp: int, spp_per_pass: int | None
+    plan: Plan,
+    scene: mi.Scene,
+    sensor: mi.Sensor,
+    seed: mi.UInt32,
+    spp: int,
+    spp_per_pass: int | None,
+    table: Table | None = None,
 ) -> list[Samples]:
     """All samples of an image, in passes of `spp_per_pass` samples per pixel, which must divide `spp`, or less.
 
-    The first pass has the seed itself, so that it traces what `ptracer` does.
+    The first pass has the seed itself, so that it traces what `ptracer` does. With a `table`, which belongs to the
+    plan's grid, emission is drawn from that.
     """
     unit = spp if spp_per_pass is None else min(spp_per_pass, spp)
     if spp % unit:
@@ -120,6 +138,8 @@ def passes(
     seeds = [mi.UInt32(seed), *others]
     dr.make_opaque(seeds)
     made = {size: make_samples(plan, scene, sensor, seeds[0], size, spp) for size in set(sizes)}
+    if table is not None:
+        made = {size: replace(part, guide=Guide.of(table, part.width)) for size, part in made.items()}
     return [replace(made[size], seed=s) for size, s in zip(sizes, seeds, strict=True)]
 
 

@@ -54,7 +54,12 @@ def walk(samples: Samples, hooks: Hooks, active: mi.Bool | bool = True) -> Any:
         active &= product.alive()
         if plan.roulette:
             # Relative to emission where that is dim: else light of small lamps, or in large units, would end at once.
-            eta = dr.rsqrt(dr.clip(dr.max(product.weight()), DIMMEST, 1))
+            light = dr.max(product.weight())
+            if emission.guided is None:
+                eta = dr.rsqrt(dr.clip(light, DIMMEST, 1))
+            else:
+                # As without the guide: paths that it has found would end for being many.
+                eta = dr.rsqrt(dr.clip(light / emission.guided, DIMMEST, 1)) * dr.rsqrt(emission.guided)
     state = hooks.start(product)
     active &= plan.max_depth > 1
     pi, active = intersect(plan, scene, emission.ray, active)

@@ -64,6 +64,13 @@ def test_a_whole_folder_is_replayed(run, capsys):
     assert out.startswith("iteration 0, sensor 0")
 
 
+def test_a_guided_run_is_refused(run, capsys):
+    config = (run / "config.yaml").read_text()
+    assert "guiding: 'off'" in config
+    (run / "config.yaml").write_text(config.replace("guiding: 'off'", "guiding: 'on'"))
+    assert told(capsys, run).startswith("config.yaml: integrator.guiding: where the paths of a guided step started")
+
+
 def arrays(**changes):
     """What the archive of the run holds, with changes; None leaves out."""
     all_ = {"iteration": np.array(0), f"parameter/{KEY}": np.full(3, 0.5, np.float32)} | changes

@@ -71,6 +71,7 @@ CASES: dict[str, list[str]] = {
     "reservoir": [*BATCHED, "integrator.estimator=reservoir"],
     "event": [*BATCHED, "integrator.estimator=event"],
     "gather": [*BATCHED, "integrator.estimator=gather"],
+    "guided": [*BATCHED, "integrator.guiding=on", "integrator.estimator=stack"],
     "pilot": ["integrator.estimator=auto", "parameters=[{key: poster.reflectance.data, initial: 0.5, bounds: [0, 1]}]"],
     "passes": [*BATCHED, "integrator.samples_per_pass=1"],
     "budget": [*BATCHED, "run.memory_budget=8"],

@@ -1,0 +1,123 @@
+"""What light paths have to say, by the cell that they start in: how much they would move gradient and image.
+
+A walk of its own, with random numbers that nothing else has. Of each path and each BSDF that is differentiated
+
+    G = sum_i delta_i C_i n_i        n_i: how many factors of C_i are this BSDF's
+
+is the derivative by the logarithm of a factor that all its values share; of emission n = 1. Where light moves, it is
+the sum of |delta_i C_i|. Summed are the squares of what a path would say if all paths started evenly, G p / v, as the
+variance of the sum over all paths is made of these.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from reslrb_cli.transport.connection import Connection
+from reslrb_cli.transport.emission import sample_time
+from reslrb_cli.transport.factors import Product
+from reslrb_cli.transport.hooks import Hooks, Vertex
+from reslrb_cli.transport.plan import Plan
+from reslrb_cli.transport.samples import Samples
+from reslrb_cli.transport.scattering import Scattering
+from reslrb_cli.transport.splat import AdjointImage
+from reslrb_cli.transport.walk import walk
+
+Array = np.ndarray[Any, Any]
+
+MOST_BSDFS = 6  # that are heard apart; the others are heard together
+MOST_VOICES = MOST_BSDFS + 3  # and emission, what moves, the image
+
+
+def bsdf_groups(plan: Plan) -> list[tuple[mi.BSDF, ...]]:
+    """BSDFs whose derivatives are heard apart from one another; an empty group is all of the scene's."""
+    if not plan.differentiate_bsdfs:
+        return []
+    if not plan.only_bsdfs:
+        return [()]
+    alone = plan.only_bsdfs[: MOST_BSDFS - 1]
+    others = plan.only_bsdfs[MOST_BSDFS - 1 :]
+    return [*((bsdf,) for bsdf in alone), *([others] if others else [])]
+
+
+def voices(plan: Plan) -> int:
+    """How many things are heard apart: groups of BSDFs, emission, what moves, and last the image."""
+    return len(bsdf_groups(plan)) + plan.differentiate_emission + plan.attached + 1
+
+
+@dataclass
+class Heard:
+    """Loop state. `counts` says how often a group's BSDFs have been met, `sums` are G (C,): of the groups, of emission,
+    of what moves. `image` is sum_i |C_i|^2."""
+
+    counts: list[mi.UInt32]
+    sums: list[mi.Spectrum]
+    image: mi.Float
+
+
+class Hearing(Hooks):
+    """Sums what each path says; dL/dI and contributions are scaled by `loudness` and by the number of paths."""
+
+    def __init__(self, samples: Samples, adjoint: AdjointImage, loudness: mi.Float) -> None:
+        self.samples, self.adjoint, self.loudness = samples, adjoint, loudness
+        self.groups = bsdf_groups(samples.plan)
+
+    def start(self, product: Product) -> Heard:
+        sums = [mi.Spectrum(0) for _ in range(voices(self.samples.plan) - 1)]
+        return Heard([mi.UInt32(0) for _ in self.groups], sums, mi.Float(0))
+
+    def _met(self, group: tuple[mi.BSDF, ...], vertex: Vertex) -> mi.UInt32:
+        met = mi.Bool(not group)
+        for bsdf in group:
+            met |= vertex.bsdf == mi.BSDFPtr(bsdf)
+        return dr.select(met, mi.UInt32(1), 0)
+
+    def connection(self, state: Heard, vertex: Vertex, connection: Connection, numbers: list[mi.Float]) -> Heard:
+        plan, active = self.samples.plan, connection.active
+        C = vertex.product.times(connection.c, vertex.depth)
+        said = self.adjoint.lookup(connection.u, active) * self.loudness * C.weight()
+        said = dr.select(active, said, 0)
+        counts = [count + self._met(group, vertex) for count, group in zip(state.counts, self.groups, strict=True)]
+        parts = [said * mi.Float(count) for count in counts]
+        if plan.differentiate_emission:
+            parts.append(said)
+        if plan.attached:
+            parts.append(dr.abs(said))
+        value = dr.select(active, C.value(), 0)
+        sums = [total + part for total, part in zip(state.sums, parts, strict=True)]
+        return Heard(state.counts, sums, state.image + dr.squared_norm(value))
+
+    def scattering(self, state: Heard, vertex: Vertex, connection: Connection, scattering: Scattering) -> Heard:
+        counts = [
+            count + dr.select(scattering.active, self._met(group, vertex), 0)
+            for count, group in zip(state.counts, self.groups, strict=True)
+        ]
+        return Heard(counts, state.sums, state.image)
+
+
+def hear(samples: Samples, adjoint: AdjointImage) -> Array:
+    """Sums of squares (voices, cells), float64, of guided samples; what is not finite is not heard."""
+    plan = samples.plan
+    assert plan.grid is not None
+    loudest = dr.max(dr.abs(dr.select(dr.isfinite(adjoint.image), adjoint.image, 0)))
+    loudness = dr.select(loudest > 0, dr.rcp(loudest), 0)
+    dr.make_opaque(loudness)
+    heard: Heard = walk(samples, Hearing(samples, adjoint, loudness))
+    sampler = samples.sampler()
+    sample_time(plan, samples.sensor, sampler)
+    drawn = samples.drawn(sampler.next_1d(), sampler.next_2d(), sampler.next_2d())  # as the walk had them
+    assert drawn is not None
+    squares = [dr.squared_norm(total) for total in heard.sums] + [heard.image]
+    cells = plan.grid.cells
+    sums = dr.zeros(mi.Float, len(squares) * cells)
+    for voice, square in enumerate(squares):
+        value = square / dr.square(drawn.weight)
+        said = dr.isfinite(value) & (value > 0)
+        dr.scatter_reduce(dr.ReduceOp.Add, sums, value, drawn.cell + voice * cells, said)
+    dr.eval(sums)
+    return np.array(sums, np.float64).reshape(len(squares), cells)

@@ -1,0 +1,175 @@
+"""Guided emission: light paths start where earlier ones had something to say, and count for less there.
+
+A path's start is a point of the unit cube in four dimensions (two numbers for a place or a disk, two for a direction)
+and a number that chooses an emitter. The cube is cut into cells, for each emitter its own. A cell k of measure v_k is
+drawn with probability p_k; within it numbers stay evenly spread, and the path's weight is multiplied by v_k / p_k.
+Whatever an emitter makes of its numbers, the mean of what a path contributes stays what it was, as long as every cell
+can be drawn and p does not depend on the numbers that it is used with.
+
+Drawing takes one look-up: of M slots, cell k owns m_k, and p_k = m_k / M exactly. Lanes draw stratified, lane i of n
+from the i-th n-th of all slots: what is left of the noise is that within cells, and paths that start alike are traced
+side by side. At least UNIFORM of all slots are shared out evenly, so that no table makes a weight larger than
+1 / UNIFORM.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+Array = np.ndarray[Any, Any]
+
+UNIFORM = 0.25  # share of paths that start evenly, at least
+CELL_BITS = 16  # cells of one emitter, log2; of all emitters together one more
+MOST_EMITTERS = 1024  # that have cells of their own; of more, neighbours share theirs
+SLOTS_PER_CELL = 8
+
+
+@dataclass(frozen=True)
+class Grid:
+    """How the cube is cut: into 2^bits along each of its four numbers, those of the place first.
+
+    `edges` (E + 1) are where the share of each emitter (or of some together) in the choosing number begins and ends.
+    """
+
+    bits: tuple[int, int, int, int]
+    edges: tuple[float, ...]
+
+    @property
+    def emitters(self) -> int:
+        """How many emitters, or groups of them, have cells of their own."""
+        return len(self.edges) - 1
+
+    @property
+    def cells(self) -> int:
+        """Cells of all emitters; those of one stand together."""
+        return self.emitters << sum(self.bits)
+
+    @property
+    def slots(self) -> int:
+        """Slots, a power of two."""
+        return 1 << (SLOTS_PER_CELL * self.cells - 1).bit_length()
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Of an array of all cells: the emitter, then the four numbers, the last of which comes first in a cell's index
+        and so last here."""
+        return (self.emitters, *(1 << bits for bits in reversed(self.bits)))
+
+    def measures(self) -> Array:
+        """v_k of all cells, float64; they sum to 1."""
+        return np.repeat(np.diff(self.edges), 1 << sum(self.bits)) / (1 << sum(self.bits))
+
+
+def make_grid(used: Sequence[bool], weights: Sequence[float]) -> Grid:
+    """A grid for emitters of these sampling weights, cut along those of the four numbers that are used."""
+    if not sum(weights) > 0:
+        weights = [1.0] * max(len(weights), 1)  # nothing shines; the grid is of no use, and does no harm
+    total = np.append(0.0, np.cumsum(np.asarray(weights, np.float64)))
+    groups = min(len(weights), MOST_EMITTERS)
+    edges = (total / total[-1])[np.round(np.linspace(0, len(weights), groups + 1)).astype(int)]
+    bits = [0, 0, 0, 0]
+    budget = min(CELL_BITS, CELL_BITS + 1 - (groups - 1).bit_length())
+    along = [k for k in range(4) if used[k]]
+    for k in range(budget if along else 0):
+        bits[along[k % len(along)]] += 1
+    return Grid((bits[0], bits[1], bits[2], bits[3]), tuple(float(np.float32(edge)) for edge in edges))
+
+
+def apportion(grid: Grid, density: Array) -> Array:
+    """Slots of each cell (int64), at least UNIFORM of its measure, the others in proportion to `density`."""
+    measures, slots = grid.measures(), grid.slots
+    least = np.where(measures > 0, np.maximum(np.ceil(UNIFORM * slots * measures - 1e-6), 1), 0)
+    wanted = (slots - least.sum()) * (density / density.sum())
+    counts: Array = (least + np.floor(wanted)).astype(np.int64)
+    missing = slots - int(counts.sum())
+    counts[np.argsort(np.floor(wanted) - wanted, kind="stable")[:missing]] += 1
+    return counts
+
+
+@dataclass
+class Table:
+    """What is drawn from: of each slot its cell, of each cell v / p, and the grid's edges."""
+
+    slots: mi.UInt32
+    weights: mi.Float
+    edges: mi.Float
+
+    @staticmethod
+    def of(grid: Grid, counts: Array) -> Table:
+        """The table in which cell k has `counts[k]` slots, all of them together `grid.slots`."""
+        measures = grid.measures()
+        weights = np.where(counts > 0, measures * grid.slots / np.maximum(counts, 1), 0)
+        table = Table(
+            _own(mi.UInt32, np.repeat(np.arange(grid.cells), counts).astype(np.uint32)),
+            _own(mi.Float, weights.astype(np.float32)),
+            _own(mi.Float, np.array(grid.edges, np.float32)),
+        )
+        dr.eval(table)
+        return table
+
+
+def even_table(grid: Grid) -> Table:
+    """The table of somebody who has learned nothing."""
+    return Table.of(grid, apportion(grid, grid.measures()))
+
+
+def _own(kind: Any, array: Array) -> Any:
+    """In Dr.Jit's own memory: kernels depend on the alignment of NumPy's."""
+    return dr.gather(kind, kind(array), dr.arange(mi.UInt32, len(array)))
+
+
+@dataclass
+class Drawn:
+    """Numbers that were drawn with a guide: those of emission, the cell they lie in, and v / p of it."""
+
+    choice: mi.Float
+    position: mi.Point2f
+    direction: mi.Point2f
+    cell: mi.UInt32
+    weight: mi.Float
+
+
+@dataclass
+class Guide:
+    """A table, and how many lanes share it (opaque)."""
+
+    table: Table
+    lanes: mi.UInt64
+
+    @staticmethod
+    def of(table: Table, width: int) -> Guide:
+        """For a pass of `width` light paths."""
+        return Guide(table, dr.opaque(mi.UInt64, width))
+
+    def draw(
+        self,
+        grid: Grid,
+        width: int,
+        stream: mi.PCG32,
+        choice: mi.Float,
+        position: mi.Point2f,
+        direction: mi.Point2f,
+    ) -> Drawn:
+        """Where each of `width` lanes starts; `choice`, `position` and `direction` say where within its cell."""
+        lane, jitter = mi.UInt64(dr.arange(mi.UInt32, width)), mi.UInt64(stream.next_uint32())
+        slot = ((lane << 32) | jitter) // self.lanes >> (32 - (grid.slots.bit_length() - 1))
+        cell = dr.gather(mi.UInt32, self.table.slots, mi.UInt32(slot))
+        weight = dr.gather(mi.Float, self.table.weights, cell)
+        numbers, shift, below = [position.x, position.y, direction.x, direction.y], 0, dr.one_minus_epsilon(mi.Float)
+        for k, bits in enumerate(grid.bits):
+            if bits > 0:
+                index = (cell >> shift) & ((1 << bits) - 1)
+                # Rounding may have it meet the next cell, but not leave the cube.
+                numbers[k] = dr.minimum((mi.Float(index) + numbers[k]) * 2.0**-bits, below)
+                shift += bits
+        if grid.emitters > 1:
+            emitter = cell >> shift
+            begin, end = (dr.gather(mi.Float, self.table.edges, emitter + k) for k in (0, 1))
+            choice = dr.minimum(dr.fma(choice, end - begin, begin), end * below)
+        return Drawn(choice, mi.Point2f(numbers[0], numbers[1]), mi.Point2f(numbers[2], numbers[3]), cell, weight)

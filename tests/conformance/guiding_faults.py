@@ -1,0 +1,140 @@
+"""Faults of guided emission, each planted by a function that patches it in."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+
+def hole(patch: pytest.MonkeyPatch) -> None:
+    """The cells of a hundredth that would be drawn most are never drawn; others have their slots."""
+    from reslrb_cli.integrators import guiding
+
+    whole = guiding.apportion
+
+    def holed(grid: Any, density: np.ndarray) -> np.ndarray:
+        counts = whole(grid, density)
+        order = np.argsort(-counts, kind="stable")
+        lost = order[: len(order) // 100]
+        counts[order[-1]] += counts[lost].sum()
+        counts[lost] = 0
+        return counts
+
+    patch.setattr(guiding, "apportion", holed)
+
+
+def without_weight(patch: pytest.MonkeyPatch) -> None:
+    """The density does not enter the weight."""
+    _weigh(patch, lambda grid, counts, weights: weights * 0 + 1)
+
+
+def not_normalised(patch: pytest.MonkeyPatch) -> None:
+    """The weight is that of the density before a quarter was shared out evenly."""
+    _weigh(patch, lambda grid, counts, weights: 0.75 / np.maximum(1 / weights - 0.25, 0.01))
+
+
+def of_the_neighbour(patch: pytest.MonkeyPatch) -> None:
+    """The weight is that of another cell."""
+    _weigh(patch, lambda grid, counts, weights: np.roll(weights, 1))
+
+
+def _weigh(patch: pytest.MonkeyPatch, change: Any) -> None:
+    from reslrb_cli.transport import guide
+
+    right = guide.Table.of
+
+    def wrong(grid: Any, counts: np.ndarray) -> Any:
+        import mitsuba as mi
+
+        table = right(grid, counts)
+        weights = change(grid, counts, np.array(table.weights, np.float64))
+        return replace(table, weights=mi.Float(weights.astype(np.float32)))
+
+    patch.setattr(guide.Table, "of", staticmethod(wrong))
+
+
+def half_of_the_strata(patch: pytest.MonkeyPatch) -> None:
+    """Lanes share the slots as if there were twice as many of them."""
+    from reslrb_cli.transport import guide
+
+    right = guide.Guide.of
+    patch.setattr(guide.Guide, "of", staticmethod(lambda table, width: right(table, 2 * width)))
+
+
+def of_another_emitter(patch: pytest.MonkeyPatch) -> None:
+    """The choosing number lies where emitters of other shares have it."""
+    from reslrb_cli.transport import guide
+
+    right = guide.Table.of
+
+    def wrong(grid: Any, counts: np.ndarray) -> Any:
+        import mitsuba as mi
+
+        table = right(grid, counts)
+        return replace(table, edges=mi.Float(np.sqrt(np.array(table.edges))))
+
+    patch.setattr(guide.Table, "of", staticmethod(wrong))
+
+
+def in_one_corner(patch: pytest.MonkeyPatch) -> None:
+    """Numbers within a cell are not evenly spread."""
+    _redraw(patch, lambda drawn: replace(drawn, direction=drawn.direction * drawn.direction))
+
+
+def with_its_own_weight(patch: pytest.MonkeyPatch) -> None:
+    """The weight is that of a table which the path has helped to make: what is dear is drawn more often by it."""
+    import drjit as dr
+
+    _redraw(patch, lambda drawn: replace(drawn, weight=drawn.weight * dr.minimum(1, 0.5 + drawn.direction.x)))
+
+
+def _redraw(patch: pytest.MonkeyPatch, change: Any) -> None:
+    from reslrb_cli.transport import guide
+
+    right = guide.Guide.draw
+    patch.setattr(guide.Guide, "draw", lambda self, *given: change(right(self, *given)))
+
+
+def same_numbers(patch: pytest.MonkeyPatch) -> None:
+    """Tables learn from the numbers of the step itself."""
+    from reslrb_cli.integrators import tracer
+
+    patch.setattr(tracer, "learning_seed", lambda seed: seed)
+
+
+def learned_in_its_midst(patch: pytest.MonkeyPatch) -> None:
+    """Tables learn from an image's samples before these are replayed, and so with another table."""
+    from reslrb_cli.integrators import light_tracer as lt
+    from reslrb_cli.integrators.guiding import Purpose
+    from reslrb_cli.integrators.reslrb import Reslrb
+
+    right = Reslrb._replay
+
+    def wrong(self: Reslrb, trace: Any, gradient: Any, params: Any) -> None:
+        import drjit as dr
+
+        guiding = self.preparation.guiding
+        assert guiding is not None
+        [samples] = trace.samples
+        with dr.suspend_grad():
+            guiding.learn(0, samples, samples.film.adjoint(gradient))
+        again = replace(samples, guide=replace(samples.guide, table=guiding.table(0, Purpose.BOTH)))
+        right(self, lt.Trace([again], trace.image, trace.state), gradient, params)
+
+    patch.setattr(Reslrb, "_replay", wrong)
+
+
+#: Those that bias.
+FAULTS = (
+    hole,
+    without_weight,
+    not_normalised,
+    of_the_neighbour,
+    half_of_the_strata,
+    of_another_emitter,
+    in_one_corner,
+    with_its_own_weight,
+)

@@ -1,0 +1,302 @@
+"""Guided emission is unbiased: with tables as they are after some steps, the means are those of unguided samples.
+
+What a table says is a matter of variance alone; what could bias is planted, and has to be missed by the same tests.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from conformance.gradient_cases import CASES
+from conformance.guiding_faults import FAULTS, learned_in_its_midst, same_numbers
+from turns import a_few
+
+import reslrb_cli
+from reslrb_cli.estimators import ESTIMATORS
+from reslrb_cli.integrators import known_step, render_image
+from reslrb_cli.integrators.features import FEATURES
+from reslrb_cli.integrators.plan_report import LARGE, count, tracking
+from reslrb_cli.measure.gradients import Case, integrator, relative, seeds
+from reslrb_cli.measure.statistics import compare
+
+pytestmark = pytest.mark.usefixtures("llvm")
+
+BY_NAME = {case.name: case for case in CASES}
+NAMES = ("texture", "two_emitters", "envmap", "roulette", "passes", "gaussian", "area_texture", "glass", "mask", "rgba")
+FEW = ["two_emitters"]
+SPP = 64
+LANES = 2**14
+
+
+def guided(name: str, steps: int, **options: Any) -> tuple[Case, Any, Any]:
+    """A case, an integrator whose tables have learned from `steps` gradients and learn no more, and one that is not
+    guided."""
+    case = BY_NAME[name]
+    scene = Case(case.scene(), case.keys)
+    own = {key: value for key, value in case.options.items() if key != "image"} | case.both | options
+    ours = integrator("reslrb", **{"estimator": "stack", **own}, guiding="on")
+    for seed in range(steps):
+        learn(scene, ours, seed)
+    ours.preparation.guiding.due = lambda number: False
+    return scene, ours, integrator("reslrb", **{"estimator": "stack", **own})
+
+
+def learn(scene: Case, ours: Any, seed: int) -> None:
+    """One step that the tables learn from."""
+    ours.preparation.guiding.due = lambda number: True
+    sample(scene, ours, 9000 + seed)
+
+
+def sample(scene: Case, ours: Any, seed: int) -> np.ndarray:
+    """Gradient and image of a step whose dL/dI is known, means over blocks of pixels, in a row."""
+    images = []
+
+    def step(integrator: Any, film: Any, sensor: Any, _objective: Any, **options: Any) -> Any:
+        result = known_step(integrator, film, sensor, scene.adjoint, **options)
+        images.append(np.array(result.image, np.float64)[:, :, :3])
+        return result
+
+    gradient = scene.gradient(ours, seed, SPP, step=step)
+    return np.concatenate([gradient, tiles(images[0])])
+
+
+def tiles(image: np.ndarray) -> np.ndarray:
+    """Means over tiles of 4 x 4 pixels, (T,); what is left over counts too."""
+    rows, columns = (range(0, size, 4) for size in image.shape[:2])
+    return np.concatenate([image[y : y + 4, x : x + 4].mean((0, 1)) for y in rows for x in columns])
+
+
+def samples(scene: Case, ours: Any, count: int, block: int = 0) -> np.ndarray:
+    """Of so many seeds, one row each."""
+    return np.stack([sample(scene, ours, seed) for seed in seeds(count, block)])
+
+
+# ---- The means -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", a_few(NAMES, FEW))
+def test_means_are_those_of_unguided_samples(name: str) -> None:
+    means_hold(name, 4, 32)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("steps", [1, 10, 100])
+@pytest.mark.parametrize("name", ["two_emitters", "envmap", "roulette"])
+def test_means_hold_after_any_number_of_steps(name: str, steps: int) -> None:
+    means_hold(name, steps, 200)
+
+
+def means_hold(name: str, steps: int, count: int) -> None:
+    scene, ours, plain = guided(name, steps)
+    assert strength(ours) > 2, "the table has learned nothing"
+    result = compare(samples(scene, ours, count), samples(scene, plain, count, 1), block=None)
+    print(name, steps, result)
+    assert result
+
+
+def strength(ours: Any) -> float:
+    """How much more often the cell that is drawn most is drawn than it would be evenly."""
+    from reslrb_cli.integrators.guiding import Purpose
+
+    guiding = ours.preparation.guiding
+    measures = guiding.grid.measures()
+    return float((guiding.counts(0, Purpose.BOTH)[measures > 0] / (guiding.grid.slots * measures[measures > 0])).max())
+
+
+@pytest.mark.parametrize("estimator", a_few(ESTIMATORS, ["event"]))
+@pytest.mark.parametrize("adjoint", a_few(["correlated", "independent", "batched"], ["batched"]))
+def test_every_way_of_a_step_has_the_mean_of_the_unguided(estimator: str, adjoint: str) -> None:
+    """The replay draws the numbers that were traced, whatever is learned in between."""
+    scene, ours, plain = guided("two_emitters", 3, estimator=estimator)
+    del ours.preparation.guiding.due  # as it comes: some of the steps learn
+    found = [scene.gradients(each, seeds(24, block), SPP, adjoint=adjoint) for block, each in enumerate((ours, plain))]
+    result = compare(*found, block=None)
+    print(estimator, adjoint, result)
+    assert result
+
+
+@pytest.mark.long
+def test_an_image_alone_has_the_mean_of_the_unguided() -> None:
+    scene, ours, plain = guided("envmap", 3)
+    images = [
+        np.stack([np.array(render_image(each, scene.scene, 0, seed, SPP), np.float64) for seed in seeds(24, block)])
+        for block, each in enumerate((ours, plain))
+    ]
+    assert compare(*images)
+
+
+@pytest.mark.parametrize("name", a_few(["two_emitters", "mask_texture_in_view"], ["two_emitters"]))
+def test_exact_estimators_agree_at_equal_seeds(name: str) -> None:
+    """A replay that drew other cells than the trace, or another weight, would not."""
+    scene, ours, _ = guided(name, 2)
+    learned = ours.preparation.guiding.learned
+    others = [guided(name, 0, estimator=kind, stack_size=2) if kind == "stack" else guided(name, 0, estimator=kind)
+              for kind in ("gather", "stack")]  # fmt: skip
+    for adjoint in ("correlated", "independent"):
+        reference = scene.gradient(ours, 5, SPP, adjoint=adjoint)
+        for _, other, _ in others:
+            other.plan(scene.scene, scene.scene.sensors()[0], scene.params)
+            other.preparation.guiding.learned = dict(learned)
+            assert relative(scene.gradient(other, 5, SPP, adjoint=adjoint), reference) < 1e-4
+
+
+def test_a_recorded_step_is_the_step() -> None:
+    scene, ours, _ = guided("envmap", 2)
+    _, frozen, _ = guided("envmap", 0, freeze=True)
+    frozen.plan(scene.scene, scene.scene.sensors()[0], scene.params)
+    guiding = frozen.preparation.guiding
+    for steps in range(3):  # tables change, and recordings have them all the same
+        guiding.learned = dict(ours.preparation.guiding.learned)
+        guiding._tables.clear()
+        both = [sample(scene, each, 5 + steps) for each in (ours, frozen)]
+        assert relative(*both) < 1e-4
+        learn(scene, ours, steps)
+        ours.preparation.guiding.due = lambda number: False
+    assert frozen.preparation.recordings.counts()["fused"] > 0
+
+
+def test_a_script_s_renders_learn_from_one_to_the_next() -> None:
+    """`mi.render`, forward and backward: the tables live in the integrator."""
+    import drjit as dr
+    import mitsuba as mi
+
+    reslrb_cli.register()
+    scene = Case(BY_NAME["two_emitters"].scene(), BY_NAME["two_emitters"].keys)
+    plugin = mi.load_dict({"type": "reslrb", "estimator": "stack", "max_depth": 4, "guiding": "on"})
+    for seed in range(3):
+        leaves = scene.leaves()
+        image = mi.render(scene.scene, scene.params, integrator=plugin, spp=4, seed=seed)
+        dr.backward(scene.objective(image))
+        assert all(np.isfinite(np.array(dr.grad(leaf))).all() for leaf in leaves.values())
+        scene.release(leaves)
+    assert plugin.tracer.preparation.guiding.learned[0].calls == 3
+    assert strength(plugin.tracer) > 1.2
+    with pytest.raises(RuntimeError, match='"guiding" must be one of on, off, not "maybe"'):
+        mi.load_dict({"type": "reslrb", "guiding": "maybe"})
+
+
+# ---- Faults ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("fault", [None, *FAULTS])
+def test_what_is_drawn_is_evenly_spread_by_its_weight(fault: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whatever the table: weighted means of functions of the numbers are those of even ones. No fault passes."""
+    if fault is not None:
+        fault(monkeypatch)
+    result = drawn_evenly()
+    print(fault, result)
+    assert bool(result) == (fault is None)
+
+
+def drawn_evenly() -> Any:
+    """Weighted sums over the numbers' intervals, of a grid of three emitters with a table of large contrasts, against
+    those of even numbers."""
+    import mitsuba as mi
+
+    from reslrb_cli.integrators import guiding
+    from reslrb_cli.transport.guide import Guide, Table, make_grid
+
+    grid = make_grid([True] * 4, [1.0, 2.0, 0.5])
+    density = np.random.default_rng(3).gamma(0.05, size=grid.cells)
+    guide = Guide.of(Table.of(grid, guiding.apportion(grid, density)), LANES)
+    rows: dict[bool, list[np.ndarray]] = {True: [], False: []}
+    for number in range(64):
+        random = np.random.default_rng(number)
+        own = [mi.Float(random.random(LANES, np.float32)) for _ in range(5)]
+        rows[False].append(histogram(own, np.ones(LANES)))
+        own = [mi.Float(random.random(LANES, np.float32)) for _ in range(5)]
+        drawn = guide.draw(grid, LANES, mi.PCG32(LANES, number), own[0], mi.Point2f(*own[1:3]), mi.Point2f(*own[3:]))
+        numbers = [drawn.choice, drawn.position.x, drawn.position.y, drawn.direction.x, drawn.direction.y]
+        rows[True].append(histogram(numbers, np.array(drawn.weight, np.float64)))
+    return compare(np.stack(rows[True]), np.stack(rows[False]), block=None)
+
+
+def histogram(numbers: list[Any], weights: np.ndarray) -> np.ndarray:
+    """Sums of weights over eighths of each number, and over pairs of halves of each two."""
+    values = np.stack([np.array(number, np.float64) for number in numbers])
+    assert values.min() >= 0
+    assert values.max() < 1
+    single = [np.bincount((row * 8).astype(int), weights, 8) for row in values]
+    halves = (values * 2).astype(int)
+    pairs = [np.bincount(2 * a + b, weights, 4) for k, a in enumerate(halves) for b in halves[:k]]
+    return np.concatenate([*single, *pairs])
+
+
+@pytest.mark.parametrize("fault", [None, same_numbers, learned_in_its_midst])
+def test_tables_learn_from_other_numbers_and_change_between_steps(fault: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    if fault is not None:
+        fault(monkeypatch)
+    assert learns_apart(monkeypatch) == (fault is None)
+
+
+def learns_apart(patch: pytest.MonkeyPatch) -> bool:
+    """Whether the walks of two steps have one table each, and what is learned has seeds that no other walk has."""
+    from reslrb_cli.estimators import base
+    from reslrb_cli.integrators import hearing
+
+    walks: dict[bool, list[tuple[int, int]]] = {True: [], False: []}
+    right, tables = base.walk, []  # held, so that no other has their addresses
+
+    def seen(learning: bool) -> Any:
+        def walk(samples: Any, *given: Any) -> Any:
+            tables.append(samples.guide.table)
+            walks[learning].append((int(samples.seed[0]), id(samples.guide.table.slots)))
+            return right(samples, *given)
+
+        return walk
+
+    patch.setattr(base, "walk", seen(False))
+    patch.setattr(hearing, "walk", seen(True))
+    scene, ours, _ = guided("two_emitters", 0, estimator="gather")
+    del ours.preparation.guiding.due
+    for seed in (1, 2):
+        scene.gradient(ours, seed, SPP, adjoint="correlated")
+    assert len(walks[True]) >= 2
+    by_seed: dict[int, set[int]] = {}
+    for seed, table in walks[False]:
+        by_seed.setdefault(seed, set()).add(table)
+    one_each = len(by_seed) == 2 and all(len(each) == 1 for each in by_seed.values())
+    return one_each and not {seed for seed, _ in walks[True]} & set(by_seed)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("fault", FAULTS)
+def test_what_would_bias_is_found(fault: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    fault(monkeypatch)
+    scene, ours, plain = guided("two_emitters", 4)
+    result = compare(samples(scene, ours, 32), samples(scene, plain, 32, 1), block=None)
+    print(fault.__name__, result)
+    assert not result
+
+
+# ---- What it costs ---------------------------------------------------------------------------------------------------
+
+
+def test_without_a_guide_nothing_of_it_is_compiled() -> None:
+    [feature] = [feature for feature in FEATURES if feature.name == "guided emission"]
+    scene, ours, plain = guided("two_emitters", 0)
+    operations = {}
+    for name, each in (("on", ours), ("off", plain)):
+        with tracking(scene.params, scene.keys):
+            plan = each.plan(scene.scene, scene.scene.sensors()[0], scene.params)
+            assert feature.needed(plan) == (name == "on")
+            for toggled in (plan, feature.toggle(plan)):
+                kind = "on" if feature.needed(toggled) else "off"
+                operations[name, kind] = sum(count(each, toggled, scene.scene, scene.scene.sensors()[0], known=True))
+    assert operations["on", "on"] == operations["off", "on"]
+    assert operations["on", "off"] == operations["off", "off"] < operations["on", "on"]
+
+
+def test_later_steps_compile_nothing() -> None:
+    """Though they learn: neither table nor seed reaches a kernel as a literal."""
+    from conformance.test_kernels import Kernels
+
+    scene, ours, _ = guided("two_emitters", 0)
+    kernels = Kernels()
+    kernels.new(lambda: learn(scene, ours, 0))
+    for seed in (1, 2):
+        found = kernels.new(lambda: learn(scene, ours, seed))  # noqa: B023
+        # Those that copy a table hang on where NumPy has it.
+        assert [kernel["operation_count"] for kernel in found if kernel["operation_count"] >= LARGE] == []
