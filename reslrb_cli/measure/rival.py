@@ -127,8 +127,6 @@ def compare(
     own: Sequence[Gradients], own_ms: Sequence[float], other: Sequence[Gradients], other_ms: Sequence[float]
 ) -> tuple[float, float, float] | tuple[None, None, None]:
     """The efficiency of the other over that of the own, and its interval; nothing where one has no noise."""
-    from scipy import stats  # here, since every run would wait a second for it that few have a use for
-
     scales = {key: float(np.mean([square(g[key]) for g in (*own, *other)])) for key in own[0]}
     scales = {key: scale for key, scale in scales.items() if scale > 0}
     logs, variance = [], 0.0
