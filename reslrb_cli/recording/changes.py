@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -33,10 +33,11 @@ def changes(before: Config, now: Config) -> dict[str, Change]:
     }
 
 
-def check_changes(found: Mapping[str, Change], source: object, run: Path) -> dict[str, Change]:
+def check_changes(found: Mapping[str, Change], blame: Callable[[str], object], run: Path) -> dict[str, Change]:
     """Of the settings that differ those that may, where the run is written left out.
 
-    Raises ConfigError, located in `source` and by the first key that must not, with the first few of them.
+    Raises ConfigError, located by the first key that must not and by who is to `blame` for it, with the first few of
+    them.
     """
     wrong = [key for key in found if not MAY_CHANGE.fullmatch(key)]
     if wrong:
@@ -45,7 +46,9 @@ def check_changes(found: Mapping[str, Change], source: object, run: Path) -> dic
         more += [f"{len(wrong) - _SHOWN} more"] if len(wrong) > _SHOWN else []
         also = f"; also {'; '.join(more)}" if more else ""
         raise ConfigError(
-            source, wrong[0], f"is {first}{also}; {run} goes on as it began, but for iterations and learning rates"
+            blame(wrong[0]),
+            wrong[0],
+            f"is {first}{also}; {run} goes on as it began, but for iterations and learning rates",
         )
     return {key: change for key, change in found.items() if key not in _PLACE}
 

@@ -153,8 +153,7 @@ def open_earlier(run: Path, config_file: Path | None, overrides: tuple[str, ...]
         elsewhere = config.run.output != source.run.output or config.run.name != source.run.name
         found = changes(began, config)
         asked = changes(source, config)
-        blame = "--set" if any(key in asked for key in found) else config.source
-        changed = check_changes(found, blame, run)
+        changed = check_changes(found, lambda key: "--set" if key in asked else config.source, run)
         iteration, last = stored.count("iteration", least=0), stored.value("last")
         if config.run.iterations < iteration:
             reason = f"is {config.run.iterations}; the run has done {iteration} already"

@@ -44,8 +44,10 @@ def opened(path: Path) -> Iterator[tuple[RunFolder, dict[str, Any]]]:
 def check_writable(folder: RunFolder) -> None:
     """Raise ConfigError, located in the folder, where nothing can be written to it, MachineError for a full disk.
 
-    What a process that is no more never came to finish is removed.
+    What is written has to stay in the folder, so that links in it are refused, which no run makes. What a process that
+    is no more never came to finish is removed.
     """
+    _check_links(folder.path)
     try:
         for name in SUBFOLDERS:
             (folder.path / name).mkdir(exist_ok=True)
@@ -61,6 +63,18 @@ def check_writable(folder: RunFolder) -> None:
             "",
             f"cannot be written to ({error.strerror}); to go on in another folder, add --set run.output=FOLDER",
         ) from None
+
+
+def _check_links(folder: Path) -> None:
+    """Raise ConfigError for links in a run's folder by which it would write elsewhere: those to folders, and that of
+    the metrics, which are added to. All other files are replaced, links and all."""
+    entries = [folder / metrics.FILE_NAME, *(folder / name for name in SUBFOLDERS)]
+    for name in SUBFOLDERS:
+        entries += [Path(parent, below) for parent, folders, _ in os.walk(folder / name) for below in folders]
+    for entry in entries:
+        if entry.is_symlink():
+            reason = "is a link, by which the run would write elsewhere; put what it leads to in its place"
+            raise ConfigError(entry, "", f"{reason}, or add --set run.output=FOLDER")
 
 
 def copy_into(folder: RunFolder, earlier: Path) -> None:

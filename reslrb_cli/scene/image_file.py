@@ -30,11 +30,21 @@ _HEAD = 2**20
 #: Parts that a PNG or a JPEG has at most, so that one of nothing but empty parts takes no time.
 _MOST_PARTS = 2**20
 
+_DAMAGED = "is damaged or cut off; copy or save it again"
+
 Size = tuple[int, int]
 
 
 class _CutOff(Exception):
     """The file ends before its image does."""
+
+
+class _Damaged(Exception):
+    """Mitsuba's reader would write past its own memory."""
+
+
+class DamagedImage(ConfigError):
+    """An image by which Mitsuba's reader, or what uses the image, would leave its own memory."""
 
 
 def read_bitmap(path: Path, size: Size | None = None) -> mi.Bitmap:
@@ -48,6 +58,8 @@ def read_bitmap(path: Path, size: Size | None = None) -> mi.Bitmap:
             says, is_jpeg = _examine(file)
         except _CutOff:
             raise ConfigError(path, "", "is cut off: the file ends before its image; copy or save it again") from None
+        except _Damaged:
+            raise DamagedImage(path, "", _DAMAGED) from None
         except OSError as error:
             raise ConfigError(path, "", f"cannot be read: {error.strerror}") from None
     if says is None or min(says) < 1:
@@ -80,7 +92,11 @@ def image_size(path: Path) -> Size:
             says, _ = _examine(file)
         except _CutOff:
             says = None
-    if says is None or min(says) < 1:
+        except _Damaged:
+            raise DamagedImage(path, "", _DAMAGED) from None
+    if says is not None and min(says) < 1:
+        raise DamagedImage(path, "", f"says that it is {says[0]}x{says[1]} pixels; save it again")
+    if says is None:
         raise ConfigError(path, "", f"is not an image that can be read ({FORMATS})")
     return says
 
@@ -161,7 +177,40 @@ def _exr_size(head: bytes, file: BinaryIO) -> Size | None:
 
 def _hdr_size(head: bytes, file: BinaryIO) -> Size | None:
     found = re.search(rb"\n-Y (\d{1,9}) \+X (\d{1,9})\n", head)
-    return (int(found[2]), int(found[1])) if found else None
+    if found is None:
+        return None
+    width, height = int(found[2]), int(found[1])
+    if width * height <= PIXELS:  # else it is refused for that
+        file.seek(found.end())
+        _check_runs(file.read(), width, height)
+    return width, height
+
+
+def _check_runs(data: bytes, width: int, height: int) -> None:
+    """Raise _Damaged where the lines of a Radiance image are not what its head says: runs that fill each of the four
+    parts of a line to its end, in all lines or in none. Mitsuba's reader believes what the lines say."""
+    start = bytes((2, 2, width >> 8, width & 255)) if 8 <= width <= 0x7FFF else b""
+    if not start or data[:2] != start[:2] or data[2:3] >= b"\x80":
+        if len(data) < 4 * width * height:
+            raise _Damaged
+        return
+    position, end = 0, len(data)
+    for _ in range(height):
+        if data[position : position + 4] != start:
+            raise _Damaged
+        position += 4
+        for _ in range(4):
+            left = width
+            while left > 0 and position < end:
+                code = data[position]
+                if code > 128:
+                    left, position = left - code + 128, position + 2
+                elif code:
+                    left, position = left - code, position + code + 1
+                else:
+                    raise _Damaged
+            if left or position > end:
+                raise _Damaged
 
 
 def _netpbm_size(head: bytes, file: BinaryIO) -> Size | None:

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import mitsuba as mi
+import numpy as np
 
 from ..errors import ConfigError
 from .cameras import read_cameras, replace_sensors
@@ -24,6 +25,7 @@ from .description import (
     read_description,
     resize_films,
 )
+from .description.element import quoted
 from .extent import lost_light
 from .thin_glass import thin_glass
 
@@ -89,6 +91,7 @@ def load_described(
         raise ConfigError(file, "", "the scene has no emitters: no light path can start")
     if len(scene.sensors()) == 0:
         raise ConfigError(file, "", "the scene has no sensor")
+    _check_meshes(file, scene)
     lost = {note.element for note in unused}  # what else was done to them says nothing
     found = [note for note in found if note.element not in lost]
     for line in notes.warnings(notes.in_order([*found, *unused], root)):
@@ -100,6 +103,16 @@ def load_described(
         if note.owner is not None:
             note.owner.children.remove(note.element)
     return scene, description
+
+
+def _check_meshes(file: Path, scene: mi.Scene) -> None:
+    """Raise ConfigError for a mesh whose faces name vertices that it lacks: Mitsuba reads past its end for them."""
+    for shape in scene.shapes():
+        if shape.is_mesh() and shape.face_count() and shape.vertex_count():
+            last = int(np.array(shape.faces_buffer()).max())
+            if last >= shape.vertex_count():
+                has = f"has a face with vertex {last}, and {shape.vertex_count()} vertices"
+                raise ConfigError(file, "", f"the mesh {quoted(shape.id())} {has}; write it again")
 
 
 @functools.cache

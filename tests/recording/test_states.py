@@ -200,6 +200,14 @@ def test_what_differs_is_shown(run: Path, capsys: pytest.CaptureFixture[str]) ->
     assert told(capsys, run).startswith("config.yaml: integrator.max_depth: is 4, 3 in the run; ")
 
 
+def test_who_changed_it_is_named(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Not an override that may change what it does, beside a file in which something else was changed."""
+    text = (run / "config.yaml").read_text()
+    (run / "config.yaml").write_text(text.replace("max_depth: 3", "max_depth: 4"))
+    line = told(capsys, run, "--set", "run.iterations=9")
+    assert line.startswith("config.yaml: integrator.max_depth: is 4, 3 in the run; ")
+
+
 def test_a_scene_that_changed_is_another_experiment(
     run: Path, interrupted: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -241,6 +249,27 @@ def test_no_run_is_told(tmp_path: Path, run: Path, capsys: pytest.CaptureFixture
     assert "is no run's folder" in told(capsys, tmp_path / "empty")
     shutil.rmtree(run / "checkpoint")
     assert "has no checkpoint/state.npz" in told(capsys, run)
+
+
+@pytest.mark.skipif(os.name != "posix", reason="links")
+@pytest.mark.parametrize("name", ["checkpoint", "images", "parameters/best", "metrics.jsonl"])
+def test_links_do_not_lead_out_of_the_folder(
+    name: str, run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Of somebody else's making; what they lead to stays as it is, and the run can go on elsewhere."""
+    victim = tmp_path / "victim"
+    if (run / name).exists():
+        (run / name).rename(victim)
+    else:
+        victim.mkdir()
+    (run / name).symlink_to(victim)
+    before = {path: path.read_bytes() for path in [victim, *victim.rglob("*")] if path.is_file()}
+    assert told(capsys, run).startswith(f"{name}: is a link, by which the run would write elsewhere; put ")
+    if name != "checkpoint":
+        return
+    assert optimize("--resume", str(run), "--quiet", "--set", f"run.output={tmp_path}/other") == 0
+    assert {path: path.read_bytes() for path in [victim, *victim.rglob("*")] if path.is_file()} == before
+    assert len(records_of(tmp_path / "other/tiny")) == 6
 
 
 @pytest.mark.skipif(os.name != "posix", reason="no locks")

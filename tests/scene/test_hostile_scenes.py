@@ -107,6 +107,63 @@ def test_what_mitsuba_would_crash_on_or_not_locate(tmp_path, objects, said):
     assert str(error.value).startswith(f"{file}:2: {said}")
 
 
+PLY = """ply
+format ascii 1.0
+element vertex {vertices}
+property float x
+property float y
+property float z
+element face 1
+property list uchar int vertex_index
+end_header
+0 0 0
+1 0 0
+0 1 0
+3 0 1 {last}
+"""
+
+
+@pytest.mark.parametrize(
+    ("vertices", "last", "said"),
+    [
+        (3, 3, "has a face with vertex 3, and 3 vertices; write it again"),
+        (
+            4294967296,
+            2,
+            "mesh.ply says that it has `4294967296` of the element `vertex`, and has 187 B; write it again",
+        ),
+        (3, 2, ""),
+    ],
+)
+def test_meshes_by_which_memory_would_be_left(tmp_path, vertices, last, said):
+    """Of vertices that are not there, and of more of them than there is room for."""
+    (tmp_path / "mesh.ply").write_text(PLY.format(vertices=vertices, last=last))
+    lamp = '<emitter type="point"/><sensor type="perspective"/>'
+    mesh = '<shape type="ply" id="mesh"><string name="filename" value="mesh.ply"/></shape>'
+    file = write(tmp_path, f"{HEAD}{lamp}{mesh}</scene>")
+    if not said:
+        assert any(shape.is_mesh() for shape in load_scene(file).shapes())
+        return
+    with pytest.raises(ConfigError) as error:
+        load_scene(file)
+    assert str(error.value).startswith(str(file))
+    assert said in str(error.value)
+
+
+def test_a_texture_that_is_damaged_is_refused_where_it_is_named(tmp_path):
+    lines = bytes((2, 2, 0, 8)) + bytes((136, 1)) * 4
+    image = b"#?RGBE\nFORMAT=32-bit_rle_rgbe\n\n-Y 2 +X 8\n" + lines + b"\xff" * 12
+    (tmp_path / "a.hdr").write_bytes(image)
+    file = write(tmp_path, f"{HEAD}{TEXTURE.format('a.hdr')}</scene>")
+    with pytest.raises(ConfigError) as error:
+        load_scene(file)
+    assert str(error.value) == f"{file}:3: filename: {tmp_path}/a.hdr: is damaged or cut off; copy or save it again"
+    (tmp_path / "a.hdr").write_bytes(b"P6\n8 0\n255\n" + bytes(24))  # of which Mitsuba makes a texture without texels
+    with pytest.raises(ConfigError) as error:
+        load_scene(file)
+    assert str(error.value) == f"{file}:3: filename: {tmp_path}/a.hdr: says that it is 8x0 pixels; save it again"
+
+
 def test_what_is_no_regular_file(tmp_path):
     os.mkfifo(tmp_path / "pipe.xml")
     for file in (tmp_path / "pipe.xml", Path("/dev/zero")):

@@ -196,3 +196,29 @@ def test_an_allocation_that_fails_is_no_damage(tmp_path, monkeypatch):
     monkeypatch.setattr(image_file, "mi", Full())
     with pytest.raises((MemoryError, OutOfMemory)):
         read_bitmap(path)
+
+
+@pytest.mark.parametrize("width", [7, 8, 40, 300])
+def test_the_lines_of_a_radiance_image_are_looked_at_before_they_are_decoded(width, tmp_path):
+    """Mitsuba writes past its memory where one of them is no runs, which the first ones are."""
+    import mitsuba as mi
+
+    path = tmp_path / "a.hdr"
+    array = np.random.default_rng(5).uniform(0, 2, (9, width, 3)).astype(np.float32)
+    array[2:5] = 0.5  # long runs, too
+    mi.Bitmap(array).write(str(path))
+    assert np.allclose(read_image(path), array, atol=0.01)
+    if width < 8:
+        return
+    data = path.read_bytes()
+    start = bytes((2, 2, width >> 8, width & 255))
+    lines = [place for place in range(len(data)) if data[place : place + 4] == start]
+    for place, there in (
+        (lines[3], b"\xff"),
+        (lines[1] + 3, b"\x07"),
+        (lines[2] + 4, b"\x00"),
+    ):
+        path.write_bytes(data[:place] + there + data[place + 1 :])
+        assert refused(path).startswith(("is cut off", "is damaged or cut off"))
+        with pytest.raises(image_file.DamagedImage):
+            image_file.image_size(path)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,7 +13,7 @@ from ...backend.memory import free_bytes
 from ...config.files import in_words
 from ...config.limits import PIXELS
 from ...errors import ConfigError
-from ..image_file import image_size
+from ..image_file import DamagedImage, image_size
 from .element import Element, quoted
 from .including import Description
 
@@ -70,7 +71,8 @@ def _size_of(film: Element) -> FilmSize:
 
 
 def _check_head(element: Element, path: Path) -> None:
-    """Refuse a PLY mesh whose elements have names that are no text: Mitsuba prints them as they come."""
+    """Refuse a PLY mesh whose elements have names that are no text, which Mitsuba prints as they come, or that says to
+    have more of them than it has bytes, for which Mitsuba makes room."""
     with path.open("rb") as file:
         head = file.read(_HEAD)
     if not head.startswith(b"ply"):
@@ -79,6 +81,10 @@ def _check_head(element: Element, path: Path) -> None:
         text = line.decode("ascii", errors="replace")
         if not line.startswith((b"comment", b"obj_info")) and not all(c == "\t" or " " <= c <= "~" for c in text):
             raise element.fail("filename", f"{path}: its head holds what is no text, {quoted(text)}; write it again")
+        count = re.fullmatch(r"\s*element\s+(\S+)\s+(\d+)\s*", text)
+        if count is not None and float(count[2]) > os.path.getsize(path):
+            what = f"says that it has {quoted(count[2])} of the element {quoted(count[1])}"
+            raise element.fail("filename", f"{path} {what}, and has {in_words(os.path.getsize(path))}; write it again")
 
 
 def _check_file(element: Element, folders: list[Path], free: int) -> None:
@@ -95,6 +101,8 @@ def _check_file(element: Element, folders: list[Path], free: int) -> None:
     _check_head(element, path)
     try:
         width, height = image_size(path)
+    except DamagedImage as error:
+        raise element.fail("filename", str(error)) from None
     except ConfigError:
         return  # no image, or none that we know
     if width * height > PIXELS:
