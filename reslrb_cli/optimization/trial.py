@@ -1,15 +1,18 @@
 """A few steps of a run, for a forecast: what one takes, and the memory of all.
 
 Where a step takes long, steps of fewer samples per pixel stand for it: time and memory are a constant and a part that
-is proportional to the samples, which two sizes tell apart.
+is proportional to the samples, which two sizes tell apart. Memory is given out in powers of two, which such a line
+misses; so where two whole steps are no long wait, they say what the memory is.
 """
 
 from __future__ import annotations
 
 import statistics
 import time
+from collections.abc import Generator, Sequence
+from contextlib import closing
 from dataclasses import dataclass, replace
-from itertools import pairwise
+from itertools import islice, pairwise
 
 from reslrb_cli.optimization.loop import optimize
 from reslrb_cli.optimization.problem import Problem
@@ -18,6 +21,8 @@ from reslrb_cli.records.metrics import Record
 
 #: Seconds of a step beyond which steps of fewer samples stand for it, and that those are to take.
 LONG_STEP, SHORT_STEP = 2.0, 0.7
+#: Seconds of a step up to which two of them are taken for their memory.
+WAIT = 15.0
 #: Steps until all is compiled and recorded; steps that are timed, at least, at most, and for so many seconds.
 WARM_UP, LEAST, MOST, SECONDS = 5, 4, 40, 5.0
 
@@ -48,34 +53,46 @@ def measure_steps(problem: Problem) -> Steps:
     small = max(min(int(SHORT_STEP / max(first.step_s, 1e-6)), whole // unit // 2), 1) * unit
     one, two = _measure(problem, small), _measure(problem, 2 * small)
     share = (whole - small) / small
-    return Steps(
-        two.spp,
-        one.step_s + share * max(two.step_s - one.step_s, 0.0),
-        two.start_s,
-        first.compile_s + one.compile_s + two.compile_s,
-        int(one.peak + share * max(two.peak - one.peak, 0)),
-    )
+    step_s = one.step_s + share * max(two.step_s - one.step_s, 0.0)
+    peak = _peak(problem, whole) if step_s <= WAIT else int(one.peak + share * max(two.peak - one.peak, 0))
+    return Steps(two.spp, step_s, two.start_s, first.compile_s + one.compile_s + two.compile_s, peak)
 
 
-def _measure(problem: Problem, spp: int) -> Steps:
-    """A few iterations of `spp` samples per pixel, by the loop itself; the parameters move."""
+def _peak(problem: Problem, spp: int) -> int:
+    """Bytes that two iterations of `spp` samples per pixel take: the second is one that was recorded."""
+    with closing(_iterations(problem, spp)) as iterations:
+        return _bytes(list(islice(iterations, 2)))
+
+
+def _iterations(problem: Problem, spp: int) -> Generator[Record, None, None]:
+    """Iterations of `spp` samples per pixel, by the loop itself; the parameters move."""
     config = problem.config
     enough = {"spp": spp, "iterations": max(config.run.iterations, WARM_UP + MOST)}  # of a run of two, too
     problem.config = config.model_copy(update={"run": config.run.model_copy(update=enough)})
+    try:
+        yield from optimize(problem)
+    finally:
+        problem.config = config
+
+
+def _bytes(records: Sequence[Record]) -> int:
+    return int(records[-1].peak_mib * MIB)
+
+
+def _measure(problem: Problem, spp: int) -> Steps:
+    """A few iterations of `spp` samples per pixel."""
     records: list[Record] = []
     begin = time.perf_counter()
-    try:
-        for record in optimize(problem):
+    with closing(_iterations(problem, spp)) as iterations:
+        for record in iterations:
             records.append(record)
             if len(records) == WARM_UP:
                 begin = time.perf_counter()
             timed = len(records) - WARM_UP
             if timed >= MOST or (timed >= LEAST and time.perf_counter() - begin > SECONDS):
                 break
-    finally:
-        problem.config = config
     times = [records[0].elapsed_s, *(b.elapsed_s - a.elapsed_s for a, b in pairwise(records))]
     steady = statistics.median(times[WARM_UP:])
     extra = sum(max(seconds - steady, 0.0) for seconds in times[:WARM_UP])
     compiled = min(sum(record.codegen_ms for record in records[:WARM_UP]) / 1e3, extra)
-    return Steps(spp, steady, extra - compiled, compiled, int(records[-1].peak_mib * MIB))
+    return Steps(spp, steady, extra - compiled, compiled, _bytes(records))

@@ -63,7 +63,12 @@ def test_long_steps_are_measured_by_shorter_ones(experiment: Path, monkeypatch: 
         taken.append(spp)
         return trial.Steps(spp, 0.1 + 0.02 * spp, 0.3, 0.5, 1000 + 7 * spp)
 
+    def peak(problem: object, spp: int) -> int:
+        taken.append(spp)
+        return 5000
+
     monkeypatch.setattr(trial, "_measure", measure)
+    monkeypatch.setattr(trial, "_peak", peak)
     forecast = make_forecast(load(experiment / "tiny.yaml", ["run.spp=4000"]), lambda line: None)
     assert taken == [4, 12, 24]
     assert forecast.spp == 24
@@ -73,6 +78,9 @@ def test_long_steps_are_measured_by_shorter_ones(experiment: Path, monkeypatch: 
     taken.clear()
     make_forecast(load(experiment / "tiny.yaml", ["run.spp=40"]), lambda line: None)
     assert taken == [4, 40]
+    taken.clear()
+    assert make_forecast(load(experiment / "tiny.yaml", ["run.spp=400"]), lambda line: None).peak == 5000
+    assert taken == [4, 12, 24, 400]  # whole steps of 8.1 s are no long wait
 
 
 def test_steps_are_timed_without_their_compilation(experiment: Path) -> None:
