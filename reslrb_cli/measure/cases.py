@@ -22,7 +22,9 @@ PLUGIN_ESTIMATOR = "reservoir"
 #: Options of a case that are those of `run`, for itself alone.
 ADJOINT = ("adjoint", "batches", "first_batch")
 _TYPES = {str(kind.model_fields["type"].default): kind for kind in (Reslrb, Ptracer, Prb, WalkAd, Trajectory)}
+#: Options that make an estimator another one, in records.
 _ESTIMATOR_OPTIONS = {option for options in ESTIMATOR_OPTIONS.values() for option in options} - {"capacity"}
+_ESTIMATOR_OPTIONS |= {"guiding"}
 _OPTION = "--integrators"
 _ITEM = re.compile(r"(?P<type>\w+)(?::(?P<estimator>\w+))?(?:\((?P<options>.*)\))?")
 

@@ -105,7 +105,7 @@ def strength(ours: Any) -> float:
     return float((guiding.counts(0, Purpose.BOTH)[measures > 0] / (guiding.grid.slots * measures[measures > 0])).max())
 
 
-@pytest.mark.parametrize("estimator", a_few(ESTIMATORS, ["event"]))
+@pytest.mark.parametrize("estimator", a_few(ESTIMATORS, ["stack"]))
 @pytest.mark.parametrize("adjoint", a_few(["correlated", "independent", "batched"], ["batched"]))
 def test_every_way_of_a_step_has_the_mean_of_the_unguided(estimator: str, adjoint: str) -> None:
     """The replay draws the numbers that were traced, whatever is learned in between."""

@@ -69,6 +69,26 @@ def test_scenes_without_emitters_are_traced() -> None:
     assert not scene.image(integrator("reslrb", guiding="on"), 1, 4).any()
 
 
+def test_roulette_does_not_see_the_weight(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Paths that are drawn often would else end for being many: a hundredth of the weight leaves just that."""
+    import mitsuba as mi
+
+    from reslrb_cli.transport import guide
+
+    right, factor = guide.Table.of, [1.0]
+
+    def weighed(grid: Grid, counts: np.ndarray) -> Table:
+        table = right(grid, counts)
+        return Table(table.slots, mi.Float(np.array(table.weights) * np.float32(factor[0])), table.edges)
+
+    monkeypatch.setattr(guide.Table, "of", staticmethod(weighed))
+    scene, images = Case(SCENES["roulette"](), []), []
+    for factor[0] in (1.0, 0.01):
+        images.append(scene.image(integrator("reslrb", 6, 1, guiding="on"), 5, 16) / factor[0])
+    assert images[0].any()
+    np.testing.assert_allclose(images[1], images[0], rtol=1e-4, atol=1e-5 * images[0].max())
+
+
 SMALL = Grid((1, 1, 1, 1), (0.0, 0.25, 1.0))
 
 

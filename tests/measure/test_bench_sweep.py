@@ -241,6 +241,9 @@ def test_cases_may_have_an_adjoint_of_their_own() -> None:
     assert [run.adjoint for run in runs] == ["batched", "correlated", "batched"]
     assert [run.batches for run in runs] == [2, 4, 4]
     assert case.estimator == "stack(adjoint=batched,batches=2)"
+    guided, plain = parse_cases("reslrb:stack(guiding=on),reslrb:stack(guiding=off)")
+    assert (guided.estimator, plain.estimator) == ("stack(guiding=on)", "stack")
+    assert guided.at(config, 4, known=True).integrator.options()["guiding"] == "on"
     assert case.at(loads(CONFIG, "x.yaml"), 9, known=False).run.batches == 2
 
 
