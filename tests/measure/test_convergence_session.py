@@ -249,7 +249,7 @@ def test_too_few_steps_for_a_slope_say_what_it_would_take(tmp_path: Path) -> Non
     _, results, said = play(tmp_path, slow(), plan(rounds=None, budget_s=45.0))
     lacking = {record.method.label for record in results.methods if record.slope is None}
     assert lacking == {"ptracer"}
-    assert said[-1].startswith("no slope of ptracer: it takes 8 steps of each; allow about ")
+    assert said[-1].startswith("no slope of ptracer: it takes 16 steps of each; allow about ")
     enough = float(said[-1].split("allow about ")[1].split(" s")[0])
     assert enough > 45
     _, results, said = play(tmp_path, slow(), plan(rounds=None, budget_s=1.05 * enough))
