@@ -50,6 +50,8 @@ ALIKE: dict[Reference, dict[str, str]] = {
     Reference.PTRACER: {"attached_sampling": "follow", "filter_normalization": "detached"},
     Reference.FINITE_DIFFERENCE: {"filter_normalization": "attached"},
 }
+#: References that trace paths from the sensor, of which the film's border takes nothing.
+CAMERA_PATHS = {Reference.PRB, Reference.PATH}
 #: The integrator whose images are differenced: ours, without roulette where paths end without.
 DIFFERENCED = "differenced"
 #: Seeds that the step of finite differences is chosen with.
@@ -189,7 +191,7 @@ class Participants:
             self.case.weigh(smooth_weights(*shape))
             return
         weights = np.random.default_rng(7).uniform(-0.5, 2.5, shape)
-        if {*self.stock.values(), self.image} & {Reference.PRB, Reference.PATH}:
+        if {*self.stock.values(), self.image} & CAMERA_PATHS:
             weights *= interior(shape, self.sensor)[:, :, None]
         self.case.weigh(weights)
 
@@ -253,8 +255,11 @@ class Participants:
         return [self.case.tangent(integrator, d.vector, seed, self.spp) for d in self.directions[key]]
 
     def picture(self, label: str, seed: int) -> np.ndarray:
-        """The image in a row."""
-        return self.case.image(self.integrators[label], seed, self.spp).ravel()
+        """The image in a row; black along the border where it is compared with one that loses no light there."""
+        image = self.case.image(self.integrators[label], seed, self.spp)
+        if self.image in CAMERA_PATHS:
+            image *= interior(image.shape, self.sensor)[:, :, None]
+        return image.ravel()
 
 
 def _emits(node: mi.Object) -> bool:

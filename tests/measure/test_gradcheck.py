@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from conformance.gradient_cases import CASES
@@ -14,7 +16,7 @@ from reslrb_cli.measure.cases import all_estimators, parse_estimators
 from reslrb_cli.measure.differences import choose_step, directions, natural_bounds
 from reslrb_cli.measure.gradcheck import Gradcheck, Result
 from reslrb_cli.measure.gradients import Case, integrator
-from reslrb_cli.measure.participants import Settings
+from reslrb_cli.measure.participants import Participants, Settings
 from reslrb_cli.measure.references import (
     Situation,
     interior,
@@ -220,6 +222,19 @@ def test_a_wide_filter_has_no_weights_along_the_border():
     assert inside[2:-2, 2:-2].all()
     assert inside.sum() == 12 * 12
     assert interior((16, 16, 3), Case(room(), []).scene.sensors()[0]).all()
+
+
+@pytest.mark.parametrize(
+    ("reference", "dark"), [(Reference.PATH, True), (Reference.PRB, True), (Reference.PTRACER, False)]
+)
+def test_images_are_compared_without_the_border_that_paths_from_the_lights_leave_dark(reference, dark):
+    case = Case(room(camera=camera("gaussian")), [])
+    sensor, integrators = case.scene.sensors()[0], {"walk_ad": integrator("walk_ad", 4)}
+    parts = SimpleNamespace(case=case, sensor=sensor, integrators=integrators, image=reference, spp=16)
+    image = Participants.picture(parts, "walk_ad", 1).reshape(16, 16, 3)
+    inside = interior(image.shape, sensor)
+    assert (image[~inside] == 0).all() == dark
+    np.testing.assert_allclose(image[inside], case.image(integrators["walk_ad"], 1, 16)[inside], rtol=1e-3, atol=1e-5)
 
 
 # ---- Finite differences ----
