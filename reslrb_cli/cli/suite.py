@@ -66,13 +66,14 @@ def run_suite_command(
             raise ConfigError("--case", "", f"there is no case `{name}`; did you mean {near[0]}?")
     settings = resuming.settings(chosen, seeds, variant, device_name(variant))
     done: dict[str, list[GradcheckRecord]] = {}
+    to_do = list(names or CASES)
     if resumed is not None:
         earlier = Earlier(resuming.KIND, resumed, *read_earlier(resumed))
         earlier.check(settings)
         done = resuming.restore(earlier)
-    to_do = [name for name in names or CASES if name not in done]
-    if not to_do:
-        raise ConfigError("--resume", "", f"{resumed} has all these cases already; name others with --case")
+        to_do = [name for name in to_do if name not in done]
+        if not to_do:
+            raise earlier.complete("all these cases", "others with --case")
     echo(f"{device_name(variant)}, {variant}")
     for case, rows in done.items():
         echo(_case_line(case, rows))

@@ -64,6 +64,10 @@ class Earlier:
         """What is raised where it cannot be gone on from."""
         return ConfigError("--resume", "", f"{self.source} is of another measurement: {reason}")
 
+    def complete(self, what: str, advice: str) -> ConfigError:
+        """What is raised where it has `what` is asked for; `advice` says how to ask for more."""
+        return ConfigError("--resume", "", f"{self.source} has {what} already; name {advice}")
+
 
 def head(kind: str, settings: Mapping[str, Any], **content: Any) -> dict[str, Any]:
     """The head of what is kept."""

@@ -68,8 +68,7 @@ class MissingCheck:
         if earlier is not None and count is not None and len(self._found) == len(self.case.keys):
             least = min(found.count for found in self._found.values())
             if least >= count:
-                reason = f"{earlier.source} has {least} seeds already; name more with --seeds"
-                raise ConfigError("--resume", "", reason)
+                raise earlier.complete(f"{least} seeds", "more with --seeds")
 
     def conditions(self) -> str:
         """What is measured, in one line."""

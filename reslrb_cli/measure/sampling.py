@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 
-from reslrb_cli.errors import ConfigError
 from reslrb_cli.measure.differences import Direction
 from reslrb_cli.measure.earlier import Earlier
 from reslrb_cli.measure.gradcheck_resuming import Name, kept, restore, restore_steps
@@ -68,8 +67,7 @@ class Sampling:
         self._to_do = list(self._expected)
         counts = [self._before.get(name, 0) for name in self._to_do]
         if self._earlier is not None and counts and min(counts) >= (self.settings.seeds or math.inf):
-            reason = f"{self._earlier.source} has {min(counts)} seeds already; name more with --seeds"
-            raise ConfigError("--resume", "", reason)
+            raise self._earlier.complete(f"{min(counts)} seeds", "more with --seeds")
 
     def kept(self, settings: dict[str, Any]) -> Kept | None:
         """What a later session, of the same `settings`, needs to go on; None where nothing has been sampled."""

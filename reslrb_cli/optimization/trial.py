@@ -61,7 +61,7 @@ def measure_steps(problem: Problem) -> Steps:
 def _peak(problem: Problem, spp: int) -> int:
     """Bytes that two iterations of `spp` samples per pixel take: the second is one that was recorded."""
     with closing(_iterations(problem, spp)) as iterations:
-        return _bytes(list(islice(iterations, 2)))
+        return _highest(list(islice(iterations, 2)))
 
 
 def _iterations(problem: Problem, spp: int) -> Generator[Record, None, None]:
@@ -75,7 +75,7 @@ def _iterations(problem: Problem, spp: int) -> Generator[Record, None, None]:
         problem.config = config
 
 
-def _bytes(records: Sequence[Record]) -> int:
+def _highest(records: Sequence[Record]) -> int:
     return int(records[-1].peak_mib * MIB)
 
 
@@ -95,4 +95,4 @@ def _measure(problem: Problem, spp: int) -> Steps:
     steady = statistics.median(times[WARM_UP:])
     extra = sum(max(seconds - steady, 0.0) for seconds in times[:WARM_UP])
     compiled = min(sum(record.codegen_ms for record in records[:WARM_UP]) / 1e3, extra)
-    return Steps(spp, steady, extra - compiled, compiled, _bytes(records))
+    return Steps(spp, steady, extra - compiled, compiled, _highest(records))

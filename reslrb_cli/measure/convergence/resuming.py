@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 
 from reslrb_cli.config import dump
-from reslrb_cli.errors import ConfigError
 from reslrb_cli.measure import earlier
 from reslrb_cli.measure.convergence.members import Member
 from reslrb_cli.measure.convergence.plan import Plan
@@ -40,7 +39,7 @@ def check(plan: Plan, before: Earlier, device: str = "") -> None:
     before.check(settings(plan, device))
     if plan.rounds is not None and before.head["rounds"] >= plan.rounds:
         rounds = before.head["rounds"]
-        raise ConfigError("--resume", "", f"{before.source} has {rounds} rounds already; name more with --rounds")
+        raise before.complete(f"{rounds} rounds", "more with --rounds")
 
 
 def restore_facts(before: Earlier, arrays_file: Path) -> dict[str, Any]:

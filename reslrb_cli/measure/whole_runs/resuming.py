@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 
-from reslrb_cli.errors import ConfigError
 from reslrb_cli.measure import earlier
 from reslrb_cli.measure.earlier import Earlier
 from reslrb_cli.measure.processes import Ended, Refused
@@ -43,7 +42,7 @@ def check(plan: RunsPlan, before: Earlier, device: str = "") -> None:
     done = before.head["seeds"]
     if done >= plan.runs:
         word = "run" if done == 1 else "runs"
-        raise ConfigError("--resume", "", f"{before.source} has {done} {word} of each already; name more with --runs")
+        raise before.complete(f"{done} {word} of each", "more with --runs")
 
 
 def kept(
