@@ -42,6 +42,28 @@ def test_one_thread_reads_and_writes_images(tmp_path: Path) -> None:
     assert (done.returncode, done.stdout) == (0, "True 1\n"), done.stderr
 
 
+ONE_CORE = """
+import os, sys
+os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
+from reslrb_cli.backend.variant import set_variant
+set_variant("llvm_ad_rgb")
+import mitsuba as mi, numpy as np
+file = sys.argv[1] + "/image.exr"
+mi.Bitmap(np.ones((8, 8, 3), np.float32)).write(file)
+print(np.array(mi.Bitmap(file)).sum())
+"""
+
+
+@pytest.mark.usefixtures("llvm")
+@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="needs to choose the cores of a process")
+def test_a_machine_of_one_core_reads_and_writes_images(tmp_path: Path) -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", ONE_CORE, str(tmp_path)], capture_output=True, text=True, check=False, timeout=60,
+        env={"PYTHONPATH": search_path(ROOT), "HOME": str(tmp_path)},
+    )  # fmt: skip
+    assert (done.returncode, done.stdout) == (0, "192.0\n"), done.stderr
+
+
 def test_tests_have_one(llvm: str, pytestconfig: pytest.Config) -> None:
     import drjit as dr
 

@@ -34,6 +34,7 @@ def set_variant(name: str = "auto") -> str:
         mi.set_variant(chosen)
     except (ImportError, AttributeError, RuntimeError) as error:
         raise BackendError(f"variant {chosen} does not start: {error}") from error
+    _have_two_threads(dr)
     prefer_own_plugins()
     logger.info("variant %s%s%s", chosen, f" (libLLVM {library.version})" if library else "", why)
     return chosen
@@ -76,6 +77,16 @@ def package_version(name: str) -> str | None:
         return metadata.version(name)
     except metadata.PackageNotFoundError:
         return None
+
+
+def _have_two_threads(dr: object) -> None:
+    """Gives Dr.Jit two threads where the process has one core.
+
+    It would have one, and with one Mitsuba 3.9 never comes to the end of reading or writing an EXR file.
+    """
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    if cores == 1 and dr.thread_count() == 1:  # type: ignore[attr-defined]
+        dr.set_thread_count(2)  # type: ignore[attr-defined]
 
 
 def _check_loaded_llvm(dr: object) -> None:
