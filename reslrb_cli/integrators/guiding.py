@@ -88,6 +88,11 @@ def _blurred(grid: Grid, values: Array) -> Array:
     return result.ravel()
 
 
+def sensor_bytes(grid: Grid) -> int:
+    """Bytes for one sensor: a table for each purpose, and what has been learned."""
+    return 4 * (len(Purpose) * (grid.slots + grid.cells) + (MOST_VOICES + 1) * grid.cells)
+
+
 class Guiding:
     """Grid and tables of one scene, as a light tracer keeps them.
 
@@ -141,9 +146,8 @@ class Guiding:
 
     @property
     def _each(self) -> int:
-        """Bytes for one sensor: a table for each purpose, and what has been learned."""
         assert self.grid is not None
-        return 4 * (len(Purpose) * (self.grid.slots + self.grid.cells) + (MOST_VOICES + 1) * self.grid.cells)
+        return sensor_bytes(self.grid)
 
     def bytes(self, sensors: int) -> int:
         """What the tables for so many sensors take."""
