@@ -10,22 +10,26 @@ import logging
 from pathlib import Path
 from typing import Any
 
+import drjit as dr
 import numpy as np
 import pytest
 from cli import tiny
 from recording.going_on import differences, left_over, optimize, run_and_kill, work_alone, write_experiment
+from turns import a_few
 
+from reslrb_cli.cli import main
 from reslrb_cli.config import load
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.integrators.guiding import Purpose
-from reslrb_cli.integrators.plan_report import count
 from reslrb_cli.measure.cases import parse_cases
-from reslrb_cli.optimization import guiding_choice
+from reslrb_cli.optimization import guiding_choice, loop
 from reslrb_cli.optimization import problem as problem_module
 from reslrb_cli.optimization.guiding_choice import StepTrial, table_bytes
 from reslrb_cli.optimization.guiding_pilot import Taken
 from reslrb_cli.optimization.problem import Problem, assemble
+from reslrb_cli.recording import run as recording
 from reslrb_cli.records.checkpoint import FILE_NAME, open_state
+from reslrb_cli.records.clock import StepClock
 from reslrb_cli.records.manifest import read_manifest
 from reslrb_cli.records.pilot_cache import PilotCache
 
@@ -64,7 +68,7 @@ def decided(monkeypatch: pytest.MonkeyPatch, guided_ms: float, *settings: str, *
     return assemble(load("tiny.yaml", [*AUTO, *settings]), **options)
 
 
-@pytest.mark.parametrize("adjoint", ["batched", "correlated", "independent"])
+@pytest.mark.parametrize("adjoint", a_few(["batched", "correlated", "independent"], ["batched"]))
 def test_on_is_guided_and_off_has_nothing_of_it(
     adjoint: str, experiment: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -83,16 +87,22 @@ def test_on_is_guided_and_off_has_nothing_of_it(
     assert off.guided.high is not None
     assert off.guided.high < 1
     assert off.integrator.preparation.guiding is None
+    assert not any(np.any(np.array(off.optimizer.gradient(key))) for key in off.selection.keys)
     counts = [operations(problem) for problem in (off, plain, on)]
+    print(counts)
     assert counts[0] == counts[1]
     assert counts[2] != counts[1]
-    assert not any(np.any(np.array(off.optimizer.gradient(key))) for key in off.selection.keys)
 
 
 def operations(problem: Problem) -> list[int]:
-    sensor = problem.scene.sensors()[0]
-    plan = problem.integrator.plan(problem.scene, sensor, problem.selection.params)
-    return count(problem.integrator, plan, problem.scene, sensor, problem.config.adjoint == "batched")
+    """Those of the kernels of a step of the run, after a first one."""
+    clock = StepClock()
+    for iteration in range(2):
+        with clock.step():
+            loss, squares, *_ = loop.gradient(problem, iteration, loop.Split())
+            dr.eval(loss, squares)
+        problem.apply()
+    return [kernel["operation_count"] for kernel in clock.history if kernel["type"] == dr.KernelType.JIT]
 
 
 def test_images_that_guiding_does_not_pay_for_are_not_guided(experiment: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -186,9 +196,26 @@ def test_a_run_says_so_once_remembers_it_and_writes_it_down(
     archive.close()
     assert values["guided"] == found
     assert values["guiding"]["0"] > 0
-    assert optimize("tiny.yaml", *sets, "--force") == 0
-    assert "as an earlier run measured" in capsys.readouterr().err
-    assert read_manifest(RUN)["guided"] == {**found, "cached": True}
+    told: list[str] = []
+    again = assemble(load("tiny.yaml", AUTO), told.append, PilotCache())
+    assert told[-1].endswith("(as an earlier run measured)")
+    assert again.guided is not None
+    assert again.guided.to_json() == {**found, "cached": True}
+    row = next(line for line in inspected(capsys, str(RUN)) if "guided emission" in line)
+    assert row.split()[0] == "needed"
+    assert "65536 cells, 9." in row
+    assert f"guiding: auto, {found['gain']:.2g} times the efficiency here (" in row
+    row = next(line for line in inspected(capsys, "tiny.yaml", "--set", AUTO[0]) if "guided emission" in line)
+    assert row.startswith("  left out")
+    assert row.endswith("guiding: auto, which a run decides by measurement")
+
+
+def inspected(capsys: pytest.CaptureFixture[str], *words: str) -> list[str]:
+    capsys.readouterr()
+    with pytest.raises(SystemExit) as end:
+        main.main(["inspect", *words, "--no-counts"])
+    assert end.value.code == 0
+    return capsys.readouterr().out.splitlines()
 
 
 def test_it_goes_on_as_it_was_decided_bit_by_bit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -196,9 +223,11 @@ def test_it_goes_on_as_it_was_decided_bit_by_bit(tmp_path: Path, monkeypatch: py
     work_alone(monkeypatch)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("RESLRB_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setattr(recording, "write_report", lambda folder, *now: (folder / "report.html").write_text("<html>"))
+    monkeypatch.setattr(recording, "seen_errors", lambda folder, results: {})
     take_times(monkeypatch, 0.2)
-    settings = [*AUTO[:3], "run.iterations=12", "run.checkpoint_every={iterations: 4}", "run.certainty=false"]
-    whole, left = run_and_kill(monkeypatch, 10, *(word for text in settings for word in ("--set", text)))
+    settings = [*AUTO[:3], "run.iterations=8", "run.checkpoint_every={iterations: 3}", "run.certainty=false"]
+    whole, left = run_and_kill(monkeypatch, 7, *(word for text in settings for word in ("--set", text)))
     monkeypatch.setattr(problem_module, "settle_guiding", lambda *args: pytest.fail("measured again"))
     (tmp_path / "cache" / "pilot.json").unlink()
     assert optimize("--resume", str(left), "--quiet") == 0
