@@ -21,14 +21,22 @@ from reslrb_cli.optimization.pilot_records import Gradients, square
 Array = np.ndarray[Any, Any]
 
 CONFIDENCE = 0.95
+#: What is left of a sum where nothing should be, as a share of it.
+ROUNDING = 1e-12
+#: A gain and the ends of its interval; nothing where it cannot be told.
+Gain = tuple[float, float, float] | tuple[None, None, None]
 
 
 def compare(
-    own: Sequence[Gradients], own_ms: Sequence[float], other: Sequence[Gradients], other_ms: Sequence[float]
-) -> tuple[float, float, float] | tuple[None, None, None]:
+    own: Sequence[Gradients],
+    own_ms: Sequence[float],
+    other: Sequence[Gradients],
+    other_ms: Sequence[float],
+    confidence: float = CONFIDENCE,
+) -> Gain:
     """The efficiency of the other over that of the own, and its interval; nothing where one has no noise.
 
-    Gradients are those of each step by parameter (two steps or more), times those of steps in any unit.
+    Gradients are those of each step by parameter (three steps or more), times those of steps in any unit.
     """
     scales = {key: float(np.mean([square(g[key]) for g in (*own, *other)])) for key in own[0]}
     scales = {key: scale for key, scale in scales.items() if scale > 0}
@@ -45,7 +53,7 @@ def compare(
 
     times = statistics.median(own_ms) / max(statistics.median(other_ms), 1e-6)
     advantage = math.exp(logs[0] - logs[1]) * times
-    quantile = float(stdtrit(min(len(own), len(other)) - 1, (1 + CONFIDENCE) / 2))
+    quantile = float(stdtrit(min(len(own), len(other)) - 1, (1 + confidence) / 2))
     half = quantile * math.sqrt(variance)
     factor = math.exp(min(half, 50.0)) * TIMING_NOISE
     return advantage, advantage / factor, advantage * factor
@@ -57,8 +65,11 @@ def _log_variances(gradients: Sequence[Gradients], scales: dict[str, float]) -> 
         np.concatenate([g[key].astype(np.float64) / math.sqrt(scale) for key, scale in scales.items()])
         for g in gradients
     ])  # fmt: skip
-    whole = float(rows.var(axis=0, ddof=1).sum()) if rows.size else 0.0
-    without = [float(np.delete(rows, number, axis=0).var(axis=0, ddof=1).sum()) for number in range(len(rows))]
-    if not min(whole, *without) > 0:
+    count = len(rows)
+    squares = np.square(rows - rows.mean(axis=0)).sum(axis=1) if rows.size else np.zeros(count)
+    whole = float(squares.sum())
+    # What a row takes with it is its own distance, and that of the mean of the others from that of all.
+    without = whole - squares * count / (count - 1)
+    if not without.min() > ROUNDING * whole:
         return None
-    return math.log(whole), np.log(without)
+    return math.log(whole / (count - 1)), np.log(without / (count - 2))

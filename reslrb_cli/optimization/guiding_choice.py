@@ -17,6 +17,7 @@ from reslrb_cli.integrators.guiding import Purpose
 from reslrb_cli.integrators.interface import Job
 from reslrb_cli.optimization.choice import Cache, Say, situation
 from reslrb_cli.optimization.guiding_pilot import GuidingPilot, Sizes, Taken
+from reslrb_cli.optimization.pilot import SHARE as PILOT_SHARE
 from reslrb_cli.optimization.samples import take_gradient
 from reslrb_cli.optimization.views import View, slope, to_tensor
 from reslrb_cli.records.clock import StepClock, StepTimes
@@ -86,7 +87,9 @@ def _record(problem: Problem, say: Say, cache: Cache | None) -> GuidedRecord:
             pass  # nothing there, or nothing that this version wrote
     say("guiding auto: measuring")
     trial = StepTrial(problem)
-    record = GuidingPilot(trial, sizes(problem), len(problem.drawn(0)) / len(trial.views)).run()
+    views = len(problem.drawn(0)) / len(trial.views)
+    share = PILOT_SHARE - (0.0 if problem.pilot is None else problem.pilot.share)
+    record = GuidingPilot(trial, sizes(problem), views, share).run()
     if cache is not None:
         cache.put(key, record.to_json())
     return record

@@ -15,15 +15,21 @@ from dataclasses import dataclass, field
 from typing import Protocol
 
 from reslrb_cli.integrators.guiding import EVERY
-from reslrb_cli.optimization.gains import compare
+from reslrb_cli.optimization.gains import CONFIDENCE, Gain, compare
 from reslrb_cli.optimization.pilot_records import ITERATIONS, Gradients
 from reslrb_cli.records.guided import LEAST_IMAGE, GuidedRecord
 
-#: Share of a run of ITERATIONS that this may cost, compilation apart.
+#: Share of a run of ITERATIONS that this is planned for, compilation apart; where it is not clear by then, it may take
+#: what a pilot has left of its own.
 SHARE = 0.025
-#: Rounds at the most, of gradients of many entries, and of few, which tell less each; fewer than LEAST say nothing.
-MOST_ROUNDS, MOST_OF_FEW, LEAST_ROUNDS = 8, 16, 4
+#: Rounds that are planned for, of gradients of many entries, and of few, which tell less each; fewer than LEAST say
+#: nothing. After each so many it is asked whether it is clear, so many times at the most.
+ROUNDS, ROUNDS_OF_FEW, LEAST_ROUNDS = 8, 16, 4
 FEW_ENTRIES = 64
+LOOKS = 3
+#: What is on before the last of these looks has to be surer than it would have to be at the end: looking again and
+#: again must not make what is worth nothing pass.
+CLEAR = 0.99
 #: Walks that a table learns from before it is tried, and the samples of each, as a share of a step's.
 LEARNINGS, LEARNING_SHARE = 2, 0.4
 #: Steps' worth of time that the rounds are planned for; a guided step may take three times as long as another.
@@ -43,8 +49,8 @@ class Sizes:
 
     @property
     def rounds(self) -> int:
-        """How many rounds are wanted."""
-        return MOST_OF_FEW if self.entries < FEW_ENTRIES else MOST_ROUNDS
+        """How many rounds are planned for."""
+        return ROUNDS_OF_FEW if self.entries < FEW_ENTRIES else ROUNDS
 
     @property
     def trial(self) -> int:
@@ -88,11 +94,11 @@ class Trial(Protocol):
 
 
 class GuidingPilot:
-    """One decision. `iterations_per_step`: of one step here, with all its views, how much an iteration is."""
+    """One decision. `views` is how many times the views of an iteration are those of a step here, `share` what of
+    ITERATIONS this may cost."""
 
-    def __init__(self, trial: Trial, sizes: Sizes, views: float = 1.0) -> None:
-        """`views`: how many times the views of an iteration are those of a step here."""
-        self._trial, self._sizes, self._views = trial, sizes, views
+    def __init__(self, trial: Trial, sizes: Sizes, views: float = 1.0, share: float = SHARE) -> None:
+        self._trial, self._sizes, self._views, self._share = trial, sizes, views, share
         self._spent_ms = self._compile_ms = self._iteration_ms = 0.0
         self._steps: dict[bool, list[Taken]] = {False: [], True: []}
         self._walk = Taken()
@@ -107,15 +113,17 @@ class GuidingPilot:
         walk = self._first(self._trial.learn(0, self._sizes.learning))  # an estimate: it compiled
         self._spent_ms += walk.kernel_ms
         if not self._affords((LEARNINGS - 1) * walk.wall_ms + LEAST_ROUNDS * (1 + LONGER) * plain.wall_ms):
-            return self._off(f"to measure it would cost more than {100 * SHARE:.1f} % of {ITERATIONS} iterations")
+            return self._off(f"to measure it would cost more than {100 * self._share:.2g} % of {ITERATIONS} iterations")
         for number in range(1, LEARNINGS):
             self._walk = self._spend(self._trial.learn(number, self._sizes.learning))
         self._first(self._trial.take(True, 0, spp))
-        for round in range(1, 1 + self._sizes.rounds):
+        for round in range(1, 1 + LOOKS * self._sizes.rounds):
             both = [self._spend(self._trial.take(guided, round, spp)) for guided in (False, True)]
             for guided, step in zip((False, True), both, strict=True):
                 self._steps[guided].append(step)
             if not self._affords(sum(step.wall_ms for step in both)):
+                break
+            if round % self._sizes.rounds == 0 and self._is_clear():
                 break
         return self._decided()
 
@@ -132,7 +140,7 @@ class GuidingPilot:
         return taken
 
     def _affords(self, more_ms: float) -> bool:
-        return self._spent_ms + more_ms <= SHARE * ITERATIONS * self._iteration_ms
+        return self._spent_ms + more_ms <= self._share * ITERATIONS * self._iteration_ms
 
     # --- judgement ----------------------------------------------------------------------------------------------------
 
@@ -142,33 +150,47 @@ class GuidingPilot:
         kernel = self._walk.kernel_ms * sizes.part / sizes.learning
         return (kernel + self._walk.beside_ms) / EVERY * sizes.trial / sizes.call
 
-    def _decided(self) -> GuidedRecord:
+    def _gain(self, images: bool, confidence: float = CONFIDENCE) -> Gain:
+        """Of the gradient, as part of steps whose images, where they have samples of their own, are guided or not."""
         plain, guided = self._steps[False], self._steps[True]
-        if len(plain) < LEAST_ROUNDS:
-            return self._off(f"{len(plain)} steps of both are too few to tell")
-        images = [[step.images for step in steps] for steps in (plain, guided)]
-        learning = self._learning_ms()
+        beside = 0.0, self._learning_ms()
         if self._sizes.alone:
-            picture = compare(images[0], [s.image_ms for s in plain], images[1], [s.image_ms for s in guided])
-            with_images = picture[1] is not None and picture[1] > 1
-            own = statistics.median(s.image_ms for s in (guided if with_images else plain))
-            beside = statistics.median(s.image_ms for s in plain), own + learning
-        else:
-            beside = 0.0, learning
+            own = [statistics.median(step.image_ms for step in steps) for steps in (plain, guided)]
+            beside = own[0], own[images] + beside[1]
         times = [[s.kernel_ms + more for s in steps] for steps, more in zip((plain, guided), beside, strict=True)]
-        gain, low, high = compare(
-            [step.gradients for step in plain], times[0], [step.gradients for step in guided], times[1]
-        )
-        if gain is None or low is None:
+        gradients = [[step.gradients for step in steps] for steps in (plain, guided)]
+        return compare(gradients[0], times[0], gradients[1], times[1], confidence)
+
+    def _image_gain(self) -> Gain:
+        """Of the image: of samples of its own, where it has them, else of those that serve the gradient too."""
+        plain, guided = self._steps[False], self._steps[True]
+        images = [[step.images for step in steps] for steps in (plain, guided)]
+        times = [[s.image_ms if self._sizes.alone else s.kernel_ms for s in steps] for steps in (plain, guided)]
+        learning = 0.0 if self._sizes.alone else self._learning_ms()  # it counts once
+        return compare(images[0], times[0], images[1], [ms + learning for ms in times[1]])
+
+    def _is_clear(self) -> bool:
+        """Whether no more steps are needed: it is not on by accident, or off at all events."""
+        _, low, high = self._gain(self._sizes.alone and self._images(self._image_gain()), CLEAR)
+        return low is None or high is None or low > 1 or high < 1
+
+    def _images(self, gain: Gain) -> bool:
+        """Whether images that have samples of their own are to be guided."""
+        return gain[1] is not None and gain[1] > 1
+
+    def _decided(self) -> GuidedRecord:
+        if len(self._steps[False]) < LEAST_ROUNDS:
+            return self._off(f"{len(self._steps[False])} steps of both are too few to tell")
+        picture = self._image_gain()
+        images = self._images(picture) if self._sizes.alone else picture[0] is None or picture[0] >= LEAST_IMAGE
+        gain = self._gain(images)
+        if gain[1] is None:
             return self._off("gradients have no noise")
         note = ""
-        if not self._sizes.alone:
-            picture = compare(images[0], times[0], images[1], times[1])
-            with_images = picture[0] is None or picture[0] >= LEAST_IMAGE
-            if low > 1 and not with_images:
-                note = f"the image, of the same samples, has {picture[0]:.2g} times the efficiency"
-        on = low > 1 and not note
-        return self._record(on, on and with_images, (gain, low, high), picture, note)
+        if gain[1] > 1 and not (images or self._sizes.alone):
+            note = f"the image, of the same samples, has {picture[0]:.2g} times the efficiency"
+        on = gain[1] > 1 and not note
+        return self._record(on, on and images, gain, picture, note)
 
     def _off(self, note: str) -> GuidedRecord:
         return self._record(False, False, (None, None, None), (None, None, None), note)
@@ -177,12 +199,19 @@ class GuidingPilot:
         self,
         guided: bool,
         images: bool,
-        gain: tuple[float | None, float | None, float | None],
-        picture: tuple[float | None, float | None, float | None],
+        gain: Gain,
+        picture: Gain,
         note: str,
     ) -> GuidedRecord:
         return GuidedRecord(
-            guided, images, *gain, *picture, rounds=len(self._steps[True]), spp=self._sizes.trial,
-            measure_s=self._spent_ms / 1e3, compile_s=self._compile_ms / 1e3,
-            share=self._spent_ms / (ITERATIONS * self._iteration_ms), note=note,
-        )  # fmt: skip
+            guided,
+            images,
+            *gain,
+            *picture,
+            len(self._steps[True]),
+            self._sizes.trial,
+            self._spent_ms / 1e3,
+            self._compile_ms / 1e3,
+            self._spent_ms / (ITERATIONS * self._iteration_ms),
+            note,
+        )

@@ -10,7 +10,7 @@ import pytest
 
 from reslrb_cli.integrators.guiding import EVERY
 from reslrb_cli.optimization import guiding_pilot
-from reslrb_cli.optimization.guiding_pilot import LEARNINGS, LEAST_ROUNDS, SHARE, GuidingPilot, Sizes, Taken
+from reslrb_cli.optimization.guiding_pilot import LEARNINGS, LEAST_ROUNDS, LOOKS, SHARE, GuidingPilot, Sizes, Taken
 from reslrb_cli.optimization.pilot import TIMING_NOISE
 from reslrb_cli.optimization.pilot_records import ITERATIONS
 from reslrb_cli.records.guided import GuidedRecord
@@ -59,8 +59,8 @@ class World:
         noise = (random.poisson(4, self.entries) - 4) / 2 if self.sparse else random.normal(size=self.entries)
         return 1 + np.sqrt(variance) * noise
 
-    def run(self, sizes: Sizes = SIZES) -> GuidedRecord:
-        return GuidingPilot(self, replace(sizes, entries=self.entries, alone=self.alone)).run()
+    def run(self, sizes: Sizes = SIZES, share: float = 2 * SHARE) -> GuidedRecord:
+        return GuidingPilot(self, replace(sizes, entries=self.entries, alone=self.alone), 1.0, share).run()
 
 
 def gain(world: World, sizes: Sizes = SIZES) -> float:
@@ -110,22 +110,23 @@ def test_the_interval_holds_the_gain_as_often_as_it_says(entries: int, sparse: b
 
 
 def on_by_accident(**world: Any) -> int:
-    """Of 200 worlds, in how many it is on."""
-    return sum(World(**world, seed=seed).run().guided for seed in range(200))
+    """Of 100 worlds, in how many it is on."""
+    return sum(World(**world, seed=seed).run().guided for seed in range(100))
 
 
 def test_where_it_does_not_pay_it_is_hardly_ever_on() -> None:
     # What it gains, learning costs again: 0.8 * (1 + 0.1 + 0.15).
     world = {"variance": 0.8, "walk": 0.7, "python": 16.8}
     assert gain(World(**world)) == pytest.approx(1)
-    assert on_by_accident(**world) <= 13  # 5 are expected on this side, were times not allowed to be off
-    assert on_by_accident(**world, entries=3) <= 13
+    # 2.5 are expected on this side, were times not allowed to be off, and one more for the looks before the last.
+    assert on_by_accident(**world) <= 9
+    assert on_by_accident(**world, entries=3) <= 9
 
 
 def test_a_fault_that_forgets_what_learning_costs_is_seen(monkeypatch: pytest.MonkeyPatch) -> None:
     """As it is seen by the tests above: the same worlds are called better then."""
     monkeypatch.setattr(GuidingPilot, "_learning_ms", lambda self: 0.0)
-    assert on_by_accident(variance=0.8, walk=0.7, python=16.8) > 100
+    assert on_by_accident(variance=0.8, walk=0.7, python=16.8) > 50
 
 
 @pytest.mark.parametrize("spp", [1, 4, 16, 64, 1024])
@@ -133,7 +134,7 @@ def test_a_fault_that_forgets_what_learning_costs_is_seen(monkeypatch: pytest.Mo
 @pytest.mark.parametrize("time", [1.0, 3.0, 10.0])
 def test_its_share_is_kept(spp: int, overhead: float, python: float, time: float) -> None:
     world = World(0.1, time, overhead=overhead, python=python, walk=1.5)
-    record = world.run(Sizes(spp, spp, spp, False, 200))
+    record = world.run(Sizes(spp, spp, spp, False, 200), SHARE)
     taken = [call for call in world.calls if call[0] is not False]
     assert all(call[2] <= spp for call in world.calls)
     if record.gain is None:
@@ -170,6 +171,15 @@ def test_images_with_samples_of_their_own_are_guided_where_that_pays() -> None:
         own = image_time if guided else 1.0
         learning = (16 + 1) / EVERY / 16
         assert record.gain == pytest.approx((1 + 1) / (0.05 * (2 + own + learning)), rel=0.2)
+
+
+def test_what_is_not_clear_is_looked_at_longer() -> None:
+    """What is, is not; and nothing is beyond its share."""
+    assert World(0.1, 2.2).run().rounds == SIZES.rounds
+    assert World(3.0, 1.0).run().rounds == SIZES.rounds
+    close = World(0.8, 1.0, walk=0.1)
+    assert close.run().rounds == LOOKS * SIZES.rounds
+    assert close.run(share=0.3 * SHARE).rounds < SIZES.rounds
 
 
 def test_no_noise_is_no_gain() -> None:
