@@ -67,10 +67,12 @@ class Case:
         if self.type != "reslrb":
             return None
         name = str(self.options.get("estimator", PLUGIN_ESTIMATOR))
+        usual = {option: Reslrb.model_fields[option].default for option in _ESTIMATOR_OPTIONS}
+        usual["guiding"] = "auto" if name == "auto" else "off"
         other = [
             f"{option}={value}"
             for option, value in self.options.items()
-            if option in ADJOINT or (option in _ESTIMATOR_OPTIONS and value != Reslrb.model_fields[option].default)
+            if option in ADJOINT or (option in usual and value != usual[option])
         ]
         return f"{name}({','.join(other)})" if other else name
 
