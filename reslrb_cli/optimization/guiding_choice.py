@@ -88,7 +88,7 @@ def _record(problem: Problem, say: Say, cache: Cache | None) -> GuidedRecord:
     say("guiding auto: measuring")
     trial = StepTrial(problem)
     views = len(problem.drawn(0)) / len(trial.views)
-    share = PILOT_SHARE - (0.0 if problem.pilot is None else problem.pilot.share)
+    share = max(PILOT_SHARE - (0.0 if problem.pilot is None else problem.pilot.share), 0.0)
     record = GuidingPilot(trial, sizes(problem), views, share).run()
     if cache is not None:
         cache.put(key, record.to_json())
