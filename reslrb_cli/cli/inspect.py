@@ -93,7 +93,7 @@ def command(
     scene = load_configured(config)
     summary = summarise(scene, config.integrator.hide_emitters)
     selection = None if "parameters" in subject.missing else select(config, scene)
-    plan = None if selection is None else make_plan_report(config, scene, selection, counts=not no_counts)
+    plan = None if selection is None else make_plan_report(subject, scene, selection, counts=not no_counts)
     edges = [] if selection is None or isinstance(selection, str) else edges_of(scene, selection)
     measured = measure(subject, overrides, samples or SAMPLES) if conditioning else None
     if as_json:
@@ -194,12 +194,14 @@ def edges_of(scene: Any, selection: Selection) -> list[str]:
     return [item.id for item in moved if casts_edges(scene, item)]
 
 
-def make_plan_report(config: Config, scene: Any, selection: Selection | str, counts: bool) -> PlanReport | str:
+def make_plan_report(subject: Subject, scene: Any, selection: Selection | str, counts: bool) -> PlanReport | str:
     """The plan of a step for the first sensor that is used, or why there is none."""
     from reslrb_cli.integrators import Reslrb
-    from reslrb_cli.integrators.plan_report import report_plan
+    from reslrb_cli.integrators.features import GUIDED
+    from reslrb_cli.integrators.plan_report import report_plan, with_reason
     from reslrb_cli.optimization.loading import choose_sensors
 
+    config = subject.config
     if isinstance(selection, str):
         return selection
     if config.integrator.type != "reslrb":
@@ -207,11 +209,27 @@ def make_plan_report(config: Config, scene: Any, selection: Selection | str, cou
     options = config.integrator.options()
     if options.get("estimator") == "auto":
         options["estimator"] = "stack"  # `auto` is chosen by a run
+    options["guiding"], why = guiding_of(subject)
     known = config.adjoint == "batched" or options.get("weight") == "adjoint"
     try:
         [sensor, *_] = choose_sensors(config, scene)
         integrator = Reslrb.of(**options)
         params, keys = selection.params, selection.scene_keys
-        return report_plan(integrator, scene, scene.sensors()[sensor], params, keys, known=known, counts=counts)
+        report = report_plan(integrator, scene, scene.sensors()[sensor], params, keys, known=known, counts=counts)
     except (ConfigError, UnsupportedScene) as error:
         return str(error)
+    return dataclasses.replace(report, rows=with_reason(report.rows, GUIDED, why)) if why else report
+
+
+def guiding_of(subject: Subject) -> tuple[str, str]:
+    """`integrator.guiding`, on or off, and why, where that was or is left to a run (else empty)."""
+    from reslrb_cli.records.guided import GuidedRecord
+
+    guiding = str(subject.config.integrator.options()["guiding"])
+    if guiding != "auto":
+        return guiding, ""
+    try:
+        record = GuidedRecord.from_json(dict((subject.run or {}).get("guided") or {}))
+    except (TypeError, ValueError):  # there is no run yet, or its manifest is damaged
+        return "off", "guiding: auto, which a run decides by measurement"
+    return "on" if record.guided else "off", f"guiding: auto, {record.why()}"

@@ -43,7 +43,9 @@ def load_replay(config: Config) -> Replay:
     saved = load_nonfinite(folder.checkpoint)
     if saved is None:
         raise ConfigError(config.source, OPTION, "this run met no value that was not finite")
-    if config.integrator.options().get("guiding") == "on":
+    decided = manifest.get("guided")
+    guided = isinstance(decided, dict) and decided.get("guided") is True
+    if config.integrator.options().get("guiding") == ("auto" if guided else "on"):
         reason = "where the paths of a guided step started is not kept; run again with off, then look"
         raise ConfigError(config.source, "integrator.guiding", reason)
     iteration, values = saved

@@ -151,18 +151,27 @@ class Reslrb(AttachingTracer):
         description="Vertices of a path that fit into thread-local memory; longer paths are traced a second time. "
         "Only with estimator `stack`.",
     )
-    guiding: Literal["on", "off"] = Field(
-        default="off",
+    guiding: Literal["auto", "on", "off"] = Field(
+        default="auto",
         description="Whether light paths start where those of earlier steps had something to say about gradient and "
         "image, at least a quarter of them anywhere. `on`: less noise where few paths say anything (a room lit "
         "through windows, a caustic), from the second step on; the first, and one in seven of those that follow, "
-        "trace as many paths again to learn where that is.",
+        "trace as many paths again to learn where that is. `auto`: where a few steps with and without it, before the "
+        "first iteration, show that it pays here. Left out it is `auto` with estimator `auto`, and `off` with one that "
+        "is named.",
     )
     freeze: bool = Field(
         default=True,
         description="Record what a step launches and launch that again, so that its Python runs once, not in every "
         "iteration. Not with passes, nor with more than 4 million paths, beside which Python does not show.",
     )
+
+    @model_validator(mode="after")
+    def _leave_unguided(self) -> Self:
+        """Whoever names an estimator, and nothing else, has nothing measured."""
+        if self.estimator != "auto" and "guiding" not in self.model_fields_set:
+            self.__dict__["guiding"] = "off"  # not by assignment, which would count it among those that were given
+        return self
 
     @model_validator(mode="after")
     def _check_options(self) -> Self:
@@ -185,9 +194,13 @@ class Reslrb(AttachingTracer):
         return {name: value for name, value in values.items() if name not in self._foreign()}
 
     def chosen(self, **options: Any) -> Reslrb:
-        """The same with an `estimator` and its options in place of those it has."""
+        """The same with an `estimator` and its options in place of those it has; unguided where that is undecided."""
         kept = {name: getattr(self, name) for name in self.model_fields_set if name not in _ANY_ESTIMATORS}
-        return Reslrb(**{**kept, **options})
+        return Reslrb(**{**kept, **options}).undecided_off()
+
+    def undecided_off(self) -> Reslrb:
+        """The same, unguided where it is left to measurement whether it is to be."""
+        return self.model_copy(update={"guiding": "off"}) if self.guiding == "auto" else self
 
     def _foreign(self) -> set[str]:
         """The options of the other estimators."""

@@ -7,9 +7,12 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
+from reslrb_cli.integrators.guiding import sensor_bytes
 from reslrb_cli.transport.guide import make_grid
 from reslrb_cli.transport.plan import UNBOUNDED, Plan
 
+#: The feature that guiding is.
+GUIDED = "guided emission"
 #: Kinds of parameters that features come with.
 EMITTERS, BSDFS = "emitter", "bsdf"
 
@@ -18,14 +21,15 @@ EMITTERS, BSDFS = "emitter", "bsdf"
 class Feature:
     """One feature of a plan.
 
-    `needed(plan)` says whether it is part of it; `present` and `absent` say why. `toggle(plan)` is the plan without it,
+    `needed(plan)` says whether it is part of it; `present` (of a plan that has it) and `absent` say why. `toggle(plan)`
+    is the plan without it,
     or with it, or the reason why there is no such plan; None: the step has it once all `parameters` of that kind are
     differentiated.
     """
 
     name: str
     needed: Callable[[Plan], bool]
-    present: str
+    present: str | Callable[[Plan], str]
     absent: str
     toggle: Callable[[Plan], Plan | str | None]
     parameters: str | None = None
@@ -113,6 +117,12 @@ def _staying(plan: Plan) -> Plan | str:
     return "all follow" if plan.max_depth <= 2 else replace(plan, stays=True)
 
 
+def _tables(plan: Plan) -> str:
+    assert plan.grid is not None
+    size = f"{plan.grid.cells} cells, {sensor_bytes(plan.grid) / 2**20:.1f} MiB of tables"
+    return f"light paths start where earlier ones had something to say: {size}"
+
+
 def _guided(plan: Plan) -> Plan:
     if plan.grid is not None:
         return replace(plan, grid=None)
@@ -186,8 +196,7 @@ FEATURES = (
             _seen_moving),
     Feature("placed lamps", lambda p: bool(p.placed_lamps), "spheres, parallel lamps, meshes that move: by the walk",
             "Mitsuba samples all emitters", _placed),
-    Feature("guided emission", lambda p: p.grid is not None,
-            "light paths start where earlier ones had something to say", "guiding: off", _guided),
+    Feature(GUIDED, lambda p: p.grid is not None, _tables, "guiding: off", _guided),
     Feature("derivative of the filter's normalization", lambda p: p.attached and p.attached_normalization,
             "as finite differences have it", "nothing moves, or it is detached", _normalization),
     Feature("zero-factor bookkeeping", lambda p: p.track_zeros, "a parameter is zero somewhere, or nearly so",

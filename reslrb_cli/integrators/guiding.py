@@ -88,10 +88,19 @@ def _blurred(grid: Grid, values: Array) -> Array:
     return result.ravel()
 
 
+def sensor_bytes(grid: Grid) -> int:
+    """Bytes for one sensor: a table for each purpose, and what has been learned."""
+    return 4 * (len(Purpose) * (grid.slots + grid.cells) + (MOST_VOICES + 1) * grid.cells)
+
+
 class Guiding:
-    """Grid and tables of one scene, as a light tracer keeps them."""
+    """Grid and tables of one scene, as a light tracer keeps them.
+
+    `images` says whether samples that serve an image alone are guided. Tables that are `held` learn no more.
+    """
 
     def __init__(self) -> None:
+        self.images, self.held = True, False
         self.grid: Grid | None = None
         self.learned: dict[int, Learned] = {}  # by the number of their sensor
         self._tables: dict[tuple[int, Purpose], tuple[Table, Array]] = {}
@@ -108,6 +117,10 @@ class Guiding:
             weights = [float(emitter.sampling_weight()) for emitter in samples.scene.emitters()]
             self.grid = make_grid(used_numbers(samples), weights)
         return self.grid
+
+    def serves(self, purpose: Purpose) -> bool:
+        """Whether samples for this are guided."""
+        return self.images or purpose is not Purpose.IMAGE
 
     def table(self, number: int, purpose: Purpose) -> Table:
         """What samples for sensor `number` are drawn from."""
@@ -133,9 +146,8 @@ class Guiding:
 
     @property
     def _each(self) -> int:
-        """Bytes for one sensor: a table for each purpose, and what has been learned."""
         assert self.grid is not None
-        return 4 * (len(Purpose) * (self.grid.slots + self.grid.cells) + (MOST_VOICES + 1) * self.grid.cells)
+        return sensor_bytes(self.grid)
 
     def bytes(self, sensors: int) -> int:
         """What the tables for so many sensors take."""
@@ -167,6 +179,8 @@ class Guiding:
 
     def due(self, number: int) -> bool:
         """Count one more gradient for a sensor, and say whether its table is to learn from that."""
+        if self.held:
+            return False
         learned = self.learned.get(self._shared(number))
         calls = 1 if learned is None else learned.calls + 1
         if learned is not None:

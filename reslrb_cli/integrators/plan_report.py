@@ -77,6 +77,14 @@ def report_plan(integrator: Reslrb, scene: mi.Scene, sensor: mi.Sensor, params: 
     return PlanReport(estimator, kernels, rows)
 
 
+def with_reason(rows: Iterable[PlanRow], feature: str, reason: str) -> list[PlanRow]:
+    """The rows with a reason of one's own for a feature; beside that of the plan where it has it."""
+    return [
+        replace(row, reason=f"{row.reason}; {reason}" if row.needed else reason) if row.feature == feature else row
+        for row in rows
+    ]
+
+
 def plan_rows(plan: Plan) -> list[PlanRow]:
     """The features of a plan, without counts."""
     return [_row(feature, plan) for feature in FEATURES]
@@ -133,8 +141,9 @@ def _update(params: mi.SceneParameters, keys: Iterable[str]) -> None:
 
 
 def _row(feature: Feature, plan: Plan) -> PlanRow:
-    needed = feature.needed(plan)
-    return PlanRow(feature.name, needed, feature.present if needed else feature.absent)
+    if not feature.needed(plan):
+        return PlanRow(feature.name, False, feature.absent)
+    return PlanRow(feature.name, True, feature.present if isinstance(feature.present, str) else feature.present(plan))
 
 
 def _toggled(integrator: Reslrb, feature: Feature, plan: Plan, scene: mi.Scene, sensor: mi.Sensor,

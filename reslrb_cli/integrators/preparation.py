@@ -101,6 +101,13 @@ class Preparation:
         self._renewal: Renewal | None = None
         self.recordings = Recordings()
 
+    def afresh(self, guided: bool, images: bool) -> Preparation:
+        """A new one with the same options, guided or not; `images`: samples of images alone, too."""
+        made = Preparation(*self._depths, self._hide_emitters, self._motion, guided)
+        if made.guiding is not None:
+            made.guiding.images = images
+        return made
+
     def plan(self, scene: mi.Scene, sensor: mi.Sensor, params: mi.SceneParameters | None = None) -> Plan:
         """What a walk of this scene needs; `params` are those to look for derivatives in.
 

@@ -57,6 +57,8 @@ class Reslrb(LightTracer):
         own = {name: options.pop(name) for name in kind.OPTIONS if name in options}
         obstacle = None if kind.attaches else _no_attached(estimator)
         motion = Motion(attached, filter_normalization, obstacle, attached_sampling)
+        if guiding == "auto":
+            raise ValueError('"guiding" auto needs an experiment to measure on (`reslrb optimize`); say on or off')
         one_of("guiding", guiding, ("on", "off"))
         return cls(kind(**own), motion=motion, guided=guiding == "on", **options)
 

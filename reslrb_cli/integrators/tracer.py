@@ -68,6 +68,12 @@ class LightTracer:
         other.samples_per_pass, other.freeze = samples_per_pass, freeze
         return other
 
+    def afresh(self, guided: bool, images: bool = True) -> Self:
+        """The same, which knows nothing of any scene yet, with guided emission or without; `images`: of images too."""
+        other = copy.copy(self)
+        other.preparation = self.preparation.afresh(guided, images)
+        return other
+
     def plan(self, scene: mi.Scene, sensor: mi.Sensor, params: mi.SceneParameters | None = None) -> Plan:
         """What a walk of this scene needs, with derivatives of `params`, if any.
 
@@ -82,9 +88,11 @@ class LightTracer:
         """
         spp = job.spp or job.sensor.sampler().sample_count()
         plan, table = self.plan(job.scene, job.sensor, job.params), None
-        if self.preparation.guiding is not None:
+        guiding = self.preparation.guiding
+        if guiding is not None:
             purpose = purpose or (Purpose.IMAGE if job.params is None else Purpose.GRADIENT)
-            table = self.preparation.guiding.table(_number(job), purpose)
+            if guiding.serves(purpose):
+                table = guiding.table(_number(job), purpose)
         return passes(plan, job.scene, job.sensor, job.seed, spp, self.samples_per_pass, table)
 
     def learn(self, job: Job, gradient: mi.TensorXf) -> None:
@@ -93,8 +101,13 @@ class LightTracer:
         After a gradient: what has been learned counts from the next one on.
         """
         guiding = self.preparation.guiding
-        if guiding is None or not guiding.due(_number(job)):
-            return
+        if guiding is not None and guiding.due(_number(job)):
+            self.learn_now(job, gradient)
+
+    def learn_now(self, job: Job, gradient: mi.TensorXf) -> None:
+        """Have the tables learn, due or not."""
+        guiding = self.preparation.guiding
+        assert guiding is not None
         with dr.suspend_grad():
             samples = self.passes(replace(job, seed=learning_seed(job.seed)), Purpose.BOTH)[0]
             guiding.learn(_number(job), samples, samples.film.adjoint(gradient))

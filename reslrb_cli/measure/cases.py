@@ -52,9 +52,13 @@ class Case:
             adjoint = {"adjoint": "independent"}  # which goes with any weight
         shared, own = config.integrator.options(), _TYPES[self.type].model_fields if self.type in _TYPES else {}
         values = {"type": self.type} | {name: shared[name] for name in SHARED if name in shared and name in own}
+        if values.get("guiding") == "auto":  # of the experiment, whose pilot decides it; what is named here has none
+            del values["guiding"]
         values |= {name: value for name, value in self.options.items() if name not in ADJOINT}
         if self.type == "reslrb" and values.setdefault("estimator", PLUGIN_ESTIMATOR) == "auto" and not auto:
             raise ConfigError(blame, "estimator", "`auto` measures which to take; name those to compare")
+        if values.get("guiding") == "auto" and not auto:
+            raise ConfigError(blame, "guiding", "`auto` measures whether it pays; compare `on` with `off`")
         return with_integrator(config, values | {"max_depth": max_depth}, blame, adjoint)
 
     @property
@@ -63,10 +67,12 @@ class Case:
         if self.type != "reslrb":
             return None
         name = str(self.options.get("estimator", PLUGIN_ESTIMATOR))
+        usual = {option: Reslrb.model_fields[option].default for option in _ESTIMATOR_OPTIONS}
+        usual["guiding"] = "auto" if name == "auto" else "off"
         other = [
             f"{option}={value}"
             for option, value in self.options.items()
-            if option in ADJOINT or (option in _ESTIMATOR_OPTIONS and value != Reslrb.model_fields[option].default)
+            if option in ADJOINT or (option in usual and value != usual[option])
         ]
         return f"{name}({','.join(other)})" if other else name
 

@@ -33,8 +33,8 @@ def comparable(config: Config, by: str) -> Config:
     replays paths from the sensor, and any other name is that of an estimator. Naive AD does not differentiate
     roulette's decision.
     """
-    own = config.integrator
-    assert isinstance(own, Reslrb), "checked by whoever compares"
+    assert isinstance(config.integrator, Reslrb), "checked by whoever compares"
+    own = config.integrator.undecided_off()
     alike: dict[str, Any] = {**ALIKE[Reference.PTRACER], "rr_depth": NEVER}
     shared: dict[str, Any] = {"max_depth": own.max_depth, "rr_depth": NEVER, "hide_emitters": own.hide_emitters}
     integrator: Prb | Ptracer | Reslrb | WalkAd = own.model_copy(

@@ -10,33 +10,27 @@ rounds, and of times by what a single one may be off.
 from __future__ import annotations
 
 import math
-import statistics
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any
-
-import numpy as np
 
 from reslrb_cli.integrators import make_integrator
 from reslrb_cli.integrators.tracer import LightTracer
 from reslrb_cli.measure.moving import moves_light
 from reslrb_cli.measure.references import Situation, prb_gradient
 from reslrb_cli.optimization.choice import Cache, measured_step, situation
-from reslrb_cli.optimization.pilot import TIMING_NOISE
-from reslrb_cli.optimization.pilot_records import ITERATIONS, Gradients, square
+from reslrb_cli.optimization.gains import compare
+from reslrb_cli.optimization.pilot_records import ITERATIONS, Gradients
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.records.clock import StepClock
 from reslrb_cli.records.pilot_cache import key_of
 from reslrb_cli.records.rival import RivalRecord
-
-Array = np.ndarray[Any, Any]
 
 RIVAL = "prb"
 #: Rounds, at most, and fewer than which say nothing.
 MOST_ROUNDS, LEAST_ROUNDS = 12, 6
 #: Share of a run of ITERATIONS that the rounds may cost, and that LEAST_ROUNDS may where that is more.
 SHARE, MOST_SHARE = 0.05, 0.1
-CONFIDENCE = 0.95
 
 
 @dataclass
@@ -55,7 +49,8 @@ def measure_rival(problem: Problem, cache: Cache | None, say: Callable[[str], No
     # A budget of memory is kept by passes, of which `prb` has none.
     if problem.pilot is None or problem.samples_per_pass is not None or why_not(problem) is not None:
         return None
-    key = "" if cache is None else key_of({"rival": RIVAL, "beside": problem.pilot.chosen, **situation(problem)})
+    beside = [problem.pilot.chosen, None if problem.guided is None else problem.guided.guided]
+    key = "" if cache is None else key_of({"rival": RIVAL, "beside": beside, **situation(problem)})
     if cache is not None:
         try:
             return replace(RivalRecord.from_json(cache.get(key) or {}), cached=True)
@@ -121,41 +116,3 @@ def _measure(problem: Problem) -> RivalRecord:
         RIVAL, rounds, spp, advantage, low, high, measure_s=spent_ms / 1e3, compile_s=compile_ms / 1e3,
         note="" if advantage is not None else "its gradients, or those of the run, have no noise",
     )  # fmt: skip
-
-
-def compare(
-    own: Sequence[Gradients], own_ms: Sequence[float], other: Sequence[Gradients], other_ms: Sequence[float]
-) -> tuple[float, float, float] | tuple[None, None, None]:
-    """The efficiency of the other over that of the own, and its interval; nothing where one has no noise."""
-    scales = {key: float(np.mean([square(g[key]) for g in (*own, *other)])) for key in own[0]}
-    scales = {key: scale for key, scale in scales.items() if scale > 0}
-    logs, variance = [], 0.0
-    for gradients in (own, other):
-        values = _log_variances(gradients, scales)
-        if values is None:
-            return None, None, None
-        whole, without = values
-        logs.append(whole)
-        count = len(gradients)
-        variance += (count - 1) / count * float(np.sum(np.square(without - without.mean())))
-    from scipy.special import stdtrit  # late: every run imports this module, and few come here
-
-    times = statistics.median(own_ms) / max(statistics.median(other_ms), 1e-6)
-    advantage = math.exp(logs[0] - logs[1]) * times
-    quantile = float(stdtrit(min(len(own), len(other)) - 1, (1 + CONFIDENCE) / 2))
-    half = quantile * math.sqrt(variance)
-    factor = math.exp(min(half, 50.0)) * TIMING_NOISE
-    return advantage, advantage / factor, advantage * factor
-
-
-def _log_variances(gradients: Sequence[Gradients], scales: dict[str, float]) -> tuple[float, Array] | None:
-    """The logarithm of the variance of all parameters, and that without each of the rounds in turn."""
-    rows = np.array([
-        np.concatenate([g[key].astype(np.float64) / math.sqrt(scale) for key, scale in scales.items()])
-        for g in gradients
-    ])  # fmt: skip
-    whole = float(rows.var(axis=0, ddof=1).sum()) if rows.size else 0.0
-    without = [float(np.delete(rows, number, axis=0).var(axis=0, ddof=1).sum()) for number in range(len(rows))]
-    if not min(whole, *without) > 0:
-        return None
-    return math.log(whole), np.log(without)

@@ -17,8 +17,9 @@ from reslrb_cli.errors import ConfigError
 from reslrb_cli.estimators import ESTIMATORS
 from reslrb_cli.integrators import Reslrb as Tracer
 from reslrb_cli.optimization.budget import MemoryPlan, choose_samples, standing
+from reslrb_cli.optimization.guiding_pilot import SHARE as GUIDING_SHARE
 from reslrb_cli.optimization.moving import ATTACHED, is_attached
-from reslrb_cli.optimization.pilot import Pilot
+from reslrb_cli.optimization.pilot import SHARE, Pilot
 from reslrb_cli.optimization.pilot_records import Candidate, Measured, Outcome
 from reslrb_cli.optimization.room import check_baseline, check_memory
 from reslrb_cli.optimization.samples import sample_gradient, take_gradient
@@ -101,7 +102,7 @@ def _fitting(problem: Problem, integrator: Reslrb, choices: list[dict[str, Any]]
     run, budget, least, options = problem.config.run, problem.config.run.budget_bytes, [], []
     fixed = 0 if budget is None else standing()
     for choice in choices:
-        own = integrator.chosen(**choice).options() if choice else integrator.options()
+        own = (integrator.chosen(**choice) if choice else integrator.undecided_off()).options()
         made = Tracer.of(**own)
         check_memory(problem, made)
         if budget is None:
@@ -164,7 +165,9 @@ def run_pilot(problem: Problem, options: list[Option]) -> Outcome:
     unit = batches * max(candidate.passes for candidate in made)
     if problem.samples_per_pass is not None:  # the user's own passes
         unit = batches * min(problem.samples_per_pass, run.spp // batches)
-    return Pilot(made, step, run.spp, unit).run()
+    integrator = problem.config.integrator
+    guiding = isinstance(integrator, Reslrb) and integrator.guiding == "auto"  # which has its part of what it may cost
+    return Pilot(made, step, run.spp, unit, SHARE - GUIDING_SHARE if guiding else SHARE).run()
 
 
 def _candidate(option: Option) -> Candidate:

@@ -15,6 +15,7 @@ from reslrb_cli.config import Config
 from reslrb_cli.integrators import Reslrb as Tracer
 from reslrb_cli.optimization.certainty import LEAST_ITERATIONS
 from reslrb_cli.optimization.choice import Cache, find_options, settle_integrator
+from reslrb_cli.optimization.guiding_choice import settle_guiding
 from reslrb_cli.optimization.problem import Problem, assemble_scene
 from reslrb_cli.optimization.rendering import saved_spp
 from reslrb_cli.optimization.targets import make_targets
@@ -72,10 +73,11 @@ def make_forecast(config: Config, say: Callable[[str], None], cache: Cache | Non
     make_targets(problem, say)
     problem.truth.clear()  # errors are no part of a step
     settle_integrator(problem, options, say, cache)
+    settle_guiding(problem, say, cache)
     image_s = _image_seconds(problem)
     say("measuring a few steps")
     steps, scratch = measure_steps(problem), _scratch(problem)
-    run, pilot = config.run, problem.pilot
+    run, measured = config.run, [each for each in (problem.pilot, problem.guided) if each is not None]
     targets = sum(4 * int(dr.prod(view.target.shape)) for view in problem.views)
     parts = {
         "geometry": buffers["geometry"],
@@ -96,7 +98,7 @@ def make_forecast(config: Config, say: Callable[[str], None], cache: Cache | Non
         iteration_s=steps.step_s,
         start_s=steps.start_s,
         compile_s=steps.compile_s,
-        pilot_s=0.0 if pilot is None or pilot.cached else pilot.measure_s + pilot.compile_s,
+        pilot_s=sum(each.measure_s + each.compile_s for each in measured if not each.cached),
         target_s=0.0 if render is None else image_s * render.spp * views,
         images_s=image_s * images * views,
         verdicts_s=VERDICTS * steps.step_s if run.certainty and run.iterations >= LEAST_ITERATIONS else 0.0,

@@ -52,9 +52,13 @@ def check_integrator(config: Config, integrator: Integrator, scene: mi.Scene, se
 
 
 def make_configured(integrator: Integrator) -> StepIntegrator:
-    """The integrator that a configuration describes; all estimators have the same image, so for `auto` any will do."""
-    if isinstance(integrator, Reslrb) and integrator.estimator == "auto":
-        integrator = integrator.chosen(estimator="reservoir")
+    """The integrator that a configuration describes; all estimators have the same image, so for `auto` any will do.
+
+    Where it is not decided yet whether it is guided, it is not.
+    """
+    if isinstance(integrator, Reslrb):
+        auto = integrator.estimator == "auto"
+        integrator = integrator.chosen(estimator="reservoir") if auto else integrator.undecided_off()
     options: dict[str, Any] = integrator.options()
     return make_integrator(integrator.type, **options)
 

@@ -25,7 +25,7 @@ from .pilot_records import ITERATIONS, Candidate, Gradients, Measured, Outcome, 
 #: Share of a run of ITERATIONS that the pilot may cost, compilation apart.
 SHARE = 0.05
 #: How much of that it plans for: a step may take longer than those before it, and a later candidate's run less time.
-PLANNED = 0.95 * SHARE
+PLANNED = 0.95
 #: Steps that the pilot plans for, the most first: the first that its share suffices for.
 PLANNED_STEPS = (24, 18, 12, 9)
 #: A candidate is dropped once the best is so many times as efficient, after at least so many rounds.
@@ -58,13 +58,18 @@ class _Entry:
 class Pilot:
     """One pilot. `step(candidate, round, spp)` takes a step; equal rounds have equal seeds.
 
-    `spp` are those of the run, of which the pilot uses a multiple of `unit`.
+    `spp` are those of the run, of which the pilot uses a multiple of `unit`, and `share` is what it may cost of one.
     """
 
     def __init__(
-        self, candidates: Sequence[Candidate], step: Callable[[Candidate, int, int], Measured], spp: int, unit: int = 1
+        self,
+        candidates: Sequence[Candidate],
+        step: Callable[[Candidate, int, int], Measured],
+        spp: int,
+        unit: int = 1,
+        share: float = SHARE,
     ) -> None:
-        self._candidates, self._step = list(candidates), step
+        self._candidates, self._step, self._share = list(candidates), step, share
         self._spp, self._unit, self._pilot_spp = spp, unit, unit
         self._entries: list[_Entry] = []
         self._notes: dict[str, str] = {}
@@ -122,7 +127,7 @@ class Pilot:
         first = self._step(entry.candidate, 0, self._unit)
         self._spent_ms += first.wall_ms
         overhead, slope = max(first.wall_ms - first.kernel_ms, 0.0), max(first.kernel_ms, 1e-6) / self._unit
-        budget = PLANNED * ITERATIONS * (overhead + slope * self._spp) - first.wall_ms
+        budget = PLANNED * self._share * ITERATIONS * (overhead + slope * self._spp) - first.wall_ms
         for steps in PLANNED_STEPS:
             fits = int((budget / steps - overhead) / slope) // self._unit * self._unit
             if fits >= self._unit:
@@ -137,7 +142,7 @@ class Pilot:
         return ITERATIONS * min(entry.overhead + entry.time * scale for entry in self._entries if entry.kernel)
 
     def _affords(self, entry: _Entry) -> bool:
-        return self._spent_ms + statistics.median(entry.wall) <= PLANNED * self._run_ms()
+        return self._spent_ms + statistics.median(entry.wall) <= PLANNED * self._share * self._run_ms()
 
     # --- judging ------------------------------------------------------------------------------------------------------
 
@@ -200,7 +205,7 @@ class Pilot:
                 self._notes[candidate.label] = f"not measured: at most {bound / best:.2f} of the best's efficiency"
             elif not self._affords(parent or self._entries[0]):
                 self._notes[candidate.label] = (
-                    f"not measured: no more than {100 * SHARE:.0f} % of the run is to be spent"
+                    f"not measured: no more than {100 * self._share:.2g} % of the run is to be spent"
                 )
             else:
                 entry = self._warm_up(candidate)

@@ -6,7 +6,8 @@ from typing import Any
 
 from reslrb_cli.config import Reslrb as ReslrbConfig
 from reslrb_cli.integrators import Reslrb
-from reslrb_cli.integrators.plan_report import plan_rows
+from reslrb_cli.integrators.features import GUIDED
+from reslrb_cli.integrators.plan_report import plan_rows, with_reason
 from reslrb_cli.optimization.problem import Problem
 
 
@@ -19,7 +20,10 @@ def plan_record(problem: Problem) -> dict[str, Any]:
     if not isinstance(integrator, Reslrb):
         return {"integrator": config.type, "estimator": None, "rows": []}
     plan = integrator.plan(problem.scene, problem.scene.sensors()[problem.sensors[0]], problem.selection.params)
-    rows = [{"feature": row.feature, "needed": row.needed, "reason": row.reason} for row in plan_rows(plan)]
+    found = plan_rows(plan)
+    if problem.guided is not None:
+        found = with_reason(found, GUIDED, f"guiding: auto, {problem.guided.why()}")
+    rows = [{"feature": row.feature, "needed": row.needed, "reason": row.reason} for row in found]
     estimator = type(integrator.estimator).__name__.removesuffix("Estimator").lower()
     assert isinstance(config, ReslrbConfig)
     return {"integrator": config.type, "estimator": estimator, "rows": rows}

@@ -16,6 +16,7 @@ from reslrb_cli.optimization.announced import check_announced, check_described
 from reslrb_cli.optimization.budget import MemoryPlan
 from reslrb_cli.optimization.choice import Cache, find_options, settle_integrator
 from reslrb_cli.optimization.errors import ErrorMeter, quantity
+from reslrb_cli.optimization.guiding_choice import settle_guiding
 from reslrb_cli.optimization.loading import (
     check_integrator,
     choose_sensors,
@@ -34,6 +35,7 @@ from reslrb_cli.optimization.settled import Settled
 from reslrb_cli.optimization.targets import make_targets
 from reslrb_cli.optimization.transforms import make_transform
 from reslrb_cli.optimization.views import View, expose, make_views, slope, to_tensor
+from reslrb_cli.records.guided import GuidedRecord
 from reslrb_cli.scene import Selection, select_parameters
 from reslrb_cli.seeds import seed
 
@@ -63,6 +65,7 @@ class Problem:
     samples_per_pass: int | None = None
     #: What was measured and planned before the first iteration, where it was.
     pilot: Outcome | None = None
+    guided: GuidedRecord | None = None
     memory: MemoryPlan | None = None
     sensitivities: list[Scaled] | None = None
 
@@ -159,6 +162,7 @@ def assemble(
         settled.reach(problem)
         return problem
     settle_integrator(problem, options, say, cache)
+    settle_guiding(problem, say, cache)
     if to_run:
         check_exposures(problem)
         find_reached(problem, say)

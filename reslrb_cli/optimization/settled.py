@@ -1,4 +1,4 @@
-"""What an earlier process has settled for a run: values that it began with, its estimator, passes and masks."""
+"""What an earlier process has settled for a run: values that it began with, estimator, passes, masks and guiding."""
 
 from __future__ import annotations
 
@@ -9,8 +9,10 @@ from typing import TYPE_CHECKING, Any
 
 from reslrb_cli.optimization.budget import Estimate, MemoryPlan
 from reslrb_cli.optimization.choice import Option
+from reslrb_cli.optimization.guiding_choice import is_undecided, take_up
 from reslrb_cli.optimization.pilot_records import Outcome
 from reslrb_cli.optimization.stored import Stored, is_number
+from reslrb_cli.records.guided import GuidedRecord
 
 if TYPE_CHECKING:
     from reslrb_cli.optimization.problem import Problem
@@ -35,7 +37,16 @@ class Settled:
         problem.apply()
 
     def settle(self, problem: Problem, options: Sequence[Option]) -> None:
-        """Choose what the run had chosen: the pilot's estimator, and the samples of a pass."""
+        """Choose what the run had chosen: the pilot's estimator, the samples of a pass, and whether it is guided."""
+        self._estimator(problem, options)
+        if is_undecided(problem) and self.stored.value("guided") is not None:
+            try:
+                problem.guided = GuidedRecord.from_json(self.stored.value("guided"))
+            except (TypeError, AttributeError):
+                raise self.stored.wrong("guided", "is not what measuring whether guiding pays finds") from None
+            take_up(problem)
+
+    def _estimator(self, problem: Problem, options: Sequence[Option]) -> None:
         chosen = options[0] if options else None
         if self.stored.value("pilot") is not None:
             problem.pilot = self._outcome()

@@ -14,8 +14,10 @@ from contextlib import closing
 from dataclasses import dataclass, replace
 from itertools import islice, pairwise
 
+from reslrb_cli.integrators.guiding import EVERY
 from reslrb_cli.optimization.loop import optimize
 from reslrb_cli.optimization.problem import Problem
+from reslrb_cli.optimization.state import guiding_of
 from reslrb_cli.records.clock import MIB
 from reslrb_cli.records.metrics import Record
 
@@ -81,6 +83,8 @@ def _highest(records: Sequence[Record]) -> int:
 
 def _measure(problem: Problem, spp: int) -> Steps:
     """A few iterations of `spp` samples per pixel."""
+    guided = guiding_of(problem) is not None
+    least = EVERY if guided else LEAST
     records: list[Record] = []
     begin = time.perf_counter()
     with closing(_iterations(problem, spp)) as iterations:
@@ -89,10 +93,11 @@ def _measure(problem: Problem, spp: int) -> Steps:
             if len(records) == WARM_UP:
                 begin = time.perf_counter()
             timed = len(records) - WARM_UP
-            if timed >= MOST or (timed >= LEAST and time.perf_counter() - begin > SECONDS):
+            if timed >= MOST or (timed >= least and time.perf_counter() - begin > SECONDS):
                 break
     times = [records[0].elapsed_s, *(b.elapsed_s - a.elapsed_s for a, b in pairwise(records))]
-    steady = statistics.median(times[WARM_UP:])
+    # Some guided steps also learn, which is a part of what they take in the mean; a median would not have it.
+    steady = (statistics.fmean if guided else statistics.median)(times[WARM_UP:])
     extra = sum(max(seconds - steady, 0.0) for seconds in times[:WARM_UP])
     compiled = min(sum(record.codegen_ms for record in records[:WARM_UP]) / 1e3, extra)
     return Steps(spp, steady, extra - compiled, compiled, _highest(records))

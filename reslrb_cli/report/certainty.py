@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from reslrb_cli.records.guided import GuidedRecord
 from reslrb_cli.records.rival import RivalRecord
 from reslrb_cli.report.words import count, duration, number, shorten
 
@@ -78,6 +79,14 @@ def rival_line(measured: Mapping[str, Any] | None) -> str:
     try:
         return RivalRecord.from_json(dict(measured or {})).line()
     except TypeError:  # there was none, or another version's
+        return ""
+
+
+def guided_line(measured: Mapping[str, Any] | None) -> str:
+    """Whether guided emission paid; empty where that was not left to measurement."""
+    try:
+        return GuidedRecord.from_json(dict(measured or {})).line()
+    except TypeError:  # as above
         return ""
 
 

@@ -67,8 +67,15 @@ def test_a_whole_folder_is_replayed(run, capsys):
 def test_a_guided_run_is_refused(run, capsys):
     config = (run / "config.yaml").read_text()
     assert "guiding: 'off'" in config
+    refused = "config.yaml: integrator.guiding: where the paths of a guided step started"
     (run / "config.yaml").write_text(config.replace("guiding: 'off'", "guiding: 'on'"))
-    assert told(capsys, run).startswith("config.yaml: integrator.guiding: where the paths of a guided step started")
+    assert told(capsys, run).startswith(refused)
+    # And one of which measuring said so; what was left off by it is replayed.
+    (run / "config.yaml").write_text(config.replace("guiding: 'off'", "guiding: auto"))
+    assert reslrb(capsys, "inspect", run / "config.yaml", "--nonfinite")[0] == 0
+    manifest = json.loads((run / "manifest.json").read_text())
+    (run / "manifest.json").write_text(json.dumps(manifest | {"guided": {"guided": True}}))
+    assert told(capsys, run).startswith(refused)
 
 
 def arrays(**changes):

@@ -43,3 +43,16 @@ def test_amounts_of_memory(written: int | float | str, bytes_: int) -> None:
 def test_what_is_no_amount_of_memory(written: int | float | str) -> None:
     with pytest.raises(ValueError, match="no amount of memory"):
         memory_bytes(written)
+
+
+def test_guiding_is_left_to_measurement_where_the_estimator_is() -> None:
+    assert Reslrb().guiding == "auto"
+    assert Reslrb(estimator="stack").guiding == "off"
+    assert Reslrb(estimator="stack", guiding="auto").guiding == "auto"
+    assert Reslrb(guiding="off").guiding == "off"
+    # What is made before anything is measured is not guided.
+    for own in (Reslrb(), Reslrb(guiding="auto", estimator="reservoir")):
+        assert own.chosen(estimator="stack").guiding == own.undecided_off().guiding == "off"
+    assert (
+        Reslrb(guiding="on").chosen(estimator="stack").guiding == Reslrb(guiding="on").undecided_off().guiding == "on"
+    )

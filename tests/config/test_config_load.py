@@ -57,7 +57,7 @@ def test_defaults(tmp_path: Path) -> None:
     assert isinstance(config.integrator, Reslrb)
     assert config.integrator.options() == {
         "max_depth": 8, "rr_depth": 5, "hide_emitters": False, "estimator": "auto", "freeze": True,
-        "attached": "auto", "attached_sampling": "auto", "filter_normalization": "attached", "guiding": "off",
+        "attached": "auto", "attached_sampling": "auto", "filter_normalization": "attached", "guiding": "auto",
     }  # fmt: skip
     assert config.loss.type == "l2"
     assert config.loss.options() == {}

@@ -12,6 +12,7 @@ from cli.test_optimize import CONFIG, KEY, SCENE
 from reslrb_cli.cli import main
 from reslrb_cli.config import load
 from reslrb_cli.measure import rival
+from reslrb_cli.optimization import gains
 from reslrb_cli.records.manifest import read_manifest
 from reslrb_cli.records.rival import RivalRecord
 
@@ -93,8 +94,8 @@ def test_the_interval_holds_the_truth_as_often_as_it_says(entries):
     inside = 0
     for seed in range(200):
         own, other = samples(2.0, 8, 2 * seed, entries), samples(1.0, 8, 2 * seed + 1, entries)
-        value, low, high = rival.compare(own, [2.0] * 8, other, [4.0] * 8)
-        low, high = low * rival.TIMING_NOISE, high / rival.TIMING_NOISE
+        value, low, high = gains.compare(own, [2.0] * 8, other, [4.0] * 8)
+        low, high = low * gains.TIMING_NOISE, high / gains.TIMING_NOISE
         assert low < value < high
         inside += low < 2.0 < high
     # 190 of 200 are expected; fewer than 176 have a probability of 1e-4.
@@ -103,7 +104,7 @@ def test_the_interval_holds_the_truth_as_often_as_it_says(entries):
 
 def test_equals_are_hardly_ever_called_better():
     better = sum(
-        rival.compare(samples(1.0, 8, 2 * seed), [3.0] * 8, samples(1.0, 8, 2 * seed + 1), [3.0] * 8)[1] > 1
+        gains.compare(samples(1.0, 8, 2 * seed), [3.0] * 8, samples(1.0, 8, 2 * seed + 1), [3.0] * 8)[1] > 1
         for seed in range(200)
     )
     assert better <= 13  # 5 are expected on this side without what times may be off
@@ -111,4 +112,4 @@ def test_equals_are_hardly_ever_called_better():
 
 def test_no_noise_is_no_comparison():
     still = [{KEY: np.ones(4, np.float32)}] * 6
-    assert rival.compare(still, [1.0] * 6, samples(1.0, 6, 1, 4), [1.0] * 6) == (None, None, None)
+    assert gains.compare(still, [1.0] * 6, samples(1.0, 6, 1, 4), [1.0] * 6) == (None, None, None)

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from reslrb_cli.errors import ConfigError
-from reslrb_cli.report.certainty import certainty_words, rival_line
+from reslrb_cli.report.certainty import certainty_words, guided_line, rival_line
 from reslrb_cli.report.page import facts
 from reslrb_cli.report.page.curves import convergence
 from reslrb_cli.report.page.images import image_rows
@@ -76,7 +76,9 @@ def record_parts(run: Run) -> dict[str, str]:
         "Run": lambda: facts.run_facts(run),
         "Plan": lambda: facts.plan_table(manifest.get("plan")),
         "Choice of the estimator": lambda: (
-            facts.pilot_table(manifest.get("pilot")) + soft(rival_line(manifest.get("rival")))
+            facts.pilot_table(manifest.get("pilot"))
+            + soft(guided_line(manifest.get("guided")))
+            + soft(rival_line(manifest.get("rival")))
         ),
         "Bias of correlated samples": lambda: facts.correlated_bias_table(manifest.get("correlated_bias")),
         "Scale of the parameters": lambda: facts.scaling_table(manifest.get("scaling")),
