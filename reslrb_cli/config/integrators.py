@@ -158,6 +158,12 @@ class Reslrb(AttachingTracer):
         "through windows, a caustic), from the second step on; the first, and one in seven of those that follow, "
         "trace as many paths again to learn where that is.",
     )
+    sequence: Literal["independent", "low_discrepancy"] = Field(
+        default="independent",
+        description="The random numbers that say where light paths start and how they first scatter. "
+        "`low_discrepancy`: evenly spread over all paths of a step, and independent from one step to the next; less "
+        "noise where little but these numbers says where light goes (a beam through glass), a little less elsewhere.",
+    )
     freeze: bool = Field(
         default=True,
         description="Record what a step launches and launch that again, so that its Python runs once, not in every "

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from reslrb_cli.transport.guide import make_grid
+from reslrb_cli.transport.nets import make_coordinates
 from reslrb_cli.transport.plan import UNBOUNDED, Plan
 
 #: Kinds of parameters that features come with.
@@ -119,6 +120,12 @@ def _guided(plan: Plan) -> Plan:
     return replace(plan, grid=make_grid([True] * 4, [1.0] * len(plan.needs.emitters)))
 
 
+def _sequence(plan: Plan) -> Plan:
+    if plan.sequence is not None:
+        return replace(plan, sequence=None)
+    return replace(plan, sequence=make_coordinates([True] * 4, len(plan.needs.emitters), plan.max_depth))
+
+
 def _several(plan: Plan) -> Plan | str:
     return "follows from the number of emitters, in Mitsuba itself"
 
@@ -188,6 +195,8 @@ FEATURES = (
             "Mitsuba samples all emitters", _placed),
     Feature("guided emission", lambda p: p.grid is not None,
             "light paths start where earlier ones had something to say", "guiding: off", _guided),
+    Feature("low-discrepancy numbers", lambda p: p.sequence is not None,
+            "where paths start, and how they first scatter, is evenly spread", "sequence: independent", _sequence),
     Feature("derivative of the filter's normalization", lambda p: p.attached and p.attached_normalization,
             "as finite differences have it", "nothing moves, or it is detached", _normalization),
     Feature("zero-factor bookkeeping", lambda p: p.track_zeros, "a parameter is zero somewhere, or nearly so",
