@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import combinations
 from typing import Any
@@ -44,7 +45,7 @@ def both(name: str, **options: Any) -> tuple[Case, Any, Any]:
 
 @pytest.mark.parametrize("name", a_few(NAMES, ["glass"]))
 def test_means_are_those_of_independent_numbers(name: str) -> None:
-    scene, ours, plain = both(name)
+    scene, ours, plain = both(name, freeze=True)
     result = compare(samples(scene, ours, 32), samples(scene, plain, 32, 1), block=None)
     print(name, result)
     assert result
@@ -55,7 +56,7 @@ def test_means_are_those_of_independent_numbers(name: str) -> None:
 @pytest.mark.parametrize("name", ["texture", "two_emitters", "glass"])
 def test_means_of_many_seeds_are_those_of_others(name: str, guiding: str) -> None:
     """Of independent numbers, and of the stock integrator that is right for the case."""
-    scene, ours, plain = both(name)
+    scene, ours, plain = both(name, freeze=True)
     if guiding == "on":
         _, ours, _ = guided(name, 4, **ON)
     found, case = samples(scene, ours, 200), BY_NAME[name]
@@ -70,7 +71,7 @@ def test_means_of_many_seeds_are_those_of_others(name: str, guiding: str) -> Non
 @pytest.mark.parametrize("estimator", a_few(ESTIMATORS, ["reservoir"]))
 @pytest.mark.parametrize("adjoint", a_few(["correlated", "independent", "batched"], ["batched"]))
 def test_every_way_of_a_step_has_the_same_mean(estimator: str, adjoint: str) -> None:
-    scene, ours, plain = both("two_emitters", estimator=estimator)
+    scene, ours, plain = both("texture", estimator=estimator, freeze=True)
     found = [scene.gradients(each, seeds(24, block), 16, adjoint=adjoint) for block, each in enumerate((ours, plain))]
     result = compare(*found, block=None)
     print(estimator, adjoint, result)
@@ -185,14 +186,13 @@ def test_exact_estimators_agree_at_equal_seeds(name: str) -> None:
 
 def test_a_replay_with_other_numbers_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
     sequence_faults.swapped_in_replays(monkeypatch)
-    assert worst_of_replays("glass") > 1e-2
+    assert worst_of_replays("glass", ["correlated"]) > 1e-2
 
 
-def worst_of_replays(name: str) -> float:
+def worst_of_replays(name: str, ways: Sequence[str] = ("correlated", "independent")) -> float:
     """How far gradients of `gather`, which traces twice, are from those of `stack`, at most."""
     scene, ours, _ = both(name)
     _, other, _ = both(name, estimator="gather")
-    ways = ("correlated", "independent")
     return max(relative(*(scene.gradient(each, 5, 64, adjoint=way) for each in (other, ours))) for way in ways)
 
 
