@@ -160,6 +160,12 @@ class Reslrb(AttachingTracer):
         "first iteration, show that it pays here. Left out it is `auto` with estimator `auto`, and `off` with one that "
         "is named.",
     )
+    sequence: Literal["independent", "low_discrepancy"] = Field(
+        default="independent",
+        description="The random numbers that say where light paths start and how they first scatter. "
+        "`low_discrepancy`: evenly spread over all paths of a step, and independent from one step to the next; less "
+        "noise where little but these numbers says where light goes (a beam through glass), a little less elsewhere.",
+    )
     freeze: bool = Field(
         default=True,
         description="Record what a step launches and launch that again, so that its Python runs once, not in every "

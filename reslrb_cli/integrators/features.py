@@ -9,6 +9,7 @@ from typing import Any
 
 from reslrb_cli.integrators.guiding import sensor_bytes
 from reslrb_cli.transport.guide import make_grid
+from reslrb_cli.transport.nets import make_coordinates
 from reslrb_cli.transport.plan import UNBOUNDED, Plan
 
 #: The feature that guiding is.
@@ -129,6 +130,12 @@ def _guided(plan: Plan) -> Plan:
     return replace(plan, grid=make_grid([True] * 4, [1.0] * len(plan.needs.emitters)))
 
 
+def _sequence(plan: Plan) -> Plan:
+    if plan.sequence is not None:
+        return replace(plan, sequence=None)
+    return replace(plan, sequence=make_coordinates([True] * 4, len(plan.needs.emitters), plan.max_depth))
+
+
 def _several(plan: Plan) -> Plan | str:
     return "follows from the number of emitters, in Mitsuba itself"
 
@@ -197,6 +204,8 @@ FEATURES = (
     Feature("placed lamps", lambda p: bool(p.placed_lamps), "spheres, parallel lamps, meshes that move: by the walk",
             "Mitsuba samples all emitters", _placed),
     Feature(GUIDED, lambda p: p.grid is not None, _tables, "guiding: off", _guided),
+    Feature("low-discrepancy numbers", lambda p: p.sequence is not None,
+            "where paths start, and how they first scatter, is evenly spread", "sequence: independent", _sequence),
     Feature("derivative of the filter's normalization", lambda p: p.attached and p.attached_normalization,
             "as finite differences have it", "nothing moves, or it is detached", _normalization),
     Feature("zero-factor bookkeeping", lambda p: p.track_zeros, "a parameter is zero somewhere, or nearly so",

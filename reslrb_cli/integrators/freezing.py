@@ -17,6 +17,7 @@ import mitsuba as mi
 
 from reslrb_cli.errors import UnsupportedScene, is_machine_fault, is_out_of_memory
 from reslrb_cli.transport.guide import Guide
+from reslrb_cli.transport.nets import Net
 from reslrb_cli.transport.samples import Samples
 from reslrb_cli.transport.splat import Film
 
@@ -58,7 +59,7 @@ class Recordings:
         # Sensors that share a recording have it made anew whenever another one's turn comes.
         key = (kind, s.plan, s.spp, s.width, tuple(s.film.size), s.sensor.ptr)
         plain = _on_samples(samples, function)
-        common = (s.scene, s.sensor, s.seed, s.scale, s.fraction, s.guide)
+        common = (s.scene, s.sensor, s.seed, s.scale, s.fraction, s.guide, s.net)
         if key not in self._functions and len(self._functions) < MOST_CALLS:
             self._functions[key] = _record(kind, plain, common, inputs)
         recorded = self._functions.get(key)
@@ -91,7 +92,7 @@ class Recordings:
 def _record(
     kind: str,
     plain: Callable[..., Any],
-    common: tuple[mi.Scene, mi.Sensor, mi.UInt32, mi.Float, mi.Float, Guide | None],
+    common: tuple[mi.Scene, mi.Sensor, mi.UInt32, mi.Float, mi.Float, Guide | None, Net | None],
     inputs: tuple[Any, ...],
 ) -> Any:
     """A recording, or None where there cannot be one.
@@ -138,8 +139,9 @@ def _on_samples(samples: Samples, function: Callable[..., Any]) -> Callable[...,
 
     def on_samples(
         scene: mi.Scene, sensor: mi.Sensor, seed: mi.UInt32, scale: mi.Float, fraction: mi.Float, guide: Guide | None,
-        *inputs: Any,
+        net: Net | None, *inputs: Any,
     ) -> Any:  # fmt: skip
-        return function(Samples(scene, sensor, plan, Film(sensor), seed, spp, width, scale, fraction, guide), *inputs)
+        film = Film(sensor)
+        return function(Samples(scene, sensor, plan, film, seed, spp, width, scale, fraction, guide, net), *inputs)
 
     return on_samples

@@ -110,7 +110,7 @@ def hear(samples: Samples, adjoint: AdjointImage) -> Array:
     heard: Heard = walk(samples, Hearing(samples, adjoint, loudness))
     sampler = samples.sampler()
     sample_time(plan, samples.sensor, sampler)
-    drawn = samples.drawn(sampler.next_1d(), sampler.next_2d(), sampler.next_2d())  # as the walk had them
+    drawn = samples.drawn(*samples.emission_numbers(sampler))  # as the walk had them
     assert drawn is not None
     squares = [dr.squared_norm(total) for total in heard.sums] + [heard.image]
     cells = plan.grid.cells

@@ -14,11 +14,13 @@ from reslrb_cli.integrators.differentiated import Differentiated, differentiated
 from reslrb_cli.integrators.freezing import Recordings
 from reslrb_cli.integrators.guiding import Guiding
 from reslrb_cli.integrators.light_tracer import settle
+from reslrb_cli.integrators.probing import used_numbers
 from reslrb_cli.integrators.renewal import Renewal, with_shading_normals
 from reslrb_cli.scene.graph import SceneGraph
 from reslrb_cli.scene.needs import check_supported, interpolates_normals, scene_needs
+from reslrb_cli.transport.nets import make_coordinates
 from reslrb_cli.transport.plan import Plan, make_plan
-from reslrb_cli.transport.samples import passes
+from reslrb_cli.transport.samples import Samples, passes
 
 
 @dataclass(frozen=True)
@@ -88,9 +90,11 @@ class Preparation:
     """Plans by sensor, owners of parameters, and recordings of one scene: the last that was asked for."""
 
     def __init__(
-        self, max_depth: int, rr_depth: int, hide_emitters: bool, motion: Motion, guided: bool = False
-    ) -> None:
+        self, max_depth: int, rr_depth: int, hide_emitters: bool, motion: Motion, guided: bool = False,
+        low_discrepancy: bool = False,
+    ) -> None:  # fmt: skip
         self.guiding = Guiding() if guided else None
+        self._low_discrepancy = low_discrepancy
         self._depths, self._hide_emitters, self._motion = (max_depth, rr_depth), hide_emitters, motion
         self._scene: tuple[int, mi.Scene | None] | None = None  # its address, and, so that it is not used again, itself
         self._plans: dict[int, Plan] = {}
@@ -103,7 +107,7 @@ class Preparation:
 
     def afresh(self, guided: bool, images: bool) -> Preparation:
         """A new one with the same options, guided or not; `images`: samples of images alone, too."""
-        made = Preparation(*self._depths, self._hide_emitters, self._motion, guided)
+        made = Preparation(*self._depths, self._hide_emitters, self._motion, guided, self._low_discrepancy)
         if made.guiding is not None:
             made.guiding.images = images
         return made
@@ -120,10 +124,10 @@ class Preparation:
             self._renewal = self._renewal or Renewal(scene)
             settle(scene)
             self._plans[sensor.ptr] = make_plan(needs, *self._depths, self._hide_emitters)
-            if self.guiding is not None:
+            if self.guiding is not None or self._low_discrepancy:
                 made = self._renewal.renew(self._plans[sensor.ptr], scene)
                 [samples] = passes(made, scene, sensor, dr.opaque(mi.UInt32, 0), 1, None)
-                self._plans[sensor.ptr] = replace(self._plans[sensor.ptr], grid=self.guiding.grid_of(samples))
+                self._plans[sensor.ptr] = self._with_numbers(self._plans[sensor.ptr], samples)
         assert self._renewal is not None
         plan = self._renewal.renew(self._plans[sensor.ptr], scene)
         if params is None:
@@ -137,6 +141,14 @@ class Preparation:
         if plan.stays and self._motion.sampling == "auto" and not self._bounces_in(plan, scene, sensor):
             return replace(plan, stays=False, glossy_follows=False)
         return plan
+
+    def _with_numbers(self, plan: Plan, samples: Samples) -> Plan:
+        """The plan with what says how the numbers of its paths are drawn."""
+        grid = None if self.guiding is None else self.guiding.grid_of(samples)
+        if not self._low_discrepancy:
+            return replace(plan, grid=grid)
+        sequence = make_coordinates(used_numbers(samples), len(plan.needs.emitters), plan.max_depth)
+        return replace(plan, grid=grid, sequence=sequence)
 
     def _bounces_in(self, plan: Plan, scene: mi.Scene, sensor: mi.Sensor) -> bool:
         """Whether vertices have to stay. Asked once, since kernels would be compiled anew for another answer."""

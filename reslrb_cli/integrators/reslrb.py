@@ -29,6 +29,7 @@ class Reslrb(LightTracer):
         "filter_normalization": "attached",
         "attached_sampling": "auto",
         "guiding": "off",
+        "sequence": "independent",
     }
 
     def __init__(self, estimator: Estimator, **common: Any) -> None:
@@ -43,6 +44,7 @@ class Reslrb(LightTracer):
         filter_normalization: str = "attached",
         attached_sampling: str = "auto",
         guiding: str = "off",
+        sequence: str = "independent",
         **options: Any,
     ) -> Reslrb:
         """From the estimator's name and all options. Raises ValueError where one is wrong."""
@@ -60,7 +62,9 @@ class Reslrb(LightTracer):
         if guiding == "auto":
             raise ValueError('"guiding" auto needs an experiment to measure on (`reslrb optimize`); say on or off')
         one_of("guiding", guiding, ("on", "off"))
-        return cls(kind(**own), motion=motion, guided=guiding == "on", **options)
+        one_of("sequence", sequence, ("independent", "low_discrepancy"))
+        low_discrepancy = sequence == "low_discrepancy"
+        return cls(kind(**own), motion=motion, guided=guiding == "on", low_discrepancy=low_discrepancy, **options)
 
     def image_estimator(self) -> Estimator | None:
         return None if self.estimator.splats_all else self.estimator

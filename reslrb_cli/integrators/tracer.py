@@ -46,11 +46,13 @@ class LightTracer:
         freeze: bool = False,
         motion: Motion | None = None,
         guided: bool = False,
+        low_discrepancy: bool = False,
     ) -> None:
         """Raises ValueError, which names the option, where one has a value that it cannot have.
 
         `freeze` says whether launches are recorded (`freezing.py`), `motion` how derivatives of what moves are taken,
-        `guided` whether emission is drawn from what earlier paths said (`guiding.py`).
+        `guided` whether emission is drawn from what earlier paths said (`guiding.py`),
+        `low_discrepancy` whether the numbers of a path's beginning are (`nets.py`).
         """
         if max_depth < -1:
             raise ValueError('"max_depth" must be -1 (no limit) or a value >= 0')
@@ -60,7 +62,7 @@ class LightTracer:
             raise ValueError('"samples_per_pass" must be greater than zero')
         self.max_depth, self.rr_depth, self.hide_emitters = max_depth, rr_depth, hide_emitters
         self.samples_per_pass, self.freeze = samples_per_pass, freeze
-        self.preparation = Preparation(max_depth, rr_depth, hide_emitters, motion or Motion(), guided)
+        self.preparation = Preparation(max_depth, rr_depth, hide_emitters, motion or Motion(), guided, low_discrepancy)
 
     def with_options(self, *, samples_per_pass: int | None, freeze: bool) -> Self:
         """The same with other passes, or without recordings; both share what they find out about a scene."""

@@ -15,7 +15,7 @@ from reslrb_cli.errors import ConfigError
 #: Options that a case takes over from the configuration's integrator, where it knows them.
 SHARED = (
     *("rr_depth", "hide_emitters", "samples_per_pass", "attached", "filter_normalization", "attached_sampling"),
-    "guiding",
+    *("guiding", "sequence"),
 )
 #: The estimator of a case that names none, as that of the plugin.
 PLUGIN_ESTIMATOR = "reservoir"
@@ -24,7 +24,7 @@ ADJOINT = ("adjoint", "batches", "first_batch")
 _TYPES = {str(kind.model_fields["type"].default): kind for kind in (Reslrb, Ptracer, Prb, WalkAd, Trajectory)}
 #: Options that make an estimator another one, in records.
 _ESTIMATOR_OPTIONS = {option for options in ESTIMATOR_OPTIONS.values() for option in options} - {"capacity"}
-_ESTIMATOR_OPTIONS |= {"guiding"}
+_ESTIMATOR_OPTIONS |= {"guiding", "sequence"}
 _OPTION = "--integrators"
 _ITEM = re.compile(r"(?P<type>\w+)(?::(?P<estimator>\w+))?(?:\((?P<options>.*)\))?")
 

@@ -61,7 +61,8 @@ def _of_view(problem: Problem, iteration: int, view: View) -> Offender | None:
 def _parts(problem: Problem, sensor: int, step_seed: int) -> Iterator[tuple[Samples, int, str]]:
     """The samples of a step, pass by pass, with the sensor's index and a name; light paths are those of the run."""
     options = problem.config.integrator.options()
-    shared = {name: options[name] for name in ("max_depth", "rr_depth", "hide_emitters")}
+    names = ("max_depth", "rr_depth", "hide_emitters", "sequence")
+    shared = {name: options[name] for name in names if name in options}
     tracer = Reslrb.of(estimator="gather", samples_per_pass=problem.samples_per_pass, **shared)
     scene = problem.scene
     # Of what moves light, contributions alone are looked at: `gather` has no derivatives of it.

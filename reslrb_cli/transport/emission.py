@@ -50,7 +50,7 @@ def sample_time(plan: Plan, sensor: mi.Sensor, sampler: Numbered) -> mi.Float:
 def sample_emission(samples: Samples, sampler: mi.Sampler) -> Emission:
     """Sample a ray from a random emitter of the scene. Draws as many numbers, in the same order, as `ptracer`."""
     time = sample_time(samples.plan, samples.sensor, sampler)
-    wavelength_sample, sample_2, sample_3 = sampler.next_1d(), sampler.next_2d(), sampler.next_2d()
+    wavelength_sample, sample_2, sample_3 = samples.emission_numbers(sampler)
     drawn = samples.drawn(wavelength_sample, sample_2, sample_3)
     if drawn is None:
         return emission_of(samples, time, wavelength_sample, sample_2, sample_3)

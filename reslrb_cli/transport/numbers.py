@@ -3,8 +3,9 @@ the same paths."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
+import drjit as dr
 import mitsuba as mi
 
 
@@ -20,3 +21,18 @@ class Numbers:
     def draw(sampler: mi.Sampler, active: mi.Bool) -> Numbers:
         """The numbers of the next segment. Roulette's follows them, and is drawn by the walk."""
         return Numbers(sampler.next_2d(active), sampler.next_2d(active), sampler.next_1d(active))
+
+    def of_early(self, early: list[Early], depth: mi.UInt32) -> Numbers:
+        """The same, but those for the BSDF as `early` has them for the first vertices; the first is of depth 1."""
+        bsdf = Early(self.bsdf_2d, self.bsdf_1d)
+        for bounce, own in enumerate(early):
+            bsdf = dr.select(depth == bounce + 1, own, bsdf)
+        return replace(self, bsdf_2d=bsdf.bsdf_2d, bsdf_1d=bsdf.bsdf_1d)
+
+
+@dataclass
+class Early:
+    """What the BSDF of one of the first vertices has, known before the path is traced."""
+
+    bsdf_2d: mi.Point2f
+    bsdf_1d: mi.Float

@@ -10,6 +10,7 @@ from reslrb_cli.scene.horizon import Horizon
 from reslrb_cli.scene.lamps import Lamp
 from reslrb_cli.scene.needs import SceneNeeds
 from reslrb_cli.transport.guide import Grid
+from reslrb_cli.transport.nets import Coordinates
 
 UNBOUNDED = 0xFFFFFFFF
 
@@ -49,6 +50,8 @@ class Plan:
     horizon: Horizon | None = None
     # The cells that emission is guided by, where it is.
     grid: Grid | None = None
+    # The numbers of low discrepancy, where there are any.
+    sequence: Coordinates | None = None
 
     @property
     def moving_emission(self) -> bool:

@@ -12,6 +12,8 @@ from reslrb_cli.scene.lamps import Lamp
 from reslrb_cli.transport.emission import Numbered
 from reslrb_cli.transport.guide import Drawn, Guide, Table
 from reslrb_cli.transport.lamps import sums_of_areas
+from reslrb_cli.transport.nets import Net, Points
+from reslrb_cli.transport.numbers import Early
 from reslrb_cli.transport.plan import Plan
 from reslrb_cli.transport.splat import Film
 from reslrb_cli.transport.visible import PrimaryRay, primary_ray
@@ -22,6 +24,7 @@ VISIBLE_STREAM = 0xD1EC7  # primary rays
 LAMP_STREAM = 0x1A3B5 << 12  # points of lamps; the lamp's number is added
 PASS_STREAM = 0x9A55E5  # seeds of the second pass and those after it
 GUIDE_STREAM = 0x6D1DE  # cells of emission
+NET_STREAM = 0x5EC0E  # scrambles of numbers of low discrepancy
 
 
 @dataclass
@@ -29,7 +32,7 @@ class Samples:
     """The samples of one pass. `seed` is an opaque UInt32; `width` is the number of light paths.
 
     `scale` (width 1) brings a sum over light paths to an image; of all samples of that image, these are the part
-    `fraction` (width 1). With a `guide` emission is drawn from its table.
+    `fraction` (width 1). With a `guide` emission is drawn from its table, with a `net` numbers are of low discrepancy.
     """
 
     scene: mi.Scene
@@ -42,6 +45,7 @@ class Samples:
     scale: mi.Float
     fraction: mi.Float
     guide: Guide | None = None
+    net: Net | None = None
     _areas: list[mi.Float] = field(init=False)  # of the lamps that are reshaped: `sums_of_areas`
 
     def __post_init__(self) -> None:
@@ -70,6 +74,38 @@ class Samples:
         seed = mi.sample_tea_32(self.seed, mi.UInt32(name))[0]
         state, sequence = mi.sample_tea_32(seed, dr.arange(mi.UInt32, self.width))
         return mi.PCG32(1, mi.UInt64(state), mi.UInt64(sequence))
+
+    def emission_numbers(self, sampler: mi.Sampler) -> tuple[mi.Float, mi.Point2f, mi.Point2f]:
+        """What says where paths start: the choice of an emitter, the place, the direction; in `ptracer`'s order."""
+        choice, place, direction = sampler.next_1d(), sampler.next_2d(), sampler.next_2d()
+        if self.net is None:
+            return choice, place, direction
+        return self._points(choice, place, direction)[1]
+
+    def early_numbers(self) -> list[Early]:
+        """What the BSDFs of the first vertices have, where that is of low discrepancy; else nothing."""
+        if self.net is None:
+            return []
+        assert self.plan.sequence is not None
+        # Their place in the sequence is behind that of emission's.
+        points, _ = self._points(mi.Float(0), mi.Point2f(0), mi.Point2f(0))
+        return [Early(points.next_2d(), points.next_1d()) for _ in range(self.plan.sequence.bounces)]
+
+    def _points(
+        self, choice: mi.Float, place: mi.Point2f, direction: mi.Point2f
+    ) -> tuple[Points, tuple[mi.Float, mi.Point2f, mi.Point2f]]:
+        """The net's points behind those of emission, and the latter, of these independent numbers."""
+        which = self.plan.sequence
+        assert which is not None
+        # A guide stratifies the lanes itself, emitters among them: where in its share the choice lies says nothing.
+        guided = self.guide is not None
+        points = Points(mi.sample_tea_32(self.seed, mi.UInt32(NET_STREAM))[0], self.width, None if guided else self.net)
+        if which.choice and not guided:
+            choice = points.next_1d(choice)
+        direction = points.next_2d(direction, which.direction)
+        place = points.next_2d(place, which.place)
+        points.net = None  # whether or not there was anything to stratify
+        return points, (choice, place, direction)
 
     def drawn(self, choice: mi.Float, position: mi.Point2f, direction: mi.Point2f) -> Drawn | None:
         """Where the guide has each path start, of emission's own numbers; None without a guide."""
@@ -112,7 +148,9 @@ def make_samples(plan: Plan, scene: mi.Scene, sensor: mi.Sensor, seed: mi.UInt32
         raise ValueError(f"{width} paths in one pass are more than 2^32 - 1: set samples_per_pass below {spp}")
     # Opaque: as literals they would give every sample count kernels of its own.
     scale = dr.opaque(mi.Float, float(dr.prod(film.size)) / (float(dr.prod(sensor.film().size())) * total_spp))
-    return Samples(scene, sensor, plan, film, mi.UInt32(seed), spp, width, scale, dr.opaque(mi.Float, spp / total_spp))
+    fraction = dr.opaque(mi.Float, spp / total_spp)
+    net = None if plan.sequence is None else Net.of(width)
+    return Samples(scene, sensor, plan, film, mi.UInt32(seed), spp, width, scale, fraction, net=net)
 
 
 def passes(

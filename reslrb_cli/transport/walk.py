@@ -17,7 +17,7 @@ from reslrb_cli.transport.connection import passage
 from reslrb_cli.transport.emission import sample_emission
 from reslrb_cli.transport.factors import Product
 from reslrb_cli.transport.hooks import Hooks, Vertex
-from reslrb_cli.transport.numbers import Numbers
+from reslrb_cli.transport.numbers import Early, Numbers
 from reslrb_cli.transport.plan import Plan
 from reslrb_cli.transport.samples import SELECTION_STREAM, Samples
 from reslrb_cli.transport.scattering import evaluate
@@ -37,6 +37,7 @@ class Path:
     pi: mi.PreliminaryIntersection3f  # where it does
     product: Product  # E s_1 ... s_{depth-1}, roulette weights included
     eta: mi.Float  # accumulated relative index of refraction, for roulette alone; begins larger where emission is dim
+    early: list[Early]  # numbers of the first vertices, where they are of low discrepancy; never changed
 
 
 def walk(samples: Samples, hooks: Hooks, active: mi.Bool | bool = True) -> Any:
@@ -63,7 +64,7 @@ def walk(samples: Samples, hooks: Hooks, active: mi.Bool | bool = True) -> Any:
     state = hooks.start(product)
     active &= plan.max_depth > 1
     pi, active = intersect(plan, scene, emission.ray, active)
-    path = Path(active, mi.UInt32(1), emission.ray, pi, product, eta)
+    path = Path(active, mi.UInt32(1), emission.ray, pi, product, eta, samples.early_numbers())
 
     def body(
         path: Path, state: Any, sampler: mi.Sampler, selection: mi.PCG32 | None
@@ -72,7 +73,7 @@ def walk(samples: Samples, hooks: Hooks, active: mi.Bool | bool = True) -> Any:
         vertex = Vertex(path.pi, si, bsdf, path.ray, path.depth, path.product, path.active)
 
         # ---- Connect to the sensor, and scatter ----
-        numbers = Numbers.draw(sampler, path.active)
+        numbers = Numbers.draw(sampler, path.active).of_early(path.early, path.depth)
         connected = path.active & hooks.wants(state, vertex)
         active = path.active & (path.depth + 1 < plan.max_depth) & hooks.goes_on(state, vertex)
         this = segment(
@@ -116,7 +117,7 @@ def walk(samples: Samples, hooks: Hooks, active: mi.Bool | bool = True) -> Any:
 
     def _next(path: Path, active: mi.Bool, ray: mi.Ray3f, product: Product, eta: mi.Float) -> Path:
         pi, active = intersect(plan, scene, ray, active)
-        return Path(active, path.depth + 1, ray, pi, product, eta)
+        return Path(active, path.depth + 1, ray, pi, product, eta, path.early)
 
     def recorded_body(path: Path, *rest: Any) -> tuple[Any, ...]:
         path, *changed = body(_with_masks(path), *rest)

@@ -64,6 +64,20 @@ def test_a_whole_folder_is_replayed(run, capsys):
     assert out.startswith("iteration 0, sensor 0")
 
 
+def test_paths_are_of_the_run_s_sequence(run):
+    from reslrb_cli.cli.replaying import load_replay
+    from reslrb_cli.config import load
+    from reslrb_cli.measure.offender import _parts
+
+    config = (run / "config.yaml").read_text()
+    for sequence in ("independent", "low_discrepancy"):
+        (run / "config.yaml").write_text(config.replace("sequence: independent", f"sequence: {sequence}"))
+        problem = load_replay(load(run / "config.yaml")).problem
+        own = problem.integrator.plan(problem.scene, problem.scene.sensors()[0]).sequence
+        assert (own is not None) == (sequence == "low_discrepancy")
+        assert {samples.plan.sequence for samples, *_ in _parts(problem, 0, 1)} == {own}
+
+
 def test_a_guided_run_is_refused(run, capsys):
     config = (run / "config.yaml").read_text()
     assert "guiding: 'off'" in config

@@ -22,7 +22,7 @@ def test_the_table_names_every_estimator() -> None:
 def test_options_and_defaults_are_the_estimators_own(name: str) -> None:
     options = Reslrb(estimator=name).options()  # type: ignore[arg-type]
     shared = {"max_depth", "rr_depth", "hide_emitters", "estimator", "freeze"}
-    shared |= {"attached", "filter_normalization", "attached_sampling", "guiding"}
+    shared |= {"attached", "filter_normalization", "attached_sampling", "guiding", "sequence"}
     assert {key: value for key, value in options.items() if key not in shared} == ESTIMATORS[name].OPTIONS
 
 

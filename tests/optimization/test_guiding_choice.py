@@ -103,6 +103,14 @@ def test_on_is_guided_and_off_has_nothing_of_it(
     assert on != plain
 
 
+def test_the_sequence_is_the_same_with_guiding_and_without(experiment: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for guided_ms in (1.0, 1000.0):
+        problem = decided(monkeypatch, guided_ms, "integrator.sequence=low_discrepancy")
+        plan = problem.integrator.plan(problem.scene, problem.scene.sensors()[0])
+        assert (plan.grid is None) == (guided_ms > 1)
+        assert plan.sequence is not None
+
+
 def operations(problem: Problem) -> list[int]:
     """Those of the kernels of a step of the run, after a first one."""
     clock = StepClock()

@@ -1,0 +1,132 @@
+"""Faults of numbers of low discrepancy, each planted by a function that patches it in."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+
+def never_scrambled(patch: pytest.MonkeyPatch) -> None:
+    """Points are those of the sequence itself, in every pass."""
+    from reslrb_cli.transport import nets
+
+    patch.setattr(nets, "scrambled", lambda point, shift, key: point)
+
+
+def scrambled_once(patch: pytest.MonkeyPatch) -> None:
+    """Every pass has the same scramble."""
+    from reslrb_cli.transport import samples
+
+    right = samples.Points
+
+    def wrong(seed: Any, *rest: Any) -> Any:
+        import mitsuba as mi
+
+        return right(mi.UInt32(7), *rest)
+
+    patch.setattr(samples, "Points", wrong)
+
+
+def not_shifted(patch: pytest.MonkeyPatch) -> None:
+    """Digits are permuted, but the permutation leaves the first point where it is."""
+    from reslrb_cli.transport import nets
+
+    right = nets.scrambled
+    patch.setattr(nets, "scrambled", lambda point, shift, key: right(point, shift * 0, key))
+
+
+def one_scramble_for_all(patch: pytest.MonkeyPatch) -> None:
+    """All coordinates of a pass have the same shift and key."""
+    _renumbered(patch, scramble=lambda number: 0)
+
+
+def used_twice(patch: pytest.MonkeyPatch) -> None:
+    """Each two numbers are one coordinate, under one scramble."""
+    _renumbered(patch, scramble=lambda number: number // 2, coordinate=lambda number: number // 2)
+
+
+def _renumbered(
+    patch: pytest.MonkeyPatch, scramble: Any = lambda number: number, coordinate: Any = lambda number: number
+) -> None:
+    from reslrb_cli.transport import nets
+
+    def next_1d(self: Any, independent: Any = None) -> Any:
+        import drjit as dr
+        import mitsuba as mi
+
+        if self.net is not None:
+            net, self.net = self.net, None
+            return net.stratified(self.lane, independent)
+        shift, key = mi.sample_tea_32(self.seed, mi.UInt32(scramble(self.used)))
+        digits = nets.point(self.lane, coordinate(self.used), self.digits)
+        self.used += 1
+        return nets._float(dr.brev(nets.scrambled(digits, shift, key)))
+
+    patch.setattr(nets.Points, "next_1d", next_1d)
+
+
+def half_of_the_strata(patch: pytest.MonkeyPatch) -> None:
+    """Lanes share the first number as if there were twice as many of them."""
+    from reslrb_cli.transport import nets
+
+    right = nets.Net.of
+    patch.setattr(nets.Net, "of", staticmethod(lambda width: right(2 * width)))
+
+
+def without_jitter(patch: pytest.MonkeyPatch) -> None:
+    """The first number is always where its stratum begins."""
+    from reslrb_cli.transport import nets
+
+    right = nets.Net.stratified
+    patch.setattr(nets.Net, "stratified", lambda self, lane, jitter: right(self, lane, jitter * 0))
+
+
+def squeezed(patch: pytest.MonkeyPatch) -> None:
+    """Numbers end below 1."""
+    from reslrb_cli.transport import nets
+
+    right = nets._float
+    patch.setattr(nets, "_float", lambda digits: right(digits) * 0.96)
+
+
+def of_emission_again(patch: pytest.MonkeyPatch) -> None:
+    """The first vertices have the coordinates that emission had."""
+    from reslrb_cli.transport.samples import Samples
+
+    right = Samples._points
+
+    def wrong(self: Any, *numbers: Any) -> Any:
+        points, own = right(self, *numbers)
+        points.used = 0
+        return points, own
+
+    patch.setattr(Samples, "_points", wrong)
+
+
+def shared_by_passes(patch: pytest.MonkeyPatch) -> None:
+    """All passes of an image have the first one's seed."""
+    from reslrb_cli.integrators import tracer
+
+    right = tracer.passes
+
+    def wrong(*given: Any) -> Any:
+        parts = right(*given)
+        for part in parts[1:]:
+            part.seed = parts[0].seed
+        return parts
+
+    patch.setattr(tracer, "passes", wrong)
+
+
+def swapped_in_replays(patch: pytest.MonkeyPatch) -> None:
+    """Every second walk has the numbers of its first two vertices the other way round."""
+    from reslrb_cli.transport.samples import Samples
+
+    right, calls = Samples.early_numbers, [0]
+
+    def wrong(self: Any) -> Any:
+        calls[0] += 1
+        return right(self)[:: 1 if calls[0] % 2 else -1]
+
+    patch.setattr(Samples, "early_numbers", wrong)

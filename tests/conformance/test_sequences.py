@@ -1,0 +1,238 @@
+"""Numbers of low discrepancy: evenly spread, and unbiased in every way of a step; what could bias is planted."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import combinations
+from typing import Any
+
+import numpy as np
+import pytest
+from conformance import attached_cases, moving_lamps, sequence_faults
+from conformance.gradient_cases import CASES
+from conformance.test_guiding import guided, sample, samples
+from conformance.test_kernels import steps_compile_nothing
+from turns import a_few
+
+import reslrb_cli
+from reslrb_cli.estimators import ESTIMATORS
+from reslrb_cli.integrators import make_integrator
+from reslrb_cli.integrators.features import FEATURES
+from reslrb_cli.integrators.plan_report import count, tracking
+from reslrb_cli.measure.gradients import Case, integrator, relative, seeds
+from reslrb_cli.measure.statistics import compare
+
+pytestmark = pytest.mark.usefixtures("llvm")
+
+BY_NAME = {case.name: case for case in CASES}
+MOVING = {case.name: case for case in (*attached_cases.CASES, *moving_lamps.CASES)}
+NAMES = ("texture", "two_emitters", "envmap", "roulette", "passes", "area_texture", "glass", "mask", "point", "plastic")
+ON: dict[str, Any] = {"sequence": "low_discrepancy"}
+#: So few that a point that is not evenly distributed by itself shows.
+LANES = 5
+
+
+def both(name: str, **options: Any) -> tuple[Case, Any, Any]:
+    """A case, an integrator with such numbers, and one with independent ones."""
+    case = BY_NAME[name]
+    own = {"estimator": "stack"} | {k: v for k, v in case.options.items() if k != "image"} | case.both | options
+    return Case(case.scene(), case.keys), integrator("reslrb", **own, **ON), integrator("reslrb", **own)
+
+
+# ---- The means -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", a_few(NAMES, ["glass"]))
+def test_means_are_those_of_independent_numbers(name: str) -> None:
+    scene, ours, plain = both(name, freeze=True)
+    result = compare(samples(scene, ours, 32), samples(scene, plain, 32, 1), block=None)
+    print(name, result)
+    assert result
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("guiding", ["off", "on"])
+@pytest.mark.parametrize("name", ["texture", "two_emitters", "glass"])
+def test_means_of_many_seeds_are_those_of_others(name: str, guiding: str) -> None:
+    """Of independent numbers, and of the stock integrator that is right for the case."""
+    scene, ours, plain = both(name, freeze=True)
+    if guiding == "on":
+        _, ours, _ = guided(name, 4, **ON)
+    found, case = samples(scene, ours, 200), BY_NAME[name]
+    against = compare(found, samples(scene, plain, 200, 1), block=None)
+    stock = scene.gradients(integrator(case.reference, **case.both), seeds(200, 2), case.spp)
+    independent = compare(found[:, : stock.shape[1]], stock, block=None)
+    print(name, guiding, against, independent, sep="\n")
+    assert against
+    assert independent
+
+
+@pytest.mark.parametrize("estimator", a_few(ESTIMATORS, ["reservoir"]))
+@pytest.mark.parametrize("adjoint", a_few(["correlated", "independent", "batched"], ["batched"]))
+def test_every_way_of_a_step_has_the_same_mean(estimator: str, adjoint: str) -> None:
+    scene, ours, plain = both("texture", estimator=estimator, freeze=True)
+    found = [scene.gradients(each, seeds(24, block), 16, adjoint=adjoint) for block, each in enumerate((ours, plain))]
+    result = compare(*found, block=None)
+    print(estimator, adjoint, result)
+    assert result
+
+
+@pytest.mark.parametrize("name", a_few(["latents", "spot", "mesh", "bounces_4"], ["spot"]))
+@pytest.mark.parametrize("estimator", a_few(["stack", "reservoir"], ["stack"]))
+def test_means_where_light_is_followed(name: str, estimator: str) -> None:
+    moving, found = MOVING[name].moving(), []
+    for block, sequence in enumerate(("low_discrepancy", "independent")):
+        ours = make_integrator("reslrb", max_depth=5, rr_depth=1000, estimator=estimator, sequence=sequence)
+        rows = [moving.gradient(ours, seed, 16) for seed in seeds(32, block)]
+        found.append(np.stack([np.concatenate(list(row.values())) for row in rows]))
+    result = compare(*found, block=None)
+    print(name, estimator, result)
+    assert np.abs(found[0]).max() > 0
+    assert result
+
+
+def test_there_is_less_noise_where_these_numbers_say_where_light_goes() -> None:
+    scene, ours, plain = both("point", max_depth=2)
+    variances = [samples(scene, each, 24, block).var(0, ddof=1).sum() for block, each in enumerate((ours, plain))]
+    print(variances[1] / variances[0])
+    assert variances[1] > 2 * variances[0]
+
+
+# ---- The numbers -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("guiding", ["off", "on"])
+def test_numbers_are_evenly_distributed(guiding: str) -> None:
+    result = evenly(guiding)
+    print(result)
+    assert result
+
+
+@pytest.mark.parametrize(
+    "fault",
+    [
+        sequence_faults.never_scrambled,
+        sequence_faults.scrambled_once,
+        sequence_faults.not_shifted,
+        sequence_faults.one_scramble_for_all,
+        sequence_faults.used_twice,
+        sequence_faults.half_of_the_strata,
+        sequence_faults.without_jitter,
+        sequence_faults.squeezed,
+        sequence_faults.of_emission_again,
+        sequence_faults.shared_by_passes,
+    ],
+)
+def test_what_would_bias_is_found(fault: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    fault(monkeypatch)
+    result = evenly("off")
+    print(fault.__name__, result)
+    assert not result
+
+
+def evenly(guiding: str) -> Any:
+    """Counts of the numbers of two passes of a few lanes, against what they are expected to be."""
+    import drjit as dr
+    import mitsuba as mi
+
+    from reslrb_cli.integrators import Job
+    from reslrb_cli.transport.nets import Net
+
+    case = Case(BY_NAME["two_emitters"].scene(), [])
+    ours = integrator("reslrb", guiding=guiding, samples_per_pass=1, **ON)
+    rows = []
+    for seed in range(80):
+        job = Job(case.scene, case.scene.sensors()[0], dr.opaque(mi.UInt32, seed), 2)
+        numbers: list[Any] = []
+        for part in ours.passes(job):
+            few = replace(part, width=LANES, net=Net.of(LANES))
+            choice, place, direction = few.emission_numbers(few.sampler())
+            early = [number for own in few.early_numbers() for number in (own.bsdf_2d.x, own.bsdf_2d.y, own.bsdf_1d)]
+            # In both passes a lane has its first number in the same stratum.
+            first = [choice] if guiding == "off" and not numbers else []
+            numbers += [*first, direction.x, direction.y, place.x, place.y, *early]
+        dr.eval(numbers)
+        assert len(numbers) == 20 + (guiding == "off")
+        rows.append(counts(numbers))
+    found = np.stack(rows)
+    return compare(found, np.tile(expected(len(numbers)), (2, 1)), block=None)
+
+
+def counts(numbers: list[Any]) -> np.ndarray:
+    """How many are in each eighth, and how many of each two in each quarter of the square."""
+    values = np.stack([np.array(number, np.float64) for number in numbers])
+    assert values.min() >= 0
+    assert values.max() < 1
+    halves = (values * 2).astype(int)
+    single = [np.bincount((row * 8).astype(int), minlength=8) for row in values]
+    return np.concatenate([*single, *(np.bincount(2 * a + b, minlength=4) for a, b in combinations(halves, 2))])
+
+
+def expected(numbers: int) -> np.ndarray:
+    """The same of numbers that are evenly distributed, and independent of one another within a lane."""
+    pairs = numbers * (numbers - 1) // 2
+    return np.concatenate([np.full(8 * numbers, LANES / 8), np.full(4 * pairs, LANES / 4)])
+
+
+# ---- Replays ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", a_few(["two_emitters", "glass", "mask_texture_in_view", "passes"], ["glass"]))
+def test_exact_estimators_agree_at_equal_seeds(name: str) -> None:
+    """A replay that drew other numbers than the trace would not."""
+    assert worst_of_replays(name) < 1e-4
+
+
+def test_a_replay_with_other_numbers_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
+    sequence_faults.swapped_in_replays(monkeypatch)
+    assert worst_of_replays("glass", ["correlated"]) > 1e-2
+
+
+def worst_of_replays(name: str, ways: Sequence[str] = ("correlated", "independent")) -> float:
+    """How far gradients of `gather`, which traces twice, are from those of `stack`, at most."""
+    scene, ours, _ = both(name)
+    _, other, _ = both(name, estimator="gather")
+    return max(relative(*(scene.gradient(each, 5, 64, adjoint=way) for each in (other, ours))) for way in ways)
+
+
+def test_a_recorded_step_is_the_step() -> None:
+    scene, ours, _ = both("two_emitters")
+    _, frozen, _ = both("two_emitters", freeze=True)
+    for seed in (5, 6):
+        assert relative(*(sample(scene, each, seed) for each in (ours, frozen))) < 1e-4
+    assert frozen.preparation.recordings.counts()["fused"] > 0
+
+
+# ---- What it costs ---------------------------------------------------------------------------------------------------
+
+
+def test_with_independent_numbers_nothing_of_it_is_compiled() -> None:
+    [feature] = [feature for feature in FEATURES if feature.name == "low-discrepancy numbers"]
+    scene, ours, plain = both("two_emitters")
+    operations = {}
+    for name, each in (("on", ours), ("off", plain)):
+        with tracking(scene.params, scene.keys):
+            plan = each.plan(scene.scene, scene.scene.sensors()[0], scene.params)
+            assert feature.needed(plan) == (name == "on")
+            for toggled in (plan, feature.toggle(plan)):
+                kind = "on" if feature.needed(toggled) else "off"
+                operations[name, kind] = sum(count(each, toggled, scene.scene, scene.scene.sensors()[0], known=True))
+    assert operations["on", "on"] == operations["off", "on"]
+    assert operations["on", "off"] == operations["off", "off"] < operations["on", "on"]
+
+
+def test_later_steps_compile_nothing() -> None:
+    scene, ours, _ = both("passes")
+    steps_compile_nothing(scene, lambda seed: scene.gradient(ours, seed, 64, adjoint="correlated"))
+
+
+def test_the_plugin_has_the_option() -> None:
+    import mitsuba as mi
+
+    reslrb_cli.register()
+    plugin = mi.load_dict({"type": "reslrb", "max_depth": 4, **ON})
+    scene = Case(BY_NAME["point"].scene(), [])
+    assert plugin.tracer.plan(scene.scene, scene.scene.sensors()[0]).sequence is not None
+    with pytest.raises(RuntimeError, match='"sequence" must be one of independent, low_discrepancy, not "halton"'):
+        mi.load_dict({"type": "reslrb", "sequence": "halton"})
