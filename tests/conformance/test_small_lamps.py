@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from conformance.moving import Moving, flat
 from conformance.moving_lamps import over_floor, smooth_weights
+from conformance.test_kernels import Kernels
 from measure.faults import Fault
 from measure.test_mutations import plant
 
@@ -88,6 +89,17 @@ def test_forward_mode():
     tracer = integrator("reslrb", 1, estimator="stack")
     direction = np.array([1.0, 2.0, -0.5])
     assert case.tangent(tracer, direction, 3, 64) == pytest.approx(known.gradient(case.weights) @ direction, rel=0.01)
+
+
+def test_a_recorded_step_is_the_step_and_later_ones_compile_nothing():
+    case, kernels = Case(two(), SPECKS), Kernels()
+    plain, frozen = (integrator("reslrb", 3, estimator="stack", freeze=freeze) for freeze in (False, True))
+    for seed in (1, 2, 3):
+        expected = case.gradient(plain, seed, 16)
+        assert relative(case.gradient(frozen, seed, 16), expected) < 1e-5
+    for seed in (4, 5):
+        found = kernels.new(lambda: case.gradient(plain, seed, 16))  # noqa: B023
+        assert seed == 4 or found == []
 
 
 # ---- Which lamps are small ----
