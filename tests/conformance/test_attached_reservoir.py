@@ -186,7 +186,7 @@ def test_a_lamp_alone_moves_within_walls(name: str, options: dict[str, Any]):
     error = along.std(ddof=1) / 4
     print(name, options, f"bias {along.mean():.2%} +- {error:.2%}")
     assert abs(along.mean()) < 4 * error
-    assert error < 0.02
+    assert error < 0.05
 
 
 @pytest.mark.parametrize("name", ["bounces", pytest.param("rough_slab", marks=pytest.mark.long)])
