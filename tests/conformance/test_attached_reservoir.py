@@ -167,10 +167,10 @@ def test_a_lamp_alone_moves(name: str):
 
 @pytest.mark.long
 @pytest.mark.parametrize("options", [{}, {"capacity": 3}], ids=str)
-@pytest.mark.parametrize("name", ["spot_bounces", "point_bounces"])
-def test_a_lamp_alone_moves_within_walls(name: str, options: dict[str, Any]):
-    """The same with several connections a path, of which some are selected: in expectation."""
-    [lamp] = [case for case in LAMPS if case.name == name]
+def test_a_lamp_alone_moves_within_walls(options: dict[str, Any]):
+    """The same with several connections a path, of which some are selected: in expectation. (Of a point, whose light
+    goes everywhere, 16 seeds leave a tenth of noise.)"""
+    [lamp] = [case for case in LAMPS if case.name == "spot_bounces"]
     moving = lamp.moving()
     exact, ours = (
         np.array([
@@ -184,9 +184,9 @@ def test_a_lamp_alone_moves_within_walls(name: str, options: dict[str, Any]):
     )  # fmt: skip
     along = (ours - exact) @ exact.mean(0) / np.square(exact.mean(0)).sum()
     error = along.std(ddof=1) / 4
-    print(name, options, f"bias {along.mean():.2%} +- {error:.2%}")
+    print(options, f"bias {along.mean():.2%} +- {error:.2%}")
     assert abs(along.mean()) < 4 * error
-    assert error < 0.05
+    assert error < 0.01
 
 
 @pytest.mark.parametrize("name", ["bounces", pytest.param("rough_slab", marks=pytest.mark.long)])
