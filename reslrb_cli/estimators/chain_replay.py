@@ -163,7 +163,6 @@ class ChainReplay(VertexHooks):
 
 def differentiate(p: Pass, kept: list[Kept], damping: float) -> None:
     """Add the derivatives of the kept connections."""
-    replay = ChainReplay(p, kept, damping)
     if p.plan.differentiate_emission or p.plan.moving_emission:
         emission = p.emission()
         B, origin, direction = mi.Spectrum(0), mi.Vector3f(0), mi.Vector3f(0)
@@ -176,4 +175,6 @@ def differentiate(p: Pass, kept: list[Kept], damping: float) -> None:
                 direction + by_d,
             )
         differentiate_start(p, dr.detach(Adjoint(origin, direction, B)))
-    p.walk(replay, replay.last > 0)
+    if p.plan.moving_shapes or p.plan.differentiate_bsdfs:  # else no segment has a parameter, and Dr.Jit refuses it
+        replay = ChainReplay(p, kept, damping)
+        p.walk(replay, replay.last > 0)

@@ -22,15 +22,21 @@ class Differentiated:
     """What tracks derivatives.
 
     `bsdf_nodes` are the nodes of BSDFs that have such parameters: textures, nested BSDFs, and meshes whose attributes
-    textures read. `emission` says whether what emitters emit does, `zeros` whether any of the parameters is zero, or,
-    of those of BSDFs, nearly so. `shapes` are those that move, `emitters` those whose rays do.
+    textures read. `emission_nodes` are those of what emitters emit: emitters, and their textures. `zeros` says whether
+    any of the parameters is zero, or, of those of BSDFs, nearly so. `shapes` are those that move, `emitters` those
+    whose rays do.
     """
 
     bsdf_nodes: tuple[mi.Object, ...]
-    emission: bool
+    emission_nodes: tuple[mi.Object, ...]
     zeros: bool
     shapes: tuple[mi.Shape, ...]
     emitters: tuple[mi.Emitter, ...]
+
+    @property
+    def emission(self) -> bool:
+        """Whether what any emitter emits does."""
+        return bool(self.emission_nodes)
 
     @property
     def moves(self) -> bool:
@@ -45,9 +51,10 @@ def differentiated(params: mi.SceneParameters) -> Differentiated:
     at zero.
     """
     nodes: dict[mi.Object, None] = {}
+    emitting: dict[mi.Object, None] = {}
     shapes: dict[mi.Shape, None] = {}
     emitters: dict[mi.Emitter, None] = {}
-    emission = zeros = False
+    zeros = False
     with dr.resume_grad():  # where gradients are suspended, nothing says that it tracks them
         enabled = {key: value for key, value in params.items() if dr.grad_enabled(value)}
     for key, value in enabled.items():
@@ -64,13 +71,13 @@ def differentiated(params: mi.SceneParameters) -> Differentiated:
             emitters[node] = None
             continue  # no factor of a path
         elif kind == "emitter":
-            emission = True
+            emitting[node] = None
         else:
             _refuse(key, "light tracing has derivatives of what light meets and leaves from, not of the sensor")
         dims = kind == "attribute" or (kind == "bsdf" and any(name in key for name in FACTORS))
         if kind != "shape":
             zeros = zeros or _has_singular(key, value, NEARLY_ZERO if dims else 0)
-    return Differentiated(tuple(nodes), emission, zeros, tuple(shapes), tuple(emitters))
+    return Differentiated(tuple(nodes), tuple(emitting), zeros, tuple(shapes), tuple(emitters))
 
 
 def _refuse(key: str, reason: str | None) -> None:

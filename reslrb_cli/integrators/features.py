@@ -100,6 +100,24 @@ def _seen_moving(plan: Plan) -> Plan | str:
     return "goes with visible emitters, and with moving ones"
 
 
+def _small(plan: Plan) -> Plan | str:
+    if plan.small_lamps:
+        return replace(plan, needs=replace(plan.needs, small_lamps=()))
+    lamps = tuple(lamp for lamp in plan.needs.lamps if not lamp.parallel)
+    if not (lamps and plan.visible_emission):
+        return "no lamp is to be seen"
+    if plan.differentiate_null:
+        return "masks have derivatives, which rays through the pixels take"
+    return replace(plan, needs=replace(plan.needs, small_lamps=lamps))
+
+
+def _evened(plan: Plan) -> Plan | str:
+    if plan.evened_lamps:
+        return replace(plan, evened_lamps=())
+    textured = tuple(lamp for lamp in plan.needs.lamps if lamp.texture is not None)
+    return replace(plan, evened_lamps=textured) if textured else "no lamp has a texture"
+
+
 def _placed(plan: Plan) -> Plan | str:
     return "what Mitsuba makes of them is wrong" if plan.placed_lamps else "there are none"
 
@@ -201,8 +219,12 @@ FEATURES = (
     Feature("moving lamps in view", lambda p: bool(p.visible_moving_lamps),
             "their outline moves in the image; what they cover, and shadows, do not", "no lamp that moves is seen",
             _seen_moving),
+    Feature("small lamps in view", lambda p: bool(p.small_lamps), "found by points on them, not by rays through pixels",
+            "no lamp in view is smaller than a pixel", _small),
     Feature("placed lamps", lambda p: bool(p.placed_lamps), "spheres, parallel lamps, meshes that move: by the walk",
             "Mitsuba samples all emitters", _placed),
+    Feature("black texels of lamps", lambda p: bool(p.evened_lamps), "drawn too, since their derivative counts",
+            "no texture of a lamp is differentiated: texels are drawn by their radiance", _evened),
     Feature(GUIDED, lambda p: p.grid is not None, _tables, "guiding: off", _guided),
     Feature("low-discrepancy numbers", lambda p: p.sequence is not None,
             "where paths start, and how they first scatter, is evenly spread", "sequence: independent", _sequence),

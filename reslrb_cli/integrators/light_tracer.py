@@ -21,7 +21,7 @@ from reslrb_cli.transport.samples import Samples
 from reslrb_cli.transport.splat import AdjointImage, Film
 from reslrb_cli.transport.transmittance import forward_derivatives
 from reslrb_cli.transport.visible import differentiate_visible_radiance, visible_radiance, visible_tangent
-from reslrb_cli.transport.visible_lamps import moving_splats
+from reslrb_cli.transport.visible_lamps import moving_splats, small_splat
 from reslrb_cli.transport.walk import walk
 
 
@@ -45,6 +45,8 @@ def splat_visible_emission(samples: Samples, block: mi.ImageBlock, loop_mode: st
         primary = samples.primary_ray()
         radiance = visible_radiance(samples.plan, samples.scene, primary, loop_mode)
         samples.film.put(block, primary.u, radiance * primary.weight * samples.fraction, primary.active)
+    if samples.plan.small_lamps:
+        samples.film.put(block, *small_splat(samples))
 
 
 def splat_image(samples: Samples, block: mi.ImageBlock) -> None:
@@ -178,6 +180,11 @@ def differentiate_visible_emission(samples: Samples, adjoint: AdjointImage) -> N
         primary = samples.primary_ray()
         delta = adjoint.lookup(primary.u, primary.active) * primary.weight * samples.fraction
         differentiate_visible_radiance(plan, samples.scene, primary, delta)
+    if plan.small_lamps and plan.differentiate_emission:
+        with dr.resume_grad():
+            u, C, active = small_splat(samples)
+            objective = dr.dot(adjoint.lookup(u, active), C)
+            dr.backward_from(objective, flags=dr.ADFlag.Default | dr.ADFlag.AllowNoGrad)
     if plan.visible_moving_lamps:
         with dr.resume_grad():
             for u, C, active in moving_splats(samples):
@@ -195,6 +202,10 @@ def splat_tangents(samples: Samples, block: mi.ImageBlock) -> None:
             primary = samples.primary_ray()
             tangent = visible_tangent(plan, samples.scene, primary)
             samples.film.put(block, primary.u, tangent * primary.weight * samples.fraction, primary.active)
+        if plan.small_lamps and plan.differentiate_emission:
+            u, C, active = small_splat(samples)
+            [tangent] = forward_derivatives(C)
+            samples.film.put(block, u, tangent, active)
     hooks = AttachedTangentSplat if plan.attached else TangentSplat
     walk(samples, hooks(samples, block, dE))
 

@@ -137,7 +137,10 @@ class Preparation:
         self._track_zeros |= which.zeros
         only = self._bsdfs(scene, which.bsdf_nodes)
         plan = plan.differentiating(bool(which.bsdf_nodes), which.emission, self._track_zeros, only)
-        plan = attach(plan, which, self._motion, sensor, SceneGraph.of(scene).surface_bsdfs())
+        drawn = tuple(lamp for lamp in plan.needs.lamps if lamp.texture in which.emission_nodes)
+        plan = attach(
+            replace(plan, evened_lamps=drawn), which, self._motion, sensor, SceneGraph.of(scene).surface_bsdfs()
+        )
         if plan.stays and self._motion.sampling == "auto" and not self._bounces_in(plan, scene, sensor):
             return replace(plan, stays=False, glossy_follows=False)
         return plan

@@ -61,11 +61,17 @@ class Forecast:
         return self.elapsed_s + self.target_s + self.images_s + self.verdicts_s
 
 
-def make_forecast(config: Config, say: Callable[[str], None], cache: Cache | None = None) -> Forecast:
+def make_forecast(
+    config: Config,
+    say: Callable[[str], None],
+    cache: Cache | None = None,
+    before: Callable[[Problem], object] = lambda problem: None,
+) -> Forecast:
     """Measure a few steps of the run that `config` describes; a variant must be set.
 
-    `say` is told what takes long; what a pilot learns is kept in `cache`, for the run. Raises ConfigError and
-    UnsupportedScene as the run would, and what its steps raise.
+    `say` is told what takes long; what a pilot learns is kept in `cache`, for the run. `before` is called where a run
+    measures what it does before its first iteration: with its integrator settled, and its parameters where they begin.
+    Raises ConfigError and UnsupportedScene as the run would, and what its steps raise.
     """
     problem = assemble_scene(_with_short_target(config))
     options = find_options(problem)
@@ -75,6 +81,7 @@ def make_forecast(config: Config, say: Callable[[str], None], cache: Cache | Non
     settle_integrator(problem, options, say, cache)
     settle_guiding(problem, say, cache)
     image_s = _image_seconds(problem)
+    before(problem)
     say("measuring a few steps")
     steps, scratch = measure_steps(problem), _scratch(problem)
     run, measured = config.run, [each for each in (problem.pilot, problem.guided) if each is not None]

@@ -9,7 +9,10 @@ from pathlib import Path
 from reslrb_cli.errors import MachineError, is_machine_fault
 from reslrb_cli.recording.telling import describe, tell
 from reslrb_cli.records.atomic import remove_parts
+from reslrb_cli.records.checkpoint import FILE_NAME, newest_checkpoint
 from reslrb_cli.records.manifest import Manifest, Status
+from reslrb_cli.records.parameters import FILE_NAME as PARAMETERS_FILE_NAME
+from reslrb_cli.records.run_folder import RunFolder
 
 logger = logging.getLogger(__name__)
 
@@ -68,6 +71,15 @@ class Ending:
                 logger.warning("the page was not written: %s; all else is in %s", describe(error), self._folder)
             self._write_manifest()
         remove_parts(self._folder)
+        return self._outcome()
+
+    def give_up(self, fault: OSError) -> Status:
+        """Write nothing, for the folder has gone: raise what the run failed of, or else that."""
+        if self._failure is None:
+            self._failure = fault
+        return self._outcome()
+
+    def _outcome(self) -> Status:
         if self._failure is None:
             return self._status
         if self._machine_failed():
@@ -92,3 +104,23 @@ class Ending:
         assert self._failure is not None
         line = describe(self._failure)
         return f"{line}; {self._kept()}" if self._machine_failed() else line
+
+
+def what_is_kept(folder: RunFolder, saved: int | None, done: int, parameters: bool) -> str:
+    """What a reader will find of a run of `done` iterations that ends by the machine's fault, in words.
+
+    `saved` is the number of iterations of the last state that it wrote (None: none), `parameters` says whether the
+    values of its end were written; either may have been removed since.
+    """
+    if not folder.is_there:
+        taken = "; what is there now is another's, and was left as it is" * folder.path.exists()
+        return f"{folder.path} was removed or moved away{taken}"
+    state = newest_checkpoint(folder.checkpoint)
+    if saved is not None and state is not None:
+        if state.name != FILE_NAME:
+            return f"kept: an earlier state than that after {saved} of {done} iterations, in {state}"
+        which = f"the state after {saved} of {done} iterations" if saved else "the initial state"
+        return f"kept: {which}, in {folder.checkpoint}"
+    if parameters and (folder.parameters / PARAMETERS_FILE_NAME).exists():
+        return f"kept: the values after {done} iterations, in {folder.parameters}; no state to go on from"
+    return "nothing of the run was kept"

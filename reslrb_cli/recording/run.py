@@ -19,7 +19,7 @@ from reslrb_cli.optimization.certainty import LEAST_ITERATIONS, CertaintyRecord
 from reslrb_cli.optimization.nonfinite import Findings
 from reslrb_cli.optimization.rendering import saved_spp
 from reslrb_cli.recording.course import Course
-from reslrb_cli.recording.ending import Ending
+from reslrb_cli.recording.ending import Ending, what_is_kept
 from reslrb_cli.recording.live import LivePage
 from reslrb_cli.recording.notes import check_memory, note_scaling
 from reslrb_cli.recording.telling import describe
@@ -109,7 +109,8 @@ class Recording:
         """Note in the manifest that the run was interrupted, in a process that is about to end in the midst of it."""
         if not self.manifest.results and self.last is not None:
             self.manifest.results = {"iterations": self.done, "elapsed_s": self.last.elapsed_s}
-        self.manifest.end_for_good(self.folder.path, Status.INTERRUPTED)
+        if self.folder.is_there:
+            self.manifest.end_for_good(self.folder.path, Status.INTERRUPTED)
 
     def _begin(self, reserve: Reserve) -> None:
         problem, parameters = self.problem, self.folder.parameters
@@ -148,6 +149,8 @@ class Recording:
                 metrics.write(record)
                 show(record)
                 check_memory(self.manifest, self.problem, record)
+                if (fault := self.folder.fault) is not None:  # another run's may have taken its name
+                    raise fault
                 if stop():
                     return
                 if every and self.done % every == 0 and self.done < run.iterations:
@@ -172,7 +175,10 @@ class Recording:
 
     def _end(self, status: Status, failure: BaseException | None) -> Status:
         ending = Ending(self.folder.path, self.manifest, status, failure, self._kept)
+        if (fault := self.folder.fault) is not None:
+            return ending.give_up(fault)
         ending.part("results", self._note_results)
+        ending.part("folder", self.folder.make_whole)
         ending.begin(["checkpoint", "parameters", "final images"])
         ending.part("checkpoint", self._save_last_checkpoint)
         ending.part("parameters", self._write_parameters)
@@ -259,12 +265,8 @@ class Recording:
 
     def _kept(self) -> str:
         """What of the run a reader will find."""
-        if not self.folder.path.is_dir():
-            return f"{self.folder.path} was removed or moved away"
-        if self._saved is None or not self.folder.checkpoint.is_dir():
-            return "nothing of the run was kept"
-        state = f"the state after {self._saved} of {self.done} iterations" if self._saved else "the initial state"
-        return f"kept: {state}, in {self.folder.checkpoint}"
+        written = "parameters" not in self.manifest.missing
+        return what_is_kept(self.folder, self._saved, self.done, written)
 
     def _save_last_checkpoint(self) -> None:
         """Keep the state, unless it is there already: the one before it then is an earlier one."""

@@ -18,6 +18,9 @@ from reslrb_cli.records.images import finite_range, write_bitmap, write_image
 
 Array = np.ndarray[Any, Any]
 
+#: Of all values as they are.
+FILE_NAME = "parameters.npz"
+
 
 def write_parameters(folder: Path, values: Mapping[str, Array]) -> None:
     """Write parameter values into `folder`.
@@ -40,7 +43,7 @@ def write_parameters(folder: Path, values: Mapping[str, Array]) -> None:
     arrays: dict[str, Any] = dict(values)
     text = json.dumps(summary, indent=2)
     write_atomically(folder / "parameters.json", lambda file: file.write(text.encode() + b"\n"))
-    write_atomically(folder / "parameters.npz", lambda file: np.savez(file, **arrays))
+    write_atomically(folder / FILE_NAME, lambda file: np.savez(file, **arrays))
 
 
 def write_mask(folder: Path, key: str, mask: Array) -> None:
@@ -58,7 +61,7 @@ def write_mask(folder: Path, key: str, mask: Array) -> None:
 def read_parameters(folder: Path) -> dict[str, Array]:
     """The values that `write_parameters` wrote into `folder`, by key; nothing where they are missing or damaged."""
     try:
-        with np.load(folder / "parameters.npz") as arrays:
+        with np.load(folder / FILE_NAME) as arrays:
             return {key: arrays[key] for key in arrays.files}
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
         return {}

@@ -30,10 +30,12 @@ def key_of(what: dict[str, Any]) -> str:
 
 
 class PilotCache:
-    """A JSON file of entries by key. One that cannot be read is empty, one that cannot be written stays as it is."""
+    """A JSON file of entries by key. One that cannot be read is empty, one that cannot be written stays as it is, and
+    `keeps` is False from then on."""
 
     def __init__(self, folder: Path | None = None) -> None:
         self._given = folder
+        self.keeps = True
 
     def get(self, key: str) -> dict[str, Any] | None:
         """The entry of `key`, if there is one."""
@@ -50,7 +52,7 @@ class PilotCache:
             path.parent.mkdir(parents=True, exist_ok=True)
             write_atomically(path, lambda file: file.write(text.encode() + b"\n"))
         except (OSError, RuntimeError):  # RuntimeError: there is no home
-            pass
+            self.keeps = False
 
     def _path(self) -> Path:
         return (self._given or cache_folder()) / FILE_NAME

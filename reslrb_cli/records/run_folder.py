@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import itertools
 import os
 import shutil
@@ -147,6 +148,25 @@ class RunFolder:
                 entry.unlink(missing_ok=True)
         for name in ("config.yaml", *SUBFOLDERS):
             os.replace(self.path / name, path / name)
+
+    @property
+    def is_there(self) -> bool:
+        """Whether the folder is still under its name, and not another one, such as that of a later run."""
+        if self.lock is None:
+            return self.path.is_dir()
+        return self.lock.is_of(Path(os.path.realpath(self.path)))
+
+    @property
+    def fault(self) -> OSError | None:
+        """What is wrong where it is not."""
+        if self.is_there:
+            return None
+        return FileNotFoundError(errno.ENOENT, "has gone while the run went on", str(self.path))
+
+    def make_whole(self) -> None:
+        """Make the subfolders anew that somebody has removed. Raises OSError."""
+        for name in SUBFOLDERS:
+            (self.path / name).mkdir(exist_ok=True)
 
     @property
     def images(self) -> Path:

@@ -13,6 +13,7 @@ from ..errors import UnsupportedScene
 from .emitted import emitted_rays
 from .graph import SceneGraph
 from .lamps import Lamp, find_lamps
+from .small_lamps import small_lamps
 
 #: Sensors to which a light path can connect: `sample_direction` is there, and its density is that of `sample_ray`.
 SENSORS = ("PerspectiveCamera", "ThinLensCamera")
@@ -56,6 +57,7 @@ class SceneNeeds:
     principal_point: bool
     unfollowed: tuple[mi.BSDF, ...] = ()  # surfaces' BSDFs whose sampling is not to be differentiated
     lamps: tuple[Lamp, ...] = ()  # shapes that emit
+    small_lamps: tuple[Lamp, ...] = ()  # those of them that the sensor sees as less than a pixel
 
 
 @dataclass(frozen=True)
@@ -81,6 +83,7 @@ def scene_needs(scene: Any, sensor: Any) -> SceneNeeds:
         flags |= int(bsdf.flags())
     emitters, environment = list(scene.emitters()), scene.environment()
     delta = int(mi.BSDFFlags.Delta) & ~int(mi.BSDFFlags.Null)  # `Delta` holds it too
+    lamps = find_lamps(scene, graph)
     pointlike = int(mi.EmitterFlags.Delta)
     return SceneNeeds(
         emitters=tuple(emitter.class_name() for emitter in emitters),
@@ -97,7 +100,8 @@ def scene_needs(scene: Any, sensor: Any) -> SceneNeeds:
         thin_lens=bool(sensor.needs_aperture_sample()),
         principal_point=_has_principal_point(sensor),
         unfollowed=tuple(bsdf for bsdf in graph.surface_bsdfs() if not _is_followed(graph, bsdf)),
-        lamps=find_lamps(scene, graph),
+        lamps=lamps,
+        small_lamps=small_lamps(scene, sensor, lamps) if sensor.class_name() in SENSORS else (),
     )
 
 

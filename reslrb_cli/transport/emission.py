@@ -8,13 +8,11 @@ from typing import TYPE_CHECKING, Protocol
 import drjit as dr
 import mitsuba as mi
 
-from reslrb_cli.transport.lamps import lamp_ray
+from reslrb_cli.transport.lamps import DEFENSIVE, lamp_ray
 from reslrb_cli.transport.plan import Plan
 
 if TYPE_CHECKING:
     from reslrb_cli.transport.samples import Samples
-
-DEFENSIVE = 0.1  # share of directions that are drawn uniformly from an environment map
 
 
 class Numbered(Protocol):
@@ -90,7 +88,8 @@ def _emitter_ray(
     active: mi.Bool,
 ) -> tuple[mi.Ray3f, mi.Spectrum]:
     """A ray that leaves each lane's emitter: from lamps that we place as `lamp_ray` has it, else as Mitsuba has it."""
-    lamps = {lamp.emitter: (lamp, samples.areas(lamp)) for lamp in samples.plan.placed_lamps}
+    placed = samples.plan.placed_lamps
+    lamps = {lamp.emitter: (lamp, samples.areas(lamp), lamp in samples.plan.evened_lamps) for lamp in placed}
     if samples.plan.moving_emission:
         # In an indirect call, although there may be one emitter alone: outside of one the derivative by each number of
         # a transformation is a sum over all paths, for which they would be traced again.
@@ -99,15 +98,16 @@ def _emitter_ray(
             active: mi.Bool,
         ) -> tuple[mi.Ray3f, mi.Spectrum]:  # fmt: skip
             if self in lamps:
-                return lamp_ray(*lamps[self], time, number, position, direction, active)
+                lamp, areas, evened = lamps[self]
+                return lamp_ray(lamp, areas, time, number, position, direction, active, evened)
             return self.sample_ray(time, number, position, direction, active)
 
         return dr.dispatch(emitter, leave, time, number, position, direction, active)
     # Forward mode does not get through an indirect call of ours.
     ray, weight = emitter.sample_ray(time, number, position, direction, active)
-    for lamp, areas in lamps.values():
+    for lamp, areas, evened in lamps.values():
         here = emitter == mi.EmitterPtr(lamp.emitter)
-        own = lamp_ray(lamp, areas, time, number, position, direction, active & here)
+        own = lamp_ray(lamp, areas, time, number, position, direction, active & here, evened)
         ray, weight = (dr.select(here, a, b) for a, b in zip(own, (ray, weight), strict=True))
     return ray, weight
 
@@ -145,9 +145,10 @@ def _any_direction(
         x = dr.select(uniform, sample.x / DEFENSIVE, (sample.x - DEFENSIVE) / (1 - DEFENSIVE))
         sample = mi.Point2f(x, sample.y)
         ds, _ = environment.sample_direction(reference, sample, True)
-        ds.d = dr.select(uniform, mi.warp.square_to_uniform_sphere(sample), ds.d)
+        black = ~dr.isfinite(ds.d.y)  # the whole map: there is nothing in proportion to which to draw
+        ds.d = dr.select(uniform | black, mi.warp.square_to_uniform_sphere(sample), ds.d)
         own = environment.pdf_direction(reference, ds, True)
-        pdf = (1 - DEFENSIVE) * own + DEFENSIVE * dr.inv_four_pi
+        pdf = dr.select(black, dr.inv_four_pi, (1 - DEFENSIVE) * own + DEFENSIVE * dr.inv_four_pi)
         seen = dr.zeros(mi.SurfaceInteraction3f)
         seen.wi = -ds.d  # `eval_direction` goes by texture coordinates, which those drawn here do not have
     return ds, environment.eval(seen, True) / pdf

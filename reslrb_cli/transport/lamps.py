@@ -7,6 +7,9 @@ mesh that moves    it draws a face in proportion to its area, and so divides by 
 textured mesh that moves
                    its points are looked up by a ray in the plane of texture coordinates, and Mitsuba differentiates
                    them as if they moved along that ray
+textured lamp whose texture is differentiated
+                   it draws texels in proportion to their radiance, and so none that are black, which have derivatives
+                   as large as any
 """
 
 from __future__ import annotations
@@ -18,6 +21,8 @@ import mitsuba as mi
 
 from reslrb_cli.scene.lamps import Lamp
 
+DEFENSIVE = 0.1  # share of what is drawn uniformly, not in proportion to radiance that is differentiated
+
 
 def lamp_ray(
     lamp: Lamp,
@@ -27,12 +32,14 @@ def lamp_ray(
     position: mi.Point2f,
     direction: mi.Point2f,
     active: mi.Bool,
+    evened: bool = False,
 ) -> tuple[mi.Ray3f, mi.Spectrum]:
     """A ray that leaves the lamp, and radiance over density (C,), from the numbers that Mitsuba takes.
 
-    `areas` are the sums of `sums_of_areas` for a mesh whose faces move, else None.
+    `areas` are the sums of `sums_of_areas` for a mesh whose faces move, else None; `evened`: black texels are drawn,
+    too.
     """
-    si, weight = lamp_point(lamp, areas, time, position, active)
+    si, weight = lamp_point(lamp, areas, time, position, active, evened)
     _, radiance = lamp.emitter.sample_wavelengths(si, wavelength_sample, active)
     if lamp.parallel:
         d = mi.Vector3f(si.sh_frame.n)  # of a mesh the interpolated one, as Mitsuba has it
@@ -43,12 +50,15 @@ def lamp_ray(
 
 
 def lamp_point(
-    lamp: Lamp, areas: mi.Float | None, time: mi.Float, sample: mi.Point2f, active: mi.Bool
+    lamp: Lamp, areas: mi.Float | None, time: mi.Float, sample: mi.Point2f, active: mi.Bool, evened: bool = False
 ) -> tuple[mi.SurfaceInteraction3f, mi.Float]:
     """A point of the lamp, and the reciprocal of its density; both move with the lamp."""
     if lamp.texture is not None and lamp.has_faces:
-        return _textured_point(lamp.shape, lamp.texture, sample, active)
-    ps, weight = lamp.emitter.sample_position(time, sample, active)
+        return _textured_point(lamp.shape, lamp.texture, sample, active, evened)
+    if lamp.texture is not None and evened:
+        ps, weight = _any_point(lamp.shape, lamp.texture, time, sample, active)
+    else:
+        ps, weight = lamp.emitter.sample_position(time, sample, active)
     if lamp.is_sphere:
         center = mi.traverse(lamp.shape)["to_world"] @ mi.Point3f(0)
         outward = dr.normalize(ps.p - center)
@@ -64,16 +74,43 @@ def lamp_point(
 
 
 def _textured_point(
-    mesh: mi.Mesh, texture: mi.Texture, sample: mi.Point2f, active: mi.Bool
+    mesh: mi.Mesh, texture: mi.Texture, sample: mi.Point2f, active: mi.Bool, evened: bool
 ) -> tuple[mi.SurfaceInteraction3f, mi.Float]:
-    """The point that Mitsuba draws from a texture, which stays where it is within its face as that moves."""
-    uv, density = texture.sample_position(sample, active)
+    """The point that Mitsuba draws from a texture, or any, which stays where it is within its face as that moves."""
+    uv, density = _any_uv(texture, sample, active) if evened else texture.sample_position(sample, active)
     active = active & (density != 0)
     there = mesh.eval_parameterization(uv, mi.RayFlags.All | mi.RayFlags.FollowShape, active)
-    weight = dr.select(active & there.is_valid(), dr.norm(dr.cross(there.dp_du, there.dp_dv)) / density, 0)
     si = mi.SurfaceInteraction3f(mi.PositionSample3f(there), mi.Color0f())
     si.n = there.n
-    return si, weight
+    return si, _weight(there, density, active)
+
+
+def _any_point(
+    shape: mi.Shape, texture: mi.Texture, time: mi.Float, sample: mi.Point2f, active: mi.Bool
+) -> tuple[mi.PositionSample3f, mi.Float]:
+    """What Mitsuba's emitter draws from a texture on a shape, or any other point of it."""
+    uv, density = _any_uv(texture, sample, active)
+    there = shape.eval_parameterization(uv, mi.RayFlags.All, active)
+    there.time = time
+    return mi.PositionSample3f(there), _weight(there, density, active)
+
+
+def _weight(there: mi.SurfaceInteraction3f, density: mi.Float, active: mi.Bool) -> mi.Float:
+    """The reciprocal of the density over area of a point that was drawn with this density of texture coordinates."""
+    return dr.select(active & there.is_valid(), dr.norm(dr.cross(there.dp_du, there.dp_dv)) / density, 0)
+
+
+def _any_uv(texture: mi.Texture, sample: mi.Point2f, active: mi.Bool) -> tuple[mi.Point2f, mi.Float]:
+    """Texture coordinates from a mixture of the texture's own density and the uniform one, and their density."""
+    with dr.suspend_grad():
+        even = sample.x < DEFENSIVE
+        x = dr.select(even, sample.x / DEFENSIVE, (sample.x - DEFENSIVE) / (1 - DEFENSIVE))
+        sample = mi.Point2f(x, sample.y)
+        uv, density = texture.sample_position(sample, active)
+        black = ~dr.isfinite(density)  # the whole texture: there is nothing in proportion to which to draw
+        uv = dr.select(even | black, sample, uv)
+        own = texture.pdf_position(uv, active)
+        return uv, dr.select(black, 1, (1 - DEFENSIVE) * own + DEFENSIVE)
 
 
 def sums_of_areas(lamps: Sequence[Lamp]) -> list[mi.Float]:

@@ -29,6 +29,8 @@ class Plan:
     track_zeros: bool = False
     differentiate_bsdfs: bool = False
     differentiate_emission: bool = False
+    # Lamps whose texture is differentiated: also its black texels are drawn, which have derivatives as large as any.
+    evened_lamps: tuple[Lamp, ...] = ()
     # The BSDFs of surfaces that are differentiated, where not all of them are.
     only_bsdfs: tuple[mi.BSDF, ...] = ()
     # Whether any of those that are differentiated has delta lobes, or lets light pass straight through.
@@ -69,6 +71,14 @@ class Plan:
         return self.needs.has_visible_emitters and not self.hide_emitters and self.max_depth > 0
 
     @property
+    def small_lamps(self) -> tuple[Lamp, ...]:
+        """Lamps smaller than a pixel, which are seen directly by points on them in place of rays through the pixels.
+
+        None where masks have derivatives, which primary rays take.
+        """
+        return self.needs.small_lamps if self.visible_emission and not self.differentiate_null else ()
+
+    @property
     def environment_map(self) -> bool:
         """Whether an environment map emits, whose rays we place ourselves."""
         return (
@@ -82,7 +92,10 @@ class Plan:
         return tuple(
             lamp
             for lamp in self.needs.lamps
-            if lamp.parallel or lamp.is_sphere or (lamp.has_faces and lamp.shape in self.moving_shapes)
+            if lamp.parallel
+            or lamp.is_sphere
+            or lamp in self.evened_lamps
+            or (lamp.has_faces and lamp.shape in self.moving_shapes)
         )
 
     @property

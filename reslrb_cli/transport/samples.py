@@ -23,6 +23,7 @@ SELECTION_STREAM = 0x5E1EC7  # what hooks draw to select
 VISIBLE_STREAM = 0xD1EC7  # primary rays
 LAMP_STREAM = 0x1A3B5 << 12  # points of lamps; the lamp's number is added
 PASS_STREAM = 0x9A55E5  # seeds of the second pass and those after it
+SMALL_LAMP_STREAM = 0x57A25  # points of lamps that are smaller than a pixel
 GUIDE_STREAM = 0x6D1DE  # cells of emission
 NET_STREAM = 0x5EC0E  # scrambles of numbers of low discrepancy
 
@@ -118,6 +119,10 @@ class Samples:
     def primary_ray(self) -> PrimaryRay:
         """Rays for C_0, from a stream of their own: the light paths are those of `ptracer` with or without them."""
         return primary_ray(self.plan, self.sensor, _NumberStream(self.stream(VISIBLE_STREAM)), self.width)
+
+    def small_lamp_numbers(self) -> Numbered:
+        """Random numbers for points of lamps that are smaller than a pixel."""
+        return _NumberStream(self.stream(SMALL_LAMP_STREAM))
 
     def lamp_numbers(self, lamp: Lamp) -> Numbered:
         """Random numbers for points of a lamp that moves and is seen directly."""

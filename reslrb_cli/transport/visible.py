@@ -91,6 +91,14 @@ def differentiate_visible_radiance(plan: Plan, scene: mi.Scene, primary: Primary
         _look(plan, scene, primary, differentiate, "symbolic")
 
 
+def _radiance(plan: Plan, scene: mi.Scene, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Spectrum:
+    """Radiance (C,) that leaves `si`, but that of lamps smaller than a pixel, which `visible_lamps.py` has."""
+    emitter = si.emitter(scene)
+    for lamp in plan.small_lamps:
+        active = active & (emitter != mi.EmitterPtr(lamp.emitter))
+    return emitter.eval(si, active)
+
+
 def _look(
     plan: Plan,
     scene: mi.Scene,
@@ -104,7 +112,7 @@ def _look(
             si = scene.ray_intersect(state.ray, state.active)
         hit = state.active & si.is_valid()
         with dr.resume_grad(when=tangents):
-            Le = si.emitter(scene).eval(si, state.active)
+            Le = _radiance(plan, scene, si, state.active)
             transmission = si.bsdf().eval_null_transmission(si, hit) if plan.needs.has_null else mi.Spectrum(0)
             if tangents:
                 d_Le, d_transmission = forward_derivatives(Le, transmission)

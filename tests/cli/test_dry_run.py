@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import time
 from pathlib import Path
 
 import pytest
@@ -16,7 +17,9 @@ from reslrb_cli.config.passes import largest_pass, passes_obstacle
 from reslrb_cli.optimization import trial
 from reslrb_cli.optimization.forecast import make_forecast
 from reslrb_cli.records.clock import MIB, rough_duration
+from reslrb_cli.records.manifest import read_manifest
 from reslrb_cli.records.metrics import read_metrics
+from reslrb_cli.records.rival import RivalRecord
 
 pytestmark = pytest.mark.usefixtures("llvm")
 
@@ -88,6 +91,44 @@ def test_steps_are_timed_without_their_compilation(experiment: Path) -> None:
     assert 0 < forecast.iteration_s < forecast.elapsed_s
     assert forecast.peak / MIB > 0.5
     assert forecast.whole_s > forecast.elapsed_s
+
+
+@pytest.mark.parametrize("keeps", [True, pytest.param(False, marks=pytest.mark.long)])
+def test_what_comes_before_the_iterations_is_measured_once(
+    experiment: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, keeps: bool
+) -> None:
+    """Pilot and `prb` beside its choice: now, for the run that follows; or in the run again, whose time has both."""
+    few = [{"estimator": "stack"}, {"estimator": "gather"}]
+    monkeypatch.setattr("reslrb_cli.optimization.choice.candidates", lambda config: few)
+    cache = experiment / "cache"
+    monkeypatch.setenv("RESLRB_CACHE", str(cache))
+    if not keeps:
+        cache.write_text("no folder")
+    auto = ["--set", "integrator={type: reslrb, max_depth: 3}", "--set", "run.certainty=false"]
+    call("--dry-run", *auto)
+    printed = capsys.readouterr().out
+    times = []
+    for name in ("pilot", "prb beside it"):
+        told = re.search(rf"^ +([\d.]+) s(, done now and kept)?  {name}$", printed, re.MULTILINE)
+        assert told is not None, printed
+        assert (told[2] is not None) == keeps
+        times.append(float(told[1]))
+    whole = re.search(r"time of the whole run: about ([\d.]+) s", printed)
+    assert whole is not None
+    assert (float(whole[1]) > 0.9 * sum(times)) != keeps
+    begin = time.perf_counter()
+    call(*auto)
+    taken = time.perf_counter() - begin
+    print(f"{whole[0]}, and {taken:.2f} s")
+    manifest = read_manifest(experiment / "runs" / "tiny")
+    assert manifest is not None
+    assert [manifest[name]["cached"] for name in ("pilot", "rival")] == [keeps, keeps]
+    rival = RivalRecord.from_json(manifest["rival"])
+    assert rival.advantage is not None
+    assert 0 < rival.measure_s < times[1] + 0.05 or not keeps
+    call("--dry-run", *auto)
+    printed = capsys.readouterr().out
+    assert (printed.count("none, or kept from before") == 2) == keeps
 
 
 @pytest.mark.parametrize(

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 from conformance.attached_cases import CASES
+from conformance.moving_lamps import CASES as LAMPS
 from measure.test_mutations import plant
 
 from reslrb_cli.estimators import chain, jacobian
@@ -146,6 +147,46 @@ def test_bounces_with_several_connections(options: dict[str, Any]):
         print(key, along.mean(), along.std(ddof=1) / 4)
         assert abs(along.mean()) < 4 * along.std(ddof=1) / 4
         assert along.std(ddof=1) / 4 < 0.05
+
+
+@pytest.mark.parametrize("name", ["spot", pytest.param("point", marks=pytest.mark.long)])
+def test_a_lamp_alone_moves(name: str):
+    """No vertex then has anything to differentiate, only the ray that leaves the lamp. Over a floor alone, at whatever
+    depth, a path has one connection."""
+    [lamp] = [case for case in LAMPS if case.name == name]
+    moving = lamp.moving()
+    exact, ours = (
+        moving.gradient(integrator("reslrb", 5, estimator=estimator, hide_emitters=True), 1, 16)
+        for estimator in ("stack", "reservoir")
+    )
+    for key, value in exact.items():
+        print(name, key, relative(ours[key], value))
+        assert value.any()
+        assert relative(ours[key], value) < SPECULAR
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("options", [{}, {"capacity": 3}], ids=str)
+def test_a_lamp_alone_moves_within_walls(options: dict[str, Any]):
+    """The same with several connections a path, of which some are selected: in expectation. (Of a point, whose light
+    goes everywhere, 16 seeds leave a tenth of noise.)"""
+    [lamp] = [case for case in LAMPS if case.name == "spot_bounces"]
+    moving = lamp.moving()
+    exact, ours = (
+        np.array([
+            np.concatenate(list(
+                moving.gradient(integrator("reslrb", 5, estimator=estimator, hide_emitters=True, **own), seed, 256)
+                .values()
+            ))
+            for seed in seeds(16)
+        ])
+        for estimator, own in (("stack", {}), ("reservoir", options))
+    )  # fmt: skip
+    along = (ours - exact) @ exact.mean(0) / np.square(exact.mean(0)).sum()
+    error = along.std(ddof=1) / 4
+    print(options, f"bias {along.mean():.2%} +- {error:.2%}")
+    assert abs(along.mean()) < 4 * error
+    assert error < 0.01
 
 
 @pytest.mark.parametrize("name", ["bounces", pytest.param("rough_slab", marks=pytest.mark.long)])

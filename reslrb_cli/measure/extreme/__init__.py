@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 
-from reslrb_cli.measure.extreme import colours, films, glass, lights, losses, motion, places, roughness
+from reslrb_cli.measure.extreme import colours, films, glass, lights, losses, motion, places, roughness, unfound
 from reslrb_cli.measure.extreme.case import ExtremeCase
 from reslrb_cli.measure.extreme.runner import run_cases
 from reslrb_cli.records.gradcheck import GradcheckRecord
 
-TOPICS = (colours, lights, places, roughness, films, glass, losses, motion)
+TOPICS = (colours, lights, places, roughness, films, glass, losses, motion, unfound)
 
 
 def registry(cases: Iterable[ExtremeCase]) -> dict[str, ExtremeCase]:
