@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import drjit as dr
@@ -15,6 +15,7 @@ from reslrb_cli.transport.emission import Emission, sample_emission
 from reslrb_cli.transport.samples import Samples
 from reslrb_cli.transport.transmittance import forward_derivatives
 from reslrb_cli.transport.visible import visible_radiance, visible_tangent
+from reslrb_cli.transport.visible_lamps import small_points
 from reslrb_cli.transport.walk import walk
 
 Array = np.ndarray[Any, Any]
@@ -51,25 +52,47 @@ def search_paths(samples: Samples, sensor: int, label: str, pixel: tuple[int, in
 def _search_visible_emission(
     samples: Samples, describe: Describe, pixel: tuple[int, int] | None, largest: Offender | None
 ) -> Found:
-    plan = samples.plan
-    if not plan.visible_emission:
+    if not samples.plan.visible_emission:
         return Found(None, False, largest)
     with dr.suspend_grad():
-        primary = samples.primary_ray()
-        radiance = visible_radiance(plan, samples.scene, primary)
-        tangent = mi.Spectrum(0)
-        if plan.differentiate_emission or plan.differentiate_null:
-            tangent = visible_tangent(plan, samples.scene, primary)
-        si = samples.scene.ray_intersect(primary.ray, primary.active)
-        p, shape = dr.select(si.is_valid(), si.p, primary.ray.o), dr.reinterpret_array(mi.UInt32, si.shape)
-        there = np.array(reaches(samples.film, primary.u, pixel))
-        for name, value in (("emission E towards the sensor", radiance), ("derivative of emission, dE", tangent)):
-            bad = np.broadcast_to(np.array(primary.active & is_bad(value)), samples.width)
-            lane, at_pixel = _first(bad, there)
-            if lane is not None:
-                suspect = Suspect(mi.UInt32(0), mi.UInt32(0), p, shape, mi.Spectrum(value))
-                return Found(describe(suspect, primary.u, lane, name), at_pixel, largest)
+        for seen in (_through_pixels, _on_small_lamps) if samples.plan.small_lamps else (_through_pixels,):
+            suspect, tangent, u, active = seen(samples)
+            there = np.array(reaches(samples.film, u, pixel))
+            for name, value in (
+                ("emission E towards the sensor", suspect.value),
+                ("derivative of emission, dE", tangent),
+            ):
+                bad = np.broadcast_to(np.array(active & is_bad(value)), samples.width)
+                lane, at_pixel = _first(bad, there)
+                if lane is not None:
+                    offender = describe(replace(suspect, value=mi.Spectrum(value)), u, lane, name)
+                    return Found(offender, at_pixel, largest)
     return Found(None, False, largest)
+
+
+def _through_pixels(samples: Samples) -> tuple[Suspect, mi.Spectrum, mi.Point2f, mi.Bool]:
+    """What primary rays see: radiance (C,), its tangent, film positions, and the active lanes."""
+    plan, tangent = samples.plan, mi.Spectrum(0)
+    primary = samples.primary_ray()
+    radiance = visible_radiance(plan, samples.scene, primary)
+    if plan.differentiate_emission or plan.differentiate_null:
+        tangent = visible_tangent(plan, samples.scene, primary)
+    si = samples.scene.ray_intersect(primary.ray, primary.active)
+    p, shape = dr.select(si.is_valid(), si.p, primary.ray.o), dr.reinterpret_array(mi.UInt32, si.shape)
+    return Suspect(mi.UInt32(0), mi.UInt32(0), p, shape, radiance), tangent, primary.u, primary.active
+
+
+def _on_small_lamps(samples: Samples) -> tuple[Suspect, mi.Spectrum, mi.Point2f, mi.Bool]:
+    """The same of points on lamps that are smaller than a pixel."""
+    tangent = mi.Spectrum(0)
+    point = small_points(samples)
+    with dr.resume_grad():
+        radiance = point.radiance()
+        if samples.plan.differentiate_emission:
+            [tangent] = forward_derivatives(radiance)
+    shape = dr.reinterpret_array(mi.UInt32, point.emitter.get_shape())
+    suspect = Suspect(mi.UInt32(0), mi.UInt32(0), point.si.p, shape, dr.detach(radiance))
+    return suspect, tangent, point.u, point.active
 
 
 def _first(bad: Array, there: Array) -> tuple[int | None, bool]:

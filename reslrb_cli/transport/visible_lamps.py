@@ -12,7 +12,7 @@ Of lamps smaller than a pixel primary rays hit few or none: there this form is t
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import drjit as dr
@@ -37,10 +37,16 @@ def moving_splats(samples: Samples) -> Iterator[tuple[mi.Point2f, mi.Spectrum, m
 
 
 def small_splat(samples: Samples) -> tuple[mi.Point2f, mi.Spectrum, mi.Bool]:
-    """Of the lamps that are smaller than a pixel, which take turns: film position u, C_0 (C,), and the active lanes.
+    """Of the lamps that are smaller than a pixel: film position u, C_0 (C,), and the active lanes.
 
     C_0 has its derivative by their radiance where gradients are enabled.
     """
+    point = small_points(samples)
+    return point.u, dr.select(point.active, point.radiance() * point.weight, 0), point.active
+
+
+def small_points(samples: Samples) -> Points:
+    """Points on the lamps that are smaller than a pixel, which take turns; detached."""
     lamps, numbers = samples.plan.small_lamps, samples.small_lamp_numbers()
     count, lane = dr.opaque(mi.UInt32, samples.width), dr.arange(mi.UInt32, samples.width)
     turn, index = lane % len(lamps), mi.UInt32(lamps[0].index)
@@ -49,13 +55,11 @@ def small_splat(samples: Samples) -> tuple[mi.Point2f, mi.Spectrum, mi.Bool]:
     lanes = count // len(lamps) + dr.select(turn < count % len(lamps), mi.UInt32(1), 0)
     with dr.suspend_grad():
         point = _points(samples, lamps, index, numbers, attached=False)
-    radiance = point.emitter.eval(point.si, point.active)
-    weight = dr.detach(point.weight) * (mi.Float(count) / mi.Float(lanes))
-    return point.u, dr.select(point.active, radiance * weight, 0), point.active
+    return replace(point, weight=dr.detach(point.weight) * (mi.Float(count) / mi.Float(lanes)))
 
 
 @dataclass
-class _Points:
+class Points:
     """Points on lamps as the sensor sees them: `weight` (C,) is C_0 over radiance, as a part of the image."""
 
     emitter: mi.EmitterPtr
@@ -64,15 +68,19 @@ class _Points:
     weight: mi.Spectrum
     active: mi.Bool
 
+    def radiance(self) -> mi.Spectrum:
+        """What leaves them towards the sensor (C,), with its derivative by their radiance where there is any."""
+        return self.emitter.eval(self.si, self.active)
+
 
 def _splat(samples: Samples, lamp: Lamp) -> tuple[mi.Point2f, mi.Spectrum, mi.Bool]:
     point = _points(samples, (lamp,), mi.UInt32(lamp.index), samples.lamp_numbers(lamp), attached=True)
     # Points stay where they are on the lamp, so that nothing that moves has a part in their radiance.
-    radiance = dr.detach(point.emitter.eval(point.si, point.active))
+    radiance = dr.detach(point.radiance())
     return point.u, dr.select(point.active, radiance * point.weight, 0), point.active
 
 
-def _points(samples: Samples, lamps: Sequence[Lamp], index: mi.UInt32, numbers: Numbered, attached: bool) -> _Points:
+def _points(samples: Samples, lamps: Sequence[Lamp], index: mi.UInt32, numbers: Numbered, attached: bool) -> Points:
     """A point of each lane's lamp, the one of that index in `scene.emitters()`."""
     plan, sensor = samples.plan, samples.sensor
     time = sample_time(plan, sensor, numbers)
@@ -97,4 +105,4 @@ def _points(samples: Samples, lamps: Sequence[Lamp], index: mi.UInt32, numbers: 
     with dr.suspend_grad():
         active, through = passage(plan, samples.scene, si, mi.UInt32(0), connection)
     weight = through * (cos * weight) * connection.weight * samples.scale
-    return _Points(emitter, si, connection.u, weight, active)
+    return Points(emitter, si, connection.u, weight, active)

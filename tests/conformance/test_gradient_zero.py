@@ -52,7 +52,6 @@ class ZeroCase:
 
 CLIPPED = "Mitsuba clips opacities and weights to [0, 1], and Dr.Jit's clip has no derivative at the lower end"
 NOT_SAMPLED = "what has a probability of zero is not sampled, here light that passes an opaque mask"
-DARK_TEXELS = "an emitter samples its texture in proportion to the texels, and so never those that are black"
 
 CASES = [
     ZeroCase("texel_zero_in_one_channel", lambda: floor(matte(tiles((0.5, 0.0, 0.4), (0.6, 0.3, 0.0)))), (FLOOR,)),
@@ -70,7 +69,7 @@ CASES = [
              lambda: room(lamp=lamp(radiance=tiles((4, 0, 3), (1, 2, 5)))), ("lamp.emitter.radiance.data",),
              fixed_paths=False),
     ZeroCase("lamp_texture_zero_in_all", lambda: room(lamp=lamp(radiance=tiles((0, 0, 0), (1, 2, 5)))),
-             ("lamp.emitter.radiance.data",), fixed_paths=False, lost=DARK_TEXELS),
+             ("lamp.emitter.radiance.data",), fixed_paths=False),
     ZeroCase("point_zero", lambda: room(lamp=None, light={"type": "point", "position": [0.5, 0.9, 0.8],
                                                            "intensity": rgb(0, 1, 0)}), ("light.intensity.value",)),
     ZeroCase("constant_zero", lambda: room(lamp=None, light={"type": "constant", "radiance": rgb(0, 1, 0)}),

@@ -185,7 +185,7 @@ def test_radiance_counts_once_where_its_lamp_moves_too(size: float):
 
 # ---- The code broken on purpose ----
 
-SPLAT = "transport.visible_lamps:small_splat"
+SPLAT = "transport.visible_lamps:small_points"
 FAULTS = [
     Fault("left_out", "third", "integrators.light_tracer:splat_visible_emission", "if samples.plan.small_lamps",
           "if False", frozenset({("stack", "ptracer")})),
