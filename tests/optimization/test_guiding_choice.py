@@ -198,14 +198,22 @@ def test_a_run_says_so_once_remembers_it_and_writes_it_down(
 
 
 def test_it_goes_on_as_it_was_decided_bit_by_bit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Guided or not, and from which sequence: decided once, and restored."""
     begin_alone(tmp_path, monkeypatch)
-    take_times(monkeypatch, 0.2)
-    settings = [*AUTO[:3], "run.iterations=8", "run.checkpoint_every={iterations: 3}", "run.certainty=false"]
+    fix_times(monkeypatch, {"guiding": 0.2, "sequence": 0.1})
+    settings = [
+        *AUTO[:3],
+        "integrator.sequence=auto",
+        "run.iterations=8",
+        "run.checkpoint_every={iterations: 3}",
+        "run.certainty=false",
+    ]
     whole, left = run_and_kill(monkeypatch, 7, *(word for text in settings for word in ("--set", text)))
     monkeypatch.setattr(problem_module, "settle_sampling", lambda *args: pytest.fail("measured again"))
     (tmp_path / "cache" / "pilot.json").unlink()
     assert optimize("--resume", str(left), "--quiet") == 0
     assert read_manifest(left)["guided"]["guided"]
+    assert read_manifest(left)["sequence"]["low_discrepancy"]
     assert differences(whole, left) == []
     assert left_over(left) == []
 
