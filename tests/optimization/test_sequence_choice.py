@@ -167,6 +167,7 @@ def test_a_run_says_so_once_remembers_it_and_writes_it_down(
     assert row.endswith("sequence: auto, which a run decides by measurement")
 
 
+@pytest.mark.long  # the run says so too
 def test_a_dry_run_measures_it_for_the_run(
     experiment: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
