@@ -9,6 +9,7 @@ gain than whole ones have, and what pays here pays there.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 from reslrb_cli.optimization.pilot_records import ITERATIONS
@@ -33,3 +34,10 @@ class SequencePilot(StepPilot[SequenceRecord]):
 
     def _decide(self, other: bool, images: bool, found: dict[str, Any]) -> SequenceRecord:
         return SequenceRecord(low_discrepancy=other, **found)
+
+
+class InsteadPilot(SequencePilot):
+    """One decision: low-discrepancy numbers in place of guided emission, or that with independent ones."""
+
+    def _decide(self, other: bool, images: bool, found: dict[str, Any]) -> SequenceRecord:
+        return replace(super()._decide(other, images, found), alone=True)

@@ -95,13 +95,18 @@ class GuidedRecord(PaidRecord):
 
 @dataclass(frozen=True, kw_only=True)
 class SequenceRecord(PaidRecord):
-    """Of low-discrepancy numbers, which gradients and images have, or neither: `low_discrepancy`."""
+    """Of low-discrepancy numbers, which gradients and images have, or neither: `low_discrepancy`.
+
+    `alone`: they were tried in place of guided emission, which had been found to pay, and is over that what it gains.
+    """
 
     low_discrepancy: bool
+    alone: bool = False
 
     @property
     def setting(self) -> str:
         return "low_discrepancy" if self.low_discrepancy else "independent"
 
     def decision(self) -> str:
-        return f"sequence {self.setting}"
+        instead = ", guiding off" if self.alone and self.low_discrepancy else ""
+        return f"sequence {self.setting}{instead}"

@@ -200,7 +200,7 @@ def test_a_run_says_so_once_remembers_it_and_writes_it_down(
 def test_it_goes_on_as_it_was_decided_bit_by_bit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Guided or not, and from which sequence: decided once, and restored."""
     begin_alone(tmp_path, monkeypatch)
-    fix_times(monkeypatch, {"guiding": 0.2, "sequence": 0.1})
+    fix_times(monkeypatch, {"guiding": 0.2, "sequence": 0.1, "sequence alone": 1000.0})
     settings = [
         *AUTO[:3],
         "integrator.sequence=auto",

@@ -37,8 +37,10 @@ def experiment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return begin(tmp_path, monkeypatch)
 
 
-def take_times(monkeypatch: pytest.MonkeyPatch, even_ms: float, guided_ms: float = 1.0) -> None:
-    fix_times(monkeypatch, {"guiding": guided_ms, "sequence": even_ms})
+def take_times(
+    monkeypatch: pytest.MonkeyPatch, even_ms: float, guided_ms: float = 1.0, alone_ms: float = 1000.0
+) -> None:
+    fix_times(monkeypatch, {"guiding": guided_ms, "sequence": even_ms, "sequence alone": alone_ms})
 
 
 def made(settings: list[str], **options: Any) -> Problem:
@@ -126,6 +128,40 @@ def test_it_is_measured_with_guiding_as_that_was_decided(
     for table in tables:
         assert np.array_equal(table[0][0], held[0][0])
         assert table[0][1] == held[0][1]
+
+
+def test_alone_it_takes_the_place_of_guiding_where_that_is_better(
+    experiment: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Then nothing of guiding is left, neither in kernels nor in what memory is planned for."""
+    take_times(monkeypatch, 0.1, 0.1, alone_ms=0.001)
+    budget = "run.memory_budget=64"
+    counts, plans = [], []
+    for settings in (BOTH, ["integrator.sequence=low_discrepancy", *SMALL]):
+        problem = made([*settings, budget], cache=PilotCache())
+        counts.append(operations(problem))
+        assert problem.memory is not None
+        plans.append(problem.memory.expected_bytes)
+        assert is_even(problem)
+        assert problem.integrator.preparation.guiding is None
+        if settings is BOTH:
+            assert problem.guided is not None
+            assert problem.sequence is not None
+            assert not problem.guided.guided
+            assert "; low-discrepancy numbers without it have " in problem.guided.line()
+            assert problem.sequence.line().startswith("sequence low_discrepancy, guiding off: ")
+        del problem
+        gc.collect()
+    assert counts[0] == counts[1]
+    assert plans[0].total == pytest.approx(plans[1].total, rel=0.01)
+    # What was kept of both decisions says so again.
+    told: list[str] = []
+    again = made([*BOTH, budget], say=told.append, cache=PilotCache())
+    assert not [line for line in told if "measuring" in line]
+    assert again.guided is not None
+    assert not again.guided.guided
+    assert again.integrator.preparation.guiding is None
+    assert is_even(again)
 
 
 def test_a_table_of_its_own_for_either_is_seen(experiment: Path, monkeypatch: pytest.MonkeyPatch) -> None:
