@@ -119,6 +119,10 @@ def test_it_is_measured_with_guiding_as_that_was_decided(
     first = 0 if asked == "auto" else 2  # steps before what is learned
     assert {row[3] == row[1] for row in steps} == {True}
     assert [row[1] for row in seen if row[0] == "sequence"].count("learn") == (2 if asked == "on" else 0)
+    # In place of guiding: without it, beside steps that are guided, where that was measured to be on.
+    alone = [row for row in seen if row[0] == "sequence alone"]
+    assert bool(alone) == (guiding == "auto, on")
+    assert all((row[2] is None) == row[1] == row[3] for row in alone)
     tables = [row[2] for row in steps[first:]]
     if not is_on:
         assert tables == [None] * len(tables)
