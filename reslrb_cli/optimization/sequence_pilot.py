@@ -13,7 +13,8 @@ from dataclasses import replace
 from typing import Any
 
 from reslrb_cli.optimization.pilot_records import ITERATIONS
-from reslrb_cli.optimization.step_pilot import PLANNED, StepPilot
+from reslrb_cli.optimization.step_pilot import StepPilot
+from reslrb_cli.optimization.step_sizes import PLANNED
 from reslrb_cli.records.paid import SequenceRecord
 
 #: Share of a run of ITERATIONS that is left for this by what is measured before, compilation apart.

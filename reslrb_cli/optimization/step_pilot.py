@@ -13,52 +13,20 @@ from typing import Any, Generic, Protocol, TypeVar
 
 from reslrb_cli.optimization.gains import CONFIDENCE, Gain, compare
 from reslrb_cli.optimization.pilot_records import ITERATIONS, Gradients
+from reslrb_cli.optimization.step_sizes import Sizes
 from reslrb_cli.records.paid import LEAST_IMAGE, PaidRecord
 
 Record = TypeVar("Record", bound=PaidRecord)
 
-#: Rounds that are planned for, of gradients of many entries, and of few, which tell less each; fewer than LEAST say
-#: nothing. After each so many it is asked whether it is clear, so many times at the most.
-ROUNDS, ROUNDS_OF_FEW, LEAST_ROUNDS = 8, 16, 4
-FEW_ENTRIES = 64
+#: Fewer rounds than these say nothing.
+LEAST_ROUNDS = 4
+#: Whenever as many rounds have been taken as are planned for it is asked whether it is clear, so often at the most.
 LOOKS = 3
 #: What is on before the last of these looks has to be surer than it would have to be at the end: looking again and
 #: again must not make what is worth nothing pass.
 CLEAR = 0.99
-#: Walks that a table learns from before it is tried, and the samples of each, as a share of a step's.
-LEARNINGS, LEARNING_SHARE = 2, 0.4
-#: Steps' worth of time that the rounds are planned for.
-PLANNED = 3.4
-
-
-@dataclass(frozen=True)
-class Sizes:
-    """Samples per pixel: of a step of the run (`step`), of each set of its samples that has one dL/dI (`call`), and of
-    a pass of these (`part`). `alone`: images have samples of their own. `entries` are those of all gradients. A step of
-    the other kind may take `longer` times as long as one of this; `planned` are PLANNED, or less."""
-
-    step: int
-    call: int
-    part: int
-    alone: bool
-    entries: int
-    longer: float
-    planned: float = PLANNED
-
-    @property
-    def rounds(self) -> int:
-        """How many rounds are planned for."""
-        return ROUNDS_OF_FEW if self.entries < FEW_ENTRIES else ROUNDS
-
-    @property
-    def trial(self) -> int:
-        """Samples of each step that is taken here."""
-        return max(min(int(self.planned * self.step / ((1 + self.longer) * self.rounds)), self.part), 1)
-
-    @property
-    def learning(self) -> int:
-        """Samples of each walk that is learned from here."""
-        return max(min(int(LEARNING_SHARE * self.step), self.part), 1)
+#: Walks that a table learns from before it is tried.
+LEARNINGS = 2
 
 
 @dataclass

@@ -13,7 +13,8 @@ from reslrb_cli.integrators import render_image
 from reslrb_cli.integrators.guiding import Guiding, Purpose
 from reslrb_cli.integrators.interface import Job
 from reslrb_cli.optimization.samples import take_gradient
-from reslrb_cli.optimization.step_pilot import PLANNED, Sizes, Taken
+from reslrb_cli.optimization.step_pilot import Taken
+from reslrb_cli.optimization.step_sizes import PLANNED, Sizes
 from reslrb_cli.optimization.views import View, slope, to_tensor
 from reslrb_cli.records.clock import StepClock, StepTimes
 from reslrb_cli.seeds import seed

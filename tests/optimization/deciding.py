@@ -18,7 +18,8 @@ from reslrb_cli.cli import main
 from reslrb_cli.optimization import loop, step_trial
 from reslrb_cli.optimization.guiding_pilot import LONGER, SHARE, GuidingPilot
 from reslrb_cli.optimization.problem import Problem
-from reslrb_cli.optimization.step_pilot import Sizes, StepPilot, Taken
+from reslrb_cli.optimization.step_pilot import StepPilot, Taken
+from reslrb_cli.optimization.step_sizes import Sizes
 from reslrb_cli.optimization.step_trial import StepTrial
 from reslrb_cli.recording import run as recording
 from reslrb_cli.records.clock import StepClock

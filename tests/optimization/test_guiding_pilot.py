@@ -13,7 +13,8 @@ from reslrb_cli.integrators.guiding import EVERY
 from reslrb_cli.optimization.guiding_pilot import LONGER, SHARE, GuidingPilot
 from reslrb_cli.optimization.pilot import TIMING_NOISE
 from reslrb_cli.optimization.pilot_records import ITERATIONS
-from reslrb_cli.optimization.step_pilot import LEARNINGS, LEAST_ROUNDS, LOOKS, Sizes
+from reslrb_cli.optimization.step_pilot import LEARNINGS, LEAST_ROUNDS, LOOKS
+from reslrb_cli.optimization.step_sizes import Sizes
 from reslrb_cli.records.paid import GuidedRecord
 
 

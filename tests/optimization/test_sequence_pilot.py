@@ -15,7 +15,8 @@ from reslrb_cli.optimization.guiding_pilot import SHARE as GUIDING_SHARE
 from reslrb_cli.optimization.pilot import SHARE as PILOT_SHARE
 from reslrb_cli.optimization.pilot_records import ITERATIONS
 from reslrb_cli.optimization.sequence_pilot import LONGER, SHARE, SequencePilot, planned
-from reslrb_cli.optimization.step_pilot import LEARNINGS, LEAST_ROUNDS, LOOKS, PLANNED, Sizes
+from reslrb_cli.optimization.step_pilot import LEARNINGS, LEAST_ROUNDS, LOOKS
+from reslrb_cli.optimization.step_sizes import PLANNED, Sizes
 from reslrb_cli.records.paid import GuidedRecord, SequenceRecord
 
 
