@@ -197,7 +197,7 @@ def edges_of(scene: Any, selection: Selection) -> list[str]:
 def make_plan_report(subject: Subject, scene: Any, selection: Selection | str, counts: bool) -> PlanReport | str:
     """The plan of a step for the first sensor that is used, or why there is none."""
     from reslrb_cli.integrators import Reslrb
-    from reslrb_cli.integrators.features import GUIDED
+    from reslrb_cli.integrators.features import GUIDED, SEQUENCE
     from reslrb_cli.integrators.plan_report import report_plan, with_reason
     from reslrb_cli.optimization.loading import choose_sensors
 
@@ -209,7 +209,9 @@ def make_plan_report(subject: Subject, scene: Any, selection: Selection | str, c
     options = config.integrator.options()
     if options.get("estimator") == "auto":
         options["estimator"] = "stack"  # `auto` is chosen by a run
-    options["guiding"], why = guiding_of(subject)
+    reasons = {}
+    for feature, option in ((GUIDED, "guiding"), (SEQUENCE, "sequence")):
+        options[option], reasons[feature] = sampling_of(subject, option)
     known = config.adjoint == "batched" or options.get("weight") == "adjoint"
     try:
         [sensor, *_] = choose_sensors(config, scene)
@@ -218,18 +220,26 @@ def make_plan_report(subject: Subject, scene: Any, selection: Selection | str, c
         report = report_plan(integrator, scene, scene.sensors()[sensor], params, keys, known=known, counts=counts)
     except (ConfigError, UnsupportedScene) as error:
         return str(error)
-    return dataclasses.replace(report, rows=with_reason(report.rows, GUIDED, why)) if why else report
+    for feature, why in reasons.items():
+        report = dataclasses.replace(report, rows=with_reason(report.rows, feature, why)) if why else report
+    return report
 
 
-def guiding_of(subject: Subject) -> tuple[str, str]:
-    """`integrator.guiding`, on or off, and why, where that was or is left to a run (else empty)."""
-    from reslrb_cli.records.guided import GuidedRecord
+def sampling_of(subject: Subject, option: str) -> tuple[str, str]:
+    """`integrator.guiding`, or `sequence`, as it is, and why, where that was or is left to a run (else empty)."""
+    from reslrb_cli.config.integrators import UNDECIDED
+    from reslrb_cli.records.paid import GuidedRecord, PaidRecord, SequenceRecord
 
-    guiding = str(subject.config.integrator.options()["guiding"])
-    if guiding != "auto":
-        return guiding, ""
+    asked = str(subject.config.integrator.options()[option])
+    if asked != "auto":
+        return asked, ""
+    kinds: dict[str, tuple[type[PaidRecord], str]] = {
+        "guiding": (GuidedRecord, "guided"),
+        "sequence": (SequenceRecord, "sequence"),
+    }
+    kind, name = kinds[option]
     try:
-        record = GuidedRecord.from_json(dict((subject.run or {}).get("guided") or {}))
+        record = kind.from_json(dict((subject.run or {}).get(name) or {}))
     except (TypeError, ValueError):  # there is no run yet, or its manifest is damaged
-        return "off", "guiding: auto, which a run decides by measurement"
-    return "on" if record.guided else "off", f"guiding: auto, {record.why()}"
+        return UNDECIDED[option], f"{option}: auto, which a run decides by measurement"
+    return record.setting, f"{option}: auto, {record.why()}"

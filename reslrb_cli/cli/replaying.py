@@ -16,6 +16,7 @@ from reslrb_cli.optimization.views import color_channels, to_tensor
 from reslrb_cli.records.checkpoint import NONFINITE_FILE_NAME, load_nonfinite
 from reslrb_cli.records.manifest import FILE_NAME as MANIFEST
 from reslrb_cli.records.manifest import read_manifest
+from reslrb_cli.records.paid import SequenceRecord
 from reslrb_cli.records.run_folder import RunFolder
 from reslrb_cli.scene.image_file import read_bitmap
 
@@ -52,7 +53,7 @@ def load_replay(config: Config) -> Replay:
     archive, written = folder.checkpoint / NONFINITE_FILE_NAME, path / MANIFEST
     if not 0 <= iteration < config.run.iterations:
         raise ConfigError(archive, "iteration", f"is {iteration}; the run has {config.run.iterations} iterations")
-    config = _chosen(config, manifest, written)
+    config = _chosen(_with_sequence(config, manifest, written), manifest, written)
     try:
         problem = assemble_scene(config, values=values)
     except ValueError as error:
@@ -78,6 +79,18 @@ def _chosen(config: Config, manifest: dict[str, Any], path: Path) -> Config:
         options = config.integrator.chosen(**manifest["pilot"]["chosen"]).options()
     except (TypeError, KeyError, ValueError):  # pydantic's error is a ValueError
         raise ConfigError(path, "pilot.chosen", "is not an estimator with its options, as a run writes it") from None
+    return with_integrator(config, {"type": config.integrator.type} | options, str(path), {})
+
+
+def _with_sequence(config: Config, manifest: dict[str, Any], path: Path) -> Config:
+    """The configuration with the sequence that the run measured to pay, by the manifest at `path`."""
+    options = config.integrator.options()
+    if options.get("sequence") != "auto":
+        return config
+    try:
+        options["sequence"] = SequenceRecord.from_json(manifest["sequence"]).setting
+    except (TypeError, KeyError, AttributeError):
+        raise ConfigError(path, "sequence", "is not whether a sequence paid, as a run writes it") from None
     return with_integrator(config, {"type": config.integrator.type} | options, str(path), {})
 
 

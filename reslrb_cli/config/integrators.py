@@ -99,6 +99,8 @@ ESTIMATOR_OPTIONS: dict[str, tuple[str, ...]] = {
     "event": ("capacity", "weight"),
     "stack": ("stack_size",),
 }
+#: Those that `auto` leaves to measurement beside any estimator, with what they are where nothing is measured.
+UNDECIDED: dict[str, str] = {"guiding": "off", "sequence": "independent"}
 #: Every option that says which estimator, and how.
 _ANY_ESTIMATORS = {"estimator", *(option for options in ESTIMATOR_OPTIONS.values() for option in options)}
 
@@ -160,11 +162,13 @@ class Reslrb(AttachingTracer):
         "first iteration, show that it pays here. Left out it is `auto` with estimator `auto`, and `off` with one that "
         "is named.",
     )
-    sequence: Literal["independent", "low_discrepancy"] = Field(
-        default="independent",
+    sequence: Literal["auto", "independent", "low_discrepancy"] = Field(
+        default="auto",
         description="The random numbers that say where light paths start and how they first scatter. "
         "`low_discrepancy`: evenly spread over all paths of a step, and independent from one step to the next; less "
-        "noise where little but these numbers says where light goes (a beam through glass), a little less elsewhere.",
+        "noise where little but these numbers says where light goes (a beam through glass), a little less elsewhere. "
+        "`auto`: where a few steps with and without it, before the first iteration, show that it pays here. Left out "
+        "it is `auto` with estimator `auto`, and `independent` with one that is named.",
     )
     freeze: bool = Field(
         default=True,
@@ -173,10 +177,10 @@ class Reslrb(AttachingTracer):
     )
 
     @model_validator(mode="after")
-    def _leave_unguided(self) -> Self:
+    def _leave_off(self) -> Self:
         """Whoever names an estimator, and nothing else, has nothing measured."""
-        if self.estimator != "auto" and "guiding" not in self.model_fields_set:
-            self.__dict__["guiding"] = "off"  # not by assignment, which would count it among those that were given
+        if self.estimator != "auto":  # not by assignment, which would count them among those that were given
+            self.__dict__.update({name: off for name, off in UNDECIDED.items() if name not in self.model_fields_set})
         return self
 
     @model_validator(mode="after")
@@ -200,13 +204,14 @@ class Reslrb(AttachingTracer):
         return {name: value for name, value in values.items() if name not in self._foreign()}
 
     def chosen(self, **options: Any) -> Reslrb:
-        """The same with an `estimator` and its options in place of those it has; unguided where that is undecided."""
+        """The same with an `estimator` and its options in place of those it has; what is undecided is off."""
         kept = {name: getattr(self, name) for name in self.model_fields_set if name not in _ANY_ESTIMATORS}
         return Reslrb(**{**kept, **options}).undecided_off()
 
     def undecided_off(self) -> Reslrb:
-        """The same, unguided where it is left to measurement whether it is to be."""
-        return self.model_copy(update={"guiding": "off"}) if self.guiding == "auto" else self
+        """The same, with nothing of what is left to measurement."""
+        undecided = {name: off for name, off in UNDECIDED.items() if getattr(self, name) == "auto"}
+        return self.model_copy(update=undecided) if undecided else self
 
     def _foreign(self) -> set[str]:
         """The options of the other estimators."""

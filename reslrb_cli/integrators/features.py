@@ -14,6 +14,8 @@ from reslrb_cli.transport.plan import UNBOUNDED, Plan
 
 #: The feature that guiding is.
 GUIDED = "guided emission"
+#: And that which evenly spread numbers are.
+SEQUENCE = "low-discrepancy numbers"
 #: Kinds of parameters that features come with.
 EMITTERS, BSDFS = "emitter", "bsdf"
 
@@ -226,7 +228,7 @@ FEATURES = (
     Feature("black texels of lamps", lambda p: bool(p.evened_lamps), "drawn too, since their derivative counts",
             "no texture of a lamp is differentiated: texels are drawn by their radiance", _evened),
     Feature(GUIDED, lambda p: p.grid is not None, _tables, "guiding: off", _guided),
-    Feature("low-discrepancy numbers", lambda p: p.sequence is not None,
+    Feature(SEQUENCE, lambda p: p.sequence is not None,
             "where paths start, and how they first scatter, is evenly spread", "sequence: independent", _sequence),
     Feature("derivative of the filter's normalization", lambda p: p.attached and p.attached_normalization,
             "as finite differences have it", "nothing moves, or it is detached", _normalization),

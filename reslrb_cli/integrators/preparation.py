@@ -105,12 +105,20 @@ class Preparation:
         self._renewal: Renewal | None = None
         self.recordings = Recordings()
 
-    def afresh(self, guided: bool, images: bool) -> Preparation:
-        """A new one with the same options, guided or not; `images`: samples of images alone, too."""
-        made = Preparation(*self._depths, self._hide_emitters, self._motion, guided, self._low_discrepancy)
+    def afresh(self, guided: bool | None, images: bool | None, low_discrepancy: bool | None) -> Preparation:
+        """A new one with the same options, guided or not; `images`: samples of images alone, too. None: as this is."""
+        own = self.guiding
+        guided = own is not None if guided is None else guided
+        low_discrepancy = self._low_discrepancy if low_discrepancy is None else low_discrepancy
+        made = Preparation(*self._depths, self._hide_emitters, self._motion, guided, low_discrepancy)
         if made.guiding is not None:
-            made.guiding.images = images
+            made.guiding.images = (own is None or own.images) if images is None else images
         return made
+
+    def draw_from(self, guiding: Guiding, scene: mi.Scene) -> None:
+        """Draw guided samples of this scene from tables that others may draw from, too."""
+        self._turn_to(scene)  # at first sight of a scene all is forgotten
+        self.guiding = guiding
 
     def plan(self, scene: mi.Scene, sensor: mi.Sensor, params: mi.SceneParameters | None = None) -> Plan:
         """What a walk of this scene needs; `params` are those to look for derivatives in.

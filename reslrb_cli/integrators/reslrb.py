@@ -62,6 +62,11 @@ class Reslrb(LightTracer):
         if guiding == "auto":
             raise ValueError('"guiding" auto needs an experiment to measure on (`reslrb optimize`); say on or off')
         one_of("guiding", guiding, ("on", "off"))
+        if sequence == "auto":
+            raise ValueError(
+                '"sequence" auto needs an experiment to measure on (`reslrb optimize`); say independent or '
+                "low_discrepancy"
+            )
         one_of("sequence", sequence, ("independent", "low_discrepancy"))
         low_discrepancy = sequence == "low_discrepancy"
         return cls(kind(**own), motion=motion, guided=guiding == "on", low_discrepancy=low_discrepancy, **options)

@@ -70,10 +70,15 @@ class LightTracer:
         other.samples_per_pass, other.freeze = samples_per_pass, freeze
         return other
 
-    def afresh(self, guided: bool, images: bool = True) -> Self:
-        """The same, which knows nothing of any scene yet, with guided emission or without; `images`: of images too."""
+    def afresh(
+        self, *, guided: bool | None = None, images: bool | None = None, low_discrepancy: bool | None = None
+    ) -> Self:
+        """The same, which knows nothing of any scene yet, with other ways of drawing samples; None: as it has it.
+
+        Guided emission or none, `images`: of images too; low-discrepancy numbers or independent ones.
+        """
         other = copy.copy(self)
-        other.preparation = self.preparation.afresh(guided, images)
+        other.preparation = self.preparation.afresh(guided, images, low_discrepancy)
         return other
 
     def plan(self, scene: mi.Scene, sensor: mi.Sensor, params: mi.SceneParameters | None = None) -> Plan:

@@ -8,14 +8,14 @@ from dataclasses import dataclass
 from typing import Any
 
 from reslrb_cli.config import Config, Prb, Ptracer, Reslrb, Trajectory, WalkAd, with_integrator
-from reslrb_cli.config.integrators import ESTIMATOR_OPTIONS
+from reslrb_cli.config.integrators import ESTIMATOR_OPTIONS, UNDECIDED
 from reslrb_cli.config.text import parse
 from reslrb_cli.errors import ConfigError
 
 #: Options that a case takes over from the configuration's integrator, where it knows them.
 SHARED = (
     *("rr_depth", "hide_emitters", "samples_per_pass", "attached", "filter_normalization", "attached_sampling"),
-    *("guiding", "sequence"),
+    *UNDECIDED,
 )
 #: The estimator of a case that names none, as that of the plugin.
 PLUGIN_ESTIMATOR = "reservoir"
@@ -24,7 +24,7 @@ ADJOINT = ("adjoint", "batches", "first_batch")
 _TYPES = {str(kind.model_fields["type"].default): kind for kind in (Reslrb, Ptracer, Prb, WalkAd, Trajectory)}
 #: Options that make an estimator another one, in records.
 _ESTIMATOR_OPTIONS = {option for options in ESTIMATOR_OPTIONS.values() for option in options} - {"capacity"}
-_ESTIMATOR_OPTIONS |= {"guiding", "sequence"}
+_ESTIMATOR_OPTIONS |= set(UNDECIDED)
 _OPTION = "--integrators"
 _ITEM = re.compile(r"(?P<type>\w+)(?::(?P<estimator>\w+))?(?:\((?P<options>.*)\))?")
 
@@ -52,13 +52,14 @@ class Case:
             adjoint = {"adjoint": "independent"}  # which goes with any weight
         shared, own = config.integrator.options(), _TYPES[self.type].model_fields if self.type in _TYPES else {}
         values = {"type": self.type} | {name: shared[name] for name in SHARED if name in shared and name in own}
-        if values.get("guiding") == "auto":  # of the experiment, whose pilot decides it; what is named here has none
-            del values["guiding"]
+        # Of the experiment, whose pilot decides it; what is named here has none.
+        values = {name: value for name, value in values.items() if name not in UNDECIDED or value != "auto"}
         values |= {name: value for name, value in self.options.items() if name not in ADJOINT}
         if self.type == "reslrb" and values.setdefault("estimator", PLUGIN_ESTIMATOR) == "auto" and not auto:
             raise ConfigError(blame, "estimator", "`auto` measures which to take; name those to compare")
-        if values.get("guiding") == "auto" and not auto:
-            raise ConfigError(blame, "guiding", "`auto` measures whether it pays; compare `on` with `off`")
+        for option, compared in (("guiding", "`on` with `off`"), ("sequence", "`independent` with `low_discrepancy`")):
+            if values.get(option) == "auto" and not auto:
+                raise ConfigError(blame, option, f"`auto` measures whether it pays; compare {compared}")
         return with_integrator(config, values | {"max_depth": max_depth}, blame, adjoint)
 
     @property
@@ -68,7 +69,7 @@ class Case:
             return None
         name = str(self.options.get("estimator", PLUGIN_ESTIMATOR))
         usual = {option: Reslrb.model_fields[option].default for option in _ESTIMATOR_OPTIONS}
-        usual["guiding"] = "auto" if name == "auto" else "off"
+        usual |= dict.fromkeys(UNDECIDED, "auto") if name == "auto" else UNDECIDED
         other = [
             f"{option}={value}"
             for option, value in self.options.items()

@@ -49,7 +49,8 @@ def measure_rival(problem: Problem, cache: Cache | None, say: Callable[[str], No
     # A budget of memory is kept by passes, of which `prb` has none.
     if problem.pilot is None or problem.samples_per_pass is not None or why_not(problem) is not None:
         return None
-    beside = [problem.pilot.chosen, None if problem.guided is None else problem.guided.guided]
+    guided, sequence = problem.guided, problem.sequence
+    beside = [problem.pilot.chosen, guided and guided.guided, sequence and sequence.low_discrepancy]
     key = "" if cache is None else key_of({"rival": RIVAL, "beside": beside, **situation(problem)})
     if cache is not None:
         try:

@@ -5,9 +5,9 @@ from __future__ import annotations
 import hashlib
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
 import mitsuba as mi
 
@@ -23,14 +23,17 @@ from reslrb_cli.optimization.pilot import SHARE, Pilot
 from reslrb_cli.optimization.pilot_records import Candidate, Measured, Outcome
 from reslrb_cli.optimization.room import check_baseline, check_memory
 from reslrb_cli.optimization.samples import sample_gradient, take_gradient
+from reslrb_cli.optimization.sequence_pilot import SHARE as SEQUENCE_SHARE
 from reslrb_cli.records.clock import MIB, StepClock
 from reslrb_cli.records.manifest import versions
+from reslrb_cli.records.paid import PaidRecord
 from reslrb_cli.records.pilot_cache import key_of
 
 if TYPE_CHECKING:
     from reslrb_cli.optimization.problem import Problem
 
 Say = Callable[[str], None]
+Paid = TypeVar("Paid", bound=PaidRecord)
 
 
 class Cache(Protocol):
@@ -165,9 +168,10 @@ def run_pilot(problem: Problem, options: list[Option]) -> Outcome:
     unit = batches * max(candidate.passes for candidate in made)
     if problem.samples_per_pass is not None:  # the user's own passes
         unit = batches * min(problem.samples_per_pass, run.spp // batches)
-    integrator = problem.config.integrator
-    guiding = isinstance(integrator, Reslrb) and integrator.guiding == "auto"  # which has its part of what it may cost
-    return Pilot(made, step, run.spp, unit, SHARE - GUIDING_SHARE if guiding else SHARE).run()
+    # What is measured later has its part of what it may cost; guiding leaves some of its own for the sequence.
+    later = {"guiding": GUIDING_SHARE, "sequence": SEQUENCE_SHARE}
+    reserved = max([share for option, share in later.items() if is_auto(problem.config, option)], default=0.0)
+    return Pilot(made, step, run.spp, unit, SHARE - reserved).run()
 
 
 def _candidate(option: Option) -> Candidate:
@@ -190,6 +194,25 @@ def measured_step(problem: Problem, integrator: Any, clock: StepClock, round: in
     wall_ms = 1e3 * (time.perf_counter() - start)
     # Kernels are compiled side by side: their times can add up to more than was waited for.
     return Measured(gradients, times.kernel_ms, max(wall_ms - times.codegen_ms, times.kernel_ms), times.codegen_ms)
+
+
+def is_auto(config: Config, option: str) -> bool:
+    """Whether this option of the integrator is left to measurement."""
+    return bool(config.integrator.options().get(option) == "auto")
+
+
+def share_left(problem: Problem, reserved: float = 0.0) -> float:
+    """What earlier measurements left of the share of a run that all of them may cost, but for what is `reserved`."""
+    spent = sum(each.share for each in (problem.pilot, problem.guided) if each is not None)
+    return max(SHARE - spent - reserved, 0.0)
+
+
+def recall(kind: type[Paid], cache: Cache | None, key: str) -> Paid | None:
+    """What an earlier run measured and kept by this key; None where it kept nothing."""
+    try:
+        return None if cache is None else replace(kind.from_json(cache.get(key) or {}), cached=True)
+    except TypeError:  # nothing there, or nothing that this version wrote
+        return None
 
 
 def situation(problem: Problem) -> dict[str, Any]:

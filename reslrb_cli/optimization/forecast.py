@@ -15,9 +15,9 @@ from reslrb_cli.config import Config
 from reslrb_cli.integrators import Reslrb as Tracer
 from reslrb_cli.optimization.certainty import LEAST_ITERATIONS
 from reslrb_cli.optimization.choice import Cache, find_options, settle_integrator
-from reslrb_cli.optimization.guiding_choice import settle_guiding
 from reslrb_cli.optimization.problem import Problem, assemble_scene
 from reslrb_cli.optimization.rendering import saved_spp
+from reslrb_cli.optimization.sequence_choice import settle_sampling
 from reslrb_cli.optimization.targets import make_targets
 from reslrb_cli.optimization.trial import measure_steps
 
@@ -79,12 +79,12 @@ def make_forecast(
     make_targets(problem, say)
     problem.truth.clear()  # errors are no part of a step
     settle_integrator(problem, options, say, cache)
-    settle_guiding(problem, say, cache)
+    settle_sampling(problem, say, cache)
     image_s = _image_seconds(problem)
     before(problem)
     say("measuring a few steps")
     steps, scratch = measure_steps(problem), _scratch(problem)
-    run, measured = config.run, [each for each in (problem.pilot, problem.guided) if each is not None]
+    run, measured = config.run, (problem.pilot, problem.guided, problem.sequence)
     targets = sum(4 * int(dr.prod(view.target.shape)) for view in problem.views)
     parts = {
         "geometry": buffers["geometry"],
@@ -105,7 +105,7 @@ def make_forecast(
         iteration_s=steps.step_s,
         start_s=steps.start_s,
         compile_s=steps.compile_s,
-        pilot_s=sum(each.measure_s + each.compile_s for each in measured if not each.cached),
+        pilot_s=sum(each.measure_s + each.compile_s for each in measured if each and not each.cached),
         target_s=0.0 if render is None else image_s * render.spp * views,
         images_s=image_s * images * views,
         verdicts_s=VERDICTS * steps.step_s if run.certainty and run.iterations >= LEAST_ITERATIONS else 0.0,

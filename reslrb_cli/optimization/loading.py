@@ -54,7 +54,7 @@ def check_integrator(config: Config, integrator: Integrator, scene: mi.Scene, se
 def make_configured(integrator: Integrator) -> StepIntegrator:
     """The integrator that a configuration describes; all estimators have the same image, so for `auto` any will do.
 
-    Where it is not decided yet whether it is guided, it is not.
+    What is not decided yet (`guiding`, `sequence`) is off.
     """
     if isinstance(integrator, Reslrb):
         auto = integrator.estimator == "auto"

@@ -6,7 +6,7 @@ from typing import Any
 
 from reslrb_cli.config import Reslrb as ReslrbConfig
 from reslrb_cli.integrators import Reslrb
-from reslrb_cli.integrators.features import GUIDED
+from reslrb_cli.integrators.features import GUIDED, SEQUENCE
 from reslrb_cli.integrators.plan_report import plan_rows, with_reason
 from reslrb_cli.optimization.problem import Problem
 
@@ -23,6 +23,8 @@ def plan_record(problem: Problem) -> dict[str, Any]:
     found = plan_rows(plan)
     if problem.guided is not None:
         found = with_reason(found, GUIDED, f"guiding: auto, {problem.guided.why()}")
+    if problem.sequence is not None:
+        found = with_reason(found, SEQUENCE, f"sequence: auto, {problem.sequence.why()}")
     rows = [{"feature": row.feature, "needed": row.needed, "reason": row.reason} for row in found]
     estimator = type(integrator.estimator).__name__.removesuffix("Estimator").lower()
     assert isinstance(config, ReslrbConfig)

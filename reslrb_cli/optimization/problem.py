@@ -16,7 +16,6 @@ from reslrb_cli.optimization.announced import check_announced, check_described
 from reslrb_cli.optimization.budget import MemoryPlan
 from reslrb_cli.optimization.choice import Cache, find_options, settle_integrator
 from reslrb_cli.optimization.errors import ErrorMeter, quantity
-from reslrb_cli.optimization.guiding_choice import settle_guiding
 from reslrb_cli.optimization.loading import (
     check_integrator,
     choose_sensors,
@@ -31,11 +30,12 @@ from reslrb_cli.optimization.reach import find_reached
 from reslrb_cli.optimization.rendering import render_in_passes, saved_spp
 from reslrb_cli.optimization.room import check_films, outlook
 from reslrb_cli.optimization.scaling import Scaled
+from reslrb_cli.optimization.sequence_choice import settle_sampling
 from reslrb_cli.optimization.settled import Settled
 from reslrb_cli.optimization.targets import make_targets
 from reslrb_cli.optimization.transforms import make_transform
 from reslrb_cli.optimization.views import View, expose, make_views, slope, to_tensor
-from reslrb_cli.records.guided import GuidedRecord
+from reslrb_cli.records.paid import GuidedRecord, SequenceRecord
 from reslrb_cli.scene import Selection, select_parameters
 from reslrb_cli.seeds import seed
 
@@ -66,6 +66,7 @@ class Problem:
     #: What was measured and planned before the first iteration, where it was.
     pilot: Outcome | None = None
     guided: GuidedRecord | None = None
+    sequence: SequenceRecord | None = None
     memory: MemoryPlan | None = None
     sensitivities: list[Scaled] | None = None
 
@@ -162,7 +163,7 @@ def assemble(
         settled.reach(problem)
         return problem
     settle_integrator(problem, options, say, cache)
-    settle_guiding(problem, say, cache)
+    settle_sampling(problem, say, cache)
     if to_run:
         check_exposures(problem)
         find_reached(problem, say)

@@ -1,21 +1,23 @@
-"""What an earlier process has settled for a run: values that it began with, estimator, passes, masks and guiding."""
+"""What an earlier process has settled for a run: where it began, estimator, passes, masks, how samples are drawn."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
+from reslrb_cli.optimization import guiding_choice, sequence_choice
 from reslrb_cli.optimization.budget import Estimate, MemoryPlan
-from reslrb_cli.optimization.choice import Option
-from reslrb_cli.optimization.guiding_choice import is_undecided, take_up
+from reslrb_cli.optimization.choice import Option, is_auto
 from reslrb_cli.optimization.pilot_records import Outcome
 from reslrb_cli.optimization.stored import Stored, is_number
-from reslrb_cli.records.guided import GuidedRecord
+from reslrb_cli.records.paid import GuidedRecord, PaidRecord, SequenceRecord
 
 if TYPE_CHECKING:
     from reslrb_cli.optimization.problem import Problem
+
+Paid = TypeVar("Paid", bound=PaidRecord)
 
 
 @dataclass(frozen=True)
@@ -37,14 +39,21 @@ class Settled:
         problem.apply()
 
     def settle(self, problem: Problem, options: Sequence[Option]) -> None:
-        """Choose what the run had chosen: the pilot's estimator, the samples of a pass, and whether it is guided."""
+        """Choose what the run had chosen: the pilot's estimator, the samples of a pass, and how samples are drawn."""
         self._estimator(problem, options)
-        if is_undecided(problem) and self.stored.value("guided") is not None:
-            try:
-                problem.guided = GuidedRecord.from_json(self.stored.value("guided"))
-            except (TypeError, AttributeError):
-                raise self.stored.wrong("guided", "is not what measuring whether guiding pays finds") from None
-            take_up(problem)
+        if is_auto(problem.config, "guiding"):
+            problem.guided = self._paid(GuidedRecord, "guided", "guiding")
+            guiding_choice.take_up(problem)
+        if is_auto(problem.config, "sequence"):
+            problem.sequence = self._paid(SequenceRecord, "sequence", "the sequence")
+            sequence_choice.take_up(problem)
+
+    def _paid(self, kind: type[Paid], name: str, what: str) -> Paid | None:
+        """What was measured, where it was."""
+        try:
+            return None if self.stored.value(name) is None else kind.from_json(self.stored.value(name))
+        except (TypeError, AttributeError):
+            raise self.stored.wrong(name, f"is not what measuring whether {what} pays finds") from None
 
     def _estimator(self, problem: Problem, options: Sequence[Option]) -> None:
         chosen = options[0] if options else None

@@ -55,6 +55,7 @@ def manifest_of(problem: Problem, variant: str, config_file: Path) -> Manifest:
     manifest.views = view_records(problem.views)
     manifest.pilot = None if problem.pilot is None else problem.pilot.to_json()
     manifest.guided = None if problem.guided is None else problem.guided.to_json()
+    manifest.sequence = None if problem.sequence is None else problem.sequence.to_json()
     manifest.memory = None if problem.memory is None else problem.memory.to_json()
     return manifest
 
@@ -67,6 +68,7 @@ def fixed_of(problem: Problem, variant: str) -> dict[str, Any]:
         "files": digests(problem.config),
         "pilot": None if problem.pilot is None else problem.pilot.to_json(),
         "guided": None if problem.guided is None else problem.guided.to_json(),
+        "sequence": None if problem.sequence is None else problem.sequence.to_json(),
         "memory": None if problem.memory is None else problem.memory.to_json(),
     }
 

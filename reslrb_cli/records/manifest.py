@@ -45,9 +45,9 @@ class Manifest:
     """Provenance and outcome of one run.
 
     `process` is who works in the folder. `plan` is what a step consists of, `pilot` the table by which an estimator was
-    chosen, `guided` whether guided emission paid, `rival` how `prb` did beside that, `memory` how a memory budget is
-    kept, `scaling` what was measured of each parameter for `scale: auto`, `correlated_bias` what of the bias of
-    `adjoint: correlated`; each is None where that
+    chosen, `guided` whether guided emission paid, `sequence` whether low-discrepancy numbers did, `rival` how `prb` did
+    beside that, `memory` how a memory budget is kept, `scaling` what was measured of each parameter for `scale: auto`,
+    `correlated_bias` what of the bias of `adjoint: correlated`; each is None where that
     was not asked for. `views` has, of each view, its share of the loss, and how many of its pixels are left out, by
     kind. `results` is what the run found (`iterations`, values and errors by key, `certainty`, `warnings`, and `seen`,
     errors as people see them, ...); `error` is the line that the user saw where the run failed. `resumed` says of each
@@ -72,6 +72,7 @@ class Manifest:
     plan: dict[str, Any] | None = None
     pilot: dict[str, Any] | None = None
     guided: dict[str, Any] | None = None
+    sequence: dict[str, Any] | None = None
     memory: dict[str, Any] | None = None
     scaling: list[dict[str, Any]] | None = None
     correlated_bias: dict[str, Any] | None = None

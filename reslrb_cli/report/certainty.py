@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from reslrb_cli.records.guided import GuidedRecord
+from reslrb_cli.records.paid import PaidRecord
 from reslrb_cli.records.rival import RivalRecord
 from reslrb_cli.report.words import count, duration, number, shorten
 
@@ -82,10 +82,10 @@ def rival_line(measured: Mapping[str, Any] | None) -> str:
         return ""
 
 
-def guided_line(measured: Mapping[str, Any] | None) -> str:
-    """Whether guided emission paid; empty where that was not left to measurement."""
+def paid_line(kind: type[PaidRecord], measured: Mapping[str, Any] | None) -> str:
+    """Whether another way of drawing samples paid; empty where that was not left to measurement."""
     try:
-        return GuidedRecord.from_json(dict(measured or {})).line()
+        return kind.from_json(dict(measured or {})).line()
     except TypeError:  # as above
         return ""
 

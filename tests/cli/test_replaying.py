@@ -78,6 +78,28 @@ def test_paths_are_of_the_run_s_sequence(run):
         assert {samples.plan.sequence for samples, *_ in _parts(problem, 0, 1)} == {own}
 
 
+def test_paths_are_of_the_sequence_that_was_measured_to_pay(run, capsys):
+    from reslrb_cli.cli.replaying import load_replay
+    from reslrb_cli.config import load
+    from reslrb_cli.measure.offender import _parts
+    from reslrb_cli.records.paid import SequenceRecord
+
+    config = (run / "config.yaml").read_text()
+    assert "sequence: independent" in config
+    (run / "config.yaml").write_text(config.replace("sequence: independent", "sequence: auto"))
+    manifest = json.loads((run / "manifest.json").read_text())
+    for paid in (True, False):
+        measured = SequenceRecord(low_discrepancy=paid).to_json()
+        (run / "manifest.json").write_text(json.dumps(manifest | {"sequence": measured}))
+        problem = load_replay(load(run / "config.yaml")).problem
+        own = problem.integrator.plan(problem.scene, problem.scene.sensors()[0]).sequence
+        assert (own is not None) == paid
+        assert {samples.plan.sequence for samples, *_ in _parts(problem, 0, 1)} == {own}
+    for wrong in (None, {"low_discrepancy": "maybe"}, [1]):
+        (run / "manifest.json").write_text(json.dumps(manifest | {"sequence": wrong}))
+        assert told(capsys, run) == "manifest.json: sequence: is not whether a sequence paid, as a run writes it"
+
+
 def test_a_guided_run_is_refused(run, capsys):
     config = (run / "config.yaml").read_text()
     assert "guiding: 'off'" in config

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import get_args
+from typing import Any, get_args
 
 import pytest
 
@@ -45,14 +45,19 @@ def test_what_is_no_amount_of_memory(written: int | float | str) -> None:
         memory_bytes(written)
 
 
-def test_guiding_is_left_to_measurement_where_the_estimator_is() -> None:
-    assert Reslrb().guiding == "auto"
-    assert Reslrb(estimator="stack").guiding == "off"
-    assert Reslrb(estimator="stack", guiding="auto").guiding == "auto"
-    assert Reslrb(guiding="off").guiding == "off"
-    # What is made before anything is measured is not guided.
-    for own in (Reslrb(), Reslrb(guiding="auto", estimator="reservoir")):
-        assert own.chosen(estimator="stack").guiding == own.undecided_off().guiding == "off"
-    assert (
-        Reslrb(guiding="on").chosen(estimator="stack").guiding == Reslrb(guiding="on").undecided_off().guiding == "on"
-    )
+@pytest.mark.parametrize(
+    ("name", "off", "on"), [("guiding", "off", "on"), ("sequence", "independent", "low_discrepancy")]
+)
+def test_what_is_left_to_measurement_where_the_estimator_is(name: str, off: str, on: str) -> None:
+    def given(**options: Any) -> str:
+        return str(getattr(Reslrb(**options), name))
+
+    assert given() == "auto"
+    assert given(estimator="stack") == off
+    assert given(estimator="stack", **{name: "auto"}) == "auto"
+    assert given(**{name: off}) == off
+    # What is made before anything is measured has nothing of it.
+    for own in (Reslrb(), Reslrb(**{name: "auto", "estimator": "reservoir"})):
+        assert getattr(own.chosen(estimator="stack"), name) == getattr(own.undecided_off(), name) == off
+    asked = Reslrb(**{name: on})
+    assert getattr(asked.chosen(estimator="stack"), name) == getattr(asked.undecided_off(), name) == on

@@ -58,7 +58,7 @@ def test_defaults(tmp_path: Path) -> None:
     assert config.integrator.options() == {
         "max_depth": 8, "rr_depth": 5, "hide_emitters": False, "estimator": "auto", "freeze": True,
         "attached": "auto", "attached_sampling": "auto", "filter_normalization": "attached", "guiding": "auto",
-        "sequence": "independent",
+        "sequence": "auto",
     }  # fmt: skip
     assert config.loss.type == "l2"
     assert config.loss.options() == {}

@@ -7,30 +7,25 @@ path in twenty to where anything is seen.
 from __future__ import annotations
 
 import gc
-import logging
 from pathlib import Path
 from typing import Any
 
-import drjit as dr
 import numpy as np
 import pytest
-from cli import tiny
-from recording.going_on import differences, left_over, optimize, run_and_kill, work_alone, write_experiment
+from optimization.deciding import begin, begin_alone, fix_times, inspected, operations
+from recording.going_on import differences, left_over, optimize, run_and_kill
 from turns import a_few
 
-from reslrb_cli.cli import main
 from reslrb_cli.config import load
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.integrators.guiding import Purpose
 from reslrb_cli.measure.cases import parse_cases
-from reslrb_cli.optimization import guiding_choice, loop
 from reslrb_cli.optimization import problem as problem_module
-from reslrb_cli.optimization.guiding_choice import StepTrial, table_bytes
-from reslrb_cli.optimization.guiding_pilot import Taken
+from reslrb_cli.optimization.guiding_choice import table_bytes
 from reslrb_cli.optimization.problem import Problem, assemble
-from reslrb_cli.recording import run as recording
+from reslrb_cli.optimization.step_pilot import Taken
+from reslrb_cli.optimization.step_trial import StepTrial
 from reslrb_cli.records.checkpoint import FILE_NAME, open_state
-from reslrb_cli.records.clock import StepClock
 from reslrb_cli.records.manifest import read_manifest
 from reslrb_cli.records.pilot_cache import PilotCache
 
@@ -42,26 +37,11 @@ RUN = Path("runs/tiny")
 
 @pytest.fixture
 def experiment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The tiny experiment in the working directory, with a cache of its own."""
-    tiny.write_experiment(tmp_path)
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("RESLRB_CACHE", str(tmp_path / "cache"))
-    logging.getLogger("reslrb_cli").setLevel(logging.INFO)
-    return tmp_path
+    return begin(tmp_path, monkeypatch)
 
 
 def take_times(monkeypatch: pytest.MonkeyPatch, guided_ms: float) -> None:
-    """Have a step take 1 ms, guided `guided_ms`, and a walk that is learned from 1 ms."""
-    monkeypatch.setattr(guiding_choice, "_taken", lambda times: Taken(kernel_ms=1.0, wall_ms=1.0))
-    take = StepTrial.take
-
-    def timed(self: StepTrial, guided: bool, round: int, spp: int) -> Taken:
-        taken = take(self, guided, round, spp)
-        if guided:
-            taken.kernel_ms = taken.image_ms = guided_ms
-        return taken
-
-    monkeypatch.setattr(StepTrial, "take", timed)
+    fix_times(monkeypatch, {"guiding": guided_ms})
 
 
 def decided(monkeypatch: pytest.MonkeyPatch, guided_ms: float, *settings: str, **options: Any) -> Problem:
@@ -111,23 +91,12 @@ def test_the_sequence_is_the_same_with_guiding_and_without(experiment: Path, mon
         assert plan.sequence is not None
 
 
-def operations(problem: Problem) -> list[int]:
-    """Those of the kernels of a step of the run, after a first one."""
-    clock = StepClock()
-    for iteration in range(2):
-        with clock.step():
-            loss, squares, *_ = loop.gradient(problem, iteration, loop.Split())
-            dr.eval(loss, squares)
-        problem.apply()
-    return [kernel["operation_count"] for kernel in clock.history if kernel["type"] == dr.KernelType.JIT]
-
-
 def test_images_that_guiding_does_not_pay_for_are_not_guided(experiment: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     take = StepTrial.take
 
-    def slow(self: StepTrial, guided: bool, round: int, spp: int) -> Taken:
-        taken = take(self, guided, round, spp)
-        taken.image_ms = 1000.0 if guided else 1.0
+    def slow(self: StepTrial, other: bool, round: int, spp: int) -> Taken:
+        taken = take(self, other, round, spp)
+        taken.image_ms = 1000.0 if other else 1.0
         return taken
 
     take_times(monkeypatch, 0.5)
@@ -151,7 +120,8 @@ def seeds_of_parts(monkeypatch: pytest.MonkeyPatch, experiment: Path) -> tuple[s
     """The seeds of walks that a table learned from, and those of steps; whatever learned in between has failed."""
     drawn: dict[str, set[int]] = {"learn": set(), "take": set()}
     problem = assemble(load("tiny.yaml", AUTO[1:]))
-    trial, job = StepTrial(problem), StepTrial._job
+    plain, guided = (problem.integrator.afresh(guided=on) for on in (False, True))
+    trial, job = StepTrial(problem, "guiding", plain, guided), StepTrial._job
     part = "learn"
 
     def spy(self: StepTrial, view: Any, number: int, spp: int) -> Any:
@@ -227,28 +197,23 @@ def test_a_run_says_so_once_remembers_it_and_writes_it_down(
     assert row.endswith("guiding: auto, which a run decides by measurement")
 
 
-def inspected(capsys: pytest.CaptureFixture[str], *words: str) -> list[str]:
-    capsys.readouterr()
-    with pytest.raises(SystemExit) as end:
-        main.main(["inspect", *words, "--no-counts"])
-    assert end.value.code == 0
-    return capsys.readouterr().out.splitlines()
-
-
 def test_it_goes_on_as_it_was_decided_bit_by_bit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    write_experiment(tmp_path)
-    work_alone(monkeypatch)
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("RESLRB_CACHE", str(tmp_path / "cache"))
-    monkeypatch.setattr(recording, "write_report", lambda folder, *now: (folder / "report.html").write_text("<html>"))
-    monkeypatch.setattr(recording, "seen_errors", lambda folder, results: {})
-    take_times(monkeypatch, 0.2)
-    settings = [*AUTO[:3], "run.iterations=8", "run.checkpoint_every={iterations: 3}", "run.certainty=false"]
+    """Guided or not, and from which sequence: decided once, and restored."""
+    begin_alone(tmp_path, monkeypatch)
+    fix_times(monkeypatch, {"guiding": 0.2, "sequence": 0.1, "sequence alone": 1000.0})
+    settings = [
+        *AUTO[:3],
+        "integrator.sequence=auto",
+        "run.iterations=8",
+        "run.checkpoint_every={iterations: 3}",
+        "run.certainty=false",
+    ]
     whole, left = run_and_kill(monkeypatch, 7, *(word for text in settings for word in ("--set", text)))
-    monkeypatch.setattr(problem_module, "settle_guiding", lambda *args: pytest.fail("measured again"))
+    monkeypatch.setattr(problem_module, "settle_sampling", lambda *args: pytest.fail("measured again"))
     (tmp_path / "cache" / "pilot.json").unlink()
     assert optimize("--resume", str(left), "--quiet") == 0
     assert read_manifest(left)["guided"]["guided"]
+    assert read_manifest(left)["sequence"]["low_discrepancy"]
     assert differences(whole, left) == []
     assert left_over(left) == []
 

@@ -2,65 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
+from optimization.deciding import SIZES, World
 
 from reslrb_cli.integrators.guiding import EVERY
-from reslrb_cli.optimization import guiding_pilot
-from reslrb_cli.optimization.guiding_pilot import LEARNINGS, LEAST_ROUNDS, LOOKS, SHARE, GuidingPilot, Sizes, Taken
+from reslrb_cli.optimization.guiding_pilot import LONGER, SHARE, GuidingPilot
 from reslrb_cli.optimization.pilot import TIMING_NOISE
 from reslrb_cli.optimization.pilot_records import ITERATIONS
-from reslrb_cli.records.guided import GuidedRecord
-
-SIZES = Sizes(step=64, call=16, part=16, alone=False, entries=200)
-
-
-@dataclass
-class World:
-    """Steps whose times and variances are given, for each sample: guided ones have `variance` and `time` times those of
-    others, and their images `image` times; a walk that is learned from takes `walk` ms a sample and `python` beside.
-    `sparse`: a gradient is made of so few paths that say anything (a thirtieth of them)."""
-
-    variance: float = 1.0
-    time: float = 1.0
-    image: float | None = None
-    image_time: float = 1.0
-    walk: float = 1.0
-    python: float = 1.0
-    overhead: float = 0.1
-    sparse: bool = False
-    seed: int = 0
-    entries: int = 200
-    alone: bool = False
-    calls: list[Any] = field(default_factory=list)
-
-    def learn(self, round: int, spp: int) -> Taken:
-        self.calls.append(("learn", round, spp))
-        return Taken(kernel_ms=self.walk * spp, wall_ms=self.walk * spp + self.python, compile_ms=5.0)
-
-    def take(self, guided: bool, round: int, spp: int) -> Taken:
-        self.calls.append((guided, round, spp))
-        random = np.random.default_rng([self.seed, round, guided])
-        factor = self.variance if guided else 1.0
-        picture = factor if self.image is None else (self.image if guided else 1.0)
-        kernel = spp * (self.time if guided else 1.0)
-        apart = spp * (self.image_time if guided else 1.0) if self.alone else 0.0
-        return Taken(
-            {"a": self._noisy(random, factor / spp), "b": 1000 * self._noisy(random, factor / spp)},
-            {"0": self._noisy(random, picture / spp)},
-            kernel, apart, kernel + apart + self.overhead, 0.0,
-        )  # fmt: skip
-
-    def _noisy(self, random: np.random.Generator, variance: float) -> np.ndarray:
-        # Sparse noise, of variance 1 as well, is of a number of paths each of which says the same.
-        noise = (random.poisson(4, self.entries) - 4) / 2 if self.sparse else random.normal(size=self.entries)
-        return 1 + np.sqrt(variance) * noise
-
-    def run(self, sizes: Sizes = SIZES, share: float = 2 * SHARE) -> GuidedRecord:
-        return GuidingPilot(self, replace(sizes, entries=self.entries, alone=self.alone), 1.0, share).run()
+from reslrb_cli.optimization.step_pilot import LEARNINGS, LEAST_ROUNDS, LOOKS
+from reslrb_cli.optimization.step_sizes import Sizes
+from reslrb_cli.records.paid import GuidedRecord
 
 
 def gain(world: World, sizes: Sizes = SIZES) -> float:
@@ -125,7 +80,7 @@ def test_where_it_does_not_pay_it_is_hardly_ever_on() -> None:
 
 def test_a_fault_that_forgets_what_learning_costs_is_seen(monkeypatch: pytest.MonkeyPatch) -> None:
     """As it is seen by the tests above: the same worlds are called better then."""
-    monkeypatch.setattr(GuidingPilot, "_learning_ms", lambda self: 0.0)
+    monkeypatch.setattr(GuidingPilot, "_more_ms", lambda self: 0.0)
     assert on_by_accident(variance=0.8, walk=0.7, python=16.8) > 50
 
 
@@ -134,7 +89,7 @@ def test_a_fault_that_forgets_what_learning_costs_is_seen(monkeypatch: pytest.Mo
 @pytest.mark.parametrize("time", [1.0, 3.0, 10.0])
 def test_its_share_is_kept(spp: int, overhead: float, python: float, time: float) -> None:
     world = World(0.1, time, overhead=overhead, python=python, walk=1.5)
-    record = world.run(Sizes(spp, spp, spp, False, 200), SHARE)
+    record = world.run(Sizes(spp, spp, spp, False, 200, LONGER), SHARE)
     taken = [call for call in world.calls if call[0] is not False]
     assert all(call[2] <= spp for call in world.calls)
     if record.gain is None:
@@ -150,7 +105,7 @@ def test_its_share_is_kept(spp: int, overhead: float, python: float, time: float
 
 def test_samples_are_no_more_than_those_of_a_pass() -> None:
     world = World(0.1, 2.0)
-    record = world.run(Sizes(step=4096, call=1024, part=8, alone=False, entries=200))
+    record = world.run(Sizes(step=4096, call=1024, part=8, alone=False, entries=200, longer=LONGER))
     assert max(call[2] for call in world.calls) == 8
     assert record.guided
 
@@ -207,4 +162,4 @@ def test_walks_that_are_learned_from_come_before_all_steps_that_are_guided() -> 
     world.run()
     kinds = [call[0] for call in world.calls]
     assert kinds.index(True) > max(k for k, kind in enumerate(kinds) if kind == "learn")
-    assert guiding_pilot.LEARNINGS == kinds.count("learn")
+    assert LEARNINGS == kinds.count("learn")

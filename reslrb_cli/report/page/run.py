@@ -7,7 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from reslrb_cli.errors import ConfigError
-from reslrb_cli.report.certainty import certainty_words, guided_line, rival_line
+from reslrb_cli.records.paid import GuidedRecord, SequenceRecord
+from reslrb_cli.report.certainty import certainty_words, paid_line, rival_line
 from reslrb_cli.report.page import facts
 from reslrb_cli.report.page.curves import convergence
 from reslrb_cli.report.page.images import image_rows
@@ -77,7 +78,8 @@ def record_parts(run: Run) -> dict[str, str]:
         "Plan": lambda: facts.plan_table(manifest.get("plan")),
         "Choice of the estimator": lambda: (
             facts.pilot_table(manifest.get("pilot"))
-            + soft(guided_line(manifest.get("guided")))
+            + soft(paid_line(GuidedRecord, manifest.get("guided")))
+            + soft(paid_line(SequenceRecord, manifest.get("sequence")))
             + soft(rival_line(manifest.get("rival")))
         ),
         "Bias of correlated samples": lambda: facts.correlated_bias_table(manifest.get("correlated_bias")),

@@ -1,0 +1,128 @@
+"""What tests share of decisions by steps taken both ways: worlds that are made up, and runs whose times are given."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import drjit as dr
+import numpy as np
+import pytest
+from cli import tiny
+from recording.going_on import work_alone, write_experiment
+
+from reslrb_cli.cli import main
+from reslrb_cli.optimization import loop, step_trial
+from reslrb_cli.optimization.guiding_pilot import LONGER, SHARE, GuidingPilot
+from reslrb_cli.optimization.problem import Problem
+from reslrb_cli.optimization.step_pilot import StepPilot, Taken
+from reslrb_cli.optimization.step_sizes import Sizes
+from reslrb_cli.optimization.step_trial import StepTrial
+from reslrb_cli.recording import run as recording
+from reslrb_cli.records.clock import StepClock
+
+SIZES = Sizes(step=64, call=16, part=16, alone=False, entries=200, longer=LONGER)
+
+
+@dataclass
+class World:
+    """Steps whose times and variances are given, for each sample: those of the other kind have `variance` and `time`
+    times those of the one, and their images `image` times; a walk that is learned from takes `walk` ms a sample and
+    `python` beside. `sparse`: a gradient is made of so few paths that say anything (a thirtieth of them)."""
+
+    variance: float = 1.0
+    time: float = 1.0
+    image: float | None = None
+    image_time: float = 1.0
+    walk: float = 1.0
+    python: float = 1.0
+    overhead: float = 0.1
+    sparse: bool = False
+    seed: int = 0
+    entries: int = 200
+    alone: bool = False
+    calls: list[Any] = field(default_factory=list)
+
+    learns: bool = True
+    pilot: type[StepPilot[Any]] = GuidingPilot
+
+    def learn(self, round: int, spp: int) -> Taken:
+        self.calls.append(("learn", round, spp))
+        return Taken(kernel_ms=self.walk * spp, wall_ms=self.walk * spp + self.python, compile_ms=5.0)
+
+    def take(self, other: bool, round: int, spp: int) -> Taken:
+        self.calls.append((other, round, spp))
+        random = np.random.default_rng([self.seed, round, other])
+        factor = self.variance if other else 1.0
+        picture = factor if self.image is None else (self.image if other else 1.0)
+        kernel = spp * (self.time if other else 1.0)
+        apart = spp * (self.image_time if other else 1.0) if self.alone else 0.0
+        return Taken(
+            {"a": self._noisy(random, factor / spp), "b": 1000 * self._noisy(random, factor / spp)},
+            {"0": self._noisy(random, picture / spp)},
+            kernel, apart, kernel + apart + self.overhead, 0.0,
+        )  # fmt: skip
+
+    def _noisy(self, random: np.random.Generator, variance: float) -> np.ndarray:
+        # Sparse noise, of variance 1 as well, is of a number of paths each of which says the same.
+        noise = (random.poisson(4, self.entries) - 4) / 2 if self.sparse else random.normal(size=self.entries)
+        return 1 + np.sqrt(variance) * noise
+
+    def run(self, sizes: Sizes = SIZES, share: float = 2 * SHARE) -> Any:
+        """The record of what is decided."""
+        return self.pilot(self, replace(sizes, entries=self.entries, alone=self.alone), 1.0, share).run()
+
+
+def begin(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The tiny experiment in the working directory, with a cache of its own."""
+    tiny.write_experiment(folder)
+    monkeypatch.chdir(folder)
+    monkeypatch.setenv("RESLRB_CACHE", str(folder / "cache"))
+    logging.getLogger("reslrb_cli").setLevel(logging.INFO)
+    return folder
+
+
+def begin_alone(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The experiment of runs that are to be equal bit by bit, whose pages are not drawn."""
+    write_experiment(folder)
+    work_alone(monkeypatch)
+    monkeypatch.chdir(folder)
+    monkeypatch.setenv("RESLRB_CACHE", str(folder / "cache"))
+    monkeypatch.setattr(recording, "write_report", lambda folder, *now: (folder / "report.html").write_text("<html>"))
+    monkeypatch.setattr(recording, "seen_errors", lambda folder, results: {})
+
+
+def fix_times(monkeypatch: pytest.MonkeyPatch, other_ms: Mapping[str, float]) -> None:
+    """Have a step take 1 ms, one of the other kind what is given for what is decided, and a walk to learn from 1 ms."""
+    monkeypatch.setattr(step_trial, "_taken", lambda times: Taken(kernel_ms=1.0, wall_ms=1.0))
+    take = StepTrial.take
+
+    def timed(self: StepTrial, other: bool, round: int, spp: int) -> Taken:
+        taken = take(self, other, round, spp)
+        if other:
+            taken.kernel_ms = taken.image_ms = other_ms[self._what]
+        return taken
+
+    monkeypatch.setattr(StepTrial, "take", timed)
+
+
+def operations(problem: Problem) -> list[int]:
+    """Those of the kernels of a step of the run, after a first one."""
+    clock = StepClock()
+    for iteration in range(2):
+        with clock.step():
+            loss, squares, *_ = loop.gradient(problem, iteration, loop.Split())
+            dr.eval(loss, squares)
+        problem.apply()
+    return [kernel["operation_count"] for kernel in clock.history if kernel["type"] == dr.KernelType.JIT]
+
+
+def inspected(capsys: pytest.CaptureFixture[str], *words: str) -> list[str]:
+    capsys.readouterr()
+    with pytest.raises(SystemExit) as end:
+        main.main(["inspect", *words, "--no-counts"])
+    assert end.value.code == 0
+    return capsys.readouterr().out.splitlines()
