@@ -92,8 +92,9 @@ def measure_chains(problem: Problem) -> list[ChainConditions]:
         return []
     options = problem.config.integrator.options()
     damping = options.get("jacobian_damping", JACOBIAN_DAMPING)
-    shared = {name: value for name, value in options.items() if name in Reslrb.OPTIONS} | {"freeze": False}
-    tracer = Reslrb.of(**(shared | {"estimator": "reservoir", "guiding": "off"}))
+    shared = {name: value for name, value in options.items() if name in Reslrb.OPTIONS}
+    own = {"estimator": "reservoir", "guiding": "off", "sequence": "independent", "freeze": False}
+    tracer = Reslrb.of(**(shared | own))
     scene, sensor = problem.scene, problem.scene.sensors()[problem.sensors[0]]
     problem.apply()
     width, height = sensor.film().crop_size()

@@ -14,7 +14,8 @@ from reslrb_cli.cli import main
 from reslrb_cli.records.manifest import read_manifest
 from reslrb_cli.records.metrics import read_metrics
 
-AUTO = CONFIG.replace("{type: ptracer, max_depth: 3}", "{max_depth: 4, guiding: off}").replace("iterations: 25", "iterations: 2")
+OWN = "{max_depth: 4, guiding: off, sequence: independent}"
+AUTO = CONFIG.replace("{type: ptracer, max_depth: 3}", OWN).replace("iterations: 25", "iterations: 2")
 
 
 @pytest.fixture

@@ -14,7 +14,8 @@ from reslrb_cli.measure.chain_conditions import ChainConditions, measure_chains
 from reslrb_cli.optimization.problem import Problem, assemble
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
-SMALL = ["scene.options={resx: 24, resy: 24}", "target.render.spp=16", "run.spp=16", "integrator.guiding=off"]
+UNGUIDED = ["integrator.guiding=off", "integrator.sequence=independent"]
+SMALL = ["scene.options={resx: 24, resy: 24}", "target.render.spp=16", "run.spp=16", *UNGUIDED]
 #: Of glass against air, as the scene names them.
 IOR = 1.5046 / 1.000277
 

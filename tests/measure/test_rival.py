@@ -16,7 +16,8 @@ from reslrb_cli.optimization import gains
 from reslrb_cli.records.manifest import read_manifest
 from reslrb_cli.records.rival import RivalRecord
 
-AUTO = CONFIG.replace("{type: ptracer, max_depth: 3}", "{max_depth: 3, guiding: off}").replace("iterations: 25", "iterations: 2")
+OWN = "{max_depth: 3, guiding: off, sequence: independent}"
+AUTO = CONFIG.replace("{type: ptracer, max_depth: 3}", OWN).replace("iterations: 25", "iterations: 2")
 POINT = """<emitter type="point" id="bulb"><point name="position" x="0" y="0" z="2"/>
     <rgb name="intensity" value="3, 3, 3"/></emitter>"""
 GLASS = """<shape type="sphere"><float name="radius" value="0.2"/><point name="center" x="0" y="0" z="1"/>
