@@ -81,6 +81,11 @@ class LightTracer:
         other.preparation = self.preparation.afresh(guided, images, low_discrepancy)
         return other
 
+    def to_measure(self) -> Self:
+        """This one, or, where it is guided, one with tables of its own: whoever measures steps before a run teaches
+        those of the run nothing, which is then the same whether they were measured now or by an earlier one."""
+        return self if self.preparation.guiding is None else self.afresh()
+
     def plan(self, scene: mi.Scene, sensor: mi.Sensor, params: mi.SceneParameters | None = None) -> Plan:
         """What a walk of this scene needs, with derivatives of `params`, if any.
 

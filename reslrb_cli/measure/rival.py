@@ -11,14 +11,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 from reslrb_cli.integrators import make_integrator
 from reslrb_cli.integrators.tracer import LightTracer
 from reslrb_cli.measure.moving import moves_light
 from reslrb_cli.measure.references import Situation, prb_gradient
-from reslrb_cli.optimization.choice import Cache, measured_step, situation
+from reslrb_cli.optimization.choice import Cache, measured_step, recall, situation
 from reslrb_cli.optimization.gains import compare
 from reslrb_cli.optimization.pilot_records import ITERATIONS, Gradients
 from reslrb_cli.optimization.problem import Problem
@@ -52,11 +52,9 @@ def measure_rival(problem: Problem, cache: Cache | None, say: Callable[[str], No
     guided, sequence = problem.guided, problem.sequence
     beside = [problem.pilot.chosen, guided and guided.guided, sequence and sequence.low_discrepancy]
     key = "" if cache is None else key_of({"rival": RIVAL, "beside": beside, **situation(problem)})
-    if cache is not None:
-        try:
-            return replace(RivalRecord.from_json(cache.get(key) or {}), cached=True)
-        except TypeError:
-            pass  # nothing there, or nothing that this version wrote
+    known = recall(RivalRecord, cache, key)
+    if known is not None:
+        return known
     say(f"measuring {RIVAL} beside it")
     record = _measure(problem)
     if cache is not None:
@@ -88,7 +86,7 @@ def _measure(problem: Problem) -> RivalRecord:
     spp = problem.pilot.spp if problem.pilot is not None else problem.config.run.spp
     own_integrator: Any = problem.integrator
     if isinstance(own_integrator, LightTracer):  # a recording would cost more than so few steps save
-        own_integrator = own_integrator.with_options(samples_per_pass=None, freeze=False)
+        own_integrator = own_integrator.to_measure().with_options(samples_per_pass=None, freeze=False)
     both = {RIVAL: (rival, _Measured()), "own": (own_integrator, _Measured())}
     compile_ms = spent_ms = 0.0
     budget_ms = math.inf

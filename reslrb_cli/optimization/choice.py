@@ -26,14 +26,15 @@ from reslrb_cli.optimization.samples import sample_gradient, take_gradient
 from reslrb_cli.optimization.sequence_pilot import SHARE as SEQUENCE_SHARE
 from reslrb_cli.records.clock import MIB, StepClock
 from reslrb_cli.records.manifest import versions
-from reslrb_cli.records.paid import PaidRecord
+from reslrb_cli.records.paid import GuidedRecord, SequenceRecord
 from reslrb_cli.records.pilot_cache import key_of
+from reslrb_cli.records.rival import RivalRecord
 
 if TYPE_CHECKING:
     from reslrb_cli.optimization.problem import Problem
 
 Say = Callable[[str], None]
-Paid = TypeVar("Paid", bound=PaidRecord)
+Kept = TypeVar("Kept", GuidedRecord, SequenceRecord, RivalRecord)
 
 
 class Cache(Protocol):
@@ -155,7 +156,7 @@ def run_pilot(problem: Problem, options: list[Option]) -> Outcome:
     integrators: dict[str, Tracer] = {}
     made = [_candidate(option) for option in options]
     for candidate, option in zip(made, options, strict=True):
-        integrators[candidate.label] = option.integrator
+        integrators[candidate.label] = option.integrator.to_measure()
     clock = StepClock()
 
     def step(candidate: Candidate, round: int, spp: int) -> Measured:
@@ -207,7 +208,7 @@ def share_left(problem: Problem, reserved: float = 0.0) -> float:
     return max(SHARE - spent - reserved, 0.0)
 
 
-def recall(kind: type[Paid], cache: Cache | None, key: str) -> Paid | None:
+def recall(kind: type[Kept], cache: Cache | None, key: str) -> Kept | None:
     """What an earlier run measured and kept by this key; None where it kept nothing."""
     try:
         return None if cache is None else replace(kind.from_json(cache.get(key) or {}), cached=True)

@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 from typing import Any
 
+from typing_extensions import Self
+
 
 @dataclass(frozen=True)
 class RivalRecord:
@@ -29,10 +31,10 @@ class RivalRecord:
         """As a mapping for JSON."""
         return asdict(self)
 
-    @staticmethod
-    def from_json(data: dict[str, Any]) -> RivalRecord:
+    @classmethod
+    def from_json(cls, data: dict[str, Any]) -> Self:
         """The same again. Raises TypeError where `data` is nothing that `to_json` made."""
-        return RivalRecord(**data)
+        return cls(**data)
 
     @property
     def is_better(self) -> bool:

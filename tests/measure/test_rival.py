@@ -13,6 +13,7 @@ from reslrb_cli.cli import main
 from reslrb_cli.config import load
 from reslrb_cli.measure import rival
 from reslrb_cli.optimization import gains
+from reslrb_cli.optimization.problem import assemble
 from reslrb_cli.records.manifest import read_manifest
 from reslrb_cli.records.rival import RivalRecord
 
@@ -57,6 +58,13 @@ def test_it_is_measured_once_and_remembered(experiment, capsys):
     err, again = optimize(capsys)
     assert again["rival"] == {**manifest["rival"], "cached": True}
     assert "measuring prb" not in err
+
+
+def test_the_tables_of_a_guided_run_learn_nothing_from_it(experiment: None) -> None:
+    """A run begins alike whether this was measured now or by an earlier one."""
+    problem = assemble(load("box.yaml", ["integrator.guiding=on"]))
+    assert rival.measure_rival(problem, None, lambda line: None) is not None
+    assert problem.integrator.preparation.guiding.learned == {}
 
 
 def test_it_is_not_tried_where_nobody_chose_an_estimator(experiment, capsys, monkeypatch):
