@@ -12,14 +12,13 @@ import pytest
 from conformance import attached_cases, moving_lamps, sequence_faults
 from conformance.gradient_cases import CASES
 from conformance.test_guiding import guided, sample, samples
-from conformance.test_kernels import steps_compile_nothing
+from conformance.test_kernels import nothing_is_compiled_without, steps_compile_nothing
 from turns import a_few
 
 import reslrb_cli
 from reslrb_cli.estimators import ESTIMATORS
 from reslrb_cli.integrators import make_integrator
-from reslrb_cli.integrators.features import FEATURES
-from reslrb_cli.integrators.plan_report import count, tracking
+from reslrb_cli.integrators.features import SEQUENCE
 from reslrb_cli.measure.gradients import Case, integrator, relative, seeds
 from reslrb_cli.measure.statistics import compare
 
@@ -208,18 +207,7 @@ def test_a_recorded_step_is_the_step() -> None:
 
 
 def test_with_independent_numbers_nothing_of_it_is_compiled() -> None:
-    [feature] = [feature for feature in FEATURES if feature.name == "low-discrepancy numbers"]
-    scene, ours, plain = both("two_emitters")
-    operations = {}
-    for name, each in (("on", ours), ("off", plain)):
-        with tracking(scene.params, scene.keys):
-            plan = each.plan(scene.scene, scene.scene.sensors()[0], scene.params)
-            assert feature.needed(plan) == (name == "on")
-            for toggled in (plan, feature.toggle(plan)):
-                kind = "on" if feature.needed(toggled) else "off"
-                operations[name, kind] = sum(count(each, toggled, scene.scene, scene.scene.sensors()[0], known=True))
-    assert operations["on", "on"] == operations["off", "on"]
-    assert operations["on", "off"] == operations["off", "off"] < operations["on", "on"]
+    nothing_is_compiled_without(SEQUENCE, *both("two_emitters"))
 
 
 def test_later_steps_compile_nothing() -> None:

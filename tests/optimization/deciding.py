@@ -12,7 +12,6 @@ import drjit as dr
 import numpy as np
 import pytest
 from cli import tiny
-from recording.going_on import work_alone, write_experiment
 
 from reslrb_cli.cli import main
 from reslrb_cli.optimization import loop, step_trial
@@ -21,7 +20,6 @@ from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.step_pilot import StepPilot, Taken
 from reslrb_cli.optimization.step_sizes import Sizes
 from reslrb_cli.optimization.step_trial import StepTrial
-from reslrb_cli.recording import run as recording
 from reslrb_cli.records.clock import StepClock
 
 SIZES = Sizes(step=64, call=16, part=16, alone=False, entries=200, longer=LONGER)
@@ -83,16 +81,6 @@ def begin(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setenv("RESLRB_CACHE", str(folder / "cache"))
     logging.getLogger("reslrb_cli").setLevel(logging.INFO)
     return folder
-
-
-def begin_alone(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The experiment of runs that are to be equal bit by bit, whose pages are not drawn."""
-    write_experiment(folder)
-    work_alone(monkeypatch)
-    monkeypatch.chdir(folder)
-    monkeypatch.setenv("RESLRB_CACHE", str(folder / "cache"))
-    monkeypatch.setattr(recording, "write_report", lambda folder, *now: (folder / "report.html").write_text("<html>"))
-    monkeypatch.setattr(recording, "seen_errors", lambda folder, results: {})
 
 
 def fix_times(monkeypatch: pytest.MonkeyPatch, other_ms: Mapping[str, float]) -> None:

@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from optimization.deciding import begin, begin_alone, fix_times, inspected, operations
-from recording.going_on import differences, left_over, optimize, run_and_kill
+from optimization.deciding import begin, fix_times, inspected, operations
+from recording.going_on import begin_alone, differences, left_over, optimize, run_and_kill
 from turns import a_few
 
 from reslrb_cli.config import load

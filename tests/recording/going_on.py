@@ -18,6 +18,7 @@ from cli import tiny
 from reslrb_cli.cli import main, progress
 from reslrb_cli.optimization import loop, optimizers, problem, sensitivity, targets
 from reslrb_cli.optimization.certainty import measuring
+from reslrb_cli.recording import run as recording
 from reslrb_cli.records.metrics import Record
 
 #: What two runs of one experiment do not share: times, and the allocator's peak.
@@ -45,7 +46,7 @@ def work_alone(patch: pytest.MonkeyPatch) -> None:
     """Have one thread compute what is measured before the first iteration, every step, and what follows from it.
 
     Sums have one order then. Not all of the program: with one thread Mitsuba never comes to the end of reading, or
-    writing, an EXR file (so on a machine of one core too).
+    writing, an EXR file.
     """
 
     def alone(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -68,6 +69,17 @@ def work_alone(patch: pytest.MonkeyPatch) -> None:
     for module, name in places:
         patch.setattr(module, name, alone(getattr(module, name)))
     patch.setattr(optimizers.Optimizer, "step", alone(optimizers.Optimizer.step))
+
+
+def begin_alone(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The experiment in the working directory, for runs that are to be equal bit by bit; their pages, which take longer
+    than they do, are not drawn."""
+    write_experiment(folder)
+    work_alone(monkeypatch)
+    monkeypatch.chdir(folder)
+    monkeypatch.setenv("RESLRB_CACHE", str(folder / "cache"))
+    monkeypatch.setattr(recording, "write_report", lambda folder, *now: (folder / "report.html").write_text("<html>"))
+    monkeypatch.setattr(recording, "seen_errors", lambda folder, results: {})
 
 
 def optimize(*args: str) -> int:

@@ -11,20 +11,18 @@ import pytest
 from cli import tiny
 from recording.going_on import (
     MOTION,
+    begin_alone,
     differences,
     left_over,
     optimize,
     records_of,
     run_and_kill,
     state_of,
-    work_alone,
-    write_experiment,
 )
 from turns import a_few
 
 from reslrb_cli.cli import main
 from reslrb_cli.optimization import loop, optimizers
-from reslrb_cli.recording import run as recording
 
 RUN = Path("runs/tiny")
 #: Enough for the best to be known when the run is killed.
@@ -85,13 +83,7 @@ KILLED: dict[str, tuple[int, int]] = {"certainty": (23, 20)}
 
 @pytest.fixture
 def experiment(llvm: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """An experiment in the working directory, whose pages are not drawn: that takes longer than the run."""
-    write_experiment(tmp_path)
-    work_alone(monkeypatch)
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("RESLRB_CACHE", str(tmp_path / "cache"))
-    monkeypatch.setattr(recording, "write_report", lambda folder, *now: (folder / "report.html").write_text("<html>"))
-    monkeypatch.setattr(recording, "seen_errors", lambda folder, results: {})
+    begin_alone(tmp_path, monkeypatch)
     return tmp_path
 
 
