@@ -24,20 +24,24 @@ def show_forecast(config: Config) -> None:
     """Measure what a run of `config` will take, and print it; a variant must be set, and nothing is written but the
     caches of kernels and pilots."""
     from reslrb_cli.measure.rival import RIVAL, measure_rival
+    from reslrb_cli.optimization.correlated_rounds import measure_correlated_bias
     from reslrb_cli.optimization.forecast import make_forecast
     from reslrb_cli.records.pilot_cache import PilotCache
 
     cache, say = PilotCache(), logging.getLogger(__name__).info
-    rival_s = 0.0
+    measured: list[Before] = []
 
     def measure_before(problem: Problem) -> None:
-        nonlocal rival_s
+        begin = time.perf_counter()
+        if measure_correlated_bias(problem, say) is not None:
+            measured.append(Before("bias of correlated", time.perf_counter() - begin, kept=False))
         begin = time.perf_counter()
         rival = measure_rival(problem, cache, say)
         rival_s = 0.0 if rival is None or rival.cached else time.perf_counter() - begin
+        measured.append(Before(f"{RIVAL} beside it", rival_s, cache.keeps))
 
     forecast = make_forecast(config, say, cache, measure_before)
-    before = [Before("pilot", forecast.pilot_s, cache.keeps), Before(f"{RIVAL} beside it", rival_s, cache.keeps)]
+    before = [Before("pilot", forecast.pilot_s, cache.keeps), *measured]
     echo(f"forecast of {printable(config.source)}; nothing was written")
     for line in [*memory_lines(forecast, config.run.budget_bytes), *time_lines(forecast, before)]:
         echo(line)

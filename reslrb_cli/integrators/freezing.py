@@ -110,6 +110,7 @@ def _record(
         with _without_garbage_collection():
             for done in range(TRIALS):
                 recorded(*common, *inputs)
+                dr.sync_thread()  # else a trial's memory may or may not be free for the next one, and peaks vary
                 if recorded.n_recordings <= done:
                     break
     except RuntimeError as error:

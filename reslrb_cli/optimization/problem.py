@@ -11,6 +11,7 @@ import numpy as np
 
 from reslrb_cli.config import Config
 from reslrb_cli.integrators import OnSamples
+from reslrb_cli.integrators.tracer import LightTracer
 from reslrb_cli.optimization.ambiguity import check_exposures
 from reslrb_cli.optimization.announced import check_announced, check_described
 from reslrb_cli.optimization.budget import MemoryPlan
@@ -74,6 +75,16 @@ class Problem:
         """Hand the optimiser's values to the scene, or, of the keys in `others`, those."""
         values = {key: self.optimizer[key] for key in self.selection.keys}
         self.selection.hand_over({**values, **(others or {})})
+
+    def begin_again(self, values: Mapping[str, Array]) -> None:
+        """Be as before the first iteration, with these values, as `values` has them; what was learned is forgotten."""
+        self.selection.set_arrays(values)
+        self.optimizer = make_optimizer(self.config, self.selection)
+        if isinstance(self.integrator, LightTracer):
+            self.integrator = self.integrator.afresh()
+            for sensor in self.sensors:  # what it finds out about the scene is no part of the first iteration
+                self.integrator.plan(self.scene, self.scene.sensors()[sensor])
+        self.apply()
 
     def gradients(self) -> dict[str, Any]:
         """The gradient of each parameter that steps have added up since it was last handed over or cleared."""
@@ -201,8 +212,25 @@ def assemble_scene(config: Config, scene: Any = None, values: Mapping[str, Array
     if values is not None:
         _check_values(selection, values)
         selection.set_arrays(values)
+    problem = Problem(
+        config=config,
+        scene=scene,
+        views=views,
+        selection=selection,
+        integrator=make_configured(config.integrator),
+        optimizer=make_optimizer(config, selection),
+        samples_per_pass=samples_per_pass(config),
+        quantities={key: _quantity(selection, key) for key in selection.keys},
+    )
+    problem.apply()
+    check_moving(problem)
+    return problem
+
+
+def make_optimizer(config: Config, selection: Selection) -> Optimizer:
+    """An optimiser that has done nothing yet, of the values that the parameters have now."""
     specs = {key: selection.spec(key) for key in selection.keys}
-    optimizer = Optimizer(
+    return Optimizer(
         config.optimizer.type,
         config.optimizer.learning_rate,
         config.optimizer.own_options(),
@@ -211,19 +239,6 @@ def assemble_scene(config: Config, scene: Any = None, values: Mapping[str, Array
         bounds={key: spec.bounds for key, spec in specs.items()},
         transforms={key: make_transform(spec.transform, spec.bounds) for key, spec in specs.items()},
     )
-    problem = Problem(
-        config=config,
-        scene=scene,
-        views=views,
-        selection=selection,
-        integrator=make_configured(config.integrator),
-        optimizer=optimizer,
-        samples_per_pass=samples_per_pass(config),
-        quantities={key: _quantity(selection, key) for key in selection.keys},
-    )
-    problem.apply()
-    check_moving(problem)
-    return problem
 
 
 def _quantity(selection: Selection, key: str) -> str:

@@ -63,22 +63,24 @@ def measure_steps(problem: Problem) -> Steps:
 def _peak(problem: Problem, spp: int) -> int:
     """Bytes that two iterations of `spp` samples per pixel take: the second is one that was recorded."""
     with closing(_iterations(problem, spp)) as iterations:
-        return _highest(list(islice(iterations, 2)))
+        return _highest(problem, list(islice(iterations, 2)))
 
 
 def _iterations(problem: Problem, spp: int) -> Generator[Record, None, None]:
-    """Iterations of `spp` samples per pixel, by the loop itself; the parameters move."""
-    config = problem.config
+    """The first iterations of `spp` samples per pixel, by the loop itself; then all is as it was before."""
+    config, values = problem.config, problem.values()
     enough = {"spp": spp, "iterations": max(config.run.iterations, WARM_UP + MOST)}  # of a run of two, too
     problem.config = config.model_copy(update={"run": config.run.model_copy(update=enough)})
     try:
         yield from optimize(problem)
     finally:
         problem.config = config
+        problem.begin_again(values)
 
 
-def _highest(records: Sequence[Record]) -> int:
-    return int(records[-1].peak_mib * MIB)
+def _highest(problem: Problem, records: Sequence[Record]) -> int:
+    """The peak in bytes of those that the run has, too: kernels may become others as values move, to 0 for example."""
+    return int(records[: problem.config.run.iterations][-1].peak_mib * MIB)
 
 
 def _measure(problem: Problem, spp: int) -> Steps:
@@ -100,4 +102,4 @@ def _measure(problem: Problem, spp: int) -> Steps:
     steady = (statistics.fmean if guided else statistics.median)(times[WARM_UP:])
     extra = sum(max(seconds - steady, 0.0) for seconds in times[:WARM_UP])
     compiled = min(sum(record.codegen_ms for record in records[:WARM_UP]) / 1e3, extra)
-    return Steps(spp, steady, extra - compiled, compiled, _highest(records))
+    return Steps(spp, steady, extra - compiled, compiled, _highest(problem, records))
