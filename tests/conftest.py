@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import os
+import signal
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -31,7 +32,12 @@ def is_quick(config: pytest.Config) -> bool:
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Compiles quickly, where that is worth it."""
+    """Compiles quickly, where that is worth it, and heeds signals."""
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        # Shells start what is in the background with SIGINT ignored, and nohup without SIGHUP: so would be all runs
+        # that tests start, some of which are to be interrupted.
+        if signal.getsignal(number) is signal.SIG_IGN:
+            signal.signal(number, signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL)
     if is_quick(config):
         leave_out_optimisations()
 

@@ -2,11 +2,26 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 import drjit as dr
 import mitsuba as mi
 
 from reslrb_cli.integrators.interface import Derivative, Job
 from reslrb_cli.scene.horizon import Surroundings
+
+
+@contextmanager
+def _no_word_of_signals() -> Iterator[None]:
+    """While its own C++ code renders, Mitsuba hears of Ctrl-C, too, and says so on stdout, in red, whatever that is."""
+    logger = mi.logger()
+    level = logger.log_level()
+    logger.set_log_level(mi.LogLevel.Error)
+    try:
+        yield
+    finally:
+        logger.set_log_level(level)
 
 
 class Replayed:
@@ -21,7 +36,7 @@ class Replayed:
     def image(self, job: Job) -> mi.TensorXf:
         """The image, without derivatives."""
         self.surroundings.follow(job.scene)
-        with dr.suspend_grad():
+        with dr.suspend_grad(), _no_word_of_signals():
             return self.plugin.render(job.scene, job.sensor, job.seed, job.spp)
 
     def backward(self, job: Job, gradient: mi.TensorXf) -> None:
@@ -56,7 +71,8 @@ class NaiveAD(Replayed):
     def correlated(self, job: Job, derivative: Derivative) -> mi.TensorXf:
         self.surroundings.follow(job.scene)
         with dr.scoped_set_flag(dr.JitFlag.SymbolicLoops, False), dr.isolate_grad():
-            image = self.plugin.render(job.scene, job.sensor, job.seed, job.spp, develop=True, evaluate=False)
+            with _no_word_of_signals():
+                image = self.plugin.render(job.scene, job.sensor, job.seed, job.spp, develop=True, evaluate=False)
             # Where no path of a few meets anything, evaluated loops end before the image depends on a parameter.
             flags = dr.ADFlag.Default | dr.ADFlag.AllowNoGrad
             dr.backward_from(image * derivative(dr.detach(image)), flags=flags)

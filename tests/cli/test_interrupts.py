@@ -220,3 +220,24 @@ import reslrb_cli
     process = start(script)
     process.send_signal(signal.SIGINT)
     assert end(process) == (-signal.SIGINT, "", "")
+
+
+RENDERS = """
+import reslrb_cli, mitsuba as mi
+from reslrb_cli.integrators.step import make_integrator, render_image
+
+mi.set_variant("llvm_ad_rgb")
+scene, integrator = mi.load_dict(mi.cornell_box()), make_integrator("ptracer", max_depth=2)
+print("ready", flush=True)
+threading.Timer(0.1, os.kill, (os.getpid(), signal.SIGINT)).start()
+try:
+    for number in range(10000):
+        render_image(integrator, scene, 0, number, 4)
+except KeyboardInterrupt:
+    print("interrupted")
+"""
+
+
+def test_mitsuba_does_not_write_of_signals_where_results_go():
+    code, out, err = end(start(RENDERS))
+    assert (code, out, err) == (0, "interrupted\n", "")
