@@ -6,7 +6,10 @@ import logging
 from collections.abc import Iterator, Sequence
 
 import pytest
+from cli.tiny import write_experiment
 
+from reslrb_cli.cli import main, progress
+from reslrb_cli.recording import run as recording
 from reslrb_cli.report.page import curves
 from reslrb_cli.report.page.drawing import Curve, diagram
 from reslrb_cli.report.seen import flip
@@ -36,3 +39,38 @@ def _own_log_and_cache(tmp_path_factory: pytest.TempPathFactory, monkeypatch: py
     logger.handlers.clear()
     yield
     logger.handlers.clear()
+
+
+@pytest.fixture
+def optimize(llvm, tmp_path, monkeypatch, capsys, request):
+    """A function that runs `reslrb optimize tiny.yaml` and returns exit code, standard output and standard error."""
+    write_experiment(tmp_path)
+    monkeypatch.chdir(tmp_path)
+    if getattr(request, "param", None) != "real page":  # which takes longer than the run
+        monkeypatch.setattr(
+            recording, "write_report", lambda folder, *now: (folder / "report.html").write_text("<html>")
+        )
+
+    def call(*args):
+        with pytest.raises(SystemExit) as end:
+            main.main(["optimize", "tiny.yaml", *args])
+        out, err = capsys.readouterr()
+        return int(end.value.code or 0), out, err
+
+    return call
+
+
+@pytest.fixture
+def during(monkeypatch):
+    """A function that has `act(record)` called after each iteration."""
+
+    def install(act):
+        show = progress.Progress.show
+
+        def acting(self, record):
+            show(self, record)
+            act(record)
+
+        monkeypatch.setattr(progress.Progress, "show", acting)
+
+    return install
