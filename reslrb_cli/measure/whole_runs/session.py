@@ -238,8 +238,8 @@ class RunsSession:
             return
         self._warn(opening)
         run.counted_s = opening["loading_s"]
-        if opening["chose"]:
-            self._once(f"{run.method.label}: {opening['chose']}")
+        for line in opening["chose"]:
+            self._once(f"{run.method.label}: {line}")
 
     def _late(self, left_s: float, grace: float = GRACE) -> Callable[[], bool]:
         """Whether the whole is over, or a run has been waited for longer than what is left of its time."""
