@@ -45,7 +45,8 @@ def begun(experiment: Path, monkeypatch: pytest.MonkeyPatch, *settings: str) -> 
 
 
 @pytest.mark.parametrize(
-    ("ms", "chose"), [(0.2, ["guiding on", "sequence low_discrepancy"]), (1000.0, ["guiding off", "sequence independent"])]
+    ("ms", "chose"),
+    [(0.2, ["guiding on", "sequence low_discrepancy"]), (1000.0, ["guiding off", "sequence independent"])],
 )
 def test_what_is_left_to_measurement_is_decided(
     ms: float, chose: list[str], experiment: Path, monkeypatch: pytest.MonkeyPatch
