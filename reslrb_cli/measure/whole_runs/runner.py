@@ -57,13 +57,20 @@ class Advance:
         self.before = self.now = State(0.0, 0, take())
         self.first_s: float | None = None
         self.finished = False
-        self._quickest_s = 0.0
+        self._quickest_s, self._limit_s = 0.0, float("inf")
+
+    def progress(self) -> float:
+        """The share of the time from its first state to its end that has gone: 0 to 1; compiling is before that."""
+        if self.first_s is None or self.first_s >= self._limit_s:
+            return 0.0
+        return min((self._spent_s - self.first_s) / (self._limit_s - self.first_s), 1.0)
 
     def until(self, elapsed_s: float, limit_s: float) -> State:
         """The state that stands at `elapsed_s`: the newest that was done by then; times asked for may not fall.
 
         An iteration that would not be done by `limit_s` even if it were the quickest so far is not begun.
         """
+        self._limit_s = limit_s
         while not self.finished and self.now.elapsed_s <= elapsed_s:
             if self.now.elapsed_s + self._quickest_s > limit_s:
                 break
@@ -101,7 +108,8 @@ def begin(first: dict[str, Any]) -> Begun:
     settle_sampling(problem, lambda line: None, None)
     dr.sync_thread()
     loading_s = time.perf_counter() - start
-    advance = Advance(optimize(problem), lambda: copies(problem), loading_s)
+    records = optimize(problem, progress=lambda: advance.progress())  # first asked for in its first iteration
+    advance = Advance(records, lambda: copies(problem), loading_s)
 
     def answer(question: dict[str, Any]) -> dict[str, Any]:
         state = advance.until(question["until_s"], question["limit_s"])
