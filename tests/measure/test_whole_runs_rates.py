@@ -74,6 +74,20 @@ def test_without_rates_there_are_ratios_of_enough_seeds_alone(tmp_path: Path) ->
         assert all("rates" not in best_line(best) for best in found.bests)
 
 
+def test_a_seed_that_was_broken_off_does_not_count(tmp_path: Path) -> None:
+    """Of three seeds the last is over for one method alone: medians are over the two that both have."""
+    session, _, _ = play(tmp_path, Stage(ptracer=Pretence(0.9)), plan(rates=RATES))
+    last = [run for run in session.runs if run.seed == 2]
+    for run in last[1:]:
+        run.points.pop()
+    found = outcome(session.runs, session.limit_s, plan(rates=RATES).names)
+    assert [record.runs for record in found.methods] == [3, 2, 2, 2, 2, 2]
+    assert {best.runs for best in found.bests} == {2}
+    first = next(best for best in found.bests if best.of == "parameter_error")
+    ends = [run.points[-1].parameter_error for run in session.runs if run.method.label == first.at and run.seed < 2]
+    assert [first.value.low, first.value.high] == sorted(ends)
+
+
 def test_which_rate_is_the_best() -> None:
     names = {"a, 1": "a", "a, 2": "a", "b, 1": "b", "b, 2": "b"}
     values = {"a, 1": [3.0, 1.0, 9.0], "a, 2": [2.0, 2.5, 2.0], "b, 2": [1.0, 1.0, 1.0]}

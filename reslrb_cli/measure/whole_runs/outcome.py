@@ -26,6 +26,9 @@ def outcome(runs: Sequence[Run], limit_s: float, names: Mapping[str, str]) -> Ou
     bests, verdicts = [], []
     for of in ("loss", "parameter_error"):
         values = finals(runs, limit_s, of)
+        # Of a seed that was broken off some have runs: medians over other seeds than the others' would be compared.
+        seeds = min(map(len, values.values()), default=0)
+        values = {label: found[:seeds] for label, found in values.items()}
         best = best_of(values, names)
         verdicts.append(find_best({name: values[label] for name, label in best.items()}))
         bests += _bests(of, values, best, names)
