@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -78,6 +79,7 @@ def test_a_seed_that_was_broken_off_does_not_count(tmp_path: Path) -> None:
     """Of three seeds the last is over for one method alone: medians are over the two that both have."""
     session, _, _ = play(tmp_path, Stage(ptracer=Pretence(0.9)), plan(rates=RATES))
     last = [run for run in session.runs if run.seed == 2]
+    last[0].points[-1] = replace(last[0].points[-1], loss=0.0, parameter_error=0.0)  # it would be the best
     for run in last[1:]:
         run.points.pop()
     found = outcome(session.runs, session.limit_s, plan(rates=RATES).names)
