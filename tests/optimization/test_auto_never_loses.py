@@ -8,6 +8,7 @@ the extreme suite have so many samples that there is time to measure.
 from __future__ import annotations
 
 import gc
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -19,10 +20,11 @@ from reslrb_cli.integrators import render_image
 from reslrb_cli.measure.extreme import CASES, ExtremeCase
 from reslrb_cli.measure.gradients import integrator
 from reslrb_cli.measure.small_scenes import load as load_scene
-from reslrb_cli.optimization.choice import find_options, settle_integrator
+from reslrb_cli.optimization.choice import find_options, is_auto, settle_integrator
 from reslrb_cli.optimization.pilot import SHARE
 from reslrb_cli.optimization.problem import Problem, assemble_scene
 from reslrb_cli.optimization.sequence_choice import settle_sampling
+from reslrb_cli.optimization.step_pilot import StepPilot
 from reslrb_cli.optimization.targets import make_targets
 from reslrb_cli.records.images import write_file
 from reslrb_cli.records.paid import LEAST_IMAGE, PaidRecord
@@ -45,6 +47,14 @@ PREFIX = "extreme/"
 PATHS = 2**20
 #: What single steps may take beyond what all are to: the last round is begun while there is time.
 OVERRUN = 1.1
+#: What decides how samples are drawn.
+SETTLE: dict[str, Callable[[Problem, Callable[[str], None]], None]] = {"sampling": settle_sampling}
+
+
+@pytest.fixture(autouse=True)
+def alone() -> None:
+    """Scenes that are alive at the same time show in each other's kernels."""
+    gc.collect()
 
 
 def decided(config: Config, case: ExtremeCase | None) -> Problem:
@@ -53,7 +63,7 @@ def decided(config: Config, case: ExtremeCase | None) -> Problem:
     options = find_options(problem)
     make_targets(problem, lambda line: None)
     settle_integrator(problem, options, lambda line: None)
-    settle_sampling(problem, lambda line: None)
+    SETTLE["sampling"](problem, lambda line: None)
     return problem
 
 
@@ -114,5 +124,23 @@ def test_no_scene_loses(name: str, tmp_path: Path) -> None:
     settings += [f"integrator.guiding={guided.setting}", f"integrator.sequence={sequence.setting}"]
     found = operations(problem)
     del problem
-    gc.collect()  # scenes that are alive at the same time show in each other's kernels
+    gc.collect()
     assert found == operations(decided(config_of(name, case, tmp_path, *settings), case))
+
+
+@pytest.mark.parametrize("fault", ["on whatever is found", "off with a grid"])
+def test_losses_are_seen(fault: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In a scene that guiding has a third of the efficiency in: it is on; and it is off, and paths start in cells."""
+    if fault == "on whatever is found":
+        found = StepPilot._record
+        monkeypatch.setattr(StepPilot, "_record", lambda self, other, images, *rest: found(self, True, True, *rest))
+    else:
+
+        def settle(problem: Problem, say: Callable[[str], None]) -> None:
+            settle_sampling(problem, say)
+            if is_auto(problem.config, "guiding"):
+                problem.integrator = problem.integrator.afresh(guided=True)
+
+        monkeypatch.setitem(SETTLE, "sampling", settle)
+    with pytest.raises(AssertionError):
+        test_no_scene_loses("stiff/wall", tmp_path)
