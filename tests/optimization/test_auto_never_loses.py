@@ -45,8 +45,9 @@ EXTREME = ["sun_1e6", "lamp_of_area_1e-8", "grazing_light", "nested_dielectrics"
 PREFIX = "extreme/"
 #: Light paths of a step of theirs.
 PATHS = 2**20
-#: What single steps may take beyond what all are to: the last round is begun while there is time.
-OVERRUN = 1.1
+#: The last round is begun while there is time for one like that before it. Beside others' work on the machine it may
+#: take so many times as long as the mean of all: where steps take milliseconds, that is a part of the whole that counts.
+OVERRUN = 2
 #: What decides how samples are drawn.
 SETTLE: dict[str, Callable[[Problem, Callable[[str], None]], None]] = {"sampling": settle_sampling}
 
@@ -110,13 +111,14 @@ def test_no_scene_loses(name: str, tmp_path: Path) -> None:
     problem = decided(config_of(name, case, tmp_path, *AUTO), case)
     guided, sequence, pilot = problem.guided, problem.sequence, problem.pilot
     share = sum(each.share for each in (pilot, guided, sequence) if each is not None)
+    round_share = max(each.share / max(each.rounds, 1) for each in (guided, sequence) if each is not None)
     print(name, *(each.line() for each in (pilot, guided, sequence) if each is not None), f"{share:.2%}", sep="\n  ")
     assert guided is not None
     assert sequence is not None
     alone = problem.config.adjoint == "independent"
     assert judged(guided, guided.guided, alone) == []
     assert judged(sequence, sequence.low_discrepancy, False) == []
-    assert share <= OVERRUN * SHARE
+    assert share <= SHARE + OVERRUN * round_share
     if guided.guided:
         return
     chosen = {} if pilot is None else pilot.chosen
