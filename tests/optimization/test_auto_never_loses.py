@@ -46,7 +46,7 @@ PREFIX = "extreme/"
 #: Light paths of a step of theirs.
 PATHS = 2**20
 #: The last round is begun while there is time for one like that before it. Beside others' work on the machine it may
-#: take so many times as long as the mean of all: where steps take milliseconds, that is a part of the whole that counts.
+#: take so many times as long as the mean of all: where steps take milliseconds, that is a part that counts.
 OVERRUN = 2
 #: What decides how samples are drawn.
 SETTLE: dict[str, Callable[[Problem, Callable[[str], None]], None]] = {"sampling": settle_sampling}
