@@ -14,6 +14,7 @@ from reslrb_cli.cli.bench import Size
 from reslrb_cli.cli.experiment import (
     COUNT,
     Counts,
+    Factors,
     allowance,
     check_writable,
     experiment_arguments,
@@ -47,6 +48,9 @@ MOST_RUNS = 100
 @click.option("--runs", type=click.IntRange(min=1, max=MOST_RUNS), metavar="N",
               help="Whole optimisations in place of gradients: N seeds by each method, at equal wall time, all costs "
                    "counted. Default list: ptracer, prb, reslrb:stack and reslrb:auto.")  # fmt: skip
+@click.option("--rates", type=Factors(), metavar="LIST",
+              help="With --runs: each method tries its learning rates times each of these, e.g. 0.3,1,3, and is "
+                   "compared at its best.")  # fmt: skip
 @click.option("--budget", type=click.FloatRange(min=0), default=240.0, show_default=True, metavar="SECONDS",
               help="Time for the whole, loading and compiling included; what it does not suffice for is named, with "
                    "what it would take.")  # fmt: skip
@@ -70,6 +74,7 @@ def command(
     integrators: str | None,
     objective: str,
     runs: int | None,
+    rates: tuple[float, ...] | None,
     budget: float,
     rounds: int | None,
     spps: tuple[int, ...] | None,
@@ -103,6 +108,8 @@ def command(
     config = load(config_file, overrides)
     if runs is not None:
         _refuse_with_runs()
+    elif rates is not None:
+        raise ConfigError("--rates", "", "are those of whole optimisations; add --runs N")
     cases = parse_cases(integrators or (DEFAULTS[objective] if runs is None else DEFAULT), deep=False)
     stands = parse_cases(reference, "--reference", deep=False)
     if len(stands) != 1:
@@ -133,7 +140,7 @@ def command(
     if runs is not None:
         from reslrb_cli.cli.whole_runs import measure_runs
 
-        whole = RunsPlan(**settings, runs=runs)
+        whole = RunsPlan(**settings, runs=runs, rates=rates or ())
         whole.check()
         return measure_runs(whole, resumed, json_file, plot_file, began, where)
     plan = Plan(**settings)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import logging
+import math
 import os
 from collections.abc import Callable
 from pathlib import Path
@@ -31,6 +32,22 @@ class Counts(click.ParamType):
         if len(set(counts)) < len(counts):
             self.fail(f"`{value}` names a number twice", param, ctx)
         return tuple(counts)
+
+
+class Factors(click.ParamType):
+    """Different positive factors, such as `0.3,1,3`; they come in ascending order."""
+
+    name = "list"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[float, ...]:
+        parts: list[Any] = str(value).split(",")
+        factors = [float(click.FLOAT.convert(part, param, ctx)) for part in parts]
+        for factor in factors:
+            if not (math.isfinite(factor) and factor > 0):
+                self.fail(f"{factor:g} is no factor above 0", param, ctx)
+        if len(set(factors)) < len(factors):
+            self.fail(f"`{value}` names a factor twice", param, ctx)
+        return tuple(sorted(factors))
 
 
 def experiment_arguments(function: Callable[..., Any]) -> Callable[..., Any]:

@@ -11,12 +11,14 @@ import numpy as np
 
 from reslrb_cli.config import Config, Reslrb, with_integrator
 from reslrb_cli.errors import ConfigError
+from reslrb_cli.optimization.guiding_choice import take_up
 from reslrb_cli.optimization.problem import Problem, assemble_scene
+from reslrb_cli.optimization.state import guiding_of
 from reslrb_cli.optimization.views import color_channels, to_tensor
-from reslrb_cli.records.checkpoint import NONFINITE_FILE_NAME, load_nonfinite
+from reslrb_cli.records.checkpoint import NONFINITE_FILE_NAME, NonFiniteStep, load_nonfinite
 from reslrb_cli.records.manifest import FILE_NAME as MANIFEST
 from reslrb_cli.records.manifest import read_manifest
-from reslrb_cli.records.paid import SequenceRecord
+from reslrb_cli.records.paid import GuidedRecord, SequenceRecord
 from reslrb_cli.records.run_folder import RunFolder
 from reslrb_cli.scene.image_file import read_bitmap
 
@@ -44,13 +46,9 @@ def load_replay(config: Config) -> Replay:
     saved = load_nonfinite(folder.checkpoint)
     if saved is None:
         raise ConfigError(config.source, OPTION, "this run met no value that was not finite")
-    decided = manifest.get("guided")
-    guided = isinstance(decided, dict) and decided.get("guided") is True
-    if config.integrator.options().get("guiding") == ("auto" if guided else "on"):
-        reason = "where the paths of a guided step started is not kept; run again with off, then look"
-        raise ConfigError(config.source, "integrator.guiding", reason)
-    iteration, values = saved
+    iteration, values = saved.iteration, saved.parameters
     archive, written = folder.checkpoint / NONFINITE_FILE_NAME, path / MANIFEST
+    guided = _guided(config, manifest, written)
     if not 0 <= iteration < config.run.iterations:
         raise ConfigError(archive, "iteration", f"is {iteration}; the run has {config.run.iterations} iterations")
     config = _chosen(_with_sequence(config, manifest, written), manifest, written)
@@ -63,6 +61,9 @@ def load_replay(config: Config) -> Replay:
         problem.integrator = problem.integrator.with_options(
             samples_per_pass=problem.samples_per_pass, freeze=problem.integrator.freeze
         )
+    problem.guided = guided
+    take_up(problem)
+    _teach(problem, saved, archive)
     for view in problem.views:
         suffix = "" if len(problem.views) == 1 else f"-{view.sensor}"
         view.made = _read_image(folder.images / f"target{suffix}.exr", problem, view.sensor)
@@ -92,6 +93,33 @@ def _with_sequence(config: Config, manifest: dict[str, Any], path: Path) -> Conf
     except (TypeError, KeyError, AttributeError):
         raise ConfigError(path, "sequence", "is not whether a sequence paid, as a run writes it") from None
     return with_integrator(config, {"type": config.integrator.type} | options, str(path), {})
+
+
+def _guided(config: Config, manifest: dict[str, Any], path: Path) -> GuidedRecord | None:
+    """Whether guided emission was measured to pay, by the manifest at `path`; None where that was not measured."""
+    if config.integrator.options().get("guiding") != "auto" or manifest.get("guided") is None:
+        return None
+    try:
+        return GuidedRecord.from_json(manifest["guided"])
+    except (TypeError, AttributeError):
+        raise ConfigError(path, "guided", "is not whether guiding paid, as a run writes it") from None
+
+
+def _teach(problem: Problem, saved: NonFiniteStep, archive: Path) -> None:
+    """Have the tables of a guided run's integrator know what they knew when the step began."""
+    guiding = guiding_of(problem)
+    if guiding is None:
+        return
+    if saved.calls is None:
+        raise ConfigError(archive, "calls", "is missing: what the paths of a guided step were drawn from")
+    sensors = [str(number) for number in range(len(problem.scene.sensors()))]
+    names = {f"{number}/{what}" for number in saved.calls for what in ("sums", "draws")}
+    problem.integrator.plan(problem.scene, problem.scene.sensors()[problem.sensors[0]])  # makes the grid
+    known = names == set(saved.learned) and set(saved.calls) <= set(sensors)
+    wrong = guiding.restore(saved.calls, lambda name: saved.learned[name]) if known else ""
+    if wrong is not None:
+        where = f"guiding/{wrong}" if wrong else "guiding"
+        raise ConfigError(archive, where, "is not what was learned of this scene")
 
 
 def _samples_per_pass(memory: Any, path: Path) -> int:

@@ -7,6 +7,7 @@ import shutil
 import tempfile
 import time
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 
 from reslrb_cli.cli.experiment import allowance
@@ -17,16 +18,16 @@ from reslrb_cli.cli.output import echo
 from reslrb_cli.errors import ExitCode
 from reslrb_cli.measure.earlier import Earlier
 from reslrb_cli.measure.processes import abandon_all
+from reslrb_cli.measure.whole_runs.outcome import outcome
 from reslrb_cli.measure.whole_runs.plan import RunsPlan
 from reslrb_cli.measure.whole_runs.resuming import KIND, check
 from reslrb_cli.measure.whole_runs.session import RunsSession
-from reslrb_cli.measure.whole_runs.verdict import finals, find_best, method_records
 from reslrb_cli.records.bench import BenchStatus
 from reslrb_cli.records.convergence import SummaryRecord
 from reslrb_cli.records.lines import Line
-from reslrb_cli.records.whole_runs import RunMethodRecord, RunPointRecord
+from reslrb_cli.records.whole_runs import RunBestRecord, RunMethodRecord, RunPointRecord
 from reslrb_cli.report.whole_runs_plot import plot_runs
-from reslrb_cli.report.whole_runs_table import RunsTable, closing_sentence, notes
+from reslrb_cli.report.whole_runs_table import RunsTable, best_line, closing_sentence, notes
 from reslrb_cli.report.words import WITHOUT_BORDER, count
 
 
@@ -50,7 +51,7 @@ def measure_runs(
             shutil.rmtree(folder, ignore_errors=True)
 
         interrupts = stack.enter_context(Interrupts(last_act=tidy))
-        table = RunsTable([plan.method_of(case, spp).label for case, spp in plan.entries])
+        table = RunsTable(list(plan.names))
         spent_s = time.monotonic() - began
         session = RunsSession(
             plan, folder, lambda: interrupts.requested, echo, spent_s=spent_s, earlier=earlier, device=where
@@ -61,14 +62,14 @@ def measure_runs(
             if point.elapsed_s == session.limit_s:
                 echo(table.point(point, session.run_of(point).first_s))
 
-        def outcome() -> tuple[list[RunMethodRecord], str]:
-            loss, error = (find_best(finals(session.runs, session.limit_s, of)) for of in ("loss", "parameter_error"))
-            sentence = closing_sentence(loss, error, session.limit_s)
-            return method_records(session.runs, session.limit_s), sentence
+        def found() -> tuple[list[RunMethodRecord], list[RunBestRecord], str]:
+            now = outcome(session.runs, session.limit_s, plan.names)
+            bests = [replace(record, line=best_line(record)) for record in now.bests]
+            return now.methods, bests, closing_sentence(now.loss, now.error, session.limit_s)
 
         def outcome_lines() -> list[Line]:
-            records, sentence = outcome()
-            return [*records, SummaryRecord(sentence)]
+            records, bests, sentence = found()
+            return [*records, *bests, SummaryRecord(sentence)]
 
         keeper = Keeper(json_file, origin_of(plan.variant), lambda: points, outcome_lines, session.keep)
         headed = False
@@ -83,13 +84,12 @@ def measure_runs(
             show(point)
             keeper.refresh()
         keeper.finish([*points, *outcome_lines()])
-        records, sentence = outcome()
+        records, bests, sentence = found()
         echo(table.head())
         for record in records:
             echo(table.line(record))
-        for note in notes(records):
-            echo(note)
-        echo(sentence)
+        for line in [*notes(records), *(best.line for best in bests), sentence]:
+            echo(line)
         conditions = _conditions(plan, session)
     if plot_file is not None and points:
         plot_runs(points, session.facts.get("error_of", ""), plot_file, f"{where}\n{conditions}")
@@ -104,7 +104,7 @@ def _conditions(plan: RunsPlan, session: RunsSession) -> str:
         str(plan.config.source),
         f"{count(plan.runs, 'seed')}, {session.limit_s:.3g} s each",
         f"loss {plan.config.loss.type}",
-        f"{optimizer.type} at {optimizer.learning_rate:g}",
+        f"{optimizer.type} at {optimizer.learning_rate:g}" + "".join(f", x {rate:g}" for rate in plan.rates),
         facts.get("pictures", ""),
         facts.get("error_of", ""),
         WITHOUT_BORDER if facts.get("masked") else "",

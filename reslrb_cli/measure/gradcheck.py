@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 
+from reslrb_cli.config import Config
 from reslrb_cli.estimators import ESTIMATORS
 from reslrb_cli.measure.comparison import ROUNDING, Comparison, Family, compare_equal_seeds, compare_expectations
 from reslrb_cli.measure.earlier import Earlier
@@ -77,9 +78,10 @@ class Gradcheck:
         """What is compared, in the order of the table: last, what needs naive AD, which compiles for longest."""
         parts = self.participants
         found = [] if parts.image is None else [Row(None, "reslrb", parts.image, Kind.IMAGE)]
+        plain = [label for label, config in self.settings.configs().items() if _draws_plainly(config)]
         for key in parts.case.keys:
             for listed in parts.listed:
-                exact = ESTIMATORS[listed.options["estimator"]].exact
+                exact = ESTIMATORS[listed.options["estimator"]].exact and listed.label in plain
                 kind = Kind.EQUAL_SEEDS if exact else Kind.EXPECTATION
                 found.append(Row(key, listed.label, Reference.WALK_AD, kind))
                 stock = parts.stock[key]
@@ -229,6 +231,12 @@ class Gradcheck:
             missing.append((Row(None, "reslrb", Reference.PATH, Kind.IMAGE), parts.why_no_image))
         for row, why in missing:
             yield Result(self._record(row, Comparison(Verdict.NO_REFERENCE, None, message=why), 0))
+
+
+def _draws_plainly(config: Config) -> bool:
+    """Whether paths are those of naive AD at equal seeds: it draws them by nothing that it learned, nor evenly."""
+    options = config.integrator.options()
+    return options.get("guiding", "off") != "on" and options.get("sequence", "independent") == "independent"
 
 
 def _maps(ours: np.ndarray, reference: np.ndarray, shape: tuple[int, ...]) -> Maps | None:

@@ -13,15 +13,18 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from reslrb_cli.integrators import Job, Reslrb, gradient_step, sample_sets
+from reslrb_cli.integrators import Reslrb, gradient_step, sample_sets
 from reslrb_cli.measure.offender_paths import search_paths
+from reslrb_cli.measure.offender_tables import Witness, purposes
 from reslrb_cli.optimization.loading import LIGHT_TRACERS
 from reslrb_cli.optimization.moving import is_attached
 from reslrb_cli.optimization.problem import Problem
+from reslrb_cli.optimization.state import guiding_of
 from reslrb_cli.optimization.views import View
 from reslrb_cli.records.offender import Offender
 from reslrb_cli.seeds import seed
-from reslrb_cli.transport.samples import Samples
+from reslrb_cli.transport.guide import Table
+from reslrb_cli.transport.samples import Samples, passes
 
 Array = np.ndarray[Any, Any]
 
@@ -34,7 +37,9 @@ GRADIENT = "gradient (of this integrator no paths are looked at) of"
 def find_offenders(problem: Problem, iteration: int) -> list[Offender]:
     """The first value that is not finite of each view in which there is any; the parameters are those of `problem`."""
     found = []
-    for view in problem.views:
+    guided = guiding_of(problem) is not None
+    # What is not drawn in this iteration has taught no table anything.
+    for view in [view for view, _ in problem.drawn(iteration)] if guided else problem.views:
         offender = _of_view(problem, iteration, view)
         if offender is not None:
             found.append(offender)
@@ -43,12 +48,16 @@ def find_offenders(problem: Problem, iteration: int) -> list[Offender]:
 
 def _of_view(problem: Problem, iteration: int, view: View) -> Offender | None:
     step_seed = seed(problem.config.run.seed, iteration, view.sensor, "image")
+    guiding = guiding_of(problem)
+    witness = None if guiding is None else Witness(guiding)
+    if witness is not None:
+        problem.integrator.preparation.draw_from(witness, problem.scene)
     step = _take_step(problem, view, step_seed)
     if problem.config.integrator.type not in LIGHT_TRACERS:
         return _of_step(step, view.sensor, view.target, None)
     if not is_attached(problem):
         _set_tangents(problem)
-    found = [search_paths(*part, step.pixel) for part in _parts(problem, view.sensor, step_seed)]
+    found = [search_paths(*part, step.pixel) for part in _parts(problem, view, step_seed, witness)]
     problem.apply()
     offenders = sorted((part for part in found if part.offender is not None), key=lambda part: not part.there)
     if offenders:
@@ -58,19 +67,33 @@ def _of_view(problem: Problem, iteration: int, view: View) -> Offender | None:
     return _of_step(step, view.sensor, view.target, most)
 
 
-def _parts(problem: Problem, sensor: int, step_seed: int) -> Iterator[tuple[Samples, int, str]]:
-    """The samples of a step, pass by pass, with the sensor's index and a name; light paths are those of the run."""
+def _parts(
+    problem: Problem, view: View, step_seed: int, witness: Witness | None = None
+) -> Iterator[tuple[Samples, int, str]]:
+    """The samples of a step, pass by pass, with the sensor's index and a name; light paths are those of the run.
+
+    Of a guided one the `witness` knows what it was drawn from.
+    """
+    sensor = view.sensor
     options = problem.config.integrator.options()
     names = ("max_depth", "rr_depth", "hide_emitters", "sequence")
     shared = {name: options[name] for name in names if name in options}
-    tracer = Reslrb.of(estimator="gather", samples_per_pass=problem.samples_per_pass, **shared)
+    tracer = Reslrb.of(estimator="gather", **shared)
     scene = problem.scene
     # Of what moves light, contributions alone are looked at: `gather` has no derivatives of it.
     params = None if is_attached(problem) else problem.selection.params
-    for name, samples_seed, spp in sample_sets(step_seed, problem.config.step_options()):
-        passes = tracer.passes(Job(scene, scene.sensors()[sensor], samples_seed, spp, params))
-        for number, samples in enumerate(passes):
-            yield samples, sensor, name if len(passes) == 1 else f"{name}, pass {number + 1}"
+    sets = sample_sets(step_seed, problem.config.step_options())
+    tables: list[Table | None] = [None] * len(sets)
+    if witness is not None:
+        tracer.preparation.draw_from(witness, scene)  # for the sake of its grid
+        wanted, noted = purposes(problem, view), iter(witness.drawn[:])
+        tables = [next(noted) if witness.serves(purpose) else None for _, _, purpose in wanted]
+        sets = [(sets[place][0] + word, *sets[place][1:]) for place, word, _ in wanted]
+    for (name, samples_seed, spp), table in zip(sets, tables, strict=True):
+        plan = tracer.plan(scene, scene.sensors()[sensor], params)
+        parts = passes(plan, scene, scene.sensors()[sensor], samples_seed, spp, problem.samples_per_pass, table)
+        for number, samples in enumerate(parts):
+            yield samples, sensor, name if len(parts) == 1 else f"{name}, pass {number + 1}"
 
 
 def _set_tangents(problem: Problem) -> None:

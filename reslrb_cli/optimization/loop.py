@@ -28,7 +28,10 @@ HELD_OUT_EVERY = 10
 
 
 def optimize(
-    problem: Problem, on_nonfinite: Callable[[Findings], None] = lambda found: None, state: State | None = None
+    problem: Problem,
+    on_nonfinite: Callable[[Findings], None] = lambda found: None,
+    state: State | None = None,
+    progress: Callable[[], float] = lambda: 0.0,
 ) -> Iterator[Record]:
     """Run the iterations of `problem`, one record each; the parameters are updated when a record is yielded.
 
@@ -37,7 +40,8 @@ def optimize(
     An iteration is a step (image, loss and gradient of every sensor; the loss is the mean over the sensors) and an
     update. What is not finite reaches no parameter; what happens instead, and when NonFinite is raised, is in
     `NonFinitePolicy`. `on_nonfinite` is told of it before the update, while the scene is as it was in the step.
-    `optimizer.scale: auto` measures before the first iteration, and `elapsed_s` counts that.
+    `optimizer.scale: auto` measures before the first iteration, and `elapsed_s` counts that. Where a time may end the
+    run, `progress` says what share of it has gone (0 to 1): the schedule is as far as that, or as the iterations.
     """
     config = problem.config
     state = State(problem) if state is None else state
@@ -56,7 +60,7 @@ def optimize(
             loss, squares, counts, refused = gradient(problem, iteration, split)
             dr.eval(loss, squares, counts)
         factor = learning_rate_factor(
-            config.optimizer.schedule, iteration, config.run.iterations, config.optimizer.final_fraction
+            config.optimizer.schedule, iteration, config.run.iterations, config.optimizer.final_fraction, progress()
         )
         with clock.counted():
             value = float(loss[0])

@@ -28,6 +28,11 @@ SCHEDULES: dict[str, Callable[[float, float], float]] = {
 }
 
 
-def learning_rate_factor(schedule: str, iteration: int, iterations: int, final_fraction: float) -> float:
-    """Return the factor of `iteration` (0-based) of `iterations`. Raises KeyError for an unknown schedule."""
-    return SCHEDULES[schedule](iteration / max(iterations - 1, 1), final_fraction)
+def learning_rate_factor(
+    schedule: str, iteration: int, iterations: int, final_fraction: float, least: float = 0.0
+) -> float:
+    """Return the factor of `iteration` (0-based) of `iterations`. Raises KeyError for an unknown schedule.
+
+    `least` (0 to 1) is how far a run is at least, of which less than all iterations will be made.
+    """
+    return SCHEDULES[schedule](max(iteration / max(iterations - 1, 1), least), final_fraction)

@@ -60,6 +60,15 @@ class Course:
         self.nonfinite.add(record)
         self.clamped.add(record)
 
+    def learned(self) -> tuple[dict[str, int] | None, dict[str, Array]]:
+        """What guided emission knew before the iteration that is at work, which may have taught it more by now.
+
+        That is the number of gradients by sensor, and arrays by `<sensor>/<what>`; None and nothing where it is off.
+        """
+        prefix = "guiding/"
+        arrays = {name.removeprefix(prefix): a for name, a in self._snapshot.arrays.items() if name.startswith(prefix)}
+        return self._snapshot.values.get("guiding"), arrays
+
     def best_values(self) -> dict[str, Array]:
         """The best parameters so far, as `problem.values()` has them; nothing where there are none yet."""
         shown = self.problem.selection.shown

@@ -23,7 +23,7 @@ from reslrb_cli.recording.ending import Ending, what_is_kept
 from reslrb_cli.recording.live import LivePage
 from reslrb_cli.recording.notes import check_memory, note_scaling
 from reslrb_cli.recording.telling import describe
-from reslrb_cli.records.checkpoint import FILE_NAME, NONFINITE_FILE_NAME, save_nonfinite
+from reslrb_cli.records.checkpoint import FILE_NAME, NONFINITE_FILE_NAME, NonFiniteStep, save_nonfinite
 from reslrb_cli.records.images import write_image
 from reslrb_cli.records.manifest import Manifest, Status
 from reslrb_cli.records.metrics import MetricsWriter, Record, finite
@@ -162,10 +162,11 @@ class Recording:
                 self.page.refresh()
 
     def _on_nonfinite(self, found: Findings) -> None:
-        """Keep the parameters of the first step that met a value that is not finite, and say how to look into it."""
+        """Keep what the first step that met a value that is not finite began with, and say how to look into it."""
         if self._saved_nonfinite:
             return
-        save_nonfinite(self.folder.checkpoint, found.iteration, self.problem.values())
+        step = NonFiniteStep(found.iteration, self.problem.values(), *self.course.learned())
+        save_nonfinite(self.folder.checkpoint, step)
         self._saved_nonfinite = True
         if self.problem.config.run.on_nonfinite != "stop":  # which says so when it ends
             logger.warning(f"{found}; where: {self._inspection()}")

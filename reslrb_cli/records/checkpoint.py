@@ -3,7 +3,7 @@
 `state.npz`      the newest state; `iteration`, `parameter/<key>`, what else the iterations carry on as arrays, and
                  `state`, the rest of it as JSON
 `previous.npz`   the state before that
-`nonfinite.npz`  parameters in the first iteration with a value that was not finite
+`nonfinite.npz`  parameters in the first iteration with a value that was not finite, and what guided emission knew then
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ import errno
 import json
 import os
 from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -112,15 +113,33 @@ def newest_checkpoint(folder: Path) -> Path | None:
     return next((path for name in (FILE_NAME, PREVIOUS_FILE_NAME) if (path := folder / name).exists()), None)
 
 
-def save_nonfinite(folder: Path, iteration: int, parameters: Mapping[str, Array]) -> None:
-    """Write the parameters of the step of `iteration`, from 0, into `folder`: `iteration` and `parameter/<key>`."""
-    arrays: dict[str, Any] = {"iteration": np.array(iteration)}
-    arrays |= {f"parameter/{key}": value for key, value in parameters.items()}
+@dataclass(frozen=True)
+class NonFiniteStep:
+    """A step that met a value that is not finite: its `iteration`, from 0, and the parameters' values, finite or not.
+
+    `calls` is, of each sensor that guided emission had learned of, by its number, how many gradients that had had, and
+    `learned` what it knew, by `<sensor>/<what>`; None of a run that is not guided.
+    """
+
+    iteration: int
+    parameters: Mapping[str, Array]
+    calls: Mapping[str, int] | None = None
+    learned: Mapping[str, Array] = field(default_factory=dict)
+
+
+def save_nonfinite(folder: Path, step: NonFiniteStep) -> None:
+    """Write it into `folder`: `iteration`, `parameter/<key>`, and `calls` (N, 2) with `guiding/<sensor>/<what>`."""
+    arrays: dict[str, Any] = {"iteration": np.array(step.iteration)}
+    arrays |= {f"parameter/{key}": value for key, value in step.parameters.items()}
+    if step.calls is not None:
+        arrays["calls"] = np.array([[int(name), count] for name, count in step.calls.items()]).reshape(-1, 2)
+        arrays["calls"] = arrays["calls"].astype(np.int64)
+        arrays |= {f"guiding/{name}": value for name, value in step.learned.items()}
     write_archive(folder / NONFINITE_FILE_NAME, arrays)
 
 
-def load_nonfinite(folder: Path) -> tuple[int, dict[str, Array]] | None:
-    """What `save_nonfinite` wrote into `folder`, iteration and parameters, finite or not; None where there is nothing.
+def load_nonfinite(folder: Path) -> NonFiniteStep | None:
+    """What `save_nonfinite` wrote into `folder`; None where there is nothing.
 
     Raises ConfigError, located in the file, where it cannot be read, is damaged, or is nothing that a run wrote.
     """
@@ -130,4 +149,11 @@ def load_nonfinite(folder: Path) -> tuple[int, dict[str, Array]] | None:
     with Archive(path, whole=False) as archive:
         keys = archive.names("parameter/")
         iteration = int(archive.array("iteration", (), "i"))
-        return iteration, {key: archive.array(f"parameter/{key}", values="any") for key in keys}
+        parameters = {key: archive.array(f"parameter/{key}", values="any") for key in keys}
+        if "calls" not in archive.heads:
+            return NonFiniteStep(iteration, parameters)
+        calls = archive.array("calls", kind="i")
+        if calls.ndim != 2 or calls.shape[1] != 2 or (calls < 0).any():
+            raise ConfigError(path, "calls", "is not the gradients of sensors by their numbers, as a run writes it")
+        learned = {name: archive.array(f"guiding/{name}", kind="f") for name in archive.names("guiding/")}
+        return NonFiniteStep(iteration, parameters, {str(number): int(count) for number, count in calls}, learned)

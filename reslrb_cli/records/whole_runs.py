@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 
 from reslrb_cli.records.bench import BenchStatus
-from reslrb_cli.records.convergence import Method
+from reslrb_cli.records.convergence import Method, Range
 from reslrb_cli.records.metrics import finite
 
 
@@ -69,6 +69,31 @@ class RunMethodRecord:
     def to_json(self) -> str:
         """The record as one line of JSON."""
         return _line("run_method", self)
+
+
+@dataclass(frozen=True)
+class RunBestRecord:
+    """A method at the best of its learning rates, and over the method that was named first.
+
+    `of` is what is compared at the end of the runs, `loss` or `parameter_error`; `value` is that of the best rate,
+    `at`, which is None where there is one alone; at the `outermost` of those that were tried a better one may lie
+    beyond. `ratio` is the median over that of the method `to` at its own best; None where that is not known. `line`
+    is the record in words.
+    """
+
+    label: str
+    of: str
+    at: str | None
+    outermost: bool
+    runs: int
+    value: Band
+    ratio: Range | None
+    to: str | None
+    line: str = ""
+
+    def to_json(self) -> str:
+        """The record as one line of JSON."""
+        return json.dumps({"kind": "run_best"} | finite(asdict(self)), allow_nan=False)
 
 
 def _line(kind: str, record: RunPointRecord | RunMethodRecord) -> str:

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from reslrb_cli.measure.whole_runs.verdict import ALPHA, Verdict
 from reslrb_cli.records.bench import BenchStatus
-from reslrb_cli.records.whole_runs import Band, RunMethodRecord, RunPointRecord
+from reslrb_cli.records.whole_runs import Band, RunBestRecord, RunMethodRecord, RunPointRecord
 from reslrb_cli.report.words import count, number
 
 _HEAD = ("", "seed", "iterations", "first s", "loss", "error")
@@ -47,6 +47,18 @@ def band(value: Band | None, digits: int) -> str:
     return "" if value is None else (
         f"{value.median:.{digits}g} [{value.low:.{digits}g}, {value.high:.{digits}g}]"
     )  # fmt: skip
+
+
+def best_line(record: RunBestRecord) -> str:
+    """A method at its best in one line."""
+    words = f"{'loss' if record.of == 'loss' else 'error'} of {record.at or record.label}: {band(record.value, 4)}"
+    if record.at is not None:
+        words += ", the best of its rates"
+        words += ", and the outermost that was tried" if record.outermost else ""
+    if record.ratio is not None:
+        apart = f"{number(record.ratio.value, 3)} [{number(record.ratio.low, 3)}, {number(record.ratio.high, 3)}]"
+        words += f"; {apart} times that of {record.to}{' at its best' if record.at else ''}"
+    return words
 
 
 def notes(records: Sequence[RunMethodRecord]) -> list[str]:

@@ -16,6 +16,7 @@ import pytest
 from cli.test_nonfinite import CONFIG, KEY, PLAIN, SCENE, reslrb
 
 from reslrb_cli.cli import main
+from reslrb_cli.records.paid import GuidedRecord
 
 ARCHIVE, MANIFEST, TARGET = "checkpoint/nonfinite.npz", "manifest.json", "images/target.exr"
 
@@ -75,7 +76,7 @@ def test_paths_are_of_the_run_s_sequence(run):
         problem = load_replay(load(run / "config.yaml")).problem
         own = problem.integrator.plan(problem.scene, problem.scene.sensors()[0]).sequence
         assert (own is not None) == (sequence == "low_discrepancy")
-        assert {samples.plan.sequence for samples, *_ in _parts(problem, 0, 1)} == {own}
+        assert {samples.plan.sequence for samples, *_ in _parts(problem, problem.views[0], 1)} == {own}
 
 
 def test_paths_are_of_the_sequence_that_was_measured_to_pay(run, capsys):
@@ -94,24 +95,53 @@ def test_paths_are_of_the_sequence_that_was_measured_to_pay(run, capsys):
         problem = load_replay(load(run / "config.yaml")).problem
         own = problem.integrator.plan(problem.scene, problem.scene.sensors()[0]).sequence
         assert (own is not None) == paid
-        assert {samples.plan.sequence for samples, *_ in _parts(problem, 0, 1)} == {own}
+        assert {samples.plan.sequence for samples, *_ in _parts(problem, problem.views[0], 1)} == {own}
     for wrong in (None, {"low_discrepancy": "maybe"}, [1]):
         (run / "manifest.json").write_text(json.dumps(manifest | {"sequence": wrong}))
         assert told(capsys, run) == "manifest.json: sequence: is not whether a sequence paid, as a run writes it"
 
 
-def test_a_guided_run_is_refused(run, capsys):
+def test_a_guided_run_without_its_tables_is_refused(run, capsys):
     config = (run / "config.yaml").read_text()
     assert "guiding: 'off'" in config
-    refused = "config.yaml: integrator.guiding: where the paths of a guided step started"
+    refused = f"{ARCHIVE}: calls: is missing: what the paths of a guided step were drawn from"
     (run / "config.yaml").write_text(config.replace("guiding: 'off'", "guiding: 'on'"))
-    assert told(capsys, run).startswith(refused)
+    assert told(capsys, run) == refused
     # And one of which measuring said so; what was left off by it is replayed.
     (run / "config.yaml").write_text(config.replace("guiding: 'off'", "guiding: auto"))
     assert reslrb(capsys, "inspect", run / "config.yaml", "--nonfinite")[0] == 0
     manifest = json.loads((run / "manifest.json").read_text())
-    (run / "manifest.json").write_text(json.dumps(manifest | {"guided": {"guided": True}}))
-    assert told(capsys, run).startswith(refused)
+    for measured, line in (
+        (GuidedRecord(guided=True).to_json(), refused),
+        (None, ""),
+        ({"guided": True}, "manifest.json: guided: is not whether guiding paid, as a run writes it"),
+    ):
+        (run / "manifest.json").write_text(json.dumps(manifest | {"guided": measured}))
+        if line:
+            assert told(capsys, run) == line
+        else:
+            assert reslrb(capsys, "inspect", run / "config.yaml", "--nonfinite")[0] == 0
+
+
+LEARNED = {"guiding/0/sums": np.ones((2, 16), np.float32), "guiding/0/draws": np.ones(16, np.float32)}
+
+
+@pytest.mark.parametrize(
+    ("changes", "what"),
+    [
+        ({"calls": np.zeros((1, 3), np.int64)}, "calls: is not the gradients of sensors"),
+        ({"calls": np.array([[0, -1]])}, "calls: is not the gradients of sensors"),
+        ({"calls": np.array([[0, 1]])}, "guiding: is not what was learned of this scene"),
+        ({"calls": np.array([[7, 1]]), **{f"guiding/7/{n.rpartition('/')[2]}": a for n, a in LEARNED.items()}},
+         "guiding: is not what was learned of this scene"),
+        ({"calls": np.array([[0, 1]]), **LEARNED}, "guiding/0/sums: is not what was learned of this scene"),
+    ],
+)  # fmt: skip
+def test_tables_of_another_run_are_told(changes, what, run, capsys):
+    config = (run / "config.yaml").read_text()
+    (run / "config.yaml").write_text(config.replace("guiding: 'off'", "guiding: 'on'"))
+    (run / ARCHIVE).write_bytes(archive(**changes))
+    assert told(capsys, run).startswith(f"{ARCHIVE}: {what}")
 
 
 def arrays(**changes):

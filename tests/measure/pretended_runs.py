@@ -38,7 +38,7 @@ class Pretence:
     iterations: int = 100_000
     ends_s: float = float("inf")
     refuses: bool = False
-    chose: str = ""
+    chose: tuple[str, ...] = ()
 
 
 class Stage:

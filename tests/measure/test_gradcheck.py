@@ -7,6 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from conformance.gradient_cases import CASES
+from turns import a_few
 
 from reslrb_cli.config import loads
 from reslrb_cli.errors import ConfigError
@@ -65,6 +66,14 @@ def test_it_holds():
     assert len(maps) == 8
     assert maps[0].gradient.shape == maps[0].reference.shape == (4, 4, 3)
     assert maps[0].z.shape == (4, 4)
+
+
+@pytest.mark.parametrize("drawn", a_few(["guiding=on", "sequence=low_discrepancy"], ["guiding=on"]))
+def test_paths_that_are_drawn_otherwise_agree_with_naive_ad_in_expectation(drawn: str):
+    records = [result.record for result in check(f"integrator.{drawn}", estimators="stack", seeds=16)]
+    assert [(record.reference.value, record.verdict) for record in records if record.verdict is not Verdict.HOLDS] == []
+    kinds = {record.kind for record in records if record.reference is Reference.WALK_AD}
+    assert kinds == {Kind.EXPECTATION}
 
 
 def test_a_selection_weight_that_is_wrong(monkeypatch: pytest.MonkeyPatch):

@@ -16,6 +16,7 @@ from reslrb_cli.report.sources import read_sources
 
 def test_whole_runs(tmp_path):
     lines = [*runs_lines(), {"kind": "run_method", "label": "prb", "status": "out_of_memory", "message": "<ended>"}]
+    lines += [{"kind": "run_best", "label": "x", "line": "error of x: 0.5 [0.4, 0.6] times that of ptracer"}]
     (tmp_path / "c.jsonl").write_text("".join(json.dumps(line) + "\n" for line in [*lines, {"kind": "news"}]))
     markup = render(read_sources([tmp_path / "c.jsonl"]))
     page, title = Page(markup), "Error against run time: c.jsonl"
@@ -25,6 +26,7 @@ def test_whole_runs(tmp_path):
     assert "prb: <ended>" in page.sections[title]
     assert "best by the loss is reslrb:stack" in page.sections[title]
     assert "1 line of other kinds" in page.sections[title]
+    assert "0.5 [0.4, 0.6] times that of ptracer" in page.sections[title]
     assert lines_drawn(markup) == [list(COLORS[:2])] * 2  # loss, and the parameters' error
 
 

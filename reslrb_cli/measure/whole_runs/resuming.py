@@ -32,6 +32,7 @@ def settings(plan: RunsPlan, device: str = "") -> dict[str, Any]:
         integrators=[case.label for case in plan.cases],
         reference=plan.reference.label,
         spp=list(plan.spps),
+        rates=list(plan.rates),
         **{"memory limit": plan.memory_limit},
     )
 
@@ -70,7 +71,7 @@ def _entry(run: Run) -> dict[str, Any]:
 
 def restore(before: Earlier, plan: RunsPlan) -> list[Run]:
     """The runs of an earlier session, none of which is under way."""
-    methods = {method.label: method for method in (plan.method_of(case, spp) for case, spp in plan.entries)}
+    methods = {method.label: method for method in map(plan.method_of, plan.sides)}
     runs = []
     for entry in before.head["runs"]:
         method, seed, refusal = methods[entry["label"]], entry["seed"], entry["refusal"]

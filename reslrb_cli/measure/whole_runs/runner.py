@@ -1,6 +1,6 @@
 """One whole optimisation by one method, in a process of its own (`worker.py`), which goes on as far as it is asked to.
 
-Its time is what a user of the method waits for: loading the scene, the pilot where there is one, compiling, steps and
+Its time is what a user of the method waits for: loading the scene, what is left to measurement, compiling, steps and
 updates. Starting Python is not in it, nor is the target, which all methods have from the one that judges them.
 """
 
@@ -22,6 +22,7 @@ from reslrb_cli.measure.worker import Begun
 from reslrb_cli.optimization.choice import find_options, settle_integrator
 from reslrb_cli.optimization.loop import optimize
 from reslrb_cli.optimization.problem import Problem, assemble_scene
+from reslrb_cli.optimization.sequence_choice import settle_sampling
 from reslrb_cli.optimization.views import set_targets
 from reslrb_cli.records.clock import peak_mib
 from reslrb_cli.records.metrics import Record
@@ -56,13 +57,20 @@ class Advance:
         self.before = self.now = State(0.0, 0, take())
         self.first_s: float | None = None
         self.finished = False
-        self._quickest_s = 0.0
+        self._quickest_s, self._limit_s = 0.0, float("inf")
+
+    def progress(self) -> float:
+        """The share of the time from its first state to its end that has gone: 0 to 1; compiling is before that."""
+        if self.first_s is None or self.first_s >= self._limit_s:
+            return 0.0
+        return min((self._spent_s - self.first_s) / (self._limit_s - self.first_s), 1.0)
 
     def until(self, elapsed_s: float, limit_s: float) -> State:
         """The state that stands at `elapsed_s`: the newest that was done by then; times asked for may not fall.
 
         An iteration that would not be done by `limit_s` even if it were the quickest so far is not begun.
         """
+        self._limit_s = limit_s
         while not self.finished and self.now.elapsed_s <= elapsed_s:
             if self.now.elapsed_s + self._quickest_s > limit_s:
                 break
@@ -96,11 +104,12 @@ def begin(first: dict[str, Any]) -> Begun:
     if first["masked"]:
         leave_out_border(problem)
     # Nothing is remembered of earlier pilots: what a pilot costs is to be seen.
-    said: list[str] = []
-    settle_integrator(problem, options, said.append, None)
+    settle_integrator(problem, options, lambda line: None, None)
+    settle_sampling(problem, lambda line: None, None)
     dr.sync_thread()
     loading_s = time.perf_counter() - start
-    advance = Advance(optimize(problem), lambda: copies(problem), loading_s)
+    records = optimize(problem, progress=lambda: advance.progress())  # first asked for in its first iteration
+    advance = Advance(records, lambda: copies(problem), loading_s)
 
     def answer(question: dict[str, Any]) -> dict[str, Any]:
         state = advance.until(question["until_s"], question["limit_s"])
@@ -115,7 +124,13 @@ def begin(first: dict[str, Any]) -> Begun:
             dr.flush_malloc_cache()
         return reply
 
-    return {"loading_s": loading_s, "chose": said[-1] if said else ""}, answer
+    return {"loading_s": loading_s, "chose": decisions(problem)}, answer
+
+
+def decisions(problem: Problem) -> list[str]:
+    """What was decided by measurement, in words; of how samples are drawn without figures, which differ every time."""
+    found = [] if problem.pilot is None else [problem.pilot.line()]
+    return found + [each.decision() for each in (problem.guided, problem.sequence) if each is not None]
 
 
 def copies(problem: Problem) -> dict[str, Array]:

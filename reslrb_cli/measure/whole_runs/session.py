@@ -14,13 +14,12 @@ from pathlib import Path
 from typing import Any
 
 from reslrb_cli.config import Config, dump
-from reslrb_cli.measure.cases import Case
 from reslrb_cli.measure.convergence.session import AFTERWARDS, AFTERWARDS_S, MEMORY_SHARE, MIB, Start, start_process
 from reslrb_cli.measure.earlier import Earlier
 from reslrb_cli.measure.pace import NO_TIME, Pace
 from reslrb_cli.measure.processes import Stopped
 from reslrb_cli.measure.whole_runs.judging import Judging
-from reslrb_cli.measure.whole_runs.plan import RunsPlan
+from reslrb_cli.measure.whole_runs.plan import RunsPlan, Side
 from reslrb_cli.measure.whole_runs.resuming import kept, restore, settings
 from reslrb_cli.measure.whole_runs.run import POINTS, Run, times
 from reslrb_cli.records.bench import BenchStatus
@@ -94,9 +93,9 @@ class RunsSession:
         """
         try:
             if self._prepare():
-                entries = self._entries()
-                if self._divide(len(entries)):
-                    yield from self._waves(entries)
+                sides = self._sides()
+                if self._divide(len(sides)):
+                    yield from self._waves(sides)
         except Stopped:
             return
         finally:
@@ -129,19 +128,19 @@ class RunsSession:
             if self._earlier is not None:
                 self.facts = judge.restore(targets, self._earlier)
             else:
-                image_s = JUDGED * self._budget_s / (len(plan.entries) * plan.runs * POINTS)
+                image_s = JUDGED * self._budget_s / (len(plan.sides) * plan.runs * POINTS)
                 self.facts = judge.prepare(targets, budget_s=self._budget_s, image_s=image_s, **plan.camera)
         if judge.late:
             self._say(f"the budget of {plan.budget_s:g} s was spent before there was a target; allow several times it")
         return not judge.late
 
-    def _entries(self) -> list[tuple[Case, int]]:
+    def _sides(self) -> list[Side]:
         """What is compared: of the default list, what cannot do the scene is left out, and named."""
         plan, without = self.plan, self.facts["without"] if self.plan.default else {}
         for case in plan.cases:
             if case.type in without:
                 self._say(f"left out: {case.label}: {without[case.type]}")
-        return [(case, spp) for case, spp in plan.entries if case.type not in without]
+        return [side for side in plan.sides if side.case.type not in without]
 
     def _divide(self, methods: int) -> bool:
         """Give each run its time; False where there is too little."""
@@ -179,9 +178,9 @@ class RunsSession:
 
     # --- the runs -----------------------------------------------------------------------------------------------------
 
-    def _waves(self, entries: list[tuple[Case, int]]) -> Iterator[RunPointRecord]:
+    def _waves(self, sides: list[Side]) -> Iterator[RunPointRecord]:
         if self._earlier is not None:
-            entries = [entry for entry in entries if self.plan.method_of(*entry) not in self._gone(self.runs)]
+            sides = [side for side in sides if self.plan.method_of(side) not in self._gone(self.runs)]
         for number, seed in enumerate(self.plan.seeds):
             if number < self._seeds:
                 continue
@@ -189,8 +188,8 @@ class RunsSession:
                 self._say(f"not measured: runs from seed {seed} on: {NO_TIME}")
                 return
             wave = []
-            for case, spp in entries:
-                run = self._begin(case, spp, seed)
+            for side in sides:
+                run = self._begin(side, seed)
                 wave.append(run)
                 self._open(run)
             for turn, until_s in enumerate(times(self.limit_s)):
@@ -211,21 +210,21 @@ class RunsSession:
                 self._say(f"no method came to an iteration in the {self.limit_s:.3g} s of a run; allow several times "
                           "as much with --budget, or fewer --runs or --integrators")  # fmt: skip
                 return
-            entries = [entry for entry in entries if self.plan.method_of(*entry) not in self._gone(wave)]
+            sides = [side for side in sides if self.plan.method_of(side) not in self._gone(wave)]
 
     def _gone(self, runs: Sequence[Run]) -> set[Method]:
         """The methods that need not be tried with another seed: they refused, or need more memory than there is."""
         return {run.method for run in runs if run.refusal or (run.end and run.end.status is BenchStatus.OUT_OF_MEMORY)}
 
-    def _begin(self, case: Case, spp: int, seed: int) -> Run:
-        plan, config = self.plan, self.plan.seeded(self.plan.config_of(case, spp), seed)
+    def _begin(self, side: Side, seed: int) -> Run:
+        plan, config = self.plan, self.plan.seeded(self.plan.config_at(side), seed)
         run = Run(
             process=self._start(self._first(config), "whole_runs"),
             may_refuse=plan.default,
-            method=plan.method_of(case, spp),
+            method=plan.method_of(side),
             seed=seed,
             out=self.folder / f"values-{len(self.runs)}.npz",
-            state=RunPointRecord(plan.method_of(case, spp), seed, 0.0, 0, self.facts["loss"], self.facts["error"]),
+            state=RunPointRecord(plan.method_of(side), seed, 0.0, 0, self.facts["loss"], self.facts["error"]),
         )
         self.runs.append(run)
         return run
@@ -238,8 +237,8 @@ class RunsSession:
             return
         self._warn(opening)
         run.counted_s = opening["loading_s"]
-        if opening["chose"]:
-            self._once(f"{run.method.label}: {opening['chose']}")
+        for line in opening["chose"]:
+            self._once(f"{run.method.label}: {line}")
 
     def _late(self, left_s: float, grace: float = GRACE) -> Callable[[], bool]:
         """Whether the whole is over, or a run has been waited for longer than what is left of its time."""

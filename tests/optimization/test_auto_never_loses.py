@@ -1,0 +1,148 @@
+"""No scene loses by `guiding: auto` and `sequence: auto`: all shipped configurations, and scenes of the extreme suite.
+
+What is on has a gain whose interval lies above 1; what is off traces what `off` does, operation by operation; and all
+that is measured takes what it may. Shipped films are as they are, or smaller where an iteration takes seconds; those of
+the extreme suite have so many samples that there is time to measure.
+"""
+
+from __future__ import annotations
+
+import gc
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from optimization.deciding import operations
+
+from reslrb_cli.config import Config, load, loads
+from reslrb_cli.integrators import render_image
+from reslrb_cli.measure.extreme import CASES, ExtremeCase
+from reslrb_cli.measure.gradients import integrator
+from reslrb_cli.measure.small_scenes import load as load_scene
+from reslrb_cli.optimization.choice import find_options, is_auto, settle_integrator
+from reslrb_cli.optimization.pilot import SHARE
+from reslrb_cli.optimization.problem import Problem, assemble_scene
+from reslrb_cli.optimization.sequence_choice import settle_sampling
+from reslrb_cli.optimization.step_pilot import StepPilot
+from reslrb_cli.optimization.targets import make_targets
+from reslrb_cli.records.images import write_file
+from reslrb_cli.records.paid import LEAST_IMAGE, PaidRecord
+
+pytestmark = [pytest.mark.usefixtures("llvm"), pytest.mark.long]
+
+FOLDER = Path(__file__).resolve().parents[2] / "configs"
+SHIPPED = sorted(str(path.relative_to(FOLDER).with_suffix("")) for path in FOLDER.rglob("*.yaml"))
+#: Films of which a step takes a second at the most.
+SMALLER = {
+    "grey_room": ["scene.options.resx=120", "scene.options.resy=90"],
+    "cornell_floor": ["scene.options.resx=128", "scene.options.resy=128"],
+}
+AUTO = ["integrator.guiding=auto", "integrator.sequence=auto"]
+#: Scenes in which gradients break, each with another reason to draw samples otherwise: a sun, a lamp that is a dot,
+#: parallel light that grazes a floor, glass in glass, texels that are black, a film of one column.
+EXTREME = ["sun_1e6", "lamp_of_area_1e-8", "grazing_light", "nested_dielectrics", "albedo_0_roulette", "film_1x4096"]
+PREFIX = "extreme/"
+#: Light paths of a step of theirs.
+PATHS = 2**20
+#: The last round is begun while there is time for one like that before it. Beside others' work on the machine it may
+#: take so many times as long as the mean of all: where steps take milliseconds, that is a part that counts.
+OVERRUN = 2
+#: What decides how samples are drawn.
+SETTLE: dict[str, Callable[[Problem, Callable[[str], None]], None]] = {"sampling": settle_sampling}
+
+
+@pytest.fixture(autouse=True)
+def alone() -> None:
+    """Scenes that are alive at the same time show in each other's kernels."""
+    gc.collect()
+
+
+def decided(config: Config, case: ExtremeCase | None) -> Problem:
+    """The problem, in the scene of a case if one is given, with all that is left to measurement decided now."""
+    problem = assemble_scene(config, None if case is None else load_scene(case.scene()))
+    options = find_options(problem)
+    make_targets(problem, lambda line: None)
+    settle_integrator(problem, options, lambda line: None)
+    SETTLE["sampling"](problem, lambda line: None)
+    return problem
+
+
+def extreme(case: ExtremeCase, folder: Path) -> str:
+    """A configuration of a case: reflectances that are to be recovered from an image of it, which is written here."""
+    keys = [key for key in case.keys if "reflectance" in key]
+    image = render_image(integrator("reslrb", **case.options), load_scene(case.scene()), 0, 1, 256)
+    write_file(folder / "target.exr", np.array(image), linear=True)
+    spp = max(PATHS // (image.shape[0] * image.shape[1]), 1)
+    options = ", ".join(f"{option}: {value}" for option, value in case.options.items())
+    return f"""
+scene: {{file: {case.name}.xml}}
+target: {{file: {folder}/target.exr}}
+parameters: [{", ".join(f"{{key: {key}, initial: 0.3}}" for key in keys)}]
+integrator: {{type: reslrb, {options}}}
+run: {{spp: {spp}, iterations: 200}}
+"""
+
+
+def config_of(name: str, case: ExtremeCase | None, folder: Path, *settings: str) -> Config:
+    """A shipped configuration by its name, or that of a case of the extreme suite."""
+    if case is not None:
+        return loads(extreme(case, folder), Path(f"{case.name}.yaml"), [*settings])
+    return load(FOLDER / f"{name}.yaml", ["target.render.spp=64", *SMALLER.get(name, ()), *settings])
+
+
+def judged(record: PaidRecord | None, on: bool, alone: bool) -> list[str]:
+    """What a decision has that it may not."""
+    if record is None:
+        return ["nothing was decided"]
+    if not on:
+        return []
+    assert record.low is not None
+    assert record.image_gain is not None
+    found = [f"on, and the gain is {record.low:.3g} at least"] if record.low <= 1 else []
+    if not alone and record.image_gain < LEAST_IMAGE:
+        found.append(f"on, and the image's efficiency falls to {record.image_gain:.3g}")
+    return found
+
+
+@pytest.mark.parametrize("name", [*SHIPPED, *(PREFIX + name for name in EXTREME)])
+def test_no_scene_loses(name: str, tmp_path: Path) -> None:
+    case = CASES[name.removeprefix(PREFIX)] if name.startswith(PREFIX) else None
+    problem = decided(config_of(name, case, tmp_path, *AUTO), case)
+    guided, sequence, pilot = problem.guided, problem.sequence, problem.pilot
+    share = sum(each.share for each in (pilot, guided, sequence) if each is not None)
+    round_share = max(each.share / max(each.rounds, 1) for each in (guided, sequence) if each is not None)
+    print(name, *(each.line() for each in (pilot, guided, sequence) if each is not None), f"{share:.2%}", sep="\n  ")
+    assert guided is not None
+    assert sequence is not None
+    alone = problem.config.adjoint == "independent"
+    assert judged(guided, guided.guided, alone) == []
+    assert judged(sequence, sequence.low_discrepancy, False) == []
+    assert share <= SHARE + OVERRUN * round_share
+    if guided.guided:
+        return
+    chosen = {} if pilot is None else pilot.chosen
+    settings = [f"integrator.{option}={value}" for option, value in chosen.items()]
+    settings += [f"integrator.guiding={guided.setting}", f"integrator.sequence={sequence.setting}"]
+    found = operations(problem)
+    del problem
+    gc.collect()
+    assert found == operations(decided(config_of(name, case, tmp_path, *settings), case))
+
+
+@pytest.mark.parametrize("fault", ["on whatever is found", "off with a grid"])
+def test_losses_are_seen(fault: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In a scene that guiding has a third of the efficiency in: it is on; and it is off, and paths start in cells."""
+    if fault == "on whatever is found":
+        found = StepPilot._record
+        monkeypatch.setattr(StepPilot, "_record", lambda self, other, images, *rest: found(self, True, True, *rest))
+    else:
+
+        def settle(problem: Problem, say: Callable[[str], None]) -> None:
+            settle_sampling(problem, say)
+            if is_auto(problem.config, "guiding"):
+                problem.integrator = problem.integrator.afresh(guided=True)
+
+        monkeypatch.setitem(SETTLE, "sampling", settle)
+    with pytest.raises(AssertionError):
+        test_no_scene_loses("stiff/wall", tmp_path)
