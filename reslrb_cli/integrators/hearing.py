@@ -101,7 +101,7 @@ class Hearing(Hooks):
 
 
 def hear(samples: Samples, adjoint: AdjointImage) -> Array:
-    """Sums of squares (voices, cells), float64, of guided samples; what is not finite is not heard."""
+    """Sums of squares (voices, cells), float32, of guided samples; what is not finite is not heard."""
     plan = samples.plan
     assert plan.grid is not None
     loudest = dr.max(dr.abs(dr.select(dr.isfinite(adjoint.image), adjoint.image, 0)))
@@ -120,4 +120,4 @@ def hear(samples: Samples, adjoint: AdjointImage) -> Array:
         said = dr.isfinite(value) & (value > 0)
         dr.scatter_reduce(dr.ReduceOp.Add, sums, value, drawn.cell + voice * cells, said)
     dr.eval(sums)
-    return np.array(sums, np.float64).reshape(len(squares), cells)
+    return np.array(sums).reshape(len(squares), cells)
