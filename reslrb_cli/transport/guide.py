@@ -71,14 +71,17 @@ class Grid:
         """The same cut into at most so many cells, or one of each emitter; each is made of this one's."""
         bits = list(self.bits)
         while sum(bits) > 0 and self.emitters << sum(bits) > cells:
-            bits[3 - bits[::-1].index(max(bits))] -= 1
+            bits[3 - bits[::-1].index(max(bits))] -= 1  # the one that was cut last
         return Grid((bits[0], bits[1], bits[2], bits[3]), self.edges)
 
     def summed(self, values: Array, coarser: Grid) -> Array:
         """Of values for these cells (cells,) the sums over each coarser one's."""
-        pairs = [size for fine, few in zip(self.shape, coarser.shape, strict=True) for size in (few, fine // few)]
-        result: Array = values.reshape(pairs).sum(axis=tuple(range(1, len(pairs), 2)), dtype=np.float64)
-        return result.ravel()
+        result = values.reshape(self.shape)
+        for axis, few in enumerate(coarser.shape):
+            while result.shape[axis] > few:
+                rows = np.moveaxis(result, axis, 0)
+                result = np.moveaxis(rows[::2] + rows[1::2], 0, axis)
+        return result.astype(np.float64).ravel()
 
     def shared_out(self, values: Array, coarser: Grid) -> Array:
         """Of values for coarser cells, each one's spread evenly over its own; the inverse of `summed`."""
@@ -89,10 +92,7 @@ class Grid:
 
 
 def make_grid(used: Sequence[bool], weights: Sequence[float], cell_bits: int = CELL_BITS) -> Grid:
-    """A grid for emitters of these sampling weights, cut along those of the four numbers that are used.
-
-    It has at most 2^cell_bits cells, and all of them where the number of emitters is a power of two.
-    """
+    """A grid of at most 2^cell_bits cells for emitters of these weights, cut along those of the numbers that are used."""
     if not sum(weights) > 0:
         weights = [1.0] * max(len(weights), 1)  # nothing shines; the grid is of no use, and does no harm
     total = np.append(0.0, np.cumsum(np.asarray(weights, np.float64)))
@@ -113,8 +113,7 @@ def apportion(grid: Grid, density: Array) -> Array:
     # Rounded along the cells' order, so that what one loses a neighbour gains.
     reached = np.cumsum(density / density.sum())
     ends = np.rint((slots - least.sum()) * (reached / reached[-1]))
-    counts: Array = (least + np.diff(ends, prepend=0)).astype(np.int64)
-    return counts
+    return np.asarray(least + np.diff(ends, prepend=0), np.int64)
 
 
 @dataclass
