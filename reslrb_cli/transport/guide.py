@@ -92,7 +92,7 @@ class Grid:
 
 
 def make_grid(used: Sequence[bool], weights: Sequence[float], cell_bits: int = CELL_BITS) -> Grid:
-    """A grid of at most 2^cell_bits cells for emitters of these weights, cut along those of the numbers that are used."""
+    """A grid of at most 2^cell_bits cells for emitters of these sampling weights, cut along the used numbers."""
     if not sum(weights) > 0:
         weights = [1.0] * max(len(weights), 1)  # nothing shines; the grid is of no use, and does no harm
     total = np.append(0.0, np.cumsum(np.asarray(weights, np.float64)))
