@@ -9,7 +9,7 @@ import pytest
 from conformance.gradient_cases import CASES
 
 from reslrb_cli.measure.gradients import Case, integrator
-from reslrb_cli.transport.guide import UNIFORM, Grid, Table, apportion, even_table, make_grid
+from reslrb_cli.transport.guide import UNIFORM, Grid, Guide, Table, apportion, even_table, make_grid
 
 pytestmark = pytest.mark.usefixtures("llvm")
 
@@ -146,6 +146,30 @@ def test_cells_part_the_cube_and_coarser_ones_are_made_of_them(name: str) -> Non
         shared = grid.shared_out(summed, coarser)
         np.testing.assert_allclose(shared, summed[owner] * coarser.cells / grid.cells, rtol=1e-9)
         assert shared.sum() == pytest.approx(values.sum())
+
+
+@pytest.mark.parametrize("weights", [[1.0], [1.0, 0.0, 2.0, 0.5]])
+def test_each_cell_is_drawn_as_often_as_its_weight_says_and_numbers_lie_in_it(weights: list[float]) -> None:
+    """Of three lanes for each slot a cell has exactly three times its slots; p is that share, with no rounding."""
+    import mitsuba as mi
+
+    grid = make_grid([True, True, False, True], weights, 10)
+    counts = apportion(grid, np.random.default_rng(4).gamma(0.1, size=grid.cells) * grid.measures())
+    table, lanes = Table.of(grid, counts), 3 * grid.slots
+    random = np.random.default_rng(5)
+    own = [mi.Float(random.uniform(0.01, 0.99, lanes).astype(np.float32)) for _ in range(5)]
+    drawn = Guide.of(table, lanes).draw(
+        grid, lanes, mi.PCG32(lanes, 1), own[0], mi.Point2f(own[1], own[2]), mi.Point2f(own[3], own[4])
+    )
+    cell = np.array(drawn.cell)
+    np.testing.assert_array_equal(np.bincount(cell, minlength=grid.cells), 3 * counts)
+    p = counts[cell] / grid.slots
+    np.testing.assert_allclose(np.array(drawn.weight), grid.measures()[cell] / p, rtol=1e-6)
+    numbers = [drawn.position.x, drawn.position.y, drawn.direction.x, drawn.direction.y]
+    index = [(np.array(number) * 2**bits).astype(int) for number, bits in zip(numbers, grid.bits, strict=True)]
+    emitter = np.searchsorted(grid.edges, np.array(drawn.choice), "right") - 1 if grid.emitters > 1 else 0 * cell
+    lies_in = np.ravel_multi_index([emitter, *reversed(index)], grid.shape)
+    np.testing.assert_array_equal(lies_in, cell)
 
 
 def test_cells_are_as_fine_as_there_are_paths_to_tell_them_apart() -> None:
