@@ -127,7 +127,7 @@ class Guiding:
         for number, count in calls.items():
             sums, draws = (take(f"{number}/{name}") for name in ("sums", "draws"))
             for name, array, rows in (("sums", sums, (2,)), ("draws", draws, ())):
-                if array.shape != (*rows, self.grid.cells) or array.min() < 0:
+                if array.shape != (*rows, self.grid.cells) or not (np.isfinite(array) & (array >= 0)).all():
                     return f"{number}/{name}"
             found[int(number)] = Learned(sums.astype(np.float32), draws.astype(np.float32), count)
         self.learned, self._tables = found, {}
