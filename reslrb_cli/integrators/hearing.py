@@ -31,7 +31,6 @@ from reslrb_cli.transport.walk import walk
 Array = np.ndarray[Any, Any]
 
 MOST_BSDFS = 6  # that are heard apart; the others are heard together
-MOST_VOICES = MOST_BSDFS + 3  # and emission, what moves, the image
 
 
 def bsdf_groups(plan: Plan) -> list[tuple[mi.BSDF, ...]]:
