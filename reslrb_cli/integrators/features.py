@@ -7,8 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
-from reslrb_cli.integrators.guiding import sensor_bytes
-from reslrb_cli.transport.guide import make_grid
+from reslrb_cli.integrators.guiding import grid_for, sensor_bytes
 from reslrb_cli.transport.nets import make_coordinates
 from reslrb_cli.transport.plan import UNBOUNDED, Plan
 
@@ -147,7 +146,7 @@ def _tables(plan: Plan) -> str:
 def _guided(plan: Plan) -> Plan:
     if plan.grid is not None:
         return replace(plan, grid=None)
-    return replace(plan, grid=make_grid([True] * 4, [1.0] * len(plan.needs.emitters)))
+    return replace(plan, grid=grid_for([True] * 4, [1.0] * len(plan.needs.emitters), 1))
 
 
 def _sequence(plan: Plan) -> Plan:

@@ -1,25 +1,23 @@
 """Guiding of a scene's emission: tables for each sensor, learned from steps that are done, for those to come.
 
-What the variance of a sum over paths is made of is the mean square of what those of a cell say; it is least where cells
-are drawn in proportion to its root (`hearing.py` says what is heard). Each voice is scaled to a total of 1, so that no
-parameter drowns another. Samples that serve image and gradient both are drawn half for the one, half for the other.
+Cells are drawn by what their paths have said (`learned.py`). Samples that serve image and gradient both are drawn half
+for the one, half for the other.
 """
 
 from __future__ import annotations
 
 import enum
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from scipy import ndimage
 
-from reslrb_cli.integrators.hearing import MOST_VOICES, hear, voices
+from reslrb_cli.integrators.hearing import hear
+from reslrb_cli.integrators.learned import Learned
 from reslrb_cli.integrators.probing import used_numbers
-from reslrb_cli.transport.guide import Grid, Table, apportion, make_grid
+from reslrb_cli.transport.guide import CELL_BITS, Grid, Table, apportion, make_grid
 from reslrb_cli.transport.samples import Samples
 from reslrb_cli.transport.splat import AdjointImage
 
@@ -27,8 +25,7 @@ Array = np.ndarray[Any, Any]
 
 FIRST = (1, 2, 4)  # gradients of a sensor after which its table learns, and then
 EVERY = 7  # after every so many
-KEEP = 0.5  # what of the past counts beside the newest, each time that a table learns
-BLUR = (0.25, 0.5, 0.25)  # along each number, of neighbouring cells
+LEAST_BITS = 16  # cells, log2, however many sensors there are
 MOST_BYTES = 2**26  # of all tables together; sensors for which there is no room share
 LEARNING_STREAM = 0x1EA2  # seeds of the samples that tables learn from
 
@@ -41,56 +38,16 @@ class Purpose(enum.Enum):
     BOTH = 0.5
 
 
-@dataclass
-class Learned:
-    """What the paths for one sensor have said: sums of squares (voices, cells), and how many started in each cell.
-
-    `calls` is the number of gradients so far. Arrays are float32, and never changed.
-    """
-
-    sums: Array
-    draws: Array
-    calls: int = 0
-
-    @staticmethod
-    def nothing(grid: Grid, count: int) -> Learned:
-        """Before the first gradient."""
-        return Learned(np.zeros((count, grid.cells), np.float32), np.zeros(grid.cells, np.float32))
-
-    def with_more(self, grid: Grid, heard: Array, draws: Array) -> Learned:
-        """With what newer paths have said (voices, cells), `draws` (cells) of them."""
-        sums = KEEP * self.sums.astype(np.float64)
-        means = np.divide(heard, draws, out=np.zeros_like(heard), where=draws > 0)
-        totals = means @ grid.measures()
-        audible = np.isfinite(totals) & (totals > 0)
-        sums[audible] += heard[audible] / totals[audible, None]
-        return Learned(sums.astype(np.float32), (KEEP * self.draws + draws).astype(np.float32), self.calls)
-
-    def density(self, grid: Grid, purpose: Purpose) -> Array:
-        """How cells are to be drawn (cells,), normalised, before any are shared out evenly."""
-        measures = grid.measures()
-        draws = _blurred(grid, self.draws)
-        result = np.zeros(grid.cells)
-        for share, rows in ((purpose.value, self.sums[:-1]), (1 - purpose.value, self.sums[-1:])):
-            square = _blurred(grid, rows.sum(0, dtype=np.float64))
-            loud = np.sqrt(np.divide(square, draws, out=np.zeros(grid.cells), where=draws > 0)) * measures
-            total = loud.sum()
-            result += share * (loud / total if np.isfinite(total) and total > 0 else measures / measures.sum())
-        return result
-
-
-def _blurred(grid: Grid, values: Array) -> Array:
-    """Sums over neighbouring cells, weighted; the cells of one emitter are none of another's neighbours."""
-    result = values.astype(np.float64).reshape(grid.shape)
-    for axis in range(1, result.ndim):
-        if result.shape[axis] > 1:
-            result = ndimage.convolve1d(result, BLUR, axis, mode="nearest")
-    return result.ravel()
-
-
 def sensor_bytes(grid: Grid) -> int:
     """Bytes for one sensor: a table for each purpose, and what has been learned."""
-    return 4 * (len(Purpose) * (grid.slots + grid.cells) + (MOST_VOICES + 1) * grid.cells)
+    return 4 * (len(Purpose) * (grid.slots + 2 * grid.cells) + 3 * grid.cells)
+
+
+def grid_for(used: Sequence[bool], weights: Sequence[float], sensors: int) -> Grid:
+    """A grid of which so many sensors have tables of their own, as fine as these leave room for; of more they share."""
+    grids = (make_grid(used, weights, bits) for bits in range(CELL_BITS, LEAST_BITS, -1))
+    fitting = (grid for grid in grids if sensors * sensor_bytes(grid) <= MOST_BYTES)
+    return next(fitting, make_grid(used, weights, LEAST_BITS))
 
 
 class Guiding:
@@ -115,7 +72,7 @@ class Guiding:
         """The grid of the samples' scene, found out once."""
         if self.grid is None:
             weights = [float(emitter.sampling_weight()) for emitter in samples.scene.emitters()]
-            self.grid = make_grid(used_numbers(samples), weights)
+            self.grid = grid_for(used_numbers(samples), weights, len(samples.scene.sensors()))
         return self.grid
 
     def serves(self, purpose: Purpose) -> bool:
@@ -135,8 +92,8 @@ class Guiding:
         number = self._shared(number)
         if (number, purpose) not in self._tables:
             learned = self.learned.get(number)
-            density = self.grid.measures() if learned is None else learned.density(self.grid, purpose)
-            counts = apportion(self.grid, density)
+            density = self.grid.measures() if learned is None else learned.density(self.grid, purpose.value)
+            counts = apportion(self.grid, density).astype(np.uint32)
             self._tables[number, purpose] = Table.of(self.grid, counts), counts
         return self._tables[number, purpose]
 
@@ -169,9 +126,8 @@ class Guiding:
         found = {}
         for number, count in calls.items():
             sums, draws = (take(f"{number}/{name}") for name in ("sums", "draws"))
-            for name, array, dimensions in (("sums", sums, 2), ("draws", draws, 1)):
-                fits = array.ndim == dimensions and array.shape[-1] == self.grid.cells
-                if not fits or array.size == 0 or array.min() < 0:
+            for name, array, rows in (("sums", sums, (2,)), ("draws", draws, ())):
+                if array.shape != (*rows, self.grid.cells) or not (np.isfinite(array) & (array >= 0)).all():
                     return f"{number}/{name}"
             found[int(number)] = Learned(sums.astype(np.float32), draws.astype(np.float32), count)
         self.learned, self._tables = found, {}
@@ -192,9 +148,9 @@ class Guiding:
         assert self.grid is not None
         counts, number = self.counts(number, Purpose.BOTH), self._shared(number)
         before = self.learned.get(number)
-        if before is None or len(before.sums) != voices(samples.plan):
-            before = Learned.nothing(self.grid, voices(samples.plan))
-            before.calls = 1 if number not in self.learned else self.learned[number].calls
+        if before is None:
+            before = Learned.nothing(self.grid)
+            before.calls = 1
         draws = samples.width * (counts / self.grid.slots)
         self.learned[number] = before.with_more(self.grid, hear(samples, adjoint), draws)
         for purpose in Purpose:

@@ -31,7 +31,6 @@ from reslrb_cli.transport.walk import walk
 Array = np.ndarray[Any, Any]
 
 MOST_BSDFS = 6  # that are heard apart; the others are heard together
-MOST_VOICES = MOST_BSDFS + 3  # and emission, what moves, the image
 
 
 def bsdf_groups(plan: Plan) -> list[tuple[mi.BSDF, ...]]:
@@ -101,7 +100,7 @@ class Hearing(Hooks):
 
 
 def hear(samples: Samples, adjoint: AdjointImage) -> Array:
-    """Sums of squares (voices, cells), float64, of guided samples; what is not finite is not heard."""
+    """Sums of squares (voices, cells), float32, of guided samples; what is not finite is not heard."""
     plan = samples.plan
     assert plan.grid is not None
     loudest = dr.max(dr.abs(dr.select(dr.isfinite(adjoint.image), adjoint.image, 0)))
@@ -120,4 +119,4 @@ def hear(samples: Samples, adjoint: AdjointImage) -> Array:
         said = dr.isfinite(value) & (value > 0)
         dr.scatter_reduce(dr.ReduceOp.Add, sums, value, drawn.cell + voice * cells, said)
     dr.eval(sums)
-    return np.array(sums, np.float64).reshape(len(squares), cells)
+    return np.array(sums).reshape(len(squares), cells)

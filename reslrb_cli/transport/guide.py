@@ -25,9 +25,10 @@ import numpy as np
 Array = np.ndarray[Any, Any]
 
 UNIFORM = 0.25  # share of paths that start evenly, at least
-CELL_BITS = 16  # cells of one emitter, log2; of all emitters together one more
+CELL_BITS = 19  # cells of all emitters together, log2
 MOST_EMITTERS = 1024  # that have cells of their own; of more, neighbours share theirs
-SLOTS_PER_CELL = 8
+SLOTS_PER_CELL = 4  # one of them is the even share
+SLOTS_OF_SEVERAL = 8  # where emitters have unequal shares, which are rounded up to whole slots
 
 
 @dataclass(frozen=True)
@@ -53,7 +54,8 @@ class Grid:
     @property
     def slots(self) -> int:
         """Slots, a power of two."""
-        return 1 << (SLOTS_PER_CELL * self.cells - 1).bit_length()
+        each = SLOTS_PER_CELL if self.emitters == 1 else SLOTS_OF_SEVERAL
+        return 1 << (each * self.cells - 1).bit_length()
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -65,16 +67,39 @@ class Grid:
         """v_k of all cells, float64; they sum to 1."""
         return np.repeat(np.diff(self.edges), 1 << sum(self.bits)) / (1 << sum(self.bits))
 
+    def coarser(self, cells: float) -> Grid:
+        """The same cut into at most so many cells, or one of each emitter; each is made of this one's."""
+        bits = list(self.bits)
+        while sum(bits) > 0 and self.emitters << sum(bits) > cells:
+            bits[3 - bits[::-1].index(max(bits))] -= 1  # the one that was cut last
+        return Grid((bits[0], bits[1], bits[2], bits[3]), self.edges)
 
-def make_grid(used: Sequence[bool], weights: Sequence[float]) -> Grid:
-    """A grid for emitters of these sampling weights, cut along those of the four numbers that are used."""
+    def summed(self, values: Array, coarser: Grid) -> Array:
+        """Of values for these cells (cells,) the sums over each coarser one's."""
+        result = values.reshape(self.shape)
+        for axis, few in enumerate(coarser.shape):
+            while result.shape[axis] > few:
+                rows = np.moveaxis(result, axis, 0)
+                result = np.moveaxis(rows[::2] + rows[1::2], 0, axis)
+        return result.astype(np.float64).ravel()
+
+    def shared_out(self, values: Array, coarser: Grid) -> Array:
+        """Of values for coarser cells, each one's spread evenly over its own; the inverse of `summed`."""
+        result = values.reshape(coarser.shape) * (coarser.cells / self.cells)
+        for axis, (fine, few) in enumerate(zip(self.shape, coarser.shape, strict=True)):
+            result = result.repeat(fine // few, axis)
+        return result.ravel()
+
+
+def make_grid(used: Sequence[bool], weights: Sequence[float], cell_bits: int = CELL_BITS) -> Grid:
+    """A grid of at most 2^cell_bits cells for emitters of these sampling weights, cut along the used numbers."""
     if not sum(weights) > 0:
         weights = [1.0] * max(len(weights), 1)  # nothing shines; the grid is of no use, and does no harm
     total = np.append(0.0, np.cumsum(np.asarray(weights, np.float64)))
     groups = min(len(weights), MOST_EMITTERS)
     edges = (total / total[-1])[np.round(np.linspace(0, len(weights), groups + 1)).astype(int)]
     bits = [0, 0, 0, 0]
-    budget = min(CELL_BITS, CELL_BITS + 1 - (groups - 1).bit_length())
+    budget = cell_bits - (groups - 1).bit_length()
     along = [k for k in range(4) if used[k]]
     for k in range(budget if along else 0):
         bits[along[k % len(along)]] += 1
@@ -85,11 +110,10 @@ def apportion(grid: Grid, density: Array) -> Array:
     """Slots of each cell (int64), at least UNIFORM of its measure, the others in proportion to `density`."""
     measures, slots = grid.measures(), grid.slots
     least = np.where(measures > 0, np.maximum(np.ceil(UNIFORM * slots * measures - 1e-6), 1), 0)
-    wanted = (slots - least.sum()) * (density / density.sum())
-    counts: Array = (least + np.floor(wanted)).astype(np.int64)
-    missing = slots - int(counts.sum())
-    counts[np.argsort(np.floor(wanted) - wanted, kind="stable")[:missing]] += 1
-    return counts
+    # Rounded along the cells' order, so that what one loses a neighbour gains.
+    reached = np.cumsum(density / density.sum())
+    ends = np.rint((slots - least.sum()) * (reached / reached[-1]))
+    return np.asarray(least + np.diff(ends, prepend=0), np.int64)
 
 
 @dataclass

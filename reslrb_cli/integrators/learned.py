@@ -1,0 +1,87 @@
+"""What light paths for one sensor have said, by the cell that they started in, and how cells are drawn by that.
+
+What the variance of a sum over paths is made of is the mean square of what those of a cell say; it is least where cells
+are drawn in proportion to its root (`hearing.py` says what is heard). Each voice is scaled to a total of 1, so that no
+parameter drowns another.
+
+Cells are as fine as there are paths to tell them apart: of a few thousand paths they are put together by hundreds. The
+more have been heard, the finer they are, up to the grid's own.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from reslrb_cli.transport.guide import Grid
+
+Array = np.ndarray[Any, Any]
+
+KEEP = 0.75  # what of the past counts beside the newest, each time that a table learns
+FINE = 2.0  # cells, at most, for each path that has been heard
+
+
+@dataclass
+class Learned:
+    """What the paths for one sensor have said: sums of squares (2, cells), about the gradient and about the image, and
+    how many started in each cell.
+
+    `calls` is the number of gradients so far. Arrays are float32, and never changed.
+    """
+
+    sums: Array
+    draws: Array
+    calls: int = 0
+
+    @staticmethod
+    def nothing(grid: Grid) -> Learned:
+        """Before the first gradient."""
+        return Learned(np.zeros((2, grid.cells), np.float32), np.zeros(grid.cells, np.float32))
+
+    def with_more(self, grid: Grid, heard: Array, draws: Array) -> Learned:
+        """With what newer paths have said (voices, cells), the image last, `draws` (cells) of them.
+
+        Each voice is scaled to a total of 1.
+        """
+        sums = np.float32(KEEP) * self.sums
+        means = np.divide(grid.measures(), draws, out=np.zeros(grid.cells), where=draws > 0).astype(np.float32)
+        for voice, said in enumerate(heard.astype(np.float32)):
+            total = said @ means
+            if np.isfinite(total) and total > 0:
+                sums[int(voice == len(heard) - 1)] += said / total
+        return Learned(sums, (KEEP * self.draws + draws).astype(np.float32), self.calls)
+
+    def density(self, grid: Grid, share: float) -> Array:
+        """How cells are to be drawn (cells,), normalised, before any are shared out evenly: `share` of them by what was
+        said about the gradient, the others by what was said about the image.
+
+        Cells that few paths have been heard of are put together, all of them alike.
+        """
+        coarser = grid.coarser(FINE * self.draws.sum(dtype=np.float64))
+        measures, result = coarser.measures(), np.zeros(coarser.cells)
+        draws = _blurred(coarser, grid.summed(self.draws, coarser))
+        for part, row in zip((share, 1 - share), self.sums, strict=True):
+            if part > 0:
+                square = _blurred(coarser, grid.summed(row, coarser))
+                loud = np.sqrt(np.divide(square, draws, out=np.zeros(coarser.cells), where=draws > 0)) * measures
+                total = loud.sum()
+                result += part * (loud / total if np.isfinite(total) and total > 0 else measures / measures.sum())
+        return grid.shared_out(result, coarser)
+
+
+def _blurred(grid: Grid, values: Array) -> Array:
+    """Sums over neighbouring cells, weighted by 1/4, 1/2, 1/4 along each number; the cells of one emitter are none of
+    another's neighbours."""
+    result = values.reshape(grid.shape)
+    for axis in range(1, result.ndim):
+        if result.shape[axis] > 1:
+            rows = np.moveaxis(result, axis, 0)
+            result = 0.5 * result
+            to = np.moveaxis(result, axis, 0)
+            to[1:] += 0.25 * rows[:-1]
+            to[:-1] += 0.25 * rows[1:]
+            to[0] += 0.25 * rows[0]
+            to[-1] += 0.25 * rows[-1]
+    return result.ravel()
