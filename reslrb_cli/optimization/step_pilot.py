@@ -161,10 +161,10 @@ class StepPilot(Generic[Record]):
         return low is None or high is None or low > 1 or high < 1
 
     def _images(self, gain: Gain) -> bool:
-        """Whether images are to be drawn so too; where that is not decided apart, whether it does them no harm."""
+        """Whether images are to be drawn so too; where that is not decided apart, whether no harm to them is seen."""
         if self._apart:
             return gain[1] is not None and gain[1] > 1
-        return gain[0] is None or gain[0] >= LEAST_IMAGE
+        return gain[2] is None or gain[2] >= LEAST_IMAGE
 
     def _decided(self) -> Record:
         if len(self._steps[False]) < LEAST_ROUNDS:

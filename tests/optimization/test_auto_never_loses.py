@@ -98,10 +98,10 @@ def judged(record: PaidRecord | None, on: bool, alone: bool) -> list[str]:
     if not on:
         return []
     assert record.low is not None
-    assert record.image_gain is not None
+    assert record.image_high is not None
     found = [f"on, and the gain is {record.low:.3g} at least"] if record.low <= 1 else []
-    if not alone and record.image_gain < LEAST_IMAGE:
-        found.append(f"on, and the image's efficiency falls to {record.image_gain:.3g}")
+    if not alone and record.image_high < LEAST_IMAGE:
+        found.append(f"on, and the image's efficiency falls to {record.image_high:.3g} at most")
     return found
 
 
