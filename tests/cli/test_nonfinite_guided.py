@@ -24,7 +24,7 @@ SETTINGS = ["integrator.guiding=on", "scene.options={wall: spoilt.exr}", "run.it
 WAYS = {
     "correlated": ["run.adjoint=correlated", "run.spp=2", "run.seed=1"],
     "independent": ["run.adjoint=independent", "run.spp=2", "run.seed=1"],
-    "batched": ["run.adjoint=batched", "run.spp=4", "run.seed=1"],
+    "batched": ["run.adjoint=batched", "run.spp=4", "run.seed=5"],
     "again": ["run.adjoint=batched", "run.first_batch=again", "run.spp=4", "run.seed=3"],
 }
 
