@@ -84,7 +84,7 @@ def test_all_processes_of_whole_runs_leave_it_out(llvm: None, tmp_path: Path, ca
 
     seen: list[bool] = []
 
-    def optimize(what: Any) -> Any:
+    def optimize(what: Any, progress: Any) -> Any:
         image = mi.TensorXf(np.array(what.views[0].target))
         image[0] = 9.0
         seen.append(float(what.views[0].compare(image)[0]) == 0)
