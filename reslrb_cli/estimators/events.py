@@ -13,7 +13,8 @@ from reslrb_cli.transport.connection import Connection, connect, stand_in
 from reslrb_cli.transport.factors import NO_ZERO
 from reslrb_cli.transport.hooks import Vertex
 from reslrb_cli.transport.plan import Plan
-from reslrb_cli.transport.scattering import Scattering, tracked_factor
+from reslrb_cli.transport.scattering import Scattering
+from reslrb_cli.transport.tracked import tracked_factor
 
 
 @dataclass

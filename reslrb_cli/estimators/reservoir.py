@@ -37,7 +37,8 @@ from reslrb_cli.transport.connection import Connection
 from reslrb_cli.transport.factors import Product
 from reslrb_cli.transport.hooks import Vertex
 from reslrb_cli.transport.plan import Plan
-from reslrb_cli.transport.scattering import Scattering, tracked_factor
+from reslrb_cli.transport.scattering import Scattering
+from reslrb_cli.transport.tracked import tracked_factor
 
 JACOBIAN_DAMPING = 0.1  # of attached derivatives: `estimators.jacobian`
 SHARE = 0.01  # the least share of a candidate in the weights up to it

@@ -39,7 +39,8 @@ from reslrb_cli.transport.connection import Connection, Seen, stand_in
 from reslrb_cli.transport.factors import NO_ZERO, Product
 from reslrb_cli.transport.hooks import Splat, Vertex
 from reslrb_cli.transport.plan import Plan
-from reslrb_cli.transport.scattering import Scattering, tracked_factors
+from reslrb_cli.transport.scattering import Scattering
+from reslrb_cli.transport.tracked import tracked_factors
 
 STACK_SIZE = 64  # vertices
 

@@ -12,8 +12,9 @@ from reslrb_cli.transport.connection import Connection
 from reslrb_cli.transport.factors import Product
 from reslrb_cli.transport.hooks import Hooks, Vertex
 from reslrb_cli.transport.samples import Samples
-from reslrb_cli.transport.scattering import Scattering, evaluate, tracked_factor
+from reslrb_cli.transport.scattering import Scattering, evaluate
 from reslrb_cli.transport.splat import Film
+from reslrb_cli.transport.tracked import tracked_factor
 from reslrb_cli.transport.transmittance import forward_derivatives
 
 #: What may not be finite; `Suspect.kind` is the index.

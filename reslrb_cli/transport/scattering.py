@@ -1,13 +1,4 @@
-"""One scattering event of a light path: a direction sampled from the BSDF, its weight, and derivatives of both kinds of
-BSDF factor, s_j (along the path) and c_i (towards the sensor).
-
-Sampling is detached: directions and densities do not depend on the parameters. A factor is then f / pdf, where only
-
-    f = bsdf * cos        a smooth lobe, evaluated for a given direction
-    f = weight * pdf      a delta lobe, which has a weight and a discrete probability, and no value
-    f = transmission      passing straight through (a mask, a thin sheet)
-
-has a derivative.
+"""One scattering event of a light path: a direction sampled from the BSDF, and its weight (derivatives: `tracked.py`).
 
 Bump and normal maps perturb the shading frame inside of the BSDF, where Veach's correction cannot see it. In scenes
 that have them a smooth lobe is evaluated as a path from the camera would, with its two directions exchanged,
@@ -89,7 +80,7 @@ def scatter(
 ) -> tuple[Scattering, mi.Spectrum | None]:
     """Sample the next direction, and evaluate f (C,) towards `connection_wo` in `connected` lanes (None: in no lane).
 
-    Detached, unless `attached`; `tracked_factors` has the derivatives of the factors alone. Both queries share one
+    Detached, unless `attached`; `tracked.py` has the derivatives of the factors alone. Both queries share one
     indirect call, and in it what they have in common (looking up textures, mostly).
     """
     context = importance_context()
@@ -262,68 +253,3 @@ def evaluate(
     exchanged = type(si)(si)
     exchanged.wi = wo
     return bsdf.eval(mi.BSDFContext(mi.TransportMode.Radiance), exchanged, si.wi, active)
-
-
-def tracked_factor(
-    plan: Plan, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, scattering: Scattering, active: mi.Bool
-) -> mi.Spectrum:
-    """f (C,) with derivatives, of the event that `scattering` is.
-
-    Call under `dr.resume_grad()`. What the scene has no lobes for is not compiled.
-    """
-    f = evaluate(plan, si, bsdf, scattering.wo, active & ~(scattering.is_delta | scattering.is_null))
-    return _singular_factor(plan, si, bsdf, scattering, active, f)
-
-
-def tracked_factors(
-    plan: Plan,
-    si: mi.SurfaceInteraction3f,
-    bsdf: mi.BSDFPtr,
-    connection_wo: mi.Vector3f,
-    connected: mi.Bool,
-    scattering: Scattering,
-    scattered: mi.Bool,
-) -> tuple[mi.Spectrum, mi.Spectrum]:
-    """f (C,) towards the sensor and f along the path, both with derivatives, from one indirect call.
-
-    Call under `dr.resume_grad()`.
-    """
-
-    def both(
-        self: mi.BSDF,
-        si: mi.SurfaceInteraction3f,
-        wo_c: mi.Vector3f,
-        wo_s: mi.Vector3f,
-        connected: mi.Bool,
-        smooth: mi.Bool,
-        any_: mi.Bool,
-    ) -> tuple[mi.Spectrum, mi.Spectrum]:
-        return evaluate(plan, si, self, wo_c, connected), evaluate(plan, si, self, wo_s, smooth)
-
-    smooth = scattered & ~(scattering.is_delta | scattering.is_null)
-    f_c, f_s = dr.dispatch(bsdf, both, si, connection_wo, scattering.wo, connected, smooth, connected | scattered)
-    return f_c, _singular_factor(plan, si, bsdf, scattering, scattered, f_s)
-
-
-def _singular_factor(
-    plan: Plan,
-    si: mi.SurfaceInteraction3f,
-    bsdf: mi.BSDFPtr,
-    scattering: Scattering,
-    active: mi.Bool,
-    f: mi.Spectrum,
-) -> mi.Spectrum:
-    """`f`, replaced where a delta lobe was sampled or light passed straight through, where that has derivatives."""
-    if plan.differentiate_delta:
-        delta = active & scattering.is_delta
-        bs, weight = bsdf.sample(importance_context(), si, scattering.sample_1, scattering.sample_2, delta)
-        pdf = bs.pdf
-        if plan.differentiate_null:
-            # A mask's weight carries the derivative of its opacity already, and so does its density. Other BSDFs divide
-            # by a density that may depend on their parameters (plastic).
-            pdf = dr.select(mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null), dr.detach(pdf), pdf)
-        f = dr.select(delta, weight * pdf, f)
-    if plan.differentiate_null:
-        null = active & scattering.is_null
-        f = dr.select(null, bsdf.eval_null_transmission(si, null), f)
-    return f

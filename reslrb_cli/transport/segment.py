@@ -15,7 +15,8 @@ import mitsuba as mi
 from reslrb_cli.transport.connection import Connection, connect
 from reslrb_cli.transport.numbers import Numbers
 from reslrb_cli.transport.plan import Plan
-from reslrb_cli.transport.scattering import Scattering, scatter, tracked_factor
+from reslrb_cli.transport.scattering import Scattering, scatter
+from reslrb_cli.transport.tracked import tracked_factor
 
 
 @dataclass

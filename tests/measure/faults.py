@@ -162,7 +162,7 @@ FAULTS = [
     Fault("stand_in_without_cosine", "black_texels", "transport.connection:stand_in",
           "connection.weight * f", "connection.weight * dr.inv_pi",
           by("reservoir event gather stack", "walk_ad", "finite_difference")),
-    Fault("delta_lobe_without_probability", "delta_lobes", "transport.scattering:_singular_factor",
+    Fault("delta_lobe_without_probability", "delta_lobes", "transport.tracked:_singular_factor",
           "weight * pdf", "weight", by("reservoir stack", "ptracer")),
     Fault("veil_not_differentiated", "veil", "estimators.base:differentiate_passage",
           "differentiate if p.plan.differentiate_null else None", "None",
