@@ -13,7 +13,7 @@ from reslrb_cli.config import Config, Reslrb, with_integrator
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.optimization.guiding_choice import take_up
 from reslrb_cli.optimization.problem import Problem, assemble_scene
-from reslrb_cli.optimization.state import guiding_of
+from reslrb_cli.optimization.state import guiding_of, restore_tables
 from reslrb_cli.optimization.views import color_channels, to_tensor
 from reslrb_cli.records.checkpoint import NONFINITE_FILE_NAME, NonFiniteStep, load_nonfinite
 from reslrb_cli.records.manifest import FILE_NAME as MANIFEST
@@ -114,9 +114,8 @@ def _teach(problem: Problem, saved: NonFiniteStep, archive: Path) -> None:
         raise ConfigError(archive, "calls", "is missing: what the paths of a guided step were drawn from")
     sensors = [str(number) for number in range(len(problem.scene.sensors()))]
     names = {f"{number}/{what}" for number in saved.calls for what in ("sums", "draws")}
-    problem.integrator.plan(problem.scene, problem.scene.sensors()[problem.sensors[0]])  # makes the grid
     known = names == set(saved.learned) and set(saved.calls) <= set(sensors)
-    wrong = guiding.restore(saved.calls, lambda name: saved.learned[name]) if known else ""
+    wrong = restore_tables(problem, guiding, saved.calls, lambda name: saved.learned[name]) if known else ""
     if wrong is not None:
         where = f"guiding/{wrong}" if wrong else "guiding"
         raise ConfigError(archive, where, "is not what was learned of this scene")

@@ -14,12 +14,14 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from scipy import ndimage
 
 from reslrb_cli.transport.guide import Grid
 
 Array = np.ndarray[Any, Any]
 
 KEEP = 0.75  # what of the past counts beside the newest, each time that a table learns
+BLUR = (0.25, 0.5, 0.25)  # along each number, of neighbouring cells
 FINE = 2.0  # cells, at most, for each path that has been heard
 
 
@@ -47,7 +49,7 @@ class Learned:
         """
         sums = np.float32(KEEP) * self.sums
         means = np.divide(grid.measures(), draws, out=np.zeros(grid.cells), where=draws > 0).astype(np.float32)
-        for voice, said in enumerate(heard.astype(np.float32)):
+        for voice, said in enumerate(heard.astype(np.float32, copy=False)):
             total = said @ means
             if np.isfinite(total) and total > 0:
                 sums[int(voice == len(heard) - 1)] += said / total
@@ -72,16 +74,9 @@ class Learned:
 
 
 def _blurred(grid: Grid, values: Array) -> Array:
-    """Sums over neighbouring cells, weighted by 1/4, 1/2, 1/4 along each number; the cells of one emitter are none of
-    another's neighbours."""
+    """Sums over neighbouring cells, weighted; the cells of one emitter are none of another's neighbours."""
     result = values.reshape(grid.shape)
     for axis in range(1, result.ndim):
         if result.shape[axis] > 1:
-            rows = np.moveaxis(result, axis, 0)
-            result = 0.5 * result
-            to = np.moveaxis(result, axis, 0)
-            to[1:] += 0.25 * rows[:-1]
-            to[:-1] += 0.25 * rows[1:]
-            to[0] += 0.25 * rows[0]
-            to[-1] += 0.25 * rows[-1]
+            result = ndimage.convolve1d(result, BLUR, axis, mode="nearest")
     return result.ravel()

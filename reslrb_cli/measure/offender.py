@@ -74,12 +74,11 @@ def _parts(
 
     Of a guided one the `witness` knows what it was drawn from.
     """
-    sensor = view.sensor
+    scene, sensor = problem.scene, problem.scene.sensors()[view.sensor]
     options = problem.config.integrator.options()
     names = ("max_depth", "rr_depth", "hide_emitters", "sequence")
     shared = {name: options[name] for name in names if name in options}
     tracer = Reslrb.of(estimator="gather", **shared)
-    scene = problem.scene
     # Of what moves light, contributions alone are looked at: `gather` has no derivatives of it.
     params = None if is_attached(problem) else problem.selection.params
     sets = sample_sets(step_seed, problem.config.step_options())
@@ -89,11 +88,11 @@ def _parts(
         wanted, noted = purposes(problem, view), iter(witness.drawn[:])
         tables = [next(noted) if witness.serves(purpose) else None for _, _, purpose in wanted]
         sets = [(sets[place][0] + word, *sets[place][1:]) for place, word, _ in wanted]
+    plan = tracer.plan(scene, sensor, params)
     for (name, samples_seed, spp), table in zip(sets, tables, strict=True):
-        plan = tracer.plan(scene, scene.sensors()[sensor], params)
-        parts = passes(plan, scene, scene.sensors()[sensor], samples_seed, spp, problem.samples_per_pass, table)
+        parts = passes(plan, scene, sensor, samples_seed, spp, problem.samples_per_pass, table)
         for number, samples in enumerate(parts):
-            yield samples, sensor, name if len(parts) == 1 else f"{name}, pass {number + 1}"
+            yield samples, view.sensor, name if len(parts) == 1 else f"{name}, pass {number + 1}"
 
 
 def _set_tangents(problem: Problem) -> None:

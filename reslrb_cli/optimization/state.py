@@ -9,6 +9,7 @@ equal ones follow.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -113,14 +114,21 @@ def guiding_of(problem: Problem) -> Guiding | None:
     return problem.integrator.preparation.guiding if isinstance(problem.integrator, Reslrb) else None
 
 
+def restore_tables(
+    problem: Problem, guiding: Guiding, calls: Mapping[str, int], take: Callable[[str], Array]
+) -> str | None:
+    """Have the tables of the run's integrator go on from what is stored, as `Guiding.restore` does."""
+    problem.integrator.plan(problem.scene, problem.scene.sensors()[problem.sensors[0]])  # makes the grid
+    return guiding.restore(calls, take)
+
+
 def _restore_guiding(problem: Problem, guiding: Guiding, stored: Stored) -> None:
     names = [str(number) for number in range(len(problem.scene.sensors()))]
     gradients = stored.value("guiding")
     if not isinstance(gradients, dict) or not all(name in names for name in gradients):
         raise stored.wrong("guiding", "does not have the gradients of sensors by their numbers")
-    problem.integrator.plan(problem.scene, problem.scene.sensors()[problem.sensors[0]])  # makes the grid
     counts = {name: stored.count("guiding", name) for name in gradients}
-    wrong = guiding.restore(counts, lambda name: stored.archive.array(f"guiding/{name}", kind="f"))
+    wrong = restore_tables(problem, guiding, counts, lambda name: stored.archive.array(f"guiding/{name}", kind="f"))
     if wrong is not None:
         raise stored.wrong(f"guiding/{wrong}", "is not what was learned of this scene")
 
