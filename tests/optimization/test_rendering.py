@@ -1,0 +1,35 @@
+"""Images that are saved: which of them are recorded."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from reslrb_cli.config import load
+from reslrb_cli.optimization import rendering
+from reslrb_cli.optimization.problem import assemble_scene
+
+CONFIG = Path(__file__).resolve().parents[2] / "configs" / "stiff" / "lamp.yaml"
+TINY = ["scene.options={resx: 12, resy: 12}", "integrator.max_depth=2", "integrator.freeze=true"]
+
+
+@pytest.mark.parametrize(("most", "recorded"), [(12 * 12 * 8, True), (12 * 12 * 8 - 1, False)])
+def test_only_small_images_are_recorded(monkeypatch, most, recorded):
+    """The trials of a recording render an image three times more: no gain where that takes long, and it comes once."""
+    monkeypatch.setattr(rendering, "MOST_PATHS_RECORDED", most)
+    problem = assemble_scene(load(CONFIG, TINY))
+    image = problem.render(0, 8, 0, "saved image")
+    assert bool(problem.integrator.preparation.recordings.counts()) == recorded
+    problem.integrator = problem.integrator.with_options(samples_per_pass=None, freeze=False)
+    assert np.array_equal(image, problem.render(0, 8, 0, "saved image"))
+
+
+def test_passes_of_a_large_image_are_not_recorded(monkeypatch):
+    """However small the last of them is."""
+    monkeypatch.setattr(rendering, "PATHS_PER_PASS", 12 * 12 * 4)
+    monkeypatch.setattr(rendering, "MOST_PATHS_RECORDED", 12 * 12 * 3)
+    problem = assemble_scene(load(CONFIG, TINY))
+    problem.render(0, 5, 0, "saved image")
+    assert not problem.integrator.preparation.recordings.counts()
