@@ -7,6 +7,8 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
+from reslrb_cli.backend.own_memory import own_memory
+
 Array = np.ndarray[Any, Any]
 
 
@@ -18,8 +20,8 @@ def to_array(value: Any) -> Array:
 def like(value: Any, array: Array) -> Any:
     """`array` as a value of the type of `value`, in Dr.Jit's own memory.
 
-    `value` and `array` have one shape (`to_array`). Kernels depend on the alignment of NumPy's memory; and a number
-    that was part of a kernel's code (a literal, as Adam's count of steps) is so again, so that the same kernel results.
+    `value` and `array` have one shape (`to_array`). A number that was part of a kernel's code (a literal, as Adam's count of
+    steps) is so again, so that the same kernel results.
     """
     kind = type(value)
     if not dr.is_array_v(value):
@@ -27,15 +29,8 @@ def like(value: Any, array: Array) -> Any:
     if dr.depth_v(kind) == 1 and not dr.is_tensor_v(kind):
         if value.state == dr.VarState.Literal:
             return kind(array.ravel()[0].item())
-        return _own(kind, array)
+        return own_memory(kind, array)
     if dr.is_tensor_v(kind):
-        return kind(_own(dr.array_t(kind), array.ravel()), tuple(array.shape))
+        return kind(own_memory(dr.array_t(kind), array.ravel()), tuple(array.shape))
     parts = [like(part, np.ascontiguousarray(each)) for part, each in zip(value, array, strict=True)]
     return kind(*parts)
-
-
-def _own(kind: Any, array: Array) -> Any:
-    given = kind(np.ascontiguousarray(array))
-    copy = dr.gather(kind, given, dr.arange(dr.uint32_array_t(kind), dr.width(given)))
-    dr.eval(copy)
-    return copy

@@ -11,6 +11,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from reslrb_cli.backend.own_memory import own_memory
 from reslrb_cli.config import Config
 from reslrb_cli.integrators import first_channels
 from reslrb_cli.optimization.exposure import Exposure, add_exposure
@@ -143,10 +144,8 @@ def color_channels(film: mi.Film) -> int:
 
 
 def to_tensor(array: Array) -> mi.TensorXf:
-    """An image (H, W, C) in Dr.Jit's own memory: kernels depend on the alignment of NumPy's, which is random."""
-    tensor = mi.TensorXf(np.ascontiguousarray(array, dtype=np.float32)) + dr.opaque(mi.Float, 0)
-    dr.eval(tensor)
-    return tensor
+    """An image (H, W, C) in Dr.Jit's own memory."""
+    return mi.TensorXf(own_memory(mi.Float, np.ravel(array).astype(np.float32, copy=False)), array.shape)
 
 
 def target_arrays(views: list[View]) -> dict[str, Array]:

@@ -22,6 +22,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from reslrb_cli.backend.own_memory import own_memory
+
 Array = np.ndarray[Any, Any]
 
 UNIFORM = 0.25  # share of paths that start evenly, at least
@@ -129,23 +131,16 @@ class Table:
         """The table in which cell k has `counts[k]` slots, all of them together `grid.slots`."""
         measures = grid.measures()
         weights = np.where(counts > 0, measures * grid.slots / np.maximum(counts, 1), 0)
-        table = Table(
-            _own(mi.UInt32, np.repeat(np.arange(grid.cells), counts).astype(np.uint32)),
-            _own(mi.Float, weights.astype(np.float32)),
-            _own(mi.Float, np.array(grid.edges, np.float32)),
+        return Table(
+            own_memory(mi.UInt32, np.repeat(np.arange(grid.cells), counts).astype(np.uint32)),
+            own_memory(mi.Float, weights.astype(np.float32)),
+            own_memory(mi.Float, np.array(grid.edges, np.float32)),
         )
-        dr.eval(table)
-        return table
 
 
 def even_table(grid: Grid) -> Table:
     """The table of somebody who has learned nothing."""
     return Table.of(grid, apportion(grid, grid.measures()))
-
-
-def _own(kind: Any, array: Array) -> Any:
-    """In Dr.Jit's own memory: kernels depend on the alignment of NumPy's."""
-    return dr.gather(kind, kind(array), dr.arange(mi.UInt32, len(array)))
 
 
 @dataclass

@@ -25,3 +25,16 @@ def test_later_steps_compile_nothing() -> None:
         found = kernels.new(lambda: learn(scene, ours, seed))  # noqa: B023
         # Those that copy a table hang on where NumPy has it.
         assert [kernel["operation_count"] for kernel in found if kernel["operation_count"] >= LARGE] == []
+
+
+def test_a_step_stays_recorded_whatever_its_tables_learn() -> None:
+    """A step that is recorded anew for each new table would, after a few of them, not be recorded any more."""
+    scene, ours, _ = guided("two_emitters", 0, freeze=True)
+    for seed in range(2):
+        learn(scene, ours, seed)
+    recordings = ours.preparation.recordings
+    counts = recordings.counts()
+    assert counts["fused"] > 0
+    for seed in range(2, 12):
+        learn(scene, ours, seed)
+    assert recordings.counts() == counts
