@@ -1,7 +1,7 @@
 """Arrays of NumPy's in Dr.Jit's own memory.
 
-Dr.Jit takes up NumPy's memory as it lies, and compiles and records for its alignment, which is random: the next array of
-the same size may lie otherwise, and then all is compiled and recorded once more.
+Dr.Jit takes up NumPy's memory as it lies, and compiles and records for its alignment, which is random: the next array
+of the same size may lie otherwise, and then all is compiled and recorded once more.
 """
 
 from __future__ import annotations

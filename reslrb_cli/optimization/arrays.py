@@ -20,8 +20,8 @@ def to_array(value: Any) -> Array:
 def like(value: Any, array: Array) -> Any:
     """`array` as a value of the type of `value`, in Dr.Jit's own memory.
 
-    `value` and `array` have one shape (`to_array`). A number that was part of a kernel's code (a literal, as Adam's count of
-    steps) is so again, so that the same kernel results.
+    `value` and `array` have one shape (`to_array`). A number that was part of a kernel's code (a literal, as Adam's
+    count of steps) is so again, so that the same kernel results.
     """
     kind = type(value)
     if not dr.is_array_v(value):
