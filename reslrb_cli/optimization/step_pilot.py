@@ -25,7 +25,7 @@ LOOKS = 3
 #: What is on before the last of these looks has to be surer than it would have to be at the end: looking again and
 #: again must not make what is worth nothing pass.
 CLEAR = 0.99
-#: Walks that a table learns from before it is tried.
+#: Walks that a table learns from before it is tried, where there is time for more than one.
 LEARNINGS = 2
 
 
@@ -70,7 +70,8 @@ class StepPilot(Generic[Record]):
 
     def __init__(self, trial: Trial, sizes: Sizes, views: float, share: float) -> None:
         self._trial, self._sizes, self._views, self._share = trial, sizes, views, share
-        self._spent_ms = self._compile_ms = self._iteration_ms = 0.0
+        self._spent_ms = self._compile_ms = 0.0
+        self._plain: list[Taken] = []  # all steps as they are whose times count
         self._steps: dict[bool, list[Taken]] = {False: [], True: []}
         self._walk = Taken()
 
@@ -79,15 +80,17 @@ class StepPilot(Generic[Record]):
         spp = self._sizes.trial
         self._first(self._trial.take(False, 0, spp))
         plain = self._spend(self._trial.take(False, 0, spp))
-        scale = self._sizes.step / spp
-        self._iteration_ms = self._views * ((plain.kernel_ms + plain.image_ms) * scale + plain.beside_ms)
-        if not self._learned(LEAST_ROUNDS * (1 + self._sizes.longer) * plain.wall_ms):
+        self._plain.append(plain)
+        # What Python takes is the same for both.
+        kernels = (1 + self._sizes.longer) * (plain.kernel_ms + plain.image_ms)
+        if not self._learned(LEAST_ROUNDS * (kernels + 2 * plain.beside_ms)):
             return self._off(f"to measure it would cost more than {100 * self._share:.2g} % of {ITERATIONS} iterations")
         self._first(self._trial.take(True, 0, spp))
         for round in range(1, 1 + LOOKS * self._sizes.rounds):
             both = [self._spend(self._trial.take(other, round, spp)) for other in (False, True)]
             for other, step in zip((False, True), both, strict=True):
                 self._steps[other].append(step)
+            self._plain.append(both[0])
             if not self._affords(sum(step.wall_ms for step in both)):
                 break
             if round % self._sizes.rounds == 0 and self._is_clear():
@@ -98,12 +101,14 @@ class StepPilot(Generic[Record]):
         """Have the table learn, if it has not; False where that, and `beside_ms` more, cannot be afforded."""
         if not self._trial.learns:
             return self._affords(beside_ms)
-        walk = self._first(self._trial.learn(0, self._sizes.learning))  # an estimate: it compiled
-        self._spent_ms += walk.kernel_ms
-        if not self._affords((LEARNINGS - 1) * walk.wall_ms + beside_ms):
+        walk = self._trial.learn(0, self._sizes.learning)
+        if not self._affords(walk.wall_ms + beside_ms):
+            self._first(walk)
             return False
+        self._walk = self._spend(walk)
         for number in range(1, LEARNINGS):
-            self._walk = self._spend(self._trial.learn(number, self._sizes.learning))
+            if self._affords(self._walk.wall_ms + beside_ms):
+                self._walk = self._spend(self._trial.learn(number, self._sizes.learning))
         return True
 
     # --- cost ---------------------------------------------------------------------------------------------------------
@@ -117,6 +122,14 @@ class StepPilot(Generic[Record]):
         self._spent_ms += taken.wall_ms
         self._compile_ms += taken.compile_ms
         return taken
+
+    @property
+    def _iteration_ms(self) -> float:
+        """Of the run: kernels of all its samples, and what goes on beside them for each set that has one dL/dI."""
+        kernels = statistics.median(step.kernel_ms + step.image_ms for step in self._plain)
+        beside = statistics.median(step.beside_ms for step in self._plain)
+        sizes = self._sizes
+        return self._views * (kernels * sizes.step / sizes.trial + beside * (sizes.step // sizes.call))
 
     def _affords(self, more_ms: float) -> bool:
         return self._spent_ms + more_ms <= self._share * ITERATIONS * self._iteration_ms

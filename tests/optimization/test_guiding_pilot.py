@@ -97,7 +97,7 @@ def test_its_share_is_kept(spp: int, overhead: float, python: float, time: float
         assert not record.guided
     else:
         assert record.rounds >= LEAST_ROUNDS
-        assert [call[0] for call in taken].count("learn") == LEARNINGS
+        assert 1 <= [call[0] for call in taken].count("learn") <= LEARNINGS
     # The last round may be longer than those before.
     assert record.share <= SHARE * 1.05
     assert record.share * ITERATIONS * (spp + overhead) == pytest.approx(1e3 * record.measure_s, rel=1e-6)
