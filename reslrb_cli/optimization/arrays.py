@@ -35,7 +35,7 @@ def like(value: Any, array: Array) -> Any:
 
 
 def _own(kind: Any, array: Array) -> Any:
-    given = kind(np.ascontiguousarray(array))
-    copy = dr.gather(kind, given, dr.arange(dr.uint32_array_t(kind), dr.width(given)))
+    # The sum makes the copy: of all entries in their order `dr.gather` returns what it was given.
+    copy = kind(np.ascontiguousarray(array)) + dr.opaque(kind, 0)
     dr.eval(copy)
     return copy

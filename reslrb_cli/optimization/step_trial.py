@@ -103,23 +103,23 @@ class StepTrial:
         """
         jobs = [self._job(view, self._seed(round, view, "learned from"), spp) for view in self.views]
         compile_ms = 0.0
-        if self.table is not None and self.learns:
+        assert self.table is not None
+        if self.learns:
             with self._clock.step() as times:
-                self._teach(jobs)
+                self._teach(self.table, jobs)
             self.table.forget()
             compile_ms = times.wall_ms
         with self._clock.step() as times:
-            self._teach(jobs)
+            self._teach(self.table, jobs)
         taken = _taken(times)
         taken.compile_ms += compile_ms
         return taken
 
-    def _teach(self, jobs: list[Job]) -> None:
-        tracer = self._guided[0]
-        for job, gradient in zip(jobs, self._slopes, strict=True):
-            tracer.learn_now(job, gradient)
+    def _teach(self, table: Guiding, jobs: list[Job]) -> None:
+        for view, job, gradient in zip(self.views, jobs, self._slopes, strict=True):
+            self._guided[0].learn_now(job, gradient)
             for purpose in Purpose if self._adjoint == "independent" else (Purpose.BOTH, Purpose.IMAGE):
-                tracer.passes(job, purpose)
+                table.table(view.sensor, purpose)
 
     def take(self, other: bool, round: int, spp: int) -> Taken:
         """One step of all views."""
