@@ -199,7 +199,7 @@ def make_plan_report(subject: Subject, scene: Any, selection: Selection | str, c
     from reslrb_cli.integrators import Reslrb
     from reslrb_cli.integrators.features import GUIDED, SEQUENCE
     from reslrb_cli.integrators.plan_report import report_plan, with_reason
-    from reslrb_cli.optimization.loading import choose_sensors
+    from reslrb_cli.optimization.loading import choose_sensors, pass_spp
 
     config = subject.config
     if isinstance(selection, str):
@@ -216,6 +216,7 @@ def make_plan_report(subject: Subject, scene: Any, selection: Selection | str, c
     try:
         [sensor, *_] = choose_sensors(config, scene)
         integrator = Reslrb.of(**options)
+        integrator.expect(pass_spp(config))
         params, keys = selection.params, selection.scene_keys
         report = report_plan(integrator, scene, scene.sensors()[sensor], params, keys, known=known, counts=counts)
     except (ConfigError, UnsupportedScene) as error:

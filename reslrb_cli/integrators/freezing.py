@@ -25,6 +25,8 @@ logger = logging.getLogger(__name__)
 
 #: Paths beyond which nothing is recorded: Python does not show beside them, and the trials of a recording would.
 MOST_PATHS = 2**22
+#: Paths beyond which what comes once in a while is not: the trials take as long as three more passes.
+MOST_PATHS_APART = 2**17
 #: Recordings of one kind of call that are kept, for inputs that change in more than their values.
 KEPT = 4
 #: Calls after which a recording is in use, at most: Dr.Jit makes some twice before it trusts them.

@@ -14,12 +14,10 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from reslrb_cli.integrators.hearing import hear
-from reslrb_cli.integrators.learned import Learned
+from reslrb_cli.integrators.learned import Learned, most_cells
 from reslrb_cli.integrators.probing import used_numbers
 from reslrb_cli.transport.guide import CELL_BITS, Grid, Table, apportion, make_grid
 from reslrb_cli.transport.samples import Samples
-from reslrb_cli.transport.splat import AdjointImage
 
 Array = np.ndarray[Any, Any]
 
@@ -43,11 +41,15 @@ def sensor_bytes(grid: Grid) -> int:
     return 4 * (len(Purpose) * (grid.slots + 2 * grid.cells) + 3 * grid.cells)
 
 
-def grid_for(used: Sequence[bool], weights: Sequence[float], sensors: int) -> Grid:
-    """A grid of which so many sensors have tables of their own, as fine as these leave room for; of more they share."""
+def grid_for(used: Sequence[bool], weights: Sequence[float], sensors: int, paths: int | None = None) -> Grid:
+    """A grid of which so many sensors have tables of their own, as fine as these leave room for; of more they share.
+
+    No finer than walks of so many `paths` can ever tell; None: nobody knows how many they will have.
+    """
     grids = (make_grid(used, weights, bits) for bits in range(CELL_BITS, LEAST_BITS, -1))
     fitting = (grid for grid in grids if sensors * sensor_bytes(grid) <= MOST_BYTES)
-    return next(fitting, make_grid(used, weights, LEAST_BITS))
+    grid = next(fitting, make_grid(used, weights, LEAST_BITS))
+    return grid if paths is None else grid.coarser(most_cells(paths))
 
 
 class Guiding:
@@ -59,20 +61,34 @@ class Guiding:
     def __init__(self) -> None:
         self.images, self.held = True, False
         self.grid: Grid | None = None
+        self._emission: tuple[list[bool], list[float], int] | None = None  # what `grid_for` is to know of a scene
         self.learned: dict[int, Learned] = {}  # by the number of their sensor
         self._tables: dict[tuple[int, Purpose], tuple[Table, Array]] = {}
 
     def clear(self) -> None:
         """Forget everything, for a new scene."""
-        self.grid = None
+        self.grid = self._emission = None
+        self.forget()
+
+    def forget(self) -> None:
+        """Forget what has been learned."""
         self.learned.clear()
         self._tables.clear()
 
-    def grid_of(self, samples: Samples) -> Grid:
-        """The grid of the samples' scene, found out once."""
-        if self.grid is None:
+    def grid_of(self, samples: Samples, paths: int | None) -> Grid:
+        """The grid of the samples' scene for walks of so many paths.
+
+        Where it was another before, that had been made for fewer, or for nobody knew how many and nothing was learned:
+        what was learned is kept.
+        """
+        if self._emission is None:
             weights = [float(emitter.sampling_weight()) for emitter in samples.scene.emitters()]
-            self.grid = grid_for(used_numbers(samples), weights, len(samples.scene.sensors()))
+            self._emission = used_numbers(samples), weights, len(samples.scene.sensors())
+        before, self.grid = self.grid, grid_for(*self._emission, paths)
+        if before is not None and before != self.grid:
+            kept = {number: one for number, one in self.learned.items() if number == self._shared(number)}
+            self.learned = {number: one.on(self.grid, before) for number, one in kept.items()}
+            self._tables.clear()
         return self.grid
 
     def serves(self, purpose: Purpose) -> bool:
@@ -143,16 +159,19 @@ class Guiding:
             learned.calls = calls
         return learned is None or calls in FIRST or calls % EVERY == 0
 
-    def learn(self, number: int, samples: Samples, adjoint: AdjointImage) -> None:
-        """Have the table of a sensor learn from samples, drawn from its table for BOTH, which serve nothing else."""
+    def learn(self, number: int, paths: int, heard: mi.Float) -> None:
+        """Have the table of a sensor learn from what so many paths said (`hearing.py`).
+
+        They are drawn from its table for BOTH, and serve nothing else.
+        """
         assert self.grid is not None
         counts, number = self.counts(number, Purpose.BOTH), self._shared(number)
         before = self.learned.get(number)
         if before is None:
             before = Learned.nothing(self.grid)
             before.calls = 1
-        draws = samples.width * (counts / self.grid.slots)
-        self.learned[number] = before.with_more(self.grid, hear(samples, adjoint), draws)
+        said = np.array(heard).reshape(-1, self.grid.cells)
+        self.learned[number] = before.with_more(self.grid, said, paths * (counts / self.grid.slots))
         for purpose in Purpose:
             self._tables.pop((number, purpose), None)
 

@@ -12,11 +12,9 @@ variance of the sum over all paths is made of these.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
-import numpy as np
 
 from reslrb_cli.transport.connection import Connection
 from reslrb_cli.transport.emission import sample_time
@@ -27,8 +25,6 @@ from reslrb_cli.transport.samples import Samples
 from reslrb_cli.transport.scattering import Scattering
 from reslrb_cli.transport.splat import AdjointImage
 from reslrb_cli.transport.walk import walk
-
-Array = np.ndarray[Any, Any]
 
 MOST_BSDFS = 6  # that are heard apart; the others are heard together
 
@@ -99,9 +95,12 @@ class Hearing(Hooks):
         return Heard(counts, state.sums, state.image)
 
 
-def hear(samples: Samples, adjoint: AdjointImage) -> Array:
-    """Sums of squares (voices, cells), float32, of guided samples; what is not finite is not heard."""
-    plan = samples.plan
+def hear(samples: Samples, gradient: mi.TensorXf) -> mi.Float:
+    """Sums of squares (voices * cells), voice by voice, of guided samples with dL/dI `gradient` (H, W, C), evaluated.
+
+    What is not finite is not heard.
+    """
+    plan, adjoint = samples.plan, samples.film.adjoint(gradient)
     assert plan.grid is not None
     loudest = dr.max(dr.abs(dr.select(dr.isfinite(adjoint.image), adjoint.image, 0)))
     loudness = dr.select(loudest > 0, dr.rcp(loudest), 0)
@@ -119,4 +118,4 @@ def hear(samples: Samples, adjoint: AdjointImage) -> Array:
         said = dr.isfinite(value) & (value > 0)
         dr.scatter_reduce(dr.ReduceOp.Add, sums, value, drawn.cell + voice * cells, said)
     dr.eval(sums)
-    return np.array(sums).reshape(len(squares), cells)
+    return sums

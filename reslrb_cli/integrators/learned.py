@@ -10,7 +10,7 @@ more have been heard, the finer they are, up to the grid's own.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -25,6 +25,12 @@ BLUR = (0.25, 0.5, 0.25)  # along each number, of neighbouring cells
 FINE = 2.0  # cells, at most, for each path that has been heard
 
 
+def most_cells(paths: int) -> float:
+    """More cells than can ever be told apart where each walk that is learned from has so many paths: what counts of all
+    of them stays below the sum of the past's geometric series."""
+    return FINE * paths / (1 - KEEP) * (1 - 1e-6)
+
+
 @dataclass
 class Learned:
     """What the paths for one sensor have said: sums of squares (2, cells), about the gradient and about the image, and
@@ -36,6 +42,7 @@ class Learned:
     sums: Array
     draws: Array
     calls: int = 0
+    _densities: tuple[Grid, list[Array]] | None = field(default=None, init=False, repr=False, compare=False)
 
     @staticmethod
     def nothing(grid: Grid) -> Learned:
@@ -55,22 +62,33 @@ class Learned:
                 sums[int(voice == len(heard) - 1)] += said / total
         return Learned(sums, (KEEP * self.draws + draws).astype(np.float32), self.calls)
 
+    def on(self, grid: Grid, before: Grid) -> Learned:
+        """The same about the cells of another grid, of which those of the one before are made, spread evenly."""
+        sums = np.stack([grid.shared_out(row, before) for row in self.sums])
+        return Learned(sums.astype(np.float32), grid.shared_out(self.draws, before).astype(np.float32), self.calls)
+
     def density(self, grid: Grid, share: float) -> Array:
         """How cells are to be drawn (cells,), normalised, before any are shared out evenly: `share` of them by what was
         said about the gradient, the others by what was said about the image.
 
         Cells that few paths have been heard of are put together, all of them alike.
         """
+        if self._densities is None:
+            self._densities = self._both(grid)
+        coarser, (gradient, image) = self._densities
+        return grid.shared_out(share * gradient + (1 - share) * image, coarser)
+
+    def _both(self, grid: Grid) -> tuple[Grid, list[Array]]:
+        """The densities by the gradient and by the image, and the cells that they are of."""
         coarser = grid.coarser(FINE * self.draws.sum(dtype=np.float64))
-        measures, result = coarser.measures(), np.zeros(coarser.cells)
+        measures, found = coarser.measures(), []
         draws = _blurred(coarser, grid.summed(self.draws, coarser))
-        for part, row in zip((share, 1 - share), self.sums, strict=True):
-            if part > 0:
-                square = _blurred(coarser, grid.summed(row, coarser))
-                loud = np.sqrt(np.divide(square, draws, out=np.zeros(coarser.cells), where=draws > 0)) * measures
-                total = loud.sum()
-                result += part * (loud / total if np.isfinite(total) and total > 0 else measures / measures.sum())
-        return grid.shared_out(result, coarser)
+        for row in self.sums:
+            square = _blurred(coarser, grid.summed(row, coarser))
+            loud = np.sqrt(np.divide(square, draws, out=np.zeros(coarser.cells), where=draws > 0)) * measures
+            total = loud.sum()
+            found.append(loud / total if np.isfinite(total) and total > 0 else measures / measures.sum())
+        return coarser, found
 
 
 def _blurred(grid: Grid, values: Array) -> Array:

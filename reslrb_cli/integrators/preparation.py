@@ -94,6 +94,9 @@ class Preparation:
         low_discrepancy: bool = False,
     ) -> None:  # fmt: skip
         self.guiding = Guiding() if guided else None
+        #: Samples per pixel of the passes that tables learn from, where somebody said; else as passes come.
+        self.expected: int | None = None
+        self._met = 0
         self._low_discrepancy = low_discrepancy
         self._depths, self._hide_emitters, self._motion = (max_depth, rr_depth), hide_emitters, motion
         self._scene: tuple[int, mi.Scene | None] | None = None  # its address, and, so that it is not used again, itself
@@ -113,6 +116,7 @@ class Preparation:
         made = Preparation(*self._depths, self._hide_emitters, self._motion, guided, low_discrepancy)
         if made.guiding is not None:
             made.guiding.images = (own is None or own.images) if images is None else images
+        made.expected = self.expected
         return made
 
     def draw_from(self, guiding: Guiding, scene: mi.Scene) -> None:
@@ -120,12 +124,17 @@ class Preparation:
         self._turn_to(scene)  # at first sight of a scene all is forgotten
         self.guiding = guiding
 
-    def plan(self, scene: mi.Scene, sensor: mi.Sensor, params: mi.SceneParameters | None = None) -> Plan:
-        """What a walk of this scene needs; `params` are those to look for derivatives in.
+    def plan(
+        self, scene: mi.Scene, sensor: mi.Sensor, params: mi.SceneParameters | None = None, spp: int | None = None
+    ) -> Plan:
+        """What a walk of this scene needs; `params` are those to look for derivatives in, and `spp` are the samples per
+        pixel of a pass, where it is one that is asked for.
 
         Raises UnsupportedScene for what cannot work.
         """
         self._turn_to(scene)
+        if self.guiding is not None and spp is not None:
+            self._meet(spp, params is not None)
         if sensor.ptr not in self._plans:
             check_supported(scene, sensor, self._hide_emitters)
             needs = scene_needs(scene, sensor)
@@ -155,11 +164,22 @@ class Preparation:
 
     def _with_numbers(self, plan: Plan, samples: Samples) -> Plan:
         """The plan with what says how the numbers of its paths are drawn."""
-        grid = None if self.guiding is None else self.guiding.grid_of(samples)
+        grid = None
+        if self.guiding is not None:
+            spp, sensors = self.expected or self._met, samples.scene.sensors()
+            pixels = max((int(dr.prod(one.film().size())) for one in sensors), default=samples.width)
+            grid = self.guiding.grid_of(samples, spp * pixels or None)
         if not self._low_discrepancy:
             return replace(plan, grid=grid)
         sequence = make_coordinates(used_numbers(samples), len(plan.needs.emitters), plan.max_depth)
         return replace(plan, grid=grid, sequence=sequence)
+
+    def _meet(self, spp: int, differentiated: bool) -> None:
+        """Have cells so fine as passes of so many samples per pixel can tell: those of the first pass, whatever it is
+        for, and of gradients that have more. An image that has more paths teaches the tables nothing."""
+        if self.expected is None and (self._met == 0 or (differentiated and spp > self._met)):
+            self._met = spp
+            self._plans.clear()  # they have the grid
 
     def _bounces_in(self, plan: Plan, scene: mi.Scene, sensor: mi.Sensor) -> bool:
         """Whether vertices have to stay. Asked once, since kernels would be compiled anew for another answer."""
@@ -177,6 +197,7 @@ class Preparation:
             self._plans.clear()
             self._owners.clear()
             self._bounce.clear()
+            self._met = 0
             self._renewal = None
             self.recordings.clear()
             if self.guiding is not None:

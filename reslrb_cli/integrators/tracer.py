@@ -19,6 +19,7 @@ from reslrb_cli.estimators import Estimator
 from reslrb_cli.integrators import freezing
 from reslrb_cli.integrators import light_tracer as lt
 from reslrb_cli.integrators.guiding import Purpose, learning_seed
+from reslrb_cli.integrators.hearing import hear
 from reslrb_cli.integrators.interface import Derivative, Job
 from reslrb_cli.integrators.preparation import Motion, Preparation
 from reslrb_cli.transport.accumulation import in_passes
@@ -86,6 +87,13 @@ class LightTracer:
         those of the run nothing, which is then the same whether they were measured now or by an earlier one."""
         return self if self.preparation.guiding is None else self.afresh()
 
+    def expect(self, spp: int) -> None:
+        """Be told how many samples per pixel there are in each pass that tables learn from, whatever passes come first.
+
+        A run says so: it is then the same whether it begins or goes on.
+        """
+        self.preparation.expected = spp
+
     def plan(self, scene: mi.Scene, sensor: mi.Sensor, params: mi.SceneParameters | None = None) -> Plan:
         """What a walk of this scene needs, with derivatives of `params`, if any.
 
@@ -99,7 +107,8 @@ class LightTracer:
         The `purpose` says what guided samples are drawn by; None: for the gradient, or the image where there is none.
         """
         spp = job.spp or job.sensor.sampler().sample_count()
-        plan, table = self.plan(job.scene, job.sensor, job.params), None
+        unit = min(self.samples_per_pass or spp, spp)
+        plan, table = self.preparation.plan(job.scene, job.sensor, job.params, unit), None
         guiding = self.preparation.guiding
         if guiding is not None:
             purpose = purpose or (Purpose.IMAGE if job.params is None else Purpose.GRADIENT)
@@ -122,7 +131,11 @@ class LightTracer:
         assert guiding is not None
         with dr.suspend_grad():
             samples = self.passes(replace(job, seed=learning_seed(job.seed)), Purpose.BOTH)[0]
-            guiding.learn(_number(job), samples, samples.film.adjoint(gradient))
+            if self.freezes([samples]) and samples.width <= freezing.MOST_PATHS_APART:
+                heard = self.preparation.recordings.call("hear", samples, hear, gradient)
+            else:
+                heard = hear(samples, gradient)
+            guiding.learn(_number(job), samples.width, heard)
 
     def image_estimator(self) -> Estimator | None:
         """The estimator that makes images of its own; None where they show every connection."""

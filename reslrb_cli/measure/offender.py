@@ -16,7 +16,7 @@ import numpy as np
 from reslrb_cli.integrators import Reslrb, gradient_step, sample_sets
 from reslrb_cli.measure.offender_paths import search_paths
 from reslrb_cli.measure.offender_tables import Witness, purposes
-from reslrb_cli.optimization.loading import LIGHT_TRACERS
+from reslrb_cli.optimization.loading import LIGHT_TRACERS, pass_spp
 from reslrb_cli.optimization.moving import is_attached
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.state import guiding_of
@@ -84,6 +84,7 @@ def _parts(
     sets = sample_sets(step_seed, problem.config.step_options())
     tables: list[Table | None] = [None] * len(sets)
     if witness is not None:
+        tracer.expect(pass_spp(problem.config))
         tracer.preparation.draw_from(witness, scene)  # for the sake of its grid
         wanted, noted = purposes(problem, view), iter(witness.drawn[:])
         tables = [next(noted) if witness.serves(purpose) else None for _, _, purpose in wanted]

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+import mitsuba as mi
+
 from reslrb_cli.integrators.guiding import Guiding, Purpose
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.views import View
 from reslrb_cli.transport.guide import Table
-from reslrb_cli.transport.samples import Samples
-from reslrb_cli.transport.splat import AdjointImage
 
 
 class Witness(Guiding):
@@ -28,10 +28,10 @@ class Witness(Guiding):
         self.drawn.append(found)
         return found
 
-    def learn(self, number: int, samples: Samples, adjoint: AdjointImage) -> None:
-        """Have the table of a sensor learn from samples, which were drawn for this alone."""
+    def learn(self, number: int, paths: int, heard: mi.Float) -> None:
+        """Have the table of a sensor learn from paths that were drawn for this alone."""
         self.drawn.pop()
-        super().learn(number, samples, adjoint)
+        super().learn(number, paths, heard)
 
 
 def purposes(problem: Problem, view: View) -> list[tuple[int, str, Purpose]]:

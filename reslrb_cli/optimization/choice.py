@@ -18,6 +18,7 @@ from reslrb_cli.estimators import ESTIMATORS
 from reslrb_cli.integrators import Reslrb as Tracer
 from reslrb_cli.optimization.budget import MemoryPlan, choose_samples, standing
 from reslrb_cli.optimization.guiding_pilot import SHARE as GUIDING_SHARE
+from reslrb_cli.optimization.loading import pass_spp
 from reslrb_cli.optimization.moving import ATTACHED, is_attached
 from reslrb_cli.optimization.pilot import SHARE, Pilot
 from reslrb_cli.optimization.pilot_records import Candidate, Measured, Outcome
@@ -108,6 +109,7 @@ def _fitting(problem: Problem, integrator: Reslrb, choices: list[dict[str, Any]]
     for choice in choices:
         own = (integrator.chosen(**choice) if choice else integrator.undecided_off()).options()
         made = Tracer.of(**own)
+        made.expect(pass_spp(problem.config))
         check_memory(problem, made)
         if budget is None:
             options.append(Option(choice, made, None))

@@ -63,6 +63,12 @@ def make_configured(integrator: Integrator) -> StepIntegrator:
     return make_integrator(integrator.type, **options)
 
 
+def pass_spp(config: Config) -> int:
+    """Samples per pixel of each pass of a step's gradient; where passes are chosen by `run.memory_budget`, at most."""
+    call = config.run.spp // config.run.batches if config.adjoint == "batched" else config.run.spp
+    return min(samples_per_pass(config) or call, call)
+
+
 def samples_per_pass(config: Config) -> int | None:
     """The integrator's own bound on the samples of a pass."""
     value = config.integrator.options().get("samples_per_pass")

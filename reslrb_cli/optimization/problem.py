@@ -22,6 +22,7 @@ from reslrb_cli.optimization.loading import (
     choose_sensors,
     load_configured,
     make_configured,
+    pass_spp,
     samples_per_pass,
 )
 from reslrb_cli.optimization.moving import check_moving
@@ -222,6 +223,8 @@ def assemble_scene(config: Config, scene: Any = None, values: Mapping[str, Array
         samples_per_pass=samples_per_pass(config),
         quantities={key: _quantity(selection, key) for key in selection.keys},
     )
+    if isinstance(problem.integrator, LightTracer):
+        problem.integrator.expect(pass_spp(config))
     problem.apply()
     check_moving(problem)
     return problem

@@ -9,6 +9,7 @@ import drjit as dr
 import numpy as np
 
 from reslrb_cli.integrators import Reslrb, render_image
+from reslrb_cli.integrators.freezing import MOST_PATHS_APART
 from reslrb_cli.seeds import seed
 
 if TYPE_CHECKING:
@@ -16,9 +17,6 @@ if TYPE_CHECKING:
 
 #: Paths in one pass. Baselines keep the state of every path in memory; 2**22 of them stay below 2 GB.
 PATHS_PER_PASS = 2**22
-#: Paths beyond which a pass is not recorded. The trials of a recording take as long as three more passes, and it saves
-#: 5 ms of Python each time that the image comes again, which most do not: targets, and those of a run's two ends.
-MOST_PATHS_RECORDED = 2**17
 #: Samples per pixel of images that are saved between the first and the last, at least.
 BETWEEN_SPP = 64
 
@@ -64,7 +62,7 @@ def render_in_passes(
     """
     width, height = scene.sensors()[sensor].film().crop_size()
     pixels = int(width) * int(height)
-    if isinstance(integrator, Reslrb) and min(spp * pixels, PATHS_PER_PASS) > MOST_PATHS_RECORDED:
+    if isinstance(integrator, Reslrb) and min(spp * pixels, PATHS_PER_PASS) > MOST_PATHS_APART:
         integrator = integrator.with_options(samples_per_pass=integrator.samples_per_pass, freeze=False)
     total: np.ndarray[Any, Any] | None = None
     for number, part in enumerate(passes(spp, pixels, multiple)):

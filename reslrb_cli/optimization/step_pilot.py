@@ -1,8 +1,9 @@
 """Whether another way of drawing samples pays here: steps that draw so take turns with steps as they are.
 
-Gradients have dL/dI held at one image's, so that both kinds estimate the same. Times are those of kernels. Where steps
-draw from a table that paths before them have made, it is learned first, and held: none of the steps' paths is one that
-it learned from.
+Gradients have dL/dI held at one image's, so that both kinds estimate the same. Times are those of kernels, and, alike
+for both kinds, what goes on beside them in a run for as many samples: it counts where iterations take milliseconds.
+Where steps draw from a table that paths before them have made, it is learned first, and held: none of the steps' paths
+is one that it learned from.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ LOOKS = 3
 #: What is on before the last of these looks has to be surer than it would have to be at the end: looking again and
 #: again must not make what is worth nothing pass.
 CLEAR = 0.99
-#: Walks that a table learns from before it is tried.
+#: Walks that a table learns from before it is tried, where there is time for more than one.
 LEARNINGS = 2
 
 
@@ -70,7 +71,8 @@ class StepPilot(Generic[Record]):
 
     def __init__(self, trial: Trial, sizes: Sizes, views: float, share: float) -> None:
         self._trial, self._sizes, self._views, self._share = trial, sizes, views, share
-        self._spent_ms = self._compile_ms = self._iteration_ms = 0.0
+        self._spent_ms = self._compile_ms = 0.0
+        self._plain: list[Taken] = []  # all steps as they are whose times count
         self._steps: dict[bool, list[Taken]] = {False: [], True: []}
         self._walk = Taken()
 
@@ -79,31 +81,37 @@ class StepPilot(Generic[Record]):
         spp = self._sizes.trial
         self._first(self._trial.take(False, 0, spp))
         plain = self._spend(self._trial.take(False, 0, spp))
-        scale = self._sizes.step / spp
-        self._iteration_ms = self._views * ((plain.kernel_ms + plain.image_ms) * scale + plain.beside_ms)
-        if not self._learned(LEAST_ROUNDS * (1 + self._sizes.longer) * plain.wall_ms):
+        self._plain.append(plain)
+        # What Python takes is the same for both.
+        kernels = (1 + self._sizes.longer) * (plain.kernel_ms + plain.image_ms)
+        if not self._learned(kernels + 2 * plain.beside_ms):
             return self._off(f"to measure it would cost more than {100 * self._share:.2g} % of {ITERATIONS} iterations")
         self._first(self._trial.take(True, 0, spp))
         for round in range(1, 1 + LOOKS * self._sizes.rounds):
             both = [self._spend(self._trial.take(other, round, spp)) for other in (False, True)]
             for other, step in zip((False, True), both, strict=True):
                 self._steps[other].append(step)
+            self._plain.append(both[0])
             if not self._affords(sum(step.wall_ms for step in both)):
                 break
             if round % self._sizes.rounds == 0 and self._is_clear():
                 break
         return self._decided()
 
-    def _learned(self, beside_ms: float) -> bool:
-        """Have the table learn, if it has not; False where that, and `beside_ms` more, cannot be afforded."""
+    def _learned(self, round_ms: float) -> bool:
+        """Have the table learn, if it has not; False where that, and rounds of so long, cannot be afforded."""
         if not self._trial.learns:
-            return self._affords(beside_ms)
-        walk = self._first(self._trial.learn(0, self._sizes.learning))  # an estimate: it compiled
-        self._spent_ms += walk.kernel_ms
-        if not self._affords((LEARNINGS - 1) * walk.wall_ms + beside_ms):
+            return self._affords(LEAST_ROUNDS * round_ms)
+        walk = self._trial.learn(0, self._sizes.learning)
+        if not self._affords(walk.wall_ms + LEAST_ROUNDS * round_ms):
+            self._first(walk)
             return False
+        self._walk = self._spend(walk)
+        # What one walk more would gain is little beside what rounds that are too few leave open.
+        rounds = max(self._sizes.rounds // 2, LEAST_ROUNDS)
         for number in range(1, LEARNINGS):
-            self._walk = self._spend(self._trial.learn(number, self._sizes.learning))
+            if self._affords(self._walk.wall_ms + rounds * round_ms):
+                self._walk = self._spend(self._trial.learn(number, self._sizes.learning))
         return True
 
     # --- cost ---------------------------------------------------------------------------------------------------------
@@ -117,6 +125,18 @@ class StepPilot(Generic[Record]):
         self._spent_ms += taken.wall_ms
         self._compile_ms += taken.compile_ms
         return taken
+
+    @property
+    def _iteration_ms(self) -> float:
+        """Of the run: kernels of all its samples, and what goes on beside them for each set that has one dL/dI."""
+        kernels = statistics.median(step.kernel_ms + step.image_ms for step in self._plain)
+        return self._views * (kernels + self._python_ms) * self._sizes.step / self._sizes.trial
+
+    @property
+    def _python_ms(self) -> float:
+        """What goes on beside the kernels of `trial` samples in a run, which has it once for each `call`."""
+        beside = statistics.median(step.beside_ms for step in self._plain)
+        return beside * self._sizes.trial / self._sizes.call
 
     def _affords(self, more_ms: float) -> bool:
         return self._spent_ms + more_ms <= self._share * ITERATIONS * self._iteration_ms
@@ -139,10 +159,10 @@ class StepPilot(Generic[Record]):
     def _gain(self, images: bool, confidence: float = CONFIDENCE) -> Gain:
         """Of the gradient, as part of steps whose images, where they have samples of their own, are drawn so or not."""
         plain, other = self._steps[False], self._steps[True]
-        beside = 0.0, self._more_ms()
+        beside = self._python_ms, self._python_ms + self._more_ms()
         if self._sizes.alone:
             own = [statistics.median(step.image_ms for step in steps) for steps in (plain, other)]
-            beside = own[0], own[images] + beside[1]
+            beside = beside[0] + own[0], beside[1] + own[images]
         times = [[s.kernel_ms + more for s in steps] for steps, more in zip((plain, other), beside, strict=True)]
         gradients = [[step.gradients for step in steps] for steps in (plain, other)]
         return compare(gradients[0], times[0], gradients[1], times[1], confidence)
@@ -152,8 +172,10 @@ class StepPilot(Generic[Record]):
         plain, other = self._steps[False], self._steps[True]
         images = [[step.images for step in steps] for steps in (plain, other)]
         times = [[s.image_ms if self._sizes.alone else s.kernel_ms for s in steps] for steps in (plain, other)]
-        more = 0.0 if self._sizes.alone else self._more_ms()  # it counts once
-        return compare(images[0], times[0], images[1], [ms + more for ms in times[1]])
+        if not self._sizes.alone:  # else both count once, with the gradient
+            more = self._python_ms, self._python_ms + self._more_ms()
+            times = [[ms + one for ms in row] for row, one in zip(times, more, strict=True)]
+        return compare(images[0], times[0], images[1], times[1])
 
     def _is_clear(self) -> bool:
         """Whether no more steps are needed: it is not on by accident, or off at all events."""

@@ -96,14 +96,30 @@ class StepTrial:
         return to_tensor(np.nan_to_num(slope(view.objective, np.array(image)), nan=0.0, posinf=0.0, neginf=0.0))
 
     def learn(self, round: int, spp: int) -> Taken:
-        """Have the table learn, and be ready to be drawn from, as it is from then on."""
+        """Have the table learn, and be ready to be drawn from, as it is from then on.
+
+        The first time all of it is done before as well, and forgotten: what that compiles and records is no part of the
+        time.
+        """
+        jobs = [self._job(view, self._seed(round, view, "learned from"), spp) for view in self.views]
+        compile_ms = 0.0
+        assert self.table is not None
+        if self.learns:
+            with self._clock.step() as times:
+                self._teach(self.table, jobs)
+            self.table.forget()
+            compile_ms = times.wall_ms
         with self._clock.step() as times:
-            for view, gradient in zip(self.views, self._slopes, strict=True):
-                job = self._job(view, self._seed(round, view, "learned from"), spp)
-                self._guided[0].learn_now(job, gradient)
-                for purpose in Purpose if self._adjoint == "independent" else (Purpose.BOTH, Purpose.IMAGE):
-                    self._guided[0].passes(job, purpose)
-        return _taken(times)
+            self._teach(self.table, jobs)
+        taken = _taken(times)
+        taken.compile_ms += compile_ms
+        return taken
+
+    def _teach(self, table: Guiding, jobs: list[Job]) -> None:
+        for view, job, gradient in zip(self.views, jobs, self._slopes, strict=True):
+            self._guided[0].learn_now(job, gradient)
+            for purpose in Purpose if self._adjoint == "independent" else (Purpose.BOTH, Purpose.IMAGE):
+                table.table(view.sensor, purpose)
 
     def take(self, other: bool, round: int, spp: int) -> Taken:
         """One step of all views."""

@@ -14,6 +14,7 @@ side by side. At least UNIFORM of all slots are shared out evenly, so that no ta
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -66,8 +67,8 @@ class Grid:
         return (self.emitters, *(1 << bits for bits in reversed(self.bits)))
 
     def measures(self) -> Array:
-        """v_k of all cells, float64; they sum to 1."""
-        return np.repeat(np.diff(self.edges), 1 << sum(self.bits)) / (1 << sum(self.bits))
+        """v_k of all cells, float64, not to be written to; they sum to 1."""
+        return _measures(self)
 
     def coarser(self, cells: float) -> Grid:
         """The same cut into at most so many cells, or one of each emitter; each is made of this one's."""
@@ -93,6 +94,23 @@ class Grid:
         return result.ravel()
 
 
+@functools.lru_cache(maxsize=4)
+def _measures(grid: Grid) -> Array:
+    # Every table that is made asks for them, several times.
+    result = np.repeat(np.diff(grid.edges) / (1 << sum(grid.bits)), 1 << sum(grid.bits))
+    result.setflags(write=False)
+    return result
+
+
+@functools.lru_cache(maxsize=4)
+def _least_slots(grid: Grid) -> Array:
+    """Slots that each cell has at least, float64: UNIFORM of its measure."""
+    measures = grid.measures()
+    result = np.where(measures > 0, np.maximum(np.ceil(UNIFORM * grid.slots * measures - 1e-6), 1), 0)
+    result.setflags(write=False)
+    return result
+
+
 def make_grid(used: Sequence[bool], weights: Sequence[float], cell_bits: int = CELL_BITS) -> Grid:
     """A grid of at most 2^cell_bits cells for emitters of these sampling weights, cut along the used numbers."""
     if not sum(weights) > 0:
@@ -110,12 +128,16 @@ def make_grid(used: Sequence[bool], weights: Sequence[float], cell_bits: int = C
 
 def apportion(grid: Grid, density: Array) -> Array:
     """Slots of each cell (int64), at least UNIFORM of its measure, the others in proportion to `density`."""
-    measures, slots = grid.measures(), grid.slots
-    least = np.where(measures > 0, np.maximum(np.ceil(UNIFORM * slots * measures - 1e-6), 1), 0)
+    least = _least_slots(grid)
     # Rounded along the cells' order, so that what one loses a neighbour gains.
-    reached = np.cumsum(density / density.sum())
-    ends = np.rint((slots - least.sum()) * (reached / reached[-1]))
-    return np.asarray(least + np.diff(ends, prepend=0), np.int64)
+    ends = np.cumsum(density)
+    ends *= (grid.slots - least.sum()) / ends[-1]
+    np.rint(ends, out=ends)
+    counts = least.copy()
+    counts[0] += ends[0]
+    counts[1:] += ends[1:]
+    counts[1:] -= ends[:-1]
+    return counts.astype(np.int64)
 
 
 @dataclass
@@ -129,10 +151,10 @@ class Table:
     @staticmethod
     def of(grid: Grid, counts: Array) -> Table:
         """The table in which cell k has `counts[k]` slots, all of them together `grid.slots`."""
-        measures = grid.measures()
-        weights = np.where(counts > 0, measures * grid.slots / np.maximum(counts, 1), 0)
+        weights = grid.measures() * grid.slots  # 0 where there is no slot
+        weights /= np.maximum(counts, 1)
         return Table(
-            own_memory(mi.UInt32, np.repeat(np.arange(grid.cells), counts).astype(np.uint32)),
+            own_memory(mi.UInt32, np.repeat(np.arange(grid.cells, dtype=np.uint32), counts)),
             own_memory(mi.Float, weights.astype(np.float32)),
             own_memory(mi.Float, np.array(grid.edges, np.float32)),
         )

@@ -109,6 +109,7 @@ def learned_in_its_midst(patch: pytest.MonkeyPatch) -> None:
     """Tables learn from an image's samples before these are replayed, and so with another table."""
     from reslrb_cli.integrators import light_tracer as lt
     from reslrb_cli.integrators.guiding import Purpose
+    from reslrb_cli.integrators.hearing import hear
     from reslrb_cli.integrators.reslrb import Reslrb
 
     right = Reslrb._replay
@@ -120,7 +121,7 @@ def learned_in_its_midst(patch: pytest.MonkeyPatch) -> None:
         assert guiding is not None
         [samples] = trace.samples
         with dr.suspend_grad():
-            guiding.learn(0, samples, samples.film.adjoint(gradient))
+            guiding.learn(0, samples.width, hear(samples, gradient))
         again = replace(samples, guide=replace(samples.guide, table=guiding.table(0, Purpose.BOTH)))
         right(self, lt.Trace([again], trace.image, trace.state), gradient, params)
 

@@ -135,6 +135,7 @@ def test_exact_estimators_agree_at_equal_seeds(name: str) -> None:
     for adjoint in ("correlated", "independent"):
         reference = scene.gradient(ours, 5, SPP, adjoint=adjoint)
         for _, other, _ in others:
+            other.expect(SPP)
             other.plan(scene.scene, scene.scene.sensors()[0], scene.params)
             other.preparation.guiding.learned = dict(learned)
             assert relative(scene.gradient(other, 5, SPP, adjoint=adjoint), reference) < 1e-4
@@ -143,6 +144,7 @@ def test_exact_estimators_agree_at_equal_seeds(name: str) -> None:
 def test_a_recorded_step_is_the_step() -> None:
     scene, ours, _ = guided("envmap", 2)
     _, frozen, _ = guided("envmap", 0, freeze=True)
+    frozen.expect(SPP)
     frozen.plan(scene.scene, scene.scene.sensors()[0], scene.params)
     guiding = frozen.preparation.guiding
     for steps in range(3):  # tables change, and recordings have them all the same

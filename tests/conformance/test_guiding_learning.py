@@ -1,0 +1,130 @@
+"""How tables of guided emission learn: from recorded walks as from plain ones, of cells that passes can tell apart."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from conformance.test_guiding import SPP, guided, sample
+
+from reslrb_cli.integrators import freezing
+from reslrb_cli.integrators.guiding import grid_for
+from reslrb_cli.integrators.learned import FINE, KEEP, Learned, most_cells
+from reslrb_cli.transport.guide import Grid, Table, apportion, make_grid
+
+pytestmark = pytest.mark.usefixtures("llvm")
+
+SIDE = 16  # pixels of the film
+
+
+def taught(name: str, steps: int, **options: Any) -> Any:
+    """The tracer of a case after so many gradients, each of which its tables learned from."""
+    scene, ours, _ = guided(name, 0, **options)
+    ours.preparation.guiding.due = lambda number: True
+    for seed in range(steps):
+        sample(scene, ours, seed)
+    return ours
+
+
+@pytest.mark.parametrize("name", ["two_emitters", "envmap"])
+def test_what_a_recorded_walk_says_is_what_a_plain_one_does(name: str) -> None:
+    """Bit by bit; and tables that have changed are no reason to record anew."""
+    plain, recorded = (taught(name, 7, freeze=freeze) for freeze in (False, True))
+    for one, other in zip(*(each.preparation.guiding.learned.values() for each in (plain, recorded)), strict=True):
+        np.testing.assert_array_equal(one.sums, other.sums)
+        np.testing.assert_array_equal(one.draws, other.draws)
+    counts = recorded.preparation.recordings.counts()
+    assert 1 <= counts["hear"] <= 2
+    assert counts["fused"] <= 2
+
+
+def test_walks_of_many_paths_are_not_recorded(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(freezing, "MOST_PATHS_APART", 1)
+    counts = taught("two_emitters", 2, freeze=True).preparation.recordings.counts()
+    assert "hear" not in counts
+    assert counts["fused"] > 0
+
+
+def test_tables_lie_where_every_kernel_finds_them_alike() -> None:
+    """In memory that Dr.Jit aligns, wherever NumPy has what they are made of."""
+    grid, kept = make_grid([True] * 4, [1.0, 2.0], 8), []
+    for number in range(20):
+        counts = apportion(grid, np.random.default_rng(number).random(grid.cells))
+        table = Table.of(grid, counts.astype(np.uint32))
+        kept.append((table, np.zeros(number)))
+        for array in (table.slots, table.weights, table.edges):
+            assert array.numpy().ctypes.data % 32 == 0
+
+
+# ---- Cells -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("paths", [100, 4096, 20_000, 10**7])
+@pytest.mark.parametrize("weights", [[1.0], [1.0, 1e-3, 2.0]])
+def test_a_grid_is_as_fine_as_its_walks_can_ever_tell(paths: int, weights: list[float]) -> None:
+    finest = grid_for([True] * 4, weights, 1)
+    grid = grid_for([True] * 4, weights, 1, paths)
+    assert finest.coarser(grid.cells) == grid  # made of the same cuts
+    heard, used = 0.0, []
+    for _ in range(200):
+        heard = KEEP * heard + paths
+        used.append(finest.coarser(min(FINE * heard, most_cells(paths))).cells)
+    assert max(used) == grid.cells <= finest.cells
+
+
+def test_a_grid_of_few_cells_says_what_the_finest_does() -> None:
+    """Of the same paths, heard by either: each of its cells is drawn as those are that it is made of."""
+    finest, paths = make_grid([True] * 4, [1.0, 3.0], 14), 500
+    grid = finest.coarser(most_cells(paths))
+    assert grid.cells < finest.cells
+    random, both = np.random.default_rng(7), [Learned.nothing(each) for each in (finest, grid)]
+    for _ in range(3):
+        heard, draws = random.gamma(0.1, size=(3, finest.cells)), paths * finest.measures()
+        both[0] = both[0].with_more(finest, heard, draws)
+        few = np.stack([finest.summed(row, grid) for row in heard])
+        both[1] = both[1].with_more(grid, few, finest.summed(draws, grid))
+        for share in (0.0, 0.5, 1.0):
+            expected = finest.summed(both[0].density(finest, share), grid)
+            np.testing.assert_allclose(both[1].density(grid, share), expected, rtol=1e-4)
+    again = both[1].on(finest, grid)  # what was learned is kept where cells become finer
+    np.testing.assert_allclose(again.density(finest, 0.2), both[0].density(finest, 0.2), rtol=1e-4)
+
+
+def cells_after(*calls: Any, told: int | None = None) -> list[Grid]:
+    """The grid after each of some calls on a tracer, which may be told the samples of its passes."""
+    scene, ours, _ = guided("two_emitters", 0)
+    del ours.preparation.guiding.due
+    if told is not None:
+        ours.expect(told)
+    found = []
+    for spp, differentiated in calls:
+        if differentiated:
+            scene.gradient(ours, 1, spp, adjoint="correlated")
+        else:
+            scene.image(ours, 1, spp)
+        found.append(ours.preparation.guiding.grid)
+        gradients = [one[0] for one in calls[: len(found)] if one[1]]
+        for learned in ours.preparation.guiding.learned.values():
+            assert learned.draws.size == found[-1].cells
+            assert learned.calls == len(gradients)
+            # It has learned from the first two, as far as there are two.
+            assert learned.draws.sum() > 0.99 * KEEP * SIDE * SIDE * sum(gradients[:2])
+        assert (ours.preparation.guiding.learned == {}) == (gradients == [])
+    return found
+
+
+def test_the_first_pass_settles_the_grid_and_gradients_of_more_samples_refine_it() -> None:
+    small, image, large, again = cells_after((1, True), (64, False), (64, True), (1, True))
+    assert small == image
+    assert 16 * small.cells <= large.cells <= 128 * small.cells
+    assert large.coarser(small.cells) == small
+    assert again == large
+    first, gradient = cells_after((64, False), (1, True))
+    assert first == gradient == large
+
+
+def test_a_run_that_says_so_has_the_same_grid_whatever_comes_first() -> None:
+    grids = [*cells_after((SPP, False), (4, True), (SPP, True), told=4), *cells_after((4, True), (64, True), told=4)]
+    assert len(set(grids)) == 1
+    assert grids[0] == cells_after((4, True))[0]
