@@ -16,18 +16,24 @@ import numpy as np
 
 from reslrb_cli.integrators.hearing import hear
 from reslrb_cli.integrators.learned import Learned
+from reslrb_cli.integrators.onward import Onward
 from reslrb_cli.integrators.probing import used_numbers
 from reslrb_cli.transport.guide import CELL_BITS, Grid, Table, apportion, make_grid
 from reslrb_cli.transport.samples import Samples
 from reslrb_cli.transport.splat import AdjointImage
+from reslrb_cli.transport.survival import CELLS, Survival, box_of
 
 Array = np.ndarray[Any, Any]
 
 FIRST = (1, 2, 4)  # gradients of a sensor after which its table learns, and then
 EVERY = 7  # after every so many
 LEAST_BITS = 16  # cells, log2, however many sensors there are
-MOST_BYTES = 2**26  # of all tables together; sensors for which there is no room share
+MOST_BYTES = 66 * 2**20  # of all tables together; sensors for which there is no room share
 LEARNING_STREAM = 0x1EA2  # seeds of the samples that tables learn from
+
+
+#: Names of the arrays of each sensor in what has been learned.
+KNOWN = ("sums", "draws", "onward", "frame")
 
 
 class Purpose(enum.Enum):
@@ -40,7 +46,8 @@ class Purpose(enum.Enum):
 
 def sensor_bytes(grid: Grid) -> int:
     """Bytes for one sensor: a table for each purpose, and what has been learned."""
-    return 4 * (len(Purpose) * (grid.slots + 2 * grid.cells) + 3 * grid.cells)
+    emission = len(Purpose) * (grid.slots + 2 * grid.cells) + 3 * grid.cells
+    return 4 * (emission + (len(Purpose) + 4) * CELLS)
 
 
 def grid_for(used: Sequence[bool], weights: Sequence[float], sensors: int) -> Grid:
@@ -59,6 +66,7 @@ class Guiding:
     def __init__(self) -> None:
         self.images, self.held = True, False
         self.grid: Grid | None = None
+        self.box = np.zeros((2, 3), np.float32)  # of the scene, as it was first seen
         self.learned: dict[int, Learned] = {}  # by the number of their sensor
         self._tables: dict[tuple[int, Purpose], tuple[Table, Array]] = {}
 
@@ -73,6 +81,7 @@ class Guiding:
         if self.grid is None:
             weights = [float(emitter.sampling_weight()) for emitter in samples.scene.emitters()]
             self.grid = grid_for(used_numbers(samples), weights, len(samples.scene.sensors()))
+            self.box = box_of(samples.scene)
         return self.grid
 
     def serves(self, purpose: Purpose) -> bool:
@@ -94,8 +103,15 @@ class Guiding:
             learned = self.learned.get(number)
             density = self.grid.measures() if learned is None else learned.density(self.grid, purpose.value)
             counts = apportion(self.grid, density).astype(np.uint32)
-            self._tables[number, purpose] = Table.of(self.grid, counts), counts
+            onward = self._onward(number)
+            survival = Survival.of(onward.box, onward.chances(purpose.value))
+            self._tables[number, purpose] = Table.of(self.grid, counts, survival), counts
         return self._tables[number, purpose]
+
+    def _onward(self, number: int) -> Onward:
+        """What is known of where the paths for a sensor go on to, `number` being what its tables are kept under."""
+        learned = self.learned.get(number)
+        return Onward.nothing(self.box) if learned is None or learned.onward is None else learned.onward
 
     def _shared(self, number: int) -> int:
         """The number of the sensor that the tables are kept under."""
@@ -114,7 +130,8 @@ class Guiding:
         """What has been learned: the number of gradients of each sensor, and arrays by `<sensor>/<what>`."""
         arrays: dict[str, Array] = {}
         for number, learned in self.learned.items():
-            arrays |= {f"{number}/sums": learned.sums, f"{number}/draws": learned.draws}
+            found = {"sums": learned.sums, "draws": learned.draws, **self._onward(number).arrays()}
+            arrays |= {f"{number}/{name}": array for name, array in found.items()}
         return {str(number): learned.calls for number, learned in self.learned.items()}, arrays
 
     def restore(self, calls: Mapping[str, int], take: Callable[[str], Array]) -> str | None:
@@ -129,7 +146,10 @@ class Guiding:
             for name, array, rows in (("sums", sums, (2,)), ("draws", draws, ())):
                 if array.shape != (*rows, self.grid.cells) or not (np.isfinite(array) & (array >= 0)).all():
                     return f"{number}/{name}"
-            found[int(number)] = Learned(sums.astype(np.float32), draws.astype(np.float32), count)
+            onward = Onward.taken({name: take(f"{number}/{name}") for name in KNOWN[2:]})
+            if isinstance(onward, str):
+                return f"{number}/{onward}"
+            found[int(number)] = Learned(sums.astype(np.float32), draws.astype(np.float32), count, onward)
         self.learned, self._tables = found, {}
         return None
 
@@ -152,7 +172,8 @@ class Guiding:
             before = Learned.nothing(self.grid)
             before.calls = 1
         draws = samples.width * (counts / self.grid.slots)
-        self.learned[number] = before.with_more(self.grid, hear(samples, adjoint), draws)
+        heard, walked = hear(samples, adjoint)
+        self.learned[number] = before.with_more(self.grid, heard, draws, self._onward(number).with_more(walked))
         for purpose in Purpose:
             self._tables.pop((number, purpose), None)
 

@@ -11,13 +11,15 @@ variance of the sum over all paths is made of these.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from reslrb_cli.integrators.onward import Walked
+from reslrb_cli.integrators.trail import Trail, walk_back
 from reslrb_cli.transport.connection import Connection
 from reslrb_cli.transport.emission import sample_time
 from reslrb_cli.transport.factors import Product
@@ -52,11 +54,13 @@ def voices(plan: Plan) -> int:
 @dataclass
 class Heard:
     """Loop state. `counts` says how often a group's BSDFs have been met, `sums` are G (C,): of the groups, of emission,
-    of what moves. `image` is sum_i |C_i|^2."""
+    of what moves. `image` is sum_i |C_i|^2, `light` the weight that the path left the emitter with."""
 
     counts: list[mi.UInt32]
     sums: list[mi.Spectrum]
     image: mi.Float
+    light: mi.Float
+    trail: Trail
 
 
 class Hearing(Hooks):
@@ -65,10 +69,14 @@ class Hearing(Hooks):
     def __init__(self, samples: Samples, adjoint: AdjointImage, loudness: mi.Float) -> None:
         self.samples, self.adjoint, self.loudness = samples, adjoint, loudness
         self.groups = bsdf_groups(samples.plan)
+        assert samples.guide is not None
+        self.survival = samples.guide.table.survival
 
     def start(self, product: Product) -> Heard:
-        sums = [mi.Spectrum(0) for _ in range(voices(self.samples.plan) - 1)]
-        return Heard([mi.UInt32(0) for _ in self.groups], sums, mi.Float(0))
+        number = voices(self.samples.plan) - 1
+        light = dr.max(dr.abs(product.weight()))
+        sums = [mi.Spectrum(0) for _ in range(number)]
+        return Heard([mi.UInt32(0) for _ in self.groups], sums, mi.Float(0), light, Trail.begin(number))
 
     def _met(self, group: tuple[mi.BSDF, ...], vertex: Vertex) -> mi.UInt32:
         met = mi.Bool(not group)
@@ -87,20 +95,28 @@ class Hearing(Hooks):
             parts.append(said)
         if plan.attached:
             parts.append(dr.abs(said))
-        value = dr.select(active, C.value(), 0)
+        image = dr.squared_norm(dr.select(active, C.value(), 0))
         sums = [total + part for total, part in zip(state.sums, parts, strict=True)]
-        return Heard(state.counts, sums, state.image + dr.squared_norm(value))
+        return replace(state, sums=sums, image=state.image + image, trail=state.trail.said(parts, image))
 
     def scattering(self, state: Heard, vertex: Vertex, connection: Connection, scattering: Scattering) -> Heard:
         counts = [
             count + dr.select(scattering.active, self._met(group, vertex), 0)
             for count, group in zip(state.counts, self.groups, strict=True)
         ]
-        return Heard(counts, state.sums, state.image)
+        throughput = dr.max(dr.abs(vertex.product.times(scattering.weight, vertex.depth).weight()))
+        inverse = dr.select(scattering.active & (throughput > 0), dr.rcp(throughput), 0)
+        state.trail.leaves(self.survival.cell(vertex.si.p, scattering.d), inverse)
+        return replace(state, counts=counts)
+
+    def survived(self, state: Heard, weight: mi.Float) -> Heard:
+        state.trail.survives(weight)
+        return state
 
 
-def hear(samples: Samples, adjoint: AdjointImage) -> Array:
-    """Sums of squares (voices, cells), float32, of guided samples; what is not finite is not heard."""
+def hear(samples: Samples, adjoint: AdjointImage) -> tuple[Array, Walked]:
+    """Of guided samples, sums of squares (voices, cells), float32, by the cell that paths start in, and what they go on
+    to say from where they are; what is not finite is not heard."""
     plan = samples.plan
     assert plan.grid is not None
     loudest = dr.max(dr.abs(dr.select(dr.isfinite(adjoint.image), adjoint.image, 0)))
@@ -118,5 +134,10 @@ def hear(samples: Samples, adjoint: AdjointImage) -> Array:
         value = square / dr.square(drawn.weight)
         said = dr.isfinite(value) & (value > 0)
         dr.scatter_reduce(dr.ReduceOp.Add, sums, value, drawn.cell + voice * cells, said)
-    dr.eval(sums)
-    return np.array(sums).reshape(len(squares), cells)
+    length = mi.Float(heard.trail.count)
+    dr.schedule(sums, squares, heard.light, length)  # one kernel: what is evaluated apart would be traced again
+    onward = walk_back(heard.trail)
+    finite = (dr.select(dr.isfinite(value), value, 0) for value in (*squares, heard.light))
+    *said, light = (float(np.array(value, np.float64).mean()) for value in finite)
+    walked = Walked(*onward, np.array(said), light, 1 + float(np.array(length, np.float64).mean()))
+    return np.array(sums).reshape(len(squares), cells), walked

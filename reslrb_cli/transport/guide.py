@@ -15,12 +15,14 @@ side by side. At least UNIFORM of all slots are shared out evenly, so that no ta
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+
+from reslrb_cli.transport.survival import Survival
 
 Array = np.ndarray[Any, Any]
 
@@ -118,14 +120,15 @@ def apportion(grid: Grid, density: Array) -> Array:
 
 @dataclass
 class Table:
-    """What is drawn from: of each slot its cell, of each cell v / p, and the grid's edges."""
+    """What is drawn from: of each slot its cell, of each cell v / p, and the grid's edges; and which paths go on."""
 
     slots: mi.UInt32
     weights: mi.Float
     edges: mi.Float
+    survival: Survival = field(default_factory=Survival.certain)
 
     @staticmethod
-    def of(grid: Grid, counts: Array) -> Table:
+    def of(grid: Grid, counts: Array, survival: Survival | None = None) -> Table:
         """The table in which cell k has `counts[k]` slots, all of them together `grid.slots`."""
         measures = grid.measures()
         weights = np.where(counts > 0, measures * grid.slots / np.maximum(counts, 1), 0)
@@ -133,6 +136,7 @@ class Table:
             _own(mi.UInt32, np.repeat(np.arange(grid.cells), counts).astype(np.uint32)),
             _own(mi.Float, weights.astype(np.float32)),
             _own(mi.Float, np.array(grid.edges, np.float32)),
+            survival or Survival.certain(),
         )
         dr.eval(table)
         return table
