@@ -22,7 +22,7 @@ from reslrb_cli.transport.survival import BITS, CELLS, LEAST, Survival
 
 pytestmark = pytest.mark.usefixtures("llvm")
 
-NAMES = ("texture", "two_emitters", "envmap", "roulette", "glass", "mask", "texture_zeros")
+NAMES = ("texture", "two_emitters", "envmap", "roulette", "glass", "mask", "mask_texture_in_view")
 BOX = np.array([[-1.0, -2.0, 0.0], [3.0, 2.0, 0.0]], np.float32)  # flat
 
 
@@ -161,6 +161,67 @@ def test_what_is_heard_is_what_there_is_whatever_roulette_ends(fault: str | None
     result = compare(heard("two_emitters", harsh, 24, 0), heard("two_emitters", certain, 24, 1), block=None)
     print(fault, result)
     assert bool(result) == (fault is None)
+
+
+def test_what_follows_a_bounce_is_heard_where_its_ray_left() -> None:
+    """Against sums in NumPy over the paths of the same seed, vertex by vertex, of what they say about the image."""
+    import drjit as dr
+    import mitsuba as mi
+
+    from reslrb_cli.transport.hooks import Hooks
+    from reslrb_cli.transport.walk import walk
+
+    class Keeping(Hooks):
+        """Of each path: where it leaves the first vertex, its throughput then, and what the second one says."""
+
+        def __init__(self, width: int) -> None:
+            self.kept = dr.zeros(mi.Float, 10 * width)
+            self.lane = 10 * dr.arange(mi.UInt32, width)
+
+        def keep(self, first: int, active: Any, *values: Any) -> None:
+            for k, value in enumerate(values):
+                dr.scatter(self.kept, mi.Float(value), self.lane + (first + k), active)
+
+        def connection(self, state: Any, vertex: Any, connection: Any, numbers: Any) -> Any:
+            C = vertex.product.times(connection.c, vertex.depth).value()
+            self.keep(8, vertex.depth == 2, dr.select(connection.active, dr.squared_norm(C), 0), 1)
+            return state
+
+        def scattering(self, state: Any, vertex: Any, connection: Any, scattering: Any) -> Any:
+            weight = dr.max(vertex.product.times(scattering.weight, vertex.depth).value())
+            self.keep(0, (vertex.depth == 1) & scattering.active, 1, weight, *vertex.si.p, *scattering.d)
+            return state
+
+    scene, ours, _ = guided("two_emitters", 1, max_depth=3)
+    certain(scene, ours)
+    found = walk_of(scene, ours, 5)
+    job = Job(scene.scene, scene.scene.sensors()[0], learning_seed(5), SPP, scene.params)
+    leaves = scene.leaves()  # what is differentiated has a part in how lamps are drawn
+    [samples] = ours.passes(job, Purpose.BOTH)
+    scene.release(leaves)
+    hooks = Keeping(samples.width)
+    with dr.suspend_grad():
+        dr.eval(walk(samples, hooks), hooks.kept)
+    rows = np.array(hooks.kept, np.float64).reshape(-1, 10)
+    rows = rows[(rows[:, 0] > 0) & (rows[:, 1] > 0)].T
+    cell = np.array(samples.guide.table.survival.cell(mi.Point3f(*rows[2:5]), mi.Vector3f(*rows[5:8])))
+    for values, sums in ((rows[0], found.left), (rows[9], found.followed), (rows[8] / rows[1] ** 2, found.squares[-1])):
+        assert values.any()
+        np.testing.assert_allclose(np.bincount(cell, values, CELLS), sums, rtol=1e-3, atol=1e-6 * sums.max())
+
+
+def test_vertices_that_find_no_room_are_summed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of walks of two bounces rays leave the first vertex alone: there is room for that, or for both."""
+    from reslrb_cli.integrators import trail
+
+    scene, ours, _ = guided("two_emitters", 1, max_depth=3)
+    found = []
+    for places in (32, 1):
+        monkeypatch.setattr(trail, "PLACES", places)
+        found.append(walk_of(scene, ours, 5))
+    assert found[0].left.sum() > 0
+    for name in ("squares", "followed", "left"):
+        np.testing.assert_allclose(getattr(found[1], name), getattr(found[0], name), rtol=1e-4)
 
 
 # ---- The means -------------------------------------------------------------------------------------------------------

@@ -190,7 +190,7 @@ def test_a_run_says_so_once_remembers_it_and_writes_it_down(
     assert again.guided.to_json() == {**found, "cached": True}
     row = next(line for line in inspected(capsys, str(RUN)) if "guided emission" in line)
     assert row.split()[0] == "needed"
-    assert "524288 cells, 42.0 MiB" in row
+    assert "524288 cells, 42.9 MiB" in row
     assert f"guiding: auto, {found['gain']:.2g} times the efficiency here (" in row
     row = next(line for line in inspected(capsys, "tiny.yaml", "--set", AUTO[0]) if "guided emission" in line)
     assert row.startswith("  left out")
