@@ -18,7 +18,7 @@ from reslrb_cli.integrators.interface import Job
 from reslrb_cli.integrators.onward import FLOOR, LEAN, SURE, Onward, Walked
 from reslrb_cli.measure.gradients import Case, relative
 from reslrb_cli.measure.statistics import compare
-from reslrb_cli.transport.survival import BITS, CELLS, LEAST, Survival
+from reslrb_cli.transport.survival import BITS, CELLS, LEAST, SHAPE, Survival
 
 pytestmark = pytest.mark.usefixtures("llvm")
 
@@ -82,10 +82,14 @@ def walked(**changes: Any) -> Walked:
     return replace(Walked(np.zeros((2, CELLS)), zeros, zeros, np.array([4.0, 9.0]), 2.0, 3.0), **changes)
 
 
+def cell_of(x: int, y: int, z: int) -> int:
+    return int(np.ravel_multi_index((x, y, z, 3), SHAPE))
+
+
 def test_cells_lean_on_those_about_them_and_none_is_given_up() -> None:
     """The formula of the docstring where a cell is well known; of one that nobody has met, that of its neighbours."""
     left = np.zeros(CELLS)
-    loud, quiet = 8 * 5 + 3, CELLS - 1
+    loud, near, quiet, far = (cell_of(*cube) for cube in ((10, 10, 10), (10, 10, 11), (1, 1, 1), (1, 14, 1)))
     left[[loud, quiet]] = 1e6
     squares = np.zeros((2, CELLS))
     squares[0, loud], squares[1, loud] = 1e6 * 0.25 * 4, 1e6 * 0.5 * 9
@@ -96,8 +100,8 @@ def test_cells_lean_on_those_about_them_and_none_is_given_up() -> None:
         assert s[loud] == pytest.approx(SURE * np.sqrt(square * 4 / 2.2 * 3) / 2, rel=2e-3)
         assert s[quiet] == pytest.approx(SURE * np.sqrt(FLOOR * square / 2 * 4 / 2.2 * 3) / 2, rel=2e-3)
         assert (s >= s[quiet] * (1 - 1e-6)).all()
-        assert s[8 * 4 + 3] == pytest.approx(s[loud], rel=1e-3)  # in the same larger cube
-        assert s[quiet] < s[8 * 64 + 3] < s[loud]  # nowhere near, in the same octant
+        assert s[near] == pytest.approx(s[loud], rel=1e-3)  # in the same larger cube
+        assert s[far] == pytest.approx(s[loud] / np.sqrt(2), rel=1e-3)  # near neither
     assert 1e6 > 1e3 * LEAN
 
 
