@@ -11,6 +11,7 @@ import numpy as np
 
 from reslrb_cli.config import Config, Reslrb, with_integrator
 from reslrb_cli.errors import ConfigError
+from reslrb_cli.integrators.guiding import KNOWN
 from reslrb_cli.optimization.guiding_choice import take_up
 from reslrb_cli.optimization.problem import Problem, assemble_scene
 from reslrb_cli.optimization.state import guiding_of, restore_tables
@@ -113,7 +114,7 @@ def _teach(problem: Problem, saved: NonFiniteStep, archive: Path) -> None:
     if saved.calls is None:
         raise ConfigError(archive, "calls", "is missing: what the paths of a guided step were drawn from")
     sensors = [str(number) for number in range(len(problem.scene.sensors()))]
-    names = {f"{number}/{what}" for number in saved.calls for what in ("sums", "draws")}
+    names = {f"{number}/{what}" for number in saved.calls for what in KNOWN}
     known = names == set(saved.learned) and set(saved.calls) <= set(sensors)
     wrong = restore_tables(problem, guiding, saved.calls, lambda name: saved.learned[name]) if known else ""
     if wrong is not None:

@@ -14,10 +14,13 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from reslrb_cli.integrators.hearing import Said
 from reslrb_cli.integrators.learned import Learned, most_cells
+from reslrb_cli.integrators.onward import Onward
 from reslrb_cli.integrators.probing import used_numbers
 from reslrb_cli.transport.guide import CELL_BITS, Grid, Table, apportion, make_grid
 from reslrb_cli.transport.samples import Samples
+from reslrb_cli.transport.survival import CELLS, Survival, box_of
 
 Array = np.ndarray[Any, Any]
 
@@ -26,6 +29,10 @@ EVERY = 7  # after every so many
 LEAST_BITS = 16  # cells, log2, however many sensors there are
 MOST_BYTES = 2**26  # of all tables together; sensors for which there is no room share
 LEARNING_STREAM = 0x1EA2  # seeds of the samples that tables learn from
+
+
+#: Names of the arrays of each sensor in what has been learned.
+KNOWN = ("sums", "draws", "onward", "frame")
 
 
 class Purpose(enum.Enum):
@@ -38,7 +45,8 @@ class Purpose(enum.Enum):
 
 def sensor_bytes(grid: Grid) -> int:
     """Bytes for one sensor: a table for each purpose, and what has been learned."""
-    return 4 * (len(Purpose) * (grid.slots + 2 * grid.cells) + 3 * grid.cells)
+    emission = len(Purpose) * (grid.slots + 2 * grid.cells) + 3 * grid.cells
+    return 4 * (emission + (len(Purpose) + 4) * CELLS)
 
 
 def grid_for(used: Sequence[bool], weights: Sequence[float], sensors: int, paths: int | None = None) -> Grid:
@@ -62,6 +70,7 @@ class Guiding:
         self.images, self.held = True, False
         self.grid: Grid | None = None
         self._emission: tuple[list[bool], list[float], int] | None = None  # what `grid_for` is to know of a scene
+        self.box = np.zeros((2, 3), np.float32)  # of the scene, as it was first seen
         self.learned: dict[int, Learned] = {}  # by the number of their sensor
         self._tables: dict[tuple[int, Purpose], tuple[Table, Array]] = {}
 
@@ -84,6 +93,7 @@ class Guiding:
         if self._emission is None:
             weights = [float(emitter.sampling_weight()) for emitter in samples.scene.emitters()]
             self._emission = used_numbers(samples), weights, len(samples.scene.sensors())
+            self.box = box_of(samples.scene)
         before, self.grid = self.grid, grid_for(*self._emission, paths)
         if before is not None and before != self.grid:
             kept = {number: one for number, one in self.learned.items() if number == self._shared(number)}
@@ -110,8 +120,15 @@ class Guiding:
             learned = self.learned.get(number)
             density = self.grid.measures() if learned is None else learned.density(self.grid, purpose.value)
             counts = apportion(self.grid, density).astype(np.uint32)
-            self._tables[number, purpose] = Table.of(self.grid, counts), counts
+            onward = self._onward(number)
+            survival = Survival.of(onward.box, onward.chances(purpose.value))
+            self._tables[number, purpose] = Table.of(self.grid, counts, survival), counts
         return self._tables[number, purpose]
+
+    def _onward(self, number: int) -> Onward:
+        """What is known of where the paths for a sensor go on to, `number` being what its tables are kept under."""
+        learned = self.learned.get(number)
+        return Onward.nothing(self.box) if learned is None or learned.onward is None else learned.onward
 
     def _shared(self, number: int) -> int:
         """The number of the sensor that the tables are kept under."""
@@ -130,7 +147,8 @@ class Guiding:
         """What has been learned: the number of gradients of each sensor, and arrays by `<sensor>/<what>`."""
         arrays: dict[str, Array] = {}
         for number, learned in self.learned.items():
-            arrays |= {f"{number}/sums": learned.sums, f"{number}/draws": learned.draws}
+            found = {"sums": learned.sums, "draws": learned.draws, **self._onward(number).arrays()}
+            arrays |= {f"{number}/{name}": array for name, array in found.items()}
         return {str(number): learned.calls for number, learned in self.learned.items()}, arrays
 
     def restore(self, calls: Mapping[str, int], take: Callable[[str], Array]) -> str | None:
@@ -145,7 +163,10 @@ class Guiding:
             for name, array, rows in (("sums", sums, (2,)), ("draws", draws, ())):
                 if array.shape != (*rows, self.grid.cells) or not (np.isfinite(array) & (array >= 0)).all():
                     return f"{number}/{name}"
-            found[int(number)] = Learned(sums.astype(np.float32), draws.astype(np.float32), count)
+            onward = Onward.taken({name: take(f"{number}/{name}") for name in KNOWN[2:]})
+            if isinstance(onward, str):
+                return f"{number}/{onward}"
+            found[int(number)] = Learned(sums.astype(np.float32), draws.astype(np.float32), count, onward)
         self.learned, self._tables = found, {}
         return None
 
@@ -159,7 +180,7 @@ class Guiding:
             learned.calls = calls
         return learned is None or calls in FIRST or calls % EVERY == 0
 
-    def learn(self, number: int, paths: int, heard: mi.Float) -> None:
+    def learn(self, number: int, paths: int, said: Said) -> None:
         """Have the table of a sensor learn from what so many paths said (`hearing.py`).
 
         They are drawn from its table for BOTH, and serve nothing else.
@@ -170,8 +191,9 @@ class Guiding:
         if before is None:
             before = Learned.nothing(self.grid)
             before.calls = 1
-        said = np.array(heard).reshape(-1, self.grid.cells)
-        self.learned[number] = before.with_more(self.grid, said, paths * (counts / self.grid.slots))
+        onward = self._onward(number).with_more(said.walked(paths))
+        draws = paths * (counts / self.grid.slots)
+        self.learned[number] = before.with_more(self.grid, said.by_start(self.grid.cells), draws, onward)
         for purpose in Purpose:
             self._tables.pop((number, purpose), None)
 

@@ -11,11 +11,15 @@ variance of the sum over all paths is made of these.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
+from reslrb_cli.integrators.onward import Walked
+from reslrb_cli.integrators.trail import Onwards, Trail, walk_back
 from reslrb_cli.transport.connection import Connection
 from reslrb_cli.transport.emission import sample_time
 from reslrb_cli.transport.factors import Product
@@ -26,7 +30,10 @@ from reslrb_cli.transport.scattering import Scattering
 from reslrb_cli.transport.splat import AdjointImage
 from reslrb_cli.transport.walk import walk
 
+Array = np.ndarray[Any, Any]
+
 MOST_BSDFS = 6  # that are heard apart; the others are heard together
+BINS = 1024  # of sums over all paths, so that none loses small numbers
 
 
 def bsdf_groups(plan: Plan) -> list[tuple[mi.BSDF, ...]]:
@@ -48,11 +55,13 @@ def voices(plan: Plan) -> int:
 @dataclass
 class Heard:
     """Loop state. `counts` says how often a group's BSDFs have been met, `sums` are G (C,): of the groups, of emission,
-    of what moves. `image` is sum_i |C_i|^2."""
+    of what moves. `image` is sum_i |C_i|^2, `light` the weight that the path left the emitter with."""
 
     counts: list[mi.UInt32]
     sums: list[mi.Spectrum]
     image: mi.Float
+    light: mi.Float
+    trail: Trail
 
 
 class Hearing(Hooks):
@@ -61,10 +70,14 @@ class Hearing(Hooks):
     def __init__(self, samples: Samples, adjoint: AdjointImage, loudness: mi.Float) -> None:
         self.samples, self.adjoint, self.loudness = samples, adjoint, loudness
         self.groups = bsdf_groups(samples.plan)
+        assert samples.guide is not None
+        self.survival = samples.guide.table.survival
 
     def start(self, product: Product) -> Heard:
-        sums = [mi.Spectrum(0) for _ in range(voices(self.samples.plan) - 1)]
-        return Heard([mi.UInt32(0) for _ in self.groups], sums, mi.Float(0))
+        number = voices(self.samples.plan) - 1
+        light = dr.max(dr.abs(product.weight()))
+        sums = [mi.Spectrum(0) for _ in range(number)]
+        return Heard([mi.UInt32(0) for _ in self.groups], sums, mi.Float(0), light, Trail.begin(number))
 
     def _met(self, group: tuple[mi.BSDF, ...], vertex: Vertex) -> mi.UInt32:
         met = mi.Bool(not group)
@@ -83,23 +96,50 @@ class Hearing(Hooks):
             parts.append(said)
         if plan.attached:
             parts.append(dr.abs(said))
-        value = dr.select(active, C.value(), 0)
+        image = dr.squared_norm(dr.select(active, C.value(), 0))
         sums = [total + part for total, part in zip(state.sums, parts, strict=True)]
-        return Heard(state.counts, sums, state.image + dr.squared_norm(value))
+        return replace(state, sums=sums, image=state.image + image, trail=state.trail.said(parts, image))
 
     def scattering(self, state: Heard, vertex: Vertex, connection: Connection, scattering: Scattering) -> Heard:
         counts = [
             count + dr.select(scattering.active, self._met(group, vertex), 0)
             for count, group in zip(state.counts, self.groups, strict=True)
         ]
-        return Heard(counts, state.sums, state.image)
+        throughput = dr.max(dr.abs(vertex.product.times(scattering.weight, vertex.depth).weight()))
+        inverse = dr.select(scattering.active & (throughput > 0), dr.rcp(throughput), 0)
+        state.trail.leaves(self.survival.cell(vertex.si.p, scattering.d), inverse)
+        return replace(state, counts=counts)
+
+    def survived(self, state: Heard, weight: mi.Float) -> Heard:
+        state.trail.survives(weight)
+        return state
 
 
-def hear(samples: Samples, gradient: mi.TensorXf) -> mi.Float:
-    """Sums of squares (voices * cells), voice by voice, of guided samples with dL/dI `gradient` (H, W, C), evaluated.
+@dataclass
+class Said:
+    """What guided samples have said, evaluated: sums over paths.
 
-    What is not finite is not heard.
+    `starts` (voices * cells), voice by voice, are squares by the cell that a path starts in; `onward` is what paths go
+    on to say from where they are; `whole` (rows * BINS) are squares by voice, the weights that paths left emitters
+    with, and their vertices.
     """
+
+    starts: mi.Float
+    onward: Onwards
+    whole: mi.Float
+
+    def by_start(self, cells: int) -> Array:
+        """Sums of squares (voices, cells), float32."""
+        return np.array(self.starts).reshape(-1, cells)
+
+    def walked(self, paths: int) -> Walked:
+        """What that says of where paths go on to."""
+        *said, light, count = np.array(self.whole, np.float64).reshape(-1, BINS).sum(1) / paths
+        return Walked(*self.onward.arrays(len(said)), np.array(said), float(light), 1 + float(count))
+
+
+def hear(samples: Samples, gradient: mi.TensorXf) -> Said:
+    """What guided samples with dL/dI `gradient` (H, W, C) say; what is not finite is not heard."""
     plan, adjoint = samples.plan, samples.film.adjoint(gradient)
     assert plan.grid is not None
     loudest = dr.max(dr.abs(dr.select(dr.isfinite(adjoint.image), adjoint.image, 0)))
@@ -115,7 +155,18 @@ def hear(samples: Samples, gradient: mi.TensorXf) -> mi.Float:
     sums = dr.zeros(mi.Float, len(squares) * cells)
     for voice, square in enumerate(squares):
         value = square / dr.square(drawn.weight)
-        said = dr.isfinite(value) & (value > 0)
-        dr.scatter_reduce(dr.ReduceOp.Add, sums, value, drawn.cell + voice * cells, said)
-    dr.eval(sums)
-    return sums
+        counts = dr.isfinite(value) & (value > 0)
+        dr.scatter_reduce(dr.ReduceOp.Add, sums, value, drawn.cell + voice * cells, counts)
+    # All is one kernel: what is evaluated apart would be traced again.
+    whole = _sums([*squares, heard.light, mi.Float(heard.trail.count)], samples.width)
+    said = Said(sums, walk_back(heard.trail), whole)
+    dr.eval(said)
+    return said
+
+
+def _sums(values: list[mi.Float], width: int) -> mi.Float:
+    """Sums (len(values) * BINS) over paths, what is not finite left out."""
+    result, lane = dr.zeros(mi.Float, len(values) * BINS), dr.arange(mi.UInt32, width) % BINS
+    for number, value in enumerate(values):
+        dr.scatter_reduce(dr.ReduceOp.Add, result, value, lane + number * BINS, dr.isfinite(value))
+    return result

@@ -16,11 +16,11 @@ from typing import Any
 import numpy as np
 from scipy import ndimage
 
+from reslrb_cli.integrators.onward import KEEP, Onward
 from reslrb_cli.transport.guide import Grid
 
 Array = np.ndarray[Any, Any]
 
-KEEP = 0.75  # what of the past counts beside the newest, each time that a table learns
 BLUR = (0.25, 0.5, 0.25)  # along each number, of neighbouring cells
 FINE = 2.0  # cells, at most, for each path that has been heard
 
@@ -36,12 +36,14 @@ class Learned:
     """What the paths for one sensor have said: sums of squares (2, cells), about the gradient and about the image, and
     how many started in each cell.
 
-    `calls` is the number of gradients so far. Arrays are float32, and never changed.
+    `calls` is the number of gradients so far. Arrays are float32, and never changed. `onward` is what paths went on to
+    say from where they were; None where nothing of that is known.
     """
 
     sums: Array
     draws: Array
     calls: int = 0
+    onward: Onward | None = None
     _densities: tuple[Grid, list[Array]] | None = field(default=None, init=False, repr=False, compare=False)
 
     @staticmethod
@@ -49,10 +51,10 @@ class Learned:
         """Before the first gradient."""
         return Learned(np.zeros((2, grid.cells), np.float32), np.zeros(grid.cells, np.float32))
 
-    def with_more(self, grid: Grid, heard: Array, draws: Array) -> Learned:
+    def with_more(self, grid: Grid, heard: Array, draws: Array, onward: Onward | None = None) -> Learned:
         """With what newer paths have said (voices, cells), the image last, `draws` (cells) of them.
 
-        Each voice is scaled to a total of 1.
+        Each voice is scaled to a total of 1. `onward` has learned from the same paths already.
         """
         sums = np.float32(KEEP) * self.sums
         means = np.divide(grid.measures(), draws, out=np.zeros(grid.cells), where=draws > 0).astype(np.float32)
@@ -60,12 +62,13 @@ class Learned:
             total = said @ means
             if np.isfinite(total) and total > 0:
                 sums[int(voice == len(heard) - 1)] += said / total
-        return Learned(sums, (KEEP * self.draws + draws).astype(np.float32), self.calls)
+        return Learned(sums, (KEEP * self.draws + draws).astype(np.float32), self.calls, onward)
 
     def on(self, grid: Grid, before: Grid) -> Learned:
         """The same about the cells of another grid, of which those of the one before are made, spread evenly."""
         sums = np.stack([grid.shared_out(row, before) for row in self.sums])
-        return Learned(sums.astype(np.float32), grid.shared_out(self.draws, before).astype(np.float32), self.calls)
+        draws = grid.shared_out(self.draws, before).astype(np.float32)
+        return Learned(sums.astype(np.float32), draws, self.calls, self.onward)
 
     def density(self, grid: Grid, share: float) -> Array:
         """How cells are to be drawn (cells,), normalised, before any are shared out evenly: `share` of them by what was

@@ -132,10 +132,10 @@ class LightTracer:
         with dr.suspend_grad():
             samples = self.passes(replace(job, seed=learning_seed(job.seed)), Purpose.BOTH)[0]
             if self.freezes([samples]) and samples.width <= freezing.MOST_PATHS_APART:
-                heard = self.preparation.recordings.call("hear", samples, hear, gradient)
+                said = self.preparation.recordings.call("hear", samples, hear, gradient)
             else:
-                heard = hear(samples, gradient)
-            guiding.learn(_number(job), samples.width, heard)
+                said = hear(samples, gradient)
+            guiding.learn(_number(job), samples.width, said)
 
     def image_estimator(self) -> Estimator | None:
         """The estimator that makes images of its own; None where they show every connection."""

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import mitsuba as mi
-
 from reslrb_cli.integrators.guiding import Guiding, Purpose
+from reslrb_cli.integrators.hearing import Said
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.views import View
 from reslrb_cli.transport.guide import Table
@@ -28,10 +27,10 @@ class Witness(Guiding):
         self.drawn.append(found)
         return found
 
-    def learn(self, number: int, paths: int, heard: mi.Float) -> None:
+    def learn(self, number: int, paths: int, said: Said) -> None:
         """Have the table of a sensor learn from paths that were drawn for this alone."""
         self.drawn.pop()
-        super().learn(number, paths, heard)
+        super().learn(number, paths, said)
 
 
 def purposes(problem: Problem, view: View) -> list[tuple[int, str, Purpose]]:

@@ -56,7 +56,7 @@ def _record(problem: Problem, say: Say, cache: Cache | None) -> tuple[GuidedReco
             note = f"run.memory_budget has no room for tables of {in_words(needed)}"
             return GuidedRecord(guided=False, note=note), None
     chosen = None if problem.pilot is None else problem.pilot.chosen
-    key = "" if cache is None else key_of({"guiding": 2, "of": chosen, **situation(problem)})
+    key = "" if cache is None else key_of({"guiding": 3, "of": chosen, **situation(problem)})
     known = recall(GuidedRecord, cache, key)
     if known is not None:
         return known, None

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import drjit as dr
@@ -24,6 +24,7 @@ import mitsuba as mi
 import numpy as np
 
 from reslrb_cli.backend.own_memory import own_memory
+from reslrb_cli.transport.survival import Survival
 
 Array = np.ndarray[Any, Any]
 
@@ -142,14 +143,15 @@ def apportion(grid: Grid, density: Array) -> Array:
 
 @dataclass
 class Table:
-    """What is drawn from: of each slot its cell, of each cell v / p, and the grid's edges."""
+    """What is drawn from: of each slot its cell, of each cell v / p, and the grid's edges; and which paths go on."""
 
     slots: mi.UInt32
     weights: mi.Float
     edges: mi.Float
+    survival: Survival = field(default_factory=Survival.certain)
 
     @staticmethod
-    def of(grid: Grid, counts: Array) -> Table:
+    def of(grid: Grid, counts: Array, survival: Survival | None = None) -> Table:
         """The table in which cell k has `counts[k]` slots, all of them together `grid.slots`."""
         weights = grid.measures() * grid.slots  # 0 where there is no slot
         weights /= np.maximum(counts, 1)
@@ -157,6 +159,7 @@ class Table:
             own_memory(mi.UInt32, np.repeat(np.arange(grid.cells, dtype=np.uint32), counts)),
             own_memory(mi.Float, weights.astype(np.float32)),
             own_memory(mi.Float, np.array(grid.edges, np.float32)),
+            survival or Survival.certain(),
         )
 
 

@@ -45,6 +45,7 @@ def walk(samples: Samples, hooks: Hooks, active: mi.Bool | bool = True) -> Any:
     plan, scene, sensor = samples.plan, samples.scene, samples.sensor
     sampler = samples.sampler()
     selection = samples.stream(SELECTION_STREAM) if hooks.numbers else None
+    survival = None if samples.guide is None else samples.guide.table.survival
 
     # ---- Leave the emitter ----
     loop_mode = "evaluated" if hooks.tracked and hooks.max_iterations is None else "symbolic"
@@ -105,10 +106,14 @@ def walk(samples: Samples, hooks: Hooks, active: mi.Bool | bool = True) -> Any:
 
         # ---- Russian roulette ----
         number = sampler.next_1d(active)
-        if plan.roulette:
-            throughput = dr.max(dr.abs(product.weight()))
-            q = dr.minimum(throughput * dr.square(eta), ROULETTE_LIMIT)
-            playing = path.depth + 1 > plan.rr_depth
+        if plan.roulette or survival is not None:
+            throughput, q, playing = dr.max(dr.abs(product.weight())), mi.Float(1), mi.Bool(False)
+            if plan.roulette:
+                q = dr.minimum(throughput * dr.square(eta), ROULETTE_LIMIT)
+                playing = path.depth + 1 > plan.rr_depth
+            if survival is not None:
+                learned = survival.probability(si.p, scattering.d, throughput)
+                q, playing = dr.minimum(dr.select(playing, q, 1), learned), mi.Bool(True)
             active &= ~playing | (number < q)
             roulette_weight = dr.select(playing, dr.rcp(q), 1)
             product, state = product.scaled(roulette_weight), hooks.survived(state, roulette_weight)

@@ -46,10 +46,10 @@ def _weigh(patch: pytest.MonkeyPatch, change: Any) -> None:
 
     right = guide.Table.of
 
-    def wrong(grid: Any, counts: np.ndarray) -> Any:
+    def wrong(grid: Any, counts: np.ndarray, *survival: Any) -> Any:
         import mitsuba as mi
 
-        table = right(grid, counts)
+        table = right(grid, counts, *survival)
         weights = change(grid, counts, np.array(table.weights, np.float64))
         return replace(table, weights=mi.Float(weights.astype(np.float32)))
 
@@ -70,10 +70,10 @@ def of_another_emitter(patch: pytest.MonkeyPatch) -> None:
 
     right = guide.Table.of
 
-    def wrong(grid: Any, counts: np.ndarray) -> Any:
+    def wrong(grid: Any, counts: np.ndarray, *survival: Any) -> Any:
         import mitsuba as mi
 
-        table = right(grid, counts)
+        table = right(grid, counts, *survival)
         return replace(table, edges=mi.Float(np.sqrt(np.array(table.edges))))
 
     patch.setattr(guide.Table, "of", staticmethod(wrong))

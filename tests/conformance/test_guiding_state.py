@@ -9,7 +9,9 @@ import pytest
 
 from reslrb_cli.integrators.guiding import Guiding
 from reslrb_cli.integrators.learned import Learned
+from reslrb_cli.integrators.onward import Onward
 from reslrb_cli.transport.guide import make_grid
+from reslrb_cli.transport.survival import CELLS
 
 GRID = make_grid([True] * 4, [1.0, 3.0], 9)
 
@@ -21,7 +23,9 @@ def learned() -> Guiding:
     for number in (0, 3):
         draws = random.random(GRID.cells) * 100
         said = Learned.nothing(GRID).with_more(GRID, random.random((4, GRID.cells)), draws)
-        guiding.learned[number] = Learned(said.sums, said.draws, 5 + number)
+        squares, light, length = random.random((4, CELLS)).astype(np.float32), random.random(), 1 + random.random()
+        onward = Onward(random.random((2, 3)).cumsum(0).astype(np.float32), squares, light, length)
+        guiding.learned[number] = Learned(said.sums, said.draws, 5 + number, onward)
     return guiding
 
 
@@ -42,6 +46,11 @@ def test_what_was_learned_comes_back() -> None:
             np.testing.assert_array_equal(
                 after.learned[number].density(GRID, share), one.density(GRID, share)
             )  # bit by bit
+            found, known = after.learned[number].onward, one.onward
+            assert found is not None
+            assert known is not None
+            np.testing.assert_array_equal(found.chances(share), known.chances(share))
+            np.testing.assert_array_equal(found.box, known.box)
 
 
 @pytest.mark.parametrize(
@@ -54,6 +63,12 @@ def test_what_was_learned_comes_back() -> None:
         ("0/draws", lambda draws: -draws),
         ("0/sums", lambda sums: sums * np.nan),
         ("3/draws", lambda draws: draws * np.inf),
+        ("0/onward", lambda sums: sums[:3]),
+        ("3/onward", lambda sums: sums[:, 1:]),
+        ("0/onward", lambda sums: -sums),
+        ("0/frame", lambda frame: frame[:6]),
+        ("3/frame", lambda frame: frame * np.nan),
+        ("3/frame", lambda frame: -frame),
     ],
 )
 def test_what_is_of_other_cells_is_refused_and_changes_nothing(name: str, wrong: Any) -> None:

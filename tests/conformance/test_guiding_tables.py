@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,7 @@ from conformance.gradient_cases import CASES
 
 from reslrb_cli.measure.gradients import Case, integrator
 from reslrb_cli.transport.guide import UNIFORM, Grid, Guide, Table, apportion, even_table, make_grid
+from reslrb_cli.transport.survival import Survival
 
 pytestmark = pytest.mark.usefixtures("llvm")
 
@@ -82,9 +84,9 @@ def test_roulette_does_not_see_the_weight(monkeypatch: pytest.MonkeyPatch) -> No
 
     right, factor = guide.Table.of, [1.0]
 
-    def weighed(grid: Grid, counts: np.ndarray) -> Table:
-        table = right(grid, counts)
-        return Table(table.slots, mi.Float(np.array(table.weights) * np.float32(factor[0])), table.edges)
+    def weighed(grid: Grid, counts: np.ndarray, survival: Survival) -> Table:
+        table = right(grid, counts, survival)
+        return replace(table, weights=mi.Float(np.array(table.weights) * np.float32(factor[0])))
 
     monkeypatch.setattr(guide.Table, "of", staticmethod(weighed))
     scene, images = Case(SCENES["roulette"](), []), []
