@@ -33,6 +33,7 @@ from reslrb_cli.transport.walk import walk
 Array = np.ndarray[Any, Any]
 
 MOST_BSDFS = 6  # that are heard apart; the others are heard together
+BINS = 1024
 
 
 def bsdf_groups(plan: Plan) -> list[tuple[mi.BSDF, ...]]:
@@ -134,10 +135,18 @@ def hear(samples: Samples, adjoint: AdjointImage) -> tuple[Array, Walked]:
         value = square / dr.square(drawn.weight)
         said = dr.isfinite(value) & (value > 0)
         dr.scatter_reduce(dr.ReduceOp.Add, sums, value, drawn.cell + voice * cells, said)
-    length = mi.Float(heard.trail.count)
-    dr.schedule(sums, squares, heard.light, length)  # one kernel: what is evaluated apart would be traced again
+    # All are one kernel: what is evaluated apart would be traced again.
+    means = _sums([*squares, heard.light, mi.Float(heard.trail.count)], samples.width)
+    dr.schedule(sums, means)
     onward = walk_back(heard.trail)
-    finite = (dr.select(dr.isfinite(value), value, 0) for value in (*squares, heard.light))
-    *said, light = (float(np.array(value, np.float64).mean()) for value in finite)
-    walked = Walked(*onward, np.array(said), light, 1 + float(np.array(length, np.float64).mean()))
+    *said, light, count = np.array(means, np.float64).reshape(-1, BINS).sum(1) / samples.width
+    walked = Walked(*onward, np.array(said), float(light), 1 + float(count))
     return np.array(sums).reshape(len(squares), cells), walked
+
+
+def _sums(values: list[mi.Float], width: int) -> mi.Float:
+    """Sums (len(values) * BINS) over paths, what is not finite left out; in bins, so that none loses small numbers."""
+    result, lane = dr.zeros(mi.Float, len(values) * BINS), dr.arange(mi.UInt32, width) % BINS
+    for number, value in enumerate(values):
+        dr.scatter_reduce(dr.ReduceOp.Add, result, value, lane + number * BINS, dr.isfinite(value))
+    return result
