@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 from conformance import attached_cases, moving_lamps
+from conformance.test_survival import by_harsh_table
 from turns import a_few
 
 from reslrb_cli.integrators import make_integrator
@@ -29,13 +30,21 @@ def test_means_by_reservoir_are_those_of_unguided_samples(name: str) -> None:
     means_hold(name, "reservoir")
 
 
-def means_hold(name: str, estimator: str) -> None:
+@pytest.mark.parametrize("name", a_few(["latents", "mesh", "bounces_4"], ["bounces_4"]))
+@pytest.mark.parametrize("estimator", a_few(["stack", "reservoir"], ["stack"]))
+def test_means_hold_where_paths_end_by_a_table(name: str, estimator: str) -> None:
+    means_hold(name, estimator, harsh=True)
+
+
+def means_hold(name: str, estimator: str, harsh: bool = False) -> None:
     moving = MOVING[name].moving()
     found = {}
     for block, guiding in enumerate(("on", "off")):
         ours = make_integrator("reslrb", max_depth=5, rr_depth=1000, estimator=estimator, guiding=guiding)
         if guiding == "on":
             learn(moving, ours)
+            if harsh:
+                by_harsh_table(ours.preparation.guiding)
         rows = [moving.gradient(ours, seed, 16) for seed in seeds(32, block)]
         found[guiding] = np.stack([np.concatenate(list(row.values())) for row in rows])
     result = compare(found["on"], found["off"], block=None)

@@ -13,7 +13,7 @@ from conformance.test_guiding import SPP, guided, sample, samples, seeds
 from turns import a_few
 
 from reslrb_cli.estimators import ESTIMATORS
-from reslrb_cli.integrators.guiding import Purpose, learning_seed
+from reslrb_cli.integrators.guiding import Guiding, Purpose, learning_seed
 from reslrb_cli.integrators.interface import Job
 from reslrb_cli.integrators.onward import FLOOR, LEAN, SURE, Onward, Walked
 from reslrb_cli.measure.gradients import Case, relative
@@ -28,15 +28,19 @@ BOX = np.array([[-1.0, -2.0, 0.0], [3.0, 2.0, 0.0]], np.float32)  # flat
 
 def harsh(scene: Case, ours: Any, factor: float = 1.0) -> Any:
     """Have an integrator play roulette by a table of large contrasts, which has nothing to do with the scene."""
-    preparation = ours.preparation
-    preparation.plan(scene.scene, scene.scene.sensors()[0], scene.params)
-    guiding = preparation.guiding
-    light = guiding.learned[0].onward.light if 0 in guiding.learned else 1.0
+    ours.preparation.plan(scene.scene, scene.scene.sensors()[0], scene.params)
+    by_harsh_table(ours.preparation.guiding, factor)
+    return ours
+
+
+def by_harsh_table(guiding: Guiding, factor: float = 1.0) -> None:
+    """The same of its tables, from which the first sensor's samples are drawn until they next learn."""
+    onward = guiding.learned[0].onward if 0 in guiding.learned else None
+    light = 1.0 if onward is None else onward.light
     survival = Survival.of(guiding.box, factor / light * np.random.default_rng(1).lognormal(-1, 1.5, CELLS))
     for purpose in Purpose:
         table, counts = guiding._table(0, purpose)
         guiding._tables[0, purpose] = replace(table, survival=survival), counts
-    return ours
 
 
 # ---- The table -------------------------------------------------------------------------------------------------------
