@@ -30,7 +30,7 @@ Array = np.ndarray[Any, Any]
 KEEP = 0.75  # what of the past counts beside the newest walk
 SURE = 4.0
 LEAN = 100.0
-FLOOR = 0.01
+FLOOR = 0.1
 RAY = 0.2  # what a ray costs that meets nothing, in vertices
 
 

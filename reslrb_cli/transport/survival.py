@@ -8,9 +8,9 @@ with throughput w (the largest channel, emission and the weights of earlier roul
 and counts for 1 / q if it does. The mean of whatever is computed from paths stays what it was for any s that does not
 depend on the random numbers that it is used with. How s is learned says `integrators/onward.py`.
 
-The more a path has been weighted up, the larger is its w, and so its q: where s is nowhere below s_0, no throughput is
-raised beyond 1 / (LEAST s_0). Roulette on throughput alone is played beside it from `rr_depth` on, so that paths end
-that nothing else would end.
+The more a path has been weighted up, the larger is its w, and so its q: since q is at least w s where it is below 1, no
+throughput is raised beyond 1 / s_0, where s is nowhere below s_0. Roulette on throughput alone is played beside it from
+`rr_depth` on, so that paths end that nothing else would end.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ BITS = 4  # cubes along each axis of the box, log2
 OCTANTS = 8
 CELLS = OCTANTS << (3 * BITS)
 SHAPE = (1 << BITS, 1 << BITS, 1 << BITS, OCTANTS)  # of an array of all cells
-LEAST = 0.25  # the smallest probability of going on
+LEAST = 0.5  # the smallest probability of going on
 
 
 @dataclass

@@ -76,6 +76,8 @@ def test_the_probability_is_bounded_on_both_sides() -> None:
         survival = Survival.of(BOX, np.full(CELLS, chance))
         q = survival.probability(mi.Point3f(0), mi.Vector3f(1), throughput)
         np.testing.assert_allclose(np.array(q), expected)
+        raised = np.array(throughput)[:5] / np.array(q)[:5]
+        assert (raised <= np.maximum(np.array(throughput)[:5], 1 / chance if chance else np.inf)).all()
 
 
 # ---- What is learned -------------------------------------------------------------------------------------------------
