@@ -28,7 +28,7 @@ from reslrb_cli.transport.survival import BITS, CELLS, SHAPE
 Array = np.ndarray[Any, Any]
 
 KEEP = 0.75  # what of the past counts beside the newest walk
-SURE = 4.0
+SURE = 16.0
 LEAN = 100.0
 FLOOR = 0.1
 RAY = 0.2  # what a ray costs that meets nothing, in vertices
