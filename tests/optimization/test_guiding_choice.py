@@ -190,7 +190,7 @@ def test_a_run_says_so_once_remembers_it_and_writes_it_down(
     assert again.guided.to_json() == {**found, "cached": True}
     row = next(line for line in inspected(capsys, str(RUN)) if "guided emission" in line)
     assert row.split()[0] == "needed"
-    assert "65536 cells, 5.2 MiB" in row  # no more than the 16,384 paths of a batch can tell apart
+    assert "65536 cells, 6.1 MiB" in row  # no more than the 16,384 paths of a batch can tell apart
     assert f"guiding: auto, {found['gain']:.2g} times the efficiency here (" in row
     row = next(line for line in inspected(capsys, "tiny.yaml", "--set", AUTO[0]) if "guided emission" in line)
     assert row.startswith("  left out")
