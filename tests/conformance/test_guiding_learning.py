@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import drjit as dr
 import numpy as np
 import pytest
 from conformance.test_guiding import SPP, guided, sample
@@ -11,6 +12,7 @@ from conformance.test_guiding import SPP, guided, sample
 from reslrb_cli.integrators import freezing
 from reslrb_cli.integrators.guiding import grid_for
 from reslrb_cli.integrators.learned import FINE, KEEP, Learned, most_cells
+from reslrb_cli.measure.gradients import relative
 from reslrb_cli.transport.guide import Grid, Table, apportion, make_grid
 
 pytestmark = pytest.mark.usefixtures("llvm")
@@ -29,11 +31,13 @@ def taught(name: str, steps: int, **options: Any) -> Any:
 
 @pytest.mark.parametrize("name", ["two_emitters", "envmap"])
 def test_what_a_recorded_walk_says_is_what_a_plain_one_does(name: str) -> None:
-    """Bit by bit; and tables that have changed are no reason to record anew."""
+    """Bit by bit with one thread, as tests have it; and tables that have changed are no reason to record anew."""
     plain, recorded = (taught(name, 7, freeze=freeze) for freeze in (False, True))
     for one, other in zip(*(each.preparation.guiding.learned.values() for each in (plain, recorded)), strict=True):
-        np.testing.assert_array_equal(one.sums, other.sums)
-        np.testing.assert_array_equal(one.draws, other.draws)
+        assert relative(one.sums, other.sums) < 1e-3
+        assert relative(one.draws, other.draws) < 1e-3
+        assert dr.thread_count() > 1 or np.array_equal(one.sums, other.sums)
+        assert dr.thread_count() > 1 or np.array_equal(one.draws, other.draws)
     counts = recorded.preparation.recordings.counts()
     assert 1 <= counts["hear"] <= 2
     assert counts["fused"] <= 2
