@@ -101,8 +101,11 @@ class Onward:
         return Onward(box, sums.astype(np.float32), float(frame[6]), float(frame[7]))
 
     def chances(self, share: float) -> Array:
-        """s of all cells (CELLS); `share` is that of the gradient in what counts as said, the rest is the image's."""
-        if not self.light > 0:
+        """s of all cells (CELLS); `share` is that of the gradient in what counts as said, the rest is the image's.
+
+        Where no ray has ever left a vertex all are infinite: whatever does go on.
+        """
+        if not (self.light > 0 and self.sums[3].any()):
             return np.full(CELLS, np.inf)
         sums = self.sums.astype(np.float64)
         squares, followed, left = share * sums[0] + (1 - share) * sums[1], sums[2], sums[3]

@@ -96,6 +96,14 @@ def test_walks_in_which_nothing_was_said_teach_nothing() -> None:
         assert onward.with_more(walked(said=np.array(said), light=light)) is onward
 
 
+def test_where_no_ray_has_left_a_vertex_all_go_on() -> None:
+    """As in a scene whose paths are not followed beyond their first surface."""
+    known = Onward.nothing(BOX).with_more(walked())
+    assert known.light > 0
+    for share in (0.0, 0.5, 1.0):
+        assert np.isposinf(known.chances(share)).all()
+
+
 def test_what_is_known_does_not_depend_on_the_unit_of_light() -> None:
     """Throughputs are as bright as the light is: s is in proportion to one over that."""
     random = np.random.default_rng(3)

@@ -21,10 +21,11 @@ from reslrb_cli.measure.extreme import CASES, ExtremeCase
 from reslrb_cli.measure.gradients import integrator
 from reslrb_cli.measure.small_scenes import load as load_scene
 from reslrb_cli.optimization.choice import find_options, is_auto, settle_integrator
+from reslrb_cli.optimization.guiding_pilot import GuidingPilot
 from reslrb_cli.optimization.pilot import SHARE
 from reslrb_cli.optimization.problem import Problem, assemble_scene
 from reslrb_cli.optimization.sequence_choice import settle_sampling
-from reslrb_cli.optimization.step_pilot import StepPilot
+from reslrb_cli.optimization.sequence_pilot import SequencePilot
 from reslrb_cli.optimization.targets import make_targets
 from reslrb_cli.records.images import write_file
 from reslrb_cli.records.paid import LEAST_IMAGE, PaidRecord
@@ -134,8 +135,10 @@ def test_no_scene_loses(name: str, tmp_path: Path) -> None:
 def test_losses_are_seen(fault: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """In a scene that guiding has a third of the efficiency in: it is on; and it is off, and paths start in cells."""
     if fault == "on whatever is found":
-        found = StepPilot._record
-        monkeypatch.setattr(StepPilot, "_record", lambda self, other, images, *rest: found(self, True, True, *rest))
+        record, other = GuidingPilot._record, SequencePilot._record
+        monkeypatch.setattr(GuidingPilot, "_record", lambda self, on, images, *rest: record(self, True, True, *rest))
+        # What would take the place of guiding here.
+        monkeypatch.setattr(SequencePilot, "_record", lambda self, on, images, *rest: other(self, False, False, *rest))
     else:
 
         def settle(problem: Problem, say: Callable[[str], None]) -> None:
