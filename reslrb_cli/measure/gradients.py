@@ -65,12 +65,13 @@ class Case:
         """A row of values as the parameter's type."""
         import drjit as dr
 
+        from reslrb_cli.backend.own_memory import own_memory
+
         now, array = self.values.value(key), np.asarray(row, np.float32)
         kind = type(now)
         if dr.is_tensor_v(kind):
-            # A sum, since NumPy's own memory would be used as it is: kernels depend on its alignment, which is random.
-            return kind(array.reshape(now.shape)) + dr.opaque(dr.array_t(kind), 0)
-        return kind(*array.tolist()) if dr.depth_v(kind) > 1 else kind(array) + dr.opaque(kind, 0)
+            return kind(own_memory(dr.array_t(kind), array.ravel()), now.shape)
+        return kind(*array.tolist()) if dr.depth_v(kind) > 1 else own_memory(kind, array)
 
     def set(self, values: dict[str, np.ndarray]) -> None:
         """Set parameters from rows of values."""

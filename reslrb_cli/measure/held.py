@@ -18,6 +18,7 @@ from reslrb_cli.measure.participants import ALIKE, NEVER
 from reslrb_cli.measure.references import interior
 from reslrb_cli.measure.worker import Begun
 from reslrb_cli.optimization.problem import assemble, assemble_scene
+from reslrb_cli.optimization.views import to_tensor
 from reslrb_cli.records.clock import peak_mib, reset_peak
 from reslrb_cli.records.gradcheck import Reference
 from reslrb_cli.scene.seen import sees_specular
@@ -76,9 +77,7 @@ class Held:
     def __init__(self, config: Config, adjoint: np.ndarray) -> None:
         self.problem = assemble_scene(config.with_exposures_fixed())
         self.key = self.problem.selection.keys[0]
-        # A sum, since NumPy's own memory would be used as it is: kernels depend on its alignment, which is random.
-        self.adjoint = mi.TensorXf(np.ascontiguousarray(adjoint, np.float32)) + dr.opaque(mi.Float, 0)
-        dr.eval(self.adjoint)
+        self.adjoint = to_tensor(adjoint)
 
     def gradient(self, seed: int, spp: int) -> np.ndarray:
         """One gradient, of the parameter's shape."""

@@ -127,7 +127,7 @@ def _with_short_target(config: Config) -> Config:
 def _image_seconds(problem: Problem) -> float:
     """Seconds that a sample per pixel of a saved image takes, of the first view."""
     view, spp = problem.views[0], saved_spp(problem, between=True)
-    problem.render(view.sensor, spp, 0, "forecast")  # compiles and records, which takes several times as long
+    problem.render(view.sensor, spp, 0, "forecast")  # compiles, and records what is small: several times as long
     begin = time.perf_counter()
     problem.render(view.sensor, spp, 1, "forecast")
     return (time.perf_counter() - begin) / spp

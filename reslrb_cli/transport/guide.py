@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
@@ -148,7 +148,7 @@ class Table:
     slots: mi.UInt32
     weights: mi.Float
     edges: mi.Float
-    survival: Survival = field(default_factory=Survival.certain)
+    survival: Survival
 
     @staticmethod
     def of(grid: Grid, counts: Array, survival: Survival | None = None) -> Table:

@@ -10,6 +10,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from reslrb_cli.backend.own_memory import own_memory
 from reslrb_cli.scene.graph import SceneGraph
 
 #: The name of the amplitudes among the parameters.
@@ -50,7 +51,7 @@ class Displacement:
     def value(self, initial: mi.Float, amplitudes: list[mi.Float]) -> mi.Float:
         result = mi.Float(initial)
         for row, amplitude in zip(self.fields, amplitudes, strict=True):
-            result += amplitude * _opaque(row.ravel())
+            result += amplitude * own_memory(mi.Float, row.ravel().astype(np.float32))
         return result
 
 
@@ -141,8 +142,3 @@ def _copy(value: Any) -> Any:
     result = type(value)(dr.detach(value))
     dr.make_opaque(result)
     return result
-
-
-def _opaque(row: np.ndarray) -> mi.Float:
-    # A sum, since NumPy's own memory would be used as it is: kernels depend on its alignment, which is random.
-    return mi.Float(np.ascontiguousarray(row, np.float32)) + dr.opaque(mi.Float, 0)
