@@ -18,6 +18,7 @@ from reslrb_cli.integrators.hearing import Said
 from reslrb_cli.integrators.learned import Learned, most_cells
 from reslrb_cli.integrators.onward import Onward
 from reslrb_cli.integrators.probing import used_numbers
+from reslrb_cli.transport.aim import BLOCKS, SLOTS, Aim, Blocks
 from reslrb_cli.transport.guide import CELL_BITS, Grid, Table, apportion, make_grid
 from reslrb_cli.transport.samples import Samples
 from reslrb_cli.transport.survival import CELLS, Survival, box_of
@@ -32,7 +33,7 @@ LEARNING_STREAM = 0x1EA2  # seeds of the samples that tables learn from
 
 
 #: Names of the arrays of each sensor in what has been learned.
-KNOWN = ("sums", "draws", "onward", "frame")
+KNOWN = ("sums", "draws", "onward", "frame", "film")
 
 
 class Purpose(enum.Enum):
@@ -46,7 +47,7 @@ class Purpose(enum.Enum):
 def sensor_bytes(grid: Grid) -> int:
     """Bytes for one sensor: a table for each purpose, and what has been learned."""
     emission = len(Purpose) * (grid.slots + 2 * grid.cells) + 3 * grid.cells
-    return 4 * (emission + (len(Purpose) + 4) * CELLS)
+    return 4 * (emission + (len(Purpose) + 4) * CELLS + len(Purpose) * (SLOTS + BLOCKS) + BLOCKS)
 
 
 def grid_for(used: Sequence[bool], weights: Sequence[float], sensors: int, paths: int | None = None) -> Grid:
@@ -72,11 +73,13 @@ class Guiding:
         self._emission: tuple[list[bool], list[float], int] | None = None  # what `grid_for` is to know of a scene
         self.box = np.zeros((2, 3), np.float32)  # of the scene, as it was first seen
         self.learned: dict[int, Learned] = {}  # by the number of their sensor
+        self.films: dict[int, Blocks] = {}  # of sensors whose paths may be aimed
         self._tables: dict[tuple[int, Purpose], tuple[Table, Array]] = {}
 
     def clear(self) -> None:
         """Forget everything, for a new scene."""
         self.grid = self._emission = None
+        self.films.clear()
         self.forget()
 
     def forget(self) -> None:
@@ -122,8 +125,26 @@ class Guiding:
             counts = apportion(self.grid, density).astype(np.uint32)
             onward = self._onward(number)
             survival = Survival.of(onward.box, onward.chances(purpose.value))
-            self._tables[number, purpose] = Table.of(self.grid, counts, survival), counts
+            aim = self._aim(number, purpose, learned)
+            self._tables[number, purpose] = Table.of(self.grid, counts, survival, aim), counts
         return self._tables[number, purpose]
+
+    def aims(self, number: int, film: Blocks) -> bool:
+        """Have the paths for a sensor with this film be aimed; not where it shares its tables with others."""
+        if self._shared(number) != number or any(self._shared(n) != n for n in range(self._sensors)):
+            return False
+        self.films[number] = film
+        return True
+
+    def _aim(self, number: int, purpose: Purpose, learned: Learned | None) -> Aim | None:
+        """Where on the film of a sensor paths are sent: by where gradients were asked for, and for an image evenly."""
+        if number not in self.films:
+            return None
+        film = self.films[number]
+        areas = film.areas()
+        even, asked = areas / areas.sum(), areas if learned is None else learned.film
+        wanted = asked / asked.sum() if asked.shape == areas.shape and asked.sum() > 0 else even
+        return Aim.of(film, purpose.value * wanted + (1 - purpose.value) * even)
 
     def _onward(self, number: int) -> Onward:
         """What is known of where the paths for a sensor go on to, `number` being what its tables are kept under."""
@@ -133,6 +154,11 @@ class Guiding:
     def _shared(self, number: int) -> int:
         """The number of the sensor that the tables are kept under."""
         return number % max(MOST_BYTES // self._each, 1)
+
+    @property
+    def _sensors(self) -> int:
+        assert self._emission is not None
+        return self._emission[2]
 
     @property
     def _each(self) -> int:
@@ -147,7 +173,8 @@ class Guiding:
         """What has been learned: the number of gradients of each sensor, and arrays by `<sensor>/<what>`."""
         arrays: dict[str, Array] = {}
         for number, learned in self.learned.items():
-            found = {"sums": learned.sums, "draws": learned.draws, **self._onward(number).arrays()}
+            found = {"sums": learned.sums, "draws": learned.draws, "film": learned.film}
+            found |= self._onward(number).arrays()
             arrays |= {f"{number}/{name}": array for name, array in found.items()}
         return {str(number): learned.calls for number, learned in self.learned.items()}, arrays
 
@@ -163,10 +190,14 @@ class Guiding:
             for name, array, rows in (("sums", sums, (2,)), ("draws", draws, ())):
                 if array.shape != (*rows, self.grid.cells) or not (np.isfinite(array) & (array >= 0)).all():
                     return f"{number}/{name}"
-            onward = Onward.taken({name: take(f"{number}/{name}") for name in KNOWN[2:]})
+            onward = Onward.taken({name: take(f"{number}/{name}") for name in KNOWN[2:4]})
             if isinstance(onward, str):
                 return f"{number}/{onward}"
-            found[int(number)] = Learned(sums.astype(np.float32), draws.astype(np.float32), count, onward)
+            film = take(f"{number}/film")
+            if film.ndim != 1 or not (np.isfinite(film) & (film >= 0)).all():
+                return f"{number}/film"
+            own = (array.astype(np.float32) for array in (sums, draws, film))
+            found[int(number)] = Learned(next(own), next(own), count, onward, next(own))
         self.learned, self._tables = found, {}
         return None
 
@@ -180,8 +211,8 @@ class Guiding:
             learned.calls = calls
         return learned is None or calls in FIRST or calls % EVERY == 0
 
-    def learn(self, number: int, paths: int, said: Said) -> None:
-        """Have the table of a sensor learn from what so many paths said (`hearing.py`).
+    def learn(self, number: int, paths: int, said: Said, gradient: Array) -> None:
+        """Have the table of a sensor learn from what so many paths said (`hearing.py`) of dL/dI `gradient` (H, W, C).
 
         They are drawn from its table for BOTH, and serve nothing else.
         """
@@ -193,7 +224,11 @@ class Guiding:
             before.calls = 1
         onward = self._onward(number).with_more(said.walked(paths))
         draws = paths * (counts / self.grid.slots)
-        self.learned[number] = before.with_more(self.grid, said.by_start(self.grid.cells), draws, onward)
+        asked = None
+        if number in self.films:
+            pixels = np.abs(np.asarray(gradient, np.float64)).sum(-1)
+            asked = self.films[number].sums(np.where(np.isfinite(pixels), pixels, 0))
+        self.learned[number] = before.with_more(self.grid, said.by_start(self.grid.cells), draws, onward, asked)
         for purpose in Purpose:
             self._tables.pop((number, purpose), None)
 

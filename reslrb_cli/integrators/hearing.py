@@ -110,6 +110,9 @@ class Hearing(Hooks):
         state.trail.leaves(self.survival.cell(vertex.si.p, scattering.d), inverse)
         return replace(state, counts=counts)
 
+    def aimed(self, state: Heard, factor: mi.Float) -> Heard:
+        return state  # part of what paths say, other than the weight of a roulette that is being learned for
+
     def survived(self, state: Heard, weight: mi.Float) -> Heard:
         state.trail.survives(weight)
         return state

@@ -37,13 +37,15 @@ class Learned:
     how many started in each cell.
 
     `calls` is the number of gradients so far. Arrays are float32, and never changed. `onward` is what paths went on to
-    say from where they were; None where nothing of that is known.
+    say from where they were; None where nothing of that is known. `film` is where on the film gradients were asked for,
+    |dL/dI| by block (`transport/aim.py`); empty where nobody wants to know.
     """
 
     sums: Array
     draws: Array
     calls: int = 0
     onward: Onward | None = None
+    film: Array = field(default_factory=lambda: np.zeros(0, np.float32))
     _densities: tuple[Grid, list[Array]] | None = field(default=None, init=False, repr=False, compare=False)
 
     @staticmethod
@@ -51,7 +53,9 @@ class Learned:
         """Before the first gradient."""
         return Learned(np.zeros((2, grid.cells), np.float32), np.zeros(grid.cells, np.float32))
 
-    def with_more(self, grid: Grid, heard: Array, draws: Array, onward: Onward | None = None) -> Learned:
+    def with_more(
+        self, grid: Grid, heard: Array, draws: Array, onward: Onward | None = None, film: Array | None = None
+    ) -> Learned:
         """With what newer paths have said (voices, cells), the image last, `draws` (cells) of them.
 
         Each voice is scaled to a total of 1. `onward` has learned from the same paths already.
@@ -62,13 +66,21 @@ class Learned:
             total = said @ means
             if np.isfinite(total) and total > 0:
                 sums[int(voice == len(heard) - 1)] += said / total
-        return Learned(sums, (KEEP * self.draws + draws).astype(np.float32), self.calls, onward)
+        draws = (KEEP * self.draws + draws).astype(np.float32)
+        return Learned(sums, draws, self.calls, onward, self._asked(film))
+
+    def _asked(self, film: Array | None) -> Array:
+        """`film` with that of a newer gradient, each gradient as much as another."""
+        total = 0.0 if film is None else float(film.sum())
+        if film is None or not (np.isfinite(total) and total > 0):
+            return self.film
+        return ((KEEP * self.film if self.film.shape == film.shape else 0) + film / total).astype(np.float32)
 
     def on(self, grid: Grid, before: Grid) -> Learned:
         """The same about the cells of another grid, of which those of the one before are made, spread evenly."""
         sums = np.stack([grid.shared_out(row, before) for row in self.sums])
         draws = grid.shared_out(self.draws, before).astype(np.float32)
-        return Learned(sums.astype(np.float32), draws, self.calls, self.onward)
+        return Learned(sums.astype(np.float32), draws, self.calls, self.onward, self.film)
 
     def density(self, grid: Grid, share: float) -> Array:
         """How cells are to be drawn (cells,), normalised, before any are shared out evenly: `share` of them by what was

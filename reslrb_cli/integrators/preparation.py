@@ -18,6 +18,7 @@ from reslrb_cli.integrators.probing import used_numbers
 from reslrb_cli.integrators.renewal import Renewal, with_shading_normals
 from reslrb_cli.scene.graph import SceneGraph
 from reslrb_cli.scene.needs import check_supported, interpolates_normals, scene_needs
+from reslrb_cli.transport.aim import film_blocks, worthwhile
 from reslrb_cli.transport.nets import make_coordinates
 from reslrb_cli.transport.plan import Plan, make_plan
 from reslrb_cli.transport.samples import Samples, passes
@@ -164,11 +165,16 @@ class Preparation:
 
     def _with_numbers(self, plan: Plan, samples: Samples) -> Plan:
         """The plan with what says how the numbers of its paths are drawn."""
-        grid = None
+        grid, aims = None, False
         if self.guiding is not None:
             spp, sensors = self.expected or self._met, samples.scene.sensors()
             pixels = max((int(dr.prod(one.film().size())) for one in sensors), default=samples.width)
             grid = self.guiding.grid_of(samples, spp * pixels or None)
+            if worthwhile(plan.needs, plan.max_depth):
+                known = [one.ptr for one in sensors]
+                number = known.index(samples.sensor.ptr) if samples.sensor.ptr in known else len(known)
+                aims = self.guiding.aims(number, film_blocks(samples.sensor))
+        plan = replace(plan, aims=aims)
         if not self._low_discrepancy:
             return replace(plan, grid=grid)
         sequence = make_coordinates(used_numbers(samples), len(plan.needs.emitters), plan.max_depth)

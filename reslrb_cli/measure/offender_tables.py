@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from reslrb_cli.integrators.guiding import Guiding, Purpose
+from reslrb_cli.integrators.guiding import Array, Guiding, Purpose
 from reslrb_cli.integrators.hearing import Said
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.views import View
@@ -18,7 +18,7 @@ class Witness(Guiding):
     def __init__(self, other: Guiding) -> None:
         super().__init__()
         self.images, self.held, self.grid = other.images, other.held, other.grid
-        self.learned = dict(other.learned)
+        self.learned, self.films = dict(other.learned), dict(other.films)
         self.drawn: list[Table] = []
 
     def table(self, number: int, purpose: Purpose) -> Table:
@@ -27,10 +27,10 @@ class Witness(Guiding):
         self.drawn.append(found)
         return found
 
-    def learn(self, number: int, paths: int, said: Said) -> None:
+    def learn(self, number: int, paths: int, said: Said, gradient: Array) -> None:
         """Have the table of a sensor learn from paths that were drawn for this alone."""
         self.drawn.pop()
-        super().learn(number, paths, said)
+        super().learn(number, paths, said, gradient)
 
 
 def purposes(problem: Problem, view: View) -> list[tuple[int, str, Purpose]]:

@@ -46,6 +46,7 @@ class SceneNeeds:
     environment: int | None
     has_visible_emitters: bool
     has_smooth: bool
+    has_glossy: bool
     has_delta_lobes: bool
     has_null: bool
     has_instances: bool
@@ -90,6 +91,7 @@ def scene_needs(scene: Any, sensor: Any) -> SceneNeeds:
         environment=None if environment is None else emitters.index(environment),
         has_visible_emitters=any(int(emitter.flags()) & pointlike == 0 for emitter in emitters),
         has_smooth=flags & int(mi.BSDFFlags.Smooth) != 0,
+        has_glossy=flags & int(mi.BSDFFlags.Glossy) != 0,
         has_delta_lobes=flags & delta != 0,
         has_null=flags & int(mi.BSDFFlags.Null) != 0,
         has_instances=any(shape.class_name() == "Instance" for shape in graph.of_type(mi.Shape)),

@@ -24,6 +24,7 @@ import mitsuba as mi
 import numpy as np
 
 from reslrb_cli.backend.own_memory import own_memory
+from reslrb_cli.transport.aim import Aim
 from reslrb_cli.transport.survival import Survival
 
 Array = np.ndarray[Any, Any]
@@ -143,15 +144,17 @@ def apportion(grid: Grid, density: Array) -> Array:
 
 @dataclass
 class Table:
-    """What is drawn from: of each slot its cell, of each cell v / p, and the grid's edges; and which paths go on."""
+    """What is drawn from: of each slot its cell, of each cell v / p, and the grid's edges; which paths go on, and
+    where those that scatter are sent."""
 
     slots: mi.UInt32
     weights: mi.Float
     edges: mi.Float
     survival: Survival
+    aim: Aim | None = None
 
     @staticmethod
-    def of(grid: Grid, counts: Array, survival: Survival | None = None) -> Table:
+    def of(grid: Grid, counts: Array, survival: Survival | None = None, aim: Aim | None = None) -> Table:
         """The table in which cell k has `counts[k]` slots, all of them together `grid.slots`."""
         weights = grid.measures() * grid.slots  # 0 where there is no slot
         weights /= np.maximum(counts, 1)
@@ -160,6 +163,7 @@ class Table:
             own_memory(mi.Float, weights.astype(np.float32)),
             own_memory(mi.Float, np.array(grid.edges, np.float32)),
             survival or Survival.certain(),
+            aim,
         )
 
 

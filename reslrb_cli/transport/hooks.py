@@ -76,6 +76,10 @@ class Hooks:
         """Called with the weight that roulette has just given the path's product, 1 where it was not played."""
         return state
 
+    def aimed(self, state: Any, factor: mi.Float) -> Any:
+        """Called, where paths are aimed (`aim.py`), with the factor r that the path's product has just been given."""
+        return self.survived(state, factor)
+
 
 class Splat(Hooks):
     """Splat every connection, and keep nothing."""

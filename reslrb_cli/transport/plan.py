@@ -52,8 +52,15 @@ class Plan:
     horizon: Horizon | None = None
     # The cells that emission is guided by, where it is.
     grid: Grid | None = None
+    # Whether guided paths may be aimed at what the sensor sees (`aim.py`), where nothing moves.
+    aims: bool = False
     # The numbers of low discrepancy, where there are any.
     sequence: Coordinates | None = None
+
+    @property
+    def aimed(self) -> bool:
+        """Whether guided paths are aimed."""
+        return self.aims and not self.attached
 
     @property
     def moving_emission(self) -> bool:

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
+from reslrb_cli.transport.aim import Aimed
 from reslrb_cli.transport.plan import Plan
 
 DEFENSIVE = 0.2  # share of samples that a perturbed BSDF does not draw itself
@@ -77,11 +78,13 @@ def scatter(
     connection_wo: mi.Vector3f,
     connected: mi.Bool | None,
     attached: bool = False,
+    aimed: Aimed | None = None,
 ) -> tuple[Scattering, mi.Spectrum | None]:
     """Sample the next direction, and evaluate f (C,) towards `connection_wo` in `connected` lanes (None: in no lane).
 
     Detached, unless `attached`; `tracked.py` has the derivatives of the factors alone. Both queries share one
-    indirect call, and in it what they have in common (looking up textures, mostly).
+    indirect call, and in it what they have in common (looking up textures, mostly). Lanes that are `aimed` have the
+    direction of their point, and the BSDF's own density of it.
     """
     context = importance_context()
 
@@ -112,6 +115,8 @@ def scatter(
             )
         if plan.needs.has_perturbed_normals:
             wo, pdf, eta, lobe = _mixed(si, bsdf, sample_2, defensive, active, wo, pdf, eta, lobe)
+        if aimed is not None:
+            wo, pdf, weight, eta, lobe = _to_point(si, bsdf, aimed, wo, pdf, weight, eta, lobe)
         if attached and plan.stays:
             wo, pdf, weight = staying(plan, si, bsdf, active, wo, pdf, lobe, weight)
         elif attached:
@@ -236,6 +241,26 @@ def _mixed(
     pdf = (1 - DEFENSIVE) * own + dr.select(singular, 0, DEFENSIVE * other)
     eta = dr.select(defensive, 1, eta)
     return wo, pdf, eta, dr.select(defensive, mi.UInt32(int(mi.BSDFFlags.GlossyReflection)), lobe)
+
+
+def _to_point(
+    si: mi.SurfaceInteraction3f,
+    bsdf: mi.BSDFPtr,
+    aimed: Aimed,
+    wo: mi.Vector3f,
+    pdf: mi.Float,
+    weight: mi.Spectrum,
+    eta: mi.Float,
+    lobe: mi.UInt32,
+) -> tuple[mi.Vector3f, mi.Float, mi.Spectrum, mi.Float, mi.UInt32]:
+    """A BSDF's sample (direction, density, weight (C,), eta, lobe), replaced by one towards their point in lanes that
+    are aimed; of density 0 where there is no point, or none of the BSDF's own samples goes there."""
+    there = si.to_local(dr.normalize(aimed.point - si.p))
+    f, own = bsdf.eval_pdf(importance_context(), si, there, aimed.active & aimed.found)
+    own = dr.select(aimed.found, own, 0)
+    weight = dr.select(aimed.active, dr.select(own > 0, f / own, 0), weight)
+    wo, pdf, eta = (dr.select(aimed.active, a, b) for a, b in ((there, wo), (own, pdf), (mi.Float(1), eta)))
+    return wo, pdf, weight, eta, dr.select(aimed.active, mi.UInt32(int(mi.BSDFFlags.GlossyReflection)), lobe)
 
 
 def _delta_correction(wi: mi.Vector3f, wo: mi.Vector3f, eta: mi.Float) -> mi.Float:

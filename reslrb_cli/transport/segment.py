@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
+from reslrb_cli.transport.aim import Aimed
 from reslrb_cli.transport.connection import Connection, connect
 from reslrb_cli.transport.numbers import Numbers
 from reslrb_cli.transport.plan import Plan
@@ -74,18 +75,19 @@ def segment(
     evaluates: bool = True,
     tracked: bool = False,
     attached: bool = False,
+    aimed: Aimed | None = None,
 ) -> Segment:
     """The segment from the vertex `si`, which `ray` reaches: connected in some lanes, scattered in some.
 
     Without `evaluates` the BSDF is not evaluated towards the sensor. With `tracked` the scattering weight carries the
     derivatives of the scene's parameters, where gradients are enabled, and the connection is left to be evaluated where
     it turns out to be visible; directions, densities and film positions have no derivatives then. With `attached` they
-    have, and so has everything else.
+    have, and so has everything else. Lanes that are `aimed` scatter to their points.
     """
     connection = connect(plan, sensor, si, ray, numbers.aperture, connected, attached)
     wanted = connection.active if evaluates and not tracked else None
     scattering, connection.f = scatter(
-        plan, si, bsdf, ray, numbers.bsdf_1d, numbers.bsdf_2d, scattered, connection.wo, wanted, attached
+        plan, si, bsdf, ray, numbers.bsdf_1d, numbers.bsdf_2d, scattered, connection.wo, wanted, attached, aimed
     )
     if tracked and not attached:
         f = tracked_factor(plan, si, bsdf, scattering, scattering.active)

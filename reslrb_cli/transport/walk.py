@@ -13,7 +13,8 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from reslrb_cli.transport.connection import passage
+from reslrb_cli.transport.aim import Pending, aims_from, choose
+from reslrb_cli.transport.connection import Seen, connect, passage
 from reslrb_cli.transport.emission import sample_emission
 from reslrb_cli.transport.factors import Product
 from reslrb_cli.transport.hooks import Hooks, Vertex
@@ -38,6 +39,7 @@ class Path:
     product: Product  # E s_1 ... s_{depth-1}, roulette weights included
     eta: mi.Float  # accumulated relative index of refraction, for roulette alone; begins larger where emission is dim
     early: list[Early]  # numbers of the first vertices, where they are of low discrepancy; never changed
+    pending: list[Pending]  # how the last event was aimed, where any are; a replay has no use for it
 
 
 def walk(samples: Samples, hooks: Hooks, active: mi.Bool | bool = True) -> Any:
@@ -46,6 +48,7 @@ def walk(samples: Samples, hooks: Hooks, active: mi.Bool | bool = True) -> Any:
     sampler = samples.sampler()
     selection = samples.stream(SELECTION_STREAM) if hooks.numbers else None
     survival = None if samples.guide is None else samples.guide.table.survival
+    aim = samples.guide.table.aim if samples.guide is not None and plan.aimed else None
 
     # ---- Leave the emitter ----
     loop_mode = "evaluated" if hooks.tracked and hooks.max_iterations is None else "symbolic"
@@ -65,28 +68,45 @@ def walk(samples: Samples, hooks: Hooks, active: mi.Bool | bool = True) -> Any:
     state = hooks.start(product)
     active &= plan.max_depth > 1
     pi, active = intersect(plan, scene, emission.ray, active)
-    path = Path(active, mi.UInt32(1), emission.ray, pi, product, eta, samples.early_numbers())
+    path = Path(active, mi.UInt32(1), emission.ray, pi, product, eta, samples.early_numbers(), [])
+    if aim is not None and not hooks.replaying:
+        path.pending = [Pending.nothing()]
 
     def body(
         path: Path, state: Any, sampler: mi.Sampler, selection: mi.PCG32 | None
     ) -> tuple[Path, Any, mi.Sampler, mi.PCG32 | None]:
         si, bsdf = find_vertex(path.ray, path.pi, path.active)
+        numbers = Numbers.draw(sampler, path.active).of_early(path.early, path.depth)
+        slot = None if aim is None else sampler.next_1d(path.active)
+        seen = None
+        for before in path.pending:  # one, or none
+            assert aim is not None
+            here = connect(plan, sensor, si, None, numbers.aperture, path.active & aims_from(bsdf))
+            visible = here.active & ~scene.ray_test(si.spawn_ray_to(here.target), here.active)
+            seen = Seen(visible)
+            r = before.factor(aim, sensor, si, path.ray, here, visible)
+            path = replace(path, active=path.active & (r != 0), product=path.product.scaled(r))  # NaN goes on
+            state = hooks.aimed(state, r)
         vertex = Vertex(path.pi, si, bsdf, path.ray, path.depth, path.product, path.active)
 
         # ---- Connect to the sensor, and scatter ----
-        numbers = Numbers.draw(sampler, path.active).of_early(path.early, path.depth)
         connected = path.active & hooks.wants(state, vertex)
         active = path.active & (path.depth + 1 < plan.max_depth) & hooks.goes_on(state, vertex)
+        aimed = None
+        if aim is not None:
+            able = active & aims_from(bsdf)
+            aimed, numbers = choose(scene, sensor, aim, path.ray.time, numbers, slot, able)
         this = segment(
-            plan, sensor, path.ray, si, bsdf, numbers, connected, active, hooks.connects, hooks.tracked, hooks.attached
-        )
+            plan, sensor, path.ray, si, bsdf, numbers, connected, active, hooks.connects, hooks.tracked,
+            hooks.attached, aimed,
+        )  # fmt: skip
         connection, scattering = this.connection, this.scattering
         if hooks.connects:
             if not (hooks.tracked or plan.track_zeros):
                 # No shadow ray where neither light nor its derivative would arrive.
                 connection.active = connection.active & ~dr.all(connection.f == 0)  # NaN arrives
             with dr.suspend_grad(when=not plan.differentiate_null):
-                shadow = passage(plan, scene, si, path.depth, connection, hooks.seen(vertex), loop_mode)
+                shadow = passage(plan, scene, si, path.depth, connection, seen or hooks.seen(vertex), loop_mode)
             connection.active, transmittance = shadow
             if hooks.tracked:
                 connection.f = evaluate(plan, si, bsdf, connection.wo, connection.active)
@@ -99,7 +119,7 @@ def walk(samples: Samples, hooks: Hooks, active: mi.Bool | bool = True) -> Any:
         if hooks.replaying:
             sampler.next_1d(active)  # roulette's
             active &= hooks.is_followed(state, vertex)
-            return _next(path, active, this.next_ray(hooks.attached), path.product, path.eta), state, sampler, selection
+            return _next(path, active, this.next_ray(hooks.attached)), state, sampler, selection
         product = path.product.times(scattering.weight, path.depth)
         eta = path.eta * dr.detach(scattering.eta)
         active = scattering.active & product.alive()
@@ -118,11 +138,13 @@ def walk(samples: Samples, hooks: Hooks, active: mi.Bool | bool = True) -> Any:
             roulette_weight = dr.select(playing, dr.rcp(q), 1)
             product, state = product.scaled(roulette_weight), hooks.survived(state, roulette_weight)
 
-        return _next(path, active, this.next_ray(hooks.attached), product, eta), state, sampler, selection
+        pending = [] if aimed is None else [aimed.pending(si, scattering.pdf, scattering.is_delta | scattering.is_null)]
+        path = replace(path, product=product, eta=eta, pending=pending)
+        return _next(path, active, this.next_ray(hooks.attached)), state, sampler, selection
 
-    def _next(path: Path, active: mi.Bool, ray: mi.Ray3f, product: Product, eta: mi.Float) -> Path:
+    def _next(path: Path, active: mi.Bool, ray: mi.Ray3f) -> Path:
         pi, active = intersect(plan, scene, ray, active)
-        return Path(active, path.depth + 1, ray, pi, product, eta, path.early)
+        return replace(path, active=active, depth=path.depth + 1, ray=ray, pi=pi)
 
     def recorded_body(path: Path, *rest: Any) -> tuple[Any, ...]:
         path, *changed = body(_with_masks(path), *rest)

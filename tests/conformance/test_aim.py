@@ -1,0 +1,262 @@
+"""Scattering that is aimed at what the sensor sees: means stay, whatever it sees and however it is aimed."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from conformance.test_guiding import SPP, guided, sample, samples, seeds
+from turns import a_few
+
+from reslrb_cli.estimators import ESTIMATORS
+from reslrb_cli.integrators import preparation
+from reslrb_cli.integrators.guiding import Purpose
+from reslrb_cli.measure.gradients import Case, relative
+from reslrb_cli.measure.statistics import compare
+from reslrb_cli.transport import aim
+from reslrb_cli.transport.aim import SLOTS, UNIFORM, Aim, Blocks, Pending
+
+pytestmark = pytest.mark.usefixtures("llvm")
+
+NAMES = (
+    *("roughconductor", "roughplastic", "plastic", "blend", "roughdielectric", "principled"),
+    *(
+        "texture",
+        "crop",
+        "gaussian",
+        "passes",
+        "roulette",
+        "envmap",
+        "glass",
+        "mask",
+        "plastic_beside_mask",
+        "twosided",
+    ),
+)
+FEW = ["roughplastic", "crop", "plastic_beside_mask"]
+
+
+@pytest.fixture(autouse=True)
+def everywhere(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Aim in scenes without glossy surfaces, too."""
+    monkeypatch.setattr(preparation, "worthwhile", lambda needs, max_depth: max_depth > 2)
+
+
+def aimed(name: str, **options: Any) -> tuple[Case, Any, Any]:
+    """A case, an integrator that has learned from one gradient, and is aimed by a table of large contrasts that has
+    nothing to do with the scene; and one that is not guided."""
+    scene, ours, plain = guided(name, 1, **options)
+    askew(scene, ours)
+    return scene, ours, plain
+
+
+def askew(scene: Case, ours: Any, factor: float = 1.5) -> None:
+    """Have the samples of the first sensor be aimed by such a table."""
+    ours.preparation.plan(scene.scene, scene.scene.sensors()[0], scene.params)
+    guiding = ours.preparation.guiding
+    film = guiding.films[0]
+    wanted = np.random.default_rng(1).lognormal(0, factor, len(film.areas())) * film.areas()
+    for purpose in Purpose:
+        table, counts = guiding._table(0, purpose)
+        guiding._tables[0, purpose] = replace(table, aim=Aim.of(film, wanted)), counts
+
+
+# ---- The means -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", a_few(NAMES, FEW))
+def test_means_are_those_of_unguided_samples(name: str) -> None:
+    assert means_hold(name, 32)
+
+
+def means_hold(name: str, count: int) -> Any:
+    scene, ours, plain = aimed(name)
+    result = compare(samples(scene, ours, count), samples(scene, plain, count, 1), block=None)
+    print(name, result)
+    return result
+
+
+@pytest.mark.parametrize("estimator", a_few(ESTIMATORS, ["reservoir", "gather"]))
+@pytest.mark.parametrize("adjoint", a_few(["correlated", "independent", "batched"], ["batched"]))
+def test_every_way_of_a_step_has_the_mean_of_the_unguided(estimator: str, adjoint: str) -> None:
+    scene, ours, plain = aimed("roughplastic", estimator=estimator)
+    found = [scene.gradients(each, seeds(24, block), SPP, adjoint=adjoint) for block, each in enumerate((ours, plain))]
+    result = compare(*found, block=None)
+    print(estimator, adjoint, result)
+    assert result
+
+
+def test_sequences_of_low_discrepancy_have_the_same_means() -> None:
+    scene, ours, plain = aimed("roughplastic", sequence="low_discrepancy")
+    assert compare(samples(scene, ours, 32), samples(scene, plain, 32, 1), block=None)
+
+
+def without_factor(patch: pytest.MonkeyPatch) -> None:
+    """Paths that were not aimed count as if none were."""
+    right = Pending.factor
+
+    def wrong(self: Pending, *rest: Any) -> Any:
+        import drjit as dr
+
+        r = right(self, *rest)
+        return dr.select(self.distance > 0, r, dr.maximum(r, 1))
+
+    patch.setattr(Pending, "factor", wrong)
+
+
+def of_even_density(patch: pytest.MonkeyPatch) -> None:
+    """The density is that of a film whose positions are drawn evenly."""
+    right = Aim.of
+
+    def wrong(blocks: Blocks, wanted: Any) -> Aim:
+        table = right(blocks, wanted)
+        return replace(table, density=type(table.density)(1) + 0 * table.density)
+
+    patch.setattr(Aim, "of", wrong)
+
+
+def behind_others(patch: pytest.MonkeyPatch) -> None:
+    """A path that meets something on its way to its point goes on as if it had arrived."""
+    patch.setattr(aim, "REACHED", 0.0)
+
+
+def seen_through_others(patch: pytest.MonkeyPatch) -> None:
+    """What the sensor does not see has the density of what it sees."""
+    right = Pending.factor
+
+    def wrong(self: Pending, table: Any, sensor: Any, si: Any, ray: Any, connection: Any, visible: Any) -> Any:
+        return right(self, table, sensor, si, ray, connection, connection.active)
+
+    patch.setattr(Pending, "factor", wrong)
+
+
+def with_delta_lobes(patch: pytest.MonkeyPatch) -> None:
+    """A mirror's direction counts as one that paths are aimed at."""
+    from reslrb_cli.transport.aim import Aimed
+
+    right = Aimed.pending
+    patch.setattr(Aimed, "pending", lambda self, si, pdf, discrete: right(self, si, pdf, discrete & False))
+
+
+def from_everywhere(patch: pytest.MonkeyPatch) -> None:
+    """The share that glass keeps for itself is missing."""
+    from reslrb_cli.transport import walk
+
+    patch.setattr(walk, "choose", lambda *args: _with_share(aim.choose(*args)))
+
+
+def _with_share(found: Any) -> Any:
+    aimed, numbers = found
+    return replace(aimed, share=0 * aimed.share + aim.SHARE), numbers
+
+
+#: With a case that shows them, and the steps that it takes.
+FAULTS = {
+    "without_factor": (without_factor, "roughplastic", 48),
+    "of_even_density": (of_even_density, "roughplastic", 48),
+    "behind_others": (behind_others, "twosided", 384),
+    "seen_through_others": (seen_through_others, "twosided", 384),
+    "with_delta_lobes": (with_delta_lobes, "plastic", 48),
+    "from_everywhere": (from_everywhere, "glass", 48),
+}
+
+
+@pytest.mark.parametrize("name", a_few(FAULTS, ["without_factor", "of_even_density"]))
+def test_what_would_bias_is_found(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    fault, case, count = FAULTS[name]
+    fault(monkeypatch)
+    assert not means_hold(case, count)
+
+
+# ---- Replays ---------------------------------------------------------------------------------------------------------
+
+
+def replayed_elsewhere(patch: pytest.MonkeyPatch) -> None:
+    """The replay is aimed by another table."""
+    from reslrb_cli.integrators import light_tracer as lt
+    from reslrb_cli.integrators.reslrb import Reslrb
+
+    right = Reslrb._replay
+
+    def wrong(self: Reslrb, trace: Any, gradient: Any, params: Any) -> None:
+        [samples] = trace.samples
+        table = samples.guide.table
+        other = replace(table, aim=replace(table.aim, slots=0 * table.aim.slots))
+        again = replace(samples, guide=replace(samples.guide, table=other))
+        right(self, lt.Trace([again], trace.image, trace.state), gradient, params)
+
+    patch.setattr(Reslrb, "_replay", wrong)
+
+
+@pytest.mark.parametrize("fault", [None, replayed_elsewhere])
+@pytest.mark.parametrize("name", a_few(["roughplastic", "plastic", "mask_texture_in_view"], ["plastic"]))
+def test_a_replay_follows_the_paths_that_were_traced(name: str, fault: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """At equal seeds `gather`, which traces twice, has the gradient of `stack` by dL/dI that is known beforehand."""
+    if fault is not None:
+        fault(monkeypatch)
+    found = {}
+    for kind in ("gather", "stack"):
+        scene, ours, _ = aimed(name, estimator=kind)
+        found[kind] = scene.gradient(ours, 5, SPP, adjoint="correlated")
+    known = sample(scene, ours, 5)[: len(found["gather"])]  # by `stack`, in one traversal
+    assert (relative(found["gather"], known) < 1e-4) == (fault is None)
+    if fault is None:
+        assert relative(found["stack"], known) < 1e-4
+
+
+def test_a_recorded_step_is_the_step() -> None:
+    """Recordings have the table that there is, not the one that they were made with."""
+    (scene, ours, _), (_, frozen, _) = (guided("roughplastic", 0, freeze=freeze) for freeze in (False, True))
+    for factor in (0.0, 1.0, 2.0):
+        for each in (ours, frozen):
+            askew(scene, each, factor)
+        assert relative(*(sample(scene, each, 5) for each in (ours, frozen))) < 1e-4
+    assert frozen.preparation.recordings.counts()["fused"] > 0
+
+
+# ---- Tables ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("size", [(1, 1), (9, 7), (160, 90), (1000, 3), (1920, 1080)])
+def test_blocks_part_the_film_and_their_densities_are_those_of_their_slots(size: tuple[int, int]) -> None:
+    film, random = Blocks.of(size), np.random.default_rng(3)
+    pixels = random.lognormal(0, 2, (size[1], size[0]))
+    areas, wanted = film.areas(), film.sums(pixels)
+    assert len(areas) == len(wanted) == film.rows * film.columns <= aim.BLOCKS
+    assert areas.sum() == size[0] * size[1]
+    row, column = size[1] // 2, size[0] // 2
+    block = row // film.side * film.columns + column // film.side
+    top, left = row // film.side * film.side, column // film.side * film.side
+    assert np.isclose(wanted[block], pixels[top : top + film.side, left : left + film.side].sum())
+    table = Aim.of(film, wanted)
+    counts = np.bincount(np.array(table.slots), minlength=len(areas))
+    density = np.array(table.density, np.float64)
+    even = areas / areas.sum()
+    assert counts.sum() == SLOTS
+    assert counts.min() > 0
+    assert np.allclose(density * even, counts / SLOTS, rtol=1e-5)
+    assert (density > 0.85 * UNIFORM).all()
+    assert np.abs(density * even - UNIFORM * even - (1 - UNIFORM) * wanted / wanted.sum()).sum() < 0.3
+    nothing = np.array(Aim.of(film, 0 * wanted).density)
+    assert nothing.min() > 0.4
+    assert nothing.max() < 2.5
+
+
+def test_paths_are_sent_where_gradients_were_asked_for() -> None:
+    _, ours, _ = guided("roughplastic", 2)
+    guiding = ours.preparation.guiding
+    asked = guiding.learned[0].film
+    assert asked.shape == guiding.films[0].areas().shape
+    densities = {p: np.array(guiding.table(0, p).aim.density, np.float64) for p in Purpose}
+    assert np.corrcoef(densities[Purpose.GRADIENT], asked)[0, 1] > 0.95
+    assert densities[Purpose.IMAGE].std() < 0.1 * densities[Purpose.GRADIENT].std()
+
+
+def test_only_scenes_with_glossy_surfaces_pay_for_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(preparation, "worthwhile", aim.worthwhile)
+    for name, expected in (("roughplastic", True), ("texture", False), ("thin_lens", False), ("bumpmap", False)):
+        scene, ours, _ = guided(name, 1)
+        assert ours.preparation.plan(scene.scene, scene.scene.sensors()[0], scene.params).aimed is expected
+        assert (ours.preparation.guiding.table(0, Purpose.BOTH).aim is not None) is expected
