@@ -137,14 +137,14 @@ class Guiding:
         return True
 
     def _aim(self, number: int, purpose: Purpose, learned: Learned | None) -> Aim | None:
-        """Where on the film of a sensor paths are sent: by where gradients were asked for, and for an image evenly."""
+        """Where on the film of a sensor paths are sent, by what was said there."""
         if number not in self.films:
             return None
-        film = self.films[number]
-        areas = film.areas()
-        even, asked = areas / areas.sum(), areas if learned is None else learned.film
-        wanted = asked / asked.sum() if asked.shape == areas.shape and asked.sum() > 0 else even
-        return Aim.of(film, purpose.value * wanted + (1 - purpose.value) * even)
+        film, said = self.films[number], np.zeros((2, 0)) if learned is None else learned.film
+        even = film.areas() / film.areas().sum()
+        loud = [np.sqrt(row, dtype=np.float64) for row in said] if said.shape == (2, film.count) else [even, even]
+        gradient, image = (row / row.sum() if row.sum() > 0 else even for row in loud)
+        return Aim.of(film, purpose.value * gradient + (1 - purpose.value) * image)
 
     def _onward(self, number: int) -> Onward:
         """What is known of where the paths for a sensor go on to, `number` being what its tables are kept under."""
@@ -194,7 +194,7 @@ class Guiding:
             if isinstance(onward, str):
                 return f"{number}/{onward}"
             film = take(f"{number}/film")
-            if film.ndim != 1 or not (np.isfinite(film) & (film >= 0)).all():
+            if film.ndim != 2 or len(film) != 2 or not (np.isfinite(film) & (film >= 0)).all():
                 return f"{number}/film"
             own = (array.astype(np.float32) for array in (sums, draws, film))
             found[int(number)] = Learned(next(own), next(own), count, onward, next(own))
@@ -211,8 +211,8 @@ class Guiding:
             learned.calls = calls
         return learned is None or calls in FIRST or calls % EVERY == 0
 
-    def learn(self, number: int, paths: int, said: Said, gradient: Array) -> None:
-        """Have the table of a sensor learn from what so many paths said (`hearing.py`) of dL/dI `gradient` (H, W, C).
+    def learn(self, number: int, paths: int, said: Said) -> None:
+        """Have the table of a sensor learn from what so many paths said (`hearing.py`).
 
         They are drawn from its table for BOTH, and serve nothing else.
         """
@@ -224,11 +224,8 @@ class Guiding:
             before.calls = 1
         onward = self._onward(number).with_more(said.walked(paths))
         draws = paths * (counts / self.grid.slots)
-        asked = None
-        if number in self.films:
-            pixels = np.abs(np.asarray(gradient, np.float64)).sum(-1)
-            asked = self.films[number].sums(np.where(np.isfinite(pixels), pixels, 0))
-        self.learned[number] = before.with_more(self.grid, said.by_start(self.grid.cells), draws, onward, asked)
+        heard = said.by_start(self.grid.cells)
+        self.learned[number] = before.with_more(self.grid, heard, draws, onward, said.by_block())
         for purpose in Purpose:
             self._tables.pop((number, purpose), None)
 

@@ -20,6 +20,7 @@ import numpy as np
 
 from reslrb_cli.integrators.onward import Walked
 from reslrb_cli.integrators.trail import Onwards, Trail, walk_back
+from reslrb_cli.transport.aim import film_blocks
 from reslrb_cli.transport.connection import Connection
 from reslrb_cli.transport.emission import sample_time
 from reslrb_cli.transport.factors import Product
@@ -62,6 +63,7 @@ class Heard:
     image: mi.Float
     light: mi.Float
     trail: Trail
+    factor: list[mi.Float]  # r of the vertex, where paths are aimed
 
 
 class Hearing(Hooks):
@@ -72,12 +74,22 @@ class Hearing(Hooks):
         self.groups = bsdf_groups(samples.plan)
         assert samples.guide is not None
         self.survival = samples.guide.table.survival
+        self.film = film_blocks(samples.sensor) if samples.plan.aimed else None
+        cells = 0 if self.film is None else voices(samples.plan) * self.film.count
+        self.places = dr.zeros(mi.Float, cells)  # squares by voice and block of the film
 
     def start(self, product: Product) -> Heard:
         number = voices(self.samples.plan) - 1
         light = dr.max(dr.abs(product.weight()))
         sums = [mi.Spectrum(0) for _ in range(number)]
-        return Heard([mi.UInt32(0) for _ in self.groups], sums, mi.Float(0), light, Trail.begin(number))
+        return Heard(
+            [mi.UInt32(0) for _ in self.groups],
+            sums,
+            mi.Float(0),
+            light,
+            Trail.begin(number),
+            [mi.Float(1)] if self.film else [],
+        )
 
     def _met(self, group: tuple[mi.BSDF, ...], vertex: Vertex) -> mi.UInt32:
         met = mi.Bool(not group)
@@ -97,6 +109,13 @@ class Hearing(Hooks):
         if plan.attached:
             parts.append(dr.abs(said))
         image = dr.squared_norm(dr.select(active, C.value(), 0))
+        for r in state.factor:
+            assert self.film is not None
+            block = self.film.block(connection.u)
+            for voice, square in enumerate([*(dr.squared_norm(part) for part in parts), image]):
+                counts = active & dr.isfinite(square) & (square > 0) & (r > 0)
+                place = block + voice * self.film.count
+                dr.scatter_reduce(dr.ReduceOp.Add, self.places, square / r, place, counts)
         sums = [total + part for total, part in zip(state.sums, parts, strict=True)]
         return replace(state, sums=sums, image=state.image + image, trail=state.trail.said(parts, image))
 
@@ -111,7 +130,8 @@ class Hearing(Hooks):
         return replace(state, counts=counts)
 
     def aimed(self, state: Heard, factor: mi.Float) -> Heard:
-        return state  # part of what paths say, other than the weight of a roulette that is being learned for
+        # Part of what paths say, other than the weight of a roulette that is being learned for.
+        return replace(state, factor=[factor])
 
     def survived(self, state: Heard, weight: mi.Float) -> Heard:
         state.trail.survives(weight)
@@ -124,16 +144,23 @@ class Said:
 
     `starts` (voices * cells), voice by voice, are squares by the cell that a path starts in; `onward` is what paths go
     on to say from where they are; `whole` (rows * BINS) are squares by voice, the weights that paths left emitters
-    with, and their vertices.
+    with, and their vertices. `places` (voices * blocks, or none) are squares of what was said at a block of the film,
+    as if no path had been aimed there.
     """
 
     starts: mi.Float
     onward: Onwards
     whole: mi.Float
+    places: mi.Float
 
     def by_start(self, cells: int) -> Array:
         """Sums of squares (voices, cells), float32."""
         return np.array(self.starts).reshape(-1, cells)
+
+    def by_block(self) -> Array | None:
+        """Sums of squares (voices, blocks of the film), float32; None where no path is aimed."""
+        rows = len(self.whole) // BINS - 2
+        return np.array(self.places).reshape(rows, -1) if len(self.places) else None
 
     def walked(self, paths: int) -> Walked:
         """What that says of where paths go on to."""
@@ -148,7 +175,8 @@ def hear(samples: Samples, gradient: mi.TensorXf) -> Said:
     loudest = dr.max(dr.abs(dr.select(dr.isfinite(adjoint.image), adjoint.image, 0)))
     loudness = dr.select(loudest > 0, dr.rcp(loudest), 0)
     dr.make_opaque(loudness)
-    heard: Heard = walk(samples, Hearing(samples, adjoint, loudness))
+    hooks = Hearing(samples, adjoint, loudness)
+    heard: Heard = walk(samples, hooks)
     sampler = samples.sampler()
     sample_time(plan, samples.sensor, sampler)
     drawn = samples.drawn(*samples.emission_numbers(sampler))  # as the walk had them
@@ -162,7 +190,7 @@ def hear(samples: Samples, gradient: mi.TensorXf) -> Said:
         dr.scatter_reduce(dr.ReduceOp.Add, sums, value, drawn.cell + voice * cells, counts)
     # All is one kernel: what is evaluated apart would be traced again.
     whole = _sums([*squares, heard.light, mi.Float(heard.trail.count)], samples.width)
-    said = Said(sums, walk_back(heard.trail), whole)
+    said = Said(sums, walk_back(heard.trail), whole, hooks.places)
     dr.eval(said)
     return said
 

@@ -37,15 +37,15 @@ class Learned:
     how many started in each cell.
 
     `calls` is the number of gradients so far. Arrays are float32, and never changed. `onward` is what paths went on to
-    say from where they were; None where nothing of that is known. `film` is where on the film gradients were asked for,
-    |dL/dI| by block (`transport/aim.py`); empty where nobody wants to know.
+    say from where they were; None where nothing of that is known. `film` (2, blocks) are sums of squares too, by where
+    on the film paths said it (`transport/aim.py`); without blocks where none is aimed.
     """
 
     sums: Array
     draws: Array
     calls: int = 0
     onward: Onward | None = None
-    film: Array = field(default_factory=lambda: np.zeros(0, np.float32))
+    film: Array = field(default_factory=lambda: np.zeros((2, 0), np.float32))
     _densities: tuple[Grid, list[Array]] | None = field(default=None, init=False, repr=False, compare=False)
 
     @staticmethod
@@ -67,14 +67,18 @@ class Learned:
             if np.isfinite(total) and total > 0:
                 sums[int(voice == len(heard) - 1)] += said / total
         draws = (KEEP * self.draws + draws).astype(np.float32)
-        return Learned(sums, draws, self.calls, onward, self._asked(film))
+        return Learned(sums, draws, self.calls, onward, self._places(film))
 
-    def _asked(self, film: Array | None) -> Array:
-        """`film` with that of a newer gradient, each gradient as much as another."""
-        total = 0.0 if film is None else float(film.sum())
-        if film is None or not (np.isfinite(total) and total > 0):
+    def _places(self, heard: Array | None) -> Array:
+        """`film` with what newer paths have said by block (voices, blocks), the image last."""
+        if heard is None:
             return self.film
-        return ((KEEP * self.film if self.film.shape == film.shape else 0) + film / total).astype(np.float32)
+        newest = np.zeros((2, heard.shape[1]))
+        for voice, said in enumerate(heard.astype(np.float64)):
+            total = said.sum()
+            if np.isfinite(total) and total > 0:
+                newest[int(voice == len(heard) - 1)] += said / total
+        return ((KEEP * self.film if self.film.shape == newest.shape else 0) + newest).astype(np.float32)
 
     def on(self, grid: Grid, before: Grid) -> Learned:
         """The same about the cells of another grid, of which those of the one before are made, spread evenly."""

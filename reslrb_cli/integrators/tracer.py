@@ -12,7 +12,6 @@ from typing import Any, ClassVar
 
 import drjit as dr
 import mitsuba as mi
-import numpy as np
 from typing_extensions import Self
 
 from reslrb_cli.errors import UnsupportedScene
@@ -136,7 +135,7 @@ class LightTracer:
                 said = self.preparation.recordings.call("hear", samples, hear, gradient)
             else:
                 said = hear(samples, gradient)
-            guiding.learn(_number(job), samples.width, said, np.array(gradient))
+            guiding.learn(_number(job), samples.width, said)
 
     def image_estimator(self) -> Estimator | None:
         """The estimator that makes images of its own; None where they show every connection."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from reslrb_cli.integrators.guiding import Array, Guiding, Purpose
+from reslrb_cli.integrators.guiding import Guiding, Purpose
 from reslrb_cli.integrators.hearing import Said
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.views import View
@@ -27,10 +27,10 @@ class Witness(Guiding):
         self.drawn.append(found)
         return found
 
-    def learn(self, number: int, paths: int, said: Said, gradient: Array) -> None:
+    def learn(self, number: int, paths: int, said: Said) -> None:
         """Have the table of a sensor learn from paths that were drawn for this alone."""
         self.drawn.pop()
-        super().learn(number, paths, said, gradient)
+        super().learn(number, paths, said)
 
 
 def purposes(problem: Problem, view: View) -> list[tuple[int, str, Purpose]]:

@@ -69,6 +69,15 @@ class Blocks:
     def rows(self) -> int:
         return -(-self.height // self.side)
 
+    @property
+    def count(self) -> int:
+        return self.rows * self.columns
+
+    def block(self, u: mi.Point2f) -> mi.UInt32:
+        """The block that a film position (pixels) lies in, or is nearest to."""
+        column, row = (mi.UInt32(dr.clip(x, 0, n - 1)) // self.side for x, n in ((u.x, self.width), (u.y, self.height)))
+        return row * self.columns + column
+
     def areas(self) -> NDArray[np.float64]:
         """Pixels of each block (rows * columns)."""
         across, down = (np.minimum(self.side, n - np.arange(0, n, self.side)) for n in (self.width, self.height))
@@ -134,9 +143,7 @@ class Pending:
         `connection` is as from an emitter, without the correction for shading normals.
         """
         film = film_blocks(sensor)
-        column, row = (mi.UInt32(dr.clip(x, 0, n - 1)) // film.side
-                       for x, n in ((connection.u.x, film.width), (connection.u.y, film.height)))  # fmt: skip
-        p_film = dr.gather(mi.Float, aim.density, row * film.columns + column, visible)
+        p_film = dr.gather(mi.Float, aim.density, film.block(connection.u), visible)
         cos_z = dr.abs(dr.dot(si.n, dr.normalize(connection.target - si.p)))
         cos = dr.maximum(dr.abs(dr.dot(si.n, ray.d)), 1e-20)
         p_a = p_film * cos_z * connection.weight[0] * dr.square(si.t) / cos
