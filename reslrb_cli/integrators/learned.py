@@ -36,14 +36,17 @@ class Learned:
     """What the paths for one sensor have said: sums of squares (2, cells), about the gradient and about the image, and
     how many started in each cell.
 
-    `calls` is the number of gradients so far. Arrays are float32, and never changed. `onward` is what paths went on to
-    say from where they were; None where nothing of that is known.
+    `calls` is the number of gradients so far, or since what was learned was found to be wrong. Arrays are float32, and
+    never changed. `onward` is what paths went on to say from where they were; None where nothing of that is known.
+    `worse` is the mean square of what the newest paths said, in that of evenly drawn ones: above 1 the table that they
+    were drawn from did harm, as it does where a scene has changed.
     """
 
     sums: Array
     draws: Array
     calls: int = 0
     onward: Onward | None = None
+    worse: float = 1.0
     _densities: tuple[Grid, list[Array]] | None = field(default=None, init=False, repr=False, compare=False)
 
     @staticmethod
@@ -58,11 +61,14 @@ class Learned:
         """
         sums = np.float32(KEEP) * self.sums
         means = np.divide(grid.measures(), draws, out=np.zeros(grid.cells), where=draws > 0).astype(np.float32)
+        paths, guided = float(draws.sum()), []
         for voice, said in enumerate(heard.astype(np.float32, copy=False)):
             total = said @ means
             if np.isfinite(total) and total > 0:
                 sums[int(voice == len(heard) - 1)] += said / total
-        return Learned(sums, (KEEP * self.draws + draws).astype(np.float32), self.calls, onward)
+                guided.append(paths * float(said @ np.square(means)) / float(total))
+        worse = float(np.mean(guided)) if guided else 1.0
+        return Learned(sums, (KEEP * self.draws + draws).astype(np.float32), self.calls, onward, worse)
 
     def on(self, grid: Grid, before: Grid) -> Learned:
         """The same about the cells of another grid, of which those of the one before are made, spread evenly."""

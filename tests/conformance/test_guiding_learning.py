@@ -10,10 +10,12 @@ import pytest
 from conformance.test_guiding import SPP, guided, sample
 
 from reslrb_cli.integrators import freezing
-from reslrb_cli.integrators.guiding import grid_for
+from reslrb_cli.integrators.guiding import Guiding, Purpose, grid_for, learnings
 from reslrb_cli.integrators.learned import FINE, KEEP, Learned, most_cells
+from reslrb_cli.integrators.onward import Walked
 from reslrb_cli.measure.gradients import relative
 from reslrb_cli.transport.guide import Grid, Table, apportion, make_grid
+from reslrb_cli.transport.survival import CELLS
 
 pytestmark = pytest.mark.usefixtures("llvm")
 
@@ -59,6 +61,58 @@ def test_tables_lie_where_every_kernel_finds_them_alike() -> None:
         kept.append((table, np.zeros(number)))
         for array in (table.slots, table.weights, table.edges):
             assert array.numpy().ctypes.data % 32 == 0
+
+
+def lessons(ours: Any, count: int, learn: Any = lambda: None) -> list[int]:
+    """Of so many more gradients, those that are learned from."""
+    guiding, found = ours.preparation.guiding, []
+    for gradient in range(1, count + 1):
+        if guiding.due(0):
+            found.append(gradient)
+            learn()
+    return found
+
+
+def test_tables_learn_often_at_first_and_soon_enough_later() -> None:
+    """What a run is told that it pays for is what it has."""
+    scene, ours, _ = guided("two_emitters", 0)
+    guiding = ours.preparation.guiding
+    del guiding.due
+    scene.gradient(ours, 1, 1, adjoint="correlated")
+    learned = [1, *(1 + gradient for gradient in lessons(ours, 99))]
+    assert learned == [1, 2, 4, 8, 16, 32, 48, 64, 80, 96]
+    assert [learnings(k) for k in range(1, 101)] == [sum(one <= k for one in learned) for k in range(1, 101)]
+
+
+class Contrary:
+    """Paths that speak only where the table has them start less often than evenly, or only where it does more often."""
+
+    def __init__(self, guiding: Guiding, harmed: bool) -> None:
+        self.guiding, self.harmed = guiding, harmed
+
+    def by_start(self, cells: int) -> np.ndarray:
+        counts, grid = self.guiding.counts(0, Purpose.BOTH), self.guiding.grid
+        assert grid is not None
+        rare = counts < grid.slots * grid.measures()
+        return np.tile(np.where(rare == self.harmed, counts, 0).astype(np.float32), (2, 1))
+
+    def walked(self, paths: int) -> Walked:
+        return Walked(np.zeros((2, CELLS)), np.zeros(CELLS), np.zeros(CELLS), np.zeros(2), 0.0, 1.0)
+
+
+@pytest.mark.parametrize("harmed", [False, True])
+def test_tables_that_do_harm_learn_as_often_as_at_first(harmed: bool) -> None:
+    """But no oftener where they go on to do harm: only what learns rarely begins anew."""
+    scene, ours, _ = guided("two_emitters", 0)
+    guiding = ours.preparation.guiding
+    del guiding.due
+    scene.gradient(ours, 1, 64, adjoint="correlated")
+    said = Contrary(guiding, harmed)
+    found = [1, *(1 + gradient for gradient in lessons(ours, 47, lambda: guiding.learn(0, 1000, said)))]
+    assert (guiding.learned[0].worse > 1) == harmed
+    anew = [17, 18, 20, 24, 32, 33, 34, 36, 40, 48] if harmed else [32, 48]
+    assert found == [1, 2, 4, 8, 16, *anew]
+    assert guiding.lessons == len(found)
 
 
 # ---- Cells -----------------------------------------------------------------------------------------------------------
