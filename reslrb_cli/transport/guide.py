@@ -79,13 +79,13 @@ class Grid:
         return Grid((bits[0], bits[1], bits[2], bits[3]), self.edges)
 
     def summed(self, values: Array, coarser: Grid) -> Array:
-        """Of values for these cells (cells,) the sums over each coarser one's."""
+        """Of values for these cells (cells,) the sums over each coarser one's, of the same type."""
         result = values.reshape(self.shape)
         for axis, few in enumerate(coarser.shape):
             while result.shape[axis] > few:
                 rows = np.moveaxis(result, axis, 0)
                 result = np.moveaxis(rows[::2] + rows[1::2], 0, axis)
-        return result.astype(np.float64).ravel()
+        return result.ravel()
 
     def shared_out(self, values: Array, coarser: Grid) -> Array:
         """Of values for coarser cells, each one's spread evenly over its own; the inverse of `summed`."""
@@ -131,7 +131,7 @@ def apportion(grid: Grid, density: Array) -> Array:
     """Slots of each cell (int64), at least UNIFORM of its measure, the others in proportion to `density`."""
     least = _least_slots(grid)
     # Rounded along the cells' order, so that what one loses a neighbour gains.
-    ends = np.cumsum(density)
+    ends = np.cumsum(density, dtype=np.float64)
     ends *= (grid.slots - least.sum()) / ends[-1]
     np.rint(ends, out=ends)
     counts = least.copy()

@@ -8,10 +8,11 @@ import drjit as dr
 import numpy as np
 import pytest
 from conformance.test_guiding import SPP, guided, sample
+from scipy import ndimage
 
 from reslrb_cli.integrators import freezing
 from reslrb_cli.integrators.guiding import Guiding, Purpose, grid_for, learnings
-from reslrb_cli.integrators.learned import FINE, KEEP, Learned, most_cells
+from reslrb_cli.integrators.learned import FINE, KEEP, Learned, _blurred, most_cells
 from reslrb_cli.integrators.onward import Walked
 from reslrb_cli.measure.gradients import relative
 from reslrb_cli.transport.guide import Grid, Table, apportion, make_grid
@@ -147,6 +148,22 @@ def test_a_grid_of_few_cells_says_what_the_finest_does() -> None:
             np.testing.assert_allclose(both[1].density(grid, share), expected, rtol=1e-4)
     again = both[1].on(finest, grid)  # what was learned is kept where cells become finer
     np.testing.assert_allclose(again.density(finest, 0.2), both[0].density(finest, 0.2), rtol=1e-4)
+
+
+@pytest.mark.parametrize("kind", [np.float32, np.float64])
+@pytest.mark.parametrize("bits", [(3, 2, 4, 3), (0, 1, 0, 2), (2, 0, 0, 0), (0, 0, 0, 0)])
+def test_cells_are_smoothed_over_their_neighbours(bits: Any, kind: Any) -> None:
+    """As SciPy does it; nothing goes from one emitter to another, and a sum stays what it was."""
+    grid = Grid(bits, (0.0, 0.3, 1.0))
+    values = np.random.default_rng(5).gamma(0.1, size=grid.cells).astype(kind)
+    expected, before = values.reshape(grid.shape), values.copy()
+    for axis in range(1, 5):
+        expected = ndimage.convolve1d(expected, (0.25, 0.5, 0.25), axis, mode="nearest")
+    found = _blurred(grid, values)
+    assert found.dtype == kind
+    np.testing.assert_allclose(found, expected.ravel(), rtol=1e-6)
+    np.testing.assert_allclose(found.reshape(2, -1).sum(1), values.reshape(2, -1).sum(1), rtol=1e-5)
+    assert np.array_equal(values, before)
 
 
 def cells_after(*calls: Any, told: int | None = None) -> list[Grid]:
