@@ -25,6 +25,7 @@ from reslrb_cli.transport.survival import CELLS, Survival, box_of
 Array = np.ndarray[Any, Any]
 
 EVERY = 16  # gradients of a sensor from one time that its table learns to the next; at first after 1, 2, 4 and 8
+WRONG = 1.5  # `Learned.worse` of a table that does harm; one that is worth nothing, and right, has 1
 LEAST_BITS = 16  # cells, log2, however many sensors there are
 MOST_BYTES = 2**26  # of all tables together; sensors for which there is no room share
 LEARNING_STREAM = 0x1EA2  # seeds of the samples that tables learn from
@@ -194,7 +195,7 @@ class Guiding:
         onward = self._onward(number).with_more(said.walked(paths))
         draws = paths * (counts / self.grid.slots)
         learned = before.with_more(self.grid, said.by_start(self.grid.cells), draws, onward)
-        if learned.worse > 1 and learned.calls % EVERY == 0:
+        if learned.worse > WRONG and learned.calls % EVERY == 0:
             learned.calls = 0  # the scene has changed: it learns as often as it did at first
         self.learned[number] = learned
         self.lessons += 1

@@ -36,8 +36,8 @@ class Learned:
 
     `calls` is the number of gradients so far, or since what was learned was found to be wrong. Arrays are float32, and
     never changed. `onward` is what paths went on to say from where they were; None where nothing of that is known.
-    `worse` is the mean square of what the newest paths said, in that of evenly drawn ones: above 1 the table that they
-    were drawn from did harm, as it does where a scene has changed.
+    `worse` is the mean square of what the newest paths said, in that of evenly drawn ones: far above 1 the table that
+    they were drawn from did harm, as it does where a scene has changed.
     """
 
     sums: Array

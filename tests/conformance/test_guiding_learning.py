@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import drjit as dr
@@ -11,12 +12,10 @@ from conformance.test_guiding import SPP, guided, sample
 from scipy import ndimage
 
 from reslrb_cli.integrators import freezing
-from reslrb_cli.integrators.guiding import Guiding, Purpose, grid_for, learnings
+from reslrb_cli.integrators.guiding import grid_for, learnings
 from reslrb_cli.integrators.learned import FINE, KEEP, Learned, _blurred, most_cells
-from reslrb_cli.integrators.onward import Walked
 from reslrb_cli.measure.gradients import relative
 from reslrb_cli.transport.guide import Grid, Table, apportion, make_grid
-from reslrb_cli.transport.survival import CELLS
 
 pytestmark = pytest.mark.usefixtures("llvm")
 
@@ -64,56 +63,48 @@ def test_tables_lie_where_every_kernel_finds_them_alike() -> None:
             assert array.numpy().ctypes.data % 32 == 0
 
 
-def lessons(ours: Any, count: int, learn: Any = lambda: None) -> list[int]:
-    """Of so many more gradients, those that are learned from."""
-    guiding, found = ours.preparation.guiding, []
-    for gradient in range(1, count + 1):
-        if guiding.due(0):
-            found.append(gradient)
-            learn()
-    return found
-
-
 def test_tables_learn_often_at_first_and_soon_enough_later() -> None:
     """What a run is told that it pays for is what it has."""
     scene, ours, _ = guided("two_emitters", 0)
     guiding = ours.preparation.guiding
     del guiding.due
     scene.gradient(ours, 1, 1, adjoint="correlated")
-    learned = [1, *(1 + gradient for gradient in lessons(ours, 99))]
+    learned = [1, *(gradient for gradient in range(2, 101) if guiding.due(0))]
     assert learned == [1, 2, 4, 8, 16, 32, 48, 64, 80, 96]
     assert [learnings(k) for k in range(1, 101)] == [sum(one <= k for one in learned) for k in range(1, 101)]
 
 
-class Contrary:
-    """Paths that speak only where the table has them start less often than evenly, or only where it does more often."""
-
-    def __init__(self, guiding: Guiding, harmed: bool) -> None:
-        self.guiding, self.harmed = guiding, harmed
-
-    def by_start(self, cells: int) -> np.ndarray:
-        counts, grid = self.guiding.counts(0, Purpose.BOTH), self.guiding.grid
-        assert grid is not None
-        rare = counts < grid.slots * grid.measures()
-        return np.tile(np.where(rare == self.harmed, counts, 0).astype(np.float32), (2, 1))
-
-    def walked(self, paths: int) -> Walked:
-        return Walked(np.zeros((2, CELLS)), np.zeros(CELLS), np.zeros(CELLS), np.zeros(2), 0.0, 1.0)
-
-
-@pytest.mark.parametrize("harmed", [False, True])
-def test_tables_that_do_harm_learn_as_often_as_at_first(harmed: bool) -> None:
+@pytest.mark.parametrize("worse", [0.3, 1.0, 3.0])
+def test_tables_that_do_harm_learn_as_often_as_at_first(worse: float, monkeypatch: pytest.MonkeyPatch) -> None:
     """But no oftener where they go on to do harm: only what learns rarely begins anew."""
     scene, ours, _ = guided("two_emitters", 0)
-    guiding = ours.preparation.guiding
+    guiding, right = ours.preparation.guiding, Learned.with_more
     del guiding.due
-    scene.gradient(ours, 1, 64, adjoint="correlated")
-    said = Contrary(guiding, harmed)
-    found = [1, *(1 + gradient for gradient in lessons(ours, 47, lambda: guiding.learn(0, 1000, said)))]
-    assert (guiding.learned[0].worse > 1) == harmed
-    anew = [17, 18, 20, 24, 32, 33, 34, 36, 40, 48] if harmed else [32, 48]
-    assert found == [1, 2, 4, 8, 16, *anew]
-    assert guiding.lessons == len(found)
+    monkeypatch.setattr(Learned, "with_more", lambda *given: replace(right(*given), worse=worse))
+    learned = []
+    for seed in range(1, 49):
+        before = guiding.lessons
+        scene.gradient(ours, seed, 1, adjoint="correlated")
+        learned += [seed] * (guiding.lessons - before)
+    anew = [17, 18, 20, 24, 32, 33, 34, 36, 40, 48] if worse > 1 else [32, 48]
+    assert learned == [1, 2, 4, 8, 16, *anew]
+
+
+@pytest.mark.parametrize("weight", [0.5, 1.0, 4.0])
+def test_what_a_table_does_to_those_who_speak_is_what_it_is_worth(weight: float) -> None:
+    """Of a voice that speaks where paths weigh so much, and beside one that speaks where they weigh nothing of note."""
+    grid, paths = make_grid([True] * 4, [1.0], 8), 1e4
+    rare = np.arange(grid.cells) < 8
+    others = (1 - (rare * grid.measures()).sum() / weight) / (~rare * grid.measures()).sum()
+    draws = paths * grid.measures() * np.where(rare, 1 / weight, others)
+    assert draws.sum() == pytest.approx(paths)
+    heard = np.stack([rare * draws, ~rare * draws])
+    alone = Learned.nothing(grid).with_more(grid, heard[[0, 0]], draws)
+    assert alone.worse == pytest.approx(weight, rel=1e-5)
+    assert Learned.nothing(grid).with_more(grid, heard, draws).worse == pytest.approx(
+        (weight + 1 / others) / 2, rel=1e-5
+    )
+    assert Learned.nothing(grid).with_more(grid, 0 * heard, draws).worse == 1
 
 
 # ---- Cells -----------------------------------------------------------------------------------------------------------
