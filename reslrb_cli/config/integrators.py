@@ -156,9 +156,10 @@ class Reslrb(AttachingTracer):
     guiding: Literal["auto", "on", "off"] = Field(
         default="auto",
         description="Whether light paths start where those of earlier steps had something to say about gradient and "
-        "image, at least a quarter of them anywhere, and end where those had little left to say. `on`: less noise "
-        "where few paths say anything (a room lit through windows, a caustic), from the second step on; the first, and "
-        "one in seven of those that follow, trace as many paths again to learn where that is. `auto`: where a few "
+        "image, at least a quarter of them anywhere, and end where those had little left to say; in scenes with glossy "
+        "surfaces they are also sent to what the sensor sees. `on`: less noise "
+        "where few paths say anything (a room lit through windows, a caustic), from the second step on; a few of the "
+        "first, and one in sixteen later, trace as many paths again to learn where that is. `auto`: where a few "
         "steps with and without it, before the first iteration, show that it pays here. Left out it is `auto` with "
         "estimator `auto`, and `off` with one that is named.",
     )

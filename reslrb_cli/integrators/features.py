@@ -143,9 +143,15 @@ def _tables(plan: Plan) -> str:
     return f"light paths start, and go on, where earlier ones had something to say: {size}"
 
 
+def _aimed(plan: Plan) -> Plan | str:
+    if plan.grid is None:
+        return "emission is not guided"
+    return replace(plan, aims=not plan.aims) if not plan.attached else "something moves"
+
+
 def _guided(plan: Plan) -> Plan:
     if plan.grid is not None:
-        return replace(plan, grid=None)
+        return replace(plan, grid=None, aims=False)
     return replace(plan, grid=grid_for([True] * 4, [1.0] * len(plan.needs.emitters), 1))
 
 
@@ -227,6 +233,8 @@ FEATURES = (
     Feature("black texels of lamps", lambda p: bool(p.evened_lamps), "drawn too, since their derivative counts",
             "no texture of a lamp is differentiated: texels are drawn by their radiance", _evened),
     Feature(GUIDED, lambda p: p.grid is not None, _tables, "guiding: off", _guided),
+    Feature("aimed scattering", lambda p: p.aimed, "a quarter of scattered paths go where the sensor looks",
+            "only guided paths are, in scenes with glossy surfaces, where nothing moves", _aimed),
     Feature(SEQUENCE, lambda p: p.sequence is not None,
             "where paths start, and how they first scatter, is evenly spread", "sequence: independent", _sequence),
     Feature("derivative of the filter's normalization", lambda p: p.attached and p.attached_normalization,

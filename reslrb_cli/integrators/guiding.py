@@ -25,8 +25,8 @@ from reslrb_cli.transport.survival import CELLS, Survival, box_of
 
 Array = np.ndarray[Any, Any]
 
-FIRST = (1, 2, 4)  # gradients of a sensor after which its table learns, and then
-EVERY = 7  # after every so many
+EVERY = 16  # gradients of a sensor from one time that its table learns to the next; at first after 1, 2, 4 and 8
+WRONG = 1.5  # `Learned.worse` of a table that does harm; one that is worth nothing, and right, has 1
 LEAST_BITS = 16  # cells, log2, however many sensors there are
 MOST_BYTES = 2**26  # of all tables together; sensors for which there is no room share
 LEARNING_STREAM = 0x1EA2  # seeds of the samples that tables learn from
@@ -64,11 +64,12 @@ def grid_for(used: Sequence[bool], weights: Sequence[float], sensors: int, paths
 class Guiding:
     """Grid and tables of one scene, as a light tracer keeps them.
 
-    `images` says whether samples that serve an image alone are guided. Tables that are `held` learn no more.
+    `images` says whether samples that serve an image alone are guided. Tables that are `held` learn no more. `lessons`
+    counts how often any have learned.
     """
 
     def __init__(self) -> None:
-        self.images, self.held = True, False
+        self.images, self.held, self.lessons = True, False, 0
         self.grid: Grid | None = None
         self._emission: tuple[list[bool], list[float], int] | None = None  # what `grid_for` is to know of a scene
         self.box = np.zeros((2, 3), np.float32)  # of the scene, as it was first seen
@@ -209,7 +210,7 @@ class Guiding:
         calls = 1 if learned is None else learned.calls + 1
         if learned is not None:
             learned.calls = calls
-        return learned is None or calls in FIRST or calls % EVERY == 0
+        return learned is None or learns_after(calls)
 
     def learn(self, number: int, paths: int, said: Said) -> None:
         """Have the table of a sensor learn from what so many paths said (`hearing.py`).
@@ -225,9 +226,27 @@ class Guiding:
         onward = self._onward(number).with_more(said.walked(paths))
         draws = paths * (counts / self.grid.slots)
         heard = said.by_start(self.grid.cells)
-        self.learned[number] = before.with_more(self.grid, heard, draws, onward, said.by_block())
+        learned = before.with_more(self.grid, heard, draws, onward, said.by_block())
+        if learned.worse > WRONG and learned.calls % EVERY == 0:
+            learned.calls = 0  # the scene has changed: it learns as often as it did at first
+        self.learned[number] = learned
+        self.lessons += 1
         for purpose in Purpose:
             self._tables.pop((number, purpose), None)
+
+
+def learns_after(gradients: int) -> bool:
+    """Whether a table learns from the gradient of this number, counted from 1.
+
+    What it knows doubles each time at first. Later it has to look again soon enough for a scene that has changed; if it
+    finds one, counting begins anew.
+    """
+    return gradients % EVERY == 0 or (gradients < EVERY and gradients.bit_count() == 1)
+
+
+def learnings(gradients: int) -> int:
+    """How often a table has learned after so many gradients of its sensor."""
+    return min(gradients, EVERY - 1).bit_length() + gradients // EVERY
 
 
 def learning_seed(seed: mi.UInt32 | int) -> mi.UInt32:

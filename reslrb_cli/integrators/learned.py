@@ -14,14 +14,12 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from scipy import ndimage
 
 from reslrb_cli.integrators.onward import KEEP, Onward
 from reslrb_cli.transport.guide import Grid
 
 Array = np.ndarray[Any, Any]
 
-BLUR = (0.25, 0.5, 0.25)  # along each number, of neighbouring cells
 FINE = 2.0  # cells, at most, for each path that has been heard
 
 
@@ -36,9 +34,11 @@ class Learned:
     """What the paths for one sensor have said: sums of squares (2, cells), about the gradient and about the image, and
     how many started in each cell.
 
-    `calls` is the number of gradients so far. Arrays are float32, and never changed. `onward` is what paths went on to
-    say from where they were; None where nothing of that is known. `film` (2, blocks) are sums of squares too, by where
-    on the film paths said it (`transport/aim.py`); without blocks where none is aimed.
+    `calls` is the number of gradients so far, or since what was learned was found to be wrong. Arrays are float32, and
+    never changed. `onward` is what paths went on to say from where they were; None where nothing of that is known.
+    `worse` is the mean square of what the newest paths said, in that of evenly drawn ones: far above 1 the table that
+    they were drawn from did harm, as it does where a scene has changed. `film` (2, blocks) are sums of squares too, by
+    where on the film paths said it (`transport/aim.py`); without blocks where none is aimed.
     """
 
     sums: Array
@@ -46,6 +46,7 @@ class Learned:
     calls: int = 0
     onward: Onward | None = None
     film: Array = field(default_factory=lambda: np.zeros((2, 0), np.float32))
+    worse: float = 1.0
     _densities: tuple[Grid, list[Array]] | None = field(default=None, init=False, repr=False, compare=False)
 
     @staticmethod
@@ -61,13 +62,18 @@ class Learned:
         Each voice is scaled to a total of 1. `onward` has learned from the same paths already.
         """
         sums = np.float32(KEEP) * self.sums
-        means = np.divide(grid.measures(), draws, out=np.zeros(grid.cells), where=draws > 0).astype(np.float32)
+        means = np.zeros(grid.cells, np.float32)
+        np.divide(grid.measures(), draws, out=means, where=draws > 0, casting="same_kind")
+        paths, guided = float(draws.sum()), []
         for voice, said in enumerate(heard.astype(np.float32, copy=False)):
             total = said @ means
             if np.isfinite(total) and total > 0:
                 sums[int(voice == len(heard) - 1)] += said / total
-        draws = (KEEP * self.draws + draws).astype(np.float32)
-        return Learned(sums, draws, self.calls, onward, self._places(film))
+                guided.append(paths * float(said @ np.square(means)) / float(total))
+        started = np.float32(KEEP) * self.draws
+        started += draws
+        worse = float(np.mean(guided)) if guided else 1.0
+        return Learned(sums, started, self.calls, onward, self._places(film), worse)
 
     def _places(self, heard: Array | None) -> Array:
         """`film` with what newer paths have said by block (voices, blocks), the image last."""
@@ -95,25 +101,34 @@ class Learned:
         if self._densities is None:
             self._densities = self._both(grid)
         coarser, (gradient, image) = self._densities
-        return grid.shared_out(share * gradient + (1 - share) * image, coarser)
+        return grid.shared_out(np.float32(share) * gradient + np.float32(1 - share) * image, coarser)
 
     def _both(self, grid: Grid) -> tuple[Grid, list[Array]]:
-        """The densities by the gradient and by the image, and the cells that they are of."""
+        """The densities by the gradient and by the image, float32, and the cells that they are of."""
         coarser = grid.coarser(FINE * self.draws.sum(dtype=np.float64))
-        measures, found = coarser.measures(), []
+        measures, found = coarser.measures().astype(np.float32), []
         draws = _blurred(coarser, grid.summed(self.draws, coarser))
         for row in self.sums:
-            square = _blurred(coarser, grid.summed(row, coarser))
-            loud = np.sqrt(np.divide(square, draws, out=np.zeros(coarser.cells), where=draws > 0)) * measures
+            square, loud = _blurred(coarser, grid.summed(row, coarser)), np.zeros(coarser.cells, np.float32)
+            np.divide(square, draws, out=loud, where=draws > 0)
+            np.sqrt(loud, out=loud)
+            loud *= measures
             total = loud.sum()
             found.append(loud / total if np.isfinite(total) and total > 0 else measures / measures.sum())
         return coarser, found
 
 
 def _blurred(grid: Grid, values: Array) -> Array:
-    """Sums over neighbouring cells, weighted; the cells of one emitter are none of another's neighbours."""
+    """Sums over neighbouring cells, a quarter, a half and a quarter of them along each number, the cell at an end
+    counted once more beyond it; the cells of one emitter are none of another's neighbours."""
     result = values.reshape(grid.shape)
     for axis in range(1, result.ndim):
         if result.shape[axis] > 1:
-            result = ndimage.convolve1d(result, BLUR, axis, mode="nearest")
+            rows, made = np.moveaxis(result, axis, 0), np.empty_like(result)
+            between, sums = rows[1:] + rows[:-1], np.moveaxis(made, axis, 0)
+            between *= 0.25
+            np.add(between[1:], between[:-1], out=sums[1:-1])
+            for end in (0, -1):
+                np.add(0.5 * rows[end], between[end], out=sums[end])
+            result = made
     return result.ravel()

@@ -14,6 +14,7 @@ from reslrb_cli.integrators import light_tracer as lt
 from reslrb_cli.integrators.features import FEATURES, Feature
 from reslrb_cli.integrators.reslrb import Reslrb
 from reslrb_cli.scene.catalog import list_parameters
+from reslrb_cli.transport.aim import film_blocks
 from reslrb_cli.transport.guide import even_table
 from reslrb_cli.transport.plan import Plan
 from reslrb_cli.transport.samples import passes
@@ -93,7 +94,7 @@ def plan_rows(plan: Plan) -> list[PlanRow]:
 def count(integrator: Reslrb, plan: Plan, scene: mi.Scene, sensor: mi.Sensor, known: bool) -> list[int]:
     """Operations of each large kernel of a step by this plan."""
     with dr.suspend_grad():
-        table = None if plan.grid is None else even_table(plan.grid)
+        table = None if plan.grid is None else even_table(plan.grid, film_blocks(sensor) if plan.aimed else None)
         [samples] = passes(plan, scene, sensor, 0, 1, None, table)
         samples = replace(samples, width=PATHS)
         channels = samples.film.film.base_channels_count()

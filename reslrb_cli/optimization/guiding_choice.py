@@ -56,7 +56,10 @@ def _record(problem: Problem, say: Say, cache: Cache | None) -> tuple[GuidedReco
             note = f"run.memory_budget has no room for tables of {in_words(needed)}"
             return GuidedRecord(guided=False, note=note), None
     chosen = None if problem.pilot is None else problem.pilot.chosen
-    key = "" if cache is None else key_of({"guiding": 3, "of": chosen, **situation(problem)})
+    plan = sizes(problem, LONGER)
+    # Learning is a larger part of a short run, where tables learn most often at first.
+    of = {"guiding": 4, "of": chosen, "lessons": plan.lessons}
+    key = "" if cache is None else key_of({**of, **situation(problem)})
     known = recall(GuidedRecord, cache, key)
     if known is not None:
         return known, None
@@ -64,7 +67,7 @@ def _record(problem: Problem, say: Say, cache: Cache | None) -> tuple[GuidedReco
     plain, guided = (problem.integrator.afresh(guided=on) for on in (False, True))
     trial = StepTrial(problem, "guiding", plain, guided)
     share = share_left(problem, SEQUENCE_SHARE if is_auto(problem.config, "sequence") else 0.0)
-    record = GuidingPilot(trial, sizes(problem, LONGER), trial.part_of_views(), share).run()
+    record = GuidingPilot(trial, plan, trial.part_of_views(), share).run()
     if cache is not None:
         cache.put(key, record.to_json())
     return record, trial

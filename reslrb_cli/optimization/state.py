@@ -127,7 +127,7 @@ def _restore_guiding(problem: Problem, guiding: Guiding, stored: Stored) -> None
     gradients = stored.value("guiding")
     if not isinstance(gradients, dict) or not all(name in names for name in gradients):
         raise stored.wrong("guiding", "does not have the gradients of sensors by their numbers")
-    counts = {name: stored.count("guiding", name) for name in gradients}
+    counts = {name: stored.count("guiding", name, least=0) for name in gradients}
     wrong = restore_tables(problem, guiding, counts, lambda name: stored.archive.array(f"guiding/{name}", kind="f"))
     if wrong is not None:
         raise stored.wrong(f"guiding/{wrong}", "is not what was learned of this scene")

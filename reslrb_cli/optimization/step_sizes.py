@@ -15,14 +15,16 @@ PLANNED = 3.4
 @dataclass(frozen=True)
 class Sizes:
     """Samples per pixel: of a step of the run (`step`), of each set of its samples that has one dL/dI (`call`), and of
-    a pass of these (`part`). `alone`: images have samples of their own. `entries` are those of all gradients. A step of
-    the other kind may take `longer` times as long as one of this; `planned` are PLANNED, or less."""
+    a pass of these (`part`). `alone`: images have samples of their own. `entries` are those of all gradients.
+    `lessons` says how often tables of guided emission learn for each such set, in the mean over the run. A step of the
+    other kind may take `longer` times as long as one of this; `planned` are PLANNED, or less."""
 
     step: int
     call: int
     part: int
     alone: bool
     entries: int
+    lessons: float
     longer: float
     planned: float = PLANNED
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from reslrb_cli.integrators import Reslrb as Tracer
 from reslrb_cli.integrators import render_image
-from reslrb_cli.integrators.guiding import Guiding, Purpose
+from reslrb_cli.integrators.guiding import Guiding, Purpose, learnings
 from reslrb_cli.integrators.interface import Job
 from reslrb_cli.optimization.samples import take_gradient
 from reslrb_cli.optimization.step_pilot import Taken
@@ -36,7 +36,16 @@ def sizes(problem: Problem, longer: float, planned: float = PLANNED) -> Sizes:
     call = run.spp // run.batches if adjoint == "batched" else run.spp
     part = min(problem.samples_per_pass or call, call)
     entries = sum(problem.selection.array(key).size for key in problem.selection.keys)
-    return Sizes(run.spp, call, part, adjoint == "independent", entries, longer, planned)
+    sets = run.spp / call * len(problem.drawn(0))
+    return Sizes(run.spp, call, part, adjoint == "independent", entries, lessons(problem) / sets, longer, planned)
+
+
+def lessons(problem: Problem) -> float:
+    """How often tables of guided emission learn in an iteration of the run, in the mean over all of it."""
+    run, sensors = problem.config.run, len(problem.trained)
+    each = run.batches - (run.first_batch == "image") if problem.config.adjoint == "batched" else 1
+    gradients = run.iterations * each * len(problem.drawn(0)) / sensors
+    return learnings(max(round(gradients), 1)) * sensors / run.iterations
 
 
 class StepTrial:

@@ -14,10 +14,10 @@ from contextlib import closing
 from dataclasses import dataclass, replace
 from itertools import islice, pairwise
 
-from reslrb_cli.integrators.guiding import EVERY
 from reslrb_cli.optimization.loop import optimize
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.state import guiding_of
+from reslrb_cli.optimization.step_trial import lessons
 from reslrb_cli.records.clock import MIB
 from reslrb_cli.records.metrics import Record
 
@@ -85,21 +85,34 @@ def _highest(problem: Problem, records: Sequence[Record]) -> int:
 
 def _measure(problem: Problem, spp: int) -> Steps:
     """A few iterations of `spp` samples per pixel."""
-    guided = guiding_of(problem) is not None
-    least = EVERY if guided else LEAST
+    guiding = guiding_of(problem)
     records: list[Record] = []
+    taught: list[int] = []  # how often tables had learned after each
     begin = time.perf_counter()
     with closing(_iterations(problem, spp)) as iterations:
         for record in iterations:
             records.append(record)
+            taught.append(0 if guiding is None else guiding.lessons)
             if len(records) == WARM_UP:
                 begin = time.perf_counter()
             timed = len(records) - WARM_UP
-            if timed >= MOST or (timed >= least and time.perf_counter() - begin > SECONDS):
+            if timed >= MOST or (timed >= LEAST and time.perf_counter() - begin > SECONDS):
                 break
     times = [records[0].elapsed_s, *(b.elapsed_s - a.elapsed_s for a, b in pairwise(records))]
-    # Some guided steps also learn, which is a part of what they take in the mean; a median would not have it.
-    steady = (statistics.fmean if guided else statistics.median)(times[WARM_UP:])
+    steady = statistics.median(times[WARM_UP:])
+    if guiding is not None:
+        learned = [b - a for a, b in pairwise(taught)]
+        steady = _with_learning(times[WARM_UP:], learned[WARM_UP - 1 :], lessons(problem))
     extra = sum(max(seconds - steady, 0.0) for seconds in times[:WARM_UP])
     compiled = min(sum(record.codegen_ms for record in records[:WARM_UP]) / 1e3, extra)
     return Steps(spp, steady, extra - compiled, compiled, _highest(problem, records))
+
+
+def _with_learning(times: Sequence[float], learned: Sequence[int], mean: float) -> float:
+    """Seconds of an iteration in which tables learn `mean` times, from some in which they learned as often as `learned`
+    says: oftener than later on, since these are early ones."""
+    plain = [seconds for seconds, count in zip(times, learned, strict=True) if count == 0]
+    if not plain or sum(learned) == 0:
+        return statistics.fmean(times)
+    without = statistics.median(plain)
+    return without + mean * max(sum(times) - len(times) * without, 0.0) / sum(learned)

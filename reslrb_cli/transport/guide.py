@@ -24,7 +24,7 @@ import mitsuba as mi
 import numpy as np
 
 from reslrb_cli.backend.own_memory import own_memory
-from reslrb_cli.transport.aim import Aim
+from reslrb_cli.transport.aim import Aim, Blocks
 from reslrb_cli.transport.survival import Survival
 
 Array = np.ndarray[Any, Any]
@@ -80,13 +80,13 @@ class Grid:
         return Grid((bits[0], bits[1], bits[2], bits[3]), self.edges)
 
     def summed(self, values: Array, coarser: Grid) -> Array:
-        """Of values for these cells (cells,) the sums over each coarser one's."""
+        """Of values for these cells (cells,) the sums over each coarser one's, of the same type."""
         result = values.reshape(self.shape)
         for axis, few in enumerate(coarser.shape):
             while result.shape[axis] > few:
                 rows = np.moveaxis(result, axis, 0)
                 result = np.moveaxis(rows[::2] + rows[1::2], 0, axis)
-        return result.astype(np.float64).ravel()
+        return result.ravel()
 
     def shared_out(self, values: Array, coarser: Grid) -> Array:
         """Of values for coarser cells, each one's spread evenly over its own; the inverse of `summed`."""
@@ -132,7 +132,7 @@ def apportion(grid: Grid, density: Array) -> Array:
     """Slots of each cell (int64), at least UNIFORM of its measure, the others in proportion to `density`."""
     least = _least_slots(grid)
     # Rounded along the cells' order, so that what one loses a neighbour gains.
-    ends = np.cumsum(density)
+    ends = np.cumsum(density, dtype=np.float64)
     ends *= (grid.slots - least.sum()) / ends[-1]
     np.rint(ends, out=ends)
     counts = least.copy()
@@ -167,9 +167,10 @@ class Table:
         )
 
 
-def even_table(grid: Grid) -> Table:
-    """The table of somebody who has learned nothing."""
-    return Table.of(grid, apportion(grid, grid.measures()))
+def even_table(grid: Grid, film: Blocks | None = None) -> Table:
+    """The table of somebody who has learned nothing; paths are aimed at all of the `film`, if any."""
+    aim = None if film is None else Aim.of(film, film.areas())
+    return Table.of(grid, apportion(grid, grid.measures()), aim=aim)
 
 
 @dataclass

@@ -7,13 +7,16 @@ from typing import Any
 import numpy as np
 import pytest
 
+from reslrb_cli.integrators.guiding import EVERY
 from reslrb_cli.measure.gradients import Case, integrator, seeds
 from reslrb_cli.measure.small_scenes import SIZE, diffuse, rgb, texture, transform
 
 pytestmark = pytest.mark.usefixtures("llvm")
 
 SPP = 64
-BEFORE, WITHIN = 14, 20  # steps with the one opening, and with the other
+#: Steps with the one opening, and with the other: it slides when tables have just learned, and do not again for as long
+#: as they ever do.
+BEFORE, WITHIN = 2 * EVERY, 20
 AT_FIRST, AT_LAST = 2.0, 1.1  # how many times the error of unguided samples a step's may have
 TELLING = 0.1  # the largest standard error, as a share of the limit, of which anything is to be said
 RIGHT, LEFT = 0.6, -0.6  # where the shutter is
@@ -76,7 +79,7 @@ def rows(scene: Case, ours: Any, count: int, block: int) -> np.ndarray:
     return found
 
 
-def errors(count: int) -> tuple[tuple[float, float], ...]:
+def errors(count: int, before: int = BEFORE) -> tuple[tuple[float, float], ...]:
     """Root mean square errors of guided steps, in those of unguided ones, with their standard errors: before the
     shutter slides, in the first step after that, and WITHIN steps later."""
     scene = Case(chamber(), [KEY])
@@ -93,7 +96,7 @@ def errors(count: int) -> tuple[tuple[float, float], ...]:
         ratio = float(np.sqrt(guided / even))
         return ratio, ratio * float(np.sqrt(spread)) / 2
 
-    for seed in range(BEFORE):
+    for seed in range(before):
         scene.gradient(ours, 9000 + seed, SPP, adjoint="correlated")
     found.append(compared())
     slide(scene, LEFT)
@@ -116,12 +119,25 @@ def holds(found: tuple[tuple[float, float], ...]) -> bool:
 
 
 def test_a_table_that_has_gone_wrong_does_little_harm_and_is_soon_corrected() -> None:
-    assert holds(errors(32))
+    assert holds(errors(48))
 
 
 @pytest.mark.long
 def test_many_steps_say_so_too() -> None:
     assert holds(errors(400))
+
+
+@pytest.mark.long
+def test_tables_that_know_much_forget_it_as_soon() -> None:
+    assert holds(errors(100, 8 * EVERY))
+
+
+@pytest.mark.long
+def test_tables_that_do_not_look_again_in_time_are_too_wrong(monkeypatch: pytest.MonkeyPatch) -> None:
+    from reslrb_cli.integrators import guiding
+
+    monkeypatch.setattr(guiding, "EVERY", 2 * EVERY)
+    assert not holds(errors(32))
 
 
 @pytest.mark.long

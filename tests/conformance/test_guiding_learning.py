@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import drjit as dr
 import numpy as np
 import pytest
 from conformance.test_guiding import SPP, guided, sample
+from scipy import ndimage
 
 from reslrb_cli.integrators import freezing
-from reslrb_cli.integrators.guiding import grid_for
-from reslrb_cli.integrators.learned import FINE, KEEP, Learned, most_cells
+from reslrb_cli.integrators.guiding import grid_for, learnings
+from reslrb_cli.integrators.learned import FINE, KEEP, Learned, _blurred, most_cells
 from reslrb_cli.measure.gradients import relative
 from reslrb_cli.transport.guide import Grid, Table, apportion, make_grid
 
@@ -61,6 +63,50 @@ def test_tables_lie_where_every_kernel_finds_them_alike() -> None:
             assert array.numpy().ctypes.data % 32 == 0
 
 
+def test_tables_learn_often_at_first_and_soon_enough_later() -> None:
+    """What a run is told that it pays for is what it has."""
+    scene, ours, _ = guided("two_emitters", 0)
+    guiding = ours.preparation.guiding
+    del guiding.due
+    scene.gradient(ours, 1, 1, adjoint="correlated")
+    learned = [1, *(gradient for gradient in range(2, 101) if guiding.due(0))]
+    assert learned == [1, 2, 4, 8, 16, 32, 48, 64, 80, 96]
+    assert [learnings(k) for k in range(1, 101)] == [sum(one <= k for one in learned) for k in range(1, 101)]
+
+
+@pytest.mark.parametrize("worse", [0.3, 1.0, 3.0])
+def test_tables_that_do_harm_learn_as_often_as_at_first(worse: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    """But no oftener where they go on to do harm: only what learns rarely begins anew."""
+    scene, ours, _ = guided("two_emitters", 0)
+    guiding, right = ours.preparation.guiding, Learned.with_more
+    del guiding.due
+    monkeypatch.setattr(Learned, "with_more", lambda *given: replace(right(*given), worse=worse))
+    learned = []
+    for seed in range(1, 49):
+        before = guiding.lessons
+        scene.gradient(ours, seed, 1, adjoint="correlated")
+        learned += [seed] * (guiding.lessons - before)
+    anew = [17, 18, 20, 24, 32, 33, 34, 36, 40, 48] if worse > 1 else [32, 48]
+    assert learned == [1, 2, 4, 8, 16, *anew]
+
+
+@pytest.mark.parametrize("weight", [0.5, 1.0, 4.0])
+def test_what_a_table_does_to_those_who_speak_is_what_it_is_worth(weight: float) -> None:
+    """Of a voice that speaks where paths weigh so much, and beside one that speaks where they weigh nothing of note."""
+    grid, paths = make_grid([True] * 4, [1.0], 8), 1e4
+    rare = np.arange(grid.cells) < 8
+    others = (1 - (rare * grid.measures()).sum() / weight) / (~rare * grid.measures()).sum()
+    draws = paths * grid.measures() * np.where(rare, 1 / weight, others)
+    assert draws.sum() == pytest.approx(paths)
+    heard = np.stack([rare * draws, ~rare * draws])
+    alone = Learned.nothing(grid).with_more(grid, heard[[0, 0]], draws)
+    assert alone.worse == pytest.approx(weight, rel=1e-5)
+    assert Learned.nothing(grid).with_more(grid, heard, draws).worse == pytest.approx(
+        (weight + 1 / others) / 2, rel=1e-5
+    )
+    assert Learned.nothing(grid).with_more(grid, 0 * heard, draws).worse == 1
+
+
 # ---- Cells -----------------------------------------------------------------------------------------------------------
 
 
@@ -93,6 +139,22 @@ def test_a_grid_of_few_cells_says_what_the_finest_does() -> None:
             np.testing.assert_allclose(both[1].density(grid, share), expected, rtol=1e-4)
     again = both[1].on(finest, grid)  # what was learned is kept where cells become finer
     np.testing.assert_allclose(again.density(finest, 0.2), both[0].density(finest, 0.2), rtol=1e-4)
+
+
+@pytest.mark.parametrize("kind", [np.float32, np.float64])
+@pytest.mark.parametrize("bits", [(3, 2, 4, 3), (0, 1, 0, 2), (2, 0, 0, 0), (0, 0, 0, 0)])
+def test_cells_are_smoothed_over_their_neighbours(bits: Any, kind: Any) -> None:
+    """As SciPy does it; nothing goes from one emitter to another, and a sum stays what it was."""
+    grid = Grid(bits, (0.0, 0.3, 1.0))
+    values = np.random.default_rng(5).gamma(0.1, size=grid.cells).astype(kind)
+    expected, before = values.reshape(grid.shape), values.copy()
+    for axis in range(1, 5):
+        expected = ndimage.convolve1d(expected, (0.25, 0.5, 0.25), axis, mode="nearest")
+    found = _blurred(grid, values)
+    assert found.dtype == kind
+    np.testing.assert_allclose(found, expected.ravel(), rtol=1e-6)
+    np.testing.assert_allclose(found.reshape(2, -1).sum(1), values.reshape(2, -1).sum(1), rtol=1e-5)
+    assert np.array_equal(values, before)
 
 
 def cells_after(*calls: Any, told: int | None = None) -> list[Grid]:

@@ -22,7 +22,7 @@ from reslrb_cli.optimization.step_sizes import Sizes
 from reslrb_cli.optimization.step_trial import StepTrial
 from reslrb_cli.records.clock import StepClock
 
-SIZES = Sizes(step=64, call=16, part=16, alone=False, entries=200, longer=LONGER)
+SIZES = Sizes(step=64, call=16, part=16, alone=False, entries=200, lessons=1 / 7, longer=LONGER)
 
 
 @dataclass

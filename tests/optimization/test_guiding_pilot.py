@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from optimization.deciding import SIZES, World
 
-from reslrb_cli.integrators.guiding import EVERY
 from reslrb_cli.optimization.guiding_pilot import LONGER, SHARE, GuidingPilot
 from reslrb_cli.optimization.pilot import TIMING_NOISE
 from reslrb_cli.optimization.pilot_records import ITERATIONS
@@ -20,8 +19,8 @@ from reslrb_cli.records.paid import GuidedRecord
 
 def gain(world: World, sizes: Sizes = SIZES) -> float:
     """The true gain of a world: by hand."""
-    learning = (world.walk * sizes.part + world.python) / EVERY
-    return 1 / (world.variance * (world.time + learning / sizes.call))
+    learning = (world.walk * sizes.part + world.python) / sizes.call
+    return 1 / (world.variance * (world.time + learning * sizes.lessons))
 
 
 @pytest.mark.parametrize(
@@ -84,12 +83,26 @@ def test_a_fault_that_forgets_what_learning_costs_is_seen(monkeypatch: pytest.Mo
     assert on_by_accident(variance=0.8, walk=0.7, python=16.8) > 50
 
 
+def test_a_run_pays_for_as_much_learning_as_it_has() -> None:
+    """What is worth nothing where a table learns from each seventh set of samples is worse where it learns from most of
+    them, as in a short run, and better where it rarely does."""
+    world, gains = {"variance": 0.8, "walk": 0.7, "python": 16.8}, []
+    for lessons in (3 / 4, SIZES.lessons, 1 / 16):
+        sizes = replace(SIZES, lessons=lessons)
+        by_hand = 1 / (0.8 * (1 + (0.7 * 16 + 16.8) * lessons / 16))
+        assert gain(World(**world), sizes) == pytest.approx(by_hand)
+        record = World(**world).run(sizes)
+        assert record.low < by_hand < record.high
+        gains.append(record.gain)
+    assert gains[0] < 0.6 * gains[1] < gains[1] < gains[2]
+
+
 @pytest.mark.parametrize("spp", [1, 4, 16, 64, 1024])
 @pytest.mark.parametrize(("overhead", "python"), [(0.0, 0.0), (0.1, 1.0), (1.0, 100.0), (1000.0, 1000.0)])
 @pytest.mark.parametrize("time", [1.0, 3.0, 10.0])
 def test_its_share_is_kept(spp: int, overhead: float, python: float, time: float) -> None:
     world = World(0.1, time, overhead=overhead, python=python, walk=1.5)
-    record = world.run(Sizes(spp, spp, spp, False, 200, LONGER), SHARE)
+    record = world.run(Sizes(spp, spp, spp, False, 200, 1 / 7, LONGER), SHARE)
     taken = [call for call in world.calls if call[0] is not False]
     assert all(call[2] <= spp for call in world.calls)
     if record.gain is None:
@@ -108,7 +121,7 @@ def test_what_a_step_takes_beside_its_kernels_counts_as_often_as_a_run_has_it() 
     world = World(0.5, 3.0, overhead=160.0)
     record, trial = world.run(), SIZES.trial
     python = world.overhead * trial / SIZES.call
-    learning = (world.walk * SIZES.part + world.python) / EVERY * trial / SIZES.call
+    learning = (world.walk * SIZES.part + world.python) * SIZES.lessons * trial / SIZES.call
     assert record.low < (trial + python) / (0.5 * (3 * trial + python + learning)) < record.high
     assert record.guided
     assert not World(0.5, 3.0).run().guided
@@ -119,7 +132,7 @@ def test_what_a_step_takes_beside_its_kernels_counts_as_often_as_a_run_has_it() 
 @pytest.mark.parametrize(("python", "walks"), [(10.0, 2), (30.0, 1), (60.0, 0)])
 def test_a_second_walk_is_left_out_where_there_is_no_time_for_it(python: float, walks: int) -> None:
     world = World(0.1, 1.0, overhead=1.0, python=python, walk=1.5)
-    record = world.run(Sizes(16, 16, 16, False, 200, LONGER), SHARE)
+    record = world.run(Sizes(16, 16, 16, False, 200, 1 / 7, LONGER), SHARE)
     assert [call[0] for call in world.calls].count("learn") == max(walks, 1)  # one, to see what it takes
     assert (record.rounds >= LEAST_ROUNDS) == (walks > 0)
     assert record.share <= SHARE * 1.05
@@ -127,7 +140,7 @@ def test_a_second_walk_is_left_out_where_there_is_no_time_for_it(python: float, 
 
 def test_samples_are_no_more_than_those_of_a_pass() -> None:
     world = World(0.1, 2.0)
-    record = world.run(Sizes(step=4096, call=1024, part=8, alone=False, entries=200, longer=LONGER))
+    record = world.run(replace(SIZES, step=4096, call=1024, part=8))
     assert max(call[2] for call in world.calls) == 8
     assert record.guided
 
@@ -146,7 +159,7 @@ def test_images_with_samples_of_their_own_are_guided_where_that_pays() -> None:
         assert record.line().startswith("guiding on: " if guided else "guiding on for gradients, off for images: ")
         # What the image takes is a part of the step.
         own = image_time if guided else 1.0
-        learning = (16 + 1) / EVERY / 16
+        learning = (16 + 1) * SIZES.lessons / 16
         assert record.gain == pytest.approx((1 + 1) / (0.05 * (2 + own + learning)), rel=0.2)
 
 

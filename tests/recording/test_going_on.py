@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -22,7 +24,9 @@ from recording.going_on import (
 from turns import a_few
 
 from reslrb_cli.cli import main
+from reslrb_cli.integrators.learned import Learned
 from reslrb_cli.optimization import loop, optimizers
+from reslrb_cli.records.checkpoint import FILE_NAME, open_state
 
 RUN = Path("runs/tiny")
 #: Enough for the best to be known when the run is killed.
@@ -105,6 +109,24 @@ def test_a_killed_run_goes_on_as_if_nothing_had_been(
     assert manifest["status"] == "finished"
     [resumed] = manifest["resumed"]
     assert (resumed["iteration"], resumed["changed"]) == (newest, {})
+
+
+def test_a_run_goes_on_whose_tables_were_just_found_wrong(experiment: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its newest state is that of a moment at which gradients are counted anew."""
+    right = Learned.with_more
+
+    def wrong(*given: Any) -> Learned:
+        return replace(right(*given), worse=2.0)
+
+    monkeypatch.setattr(Learned, "with_more", wrong)
+    settings = [*CASES["guided"], "run.iterations=9", "run.checkpoint_every={iterations: 5}"]
+    sets = [word for setting in settings for word in ("--set", setting)]
+    whole, left = run_and_kill(monkeypatch, 7, *ITERATIONS, *sets)
+    archive, values = open_state(left / "checkpoint" / FILE_NAME)
+    archive.close()
+    assert values["guiding"] == {"0": 0}
+    assert optimize("--resume", str(left), "--quiet") == 0
+    assert differences(whole, left) == []
 
 
 def test_a_run_that_went_on_can_go_on_again(experiment: Path, monkeypatch: pytest.MonkeyPatch) -> None:
