@@ -139,7 +139,7 @@ def _staying(plan: Plan) -> Plan | str:
 
 def _tables(plan: Plan) -> str:
     assert plan.grid is not None
-    size = f"{plan.grid.cells} cells, {sensor_bytes(plan.grid) / 2**20:.1f} MiB of tables"
+    size = f"{plan.grid.cells} cells, {sensor_bytes(plan.grid, plan.aims) / 2**20:.1f} MiB of tables"
     return f"light paths start, and go on, where earlier ones had something to say: {size}"
 
 

@@ -44,10 +44,11 @@ class Purpose(enum.Enum):
     BOTH = 0.5
 
 
-def sensor_bytes(grid: Grid) -> int:
-    """Bytes for one sensor: a table for each purpose, and what has been learned."""
+def sensor_bytes(grid: Grid, aims: bool = True) -> int:
+    """Bytes for one sensor: a table for each purpose, and what has been learned; `aims`: where paths are sent, too."""
     emission = len(Purpose) * (grid.slots + 2 * grid.cells) + 3 * grid.cells
-    return 4 * (emission + (len(Purpose) + 4) * CELLS + len(Purpose) * (SLOTS + BLOCKS) + BLOCKS)
+    aim = len(Purpose) * (SLOTS + BLOCKS) + 2 * BLOCKS
+    return 4 * (emission + (len(Purpose) + 4) * CELLS + (aim if aims else 0))
 
 
 def grid_for(used: Sequence[bool], weights: Sequence[float], sensors: int, paths: int | None = None) -> Grid:

@@ -75,8 +75,8 @@ class Hearing(Hooks):
         assert samples.guide is not None
         self.survival = samples.guide.table.survival
         self.film = film_blocks(samples.sensor) if samples.plan.aimed else None
-        cells = 0 if self.film is None else voices(samples.plan) * self.film.count
-        self.places = dr.zeros(mi.Float, cells)  # squares by voice and block of the film
+        # Squares by voice and block of the film, where paths are aimed.
+        self.places = [dr.zeros(mi.Float, voices(samples.plan) * self.film.count)] if self.film else []
 
     def start(self, product: Product) -> Heard:
         number = voices(self.samples.plan) - 1
@@ -115,7 +115,7 @@ class Hearing(Hooks):
             for voice, square in enumerate([*(dr.squared_norm(part) for part in parts), image]):
                 counts = active & dr.isfinite(square) & (square > 0) & (r > 0)
                 place = block + voice * self.film.count
-                dr.scatter_reduce(dr.ReduceOp.Add, self.places, square / r, place, counts)
+                dr.scatter_reduce(dr.ReduceOp.Add, self.places[0], square / r, place, counts)
         sums = [total + part for total, part in zip(state.sums, parts, strict=True)]
         return replace(state, sums=sums, image=state.image + image, trail=state.trail.said(parts, image))
 
@@ -151,7 +151,7 @@ class Said:
     starts: mi.Float
     onward: Onwards
     whole: mi.Float
-    places: mi.Float
+    places: list[mi.Float]
 
     def by_start(self, cells: int) -> Array:
         """Sums of squares (voices, cells), float32."""
@@ -160,7 +160,7 @@ class Said:
     def by_block(self) -> Array | None:
         """Sums of squares (voices, blocks of the film), float32; None where no path is aimed."""
         rows = len(self.whole) // BINS - 2
-        return np.array(self.places).reshape(rows, -1) if len(self.places) else None
+        return np.array(self.places[0]).reshape(rows, -1) if self.places else None
 
     def walked(self, paths: int) -> Walked:
         """What that says of where paths go on to."""

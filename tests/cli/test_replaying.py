@@ -124,7 +124,8 @@ def test_a_guided_run_without_its_tables_is_refused(run, capsys):
 
 
 LEARNED = {"guiding/0/sums": np.ones((2, 16), np.float32), "guiding/0/draws": np.ones(16, np.float32),
-           "guiding/0/onward": np.ones((4, 16), np.float32), "guiding/0/frame": np.ones(8)}  # fmt: skip
+           "guiding/0/onward": np.ones((4, 16), np.float32), "guiding/0/frame": np.ones(8),
+           "guiding/0/film": np.ones((2, 16), np.float32)}  # fmt: skip
 
 
 @pytest.mark.parametrize(

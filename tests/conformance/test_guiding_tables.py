@@ -11,7 +11,6 @@ from conformance.gradient_cases import CASES
 
 from reslrb_cli.measure.gradients import Case, integrator
 from reslrb_cli.transport.guide import UNIFORM, Grid, Guide, Table, apportion, even_table, make_grid
-from reslrb_cli.transport.survival import Survival
 
 pytestmark = pytest.mark.usefixtures("llvm")
 
@@ -84,8 +83,8 @@ def test_roulette_does_not_see_the_weight(monkeypatch: pytest.MonkeyPatch) -> No
 
     right, factor = guide.Table.of, [1.0]
 
-    def weighed(grid: Grid, counts: np.ndarray, survival: Survival) -> Table:
-        table = right(grid, counts, survival)
+    def weighed(grid: Grid, counts: np.ndarray, *rest: Any) -> Table:
+        table = right(grid, counts, *rest)
         return replace(table, weights=mi.Float(np.array(table.weights) * np.float32(factor[0])))
 
     monkeypatch.setattr(guide.Table, "of", staticmethod(weighed))
