@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from conformance.test_guiding import SPP, guided, sample, samples, seeds
+from conformance.test_survival import replayed_from, replays_agree
 from turns import a_few
 
 from reslrb_cli.estimators import ESTIMATORS
@@ -173,37 +174,12 @@ def test_what_would_bias_is_found(name: str, monkeypatch: pytest.MonkeyPatch) ->
 # ---- Replays ---------------------------------------------------------------------------------------------------------
 
 
-def replayed_elsewhere(patch: pytest.MonkeyPatch) -> None:
-    """The replay is aimed by another table."""
-    from reslrb_cli.integrators import light_tracer as lt
-    from reslrb_cli.integrators.reslrb import Reslrb
-
-    right = Reslrb._replay
-
-    def wrong(self: Reslrb, trace: Any, gradient: Any, params: Any) -> None:
-        [samples] = trace.samples
-        table = samples.guide.table
-        other = replace(table, aim=replace(table.aim, slots=0 * table.aim.slots))
-        again = replace(samples, guide=replace(samples.guide, table=other))
-        right(self, lt.Trace([again], trace.image, trace.state), gradient, params)
-
-    patch.setattr(Reslrb, "_replay", wrong)
-
-
-@pytest.mark.parametrize("fault", [None, replayed_elsewhere])
+@pytest.mark.parametrize("fault", [False, True])
 @pytest.mark.parametrize("name", a_few(["roughplastic", "plastic", "mask_texture_in_view"], ["plastic"]))
-def test_a_replay_follows_the_paths_that_were_traced(name: str, fault: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    """At equal seeds `gather`, which traces twice, has the gradient of `stack` by dL/dI that is known beforehand."""
-    if fault is not None:
-        fault(monkeypatch)
-    found = {}
-    for kind in ("gather", "stack"):
-        scene, ours, _ = aimed(name, estimator=kind)
-        found[kind] = scene.gradient(ours, 5, SPP, adjoint="correlated")
-    known = sample(scene, ours, 5)[: len(found["gather"])]  # by `stack`, in one traversal
-    assert (relative(found["gather"], known) < 1e-4) == (fault is None)
-    if fault is None:
-        assert relative(found["stack"], known) < 1e-4
+def test_a_replay_follows_the_paths_that_were_traced(name: str, fault: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    if fault:
+        replayed_from(monkeypatch, lambda table: replace(table, aim=replace(table.aim, slots=0 * table.aim.slots)))
+    assert replays_agree(lambda kind: aimed(name, estimator=kind)[:2]) is not fault
 
 
 def test_a_recorded_step_is_the_step() -> None:
