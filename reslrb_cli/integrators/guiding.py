@@ -16,9 +16,10 @@ import numpy as np
 
 from reslrb_cli.integrators.hearing import Said
 from reslrb_cli.integrators.learned import Learned, most_cells
-from reslrb_cli.integrators.onward import Onward
+from reslrb_cli.integrators.onward import NAMES, Onward
 from reslrb_cli.integrators.probing import used_numbers
-from reslrb_cli.transport.aim import BLOCKS, SLOTS, Aim, Blocks
+from reslrb_cli.transport.aim import SLOTS, Aim
+from reslrb_cli.transport.blocks import BLOCKS, Blocks
 from reslrb_cli.transport.guide import CELL_BITS, Grid, Table, apportion, make_grid
 from reslrb_cli.transport.samples import Samples
 from reslrb_cli.transport.survival import CELLS, Survival, box_of
@@ -33,7 +34,7 @@ LEARNING_STREAM = 0x1EA2  # seeds of the samples that tables learn from
 
 
 #: Names of the arrays of each sensor in what has been learned.
-KNOWN = ("sums", "draws", "onward", "frame", "film")
+KNOWN = ("sums", "draws", "film", *NAMES)
 
 
 class Purpose(enum.Enum):
@@ -133,7 +134,8 @@ class Guiding:
 
     def aims(self, number: int, film: Blocks) -> bool:
         """Have the paths for a sensor with this film be aimed; not where it shares its tables with others."""
-        if self._shared(number) != number or any(self._shared(n) != n for n in range(self._sensors)):
+        assert self._emission is not None
+        if max(number + 1, self._emission[2]) > self._apart:
             return False
         self.films[number] = film
         return True
@@ -155,12 +157,12 @@ class Guiding:
 
     def _shared(self, number: int) -> int:
         """The number of the sensor that the tables are kept under."""
-        return number % max(MOST_BYTES // self._each, 1)
+        return number % self._apart
 
     @property
-    def _sensors(self) -> int:
-        assert self._emission is not None
-        return self._emission[2]
+    def _apart(self) -> int:
+        """How many sensors have tables of their own."""
+        return max(MOST_BYTES // self._each, 1)
 
     @property
     def _each(self) -> int:
@@ -169,7 +171,7 @@ class Guiding:
 
     def bytes(self, sensors: int) -> int:
         """What the tables for so many sensors take."""
-        return min(sensors, max(MOST_BYTES // self._each, 1)) * self._each
+        return min(sensors, self._apart) * self._each
 
     def state(self) -> tuple[dict[str, int], dict[str, Array]]:
         """What has been learned: the number of gradients of each sensor, and arrays by `<sensor>/<what>`."""
@@ -192,14 +194,14 @@ class Guiding:
             for name, array, rows in (("sums", sums, (2,)), ("draws", draws, ())):
                 if array.shape != (*rows, self.grid.cells) or not (np.isfinite(array) & (array >= 0)).all():
                     return f"{number}/{name}"
-            onward = Onward.taken({name: take(f"{number}/{name}") for name in KNOWN[2:4]})
+            onward = Onward.taken({name: take(f"{number}/{name}") for name in NAMES})
             if isinstance(onward, str):
                 return f"{number}/{onward}"
             film = take(f"{number}/film")
             if film.ndim != 2 or len(film) != 2 or not (np.isfinite(film) & (film >= 0)).all():
                 return f"{number}/film"
-            own = (array.astype(np.float32) for array in (sums, draws, film))
-            found[int(number)] = Learned(next(own), next(own), count, onward, next(own))
+            sums, draws, film = (array.astype(np.float32) for array in (sums, draws, film))
+            found[int(number)] = Learned(sums, draws, count, onward, film)
         self.learned, self._tables = found, {}
         return None
 

@@ -20,7 +20,7 @@ import numpy as np
 
 from reslrb_cli.integrators.onward import Walked
 from reslrb_cli.integrators.trail import Onwards, Trail, walk_back
-from reslrb_cli.transport.aim import film_blocks
+from reslrb_cli.transport.blocks import film_blocks
 from reslrb_cli.transport.connection import Connection
 from reslrb_cli.transport.emission import sample_time
 from reslrb_cli.transport.factors import Product

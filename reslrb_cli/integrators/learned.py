@@ -20,6 +20,7 @@ from reslrb_cli.transport.guide import Grid
 
 Array = np.ndarray[Any, Any]
 
+BLUR = (0.25, 0.5, 0.25)  # along each number, of neighbouring cells
 FINE = 2.0  # cells, at most, for each path that has been heard
 
 
@@ -64,27 +65,20 @@ class Learned:
         sums = np.float32(KEEP) * self.sums
         means = np.zeros(grid.cells, np.float32)
         np.divide(grid.measures(), draws, out=means, where=draws > 0, casting="same_kind")
-        paths, guided = float(draws.sum()), []
-        for voice, said in enumerate(heard.astype(np.float32, copy=False)):
-            total = said @ means
-            if np.isfinite(total) and total > 0:
-                sums[int(voice == len(heard) - 1)] += said / total
-                guided.append(paths * float(said @ np.square(means)) / float(total))
+        guided = _add(sums, heard, means)
         started = np.float32(KEEP) * self.draws
         started += draws
-        worse = float(np.mean(guided)) if guided else 1.0
+        worse = float(draws.sum() * np.mean(guided)) if guided else 1.0
         return Learned(sums, started, self.calls, onward, self._places(film), worse)
 
     def _places(self, heard: Array | None) -> Array:
         """`film` with what newer paths have said by block (voices, blocks), the image last."""
         if heard is None:
             return self.film
-        newest = np.zeros((2, heard.shape[1]))
-        for voice, said in enumerate(heard.astype(np.float64)):
-            total = said.sum()
-            if np.isfinite(total) and total > 0:
-                newest[int(voice == len(heard) - 1)] += said / total
-        return ((KEEP * self.film if self.film.shape == newest.shape else 0) + newest).astype(np.float32)
+        shape = 2, heard.shape[1]
+        film = np.float32(KEEP) * self.film if self.film.shape == shape else np.zeros(shape, np.float32)
+        _add(film, heard, np.ones(shape[1], np.float32))
+        return film
 
     def on(self, grid: Grid, before: Grid) -> Learned:
         """The same about the cells of another grid, of which those of the one before are made, spread evenly."""
@@ -118,17 +112,27 @@ class Learned:
         return coarser, found
 
 
+def _add(sums: Array, heard: Array, means: Array) -> list[float]:
+    """Add to `sums` (2, n), about the gradient and about the image, what each of the voices (voices, n) has said, the
+    image last, scaled to a total of 1; `means` (n) are what a thing said at each counts for in the total.
+
+    Returns the mean of `means` over what each voice has said; a voice without a finite total is left out.
+    """
+    found = []
+    for voice, said in enumerate(heard.astype(np.float32, copy=False)):
+        total = said @ means
+        if np.isfinite(total) and total > 0:
+            sums[int(voice == len(heard) - 1)] += said / total
+            found.append(float(said @ np.square(means)) / float(total))
+    return found
+
+
 def _blurred(grid: Grid, values: Array) -> Array:
-    """Sums over neighbouring cells, a quarter, a half and a quarter of them along each number, the cell at an end
-    counted once more beyond it; the cells of one emitter are none of another's neighbours."""
+    """Sums over neighbouring cells, weighted; the cells of one emitter are none of another's neighbours."""
+    from scipy import ndimage  # here: few commands ever learn, and all import this module
+
     result = values.reshape(grid.shape)
     for axis in range(1, result.ndim):
         if result.shape[axis] > 1:
-            rows, made = np.moveaxis(result, axis, 0), np.empty_like(result)
-            between, sums = rows[1:] + rows[:-1], np.moveaxis(made, axis, 0)
-            between *= 0.25
-            np.add(between[1:], between[:-1], out=sums[1:-1])
-            for end in (0, -1):
-                np.add(0.5 * rows[end], between[end], out=sums[end])
-            result = made
+            result = ndimage.convolve1d(result, BLUR, axis, mode="nearest")
     return result.ravel()

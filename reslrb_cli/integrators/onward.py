@@ -27,6 +27,7 @@ from reslrb_cli.transport.survival import BITS, CELLS, SHAPE
 
 Array = np.ndarray[Any, Any]
 
+NAMES = ("onward", "frame")  # of its arrays
 KEEP = 0.75  # what of the past counts beside the newest walk
 SURE = 16.0
 LEAN = 100.0
@@ -87,12 +88,12 @@ class Onward:
     def arrays(self) -> dict[str, Array]:
         """All of it, by name; the inverse of `taken`."""
         frame = np.array([*self.box.ravel(), self.light, self.length], np.float64)
-        return {"onward": self.sums, "frame": frame}
+        return dict(zip(NAMES, (self.sums, frame), strict=True))
 
     @staticmethod
     def taken(arrays: Mapping[str, Array]) -> Onward | str:
         """What had these `arrays`; the name of one that cannot be."""
-        sums, frame = arrays["onward"], arrays["frame"]
+        sums, frame = (arrays[name] for name in NAMES)
         if sums.shape != (4, CELLS) or not (np.isfinite(sums) & (sums >= 0)).all():
             return "onward"
         if frame.shape != (8,) or not np.isfinite(frame).all() or (frame[6:] < 0).any():

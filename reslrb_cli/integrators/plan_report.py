@@ -14,7 +14,7 @@ from reslrb_cli.integrators import light_tracer as lt
 from reslrb_cli.integrators.features import FEATURES, Feature
 from reslrb_cli.integrators.reslrb import Reslrb
 from reslrb_cli.scene.catalog import list_parameters
-from reslrb_cli.transport.aim import film_blocks
+from reslrb_cli.transport.blocks import film_blocks
 from reslrb_cli.transport.guide import even_table
 from reslrb_cli.transport.plan import Plan
 from reslrb_cli.transport.samples import passes

@@ -18,7 +18,8 @@ from reslrb_cli.integrators.probing import used_numbers
 from reslrb_cli.integrators.renewal import Renewal, with_shading_normals
 from reslrb_cli.scene.graph import SceneGraph
 from reslrb_cli.scene.needs import check_supported, interpolates_normals, scene_needs
-from reslrb_cli.transport.aim import film_blocks, worthwhile
+from reslrb_cli.transport.aim import worthwhile
+from reslrb_cli.transport.blocks import film_blocks
 from reslrb_cli.transport.nets import make_coordinates
 from reslrb_cli.transport.plan import Plan, make_plan
 from reslrb_cli.transport.samples import Samples, passes
@@ -85,6 +86,12 @@ def attach(plan: Plan, which: Differentiated, motion: Motion, sensor: mi.Sensor,
         moving_emitters=which.emitters,
         attached_normalization=motion.filter_normalization == "attached",
     )
+
+
+def sensor_number(scene: mi.Scene, sensor: mi.Sensor) -> int:
+    """The number of a sensor among those of a scene; of one that is none of them, the number after theirs."""
+    known = [one.ptr for one in scene.sensors()]
+    return known.index(sensor.ptr) if sensor.ptr in known else len(known)
 
 
 class Preparation:
@@ -171,8 +178,7 @@ class Preparation:
             pixels = max((int(dr.prod(one.film().size())) for one in sensors), default=samples.width)
             grid = self.guiding.grid_of(samples, spp * pixels or None)
             if worthwhile(plan.needs, plan.max_depth):
-                known = [one.ptr for one in sensors]
-                number = known.index(samples.sensor.ptr) if samples.sensor.ptr in known else len(known)
+                number = sensor_number(samples.scene, samples.sensor)
                 aims = self.guiding.aims(number, film_blocks(samples.sensor))
         plan = replace(plan, aims=aims)
         if not self._low_discrepancy:

@@ -21,7 +21,7 @@ from reslrb_cli.integrators import light_tracer as lt
 from reslrb_cli.integrators.guiding import Purpose, learning_seed
 from reslrb_cli.integrators.hearing import hear
 from reslrb_cli.integrators.interface import Derivative, Job
-from reslrb_cli.integrators.preparation import Motion, Preparation
+from reslrb_cli.integrators.preparation import Motion, Preparation, sensor_number
 from reslrb_cli.transport.accumulation import in_passes
 from reslrb_cli.transport.plan import Plan
 from reslrb_cli.transport.samples import Samples, passes
@@ -113,7 +113,7 @@ class LightTracer:
         if guiding is not None:
             purpose = purpose or (Purpose.IMAGE if job.params is None else Purpose.GRADIENT)
             if guiding.serves(purpose):
-                table = guiding.table(_number(job), purpose)
+                table = guiding.table(sensor_number(job.scene, job.sensor), purpose)
         return passes(plan, job.scene, job.sensor, job.seed, spp, self.samples_per_pass, table)
 
     def learn(self, job: Job, gradient: mi.TensorXf) -> None:
@@ -122,7 +122,7 @@ class LightTracer:
         After a gradient: what has been learned counts from the next one on.
         """
         guiding = self.preparation.guiding
-        if guiding is not None and guiding.due(_number(job)):
+        if guiding is not None and guiding.due(sensor_number(job.scene, job.sensor)):
             self.learn_now(job, gradient)
 
     def learn_now(self, job: Job, gradient: mi.TensorXf) -> None:
@@ -135,7 +135,7 @@ class LightTracer:
                 said = self.preparation.recordings.call("hear", samples, hear, gradient)
             else:
                 said = hear(samples, gradient)
-            guiding.learn(_number(job), samples.width, said)
+            guiding.learn(sensor_number(job.scene, job.sensor), samples.width, said)
 
     def image_estimator(self) -> Estimator | None:
         """The estimator that makes images of its own; None where they show every connection."""
@@ -171,12 +171,6 @@ class LightTracer:
     def freezes(self, parts: list[Samples]) -> bool:
         """Whether these samples are traced from a recording; large ones, and so several passes, gain little."""
         return self.freeze and len(parts) == 1 and parts[0].width <= freezing.MOST_PATHS
-
-
-def _number(job: Job) -> int:
-    """The number of a job's sensor among those of its scene; of one that is none of them, the number after theirs."""
-    sensors = [sensor.ptr for sensor in job.scene.sensors()]
-    return sensors.index(job.sensor.ptr) if job.sensor.ptr in sensors else len(sensors)
 
 
 class Reversed(LightTracer):

@@ -32,6 +32,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reslrb_cli.backend.own_memory import own_memory
+from reslrb_cli.transport.blocks import Blocks, film_blocks
 from reslrb_cli.transport.numbers import Numbers
 
 if TYPE_CHECKING:
@@ -40,53 +41,8 @@ if TYPE_CHECKING:
 
 SHARE = 0.25  # of the paths that scatter
 UNIFORM = 0.2  # of these, how many are sent to places drawn evenly on the film, at least
-BLOCKS = 1 << 14  # of pixels, at most
 SLOTS = 1 << 17
 REACHED = 1 - 1e-3  # of the distance to a point, where nothing stands in the way: as far as shadow rays look
-
-
-@dataclass(frozen=True)
-class Blocks:
-    """Blocks of `side` x `side` pixels that cover a film (crop window) of `width` x `height`, cut off at its end."""
-
-    width: int
-    height: int
-    side: int
-
-    @staticmethod
-    def of(size: tuple[int, int]) -> Blocks:
-        """The smallest that are not more than BLOCKS."""
-        side = 1
-        while -(-size[0] // side) * -(-size[1] // side) > BLOCKS:
-            side += 1
-        return Blocks(*size, side)
-
-    @property
-    def columns(self) -> int:
-        return -(-self.width // self.side)
-
-    @property
-    def rows(self) -> int:
-        return -(-self.height // self.side)
-
-    @property
-    def count(self) -> int:
-        return self.rows * self.columns
-
-    def block(self, u: mi.Point2f) -> mi.UInt32:
-        """The block that a film position (pixels) lies in, or is nearest to."""
-        column, row = (mi.UInt32(dr.clip(x, 0, n - 1)) // self.side for x, n in ((u.x, self.width), (u.y, self.height)))
-        return row * self.columns + column
-
-    def areas(self) -> NDArray[np.float64]:
-        """Pixels of each block (rows * columns)."""
-        across, down = (np.minimum(self.side, n - np.arange(0, n, self.side)) for n in (self.width, self.height))
-        return np.outer(down, across).ravel().astype(np.float64)
-
-    def sums(self, pixels: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Sums over each block (rows * columns) of values (height, width)."""
-        down = np.add.reduceat(pixels, np.arange(0, self.height, self.side), 0)
-        return np.asarray(np.add.reduceat(down, np.arange(0, self.width, self.side), 1).ravel())
 
 
 @dataclass
@@ -205,9 +161,3 @@ def choose(
     pi = scene.ray_intersect_preliminary(ray, coherent=False, active=active)
     aimed = Aimed(active, dr.detach(ray(pi.t)), pi.is_valid(), share)
     return aimed, replace(numbers, bsdf_1d=dr.clip(own, 0, below))
-
-
-def film_blocks(sensor: mi.Sensor) -> Blocks:
-    """The blocks of a sensor's film."""
-    size = sensor.film().crop_size()
-    return Blocks.of((int(size[0]), int(size[1])))

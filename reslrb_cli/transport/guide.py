@@ -24,7 +24,8 @@ import mitsuba as mi
 import numpy as np
 
 from reslrb_cli.backend.own_memory import own_memory
-from reslrb_cli.transport.aim import Aim, Blocks
+from reslrb_cli.transport.aim import Aim
+from reslrb_cli.transport.blocks import Blocks
 from reslrb_cli.transport.survival import Survival
 
 Array = np.ndarray[Any, Any]

@@ -17,7 +17,8 @@ from reslrb_cli.integrators.guiding import Purpose
 from reslrb_cli.measure.gradients import Case, relative
 from reslrb_cli.measure.statistics import compare
 from reslrb_cli.transport import aim
-from reslrb_cli.transport.aim import SLOTS, UNIFORM, Aim, Blocks, Pending
+from reslrb_cli.transport.aim import SLOTS, UNIFORM, Aim, Pending
+from reslrb_cli.transport.blocks import BLOCKS, Blocks
 
 pytestmark = pytest.mark.usefixtures("llvm")
 
@@ -197,15 +198,18 @@ def test_a_recorded_step_is_the_step() -> None:
 
 @pytest.mark.parametrize("size", [(1, 1), (9, 7), (160, 90), (1000, 3), (1920, 1080)])
 def test_blocks_part_the_film_and_their_densities_are_those_of_their_slots(size: tuple[int, int]) -> None:
+    import mitsuba as mi
+
     film, random = Blocks.of(size), np.random.default_rng(3)
-    pixels = random.lognormal(0, 2, (size[1], size[0]))
-    areas, wanted = film.areas(), film.sums(pixels)
-    assert len(areas) == len(wanted) == film.rows * film.columns <= aim.BLOCKS
+    areas = film.areas()
+    wanted = random.lognormal(0, 2, film.count) * areas
+    assert len(areas) == film.rows * film.columns == film.count <= BLOCKS
     assert areas.sum() == size[0] * size[1]
-    row, column = size[1] // 2, size[0] // 2
-    block = row // film.side * film.columns + column // film.side
-    top, left = row // film.side * film.side, column // film.side * film.side
-    assert np.isclose(wanted[block], pixels[top : top + film.side, left : left + film.side].sum())
+    across, down = np.meshgrid(*(np.arange(n, dtype=np.float32) + np.float32(0.5) for n in size))
+    blocks = np.array(film.block(mi.Point2f(across.ravel(), down.ravel())))
+    assert (np.bincount(blocks, minlength=film.count) == areas).all()
+    own = np.flatnonzero(blocks == blocks[size[1] // 2 * size[0] + size[0] // 2])
+    assert np.ptp(across.ravel()[own]) < film.side > np.ptp(down.ravel()[own])
     table = Aim.of(film, wanted)
     counts = np.bincount(np.array(table.slots), minlength=len(areas))
     density = np.array(table.density, np.float64)
