@@ -43,6 +43,7 @@ class FirstConfig:
     size: tuple[int, int]
     film: tuple[int, int]
     integrator: str
+    hides_emitters: bool
     depth: Depth
     proposals: Sequence[Proposal]
 
@@ -64,6 +65,7 @@ class FirstConfig:
             "integrator:",
             f"  type: {self.integrator}",
             f"  max_depth: {self.depth.segments}  # {self._depth_words()}; depth costs time alone, no memory",
+            *(["  hide_emitters: true  # as the scene's own integrator has it"] if self.hides_emitters else []),
             "loss:",
             "  type: relative_l2  # by l2 the noise of the brightest parts would drown what the others say",
             "optimizer:",

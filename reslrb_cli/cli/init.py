@@ -108,7 +108,8 @@ def command(
         is_integer=is_integer,
         size=size,
         film=own,
-        integrator=_integrator(scene, sensor),
+        integrator=_integrator(scene, sensor, description.hides_emitters),
+        hides_emitters=description.hides_emitters,
         depth=find_depth(scene, index),
         proposals=proposals,
     )
@@ -176,12 +177,12 @@ def _tell_sensor(index: int, sensors: Sequence[str]) -> None:
         echo(f"sensor {named[index]}; --sensor takes another: {', '.join(others[:LISTED_SENSORS])}{more}")
 
 
-def _integrator(scene: mi.Scene, sensor: mi.Sensor) -> str:
+def _integrator(scene: mi.Scene, sensor: mi.Sensor, hides_emitters: bool) -> str:
     """The integrator that can render the scene: paths from the light, or where these cannot, from the sensor."""
     from reslrb_cli.scene import check_camera_paths, check_supported
 
     try:
-        check_supported(scene, sensor, False)
+        check_supported(scene, sensor, hides_emitters)
     except UnsupportedScene as error:
         try:
             check_camera_paths(scene)

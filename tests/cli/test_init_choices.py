@@ -53,6 +53,17 @@ def test_of_several_sensors_one_is_named(choices: Path) -> None:
     assert "--sensor: is 2; the scene has 0 (floor), 1 (ball)" in missing.output
 
 
+def test_a_scene_that_hides_its_lights_keeps_hiding_them(choices: Path) -> None:
+    scene = choices / "hall.xml"
+    assert reslrb("init", "hall.xml").exit_code == 0
+    assert "hide_emitters" not in (choices / "hall.yaml").read_text()
+    for name, value in (("hide_emitters", "true"), ("hideEmitters", "true"), ("hide_emitters", "false")):
+        own = f'<integrator type="path"><boolean name="{name}" value="{value}"/></integrator>'
+        scene.write_text(CHOICES.replace("<sensor", own + "<sensor", 1))
+        assert reslrb("init", "hall.xml", "--force").exit_code == 0
+        assert load(choices / "hall.yaml").integrator.hide_emitters == (value == "true")
+
+
 def test_what_a_scene_leaves_open_is_named_and_can_be_set(choices: Path) -> None:
     made = reslrb("init", "hall.xml")
     assert "at 16x16 pixels" in made.output

@@ -23,12 +23,14 @@ class Description:
     """A scene as its files describe it, with nothing left to include or to put in.
 
     `folders` are those in which the files that it names are looked for, first to last; `variables` are the values of
-    its `$name` variables, those that it has itself among them.
+    its `$name` variables, those that it has itself among them. `hides_emitters`: whether the integrator that it names,
+    of which nothing else is kept, leaves lights out of the picture.
     """
 
     root: Element
     folders: list[Path]
     variables: dict[str, str]
+    hides_emitters: bool
 
 
 def read_description(file: Path, options: Mapping[str, str]) -> Description:
@@ -41,7 +43,16 @@ def read_description(file: Path, options: Mapping[str, str]) -> Description:
     folders = [file.absolute().parent]
     root = reader.read(file, folders, None)
     reader.variables.check_used(file)
-    return Description(root, folders, reader.variables.values())
+    return Description(root, folders, reader.variables.values(), _hides_emitters(root))
+
+
+def _hides_emitters(root: Element) -> bool:
+    """Whether an integrator of the scene says so, in the spelling of any version."""
+    found = [value for child in root.children if child.tag == "integrator" for value in child.walk()]
+    return any(
+        value.name in ("hide_emitters", "hideEmitters") and value.attributes.get("value", "").strip() == "true"
+        for value in found
+    )
 
 
 @dataclass
