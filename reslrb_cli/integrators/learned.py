@@ -20,7 +20,7 @@ from reslrb_cli.transport.guide import Grid
 
 Array = np.ndarray[Any, Any]
 
-BLUR = (0.25, 0.5, 0.25)  # along each number, of neighbouring cells
+BLUR = (0.05, 0.9, 0.05)  # along each number, of neighbouring cells
 FINE = 2.0  # cells, at most, for each path that has been heard
 
 

@@ -12,7 +12,7 @@ from conformance.test_guiding import SPP, guided, sample
 
 from reslrb_cli.integrators import freezing
 from reslrb_cli.integrators.guiding import grid_for, learnings
-from reslrb_cli.integrators.learned import FINE, KEEP, Learned, _blurred, most_cells
+from reslrb_cli.integrators.learned import BLUR, FINE, KEEP, Learned, _blurred, most_cells
 from reslrb_cli.measure.gradients import relative
 from reslrb_cli.transport.guide import Grid, Table, apportion, make_grid
 
@@ -143,14 +143,16 @@ def test_a_grid_of_few_cells_says_what_the_finest_does() -> None:
 @pytest.mark.parametrize("kind", [np.float32, np.float64])
 @pytest.mark.parametrize("bits", [(3, 2, 4, 3), (0, 1, 0, 2), (2, 0, 0, 0), (0, 0, 0, 0)])
 def test_cells_are_smoothed_over_their_neighbours(bits: Any, kind: Any) -> None:
-    """A quarter, a half and a quarter along each number, the last cell counted again beyond the end; nothing goes from
-    one emitter to another, and a sum stays what it was."""
+    """With their weights along each number, the last cell counted again beyond the end; nothing goes from one emitter
+    to another, and a sum stays what it was."""
     grid = Grid(bits, (0.0, 0.3, 1.0))
     values = np.random.default_rng(5).gamma(0.1, size=grid.cells).astype(kind)
     expected, before = values.reshape(grid.shape), values.copy()
     for axis in range(1, 5):
         wide = np.pad(np.moveaxis(expected, axis, -1), [(0, 0)] * 4 + [(1, 1)], mode="edge")
-        expected = np.moveaxis(wide[..., :-2] / 4 + wide[..., 1:-1] / 2 + wide[..., 2:] / 4, -1, axis)
+        expected = np.moveaxis(
+            sum(weight * wide[..., k : k + wide.shape[-1] - 2] for k, weight in enumerate(BLUR)), -1, axis
+        )
     found = _blurred(grid, values)
     assert found.dtype == kind
     np.testing.assert_allclose(found, expected.ravel(), rtol=1e-6)
