@@ -19,15 +19,16 @@ from reslrb_cli.measure.offender_tables import Witness
 
 #: So few paths that the spoilt texel is met for the first time behind many iterations.
 SETTINGS = ["integrator.guiding=on", "scene.options={wall: spoilt.exr}", "run.iterations=60", "run.on_nonfinite=stop"]
-#: Ways to take a step, each with a seed of which the texel is met once tables have learned; `again` has it met in the
-#: third batch of a step whose second one taught them.
+#: Ways to take a step; `again` has tables learn between the batches of a step.
 WAYS = {
-    "correlated": ["run.adjoint=correlated", "run.spp=2", "run.seed=1"],
-    "independent": ["run.adjoint=independent", "run.spp=2", "run.seed=1"],
-    "batched": ["run.adjoint=batched", "run.spp=4", "run.seed=5"],
-    "again": ["run.adjoint=batched", "run.first_batch=again", "run.batches=3", "run.spp=3", "run.seed=11"],
+    "correlated": ["run.adjoint=correlated", "run.spp=2"],
+    "independent": ["run.adjoint=independent", "run.spp=2"],
+    "batched": ["run.adjoint=batched", "run.spp=4"],
+    "again": ["run.adjoint=batched", "run.first_batch=again", "run.batches=3", "run.spp=3"],
 }
-
+#: Seeds that are tried in turn until one meets the texel when tables have learned; what they meet changes with whatever
+#: changes tables. Of `again` these meet it in the third batch of a step whose second one taught them.
+SEEDS = {"again": [5, 15, 16, 28, 23]}
 
 Drawn = list[tuple[int, dict[str, np.ndarray] | None]]
 
@@ -50,9 +51,13 @@ def note(monkeypatch: pytest.MonkeyPatch, module: ModuleType) -> Drawn:
 def differences(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], way: str) -> list[str]:
     """What is not of the run's last step in what its replay looked at."""
     taken, looked_at = note(monkeypatch, tracer), note(monkeypatch, offender)
-    _, err = optimize(capsys, *SETTINGS, *WAYS[way])
+    for seed in SEEDS.get(way, [1, 2, 3, 4, 5, 6, 7, 8]):
+        taken.clear()
+        _, err = optimize(capsys, *SETTINGS, *WAYS[way], f"run.seed={seed}")
+        told = re.search(r"not finite in iteration (\d+): .*the first at pixel \((\d+), (\d+)\)", err)
+        if told is not None and int(told[1]) > 0:
+            break
     run = taken[:]
-    told = re.search(r"not finite in iteration (\d+): .*the first at pixel \((\d+), (\d+)\)", err)
     assert told is not None, err
     assert int(told[1]) > 0  # tables have learned
     iteration, offenders, _ = inspect(capsys, err)
