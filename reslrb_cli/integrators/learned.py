@@ -21,7 +21,8 @@ from reslrb_cli.transport.guide import Grid
 Array = np.ndarray[Any, Any]
 
 #: Of neighbouring cells, along each number. A quarter in place of the twentieth leaves a cell a sixteenth of what was
-#: heard of it, and rooms 1.3 to 1.4 times the squares; with none, cells that few paths have met count for what these said.
+#: heard of it, and rooms 1.3 to 1.4 times the squares; with none, cells that few paths have met count for what these
+#: few said.
 BLUR = (0.05, 0.9, 0.05)
 FINE = 2.0  # cells, at most, for each path that has been heard
 
