@@ -11,6 +11,14 @@ RECORDS = ROOT / "docs" / "benchmarks"
 #: Of the experiments in configs/, in the order of the README's table.
 EXPERIMENTS = ("cornell_floor", "caustic_slab", "grey_room", "furnace", "lens_pose", "caustic_heightmap",
                "paper/figure1", "stiff/lamp", "stiff/plate", "stiff/wall")  # fmt: skip
+#: Whole runs by other integrators: the record's name, what the README calls the run, and its command.
+OTHERS = {
+    f"optimize_cornell_floor_{name}": (
+        f"`cornell_floor` by {words}",
+        f"optimize configs/cornell_floor.yaml --set integrator.type={name}",
+    )
+    for name, words in {"ptracer": "`ptracer` under naive AD", "prb": "`prb`"}.items()
+}
 CHECKED = ("furnace", "caustic_slab", "cornell_floor", "grey_room")
 _GLASS = (
     "bench configs/caustic_heightmap.yaml --integrators ptracer,reslrb:reservoir,reslrb:stack --max-depth 16 "
@@ -50,6 +58,7 @@ def _all() -> list[Measurement]:
     commands |= {f"gradcheck_{name}": f"gradcheck configs/{name}.yaml --seeds 16" for name in CHECKED}
     for name in EXPERIMENTS:
         commands[experiment_record(name)] = f"optimize configs/{name}.yaml"
+    commands |= {name: command for name, (_, command) in OTHERS.items()}
     return [Measurement(name, tuple(shlex.split(command))) for name, command in commands.items()]
 
 

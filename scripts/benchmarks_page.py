@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import benchmarks_tables as tables
-from benchmarks_list import CHECKED, EXPERIMENTS, MEASUREMENTS, RECORDS, ROOT, experiment_record
+from benchmarks_list import CHECKED, EXPERIMENTS, MEASUREMENTS, OTHERS, RECORDS, ROOT, experiment_record
 from gpu_report import gpu_section
 from paper_page import figure1_summary
 
@@ -45,6 +45,7 @@ class Blocks:
             "moving_ratios": lambda: self._ratios("moving", "max_depth"),
             "gradcheck": self.gradcheck,
             "experiments": self.experiments,
+            "others": self.others,
             "runs": self.runs,
             "gpu": lambda: gpu_section(self.folder),
             "figure1": figure1_summary,
@@ -88,12 +89,20 @@ class Blocks:
 
     def experiments(self) -> str:
         """The README's table of whole runs."""
+        return self._ends({experiment_record(name): f"`{name}`: {ABOUT[name]}" for name in self.recorded()})
+
+    def others(self) -> str:
+        """The README's table of whole runs by other integrators."""
+        return self._ends({name: words for name, (words, _) in OTHERS.items()})
+
+    def _ends(self, runs: Mapping[str, str]) -> str:
+        """Errors at the start and at the end of runs, by the names of their records, and what they are called."""
         head = ("experiment", "parameter RMSE, start", "end", "time", "command that prints it")
         rows = []
-        for name in self.recorded():
-            record = self.record(experiment_record(name))
+        for name, words in runs.items():
+            record = self.record(name)
             errors = [tables.run_errors(record, moment) for moment in ("initial", "final")]
-            rows.append([f"`{name}`: {ABOUT[name]}", *errors, tables.took(record), f"`{record.command}`"])
+            rows.append([words, *errors, tables.took(record), f"`{record.command}`"])
         return tables.table(head, rows)
 
     def runs(self) -> str:
@@ -132,9 +141,7 @@ def page(blocks: Blocks) -> str:
 
 
 def readme(blocks: Blocks, text: str) -> str:
-    """The README with its tables made anew, and without rows that were typed before there was a record."""
-    for name in blocks.recorded():
-        text = re.sub(rf"^\| `{re.escape(name)}`: .*\n", "", text, flags=re.MULTILINE)
+    """The README with its tables made anew."""
 
     def made(match: re.Match[str]) -> str:
         return f"<!-- benchmarks: {match[1]} -->\n{blocks.make(match[1])}\n<!-- end -->"

@@ -11,7 +11,7 @@ import benchmarks_measure
 import benchmarks_page as pages
 import paper_page
 import pytest
-from benchmarks_list import MEASUREMENTS, RECORDS, ROOT, Measurement
+from benchmarks_list import MEASUREMENTS, OTHERS, RECORDS, ROOT, Measurement
 from benchmarks_tables import read
 from make_benchmarks import main
 
@@ -34,6 +34,8 @@ def test_every_measurement_is_recorded_by_its_own_command() -> None:
     readme = pages.README.read_text(encoding="utf-8")
     for name in pages.EXPERIMENTS:  # what a record shows is not typed beside it
         assert readme.count(f"\n| `{name}`: ") == 1
+    for words, _ in OTHERS.values():
+        assert readme.count(f"\n| {words} | ") == 1
     for measurement in (MEASUREMENTS[name] for name in recorded):
         origin = read(measurement.file).origin
         assert origin["command"] == measurement.command
