@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import enum
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import drjit as dr
@@ -30,6 +31,7 @@ EVERY = 16  # gradients of a sensor from one time that its table learns to the n
 WRONG = 1.5  # `Learned.worse` of a table that does harm; one that is worth nothing, and right, has 1
 LEAST_BITS = 16  # cells, log2, however many sensors there are
 MOST_BYTES = 2**26  # of all tables together; sensors for which there is no room share
+NOW = 0.2  # of the paths aimed for a gradient: by its own dL/dI, where that is known; the others by what was said
 LEARNING_STREAM = 0x1EA2  # seeds of the samples that tables learn from
 
 
@@ -46,9 +48,10 @@ class Purpose(enum.Enum):
 
 
 def sensor_bytes(grid: Grid, aims: bool = True) -> int:
-    """Bytes for one sensor: a table for each purpose, and what has been learned; `aims`: where paths are sent, too."""
+    """Bytes for one sensor: a table for each purpose, and what has been learned; `aims`: where paths are sent, too, of
+    which a gradient has one of its own."""
     emission = len(Purpose) * (grid.slots + 2 * grid.cells) + 3 * grid.cells
-    aim = len(Purpose) * (SLOTS + BLOCKS) + 2 * BLOCKS
+    aim = (len(Purpose) + 1) * (SLOTS + BLOCKS) + 2 * BLOCKS
     return 4 * (emission + (len(Purpose) + 4) * CELLS + (aim if aims else 0))
 
 
@@ -111,9 +114,14 @@ class Guiding:
         """Whether samples for this are guided."""
         return self.images or purpose is not Purpose.IMAGE
 
-    def table(self, number: int, purpose: Purpose) -> Table:
-        """What samples for sensor `number` are drawn from."""
-        return self._table(number, purpose)[0]
+    def table(self, number: int, purpose: Purpose, delta: mi.TensorXf | None = None) -> Table:
+        """What samples for sensor `number` are drawn from; of the places on the film that paths are aimed at, some are
+        those of dL/dI `delta` (H, W, C), where it is known before the samples are."""
+        table = self._table(number, purpose)[0]
+        if delta is None or table.aim is None:
+            return table
+        number = self._shared(number)
+        return replace(table, aim=self._aim(number, purpose, self.learned.get(number), delta))
 
     def counts(self, number: int, purpose: Purpose) -> Array:
         """Slots of each cell of that table."""
@@ -140,14 +148,19 @@ class Guiding:
         self.films[number] = film
         return True
 
-    def _aim(self, number: int, purpose: Purpose, learned: Learned | None) -> Aim | None:
-        """Where on the film of a sensor paths are sent, by what was said there."""
+    def _aim(
+        self, number: int, purpose: Purpose, learned: Learned | None, delta: mi.TensorXf | None = None
+    ) -> Aim | None:
+        """Where on the film of a sensor paths are sent, by what was said there, and where dL/dI is large now."""
         if number not in self.films:
             return None
         film, said = self.films[number], np.zeros((2, 0)) if learned is None else learned.film
         even = film.areas() / film.areas().sum()
-        loud = [np.sqrt(row, dtype=np.float64) for row in said] if said.shape == (2, film.count) else [even, even]
-        gradient, image = (row / row.sum() if row.sum() > 0 else even for row in loud)
+        loud = list(np.sqrt(said, dtype=np.float64)) if said.shape == (2, film.count) else [even, even]
+        now = [] if delta is None else [film.root_means(delta)]
+        gradient, image, *now = (row / row.sum() if row.sum() > 0 else even for row in [*loud, *now])
+        for row in now:
+            gradient = (1 - NOW) * gradient + NOW * row
         return Aim.of(film, purpose.value * gradient + (1 - purpose.value) * image)
 
     def _onward(self, number: int) -> Onward:

@@ -96,7 +96,7 @@ class Reslrb(LightTracer):
     def backward(self, job: Job, gradient: mi.TensorXf) -> None:
         """Add the gradient of the objective with dL/dI `gradient` (H, W, C)."""
         with dr.suspend_grad():
-            trace = lt.Trace(self.passes(job))
+            trace = lt.Trace(self.passes(job, delta=gradient))
         self._replay(trace, gradient, job.params)
         self.learn(job, gradient)
 
@@ -111,7 +111,7 @@ class Reslrb(LightTracer):
             return lt.fused([samples], estimator, gradient)
 
         with dr.suspend_grad():
-            parts = self.passes(job, Purpose.BOTH)
+            parts = self.passes(job, Purpose.BOTH, gradient)
             if self.freezes(parts):
                 image = self.preparation.recordings.call("fused", parts[0], fused, gradient)
             else:

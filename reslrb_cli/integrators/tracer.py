@@ -101,10 +101,11 @@ class LightTracer:
         """
         return self.preparation.plan(scene, sensor, params)
 
-    def passes(self, job: Job, purpose: Purpose | None = None) -> list[Samples]:
+    def passes(self, job: Job, purpose: Purpose | None = None, delta: mi.TensorXf | None = None) -> list[Samples]:
         """The samples of a job; where its `spp` is 0, the sensor's own number of them.
 
         The `purpose` says what guided samples are drawn by; None: for the gradient, or the image where there is none.
+        So does dL/dI `delta` (H, W, C), which the samples have had no part in.
         """
         spp = job.spp or job.sensor.sampler().sample_count()
         unit = min(self.samples_per_pass or spp, spp)
@@ -113,7 +114,7 @@ class LightTracer:
         if guiding is not None:
             purpose = purpose or (Purpose.IMAGE if job.params is None else Purpose.GRADIENT)
             if guiding.serves(purpose):
-                table = guiding.table(sensor_number(job.scene, job.sensor), purpose)
+                table = guiding.table(sensor_number(job.scene, job.sensor), purpose, delta)
         return passes(plan, job.scene, job.sensor, job.seed, spp, self.samples_per_pass, table)
 
     def learn(self, job: Job, gradient: mi.TensorXf) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import mitsuba as mi
+
 from reslrb_cli.integrators.guiding import Guiding, Purpose
 from reslrb_cli.integrators.hearing import Said
 from reslrb_cli.optimization.problem import Problem
@@ -21,9 +23,9 @@ class Witness(Guiding):
         self.learned, self.films = dict(other.learned), dict(other.films)
         self.drawn: list[Table] = []
 
-    def table(self, number: int, purpose: Purpose) -> Table:
+    def table(self, number: int, purpose: Purpose, delta: mi.TensorXf | None = None) -> Table:
         """What samples for sensor `number` are drawn from."""
-        found = super().table(number, purpose)
+        found = super().table(number, purpose, delta)
         self.drawn.append(found)
         return found
 

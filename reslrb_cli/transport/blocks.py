@@ -50,6 +50,24 @@ class Blocks:
         across, down = (np.minimum(self.side, n - np.arange(0, n, self.side)) for n in (self.width, self.height))
         return np.outer(down, across).ravel().astype(np.float64)
 
+    def root_means(self, image: mi.TensorXf) -> NDArray[np.float64]:
+        """Of an image (height, width, C) the root of the mean square in each block (rows * columns), times its area.
+
+        The unit is the image's largest value; what is not finite counts as 0.
+        """
+        channels, values = image.shape[2], dr.abs(image.array)
+        values = dr.select(dr.isfinite(values), values, 0)
+        largest = dr.max(values)
+        values = dr.select(largest > 0, values / largest, 0)
+        pixel = dr.arange(mi.UInt32, self.width * self.height)
+        square = mi.Float(0)
+        for channel in range(channels):
+            square += dr.square(dr.gather(mi.Float, values, pixel * channels + channel))
+        sums = dr.zeros(mi.Float, self.count)
+        block = pixel // self.width // self.side * self.columns + pixel % self.width // self.side
+        dr.scatter_reduce(dr.ReduceOp.Add, sums, square, block)
+        return np.sqrt(np.array(sums, np.float64) * self.areas())
+
 
 def film_blocks(sensor: mi.Sensor) -> Blocks:
     """The blocks of a sensor's film."""

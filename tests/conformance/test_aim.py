@@ -12,8 +12,9 @@ from conformance.test_survival import replayed_from, replays_agree
 from turns import a_few
 
 from reslrb_cli.estimators import ESTIMATORS
-from reslrb_cli.integrators import preparation
-from reslrb_cli.integrators.guiding import Purpose
+from reslrb_cli.integrators import guiding, preparation
+from reslrb_cli.integrators.guiding import NOW, Purpose
+from reslrb_cli.integrators.learned import Learned
 from reslrb_cli.measure.gradients import Case, relative
 from reslrb_cli.measure.statistics import compare
 from reslrb_cli.transport import aim
@@ -56,13 +57,12 @@ def aimed(name: str, **options: Any) -> tuple[Case, Any, Any]:
 
 def askew(scene: Case, ours: Any, factor: float = 1.5) -> None:
     """Have the samples of the first sensor be aimed by such a table."""
-    ours.preparation.plan(scene.scene, scene.scene.sensors()[0], scene.params)
-    guiding = ours.preparation.guiding
-    film = guiding.films[0]
-    wanted = np.random.default_rng(1).lognormal(0, factor, len(film.areas())) * film.areas()
-    for purpose in Purpose:
-        table, counts = guiding._table(0, purpose)
-        guiding._tables[0, purpose] = replace(table, aim=Aim.of(film, wanted)), counts
+    tables = ours.preparation.guiding
+    areas = tables.films[0].areas()
+    loud = np.random.default_rng(1).lognormal(0, factor, len(areas)) * areas
+    learned = tables.learned.get(0) or Learned.nothing(tables.grid)
+    tables.learned[0] = replace(learned, film=np.square([loud, loud], dtype=np.float32))
+    tables._tables.clear()
 
 
 # ---- The means -------------------------------------------------------------------------------------------------------
@@ -180,6 +180,7 @@ def test_what_would_bias_is_found(name: str, monkeypatch: pytest.MonkeyPatch) ->
 def test_a_replay_follows_the_paths_that_were_traced(name: str, fault: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     if fault:
         replayed_from(monkeypatch, lambda table: replace(table, aim=replace(table.aim, slots=0 * table.aim.slots)))
+    monkeypatch.setattr(guiding, "NOW", 0.0)  # what is known beforehand is compared with what is not
     assert replays_agree(lambda kind: aimed(name, estimator=kind)[:2]) is not fault
 
 
@@ -188,6 +189,7 @@ def test_a_recorded_step_is_the_step() -> None:
     (scene, ours, _), (_, frozen, _) = (guided("roughplastic", 0, freeze=freeze) for freeze in (False, True))
     for factor in (0.0, 1.0, 2.0):
         for each in (ours, frozen):
+            sample(scene, each, 4)  # which settles the grid
             askew(scene, each, factor)
         assert relative(*(sample(scene, each, 5) for each in (ours, frozen))) < 1e-4
     assert frozen.preparation.recordings.counts()["fused"] > 0
@@ -226,12 +228,49 @@ def test_blocks_part_the_film_and_their_densities_are_those_of_their_slots(size:
 
 def test_paths_are_sent_where_something_was_said() -> None:
     _, ours, _ = guided("roughplastic", 2)
-    guiding = ours.preparation.guiding
-    said = np.sqrt(guiding.learned[0].film)
-    assert said.shape == (2, guiding.films[0].count)
+    tables = ours.preparation.guiding
+    said = np.sqrt(tables.learned[0].film)
+    assert said.shape == (2, tables.films[0].count)
     for purpose, row in ((Purpose.GRADIENT, said[0]), (Purpose.IMAGE, said[1])):
-        density = np.array(guiding.table(0, purpose).aim.density, np.float64)
+        density = np.array(tables.table(0, purpose).aim.density, np.float64)
         assert np.corrcoef(density, row)[0, 1] > 0.99
+
+
+@pytest.mark.parametrize("purpose", Purpose)
+def test_paths_of_a_gradient_are_sent_where_its_own_dl_di_is_large(purpose: Purpose) -> None:
+    import mitsuba as mi
+
+    _, ours, _ = guided("roughplastic", 2)
+    tables = ours.preparation.guiding
+    film = tables.films[0]
+    delta = np.random.default_rng(5).normal(0, 1e-6, (film.height, film.width, 3)).astype(np.float32)
+    delta[3, 2] = 1.0  # a single pixel of an image was far too bright
+    known = np.array(tables.table(0, purpose, mi.TensorXf(delta)).aim.density, np.float64)
+    before = np.array(tables.table(0, purpose).aim.density, np.float64)
+    expected = (1 - purpose.value * NOW * (1 - UNIFORM)) * before
+    expected[3 * film.width + 2] += purpose.value * NOW * (1 - UNIFORM) * film.count
+    # What is there evenly stays as it was, of the rest a share is the pixel's.
+    assert np.isclose(known[3 * film.width + 2], expected[3 * film.width + 2], rtol=0.05)
+    assert known.min() > 0.85 * UNIFORM
+
+
+@pytest.mark.parametrize("size", [(9, 7), (1000, 30)])
+def test_means_of_blocks(size: tuple[int, int]) -> None:
+    import mitsuba as mi
+
+    film = Blocks.of(size)
+    image = np.random.default_rng(3).normal(size=(size[1], size[0], 3)).astype(np.float32)
+    across, down = np.meshgrid(*(np.arange(n, dtype=np.float32) + np.float32(0.5) for n in size))
+    blocks = np.array(film.block(mi.Point2f(across.ravel(), down.ravel())))
+    sums = np.bincount(blocks, np.square(image, dtype=np.float64).sum(2).ravel(), film.count)
+    means = film.areas() * np.sqrt(sums / film.areas())
+    for scale in (1.0, 1e-30, 1e30):
+        found = film.root_means(mi.TensorXf(image * np.float32(scale)))
+        assert np.allclose(found, means / np.abs(image).max(), rtol=1e-5)
+    image[2, 3, 1] = np.nan
+    image[4, 5] = -np.inf
+    assert (np.isfinite(film.root_means(mi.TensorXf(image)))).all()
+    assert (film.root_means(mi.TensorXf(0 * np.ones_like(image))) == 0).all()
 
 
 def test_only_scenes_with_glossy_surfaces_pay_for_it(monkeypatch: pytest.MonkeyPatch) -> None:
