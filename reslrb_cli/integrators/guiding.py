@@ -157,10 +157,9 @@ class Guiding:
         film, said = self.films[number], np.zeros((2, 0)) if learned is None else learned.film
         even = film.areas() / film.areas().sum()
         loud = list(np.sqrt(said, dtype=np.float64)) if said.shape == (2, film.count) else [even, even]
-        now = [] if delta is None else [film.root_means(delta)]
-        gradient, image, *now = (row / row.sum() if row.sum() > 0 else even for row in [*loud, *now])
-        for row in now:
-            gradient = (1 - NOW) * gradient + NOW * row
+        gradient, image = (_shares(row, even) for row in loud)
+        if delta is not None:
+            gradient = (1 - NOW) * gradient + NOW * _shares(film.root_means(delta), even)
         return Aim.of(film, purpose.value * gradient + (1 - purpose.value) * image)
 
     def _onward(self, number: int) -> Onward:
@@ -249,6 +248,11 @@ class Guiding:
         self.lessons += 1
         for purpose in Purpose:
             self._tables.pop((number, purpose), None)
+
+
+def _shares(row: Array, even: Array) -> Array:
+    """What each has of the sum of all; as much as is `even` where there is nothing."""
+    return row / row.sum() if row.sum() > 0 else even
 
 
 def learns_after(gradients: int) -> bool:

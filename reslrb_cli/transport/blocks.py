@@ -64,8 +64,8 @@ class Blocks:
         for channel in range(channels):
             square += dr.square(dr.gather(mi.Float, values, pixel * channels + channel))
         sums = dr.zeros(mi.Float, self.count)
-        block = pixel // self.width // self.side * self.columns + pixel % self.width // self.side
-        dr.scatter_reduce(dr.ReduceOp.Add, sums, square, block)
+        position = mi.Point2f(pixel % self.width, pixel // self.width)
+        dr.scatter_reduce(dr.ReduceOp.Add, sums, square, self.block(position))
         return np.sqrt(np.array(sums, np.float64) * self.areas())
 
 
