@@ -17,10 +17,13 @@ from reslrb_cli.scene.description import Description
 LIGHT_TRACERS = ("reslrb", "ptracer", "walk_ad", "trajectory")
 
 
-def load_configured(config: Config, look: Callable[[Description], object] | None = None) -> mi.Scene:
-    """Load the scene that `config` names; `look` sees its description before it is built. Raises ConfigError."""
+def load_configured(
+    config: Config, look: Callable[[Description], object] | None = None, warn: bool = True
+) -> mi.Scene:
+    """Load the scene that `config` names; `look` sees its description before it is built, and what is doubtful in it is
+    warned of, or not. Raises ConfigError."""
     scene = config.scene
-    return load_scene(scene.file, scene.options, scene.strict, scene.size, scene.cameras, look)
+    return load_scene(scene.file, scene.options, scene.strict, scene.size, scene.cameras, look, warn)
 
 
 def choose_sensors(config: Config, scene: mi.Scene) -> list[int]:

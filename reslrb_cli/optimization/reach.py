@@ -10,6 +10,8 @@ import mitsuba as mi
 import numpy as np
 
 from reslrb_cli.integrators import known_step
+from reslrb_cli.integrators.freezing import MOST_PATHS
+from reslrb_cli.integrators.tracer import LightTracer
 from reslrb_cli.optimization.loading import samples_per_pass
 from reslrb_cli.optimization.rendering import passes
 from reslrb_cli.scene import visible_texels
@@ -20,7 +22,7 @@ if TYPE_CHECKING:
 
 Array = np.ndarray[Any, Any]
 
-#: Paths in one pass of the gradient; naive AD keeps every vertex of each of them.
+#: Paths in one pass of the gradient where naive AD keeps every vertex of each of them; light tracing keeps none.
 PATHS_PER_PASS = 2**18
 
 
@@ -48,6 +50,10 @@ def find_reached(problem: Problem, say: Callable[[str], None] = lambda line: Non
 def sensitivity(problem: Problem) -> dict[str, Array]:
     """For each parameter whether the mean image depends on an entry, boolean, of the parameter's shape."""
     run, optimizer = problem.config.run, problem.optimizer
+    integrator, paths_per_pass = problem.integrator, PATHS_PER_PASS
+    if isinstance(integrator, LightTracer):  # a recording takes as long as some passes, of which there is mostly one
+        integrator = integrator.with_options(samples_per_pass=integrator.samples_per_pass, freeze=False)
+        paths_per_pass = MOST_PATHS
     found: dict[str, Array] = {}
     for sensor in [view.sensor for view in problem.trained]:
         film = problem.scene.sensors()[sensor].film()
@@ -57,9 +63,9 @@ def sensitivity(problem: Problem) -> dict[str, Array]:
         dr.make_opaque(ones)
         multiple = samples_per_pass(problem.config)
         spp = -(-run.reach_spp // multiple) * multiple if multiple else run.reach_spp
-        for number, part in enumerate(passes(spp, width * height, multiple, PATHS_PER_PASS)):
+        for number, part in enumerate(passes(spp, width * height, multiple, paths_per_pass)):
             known_step(
-                problem.integrator,
+                integrator,
                 problem.scene,
                 sensor,
                 ones,

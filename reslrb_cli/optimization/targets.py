@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
@@ -39,6 +40,7 @@ def make_targets(problem: Problem, say: Callable[[str], None]) -> None:
             _see(problem, view, photo.image, photo, say)
     if problem.config.target.render is not None:
         _render_targets(problem, say)
+        gc.collect()  # a second scene takes part in all that is traced, until it is gone
 
 
 def _see(problem: Problem, view: View, image: Array, photo: Photo | None, say: Callable[[str], None]) -> None:
@@ -62,7 +64,7 @@ def _see(problem: Problem, view: View, image: Array, photo: Photo | None, say: C
 def _render_targets(problem: Problem, say: Callable[[str], None]) -> None:
     config, render = problem.config, problem.config.target.render
     assert render is not None, "called for rendered targets only"
-    true_scene = load_configured(config)
+    true_scene = load_configured(config, warn=False)
     true_values = set_true_values(config, true_scene)
     for key in problem.selection.keys:
         if key in problem.selection.factors:  # the scene's own images are the target

@@ -39,6 +39,7 @@ def load_scene(
     size: tuple[int, int] | None = None,
     cameras: Path | None = None,
     look: Callable[[Description], object] | None = None,
+    warn: bool = True,
 ) -> mi.Scene:
     """Load a Mitsuba scene (XML, versions 0.4 to 3); a variant must be set.
 
@@ -51,9 +52,10 @@ def load_scene(
     is to be built before anything of it is, and may raise.
 
     Raises ConfigError, located in the scene file, where it is missing or wrong, has nothing in it, or no light. Warns,
-    too, of a scene that is too far from the origin, or too small, and of glass that is too thin.
+    too, of a scene that is too far from the origin, or too small, and of glass that is too thin, all of which is looked
+    for by tracing rays; without `warn`, as for a scene that was looked at before, it is not.
     """
-    return load_described(file, options, strict, size, cameras, look)[0]
+    return load_described(file, options, strict, size, cameras, look, warn)[0]
 
 
 def load_described(
@@ -63,6 +65,7 @@ def load_described(
     size: tuple[int, int] | None = None,
     cameras: Path | None = None,
     look: Callable[[Description], object] | None = None,
+    warn: bool = True,
 ) -> tuple[mi.Scene, Description]:
     """The same, and the description that the scene was built from, of which Mitsuba has a use for every element."""
     file = Path(file)
@@ -96,7 +99,7 @@ def load_described(
     found = [note for note in found if note.element not in lost]
     for line in notes.warnings(notes.in_order([*found, *unused], root)):
         _warn(line)
-    for loss in (lost_light(scene), thin_glass(scene)):
+    for loss in (lost_light(scene), thin_glass(scene)) if warn else ():
         if loss is not None:
             _warn(f"{file}: {loss}")
     for note in unused:

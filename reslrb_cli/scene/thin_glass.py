@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -35,25 +37,40 @@ def thin_glass(scene: mi.Scene) -> str | None:
         ray, _ = emitted_rays(scene, numbers[0], mi.Point2f(*numbers[1:3]), mi.Point2f(*numbers[3:5]))
     except UnsupportedScene:  # which is said where paths from the light are wanted
         return None
-    si = scene.ray_intersect(ray)
-    active = si.is_valid()
-    gaps: list[np.ndarray] = []
-    for _ in range(_SURFACES):
-        active = active & mi.has_flag(si.bsdf().flags(), mi.BSDFFlags.Transmission)
-        following = scene.ray_intersect(si.spawn_ray(ray.d), active)
+    # Each surface of a shape is a program of its own to trace, in every interaction that is asked for: of thousands of
+    # shapes as many. So the loop is symbolic, and the way back, of which the distance alone is wanted, has none.
+    first = scene.ray_intersect_preliminary(ray)
+    si = first.compute_surface_interaction(ray, mi.RayFlags.Minimal)
+    gaps = dr.full(mi.Float, dr.nan, _PATHS * _SURFACES)
+    passing_on = si.is_valid() & mi.has_flag(si.bsdf().flags(), mi.BSDFFlags.Transmission)
+    d = ray.d
+
+    def goes_on(k: mi.UInt32, o: mi.Point3f, p: mi.Point3f, active: mi.Mask) -> mi.Mask:
+        return active & (k < _SURFACES)
+
+    def cross(k: mi.UInt32, o: mi.Point3f, p: mi.Point3f, active: mi.Mask) -> tuple[Any, ...]:
+        """From the surface at `p`, which the ray leaves from `o`, to the next one."""
+        ray = mi.Ray3f(o, d)
+        hit = scene.ray_intersect_preliminary(ray, active=active)
+        following = hit.compute_surface_interaction(ray, mi.RayFlags.Minimal, active)
         onward = active & following.is_valid()
         # From the next surface back: this one, or what the ray on has jumped over.
-        back = scene.ray_intersect(following.spawn_ray(-ray.d), onward)
-        offset = mi.math.RayEpsilon * (1 + dr.max(dr.abs(si.p)))
-        jumped = dr.dot(back.p - si.p, ray.d)
+        returning = following.spawn_ray(-d)
+        back = scene.ray_intersect_preliminary(returning, active=onward)
+        offset = mi.math.RayEpsilon * (1 + dr.max(dr.abs(p)))
+        jumped = dr.dot(returning(back.t) - p, d)
         apart = dr.select(
             onward & back.is_valid() & (jumped > offset * ROUNDING + FAR * following.t),
             jumped,
-            dr.norm(following.p - si.p),
+            dr.norm(following.p - p),
         )
-        gaps.append(np.array(dr.select(onward, apart / offset, dr.nan)))
-        si, active = following, onward
-    found = np.concatenate(gaps)
+        dr.scatter(gaps, apart / offset, k * _PATHS + index, onward)
+        is_passed = onward & mi.has_flag(following.bsdf().flags(), mi.BSDFFlags.Transmission)
+        return k + 1, following.spawn_ray(d).o, following.p, is_passed
+
+    state = (dr.zeros(mi.UInt32, _PATHS), si.spawn_ray(d).o, si.p, passing_on)
+    dr.while_loop(state, goes_on, cross, labels=("k", "o", "p", "active"), label="thin glass")
+    found = np.array(gaps)
     found = found[np.isfinite(found)]
     near = found[found < LEAST_OFFSETS]
     if len(near) <= SHARE * len(found) or len(near) == 0:
