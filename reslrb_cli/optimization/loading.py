@@ -17,9 +17,7 @@ from reslrb_cli.scene.description import Description
 LIGHT_TRACERS = ("reslrb", "ptracer", "walk_ad", "trajectory")
 
 
-def load_configured(
-    config: Config, look: Callable[[Description], object] | None = None, warn: bool = True
-) -> mi.Scene:
+def load_configured(config: Config, look: Callable[[Description], object] | None = None, warn: bool = True) -> mi.Scene:
     """Load the scene that `config` names; `look` sees its description before it is built, and what is doubtful in it is
     warned of, or not. Raises ConfigError."""
     scene = config.scene
