@@ -243,6 +243,12 @@ class RunConfig(Section):
         "image's name without its suffix; their loss is recorded every 10 iterations (`held_out`), and of the first "
         "and the last image.",
     )
+    measuring: Annotated[float, Field(ge=0, allow_inf_nan=False)] = Field(
+        default=0.1,
+        description="What is `auto` in the integrator is measured before the first iteration. This is what all of that "
+        "may take, kernels that are compiled for it included, as a share of what the run itself is expected to take. "
+        "What there is no time for is decided by the scene's features; 0: all of it, and nothing is measured.",
+    )
     certainty: bool = Field(
         default=True,
         description="After the last iteration, measure how certain the values are: their spread, and a verdict on each "

@@ -31,6 +31,10 @@ RIVAL = "prb"
 MOST_ROUNDS, LEAST_ROUNDS = 12, 6
 #: Share of a run of ITERATIONS that the rounds may cost, and that LEAST_ROUNDS may where that is more.
 SHARE, MOST_SHARE = 0.05, 0.1
+#: What it takes at least: kernels to compile, in those of one step of the run, and iterations' worth of work.
+NEEDS = (2.0, 2.0)
+#: A round of both may take so many times as long as one step of the run.
+LONGER = 3.0
 
 
 @dataclass
@@ -55,8 +59,17 @@ def measure_rival(problem: Problem, cache: Cache | None, say: Callable[[str], No
     known = recall(RivalRecord, cache, key)
     if known is not None:
         return known
-    say(f"measuring {RIVAL} beside it")
-    record = _measure(problem)
+    allowance = problem.allowance
+    if allowance is None:
+        say(f"measuring {RIVAL} beside it")
+        record = _measure(problem, problem.pilot.spp or problem.config.run.spp, math.inf)
+    else:
+        if not allowance.affords(NEEDS):
+            return RivalRecord(RIVAL, note=allowance.note())
+        say(f"measuring {RIVAL} beside it")
+        left = allowance.iterations_left(NEEDS[0])
+        with allowance.counted():
+            record = _measure(problem, problem.pilot.spp or _samples(problem, left), 1e3 * left * allowance.iteration_s)
     if cache is not None:
         cache.put(key, record.to_json())
     return record
@@ -79,11 +92,18 @@ def why_not(problem: Problem) -> str | None:
     return None
 
 
-def _measure(problem: Problem) -> RivalRecord:
+def _samples(problem: Problem, iterations: float) -> int:
+    """Samples per pixel of steps, with which the rounds that there are to be take so many iterations' worth of time."""
+    run = problem.config.run
+    unit = run.batches if problem.config.adjoint == "batched" else 1
+    share = min(iterations / (LONGER * MOST_ROUNDS), 1.0)
+    return max(int(share * run.spp) // unit, 1) * unit
+
+
+def _measure(problem: Problem, spp: int, most_ms: float) -> RivalRecord:
     options, clock = problem.config.integrator.options(), StepClock()
     shared = {name: options[name] for name in ("max_depth", "rr_depth", "hide_emitters")}
     rival = make_integrator(RIVAL, **shared)
-    spp = problem.pilot.spp if problem.pilot is not None else problem.config.run.spp
     own_integrator: Any = problem.integrator
     if isinstance(own_integrator, LightTracer):  # a recording would cost more than so few steps save
         own_integrator = own_integrator.to_measure().with_options(samples_per_pass=None, freeze=False)
@@ -101,11 +121,11 @@ def _measure(problem: Problem) -> RivalRecord:
             measured.gradients.append(step.gradients)
             measured.kernel_ms.append(step.kernel_ms)
             if name == "own":
-                budget_ms = SHARE * ITERATIONS * step.wall_ms * problem.config.run.spp / spp
+                budget_ms = min(SHARE * ITERATIONS * step.wall_ms * problem.config.run.spp / spp, most_ms)
         done = len(both["own"][1].gradients)
         if done >= LEAST_ROUNDS and spent_ms * (done + 1) / done > budget_ms:
             break
-        if done == 1 and spent_ms * LEAST_ROUNDS > budget_ms * MOST_SHARE / SHARE:
+        if done == 1 and spent_ms * LEAST_ROUNDS > min(budget_ms * MOST_SHARE / SHARE, most_ms):
             note = f"{LEAST_ROUNDS} steps of both would take {spent_ms * LEAST_ROUNDS / 1e3:.1f} s"
             return RivalRecord(RIVAL, 1, spp, measure_s=spent_ms / 1e3, compile_s=compile_ms / 1e3, note=note)
     own, other = both["own"][1], both[RIVAL][1]

@@ -21,7 +21,7 @@ from reslrb_cli.optimization.guiding_pilot import SHARE as GUIDING_SHARE
 from reslrb_cli.optimization.loading import pass_spp
 from reslrb_cli.optimization.moving import ATTACHED, is_attached
 from reslrb_cli.optimization.pilot import SHARE, Pilot
-from reslrb_cli.optimization.pilot_records import Candidate, Measured, Outcome
+from reslrb_cli.optimization.pilot_records import ITERATIONS, Allowance, Candidate, Measured, Outcome
 from reslrb_cli.optimization.room import check_baseline, check_memory
 from reslrb_cli.optimization.samples import sample_gradient, take_gradient
 from reslrb_cli.optimization.sequence_pilot import SHARE as SEQUENCE_SHARE
@@ -33,6 +33,11 @@ from reslrb_cli.records.rival import RivalRecord
 
 if TYPE_CHECKING:
     from reslrb_cli.optimization.problem import Problem
+
+#: What measurements take at least that say anything: kernels to compile, in those of one step, and iterations' worth of
+#: work. Compiling is that of both kinds of steps, and of walks that are learned from.
+ESTIMATOR_NEEDS, GUIDING_NEEDS, SEQUENCE_NEEDS = (4.0, 4.0), (2.5, 3.0), (2.5, 1.0)
+LATER = {"guiding": GUIDING_NEEDS, "sequence": SEQUENCE_NEEDS}  # once the estimator is settled
 
 Say = Callable[[str], None]
 Kept = TypeVar("Kept", GuidedRecord, SequenceRecord, RivalRecord)
@@ -144,11 +149,24 @@ def _outcome(problem: Problem, options: list[Option], say: Say, cache: Cache | N
                 return outcome
         except (TypeError, KeyError):
             pass  # nothing there, or nothing that this version wrote
+    later = [needs for option, needs in LATER.items() if is_auto(problem.config, option)]
+    allowance = allowance_of(problem, options[0].integrator)
+    if not allowance.affords(ESTIMATOR_NEEDS, *later):
+        return _usual(options, allowance)
     say("estimator auto: measuring")
-    outcome = run_pilot(problem, options)
+    with allowance.counted():
+        outcome = run_pilot(problem, options)
     if cache is not None:
         cache.put(key, outcome.to_json())
     return outcome
+
+
+def _usual(options: list[Option], allowance: Allowance) -> Outcome:
+    """The candidate that others are judged by, where there is no time to judge them: it has been the best, or within a
+    few percent of it, wherever that was measured (docs/benchmarks.md)."""
+    found = _candidate(options[0])
+    note = f"{allowance.note()}; every connection, in one traversal"
+    return Outcome(found.options, found.label, [], note=note)
 
 
 def run_pilot(problem: Problem, options: list[Option]) -> Outcome:
@@ -174,17 +192,30 @@ def run_pilot(problem: Problem, options: list[Option]) -> Outcome:
     # What is measured later has its part of what it may cost; guiding leaves some of its own for the sequence.
     later = {"guiding": GUIDING_SHARE, "sequence": SEQUENCE_SHARE}
     reserved = max([share for option, share in later.items() if is_auto(problem.config, option)], default=0.0)
-    return Pilot(made, step, run.spp, unit, SHARE - reserved).run()
+    if problem.allowance is None:
+        return Pilot(made, step, run.spp, unit, SHARE - reserved).run()
+    began, allowance = time.perf_counter(), problem.allowance
+    kernels = sum(LATER[option][0] for option in later if is_auto(problem.config, option))
+    share = min(SHARE, allowance.iterations_left(ESTIMATOR_NEEDS[0] + kernels) / ITERATIONS) - reserved
+
+    def compiles() -> bool:
+        """Whether there is time for the kernels of one more candidate, with those of what is measured later."""
+        spent = replace(allowance, spent_s=allowance.spent_s + time.perf_counter() - began)
+        return spent.affords((1 + kernels, reserved * ITERATIONS))
+
+    return Pilot(made, step, run.spp, unit, share, compiles).run()
 
 
 def _candidate(option: Option) -> Candidate:
     """As the pilot sees it: with two passes where the run has more, which take as many traversals."""
     options = option.options
-    parent = None
-    if options.get("capacity", 1) > 1 or "weight" in options:
-        parent = Candidate({"estimator": options["estimator"], "capacity": 1}, exact=False).label
+    name, slots, parent = options["estimator"], options.get("capacity", 1) > 1, None
+    if slots or "weight" in options:
+        parent = Candidate({"estimator": name, "capacity": 1}, exact=False).label
+    elif name in ("gather", "reservoir"):  # which trace their paths twice, where `event` traces them once
+        parent = Candidate({"estimator": "event", "capacity": 1}, exact=False).label
     several = option.memory is not None and option.memory.passes > 1
-    return Candidate(options, ESTIMATORS[options["estimator"]].exact, 2 if several else 1, parent)
+    return Candidate(options, ESTIMATORS[name].exact, 2 if several else 1, parent, slots and "weight" not in options)
 
 
 def measured_step(problem: Problem, integrator: Any, clock: StepClock, round: int, spp: int) -> Measured:
@@ -204,10 +235,41 @@ def is_auto(config: Config, option: str) -> bool:
     return bool(config.integrator.options().get(option) == "auto")
 
 
-def share_left(problem: Problem, reserved: float = 0.0) -> float:
-    """What earlier measurements left of the share of a run that all of them may cost, but for what is `reserved`."""
+def share_left(problem: Problem, reserved: float = 0.0, kernels: float = 0.0) -> float:
+    """What earlier measurements left of the share of 200 iterations that all of them may cost, but for what is
+    `reserved`, and no more than there is time for in a run as short as this, with `kernels` to compile."""
     spent = sum(each.share for each in (problem.pilot, problem.guided) if each is not None)
-    return max(SHARE - spent - reserved, 0.0)
+    left = max(SHARE - spent - reserved, 0.0)
+    if problem.allowance is None:
+        return left
+    return min(left, max(problem.allowance.iterations_left(kernels) / ITERATIONS - reserved, 0.0))
+
+
+def allowance_of(problem: Problem, integrator: Tracer) -> Allowance:
+    """What may be spent on measuring: as begun before, or by two first steps of `integrator` now, of few samples."""
+    if problem.allowance is None:
+        run = problem.config.run
+        unit = run.batches if problem.config.adjoint == "batched" else 1
+        own = integrator.to_measure().with_options(samples_per_pass=None, freeze=False)
+        clock = StepClock()
+        first, second = (measured_step(problem, own, clock, 0, unit) for _ in range(2))
+        compile_ms = max(first.wall_ms + first.compile_ms - second.wall_ms, 0.0)
+        beside = max(second.wall_ms - second.kernel_ms, 0.0)
+        iteration_ms = beside + second.kernel_ms * run.spp / unit
+        run_ms = compile_ms + run.iterations * iteration_ms
+        problem.allowance = Allowance(run.measuring, run_ms / 1e3, compile_ms / 1e3, iteration_ms / 1e3)
+    return problem.allowance
+
+
+def suits_even_numbers(problem: Problem) -> str | None:
+    """Why evenly spread numbers are likely to do better here than guided paths, by what the scene has; None where it is
+    not known. docs/sequences.md has what this was seen on."""
+    if is_attached(problem):
+        return "of what moves light, evenly spread numbers say most"
+    for emitter in problem.scene.emitters():
+        if not mi.has_flag(emitter.flags(), mi.EmitterFlags.Delta) and emitter.class_name() != "DirectionalArea":
+            return None
+    return "of light from points and beams, evenly spread numbers say most"
 
 
 def recall(kind: type[Kept], cache: Cache | None, key: str) -> Kept | None:

@@ -6,7 +6,18 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from reslrb_cli.config.files import in_words
-from reslrb_cli.optimization.choice import Cache, Say, is_auto, recall, share_left, situation
+from reslrb_cli.optimization.choice import (
+    GUIDING_NEEDS,
+    SEQUENCE_NEEDS,
+    Cache,
+    Say,
+    allowance_of,
+    is_auto,
+    recall,
+    share_left,
+    situation,
+    suits_even_numbers,
+)
 from reslrb_cli.optimization.guiding_pilot import LONGER, GuidingPilot
 from reslrb_cli.optimization.sequence_pilot import SHARE as SEQUENCE_SHARE
 from reslrb_cli.optimization.step_trial import StepTrial, sizes
@@ -63,11 +74,19 @@ def _record(problem: Problem, say: Say, cache: Cache | None) -> tuple[GuidedReco
     known = recall(GuidedRecord, cache, key)
     if known is not None:
         return known, None
+    allowance = allowance_of(problem, problem.integrator)
+    sequence = is_auto(problem.config, "sequence")
+    why = suits_even_numbers(problem) if sequence else None
+    # Where these are likely to do better, to measure guiding alone would mislead.
+    if not allowance.affords(GUIDING_NEEDS, *([] if why is None else 2 * [SEQUENCE_NEEDS])):
+        note = f"{allowance.note()}; {why or 'it pays in long runs'}"
+        return GuidedRecord(guided=False, note=note), None
     say("guiding auto: measuring")
-    plain, guided = (problem.integrator.afresh(guided=on) for on in (False, True))
-    trial = StepTrial(problem, "guiding", plain, guided)
-    share = share_left(problem, SEQUENCE_SHARE if is_auto(problem.config, "sequence") else 0.0)
-    record = GuidingPilot(trial, plan, trial.part_of_views(), share).run()
+    with allowance.counted():
+        plain, guided = (problem.integrator.afresh(guided=on) for on in (False, True))
+        trial = StepTrial(problem, "guiding", plain, guided)
+        share = share_left(problem, SEQUENCE_SHARE if sequence else 0.0, GUIDING_NEEDS[0])
+        record = GuidingPilot(trial, plan, trial.part_of_views(), share).run()
     if cache is not None:
         cache.put(key, record.to_json())
     return record, trial

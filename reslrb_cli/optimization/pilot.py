@@ -16,7 +16,7 @@ from __future__ import annotations
 import math
 import statistics
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -59,6 +59,7 @@ class Pilot:
     """One pilot. `step(candidate, round, spp)` takes a step; equal rounds have equal seeds.
 
     `spp` are those of the run, of which the pilot uses a multiple of `unit`, and `share` is what it may cost of one.
+    `compiles` says whether there is time for the kernels of one more candidate.
     """
 
     def __init__(
@@ -68,8 +69,12 @@ class Pilot:
         spp: int,
         unit: int = 1,
         share: float = SHARE,
+        compiles: Callable[[], bool] = lambda: True,
     ) -> None:
-        self._candidates, self._step, self._share = list(candidates), step, share
+        labels = {candidate.label for candidate in candidates}
+        # What a budget of memory left out says nothing of others.
+        self._candidates = [c if c.parent in {None, *labels} else replace(c, parent=None) for c in candidates]
+        self._step, self._share, self._compiles = step, share, compiles
         self._spp, self._unit, self._pilot_spp = spp, unit, unit
         self._entries: list[_Entry] = []
         self._notes: dict[str, str] = {}
@@ -194,18 +199,22 @@ class Pilot:
         return kept
 
     def _promising(self) -> list[_Entry]:
-        """Measure the variants that could be the best, by what is known of those they vary."""
+        """Measure those that could be the best, by what is known of their relatives."""
         best = max(self._efficiency(entry) for entry in self._entries)
-        labels = {entry.candidate.label: entry for entry in self._entries}
+        labels: dict[str | None, _Entry] = {entry.candidate.label: entry for entry in self._entries}
         found = []
         for candidate in self._candidates:
             if candidate.parent is None:
                 continue
+            relative = candidate
             parent = labels.get(candidate.parent)
+            while parent is None:  # that was left out as well: it would have been no faster than its own
+                [relative] = [c for c in self._candidates if c.label == relative.parent]
+                parent = labels.get(relative.label)
             bound = self._bound(candidate, parent)
             if bound * TIMING_NOISE < best:
                 self._notes[candidate.label] = f"not measured: at most {bound / best:.2f} of the best's efficiency"
-            elif not self._affords(parent or self._entries[0]):
+            elif not (self._affords(parent) and self._compiles()):
                 self._notes[candidate.label] = (
                     f"not measured: no more than {100 * self._share:.2g} % of the run is to be spent"
                 )
@@ -215,17 +224,19 @@ class Pilot:
                 if self._affords(entry):
                     self._measure(entry)
                 found.append(entry)
+                labels[candidate.label] = entry
         return found
 
-    def _bound(self, candidate: Candidate, parent: _Entry | None) -> float:
-        """The greatest efficiency that a variant can have: it is no faster than its parent."""
-        if parent is None or not self._references(candidate.passes) or candidate.passes != parent.candidate.passes:
+    def _bound(self, candidate: Candidate, relative: _Entry) -> float:
+        """The greatest efficiency that a candidate can have: it is no faster than its relative, and its variance is no
+        less than an exact one's. Of more slots of one estimator the variance is known."""
+        if not self._references(candidate.passes) or candidate.passes != relative.candidate.passes:
             return math.inf
         exact = next(e for e in self._entries if e.candidate.exact and e.candidate.passes == candidate.passes)
         least = self._variance(exact)
-        if candidate.options.get("weight") != "adjoint":
-            least += (self._variance(parent) - least) / candidate.options["capacity"]
-        return 1 / (least * max(parent.time, 1e-6))
+        if candidate.parent == relative.candidate.label and candidate.varies_slots:
+            least += (self._variance(relative) - least) / candidate.options["capacity"]
+        return 1 / (least * max(relative.time, 1e-6))
 
     def _outcome(self) -> Outcome:
         ranked = sorted(self._entries, key=self._efficiency, reverse=True)

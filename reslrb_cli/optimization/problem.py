@@ -27,7 +27,7 @@ from reslrb_cli.optimization.loading import (
 )
 from reslrb_cli.optimization.moving import check_moving
 from reslrb_cli.optimization.optimizers import Optimizer
-from reslrb_cli.optimization.pilot_records import Outcome
+from reslrb_cli.optimization.pilot_records import Allowance, Outcome
 from reslrb_cli.optimization.reach import find_reached
 from reslrb_cli.optimization.rendering import render_in_passes, saved_spp
 from reslrb_cli.optimization.room import check_films, outlook
@@ -65,6 +65,8 @@ class Problem:
     quantities: dict[str, str] = field(default_factory=dict)
     #: The integrator's own bound on the samples of a pass.
     samples_per_pass: int | None = None
+    #: What measuring before the first iteration may take, where anything was left to it, and was not known already.
+    allowance: Allowance | None = None
     #: What was measured and planned before the first iteration, where it was.
     pilot: Outcome | None = None
     guided: GuidedRecord | None = None

@@ -6,7 +6,17 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from reslrb_cli.optimization.choice import Cache, Say, is_auto, recall, share_left, situation
+from reslrb_cli.optimization.choice import (
+    SEQUENCE_NEEDS,
+    Cache,
+    Say,
+    allowance_of,
+    is_auto,
+    recall,
+    share_left,
+    situation,
+    suits_even_numbers,
+)
 from reslrb_cli.optimization.guiding_choice import settle_guiding
 from reslrb_cli.optimization.sequence_pilot import LONGER, InsteadPilot, SequencePilot, planned
 from reslrb_cli.optimization.step_trial import StepTrial, sizes
@@ -50,20 +60,34 @@ def _record(problem: Problem, say: Say, cache: Cache | None, earlier: StepTrial 
     known = recall(SequenceRecord, cache, key)
     if known is not None:
         return known
+    allowance = allowance_of(problem, problem.integrator)
+    if not allowance.affords(SEQUENCE_NEEDS):
+        is_guided = problem.integrator.preparation.guiding is not None
+        why = "guided paths gain little by others" if is_guided else suits_even_numbers(problem)
+        note = f"{allowance.note()}; {why or 'evenly spread ones have been no loss in any scene'}"
+        return SequenceRecord(low_discrepancy=not is_guided, note=note)
     say("sequence auto: measuring")
+    with allowance.counted():
+        record = _measure(problem, earlier)
+    if cache is not None:
+        cache.put(key, record.to_json())
+    return record
+
+
+def _measure(problem: Problem, earlier: StepTrial | None) -> SequenceRecord:
+    """What is measured now; `earlier`: what guiding was measured on."""
     alone = None
     if problem.guided is not None and problem.guided.guided:
         # Guided paths start in cells of their own, within which little is left to spread evenly: where numbers that are
         # say nearly all, as under a beam through glass, they do better alone.
-        alone, earlier = _measured(problem, InsteadPilot, earlier, share_left(problem) / 2)
+        share = share_left(problem, kernels=2 * SEQUENCE_NEEDS[0])
+        alone, earlier = _measured(problem, InsteadPilot, earlier, share / 2)
     if alone is not None and alone.low_discrepancy:
         record = alone
     else:
         spent = 0.0 if alone is None else alone.share
-        record, _ = _measured(problem, SequencePilot, earlier, share_left(problem, spent))
+        record, _ = _measured(problem, SequencePilot, earlier, share_left(problem, spent, SEQUENCE_NEEDS[0]))
         record = record if alone is None else _added(record, alone)
-    if cache is not None:
-        cache.put(key, record.to_json())
     return record
 
 

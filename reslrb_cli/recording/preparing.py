@@ -38,6 +38,8 @@ def prepare(config: Config, variant: str, say: Say, warn: Say) -> tuple[Course, 
         warn(line)
     warn_of_border(problem, warn)
     rival = measure_rival(problem, cache, say)
+    if problem.allowance is not None and problem.allowance.spent_s:
+        say(problem.allowance.line())
     if rival is not None and rival.is_better:
         warn(f"{rival.line()}; --set integrator.type={rival.integrator}")
     manifest = manifest_of(problem, variant, config.source)

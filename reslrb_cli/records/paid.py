@@ -72,8 +72,9 @@ class PaidRecord:
 
     def line(self) -> str:
         """What the user is told."""
-        cost = f"measured in {self.measure_s:.1f} s, {100 * self.share:.1f} % of 200 iterations, and "
-        cost += f"{self.compile_s:.1f} s of first steps"
+        if not (self.cached or self.measure_s or self.compile_s):
+            return f"{self.decision()}: {self.why()}"
+        cost = f"measured in {self.measure_s:.1f} s and {self.compile_s:.1f} s of first steps"
         return f"{self.decision()}: {self.why()} ({'as an earlier run measured' if self.cached else cost})"
 
 

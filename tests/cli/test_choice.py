@@ -15,7 +15,7 @@ from reslrb_cli.records.manifest import read_manifest
 from reslrb_cli.records.metrics import read_metrics
 
 OWN = "{max_depth: 4, guiding: off, sequence: independent}"
-AUTO = CONFIG.replace("{type: ptracer, max_depth: 3}", OWN).replace("iterations: 25", "iterations: 2")
+AUTO = CONFIG.replace("{type: ptracer, max_depth: 3}", OWN).replace("iterations: 25", "iterations: 2, measuring: 1000")
 
 
 @pytest.fixture
@@ -72,6 +72,47 @@ def test_auto_measures_once_and_remembers(experiment, capsys):
     assert "measuring" not in err
     # The pilot changed neither parameters nor random numbers.
     np.testing.assert_allclose([record["loss"] for record in read_metrics(Path("runs/box"))], first, rtol=1e-4)
+
+
+def test_a_short_run_measures_nothing_and_says_so(experiment, capsys, monkeypatch):
+    """Where a tenth of the run has no room for it, what is `auto` is decided by the scene; with more room it is not."""
+    from reslrb_cli.optimization import choice
+
+    options = ["integrator={max_depth: 4}", "run.measuring=0.1", "run.iterations=3"]
+    with monkeypatch.context() as patch:
+        patch.setattr(choice, "run_pilot", lambda *args: pytest.fail("measured"))
+        code, err = optimize(capsys, *options)
+    assert code == 0, err
+    assert "measuring" not in err
+    because = "not measured, which would take more than 10 % of this run; "
+    assert f"estimator stack: {because}every connection, in one traversal" in err
+    assert f"guiding off: {because}it pays in long runs" in err
+    assert f"sequence low_discrepancy: {because}evenly spread ones" in err
+    manifest = read_manifest(Path("runs/box"))
+    assert manifest["pilot"]["chosen"] == {"estimator": "stack"}
+    assert manifest["pilot"]["rows"] == []
+    assert manifest["sequence"]["low_discrepancy"]
+    assert manifest["rival"]["note"].startswith("not measured")
+    assert "estimator stack: not measured" in Path("runs/box/report.html").read_text()
+    code, err = optimize(capsys, *options, "run.measuring=1000")
+    assert code == 0, err
+    assert "estimator auto: measuring" in err  # what was decided so is not remembered as measured
+    told = next(line for line in err.splitlines() if line.startswith("measuring took "))
+    assert told.endswith(" % of what this run is expected to take")
+
+
+@pytest.mark.parametrize(("light", "parallel"), [("point", True), ("area", False)])
+def test_what_the_scene_has_decides_where_nothing_is_measured(experiment, light, parallel):
+    from reslrb_cli.config import load
+    from reslrb_cli.optimization import choice
+    from reslrb_cli.optimization.problem import assemble_scene
+
+    if light == "point":
+        lamp = SCENE[SCENE.index('<shape type="rectangle" id="lamp">') : SCENE.index("</scene>")]
+        point = """<emitter type="point"><point name="position" x="0" y="0" z="2"/></emitter>\n"""
+        Path("scene.xml").write_text(SCENE.replace(lamp, point))
+    problem = assemble_scene(load("box.yaml", []))
+    assert (choice.suits_even_numbers(problem) is not None) == parallel
 
 
 def test_other_settings_are_another_situation(experiment):

@@ -18,7 +18,7 @@ from reslrb_cli.records.manifest import read_manifest
 from reslrb_cli.records.rival import RivalRecord
 
 OWN = "{max_depth: 3, guiding: off, sequence: independent}"
-AUTO = CONFIG.replace("{type: ptracer, max_depth: 3}", OWN).replace("iterations: 25", "iterations: 2")
+AUTO = CONFIG.replace("{type: ptracer, max_depth: 3}", OWN).replace("iterations: 25", "iterations: 2, measuring: 1000")
 POINT = """<emitter type="point" id="bulb"><point name="position" x="0" y="0" z="2"/>
     <rgb name="intensity" value="3, 3, 3"/></emitter>"""
 GLASS = """<shape type="sphere"><float name="radius" value="0.2"/><point name="center" x="0" y="0" z="1"/>

@@ -39,7 +39,7 @@ SMALLER = {
     "grey_room": ["scene.options.resx=120", "scene.options.resy=90"],
     "cornell_floor": ["scene.options.resx=128", "scene.options.resy=128"],
 }
-AUTO = ["integrator.guiding=auto", "integrator.sequence=auto"]
+AUTO = ["integrator.guiding=auto", "integrator.sequence=auto", "run.measuring=1000"]
 #: Scenes in which gradients break, each with another reason to draw samples otherwise: a sun, a lamp that is a dot,
 #: parallel light that grazes a floor, glass in glass, texels that are black, a film of one column.
 EXTREME = ["sun_1e6", "lamp_of_area_1e-8", "grazing_light", "nested_dielectrics", "albedo_0_roulette", "film_1x4096"]

@@ -32,6 +32,7 @@ from reslrb_cli.records.pilot_cache import PilotCache
 pytestmark = pytest.mark.usefixtures("llvm")
 
 AUTO = ["integrator.guiding=auto", "scene.size=[32, 32]", "run.spp=64", "run.iterations=2", "run.certainty=false"]
+AUTO += ["run.measuring=1000"]  # though iterations are so few
 RUN = Path("runs/tiny")
 
 

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import time
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from reslrb_cli.optimization.guiding_pilot import SHARE as GUIDING_SHARE
 from reslrb_cli.optimization.pilot import SHARE, Pilot
-from reslrb_cli.optimization.pilot_records import ITERATIONS, Candidate, Measured, Outcome
+from reslrb_cli.optimization.pilot_records import ITERATIONS, Allowance, Candidate, Measured, Outcome
 
 STACK, GATHER = Candidate({"estimator": "stack"}, True), Candidate({"estimator": "gather"}, True)
 RESERVOIR = Candidate({"estimator": "reservoir", "capacity": 1}, False)
-RESERVOIR_4 = Candidate({"estimator": "reservoir", "capacity": 4}, False, parent=RESERVOIR.label)
+RESERVOIR_4 = Candidate({"estimator": "reservoir", "capacity": 4}, False, parent=RESERVOIR.label, varies_slots=True)
 EVENT = Candidate({"estimator": "event", "capacity": 1}, False)
 ADJOINT = Candidate({"estimator": "event", "capacity": 1, "weight": "adjoint"}, False, parent=EVENT.label)
 ALL = [STACK, GATHER, RESERVOIR, EVENT, RESERVOIR_4, ADJOINT]
@@ -89,6 +92,45 @@ def test_what_cannot_win_is_not_measured() -> None:
         assert row.efficiency is None
         assert row.note.startswith("not measured: at most")
     assert [row.rounds for row in outcome.rows[2:4]] == [1, 1]  # no faster than what is exact
+
+
+def test_relatives_of_what_cannot_win_are_not_compiled() -> None:
+    """What traces its paths twice is no faster than what traces them once; nor are its own variants."""
+    twice = [replace(c, parent=EVENT.label) for c in (GATHER, RESERVOIR)]
+    every = [STACK, twice[0], EVENT, twice[1], RESERVOIR_4, ADJOINT]
+    slow = World({**times(), EVENT.label: 12.0}, {RESERVOIR.label: 1.0, EVENT.label: 2.0})
+    outcome = slow.run(every)
+    assert outcome.label == "stack"
+    assert {name for name, _, _ in slow.calls} == {STACK.label, EVENT.label}
+    assert sum(row.note.startswith("not measured: at most") for row in outcome.rows) == 4
+    quick = World({**times(), EVENT.label: 5.0, GATHER.label: 6.0}, {RESERVOIR.label: 4.0, EVENT.label: 9.0})
+    assert quick.run(every).label == "gather"
+    # Without `event`, which a budget of memory may leave out, all are measured.
+    alone = World(times(), {RESERVOIR.label: 1.0})
+    alone.run([STACK, *twice])
+    assert {name for name, _, _ in alone.calls} == {STACK.label, GATHER.label, RESERVOIR.label}
+
+
+def test_nothing_more_is_compiled_where_there_is_no_time() -> None:
+    changed = {EVENT.label: 3.0, ADJOINT.label: 3.0}
+    world = World({**times(), **changed}, {EVENT.label: 2.0, RESERVOIR.label: 1.0})
+    outcome = Pilot(ALL, world.step, 64, compiles=lambda: False).run()
+    assert ADJOINT.label not in {name for name, _, _ in world.calls}
+    assert "no more than" in outcome.rows[-1].note
+
+
+def test_an_allowance_is_what_is_left_of_a_share_of_the_run() -> None:
+    allowance = Allowance(0.1, run_s=100.0, compile_s=1.0, iteration_s=0.5)
+    assert allowance.affords((4, 4), (4, 0))
+    assert not allowance.affords((4, 4), (4, 1))
+    assert allowance.iterations_left(4) == 12
+    with allowance.counted():
+        time.sleep(0.01)
+    assert 0.01 <= allowance.spent_s < 1
+    assert allowance.left_s == pytest.approx(10 - allowance.spent_s)
+    allowance.spent_s = 11.0
+    assert allowance.left_s == allowance.iterations_left(0) == 0
+    assert allowance.line() == "measuring took 11.0 s, 11 % of what this run is expected to take"
 
 
 def test_variances_do_not_depend_on_units() -> None:

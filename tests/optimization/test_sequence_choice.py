@@ -26,7 +26,7 @@ from reslrb_cli.records.pilot_cache import PilotCache
 
 pytestmark = pytest.mark.usefixtures("llvm")
 
-SMALL = ["scene.size=[16, 16]", "run.spp=64", "run.iterations=2", "run.certainty=false"]
+SMALL = ["scene.size=[16, 16]", "run.spp=64", "run.iterations=2", "run.certainty=false", "run.measuring=1000"]
 AUTO = ["integrator.sequence=auto", *SMALL]
 BOTH = ["integrator.guiding=auto", *AUTO]
 RUN = Path("runs/tiny")
