@@ -128,6 +128,7 @@ def test_what_comes_before_the_iterations_is_measured_once(
     if not keeps:
         cache.write_text("no folder")
     auto = ["--set", "integrator={type: reslrb, max_depth: 3}", "--set", "run.certainty=false"]
+    auto += ["--set", "run.measuring=1000"]
     call("--dry-run", *auto)
     printed = capsys.readouterr().out
     times = []

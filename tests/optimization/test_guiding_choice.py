@@ -204,6 +204,7 @@ def test_it_goes_on_as_it_was_decided_bit_by_bit(tmp_path: Path, monkeypatch: py
     fix_times(monkeypatch, {"guiding": 0.2, "sequence": 0.1, "sequence alone": 1000.0})
     settings = [
         *AUTO[:3],
+        "run.measuring=1000",
         "integrator.sequence=auto",
         "run.iterations=8",
         "run.checkpoint_every={iterations: 3}",

@@ -116,6 +116,7 @@ class Spent:
     def __init__(self, pilot: float | None, guided: float | None) -> None:
         self.pilot = None if pilot is None else SimpleNamespace(share=pilot)
         self.guided = None if guided is None else GuidedRecord(guided=True, share=guided)
+        self.allowance = None
 
 
 @pytest.mark.parametrize("pilot", [None, 0.02, PILOT_SHARE - GUIDING_SHARE])
