@@ -39,6 +39,15 @@ def choose_sensors(config: Config, scene: mi.Scene) -> list[int]:
     return list(named.values())
 
 
+def are_upright(config: Config) -> bool:
+    """Whether images of views are turned as their EXIF orientation says.
+
+    Cameras of a file were found for pixels as they lie in theirs: COLMAP leaves orientations aside on purpose, since
+    all images of one camera are to have one projection.
+    """
+    return config.scene.cameras is None
+
+
 def check_integrator(config: Config, integrator: Integrator, scene: mi.Scene, sensors: list[int]) -> None:
     """Raise ConfigError, located in the scene's file, where `integrator` cannot render `scene` through `sensors`."""
     try:
