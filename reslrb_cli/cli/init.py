@@ -77,7 +77,7 @@ def command(
     from reslrb_cli.cli.first_config import FirstConfig
     from reslrb_cli.scene import select_parameters, turned_line
     from reslrb_cli.scene.depth import find_depth
-    from reslrb_cli.scene.load import load_described
+    from reslrb_cli.scene.load import load_described, read_as_floats
     from reslrb_cli.scene.photograph import open_photograph, write_smaller
     from reslrb_cli.scene.proposal import propose
 
@@ -117,7 +117,9 @@ def command(
         proposals=proposals,
     )
     text = first.text(path)
-    select_parameters(scene, loads(text, path).parameters, path)  # what is wrong is to show before anything is written
+    specs = loads(text, path).parameters
+    scene = read_as_floats(scene, description, [key for spec in specs for key in spec.keys])
+    select_parameters(scene, specs, path)  # what is wrong is to show before anything is written
     try:
         if copied and photo is not None and image is not None:
             write_smaller(photo, size, image)

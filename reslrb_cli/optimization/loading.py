@@ -17,10 +17,22 @@ from reslrb_cli.scene.description import Description
 LIGHT_TRACERS = ("reslrb", "ptracer", "walk_ad", "trajectory")
 
 
-def load_configured(config: Config, look: Callable[[Description], object] | None = None) -> mi.Scene:
-    """Load the scene that `config` names; `look` sees its description before it is built. Raises ConfigError."""
+def load_configured(
+    config: Config, look: Callable[[Description], object] | None = None, selects: bool = True
+) -> mi.Scene:
+    """Load the scene that `config` names; `look` sees its description before it is built. Raises ConfigError.
+
+    Textures of 8 or 16 bits that its parameters select are read as floating point, unless nothing is to be selected.
+    """
     scene = config.scene
-    return load_scene(scene.file, scene.options, scene.strict, scene.size, scene.cameras, look)
+    keys = selected_keys(config) if selects else []
+    return load_scene(scene.file, scene.options, scene.strict, scene.size, scene.cameras, look, keys)
+
+
+def selected_keys(config: Config) -> list[str]:
+    """The keys and globs of what `config` recovers, or gives true values."""
+    render = config.target.render
+    return [*(key for spec in config.parameters for key in spec.keys), *(render.parameters if render else ())]
 
 
 def choose_sensors(config: Config, scene: mi.Scene) -> list[int]:

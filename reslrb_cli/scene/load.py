@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import functools
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
+from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ import numpy as np
 
 from ..errors import ConfigError
 from .cameras import read_cameras, replace_sensors
+from .catalog import coarse_bits
 from .description import (
     Description,
     build,
@@ -25,7 +27,8 @@ from .description import (
     read_description,
     resize_films,
 )
-from .description.element import quoted
+from .description.element import Element, quoted
+from .description.naming import Owners
 from .extent import lost_light
 from .thin_glass import thin_glass
 
@@ -39,6 +42,7 @@ def load_scene(
     size: tuple[int, int] | None = None,
     cameras: Path | None = None,
     look: Callable[[Description], object] | None = None,
+    keys: Iterable[str] = (),
 ) -> mi.Scene:
     """Load a Mitsuba scene (XML, versions 0.4 to 3); a variant must be set.
 
@@ -48,12 +52,13 @@ def load_scene(
     out, with a warning in the log; `strict` has it refused. Those of `cameras`, a file, stand in place of the scene's
     sensors. The scene's integrator is not loaded: an experiment has its own. Plugins are loaded from Mitsuba's own
     folder alone. `size` is the (width, height) of all films in pixels, in place of what the files say. `look` sees what
-    is to be built before anything of it is, and may raise.
+    is to be built before anything of it is, and may raise. `keys`, which may be globs, are of parameters that are to
+    have derivatives: bitmaps among them that Mitsuba would keep with 8 or 16 bits are read as floating point.
 
     Raises ConfigError, located in the scene file, where it is missing or wrong, has nothing in it, or no light. Warns,
     too, of a scene that is too far from the origin, or too small, and of glass that is too thin.
     """
-    return load_described(file, options, strict, size, cameras, look)[0]
+    return load_described(file, options, strict, size, cameras, look, keys)[0]
 
 
 def load_described(
@@ -63,6 +68,7 @@ def load_described(
     size: tuple[int, int] | None = None,
     cameras: Path | None = None,
     look: Callable[[Description], object] | None = None,
+    keys: Iterable[str] = (),
 ) -> tuple[mi.Scene, Description]:
     """The same, and the description that the scene was built from, of which Mitsuba has a use for every element."""
     file = Path(file)
@@ -102,7 +108,42 @@ def load_described(
     for note in unused:
         if note.owner is not None:
             note.owner.children.remove(note.element)
+    if _mark_floats(scene, description, keys):
+        scene = None  # before the other takes its memory
+        scene = build(description)[0]
     return scene, description
+
+
+def read_as_floats(scene: mi.Scene, description: Description, keys: Iterable[str]) -> mi.Scene:
+    """The scene with bitmaps of 8 or 16 bits that `keys`, which may be globs, name read as floating point.
+
+    That is `scene` itself where there are none, else one that is built anew from `description`, which is changed.
+    """
+    return build(description)[0] if _mark_floats(scene, description, keys) else scene
+
+
+def _mark_floats(scene: mi.Scene, description: Description, keys: Iterable[str]) -> bool:
+    """Have those bitmaps say in the description that they are floats; whether there are any.
+
+    All others stay as they are: floats take four times the memory of bytes. The values are the same, decoded from sRGB
+    when they are read and not when they are looked up.
+    """
+    keys = list(keys)
+    if not keys or not any(element.type == "bitmap" for element in description.root.walk()):
+        return False
+    params, owners, changed = mi.traverse(scene), Owners(description.root), False
+    for key in params.properties:
+        if coarse_bits(params, key) is None or not any(key == each or fnmatchcase(key, each) for each in keys):
+            continue
+        owner, names = owners.place(params, key) or (description.root, [])
+        if owner.type == "bitmap" and names == ["data"]:  # else nothing is done, and to select it says why
+            logger.info("%s: `%s` is read as floating point", owner.place, key)
+            owner.children[:] = [child for child in owner.children if child.name != "format"]
+            owner.children.append(Element("string", {"name": "format", "value": "variant"}, owner.source, owner.line))
+            changed = True
+    if changed:
+        check_sizes(description)
+    return changed
 
 
 def _check_meshes(file: Path, scene: mi.Scene) -> None:
