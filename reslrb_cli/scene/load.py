@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import logging
+import os
 from collections.abc import Callable, Iterable, Mapping
 from fnmatch import fnmatchcase
 from pathlib import Path
@@ -12,6 +13,7 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
+from ..backend.variant import check_variant
 from ..errors import ConfigError
 from .cameras import read_cameras, replace_sensors
 from .catalog import coarse_bits
@@ -59,6 +61,22 @@ def load_scene(
     too, of a scene that is too far from the origin, or too small, and of glass that is too thin.
     """
     return load_described(file, options, strict, size, cameras, look, keys)[0]
+
+
+def load_for_script(file: str | os.PathLike[str], keys: Iterable[str] = (), /, **options: Any) -> mi.Scene:
+    """Load a Mitsuba scene file as the command line does: its parameters have the names that `reslrb inspect` lists.
+
+    In place of `mi.load_file(file, optimize=False, **options)`, which refuses what other versions of Mitsuba and
+    exporters wrote, and names objects without an id otherwise. `options` are the values of the file's `$name`
+    variables, which messages call `scene.options.NAME`, as configurations do. `keys` are parameters, or globs, that are
+    to have gradients: their textures of 8 or 16 bits are read as floating point. A variant must be set; the scene's own
+    integrator is not loaded.
+
+    Raises `reslrb_cli.errors.ConfigError`, one line that says where, for a file that is missing or wrong, and
+    BackendError under a variant that reslrb does not work with.
+    """
+    check_variant()
+    return load_scene(Path(file), options, keys=[keys] if isinstance(keys, str) else keys)
 
 
 def load_described(
@@ -137,7 +155,7 @@ def _mark_floats(scene: mi.Scene, description: Description, keys: Iterable[str])
             continue
         owner, names = owners.place(params, key) or (description.root, [])
         if owner.type == "bitmap" and names == ["data"]:  # else nothing is done, and to select it says why
-            logger.info("%s: `%s` is read as floating point", owner.place, key)
+            _tell(f"{owner.place}: `{key}` is read as floating point")
             owner.children[:] = [child for child in owner.children if child.name != "format"]
             owner.children.append(Element("string", {"name": "format", "value": "variant"}, owner.source, owner.line))
             changed = True
@@ -160,6 +178,12 @@ def _check_meshes(file: Path, scene: mi.Scene) -> None:
 def _warn(line: str) -> None:
     """Say it once: one experiment may load its scene several times."""
     logger.warning("%s", line)
+
+
+@functools.cache
+def _tell(line: str) -> None:
+    """The same of what is nothing to worry about."""
+    logger.info("%s", line)
 
 
 def _as_text(value: Any) -> str:
