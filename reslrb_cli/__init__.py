@@ -1,7 +1,8 @@
 """Gradients through light paths: reservoir light replay backpropagation on Mitsuba 3.
 
 `import reslrb_cli` needs no variant and loads no Mitsuba. Import it before Mitsuba: it chooses the libLLVM that Dr.Jit
-will load. `register()` makes the plugins known to Mitsuba, `step(...)` is one gradient step.
+will load. `register()` makes the plugins known to Mitsuba, `load_scene(...)` gives a scene whose parameters are named
+as on the command line, `step(...)` is one gradient step.
 """
 
 from __future__ import annotations
@@ -23,20 +24,26 @@ from reslrb_cli.backend import llvm as _llvm  # noqa: E402
 if TYPE_CHECKING:
     from reslrb_cli.integrators import gradient_step as step
     from reslrb_cli.integrators import register
+    from reslrb_cli.scene.load import load_for_script as load_scene
 
 __version__ = "0.1.0"
-__all__ = ["__version__", "register", "step"]
+__all__ = ["__version__", "load_scene", "register", "step"]
 
 # Dr.Jit loads libLLVM on a thread of its own while it is being imported: later is too late.
 _llvm.prepare()
 
-_LAZY = {"register": "register", "step": "gradient_step"}
+_LAZY = {
+    "load_scene": ("reslrb_cli.scene.load", "load_for_script"),
+    "register": ("reslrb_cli.integrators", "register"),
+    "step": ("reslrb_cli.integrators", "gradient_step"),
+}
 
 
 def __getattr__(name: str) -> Any:
     """Loads a public name that needs Mitsuba when it is first asked for."""
     if name not in _LAZY:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    value = getattr(importlib.import_module("reslrb_cli.integrators"), _LAZY[name])
+    module, its_name = _LAZY[name]
+    value = getattr(importlib.import_module(module), its_name)
     globals()[name] = value
     return value

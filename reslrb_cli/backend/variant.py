@@ -48,6 +48,24 @@ def choose(name: str = "auto") -> tuple[str, str]:
     return ("llvm_ad_rgb", f"; no CUDA: {missing}") if missing else ("cuda_ad_rgb", "")
 
 
+def works_under(variant: str) -> bool:
+    """Whether our integrators work under that variant of Mitsuba: with derivatives, by three colours or one."""
+    return variant.endswith(("_ad_rgb", "_ad_mono"))
+
+
+def check_variant() -> None:
+    """Raises BackendError where the variant that is set is none under which our integrators work, or none is set."""
+    import mitsuba as mi
+
+    variant = mi.variant()
+    if variant is None or not works_under(variant):
+        is_set = (
+            "no variant is set" if variant is None else f"variant {variant} is set, under which reslrb does not work"
+        )
+        works = ", ".join(sorted(filter(works_under, mi.variants()), key=lambda name: not name.endswith("_rgb")))
+        raise BackendError(f"{is_set}; call mitsuba.set_variant(...) with one of {works}")
+
+
 def require_cuda(variant: str = "cuda_ad_rgb") -> None:
     """Raises BackendError where Mitsuba cannot trace rays with `variant`."""
     missing = missing_cuda(variant)

@@ -41,7 +41,8 @@ def command(run: Path, overrides: tuple[str, ...], output: Path) -> None:
     from reslrb_cli.scene.load import load_described
 
     at = config.scene
-    scene, description = load_described(at.file, at.options, at.strict, at.size, at.cameras)
+    keys = [key for spec in config.parameters for key in spec.keys]
+    scene, description = load_described(at.file, at.options, at.strict, at.size, at.cameras, keys=keys)
     selection = select_parameters(scene, config.parameters, config.source)
     integrator, why = choose_integrator(config, scene, selection.params)
     try:

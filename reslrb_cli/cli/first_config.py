@@ -148,7 +148,7 @@ def _note(proposal: Proposal) -> str:
     info = proposal.info
     seen = f"{100 * proposal.share:.0f} % of the picture" if proposal.share >= 0.005 else "not seen itself"
     size = f", {info.shape[1]}x{info.shape[0]} texels" if len(info.shape) == 3 else ""
-    return f"{seen}{size}{_value(info.value)}"
+    return f"{seen}{size}{_value(info.value)}" + (f", {info.remark}" if info.remark is not None else "")
 
 
 def _value(value: Value | None) -> str:

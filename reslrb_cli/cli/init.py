@@ -75,13 +75,16 @@ def command(
     set_variant("auto")
 
     from reslrb_cli.cli.first_config import FirstConfig
-    from reslrb_cli.scene import select_parameters
+    from reslrb_cli.scene import select_parameters, turned_line
     from reslrb_cli.scene.depth import find_depth
-    from reslrb_cli.scene.load import load_described
+    from reslrb_cli.scene.load import load_described, read_as_floats
     from reslrb_cli.scene.photograph import open_photograph, write_smaller
     from reslrb_cli.scene.proposal import propose
 
     photo = None if target is None else open_photograph(target)
+    turned = None if target is None else turned_line(target)
+    if turned is not None:
+        echo(turned)
     scene, description = load_described(scene_file, options)
     sensors = [str(sensor.id()) for sensor in scene.sensors()]
     _tell_sensor(index, sensors)
@@ -114,7 +117,9 @@ def command(
         proposals=proposals,
     )
     text = first.text(path)
-    select_parameters(scene, loads(text, path).parameters, path)  # what is wrong is to show before anything is written
+    specs = loads(text, path).parameters
+    scene = read_as_floats(scene, description, [key for spec in specs for key in spec.keys])
+    select_parameters(scene, specs, path)  # what is wrong is to show before anything is written
     try:
         if copied and photo is not None and image is not None:
             write_smaller(photo, size, image)

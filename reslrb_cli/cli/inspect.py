@@ -90,7 +90,7 @@ def command(
     from reslrb_cli.optimization.loading import load_configured
     from reslrb_cli.scene import summarise
 
-    scene = load_configured(config)
+    scene = load_configured(config, selects="parameters" not in subject.missing)
     summary = summarise(scene, config.integrator.hide_emitters)
     selection = None if "parameters" in subject.missing else select(config, scene)
     plan = None if selection is None else make_plan_report(subject, scene, selection, counts=not no_counts)

@@ -12,8 +12,8 @@ if TYPE_CHECKING:
     from reslrb_cli.scene import ParameterInfo, SceneSummary, SensorSummary
     from reslrb_cli.scene.inspect import MovableSummary
 
-#: Sensors, parameters that can be recovered, and keys that one reason names, without `--all`.
-LISTED_SENSORS, _LISTED, _NAMED = 3, 30, 3
+#: Sensors, and parameters that can be recovered, without `--all`.
+LISTED_SENSORS, _LISTED = 3, 30
 #: And what can be moved.
 _MOVED = 10
 
@@ -80,7 +80,7 @@ def parameter_lines(infos: Sequence[ParameterInfo], wanted: Sequence[str], every
     others = [info for info in infos if info.obstacle is not None]
     marked = {info.key for info in usable if any(info.key == key or fnmatchcase(info.key, key) for key in wanted)}
     shown = usable if everything else sorted(usable, key=lambda info: info.key not in marked)[:_LISTED]
-    rows = [("* " * (info.key in marked) + info.key, _value(info)) for info in shown]
+    rows = [("* " * (info.key in marked) + info.key, _noted(info)) for info in shown]
     note = " (* in `parameters`)" if marked else ""
     lines = [f"can be recovered: {len(usable) or 'none'}{note}", *(f"  {line}" for line in _columns(rows))]
     if len(shown) < len(usable):
@@ -109,21 +109,14 @@ def moving_lines(movable: Sequence[MovableSummary], everything: bool) -> list[st
 
 
 def _reasons(others: Sequence[ParameterInfo]) -> list[str]:
-    """How many there are with each reason; where the reason says what to do, with their keys."""
+    """How many there are with each reason."""
     groups: dict[str, list[str]] = {}
     for info in others:
-        # What comes in brackets differs from one to the next; what no advice follows is the same for all.
-        reason = str(info.obstacle).partition(" (")[0]
-        reason = reason if "; give" in reason else reason.partition(";")[0]
-        groups.setdefault(reason, []).append(info.key)
+        # What comes in brackets differs from one to the next.
+        groups.setdefault(str(info.obstacle).partition(" (")[0].partition(";")[0], []).append(info.key)
     width = len(str(max(map(len, groups.values()))))
-    lines = []
-    for reason, keys in sorted(groups.items(), key=lambda group: -len(group[1])):
-        lines.append(f"{len(keys):{width}}  {reason}")
-        if "; give" in reason:
-            more = f" and {len(keys) - _NAMED} more" if len(keys) > _NAMED else ""
-            lines.append(f"{'':{width}}  ({', '.join(keys[:_NAMED])}{more})")
-    return lines
+    counted = sorted(groups.items(), key=lambda group: -len(group[1]))
+    return [f"{len(keys):{width}}  {reason}" for reason, keys in counted]
 
 
 def _columns(rows: Sequence[tuple[str, ...]]) -> list[str]:
@@ -147,6 +140,11 @@ def _value(info: ParameterInfo) -> str:
     if value is None or info.kind == "shape" or "AffineTransform" in info.type:
         return size if info.shape else info.type
     return f"{size}, mean {value.mean:.4g}, {value.low:.4g} to {value.high:.4g}"
+
+
+def _noted(info: ParameterInfo) -> str:
+    """The value, and what is to be known of it."""
+    return _value(info) + (f"; {info.remark}" if info.remark is not None else "")
 
 
 def _flags(info: ParameterInfo) -> str:

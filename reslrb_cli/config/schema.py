@@ -128,7 +128,7 @@ class TargetConfig(Section):
     file: _Files | None = Field(
         default=None,
         description="Target image (EXR, PNG, JPG, HDR), or a list with one for each sensor, in their order; "
-        "relative to the config file.",
+        "relative to the config file. It is turned as its EXIF orientation says, unless `scene.cameras` is given.",
     )
     color_space: ColorSpace = Field(default="auto", description=f"{COLOR_SPACE} Only with `file`.")
     gamma: Positive | None = Field(

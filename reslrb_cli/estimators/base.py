@@ -203,7 +203,9 @@ def one_of(name: str, value: str, allowed: tuple[str, ...]) -> None:
         raise ValueError(f'"{name}" must be one of {", ".join(allowed)}, not "{value}"')
 
 
-def at_least_one(name: str, value: int) -> None:
-    """Raise ValueError where an option that counts something is less than 1."""
+def at_least_one(name: str, value: int, most: int | None = None) -> None:
+    """Raise ValueError where an option that counts something is less than 1, or more than `most`."""
     if value < 1:
         raise ValueError(f'"{name}" must be at least 1, not {value}')
+    if most is not None and value > most:
+        raise ValueError(f'"{name}" must be at most {most}, not {value}')

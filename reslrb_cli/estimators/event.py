@@ -21,6 +21,7 @@ from typing import Any, ClassVar
 import drjit as dr
 import mitsuba as mi
 
+from reslrb_cli.config.limits import CAPACITY
 from reslrb_cli.estimators.base import (
     Estimator,
     Pass,
@@ -135,7 +136,7 @@ class EventEstimator(Estimator):
     OPTIONS: ClassVar[dict[str, Any]] = {"capacity": 1, "weight": "luminance"}
 
     def __init__(self, capacity: int = 1, weight: str = "luminance") -> None:
-        at_least_one("capacity", capacity)
+        at_least_one("capacity", capacity, CAPACITY)
         one_of("weight", weight, ("luminance", "adjoint"))
         self.capacity, self.weight = capacity, weight
 

@@ -20,6 +20,7 @@ from typing import Any, ClassVar, Protocol
 import drjit as dr
 import mitsuba as mi
 
+from reslrb_cli.config.limits import CAPACITY
 from reslrb_cli.estimators import chain, chain_replay
 from reslrb_cli.estimators.base import (
     Estimator,
@@ -221,7 +222,7 @@ class Reservoir(Estimator):
     ) -> None:
         one_of("weight", weight, ("luminance", "adjoint"))
         one_of("image", image, ("all", "retained"))
-        at_least_one("capacity", capacity)
+        at_least_one("capacity", capacity, CAPACITY)
         if image == "retained" and weight == "adjoint":
             raise ValueError('image "retained" needs weight "luminance": an image is made before dL/dI is known')
         if not jacobian_damping > 0:

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from numbers import Integral
+from typing import Any, NoReturn
 
 import mitsuba as mi
 
+from reslrb_cli.backend.variant import check_variant, works_under
 from reslrb_cli.estimators import ESTIMATORS
 from reslrb_cli.integrators.comparisons import Trajectory, WalkAd
 from reslrb_cli.integrators.interface import Job, StepIntegrator
@@ -19,13 +21,18 @@ _registered_with_callback = False
 
 
 def register() -> None:
-    """Make our integrators known to Mitsuba, in the current variant and in any that is set later."""
+    """Make our integrators known to Mitsuba, in the current variant and in any that is set later.
+
+    Raises BackendError, with the variants that work, where the current one does not. Under one that is set later and
+    does not, loading one of the integrators says so.
+    """
     global _registered_with_callback
     if not _registered_with_callback:
         mi.detail.add_variant_callback(_on_variant)
         _registered_with_callback = True
     if mi.variant() is not None:
         _on_variant(None, mi.variant())
+        check_variant()
 
 
 def make_tracer(type: str, options: Mapping[str, Any]) -> Reslrb | WalkAd | Trajectory:
@@ -49,15 +56,26 @@ def interface_of(integrator: StepIntegrator | mi.Integrator) -> StepIntegrator:
 
 
 def resolve_sensor(scene: mi.Scene, sensor: mi.Sensor | int) -> mi.Sensor:
-    """A sensor of the scene, given as itself or as its index."""
-    return scene.sensors()[sensor] if isinstance(sensor, int) else sensor
+    """A sensor of the scene, given as itself or as its index. Raises ValueError for an index of none."""
+    if not isinstance(sensor, Integral):
+        return sensor
+    index, count = int(sensor), len(scene.sensors())
+    if not 0 <= index < count:
+        has = "one sensor, index 0" if count == 1 else f"{count} sensors, indices 0 to {count - 1}"
+        raise ValueError(f'"sensor" is {index}, but the scene has {has}')
+    return scene.sensors()[index]
 
 
 def _on_variant(old: str | None, new: str) -> None:
-    if new.endswith(("_ad_rgb", "_ad_mono")):
-        plugin = _plugin_class()
-        for name in TRACERS:
-            mi.register_integrator(name, lambda props, name=name: plugin(name, props))
+    plugin = _plugin_class() if works_under(new) else _refuse
+    for name in TRACERS:
+        mi.register_integrator(name, lambda props, name=name: plugin(name, props))
+
+
+def _refuse(type: str, props: mi.Properties) -> NoReturn:
+    """In place of a plugin under a variant that has none: that there is no such plugin would be no help."""
+    check_variant()
+    raise AssertionError("called under such variants only")
 
 
 def _plugin_class() -> type[mi.CppADIntegrator]:

@@ -9,11 +9,15 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal, TypeAlias
+from numbers import Integral
+from typing import Any, Literal, TypeAlias, get_args
 
 import drjit as dr
 import mitsuba as mi
 
+from reslrb_cli.backend.variant import check_variant
+from reslrb_cli.config.limits import PASS_SAMPLES, PASSES
+from reslrb_cli.estimators.base import one_of
 from reslrb_cli.integrators.adapter import TRACERS, interface_of, make_tracer, resolve_sensor
 from reslrb_cli.integrators.interface import Job, StepIntegrator
 from reslrb_cli.integrators.refusal import Refused
@@ -88,7 +92,17 @@ def gradient_step(
     `first_batch` belong to `adjoint="batched"`, whose loss is that of all samples' image. `on_samples` is called with
     the image of each set of samples that is differentiated, and with the dL/dI that it is differentiated with: what
     the image alone is multiplied by has its derivative from the same samples.
+
+    `spp` of 0 are the sensor's own number. Raises ValueError for numbers out of their range and for words that are
+    none of the above, and BackendError under a variant of Mitsuba that reslrb does not work with.
     """
+    check_variant()
+    one_of("adjoint", adjoint, get_args(Adjoint))
+    one_of("first_batch", first_batch, get_args(FirstBatch))
+    _check_number("spp", spp, 0, PASSES * PASS_SAMPLES)
+    _check_number("batches", batches, 2 if adjoint == "batched" else 1, PASSES)
+    if isinstance(seed, Integral):
+        _check_number("seed", seed, 0, 2**32 - 1)
     work, job = interface_of(integrator), _job(scene, sensor, seed, spp, params)
     if adjoint == "batched":
         return _batched(work, job, objective, batches, first_batch, on_samples)
@@ -156,6 +170,12 @@ def cross_step(
     _differentiate(work, job, gradient, on_samples)
 
 
+def _check_number(name: str, value: object, least: int, most: int) -> None:
+    """Raise ValueError for an argument that is no whole number from `least` to `most`."""
+    if not isinstance(value, Integral) or not least <= int(value) <= most:
+        raise ValueError(f'"{name}" must be a whole number from {least} to {most}, not {value!r}')
+
+
 def _differentiate(work: StepIntegrator, job: Job, gradient: mi.TensorXf, on_samples: OnSamples | None) -> None:
     """Add the gradient of samples with a known dL/dI; their image is made only where somebody wants it."""
     if on_samples is None:
@@ -185,8 +205,8 @@ def _batched(
     No path sees a delta that it helped to make, so that the gradient of an L2 loss is unbiased, as with `independent`,
     from half the paths. The first batch gives an image alone, or is traced `again` with the delta of all others.
     """
-    if batches < 2 or job.spp % batches:
-        raise ValueError(f"the samples per pixel ({job.spp}) must be a multiple of the batches ({batches}), at least 2")
+    if job.spp < 1 or job.spp % batches:
+        raise ValueError(f"the samples per pixel ({job.spp}) must be a multiple of the batches ({batches})")
     parts = [replace(job, seed=seed, spp=job.spp // batches) for seed in batch_seeds(job.seed, batches)]
     share = 1 / (batches if first_batch == "again" else batches - 1)
     first = integrator.image(parts[0])

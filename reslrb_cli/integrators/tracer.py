@@ -105,8 +105,10 @@ class LightTracer:
         """The samples of a job; where its `spp` is 0, the sensor's own number of them.
 
         The `purpose` says what guided samples are drawn by; None: for the gradient, or the image where there is none.
-        So does dL/dI `delta` (H, W, C), which the samples have had no part in.
+        So does dL/dI `delta` (H, W, C), which the samples have had no part in. Raises ValueError for an `spp` below 0.
         """
+        if job.spp < 0:
+            raise ValueError(f'"spp" must be 0 (the sensor\'s own sample count) or more, not {job.spp}')
         spp = job.spp or job.sensor.sampler().sample_count()
         unit = min(self.samples_per_pass or spp, spp)
         plan, table = self.preparation.plan(job.scene, job.sensor, job.params, unit), None

@@ -17,11 +17,26 @@ from reslrb_cli.scene.description import Description
 LIGHT_TRACERS = ("reslrb", "ptracer", "walk_ad", "trajectory")
 
 
-def load_configured(config: Config, look: Callable[[Description], object] | None = None, warn: bool = True) -> mi.Scene:
-    """Load the scene that `config` names; `look` sees its description before it is built, and what is doubtful in it is
-    warned of, or not. Raises ConfigError."""
+def load_configured(
+    config: Config,
+    look: Callable[[Description], object] | None = None,
+    selects: bool = True,
+    warn: bool = True,
+) -> mi.Scene:
+    """Load the scene that `config` names; `look` sees its description before it is built. Raises ConfigError.
+
+    Textures of 8 or 16 bits that its parameters select are read as floating point, unless nothing is to be selected.
+    What is doubtful in the scene is warned of, or not.
+    """
     scene = config.scene
-    return load_scene(scene.file, scene.options, scene.strict, scene.size, scene.cameras, look, warn)
+    keys = selected_keys(config) if selects else []
+    return load_scene(scene.file, scene.options, scene.strict, scene.size, scene.cameras, look, keys, warn)
+
+
+def selected_keys(config: Config) -> list[str]:
+    """The keys and globs of what `config` recovers, or gives true values."""
+    render = config.target.render
+    return [*(key for spec in config.parameters for key in spec.keys), *(render.parameters if render else ())]
 
 
 def choose_sensors(config: Config, scene: mi.Scene) -> list[int]:
@@ -38,6 +53,15 @@ def choose_sensors(config: Config, scene: mi.Scene) -> list[int]:
             has = "one sensor, index 0" if count == 1 else f"{count} sensors, indices 0 to {count - 1}"
             raise ConfigError(config.source, key, f"is {sensor}, but the scene has {has}")
     return list(named.values())
+
+
+def are_upright(config: Config) -> bool:
+    """Whether images of views are turned as their EXIF orientation says.
+
+    Cameras of a file were found for pixels as they lie in theirs: COLMAP leaves orientations aside on purpose, since
+    all images of one camera are to have one projection.
+    """
+    return config.scene.cameras is None
 
 
 def check_integrator(config: Config, integrator: Integrator, scene: mi.Scene, sensors: list[int]) -> None:

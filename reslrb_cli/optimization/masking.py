@@ -10,7 +10,7 @@ import numpy as np
 
 from reslrb_cli.config import Config, Mask
 from reslrb_cli.errors import ConfigError
-from reslrb_cli.optimization.loading import LIGHT_TRACERS
+from reslrb_cli.optimization.loading import LIGHT_TRACERS, are_upright
 from reslrb_cli.scene import Photo, read_weights
 from reslrb_cli.scene.seen import interior, sees_specular
 
@@ -76,7 +76,7 @@ def mask_of(config: Config, mask: Mask, mixed: bool, key: str, scene: mi.Scene, 
         found.left_out |= {kind: pixels for kind, pixels in kinds.items() if getattr(mask, kind)}
     if mask.file is not None:
         try:
-            found.weights = read_weights(mask.file, (width, height))
+            found.weights = read_weights(mask.file, (width, height), are_upright(config))
         except ConfigError as error:
             raise ConfigError(config.source, f"{key}.file", error.message) from None
         found.left_out["file"] = found.weights == 0

@@ -192,7 +192,7 @@ def load_for_rendering(config: Config, initial: bool) -> tuple[Any, list[int], A
     if initial:
         problem = assemble_scene(config)
         return problem.scene, problem.sensors, problem.integrator, samples_per_pass(config)
-    scene = load_configured(config)
+    scene = load_configured(config, selects=False)
     sensors = choose_sensors(config, scene)
     check_integrator(config, config.integrator, scene, sensors)
     integrator = make_configured(config.integrator)

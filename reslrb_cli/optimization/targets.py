@@ -12,11 +12,11 @@ import numpy as np
 from reslrb_cli.config import Config
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.optimization.errors import comparison_grid
-from reslrb_cli.optimization.loading import check_integrator, load_configured, make_configured
+from reslrb_cli.optimization.loading import are_upright, check_integrator, load_configured, make_configured
 from reslrb_cli.optimization.masking import mask_line, mask_of
 from reslrb_cli.optimization.rendering import render_in_passes
 from reslrb_cli.optimization.views import View, color_channels
-from reslrb_cli.scene import Photo, Selection, check_photo, read_photo, set_values
+from reslrb_cli.scene import Photo, Selection, check_photo, read_photo, set_values, turned_line
 
 if TYPE_CHECKING:
     from reslrb_cli.optimization.problem import Problem
@@ -37,6 +37,9 @@ def make_targets(problem: Problem, say: Callable[[str], None]) -> None:
     for view in problem.views:
         if view.wanted.file is not None:
             photo = _read_photo(problem, view)
+            line = turned_line(view.wanted.file, are_upright(problem.config))
+            if line is not None:
+                say(line)
             _see(problem, view, photo.image, photo, say)
     if problem.config.target.render is not None:
         _render_targets(problem, say)
@@ -110,9 +113,10 @@ def _read_photo(problem: Problem, view: View) -> Photo:
     """Read the target file of a view. Raises ConfigError."""
     config, wanted = problem.config, view.wanted
     assert wanted.file is not None, "called for target files only"
-    width, height = problem.scene.sensors()[view.sensor].film().crop_size()
+    width, height = (int(n) for n in problem.scene.sensors()[view.sensor].film().crop_size())
+    upright = are_upright(config)
     try:
-        photo = read_photo(wanted.file, config.target.color_space, (int(width), int(height)), config.target.gamma)
+        photo = read_photo(wanted.file, config.target.color_space, (width, height), config.target.gamma, upright)
         check_photo(wanted.file, photo, allow_nonfinite=wanted.mask.nonfinite)
     except ConfigError as error:
         raise ConfigError(config.source, wanted.file_key, error.message) from None

@@ -8,7 +8,7 @@ from .needs import SceneNeeds, View, check_camera_paths, check_supported, look, 
 from .parameters import select_parameters, set_values
 from .reach import visible_texels
 from .selection import Selection
-from .target import Photo, check_photo, read_image, read_photo, read_weights
+from .target import Photo, check_photo, read_image, read_photo, read_weights, turned_line
 
 __all__ = [
     "ParameterInfo",
@@ -32,5 +32,6 @@ __all__ = [
     "select_parameters",
     "set_values",
     "summarise",
+    "turned_line",
     "visible_texels",
 ]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -42,6 +43,8 @@ class ParameterInfo:
     `kind` is what it belongs to: `bsdf`, `emitter`, `attribute` (of a mesh, such as `vertex_color`), `shape`, `sensor`,
     `film`, `medium`, `integrator` or `scene`. `type` and `shape` describe the value: (height, width, channels) for
     textures. `obstacle` says why it cannot be recovered; None where it can. `value` is None for what is no number.
+    `bits` are those of a texel where Mitsuba keeps a texture with too few to follow a gradient, so that it has to be
+    read as floating point to be recovered (`load.read_as_floats`); None of all else.
     """
 
     key: str
@@ -52,6 +55,12 @@ class ParameterInfo:
     discontinuous: bool
     obstacle: str | None
     value: Value | None = None
+    bits: int | None = None
+
+    @property
+    def remark(self) -> str | None:
+        """What is to be known of it before it is recovered."""
+        return None if self.bits is None else f"{self.bits} bits, read as floats if recovered"
 
 
 def list_parameters(params: Any, values: bool = False) -> list[ParameterInfo]:
@@ -64,7 +73,7 @@ def describe(params: Any, key: str) -> ParameterInfo:
     """Describe one entry of a `mi.traverse` result."""
     value, node, flags = _value(params, key), params.properties[key][2], int(params.flags(key))
     differentiable = flags & (int(mi.ParamFlags.NonDifferentiable) | int(mi.ParamFlags.ReadOnly)) == 0
-    kind = parameter_kind(params, key)
+    kind, bits = parameter_kind(params, key), coarse_bits(params, key)
     return ParameterInfo(
         key=key,
         kind=kind,
@@ -72,8 +81,17 @@ def describe(params: Any, key: str) -> ParameterInfo:
         shape=value_shape(value, halo(node, value)),
         differentiable=differentiable,
         discontinuous=flags & int(mi.ParamFlags.Discontinuous) != 0,
-        obstacle=_obstacle(kind, key, value, differentiable, node),
+        obstacle=_obstacle(kind, key, value, differentiable, node, bits),
+        bits=bits,
     )
+
+
+def coarse_bits(params: Any, key: str) -> int | None:
+    """The bits with which Mitsuba keeps a texel of the bitmap `key`, where these are fewer than 32; else None."""
+    if not key.endswith("data") or not params.properties[key][2].class_name().startswith("BitmapTexture"):
+        return None
+    bits = _storage_bits(_value(params, key))
+    return bits if bits is not None and bits < 32 else None
 
 
 def halo(node: Any, value: Any) -> int:
@@ -101,10 +119,25 @@ def current_value(params: Any, key: str) -> Value | None:
         return None
     if array.dtype.kind not in "buif" or array.size == 0:
         return None
+    if array.dtype == np.uint8 and coarse_bits(params, key) is not None:
+        return _encoded_value(array, params.properties[key][2])
     columns = halo(params.properties[key][2], value)
     array = array[:, columns : array.shape[1] - columns] if columns else array
     numbers = [float(number) for number in array.ravel()] if array.size <= _FEW else None
     return Value(numbers, float(array.mean(dtype=np.float64)), float(array.min()), float(array.max()))
+
+
+def _encoded_value(array: np.ndarray, texture: mi.Texture) -> Value:
+    """The value of a texture of 8 bits as it is looked up: a share of 255, decoded from sRGB unless it is raw."""
+    table = np.arange(256, dtype=np.float32) / 255
+    if not re.search(r"^ *raw = 1,$", str(texture), re.MULTILINE):
+        table = np.array(dr.srgb_to_linear(mi.Float(table)))
+    levels = array.ravel()
+    parts = (levels[start : start + 2**20] for start in range(0, levels.size, 2**20))  # each as integers of 8 bytes
+    counts = sum((np.bincount(part, minlength=256) for part in parts), start=np.zeros(256, dtype=np.int64))
+    there = table[counts > 0]
+    numbers = [float(table[level]) for level in levels] if array.size <= _FEW else None
+    return Value(numbers, float(table.astype(np.float64) @ counts / array.size), float(there.min()), float(there.max()))
 
 
 def _value(params: Any, key: str) -> Any:
@@ -140,7 +173,7 @@ def _is_attribute(name: str) -> bool:
     return name.startswith(("vertex_", "face_")) and name not in _MESH_GEOMETRY
 
 
-def _obstacle(kind: str, key: str, value: Any, differentiable: bool, node: Any) -> str | None:
+def _obstacle(kind: str, key: str, value: Any, differentiable: bool, node: Any, coarse: int | None) -> str | None:
     only = "only materials, emission, shapes and lights have derivatives"
     id, _, name = key.rpartition(".")
     if kind == "shape" or (kind == "emitter" and name in ("to_world", "position")):
@@ -151,12 +184,11 @@ def _obstacle(kind: str, key: str, value: Any, differentiable: bool, node: Any) 
         return f"is no property of a material or a light; {only}"
     if kind == "emitter" and name in _BEAM_SHAPES:
         return f"{_BEAM_SHAPES[name]}; of an emitter, only what it emits has derivatives"
+    if coarse is not None:  # not differentiable for that reason alone
+        return None
     bits = _storage_bits(value)
     if bits is not None and bits < 32:
-        return (
-            f"is stored with {bits} bits a channel, too few to follow a gradient; give the texture in the scene file "
-            '<string name="format" value="variant"/>'
-        )
+        return f"is stored with {bits} bits a channel, too few to follow a gradient"
     if not differentiable:
         return f"is not differentiable ({node.class_name()})"
     if bits is None:

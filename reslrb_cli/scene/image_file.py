@@ -1,8 +1,10 @@
-"""Image files before they are decoded: how large they say they are, and whether they end where they should.
+"""Image files before they are decoded: how large they say they are, whether they end where they should, and how the
+camera was held.
 
 A file of some kilobytes can say that it is an image of gigabytes, and Mitsuba's reader fills what a JPEG lacks with
 grey. A file that was cut off and then padded is told as well where its format is compressed, but for the last lines of
-an EXR, which has no check sums.
+an EXR, which has no check sums. Cameras and phones write the pixels as the sensor has them, and say beside it (EXIF, in
+JPEG and PNG) how these are to be turned to stand upright, which Mitsuba's reader does not look at.
 """
 
 from __future__ import annotations
@@ -13,10 +15,12 @@ import re
 import struct
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext, suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
 
 import mitsuba as mi
+import numpy as np
 
 from ..config.files import open_file
 from ..config.limits import IMAGE_BYTES, PIXELS
@@ -30,9 +34,22 @@ _HEAD = 2**20
 #: Parts that a PNG or a JPEG has at most, so that one of nothing but empty parts takes no time.
 _MOST_PARTS = 2**20
 
+#: Bytes of what EXIF says: a segment of a JPEG has no more, and the orientation stands at its beginning.
+_EXIF_BYTES = 2**16
+
 _DAMAGED = "is damaged or cut off; copy or save it again"
 
 Size = tuple[int, int]
+#: What is done to the pixels of a file to see them upright, by EXIF's number of the orientation; 1 is upright.
+TURNS = {
+    2: "mirrored left to right",
+    3: "turned by 180 degrees",
+    4: "mirrored top to bottom",
+    5: "turned by 90 degrees clockwise and mirrored left to right",
+    6: "turned by 90 degrees clockwise",
+    7: "turned by 90 degrees counterclockwise and mirrored left to right",
+    8: "turned by 90 degrees counterclockwise",
+}
 
 
 class _CutOff(Exception):
@@ -47,30 +64,85 @@ class DamagedImage(ConfigError):
     """An image by which Mitsuba's reader, or what uses the image, would leave its own memory."""
 
 
+@dataclass(frozen=True)
+class _Says:
+    """What a file says of its image: (width, height) of the pixels as they lie in it, and EXIF's orientation."""
+
+    size: Size
+    orientation: int = 1
+    is_jpeg: bool = False
+
+    def seen(self, upright: bool) -> Size:
+        """The (width, height) of the image, as it lies or `upright`."""
+        return self.size[::-1] if upright and self.orientation >= 5 else self.size
+
+
 def read_bitmap(path: Path, size: Size | None = None) -> mi.Bitmap:
     """Decode the image file `path`; `size` is the (width, height) that it must have, None for any.
 
-    Raises ConfigError, located in the file, where it cannot be read, is no image, too large, of another size, damaged
-    or cut off. What is checked first is what the file says of itself.
+    Its pixels are as they lie in the file, whatever EXIF says. Raises ConfigError, located in the file, where it cannot
+    be read, is no image, too large, of another size, damaged or cut off. What is checked first is what the file says of
+    itself.
     """
+    return _read(path, size, upright=False)[0]
+
+
+def read_upright(path: Path, size: Size | None = None) -> mi.Bitmap:
+    """The image of a file as a person sees it: turned as its EXIF orientation says (`TURNS`).
+
+    `size` is the (width, height) after that; it raises as `read_bitmap`.
+    """
+    bitmap, orientation = _read(path, size, upright=True)
+    if orientation == 1:
+        return bitmap
+    pixels = np.array(bitmap)
+    turned = mi.Bitmap(np.ascontiguousarray(turn(pixels, orientation)), bitmap.pixel_format())
+    turned.set_srgb_gamma(bitmap.srgb_gamma())
+    turned.set_premultiplied_alpha(bitmap.premultiplied_alpha())
+    return turned
+
+
+def turn(pixels: np.ndarray, orientation: int) -> np.ndarray:
+    """An image (H, W, ...) of this EXIF orientation as it is seen upright; a view."""
+    if orientation >= 5:  # rows of the file are columns of what is seen
+        pixels = pixels.swapaxes(0, 1)
+    if orientation in (3, 4, 7, 8):
+        pixels = pixels[::-1]
+    if orientation in (2, 3, 6, 7):
+        pixels = pixels[:, ::-1]
+    return pixels
+
+
+def orientation_of(path: Path) -> int:
+    """EXIF's orientation of an image file, 1 to 8: 1 of one that has none. Raises ConfigError where it is no file."""
+    with open_file(path, IMAGE_BYTES) as file, suppress(_CutOff, _Damaged, OSError):
+        says = _examine(file)
+        return 1 if says is None else says.orientation
+    return 1
+
+
+def _read(path: Path, size: Size | None, upright: bool) -> tuple[mi.Bitmap, int]:
+    """The image as it lies in the file, and its orientation; `size` is that of the image as it lies, or `upright`."""
     with open_file(path, IMAGE_BYTES) as file:
         try:
-            says, is_jpeg = _examine(file)
+            says = _examine(file)
         except _CutOff:
             raise ConfigError(path, "", "is cut off: the file ends before its image; copy or save it again") from None
         except _Damaged:
             raise DamagedImage(path, "", _DAMAGED) from None
         except OSError as error:
             raise ConfigError(path, "", f"cannot be read: {error.strerror}") from None
-    if says is None or min(says) < 1:
+    if says is None or min(says.size) < 1:
         raise ConfigError(path, "", f"is not an image that can be read ({FORMATS})")
-    if size is not None and says != size:
-        raise ConfigError(path, "", f"is {says[0]}x{says[1]} pixels; it must be {size[0]}x{size[1]}")
-    if says[0] * says[1] > PIXELS:
-        raise ConfigError(path, "", f"is {says[0]}x{says[1]} pixels; more than {PIXELS} are not read")
+    width, height = says.seen(upright)
+    if size is not None and (width, height) != size:
+        turned = f", {TURNS[says.orientation]} as its EXIF orientation says" if upright and says.orientation > 1 else ""
+        raise ConfigError(path, "", f"is {width}x{height} pixels{turned}; it must be {size[0]}x{size[1]}")
+    if width * height > PIXELS:
+        raise ConfigError(path, "", f"is {width}x{height} pixels; more than {PIXELS} are not read")
     complaints: list[str] = []
     try:
-        with _heard(complaints) if is_jpeg else nullcontext():
+        with _heard(complaints) if says.is_jpeg else nullcontext():
             bitmap = mi.Bitmap(str(path))
     except Exception as error:
         if is_out_of_memory(error):
@@ -80,74 +152,79 @@ def read_bitmap(path: Path, size: Size | None = None) -> mi.Bitmap:
         if line.startswith(("Corrupt JPEG data", "Premature end")):
             raise ConfigError(path, "", f"is damaged or cut off ({line}); copy or save it again")
         logger.warning("%s: %s", path, line)
-    if (int(bitmap.width()), int(bitmap.height())) != says:
-        raise ConfigError(path, "", f"says that it is {says[0]}x{says[1]} pixels, and is not")
-    return bitmap
+    if (int(bitmap.width()), int(bitmap.height())) != says.size:
+        raise ConfigError(path, "", f"says that it is {says.size[0]}x{says.size[1]} pixels, and is not")
+    return bitmap, says.orientation
 
 
 def image_size(path: Path) -> Size:
-    """The (width, height) that an image file says it has. Raises ConfigError, located in the file, where it is none."""
+    """The (width, height) of an image as it lies in its file. Raises ConfigError, located in it, where it is none."""
     with open_file(path, IMAGE_BYTES) as file:
         try:
-            says, _ = _examine(file)
+            says = _examine(file)
         except _CutOff:
             says = None
         except _Damaged:
             raise DamagedImage(path, "", _DAMAGED) from None
-    if says is not None and min(says) < 1:
-        raise DamagedImage(path, "", f"says that it is {says[0]}x{says[1]} pixels; save it again")
+    if says is not None and min(says.size) < 1:
+        raise DamagedImage(path, "", f"says that it is {says.size[0]}x{says.size[1]} pixels; save it again")
     if says is None:
         raise ConfigError(path, "", f"is not an image that can be read ({FORMATS})")
-    return says
+    return says.size
 
 
-def _examine(file: BinaryIO) -> tuple[Size | None, bool]:
-    """The (width, height) that a file says its image has, None where it is no image; and whether it is a JPEG.
+def _examine(file: BinaryIO) -> _Says | None:
+    """What a file says of its image, None where it is none.
 
     Raises _CutOff where a PNG or JPEG has no end; the readers of the other formats tell that themselves.
     """
     head = file.read(_HEAD) or b""
-    for magic, size_of in _SIZES.items():
+    for magic, reader in _READERS.items():
         if head.startswith(magic):
             with suppress(struct.error, ValueError):  # a head that is cut off is none
-                return size_of(head, file), magic == _JPEG
-            return None, False
-    return None, False
+                says = reader(head, file)
+                return _Says(says) if isinstance(says, tuple) else says
+            return None
+    return None
 
 
 # --- formats ----------------------------------------------------------------------------------------------------------
 
 _PNG, _JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff"
+#: How a JPEG's segment of EXIF begins, and the entry in it that says how the camera was held: a number of 16 bits.
+_EXIF, _ORIENTATION, _SHORT = b"Exif\0\0", 0x0112, 3
 #: The next marker after compressed data, in which 0xFF stands before 0, or before the number of a restart.
 _MARKER = re.compile(rb"\xff+[\x01-\xcf\xd8-\xfe]")
 
 
-def _png_size(head: bytes, file: BinaryIO) -> Size | None:
+def _png(head: bytes, file: BinaryIO) -> _Says | None:
     if head[12:16] != b"IHDR":
         return None
     width, height = struct.unpack(">II", head[16:24])
-    end, position = file.seek(0, os.SEEK_END), len(_PNG)
+    end, position, exif = file.seek(0, os.SEEK_END), len(_PNG), b""
     for _ in range(_MOST_PARTS):
         file.seek(position)
         length, kind = struct.unpack(">I4s", file.read(8).ljust(8, b"\0"))
         position += 12 + length  # with its check sum
         if position > end:
             raise _CutOff
+        if kind == b"eXIf" and not exif:
+            exif = file.read(min(length, _EXIF_BYTES))
         if kind == b"IEND":
-            return width, height
+            return _Says((width, height), _orientation(exif))
     return None
 
 
-def _jpeg_size(head: bytes, file: BinaryIO) -> Size | None:
+def _jpeg(head: bytes, file: BinaryIO) -> _Says | None:
     file.seek(0)
-    data, position, size = file.read(), 2, None
+    data, position, size, exif = file.read(), 2, None, b""
     for _ in range(_MOST_PARTS):
         found = _MARKER.search(data, position)
         if found is None:
             raise _CutOff
         kind, position = data[found.end() - 1], found.end()
         if kind == 0xD9:  # the end of the image
-            return size
+            return None if size is None else _Says(size, _orientation(exif), is_jpeg=True)
         if kind == 0x01 or kind == 0xD8:
             continue
         if position + 2 > len(data):
@@ -156,8 +233,28 @@ def _jpeg_size(head: bytes, file: BinaryIO) -> Size | None:
         if 0xC0 <= kind <= 0xCF and kind not in (0xC4, 0xC8, 0xCC) and position + 7 <= len(data):
             height, width = struct.unpack_from(">HH", data, position + 3)
             size = (width, height)
+        content = data[position + 2 : position + length] if kind == 0xE1 and not exif else b""
+        if content.startswith(_EXIF):
+            exif = content[len(_EXIF) :]
         position += length
     return None
+
+
+def _orientation(exif: bytes) -> int:
+    """The orientation that EXIF data, a TIFF file's head, names: 1 to 8, and 1 where that is not to be read there.
+
+    Nothing of it but the entries of the first directory is looked at, each once.
+    """
+    order = {b"II*\0": "<", b"MM\0*": ">"}.get(exif[:4])
+    with suppress(struct.error):  # what stands outside of the data
+        if order is not None:
+            [place] = struct.unpack_from(f"{order}I", exif, 4)
+            [count] = struct.unpack_from(f"{order}H", exif, place)
+            for entry in range(place + 2, place + 2 + 12 * count, 12):
+                tag, kind, values, value = struct.unpack_from(f"{order}HHIH", exif, entry)
+                if tag == _ORIENTATION:
+                    return value if kind == _SHORT and values == 1 and 1 <= value <= 8 else 1
+    return 1
 
 
 def _exr_size(head: bytes, file: BinaryIO) -> Size | None:
@@ -223,10 +320,10 @@ def _bmp_size(head: bytes, file: BinaryIO) -> Size | None:
     return width, abs(height)
 
 
-_SIZES: dict[bytes, Callable[[bytes, BinaryIO], Size | None]] = {
+_READERS: dict[bytes, Callable[[bytes, BinaryIO], Size | _Says | None]] = {
     b"\x76\x2f\x31\x01": _exr_size,
-    _PNG: _png_size,
-    _JPEG: _jpeg_size,
+    _PNG: _png,
+    _JPEG: _jpeg,
     b"#?": _hdr_size,
     **dict.fromkeys((b"PF", b"Pf", b"P5", b"P6"), _netpbm_size),
     b"BM": _bmp_size,

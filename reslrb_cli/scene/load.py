@@ -4,15 +4,19 @@ from __future__ import annotations
 
 import functools
 import logging
-from collections.abc import Callable, Mapping
+import os
+from collections.abc import Callable, Iterable, Mapping
+from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
 
 import mitsuba as mi
 import numpy as np
 
+from ..backend.variant import check_variant
 from ..errors import ConfigError
 from .cameras import read_cameras, replace_sensors
+from .catalog import coarse_bits
 from .description import (
     Description,
     build,
@@ -25,7 +29,8 @@ from .description import (
     read_description,
     resize_films,
 )
-from .description.element import quoted
+from .description.element import Element, quoted
+from .description.naming import Owners
 from .extent import lost_light
 from .thin_glass import thin_glass
 
@@ -39,6 +44,7 @@ def load_scene(
     size: tuple[int, int] | None = None,
     cameras: Path | None = None,
     look: Callable[[Description], object] | None = None,
+    keys: Iterable[str] = (),
     warn: bool = True,
 ) -> mi.Scene:
     """Load a Mitsuba scene (XML, versions 0.4 to 3); a variant must be set.
@@ -49,13 +55,30 @@ def load_scene(
     out, with a warning in the log; `strict` has it refused. Those of `cameras`, a file, stand in place of the scene's
     sensors. The scene's integrator is not loaded: an experiment has its own. Plugins are loaded from Mitsuba's own
     folder alone. `size` is the (width, height) of all films in pixels, in place of what the files say. `look` sees what
-    is to be built before anything of it is, and may raise.
+    is to be built before anything of it is, and may raise. `keys`, which may be globs, are of parameters that are to
+    have derivatives: bitmaps among them that Mitsuba would keep with 8 or 16 bits are read as floating point.
 
     Raises ConfigError, located in the scene file, where it is missing or wrong, has nothing in it, or no light. Warns,
     too, of a scene that is too far from the origin, or too small, and of glass that is too thin, all of which is looked
     for by tracing rays; without `warn`, as for a scene that was looked at before, it is not.
     """
-    return load_described(file, options, strict, size, cameras, look, warn)[0]
+    return load_described(file, options, strict, size, cameras, look, keys, warn)[0]
+
+
+def load_for_script(file: str | os.PathLike[str], keys: Iterable[str] = (), /, **options: Any) -> mi.Scene:
+    """Load a Mitsuba scene file as the command line does: its parameters have the names that `reslrb inspect` lists.
+
+    In place of `mi.load_file(file, optimize=False, **options)`, which refuses what other versions of Mitsuba and
+    exporters wrote, and names objects without an id otherwise. `options` are the values of the file's `$name`
+    variables, which messages call `scene.options.NAME`, as configurations do. `keys` are parameters, or globs, that are
+    to have gradients: their textures of 8 or 16 bits are read as floating point. A variant must be set; the scene's own
+    integrator is not loaded.
+
+    Raises `reslrb_cli.errors.ConfigError`, one line that says where, for a file that is missing or wrong, and
+    BackendError under a variant that reslrb does not work with.
+    """
+    check_variant()
+    return load_scene(Path(file), options, keys=[keys] if isinstance(keys, str) else keys)
 
 
 def load_described(
@@ -65,6 +88,7 @@ def load_described(
     size: tuple[int, int] | None = None,
     cameras: Path | None = None,
     look: Callable[[Description], object] | None = None,
+    keys: Iterable[str] = (),
     warn: bool = True,
 ) -> tuple[mi.Scene, Description]:
     """The same, and the description that the scene was built from, of which Mitsuba has a use for every element."""
@@ -105,7 +129,42 @@ def load_described(
     for note in unused:
         if note.owner is not None:
             note.owner.children.remove(note.element)
+    if _mark_floats(scene, description, keys):
+        scene = None  # before the other takes its memory
+        scene = build(description)[0]
     return scene, description
+
+
+def read_as_floats(scene: mi.Scene, description: Description, keys: Iterable[str]) -> mi.Scene:
+    """The scene with bitmaps of 8 or 16 bits that `keys`, which may be globs, name read as floating point.
+
+    That is `scene` itself where there are none, else one that is built anew from `description`, which is changed.
+    """
+    return build(description)[0] if _mark_floats(scene, description, keys) else scene
+
+
+def _mark_floats(scene: mi.Scene, description: Description, keys: Iterable[str]) -> bool:
+    """Have those bitmaps say in the description that they are floats; whether there are any.
+
+    All others stay as they are: floats take four times the memory of bytes. The values are the same, decoded from sRGB
+    when they are read and not when they are looked up.
+    """
+    keys = list(keys)
+    if not keys or not any(element.type == "bitmap" for element in description.root.walk()):
+        return False
+    params, owners, changed = mi.traverse(scene), Owners(description.root), False
+    for key in params.properties:
+        if coarse_bits(params, key) is None or not any(key == each or fnmatchcase(key, each) for each in keys):
+            continue
+        owner, names = owners.place(params, key) or (description.root, [])
+        if owner.type == "bitmap" and names == ["data"]:  # else nothing is done, and to select it says why
+            _tell(f"{owner.place}: `{key}` is read as floating point")
+            owner.children[:] = [child for child in owner.children if child.name != "format"]
+            owner.children.append(Element("string", {"name": "format", "value": "variant"}, owner.source, owner.line))
+            changed = True
+    if changed:
+        check_sizes(description)
+    return changed
 
 
 def _check_meshes(file: Path, scene: mi.Scene) -> None:
@@ -122,6 +181,12 @@ def _check_meshes(file: Path, scene: mi.Scene) -> None:
 def _warn(line: str) -> None:
     """Say it once: one experiment may load its scene several times."""
     logger.warning("%s", line)
+
+
+@functools.cache
+def _tell(line: str) -> None:
+    """The same of what is nothing to worry about."""
+    logger.info("%s", line)
 
 
 def _as_text(value: Any) -> str:

@@ -11,7 +11,7 @@ from typing import Any
 import mitsuba as mi
 
 from ..config import HEIGHTMAP, WORDS, ParameterSpec, Settings
-from .catalog import describe, list_parameters
+from .catalog import ParameterInfo, describe, list_parameters
 from .deformation import Deformation
 from .movable import Movable, find_movable, heightmap_obstacle
 from .selection import Selection
@@ -159,8 +159,8 @@ def _matching(params: mi.SceneParameters, pattern: str, place: Place, names: Seq
     """The keys that `pattern` names, all of which can be recovered; `names` are others that could be meant."""
     if pattern in params.properties:
         info = describe(params, pattern)
-        if info.obstacle is not None:
-            raise place.fail("key", f"`{pattern}` {info.obstacle}")
+        if (obstacle := _obstacle(info)) is not None:
+            raise place.fail("key", f"`{pattern}` {obstacle}")
         return [pattern]
     matches = [key for key in params.properties if fnmatchcase(key, pattern)]
     if not matches:
@@ -173,15 +173,25 @@ def _matching(params: mi.SceneParameters, pattern: str, place: Place, names: Seq
             raise place.fail("key", f"`{pattern}` belongs to a {kind} of `{id}`, and `parameters` have none that is so")
         raise place.fail("key", f"`{pattern}` matches no parameter of the scene; did you mean {hint}?")
     infos = [describe(params, key) for key in matches]
-    usable = [info.key for info in infos if info.obstacle is None]
+    usable = [info.key for info in infos if _obstacle(info) is None]
     if not usable:
         more = f", nor can the other {len(infos) - 1}" if len(infos) > 1 else ""
         raise place.fail(
             "key",
-            f"`{pattern}` matches nothing that can be recovered: `{infos[0].key}` {infos[0].obstacle}{more}",
+            f"`{pattern}` matches nothing that can be recovered: `{infos[0].key}` {_obstacle(infos[0])}{more}",
         )
     return usable
 
 
+def _obstacle(info: ParameterInfo) -> str | None:
+    """Why a parameter cannot be recovered as the scene is: a texture of few bits, too, which loading has not mended."""
+    if info.bits is None:
+        return info.obstacle
+    return (
+        f"is stored with {info.bits} bits a channel, too few to follow a gradient; give the texture in the scene file "
+        '<string name="format" value="variant"/>'
+    )
+
+
 def _recoverable(params: mi.SceneParameters) -> list[str]:
-    return [info.key for info in list_parameters(params) if info.obstacle is None]
+    return [info.key for info in list_parameters(params) if _obstacle(info) is None]

@@ -9,13 +9,16 @@ import mitsuba as mi
 import numpy as np
 
 from ..records.images import write_bitmap
-from .image_file import read_bitmap
+from .image_file import read_upright
 from .target import Image, decode_srgb
 
 
 @dataclass(frozen=True)
 class Photograph:
-    """An image file: its (width, height) in pixels, and whether it holds integers, which clip what is bright."""
+    """An image file: its (width, height) in pixels, and whether it holds integers, which clip what is bright.
+
+    It is as a person sees it, turned as its EXIF orientation says.
+    """
 
     path: Path
     size: tuple[int, int]
@@ -25,7 +28,7 @@ class Photograph:
 
 def open_photograph(path: Path) -> Photograph:
     """Read an image file. Raises ConfigError, located in it, where it is none."""
-    bitmap = read_bitmap(path)
+    bitmap = read_upright(path)
     width, height = (int(n) for n in bitmap.size())
     return Photograph(path, (width, height), np.array(bitmap).dtype.kind in "ui", bitmap)
 

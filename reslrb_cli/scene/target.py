@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -10,7 +11,9 @@ import mitsuba as mi
 import numpy as np
 
 from ..errors import ConfigError
-from .image_file import read_bitmap
+from .image_file import TURNS, orientation_of, read_bitmap, read_upright
+
+logger = logging.getLogger(__name__)
 
 Image = np.ndarray[Any, Any]
 
@@ -29,31 +32,50 @@ class Photo:
     nonfinite: np.ndarray
 
 
+def turned_line(path: Path, upright: bool = True) -> str | None:
+    """What the user is told of an image with an EXIF orientation, which is read `upright` or not; None of others."""
+    orientation = orientation_of(path)
+    if orientation == 1:
+        return None
+    if upright:
+        return f"{path}: {TURNS[orientation]}, as its EXIF orientation says"
+    return f"{path}: not {TURNS[orientation]} as its EXIF orientation says: cameras of files see pixels as they lie"
+
+
 def read_image(
     path: Path, color_space: str = "auto", size: tuple[int, int] | None = None, signed: bool = False
 ) -> Image:
     """Read an EXR, PNG, JPG, HDR, PFM, PPM or BMP file as linear Rec. 709: (H, W, 3) float32.
 
     `color_space` says how the file's values are encoded: `linear`, `srgb`, or `auto` (integers srgb, floats linear).
-    Alpha is dropped; one channel becomes three. `size` is the (width, height) that the image must have. Raises
+    Alpha is dropped; one channel becomes three. `size` is the (width, height) that the image must have. Pixels are as
+    they lie in the file, as Mitsuba reads textures; a warning says where EXIF would have them turned. Raises
     ConfigError, located in the file, where it is missing or no image, damaged, cut off, too large or of another size,
     or holds a value that is not finite or, unless `signed`, negative.
     """
-    photo = read_photo(path, color_space, size)
+    photo = read_photo(path, color_space, size, upright=False)
     _check_values(Path(path), photo.image, signed)
+    orientation = orientation_of(Path(path))
+    if orientation > 1:
+        logger.warning("%s: is read as it lies in the file, not %s as its EXIF says", path, TURNS[orientation])
     return photo.image
 
 
 def read_photo(
-    path: Path, color_space: str = "auto", size: tuple[int, int] | None = None, gamma: float | None = None
+    path: Path,
+    color_space: str = "auto",
+    size: tuple[int, int] | None = None,
+    gamma: float | None = None,
+    upright: bool = True,
 ) -> Photo:
     """Read an image file like `read_image`, and mark pixels that are not to be trusted; values are not checked.
 
-    `gamma`, if any, decodes integers in place of `color_space`. Raises ConfigError, located in the file, also where
-    that is given for a file of floats.
+    `gamma`, if any, decodes integers in place of `color_space`. `upright` turns the image as its EXIF orientation says,
+    to how a person sees it; `size` is that of the image then. Raises ConfigError, located in the file, also where
+    `gamma` is given for a file of floats.
     """
     path = Path(path)
-    bitmap = read_bitmap(path, size)
+    bitmap = read_upright(path, size) if upright else read_bitmap(path, size)
     if bitmap.pixel_format() == mi.Bitmap.PixelFormat.MultiChannel:
         raise ConfigError(path, "", f"has {bitmap.channel_count()} channels; give one with R, G, B or Y only")
     width, height = (int(n) for n in bitmap.size())
@@ -84,13 +106,15 @@ def check_photo(path: Path, photo: Photo, allow_nonfinite: bool) -> None:
     _check_values(path, np.nan_to_num(photo.image, posinf=0, neginf=0) if allow_nonfinite else photo.image, False)
 
 
-def read_weights(path: Path, size: tuple[int, int]) -> Image:
+def read_weights(path: Path, size: tuple[int, int], upright: bool = True) -> Image:
     """Read an image of weights, float32 (H, W): values as they stand in the file, the mean of several channels.
 
-    Those of 8 and 16 bits are shares of the greatest; alpha is dropped. Raises ConfigError, located in the file, like
-    `read_image`.
+    Those of 8 and 16 bits are shares of the greatest; alpha is dropped. `upright` turns it by its own EXIF orientation,
+    like the photograph that it belongs to by that one's. Raises ConfigError, located in the file, like `read_image`.
     """
-    return read_image(path, "linear", size).mean(axis=2)
+    photo = read_photo(path, "linear", size, upright=upright)
+    _check_values(Path(path), photo.image, False)
+    return photo.image.mean(axis=2)
 
 
 def decode_srgb(image: Image) -> Image:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 import drjit as dr
 import mitsuba as mi
 
-from reslrb_cli.config.limits import PASS_PATHS, PASS_SAMPLES
+from reslrb_cli.config.limits import PASS_PATHS, PASS_SAMPLES, PASSES
 from reslrb_cli.scene.lamps import Lamp
 from reslrb_cli.transport.emission import Numbered
 from reslrb_cli.transport.guide import Drawn, Guide, Table
@@ -175,6 +175,10 @@ def passes(
     unit = spp if spp_per_pass is None else min(spp_per_pass, spp)
     if spp % unit:
         raise ValueError(f"the sample count ({spp}) must be a multiple of samples_per_pass ({unit})")
+    if -(-unit // PASS_SAMPLES) * (spp // unit) > PASSES:
+        raise ValueError(
+            f"{spp} samples per pixel in passes of {min(unit, PASS_SAMPLES)} are more than {PASSES} passes"
+        )
     sizes = _parts(unit) * (spp // unit)
     # Opaque: a seed that reached the kernel as a literal would compile a new one each step.
     others = [mi.sample_tea_32(mi.UInt32(seed), mi.UInt32(PASS_STREAM + p))[0] for p in range(1, len(sizes))]

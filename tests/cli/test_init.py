@@ -18,6 +18,7 @@ from reslrb_cli.optimization.problem import assemble_scene
 from reslrb_cli.records.manifest import read_manifest
 from reslrb_cli.scene import load_scene
 from reslrb_cli.scene.proposal import propose
+from reslrb_cli.scene.target import decode_srgb
 
 pytestmark = pytest.mark.usefixtures("llvm")
 
@@ -106,6 +107,34 @@ def test_exposure_is_recovered_where_the_photograph_clips(folder: Path) -> None:
     mi.Bitmap(image).write(str(folder / "linear.exr"))
     assert reslrb("init", "room/scene.xml", "--target", "linear.exr", "--force").exit_code == 0
     assert "exposure" not in (folder / "room.yaml").read_text()
+
+
+def test_a_texture_of_8_bits_is_offered_recovered_and_exported(folder: Path) -> None:
+    """As most textures are: read as floats while loading, and the scene's file stays as it is."""
+    pixels = np.random.default_rng(6).integers(0, 256, (4, 4, 3), dtype=np.uint8)
+    mi.Bitmap(pixels).write(str(folder / "room/poster.png"))
+    scene = folder / "room/scene.xml"
+    text = tiny.SCENE.replace("poster.exr", "poster.png").replace('<boolean name="raw" value="true"/>', "")
+    scene.write_text(text.replace('<string name="format" value="variant"/>', ""))
+    before = scene.read_bytes()
+    made = reslrb("init", "room/scene.xml")
+    assert made.exit_code == 0, made.output
+    [line] = [line for line in (folder / "room.yaml").read_text().splitlines() if f"- {{key: {tiny.KEY}" in line]
+    assert "4x4 texels" in line
+    assert line.endswith("8 bits, read as floats if recovered")
+    sets = ["target={render: {spp: 16}}", "run.iterations=2", "integrator.estimator=stack"]
+    done = reslrb("optimize", "room.yaml", *(text for each in sets for text in ("--set", each)))
+    assert done.exit_code == 0, done.output
+    linear = decode_srgb(pixels.astype(np.float32) / 255)
+    true = np.array(mi.Bitmap(str(folder / f"runs/room/parameters/true/{tiny.KEY}.exr")))
+    assert np.allclose(true, linear, atol=1e-6)
+    written = reslrb("export", "runs/room", "-o", "out")
+    assert written.exit_code == 0, written.output
+    found = mi.traverse(mi.load_file(str(folder / "out/scene.xml"), optimize=False))[tiny.KEY]
+    recovered = np.array(mi.Bitmap(str(folder / f"runs/room/parameters/{tiny.KEY}.exr")))
+    assert np.array_equal(np.array(found), recovered)
+    assert not np.allclose(recovered, linear, atol=1e-3), "two iterations have moved nothing"
+    assert scene.read_bytes() == before
 
 
 @pytest.mark.parametrize(

@@ -4,11 +4,16 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import mitsuba as mi
+import numpy as np
 import pytest
 from cli.calling import reslrb, settings
 from cli.photographs import write_noise
+from click.testing import Result
 
 from reslrb_cli.config import load
+from reslrb_cli.scene.image_file import image_size, orientation_of
+from reslrb_cli.scene.target import decode_srgb
 
 pytestmark = pytest.mark.usefixtures("llvm")
 
@@ -51,6 +56,45 @@ def test_of_several_sensors_one_is_named(choices: Path) -> None:
     missing = reslrb("init", "hall.xml", "--sensor", 2, "--force")
     assert missing.exit_code == 2
     assert "--sensor: is 2; the scene has 0 (floor), 1 (ball)" in missing.output
+
+
+def test_a_photograph_is_taken_as_a_person_sees_it(choices: Path) -> None:
+    """A phone that was held upright writes lying pixels, and EXIF beside them."""
+    from PIL import Image, ImageOps  # comes with matplotlib
+
+    def photograph(width: int, height: int, orientation: int) -> None:
+        pixels = np.random.default_rng(4).integers(40, 200, (height, width, 3), dtype=np.uint8)
+        image = Image.fromarray(pixels)
+        exif = image.getexif()
+        exif[0x0112] = orientation
+        image.save(choices / "photo.jpg", exif=exif)
+
+    def init() -> Result:
+        return reslrb("init", "hall.xml", "--sensor", 1, "--target", "photo.jpg", "--force")
+
+    told = "photo.jpg: turned by 90 degrees clockwise, as its EXIF orientation says"
+    photograph(8, 12, 6)  # the film is 12x8
+    made = init()
+    assert made.exit_code == 0, made.output
+    assert told in made.output
+    config = load(choices / "hall.yaml")
+    assert (config.scene.size, config.target.file) == (None, [choices / "photo.jpg"])
+    few = settings("run.iterations=1", "integrator.estimator=stack", "target.exposure=1", "target.mask=none")
+    done = reslrb("optimize", "hall.yaml", *few)
+    assert done.exit_code == 0, done.output
+    assert told in done.output
+    target = np.array(mi.Bitmap(str(choices / "runs/hall/images/target.exr")))
+    seen = np.array(ImageOps.exif_transpose(Image.open(choices / "photo.jpg"))).astype(np.float32) / 255
+    assert np.allclose(target, decode_srgb(seen), atol=1e-5)
+    photograph(600, 900, 8)  # copied, upright and smaller
+    assert init().exit_code == 0
+    [copy] = load(choices / "hall.yaml").target.file or []
+    assert (orientation_of(copy), image_size(copy)[0] > image_size(copy)[1]) == (1, True)
+    photograph(12, 8, 5)
+    refused = init()
+    assert refused.exit_code == 2
+    assert "is 8x12 pixels, and the scene's film 12x8" in refused.output
+    assert "cut it to what the film sees, such as 8x5" in refused.output
 
 
 def test_a_scene_that_hides_its_lights_keeps_hiding_them(choices: Path) -> None:

@@ -102,8 +102,9 @@ def lines_of(*arguments: str) -> list[str]:
 def test_a_scene_file_by_itself(scene):
     found = lines_of("scene.xml", "--set", "scene.options.power=7")
     start = found.index("parameters") + 1
-    assert found[start : start + 9] == [
-        "can be recovered: 8",
+    assert found[start : start + 10] == [
+        "can be recovered: 9",
+        "wall.reflectance.data 4x4 texels of 3, mean 0.1248, 0.1248 to 0.1248; 8 bits, read as floats if recovered",
         "floor.reflectance.data 6x4 texels of 3, mean 0.5, 0 to 1",
         "Sphere_1.bsdf.reflectance.value 0",
         "Sphere_1.emitter.radiance.value [7, 2, 0.25]",
@@ -114,15 +115,10 @@ def test_a_scene_file_by_itself(scene):
         "Envmap_1.data 8x4 texels of 3, mean 1, 1 to 1",
     ]
     assert found[-3:-1] == ["can be moved: 4", "by motion: Rectangle_1, Rectangle_2, Sphere_1, Sphere_2"]
-    others = found[start + 9 : -3]
-    assert others[0] == "others: 26; --all lists them"
+    others = found[start + 10 : -3]
+    assert others[0] == "others: 25; --all lists them"
     assert "4 is recovered as a motion" in others
-    at = others.index(
-        "1 is stored with 8 bits a channel, too few to follow a gradient; give the texture in the scene file "
-        '<string name="format" value="variant"/>'
-    )
-    assert others[at + 1] == "(wall.reflectance.data)"
-    assert sum(int(line.split()[0]) for line in others[1:] if line[0] != "(") == 26
+    assert sum(int(line.split()[0]) for line in others[1:]) == 25
     assert found[-1] == "next: `reslrb init scene.xml --target PHOTO` writes a configuration of it"
     assert "plan" not in found
 
@@ -139,8 +135,8 @@ def test_everything_with_all(scene):
 def test_a_long_list_is_cut(scene):
     scene.write_text(SCENE.replace("</scene>", '<shape type="sphere"/>' * 60 + "</scene>"))
     short = lines_of("scene.xml")
-    assert "can be recovered: 68" in short
-    assert "and 38 more; --all lists them" in short
+    assert "can be recovered: 69" in short
+    assert "and 39 more; --all lists them" in short
     assert len(short) < 60
     assert "Sphere_62.bsdf.reflectance.value 0.5" in lines_of("scene.xml", "--all")
 
@@ -157,14 +153,23 @@ def test_everything_as_json(scene):
     }  # fmt: skip
     assert parameters["Envmap_1.data"]["shape"] == [4, 8, 3]
     assert parameters["Envmap_1.data"]["value"]["numbers"] is None
-    assert parameters["wall.reflectance.data"]["obstacle"].startswith("is stored with 8 bits")
+    wall = parameters["wall.reflectance.data"]
+    assert (wall["obstacle"], wall["bits"], wall["type"]) == (None, 8, "TensorXu8")
+
+
+def test_a_texture_of_8_bits_that_is_selected_is_shown_as_it_is_read(scene):
+    config = scene.with_name("c.yaml")
+    config.write_text('scene: {file: scene.xml}\nparameters: [{key: "wall.*"}]')
+    found = lines_of("c.yaml", "--no-counts")
+    assert "* wall.reflectance.data 4x4 texels of 3, mean 0.1248, 0.1248 to 0.1248" in found
+    assert any(line.startswith("needed derivatives of BSDFs") for line in found)
 
 
 @pytest.mark.parametrize(
     ("text", "next_step"),
     [
-        ("", 'add `target: {file: IMAGE}` and `parameters: [{key: "floor.reflectance.data"}]` to c.yaml'),
-        ("target: {file: photo.exr}", 'add `parameters: [{key: "floor.reflectance.data"}]` to c.yaml'),
+        ("", 'add `target: {file: IMAGE}` and `parameters: [{key: "wall.reflectance.data"}]` to c.yaml'),
+        ("target: {file: photo.exr}", 'add `parameters: [{key: "wall.reflectance.data"}]` to c.yaml'),
         ("parameters: [{key: Sphere_1.*}]", "add `target: {file: IMAGE}` to c.yaml"),
         ("parameters:\ntarget:\nrun: {iterations: 3}", "add `target: {file: IMAGE}` and `parameters: "),
         ("parameters: [{key: Sphere_1.*}]\ntarget: {render: {}}", "`reslrb optimize c.yaml` runs it"),
@@ -177,7 +182,7 @@ def test_a_configuration_need_not_be_complete(scene, text, next_step):
     has_parameters = "Sphere_1.*" in text
     assert ("plan" in found) is has_parameters
     assert ("* Sphere_1.emitter.radiance.value [5, 2, 0.25]" in found) is has_parameters
-    assert ("can be recovered: 8 (* in `parameters`)" in found) is has_parameters
+    assert ("can be recovered: 9 (* in `parameters`)" in found) is has_parameters
 
 
 def test_sections_can_be_given_on_the_command_line(scene):

@@ -24,7 +24,11 @@ FIRST = {
         *(f"Rectangle_1.bsdf.nested_bsdf.reflectance.color{number}.value" for number in (0, 1)),
         "Cube_1.bsdf.diffuse_reflectance.value",
     ],
-    "terrace": ["Obj_1.bsdf.diffuse_reflectance.value", "Disk_1.bsdf.nested_bsdf.brdf_0.reflectance.value"],
+    "terrace": [
+        "ground.reflectance.data",  # 8 bits
+        "Obj_1.bsdf.diffuse_reflectance.value",
+        "Disk_1.bsdf.nested_bsdf.brdf_0.reflectance.value",
+    ],
 }
 #: Commands on the configuration and the run, and what each of them says when it is done.
 COMMANDS = {

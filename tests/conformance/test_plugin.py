@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 from itertools import pairwise
@@ -13,6 +14,7 @@ import pytest
 from conformance.gradient_cases import FLOOR, _mask, _textured
 from conformance.scenes import plugin
 
+from reslrb_cli import step
 from reslrb_cli.errors import UnsupportedScene
 from reslrb_cli.integrators import render_image
 from reslrb_cli.measure.gradients import Case, integrator, relative, seeds
@@ -21,6 +23,7 @@ from reslrb_cli.measure.statistics import compare
 
 pytestmark = pytest.mark.usefixtures("llvm")
 
+ROOT = Path(__file__).resolve().parents[2]
 
 SCRIPT = """
 import reslrb_cli
@@ -47,9 +50,59 @@ for variant in ("llvm_ad_mono", "llvm_ad_rgb"):
 @pytest.mark.parametrize("before", [True, False])
 def test_register_before_and_after_the_variant(before: bool):
     run = subprocess.run([sys.executable, "-c", SCRIPT.format(before=before)], capture_output=True, text=True,
-                         cwd=Path(__file__).resolve().parents[2], timeout=120)  # fmt: skip
+                         cwd=ROOT, timeout=120)  # fmt: skip
     assert run.returncode == 0, run.stderr
     assert run.stdout.split() == ["gradient", "True", "3", "3"]
+
+
+REGISTERED = """
+import reslrb_cli
+import mitsuba as mi
+for variant in ("scalar_rgb", "llvm_ad_spectral", "llvm_ad_mono_polarized"):
+    mi.set_variant(variant)
+    for call in (reslrb_cli.register, lambda: reslrb_cli.load_scene("none.xml"),
+                 lambda: mi.load_dict({"type": "reslrb"})):
+        try:
+            call()
+        except Exception as error:
+            assert f"variant {variant} is set" in str(error), error
+            assert "one of llvm_ad_rgb, cuda_ad_rgb, llvm_ad_mono, cuda_ad_mono" in str(error), error
+            print(type(error).__name__)
+mi.set_variant("llvm_ad_mono")
+print(mi.load_dict({"type": "reslrb", "max_depth": 3}).max_depth)
+"""
+
+
+def test_variants_that_do_not_work_are_refused_with_those_that_do():
+    """One that is set later, too, under which nothing was ever registered."""
+    run = subprocess.run([sys.executable, "-c", REGISTERED], capture_output=True, text=True, timeout=120, cwd=ROOT)
+    assert run.returncode == 0, run.stderr
+    assert run.stdout.split() == ["BackendError", "BackendError", "RuntimeError"] * 3 + ["3"]
+
+
+def test_a_step_without_a_variant_says_which_there_are():
+    script = """
+import reslrb_cli
+try:
+    reslrb_cli.step(None, None, 0, None, seed=0, spp=1)
+except reslrb_cli.errors.BackendError as error:
+    print(error)
+"""
+    run = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=120, cwd=ROOT)
+    assert run.stdout.startswith("no variant is set; call mitsuba.set_variant(...) with one of llvm_ad_rgb"), run.stderr
+
+
+def test_the_readmes_script_runs():
+    """What stands under "In a script", one block after the other."""
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    section = text[text.index("## In a script") : text.index("## Scenes")]
+    script = "\n".join(re.findall(r"^```python\n(.*?)^```", section, re.MULTILINE | re.DOTALL))
+    run = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=300, cwd=ROOT)
+    assert run.returncode == 0, run.stderr
+    lines = run.stdout.splitlines()
+    losses = [float(line.split()[1].strip("[]")) for line in lines[:10]]
+    assert losses[-1] < losses[0]
+    assert lines[10].startswith("(64, 64, 3)"), lines[10]
 
 
 @pytest.fixture(scope="module")
@@ -92,6 +145,8 @@ def test_defaults_are_ptracers():
         {"image": "some"},
         {"max_dpth": 3},
         {"max_depth": "deep"},
+        {"capacity": 0},
+        {"capacity": 1025},  # of each its own code in the kernel
     ],
     ids=str,
 )
@@ -122,6 +177,46 @@ def test_an_option_that_an_integrator_does_not_have_is_refused():
 def test_samples_that_passes_do_not_divide_raise(case: Case):
     with pytest.raises(ValueError, match="multiple"):
         render_image(integrator("reslrb", samples_per_pass=3), case.scene, 0, 1, 16)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"spp": -1}, '"spp" must be a whole number from 0 to'),
+        ({"spp": 1.5}, '"spp" must be a whole number from 0 to .*, not 1.5'),
+        ({"spp": 10**13}, '"spp" must be a whole number'),
+        ({"seed": -1}, '"seed" must be a whole number from 0 to 4294967295, not -1'),
+        ({"seed": 2**32}, '"seed" must be a whole number'),
+        ({"sensor": 1}, '"sensor" is 1, but the scene has one sensor, index 0'),
+        ({"sensor": -1}, '"sensor" is -1'),
+        ({"adjoint": "batches"}, '"adjoint" must be one of correlated, independent, batched, not "batches"'),
+        ({"first_batch": "none"}, '"first_batch" must be one of image, again'),
+        ({"adjoint": "batched", "batches": 1}, '"batches" must be a whole number from 2 to'),
+        ({"adjoint": "batched", "batches": 3}, r"the samples per pixel \(4\) must be a multiple of the batches \(3\)"),
+        ({"adjoint": "batched", "spp": 0}, r"the samples per pixel \(0\) must be a multiple"),
+    ],
+    ids=str,
+)
+def test_a_step_with_what_is_out_of_range_raises(case: Case, options: dict[str, Any], message: str):
+    given = {"sensor": 0, "seed": 1, "spp": 4} | options
+    with pytest.raises(ValueError, match=message):
+        step(plugin("reslrb"), case.scene, given.pop("sensor"), case.objective, params=case.params, **given)
+
+
+def test_a_step_takes_numpys_numbers(case: Case):
+    given = {"seed": np.uint32(1), "spp": np.int64(4)}
+    result = step(plugin("reslrb"), case.scene, np.int64(0), case.objective, params=case.params, **given)
+    assert np.isfinite(np.array(result.image)).all()
+
+
+def test_mi_render_with_samples_out_of_range_raises(case: Case):
+    import mitsuba as mi
+
+    with pytest.raises(RuntimeError) as error:
+        mi.render(case.scene, integrator=plugin("reslrb"), spp=-1)
+    assert '"spp" must be 0 (the sensor\'s own sample count) or more, not -1' in str(error.value.__cause__)
+    with pytest.raises(ValueError, match="are more than 65536 passes"):
+        render_image(integrator("reslrb", samples_per_pass=1), case.scene, 0, 1, 10**6)
 
 
 def test_mi_render_backward_through_a_latent_variable(case: Case):

@@ -89,6 +89,30 @@ def test_kinds_of_a_file(folder):
     assert (left_out(problem), lines) == ([], [])
 
 
+def test_photograph_and_weights_are_turned_each_by_its_own_exif(folder):
+    """The same picture upright, and upside down with an EXIF that says so, make the same target and mask."""
+    from PIL import Image  # comes with matplotlib
+
+    pixels = np.random.default_rng(2).integers(40, 200, (8, 8, 3), dtype=np.uint8)
+    pixels[1, 2] = 255
+    weights = np.full((8, 8), 255, np.uint8)
+    weights[5, 1] = 0
+    for name, orientation in (("up", 1), ("down", 3)):
+        for kind, array in (("photo", pixels), ("weights", weights)):
+            image = Image.fromarray(array if orientation == 1 else array[::-1, ::-1])
+            exif = image.getexif()
+            exif[0x0112] = orientation
+            image.save(folder / f"{kind}-{name}.png", exif=exif)
+    only = "target.mask={file: weights-%s.png, border: false}"
+    upright, _ = make(folder, "target.file=photo-up.png", only % "up")
+    said = []
+    sets = ["target.render=null", "target.file=photo-down.png", only % "down"]
+    turned = assemble(load(folder / "tiny.yaml", sets), said.append)
+    assert left_out(turned) == left_out(upright) == [(1, 2), (5, 1)]
+    np.testing.assert_array_equal(np.array(turned.views[0].target), np.array(upright.views[0].target))
+    assert f"{folder}/photo-down.png: turned by 180 degrees, as its EXIF orientation says" in said
+
+
 def test_values_that_are_not_finite(folder):
     problem, _ = make(folder, "target.file=photo.exr")
     assert left_out(problem) == [BROKEN]

@@ -89,11 +89,11 @@ def test_a_point_is_seen_where_the_camera_has_it(folder, write):
     np.testing.assert_allclose(directions(scene, 1), towards, atol=1e-5)
 
 
-def make(folder, cameras, run=""):
+def make(folder, cameras, run="", say=None):
     text = CONFIG.replace("target: {render: {spp: 16}}\n", "")
     text = text.replace("{file: scene.xml}", f"{{file: scene.xml, cameras: {cameras}, sensors: all}}")
     text = text.replace("run: {", "run: {" + run)
-    return assemble(loads(text, str(folder / "tiny.yaml")))
+    return assemble(loads(text, str(folder / "tiny.yaml")), *([] if say is None else [say]))
 
 
 def test_the_cameras_images_are_the_targets(folder):
@@ -106,6 +106,21 @@ def test_the_cameras_images_are_the_targets(folder):
     (folder / "b.exr").unlink()
     with pytest.raises(ConfigError, match=r"tiny.yaml: scene.cameras: no such file"):
         make(folder, "transforms.json")
+
+
+def test_the_cameras_images_are_not_turned(folder):
+    """COLMAP looks for cameras that see pixels as they lie in the file."""
+    from PIL import Image  # comes with matplotlib
+
+    image = Image.fromarray(np.random.default_rng(3).integers(9, 200, (HEIGHT, WIDTH, 3), dtype=np.uint8))
+    exif = image.getexif()
+    exif[0x0112] = 6
+    image.save(folder / "a.png", exif=exif)
+    path, said = write_nerf(folder), []
+    path.write_text(path.read_text().replace("a.exr", "a.png"))
+    problem = make(folder, path.name, say=said.append)
+    assert problem.views[0].target.shape[:2] == (HEIGHT, WIDTH)
+    assert any(line.startswith(f"{folder}/a.png: not turned by 90 degrees clockwise") for line in said), said
 
 
 def test_a_size_that_is_not_said_is_the_images(folder):

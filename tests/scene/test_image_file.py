@@ -1,9 +1,13 @@
-"""Files that are no whole images: cut off, padded, damaged, larger than they could be, and no files at all."""
+"""Files that are no whole images: cut off, padded, damaged, larger than they could be, and no files at all.
+
+And whole ones whose EXIF says how they are to be turned.
+"""
 
 from __future__ import annotations
 
 import os
 import struct
+import time
 import zlib
 
 import numpy as np
@@ -11,7 +15,7 @@ import pytest
 
 from reslrb_cli.errors import ConfigError, OutOfMemory
 from reslrb_cli.scene import image_file, read_image
-from reslrb_cli.scene.image_file import read_bitmap
+from reslrb_cli.scene.image_file import orientation_of, read_bitmap, read_upright
 
 pytestmark = pytest.mark.usefixtures("llvm")
 
@@ -222,3 +226,122 @@ def test_the_lines_of_a_radiance_image_are_looked_at_before_they_are_decoded(wid
         assert refused(path).startswith(("is cut off", "is damaged or cut off"))
         with pytest.raises(image_file.DamagedImage):
             image_file.image_size(path)
+
+
+# --- EXIF -------------------------------------------------------------------------------------------------------------
+
+
+def with_orientation(path, orientation, channels=3):
+    """A picture of 7x5 pixels in a file whose EXIF has this orientation, as Pillow writes it."""
+    from PIL import Image  # comes with matplotlib
+
+    pixels = np.random.default_rng(1).integers(0, 255, (5, 7, channels), dtype=np.uint8)
+    image = Image.fromarray(pixels if channels > 1 else pixels[:, :, 0])
+    exif = image.getexif()
+    exif[0x0112] = orientation
+    image.save(path, exif=exif)
+    return path
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+@pytest.mark.parametrize(("name", "channels"), [("a.jpg", 3), ("a.jpg", 1), ("a.png", 4), ("a.png", 3)])
+def test_what_is_seen_upright_is_what_pillow_makes_of_it(name, channels, orientation, tmp_path):
+    from PIL import Image, ImageOps
+
+    path = with_orientation(tmp_path / name, orientation, channels)
+    raw, seen = read_bitmap(path), read_upright(path)
+    expected = np.array(ImageOps.exif_transpose(Image.open(path))).reshape(*seen.size()[::-1], channels)
+    assert orientation_of(path) == orientation
+    assert np.array_equal(np.array(seen).reshape(expected.shape), expected)
+    assert list(raw.size()) == [7, 5]
+    assert (seen.pixel_format(), seen.srgb_gamma()) == (raw.pixel_format(), raw.srgb_gamma())
+    size = (5, 7) if orientation >= 5 else (7, 5)
+    assert list(read_upright(path, size).size()) == list(size)
+    if orientation >= 5:
+        with pytest.raises(ConfigError, match=r"is 5x7 pixels, turned by 90 degrees .* it must be 7x5"):
+            read_upright(path, (7, 5))
+
+
+def exif(entries, order=">", place=8, count=None):
+    """What EXIF says, from its entries (tag, type, count, value)."""
+    head = (b"MM\0*" if order == ">" else b"II*\0") + struct.pack(f"{order}I", place)
+    body = struct.pack(f"{order}H", len(entries) if count is None else count)
+    return head + body + b"".join(struct.pack(f"{order}HHIHH", *entry, 0) for entry in entries)
+
+
+def jpeg_with(path, *contents, kind=0xE1):
+    """A JPEG of 7x5 pixels with these application segments behind its head."""
+    import mitsuba as mi
+
+    mi.Bitmap(np.full((5, 7, 3), 128, np.uint8)).write(str(path))
+    data = path.read_bytes()
+    parts = b"".join(b"\xff" + bytes([kind]) + struct.pack(">H", len(content) + 2) + content for content in contents)
+    path.write_bytes(data[:2] + parts + data[2:])
+    return path
+
+
+SIX = (0x0112, 3, 1, 6)
+
+
+@pytest.mark.parametrize("order", "<>")
+def test_entries_before_the_orientation_and_other_segments_are_passed_over(order, tmp_path):
+    entries = [(0x010F, 2, 4, 0x4142), (0x0110, 2, 4, 0x4142), SIX, (0x0112, 3, 1, 3)]
+    data = b"Exif\0\0" + exif(entries, order)
+    path = jpeg_with(tmp_path / "a.jpg", b"http://ns.adobe.com/xap/1.0/\0<x/>", data, b"Exif\0\0" + exif([]))
+    assert orientation_of(path) == 6
+    assert list(read_upright(path).size()) == [5, 7]
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        b"",
+        b"MM\0*",
+        b"XX\0*" + exif([SIX])[4:],
+        exif([SIX])[:-4],  # cut off within the entry
+        exif([SIX], place=2**32 - 1),
+        exif([SIX], place=4),  # a directory that begins within what points to it
+        exif([], count=65535),
+        exif([], count=65535) + bytes(60_000),
+        exif([(0x0112, 3, 1, 0)]),
+        exif([(0x0112, 3, 1, 9)]),
+        exif([(0x0112, 3, 2**32 - 1, 6)]),
+        exif([(0x0112, 2, 1, 6)]),
+        exif([(0x8769, 4, 1, 0), (0x014A, 4, 1, 0)] * 1000),  # directories within directories, all of them this one
+    ],
+)
+def test_exif_that_says_nothing_turns_nothing(data, tmp_path):
+    start = time.monotonic()
+    for path in (
+        jpeg_with(tmp_path / "a.jpg", b"Exif\0\0" + data),
+        png_with(tmp_path / "a.png", data),
+    ):
+        assert orientation_of(path) == 1
+        assert list(read_upright(path).size()) == [7, 5]
+    assert time.monotonic() - start < 5
+
+
+def png_with(path, data):
+    """A PNG of 7x5 pixels with this EXIF data behind its head."""
+    import mitsuba as mi
+
+    mi.Bitmap(np.full((5, 7, 3), 128, np.uint8)).write(str(path))
+    whole, head = path.read_bytes(), 8 + 25
+    chunk = struct.pack(">I", len(data)) + b"eXIf" + data + struct.pack(">I", zlib.crc32(b"eXIf" + data))
+    path.write_bytes(whole[:head] + chunk + whole[head:])
+    return path
+
+
+def test_a_png_whose_exif_is_longer_than_its_file_is_cut_off(tmp_path):
+    path = png_with(tmp_path / "a.png", exif([SIX]))
+    assert orientation_of(path) == 6
+    data = bytearray(path.read_bytes())
+    data[33:37] = b"\x7f\xff\xff\xff"
+    path.write_bytes(data)
+    assert refused(path).startswith("is cut off")
+
+
+def test_a_texture_is_read_as_it_lies_and_that_is_said(tmp_path, caplog):
+    path = with_orientation(tmp_path / "a.png", 8)
+    assert read_image(path).shape == (5, 7, 3)
+    assert f"{path}: is read as it lies in the file, not turned by 90 degrees counter" in caplog.text

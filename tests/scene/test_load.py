@@ -4,10 +4,14 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import mitsuba as mi
+import numpy as np
 import pytest
 
+from reslrb_cli.config import ParameterSpec
 from reslrb_cli.errors import ConfigError
-from reslrb_cli.scene import load_scene
+from reslrb_cli.scene import list_parameters, load_scene, select_parameters
+from reslrb_cli.scene.description import sizes
 
 pytestmark = pytest.mark.usefixtures("llvm")
 
@@ -24,8 +28,6 @@ def load(folder: Path, text: str, **options: object):
 
 
 def test_options_are_passed_on(tmp_path):
-    import mitsuba as mi
-
     scene = load(tmp_path, LIT_SPHERE, radius=2.5)
     assert mi.traverse(scene)["ball.to_world"].matrix.numpy()[0, 0, 0] == pytest.approx(2.5)
 
@@ -41,9 +43,6 @@ def test_old_versions_load(tmp_path):
 
 
 def test_files_are_found_beside_the_scene(tmp_path, monkeypatch):
-    import mitsuba as mi
-    import numpy as np
-
     (tmp_path / "sub").mkdir()
     mi.Bitmap(np.full((2, 2, 3), 0.5, np.float32)).write(str(tmp_path / "sub" / "t.exr"))
     text = LIT_SPHERE.replace("</shape>", '<bsdf type="diffuse"><texture type="bitmap" name="reflectance">'
@@ -125,3 +124,113 @@ def test_light_that_ray_offsets_lose_is_warned_of(tmp_path, caplog, scale: float
         assert message.startswith(f"{tmp_path}/scene.xml: the scene ")
         assert advice in message
         assert "\n" not in message
+
+
+# --- textures of few bits ---------------------------------------------------------------------------------------------
+
+RAW = '<boolean name="raw" value="true"/>'
+#: How a texture is said to be looked up, none of which is to be lost.
+LOOKED_UP = (
+    '<string name="format" value="fp16"/><string name="filter_type" value="nearest"/>'
+    '<string name="wrap_mode" value="mirror"/><transform name="to_uv"><scale x="2.5" y="1.5"/></transform>'
+)
+#: A wall and a sphere with a texture each, and a lamp.
+WALLS = """<scene version="3.0.0"><sensor type="perspective"><film type="hdrfilm"><integer name="width" value="16"/>
+<integer name="height" value="16"/></film>
+<transform name="to_world"><lookat origin="0, 0, 4" target="0, 0, 0" up="0, 1, 0"/></transform></sensor>
+<emitter type="constant"/><shape type="rectangle" id="wall">{material}</shape>
+<shape type="sphere" id="ball"><point name="center" x="1" y="1" z="0"/><bsdf type="diffuse">
+<texture type="bitmap" name="reflectance"><string name="filename" value="other.png"/></texture></bsdf></shape>
+</scene>"""
+DIFFUSE = '<bsdf type="diffuse"><texture type="bitmap" name="reflectance">{}</texture></bsdf>'
+#: Materials with a texture, and the name of its file.
+TEXTURES = {
+    "RGB": (DIFFUSE, "a.png"),
+    "alpha": (DIFFUSE, "rgba.png"),
+    "grey": (DIFFUSE, "y.png"),
+    "raw": (DIFFUSE.replace("{}", "{}" + RAW), "a.png"),
+    "JPEG": (DIFFUSE, "a.jpg"),
+    "16 bits": (DIFFUSE, "a16.png"),
+    "half floats": (DIFFUSE, "half.exr"),
+    "looked up": (DIFFUSE.replace("{}", "{}" + LOOKED_UP), "a.png"),
+    "opacity": (
+        '<bsdf type="mask"><texture type="bitmap" name="opacity">{}' + RAW + '</texture><bsdf type="diffuse"/></bsdf>',
+        "y.png",
+    ),
+    "roughness": (
+        '<bsdf type="roughconductor"><texture type="bitmap" name="alpha">{}' + RAW + "</texture></bsdf>",
+        "y.png",
+    ),
+    "relief": (
+        '<bsdf type="bumpmap"><texture type="bitmap">{}' + RAW + '</texture><bsdf type="diffuse"/></bsdf>',
+        "y.png",
+    ),
+    "radiance": (
+        '<bsdf type="diffuse"/><emitter type="area"><texture type="bitmap" name="radiance">{}</texture></emitter>',
+        "a.png",
+    ),
+}
+
+
+@pytest.fixture
+def walls(tmp_path, request):
+    """A scene with this texture at its wall, and another of 8 bits at its ball."""
+    random = np.random.default_rng(0)
+    for name, channels, kind in (("a.png", 3, np.uint8), ("rgba.png", 4, np.uint8), ("y.png", 1, np.uint8),
+                                 ("a.jpg", 3, np.uint8), ("a16.png", 3, np.uint16)):  # fmt: skip
+        pixels = random.integers(0, np.iinfo(kind).max + 1, (6, 5, channels), dtype=kind)
+        pixels[0, 0] = np.iinfo(kind).max
+        mi.Bitmap(pixels).write(str(tmp_path / name))
+    mi.Bitmap(random.uniform(0, 1, (6, 5, 3)).astype(np.float16)).write(str(tmp_path / "half.exr"))
+    mi.Bitmap(random.integers(0, 256, (64, 64, 3), dtype=np.uint8)).write(str(tmp_path / "other.png"))
+    material, name = TEXTURES[request.param]
+    text = WALLS.format(material=material.format(f'<string name="filename" value="{name}"/>'))
+    (tmp_path / "scene.xml").write_text(text)
+    return tmp_path / "scene.xml"
+
+
+@pytest.mark.parametrize("walls", TEXTURES, indirect=True)
+def test_what_is_selected_of_few_bits_has_mitsubas_own_values_as_floats(walls):
+    own = load_scene(walls)
+    before = {info.key: info for info in list_parameters(mi.traverse(own), values=True) if info.bits is not None}
+    [key, other] = sorted(before, key=lambda key: key.startswith("ball"))
+    assert (before[key].obstacle, before[other].obstacle) == (None, None)
+    scene = load_scene(walls, keys=["wall.*"])
+    spec = ParameterSpec(key=key, bounds=(0.0, 1.0))
+    selection = select_parameters(scene, [spec], "c.yaml")
+    [after] = [info for info in list_parameters(selection.params, values=True) if info.key == key]
+    assert (after.bits, after.type, after.shape) == (None, "TensorXf", before[key].shape)
+    assert int(selection.params.flags(key)) & int(mi.ParamFlags.NonDifferentiable) == 0
+    assert type(selection.params[other]).__name__ == "TensorXu8", "what is not selected takes four times the memory"
+    exact = before[key].bits == 8
+    assert np.allclose(_numbers(after.value), _numbers(before[key].value), atol=1e-6 if exact else 1e-3)
+    text = walls.read_text().replace('<string name="format" value="fp16"/>', "")
+    file = text.index("<string name=", text.index('"wall"'))
+    walls.with_name("variant.xml").write_text(text[:file] + '<string name="format" value="variant"/>' + text[file:])
+    theirs = mi.traverse(mi.load_file(str(walls.with_name("variant.xml")), optimize=False))
+    assert np.array_equal(np.array(theirs[key]), np.array(selection.params[key]))
+    images = [np.array(mi.render(each, integrator=mi.load_dict({"type": "path"}), spp=4, seed=0))
+              for each in (own, scene)]  # fmt: skip
+    assert np.allclose(*images, atol=1e-5 if exact else 2e-3)
+
+
+def _numbers(value):
+    return value.mean, value.low, value.high
+
+
+@pytest.mark.parametrize("walls", ["RGB"], indirect=True)
+def test_nothing_is_built_anew_where_nothing_of_few_bits_is_selected(walls):
+    types = [type(mi.traverse(load_scene(walls, keys=keys))["ball.bsdf.reflectance.data"]).__name__
+             for keys in ([], ["Constant_1.*"], ["wall.bsdf.reflectance.data"], ["*.data"])]  # fmt: skip
+    assert types == ["TensorXu8"] * 3 + ["TensorXf"]
+    with pytest.raises(ConfigError, match=r"`ball\.bsdf\.reflectance\.data` is stored with 8 bits"):
+        select_parameters(load_scene(walls), [ParameterSpec(key="ball.bsdf.reflectance.data")], "c.yaml")
+
+
+@pytest.mark.parametrize("walls", ["RGB"], indirect=True)
+def test_floats_that_are_more_than_is_free_are_refused(walls, monkeypatch):
+    """What is free holds the texture with 8 bits, and not as floats."""
+    monkeypatch.setattr(sizes, "free_bytes", lambda variant: 64 * 64 * 11)
+    load_scene(walls, keys=["wall.*"])
+    with pytest.raises(ConfigError, match=r"scene.xml:\d+: filename: .*other.png is 64x64 pixels, which take 48 KiB"):
+        load_scene(walls, keys=["*.reflectance.data"])

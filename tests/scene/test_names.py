@@ -8,7 +8,9 @@ import sys
 from pathlib import Path
 
 import pytest
+from cli.calling import reslrb
 
+import reslrb_cli
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.scene import load_scene
 
@@ -69,6 +71,30 @@ def test_names_say_kind_and_number(tmp_path):
         "Rectangle_1.bsdf.brdf_0.diffuse_reflectance.value",
         "Diffuse_2.reflectance.color0.value",
     } <= set(found)
+
+
+def test_a_script_has_the_names_of_the_command_line(tmp_path):
+    """Of an older version's file, too, which `mi.load_file` refuses, with textures of 8 bits that are asked for."""
+    import mitsuba as mi
+    import numpy as np
+
+    mi.Bitmap(np.full((4, 4, 3), 99, np.uint8)).write(str(tmp_path / "8bit.png"))
+    texture = '<texture type="bitmap" name="reflectance"><string name="filename" value="8bit.png"/></texture>'
+    house = HOUSE.replace('<shape type="cube"/>', f'<shape type="cube"><bsdf type="diffuse">{texture}</bsdf></shape>')
+    file = write(tmp_path, house.replace('type="hdrfilm"', 'type="ldrfilm"'))
+    listed = json.loads(reslrb("inspect", str(file), "--json").stdout)["parameters"]
+    scene = reslrb_cli.load_scene(file, ["Cube_1.*"], power=7)
+    params = mi.traverse(scene)
+    assert [entry["key"] for entry in listed] == list(params.properties)
+    assert float(params["Sphere_3.emitter.radiance.value"][0][0]) == 7
+    assert type(params["Cube_1.bsdf.reflectance.data"]).__name__ == "TensorXf"
+    plain = mi.traverse(reslrb_cli.load_scene(str(file)))
+    assert float(plain["Sphere_3.emitter.radiance.value"][0][0]) == 3
+    assert type(plain["Cube_1.bsdf.reflectance.data"]).__name__ == "TensorXu8"
+    one = mi.traverse(reslrb_cli.load_scene(file, "Cube_1.bsdf.reflectance.data"))
+    assert type(one["Cube_1.bsdf.reflectance.data"]).__name__ == "TensorXf"
+    with pytest.raises(ConfigError, match=r"scene.xml: \$power2: is set in scene.options, but the scene file does not"):
+        reslrb_cli.load_scene(file, power2=3)
 
 
 def test_names_are_the_same_in_every_load_and_process(tmp_path):

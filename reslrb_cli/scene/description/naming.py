@@ -1,11 +1,14 @@
-"""Lasting names for objects without an id: their kind, and their number among all of that kind.
+"""Lasting names for objects without an id: their kind, and their number among all of that kind; and the way back.
 
 Mitsuba names an object without an id by its address in memory, which differs each time that the scene is loaded.
 """
 
 from __future__ import annotations
 
+import re
 from collections import Counter
+
+import mitsuba as mi
 
 from .element import Element, quoted
 from .notes import Note
@@ -16,6 +19,8 @@ _GROUPS = ("shapegroup", "batch")
 _UNNAMED = "_unnamed_"
 #: Characters of an id that is kept: keys become names of files.
 _LONGEST = 120
+#: Elements, by what Mitsuba makes of them.
+_KINDS = {"bsdf": "BSDF", "emitter": "Emitter", "shape": "Shape", "texture": "Texture"}
 
 
 def name_objects(root: Element) -> list[Note]:
@@ -87,3 +92,53 @@ def _same(a: Element, b: Element) -> bool:
         (a.tag, own[0], len(a.children)) == (b.tag, own[1], len(b.children))
         and all(_same(x, y) for x, y in zip(a.children, b.children, strict=True))
     )  # fmt: skip
+
+
+class Owners:
+    """The elements of a description by the ids of their objects, for the way back from a parameter to its element."""
+
+    def __init__(self, root: Element) -> None:
+        self._elements = {
+            item.attributes["id"]: item for item in root.walk() if item.is_object and "id" in item.attributes
+        }
+
+    def place(self, params: mi.SceneParameters, key: str) -> tuple[Element, list[str]] | None:
+        """The element of the nearest object above the parameter `key` that has one, and the names that lead on.
+
+        None of a parameter that nothing in the files is above of. `params` are those of a scene that was built from
+        the description.
+        """
+        chain = [params.properties[key][2]]
+        while chain[-1].id() not in self._elements:
+            parent = params.hierarchy[chain[-1]][0]
+            if parent is None:
+                return None
+            chain.append(parent)
+        owner, names = self._elements[chain.pop().id()], key.split(".")
+        names = names[-len(chain) - 1 :]
+        while chain:
+            nested = self._nested(owner, names[0], chain[-1])
+            if nested is None:
+                break
+            owner, names = nested, names[1:]
+            chain.pop()
+        return owner, names
+
+    def _nested(self, owner: Element, name: str, node: mi.Object) -> Element | None:
+        """The element, among those in `owner`, of the object `node` that Mitsuba calls `name` there.
+
+        Some objects lose their ids, as bitmaps do; those in a group have none.
+        """
+        tag = next((tag for tag, kind in _KINDS.items() if isinstance(node, getattr(mi, kind))), None)
+        named: list[Element] = []
+        unnamed: list[Element] = []
+        for item in owner.children:
+            meant = self._elements.get(item.attributes["id"], item) if item.tag == "ref" else item
+            has_own_id = owner.type == "shapegroup" and "id" in meant.attributes  # by which it is found
+            if meant.tag == tag and item.name in (name, "") and not has_own_id:
+                (named if item.name else unnamed).append(meant)
+        if named or not unnamed:
+            return named[0] if named else None
+        number = re.fullmatch(r".*?(?:_(\d+))?", name)
+        place = int(number[1] or 0) if number else 0
+        return unnamed[0] if len(unnamed) == 1 else unnamed[place] if place < len(unnamed) else None

@@ -17,8 +17,9 @@ from ..image_file import DamagedImage, image_size
 from .element import Element, quoted
 from .including import Description
 
-#: Bytes of memory that a pixel of an image takes as a texture at the least: Mitsuba keeps three half floats of it.
-_TEXEL_BYTES = 6
+#: Bytes of memory that a pixel of an image takes as a texture at the least: Mitsuba keeps three half floats of it, or
+#: floats where the scene says so.
+_TEXEL_BYTES, _FLOAT_BYTES = 6, 12
 #: Bytes in which a mesh says what it consists of.
 _HEAD = 2**16
 
@@ -37,12 +38,16 @@ class FilmSize:
 def check_sizes(description: Description) -> None:
     """Raise ConfigError, located by file and line, for films and files that are larger than can be held."""
     free: int | None = None
-    for element in description.root.walk():
-        if element.tag == "film":
-            _check_film(element)
-        elif element.tag == "string" and element.name == "filename":
-            free = free_bytes(mi.variant()) if free is None else free
-            _check_file(element, description.folders, free)
+    for owner in description.root.walk():
+        if owner.tag == "film":
+            _check_film(owner)
+        as_floats = any(
+            child.name == "format" and child.attributes.get("value") == "variant" for child in owner.children
+        )
+        for element in owner.children:
+            if element.tag == "string" and element.name == "filename":
+                free = free_bytes(mi.variant()) if free is None else free
+                _check_file(element, description.folders, free, _FLOAT_BYTES if as_floats else _TEXEL_BYTES)
 
 
 def _check_film(film: Element) -> None:
@@ -87,8 +92,11 @@ def _check_head(element: Element, path: Path) -> None:
             raise element.fail("filename", f"{path} {what}, and has {in_words(os.path.getsize(path))}; write it again")
 
 
-def _check_file(element: Element, folders: list[Path], free: int) -> None:
-    """Refuse a file that takes more memory than is free, by its size or by what an image says of itself."""
+def _check_file(element: Element, folders: list[Path], free: int, texel: int) -> None:
+    """Refuse a file that takes more memory than is free, by its size or by what an image says of itself.
+
+    `texel` are the bytes that a pixel of it takes.
+    """
     name = element.attributes.get("value", "")
     places = [*(folder / name for folder in folders), Path(name)]
     path = next((path for path in places if os.path.isfile(path)), None)  # False of names that are too long, too
@@ -107,8 +115,8 @@ def _check_file(element: Element, folders: list[Path], free: int) -> None:
         return  # no image, or none that we know
     if width * height > PIXELS:
         raise element.fail("filename", f"{path} is {width}x{height} pixels; more than {PIXELS} are not read")
-    if width * height * _TEXEL_BYTES > free:
-        needed = in_words(width * height * _TEXEL_BYTES)
+    if width * height * texel > free:
+        needed = in_words(width * height * texel)
         raise element.fail(
             "filename", f"{path} is {width}x{height} pixels, which take {needed}; {in_words(free)} are free"
         )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from typing import Any
 
 import mitsuba as mi
@@ -13,6 +12,7 @@ from ...records.file_names import file_stem
 from ...records.images import write_file
 from ..catalog import parameter_kind
 from ..description.element import Element
+from ..description.naming import Owners
 from ..values import Slot
 from .elements import child, colour, number, point, remove, replace, transform
 from .meshes import put_mesh
@@ -25,8 +25,6 @@ _OTHER_PLACES = {
 }
 #: BSDFs whose `eta` is that of the inside over that of the outside.
 _RELATIVE_INDEX = ("dielectric", "roughdielectric", "thindielectric", "plastic", "roughplastic")
-#: Elements, by what Mitsuba makes of them.
-_KINDS = {"bsdf": "BSDF", "emitter": "Emitter", "shape": "Shape", "texture": "Texture"}
 #: What Mitsuba leaves out of a `principled` BSDF for good where it begins at 0.
 LOBES = (
     *("anisotropic", "clearcoat", "diff_trans", "flatness", "metallic"),
@@ -40,14 +38,15 @@ class Replacing:
 
     def __init__(self, root: Element, params: mi.SceneParameters, parts: Parts, source: object) -> None:
         self.params, self.parts, self.source = params, parts, source
-        self._owners = {
-            item.attributes["id"]: item for item in root.walk() if item.is_object and "id" in item.attributes
-        }
+        self._owners = Owners(root)
 
     def put(self, key: str) -> None:
         """Put the value of the scene parameter `key` in. Raises ConfigError where the description cannot say it."""
         node = self.params.properties[key][2]
-        owner, *below, name = self._place(key, node)
+        place = self._owners.place(self.params, key)
+        if place is None:
+            raise self._fail(key, "what it belongs to does not stand in the scene's files")
+        owner, (*below, name) = place
         if below:
             self._put_nested(owner, below, name, key)
         elif isinstance(node, mi.Mesh) and name != "to_world":
@@ -112,45 +111,6 @@ class Replacing:
 
     def _array(self, key: str) -> Any:
         return Slot(self.params, key).get()
-
-    # --- where a parameter stands -------------------------------------------------------------------------------------
-
-    def _place(self, key: str, node: mi.Object) -> tuple[Any, ...]:
-        """The element of the nearest object above the parameter `key` that has one, and the names that lead on."""
-        chain = [node]
-        while chain[-1].id() not in self._owners:
-            parent = self.params.hierarchy[chain[-1]][0]
-            if parent is None:
-                raise self._fail(key, "what it belongs to does not stand in the scene's files")
-            chain.append(parent)
-        owner, names = self._owners[chain.pop().id()], key.split(".")
-        names = names[-len(chain) - 1 :]
-        while chain:
-            nested = self._nested(owner, names[0], chain[-1])
-            if nested is None:
-                break
-            owner, names = nested, names[1:]
-            chain.pop()
-        return owner, *names
-
-    def _nested(self, owner: Element, name: str, node: mi.Object) -> Element | None:
-        """The element, among those in `owner`, of the object `node` that Mitsuba calls `name` there.
-
-        Some objects lose their ids, as bitmaps do; those in a group have none.
-        """
-        tag = next((tag for tag, kind in _KINDS.items() if isinstance(node, getattr(mi, kind))), None)
-        named: list[Element] = []
-        unnamed: list[Element] = []
-        for item in owner.children:
-            meant = self._owners.get(item.attributes["id"], item) if item.tag == "ref" else item
-            has_own_id = owner.type == "shapegroup" and "id" in meant.attributes  # by which it is found
-            if meant.tag == tag and item.name in (name, "") and not has_own_id:
-                (named if item.name else unnamed).append(meant)
-        if named or not unnamed:
-            return named[0] if named else None
-        number = re.fullmatch(r".*?(?:_(\d+))?", name)
-        place = int(number[1] or 0) if number else 0
-        return unnamed[0] if len(unnamed) == 1 else unnamed[place] if place < len(unnamed) else None
 
     def _fail(self, key: str, why: str) -> ConfigError:
         return ConfigError(self.source, key, f"cannot be exported: {why}")
