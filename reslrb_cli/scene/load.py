@@ -95,10 +95,10 @@ def load_described(
     lost = {note.element for note in unused}  # what else was done to them says nothing
     found = [note for note in found if note.element not in lost]
     for line in notes.warnings(notes.in_order([*found, *unused], root)):
-        _warn(line)
+        warn_once(line)
     for loss in (lost_light(scene), thin_glass(scene)):
         if loss is not None:
-            _warn(f"{file}: {loss}")
+            warn_once(f"{file}: {loss}")
     for note in unused:
         if note.owner is not None:
             note.owner.children.remove(note.element)
@@ -116,8 +116,8 @@ def _check_meshes(file: Path, scene: mi.Scene) -> None:
 
 
 @functools.cache
-def _warn(line: str) -> None:
-    """Say it once: one experiment may load its scene several times."""
+def warn_once(line: str) -> None:
+    """Say it in the log, once: one experiment may load its scene several times."""
     logger.warning("%s", line)
 
 
