@@ -53,7 +53,7 @@ def clipped(scene: Any, sensor: Any) -> tuple[bool, bool]:
 
     # The box, in the sensor's coordinates, around all that may be between the aperture and the near plane.
     width, height = (int(n) for n in sensor.film().size())
-    shift = max((float(np.abs(params[key]).max()) for key in params if key.startswith("principal_point")), default=0.0)
+    shift = max((float(np.abs(value).max()) for key, value in params if key.startswith("principal_point")), default=0.0)
     tangent = np.tan(np.deg2rad(float(params["x_fov"][0])) / 2) * max(1, height / width) * (1 + 2 * shift)
     side = near * tangent + radius * (1 + near / focus if focus > 0 else 1)
     half, middle = np.array([side, side, near / 2]), np.array([0, 0, near / 2])
