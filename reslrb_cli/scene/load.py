@@ -26,7 +26,7 @@ from .description import (
     resize_films,
 )
 from .description.element import quoted
-from .extent import lost_light
+from .extent import coincident, lost_light
 from .thin_glass import thin_glass
 
 logger = logging.getLogger(__name__)
@@ -51,7 +51,8 @@ def load_scene(
     is to be built before anything of it is, and may raise.
 
     Raises ConfigError, located in the scene file, where it is missing or wrong, has nothing in it, or no light. Warns,
-    too, of a scene that is too far from the origin, or too small, and of glass that is too thin.
+    too, of a scene that is too far from the origin, or too small, of glass that is too thin, and of
+    faces at the same place.
     """
     return load_described(file, options, strict, size, cameras, look)[0]
 
@@ -96,7 +97,7 @@ def load_described(
     found = [note for note in found if note.element not in lost]
     for line in notes.warnings(notes.in_order([*found, *unused], root)):
         warn_once(line)
-    for loss in (lost_light(scene), thin_glass(scene)):
+    for loss in (lost_light(scene), thin_glass(scene), coincident(scene)):
         if loss is not None:
             warn_once(f"{file}: {loss}")
     for note in unused:
