@@ -13,7 +13,7 @@ import numpy as np
 
 from reslrb_cli.errors import UnsupportedScene
 from reslrb_cli.measure.moving import moves_light
-from reslrb_cli.scene import SceneGraph, SceneNeeds, View, check_camera_paths, look, scene_needs
+from reslrb_cli.scene import SceneGraph, SceneNeeds, View, check_camera_paths, look, scene_needs, stock_clip
 from reslrb_cli.scene.catalog import parameter_kind
 from reslrb_cli.scene.seen import interior
 
@@ -69,6 +69,9 @@ def ptracer_image(at: Situation) -> str | None:
         return "it does not connect through masks"
     if at.needs.has_perturbed_normals:
         return "it does not treat bump and normal maps as this code does"
+    clipping = stock_clip(at.needs)
+    if clipping is not None:
+        return f"it {clipping}"
     if not ends(at.max_depth):
         return f"without roulette its paths are to end at depth {DEEPEST} or before"
     return None

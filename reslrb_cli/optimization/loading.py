@@ -10,8 +10,9 @@ import mitsuba as mi
 from reslrb_cli.config import Config, Integrator, Reslrb
 from reslrb_cli.errors import ConfigError, UnsupportedScene
 from reslrb_cli.integrators import StepIntegrator, make_integrator
-from reslrb_cli.scene import check_camera_paths, check_supported, load_scene
+from reslrb_cli.scene import check_camera_paths, check_supported, load_scene, scene_needs, stock_clip
 from reslrb_cli.scene.description import Description
+from reslrb_cli.scene.load import warn_once
 
 #: Types of integrators that trace from the light, and so cannot render every scene.
 LIGHT_TRACERS = ("reslrb", "ptracer", "walk_ad", "trajectory")
@@ -70,10 +71,18 @@ def check_integrator(config: Config, integrator: Integrator, scene: mi.Scene, se
         if integrator.type in LIGHT_TRACERS:
             for sensor in sensors:
                 check_supported(scene, scene.sensors()[sensor], integrator.hide_emitters)
+                if integrator.type == "ptracer":
+                    _warn_of_clipping(config, scene.sensors()[sensor], scene)
         elif integrator.type == "prb":
             check_camera_paths(scene)
     except UnsupportedScene as error:
         raise ConfigError(config.source, "scene.file", str(error)) from error
+
+
+def _warn_of_clipping(config: Config, sensor: mi.Sensor, scene: mi.Scene) -> None:
+    wrong = stock_clip(scene_needs(scene, sensor))
+    if wrong is not None:
+        warn_once(f"{config.scene.file}: sensor {sensor.id()}: ptracer {wrong}; reslrb is right there")
 
 
 def make_configured(integrator: Integrator) -> StepIntegrator:

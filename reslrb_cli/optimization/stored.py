@@ -53,7 +53,8 @@ class Stored:
         return result
 
     def scene_value(self, problem: Problem, prefix: str, key: str) -> Any:
-        """The value of the parameter `key` that is stored as `<prefix>/<key>`, finite, as the optimiser has it."""
+        """The value of the parameter `key` that is stored as `<prefix>/<key>`, finite and within its bounds, as the
+        optimiser has it."""
         now = dr.detach(problem.optimizer[key])
         name, shape = f"{prefix}/{key}", problem.selection.array(key).shape
         if math.prod(shape) != math.prod(dr.shape(now)):  # an environment map, whose halo the value does not show
@@ -61,7 +62,22 @@ class Stored:
         array = self.archive.array(name, shape, "f")
         if array.dtype != np.float32:
             raise self.wrong(name, f"is {array.dtype} in place of float32")
+        self.check_bounds(problem, name, key, array)
         return like(now, array.reshape(dr.shape(now)))
+
+    def check_bounds(self, problem: Problem, name: str, key: str, array: Array) -> None:
+        """Raise ConfigError where an entry of the value `name` of the parameter `key` is none that a run comes to.
+
+        A run goes on with the bounds that it began with, and each of its updates ends within them: what lies outside
+        was not written by it. (Bounds cannot change: `recording.changes`.)
+        """
+        spec = problem.selection.spec(key)
+        low, high = spec.bounds or (-math.inf, math.inf)
+        if spec.transform in ("log", "softplus"):
+            low = max(low, np.finfo(np.float32).tiny)  # these yield nothing else
+        outside = (array < np.float32(low)) | (array > np.float32(high))
+        if outside.any():
+            raise self.wrong(name, f"holds {array[outside].flat[0]:g}, outside of {low:g} to {high:g}, its bounds")
 
     # --- plain values -------------------------------------------------------------------------------------------------
 

@@ -113,6 +113,8 @@ class Course:
                 key: stored.archive.array(f"best/{key}", problem.selection.array(key).shape, "f")
                 for key in problem.selection.keys
             }
+            for key, array in values.items():
+                stored.check_bounds(problem, f"best/{key}", key, array)
             self.best.restore(stored.count("best", "iteration", least=0), stored.number("best", "loss"), values)
         self.results.recall({name: stored.numbers("images", name) for name in ("trained", "held_out")})
         squares = {}

@@ -4,7 +4,7 @@ from .catalog import ParameterInfo, list_parameters
 from .graph import SceneGraph
 from .inspect import SceneSummary, SensorSummary, summarise
 from .load import load_scene
-from .needs import SceneNeeds, View, check_camera_paths, check_supported, look, scene_needs
+from .needs import SceneNeeds, View, check_camera_paths, check_supported, look, scene_needs, stock_clip
 from .parameters import select_parameters, set_values
 from .reach import visible_texels
 from .selection import Selection
@@ -31,6 +31,7 @@ __all__ = [
     "scene_needs",
     "select_parameters",
     "set_values",
+    "stock_clip",
     "summarise",
     "turned_line",
     "visible_texels",

@@ -1,15 +1,29 @@
-"""Where a scene stands and how large it is, as far as single precision cares."""
+"""Where a scene and its parts stand, as far as single precision cares, and a sensor's clip planes."""
 
 from __future__ import annotations
 
+import contextlib
+from collections.abc import Sequence
+from itertools import product
 from typing import Any
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
+
+from ..errors import UnsupportedScene
+from .description.element import quoted
+from .emitted import emitted_rays
 
 #: The largest ray offset, as a fraction of the scene's size, with which no loss of light is to be seen: that of a room
 #: of size 3 that stands about 150 from the origin, or measures a fiftieth across.
 LARGEST_OFFSET = 5e-3
+#: Rays from each sensor, and from the lights, that look for faces at the same place, along each side of a grid.
+_RAYS = 128
+#: Sensors that do.
+_SENSORS = 8
+#: Pairs of shapes that are named.
+_NAMED = 2
 
 
 def lost_light(scene: Any) -> str | None:
@@ -31,3 +45,194 @@ def lost_light(scene: Any) -> str | None:
     else:
         place, advice = f"measures {size:.3g} across", "scale it to about 1"
     return f"the scene {place}: Mitsuba starts rays {offset:.2g} off surfaces there, and light is lost; {advice}"
+
+
+def clipped(scene: Any, sensor: Any) -> tuple[bool, bool]:
+    """Whether anything of `scene`, as it stands, may be between a perspective or thin-lens sensor and its near clip
+    plane, where the sensor looks, and whether anything may be beyond its far clip plane, on any side.
+
+    Told by bounding boxes, and by triangles near the sensor: it may be so where it is not, never the other way round.
+    """
+    params = mi.traverse(sensor)
+    near, far, radius, focus = (
+        float(np.ravel(params[key])[0]) if key in params else default
+        for key, default in (("near_clip", 0), ("far_clip", np.inf), ("aperture_radius", 0), ("focus_distance", np.inf))
+    )
+    to_world = np.array(sensor.world_transform().matrix, np.float64).reshape(4, 4)
+    axes, eye = to_world[:3, :3], to_world[:3, 3]
+    box = scene.bbox()
+    corners = np.array(list(product(*zip(np.ravel(box.min), np.ravel(box.max), strict=True))), np.float64)
+    beyond = bool(((corners - eye) @ axes[:, 2]).max() > far)
+
+    # The box, in the sensor's coordinates, around all that may be between the aperture and the near plane.
+    width, height = (int(n) for n in sensor.film().size())
+    shift = max((float(np.abs(value).max()) for key, value in params if key.startswith("principal_point")), default=0.0)
+    tangent = np.tan(np.deg2rad(float(params["x_fov"][0])) / 2) * max(1, height / width) * (1 + 2 * shift)
+    side = near * tangent + radius * (1 + near / focus if focus > 0 else 1)
+    half, middle = np.array([side, side, near / 2]), np.array([0, 0, near / 2])
+    return any(_touches(shape, axes, eye, middle, half) for shape in scene.shapes()), beyond
+
+
+def _touches(shape: Any, axes: np.ndarray, eye: np.ndarray, middle: np.ndarray, half: np.ndarray) -> bool:
+    """Whether a shape may touch a box, given by its middle and half sizes in the coordinates of `axes` (columns) and
+    `eye`."""
+    box = shape.bbox()
+    low, high = np.ravel(box.min).astype(np.float64), np.ravel(box.max).astype(np.float64)
+    centre, extent = (low + high) / 2, (high - low) / 2
+    apart = centre - (eye + axes @ middle)
+    if (np.abs(apart) > extent + np.abs(axes) @ half).any() or (
+        np.abs(apart @ axes) > half + extent @ np.abs(axes)
+    ).any():
+        return False
+    if shape.class_name() == "Sphere":  # which a sensor may stand in
+        return bool(np.linalg.norm(apart) + np.linalg.norm(half) > extent.min() * 0.999)
+    if not shape.is_mesh():
+        return True
+    positions = np.array(shape.vertex_positions_buffer(), np.float64).reshape(-1, 3)
+    corners = ((positions - eye) @ axes - middle)[np.array(shape.faces_buffer()).reshape(-1, 3)]
+    corners = corners[((corners.min(1) <= half) & (corners.max(1) >= -half)).all(1)]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    return bool((np.abs((normals * corners[:, 0]).sum(1)) <= np.abs(normals) @ half).any())
+
+
+def coincident(scene: Any) -> str | None:
+    """What is wrong with a scene in which a sensor or a light meets two faces at the same place; None where nothing is.
+
+    Which of them a ray meets is decided by rounding. That makes no difference where both face the same way, or both
+    ways alike (`twosided`), and are of one BSDF; elsewhere paths from the light and from the sensor show two scenes.
+    Found are triangles with the same three corners, and disks and spheres that are the same.
+    """
+    shapes = scene.shapes()
+    twins = _twin_faces(shapes) | _twin_shapes(shapes)
+    if not twins:
+        return None
+    pairs = {twins[key]: None for key in _met(scene, shapes) if key in twins}
+    if not pairs:  # as between two boxes that stand side by side
+        return None
+    named = [" and ".join(quoted(shapes[index].id()) for index in dict.fromkeys(pair)) for pair in sorted(pairs)]
+    more = f" (and of {len(named) - _NAMED} more pairs)" if len(named) > _NAMED else ""
+    return (
+        f"faces of {', of '.join(named[:_NAMED])}{more} are at the same place and differ: rounding decides which of "
+        "them a ray meets, differently for light paths and camera paths; remove one of each, or move them apart "
+        "(`twosided` shows a face from both sides)"
+    )
+
+
+#: The number of a shape in `scene.shapes()` and that of one of its faces (of a mesh, else 0), and the shapes of it and
+#: of the face at the same place.
+_Twins = dict[tuple[int, int], tuple[int, int]]
+
+
+def _twin_faces(shapes: Sequence[Any]) -> _Twins:
+    """The triangles of meshes that are where others are, and differ."""
+    meshes = [(index, shape) for index, shape in enumerate(shapes) if shape.is_mesh() and shape.face_count()]
+    if not meshes:
+        return {}
+    corners = [
+        np.array(shape.vertex_positions_buffer(), np.float32).reshape(-1, 3)[
+            np.array(shape.faces_buffer()).reshape(-1, 3)
+        ]
+        for _, shape in meshes
+    ]
+    owner = np.concatenate([np.full(len(part), index) for (index, _), part in zip(meshes, corners, strict=True)])
+    number = np.concatenate([np.arange(len(part)) for part in corners])
+    triangles = np.concatenate(corners) + np.float32(0)  # -0 is 0
+    # Hashes of corners, summed over them: equal in any order.
+    factors = np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], np.uint64)
+    hashes = (triangles.view(np.uint32) * factors).sum(2, dtype=np.uint64)
+    hashes = (hashes ^ (hashes >> np.uint64(29))) * np.uint64(0xBF58476D1CE4E5B9)
+    keys = (hashes ^ (hashes >> np.uint64(32))).sum(1, dtype=np.uint64)
+    order = np.argsort(keys)
+    same = np.flatnonzero(keys[order[1:]] == keys[order[:-1]])
+    first, second = order[same], order[same + 1]
+    a, b = triangles[first].astype(np.float64), triangles[second].astype(np.float64)
+    facing = (_normals(a) * _normals(b)).sum(1)
+    flipped = np.array([shape.has_flipped_normals() for shape in shapes])
+    same = np.flatnonzero((np.sort(a, 1) == np.sort(b, 1)).all((1, 2)) & (facing != 0))
+    first, second = first[same], second[same]
+    turned = (facing[same] < 0) ^ (flipped[owner[first]] != flipped[owner[second]])
+    concerned = np.union1d(owner[first], owner[second]).tolist()
+    bends = np.zeros(len(number), bool)
+    for index in concerned:
+        bends[owner == index] = _bent(shapes[index])
+    kinds = np.stack([owner[first], owner[second], turned, bends[first] | bends[second]], 1)
+    found: _Twins = {}
+    for kind in np.unique(kinds, axis=0):
+        one, other = sorted(kind[:2].tolist())
+        if _differ(shapes[one], shapes[other], bool(kind[2]), bool(kind[3])):
+            these = (kinds == kind).all(1)
+            for faces in (first[these], second[these]):
+                keys_of = zip(owner[faces].tolist(), number[faces].tolist(), strict=True)
+                found |= dict.fromkeys(keys_of, (one, other))
+    return found
+
+
+def _bent(mesh: Any) -> np.ndarray:
+    """Of each face, whether its shading normals differ from its geometric one."""
+    if mesh.has_face_normals() or not mesh.has_vertex_normals():
+        return np.zeros(mesh.face_count(), bool)
+    faces = np.array(mesh.faces_buffer()).reshape(-1, 3)
+    flat = _normals(np.array(mesh.vertex_positions_buffer(), np.float64).reshape(-1, 3)[faces])
+    shading = np.array(mesh.vertex_normals_buffer(), np.float64).reshape(-1, 3)[faces]
+    lengths = np.linalg.norm(flat, axis=1)[:, None] * np.linalg.norm(shading, axis=2)
+    return np.asarray(~((flat[:, None] * shading).sum(2) > 0.999 * lengths).all(1))
+
+
+def _twin_shapes(shapes: Sequence[Any]) -> _Twins:
+    """The disks and spheres that are where others are, and differ."""
+    before: dict[tuple[str, bytes], list[int]] = {}
+    found: _Twins = {}
+    for index, shape in enumerate(shapes):
+        if shape.class_name() not in ("Disk", "Sphere"):
+            continue
+        box = shape.bbox()
+        size = np.array([*np.ravel(box.min), *np.ravel(box.max)], np.float32)
+        others = before.setdefault((shape.class_name(), size.tobytes()), [])
+        for other in others:
+            turned = shape.has_flipped_normals() != shapes[other].has_flipped_normals()
+            if shape.class_name() == "Disk":
+                one, another = (np.ravel(each.sample_position(0, mi.Point2f(0.5)).n) for each in (shape, shapes[other]))
+                if abs(np.dot(one, another)) < 0.999:
+                    continue  # they cross
+                turned = bool(np.dot(one, another) < 0)
+            if _differ(shape, shapes[other], turned, False):
+                found |= {(index, 0): (other, index), (other, 0): (other, index)}
+        others.append(index)
+    return found
+
+
+def _normals(triangles: np.ndarray) -> np.ndarray:
+    return np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+
+
+def _differ(one: Any, other: Any, turned: bool, bent: bool) -> bool:
+    """Whether it makes a difference which of two faces at the same place a ray meets.
+
+    `turned`: their normals are opposite; `bent`: they have shading normals that differ from those.
+    """
+    if one.is_emitter() or other.is_emitter() or one.bsdf() != other.bsdf():
+        return True
+    return turned and (bent or one.bsdf().class_name() != "TwoSidedBRDF")
+
+
+def _met(scene: Any, shapes: Sequence[Any]) -> set[tuple[int, int]]:
+    """The shapes and faces that rays meet first which leave sensors and lights."""
+    lane = dr.arange(mi.UInt32, _RAYS * _RAYS)
+    place = (mi.Point2f(lane % _RAYS, lane // _RAYS) + 0.5) / _RAYS
+    numbers = [mi.Float(mi.sample_tea_float32(lane, mi.UInt32(k))) for k in range(3)]
+    rays = [
+        sensor.sample_ray(sensor.shutter_open(), 0.5, place, mi.Point2f(*numbers[:2]))[0]
+        for sensor in scene.sensors()[:_SENSORS]
+    ]
+    with contextlib.suppress(UnsupportedScene):  # which is said where paths from the light are wanted
+        rays.append(emitted_rays(scene, numbers[0], mi.Point2f(*numbers[1:]), place)[0])
+    index = {int(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))[0]): k for k, shape in enumerate(shapes)}
+    met: set[tuple[int, int]] = set()
+    for ray in rays:
+        hit = scene.ray_intersect_preliminary(ray)
+        shape = np.array(dr.select(hit.is_valid(), dr.reinterpret_array(mi.UInt32, hit.shape), 0))
+        pairs = np.unique(np.stack([shape, np.array(hit.prim_index)]), axis=1).T.tolist()
+        for number, face in pairs:
+            if number in index:
+                met.add((index[number], face if shapes[index[number]].is_mesh() else 0))
+    return met

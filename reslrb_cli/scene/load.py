@@ -31,7 +31,7 @@ from .description import (
 )
 from .description.element import Element, quoted
 from .description.naming import Owners
-from .extent import lost_light
+from .extent import coincident, lost_light
 from .thin_glass import thin_glass
 
 logger = logging.getLogger(__name__)
@@ -59,8 +59,8 @@ def load_scene(
     have derivatives: bitmaps among them that Mitsuba would keep with 8 or 16 bits are read as floating point.
 
     Raises ConfigError, located in the scene file, where it is missing or wrong, has nothing in it, or no light. Warns,
-    too, of a scene that is too far from the origin, or too small, and of glass that is too thin, all of which is looked
-    for by tracing rays; without `warn`, as for a scene that was looked at before, it is not.
+    too, of a scene that is too far from the origin, or too small, of glass that is too thin, and of faces at the same
+    place; without `warn`, as for a scene that was looked at before, none of this is looked for.
     """
     return load_described(file, options, strict, size, cameras, look, keys, warn)[0]
 
@@ -122,10 +122,10 @@ def load_described(
     lost = {note.element for note in unused}  # what else was done to them says nothing
     found = [note for note in found if note.element not in lost]
     for line in notes.warnings(notes.in_order([*found, *unused], root)):
-        _warn(line)
-    for loss in (lost_light(scene), thin_glass(scene)) if warn else ():
+        warn_once(line)
+    for loss in (lost_light(scene), thin_glass(scene), coincident(scene)) if warn else ():
         if loss is not None:
-            _warn(f"{file}: {loss}")
+            warn_once(f"{file}: {loss}")
     for note in unused:
         if note.owner is not None:
             note.owner.children.remove(note.element)
@@ -178,8 +178,8 @@ def _check_meshes(file: Path, scene: mi.Scene) -> None:
 
 
 @functools.cache
-def _warn(line: str) -> None:
-    """Say it once: one experiment may load its scene several times."""
+def warn_once(line: str) -> None:
+    """Say it in the log, once: one experiment may load its scene several times."""
     logger.warning("%s", line)
 
 

@@ -11,6 +11,7 @@ import numpy as np
 
 from ..errors import UnsupportedScene
 from .emitted import emitted_rays
+from .extent import clipped
 from .graph import SceneGraph
 from .lamps import Lamp, find_lamps
 from .small_lamps import small_lamps
@@ -30,6 +31,8 @@ _FOLLOWED_BSDFS = (
     *("SmoothDiffuse", "SmoothConductor", "RoughConductor", "SmoothDielectric", "RoughDielectric", "ThinDielectric"),
     *("TwoSidedBRDF", "BumpMap", "NormalMap", "Null"),
 )
+#: What rounding may make of a depth between the clip planes, of 0 to 1.
+_DEPTH_ROUNDING = 1e-5
 #: How many see-through surfaces a primary ray is followed through.
 CROSSINGS = 32
 
@@ -39,7 +42,8 @@ class SceneNeeds:
     """Static facts of a scene as one sensor sees it; what is false or absent here need not be compiled.
 
     `emitters` holds class names in the order of `scene.emitters()`; `environment` is the index in it of the emitter
-    that surrounds the scene, or None.
+    that surrounds the scene, or None. `near_clip`: something may stand between the sensor and its near clip plane;
+    `lens_clip`: a thin lens may see something outside of its clip planes, or focuses where Mitsuba has it see nothing.
     """
 
     emitters: tuple[str, ...]
@@ -56,6 +60,8 @@ class SceneNeeds:
     moving_shutter: bool
     thin_lens: bool
     principal_point: bool
+    near_clip: bool
+    lens_clip: bool
     unfollowed: tuple[mi.BSDF, ...] = ()  # surfaces' BSDFs whose sampling is not to be differentiated
     lamps: tuple[Lamp, ...] = ()  # shapes that emit
     small_lamps: tuple[Lamp, ...] = ()  # those of them that the sensor sees as less than a pixel
@@ -85,6 +91,9 @@ def scene_needs(scene: Any, sensor: Any) -> SceneNeeds:
     emitters, environment = list(scene.emitters()), scene.environment()
     delta = int(mi.BSDFFlags.Delta) & ~int(mi.BSDFFlags.Null)  # `Delta` holds it too
     lamps = find_lamps(scene, graph)
+    is_projective = sensor.class_name() in SENSORS
+    near, far = clipped(scene, sensor) if is_projective else (False, False)
+    thin_lens = bool(sensor.needs_aperture_sample())
     pointlike = int(mi.EmitterFlags.Delta)
     return SceneNeeds(
         emitters=tuple(emitter.class_name() for emitter in emitters),
@@ -99,11 +108,13 @@ def scene_needs(scene: Any, sensor: Any) -> SceneNeeds:
         has_perturbed_normals=any(bsdf.class_name() in ("BumpMap", "NormalMap") for bsdf in graph.of_type(mi.BSDF)),
         bsdfs_read_geometry=_read_geometry(graph),
         moving_shutter=float(sensor.shutter_open_time()) > 0,
-        thin_lens=bool(sensor.needs_aperture_sample()),
+        thin_lens=thin_lens,
         principal_point=_has_principal_point(sensor),
+        near_clip=near,
+        lens_clip=thin_lens and (near or far or (is_projective and _focuses_outside(sensor))),
         unfollowed=tuple(bsdf for bsdf in graph.surface_bsdfs() if not _is_followed(graph, bsdf)),
         lamps=lamps,
-        small_lamps=small_lamps(scene, sensor, lamps) if sensor.class_name() in SENSORS else (),
+        small_lamps=small_lamps(scene, sensor, lamps) if is_projective else (),
     )
 
 
@@ -119,6 +130,15 @@ def check_supported(scene: Any, sensor: Any, hide_emitters: bool = False) -> Non
             f"only smooth specular surfaces (glass, mirrors) face sensor {name}: light paths cannot connect to it from "
             "them; let it see a rough surface, or take integrator.type: prb"
         )
+
+
+def stock_clip(needs: SceneNeeds) -> str | None:
+    """What Mitsuba's own light tracing gets wrong of a sensor's clip planes, said of it; None where nothing."""
+    if needs.lens_clip:
+        return "does not clip what a `thinlens` sees, and loses light where it focuses on a clip plane or beyond"
+    if needs.near_clip:
+        return "has what stands before the sensor's near clip plane hide what is behind it"
+    return None
 
 
 def check_camera_paths(scene: Any) -> None:
@@ -202,6 +222,15 @@ def _has_principal_point(sensor: Any) -> bool:
     params = mi.traverse(sensor)
     keys = [f"principal_point_offset_{axis}" for axis in "xy"]
     return any(np.any(np.array(params[key]) != 0) for key in keys if key in params)
+
+
+def _focuses_outside(sensor: Any) -> bool:
+    """Whether a thin lens focuses so far out that Mitsuba's `sample_direction`, in single precision, may take it to lie
+    outside of the clip planes, and so to see nothing. By default it focuses on the far one."""
+    params = mi.traverse(sensor)
+    near, far, focus = (float(np.ravel(params[key])[0]) for key in ("near_clip", "far_clip", "focus_distance"))
+    depth = (1 - near / focus) * far / (far - near) if focus > 0 else -np.inf  # as projected: 0 at near, 1 at far
+    return not _DEPTH_ROUNDING < depth < 1 - _DEPTH_ROUNDING
 
 
 def interpolates_normals(shape: mi.Shape) -> bool:

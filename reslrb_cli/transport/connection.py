@@ -17,8 +17,9 @@ class Connection:
     """The geometry of one connection, before the BSDF is evaluated and before visibility is known.
 
     `weight` is everything of c_i but the BSDF and the transmittance: sensor importance, geometry, Veach's correction,
-    (C,). `u` is the film position in pixels relative to the crop window, `target` the point on the aperture. A walk
-    that evaluates connections sets `f` (C,) to bsdf * cos, `c` to c_i (C,) as a whole, and `active` to where the sensor
+    (C,). `u` is the film position in pixels relative to the crop window, `target` the point on the aperture, or, where
+    anything stands before the near clip plane, that on the plane on the way there. A walk that evaluates connections
+    sets `f` (C,) to bsdf * cos, `c` to c_i (C,) as a whole, and `active` to where the sensor
     is seen.
     """
 
@@ -47,27 +48,47 @@ def connect(
     """
     with dr.suspend_grad(when=not attached):
         ds, importance = sensor.sample_direction(si, sample, active)
-        if plan.needs.principal_point:
-            importance = _shifted_importance(sensor, ds)
+        sees, target = ds.pdf > 0, ds.p
+        if plan.needs.near_clip or plan.needs.lens_clip:
+            sees, target = _clip(plan, sensor, ds)
+        if plan.needs.principal_point or plan.needs.lens_clip:
+            importance = _importance(sensor, ds, sees)
         # From the vertex itself, where `ptracer` takes the shadow ray's direction, which starts a little off it.
         wo = si.to_local(ds.d)
         correction, valid = mi.Float(1), mi.Bool(True)
         if ray is not None:
             correction, valid = shading_correction(plan, si, -ray.d, ds.d, wo)
-        return Connection(importance * correction, ds.uv, ds.p, wo, active & valid & (ds.pdf > 0), sample)
+        return Connection(importance * correction, ds.uv, target, wo, active & valid & sees, sample)
 
 
-def _shifted_importance(sensor: mi.Sensor, ds: mi.DirectionSample3f) -> mi.Spectrum:
-    """Importance and geometry of a pinhole camera whose principal point is not the film's centre.
+def _clip(plan: Plan, sensor: mi.Sensor, ds: mi.DirectionSample3f) -> tuple[mi.Bool, mi.Point3f]:
+    """Where the sensor sees the point, and as far as to where nothing may stand in between: its near plane, from which
+    rays of a camera start.
 
-    Mitsuba's own is zero wherever a film that is not shifted would end.
+    Of thin lenses Mitsuba leaves out the planes, and what focuses on none between them it has see nothing.
+    """
+    params = mi.traverse(sensor)
+    near, far = mi.Float(params["near_clip"]), mi.Float(params["far_clip"])
+    cos = -dr.dot(ds.d, dr.normalize(ds.n))
+    z, sees = cos * ds.dist, ds.pdf > 0
+    if plan.needs.lens_clip:
+        size = mi.Vector2f(sensor.film().crop_size())
+        sees = dr.all((ds.uv >= 0) & (ds.uv <= size)) & (z >= near) & (z <= far)
+    return sees, dr.detach(ds.p - ds.d * dr.select(sees, near / cos, 0)) if plan.needs.near_clip else ds.p
+
+
+def _importance(sensor: mi.Sensor, ds: mi.DirectionSample3f, sees: mi.Bool) -> mi.Spectrum:
+    """Importance and geometry of a camera, where it sees the point.
+
+    Mitsuba's own is zero wherever a film would end whose principal point is not shifted, or a thin lens focuses outside
+    of the clip planes.
     """
     film = sensor.film()
     size, crop = film.size(), film.crop_size()
     half = dr.tan(dr.deg2rad(mi.Float(mi.traverse(sensor)["x_fov"])) / 2)
     area = 4 * half**2 * (int(size.y) / int(size.x)) * (int(dr.prod(crop)) / int(dr.prod(size)))
     cos = -dr.dot(ds.d, dr.normalize(ds.n))
-    return mi.Spectrum(dr.select(ds.pdf > 0, dr.rcp(area * cos**3 * ds.dist**2), 0))
+    return mi.Spectrum(dr.select(sees, dr.rcp(area * cos**3 * ds.dist**2), 0))
 
 
 @dataclass

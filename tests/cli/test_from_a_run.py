@@ -77,6 +77,13 @@ def test_a_texture_of_another_size_is_resampled_where_that_is_asked_for(folder: 
         read_into(folder, "runs/tiny", finer)
 
 
+def test_values_of_a_run_are_held_to_the_bounds(folder: Path) -> None:
+    left = read_value(folder / "runs/tiny", tiny.KEY)
+    spec = f"[{{key: {tiny.KEY}, initial: {{run: runs/tiny}}, bounds: [0, {float(left.max()) - 1e-6}]}}]"
+    with pytest.raises(ConfigError, match=r"parameters\[0\].bounds: exclude the initial value of `poster"):
+        start(folder, spec)
+
+
 def read_into(folder: Path, run: str, texture: np.ndarray) -> None:
     """Start a scene whose own texture is `texture` from a run."""
     scene = load_scene(folder / "scene.xml")

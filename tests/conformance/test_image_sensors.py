@@ -117,6 +117,25 @@ def test_near_clip_cuts_surfaces_away():
     assert result, result
 
 
+LENS = {"type": "thinlens", "aperture_radius": 0.3, "focus_distance": 4.2}
+
+
+@pytest.mark.parametrize("kind", [{}, LENS], ids=["perspective", "thinlens"])
+@pytest.mark.parametrize("planes", [{"near_clip": 3.9}, {"far_clip": 4.6}], ids=["near", "far"])
+def test_clip_planes(kind, planes):
+    # A screen near the sensor, which the near plane cuts away, and so lets be seen what it hides.
+    screen = rectangle({"type": "diffuse"}, transform().translate([0.5, 1.3, 3]) @ transform().scale(0.15))
+    result = agreement(seen(camera(**kind | planes), **({"screen": screen} if "near_clip" in planes else {})))
+    assert result, result
+
+
+@pytest.mark.parametrize("focus", [{}, {"focus_distance": 0.9}, {"focus_distance": 30.0}, {"focus_distance": 2.0}])
+def test_a_lens_that_focuses_outside_of_its_clip_planes(focus):
+    # Stock light tracing has it see nothing then, or, on the far plane, where it focuses by default, a part.
+    result = agreement(seen(camera(type="thinlens", aperture_radius=0.1, near_clip=1.0, far_clip=7.0, **focus)))
+    assert result, result
+
+
 @pytest.mark.parametrize("film", [{}, CROP])
 def test_principal_point(film):
     # `ptracer` clips it to where the film would be without the offset.

@@ -212,6 +212,19 @@ def test_references_refuse_what_they_cannot_do():
     )
 
 
+def test_ptracer_is_no_reference_where_clip_planes_cut():
+    lens = {"type": "thinlens", "aperture_radius": 0.05, "focus_distance": 4.0}
+
+    def why(**changes: object) -> str | None:
+        scene = Case(room(camera=camera() | changes), [])
+        return ptracer_image(Situation.of(scene.scene, scene.scene.sensors()[0], scene.params, 4, False))
+
+    assert why() is why(**lens) is why(far_clip=4.1) is None  # stock light tracing has a pinhole's far plane
+    assert "`thinlens`" in why(**lens | {"far_clip": 4.1})
+    assert "`thinlens`" in why(**lens | {"focus_distance": 2e4})
+    assert "before the sensor's near clip" in why(near_clip=4.0)
+
+
 def test_path_loses_what_masks_reflect_before_nothing():
     """A veil of opacity 0.4 and a lamp: the stock `path` shows 0.4 of what it is to show, `prb` and ours all of it."""
     veil = {"type": "mask", "opacity": 0.4, "bsdf": {"type": "twosided", "bsdf": diffuse(0.7, 0.6, 0.3)}}

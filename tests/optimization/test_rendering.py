@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from reslrb_cli.config import load
+from reslrb_cli.config import load, loads
 from reslrb_cli.optimization import rendering
 from reslrb_cli.optimization.problem import assemble_scene
 
@@ -33,3 +33,23 @@ def test_passes_of_a_large_image_are_not_recorded(monkeypatch):
     problem = assemble_scene(load(CONFIG, TINY))
     problem.render(0, 5, 0, "saved image")
     assert not problem.integrator.preparation.recordings.counts()
+
+
+def test_a_run_with_ptracer_says_where_a_lens_is_not_clipped(tmp_path, caplog):
+    lens = '<float name="aperture_radius" value="0.1"/><float name="focus_distance" value="3"/>'
+    (tmp_path / "scene.xml").write_text(
+        f'<scene version="3.0.0"><sensor type="thinlens" id="eye"><float name="far_clip" value="4"/>{lens}</sensor>'
+        '<emitter type="point"/><shape type="rectangle" id="floor">'
+        '<transform name="to_world"><translate z="5"/></transform></shape></scene>'
+    )
+
+    def lines(integrator: str) -> list[str]:
+        own = "parameters: [{key: floor.bsdf.reflectance.value}]"
+        text = f"scene: {{file: scene.xml}}\ntarget: {{render: {{}}}}\n{own}\nintegrator: {{type: {integrator}}}\n"
+        caplog.clear()
+        assemble_scene(loads(text, tmp_path / "c.yaml", []))
+        return [record.getMessage() for record in caplog.records]
+
+    assert lines("reslrb") == []
+    [line] = lines("ptracer")
+    assert "sensor eye: ptracer does not clip what a `thinlens` sees" in line

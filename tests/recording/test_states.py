@@ -72,6 +72,17 @@ EVIL: dict[str, tuple[dict[str, Any], dict[str, Any], str]] = {
     "NaN": ({PARAMETER: np.full((4, 4, 3), np.nan, np.float32)}, {}, f"`{PARAMETER}` holds a value that is not finite"),
     "a shape": ({PARAMETER: np.ones((4, 5, 3), np.float32)}, {}, f"has `{PARAMETER}` of shape 4x5x3; it must be 4x4x3"),
     "a type": ({PARAMETER: np.ones((4, 4, 3), np.float64)}, {}, "is float64 in place of float32"),
+    "a value above its bound": (
+        {PARAMETER: np.full((4, 4, 3), 1.5, np.float32)}, {},
+        f"{PARAMETER}: holds 1.5, outside of 0 to 1, its bounds: not as a run writes it"),
+    "one value below its bound": (
+        {PARAMETER: np.eye(4, dtype=np.float32)[..., None].repeat(3, 2) - np.float32(1e-6)}, {},
+        f"{PARAMETER}: holds -1e-06, outside of 0 to 1, its bounds"),
+    "a beginning out of bounds": (
+        {f"initial/{tiny.KEY}": np.full((4, 4, 3), -2, np.float32)}, {}, f"initial/{tiny.KEY}: holds -2, outside"),
+    "a best out of bounds": (
+        {f"best/{tiny.KEY}": np.full((4, 4, 3), 7, np.float32)}, {"best": {"iteration": 1, "loss": 2}},
+        f"best/{tiny.KEY}: holds 7, outside of 0 to 1"),
     "integers": ({PARAMETER: np.ones((4, 4, 3), np.int32)}, {}, "is no array of numbers"),
     "no value": ({PARAMETER: None}, {}, f"lacks `{PARAMETER}`"),
     "a foreign value": ({"parameter/../../etc/passwd": np.ones(3, np.float32)}, {}, "is no parameter of this run"),
@@ -108,8 +119,9 @@ EVIL: dict[str, tuple[dict[str, Any], dict[str, Any], str]] = {
 }  # fmt: skip
 
 
-FEW = ("NaN", "a shape", "a foreign value", "NaN moments", "objects", "no state", "iterations",
-       "more iterations than lines", "units", "scaling", "a configuration", "a version")  # fmt: skip
+FEW = ("NaN", "a shape", "a value above its bound", "one value below its bound", "a best out of bounds",
+       "a foreign value", "NaN moments", "objects", "no state", "iterations", "more iterations than lines", "units",
+       "scaling", "a configuration", "a version")  # fmt: skip
 
 
 @pytest.mark.parametrize("case", a_few(EVIL, FEW))

@@ -12,6 +12,7 @@ from reslrb_cli.config import ParameterSpec
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.scene import list_parameters, load_scene, select_parameters
 from reslrb_cli.scene.description import sizes
+from reslrb_cli.scene.load import warn_once
 
 pytestmark = pytest.mark.usefixtures("llvm")
 
@@ -234,3 +235,72 @@ def test_floats_that_are_more_than_is_free_are_refused(walls, monkeypatch):
     load_scene(walls, keys=["wall.*"])
     with pytest.raises(ConfigError, match=r"scene.xml:\d+: filename: .*other.png is 64x64 pixels, which take 48 KiB"):
         load_scene(walls, keys=["*.reflectance.data"])
+
+
+# --- faces at the same place ------------------------------------------------------------------------------------------
+
+TRIANGLE = "v -2 -2 0\nv 2 -2 0\nv 0 2 0\n"
+ONE, OTHER, TWICE = "f 1 2 3\n", "f 3 2 1\n", "f 1 2 3\nf 2 3 1\n"
+WHITE = '<bsdf type="diffuse" id="white"/>'
+BOTH_SIDES = '<bsdf type="twosided" id="white"><bsdf type="diffuse"/></bsdf>'
+REF = '<ref id="white"/>'
+
+
+def rectangle(name: str, more: str = REF) -> str:
+    return f'<shape type="rectangle" id="{name}">{more}</shape>'
+
+
+def obj(name: str, file: str, more: str = REF) -> str:
+    return f'<shape type="obj" id="{name}"><string name="filename" value="{file}.obj"/>{more}</shape>'
+
+
+FLIPPED = '<boolean name="flip_normals" value="true"/>'
+FLAT = REF + '<boolean name="face_normals" value="true"/>'
+
+
+def moved(z: float, scale: float = 1) -> str:
+    return f'<transform name="to_world"><scale value="{scale}"/><translate z="{z}"/></transform>'
+
+
+@pytest.mark.parametrize(
+    ("bsdf", "shapes", "names"),
+    [
+        (WHITE, rectangle("a") + rectangle("b", '<bsdf type="diffuse"/>'), "`a` and `b`"),
+        (WHITE, rectangle("a") + rectangle("b"), None),
+        (WHITE, rectangle("a") + rectangle("b", REF + FLIPPED), "`a` and `b`"),
+        (BOTH_SIDES, rectangle("a") + rectangle("b", REF + FLIPPED), None),
+        (WHITE, rectangle("a") + rectangle("b", REF + '<emitter type="area"/>'), "`a` and `b`"),
+        (WHITE, rectangle("a") + rectangle("b", '<bsdf type="diffuse"/>' + moved(z=-0.1)), None),
+        (WHITE, '<shape type="sphere" id="a"/><shape type="sphere" id="b"/>', "`a` and `b`"),
+        (WHITE, f'<shape type="disk" id="a">{REF}</shape><shape type="disk" id="b">{REF}</shape>', None),
+        (
+            WHITE,
+            f'<shape type="disk" id="a">{REF}</shape><shape type="disk" id="b">{REF}{FLIPPED}</shape>',
+            "`a` and `b`",
+        ),
+        (WHITE, obj("a", "both", FLAT), "`a`"),
+        (BOTH_SIDES, obj("a", "both", FLAT), None),
+        (BOTH_SIDES, obj("a", "both"), "`a`"),  # the corners' normals are means of both faces', which is 0
+        (WHITE, obj("a", "twice"), None),
+        (WHITE, obj("a", "one") + obj("b", "one"), None),
+        (WHITE, obj("a", "one") + obj("b", "other"), "`a` and `b`"),
+        (BOTH_SIDES, obj("a", "one") + obj("b", "other"), None),
+        (BOTH_SIDES, obj("a", "one") + obj("b", "one", '<bsdf type="diffuse"/>'), "`a` and `b`"),
+        # No ray comes to what is inside of a box.
+        (WHITE, obj("a", "one") + obj("b", "other") + f'<shape type="cube">{moved(z=0, scale=3)}</shape>', None),
+    ],
+)
+def test_faces_at_the_same_place_are_warned_of(tmp_path, caplog, bsdf, shapes, names):
+    for name, faces in (("one", ONE), ("other", OTHER), ("twice", TWICE), ("both", ONE + OTHER)):
+        (tmp_path / f"{name}.obj").write_text(TRIANGLE + faces)
+    view = '<transform name="to_world"><lookat origin="0,1,6" target="0,0,0" up="0,1,0"/></transform>'
+    warn_once.cache_clear()
+    load(tmp_path, f'<scene version="3.0.0"><sensor type="perspective">{view}</sensor><emitter type="constant"/>{bsdf}'
+                   f"{shapes}</scene>")  # fmt: skip
+    lines = [record.getMessage() for record in caplog.records]
+    if names is None:
+        assert lines == []
+        return
+    [line] = lines
+    assert f"faces of {names} are at the same place and differ" in line
+    assert "remove one of each" in line

@@ -37,6 +37,34 @@ def test_everything(make_scene):
     assert needs.moving_shutter
 
 
+def test_clip_planes_are_needed_where_anything_is_outside_of_them(make_scene):
+    import mitsuba as mi
+
+    def needs(camera, **things):
+        scene = make_scene(camera={"type": "perspective", "to_world": view} | camera, **things)
+        found = scene_needs(scene, scene.sensors()[0])
+        return found.near_clip, found.lens_clip
+
+    place = mi.ScalarTransform4f().translate
+    view = mi.ScalarTransform4f().look_at(origin=[0.5, 0.4, 3], target=[0, 0, 0], up=[0, 1, 0])
+    lens = {"type": "thinlens", "aperture_radius": 0.1, "focus_distance": 3.0}
+    room = {"type": "cube", "flip_normals": True, "to_world": mi.ScalarTransform4f().scale(5)}  # around the sensor
+    ball = {"type": "sphere", "radius": 5.0}
+    for around in (room, ball):
+        assert needs({}, around=around) == (False, False)
+        assert needs(lens, around=around) == (False, False)
+        assert needs(lens | {"far_clip": 7.0}, around=around) == (False, True)
+    pane = {"type": "rectangle", "to_world": place([0.5, 0.4, 2.5]) @ mi.ScalarTransform4f().scale(0.01)}
+    assert needs({"near_clip": 0.4}, pane=pane) == (False, False)
+    assert needs({"near_clip": 0.6}, pane=pane) == (True, False)
+    assert needs(lens | {"near_clip": 0.6}, pane=pane) == (True, True)
+    beside = pane | {"to_world": place([2.5, 0.4, 2.5]) @ mi.ScalarTransform4f().scale(0.01)}
+    assert needs({"near_clip": 0.6}, pane=beside) == (False, False)
+    assert needs({"near_clip": 0.6, "fov": 150.0}, pane=beside) == (True, False)
+    crossing = pane | {"to_world": place([0.5, 0.4, 2.99]) @ mi.ScalarTransform4f().scale(5)}  # no corner is near
+    assert needs({"near_clip": 0.6}, pane=crossing) == (True, False)
+
+
 @pytest.mark.parametrize("flat", [True, False])
 def test_shading_normals(make_scene, tmp_path, flat):
     import mitsuba as mi

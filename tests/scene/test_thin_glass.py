@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from reslrb_cli.scene import load_scene
-from reslrb_cli.scene.load import _warn
+from reslrb_cli.scene.load import warn_once
 
 OFFSET = 8.94e-5 * (1 + 3)  # of a ray, where the slab is
 
@@ -31,7 +31,7 @@ SCENE = """\
 def warnings(tmp_path: Path, caplog: pytest.LogCaptureFixture, thickness: float, more: str = "") -> list[str]:
     file = tmp_path / "scene.xml"
     file.write_text(SCENE.format(bottom=3 - thickness, more=more))
-    _warn.cache_clear()
+    warn_once.cache_clear()
     caplog.clear()
     with caplog.at_level(logging.WARNING):
         load_scene(file)
