@@ -194,13 +194,9 @@ def unsupported_part(scene: Any, sensor: Any) -> str | None:
                 f"bsdf {bsdf.id()} is `{plugin}`, which is not the same with light and view exchanged: light paths "
                 "would render another material"
             )
-    for emitter in scene.emitters():
-        plugin = _lamp_plugin(emitter, _NO_POINTS)
-        if plugin is not None:
-            return (
-                f"emitter {emitter.id()} is on a shape `{plugin}`, where Mitsuba draws no points for light to start "
-                "from; give the lamp as a mesh"
-            )
+    lamp = _lamp_on(SceneGraph.of(scene), _NO_POINTS)
+    if lamp is not None:
+        return f"{lamp}, where Mitsuba draws no points for light to start from; give the lamp as a mesh"
     return None
 
 
@@ -209,7 +205,7 @@ def _unknown_part(scene: Any, sensor: Any) -> str | None:
     graph = SceneGraph.of(scene)
     for shape in graph.shapes():
         if shape.is_medium_transition() and graph.is_shown(shape):
-            return _of_medium(f"shape {shape.id()} bounds")
+            return _of_medium(f"shape {shape.id() or 'of a group'} bounds")
     for held in (sensor, *(child for child in graph.of_type(mi.Sensor) if sensor in graph.parents[child])):
         if held.get_medium() is not None:
             return _of_medium(f"sensor {held.id()} stands in")
@@ -221,12 +217,9 @@ def _unknown_part(scene: Any, sensor: Any) -> str | None:
                 f"emitter {emitter.id()} is a `timed_sunsky`, which evaluates arrays while it is traced: Mitsuba 3.9 "
                 "cannot render it in a kernel; take a `sunsky`"
             )
-        plugin = _lamp_plugin(emitter, _NO_LAMPS)
-        if plugin is not None:
-            return (
-                f"emitter {emitter.id()} is on a shape `{plugin}`, which Mitsuba cannot have emit; give the lamp as a "
-                "`cylinder` or a mesh"
-            )
+    lamp = _lamp_on(graph, _NO_LAMPS)
+    if lamp is not None:
+        return f"{lamp}, which Mitsuba cannot have emit; give the lamp as a `cylinder` or a mesh"
     return _failing_part(scene, graph)
 
 
@@ -237,10 +230,12 @@ def _of_medium(subject: str) -> str:
     )
 
 
-def _lamp_plugin(emitter: Any, plugins: dict[str, str]) -> str | None:
-    """The plugin of the shape that emits, where it is one of those."""
-    shape = emitter.get_shape()
-    return None if shape is None else plugins.get(shape.class_name())
+def _lamp_on(graph: SceneGraph, plugins: dict[str, str]) -> str | None:
+    """The first emitter that is on a shape of one of those classes, and on which; not all of those know their shape."""
+    for shape in graph.shapes():
+        if shape.is_emitter() and shape.class_name() in plugins:
+            return f"emitter {shape.emitter().id()} is on a shape `{plugins[shape.class_name()]}`"
+    return None
 
 
 def _failing_part(scene: Any, graph: SceneGraph) -> str | None:
