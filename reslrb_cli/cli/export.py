@@ -36,6 +36,7 @@ def command(run: Path, overrides: tuple[str, ...], output: Path) -> None:
     check_folder(output)
     start_variant(config)
 
+    from reslrb_cli.optimization.loading import check_integrator, choose_sensors
     from reslrb_cli.scene import select_parameters
     from reslrb_cli.scene.exporting import export_scene
     from reslrb_cli.scene.load import load_described
@@ -43,6 +44,7 @@ def command(run: Path, overrides: tuple[str, ...], output: Path) -> None:
     at = config.scene
     keys = [key for spec in config.parameters for key in spec.keys]
     scene, description = load_described(at.file, at.options, at.strict, at.size, at.cameras, keys=keys)
+    check_integrator(config, config.integrator, scene, choose_sensors(config, scene))
     selection = select_parameters(scene, config.parameters, config.source)
     integrator, why = choose_integrator(config, scene, selection.params)
     try:

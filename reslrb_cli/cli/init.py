@@ -92,6 +92,7 @@ def command(
     film = sensor.film()
     own, whole = ((int(size[0]), int(size[1])) for size in (film.crop_size(), film.size()))
     size = choose_size(own, photo, fixed=own != whole)
+    integrator = _integrator(scene, sensor, description.hides_emitters, scene_file)
     proposals = propose(scene, index)
     if not proposals:
         raise ConfigError(scene_file, "", "nothing in it can be recovered; reslrb inspect --all says why")
@@ -111,7 +112,7 @@ def command(
         is_integer=is_integer,
         size=size,
         film=own,
-        integrator=_integrator(scene, sensor, description.hides_emitters),
+        integrator=integrator,
         hides_emitters=description.hides_emitters,
         depth=find_depth(scene, index),
         proposals=proposals,
@@ -182,18 +183,19 @@ def _tell_sensor(index: int, sensors: Sequence[str]) -> None:
         echo(f"sensor {named[index]}; --sensor takes another: {', '.join(others[:LISTED_SENSORS])}{more}")
 
 
-def _integrator(scene: mi.Scene, sensor: mi.Sensor, hides_emitters: bool) -> str:
-    """The integrator that can render the scene: paths from the light, or where these cannot, from the sensor."""
-    from reslrb_cli.scene import check_camera_paths, check_supported
+def _integrator(scene: mi.Scene, sensor: mi.Sensor, hides_emitters: bool, file: Path) -> str:
+    """The integrator that can render the scene: paths from the light, or where these cannot, from the sensor.
+
+    Raises ConfigError, located in the scene's `file`, where neither can.
+    """
+    from reslrb_cli.scene.needs import camera_obstacle, check_supported
 
     try:
         check_supported(scene, sensor, hides_emitters)
     except UnsupportedScene as error:
-        try:
-            check_camera_paths(scene)
-        except UnsupportedScene:
-            raise error from None
-        return "prb"
+        if camera_obstacle(scene, sensor) is None:
+            return "prb"
+        raise ConfigError(file, "", str(error)) from None
     return "reslrb"
 
 

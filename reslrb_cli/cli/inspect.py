@@ -154,6 +154,8 @@ def run_line(subject: Subject) -> str:
 def next_step(subject: Subject, summary: SceneSummary) -> str:
     """What someone who has read all this may want to do now."""
     keys = [info.key for info in summary.parameters if info.obstacle is None]
+    if summary.sensors and all(sensor.obstacle == sensor.camera_obstacle is not None for sensor in summary.sensors):
+        return "change what cannot be rendered; the reason above says how"
     if not keys:
         return "nothing here can be recovered as it stands; the reasons above say what may be changed in the scene file"
     sections = {"target": "target: {file: IMAGE}", "parameters": f"parameters: [{{key: {json.dumps(keys[0])}}}]"}

@@ -39,8 +39,11 @@ def sensor_lines(sensor: SensorSummary) -> list[str]:
     lines.append(
         f"needs {', '.join(name.removeprefix('has_').replace('_', ' ') for name in needs) or 'nothing special'}"
     )
-    if sensor.obstacle is not None:
-        lines.append(f"no light tracing: {sensor.obstacle}")
+    if sensor.obstacle is not None and sensor.obstacle == sensor.camera_obstacle:
+        lines.append(f"cannot be rendered: {sensor.obstacle}")
+    else:
+        lines += [f"no light tracing: {sensor.obstacle}"] if sensor.obstacle is not None else []
+        lines += [f"no prb: {sensor.camera_obstacle}"] if sensor.camera_obstacle is not None else []
     return lines
 
 

@@ -68,13 +68,13 @@ def are_upright(config: Config) -> bool:
 def check_integrator(config: Config, integrator: Integrator, scene: mi.Scene, sensors: list[int]) -> None:
     """Raise ConfigError, located in the scene's file, where `integrator` cannot render `scene` through `sensors`."""
     try:
-        if integrator.type in LIGHT_TRACERS:
-            for sensor in sensors:
+        for sensor in sensors:
+            if integrator.type in LIGHT_TRACERS:
                 check_supported(scene, scene.sensors()[sensor], integrator.hide_emitters)
                 if integrator.type == "ptracer":
                     _warn_of_clipping(config, scene.sensors()[sensor], scene)
-        elif integrator.type == "prb":
-            check_camera_paths(scene)
+            else:
+                check_camera_paths(scene, scene.sensors()[sensor])
     except UnsupportedScene as error:
         raise ConfigError(config.source, "scene.file", str(error)) from error
 

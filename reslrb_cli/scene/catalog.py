@@ -18,6 +18,8 @@ _BEAM_SHAPES = {
     "beam_width": "shapes the beam",
     "sun_direction": "moves the light",
 }
+#: Spectra by wavelength, which RGB variants cannot evaluate: their numbers describe what stands in the scene file.
+_SPECTRA = ("RegularSpectrum", "IrregularSpectrum", "BlackBodySpectrum")
 #: What a mesh has besides attributes such as `vertex_color`.
 _MESH_GEOMETRY = ("vertex_positions", "vertex_normals", "vertex_texcoords", "vertex_count", "face_count", "faces")
 
@@ -96,13 +98,13 @@ def coarse_bits(params: Any, key: str) -> int | None:
 
 def halo(node: Any, value: Any) -> int:
     """How many columns Mitsuba adds at either side of a texture, copies of the opposite ones: one to an `envmap`."""
-    is_texture = dr.is_tensor_v(value) and len(value.shape) == 3
+    is_texture = value is not None and dr.is_tensor_v(value) and len(value.shape) == 3
     return 1 if is_texture and node.class_name() == "EnvironmentMapEmitter" else 0
 
 
 def value_shape(value: Any, halo: int = 0) -> tuple[int, ...]:
-    """Shape of a parameter as a NumPy array, without its `halo`; () for one number."""
-    if not dr.is_array_v(value):
+    """Shape of a parameter as a NumPy array, without its `halo`; () for one number, and for what was not given."""
+    if value is None or not dr.is_array_v(value):
         return ()
     shape = tuple(int(n) for n in dr.shape(value))
     if halo:
@@ -180,6 +182,10 @@ def _obstacle(kind: str, key: str, value: Any, differentiable: bool, node: Any, 
         return _moving_obstacle(kind, id, name, node)
     if kind in ("sensor", "film"):
         return f"belongs to the {kind}; {only}"
+    if node.class_name() in _SPECTRA:
+        return "is a constant of a spectrum; give the colour as <rgb>"
+    if value is None:
+        return "is not given in the scene file"
     if kind not in ("bsdf", "emitter", "attribute"):
         return f"is no property of a material or a light; {only}"
     if kind == "emitter" and name in _BEAM_SHAPES:

@@ -23,8 +23,7 @@ def emitted_rays(
         names = ", ".join(emitter.id() for emitter in scene.emitters() if not _can_be_sampled(emitter))
         reason = " ".join(str(error).split())
         raise UnsupportedScene(
-            f"Mitsuba cannot sample the rays of emitter {names}: {reason}; give it a `bitmap`, or take "
-            "integrator.type: prb"
+            f"Mitsuba cannot sample the rays of emitter {names}: {reason}; give it a `bitmap`"
         ) from None
     return ray, weight
 

@@ -52,6 +52,11 @@ class SceneGraph:
         """All shapes that rays can hit, also those inside of groups that are instanced."""
         return [shape for shape in self.of_type(mi.Shape) if shape.class_name() not in ("Instance", "ShapeGroupPlugin")]
 
+    def is_shown(self, shape: Any) -> bool:
+        """Whether rays may meet a shape: it does not stand in a group alone, where nothing is instanced."""
+        grouped = all(parent.class_name() == "ShapeGroupPlugin" for parent in self.parents[shape])
+        return not grouped or any(item.class_name() == "Instance" for item in self.objects)
+
     def surface_bsdfs(self) -> list[Any]:
         """The BSDFs that shapes have (not those nested in others), each once."""
         found: dict[Any, None] = {}

@@ -9,18 +9,18 @@ from typing import Any
 
 import mitsuba as mi
 
-from ..errors import UnsupportedScene
 from .catalog import ParameterInfo, list_parameters
 from .graph import SceneGraph
 from .movable import Movable, heightmap_obstacle, list_movable
-from .needs import SceneNeeds, View, check_supported, look, scene_needs, unsupported_part
+from .needs import SceneNeeds, View, camera_obstacle, light_obstacle, look, scene_needs, unsupported_part
 
 
 @dataclass(frozen=True)
 class SensorSummary:
     """One sensor: its film in pixels (`crop` is offset and size), what it sees, and what light tracing needs for it.
 
-    `obstacle` is the reason why light tracing cannot render for it, or None. `view` is None where the reason lies
+    `obstacle` is the reason why light tracing cannot render for it, or None, and `camera_obstacle` the same of paths
+    from the sensor (`prb`). `view` is None where the reason lies
     in the scene's parts and not in what the sensor sees.
     """
 
@@ -35,6 +35,7 @@ class SensorSummary:
     needs: SceneNeeds
     view: View | None
     obstacle: str | None
+    camera_obstacle: str | None
 
 
 @dataclass(frozen=True)
@@ -86,11 +87,6 @@ def _count(objects: Sequence[Any]) -> dict[str, int]:
 def _sensor(scene: Any, index: int, hide_emitters: bool) -> SensorSummary:
     sensor = scene.sensors()[index]
     film = sensor.film()
-    obstacle = None
-    try:
-        check_supported(scene, sensor, hide_emitters)
-    except UnsupportedScene as error:
-        obstacle = str(error)
     return SensorSummary(
         index=index,
         id=sensor.id(),
@@ -102,7 +98,8 @@ def _sensor(scene: Any, index: int, hide_emitters: bool) -> SensorSummary:
         channels=int(film.base_channels_count()),
         needs=scene_needs(scene, sensor),
         view=look(scene, sensor) if unsupported_part(scene, sensor) is None else None,
-        obstacle=obstacle,
+        obstacle=light_obstacle(scene, sensor, hide_emitters),
+        camera_obstacle=camera_obstacle(scene, sensor),
     )
 
 

@@ -1,15 +1,17 @@
-"""What a scene needs of a light tracer, and whether light tracing can render it at all."""
+"""What a scene needs of a light tracer, and what of it paths from the light, or from the sensor, do not know."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..errors import UnsupportedScene
+from ..errors import UnsupportedScene, is_machine_fault
 from .emitted import emitted_rays
 from .extent import clipped
 from .graph import SceneGraph
@@ -33,6 +35,12 @@ _FOLLOWED_BSDFS = (
 )
 #: What rounding may make of a depth between the clip planes, of 0 to 1.
 _DEPTH_ROUNDING = 1e-5
+#: BSDFs that are not the same with light and view exchanged, by class: camera paths alone meet them as they are meant.
+_ONE_WAY = {"Hair": "hair", "Measured": "measured"}
+#: Shapes on which Mitsuba draws no points: light cannot start there, but paths from the sensor find it.
+_NO_POINTS = {"SDFGrid": "sdfgrid", "Ellipsoids": "ellipsoids", "EllipsoidsMesh": "ellipsoidsmesh"}
+#: Shapes that Mitsuba cannot have emit at all.
+_NO_LAMPS = {"BSplineCurve": "bsplinecurve", "LinearCurve": "linearcurve"}
 #: How many see-through surfaces a primary ray is followed through.
 CROSSINGS = 32
 
@@ -119,21 +127,48 @@ def scene_needs(scene: Any, sensor: Any) -> SceneNeeds:
 
 
 def check_supported(scene: Any, sensor: Any, hide_emitters: bool = False) -> None:
-    """Raise UnsupportedScene, with the reason, where light tracing cannot render `scene` for `sensor`."""
+    """Raise UnsupportedScene, with the reason and the way out, where light tracing cannot render `scene`."""
+    obstacle = light_obstacle(scene, sensor, hide_emitters)
+    if obstacle is not None:
+        other = camera_obstacle(scene, sensor)
+        raise UnsupportedScene(_advised(obstacle, other, "take integrator.type: prb"))
+
+
+def check_camera_paths(scene: Any, sensor: Any) -> None:
+    """The same for paths from the sensor: `prb`, and `path`, which has its images."""
+    obstacle = camera_obstacle(scene, sensor)
+    if obstacle is not None:
+        other = light_obstacle(scene, sensor)
+        raise UnsupportedScene(_advised(obstacle, other, "take integrator.type: reslrb or ptracer"))
+
+
+def _advised(obstacle: str, other: str | None, way: str) -> str:
+    """The obstacle of one kind of paths, with the `way` out that the others are, or else their obstacle, too."""
+    if other is None:
+        return f"{obstacle}{', or' if ';' in obstacle else ';'} {way}"
+    return obstacle if other == obstacle else f"{obstacle}; nor can paths the other way round render it: {other}"
+
+
+def light_obstacle(scene: Any, sensor: Any, hide_emitters: bool = False) -> str | None:
+    """The reason why light tracing cannot render `scene` for `sensor`; None where it can."""
     obstacle = unsupported_part(scene, sensor)
     if obstacle is not None:
-        raise UnsupportedScene(obstacle)
-    emitted_rays(scene, mi.Float(0.5), mi.Point2f(0.5), mi.Point2f(0.5))
+        return obstacle
+    try:
+        emitted_rays(scene, mi.Float(0.5), mi.Point2f(0.5), mi.Point2f(0.5))
+    except UnsupportedScene as error:
+        return str(error)
     view, name = look(scene, sensor), sensor.id()
     if view.specular > 0 and view.smooth == 0 and (hide_emitters or view.emission == 0):
-        raise UnsupportedScene(
+        return (
             f"only smooth specular surfaces (glass, mirrors) face sensor {name}: light paths cannot connect to it from "
-            "them; let it see a rough surface, or take integrator.type: prb"
+            "them; let it see a rough surface"
         )
+    return None
 
 
 def stock_clip(needs: SceneNeeds) -> str | None:
-    """What Mitsuba's own light tracing gets wrong of a sensor's clip planes, said of it; None where nothing."""
+    """The fault of Mitsuba's own light tracing with a sensor's clip planes, in words; None where it has none."""
     if needs.lens_clip:
         return "does not clip what a `thinlens` sees, and loses light where it focuses on a clip plane or beyond"
     if needs.near_clip:
@@ -141,35 +176,144 @@ def stock_clip(needs: SceneNeeds) -> str | None:
     return None
 
 
-def check_camera_paths(scene: Any) -> None:
-    """Raise UnsupportedScene, with the reason, where `prb` cannot render `scene`."""
+def camera_obstacle(scene: Any, sensor: Any) -> str | None:
+    """The reason why paths from `sensor` cannot render `scene`, without tracing a ray; None where they can."""
+    obstacle = _unknown_part(scene, sensor)
+    if obstacle is not None:
+        return obstacle
     for emitter in scene.emitters():
         if emitter.class_name() == "DirectionalArea":
-            raise UnsupportedScene(
+            return (
                 f"emitter {emitter.id()} is a `directionalarea`, which camera paths cannot find and `prb` cannot "
-                "evaluate; take integrator.type: reslrb or ptracer"
+                "evaluate"
             )
+    half = mi.Point2f(0.5)
+    reason = _failure(partial(sensor.sample_ray_differential, 0, 0.5, half, half))
+    if reason is not None:
+        return f"Mitsuba cannot send rays from sensor {sensor.id()}: {reason}"
+    for emitter in _one_of_a_kind(SceneGraph.of(scene), scene.emitters()):
+        reason = _failure(partial(emitter.sample_direction, _somewhere(), half))
+        if reason is not None:
+            return f"Mitsuba cannot find emitter {emitter.id()} from a surface: {reason}"
+    return None
 
 
 def unsupported_part(scene: Any, sensor: Any) -> str | None:
     """What in the scene no light path can deal with, found without tracing a ray; None where there is nothing."""
-    name = sensor.id()
-    for shape in SceneGraph.of(scene).shapes():
-        if shape.is_medium_transition():
-            return f"shape {shape.id()} bounds a participating medium; media are not supported"
+    obstacle, name = _unknown_part(scene, sensor), sensor.id()
+    if obstacle is not None:
+        return obstacle
+    if sensor.class_name() not in SENSORS:
+        return f"sensor {name} is a {sensor.class_name()}; light paths connect to `perspective` and `thinlens` sensors"
+    if sensor.film().class_name() != "HDRFilm":
+        return f"sensor {name} has a {sensor.film().class_name()}; light paths are splatted on an `hdrfilm`"
+    for bsdf in SceneGraph.of(scene).of_type(mi.BSDF):
+        plugin = _ONE_WAY.get(bsdf.class_name())
+        if plugin is not None:
+            return (
+                f"bsdf {bsdf.id()} is `{plugin}`, which is not the same with light and view exchanged: light paths "
+                "would render another material"
+            )
+    lamp = _lamp_on(SceneGraph.of(scene), _NO_POINTS)
+    if lamp is not None:
+        return f"{lamp}, where Mitsuba draws no points for light to start from; give the lamp as a mesh"
+    return None
+
+
+def _unknown_part(scene: Any, sensor: Any) -> str | None:
+    """What in the scene no integrator here knows, found without tracing a ray; None where there is nothing."""
+    graph = SceneGraph.of(scene)
+    for shape in graph.shapes():
+        if shape.is_medium_transition() and graph.is_shown(shape):
+            return _of_medium(f"shape {shape.id() or 'of a group'} bounds")
+    for held in (sensor, *(child for child in graph.of_type(mi.Sensor) if sensor in graph.parents[child])):
+        if held.get_medium() is not None:
+            return _of_medium(f"sensor {held.id()} stands in")
     for emitter in scene.emitters():
+        if emitter.get_medium() is not None:
+            return _of_medium(f"emitter {emitter.id()} stands in")
         if emitter.class_name() == "TimedSunskyEmitter":
             return (
                 f"emitter {emitter.id()} is a `timed_sunsky`, which evaluates arrays while it is traced: Mitsuba 3.9 "
                 "cannot render it in a kernel; take a `sunsky`"
             )
-    if sensor.get_medium() is not None:
-        return f"sensor {name} stands in a participating medium; media are not supported"
-    if sensor.class_name() not in SENSORS:
-        return f"sensor {name} is a {sensor.class_name()}; light paths connect to `perspective` and `thinlens` sensors"
-    if sensor.film().class_name() != "HDRFilm":
-        return f"sensor {name} has a {sensor.film().class_name()}; only `hdrfilm` is supported"
+    lamp = _lamp_on(graph, _NO_LAMPS)
+    if lamp is not None:
+        return f"{lamp}, which Mitsuba cannot have emit; give the lamp as a `cylinder` or a mesh"
+    return _failing_part(scene, graph)
+
+
+def _of_medium(subject: str) -> str:
+    return (
+        f"{subject} a participating medium; no integrator here knows media (nor do Mitsuba's prb, path and ptracer): "
+        "remove it from the scene file"
+    )
+
+
+def _lamp_on(graph: SceneGraph, plugins: dict[str, str]) -> str | None:
+    """The first emitter that is on a shape of one of those classes, and on which; not all of those know their shape."""
+    for shape in graph.shapes():
+        if shape.is_emitter() and shape.class_name() in plugins:
+            return f"emitter {shape.emitter().id()} is on a shape `{plugins[shape.class_name()]}`"
     return None
+
+
+def _failing_part(scene: Any, graph: SceneGraph) -> str | None:
+    """The first surface or emitter that Mitsuba cannot evaluate, such as one whose texture has too many channels."""
+    si, half = _somewhere(), mi.Point2f(0.5)
+    for bsdf in _one_of_a_kind(graph, graph.surface_bsdfs()):
+
+        def scattered(bsdf: Any = bsdf) -> None:
+            bsdf.sample(mi.BSDFContext(), si, 0.5, half)
+            bsdf.eval(mi.BSDFContext(), si, mi.Vector3f(0, 0, 1))
+
+        reason = _failure(scattered)
+        if reason is not None:
+            return f"Mitsuba cannot evaluate bsdf {bsdf.id()}: {reason}"
+    for emitter in _one_of_a_kind(graph, scene.emitters()):
+        reason = _failure(partial(emitter.eval, si))
+        if reason is not None:
+            return f"Mitsuba cannot evaluate emitter {emitter.id()}: {reason}"
+    return None
+
+
+def _somewhere() -> Any:
+    """A point on a surface, of one entry, looked at from straight above."""
+    si = dr.zeros(mi.SurfaceInteraction3f)
+    si.wi, si.n, si.sh_frame = mi.Vector3f(0, 0, 1), mi.Normal3f(0, 0, 1), mi.Frame3f(mi.Vector3f(0, 0, 1))
+    return si
+
+
+def _failure(call: Callable[[], object]) -> str | None:
+    """Mitsuba's reason, in one line, why it cannot do what `call` asks for; None where it can."""
+    try:
+        with dr.suspend_grad():
+            call()
+    except RuntimeError as error:
+        if is_machine_fault(error):
+            raise
+        return " ".join(str(error).split())
+    return None
+
+
+def _one_of_a_kind(graph: SceneGraph, items: Sequence[Any]) -> list[Any]:
+    """Of objects that consist of the same kinds of objects the first: thousands may differ in numbers alone."""
+    below: dict[Any, list[Any]] = {}
+    for child, parents in graph.parents.items():
+        for parent in parents:
+            below.setdefault(parent, []).append(child)
+
+    def kind(item: Any) -> tuple[Any, ...]:
+        name = item.class_name()
+        # The one texture that has one channel or three by what it was given.
+        size = np.size(mi.traverse(item)["value"]) if name == "RawConstantTexture" else 0
+        used = (child for child in below.get(item, []) if isinstance(child, (mi.BSDF, mi.Texture, mi.Volume)))
+        return (name, size, *map(kind, used))
+
+    found: dict[tuple[Any, ...], Any] = {}
+    for item in items:
+        found.setdefault(kind(item), item)
+    return list(found.values())
 
 
 def look(scene: Any, sensor: Any, resolution: int = 128) -> View:

@@ -27,6 +27,9 @@ def check(description: Description) -> None:
     """Raise ConfigError, located by file and line, for what must not reach Mitsuba's parser."""
     for element in description.root.walk():
         if element.is_object:
+            refused = dialects.REFUSED_PLUGINS.get((element.tag, element.type))
+            if refused is not None:
+                raise element.fail("", f"{element.tag} `{element.type}` {refused}")
             if not is_known(element.type):
                 raise _unknown_plugin(description.root, element)
             _check_kind(element)

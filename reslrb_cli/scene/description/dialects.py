@@ -66,6 +66,12 @@ LOST_PLUGINS = {
     ("texture", "vertexcolors"): "`mesh_attribute` says the same",
 }
 
+#: Plugins that Mitsuba 3 has, and that no scene file can use here.
+REFUSED_PLUGINS = {
+    ("shape", "blender"): "reads the memory of a running Blender; export the mesh as `ply` or `obj`",
+    ("sensor", "flat_sensor"): "belongs to Mitsuba's own RayDataLoader; take a `perspective` one",
+}
+
 #: Values of text parameters, by plugin and parameter.
 VALUES = {
     ("bitmap", "filter_type"): {"trilinear": "bilinear", "ewa": "bilinear"},

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from ...backend.plugins import is_known
 from . import dialects
-from .colours import hexadecimal, linear
+from .colours import SPECTRA, by_wavelength, hexadecimal, linear
 from .coordinates import transform_coordinates
 from .element import Element, quoted
 from .including import Description
@@ -49,6 +49,7 @@ class _Mender:
         if root.is_object:
             self._element(root)
         self.mend(root)
+        self._spectra(root)
         # What refers to something that was left out goes with it.
         for element in root.walk() if self.gone else ():
             element.children[:] = [
@@ -107,6 +108,10 @@ class _Mender:
         """Mend the name of an object's plugin; False where the object is to be left out."""
         type = element.type
         if is_known(type):
+            if element.tag == "sampler" and type != "independent":
+                # Others round the number of samples, which is the experiment's, and fail where it is split otherwise.
+                element.attributes["type"] = "independent"
+                element.children[:] = [child for child in element.children if child.name == "sample_count"]
             return True
         other = dialects.PLUGINS.get((element.tag, type), type.lower())
         if is_known(other):
@@ -185,6 +190,31 @@ class _Mender:
                 dropped.add(earlier)
             last[child.name] = child
         owner.children[:] = [child for child in owner.children if child not in dropped]
+
+    def _spectra(self, root: Element) -> None:
+        """Write spectra by wavelength as parameters of what has them, since RGB variants have no such plugins."""
+        named = {
+            element.attributes["id"]: element
+            for element in root.walk()
+            if element.tag in ("spectrum", "texture") and element.type in SPECTRA and "id" in element.attributes
+        }
+        for alias in [element for element in root.walk() if element.tag == "alias"]:
+            if alias.attributes.get("id") in named:
+                named[alias.attributes.get("as", "")] = named[alias.attributes["id"]]
+        for owner in [element for element in root.walk() if element.is_object and element.type != "specfilm"]:
+            kept = []
+            for child in owner.children:
+                meant = named.get(child.attributes.get("id", ""))
+                if meant is None:
+                    kept.append(child)
+                elif owner is not root:
+                    name = child.name or meant.name
+                    if not name:
+                        raise child.fail("", f"<{meant.tag}> `{meant.type}` needs a name: that of what it is for")
+                    attributes = {"name": name, **by_wavelength(meant, owner)}
+                    kept.append(Element("spectrum", attributes, child.source, child.line))
+                    self.note(meant, f"RGB variants have no spectrum `{meant.type}`", "read as the colour of it")
+            owner.children[:] = kept
 
     def _texture_coordinates(self, owner: Element) -> None:
         replaced = transform_coordinates(owner) if owner.tag == "texture" else None

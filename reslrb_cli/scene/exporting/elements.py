@@ -58,7 +58,7 @@ def transform(owner: Element, name: str, value: mi.AffineTransform4f) -> Element
     return whole
 
 
-def point(owner: Element, name: str, value: Array) -> Element:
-    """A point of three numbers."""
+def triple(owner: Element, tag: str, name: str, value: Array) -> Element:
+    """Three numbers: a <point> or a <vector>, by `tag`."""
     x, y, z = (numbers(value.reshape(3)[k : k + 1]) for k in range(3))
-    return child(owner, "point", name=name, x=x, y=y, z=z)
+    return child(owner, tag, name=name, x=x, y=y, z=z)

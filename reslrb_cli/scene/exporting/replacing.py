@@ -14,7 +14,7 @@ from ..catalog import parameter_kind
 from ..description.element import Element
 from ..description.naming import Owners
 from ..values import Slot
-from .elements import child, colour, number, point, remove, replace, transform
+from .elements import child, colour, number, remove, replace, transform, triple
 from .meshes import put_mesh
 from .parts import Parts
 
@@ -54,11 +54,13 @@ class Replacing:
         elif name == "to_world":
             replace(owner, transform(owner, name, self.params[key]), *_OTHER_PLACES.get(owner.tag, ()))
         elif name == "position":
-            replace(owner, point(owner, name, self._array(key)), "to_world")
+            replace(owner, triple(owner, "point", name, self._array(key)), "to_world")
         elif name == "data":
             self._put_image(owner, key)
         elif name == "value" and owner.type == "srgb":
             replace(owner, colour(owner, "color", self._array(key), bounded=False))
+        elif name == "value" and owner.type == "rawconstant" and self._array(key).size == 3:
+            replace(owner, triple(owner, "vector", name, self._array(key)))
         else:
             self._put_number(owner, name, self._array(key), key)
 

@@ -1,0 +1,433 @@
+"""Every plugin that Mitsuba 3.9.1 ships, in a scene of its own, and what becomes of that: docs/plugins.md as data.
+
+`python tests/cli/every_plugin.py` writes the page anew. Of each plugin there is one row at least, and one more for each
+place or form in which it is treated otherwise.
+"""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+PAGE = Path(__file__).resolve().parents[2] / "docs" / "plugins.md"
+#: What the first column of a row may say besides the plugin's name goes into brackets.
+KINDS = ("bsdf", "shape", "emitter", "texture and spectrum", "medium", "phase", "volume", "sensor", "film", "rfilter",
+         "sampler", "integrator")  # fmt: skip
+
+PLACE = '<transform name="to_world"><lookat origin="0, 1, 4" target="0, 0, 0" up="0, 1, 0"/></transform>'
+LIGHT = '<shape type="rectangle" id="lamp"><transform name="to_world"><rotate x="1" angle="90"/><translate y="2.5"/>' \
+        '</transform><emitter type="area">{}</emitter></shape>'  # fmt: skip
+RADIANCE = '<rgb name="radiance" value="8, 7, 6"/>'
+FLOOR = """<shape type="rectangle" id="floor"><transform name="to_world"><scale value="2"/><rotate x="1" angle="-90"/>
+<translate y="-1"/></transform><bsdf type="diffuse"><rgb name="reflectance" value="0.5, 0.4, 0.3"/></bsdf></shape>"""
+WHITE = '<bsdf type="diffuse"><rgb name="reflectance" value="0.6, 0.5, 0.4"/></bsdf>'
+
+
+def film(inner: str = "", type: str = "hdrfilm", size: int = 16) -> str:
+    """A film, with a box filter unless `inner` brings one."""
+    rfilter = "" if "<rfilter" in inner else '<rfilter type="box"/>'
+    return f"""<film type="{type}"><integer name="width" value="{size}"/><integer name="height" value="{size}"/>
+    {inner}{rfilter}</film>"""
+
+
+def sensor(type: str = "perspective", inner: str = '<float name="fov" value="50"/>', on: str = "",
+           place: str = PLACE) -> str:  # fmt: skip
+    """A sensor that looks at the scene."""
+    return f'<sensor type="{type}" id="camera">{place}{inner}{on or film()}</sensor>'
+
+
+CAMERA = sensor()
+
+
+@dataclass(frozen=True)
+class Row:
+    """What becomes of a scene with a plugin.
+
+    `where` says in which place or form the plugin stands, `scene` is XML that is added to floor, lamp and sensor, or,
+    where that has its own, replaces lamp or sensor. `light` is why light paths (`reslrb`, `ptracer`) refuse it,
+    `camera` the same of `prb`; both are parts of what is printed. `loading` is the error of loading it, `mended` the
+    warning, and `note` is for the page alone.
+    """
+
+    kind: str
+    plugin: str
+    where: str = ""
+    scene: str = ""
+    light: str = ""
+    camera: str = ""
+    loading: str = ""
+    mended: str = ""
+    note: str = ""
+
+    @property
+    def name(self) -> str:
+        """What a test of it is called."""
+        return f"{self.plugin} {self.where}".strip()
+
+    @property
+    def refused(self) -> bool:
+        """Whether no integrator takes it."""
+        return bool(self.loading or (self.light and self.camera))
+
+    def xml(self) -> str:
+        """The scene."""
+        lamp = "" if 'id="lamp"' in self.scene else LIGHT.format(RADIANCE)
+        camera = "" if "<sensor" in self.scene else CAMERA
+        return f'<scene version="3.0.0">\n{camera}\n{FLOOR}\n{lamp}\n{self.scene}\n</scene>\n'
+
+
+def thing(bsdf: str, shape: str = "rectangle", more: str = "", place: str = '<rotate x="1" angle="-30"/>') -> str:
+    """Something to look at."""
+    return f'<shape type="{shape}" id="thing"><transform name="to_world">{place}</transform>{more}{bsdf}</shape>'
+
+
+def filed(shape: str, file: str, bsdf: str = WHITE) -> str:
+    """A shape from a file."""
+    return thing(bsdf, shape, f'<string name="filename" value="{file}"/>', '<scale value="0.6"/>')
+
+
+def bitmap(name: str, file: str = "texture.exr") -> str:
+    """A texture from a file."""
+    raw = '<boolean name="raw" value="true"/><string name="format" value="variant"/>'
+    return f'<texture type="bitmap" name="{name}"><string name="filename" value="{file}"/>{raw}</texture>'
+
+
+def painted(texture: str) -> str:
+    """A thing whose reflectance is this."""
+    return thing(f'<bsdf type="diffuse">{texture.format("reflectance")}</bsdf>')
+
+
+def lit(texture: str) -> str:
+    """A lamp whose radiance is this."""
+    return LIGHT.format(texture.format("radiance"))
+
+
+def fog(inner: str = "", type: str = "homogeneous", name: str = "interior", bsdf: str = '<bsdf type="null"/>') -> str:
+    """A ball of a medium."""
+    return f'<shape type="sphere" id="fog">{bsdf}<medium name="{name}" type="{type}">{inner}</medium></shape>'
+
+
+def phase(inner: str) -> str:
+    """A ball of a medium with this phase function."""
+    return fog(inner)
+
+
+MEDIUM = "a participating medium; no integrator here knows media"
+ONE_WAY = "not the same with light and view exchanged"
+NO_POINTS = "where Mitsuba draws no points for light to start from"
+NO_RAYS = "Mitsuba cannot sample the rays of emitter"
+PINHOLE = "light paths connect to `perspective` and `thinlens` sensors"
+OWN_INTEGRATOR = "the experiment's own integrator takes its place"
+ABOVE = '<transform name="to_world"><lookat origin="0, 2, 1" target="0, 0, 0" up="0, 0, 1"/></transform>'
+IRREGULAR = """<spectrum type="irregular" name="{}"><string name="wavelengths" value="400, 500, 700"/>
+<string name="values" value="0.1, 0.4, 0.8"/></spectrum>"""
+REGULAR = """<spectrum type="regular" name="{}"><float name="wavelength_min" value="400"/>
+<float name="wavelength_max" value="700"/><string name="values" value="0.1, 0.4, 0.6"/></spectrum>"""
+BLACK_BODY = '<spectrum type="blackbody" name="{}"><float name="temperature" value="5000"/></spectrum>'
+CHECKS = '<texture type="checkerboard" name="{}"/>'
+ATTRIBUTE = '<texture type="mesh_attribute" name="{}"><string name="name" value="vertex_color"/></texture>'
+SOLID = """<texture type="volume" name="{}"><volume type="gridvolume" name="volume">
+<string name="filename" value="albedo.vol"/><boolean name="raw" value="true"/></volume></texture>"""
+EVEN = """<texture type="volume" name="{}"><volume type="constvolume" name="volume">
+<rgb name="value" value="0.3, 0.4, 0.5"/></volume></texture>"""
+RAW = '<texture type="rawconstant" name="{}"><vector name="value" value="0.3, 0.4, 0.5"/></texture>'
+SHAPES = {"bsplinecurve": "curve.txt", "linearcurve": "curve.txt", "sdfgrid": "sdf.vol", "ellipsoids": "ellipsoids.ply",
+          "ellipsoidsmesh": "ellipsoids.ply", "obj": "mesh.obj", "ply": "mesh.ply",
+          "serialized": "mesh.serialized"}  # fmt: skip
+SOME = '<shape type="sphere"><float name="radius" value="0.4"/>{}</shape>'
+MATERIALS = {
+    "diffuse": WHITE,
+    "conductor": '<bsdf type="conductor"><string name="material" value="Au"/></bsdf>',
+    "roughconductor": '<bsdf type="roughconductor"><string name="material" value="Cu"/></bsdf>',
+    "dielectric": '<bsdf type="dielectric"/>',
+    "thindielectric": '<bsdf type="thindielectric"/>',
+    "roughdielectric": '<bsdf type="roughdielectric"><float name="alpha" value="0.3"/></bsdf>',
+    "plastic": '<bsdf type="plastic"/>',
+    "roughplastic": '<bsdf type="roughplastic"/>',
+    "pplastic": '<bsdf type="pplastic"><float name="alpha" value="0.3"/></bsdf>',
+    "principled": '<bsdf type="principled"/>',
+    "principledthin": '<bsdf type="principledthin"><float name="diff_trans" value="1"/></bsdf>',
+    "blendbsdf": f'<bsdf type="blendbsdf"><float name="weight" value="0.4"/>{WHITE}<bsdf type="roughconductor"/>'
+    "</bsdf>",
+    "mask": f'<bsdf type="mask"><float name="opacity" value="0.4"/>{WHITE}</bsdf>',
+    "twosided": f'<bsdf type="twosided">{WHITE}</bsdf>',
+    "null": '<bsdf type="null"/>',
+    "bumpmap": f'<bsdf type="bumpmap">{bitmap("texture")}{WHITE}</bsdf>',
+    "normalmap": f'<bsdf type="normalmap">{bitmap("normalmap", "normals.exr")}{WHITE}</bsdf>',
+    "polarizer": '<bsdf type="polarizer"/>',
+    "retarder": '<bsdf type="retarder"/>',
+    "circular": '<bsdf type="circular"/>',
+}
+#: What the page says of some of them.
+SAID_OF = {
+    **dict.fromkeys(("conductor", "dielectric", "thindielectric", "plastic"),
+                    "light paths do not connect to the sensor from its smooth lobe: what it mirrors is left out"),
+    **dict.fromkeys(("polarizer", "retarder", "circular"), "as without polarisation: light is only attenuated"),
+    "pplastic": "without its polarisation",
+}  # fmt: skip
+FILTERS = ("box", "catmullrom", "gaussian", "lanczos", "mitchell", "tent")
+PHASES = {
+    "hg": '<phase type="hg"/>',
+    "isotropic": '<phase type="isotropic"/>',
+    "rayleigh": '<phase type="rayleigh"/>',
+    "tabphase": '<phase type="tabphase"><string name="values" value="0.5, 1, 0.5"/></phase>',
+    "blendphase": '<phase type="blendphase"><float name="weight" value="0.5"/><phase type="hg"/>'
+                  '<phase type="isotropic"/></phase>',
+    "sggx": '<phase type="sggx"><volume type="gridvolume" name="S"><string name="filename" value="sggx.vol"/></volume>'
+            "</phase>",
+}  # fmt: skip
+INTEGRATORS = ("aov", "depth", "direct", "moment", "path", "ptracer", "stokes", "volpath", "volpathmis", "prb",
+               "prb_basic", "prb_projective", "prbvolpath", "volprim_rf_basic", "direct_projective")  # fmt: skip
+MENDED = "RGB variants have no spectrum `{}`: read as the colour of it"
+
+ROWS: tuple[Row, ...] = (
+    *(Row("bsdf", name, scene=thing(xml), note=SAID_OF.get(name, "")) for name, xml in MATERIALS.items()),
+    Row("bsdf", "twosided", "of a blend of rough ones",
+        thing(f'<bsdf type="twosided">{MATERIALS["blendbsdf"]}</bsdf>')),
+    Row("bsdf", "conductor", "with spectra", thing(
+        '<bsdf type="roughconductor"><spectrum name="eta" value="400:1.5, 700:0.2"/>'
+        '<spectrum name="k" filename="spectrum.spd"/></bsdf>')),
+    Row("bsdf", "hair", scene=filed("bsplinecurve", "curve.txt", '<bsdf type="hair"/>'), light=ONE_WAY),
+    Row("bsdf", "hair", "with `sigma_a`, in a mask", thing(
+        '<bsdf type="mask"><float name="opacity" value="0.5"/><bsdf type="hair">'
+        '<rgb name="sigma_a" value="0.2, 0.3, 0.4"/></bsdf></bsdf>'), light=ONE_WAY),
+    Row("bsdf", "measured", scene=thing(
+        '<bsdf type="measured"><string name="filename" value="paint.bsdf"/></bsdf>'), light=ONE_WAY,
+        note="files of RGB; those of spectra Mitsuba refuses"),
+    Row("bsdf", "measured", "without its file", thing(
+        '<bsdf type="measured"><string name="filename" value="none.bsdf"/></bsdf>'),
+        loading='The file "none.bsdf" does not exist!'),
+    Row("bsdf", "measured_polarized", scene=thing(
+        '<bsdf type="measured_polarized"><string name="filename" value="paint.pbsdf"/>'
+        '<float name="wavelength" value="500"/></bsdf>'), note="at its one wavelength"),
+    Row("bsdf", "measured_polarized", "without `wavelength`", thing(
+        '<bsdf type="measured_polarized"><string name="filename" value="paint.pbsdf"/></bsdf>'),
+        loading="can only render a specific wavelength specified by the `wavelength` parameter"),
+    *(Row("shape", name, scene=thing(WHITE, name, place='<scale value="0.6"/>'))
+      for name in ("rectangle", "disk", "sphere", "cylinder", "cube")),
+    *(Row("shape", name, scene=filed(name, file)) for name, file in SHAPES.items()),
+    *(Row("shape", name, "that emits", filed(name, SHAPES[name], '<emitter type="area"/>'),
+          light=NO_POINTS) for name in ("sdfgrid", "ellipsoids", "ellipsoidsmesh")),
+    *(Row("shape", name, "that emits", filed(name, SHAPES[name], '<emitter type="area"/>'),
+          light="which Mitsuba cannot have emit", camera="which Mitsuba cannot have emit")
+      for name in ("bsplinecurve", "linearcurve")),
+    Row("shape", "shapegroup", "with `instance`", f'<shape type="shapegroup" id="g">{SOME.format(WHITE)}</shape>'
+        '<shape type="instance"><ref id="g"/></shape><shape type="instance"><ref id="g"/>'
+        '<transform name="to_world"><translate x="1"/></transform></shape>'),
+    Row("shape", "instance", scene=f'<shape type="shapegroup" id="g">{SOME.format(WHITE)}</shape>'
+        '<shape type="instance"><ref id="g"/></shape>'),
+    Row("shape", "merge", scene=f'<shape type="merge">{filed("ply", "mesh.ply")}</shape>'),
+    Row("shape", "blender", scene='<shape type="blender"/>', loading="reads the memory of a running Blender"),
+    Row("emitter", "area", scene=lit(RADIANCE)),
+    Row("emitter", "area", "with an image", lit(bitmap("radiance"))),
+    Row("emitter", "area", "with a texture other than an image", lit(CHECKS), light=NO_RAYS),
+    Row("emitter", "point", scene='<emitter type="point"><point name="position" x="0" y="1" z="0"/></emitter>'),
+    Row("emitter", "constant", scene='<emitter type="constant"/>'),
+    Row("emitter", "directional", scene='<emitter type="directional"><vector name="direction" value="0, -1, -0.2"/>'
+        "</emitter>"),
+    Row("emitter", "directionalarea", scene=LIGHT.replace('"area"', '"directionalarea"').format(RADIANCE),
+        camera="camera paths cannot find"),
+    Row("emitter", "envmap", scene='<emitter type="envmap"><string name="filename" value="sky.exr"/></emitter>'),
+    Row("emitter", "spot", scene=f'<emitter type="spot">{ABOVE}</emitter>'),
+    Row("emitter", "spot", "with an image", f'<emitter type="spot">{ABOVE}{bitmap("texture")}</emitter>'),
+    Row("emitter", "projector", scene=f'<emitter type="projector">{ABOVE}{bitmap("irradiance")}</emitter>'),
+    Row("emitter", "sunsky", scene='<emitter type="sunsky"/>'),
+    Row("emitter", "timed_sunsky", scene='<emitter type="timed_sunsky"/>', light="take a `sunsky`",
+        camera="take a `sunsky`"),
+    Row("texture and spectrum", "bitmap", scene=painted(bitmap("reflectance"))),
+    Row("texture and spectrum", "checkerboard", scene=painted(CHECKS)),
+    Row("texture and spectrum", "mesh_attribute", scene=filed("ply", "mesh.ply", f'<bsdf type="diffuse">'
+        f'{ATTRIBUTE.format("reflectance")}</bsdf>')),
+    Row("texture and spectrum", "volume", scene=painted(SOLID)),
+    Row("texture and spectrum", "volume", "on a lamp", lit(EVEN), light=NO_RAYS),
+    *(Row("texture and spectrum", name, form, place(xml), mended=MENDED.format(name), note=note)
+      for name, xml in (("regular", REGULAR), ("irregular", IRREGULAR))
+      for form, place, note in (("on a lamp", lit, ""), ("in a material", painted, "its colour under D65"))),
+    Row("texture and spectrum", "irregular", "referred to", IRREGULAR.replace('name="{}"', 'id="s"')
+        + painted('<ref id="s" name="{}"/>'), mended=MENDED.format("irregular")),
+    Row("texture and spectrum", "irregular", "of unequal lists", painted(IRREGULAR.replace("0.1, ", "")),
+        loading="irregular has 3 wavelengths and 2 values"),
+    Row("texture and spectrum", "blackbody", "on a lamp", lit(BLACK_BODY), mended=MENDED.format("blackbody"),
+        note="in W/(m² sr), as by wavelength: thousands"),
+    Row("texture and spectrum", "blackbody", "in a material", painted(BLACK_BODY),
+        loading="a blackbody is what an emitter emits; a bsdf can have <rgb>"),
+    Row("texture and spectrum", "d65", "on a lamp", lit('<spectrum type="d65" name="{}"/>')),
+    Row("texture and spectrum", "d65", "in a material",
+        painted('<spectrum type="d65" name="{}"><float name="scale" value="0.5"/></spectrum>')),
+    Row("texture and spectrum", "uniform", scene=painted('<spectrum type="uniform" name="{}"><float name="value" '
+        'value="0.4"/></spectrum>')),
+    Row("texture and spectrum", "srgb", scene=painted('<spectrum type="srgb" name="{}"><rgb name="color" '
+        'value="0.3, 0.4, 0.5"/></spectrum>')),
+    Row("texture and spectrum", "rawconstant", scene=painted(RAW)),
+    Row("texture and spectrum", "rawconstant", "of three numbers where one is asked for",
+        thing(f'<bsdf type="roughconductor">{RAW.format("alpha")}</bsdf>'), light="eval_1() is not defined",
+        camera="eval_1() is not defined"),
+    Row("texture and spectrum", "spectrum", "on a lamp", lit('<spectrum name="{}" value="400:1, 700:9"/>')),
+    Row("texture and spectrum", "spectrum", "in a material", painted('<spectrum name="{}" value="400:0.1, 700:0.9"/>')),
+    Row("texture and spectrum", "rgb", scene=painted('<rgb name="{}" value="0.3, 0.4, 0.5"/>')),
+    Row("medium", "homogeneous", scene=fog(), light=MEDIUM, camera=MEDIUM),
+    Row("medium", "homogeneous", "around a thing", fog(name="exterior"), light=MEDIUM, camera=MEDIUM),
+    Row("medium", "homogeneous", "in glass", fog(bsdf='<bsdf type="dielectric"/>'), light=MEDIUM, camera=MEDIUM),
+    Row("medium", "homogeneous", "in a group that is instanced",
+        f'<shape type="shapegroup" id="g">{fog()}</shape><shape type="instance"><ref id="g"/></shape>',
+        light=MEDIUM, camera=MEDIUM),
+    Row("medium", "homogeneous", "in a group that is not", f'<shape type="shapegroup" id="g">{fog()}</shape>'),
+    Row("medium", "homogeneous", "around the sensor",
+        sensor(inner='<float name="fov" value="50"/><medium type="homogeneous"/>'), light=MEDIUM, camera=MEDIUM),
+    Row("medium", "homogeneous", "around a lamp", '<emitter type="point"><medium type="homogeneous"/></emitter>',
+        light=MEDIUM, camera=MEDIUM),
+    Row("medium", "homogeneous", "that nothing has", '<medium type="homogeneous" id="m"/>'),
+    Row("medium", "heterogeneous", scene=fog('<volume type="gridvolume" name="sigma_t"><string name="filename" '
+        'value="density.vol"/></volume>', "heterogeneous"), light=MEDIUM, camera=MEDIUM),
+    *(Row("phase", name, scene=phase(xml), light=MEDIUM, camera=MEDIUM) for name, xml in PHASES.items()),
+    Row("volume", "constvolume", "in a texture", painted(EVEN)),
+    Row("volume", "gridvolume", "in a texture", painted(SOLID)),
+    Row("volume", "constvolume", "in a medium", fog('<volume type="constvolume" name="albedo"><float name="value" '
+        'value="0.5"/></volume>'), light=MEDIUM, camera=MEDIUM),
+    Row("sensor", "perspective", scene=CAMERA),
+    Row("sensor", "thinlens", scene=sensor("thinlens", '<float name="fov" value="50"/><float name="focus_distance" '
+        'value="4"/><float name="aperture_radius" value="0.05"/>')),
+    Row("sensor", "orthographic", scene=sensor("orthographic", ""), light=PINHOLE),
+    Row("sensor", "distant", light=PINHOLE,
+        scene=sensor("distant", '<vector name="direction" value="0.1, -1, -0.1"/>', film(size=1), "")),
+    Row("sensor", "radiancemeter", light=PINHOLE,
+        scene=sensor("radiancemeter", "", film(size=1), PLACE.replace("0, 0, 0", "0, -1, 1"))),
+    Row("sensor", "irradiancemeter", light=PINHOLE,
+        scene='<shape type="rectangle"><transform name="to_world"><rotate x="1" angle="-90"/><translate y="-0.9"/>'
+        f'</transform>{sensor("irradiancemeter", "", film(size=1), "")}</shape>'),
+    Row("sensor", "batch", light=PINHOLE,
+        scene=sensor("batch", 2 * f'<sensor type="perspective">{PLACE}{film()}</sensor>', film(size=32), "")),
+    Row("sensor", "flat_sensor", scene=sensor("flat_sensor", ""), loading="belongs to Mitsuba's own RayDataLoader"),
+    Row("film", "hdrfilm", scene=sensor(on=film('<string name="pixel_format" value="luminance"/>'))),
+    Row("film", "specfilm", scene=sensor(on=film(REGULAR.format("band1"), "specfilm")),
+        loading="can only be used in Mitsuba variants that perform a spectral simulation"),
+    *(Row("rfilter", name, scene=sensor(on=film(f'<rfilter type="{name}"/>'))) for name in FILTERS),
+    *(Row("sampler", name, scene=sensor(inner=f'<float name="fov" value="50"/><sampler type="{name}"/>'),
+          note="" if name == "independent" else "not loaded: `independent` takes its place, with `run.spp` samples")
+      for name in ("independent", "ldsampler", "multijitter", "orthogonal", "stratified")),
+    *(Row("integrator", name, scene=f'<integrator type="{name}"/>', note=f"not loaded: {OWN_INTEGRATOR}")
+      for name in INTEGRATORS),
+)  # fmt: skip
+#: By default these are taken through three iterations, too: of each kind one, and those whose ways differ.
+FEW = (
+    "diffuse",
+    "hair",
+    "irregular in a material",
+    "blackbody on a lamp",
+    "rawconstant",
+    "orthogonal",
+    "irradiancemeter",
+)
+
+
+def write_files(folder: Path) -> None:
+    """Put what the scenes name into `folder`; a variant must be set."""
+    import mitsuba as mi
+    from mitsuba.python.tensor_io import write
+
+    rng = np.random.default_rng(0)
+
+    def save(name: str, *shape: int, high: float = 0.8) -> None:
+        mi.Bitmap(rng.uniform(0.2, high, shape).astype(np.float32)).write(str(folder / name))
+
+    save("texture.exr", 4, 4, 3)
+    save("sky.exr", 8, 16, 3, high=2)
+    mi.Bitmap(np.tile(np.float32([0.5, 0.5, 1]), (4, 4, 1))).write(str(folder / "normals.exr"))
+    places = np.float32([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
+    lines = [" ".join(f"{x:g}" for x in place) for place in places]
+    (folder / "mesh.obj").write_text("".join(f"v {line}\n" for line in lines) + "f 1 2 3\nf 1 3 4\n")
+    head = "".join(f"property float {name}\n" for name in "xyzrgb")
+    faces = "element face 2\nproperty list uchar int vertex_indices\nend_header\n"
+    vertices = "".join(f"{line} 0.5 0.4 0.2\n" for line in lines)
+    (folder / "mesh.ply").write_text(
+        f"ply\nformat ascii 1.0\nelement vertex 4\n{head}{faces}{vertices}3 0 1 2\n3 0 2 3\n"
+    )
+    body = struct.pack("<I", 0x1000) + b"mesh\0" + struct.pack("<QQ", 4, 2) + places.tobytes()
+    body = zlib.compress(body + np.uint32([0, 1, 2, 0, 2, 3]).tobytes())
+    (folder / "mesh.serialized").write_bytes(struct.pack("<HH", 0x041C, 4) + body + struct.pack("<QI", 0, 1))
+    (folder / "curve.txt").write_text("".join(f"{0.4 * i - 1:g} {0.2 * (-1) ** i:g} 0 0.1\n" for i in range(6)))
+    names = (
+        "x",
+        "y",
+        "z",
+        "nx",
+        "ny",
+        "nz",
+        "opacity",
+        "scale_0",
+        "scale_1",
+        "scale_2",
+        "rot_0",
+        "rot_1",
+        "rot_2",
+        "rot_3",
+    )
+    head = "".join(f"property float {name}\n" for name in names)
+    one = "{} 0 0 0 0 0 0.9 -1.5 -2 -1.5 1 0 0 0\n"
+    text = f"ply\nformat ascii 1.0\nelement vertex 2\n{head}end_header\n{one.format(0)}{one.format(0.6)}"
+    (folder / "ellipsoids.ply").write_text(text)
+    grid = np.stack(np.meshgrid(*3 * [np.linspace(-0.5, 0.5, 8)], indexing="ij"), axis=-1)
+    volumes = {
+        "density.vol": rng.uniform(0.2, 0.8, (3, 3, 3, 1)),
+        "albedo.vol": rng.uniform(0.2, 0.8, (3, 3, 3, 3)),
+        "sdf.vol": np.linalg.norm(grid, axis=-1, keepdims=True) - 0.35,
+        "sggx.vol": np.tile([0.2, 0.5, 0.7, 0, 0, 0], (2, 2, 2, 1)),
+    }
+    for name, values in volumes.items():
+        mi.VolumeGrid(values.astype(np.float32)).write(str(folder / name))
+    (folder / "spectrum.spd").write_text("400 2\n500 3\n700 4\n")
+    angles, ones = np.linspace(0, np.pi / 2, 8).astype(np.float32), np.ones((1, 8, 8, 8), np.float32)
+    write(str(folder / "paint.bsdf"), description=np.frombuffer(b"paint", np.uint8), theta_i=angles,
+          phi_i=np.float32([0]), ndf=ones[0, 0], sigma=ones[0, 0], vndf=ones, luminance=ones, jacobian=np.uint8([1]),
+          rgb=np.full((1, 8, 3, 8, 8), 0.3, np.float32))  # fmt: skip
+    turns, matrix = np.linspace(0, np.pi, 4).astype(np.float32), np.zeros((4, 8, 8, 5, 4, 4), np.float32)
+    matrix[..., 0, 0] = 0.2
+    write(str(folder / "paint.pbsdf"), theta_h=angles[None], theta_d=angles[None], phi_d=turns[None], M=matrix,
+          wvls=np.uint16([450, 500, 550, 600, 650]))  # fmt: skip
+
+
+HEAD = """# Mitsuba's plugins
+
+What becomes of a scene with each plugin that Mitsuba 3.9.1 ships. Each row is a scene that a test takes through
+`inspect`, `init`, three iterations of `optimize`, and `export` (`pytest -m long tests/cli/test_every_plugin.py`; without
+`-m long` those that are refused, and a few others). Written by `python tests/cli/every_plugin.py`.
+
+- **light paths**: `reslrb`, `ptracer`, `walk_ad` and `trajectory`; **`prb`**: paths from the sensor. `init` takes light
+  paths where they work, else `prb`.
+- **works**: what is said in brackets holds for it. Which of its numbers can be recovered `reslrb inspect` lists.
+- **refused**: with exit code 2 and a line that holds what stands there, by every command. What both refuse, or loading
+  does, has to be changed in the scene file.
+- **mended**: read in another form, with that warning (`scene.strict: true` refuses it).
+"""
+
+
+def page() -> str:
+    """docs/plugins.md."""
+    parts = [HEAD]
+    for kind in KINDS:
+        parts.append(f"\n## {kind[0].upper()}{kind[1:]}\n\n| plugin | light paths | `prb` |\n|---|---|---|\n")
+        for row in (row for row in ROWS if row.kind == kind):
+            note = f" ({row.note})" if row.note else ""
+            name = f"`{row.plugin}`{f' {row.where}' if row.where else ''}"
+            if row.loading:
+                parts.append(f"| {name} | refused on loading: {_cell(row.loading)} | the same |\n")
+            elif row.mended:
+                parts.append(f"| {name} | mended: {_cell(row.mended)}{note} | the same |\n")
+            elif row.light and row.light == row.camera:
+                parts.append(f"| {name} | refused: {_cell(row.light)} | the same |\n")
+            else:
+                light, camera = (f"refused: {_cell(why)}" if why else f"works{note}" for why in (row.light, row.camera))
+                parts.append(f"| {name} | {light} | {camera} |\n")
+    return "".join(parts)
+
+
+def _cell(text: str) -> str:
+    return text.replace("|", "\\|").replace("<", "&lt;")
+
+
+if __name__ == "__main__":
+    PAGE.write_text(page(), encoding="utf-8")

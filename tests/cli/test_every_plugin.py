@@ -1,0 +1,141 @@
+"""Every plugin of Mitsuba's, in a scene of its own: it works, or is refused in one line, as every_plugin.py says."""
+
+from __future__ import annotations
+
+import gc
+import re
+from pathlib import Path
+
+import mitsuba as mi
+import pytest
+from cli.calling import reslrb, settings
+from cli.every_plugin import FEW, PAGE, ROWS, Row, page, write_files
+from turns import a_few
+
+from reslrb_cli.backend.plugins import package_folder, shipped_plugins
+
+pytestmark = pytest.mark.usefixtures("llvm")
+
+#: Three iterations, as short as they may be.
+SHORT = settings("target={render: {spp: 4}}", "run.iterations=3", "run.spp=4", "run.reach_spp=1",
+                 "run.certainty=false", "integrator.max_depth=4")  # fmt: skip
+#: What a run would find out first.
+DECIDED = settings("integrator.estimator=stack", "integrator.guiding=off", "integrator.sequence=independent")
+#: All integrators of a configuration.
+TYPES = ("reslrb", "ptracer", "walk_ad", "trajectory", "prb")
+BY_HAND = """
+variant: llvm_ad_rgb
+scene: {file: scene.xml}
+target: {render: {spp: 4}}
+parameters: [{key: floor.bsdf.reflectance.value, initial: 0.3}]
+integrator: {max_depth: 3}
+run: {iterations: 1, spp: 4, reach_spp: 1}
+"""
+
+
+@pytest.fixture(scope="module")
+def files(llvm: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What the scenes name."""
+    folder = tmp_path_factory.mktemp("files")
+    write_files(folder)
+    return folder
+
+
+@pytest.fixture
+def folder(files: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The working directory, with all of that in it."""
+    for file in files.iterdir():
+        (tmp_path / file.name).symlink_to(file)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("reslrb_cli.recording.run.write_report", lambda folder, *now: None)
+    return tmp_path
+
+
+def said(*arguments: object, code: int = 0) -> str:
+    """What a command said, as one line; it is to end with this exit code."""
+    result = reslrb(*arguments)
+    text = " ".join(result.output.split())
+    ended, error = result.exit_code, repr(result.exception)
+    del result
+    gc.collect()  # Mitsuba asks all emitters that there are, those of scenes that nobody has any more among them
+    assert ended == code, f"{' '.join(map(str, arguments))}: {text} {error}"
+    assert "Traceback" not in text
+    return text
+
+
+def check(row: Row, folder: Path, to_the_end: bool) -> None:
+    """Take the row's scene through the commands, and see that each says what the row says."""
+    (folder / "scene.xml").write_text(row.xml())
+    if row.loading:
+        for command in ("inspect", "init"):
+            assert row.loading in said(command, "scene.xml", code=2)
+        return
+    inspected = said("inspect", "scene.xml")
+    assert (row.mended or "scene.xml") in inspected
+    if row.refused:
+        assert "cannot be rendered: " in inspected
+        assert row.light in inspected
+        assert "change what cannot be rendered" in inspected
+        assert row.light in said("init", "scene.xml", "-o", "c.yaml", code=2)
+        assert not (folder / "c.yaml").exists()
+        return
+    assert "cannot be rendered" not in inspected
+    assert ("no light tracing: " in inspected, "no prb: " in inspected) == (bool(row.light), bool(row.camera))
+    assert row.light in inspected
+    assert row.camera in inspected
+    said("init", "scene.xml", "-o", "c.yaml")
+    written = (folder / "c.yaml").read_text()
+    integrator = re.search(r"^integrator:\n  type: (\w+)", written, re.MULTILINE)
+    assert integrator is not None
+    assert integrator[1] == ("prb" if row.light else "reslrb")
+    if to_the_end:
+        said("optimize", "c.yaml", *SHORT, *(DECIDED if integrator[1] == "reslrb" else ()))
+        said("export", "runs/c", "-o", "out")
+        mi.load_file(str(folder / "out" / "scene.xml"))
+
+
+@pytest.mark.parametrize("row", a_few(ROWS, {*FEW, *(row.name for row in ROWS if row.refused)}))
+def test_it_works_or_is_refused_in_one_line(row: Row, folder: Path) -> None:
+    check(row, folder, to_the_end=True)
+
+
+def test_no_plugin_is_missing() -> None:
+    registered = {
+        name
+        for file in (package_folder() / "python").rglob("*.py")
+        for name in re.findall(r"mi\.register_\w+\(\s*[\"'](\w+)[\"']", file.read_text(encoding="utf-8"))
+    }
+    listed = {row.plugin for row in ROWS}
+    assert registered >= {"prb", "flat_sensor"}
+    assert (shipped_plugins() | registered | {"blender"}) - {"scene"} == listed
+    assert len({row.name for row in ROWS}) == len(ROWS)
+
+
+def test_the_page_is_what_the_table_says() -> None:
+    assert PAGE.read_text(encoding="utf-8") == page(), "`python tests/cli/every_plugin.py` writes it anew"
+
+
+@pytest.mark.parametrize("name", a_few(("homogeneous", "timed_sunsky", "linearcurve that emits"), ("homogeneous",)))
+def test_what_nobody_knows_is_refused_by_every_command_and_integrator(name: str, folder: Path) -> None:
+    [row] = [row for row in ROWS if row.name == name]
+    (folder / "scene.xml").write_text(row.xml())
+    (folder / "c.yaml").write_text(BY_HAND)
+    for type in TYPES:
+        other = settings(f"integrator.type={type}")
+        for command in (("optimize", "c.yaml"), ("render", "c.yaml", "-o", "image.exr"),
+                        ("render", "c.yaml", "--scene", "-o", "image.exr")):  # fmt: skip
+            assert row.light in said(*command, *other, code=2)
+    for command in ("gradcheck", "convergence", "bench"):
+        assert row.light in said(command, "c.yaml", code=2)
+    assert not (folder / "image.exr").exists()
+
+
+def test_a_run_of_before_is_not_exported(folder: Path) -> None:
+    [row] = [row for row in ROWS if row.name == "diffuse"]
+    (folder / "scene.xml").write_text(row.xml())
+    (folder / "c.yaml").write_text(BY_HAND)
+    said("optimize", "c.yaml", *settings("integrator.type=prb"))
+    [fog] = [row for row in ROWS if row.name == "homogeneous"]
+    (folder / "scene.xml").write_text(fog.xml())
+    assert fog.light in said("export", "runs/c", "-o", "out", code=2)
+    assert not (folder / "out").exists()
