@@ -1,4 +1,4 @@
-"""Progress of an optimisation: a bar on a terminal, plain lines elsewhere."""
+"""Progress of an optimisation, and of reading long files: a bar on a terminal, plain lines elsewhere."""
 
 from __future__ import annotations
 
@@ -6,17 +6,21 @@ import contextlib
 import logging
 import sys
 import time
+from pathlib import Path
 from types import TracebackType
 from typing import Any
 
 import click
 
+from reslrb_cli.config.files import in_words
 from reslrb_cli.optimization.errors import ErrorMeter
 from reslrb_cli.records.metrics import Record
 from reslrb_cli.report.words import shorten
 
 #: Without a terminal a line is written after each tenth of the iterations, and when this many seconds have passed.
 SECONDS_PER_LINE = 10.0
+#: What takes less has no bar.
+LEAST_SECONDS = 1.0
 #: A key in a line has at most so many characters.
 KEY_WIDTH = 32
 #: Cells that the bar has at least; what would leave it fewer is said in fewer words.
@@ -120,3 +124,51 @@ class Progress:
         if self._bar is not None:
             self._bar.close()
         self._around.close()
+
+
+class Reading:
+    """Shows how far the reading of long files has come, on standard error: called as `records.reading.Tell` is.
+
+    As a context manager it tidies the terminal up, and says, where reading took long, that what follows takes its time
+    too.
+    """
+
+    def __init__(self) -> None:
+        self._stream = sys.stderr
+        self._path: Path | None = None
+        self._bar: Any = None
+        self._began = self._said = time.monotonic()
+
+    def __call__(self, path: Path, done: int, size: int) -> None:
+        """Show that `done` of the `size` bytes of `path` are read."""
+        now, name = time.monotonic(), shorten(str(path), KEY_WIDTH)
+        if not self._stream.isatty():
+            if now - self._said >= SECONDS_PER_LINE:
+                self._said = now
+                click.echo(f"reading {name}: {in_words(done)} of {in_words(size)}", file=self._stream)
+            return
+        if path != self._path:
+            from tqdm import tqdm
+
+            self._end()
+            self._path = path
+            self._bar = tqdm(
+                total=size, file=self._stream, unit="B", unit_scale=True, unit_divisor=1024, dynamic_ncols=True,
+                desc=f"reading {name}", delay=LEAST_SECONDS, leave=False,
+            )  # fmt: skip
+        self._bar.total = size
+        self._bar.update(done - self._bar.n)
+
+    def _end(self) -> None:
+        if self._bar is not None:
+            self._bar.close()
+
+    def __enter__(self) -> Reading:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._end()
+        if error is None and time.monotonic() - self._began >= LEAST_SECONDS:
+            click.echo("drawing", file=self._stream)

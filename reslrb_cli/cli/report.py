@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 from pathlib import Path
 
@@ -30,13 +31,16 @@ def command(paths: tuple[Path, ...], output: Path | None) -> int:
     from reslrb_cli.backend.installation import load_packages
 
     load_packages()  # images are read by Mitsuba
+    from reslrb_cli.cli.progress import Reading
     from reslrb_cli.report.page import write_page
     from reslrb_cli.report.seen.fill import with_seen_errors
     from reslrb_cli.report.sources import Run, read_sources
 
     if len(paths) > MOST_SOURCES:
         raise ConfigError("RUN", "", f"{len(paths)} are given; a page shows at most {MOST_SOURCES}")
-    sources = read_sources(paths)
+    with Reading() as tell:
+        sources = read_sources(paths, tell)
+    gc.freeze()  # Python's search for cycles would go through millions of numbers while it draws
     if output is None:
         if len(sources) != 1 or not isinstance(sources[0], Run):
             raise ConfigError("--output", "", "is missing; give the page to write, as in -o page.html")

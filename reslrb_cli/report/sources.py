@@ -11,7 +11,7 @@ from reslrb_cli.errors import ConfigError, one_line
 from reslrb_cli.records import metrics
 from reslrb_cli.records.manifest import read_manifest
 from reslrb_cli.records.origin import Origin, read_origin
-from reslrb_cli.records.reading import read_lines
+from reslrb_cli.records.reading import Tell, read_lines
 from reslrb_cli.report.tone import Array
 
 #: Figures that a record of a run has, or it is none; and those that it may have.
@@ -84,22 +84,25 @@ class Maps:
 Source = Run | Measurements | Maps
 
 
-def read_sources(paths: Sequence[Path]) -> list[Source]:
-    """What lies at each path. Raises ConfigError, located in the first that is nothing of what a page can show."""
+def read_sources(paths: Sequence[Path], tell: Tell | None = None) -> list[Source]:
+    """What lies at each path; `tell` hears how far reading has come.
+
+    Raises ConfigError, located in the first that is nothing of what a page can show.
+    """
     found: list[Source] = []
     for path, name in zip(paths, _names(paths), strict=True):
         try:
             is_folder = path.is_dir()
         except (OSError, ValueError):  # a null character
             is_folder = False
-        found.append(_read_folder(path, name) if is_folder else _read_file(path, name))
+        found.append(_read_folder(path, name, tell) if is_folder else _read_file(path, name, tell))
     return found
 
 
-def read_run(folder: Path, name: str | None = None) -> Run:
+def read_run(folder: Path, name: str | None = None, tell: Tell | None = None) -> Run:
     """The run in `folder`, as far as it can be read; of another folder, one that says nothing."""
     try:
-        lines = read_lines(folder / metrics.FILE_NAME)
+        lines = read_lines(folder / metrics.FILE_NAME, tell)
         damaged = lines.damaged
         records = [record for entry in lines.objects if (record := _record(entry)) is not None]
     except ConfigError:  # there are none yet
@@ -107,9 +110,9 @@ def read_run(folder: Path, name: str | None = None) -> Run:
     return Run(folder, name or folder.absolute().name, read_manifest(folder) or {}, records, damaged=damaged)
 
 
-def _read_folder(path: Path, name: str) -> Source:
+def _read_folder(path: Path, name: str, tell: Tell | None) -> Source:
     if read_manifest(path) is not None:
-        return read_run(path, name)
+        return read_run(path, name, tell)
     from reslrb_cli.records.layers import read_layer_names
 
     try:
@@ -122,8 +125,8 @@ def _read_folder(path: Path, name: str) -> Source:
     raise ConfigError(path, "", reason)
 
 
-def _read_file(path: Path, name: str) -> Measurements:
-    lines = read_lines(path)
+def _read_file(path: Path, name: str, tell: Tell | None) -> Measurements:
+    lines = read_lines(path, tell)
     kinds = [kind for entry in lines.objects if (kind := _kind(entry)) is not None]
     if not kinds:
         reason = (
@@ -145,19 +148,26 @@ def _kind(entry: Mapping[str, Any]) -> str | None:
     return "bench" if {"integrator", "status", "step_ms"} <= set(entry) else None
 
 
-def _record(entry: Mapping[str, Any]) -> dict[str, Any] | None:
-    """A line of `metrics.jsonl` whose figures are figures; None where what each has is missing."""
-    if not all(_is_number(entry.get(key)) for key in _FIGURES):
-        return None
-    record = dict(entry) | {key: entry.get(key) if _is_number(entry.get(key)) else None for key in _MORE}
+def _record(entry: dict[str, Any]) -> dict[str, Any] | None:
+    """A line of `metrics.jsonl`, changed so that its figures are figures; None where what each has is missing."""
+    for key in _FIGURES:
+        if not _is_number(entry.get(key)):
+            return None
+    for key in _MORE:
+        if not _is_number(entry.get(key)):
+            entry[key] = None
     errors = entry.get("parameter_errors")
-    known = errors.items() if isinstance(errors, dict) else ()
-    record["parameter_errors"] = {key: value if _is_number(value) else None for key, value in known}
-    return record
+    if not isinstance(errors, dict):
+        errors = entry["parameter_errors"] = {}
+    for key, value in errors.items():
+        if not _is_number(value):
+            errors[key] = None
+    return entry
 
 
 def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1e300
+    kind = type(value)
+    return (kind is float or kind is int) and -1e300 < value < 1e300
 
 
 def _names(paths: Sequence[Path]) -> list[str]:

@@ -8,8 +8,11 @@ import math
 
 import pytest
 
+from reslrb_cli.errors import ConfigError
+from reslrb_cli.records import reading
 from reslrb_cli.records.checkpoint import save_checkpoint
 from reslrb_cli.records.metrics import MetricsWriter, Record, read_metrics
+from reslrb_cli.records.reading import read_lines
 
 KEYS = [
     "iteration", "loss", "step_ms", "primal_ms", "adjoint_ms", "codegen_ms", "elapsed_s", "peak_mib", "spp", "lr",
@@ -100,3 +103,27 @@ def test_a_checkpoint_can_be_read_by_numpy(tmp_path):
         assert state["parameter/a.data"].shape == (2, 2, 3)
         assert state["optimizer/a.data/0"] == 6
     assert sorted(path.name for path in tmp_path.iterdir()) == ["previous.npz", "state.npz"]
+
+
+def test_what_is_not_finite_or_no_line_is_told_when_a_file_is_read(tmp_path):
+    file = tmp_path / "metrics.jsonl"
+    lines = (
+        '{"a": 1e999, "b": [-1e999, NaN, {"c": Infinity}], "d": 1.5, "e": 7}', "", "[1]", '{"a": ', "\xe9"
+    )  # fmt: skip
+    file.write_bytes(b"\xef\xbb\xbf" + "\n".join(lines).encode("latin-1") + b'\n{"a": 2}')
+    found = read_lines(file)
+    assert found.objects == [{"a": None, "b": [None, None, {"c": None}], "d": 1.5, "e": 7}, {"a": 2}]
+    assert found.damaged == [3, 4, 5]
+    file.write_text('{"a": 2}\n{"a"')
+    assert read_lines(file).damaged == []  # somebody is about to end it
+
+
+def test_a_file_that_grows_too_large_while_it_is_read_is_refused(tmp_path, monkeypatch):
+    file = tmp_path / "metrics.jsonl"
+    file.write_text("{}\n" * 10)
+    monkeypatch.setattr(reading, "MOST_BYTES", 20)
+    with pytest.raises(ConfigError, match="has 30 B"):
+        read_lines(file)
+    monkeypatch.setattr(reading, "open_file", lambda path, most: path.open("rb"))
+    with pytest.raises(ConfigError, match="has more than 20 B"):
+        read_lines(file)

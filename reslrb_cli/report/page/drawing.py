@@ -56,8 +56,7 @@ class Curve:
 
     def known(self) -> Array:
         """Its points as (N, 2)."""
-        points = [(x, y) for x, y in zip(self.xs, self.ys, strict=True) if x is not None and y is not None]
-        array = np.array(points, dtype=np.float64).reshape(-1, 2)
+        array = np.array([self.xs, self.ys], dtype=np.float64).T  # None is NaN
         return array[np.isfinite(array).all(axis=1)]
 
 
