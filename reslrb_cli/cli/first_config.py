@@ -8,8 +8,8 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from textwrap import wrap
 
-from reslrb_cli.config import TargetConfig
 from reslrb_cli.scene.catalog import Value
 from reslrb_cli.scene.depth import Depth
 from reslrb_cli.scene.proposal import Proposal
@@ -21,6 +21,8 @@ SPP, ITERATIONS, RATE = 16, 200, 0.03
 _MOST_OTHERS = 60
 #: Variables and sensors that a comment names, and characters of a variable there.
 _MOST_VARIABLES, _MOST_SENSORS, _LONGEST = 8, 6, 40
+#: Columns of a comment of several lines.
+_COMMENT = 110
 _NUMBER = re.compile(r"-?\d{1,15}(\.\d{1,15})?")
 _PLAIN = re.compile(r"(\.\./)*[A-Za-z_][\w.\-]*(/[\w.\-]+)*")
 
@@ -30,7 +32,8 @@ class FirstConfig:
     """What a configuration is written from; `target` is the image that exists, or None. Sizes are (width, height).
 
     `options` are the scene file's variables that the user has set, `variables` all that it has, as text; `sensors` the
-    ids of its sensors, of which the one with the index `sensor` is used.
+    ids of its sensors, of which the one with the index `sensor` is used; `reason` says why the integrator is not
+    `reslrb`, None where it is.
     """
 
     scene: Path
@@ -43,6 +46,7 @@ class FirstConfig:
     size: tuple[int, int]
     film: tuple[int, int]
     integrator: str
+    reason: str | None
     hides_emitters: bool
     depth: Depth
     proposals: Sequence[Proposal]
@@ -63,19 +67,40 @@ class FirstConfig:
             "parameters:  # by their share of the picture; bounds are the usual ones",
             *self._parameter_lines(),
             "integrator:",
+            *self._reason_lines(),
             f"  type: {self.integrator}",
             f"  max_depth: {self.depth.segments}  # {self._depth_words()}; depth costs time alone, no memory",
             *(["  hide_emitters: true  # as the scene's own integrator has it"] if self.hides_emitters else []),
             "loss:",
             "  type: relative_l2  # by l2 the noise of the brightest parts would drown what the others say",
             "optimizer:",
-            f"  learning_rate: {RATE}  # by so much a value moves in an iteration, at first",
+            *self._step_lines(),
             "  schedule: cosine  # to next to nothing, so that the noise of the last iterations counts little",
             "run:",
             f"  iterations: {ITERATIONS}",
             f"  spp: {SPP}",
         ]
         return "\n".join(lines) + "\n"
+
+    def _reason_lines(self) -> list[str]:
+        if self.reason is None:
+            return []
+        words = f"by paths from the sensor, since light paths cannot render this: {self.reason}"
+        return wrap(words, _COMMENT, initial_indent="  # ", subsequent_indent="  # ", break_long_words=False)
+
+    def _step_lines(self) -> list[str]:
+        """The size of steps: between bounds it is known beforehand, of a lamp it has to be measured."""
+        if all(proposal.is_bounded for proposal in self.proposals) and not self._has_exposure:
+            return [f"  learning_rate: {RATE}  # by so much a value moves in an iteration, at first"]
+        return [
+            "  scale: auto  # steps in units that are measured first: a lamp's may be far from those of a colour",
+            f"  learning_rate: {RATE}  # of such a unit, by which a value moves in an iteration, at first",
+        ]
+
+    @property
+    def _has_exposure(self) -> bool:
+        """Whether one is recovered; beside a lamp, which it could not be told from, it is not."""
+        return self.is_integer and not any(item.first and item.info.kind == "emitter" for item in self.proposals)
 
     def _depth_words(self) -> str:
         missing = self.depth.missing
@@ -110,13 +135,21 @@ class FirstConfig:
 
     def _target_lines(self, folder: Path) -> list[str]:
         if self.target is not None:
-            return [f"  file: {_path(self.target, folder)}", *photo_settings(self.is_integer)]
+            return [f"  file: {_path(self.target, folder)}", *self._exposure_lines()]
         width, height = self.size
         return [
             f"  file: photo.png  # put your photograph there, of {width}x{height} pixels, or have it made by",
             "  # reslrb init --target PHOTO from one of any size in that ratio. To try without, in place of `file`:",
             "  # render: {spp: 256, parameters: {KEY: VALUE}}  # the scene itself with other values",
         ]
+
+    def _exposure_lines(self) -> list[str]:
+        """For a photograph: of 8 or 16 bits its exposure is not known. `mask: auto` is the default."""
+        if self._has_exposure:
+            return ["  exposure: auto  # one factor for the whole image, recovered beside the parameters"]
+        return [
+            "  # exposure: auto  # one factor for the whole image; the lamps below make up for it"
+        ] * self.is_integer
 
     def _parameter_lines(self) -> list[str]:
         first = [proposal for proposal in self.proposals if proposal.first]
@@ -128,13 +161,6 @@ class FirstConfig:
         if len(others) > _MOST_OTHERS:
             lines.append(f"  # and {len(others) - _MOST_OTHERS} more, as reslrb inspect --all lists them")
         return lines
-
-
-def photo_settings(is_integer: bool) -> list[str]:
-    """Lines of `target` for a photograph: of 8 or 16 bits its exposure is not known. `mask: auto` is the default."""
-    if is_integer and "exposure" in TargetConfig.model_fields:
-        return ["  exposure: auto  # one factor for the whole image, recovered beside the parameters"]
-    return []
 
 
 def _entry(proposal: Proposal) -> str:

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     import mitsuba as mi
 
     from reslrb_cli.scene.photograph import Photograph
+    from reslrb_cli.scene.proposal import Proposal
 
 Size = tuple[int, int]
 #: By how much the ratio of a photograph's sides may differ from the film's.
@@ -52,16 +53,32 @@ _RATIO = 0.01
     metavar="scene.options.NAME=VALUE",
     help="Value of a $NAME of the scene file, in place of its own; stands in the configuration, too. May be repeated.",
 )
+@click.option(
+    "--recover",
+    "wanted",
+    multiple=True,
+    metavar="KEY",
+    help="What to recover, in place of what is large in view: a key as `reslrb inspect` lists it, or a glob such as "
+    "'*.radiance.value'. May be repeated.",
+)
 @click.option("--force", is_flag=True, help="Replace files that exist.")
 def command(
-    scene_file: Path, target: Path | None, output: Path | None, index: int, overrides: tuple[str, ...], force: bool
+    scene_file: Path,
+    target: Path | None,
+    output: Path | None,
+    index: int,
+    overrides: tuple[str, ...],
+    wanted: tuple[str, ...],
+    force: bool,
 ) -> None:
     """Write a commented configuration for the scene in the file SCENE, which `reslrb optimize` takes.
 
-    It recovers the colours of the materials that are largest in view; what else can be recovered stands there as
-    comments, with bounds and present values. With --target the film gets the photograph's ratio of sides, at a size
-    with which a run takes minutes, and a copy of the photograph of that size is written beside the configuration. Of
-    several sensors it is the first that saw the photograph, unless --sensor names another.
+    It recovers the colours of the materials that are largest in view, the roughness of metals, and how bright lamps
+    are that are in view themselves (not from a photograph of 8 or 16 bits, where they are clipped); what else can be
+    recovered stands there as comments, with bounds and present values, and --recover takes other parameters. With
+    --target the film gets the photograph's ratio of sides, at a size with which a run takes minutes, and a copy of the
+    photograph of that size is written beside the configuration. Of several sensors it is the first that saw the
+    photograph, unless --sensor names another.
     """
     from reslrb_cli.backend.variant import set_variant
 
@@ -79,7 +96,6 @@ def command(
     from reslrb_cli.scene.depth import find_depth
     from reslrb_cli.scene.load import load_described, read_as_floats
     from reslrb_cli.scene.photograph import open_photograph, write_smaller
-    from reslrb_cli.scene.proposal import propose
 
     photo = None if target is None else open_photograph(target)
     turned = None if target is None else turned_line(target)
@@ -92,16 +108,14 @@ def command(
     film = sensor.film()
     own, whole = ((int(size[0]), int(size[1])) for size in (film.crop_size(), film.size()))
     size = choose_size(own, photo, fixed=own != whole)
-    integrator = _integrator(scene, sensor, description.hides_emitters, scene_file)
-    proposals = propose(scene, index)
-    if not proposals:
-        raise ConfigError(scene_file, "", "nothing in it can be recovered; reslrb inspect --all says why")
+    integrator, reason = _integrator(scene, sensor, description.hides_emitters, scene_file)
+    is_integer = photo is not None and photo.is_integer
+    proposals = _propose(scene_file, scene, index, wanted, lamps=not is_integer and not description.hides_emitters)
     image, copied = target, False
     if photo is not None and target is not None and photo.size != size:
         image = path.with_name(f"{target.stem}-{size[0]}x{size[1]}{'.png' if photo.is_integer else '.exr'}")
         copied = True
         _check_free(image, force)
-    is_integer = photo is not None and photo.is_integer
     first = FirstConfig(
         scene=scene_file,
         options=options,
@@ -113,6 +127,7 @@ def command(
         size=size,
         film=own,
         integrator=integrator,
+        reason=reason,
         hides_emitters=description.hides_emitters,
         depth=find_depth(scene, index),
         proposals=proposals,
@@ -132,6 +147,8 @@ def command(
     made = f" and {image}" if copied else ""
     count = sum(proposal.first for proposal in proposals)
     echo(f"{path}{made}: {count} of {len(proposals)} parameters, at {size[0]}x{size[1]} pixels")
+    if reason is not None:
+        echo(f"integrator.type: {integrator}, since light paths cannot render this: {reason}")
     echo(f"next: look at it, and `reslrb optimize {path}`" + ("" if target is not None else ", once there is a target"))
 
 
@@ -183,20 +200,34 @@ def _tell_sensor(index: int, sensors: Sequence[str]) -> None:
         echo(f"sensor {named[index]}; --sensor takes another: {', '.join(others[:LISTED_SENSORS])}{more}")
 
 
-def _integrator(scene: mi.Scene, sensor: mi.Sensor, hides_emitters: bool, file: Path) -> str:
-    """The integrator that can render the scene: paths from the light, or where these cannot, from the sensor.
+def _propose(scene_file: Path, scene: mi.Scene, index: int, wanted: tuple[str, ...], lamps: bool) -> list[Proposal]:
+    """What of the scene can be recovered, at least one to begin with. Raises ConfigError where there is nothing."""
+    from reslrb_cli.scene.proposal import propose
 
-    Raises ConfigError, located in the scene's `file`, where neither can.
+    try:
+        proposals = propose(scene, index, lamps, wanted)
+    except LookupError as error:
+        more = f"reslrb inspect {scene_file} lists the keys"
+        raise ConfigError("--recover", "", f"`{error.args[0]}` is nothing that can be recovered; {more}") from None
+    if not proposals:
+        raise ConfigError(scene_file, "", "nothing in it can be recovered; reslrb inspect --all says why")
+    return proposals
+
+
+def _integrator(scene: mi.Scene, sensor: mi.Sensor, hides_emitters: bool, file: Path) -> tuple[str, str | None]:
+    """The integrator that can render the scene, and why it is not light paths where these cannot.
+
+    Raises ConfigError, located in the scene's `file`, where none can.
     """
-    from reslrb_cli.scene.needs import camera_obstacle, check_supported
+    from reslrb_cli.scene.needs import camera_obstacle, check_supported, light_obstacle
 
     try:
         check_supported(scene, sensor, hides_emitters)
     except UnsupportedScene as error:
-        if camera_obstacle(scene, sensor) is None:
-            return "prb"
-        raise ConfigError(file, "", str(error)) from None
-    return "reslrb"
+        if camera_obstacle(scene, sensor) is not None:
+            raise ConfigError(file, "", str(error)) from None
+        return "prb", light_obstacle(scene, sensor, hides_emitters)
+    return "reslrb", None
 
 
 def _check_free(path: Path, force: bool) -> None:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import fnmatch
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,6 +18,11 @@ from .graph import SceneGraph
 
 #: Colours of materials, by which a photograph mostly differs from a scene.
 _COLOUR = re.compile(r"(reflectance|base_color|color\d|vertex_color)(\.(value|data))?$")
+#: What is seen foremost of a rough surface without a diffuse lobe: its colour is its material's, and a factor of 1 on
+#: that is no colour that anybody chose.
+_ROUGHNESS, _FACTOR = re.compile(r"\balpha(_u|_v)?\.value$"), re.compile(r"\bspecular_\w+\.value$")
+#: What a lamp in view shows of itself.
+_RADIANCE = re.compile(r"\bradiance\.value$")
 #: Bounds by the end of a key, and what it is; the first that fits.
 _BOUNDS: tuple[tuple[str, str], ...] = (
     (r"(reflectance|transmittance|base_color|color\d)\.(value|data)$", "[0, 1]"),
@@ -30,8 +37,9 @@ _BOUNDS: tuple[tuple[str, str], ...] = (
 )
 #: Rays along each axis of the film, by which shares are taken.
 _RAYS = 64
-#: What takes less of the picture is left for later, and so are more parameters than these.
-LEAST_SHARE, MOST_FIRST = 0.02, 8
+#: What takes less of the picture is left for later, and so are more parameters than these. A lamp is known by a few
+#: pixels.
+LEAST_SHARE, LEAST_LAMP, MOST_FIRST = 0.02, 0.002, 8
 #: Texels along an axis with which a texture begins to be recovered.
 TEXELS = 64
 
@@ -50,11 +58,18 @@ class Proposal:
     resolution: tuple[int, int] | None
     first: bool
 
+    @property
+    def is_bounded(self) -> bool:
+        """Whether the bounds say how large the parameter may be, and so how large a step is."""
+        return self.bounds is not None and "inf" not in self.bounds
 
-def propose(scene: mi.Scene, sensor: int) -> list[Proposal]:
+
+def propose(scene: mi.Scene, sensor: int, lamps: bool = False, wanted: Sequence[str] = ()) -> list[Proposal]:
     """What of `scene` can be recovered by key, through the sensor of this index, without vertices of meshes.
 
-    In the order of their shares. At least one is to begin with, where there is any.
+    In the order of their shares. At least one is to begin with, where there is any: those that match a glob of
+    `wanted`, and without any what is large in view, lamps too where the image to come is known to show how bright they
+    are (`lamps`). Raises LookupError, with the glob, where one matches nothing.
     """
     params = mi.traverse(scene)
     shares = _shares(scene, sensor)
@@ -69,12 +84,36 @@ def propose(scene: mi.Scene, sensor: int) -> list[Proposal]:
             if bsdfs and all(_is_delta(bsdf) for bsdf in bsdfs):
                 smooth.add(info.key)
     found.sort(key=lambda pair: -pair[1])
-    # A mask leaves out the pixels that see mirrors and smooth glass: only what these light shows their colours.
-    shown = [info for info, share in found if share >= LEAST_SHARE and info.key not in smooth]
-    seen = [info for info in shown if _COLOUR.search(info.key)]
-    wanted = [info.key for info in seen if info.value is None or info.value.high > 0][:MOST_FIRST]  # a lamp is black
-    wanted = wanted or [info.key for info, _ in found if info.kind == "emitter"][:1] or [i.key for i, _ in found][:1]
-    return [Proposal(info, share, _bounds(info), _resolution(info), info.key in wanted) for info, share in found]
+    if wanted:
+        first = _matching([info.key for info, _ in found], wanted)
+    else:
+        # A mask leaves out the pixels that see mirrors and smooth glass: only what these light shows their colours.
+        shown = [info for info, share in found if share >= LEAST_SHARE and info.key not in smooth]
+        seen = {info.key for info in shown if _is_foremost(params, info)}
+        if lamps:
+            seen |= {info.key for info, share in found if share >= LEAST_LAMP and _RADIANCE.search(info.key)}
+        first = [info.key for info, _ in found if info.key in seen][:MOST_FIRST]
+        first = first or [info.key for info, _ in found if info.kind == "emitter"][:1] or [i.key for i, _ in found][:1]
+    return [Proposal(info, share, _bounds(info), _resolution(info), info.key in first) for info, share in found]
+
+
+def _matching(keys: Sequence[str], globs: Sequence[str]) -> list[str]:
+    for glob in globs:
+        if not fnmatch.filter(keys, glob):
+            raise LookupError(glob)
+    return [key for key in keys if any(fnmatch.fnmatchcase(key, glob) for glob in globs)]
+
+
+def _is_foremost(params: mi.SceneParameters, info: ParameterInfo) -> bool:
+    """Whether a parameter of a surface is what a photograph shows of it first: its colour, or a metal's roughness."""
+    bsdf = next((item for item in _above(params, info.key) if isinstance(item, mi.BSDF)), None)
+    diffuse = int(mi.BSDFFlags.DiffuseReflection) | int(mi.BSDFFlags.DiffuseTransmission)
+    is_glossy = bsdf is not None and int(bsdf.flags()) & diffuse == 0
+    if is_glossy and _ROUGHNESS.search(info.key):
+        return True
+    if is_glossy and _FACTOR.search(info.key) and info.value is not None and info.value.low == info.value.high == 1:
+        return False
+    return bool(_COLOUR.search(info.key)) and (info.value is None or info.value.high > 0)  # a lamp's own is black
 
 
 def _is_left_out(params: mi.SceneParameters, info: ParameterInfo) -> bool:
@@ -93,8 +132,9 @@ def _above(params: mi.SceneParameters, key: str) -> list[Any]:
     node: Any = params.properties[key][2]
     chain: list[Any] = []
     while node is not None and not isinstance(node, mi.Scene):
-        # A material belongs to all shapes that have it, and has a share of its own.
-        if isinstance(node, (mi.BSDF, mi.Emitter)) or not any(isinstance(item, mi.BSDF) for item in chain):
+        # A material belongs to all shapes that have it, and has a share of its own; a lamp may have a back.
+        kinds = (mi.BSDF, mi.Emitter)
+        if isinstance(node, kinds) or not any(isinstance(item, kinds) for item in chain):
             chain.append(node)
         node = params.hierarchy[node][0]
     return chain
@@ -111,7 +151,7 @@ def _shares(scene: mi.Scene, index: int) -> dict[Any, float]:
     for pointers, kind, items in (
         (si.bsdf(), mi.BSDFPtr, graph.surface_bsdfs()),
         (si.shape, mi.ShapePtr, graph.shapes()),
-        (si.emitter(scene), mi.EmitterPtr, scene.emitters()),
+        (_shining(scene, si), mi.EmitterPtr, scene.emitters()),
     ):
         numbers = np.bincount(np.array(dr.reinterpret_array(mi.UInt32, pointers)))
         for item in items:
@@ -121,6 +161,12 @@ def _shares(scene: mi.Scene, index: int) -> dict[Any, float]:
         owners = graph.owning_bsdfs(bsdf)
         shares[bsdf] = max([shares.get(owner, 0.0) for owner in owners], default=0.0)
     return shares
+
+
+def _shining(scene: mi.Scene, si: mi.SurfaceInteraction3f) -> mi.EmitterPtr:
+    """The emitters that shine at where they are met: an area light has a back."""
+    emitter = si.emitter(scene)
+    return dr.select(dr.any(emitter.eval(si) > 0), emitter, dr.zeros(mi.EmitterPtr))
 
 
 def _bounds(info: ParameterInfo) -> str | None:
