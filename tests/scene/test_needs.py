@@ -174,7 +174,8 @@ def test_fractions_are_of_the_crop_window(make_scene):
 
 
 def test_light_that_camera_paths_cannot_find_is_refused_for_prb(make_scene):
-    check_camera_paths(make_scene())
+    scene = make_scene()
+    check_camera_paths(scene, scene.sensors()[0])
     scene = make_scene(lamp={"type": "rectangle", "emitter": {"type": "directionalarea"}})
     with pytest.raises(UnsupportedScene, match="`prb` cannot evaluate"):
-        check_camera_paths(scene)
+        check_camera_paths(scene, scene.sensors()[0])
