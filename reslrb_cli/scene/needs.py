@@ -36,7 +36,7 @@ _FOLLOWED_BSDFS = (
 #: What rounding may make of a depth between the clip planes, of 0 to 1.
 _DEPTH_ROUNDING = 1e-5
 #: BSDFs that are not the same with light and view exchanged, by class: camera paths alone meet them as they are meant.
-_ONE_WAY = {"Hair": "hair", "Measured": "measured"}
+_ONE_WAY = {"Hair": "hair", "Measured": "measured", "MeasuredPolarized": "measured_polarized"}
 #: Shapes on which Mitsuba draws no points: light cannot start there, but paths from the sensor find it.
 _NO_POINTS = {"SDFGrid": "sdfgrid", "Ellipsoids": "ellipsoids", "EllipsoidsMesh": "ellipsoidsmesh"}
 #: Shapes that Mitsuba cannot have emit at all.
@@ -145,7 +145,8 @@ def check_camera_paths(scene: Any, sensor: Any) -> None:
 def _advised(obstacle: str, other: str | None, way: str) -> str:
     """The obstacle of one kind of paths, with the `way` out that the others are, or else their obstacle, too."""
     if other is None:
-        return f"{obstacle}{', or' if ';' in obstacle else ';'} {way}"
+        has_its_own = any(f"; {word} " in obstacle for word in ("give", "let", "take"))
+        return f"{obstacle}{', or' if has_its_own else ';'} {way}"
     return obstacle if other == obstacle else f"{obstacle}; nor can paths the other way round render it: {other}"
 
 

@@ -14,9 +14,10 @@ from pathlib import Path
 import numpy as np
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "plugins.md"
-#: What the first column of a row may say besides the plugin's name goes into brackets.
-KINDS = ("bsdf", "shape", "emitter", "texture and spectrum", "medium", "phase", "volume", "sensor", "film", "rfilter",
-         "sampler", "integrator")  # fmt: skip
+#: Kinds of plugins, and what the page calls them.
+KINDS = {"bsdf": "BSDFs", "shape": "Shapes", "emitter": "Emitters", "texture": "Textures and spectra",
+         "medium": "Media", "phase": "Phase functions", "volume": "Volumes", "sensor": "Sensors", "film": "Films",
+         "rfilter": "Reconstruction filters", "sampler": "Samplers", "integrator": "Integrators"}  # fmt: skip
 
 PLACE = '<transform name="to_world"><lookat origin="0, 1, 4" target="0, 0, 0" up="0, 1, 0"/></transform>'
 LIGHT = '<shape type="rectangle" id="lamp"><transform name="to_world"><rotate x="1" angle="90"/><translate y="2.5"/>' \
@@ -50,7 +51,7 @@ class Row:
     `where` says in which place or form the plugin stands, `scene` is XML that is added to floor, lamp and sensor, or,
     where that has its own, replaces lamp or sensor. `light` is why light paths (`reslrb`, `ptracer`) refuse it,
     `camera` the same of `prb`; both are parts of what is printed. `loading` is the error of loading it, `mended` the
-    warning, and `note` is for the page alone.
+    warning; `note` is for the page alone, and so is `without`, what light paths leave out.
     """
 
     kind: str
@@ -62,6 +63,7 @@ class Row:
     loading: str = ""
     mended: str = ""
     note: str = ""
+    without: str = ""
 
     @property
     def name(self) -> str:
@@ -162,10 +164,10 @@ MATERIALS = {
     "retarder": '<bsdf type="retarder"/>',
     "circular": '<bsdf type="circular"/>',
 }
-#: What the page says of some of them.
+#: What the page says of some of them: of what light paths leave out, and of both.
+SMOOTH = dict.fromkeys(("conductor", "dielectric", "thindielectric", "plastic"),
+                       "without what the sensor sees in its smooth lobe")  # fmt: skip
 SAID_OF = {
-    **dict.fromkeys(("conductor", "dielectric", "thindielectric", "plastic"),
-                    "light paths do not connect to the sensor from its smooth lobe: what it mirrors is left out"),
     **dict.fromkeys(("polarizer", "retarder", "circular"), "as without polarisation: light is only attenuated"),
     "pplastic": "without its polarisation",
 }  # fmt: skip
@@ -185,10 +187,11 @@ INTEGRATORS = ("aov", "depth", "direct", "moment", "path", "ptracer", "stokes", 
 MENDED = "RGB variants have no spectrum `{}`: read as the colour of it"
 
 ROWS: tuple[Row, ...] = (
-    *(Row("bsdf", name, scene=thing(xml), note=SAID_OF.get(name, "")) for name, xml in MATERIALS.items()),
+    *(Row("bsdf", name, scene=thing(xml), note=SAID_OF.get(name, ""), without=SMOOTH.get(name, ""))
+      for name, xml in MATERIALS.items()),
     Row("bsdf", "twosided", "of a blend of rough ones",
         thing(f'<bsdf type="twosided">{MATERIALS["blendbsdf"]}</bsdf>')),
-    Row("bsdf", "conductor", "with spectra", thing(
+    Row("bsdf", "roughconductor", "with spectra", thing(
         '<bsdf type="roughconductor"><spectrum name="eta" value="400:1.5, 700:0.2"/>'
         '<spectrum name="k" filename="spectrum.spd"/></bsdf>')),
     Row("bsdf", "hair", scene=filed("bsplinecurve", "curve.txt", '<bsdf type="hair"/>'), light=ONE_WAY),
@@ -203,7 +206,7 @@ ROWS: tuple[Row, ...] = (
         loading='The file "none.bsdf" does not exist!'),
     Row("bsdf", "measured_polarized", scene=thing(
         '<bsdf type="measured_polarized"><string name="filename" value="paint.pbsdf"/>'
-        '<float name="wavelength" value="500"/></bsdf>'), note="at its one wavelength"),
+        '<float name="wavelength" value="500"/></bsdf>'), light=ONE_WAY, note="at its one wavelength"),
     Row("bsdf", "measured_polarized", "without `wavelength`", thing(
         '<bsdf type="measured_polarized"><string name="filename" value="paint.pbsdf"/></bsdf>'),
         loading="can only render a specific wavelength specified by the `wavelength` parameter"),
@@ -238,37 +241,37 @@ ROWS: tuple[Row, ...] = (
     Row("emitter", "sunsky", scene='<emitter type="sunsky"/>'),
     Row("emitter", "timed_sunsky", scene='<emitter type="timed_sunsky"/>', light="take a `sunsky`",
         camera="take a `sunsky`"),
-    Row("texture and spectrum", "bitmap", scene=painted(bitmap("reflectance"))),
-    Row("texture and spectrum", "checkerboard", scene=painted(CHECKS)),
-    Row("texture and spectrum", "mesh_attribute", scene=filed("ply", "mesh.ply", f'<bsdf type="diffuse">'
+    Row("texture", "bitmap", scene=painted(bitmap("reflectance"))),
+    Row("texture", "checkerboard", scene=painted(CHECKS)),
+    Row("texture", "mesh_attribute", scene=filed("ply", "mesh.ply", f'<bsdf type="diffuse">'
         f'{ATTRIBUTE.format("reflectance")}</bsdf>')),
-    Row("texture and spectrum", "volume", scene=painted(SOLID)),
-    Row("texture and spectrum", "volume", "on a lamp", lit(EVEN), light=NO_RAYS),
-    *(Row("texture and spectrum", name, form, place(xml), mended=MENDED.format(name), note=note)
+    Row("texture", "volume", scene=painted(SOLID)),
+    Row("texture", "volume", "on a lamp", lit(EVEN), light=NO_RAYS),
+    *(Row("texture", name, form, place(xml), mended=MENDED.format(name), note=note)
       for name, xml in (("regular", REGULAR), ("irregular", IRREGULAR))
       for form, place, note in (("on a lamp", lit, ""), ("in a material", painted, "its colour under D65"))),
-    Row("texture and spectrum", "irregular", "referred to", IRREGULAR.replace('name="{}"', 'id="s"')
+    Row("texture", "irregular", "referred to", IRREGULAR.replace('name="{}"', 'id="s"')
         + painted('<ref id="s" name="{}"/>'), mended=MENDED.format("irregular")),
-    Row("texture and spectrum", "irregular", "of unequal lists", painted(IRREGULAR.replace("0.1, ", "")),
+    Row("texture", "irregular", "of unequal lists", painted(IRREGULAR.replace("0.1, ", "")),
         loading="irregular has 3 wavelengths and 2 values"),
-    Row("texture and spectrum", "blackbody", "on a lamp", lit(BLACK_BODY), mended=MENDED.format("blackbody"),
+    Row("texture", "blackbody", "on a lamp", lit(BLACK_BODY), mended=MENDED.format("blackbody"),
         note="in W/(m² sr), as by wavelength: thousands"),
-    Row("texture and spectrum", "blackbody", "in a material", painted(BLACK_BODY),
+    Row("texture", "blackbody", "in a material", painted(BLACK_BODY),
         loading="a blackbody is what an emitter emits; a bsdf can have <rgb>"),
-    Row("texture and spectrum", "d65", "on a lamp", lit('<spectrum type="d65" name="{}"/>')),
-    Row("texture and spectrum", "d65", "in a material",
+    Row("texture", "d65", "on a lamp", lit('<spectrum type="d65" name="{}"/>')),
+    Row("texture", "d65", "in a material",
         painted('<spectrum type="d65" name="{}"><float name="scale" value="0.5"/></spectrum>')),
-    Row("texture and spectrum", "uniform", scene=painted('<spectrum type="uniform" name="{}"><float name="value" '
+    Row("texture", "uniform", scene=painted('<spectrum type="uniform" name="{}"><float name="value" '
         'value="0.4"/></spectrum>')),
-    Row("texture and spectrum", "srgb", scene=painted('<spectrum type="srgb" name="{}"><rgb name="color" '
+    Row("texture", "srgb", scene=painted('<spectrum type="srgb" name="{}"><rgb name="color" '
         'value="0.3, 0.4, 0.5"/></spectrum>')),
-    Row("texture and spectrum", "rawconstant", scene=painted(RAW)),
-    Row("texture and spectrum", "rawconstant", "of three numbers where one is asked for",
+    Row("texture", "rawconstant", scene=painted(RAW)),
+    Row("texture", "rawconstant", "of three numbers where one is asked for",
         thing(f'<bsdf type="roughconductor">{RAW.format("alpha")}</bsdf>'), light="eval_1() is not defined",
         camera="eval_1() is not defined"),
-    Row("texture and spectrum", "spectrum", "on a lamp", lit('<spectrum name="{}" value="400:1, 700:9"/>')),
-    Row("texture and spectrum", "spectrum", "in a material", painted('<spectrum name="{}" value="400:0.1, 700:0.9"/>')),
-    Row("texture and spectrum", "rgb", scene=painted('<rgb name="{}" value="0.3, 0.4, 0.5"/>')),
+    Row("texture", "spectrum", "on a lamp", lit('<spectrum name="{}" value="400:1, 700:9"/>')),
+    Row("texture", "spectrum", "in a material", painted('<spectrum name="{}" value="400:0.1, 700:0.9"/>')),
+    Row("texture", "rgb", scene=painted('<rgb name="{}" value="0.3, 0.4, 0.5"/>')),
     Row("medium", "homogeneous", scene=fog(), light=MEDIUM, camera=MEDIUM),
     Row("medium", "homogeneous", "around a thing", fog(name="exterior"), light=MEDIUM, camera=MEDIUM),
     Row("medium", "homogeneous", "in glass", fog(bsdf='<bsdf type="dielectric"/>'), light=MEDIUM, camera=MEDIUM),
@@ -393,8 +396,8 @@ def write_files(folder: Path) -> None:
 HEAD = """# Mitsuba's plugins
 
 What becomes of a scene with each plugin that Mitsuba 3.9.1 ships. Each row is a scene that a test takes through
-`inspect`, `init`, three iterations of `optimize`, and `export` (`pytest -m long tests/cli/test_every_plugin.py`; without
-`-m long` those that are refused, and a few others). Written by `python tests/cli/every_plugin.py`.
+`inspect`, `init`, three iterations of `optimize`, and `export` (`pytest -m long tests/cli/test_every_plugin.py`; those
+that are refused, and a few others, without `-m long`). Written by `python tests/cli/every_plugin.py`.
 
 - **light paths**: `reslrb`, `ptracer`, `walk_ad` and `trajectory`; **`prb`**: paths from the sensor. `init` takes light
   paths where they work, else `prb`.
@@ -408,8 +411,8 @@ What becomes of a scene with each plugin that Mitsuba 3.9.1 ships. Each row is a
 def page() -> str:
     """docs/plugins.md."""
     parts = [HEAD]
-    for kind in KINDS:
-        parts.append(f"\n## {kind[0].upper()}{kind[1:]}\n\n| plugin | light paths | `prb` |\n|---|---|---|\n")
+    for kind, heading in KINDS.items():
+        parts.append(f"\n## {heading}\n\n| plugin | light paths | `prb` |\n|---|---|---|\n")
         for row in (row for row in ROWS if row.kind == kind):
             note = f" ({row.note})" if row.note else ""
             name = f"`{row.plugin}`{f' {row.where}' if row.where else ''}"
@@ -420,8 +423,9 @@ def page() -> str:
             elif row.light and row.light == row.camera:
                 parts.append(f"| {name} | refused: {_cell(row.light)} | the same |\n")
             else:
+                without = f" ({row.without})" if row.without else ""
                 light, camera = (f"refused: {_cell(why)}" if why else f"works{note}" for why in (row.light, row.camera))
-                parts.append(f"| {name} | {light} | {camera} |\n")
+                parts.append(f"| {name} | {light}{without} | {camera} |\n")
     return "".join(parts)
 
 

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import gc
+from collections.abc import Iterator
+
 import numpy as np
 import pytest
 
@@ -9,6 +12,13 @@ from reslrb_cli.errors import UnsupportedScene
 from reslrb_cli.scene import check_camera_paths, check_supported, look, scene_needs, summarise
 
 GLASS = {"type": "dielectric"}
+
+
+@pytest.fixture(autouse=True)
+def _without_scenes_of_before() -> Iterator[None]:
+    """Mitsuba asks all emitters that there are, also a `timed_sunsky` of a scene that an error still holds."""
+    yield
+    gc.collect()
 
 
 def test_plain_scene(make_scene):
@@ -35,34 +45,6 @@ def test_everything(make_scene):
     assert needs.has_visible_emitters
     assert needs.thin_lens
     assert needs.moving_shutter
-
-
-def test_clip_planes_are_needed_where_anything_is_outside_of_them(make_scene):
-    import mitsuba as mi
-
-    def needs(camera, **things):
-        scene = make_scene(camera={"type": "perspective", "to_world": view} | camera, **things)
-        found = scene_needs(scene, scene.sensors()[0])
-        return found.near_clip, found.lens_clip
-
-    place = mi.ScalarTransform4f().translate
-    view = mi.ScalarTransform4f().look_at(origin=[0.5, 0.4, 3], target=[0, 0, 0], up=[0, 1, 0])
-    lens = {"type": "thinlens", "aperture_radius": 0.1, "focus_distance": 3.0}
-    room = {"type": "cube", "flip_normals": True, "to_world": mi.ScalarTransform4f().scale(5)}  # around the sensor
-    ball = {"type": "sphere", "radius": 5.0}
-    for around in (room, ball):
-        assert needs({}, around=around) == (False, False)
-        assert needs(lens, around=around) == (False, False)
-        assert needs(lens | {"far_clip": 7.0}, around=around) == (False, True)
-    pane = {"type": "rectangle", "to_world": place([0.5, 0.4, 2.5]) @ mi.ScalarTransform4f().scale(0.01)}
-    assert needs({"near_clip": 0.4}, pane=pane) == (False, False)
-    assert needs({"near_clip": 0.6}, pane=pane) == (True, False)
-    assert needs(lens | {"near_clip": 0.6}, pane=pane) == (True, True)
-    beside = pane | {"to_world": place([2.5, 0.4, 2.5]) @ mi.ScalarTransform4f().scale(0.01)}
-    assert needs({"near_clip": 0.6}, pane=beside) == (False, False)
-    assert needs({"near_clip": 0.6, "fov": 150.0}, pane=beside) == (True, False)
-    crossing = pane | {"to_world": place([0.5, 0.4, 2.99]) @ mi.ScalarTransform4f().scale(5)}  # no corner is near
-    assert needs({"near_clip": 0.6}, pane=crossing) == (True, False)
 
 
 @pytest.mark.parametrize("flat", [True, False])
@@ -177,5 +159,58 @@ def test_light_that_camera_paths_cannot_find_is_refused_for_prb(make_scene):
     scene = make_scene()
     check_camera_paths(scene, scene.sensors()[0])
     scene = make_scene(lamp={"type": "rectangle", "emitter": {"type": "directionalarea"}})
-    with pytest.raises(UnsupportedScene, match="`prb` cannot evaluate"):
+    with pytest.raises(UnsupportedScene, match="`prb` cannot evaluate; take integrator"):
         check_camera_paths(scene, scene.sensors()[0])
+
+
+FOG = {"type": "sphere", "bsdf": {"type": "null"}, "interior": {"type": "homogeneous"}}
+BEAM = {"type": "rectangle", "emitter": {"type": "directionalarea"}}
+WARM = {"type": "roughconductor", "alpha": {"type": "blackbody", "temperature": 9.0}}
+REF = {"type": "ref", "id": "group"}
+
+
+@pytest.mark.parametrize(
+    ("changes", "reason"),
+    [
+        ({"fog": FOG}, "shape fog bounds a participating medium.*remove it from the scene file"),
+        ({"group": {"type": "shapegroup", "fog": FOG}, "one": {"type": "instance", "g": REF}},
+         "shape fog bounds a participating medium"),
+        ({"camera": {"type": "perspective", "inside": {"type": "homogeneous"}}}, "sensor camera stands in"),
+        ({"bulb": {"type": "point", "inside": {"type": "homogeneous"}}}, "emitter bulb stands in a participating"),
+        ({"sky": {"type": "timed_sunsky"}}, "take a `sunsky`"),
+        ({"ball": {"type": "sphere", "bsdf": WARM}}, "Mitsuba cannot evaluate bsdf bsdf: .*not implemented"),
+    ],
+)  # fmt: skip
+def test_what_no_integrator_knows_is_refused_alike(make_scene, changes, reason):
+    scene = make_scene(**changes)
+    said = []
+    for check in (check_supported, check_camera_paths):
+        with pytest.raises(UnsupportedScene, match=reason) as error:
+            check(scene, scene.sensors()[0])
+        said.append(str(error.value))
+    assert said[0] == said[1]
+    assert "integrator.type" not in said[0]
+
+
+def test_a_medium_that_rays_cannot_meet_is_nobodys(make_scene):
+    scene = make_scene(group={"type": "shapegroup", "fog": FOG})
+    check_supported(scene, scene.sensors()[0])
+    check_camera_paths(scene, scene.sensors()[0])
+
+
+@pytest.mark.parametrize(
+    ("changes", "way"),
+    [
+        ({"camera": {"type": "orthographic"}}, "sensors; take integrator.type: prb"),
+        ({"plane": {"type": "rectangle", "bsdf": {"type": "hair"}}}, "another material; take integrator.type: prb"),
+        ({"plane": {"type": "rectangle", "bsdf": GLASS}}, "rough surface, or take integrator.type: prb"),
+        (
+            {"camera": {"type": "orthographic"}, "lamp": BEAM},
+            "sensors; nor can paths the other way round.*`prb` cannot",
+        ),
+    ],
+)
+def test_the_way_out_is_named_where_there_is_one(make_scene, changes, way):
+    scene = make_scene(**changes)
+    with pytest.raises(UnsupportedScene, match=f"{way}[^;]*$"):
+        check_supported(scene, scene.sensors()[0])
