@@ -40,6 +40,8 @@ def compare(
     """
     scales = {key: float(np.mean([square(g[key]) for g in (*own, *other)])) for key in own[0]}
     scales = {key: scale for key, scale in scales.items() if scale > 0}
+    if not scales:  # of no light, say
+        return None, None, None
     logs, variance = [], 0.0
     for gradients in (own, other):
         values = _log_variances(gradients, scales)

@@ -122,3 +122,8 @@ def test_equals_are_hardly_ever_called_better():
 def test_no_noise_is_no_comparison():
     still = [{KEY: np.ones(4, np.float32)}] * 6
     assert gains.compare(still, [1.0] * 6, samples(1.0, 6, 1, 4), [1.0] * 6) == (None, None, None)
+
+
+def test_gradients_of_no_light_tell_nothing():
+    none = [{KEY: np.zeros(3, dtype=np.float32)} for _ in range(8)]
+    assert gains.compare(none, [1.0] * 8, none, [1.0] * 8) == (None, None, None)
