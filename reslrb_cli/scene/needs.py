@@ -304,17 +304,19 @@ def _one_of_a_kind(graph: SceneGraph, items: Sequence[Any]) -> list[Any]:
         for parent in parents:
             below.setdefault(parent, []).append(child)
 
-    def kind(item: Any) -> tuple[Any, ...]:
-        name = item.class_name()
-        # The one texture that has one channel or three by what it was given.
-        size = np.size(mi.traverse(item)["value"]) if name == "RawConstantTexture" else 0
-        used = (child for child in below.get(item, []) if isinstance(child, (mi.BSDF, mi.Texture, mi.Volume)))
-        return (name, size, *map(kind, used))
-
     found: dict[tuple[Any, ...], Any] = {}
     for item in items:
-        found.setdefault(kind(item), item)
+        found.setdefault(_kind(item, below), item)
     return list(found.values())
+
+
+def _kind(item: Any, below: dict[Any, list[Any]]) -> tuple[Any, ...]:
+    """What an object consists of. No closure, which would call itself and so keep the scene alive."""
+    name = item.class_name()
+    # The one texture that has one channel or three by what it was given.
+    size = np.size(mi.traverse(item)["value"]) if name == "RawConstantTexture" else 0
+    used = (child for child in below.get(item, []) if isinstance(child, (mi.BSDF, mi.Texture, mi.Volume)))
+    return (name, size, *(_kind(child, below) for child in used))
 
 
 def look(scene: Any, sensor: Any, resolution: int = 128) -> View:
