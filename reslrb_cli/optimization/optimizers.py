@@ -195,6 +195,18 @@ class Optimizer:
         """The learning rate of a parameter, before any schedule."""
         return self._rates[key]
 
+    def first_step(self, key: str) -> float | None:
+        """How far a step of the parameter's rate moves the scene's value where it is, upwards or downwards, whichever
+        is farther, as a root mean square; None where that depends on the gradient."""
+        if isinstance(self._own[key], dropt.SGD):
+            return None
+        if key not in self._variables:
+            return self._rates[key]
+        variable, moved = self._variables[key], dr.detach(self._own[key][key])
+        value = variable.to_scene(moved)
+        ways = [np.array(variable.to_scene(moved + side * self._rates[key]) - value) for side in (1, -1)]
+        return float(np.sqrt(np.mean(np.square(np.maximum(*map(np.abs, ways)), dtype=np.float64))))
+
     def state(self) -> dict[str, Any]:
         """What the optimiser keeps for each parameter beside its value, as `<key>/<index>` (in Dr.Jit's order).
 

@@ -47,6 +47,17 @@ def find_reached(problem: Problem, say: Callable[[str], None] = lambda line: Non
         problem.masks[key] = mask
 
 
+def shown_texels(problem: Problem, key: str) -> Array | None:
+    """Which texels (H, W) of a texture some view that is trained on shows in pixels that count; None of what is no
+    texture to be seen."""
+    if key not in problem.selection.params or problem.selection.array(key).ndim != 3:
+        return None
+    sensors = [problem.scene.sensors()[view.sensor] for view in problem.trained]
+    pixels = [None if view.weights is None else np.array(view.weights)[:, :, 0] > 0 for view in problem.trained]
+    width = problem.selection.array(key).shape[1]
+    return _without_halo(visible_texels(problem.scene, sensors, key, pixels), width)
+
+
 def sensitivity(problem: Problem) -> dict[str, Array]:
     """For each parameter whether the mean image depends on an entry, boolean, of the parameter's shape."""
     run, optimizer = problem.config.run, problem.optimizer

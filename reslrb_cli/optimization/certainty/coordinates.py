@@ -22,17 +22,21 @@ LIKE = 0.95
 
 @dataclass
 class Coordinates:
-    """The joint posterior of all directions that are free: spread, way to go and its error, and partners, by place."""
+    """The joint posterior of all directions that are free: spread, what of it is the target's, way to go and its error,
+    and partners, by place."""
 
     spread: Array
+    of_target: Array
     to_go: Array
     error: Array
     partners: list[str | None]
     alone: Array
 
 
-def judge_together(measured: Mapping[str, Measured], directions: Sequence[Direction], curvature: Array) -> Coordinates:
-    """All directions, of curvature (M, M), in one posterior.
+def judge_together(
+    measured: Mapping[str, Measured], directions: Sequence[Direction], curvature: Array, fixed: Array
+) -> Coordinates:
+    """All directions, of curvature H and target's noise B (M, M), in one posterior.
 
     What stands at its bound, or has no effect, is taken for known: the others are judged without it.
     """
@@ -49,16 +53,19 @@ def judge_together(measured: Mapping[str, Measured], directions: Sequence[Direct
             noise[place] = own.noise[direction.entry]
             free[place] = not own.at_bound[direction.entry]
         free[place] = free[place] and np.any(along)
-    result = Coordinates(scale.copy(), np.zeros(count), np.zeros(count), [None] * count, scale.copy())
+    of_target, to_go, error = (np.zeros(count) for _ in range(3))
+    result = Coordinates(scale.copy(), of_target, to_go, error, [None] * count, scale.copy())
     chosen = np.flatnonzero(free)
     if not chosen.size:
         return result
     first = next(iter(measured.values()))
     p, size, variance, g = (each[chosen] for each in (response, scale, noise, gradient))
-    H, samples = curvature[np.ix_(chosen, chosen)], np.array([rows[place] for place in chosen])
+    free_ones = np.ix_(chosen, chosen)
+    H, B, samples = curvature[free_ones], fixed[free_ones], np.array([rows[place] for place in chosen])
     count = samples.shape[1]
-    posterior = joint(H, p, size, noise_covariance(samples, variance, H), g, count, first.rates)
-    to_go, error = alone(np.diag(H), p, size, variance, g, count, first.rates)
+    posterior = joint(H, p, size, noise_covariance(samples, variance, H), g, count, first.rates, B)
+    to_go, error = alone(np.diag(H), p, size, variance, g, count, first.rates, np.maximum(np.diag(B), 0.0))
+    result.of_target[chosen] = posterior.of_target
     result.to_go[chosen], result.error[chosen] = posterior.to_go, posterior.error
     result.spread[chosen], result.alone[chosen] = posterior.spread, np.hypot(to_go, error)
     correlation = np.abs(posterior.covariance) / np.maximum(np.outer(posterior.error, posterior.error), 1e-300)

@@ -8,11 +8,19 @@
 Of the first kind a standard error is taken off, by the terms of its sum over the pixels: too much curvature would make
 results look too sure. The second kind is noise for the most part at each entry alone. Entries whose gradients have
 alike noise have alike curvature, so it is averaged over those: `smooth`.
+
+Noise of a rendered target is in all gradients alike: b = J^T d, d what it makes of dL/dI. It is sampled by images of
+the target's own integrator (`_noises`). `d_even` is its mean, which pulls all pixels the same way (a relative loss
+weighs what noise darkens), `d_odd` the rest, taken in blocks of pixels, which the film's filter may have mixed. Then
+the second moment of b is
+
+    B = sum over blocks (J_a^T d_odd) (J_b^T d_odd)^T + (J^T d_even) (J^T d_even)^T
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import drjit as dr
@@ -22,8 +30,9 @@ import numpy as np
 from reslrb_cli.integrators import known_step, render_image
 from reslrb_cli.integrators.tracer import LightTracer
 from reslrb_cli.optimization.certainty.directions import Change, Direction
+from reslrb_cli.optimization.loading import make_configured
 from reslrb_cli.optimization.samples import take_gradient
-from reslrb_cli.optimization.views import View, slope
+from reslrb_cli.optimization.views import View, slope, to_tensor
 from reslrb_cli.seeds import seed
 
 if TYPE_CHECKING:
@@ -38,8 +47,35 @@ GROUP = 64
 SHOWN = 0.05
 #: So many standard errors are taken off.
 SURE = 1.0
-#: Values of the images that enter H along directions: of more, so many at random, the same for all.
+#: Values of the images that enter H along directions: of more, so many at random, the same for all. And blocks of B.
 MOST_VALUES = 2**18
+#: Images by which the target's noise is sampled, of as many samples where those are at most so many times a step's.
+REPLICAS, AGAIN = 4, 4
+#: Samples of it by which large parameters are probed.
+PROBED = 2
+
+
+@dataclass
+class TargetNoise:
+    """What the noise of one view's target makes of dL/dI, (H, W, C): `even` on average, and `odd` in one sample of it
+    besides; `side` is that of the blocks of pixels that share noise."""
+
+    odd: Array
+    even: Array
+    side: int
+
+    def in_blocks(self, slope: Array) -> Array:
+        """The sums over each block of what an image's derivative (H, W, C) makes of the odd part, in a row."""
+        product = np.sum(slope * self.odd, axis=2)
+        rows, columns = (np.arange(0, size, self.side) for size in product.shape)
+        return np.asarray(np.add.reduceat(np.add.reduceat(product, rows, axis=0), columns, axis=1).ravel())
+
+    def signed(self, random: np.random.Generator) -> Array:
+        """The odd part with a random sign for each block."""
+        height, width = self.odd.shape[:2]
+        signs = random.choice([-1.0, 1.0], size=(-(-height // self.side), -(-width // self.side)))
+        spread = np.repeat(np.repeat(signs, self.side, axis=0), self.side, axis=1)[:height, :width, None]
+        return self.odd * spread
 
 
 class Curvature:
@@ -61,11 +97,15 @@ class Curvature:
         random = np.random.default_rng(self._seed(0, 0))
         self._picked = None if values <= MOST_VALUES else np.sort(random.choice(values, MOST_VALUES, replace=False))
         self._thinned = max(values / MOST_VALUES, 1.0)
+        #: Samples of the targets' noise, by view; nothing where no target was rendered.
+        self.noises = self._target_noises()
 
-    def along(self, changes: Sequence[Change], go_on: Callable[[], bool]) -> tuple[list[Direction], Array]:
-        """The directions of the changes that were rendered before `go_on` said no, and H of those (M, M)."""
+    def along(self, changes: Sequence[Change], go_on: Callable[[], bool]) -> tuple[list[Direction], Array, Array]:
+        """The directions of the changes that were rendered before `go_on` said no, and H and B of those (M, M)."""
         directions: list[Direction] = []
         columns: list[list[Array]] = [[], []]
+        odd: list[list[Array]] = [[], []]
+        even: list[float] = []
         for change in changes:
             if not go_on():
                 break
@@ -75,19 +115,25 @@ class Curvature:
             self.problem.apply()
             for direction in change.directions:
                 directions.append(direction)
+                pulled = 0.0
                 for half in (0, 1):
                     pairs = zip(images[half], self._base[half], strict=True)
                     slopes = [_of_channel((a - b) / change.amount, direction.channel) for a, b in pairs]
                     columns[half].append(self._in_a_row(slopes))
+                    if self.noises:
+                        blocks, sums = self._pulls(slopes)
+                        odd[half].append(blocks)
+                        pulled += 0.5 * sums
+                even.append(pulled)
                 if direction.entry is None:
                     self.pixels[direction.key] = self.pixels.get(direction.key, 0) + _changed(slopes)
         if not directions:
-            return [], np.zeros((0, 0))
+            return [], np.zeros((0, 0)), np.zeros((0, 0))
         a, b = (np.nan_to_num(np.array(rows)) for rows in columns)
         a = a * self._in_a_row(self._weights)
         sure = _sure_share(a * b)
         product = a @ b.T * self._thinned * np.sqrt(np.outer(sure, sure))
-        return directions, 0.5 * (product + product.T)
+        return directions, 0.5 * (product + product.T), _second_moment(odd, even, len(self.noises))
 
     def by_entry(self, probes: int, go_on: Callable[[], bool]) -> dict[str, Array]:
         """For each parameter the diagonal of H in a row, unsmoothed; nothing where `go_on` said no at once."""
@@ -96,22 +142,103 @@ class Curvature:
         for probe in range(probes):
             if not go_on():
                 break
-            signs = [random.choice([-1.0, 1.0], size=weight.shape) for weight in self._weights]
-            a, b = (self._probe(signs, 2 * probe + half) for half in (0, 1))
-            for key in a:
-                total[key] = total.get(key, 0.0) + a[key].astype(np.float64) * b[key]
+            roots = [np.sqrt(weight) * random.choice([-1.0, 1.0], size=weight.shape) for weight in self._weights]
+            self._add_probe(total, roots, 2 * probe)
             self.probes += 1
         return {key: value / self.probes for key, value in total.items()}
+
+    def by_entry_of_target(self, first: int, go_on: Callable[[], bool]) -> dict[str, Array]:
+        """The diagonal of B in the same way, by probes of which `first` is the number; nothing without a rendered
+        target."""
+        odd: dict[str, Array] = {}
+        even: dict[str, Array] = {}
+        random = np.random.default_rng(self._seed(1, first))
+        views = self.noises[:PROBED]
+        for number, noises in enumerate(views):
+            if not go_on():
+                return {}
+            self._add_probe(odd, [noise.signed(random) for noise in noises], 2 * (first + number))
+            self.probes += 1
+        if odd:
+            self._add_probe(even, [noise.even for noise in views[0]], 2 * (first + PROBED))
+            self.probes += 1
+        return {key: value / len(views) + even[key] for key, value in odd.items()}
+
+    def _add_probe(self, total: dict[str, Array], gradients: Sequence[Array], number: int) -> None:
+        """Add what two sets of samples make of dL/dI, by view, multiplied."""
+        a, b = (self._probe(gradients, number + half) for half in (0, 1))
+        for key in a:
+            total[key] = total.get(key, 0.0) + a[key].astype(np.float64) * b[key]
+
+    def _pulls(self, slopes: Sequence[Array]) -> tuple[Array, float]:
+        """What derivatives of the views' images make of the target's noise: of the odd part by sample and block in a
+        row, and of the mean of the even one."""
+        blocks = [noise.in_blocks(slope) for views in self.noises for noise, slope in zip(views, slopes, strict=True)]
+        sums = [
+            float(np.sum(slope * noise.even))
+            for views in self.noises
+            for noise, slope in zip(views, slopes, strict=True)
+        ]
+        return np.concatenate(blocks), sum(sums) / len(self.noises)
+
+    def _target_noises(self) -> list[list[TargetNoise]]:
+        config, trained = self.problem.config, self.problem.trained
+        render = config.target.render
+        if render is None or all(view.wanted.file is not None for view in trained):
+            return []
+        chosen = render.integrator or config.integrator
+        integrator = make_configured(chosen)
+        if isinstance(integrator, LightTracer):
+            integrator = integrator.with_options(samples_per_pass=integrator.samples_per_pass, freeze=False)
+        unit = chosen.options().get("samples_per_pass") or 1
+        few = max(self.spp // unit, 1) * unit
+        by_view = [self._noises(view, integrator, render.spp, few) for view in trained]
+        return [list(sample) for sample in zip(*by_view, strict=True)]
+
+    def _noises(self, view: View, integrator: Any, spp: int, few: int) -> list[TargetNoise]:
+        """Samples of what the noise of a view's target, of `spp` samples, makes of dL/dI; nothing of one that was read.
+
+        Of images with as many samples each is the target in turn, and the mean of the others what it shows. Where that
+        would cost too much, and noise is small, differences of images of `few` samples are added to the target.
+        """
+        true = np.array(view.target, dtype=np.float64)
+        if view.wanted.file is not None:
+            return [TargetNoise(np.zeros_like(true), np.zeros_like(true), 1)] * REPLICAS
+        again = spp <= AGAIN * self.problem.config.run.spp
+        images = []
+        for number in range(REPLICAS):
+            at = self._seed(view.sensor, -3 - number)
+            with dr.suspend_grad():
+                image = render_image(integrator, self.problem.scene, view.sensor, at, spp if again else few)
+            images.append(view.kept(np.nan_to_num(np.array(image, dtype=np.float64)[:, :, : true.shape[2]])))
+        if again:
+            total = np.sum(images, axis=0)
+            found = [self._slope(view, image, (total - image) / (REPLICAS - 1)) for image in images]
+            even = np.mean(found, axis=0)
+            odd = [(each - even) * np.sqrt(REPLICAS / (REPLICAS - 1)) for each in found]
+        else:
+            noises = [(a - b) * np.sqrt(few / spp / 2) for a, b in zip(images[::2], images[1::2], strict=True)]
+            sides = [[self._slope(view, true + side * noise, true) for side in (1, -1)] for noise in noises]
+            odd = [0.5 * (up - down) for up, down in sides] * 2
+            even = np.mean(sides, axis=(0, 1))
+        mixed = max(round(2 * self.problem.scene.sensors()[view.sensor].film().rfilter().radius()), 1)
+        side = max(mixed, round(np.ceil(np.sqrt(true.shape[0] * true.shape[1] / MOST_VALUES))))
+        return [TargetNoise(each, even, side) for each in odd]
+
+    def _slope(self, view: View, target: Array, image: Array) -> Array:
+        """dL/dI of an exposed image with another target, both (H, W, C)."""
+        return np.nan_to_num(slope(replace(view, made=to_tensor(target)).judge, image)) * view.share
 
     def _in_a_row(self, images: Sequence[Array]) -> Array:
         row = np.concatenate([image.ravel() for image in images])
         return row if self._picked is None else row[self._picked]
 
-    def _probe(self, signs: Sequence[Array], number: int) -> dict[str, Array]:
+    def _probe(self, gradients: Sequence[Array], number: int) -> dict[str, Array]:
+        """What dL/dI of the views' exposed images (H, W, C) is in the parameters, by one set of samples."""
         problem = self.problem
         for place, view in enumerate(problem.trained):
             channels = int(problem.scene.sensors()[view.sensor].film().base_channels_count())
-            v = view.exposure.of_array(np.sqrt(self._weights[place]) * signs[place])
+            v = view.exposure.of_array(gradients[place])
             v = np.pad(v, ((0, 0), (0, 0), (0, channels - v.shape[2]))).astype(np.float32)
             gradient = mi.TensorXf(v) + dr.opaque(mi.Float, 0)
             dr.make_opaque(gradient)
@@ -153,6 +280,16 @@ def smooth(diagonal: Array, noise: Array) -> Array:
     for group in np.array_split(order, max(len(order) // GROUP, 1)):
         result[group] = max(float(diagonal[group].mean()), 0.0)
     return result
+
+
+def _second_moment(odd: Sequence[Sequence[Array]], even: Sequence[float], samples: int) -> Array:
+    """B (M, M) of what M directions make of the noise: by half of the samples and by direction in blocks, and as a
+    whole."""
+    if not samples:
+        return np.zeros((len(even), len(even)))
+    a, b = (np.nan_to_num(np.array(rows)) for rows in odd)
+    product = a @ b.T / samples
+    return np.asarray(0.5 * (product + product.T) + np.outer(even, even))
 
 
 def _of_channel(image: Array, channel: int | None) -> Array:

@@ -18,7 +18,7 @@ class Measured:
     """One parameter of N entries at the end of a run: its values (N,), bounds, scale, and K gradients (K, N).
 
     `response` is how far a step moves an entry per unit of gradient, at the factor 1, and `rates` are the schedule's
-    factors of all iterations.
+    factors of all iterations. `seen` (N,) says which entries of a texture some view shows; None of what is no texture.
     """
 
     value: Array
@@ -30,6 +30,7 @@ class Measured:
     is_small: bool
     #: The mean square of the gradients of the run's last iterations, (N,), where the optimiser kept it.
     recent: Array | None = None
+    seen: Array | None = None
     mean: Array = field(init=False)
     noise: Array = field(init=False)
 

@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
+import drjit as dr
 import numpy as np
 
 from reslrb_cli.optimization.certainty.curvature import Curvature
 from reslrb_cli.optimization.certainty.directions import MOST_ENTRIES, Direction, plan_changes, row_of
 from reslrb_cli.optimization.certainty.measured import Measured
-from reslrb_cli.optimization.certainty.records import CertaintyRecord
+from reslrb_cli.optimization.certainty.records import CertaintyRecord, ParameterCertainty
 from reslrb_cli.optimization.certainty.weighing import Gradients, weigh
+from reslrb_cli.optimization.reach import shown_texels
 from reslrb_cli.optimization.samples import sample_gradient, take_gradient
 from reslrb_cli.optimization.schedules import learning_rate_factor
 from reslrb_cli.optimization.sensitivity import rms
@@ -52,6 +55,8 @@ class Certainty:
         self._initial = {key: row_of(problem, key) for key in problem.selection.keys}
         self._squares: dict[str, tuple[Any, float] | None] = {}
         self._seen = 0
+        #: The texels (H, W) of each texture that some view shows, once that was asked.
+        self.shown: dict[str, Array] = {}
 
     def see(self, iterations: int) -> None:
         """Take note of a run that has done so many iterations; it costs nothing."""
@@ -111,8 +116,10 @@ class Certainty:
             compiled_ms += times.codegen_ms
             if stop():
                 return None
-            directions, H, diagonal = found
-            parameters = weigh(self._measured(gradients, iterations), directions, H, diagonal, curvature.pixels)
+            directions, H, B, diagonal, of_target = found
+            measured = self._measured(gradients, iterations)
+            weighed = weigh(measured, directions, H, diagonal, curvature.pixels, B, of_target)
+            parameters = {key: self._with_course(key, about, measured[key]) for key, about in weighed.items()}
             measure_s = max(clock.elapsed_s - compiled_ms / 1e3, 0.0)
             return CertaintyRecord(
                 parameters=parameters,
@@ -122,6 +129,10 @@ class Certainty:
                 measure_s=measure_s,
                 compile_s=compiled_ms / 1e3,
                 share=measure_s / max(elapsed_s, 1e-9),
+                iterations=iterations,
+                scale=problem.config.optimizer.scale,
+                target_noise=self._target_noise(),
+                target_spp=render.spp if (render := problem.config.target.render) is not None else None,
             )
         finally:
             take_gradient(problem)
@@ -134,14 +145,32 @@ class Certainty:
 
     def _measure_curvature(
         self, curvature: Curvature, gradients: Gradients, most: int, budget: _Budget
-    ) -> tuple[list[Direction], Array, Gradients]:
-        """Directions and H along them; and, unsmoothed, its diagonal by entry, of parameters that have none of them."""
+    ) -> tuple[list[Direction], Array, Array, Gradients, Gradients]:
+        """Directions, H and B along them; and, unsmoothed, their diagonals by entry, of parameters that have none of
+        them."""
         scales = {key: self.scale(key) for key in self.problem.selection.keys}
-        directions, H = curvature.along(plan_changes(self.problem, scales, STEP, most), budget)
+        directions, H, B = curvature.along(plan_changes(self.problem, scales, STEP, most), budget)
         seen = {direction.key for direction in directions if direction.entry is not None}
         left = [key for key, rows in gradients.items() if np.any(rows) and key not in seen]
         diagonal = curvature.by_entry(PROBES, budget) if left else {}
-        return directions, H, {key: diagonal[key] for key in left if key in diagonal}
+        of_target = curvature.by_entry_of_target(PROBES, budget) if diagonal else {}
+        kept = ({key: found[key] for key in left if key in found} for found in (diagonal, of_target))
+        return directions, H, B, next(kept), next(kept)
+
+    def _target_noise(self) -> str:
+        """Whether the noise of the targets is in the spreads, as `CertaintyRecord` has it."""
+        read = [view.wanted.file is not None for view in self.problem.trained]
+        return "left out" if all(read) else "in part" if any(read) else "measured"
+
+    def _with_course(self, key: str, about: ParameterCertainty, own: Measured) -> ParameterCertainty:
+        """With how far it went, how far it could have gone, and what of it is seen."""
+        optimizer = self.problem.optimizer
+        step = optimizer.first_step(key)
+        reach = None if step is None else step * float(sum(own.rates))
+        kept = np.any(own.gradients, axis=0) & (True if own.seen is None else own.seen)
+        moved = rms((own.value - self._initial[key])[kept]) if kept.any() else 0.0
+        seen = None if own.seen is None else float(own.seen.mean())
+        return replace(about, moved=moved, reach=reach, rate=optimizer.rate(key), seen=seen)
 
     def scale(self, key: str) -> float:
         """The size of a parameter, in its unit: the largest root mean square of its values at the start and at the end
@@ -153,6 +182,17 @@ class Certainty:
         if np.isfinite(high - low) and (not emits or not any(sizes)):
             sizes.append(0.5 * (high - low))
         return max(sizes) or 1.0
+
+    def _seen_entries(self, key: str) -> Array | None:
+        """Which entries of a texture some view shows, in a row as gradients are; None of what is no texture."""
+        shown = shown_texels(self.problem, key)
+        if shown is None:
+            return None
+        self.shown[key] = shown
+        halo = dr.shape(self.problem.optimizer[key])[1] - shown.shape[1]  # of an environment map
+        channels = self.problem.selection.array(key).shape[2]
+        wide = np.pad(shown, ((0, 0), (halo // 2, halo - halo // 2)), mode="wrap")
+        return np.repeat(wide.ravel(), channels)
 
     def _measured(self, gradients: Gradients, iterations: int) -> dict[str, Measured]:
         config, optimizer = self.problem.config, self.problem.optimizer
@@ -175,6 +215,7 @@ class Certainty:
                 rates=factors,
                 is_small=value.size <= MOST_ENTRIES,
                 recent=self._recent(key, iterations),
+                seen=self._seen_entries(key),
             )
         return found
 

@@ -14,6 +14,15 @@ and the start stays), and the noise of the steps. K gradients at the final value
 
     gain = C H (H C H + Sigma / K)^-1,   to go = gain g,   C <- C - gain H C
 
+Noise of the target is in every gradient alike: H d + b + noise, d now the offset from what a target without noise would
+have. With B the second moment of b, and D how far a constant gradient drives the steps,
+
+    D <- (1 - eta_t P H) D + eta_t P
+    E = C + D B D^T,   cov(d, g) = E H - D B,   cov(g) = H E H - H D B - B D^T H + B + Sigma / K
+
+take the places of C, C H and H C H + Sigma / K. Where the run has converged, D = H^-1, what b does is in no gradient,
+and H^-1 B H^-1 is left.
+
 Momentum is left out: over many steps it moves as far. P is that of the end.
 """
 
@@ -34,6 +43,8 @@ class Posterior:
 
     to_go: Array
     covariance: Array
+    #: What of the spread is the target's, (M,).
+    of_target: Array
 
     @property
     def error(self) -> Array:
@@ -48,56 +59,84 @@ class Posterior:
 
 def joint(
     curvature: Array, response: Array, scale: Array, noise: Array, gradient: Array, samples: int,
-    rates: Sequence[float],
+    rates: Sequence[float], fixed: Array | None = None,
 ) -> Posterior:  # fmt: skip
     """The offset of M entries together.
 
     `curvature` is H (M, M), `noise` the covariance of one gradient (M, M), `gradient` the mean of `samples` of them,
     `response` the diagonal of P, `scale` the standard deviation of the offset at the start, all (M,), `rates` the eta
-    of all iterations. Each entry is taken in units of its scale, so that those of different units have well-conditioned
-    matrices.
+    of all iterations, `fixed` the B (M, M) of what all gradients share; None: nothing. Each entry is taken in units of
+    its scale, so that those of different units have well-conditioned matrices.
     """
     H = curvature * scale[:, None] * scale[None, :]
     H = _positive(0.5 * (H + H.T))
     Sigma = _positive(noise * scale[:, None] * scale[None, :])
-    C = _after(H, response / scale**2, Sigma, rates)
-    seen = H @ C @ H + Sigma / samples
+    C, driven = _after(H, response / scale**2, Sigma, rates)
+    B = np.zeros_like(H) if fixed is None else _positive(fixed * scale[:, None] * scale[None, :])
+    E, pulled = C + driven @ B @ driven.T, H @ driven @ B
+    seen = H @ E @ H - pulled - pulled.T + B + Sigma / samples
     seen = seen + np.eye(len(scale)) * max(1e-9 * float(np.trace(seen)), 1e-30)
-    gain = np.linalg.solve(seen, H @ C).T
+    shared = E @ H - driven @ B
+    gain = np.linalg.solve(seen, shared.T).T
     to_go = gain @ (gradient * scale)
-    return Posterior(to_go * scale, _positive(C - gain @ H @ C) * scale[:, None] * scale[None, :])
+    of_target = np.sqrt(np.maximum(np.diag(driven @ B @ driven.T), 0.0))
+    return Posterior(to_go * scale, _positive(E - gain @ shared.T) * np.outer(scale, scale), of_target * scale)
 
 
 def alone(
     curvature: Array, response: Array, scale: Array, noise: Array, gradient: Array, samples: int,
-    rates: Sequence[float],
+    rates: Sequence[float], fixed: Array | float = 0.0,
 ) -> tuple[Array, Array]:  # fmt: skip
     """`to_go` and its standard error of each entry as if all others were known; everything is (M,), as in `joint`."""
     h = np.maximum(curvature, 0.0)
-    C = scale**2
+    C, D = scale**2, np.zeros_like(h)
     for rate in rates:
-        C = np.clip(1 - rate * response * h, 0, 1) ** 2 * C + (rate * response) ** 2 * noise
-    seen = h**2 * C + np.maximum(noise / samples, 1e-300)
-    gain = C * h / seen
-    return gain * gradient, np.sqrt(np.maximum(C - gain * h * C, 0.0))
+        left = np.clip(1 - rate * response * h, 0, 1)
+        C = left**2 * C + (rate * response) ** 2 * noise
+        D = left * D + _driven(rate * response, h)
+    E = C + D**2 * fixed
+    seen = h**2 * E - 2 * h * D * fixed + fixed + np.maximum(noise / samples, 1e-300)
+    shared = E * h - D * fixed
+    gain = shared / seen
+    return gain * gradient, np.sqrt(np.maximum(E - gain * shared, 0.0))
 
 
-def _after(H: Array, response: Array, noise: Array, rates: Sequence[float]) -> Array:
-    """The covariance after all steps from a start of unit variances; an entry that no step moves stays where it was."""
-    C, moved = np.eye(len(response)), response > 0
+def driven_alone(curvature: Array, response: Array, rates: Sequence[float]) -> Array:
+    """D of each entry as if all others were known, (M,)."""
+    h = np.maximum(curvature, 0.0)
+    D = np.zeros_like(h)
+    for rate in rates:
+        D = np.clip(1 - rate * response * h, 0, 1) * D + _driven(rate * response, h)
+    return D
+
+
+def _driven(step: Array, curvature: Array) -> Array:
+    """How far one step goes per unit of a constant gradient: not beyond where curvature makes up for that."""
+    result: Array = np.minimum(step, 1 / np.maximum(curvature, 1e-300))
+    return result
+
+
+def _after(H: Array, response: Array, noise: Array, rates: Sequence[float]) -> tuple[Array, Array]:
+    """The covariance after all steps from a start of unit variances, and how far a constant gradient has driven them.
+
+    An entry that no step moves stays where it was.
+    """
+    C, D, moved = np.eye(len(response)), np.zeros_like(H), response > 0
     if not moved.any():
-        return C
+        return C, D
     # Steps are symmetric in units of the root of the response.
     q, free = np.sqrt(response[moved]), np.ix_(moved, moved)
     values, vectors = np.linalg.eigh(H[free] * q[:, None] * q[None, :])
     now = vectors.T @ np.diag(q**-2) @ vectors
     shaken = vectors.T @ (noise[free] * q[:, None] * q[None, :]) @ vectors
+    values, driven = np.maximum(values, 0.0), np.zeros(len(values))
     for rate in rates:
-        left = np.clip(1 - rate * np.maximum(values, 0.0), 0, 1)
+        left = np.clip(1 - rate * values, 0, 1)
         now = left[:, None] * now * left[None, :] + rate**2 * shaken
+        driven = left * driven + _driven(np.full_like(values, rate), values)
     back = q[:, None] * vectors
-    C[free] = back @ now @ back.T
-    return C
+    C[free], D[free] = back @ now @ back.T, (back * driven) @ back.T
+    return C, D
 
 
 def _positive(matrix: Array) -> Array:

@@ -13,7 +13,12 @@ class ParameterCertainty:
     `spread` is one standard deviation of the final value about the optimum and `to_go` the estimated way there, in the
     parameter's unit: one number for each entry of a small parameter, else one, the root mean square over the entries
     that have an effect; None where none was measured, and of entries at their bounds. `partner` is the parameter that
-    makes up for this one, where one does.
+    makes up for this one, where one does. `of_target` is what of the spread the noise of rendered targets makes, in the
+    same layout.
+
+    `moved` is the root mean square of how far the entries went since the start, and `reach` of how far all steps would
+    have taken them one way, None where their length depends on the gradient (`sgd`); `rate` is the learning rate.
+    `seen` is the share of a texture's texels that some view shows, None where that is not asked.
     """
 
     verdict: str
@@ -21,12 +26,22 @@ class ParameterCertainty:
     spread: list[float | None] | None
     to_go: list[float | None] | None
     partner: str | None = None
+    of_target: list[float | None] | None = None
+    moved: float | None = None
+    reach: float | None = None
+    rate: float | None = None
+    seen: float | None = None
 
 
 @dataclass(frozen=True)
 class CertaintyRecord:
     """All parameters, by key, and what it took: so many gradients, renderings along directions and random probes, in
-    `measure_s` seconds, compilation (`compile_s`) apart, and that over the time of the run's iterations (`share`)."""
+    `measure_s` seconds, compilation (`compile_s`) apart, and that over the time of the run's iterations (`share`).
+
+    `iterations`, `scale` (`optimizer.scale`) and `target_spp` are the run's. `target_noise` says whether the noise of
+    the targets is in the spreads: `measured` where all of them were rendered, `in part` where some were, else `left
+    out`.
+    """
 
     parameters: dict[str, ParameterCertainty]
     gradients: int
@@ -35,6 +50,10 @@ class CertaintyRecord:
     measure_s: float
     compile_s: float
     share: float
+    iterations: int
+    scale: str
+    target_noise: str
+    target_spp: int | None = None
 
     def to_json(self) -> dict[str, Any]:
         """As a mapping for JSON."""

@@ -6,6 +6,7 @@ entry's scale.
 
 | verdict          | holds where |
 |---|---|
+| `not seen`       | it is a texel that no view shows, whatever light by way of it reaches the images |
 | `no effect`      | every gradient sample was exactly 0 |
 | `at its bound`   | the value is within a step of a bound, and the gradient does not pull it back |
 | `settled`        | spread <= tau |
@@ -13,8 +14,8 @@ entry's scale.
 | `not determined` | `alone` <= `OTHERS` of `spread`: others make up for it; the most correlated one is named |
 | `below the noise`| otherwise: the gradients do not tell within tau where the value should be |
 
-A parameter of several entries is what `SETTLED_SHARE` of those that have an effect are, if that is `settled`; otherwise
-what most of the others are.
+A parameter of several entries is what `SETTLED_SHARE` of those that are seen and have an effect are, if that is
+`settled`; otherwise what most of the others are.
 """
 
 from __future__ import annotations
@@ -50,6 +51,7 @@ class Verdict(str, enum.Enum):
     NOT_DETERMINED = "not determined"
     BELOW_NOISE = "below the noise"
     NO_EFFECT = "no effect"
+    NOT_SEEN = "not seen"
     SETTLED = "settled"
 
 
@@ -111,10 +113,11 @@ def shares(verdicts: Sequence[Verdict]) -> dict[Verdict, float]:
 
 def summarise(found: Mapping[Verdict, float]) -> Verdict:
     """The verdict of a parameter whose entries have these shares."""
-    effective = 1 - found.get(Verdict.NO_EFFECT, 0.0)
-    if effective <= 0:
-        return Verdict.NO_EFFECT
-    if found.get(Verdict.SETTLED, 0.0) >= SETTLED_SHARE * effective:
+    without = (Verdict.NO_EFFECT, Verdict.NOT_SEEN)
+    effective = {verdict: share for verdict, share in found.items() if verdict not in without}
+    if not effective:
+        return max(without, key=lambda verdict: found.get(verdict, 0.0))
+    if effective.get(Verdict.SETTLED, 0.0) >= SETTLED_SHARE * sum(effective.values()):
         return Verdict.SETTLED
-    others = [verdict for verdict in Verdict if verdict not in (Verdict.SETTLED, Verdict.NO_EFFECT)]
+    others = [verdict for verdict in Verdict if verdict not in (Verdict.SETTLED, *without)]
     return max(others, key=lambda verdict: found.get(verdict, 0.0))

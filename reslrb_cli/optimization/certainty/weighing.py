@@ -11,7 +11,7 @@ from reslrb_cli.optimization.certainty.coordinates import Coordinates, judge_tog
 from reslrb_cli.optimization.certainty.curvature import smooth
 from reslrb_cli.optimization.certainty.directions import Direction
 from reslrb_cli.optimization.certainty.measured import Measured
-from reslrb_cli.optimization.certainty.posterior import alone
+from reslrb_cli.optimization.certainty.posterior import alone, driven_alone
 from reslrb_cli.optimization.certainty.records import ParameterCertainty
 from reslrb_cli.optimization.certainty.verdicts import OTHERS, TOLERANCE, Evidence, Verdict, judge, shares, summarise
 
@@ -25,12 +25,15 @@ def weigh(
     curvature: Array,
     diagonal: Gradients,
     pixels: Mapping[str, int],
+    fixed: Array,
+    fixed_diagonal: Gradients,
 ) -> dict[str, ParameterCertainty]:
     """The certainty of each parameter, from the curvature along directions, and by entry for those of many entries.
 
-    `pixels` is by how many values of images a texture is seen, where that is known: they tell no more entries.
+    `pixels` is by how many values of images a texture is seen, where that is known: they tell no more entries. `fixed`
+    and `fixed_diagonal` are of the noise of the targets what `curvature` and `diagonal` are of the curvature.
     """
-    found = judge_together(measured, directions, curvature)
+    found = judge_together(measured, directions, curvature, fixed)
     places: dict[str, list[int]] = {}
     for place, direction in enumerate(directions):
         places.setdefault(direction.key, []).append(place)
@@ -40,7 +43,7 @@ def weigh(
         if at and directions[at[0]].entry is not None:
             result[key] = _small(own, at, found)
         else:
-            result[key] = _large(own, diagonal.get(key), at, found, pixels.get(key))
+            result[key] = _large(own, diagonal.get(key), fixed_diagonal.get(key), at, found, pixels.get(key))
     return result
 
 
@@ -60,36 +63,46 @@ def _small(own: Measured, at: Sequence[int], found: Coordinates) -> ParameterCer
         _numbers(known),
         _numbers(np.where(np.isnan(known), np.nan, to_go)),
         partner,
+        _numbers(np.where(np.isnan(known), np.nan, found.of_target[at])),
     )
 
 
 def _large(
-    own: Measured, diagonal: Array | None, at: Sequence[int], found: Coordinates, pixels: int | None
-) -> ParameterCertainty:
+    own: Measured, diagonal: Array | None, fixed: Array | None, at: Sequence[int], found: Coordinates,
+    pixels: int | None,
+) -> ParameterCertainty:  # fmt: skip
     """By entry as if the others were known; all of it together may still be what another parameter makes up for."""
     touched = np.any(own.gradients, axis=0)
     prior = np.full(own.value.shape, own.prior)
     spread, to_go, error = prior.copy(), np.zeros(own.value.shape), prior.copy()
+    of_target = np.zeros(own.value.shape)
     if diagonal is not None and touched.any():
-        h = np.zeros(own.value.shape)
+        h, B = np.zeros(own.value.shape), np.zeros(own.value.shape)
         h[touched] = smooth(diagonal[touched], own.noise[touched])
+        if fixed is not None:
+            B[touched] = smooth(fixed[touched], own.noise[touched])
         given = (own.response, prior, own.noise, own.mean)
-        to_go, error = alone(h, *given, len(own.gradients), own.rates)
+        to_go, error = alone(h, *given, len(own.gradients), own.rates, B)
+        of_target = driven_alone(h, own.response, own.rates) * np.sqrt(B)
         to_go = own.within(to_go)
         spread = np.where(touched, np.hypot(to_go, error), prior)
     verdicts = judge(_evidence(own, spread, np.full(spread.shape, np.inf), to_go, error))
+    if own.seen is not None:
+        verdicts = [v if seen else Verdict.NOT_SEEN for v, seen in zip(verdicts, own.seen, strict=True)]
     found_shares = shares(verdicts)
     verdict, partner = summarise(found_shares), None
     for place in at if verdict in (Verdict.SETTLED, Verdict.BELOW_NOISE) else ():
         name = found.partners[place]
         if name is not None and found.alone[place] <= OTHERS * found.spread[place] and found.spread[place] > TOLERANCE:
             verdict, partner = Verdict.NOT_DETERMINED, name
-    if verdict is Verdict.SETTLED and pixels is not None and int(touched.sum()) > pixels:
+    shown = touched if own.seen is None else touched & own.seen
+    if verdict is Verdict.SETTLED and pixels is not None and int(shown.sum()) > pixels:
         verdict, partner = Verdict.NOT_DETERMINED, None
-    kept = [each not in (Verdict.AT_BOUND, Verdict.NO_EFFECT) for each in verdicts]
+    kept = [each not in (Verdict.AT_BOUND, Verdict.NO_EFFECT, Verdict.NOT_SEEN) for each in verdicts]
     seen = diagonal is not None and any(kept)
-    sizes = [np.array([np.sqrt(np.mean(np.square(part[kept]))) if seen else np.nan]) for part in (spread, to_go)]
-    return ParameterCertainty(verdict.value, _named(found_shares), _numbers(sizes[0]), _numbers(sizes[1]), partner)
+    parts = (spread, to_go, of_target)
+    sizes = [_numbers(np.array([np.sqrt(np.mean(np.square(part[kept]))) if seen else np.nan])) for part in parts]
+    return ParameterCertainty(verdict.value, _named(found_shares), sizes[0], sizes[1], partner, sizes[2])
 
 
 def _evidence(own: Measured, spread: Array, alone_: Array, to_go: Array, error: Array) -> Evidence:
