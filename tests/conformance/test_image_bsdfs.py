@@ -46,6 +46,7 @@ ROUGH = {
                                            "distribution": "ggx"},
     "roughdielectric": lambda: {"type": "roughdielectric", "alpha": 0.25},
     "roughplastic": lambda: {"type": "roughplastic", "diffuse_reflectance": rgb(0.3, 0.6, 0.2), "alpha": 0.15},
+    "pplastic": lambda: {"type": "pplastic", "diffuse_reflectance": rgb(0.3, 0.6, 0.2), "alpha": 0.3},
     "principled": lambda: {"type": "principled", "base_color": rgb(0.6, 0.5, 0.2), "metallic": 0.3, "roughness": 0.4,
                            "specular": 0.5, "clearcoat": 0.5, "clearcoat_gloss": 0.4, "sheen": 0.5, "spec_tint": 0.4,
                            "anisotropic": 0.5},
@@ -63,6 +64,8 @@ SEE_THROUGH = {
     "blend with null": lambda: {"type": "blendbsdf", "weight": 0.4, "a": {"type": "twosided", "bsdf": RED},
                                 "b": {"type": "null"}},
     "null": lambda: {"type": "null"},
+    "polarizer": lambda: {"type": "polarizer"},
+    "retarder": lambda: {"type": "retarder"},
 }  # fmt: skip
 #: Their shading normals are hidden inside of the BSDF, where `ptracer`'s correction does not see them.
 HIDDEN_NORMALS = {

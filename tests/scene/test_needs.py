@@ -10,6 +10,7 @@ import pytest
 
 from reslrb_cli.errors import UnsupportedScene
 from reslrb_cli.scene import check_camera_paths, check_supported, look, scene_needs, summarise
+from reslrb_cli.scene.needs import light_obstacle
 
 GLASS = {"type": "dielectric"}
 
@@ -214,3 +215,19 @@ def test_the_way_out_is_named_where_there_is_one(make_scene, changes, way):
     scene = make_scene(**changes)
     with pytest.raises(UnsupportedScene, match=f"{way}[^;]*$"):
         check_supported(scene, scene.sensors()[0])
+
+
+@pytest.mark.parametrize(("bsdf", "same"), [("hair", False), ("pplastic", True), ("principled", True)])
+def test_a_material_is_refused_to_light_paths_that_differs_with_light_and_view_exchanged(make_scene, bsdf, same):
+    import mitsuba as mi
+
+    scene = make_scene(plane={"type": "rectangle", "bsdf": {"type": bsdf}})
+    material = next(shape for shape in scene.shapes() if shape.id() == "plane").bsdf()
+    light, view = (mi.Vector3f(mi.ScalarVector3f(way)) for way in ([0.36, 0.48, 0.8], [-0.64, 0.48, 0.6]))
+    values = []
+    for wi, wo in ((light, view), (view, light)):
+        si = mi.SurfaceInteraction3f()
+        si.wi = wi
+        values.append(np.array(material.eval(mi.BSDFContext(), si, wo)).ravel() / np.array(wo.z))
+    assert np.allclose(*values, rtol=1e-3) is same
+    assert (light_obstacle(scene, scene.sensors()[0]) is None) is same
