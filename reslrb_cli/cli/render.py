@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 import os
 import tempfile
 from pathlib import Path
+from typing import Any
 
 import click
 
@@ -26,6 +28,26 @@ FLOAT_FORMATS = (".exr", ".hdr", ".pfm")
 FORMATS = (*FLOAT_FORMATS, ".png", ".jpg", ".jpeg")
 
 
+class Exposure(click.ParamType):
+    """A factor above 0; None for `auto`."""
+
+    name = "FACTOR|auto"
+
+    def convert(
+        self, value: str | float | None, param: click.Parameter | None, ctx: click.Context | None
+    ) -> float | None:
+        """The factor."""
+        if value == "auto" or value is None:
+            return None
+        try:
+            factor = float(value)
+        except ValueError:
+            factor = math.nan
+        if not 0 < factor < math.inf:
+            self.fail(f"{value!r} is neither auto nor a number above 0", param, ctx)
+        return factor
+
+
 @click.command("render")
 @optional_experiment_arguments
 @click.option(
@@ -44,6 +66,13 @@ FORMATS = (*FLOAT_FORMATS, ".png", ".jpg", ".jpeg")
 @click.option("--spp", type=COUNT, help="Samples per pixel; default: run.spp.")
 @click.option("--sensor", type=click.IntRange(min=0), help="Index of the sensor; default: the experiment's first.")
 @click.option(
+    "--exposure",
+    type=Exposure(),
+    default="1",
+    show_default=True,
+    help="What a PNG or JPG shows the image times: a number, or auto, which suits what is in view but lamps.",
+)
+@click.option(
     "--initial/--scene",
     "initial",
     default=True,
@@ -56,11 +85,15 @@ def command(
     run: Path | None,
     spp: int | None,
     sensor: int | None,
+    exposure: float | None,
     initial: bool,
 ) -> None:
     """Render the scene of CONFIG, or of a run (--run RUN), with its integrator."""
     if run is not None and is_given("initial"):
         raise click.UsageError("--run renders the values that the run recovered; leave out --initial and --scene")
+    linear = output.suffix.lower() in FLOAT_FORMATS
+    if linear and is_given("exposure"):
+        raise click.UsageError(f"{output.suffix} holds light as it is; --exposure is for PNG and JPG")
     config = _read(config_file, run, overrides)
     check_image_path(output)
     start_variant(config)
@@ -68,6 +101,7 @@ def command(
     from reslrb_cli.optimization.problem import load_for_rendering
     from reslrb_cli.optimization.rendering import render_in_passes
     from reslrb_cli.records.images import write_file
+    from reslrb_cli.report.tone import exposure_words
 
     if sensor is not None:
         config = _of_sensor(config, sensor)
@@ -76,13 +110,26 @@ def command(
         raise ConfigError("--spp", "", f"{spp} is not a multiple of integrator.samples_per_pass, which is {multiple}")
     samples = spp or config.run.spp
     image = render_in_passes(integrator, scene, sensors[0], samples, config.run.seed, 0, "render", multiple)
+    suits = 1.0 if linear else _suiting(image, scene, scene.sensors()[sensors[0]])
+    factor = suits if exposure is None else exposure
     try:
-        write_file(output.resolve(), image, linear=output.suffix.lower() in FLOAT_FORMATS)
+        write_file(output.resolve(), image * factor, linear)
     except (OSError, RuntimeError) as error:
         if is_machine_fault(error):
             raise
         raise ConfigError("--output", "", f"cannot write {output}: {getattr(error, 'strerror', error)}") from None
-    echo(f"{output}: {image.shape[1]}x{image.shape[0]}, {samples} spp")
+    words = [f"{image.shape[1]}x{image.shape[0]}", f"{samples} spp", *filter(None, [exposure_words(factor)])]
+    hint = "" if suits == 1 or is_given("exposure") else f"; --exposure auto: {exposure_words(suits)}"
+    echo(f"{output}: {', '.join(words)}{hint}")
+
+
+def _suiting(image: Any, scene: Any, sensor: Any) -> float:
+    """The exposure that suits an image of a scene."""
+    from reslrb_cli.report.tone import exposure_for
+    from reslrb_cli.scene.needs import unsupported_part
+    from reslrb_cli.scene.seen import sees_lamps
+
+    return exposure_for(image, None if unsupported_part(scene, sensor) else sees_lamps(scene, sensor))
 
 
 def _read(config_file: Path | None, run: Path | None, overrides: tuple[str, ...]) -> Config:

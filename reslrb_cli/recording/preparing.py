@@ -7,6 +7,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from reslrb_cli.backend.device import device_name
 from reslrb_cli.config import Config, dump
 from reslrb_cli.config.files import read_file
@@ -21,6 +23,9 @@ from reslrb_cli.optimization.views import view_records
 from reslrb_cli.recording.course import Course
 from reslrb_cli.records.manifest import Manifest
 from reslrb_cli.records.pilot_cache import PilotCache
+from reslrb_cli.report.tone import exposure_for
+from reslrb_cli.scene.needs import unsupported_part
+from reslrb_cli.scene.seen import sees_lamps
 
 Say = Callable[[str], None]
 
@@ -55,6 +60,11 @@ def manifest_of(problem: Problem, variant: str, config_file: Path) -> Manifest:
     )
     manifest.plan = plan_record(problem)
     manifest.views = view_records(problem.views)
+    for record, view in zip(manifest.views, problem.views, strict=True):
+        sensor = problem.scene.sensors()[view.sensor]
+        # What no light path can deal with, primary rays may not either.
+        lamps = sees_lamps(problem.scene, sensor) if unsupported_part(problem.scene, sensor) is None else None
+        record["shown"] = exposure_for(np.array(view.target), lamps)
     manifest.pilot = None if problem.pilot is None else problem.pilot.to_json()
     manifest.guided = None if problem.guided is None else problem.guided.to_json()
     manifest.sequence = None if problem.sequence is None else problem.sequence.to_json()

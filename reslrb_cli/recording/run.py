@@ -33,6 +33,7 @@ from reslrb_cli.records.run_folder import RunFolder
 from reslrb_cli.report import write_report
 from reslrb_cli.report.error_map import write_error_map
 from reslrb_cli.report.seen import seen_errors
+from reslrb_cli.report.tone import shown_exposures
 from reslrb_cli.report.verdict import warnings
 
 logger = logging.getLogger(__name__)
@@ -117,7 +118,7 @@ class Recording:
         self.page.refresh()
         self._save_checkpoint()
         for view in problem.views:
-            write_image(self.folder.images / self._image_name("target", view.sensor), np.array(view.target))
+            self._write_image("target", view.sensor, np.array(view.target))
             if view.weights is not None:
                 write_image(self.folder.images / self._image_name("weights", view.sensor), np.array(view.weights))
         self._write_images("initial")
@@ -232,7 +233,7 @@ class Recording:
         if pixels > MANY_PIXELS:
             logger.info(f"comparing images of {pixels / 1e6:.2g} million pixels as people see them")
         try:
-            self.seen = finite(seen_errors(self.folder.path, self.manifest.results))
+            self.seen = finite(seen_errors(self.folder.path, self.manifest.results, self.manifest.views))
         except Exception as error:
             logger.warning("errors as people see them were not measured: %s", describe(error))
         else:
@@ -284,13 +285,18 @@ class Recording:
         for view in self.problem.views:
             image = self.problem.render(view.sensor, spp, self.done, "saved image")
             exposed = view.exposure.of_array(image)  # as the target is
-            write_image(self.folder.images / self._image_name(name, view.sensor), exposed)
+            self._write_image(name, view.sensor, exposed)
             self.course.results.see(name, view, image)
             if name == "final":
                 suffix = self._image_name("", view.sensor)
                 towards = self.problem.image_gradient(view, image)
                 about = write_error_map(self.folder.images, suffix, exposed, np.array(view.target), towards)
                 self.error_maps[f"error{suffix}"] = about
+
+    def _write_image(self, name: str, sensor: int, image: np.ndarray[Any, Any]) -> None:
+        """Write an image of a sensor, to look at with the exposure that suits its target, whatever is in it."""
+        exposure = shown_exposures(self.manifest.views).get(self._image_name("", sensor), 1.0)
+        write_image(self.folder.images / self._image_name(name, sensor), image, image * np.float32(exposure))
 
     def _image_name(self, name: str, sensor: int) -> str:
         return name if len(self.problem.views) == 1 else f"{name}-{sensor}"

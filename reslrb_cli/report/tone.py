@@ -3,32 +3,80 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 Array = np.ndarray[Any, Any]
 
-#: What 99 % of the values are below is shown as it is where it lies in this range, else brought to `BRIGHT`.
+#: The level of an image is shown as it is where it lies in this range, else brought to `BRIGHT`.
 LEAST_BRIGHT, MOST_BRIGHT, BRIGHT = 0.25, 1.6, 0.8
+#: The level is that below which so many of the pixels are, and so much of their light but for that of FIREFLIES.
+MOST_PIXELS, MOST_LIGHT = 0.99, 0.9
+#: The share of the pixels, the brightest, whose light does not count.
+FIREFLIES = 1e-3
+#: Pixels that see a lamp count where they raise the level by no more than this factor, or where the others are too few.
+LAMPS, LEAST_OTHERS = 3.0, 0.05
+#: What is clipped of an image is said where it is a larger share of it.
+LEAST_CLIPPED = 0.005
 
 
-def exposure_for(arrays: Iterable[Array | None]) -> float:
-    """The factor, of two digits, that makes linear values visible; 1 where they are, or there is none."""
-    brightest = [float(np.quantile(np.nan_to_num(array[:, :, :3].max(axis=2)), 0.99)) for array in arrays
-                 if array is not None and array.size]  # fmt: skip
-    level = max(brightest, default=0.0)
+def exposure_for(image: Array | None, lamps: Array | None = None) -> float:
+    """The factor, of two digits, that makes the linear values of an image (H, W, C) visible; 1 where they are, or there
+    is none.
+
+    `lamps` (H, W), boolean, are the pixels that see a lamp, which may be thousands of times as bright as all that it
+    lights: they are clipped, rather than that the others are shown nearly black. Two levels are looked at, since a
+    caustic that takes few pixels holds much of the light: it would be clipped by the first alone. And an image of few
+    samples has pixels that hold much of the light, and are wrong: they would darken it by the second alone.
+    """
+    level = 0.0 if image is None else _level(image)
+    if image is not None and lamps is not None and lamps.shape == image.shape[:2] and (~lamps).mean() >= LEAST_OTHERS:
+        others = _level(image[~lamps][:, None])
+        level = others if 0 < LAMPS * others < level else level
     if not 0 < level < math.inf or LEAST_BRIGHT <= level <= MOST_BRIGHT:
         return 1.0
     return float(f"{BRIGHT / level:.1e}")
 
 
-def exposure_words(exposure: float) -> str:
-    """What has to be said of an exposure; nothing of 1."""
-    if exposure == 1:
-        return ""
-    return f"shown {exposure:.2g} times brighter" if exposure > 1 else f"shown {1 / exposure:.2g} times darker"
+def _level(image: Array) -> float:
+    """What is to be shown of an image: the value below which most of its pixels, and most of their light, are."""
+    values = _brightest(image).astype(np.float64)
+    values = np.sort(np.maximum(values[np.isfinite(values)], 0))
+    if not values.size:
+        return 0.0
+    light = np.cumsum(values[: values.size - int(FIREFLIES * values.size)])
+    by_light = values[min(int(np.searchsorted(light, MOST_LIGHT * light[-1])), light.size - 1)]
+    return max(float(np.quantile(values, MOST_PIXELS)), float(by_light))
+
+
+def _brightest(image: Array) -> Array:
+    """The greatest of a pixel's colours (H, W), alpha left out."""
+    return np.asarray(image[:, :, : 3 if image.shape[2] >= 3 else 1].max(axis=2))
+
+
+def shown_exposures(views: Sequence[Mapping[str, Any]] | None) -> dict[str, float]:
+    """The exposures that a manifest has of its `views`, by what their images' names end in; none of older runs."""
+    found = {}
+    for view in views or ():
+        exposure = view.get("shown")
+        if isinstance(exposure, int | float) and 0 < exposure < math.inf:
+            found["" if len(views or ()) == 1 else f"-{view.get('sensor')}"] = float(exposure)
+    return found
+
+
+def exposure_words(exposure: float, target: Array | None = None) -> str:
+    """What has to be said of an exposure: nothing of 1, unless much of `target` is brighter than white with it."""
+    words = []
+    if exposure != 1:
+        times = f"{exposure:.2g} times brighter" if exposure > 1 else f"{1 / exposure:.2g} times darker"
+        words.append(f"shown {times}")
+    if target is not None and target.size:
+        clipped = float((_brightest(target) * exposure > 1).mean())
+        if clipped > LEAST_CLIPPED:
+            words.append(f"{100 * clipped:.2g} % of the target is brighter than white, and clipped")
+    return "; ".join(words)
 
 
 def encode(values: Array) -> Array:

@@ -43,6 +43,8 @@ _NO_POINTS = {"SDFGrid": "sdfgrid", "Ellipsoids": "ellipsoids", "EllipsoidsMesh"
 _NO_LAMPS = {"BSplineCurve": "bsplinecurve", "LinearCurve": "linearcurve"}
 #: How many see-through surfaces a primary ray is followed through.
 CROSSINGS = 32
+#: Primary rays that look at a scene, along each side of a grid.
+LOOK = 128
 
 
 @dataclass(frozen=True)
@@ -319,12 +321,25 @@ def _kind(item: Any, below: dict[Any, list[Any]]) -> tuple[Any, ...]:
     return (name, size, *(_kind(child, below) for child in used))
 
 
-def look(scene: Any, sensor: Any, resolution: int = 128) -> View:
-    """Cast primary rays through the centres of a grid of `resolution`^2 cells of the film's crop window."""
-    count = resolution * resolution
+def look(scene: Any, sensor: Any) -> View:
+    """Cast primary rays through the centres of a grid of LOOK^2 cells of the film's crop window."""
+    smooth, specular, emission = what_is_seen(scene, sensor)
+    count = LOOK * LOOK
+
+    def fraction(mask: Any) -> float:
+        return float(dr.count(mask)[0]) / count
+
+    return View(fraction(smooth), fraction(specular), fraction(~(smooth | specular)), fraction(emission))
+
+
+def what_is_seen(scene: Any, sensor: Any, aperture: tuple[float, float] | None = None) -> tuple[Any, Any, Any]:
+    """Of the rays through a grid of LOOK^2 cells, row by row, as `View` has them: which meet surfaces that are smooth,
+    those that are specular alone, and emission. They start at a point of the `aperture`, by default its middle."""
+    count = LOOK * LOOK
     lane = dr.arange(mi.UInt32, count)
-    position = mi.Point2f(lane % resolution + 0.5, lane // resolution + 0.5) / resolution
-    ray, _ = sensor.sample_ray(sensor.shutter_open(), 0.5, position, mi.Point2f(0.5), True)
+    position = mi.Point2f(lane % LOOK + 0.5, lane // LOOK + 0.5) / LOOK
+    lens = mi.Point2f(0.5) if aperture is None else mi.Point2f(*(dr.opaque(mi.Float, place) for place in aperture))
+    ray, _ = sensor.sample_ray(sensor.shutter_open(), 0.5, position, lens, True)
     active = dr.full(mi.Mask, True, count)
     smooth, specular, emission = (dr.zeros(mi.Mask, count) for _ in range(3))
     for _ in range(CROSSINGS):
@@ -340,11 +355,7 @@ def look(scene: Any, sensor: Any, resolution: int = 128) -> View:
         dr.eval(ray, active, smooth, specular, emission)
         if dr.none(active):
             break
-
-    def fraction(mask: Any) -> float:
-        return float(dr.count(mask)[0]) / count
-
-    return View(fraction(smooth), fraction(specular), fraction(~(smooth | specular)), fraction(emission))
+    return smooth, specular, emission
 
 
 def _read_geometry(graph: SceneGraph) -> bool:

@@ -1,6 +1,6 @@
 """Pixels of which light tracing lacks something: at the film's border, and where the sensor sees glass, mirrors, coats.
 
-From the smooth lobes of those light paths cannot connect to the sensor.
+From the smooth lobes of those light paths cannot connect to the sensor. And those that see lamps.
 """
 
 from __future__ import annotations
@@ -11,10 +11,12 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .needs import CROSSINGS
+from .needs import CROSSINGS, LOOK, what_is_seen
 
 #: Primary rays are spread over a pixel in so many rows and columns of cells.
 CELLS = 4
+#: Points of the aperture, in [0, 1]^2, from which a lens looks for lamps.
+_APERTURE = ((0.5, 0.5), (0.05, 0.5), (0.95, 0.5), (0.5, 0.05), (0.5, 0.95))
 
 
 def interior(shape: tuple[int, ...], sensor: mi.Sensor) -> np.ndarray:
@@ -72,6 +74,27 @@ def sees_specular(scene: mi.Scene, sensor: mi.Sensor) -> SeenSpecular:
         return np.asarray(maximum_filter(np.array(mask, dtype=bool).reshape(height, width), size))
 
     return SeenSpecular(reached(alone), reached(mixed))
+
+
+def sees_lamps(scene: mi.Scene, sensor: mi.Sensor) -> np.ndarray:
+    """Pixels (H, W) of a sensor's crop window that see an emitter directly, by way of the reconstruction filter too.
+
+    A lamp smaller than the cells of a grid of LOOK^2 may be missed.
+    """
+    film = sensor.film()
+    width, height = (int(n) for n in film.crop_size())
+    cells = np.zeros((LOOK, LOOK), dtype=bool)
+    for point in _APERTURE if sensor.needs_aperture_sample() else (None,):
+        cells |= np.array(what_is_seen(scene, sensor, point)[2]).reshape(LOOK, LOOK)
+    if not cells.any():
+        return np.zeros((height, width), dtype=bool)
+    from scipy.ndimage import maximum_filter  # here: a scene that shows no lamp does not wait for it
+
+    cells = np.asarray(maximum_filter(cells, 3))  # an edge may be anywhere between the centres of two cells
+    for axis, size in enumerate((height, width)):
+        first = np.arange(size) * LOOK // size
+        cells = np.maximum.reduceat(cells, first, axis=axis) if size < LOOK else np.take(cells, first, axis=axis)
+    return np.asarray(maximum_filter(cells, 2 * int(np.ceil(float(film.rfilter().radius()) - 0.5)) + 1))
 
 
 def _first_surfaces(scene: mi.Scene, ray: mi.Ray3f, count: int) -> tuple[mi.Bool, mi.Bool]:

@@ -234,3 +234,47 @@ def test_an_environment_map_has_an_error_and_a_picture(capsys):
     layers = read_layers(Path("runs/box/images/comparison.exr"))
     assert {array.shape for array in layers.values()} == {(8, 12, 3)}
     assert 'alt="true: sky.data"' in Path("runs/box/report.html").read_text()
+
+
+def test_images_are_toned_by_what_is_in_view_but_lamps(capsys):
+    bulb = '<shape type="sphere" id="bulb"><float name="radius" value="0.3"/><point name="center" value="0, 0, 1"/>' \
+        '<emitter type="area"><rgb name="radiance" value="9000, 9000, 9000"/></emitter></shape>'  # fmt: skip
+    Path("scene.xml").write_text(SCENE.replace("</scene>", f"{bulb}</scene>"))
+    optimize(capsys, "run.iterations=2")
+    [view] = read_manifest("runs/box")["views"]
+    target = read("runs/box/images/target.exr")
+    lamp = target.max(axis=2) > 4000
+    assert 0 < lamp.mean() < 0.5
+    assert 0 < view["shown"] < 1
+    wall = target.max(axis=2) < 600  # others are in part of the bulb
+    assert 0.5 < np.quantile(target[wall], 0.99) * view["shown"] < 1.5  # where 1 is white; the bulb is far beyond
+    assert target[lamp].min() * view["shown"] > 3
+    for name in ("initial", "final", "target"):
+        linear = np.clip(read(f"runs/box/images/{name}.exr") * view["shown"], 0, 1)
+        srgb = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
+        assert np.abs(read(f"runs/box/images/{name}.png") - 255 * srgb).max() < 1
+    page = Path("runs/box/report.html").read_text()
+    assert re.search(r"shown \d\S* times darker; \d\S* % of the target is brighter than white, and clipped", page)
+
+
+def test_a_png_is_toned_where_that_is_asked_for(capsys):
+    dim = re.sub(r'(name="radiance" value=")[^"]*', r"\g<1>0.01, 0.01, 0.01", SCENE)
+    assert dim != SCENE
+    Path("scene.xml").write_text(dim)
+    printed = {}
+    for name, options in (("a.exr", ()), ("as_is.png", ()), ("auto.png", ("auto",)), ("ten.png", ("10",))):
+        more = ("--exposure", *options) if options else ()
+        code, printed[name], err = reslrb(capsys, "render", "box.yaml", "--scene", "--spp", "64", "-o", name, *more)
+        assert code == 0, err
+    assert "exposure" not in printed["a.exr"] + printed["auto.png"]
+    factor = re.search(r"; --exposure auto: shown (\S+) times brighter$", printed["as_is.png"].strip())
+    assert f", shown {factor[1]} times brighter" in printed["auto.png"]
+    as_is, ten, auto = (read(f"{name}.png").mean() for name in ("as_is", "ten", "auto"))
+    assert as_is < ten < auto
+    assert 100 < auto < 230
+    for file, given, line in (
+        ("a.png", "-1", "'-1' is neither auto nor a number above 0"),
+        ("a.exr", "2", "--exposure is for PNG and JPG"),
+    ):
+        code, _, err = reslrb(capsys, "render", "box.yaml", "-o", file, "--exposure", given)
+        assert (code, line in err) == (2, True)

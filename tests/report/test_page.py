@@ -16,6 +16,7 @@ from reslrb_cli.records.layers import read_layers
 from reslrb_cli.records.manifest import Status
 from reslrb_cli.report.page import render_page, write_report
 from reslrb_cli.report.page.values import parameter_table, texture_pictures
+from reslrb_cli.report.tone import exposure_for, exposure_words, shown_exposures
 
 
 class Page(html.parser.HTMLParser):
@@ -285,3 +286,61 @@ def test_many_parameters_have_their_worst_drawn(tmp_path):
     page = page_of(make_run(tmp_path / "many", keys=keys))
     assert len(page.cells["Parameters"]) == 13
     assert "4 more are not drawn" in page.sections["Convergence"]
+
+
+# --- which exposure suits an image ------------------------------------------------------------------------------------
+
+
+def grey(shape=(64, 64), value=0.02):
+    return np.full((*shape, 3), value, np.float32)
+
+
+def test_a_lamp_in_view_does_not_darken_all_else():
+    room = np.random.default_rng(0).uniform(0.01, 0.02, (64, 64, 3)).astype(np.float32)
+    lamps = np.zeros((64, 64), bool)
+    lamps[:8, :8] = True
+    lit = np.where(lamps[:, :, None], np.float32(50), room)
+    assert exposure_for(lit) == 0.016  # where nothing is known of it
+    assert exposure_for(lit, lamps) == exposure_for(room)
+    assert 0.7 < 0.02 * exposure_for(lit, lamps) < 0.9
+    # What is not much brighter than the rest is shown with it, and so is a lamp that fills the view.
+    assert exposure_for(np.where(lamps[:, :, None], np.float32(0.05), room), lamps) == pytest.approx(16)
+    assert exposure_for(lit, np.ones_like(lamps)) == exposure_for(lit)
+    assert exposure_for(np.where(lamps[:, :, None], np.float32(50), 0), lamps) == 0.016
+    # Fireflies beside it count for nothing.
+    few = lit.copy()
+    few[40, ::20] = 1e6
+    assert exposure_for(few, lamps) == pytest.approx(exposure_for(room), rel=0.05)
+
+
+def test_a_small_caustic_is_not_blown_out():
+    image = grey(value=0.0)
+    image[30:33, 30:38] = 40.0  # less than a hundredth of the pixels, and all of the light
+    assert exposure_for(image) == 0.02
+    assert exposure_for(image + np.float32(0.01)) == 0.02
+    few = image + np.float32(0.01)
+    few[0, :4, 0] = 1e9, np.inf, np.nan, 1e9  # a thousandth of the pixels
+    assert exposure_for(few) == 0.02
+
+
+def test_what_can_be_seen_is_shown_as_it_is():
+    assert exposure_for(None) == exposure_for(grey(value=0.0)) == exposure_for(grey(value=0.5)) == 1
+    assert exposure_for(grey(value=np.nan)) == exposure_for(np.zeros((0, 4, 3))) == 1
+    assert exposure_for(grey(value=3.2)) == 0.25
+    alpha = np.concatenate([grey(value=0.001)[:, :, :1], np.ones((64, 64, 1), np.float32)], axis=2)
+    assert exposure_for(alpha) == 800
+
+
+def test_what_is_clipped_is_said():
+    image = grey(value=0.5)
+    image[:16] = 2.0
+    assert exposure_words(1.0, image) == "25 % of the target is brighter than white, and clipped"
+    assert exposure_words(0.5, image) == "shown 2 times darker"
+    assert exposure_words(1.0) == exposure_words(1.0, grey(value=0.5)) == ""
+
+
+def test_images_have_the_exposure_that_the_manifest_says(tmp_path):
+    folder = make_run(tmp_path / "lamp", sensors=2, views=[{"sensor": 0, "shown": 0.1}, {"sensor": 1}])
+    assert re.findall(r"shown .*? times \w{6}", page_of(folder).sections["Images"]) == ["shown 10 times darker"]
+    assert shown_exposures([{"sensor": 0, "shown": "x"}]) == shown_exposures(None) == {}
+    assert shown_exposures([{"sensor": 3, "shown": 2}]) == {"": 2.0}

@@ -13,7 +13,8 @@ from reslrb_cli.records.images import load_image
 from reslrb_cli.report.error_map import color_stops, colored, read_comparison, signed_end
 from reslrb_cli.report.page.markup import figure, figures, text
 from reslrb_cli.report.page.pictures import Array, embed, fit, show
-from reslrb_cli.report.tone import exposure_for, exposure_words
+from reslrb_cli.report.sources import Run
+from reslrb_cli.report.tone import exposure_for, exposure_words, shown_exposures
 from reslrb_cli.report.words import number
 
 #: Images between the first and the last that are shown of a sensor, at most.
@@ -21,21 +22,22 @@ MOST_BETWEEN = 12
 _OF_A_SENSOR = re.compile(r"(?:initial|final|target)(-\d+)?\.exr")
 
 
-def image_rows(folder: Path, results: Mapping[str, Any]) -> str:
+def image_rows(run: Run) -> str:
     """Of every sensor a row: the initial image, the final one, the target, and maps of error and dL/dI.
 
-    `folder` is `images/`. A sensor's images have one exposure. What is missing is left out.
+    A sensor's images have one exposure, that of the run's manifest, or else what suits the target. What is missing is
+    left out.
     """
+    folder, exposures = run.path / "images", shown_exposures(run.manifest.get("views"))
     suffixes = {match[1] or "" for path in folder.glob("*.exr") if (match := _OF_A_SENSOR.fullmatch(path.name))}
-    return "".join(
-        _row(folder, suffix, results) for suffix in sorted(suffixes, key=lambda suffix: int(suffix[1:] or 0))
-    )
+    ordered = sorted(suffixes, key=lambda suffix: int(suffix[1:] or 0))
+    return "".join(_row(folder, suffix, run.results, exposures.get(suffix)) for suffix in ordered)
 
 
-def _row(folder: Path, suffix: str, results: Mapping[str, Any]) -> str:
+def _row(folder: Path, suffix: str, results: Mapping[str, Any], exposure: float | None) -> str:
     names = {"start": "initial", "end": "final", "target": "target"}
     loaded = {title: load_image(folder / f"{name}{suffix}.exr") for title, name in names.items()}
-    exposure = exposure_for([loaded["target"]])
+    exposure = exposure_for(loaded["target"]) if exposure is None else exposure
     sensor = f" of sensor {suffix[1:]}" if suffix else ""
     shown = [
         _figure(image * exposure, f"{title}{sensor}", f"<b>{text(title)}</b>, {image.shape[1]}×{image.shape[0]}")
@@ -44,7 +46,7 @@ def _row(folder: Path, suffix: str, results: Mapping[str, Any]) -> str:
     ]
     shown += _weight_figure(folder, suffix, sensor) + _error_figures(folder, suffix, results)
     title = f"<h3>Sensor {text(suffix[1:])}</h3>" if suffix else ""
-    words = exposure_words(exposure)
+    words = exposure_words(exposure, loaded["target"])
     title += f'<p class="soft small">{text(words)}</p>' if words else ""
     return title + figures(shown) + _between(folder, suffix, exposure)
 

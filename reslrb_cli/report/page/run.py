@@ -52,14 +52,14 @@ def _lines(run: Run) -> str:
 
 def run_parts(run: Run) -> dict[str, str]:
     """By title, what there is to show of a run beside its header, in order; what it does not have is empty."""
-    results, images = run.results, run.path / "images"
+    results = run.results
     parts: dict[str, Callable[[], str]] = {
         "Parameters": lambda: (
             parameter_table(results, "now" if run.at_work else "end")
             + _over_what(results)
             + soft(certainty_words(results))
         ),
-        "Images": lambda: image_rows(images, results),
+        "Images": lambda: image_rows(run),
         "Views": lambda: view_table(run.manifest.get("views"), results),
         "Errors as people see them": lambda: seen_tables([run]),
         "Textures": lambda: texture_pictures(run.path / "parameters", results, run.current),

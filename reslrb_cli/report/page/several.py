@@ -50,7 +50,7 @@ def run_comparison(runs: Sequence[Run]) -> Parts:
         "Runs": lambda: overview(runs),
         "Convergence": lambda: convergence_of_all(runs),
         "Time of an iteration": lambda: bars(runs),
-        "Images": lambda: _each(runs, lambda run: image_rows(run.path / "images", run.results)),
+        "Images": lambda: _each(runs, image_rows),
         "Errors as people see them": lambda: seen_tables(runs),
         "Parameters": lambda: _each(runs, lambda run: parameter_table(run.results)),
         "Textures": lambda: _each(runs, lambda run: texture_pictures(run.path / "parameters", run.results)),

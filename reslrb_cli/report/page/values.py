@@ -90,7 +90,7 @@ def _exposure(arrays: Mapping[str, Array | None]) -> float:
     """What is emitted may be far beyond 1, and has one exposure at all moments: by the truth, where that is known."""
     true, final = arrays["true"], arrays["final"]
     known = true if true is not None else final
-    return exposure_for([known]) if known is not None and float(np.nanmax(known)) > 1 else 1.0
+    return exposure_for(known) if known is not None and float(np.nanmax(known)) > 1 else 1.0
 
 
 def _figure(title: str, alt: str, array: Array, about: Mapping[str, Any] | None, exposure: float) -> str:

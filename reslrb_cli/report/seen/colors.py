@@ -30,7 +30,7 @@ def color_errors(moments: Mapping[str, Array], true: Array, mask: Array | None, 
     shows it. Empty where these are no such arrays, or the mask is.
     """
     found: dict[str, Any] = {}
-    exposure = exposure_for([_texture(true)]) if quantity and _is_told(true) else 1.0
+    exposure = exposure_for(_texture(true)) if quantity and _is_told(true) else 1.0
     for moment, value in moments.items():
         pair = _entries(value, true, mask)
         if pair is not None and pair[0].size:

@@ -13,7 +13,7 @@ def with_seen_errors(source: Source) -> Source:
     if not isinstance(source, Run) or "seen" in source.results:
         return source
     try:
-        found = seen_errors(source.path, source.results)
+        found = seen_errors(source.path, source.results, source.manifest.get("views"))
     except Exception:  # what lies in the folder is damaged, in a way that nobody thought of; the page goes on without
         return source
     results = {**source.results, "seen": found}
