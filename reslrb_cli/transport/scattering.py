@@ -51,11 +51,14 @@ def shading_correction(
     """Veach's factor for shading normals (thesis, p. 155) and whether both directions are on consistent sides.
 
     Without shading normals the factor is 1 and both sides are consistent by construction: neither is computed. With
-    perturbed ones, it is |n . wo| / |n . wi|, what is left of it beside the exchanged BSDF.
+    perturbed ones, it is |n . wo| / |n . wi|, what is left of it beside the exchanged BSDF. n is taken on the side of
+    the shading normal: faces of a mesh that a transform mirrors wind the other way, and paths from the sensor, which
+    know the shading normal alone, see nothing of that.
     """
     if not (plan.needs.has_shading_normals or plan.needs.has_perturbed_normals):
         return mi.Float(1), mi.Bool(True)
-    wi_dot_n, wo_dot_n = dr.dot(si.n, wi_world), dr.dot(si.n, wo_world)
+    n = dr.mulsign(si.n, dr.dot(si.n, si.sh_frame.n))
+    wi_dot_n, wo_dot_n = dr.dot(n, wi_world), dr.dot(n, wo_world)
     cos_i, cos_o = mi.Frame3f.cos_theta(si.wi), mi.Frame3f.cos_theta(wo)
     valid = (wi_dot_n * cos_i > 0) & (wo_dot_n * cos_o > 0)
     if plan.needs.has_perturbed_normals:

@@ -70,3 +70,24 @@ def test_real_room(hide_emitters):
     assert left_out.mean() < 0.2
     result = compare(ours * ~left_out[..., None], theirs * ~left_out[..., None])
     assert result, result
+
+
+@pytest.mark.usefixtures("samples")
+def test_a_mesh_that_its_transform_mirrors():
+    """Its faces wind the other way than its normals: `ptracer` has it black."""
+    import mitsuba as mi
+
+    look = mi.ScalarTransform4f().look_at([0, 2, 5], [0, 0.5, 0], [0, 1, 0])
+    down = mi.ScalarTransform4f().translate([0, 3, 0]).rotate([1, 0, 0], 90)
+    mirrored = mi.ScalarTransform4f().translate([0, 0.6, 0]).scale([-0.5, 0.5, 0.5])
+    film = {"type": "hdrfilm", "width": 16, "height": 16, "filter": {"type": "box"}, "pixel_format": "rgb"}
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "sensor": {"type": "perspective", "fov": 30, "to_world": look, "film": film},
+            "lamp": {"type": "rectangle", "to_world": down, "emitter": {"type": "area", "radiance": 8.0}},
+            "box": {"type": "cube", "to_world": mirrored, "bsdf": {"type": "diffuse", "reflectance": 0.5}},
+        }
+    )
+    result = agreement(scene, "path", spp=256, max_depth=4, rr_depth=5)
+    assert result, result
