@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from textwrap import wrap
 
+from reslrb_cli.errors import printable
 from reslrb_cli.scene.catalog import Value
 from reslrb_cli.scene.depth import Depth
 from reslrb_cli.scene.proposal import Proposal
@@ -17,6 +18,9 @@ from reslrb_cli.scene.proposal import Proposal
 #: Pixels with which a run takes minutes on two cores, at the samples below.
 PIXELS = 2**14
 SPP, ITERATIONS, RATE = 16, 200, 0.03
+#: The same with a parameter that has no upper bound, of which rates are shares: it and what it shines on are told apart
+#: in many steps.
+UNBOUNDED_ITERATIONS, UNBOUNDED_RATE = 300, 0.1
 #: Commented lines of parameters; a scene can have thousands.
 _MOST_OTHERS = 60
 #: Variables and sensors that a comment names, and characters of a variable there.
@@ -77,7 +81,7 @@ class FirstConfig:
             *self._step_lines(),
             "  schedule: cosine  # to next to nothing, so that the noise of the last iterations counts little",
             "run:",
-            f"  iterations: {ITERATIONS}",
+            f"  iterations: {UNBOUNDED_ITERATIONS if self._is_scaled else ITERATIONS}",
             f"  spp: {SPP}",
         ]
         return "\n".join(lines) + "\n"
@@ -85,17 +89,22 @@ class FirstConfig:
     def _reason_lines(self) -> list[str]:
         if self.reason is None:
             return []
-        words = f"by paths from the sensor, since light paths cannot render this: {self.reason}"
+        words = f"by paths from the sensor, since light paths cannot render this: {printable(self.reason)}"
         return wrap(words, _COMMENT, initial_indent="  # ", subsequent_indent="  # ", break_long_words=False)
 
     def _step_lines(self) -> list[str]:
         """The size of steps: between bounds it is known beforehand, of a lamp it has to be measured."""
-        if all(proposal.is_bounded for proposal in self.proposals) and not self._has_exposure:
+        if not self._is_scaled:
             return [f"  learning_rate: {RATE}  # by so much a value moves in an iteration, at first"]
         return [
-            "  scale: auto  # steps in units that are measured first: a lamp's may be far from those of a colour",
-            f"  learning_rate: {RATE}  # of such a unit, by which a value moves in an iteration, at first",
+            "  scale: auto  # a lamp may be of any brightness: in what units each parameter moves is measured first",
+            f"  learning_rate: {UNBOUNDED_RATE}  # by so much of its unit a value moves in an iteration, at first",
         ]
+
+    @property
+    def _is_scaled(self) -> bool:
+        """Whether steps have to be measured: something that may be of any size is to begin with."""
+        return any(item.first and not item.is_bounded for item in self.proposals)
 
     @property
     def _has_exposure(self) -> bool:
@@ -154,19 +163,23 @@ class FirstConfig:
     def _parameter_lines(self) -> list[str]:
         first = [proposal for proposal in self.proposals if proposal.first]
         others = [proposal for proposal in self.proposals if not proposal.first]
-        lines = [f"  - {_entry(proposal)}  # {_note(proposal)}" for proposal in first]
+        lines = [f"  - {_entry(proposal, True)}  # {_note(proposal)}" for proposal in first]
         if others:
             lines.append("  # What else can be recovered; take away the # of what is to be:")
-        lines += [f"  # - {_entry(proposal)}  # {_note(proposal)}" for proposal in others[:_MOST_OTHERS]]
+        lines += [f"  # - {_entry(item, self._is_scaled)}  # {_note(item)}" for item in others[:_MOST_OTHERS]]
         if len(others) > _MOST_OTHERS:
             lines.append(f"  # and {len(others) - _MOST_OTHERS} more, as reslrb inspect --all lists them")
         return lines
 
 
-def _entry(proposal: Proposal) -> str:
+def _entry(proposal: Proposal, is_scaled: bool) -> str:
+    """What has no upper bound has a rate of its own where steps are not measured."""
     parts = [f"key: {_text(proposal.info.key)}"]
     parts += [f"bounds: {proposal.bounds}"] if proposal.bounds is not None else []
     parts += [f"resolution: {list(proposal.resolution)}"] if proposal.resolution is not None else []
+    size = 0.0 if proposal.info.value is None else abs(proposal.info.value.mean)
+    if size and not (is_scaled or proposal.is_bounded):
+        parts.append(f"learning_rate: {float(f'{UNBOUNDED_RATE * size:.2g}')}")
     return "{" + ", ".join(parts) + "}"
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from reslrb_cli.optimization.errors import nearest
 from reslrb_cli.optimization.problem import Problem
-from reslrb_cli.optimization.trend import find_trend, got_worse
+from reslrb_cli.optimization.trend import LEAST_ITERATIONS, find_trend, got_worse
 from reslrb_cli.optimization.views import View
 from reslrb_cli.records.metrics import Record, finite
 
@@ -81,12 +81,15 @@ class Results:
         those (`scale`), and `initial`, `final` and `true` values (`summary`). `loss_trend` says how loss and noise were
         at the start and the end, null for a short run; `image_loss` is that of the saved images, which have less noise,
         of views that are trained on, and `held_out` the mean of those that are not; `worse` are the keys whose error
-        ended above its start.
+        ended above its start. `samples` are those of a step and of a rendered target, null without one.
         """
         trend = find_trend(self._losses)
+        run, render = self.problem.config.run, self.problem.config.target.render
         first, last = self._first, self._last
         relative = self.meter.relative(first), self.meter.relative(last)
         worse = [key for key, error in last.items() if got_worse(self._errors.get(key, []), error)]
+        if len(self._losses) < min(run.iterations, LEAST_ITERATIONS):  # of a run that goes on nothing is known yet
+            worse = []
         found = {
             "rmse": {"initial": self.meter.total(first), "final": self.meter.total(last)},
             "parameter_rmse": {key: _pair(key, first, last) for key in first | last},
@@ -99,6 +102,7 @@ class Results:
             "held_out": {moment: float(np.mean(losses)) for moment, losses in self._held_out.items() if losses},
             "loss_trend": None if trend is None else trend.to_json(),
             "worse": worse,
+            "samples": {"step": run.spp, "target": None if render is None else render.spp},
         }
         return {name: finite(value) for name, value in found.items()}
 

@@ -29,8 +29,8 @@ LEAST_ITERATIONS, LEAST_WINDOW = 20, 5
 CONFIDENCE = 0.99
 #: A fall by no more than this share of the start is none, where noise hides it.
 MOST_FALL = 0.25
-#: An error has to rise by this share to be called worse.
-WORSE = 0.01
+#: An error has to rise by this share to be called worse, and in a run that is too short to know its wandering.
+WORSE, WORSE_IF_SHORT = 0.01, 0.1
 #: √2 Φ⁻¹(3/4): the median difference of two values from a normal distribution of standard deviation 1.
 _MEDIAN_DIFFERENCE = 0.9539
 #: The standard error of a median over that of a mean, for a normal distribution.
@@ -94,10 +94,12 @@ def find_trend(values: Sequence[float]) -> Trend | None:
 def got_worse(errors: Sequence[float], final: float) -> bool:
     """Whether an error ended above its start: the last one, `final`, and all of the last tenth before it.
 
-    Errors are known exactly, but wander with the noise of the gradients. False where there are too few to say.
+    Errors are known exactly, but wander with the noise of the gradients: a short run has to end well above its start.
     """
-    if len(errors) < LEAST_ITERATIONS:
+    if not errors:
         return False
+    if len(errors) < LEAST_ITERATIONS:
+        return final > (1 + WORSE_IF_SHORT) * errors[0]
     limit = (1 + WORSE) * errors[0]
     return min(final, *errors[-window(len(errors)) :]) > limit
 

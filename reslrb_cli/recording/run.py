@@ -222,6 +222,9 @@ class Recording:
         logger.info("measuring how certain the values are")
         try:
             self.certainty = self.course.certainty.measure(self.done, self.last.elapsed_s, self._stop)
+            for key, shown in self.course.certainty.shown.items():
+                if key not in self.problem.masks:  # of which it was found out before
+                    write_mask(self.folder.parameters, key, shown)
         except Exception as error:
             logger.warning("how certain the values are was not measured: %s", describe(error))
         else:
@@ -252,7 +255,7 @@ class Recording:
         found = self.course.results.to_json()
         if self.certainty is not None:
             found["certainty"] = finite(self.certainty.to_json())
-        found["warnings"] = warnings(found)
+        found["warnings"] = warnings({"iterations": self.done, **found})
         return {
             "iterations": self.done,
             "loss": self.last and _json_number(self.last.loss),

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from textwrap import wrap
 from typing import Any
 
-from reslrb_cli.report.certainty import spread_words, verdict_words
+from reslrb_cli.report.certainty import noise_line, spread_words, verdict_words
 from reslrb_cli.report.words import count, number, shorten
 
 #: Parameters that are listed; a run with more says so, and its page has them all.
@@ -53,7 +53,7 @@ def parameter_lines(results: Mapping[str, Any], width: int) -> list[str]:
     lines = _table(listed, titles, rows, width) or _blocks(listed, titles, rows, width)
     if len(shown) > len(listed):
         lines.append(shorten(f"and {count(len(shown) - len(listed), 'more parameter')}, on the page", width))
-    return lines
+    return [*lines, *wrap(noise_line(results), width)]
 
 
 def units_differ(results: Mapping[str, Any]) -> bool:

@@ -12,6 +12,9 @@ from reslrb_cli.report.words import count, number, shorten, with_error
 MOST_NAMED = 3
 #: What of its loss an image that came closer has left, at most.
 IMPROVED = 0.9
+#: In a run that is too short to know the noise of its loss, by how much that of the saved images has to rise; and a
+#: target that has fewer samples than so many steps is noisy itself.
+ROSE_IF_SHORT, FEW_STEPS = 1.1, 16
 #: A key in a line of text has at most so many characters.
 KEY_WIDTH = 60
 
@@ -60,13 +63,39 @@ def warnings(results: Mapping[str, Any], sign: str = "+-") -> list[str]:
         lines.append(
             f"the loss {'rose' if trend['change'] == 'rose' else flat} ({start} at the start, {end} at the end)"
         )
+    if not trend and _image_rose(results):
+        start, end = (number(results["image_loss"][at], 3) for at in ("initial", "final"))
+        lines.append(f"the images got farther from their targets (loss {start} to {end})")
     worse = [key for key in results.get("worse") or () if key in results["parameter_rmse"]]
     worse.sort(key=lambda key: -_growth(results["parameter_rmse"][key]))
     for key in worse[:MOST_NAMED]:
         lines.append(f"{shorten(key, KEY_WIDTH)} got worse (RMSE {_from_to(results['parameter_rmse'][key])})")
     if len(worse) > MOST_NAMED:
         lines.append(f"and so did {count(len(worse) - MOST_NAMED, 'more parameter')}")
+    if lines:
+        lines += _reasons(results)
     return [*lines, *certainty_lines(results)]
+
+
+def _reasons(results: Mapping[str, Any]) -> list[str]:
+    """What may have kept a run from getting better, as far as its settings tell."""
+    samples, found = results.get("samples") or {}, []
+    step, target = samples.get("step"), samples.get("target")
+    if step and target and target < FEW_STEPS * step:
+        found.append(
+            f"the target itself has {count(target, 'sample')} per pixel only: --set target.render.spp="
+            f"{max(FEW_STEPS * step, 4 * target)} makes a cleaner one"
+        )
+    if not results.get("loss_trend"):
+        found.append(f"{count(results.get('iterations') or 0, 'iteration')} are few: --set run.iterations=200")
+    return found
+
+
+def _image_rose(results: Mapping[str, Any]) -> bool:
+    """Whether the saved images ended well farther from their targets than they began."""
+    losses = results.get("image_loss") or {}
+    initial, final = losses.get("initial"), losses.get("final")
+    return initial is not None and final is not None and final > ROSE_IF_SHORT * initial
 
 
 def _image_improved(results: Mapping[str, Any]) -> bool:

@@ -51,6 +51,8 @@ SURE = 1.0
 MOST_VALUES = 2**18
 #: Images by which the target's noise is sampled, of as many samples where those are at most so many times a step's.
 REPLICAS, AGAIN = 4, 4
+#: By this factor they are made brighter or darker, at most.
+MOST_ASTRAY = 10.0
 #: Samples of it by which large parameters are probed.
 PROBED = 2
 
@@ -211,6 +213,9 @@ class Curvature:
             with dr.suspend_grad():
                 image = render_image(integrator, self.problem.scene, view.sensor, at, spp if again else few)
             images.append(view.kept(np.nan_to_num(np.array(image, dtype=np.float64)[:, :, : true.shape[2]])))
+        # Where noise has led the values astray the images are not as bright as the target.
+        bright = np.sum(view.kept(true)) * REPLICAS / max(float(np.sum(images)), 1e-300)
+        images = [image * np.clip(bright, 1 / MOST_ASTRAY, MOST_ASTRAY) for image in images]
         if again:
             total = np.sum(images, axis=0)
             found = [self._slope(view, image, (total - image) / (REPLICAS - 1)) for image in images]

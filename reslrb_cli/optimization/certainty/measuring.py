@@ -55,7 +55,7 @@ class Certainty:
         self._initial = {key: row_of(problem, key) for key in problem.selection.keys}
         self._squares: dict[str, tuple[Any, float] | None] = {}
         self._seen = 0
-        #: The texels (H, W) of each texture that some view shows, once that was asked.
+        #: The texels (H, W) of each texture that some view shows and light reaches, once that was asked.
         self.shown: dict[str, Array] = {}
 
     def see(self, iterations: int) -> None:
@@ -131,6 +131,7 @@ class Certainty:
                 share=measure_s / max(elapsed_s, 1e-9),
                 iterations=iterations,
                 scale=problem.config.optimizer.scale,
+                learning_rate=problem.config.optimizer.learning_rate,
                 target_noise=self._target_noise(),
                 target_spp=render.spp if (render := problem.config.target.render) is not None else None,
             )
@@ -183,14 +184,15 @@ class Certainty:
             sizes.append(0.5 * (high - low))
         return max(sizes) or 1.0
 
-    def _seen_entries(self, key: str) -> Array | None:
+    def _seen_entries(self, key: str, gradients: Array) -> Array | None:
         """Which entries of a texture some view shows, in a row as gradients are; None of what is no texture."""
         shown = shown_texels(self.problem, key)
         if shown is None:
             return None
-        self.shown[key] = shown
         halo = dr.shape(self.problem.optimizer[key])[1] - shown.shape[1]  # of an environment map
         channels = self.problem.selection.array(key).shape[2]
+        touched = np.any(gradients, axis=0).reshape(shown.shape[0], -1, channels).any(axis=2)
+        self.shown[key] = shown & touched[:, halo // 2 : halo // 2 + shown.shape[1]]
         wide = np.pad(shown, ((0, 0), (halo // 2, halo - halo // 2)), mode="wrap")
         return np.repeat(wide.ravel(), channels)
 
@@ -215,7 +217,7 @@ class Certainty:
                 rates=factors,
                 is_small=value.size <= MOST_ENTRIES,
                 recent=self._recent(key, iterations),
-                seen=self._seen_entries(key),
+                seen=self._seen_entries(key, rows),
             )
         return found
 

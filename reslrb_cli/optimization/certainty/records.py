@@ -38,9 +38,9 @@ class CertaintyRecord:
     """All parameters, by key, and what it took: so many gradients, renderings along directions and random probes, in
     `measure_s` seconds, compilation (`compile_s`) apart, and that over the time of the run's iterations (`share`).
 
-    `iterations`, `scale` (`optimizer.scale`) and `target_spp` are the run's. `target_noise` says whether the noise of
-    the targets is in the spreads: `measured` where all of them were rendered, `in part` where some were, else `left
-    out`.
+    `iterations`, `scale` and `learning_rate` (those of `optimizer`) and `target_spp` are the run's. `target_noise` says
+    whether the noise of the targets is in the spreads: `measured` where all of them were rendered, `in part` where some
+    were, else `left out`.
     """
 
     parameters: dict[str, ParameterCertainty]
@@ -52,6 +52,7 @@ class CertaintyRecord:
     share: float
     iterations: int
     scale: str
+    learning_rate: float
     target_noise: str
     target_spp: int | None = None
 
