@@ -132,8 +132,8 @@ def test_ids_that_mitsuba_takes_for_none(tmp_path, caplog):
 
 def test_odd_ids_stay_where_they_can(tmp_path, caplog):
     odd = ["a.b", "two words", "wall [1]*", "lampe-é", "../x"]
-    kinds = ("sphere", "cube", "disk", "cylinder", "rectangle")  # at one place
-    shapes = "".join(f'<shape type="{kind}" id="{name}"/>' for kind, name in zip(kinds, odd, strict=True))
+    balls = [(name, f'<float name="radius" value="{k + 1}"/>') for k, name in enumerate(odd)]  # none where another is
+    shapes = "".join(f'<shape type="sphere" id="{name}">{radius}</shape>' for name, radius in balls)
     found = keys(write(tmp_path, lit(shapes)))
     assert {f"{name}.to_world" for name in odd} <= set(found)
     assert len(set(found)) == len(found)
