@@ -150,7 +150,7 @@ def test_ids_that_mitsuba_takes_for_none(tmp_path, caplog):
     # as `mi.parser.write_file` writes them
     shapes = (
         '<bsdf type="diffuse" id="_unnamed_3"/><shape type="sphere" id="_unnamed_4"><ref id="_unnamed_3"/></shape>'
-        '<shape type="sphere" id=""/>'
+        '<shape type="sphere" id=""><float name="radius" value="2"/></shape>'
     )
     assert names(keys(write(tmp_path, lit(shapes))))[2:] == ["Diffuse_1", "Sphere_1", "Sphere_2"]
     assert not caplog.records
@@ -158,7 +158,8 @@ def test_ids_that_mitsuba_takes_for_none(tmp_path, caplog):
 
 def test_odd_ids_stay_where_they_can(tmp_path, caplog):
     odd = ["a.b", "two words", "wall [1]*", "lampe-é", "../x"]
-    shapes = "".join(f'<shape type="sphere" id="{name}"/>' for name in odd)
+    balls = [(name, f'<float name="radius" value="{k + 1}"/>') for k, name in enumerate(odd)]  # none where another is
+    shapes = "".join(f'<shape type="sphere" id="{name}">{radius}</shape>' for name, radius in balls)
     found = keys(write(tmp_path, lit(shapes)))
     assert {f"{name}.to_world" for name in odd} <= set(found)
     assert len(set(found)) == len(found)
@@ -178,10 +179,10 @@ def test_an_id_that_no_key_can_hold_is_replaced(tmp_path, caplog, own):
 
 
 def test_an_id_of_two_objects_is_kept_by_the_first(tmp_path, caplog):
-    file = write(tmp_path, lit('<shape type="sphere" id="ball"/>\n<shape type="sphere" id="ball"/>'))
-    assert names(keys(file))[2:] == ["ball", "Sphere_2"]
+    file = write(tmp_path, lit('<shape type="sphere" id="ball"/>\n<shape type="cube" id="ball"/>'))
+    assert names(keys(file))[2:] == ["ball", "Cube_1"]
     [record] = caplog.records
-    assert record.getMessage() == f"{file}:5: id `ball` is that of {file}:4, too: named Sphere_2"
+    assert record.getMessage() == f"{file}:5: id `ball` is that of {file}:4, too: named Cube_1"
 
 
 def test_a_reference_to_two_objects_is_refused(tmp_path):
