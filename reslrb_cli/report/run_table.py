@@ -16,7 +16,7 @@ MOST_LISTED = 12
 #: A key in the table has at most so many characters, and at least.
 WIDEST_KEY, NARROWEST_KEY = 48, 24
 #: Columns where there is no terminal.
-NO_TERMINAL = 160
+NO_TERMINAL = 200
 #: What stands over the keys, and between two columns.
 HEAD, GAP = "parameter", "  "
 #: Columns of values: what stands above each, and its name in the results.

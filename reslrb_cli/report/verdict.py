@@ -15,6 +15,8 @@ IMPROVED = 0.9
 #: In a run that is too short to know the noise of its loss, by how much that of the saved images has to rise; and a
 #: target that has fewer samples than so many steps is noisy itself.
 ROSE_IF_SHORT, FEW_STEPS = 1.1, 16
+#: In a run of fewer iterations losses tell nothing.
+LEAST_JUDGED = 20
 #: A key in a line of text has at most so many characters.
 KEY_WIDTH = 60
 
@@ -86,7 +88,7 @@ def _reasons(results: Mapping[str, Any]) -> list[str]:
             f"the target itself has {count(target, 'sample')} per pixel only: --set target.render.spp="
             f"{max(FEW_STEPS * step, 4 * target)} makes a cleaner one"
         )
-    if not results.get("loss_trend"):
+    if (results.get("iterations") or LEAST_JUDGED) < LEAST_JUDGED:
         found.append(f"{count(results.get('iterations') or 0, 'iteration')} are few: --set run.iterations=200")
     return found
 

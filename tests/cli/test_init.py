@@ -8,9 +8,10 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from cli import tiny
-from cli.calling import reslrb
+from cli.calling import reslrb, settings
 from cli.photographs import write_noise
 from click.testing import Result
+from turns import a_few
 
 from reslrb_cli.cli.first_config import PIXELS
 from reslrb_cli.config import Config, TargetConfig, load
@@ -47,7 +48,10 @@ def test_a_scene_alone_gets_a_configuration_that_lacks_its_photograph_only(folde
     assert [spec.keys for spec in config.parameters] == [[tiny.KEY]]
     assert config.parameters[0].bounds == (0, 1)
     assert (config.loss.type, config.optimizer.schedule, config.integrator.max_depth) == ("relative_l2", "cosine", 8)
-    assert "# - {key: lamp.emitter.radiance.value, bounds: [0, .inf]}" in (folder / "room.yaml").read_text()
+    assert (config.optimizer.scale, config.optimizer.learning_rate) == ("none", 0.03)
+    # Its own rate, of a tenth of what it is: once it is not commented out any more, it can get where it has to.
+    lamp = "# - {key: lamp.emitter.radiance.value, bounds: [0, .inf], learning_rate: 0.8}"
+    assert lamp in (folder / "room.yaml").read_text()
     missing = reslrb("optimize", "room.yaml")
     assert missing.exit_code == 2
     assert "target.file: no such file" in missing.output
@@ -140,6 +144,7 @@ def test_a_texture_of_8_bits_is_offered_recovered_and_exported(folder: Path) -> 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
+        (("room/scene.xml", "--recover", "lamp.*", "--recover", "wal.*"), "--recover: `wal.*` is nothing that can be "),
         (("room/scene.xml", "--target", "wide.png"), "is 16x8 pixels, and the scene's film 8x8, of another ratio"),
         (("room/scene.xml", "--target", "wide.png"), "such as 8x8"),
         (("room/scene.xml", "--target", "none.png"), "none.png: no such file"),
@@ -184,3 +189,95 @@ def test_what_is_large_in_view_comes_first(tmp_path: Path) -> None:
     assert shares["hidden.reflectance.value"] == 0
     assert 0.02 < shares["Sphere_2.bsdf.brdf_0.roughness.value"] < shares[tiles[0]] < 1
     assert not any("clearcoat.value" in key for key in shares), "it is 0, by which Mitsuba leaves it out for good"
+
+
+#: A bulb over a plate: what is in view tells how bright it is. Present values are wrong.
+BULB = """<scene version="3.0.0"><sensor type="perspective"><film type="hdrfilm"><integer name="width" value="24"/>
+<integer name="height" value="24"/><string name="pixel_format" value="rgb"/><rfilter type="box"/></film>
+<float name="fov" value="45"/>
+<transform name="to_world"><lookat origin="0, -3, 3" target="0, 0, 0.5" up="0, 0, 1"/></transform></sensor>
+<shape type="rectangle" id="plate"><transform name="to_world"><scale value="2"/></transform>{plate}</shape>
+<shape type="sphere" id="bulb"><point name="center" x="0.2" y="0.4" z="1"/><float name="radius" value="0.4"/>
+<emitter type="area"><rgb name="radiance" value="{radiance}"/></emitter></shape></scene>"""
+PAINT = '<bsdf type="diffuse"><rgb name="reflectance" value="{}"/></bsdf>'
+METAL = """<bsdf type="roughconductor"><string name="material" value="Al"/><float name="alpha" value="{}"/>
+<rgb name="specular_reflectance" value="1"/></bsdf>"""
+LAMP, WRONG, RIGHT = "bulb.emitter.radiance.value", "5, 5, 5", "12, 11, 10"
+#: By name the plate with wrong values and with right ones, and the parameters with these.
+RECOVERED = {
+    "a lamp and a wall": (PAINT.format("0.5, 0.5, 0.5"), PAINT.format("0.7, 0.35, 0.2"),
+                          {LAMP: [12, 11, 10], "plate.bsdf.reflectance.value": [0.7, 0.35, 0.2]}),
+    "a roughness and a lamp": (METAL.format(0.6), METAL.format(0.25),
+                               {LAMP: [12, 11, 10], "plate.bsdf.alpha.value": 0.25}),
+    "a lamp": (PAINT.format("0.5, 0.4, 0.3"), PAINT.format("0.5, 0.4, 0.3"),
+               {LAMP: [12, 11, 10], "plate.bsdf.reflectance.value": [0.5, 0.4, 0.3]}),
+}  # fmt: skip
+
+
+def write_bulb(folder: Path, name: str) -> None:
+    """`bulb.xml` with wrong values, and `bulb.exr` of it with right ones."""
+    wrong, right, _ = RECOVERED[name]
+    (folder / "bulb.xml").write_text(BULB.format(plate=wrong, radiance=WRONG))
+    (folder / "right.xml").write_text(BULB.format(plate=right, radiance=RIGHT))
+    scene = mi.load_file(str(folder / "right.xml"))
+    image = mi.render(scene, spp=4096, integrator=mi.load_dict({"type": "path", "max_depth": 8}))
+    mi.Bitmap(image).write(str(folder / "bulb.exr"))
+
+
+@pytest.mark.parametrize("name", a_few(RECOVERED, ["a lamp and a wall"]))
+def test_what_it_writes_recovers_lamps(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str) -> None:
+    """Unedited, within 5 %: the lamp is to be far brighter than it is, in a unit that no learning rate can know."""
+    monkeypatch.chdir(tmp_path)
+    write_bulb(tmp_path, name)
+    assert reslrb("init", "bulb.xml", "--target", "bulb.exr").exit_code == 0
+    config = load(tmp_path / "bulb.yaml")
+    assert {spec.keys[0] for spec in config.parameters} == set(RECOVERED[name][2])
+    assert config.optimizer.scale == "auto"
+    # Which estimator, and what is measured of the result, is no matter of the configuration's.
+    done = reslrb("optimize", "bulb.yaml", *settings("integrator.estimator=stack", "run.final_spp=16"))
+    assert done.exit_code == 0, done.output
+    values = np.load(tmp_path / "runs/bulb/parameters/parameters.npz")
+    for key, right in RECOVERED[name][2].items():
+        np.testing.assert_allclose(np.ravel(values[key]), np.ravel(right), rtol=0.05, err_msg=done.output)
+    certainty = read_manifest(tmp_path / "runs/bulb")["results"]["certainty"]
+    assert {about["verdict"] for about in certainty["parameters"].values()} == {"settled"}
+    assert certainty["target_noise"] == "left out"
+    assert "noise and errors of targets are not in it" in done.output
+
+
+def test_a_lamp_alone_is_recovered_if_that_is_asked_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "bulb.xml").write_text(BULB.format(plate=PAINT.format("0.5"), radiance=WRONG))
+    asked = ("--recover", "*.radiance.value", "--force")
+    for target in (None, write_noise(tmp_path / "photo.png", 24, 24)):
+        assert reslrb("init", "bulb.xml", *asked, *(() if target is None else ("--target", target))).exit_code == 0
+        config, text = load(tmp_path / "bulb.yaml"), (tmp_path / "bulb.yaml").read_text()
+        assert [spec.keys for spec in config.parameters] == [[LAMP]]
+        assert config.optimizer.scale == "auto"
+        assert "  # - {key: plate.bsdf.reflectance.value, bounds: [0, 1]}" in text
+    assert config.target.exposure == 1  # which no image tells from the lamp
+    assert "# exposure: auto  # one factor for the whole image; the lamps below make up for it" in text
+
+
+def test_of_a_photograph_that_clips_lamps_are_left_for_later(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "bulb.xml").write_text(BULB.format(plate=METAL.format(0.3), radiance=WRONG))
+    photo = write_noise(tmp_path / "photo.png", 24, 24)
+    assert reslrb("init", "bulb.xml", "--target", photo).exit_code == 0
+    config = load(tmp_path / "bulb.yaml")
+    assert [spec.keys for spec in config.parameters] == [["plate.bsdf.alpha.value"]]
+    assert (config.target.exposure, config.optimizer.scale) == ("auto", "none")
+
+
+def test_a_lamp_is_in_view_from_its_front_alone(tmp_path: Path) -> None:
+    """The back of an area light is dark, whatever it emits."""
+    shares = []
+    for angle in (0, 180):
+        lamp = '<shape type="rectangle" id="panel"><transform name="to_world"><scale value="0.5"/>'
+        lamp += f'<rotate x="1" angle="{angle}"/><translate x="-1" z="2"/></transform><emitter type="area"/></shape>'
+        text = BULB.format(plate=PAINT.format("0.5"), radiance=WRONG).replace("</scene>", f"{lamp}</scene>")
+        (tmp_path / "scene.xml").write_text(text)
+        found = propose(load_scene(tmp_path / "scene.xml"), 0, lamps=True)
+        panel = next(item for item in found if item.info.key == "panel.emitter.radiance.value")
+        shares.append((panel.share > 0, panel.first))
+    assert shares == [(True, True), (False, False)]

@@ -5,17 +5,20 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import mitsuba as mi
 import numpy as np
 import pytest
+from cli import tiny
+from cli.calling import reslrb, settings
 from cli.photographs import WALLS, write_photograph
 
 from reslrb_cli.cli import main
 from reslrb_cli.records.manifest import read_manifest
 
 
-def optimize(*settings: str) -> tuple[dict[str, np.ndarray], dict]:
+def optimize(*given: str) -> tuple[dict[str, np.ndarray], dict]:
     """Recovered values, and the manifest."""
-    sets = [text for setting in settings for text in ("--set", setting)]
+    sets = settings(*given)
     with pytest.raises(SystemExit) as end:
         main(["optimize", "photo.yaml", "--force", *sets])
     assert end.value.code in (0, None)
@@ -57,3 +60,34 @@ def test_walls_of_a_photograph_whose_exposure_is_unknown(llvm, tmp_path, monkeyp
         np.testing.assert_allclose(values[key][bright[key]], np.array(true)[bright[key]], rtol=0.1)
     given, _ = optimize("integrator.estimator=stack")
     assert any(np.any(given[key][bright[key]] < 0.9 * np.array(WALLS[key])[bright[key]]) for key in WALLS), given
+
+
+@pytest.mark.usefixtures("llvm")
+def test_texels_that_no_view_shows_are_told_from_settled_ones(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without a truth, too. They light the lamp's face, and by it what is seen: a gradient, and no colour of theirs."""
+    monkeypatch.chdir(tmp_path)
+    tiny.write_experiment(tmp_path)
+    scene = tiny.SCENE.replace('name="fov" value="50"', 'name="fov" value="14.25"')  # the middle 2 x 2 of 4 x 4 texels
+    (tmp_path / "scene.xml").write_text(scene)
+    image = mi.render(mi.load_file("scene.xml"), spp=1024, integrator=mi.load_dict({"type": "path", "max_depth": 3}))
+    mi.Bitmap(image).write("photo.exr")
+    sets = ("target={file: photo.exr}", "run.iterations=80", "run.spp=512", "loss.type=relative_l2",
+            "optimizer={learning_rate: 0.05, schedule: cosine}")  # fmt: skip
+    done = reslrb("optimize", "tiny.yaml", *settings(*sets))
+    assert done.exit_code == 0, done.output
+    about = read_manifest(Path("runs/tiny"))["results"]["certainty"]["parameters"][tiny.KEY]
+    assert (about["seen"], about["shares"]["not seen"]) == (0.25, 0.75)
+    assert about["verdict"] == "settled"
+    assert about["shares"]["settled"] > 0.2
+    values, true = np.load("runs/tiny/parameters/parameters.npz")[tiny.KEY], np.array(mi.Bitmap("poster.exr"))
+    errors = np.sqrt(np.mean(np.square(values - true), axis=2))
+    shown = np.zeros((4, 4), dtype=bool)
+    shown[1:3, 1:3] = True
+    assert errors[shown].max() < 4 * about["spread"][0] < errors[~shown].mean()
+    assert "settled (" in done.output
+    assert ", 75 % not seen" in done.output
+    np.testing.assert_array_equal(np.load(f"runs/tiny/parameters/{tiny.KEY}.mask.npy"), shown)
+    page = Path("runs/tiny/report.html").read_text()
+    assert "75 % not seen" in page
+    assert "<b>reached</b> by light and sensor (white): 25 %" in page
+    assert "noise of the target is not in it" in page

@@ -129,14 +129,31 @@ def test_a_parameter_that_got_worse_is_said_plainly(capsys):
     assert "  at its bound" in out.splitlines()[1]
 
 
-def test_a_run_that_works_or_is_short_has_nothing_to_complain_of(capsys):
+def test_a_run_that_works_has_nothing_to_complain_of(capsys):
     last, _, results = optimize(capsys, "run.adjoint=independent", "run.spp=128", "run.certainty=false")
     assert results["loss_trend"]["change"] == "fell"
     assert results["warnings"] == []
     assert last.count(";") == 1
     assert "certainty" not in results
-    last, _, results = optimize(capsys, "optimizer.learning_rate=30", "run.iterations=5")
+    last, _, results = optimize(capsys, "run.spp=128", "run.iterations=5")
     assert (results["loss_trend"], results["warnings"]) == (None, [])
+
+
+def test_a_short_run_that_got_worse_says_so_and_what_it_lacked(capsys):
+    """Images of many samples, and known errors, tell it where the losses of a few iterations do not."""
+    wall = f"parameters=[{{key: {WALL}, initial: 0.42, bounds: [0, 1]}}]"
+    last, out, results = optimize(capsys, wall, "optimizer.learning_rate=30", "run.iterations=5")
+    assert results["loss_trend"] is None
+    images, error = results["image_loss"], results["parameter_rmse"][WALL]
+    assert results["warnings"][:2] == [
+        f"the images got farther from their targets (loss {images['initial']:.3g} to {images['final']:.3g})",
+        f"{WALL} got worse (RMSE {error['initial']:.3g} to {error['final']:.3g})",
+    ]
+    assert f"; {results['warnings'][0]}; {results['warnings'][1]}; " in last
+    assert "; 5 iterations are few: --set run.iterations=200; look at" in last
+    assert ", worse" in out.splitlines()[1]
+    few = optimize(capsys, wall, "optimizer.learning_rate=30", "run.iterations=5", "target.render.spp=2")
+    assert "the target itself has 2 samples per pixel only: --set target.render.spp=" in few[0]
 
 
 def test_a_loss_that_is_nothing_but_noise_is_no_failure(capsys):
@@ -153,10 +170,11 @@ def test_a_run_that_is_not_done_says_so_everywhere(capsys):
     about = results["certainty"]["parameters"][KEY]
     assert about["verdict"] == "still moving"
     assert 0.5 < about["shares"]["still moving"] < 1
-    assert f"; not converged, still moving: {KEY}; look at " in last
+    remedy = "(a higher rate: --set optimizer.learning_rate="
+    assert f"; not converged, still moving: {KEY} {remedy}" in last
     assert "spread" in out.splitlines()[0]
-    assert re.search(r"\+- 0\.\d+ +still moving \(\d\d", out.splitlines()[1])
-    assert results["warnings"] == [f"not converged, still moving: {KEY}"]
+    assert re.search(r"\+- 0\.\d+ +still moving \(\d\d.* %\): a higher rate$", out.splitlines()[1])
+    assert [line.startswith(f"not converged, still moving: {KEY} {remedy}") for line in results["warnings"]] == [True]
     page = Path("runs/box/report.html").read_text()
     assert f"not converged, still moving: {KEY}" in page.partition("<section>")[0]
     assert '<th scope="col">verdict</th>' in page

@@ -111,3 +111,58 @@ def test_verdicts_of_twenty_runs(folder, seed):
     assert not kind
     assert sum(right) >= 18, wrong
     assert np.sqrt(np.mean(np.square(ratios))) < 1.5  # a spread that is too small would be worse than none
+
+
+#: Parameters, and the target's samples per pixel, whose noise is most of what is wrong with them.
+NOISY = {
+    "a colour": ({WALL: COLOR}, 64), "a roughness": ({ALPHA: METAL}, 64), "a lamp": ({LEFT: FAST}, 64),
+    "colour and roughness": ({WALL: COLOR, ALPHA: METAL}, 64), "a texture": ({POSTER: COLOR}, 64),
+    "a colour, few samples": ({WALL: COLOR}, 8), "a texture, many samples": ({POSTER: COLOR}, 512),
+}  # fmt: skip
+
+
+def noisy(name: str, seed: int, loss: str) -> Toy:
+    parameters, spp = NOISY[name]
+    settings = (f"target={{render: {{spp: {spp}, seed: {seed}}}}}", f"loss={{type: {loss}}}", "run.spp=64",
+                "run.iterations=120", "optimizer.schedule=cosine")  # fmt: skip
+    return Toy(name, parameters, {}, settings)
+
+
+def test_noise_of_a_rendered_target_is_in_the_spread(folder):
+    """By its samples: a quarter of the variance with four times as many. Without it nothing but the run's is left."""
+    found = {}
+    for spp in (16, 256):
+        toy = noisy("a colour", 0, "l2")
+        about = run(folder, Toy("", toy.parameters, {}, (*toy.settings, f"target.render.spp={spp}"))).certainty
+        assert (about.target_noise, about.target_spp) == ("measured", spp)
+        found[spp] = about.parameters[WALL]
+    of_target = {spp: np.mean(about.of_target) for spp, about in found.items()}
+    assert 2 < of_target[16] / of_target[256] < 8
+    assert np.all(np.array(found[16].spread) > 0.9 * np.array(found[16].of_target))
+    assert found[16].verdict == NOISE
+    assert of_target[16] > 0.03
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("loss", ["l2", "relative_l2"])
+@pytest.mark.parametrize("name", NOISY)
+def test_the_truth_is_within_spreads_that_have_the_targets_noise(folder, name, loss):
+    """Over many noisy targets: errors are as large as they are said to be, and most of that is the target's."""
+    z, without, settled = [], [], 0
+    for seed in range(12):
+        found = run(folder, noisy(name, seed, loss), seed)
+        for key, about in found.certainty.parameters.items():
+            if about.spread is None:
+                continue
+            errors = np.ravel(found.errors[key])
+            spread, of_target = (np.resize(np.array(part, dtype=float), errors.shape)
+                                 for part in (about.spread, about.of_target))  # fmt: skip
+            z += list(errors / spread)
+            without += list(errors / np.sqrt(np.maximum(spread**2 - of_target**2, 1e-4 * spread**2)))
+            settled += about.verdict == SETTLED and bool(np.any(np.abs(errors) > 5 * spread))
+    size, bare = (np.sqrt(np.nanmean(np.square(each))) for each in (z, without))
+    print(f"{name}, {loss}: {len(z)} errors over spreads, rms {size:.2f}; without the target's noise {bare:.2f}")
+    # A relative loss weighs what noise has darkened, by which it is pulled further than its spread says.
+    assert 0.3 < size < (1.5 if loss == "l2" else 2.5)
+    assert bare > 1.5
+    assert not settled

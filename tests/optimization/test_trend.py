@@ -113,7 +113,9 @@ def test_what_got_worse():
     rising, random = np.linspace(0.2, 0.3, 50), np.random.default_rng(1)
     assert got_worse(list(rising), 0.3)
     assert not got_worse(list(rising[::-1]), 0.2)
-    assert not got_worse(list(rising[:19]), 0.3)  # too short to say
+    assert not got_worse(list(rising[:19]), 0.21)  # too short to say
+    assert got_worse(list(rising[:19]), 0.3)
+    assert not got_worse([], 0.3)
     assert not got_worse([0.2] * 50, 0.2)
     assert not got_worse([0.2] * 50, 0.2019)  # below what is worth a word
     # wandering about its start: some of the last are below

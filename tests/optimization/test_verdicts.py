@@ -10,7 +10,7 @@ import pytest
 from reslrb_cli.optimization.certainty.coordinates import noise_covariance
 from reslrb_cli.optimization.certainty.curvature import smooth
 from reslrb_cli.optimization.certainty.measured import Measured
-from reslrb_cli.optimization.certainty.posterior import alone, joint
+from reslrb_cli.optimization.certainty.posterior import alone, driven_alone, joint
 from reslrb_cli.optimization.certainty.verdicts import Evidence, Verdict, judge, shares, summarise
 
 
@@ -20,7 +20,9 @@ def evidence(**changes: float | bool) -> Evidence:
         "value": 0.5, "low": 0.0, "high": 1.0, "scale": 0.5, "touched": True, "gradient": 0.0, "error": 1.0,
         "step": 0.01, "spread": 0.01, "alone": 0.01, "to_go": 0.0, "to_go_error": 0.01,
     }  # fmt: skip
-    return Evidence(**{name: np.array([value]) for name, value in (own | changes).items()})
+    own |= changes
+    own.setdefault("of_run", own["spread"])
+    return Evidence(**{name: np.array([value]) for name, value in own.items()})
 
 
 @pytest.mark.parametrize(("changes", "verdict"), [
@@ -29,6 +31,9 @@ def evidence(**changes: float | bool) -> Evidence:
     ({"spread": 0.051, "alone": 0.05}, Verdict.BELOW_NOISE),
     ({"spread": 0.2, "alone": 0.2, "to_go": 0.19, "to_go_error": 0.05}, Verdict.STILL_MOVING),
     ({"spread": 0.2, "alone": 0.2, "to_go": -0.19, "to_go_error": 0.05}, Verdict.STILL_MOVING),
+    # As near to where its target has it as noise lets it be; that is somewhere else.
+    ({"spread": 0.2, "alone": 0.2, "of_run": 0.049, "to_go": 0.045}, Verdict.BELOW_NOISE),
+    ({"spread": 0.2, "alone": 0.2, "of_run": 0.051, "to_go": 0.045}, Verdict.STILL_MOVING),
     ({"spread": 0.2, "alone": 0.2, "to_go": 0.09, "to_go_error": 0.05}, Verdict.BELOW_NOISE),
     ({"spread": 0.2, "alone": 0.02, "to_go": 0.01, "to_go_error": 0.2}, Verdict.NOT_DETERMINED),
     ({"touched": False, "spread": 0.2}, Verdict.NO_EFFECT),
@@ -64,35 +69,50 @@ def test_entries_are_judged_one_by_one():
     ("nnn", Verdict.NO_EFFECT),
     ("nnnnnnnns", Verdict.SETTLED),
     ("nnnnnnnnm", Verdict.STILL_MOVING),
+    ("uuu", Verdict.NOT_SEEN),
+    ("uun", Verdict.NOT_SEEN),
+    ("uuuuuuuus", Verdict.SETTLED),
+    ("uuuunnssm", Verdict.STILL_MOVING),
 ])  # fmt: skip
 def test_a_parameter_is_what_its_entries_are(entries, verdict):
-    kinds = {"s": Verdict.SETTLED, "m": Verdict.STILL_MOVING, "b": Verdict.AT_BOUND, "n": Verdict.NO_EFFECT}
+    kinds = {"s": Verdict.SETTLED, "m": Verdict.STILL_MOVING, "b": Verdict.AT_BOUND, "n": Verdict.NO_EFFECT,
+             "u": Verdict.NOT_SEEN}  # fmt: skip
     found = shares([kinds[entry] for entry in entries])
     assert sum(found.values()) == pytest.approx(1)
     assert summarise(found) is verdict
 
 
-def simulate(H, response, scale, noise, samples, rates, runs, random):
-    """Offsets (runs, M) at the end of the model itself, and the gradients (runs, M) that are measured there."""
+def simulate(H, response, scale, noise, samples, rates, runs, random, fixed=None):
+    """Offsets (runs, M) at the end of the model itself, and the gradients (runs, M) that are measured there.
+
+    `fixed` is the covariance of what each run's gradients have in common.
+    """
     root = np.linalg.cholesky(noise)
     offset = random.normal(size=(runs, len(scale))) * scale
+    shared = 0.0 if fixed is None else random.normal(size=offset.shape) @ np.linalg.cholesky(fixed).T
     for rate in rates:
-        offset = offset - rate * response * (offset @ H + random.normal(size=offset.shape) @ root.T)
-    gradient = offset @ H + random.normal(size=offset.shape) @ root.T / np.sqrt(samples)
+        offset = offset - rate * response * (offset @ H + shared + random.normal(size=offset.shape) @ root.T)
+    gradient = offset @ H + shared + random.normal(size=offset.shape) @ root.T / np.sqrt(samples)
     return offset, gradient
 
 
+@pytest.mark.parametrize("target", [0.0, 0.7, 5.0])
 @pytest.mark.parametrize("iterations", [5, 60, 600])
-def test_offsets_of_the_model_are_as_wide_as_they_are_said_to_be(iterations):
-    """Coverage: over many runs the way to go is right on the average, and its error is what is stated."""
+def test_offsets_of_the_model_are_as_wide_as_they_are_said_to_be(iterations, target):
+    """Coverage: over many runs the way to go is right on the average, and its error is what is stated.
+
+    With noise of a target, which all gradients of a run share, too: it is in what is left.
+    """
     H = np.array([[2.0, 1.2, 0.0], [1.2, 1.0, 0.3], [0.0, 0.3, 4.0]])
     response, scale = np.array([0.02, 0.1, 0.01]), np.array([1.0, 3.0, 0.5])
     sd = np.array([0.5, 0.8, 2.0])
     noise = np.outer(sd, sd) * np.array([[1, 0.5, 0], [0.5, 1, 0], [0, 0, 1]])
     rates = np.linspace(1, 0.2, iterations)
     runs = 4000
-    offset, gradient = simulate(H, response, scale, noise, 5, rates, runs, np.random.default_rng(3))
-    found = [joint(H, response, scale, noise, unit, 5, rates) for unit in np.eye(3)]
+    fixed = target**2 * noise if target else None
+    offset, gradient = simulate(H, response, scale, noise, 5, rates, runs, np.random.default_rng(3), fixed)
+    found = [joint(H, response, scale, noise, unit, 5, rates, fixed) for unit in np.eye(3)]
+    assert bool(target) is bool(np.all(found[0].of_target > 0))
     to_go = gradient @ np.array([each.to_go for each in found])  # it is linear in the gradient
     left = offset - to_go
     # A standard deviation from n normal deviates has a relative standard error of 1 / sqrt(2 n).
@@ -108,10 +128,21 @@ def test_alone_is_joint_where_nothing_is_shared():
     H, rates = np.array([0.5, 2.0]), [1.0] * 40
     given = np.array([0.03, 0.05]), np.array([2.0, 0.3])
     noise, gradient = np.array([0.2, 0.5]), np.array([0.1, -0.4])
-    to_go, error = alone(H, *given, noise, gradient, 4, rates)
-    both = joint(np.diag(H), *given, np.diag(noise), gradient, 4, rates)
-    np.testing.assert_allclose(to_go, both.to_go, rtol=1e-5)
-    np.testing.assert_allclose(error, both.error, rtol=1e-5)
+    for fixed in (np.zeros(2), np.array([0.3, 2.0])):
+        to_go, error = alone(H, *given, noise, gradient, 4, rates, fixed)
+        both = joint(np.diag(H), *given, np.diag(noise), gradient, 4, rates, np.diag(fixed))
+        np.testing.assert_allclose(to_go, both.to_go, rtol=1e-5)
+        np.testing.assert_allclose(error, both.error, rtol=1e-5)
+        of_target = driven_alone(H, given[0], rates) * np.sqrt(fixed)
+        np.testing.assert_allclose(of_target, both.of_target, rtol=1e-5)
+
+
+def test_noise_of_the_target_is_left_where_the_run_has_converged():
+    """H^-1 b: whatever gradients at the end say, all of them have it."""
+    found = joint(np.array([[4.0]]), np.array([0.1]), np.ones(1), np.array([[1e-8]]), np.zeros(1), 9, [1.0] * 300,
+                  np.array([[0.04]]))  # fmt: skip
+    assert found.spread == pytest.approx([0.2 / 4], rel=1e-3)
+    assert found.of_target == pytest.approx([0.2 / 4], rel=1e-3)
 
 
 def test_what_the_view_does_not_tell_stays_as_it_was():

@@ -134,3 +134,63 @@ def test_the_worst_are_named():
     assert lines[0] == "part6 got worse (RMSE 0.1 to 0.7)"
     assert lines[-1] == "and so did 3 more parameters"
     assert len(lines) == 4
+
+
+MOVING = {"verdict": "still moving", "shares": {"still moving": 1.0}, "spread": [3.0], "to_go": [7.0], "moved": 2.9,
+          "reach": 3.0, "rate": 0.03}  # fmt: skip
+
+
+def judged(about, **measured):
+    """Results of a lamp that was judged so."""
+    lamp = {"quantity": "radiance", "shape": [3], "initial": {"value": [5.0]}, "final": {"value": [7.9]}, "true": None}
+    common = {"gradients": 3, "changes": 1, "probes": 0, "measure_s": 1.0, "share": 0.1, "iterations": 200,
+              "scale": "none", "learning_rate": 0.03, "target_noise": "measured", "target_spp": 64}  # fmt: skip
+    certainty = common | {"parameters": {"lamp.radiance.value": MOVING | about}} | measured
+    trend = measured.pop("trend", None)
+    return results(parameters={"lamp.radiance.value": lamp}, certainty=certainty, loss_trend=trend)
+
+
+@pytest.mark.parametrize(("found", "words", "setting"), [
+    # Its steps took it one way all the time, and not far enough: what a lamp's unit is has to be measured.
+    (judged({}), "scale: auto", "--set optimizer.scale=auto"),
+    (judged({}, scale="auto"), "a higher rate", "--set optimizer.learning_rate=0.2"),
+    (judged({"rate": 0.5}, scale="auto"), "a higher rate", "its own learning_rate: 3"),
+    # They would have taken it far enough, and did not: it goes to and fro, or along a valley.
+    (judged({"reach": 60.0}), "more iterations", "--set run.iterations=680"),
+    (judged({"reach": 60.0, "moved": 0.0}), "more iterations", "--set run.iterations=1000"),
+    (judged({"reach": None}), "more iterations", "--set run.iterations=680"),
+    (judged({}, trend={"change": "rose", "start": {"mean": 1, "error": 0.1}, "end": {"mean": 2, "error": 0.1}}),
+     "a lower rate", "--set optimizer.learning_rate=0.01"),
+])  # fmt: skip
+def test_a_value_that_still_moves_is_told_what_helps(found, words, setting):
+    assert parameter_lines(found, 120)[1].endswith(f"still moving: {words}")
+    assert f"not converged, still moving: lamp.radiance.value ({words}: {setting})" in warnings(found)
+
+
+def test_noise_of_the_target_is_told_from_that_of_the_run():
+    noisy = {"verdict": "below the noise", "shares": {"below the noise": 1.0}, "spread": [3.0], "of_target": [2.9]}
+    found = judged(noisy)
+    assert parameter_lines(found, 120)[1].endswith("below the noise of the target: more samples for it")
+    assert warnings(found) == [
+        "below the noise of the target: lamp.radiance.value (more samples for it: --set target.render.spp=1024)"
+    ]
+    found = judged(noisy | {"of_target": [1.0]})
+    assert parameter_lines(found, 120)[1].endswith("below the noise")
+    assert len(parameter_lines(found, 120)) == 2
+
+
+def test_a_spread_that_leaves_out_the_targets_noise_says_so():
+    found = judged({}, target_noise="left out")
+    assert parameter_lines(found, 120)[-1] == (
+        "spread: by the noise of the run; noise and errors of targets are not in it"
+    )
+
+
+def test_what_no_view_shows_is_told_beside_what_is_settled():
+    shares = {"settled": 0.58, "still moving": 0.02, "not seen": 0.4}
+    found = judged({"verdict": "settled", "shares": shares})
+    assert parameter_lines(found, 120)[1].endswith("settled (58 %), 40 % not seen")
+    assert warnings(found) == []
+    found = judged({"verdict": "not seen", "shares": {"not seen": 1.0}, "spread": None})
+    assert parameter_lines(found, 120)[1].endswith("not seen")
+    assert warnings(found) == ["not seen: lamp.radiance.value"]

@@ -22,8 +22,8 @@ LIKE = 0.95
 
 @dataclass
 class Coordinates:
-    """The joint posterior of all directions that are free: spread, what of it is the target's, way to go and its error,
-    and partners, by place."""
+    """The joint posterior of all directions that are free, by place: spread, and what of it is the target's; without
+    that the way to go and its error; and partners."""
 
     spread: Array
     of_target: Array
@@ -63,11 +63,12 @@ def judge_together(
     free_ones = np.ix_(chosen, chosen)
     H, B, samples = curvature[free_ones], fixed[free_ones], np.array([rows[place] for place in chosen])
     count = samples.shape[1]
-    posterior = joint(H, p, size, noise_covariance(samples, variance, H), g, count, first.rates, B)
+    Sigma = noise_covariance(samples, variance, H)
+    posterior, whole = (joint(H, p, size, Sigma, g, count, first.rates, each) for each in (None, B))
     to_go, error = alone(np.diag(H), p, size, variance, g, count, first.rates, np.maximum(np.diag(B), 0.0))
-    result.of_target[chosen] = posterior.of_target
     result.to_go[chosen], result.error[chosen] = posterior.to_go, posterior.error
-    result.spread[chosen], result.alone[chosen] = posterior.spread, np.hypot(to_go, error)
+    result.spread[chosen], result.of_target[chosen] = whole.spread, whole.of_target
+    result.alone[chosen] = np.hypot(to_go, error)
     correlation = np.abs(posterior.covariance) / np.maximum(np.outer(posterior.error, posterior.error), 1e-300)
     for row, place in zip(correlation, chosen.tolist(), strict=True):
         result.partners[place] = _partner(row, place, chosen, directions)

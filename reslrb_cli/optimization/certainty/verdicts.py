@@ -2,7 +2,7 @@
 
 The first rule that holds of an entry decides; `spread` is the standard deviation of its final value about the optimum,
 `alone` the same with all other parameters known, `to_go` the estimated way to the optimum, and tau `TOLERANCE` of the
-entry's scale.
+entry's scale. All but `spread` are of the optimum of the loss with the target as it is, noise and all.
 
 | verdict          | holds where |
 |---|---|
@@ -10,7 +10,7 @@ entry's scale.
 | `no effect`      | every gradient sample was exactly 0 |
 | `at its bound`   | the value is within a step of a bound, and the gradient does not pull it back |
 | `settled`        | spread <= tau |
-| `still moving`   | `to_go` is told from its error (`SURE` of them) |
+| `still moving`   | `to_go` is told from its error (`SURE` of them), and spread > tau without the target's noise |
 | `not determined` | `alone` <= `OTHERS` of `spread`: others make up for it; the most correlated one is named |
 | `below the noise`| otherwise: the gradients do not tell within tau where the value should be |
 
@@ -60,7 +60,8 @@ class Evidence:
     """What was measured of the entries of a parameter: arrays (N,), in its unit but for gradients, loss per unit.
 
     `touched` says whether any gradient sample was not 0, `gradient` and `error` are their mean and its standard error,
-    `step` how far noise moved the entry in the last iteration. `low` and `high` may be infinite.
+    `step` how far noise moved the entry in the last iteration; `of_run` is the spread without the target's noise. `low`
+    and `high` may be infinite.
     """
 
     value: Array
@@ -72,6 +73,7 @@ class Evidence:
     error: Array
     step: Array
     spread: Array
+    of_run: Array
     alone: Array
     to_go: Array
     to_go_error: Array
@@ -98,7 +100,7 @@ def judge(e: Evidence) -> list[Verdict]:
         (~e.touched, Verdict.NO_EFFECT),
         (bound, Verdict.AT_BOUND),
         (e.spread <= tolerance, Verdict.SETTLED),
-        (np.abs(e.to_go) > SURE * e.to_go_error, Verdict.STILL_MOVING),
+        ((np.abs(e.to_go) > SURE * e.to_go_error) & (e.of_run > tolerance), Verdict.STILL_MOVING),
         (e.alone <= OTHERS * e.spread, Verdict.NOT_DETERMINED),
         (np.ones(e.value.shape, dtype=bool), Verdict.BELOW_NOISE),
     ]

@@ -49,9 +49,10 @@ def weigh(
 
 def _small(own: Measured, at: Sequence[int], found: Coordinates) -> ParameterCertainty:
     to_go, error = own.within(found.to_go[at]), found.error[at]
-    spread = np.hypot(to_go, error)
+    of_run = np.hypot(to_go, error)
+    spread = np.maximum(found.spread[at], of_run)  # bounds may have shortened the way
     alone_ = np.where([found.partners[place] is None for place in at], np.inf, found.alone[at])
-    verdicts = judge(_evidence(own, spread, alone_, to_go, error))
+    verdicts = judge(_evidence(own, spread, of_run, alone_, to_go, error))
     verdict = summarise(shares(verdicts))
     partners = [found.partners[place] for place, each in zip(at, verdicts, strict=True) if each is verdict]
     partner = next((name for name in partners if name), None) if verdict is Verdict.NOT_DETERMINED else None
@@ -74,7 +75,7 @@ def _large(
     """By entry as if the others were known; all of it together may still be what another parameter makes up for."""
     touched = np.any(own.gradients, axis=0)
     prior = np.full(own.value.shape, own.prior)
-    spread, to_go, error = prior.copy(), np.zeros(own.value.shape), prior.copy()
+    spread, of_run, to_go, error = prior.copy(), prior.copy(), np.zeros(own.value.shape), prior.copy()
     of_target = np.zeros(own.value.shape)
     if diagonal is not None and touched.any():
         h, B = np.zeros(own.value.shape), np.zeros(own.value.shape)
@@ -82,11 +83,13 @@ def _large(
         if fixed is not None:
             B[touched] = smooth(fixed[touched], own.noise[touched])
         given = (own.response, prior, own.noise, own.mean)
-        to_go, error = alone(h, *given, len(own.gradients), own.rates, B)
+        to_go, error = alone(h, *given, len(own.gradients), own.rates)
+        whole, left = alone(h, *given, len(own.gradients), own.rates, B)
         of_target = driven_alone(h, own.response, own.rates) * np.sqrt(B)
         to_go = own.within(to_go)
-        spread = np.where(touched, np.hypot(to_go, error), prior)
-    verdicts = judge(_evidence(own, spread, np.full(spread.shape, np.inf), to_go, error))
+        of_run = np.where(touched, np.hypot(to_go, error), prior)
+        spread = np.where(touched, np.hypot(own.within(whole), left), prior)
+    verdicts = judge(_evidence(own, spread, of_run, np.full(spread.shape, np.inf), to_go, error))
     if own.seen is not None:
         verdicts = [v if seen else Verdict.NOT_SEEN for v, seen in zip(verdicts, own.seen, strict=True)]
     found_shares = shares(verdicts)
@@ -105,11 +108,14 @@ def _large(
     return ParameterCertainty(verdict.value, _named(found_shares), sizes[0], sizes[1], partner, sizes[2])
 
 
-def _evidence(own: Measured, spread: Array, alone_: Array, to_go: Array, error: Array) -> Evidence:
+def _evidence(
+    own: Measured, spread: Array, of_run: Array, alone_: Array, to_go: Array, error: Array
+) -> Evidence:  # fmt: skip
     low, high = (np.full(own.value.shape, np.float32(bound), dtype=np.float64) for bound in own.bounds)
     touched, scale = np.any(own.gradients, axis=0), np.full(own.value.shape, own.scale)
     return Evidence(
-        own.value, low, high, scale, touched, own.mean, own.error, own.step, spread, alone_, to_go, error
+        own.value, low, high, scale, touched, own.mean, own.error, own.step, spread, of_run, alone_,
+        to_go, error
     )  # fmt: skip
 
 
