@@ -27,6 +27,7 @@ FIRST = {
     "terrace": [
         "ground.reflectance.data",  # 8 bits
         "Obj_1.bsdf.diffuse_reflectance.value",
+        *(f"Sphere_1.bsdf.alpha_{axis}.value" for axis in "uv"),  # of a rough metal
         "Disk_1.bsdf.nested_bsdf.brdf_0.reflectance.value",
     ],
 }

@@ -106,7 +106,9 @@ def test_batches_serve_the_baselines(case: Case, reference: tuple, name: str):
 
 @pytest.mark.parametrize("batches", [1, 3])
 def test_batches_that_do_not_divide_are_refused(case: Case, reference: tuple, batches: int):
-    with pytest.raises(ValueError, match="multiple of the batches"):
+    with pytest.raises(
+        ValueError, match='"batches" must be a whole number from 2' if batches < 2 else "multiple of the batches"
+    ):
         case.gradient(integrator("reslrb"), 1, SPP, l2(reference[0]), adjoint="batched", batches=batches)
 
 
