@@ -149,7 +149,7 @@ class FirstConfig:
         return [
             f"  file: photo.png  # put your photograph there, of {width}x{height} pixels, or have it made by",
             "  # reslrb init --target PHOTO from one of any size in that ratio. To try without, in place of `file`:",
-            "  # render: {spp: 256, parameters: {KEY: VALUE}}  # the scene itself with other values",
+            "  # render: {spp: 1024, parameters: {KEY: VALUE}}  # the scene itself with other values",
         ]
 
     def _exposure_lines(self) -> list[str]:

@@ -11,6 +11,7 @@ import pytest
 
 from reslrb_cli.optimization.optimizers import OPTIMIZERS, Optimizer
 from reslrb_cli.optimization.schedules import SCHEDULES, learning_rate_factor
+from reslrb_cli.optimization.transforms import make_transform
 from reslrb_cli.records.clock import StepClock
 
 RATE = 0.05
@@ -157,3 +158,15 @@ def test_schedules_run_from_one_to_the_final_fraction(schedule):
 def test_schedules_at_half_time():
     assert learning_rate_factor("cosine", 5, 11, 0.1) == pytest.approx(0.55)
     assert learning_rate_factor("exponential", 5, 11, 0.01) == pytest.approx(0.1)
+
+
+def test_how_far_a_step_goes_where_a_value_is():
+    """In the scene's unit, by way of what is moved; with plain gradient descent that depends on the gradient."""
+    start = mi.Float(2.0)
+    for kind, transform, bounds, step in (
+        ("adam", "none", None, RATE), ("rmsprop", "none", None, RATE), ("sgd", "none", None, None),
+        ("adam", "log", (0, np.inf), 2 * (np.exp(RATE) - 1)), ("sgd", "log", (0, np.inf), None),
+    ):  # fmt: skip
+        made = {"a": make_transform(transform, bounds)}
+        optimizer = Optimizer(kind, 0.3, {}, {"a": start}, {"a": RATE}, {"a": bounds}, made)
+        assert optimizer.first_step("a") == (None if step is None else pytest.approx(step, rel=1e-5))

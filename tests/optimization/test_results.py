@@ -7,6 +7,7 @@ import json
 import numpy as np
 import pytest
 from optimization.toy import make_problem
+from records.test_metrics import make_record
 
 from reslrb_cli.optimization import loop
 from reslrb_cli.optimization.results import Results, summary
@@ -51,6 +52,18 @@ def test_results_of_a_run(tmp_path, steps):
     results.see("iteration-000002", problem.views[0], image)
     assert results.to_json()["image_loss"] == {"initial": None, "final": pytest.approx(0.04, rel=1e-4)}
     assert json.dumps(found, allow_nan=False)
+
+
+@pytest.mark.parametrize(("iterations", "worse"), [(3, ["albedo"]), (4, [])])
+def test_a_short_run_is_called_worse_once_it_is_over(tmp_path, iterations, worse):
+    """Pages of a run that goes on ask from its first iterations on."""
+    problem = make_problem(tmp_path, sets=[f"run.iterations={iterations}"])
+    results = Results(problem)
+    results.begin()
+    for iteration in range(3):
+        results.add(make_record(iteration=iteration, parameter_errors={"albedo": 1e-3}))
+    results.end()
+    assert results.to_json()["worse"] == worse
 
 
 def test_a_truth_that_is_not_finite_is_null(tmp_path):

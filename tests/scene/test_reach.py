@@ -29,6 +29,18 @@ def test_crop_window_and_orientation(make_scene):
     assert np.array_equal(visible_texels(scene, scene.sensors(), KEY), expected)
 
 
+def test_pixels_that_are_left_out_show_nothing(make_scene):
+    """As a mask has them: those of the film's left half, (H, W)."""
+    scene = make_scene()
+    height, width = (int(n) for n in reversed(scene.sensors()[0].film().crop_size()))
+    kept = np.ones((height, width), dtype=bool)
+    kept[:, : width // 2] = False
+    expected = np.zeros((4, 6), dtype=bool)
+    expected[:, 3:] = True
+    assert np.array_equal(visible_texels(scene, scene.sensors(), KEY, [kept]), expected)
+    assert visible_texels(scene, scene.sensors(), KEY, [None]).all()
+
+
 def test_hidden_texels_and_what_hides(make_scene):
     import mitsuba as mi
 

@@ -31,6 +31,7 @@ from reslrb_cli.integrators import known_step, render_image
 from reslrb_cli.integrators.tracer import LightTracer
 from reslrb_cli.optimization.certainty.directions import Change, Direction
 from reslrb_cli.optimization.loading import make_configured
+from reslrb_cli.optimization.rendering import render_in_passes
 from reslrb_cli.optimization.samples import take_gradient
 from reslrb_cli.optimization.views import View, slope, to_tensor
 from reslrb_cli.seeds import seed
@@ -190,29 +191,29 @@ class Curvature:
             return []
         chosen = render.integrator or config.integrator
         integrator = make_configured(chosen)
-        if isinstance(integrator, LightTracer):
-            integrator = integrator.with_options(samples_per_pass=integrator.samples_per_pass, freeze=False)
-        unit = chosen.options().get("samples_per_pass") or 1
-        few = max(self.spp // unit, 1) * unit
-        by_view = [self._noises(view, integrator, render.spp, few) for view in trained]
+        multiple = chosen.options().get("samples_per_pass")
+        by_view = [self._noises(view, integrator, render.spp, multiple) for view in trained]
         return [list(sample) for sample in zip(*by_view, strict=True)]
 
-    def _noises(self, view: View, integrator: Any, spp: int, few: int) -> list[TargetNoise]:
+    def _noises(self, view: View, integrator: Any, spp: int, multiple: int | None) -> list[TargetNoise]:
         """Samples of what the noise of a view's target, of `spp` samples, makes of dL/dI; nothing of one that was read.
 
         Of images with as many samples each is the target in turn, and the mean of the others what it shows. Where that
-        would cost too much, and noise is small, differences of images of `few` samples are added to the target.
+        would cost too much, and noise is small, differences of images of few samples are added to the target. All
+        samples are multiples of `multiple`.
         """
         true = np.array(view.target, dtype=np.float64)
         if view.wanted.file is not None:
             return [TargetNoise(np.zeros_like(true), np.zeros_like(true), 1)] * REPLICAS
-        again = spp <= AGAIN * self.problem.config.run.spp
+        run, unit = self.problem.config.run, multiple or 1
+        again, few = spp <= AGAIN * run.spp, max(self.spp // unit, 1) * unit
         images = []
         for number in range(REPLICAS):
-            at = self._seed(view.sensor, -3 - number)
-            with dr.suspend_grad():
-                image = render_image(integrator, self.problem.scene, view.sensor, at, spp if again else few)
-            images.append(view.kept(np.nan_to_num(np.array(image, dtype=np.float64)[:, :, : true.shape[2]])))
+            image = render_in_passes(
+                integrator, self.problem.scene, view.sensor, spp if again else few, run.seed, number,
+                f"{_PURPOSE}, target", multiple,
+            )  # fmt: skip
+            images.append(view.kept(np.nan_to_num(image[:, :, : true.shape[2]].astype(np.float64))))
         # Where noise has led the values astray the images are not as bright as the target.
         bright = np.sum(view.kept(true)) * REPLICAS / max(float(np.sum(images)), 1e-300)
         images = [image * np.clip(bright, 1 / MOST_ASTRAY, MOST_ASTRAY) for image in images]
