@@ -149,9 +149,8 @@ def _outcome(problem: Problem, options: list[Option], say: Say, cache: Cache | N
                 return outcome
         except (TypeError, KeyError):
             pass  # nothing there, or nothing that this version wrote
-    later = [needs for option, needs in LATER.items() if is_auto(problem.config, option)]
     allowance = allowance_of(problem, options[0].integrator)
-    if not allowance.affords(ESTIMATOR_NEEDS, *later):
+    if not allowance.affords(ESTIMATOR_NEEDS, *(LATER[option] for option in _later(problem.config))):
         return _usual(options, allowance)
     say("estimator auto: measuring")
     with allowance.counted():
@@ -190,12 +189,12 @@ def run_pilot(problem: Problem, options: list[Option]) -> Outcome:
     if problem.samples_per_pass is not None:  # the user's own passes
         unit = batches * min(problem.samples_per_pass, run.spp // batches)
     # What is measured later has its part of what it may cost; guiding leaves some of its own for the sequence.
-    later = {"guiding": GUIDING_SHARE, "sequence": SEQUENCE_SHARE}
-    reserved = max([share for option, share in later.items() if is_auto(problem.config, option)], default=0.0)
+    later, shares = _later(problem.config), {"guiding": GUIDING_SHARE, "sequence": SEQUENCE_SHARE}
+    reserved = max((shares[option] for option in later), default=0.0)
     if problem.allowance is None:
         return Pilot(made, step, run.spp, unit, SHARE - reserved).run()
     began, allowance = time.perf_counter(), problem.allowance
-    kernels = sum(LATER[option][0] for option in later if is_auto(problem.config, option))
+    kernels = sum(LATER[option][0] for option in later)
     share = min(SHARE, allowance.iterations_left(ESTIMATOR_NEEDS[0] + kernels) / ITERATIONS) - reserved
 
     def compiles() -> bool:
@@ -233,6 +232,11 @@ def measured_step(problem: Problem, integrator: Any, clock: StepClock, round: in
 def is_auto(config: Config, option: str) -> bool:
     """Whether this option of the integrator is left to measurement."""
     return bool(config.integrator.options().get(option) == "auto")
+
+
+def _later(config: Config) -> list[str]:
+    """The options that are measured once the estimator is settled."""
+    return [option for option in LATER if is_auto(config, option)]
 
 
 def share_left(problem: Problem, reserved: float = 0.0, kernels: float = 0.0) -> float:
