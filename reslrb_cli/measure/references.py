@@ -66,6 +66,8 @@ def ptracer_image(at: Situation) -> str | None:
         return "it emits wrongly from a turned environment map"
     if at.needs.has_null:
         return "it does not connect through masks"
+    if any(_is_mirrored(shape) for shape in at.scene.shapes()):
+        return "it sees black where a mesh is mirrored"
     if at.needs.has_perturbed_normals:
         return "it does not treat bump and normal maps as this code does"
     clipping = stock_clip(at.needs)
@@ -178,6 +180,17 @@ def _is_turned(emitter: Any) -> bool:
         return False
     matrix = np.array(mi.traverse(emitter)["to_world"].matrix, np.float64).reshape(4, 4)
     return not np.allclose(matrix[:3, :3], np.eye(3))
+
+
+def _is_mirrored(shape: mi.Shape) -> bool:
+    """Whether most faces of a mesh look away from its own normals, as they do where `to_world` mirrors it."""
+    params = mi.traverse(shape)
+    if "vertex_normals" not in params or not shape.has_vertex_normals():
+        return False
+    points, normals = (np.array(params[name]).reshape(-1, 3) for name in ("vertex_positions", "vertex_normals"))
+    a, b, c = np.moveaxis(np.array(params["faces"]).reshape(-1, 3), 1, 0)
+    across = np.cross(points[b] - points[a], points[c] - points[a])
+    return float(np.median(np.sum(across * (normals[a] + normals[b] + normals[c]), axis=1))) < 0
 
 
 def _all_zero_somewhere(value: Any) -> bool:

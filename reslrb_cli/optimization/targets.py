@@ -44,6 +44,20 @@ def make_targets(problem: Problem, say: Callable[[str], None]) -> None:
     if problem.config.target.render is not None:
         _render_targets(problem, say)
         gc.collect()  # a second scene takes part in all that is traced, until it is gone
+    _check_light(problem, say)
+
+
+def _check_light(problem: Problem, say: Callable[[str], None]) -> None:
+    """Raise ConfigError where all targets are black, of which nothing can be learned; `say` which of several are."""
+    black = [view.sensor for view in problem.views if not np.any(np.array(view.target))]
+    if not black:
+        return
+    which = f"sensor{'s' * (len(black) > 1)} {', '.join(map(str, black))}"
+    if len(black) == len(problem.views):
+        where = "no light comes to" if problem.config.target.file is None else "the image is black of"
+        config = problem.config.source
+        raise ConfigError(config, "target", f"black everywhere: {where} {which}; `reslrb inspect` says what is seen")
+    say(f"the target of {which} is black everywhere")
 
 
 def _see(problem: Problem, view: View, image: Array, photo: Photo | None, say: Callable[[str], None]) -> None:

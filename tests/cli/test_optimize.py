@@ -193,6 +193,19 @@ def test_several_sensors_share_the_parameters(experiment, capsys):
     assert {"final-0.exr", "final-1.exr", "target-1.exr"} <= set(names("runs/box/images"))
 
 
+def test_a_target_without_light_is_refused(experiment, capsys):
+    """Where one sensor of two looks away it is said; where all do there is nothing to recover anything from."""
+    away = SCENE.replace('origin="1, 0, 4" target="0, 0, 0"', 'origin="1, 0, 4" target="9, 0, 4"')
+    Path("scene.xml").write_text(away.replace('<float name="fov" value="50"/>', '<float name="fov" value="20"/>'))
+    sets = ["--set", "run.iterations=1", "--set", "scene.sensors"]
+    code, _, err = reslrb(capsys, "optimize", "box.yaml", *sets[:-1], "scene.sensors=all")
+    assert code == 0
+    assert "the target of sensor 1 is black everywhere" in err
+    code, _, err = reslrb(capsys, "optimize", "box.yaml", *sets[:-1], "scene.sensors=[1]")
+    assert code == 2
+    assert err.splitlines()[-1].startswith("box.yaml: target: black everywhere: no light comes to sensor 1")
+
+
 def test_a_target_file_gives_no_parameter_error(experiment, capsys):
     assert reslrb(capsys, "render", "box.yaml", "--scene", "-o", "target.exr", "--spp", 64)[0] == 0
     Path("file.yaml").write_text(CONFIG.replace("{render: {spp: 512}}", "{file: target.exr}"))

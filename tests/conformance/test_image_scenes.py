@@ -10,7 +10,7 @@ from conformance.scenes import SAME, agreement, difference_from_ptracer, images
 from rooms import real_room
 from turns import a_few
 
-from reslrb_cli.measure.references import interior
+from reslrb_cli.measure.references import Situation, interior, ptracer_image
 from reslrb_cli.measure.statistics import compare
 from reslrb_cli.scene import load_scene
 from reslrb_cli.scene.seen import sees_specular
@@ -91,3 +91,5 @@ def test_a_mesh_that_its_transform_mirrors():
     )
     result = agreement(scene, "path", spp=256, max_depth=4, rr_depth=5)
     assert result, result
+    at = Situation.of(scene, scene.sensors()[0], mi.traverse(scene), 4, False)
+    assert ptracer_image(at) == "it sees black where a mesh is mirrored"

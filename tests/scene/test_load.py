@@ -52,6 +52,10 @@ def test_files_are_found_beside_the_scene(tmp_path, monkeypatch):
     load(tmp_path / "sub", text, radius=1)
 
 
+def lamp(radiance: str) -> str:
+    return LIT_SPHERE.replace('constant"/>', f'constant"><rgb name="radiance" value="{radiance}"/></emitter>')
+
+
 @pytest.mark.parametrize(
     ("text", "options", "where", "what"),
     [
@@ -67,6 +71,10 @@ def test_files_are_found_beside_the_scene(tmp_path, monkeypatch):
         (LIT_SPHERE, {"radius": "wide"}, ":4", 'could not parse floating point value "wide"'),
         (LIT_SPHERE.replace("constant", "envmap"), {"radius": 1}, ":3", "filename"),
         (LIT_SPHERE.replace('<emitter type="constant"/>', ""), {"radius": 1}, "", "has no emitters"),
+        (lamp("8, nan, 6"), {"radius": 1}, ":3", "radiance: `8, nan, 6`: nan is not finite"),
+        (lamp("8 -Inf 6"), {"radius": 1}, ":3", "-Inf is not finite"),
+        (LIT_SPHERE, {"radius": "nan"}, ":4", "radius: `nan`: nan is not finite"),
+        (LIT_SPHERE.replace("sphere", "hair"), {"radius": 1}, ":4", "`bsplinecurve` draws strands"),
         ('<scene version="3.0.0"><emitter type="constant"/></scene>', {}, "", "is empty"),
         ('<scene version="3.0.0"/>', {}, "", "is empty"),
         ('<shape version="3.0.0" type="sphere"/>', {}, "", "single object"),
@@ -80,6 +88,24 @@ def test_errors_are_located(tmp_path, text, options, where, what):
     assert what in line
     assert "\n" not in line
     assert ".cpp" not in line
+
+
+@pytest.mark.parametrize(
+    ("text", "what"),
+    [
+        (None, "`mesh.obj`: no such file; looked for in "),
+        ("version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 3\n", "is a pointer of Git LFS, not the file"),
+        ("v 0 0 0\nv 1 0 0\nv 0 1 0\n", "the mesh has no faces"),
+    ],
+)
+def test_meshes_that_are_not_there(tmp_path, text, what):
+    if text is not None:
+        (tmp_path / "mesh.obj").write_text(text)
+    mesh = '<shape type="obj"><string name="filename" value="mesh.obj"/></shape>'
+    with pytest.raises(ConfigError) as error:
+        load(tmp_path, LIT_SPHERE.replace("</scene>", f"{mesh}</scene>"), radius=1)
+    assert what in str(error.value)
+    assert "scene.xml:" in str(error.value)
 
 
 def test_missing_file(tmp_path):

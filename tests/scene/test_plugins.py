@@ -17,8 +17,8 @@ from reslrb_cli.scene import load_scene
 pytestmark = pytest.mark.usefixtures("llvm")
 
 SCENE = (
-    '<scene version="3.0.0">\n<sensor type="perspective"/>\n<emitter type="constant"/>\n<shape type="sphere"/>\n'
-    "{}\n</scene>"
+    '<scene version="3.0.0">\n<sensor type="perspective"/>\n<emitter type="constant"/>\n'
+    '<shape type="sphere"><point name="center" x="0" y="0" z="3"/></shape>\n{}\n</scene>'
 )
 #: Writes a file when it is loaded, as the constructor of any library could.
 LIBRARY = """#include <stdio.h>

@@ -22,6 +22,9 @@ _ORIGIN = re.compile(r"\[[\w.]+(:\d+)?\]\s*")
 _PREAMBLE = re.compile(r"^(At|Error while loading|While loading) .*?\(line \d+, col \d+\):? ?")
 _PLACE = re.compile(r"\(line (\d+), col \d+\)")
 
+#: What Mitsuba says of a mesh without faces.
+_NO_FACES = re.compile(r"Storing new normals in a Mesh that didn't have normals.*")
+
 #: Parameters of one object for which names that are like theirs are looked for.
 _HINTS = 30
 
@@ -69,6 +72,7 @@ class _Text:
         text = _ORIGIN.sub("", message).strip()
         while _PREAMBLE.match(text):
             text = _PREAMBLE.sub("", text).strip()
+        text = _NO_FACES.sub("the mesh has no faces", text)
         text = _PLACE.sub(lambda other: f"({self._elements[int(other[1]) - 1].place})", text)
         return ConfigError(element.place if element else self._root.source.file, "", text)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import stat
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
@@ -19,6 +20,9 @@ from .reading import MAX_DEPTH
 #: Parameters without which a plugin reads memory that is not its own.
 _NEEDED = {"bitmap": "filename", "normalmap": "normalmap"}
 _VECTORS = ("point", "vector", "translate", "scale", "rotate")
+_NUMBERS = ("float", "rgb", "spectrum", "matrix", "lookat", *_VECTORS)
+#: Mitsuba reads these as numbers.
+_NOT_FINITE = re.compile(r"(?i)(?<![\w.])[-+]?(nan|inf|infinity)(?!\w)")
 #: Lines, or objects, that one message names.
 _SHOWN = 5
 
@@ -34,8 +38,10 @@ def check(description: Description) -> None:
                 raise _unknown_plugin(description.root, element)
             _check_kind(element)
             _check_needed(element)
-        elif element.tag in _VECTORS:
-            _check_vector(element)
+        elif element.tag in _NUMBERS:
+            _check_finite(element)
+            if element.tag in _VECTORS:
+                _check_vector(element)
         if element.tag == "string" and element.name == "filename":
             _check_regular(element, description.folders)
     _check_chains(description.root)
@@ -55,6 +61,14 @@ def _check_needed(element: Element) -> None:
         raise element.fail("", f"{element.type} needs a parameter `{name}`")
     if element.type == "blendbsdf" and sum(child.tag in ("bsdf", "ref") for child in element.children) < 2:
         raise element.fail("", "blendbsdf needs two BSDFs")
+
+
+def _check_finite(element: Element) -> None:
+    """Refuse what is no number, and a colour or a place that is infinite: all that comes of it is not finite."""
+    for name, text in element.attributes.items():
+        bad = _NOT_FINITE.search(text) if name not in ("id", "name", "filename", "type") else None
+        if bad is not None and (element.tag != "float" or bad[1].lower() == "nan"):
+            raise element.fail(element.name or element.tag, f"{quoted(text)}: {bad[0]} is not finite")
 
 
 def _check_vector(element: Element) -> None:

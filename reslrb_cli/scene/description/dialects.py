@@ -68,6 +68,7 @@ LOST_PLUGINS = {
 
 #: Plugins that Mitsuba 3 has, and that no scene file can use here.
 REFUSED_PLUGINS = {
+    ("shape", "hair"): "is a plugin of Mitsuba 0.6 that Mitsuba 3 does not have; `bsplinecurve` draws strands",
     ("shape", "blender"): "reads the memory of a running Blender; export the mesh as `ply` or `obj`",
     ("sensor", "flat_sensor"): "belongs to Mitsuba's own RayDataLoader; take a `perspective` one",
 }

@@ -22,6 +22,8 @@ from .including import Description
 _TEXEL_BYTES, _FLOAT_BYTES = 6, 12
 #: Bytes in which a mesh says what it consists of.
 _HEAD = 2**16
+#: What Git's extension for large files writes in place of one.
+_LFS = b"version https://git-lfs.github.com/"
 
 
 @dataclass(frozen=True)
@@ -76,10 +78,12 @@ def _size_of(film: Element) -> FilmSize:
 
 
 def _check_head(element: Element, path: Path) -> None:
-    """Refuse a PLY mesh whose elements have names that are no text, which Mitsuba prints as they come, or that says to
+    """Refuse what Git LFS leaves where a file was not brought, and a PLY mesh whose elements have names that are no text, which Mitsuba prints as they come, or that says to
     have more of them than it has bytes, for which Mitsuba makes room."""
     with path.open("rb") as file:
         head = file.read(_HEAD)
+    if head.startswith(_LFS):
+        raise element.fail("filename", f"{path} is a pointer of Git LFS, not the file; `git lfs pull` brings it")
     if not head.startswith(b"ply"):
         return
     for line in head.partition(b"end_header")[0].splitlines():
@@ -101,7 +105,10 @@ def _check_file(element: Element, folders: list[Path], free: int, texel: int) ->
     places = [*(folder / name for folder in folders), Path(name)]
     path = next((path for path in places if os.path.isfile(path)), None)  # False of names that are too long, too
     if path is None:
-        return  # which Mitsuba says
+        if not os.path.basename(name):
+            return  # which Mitsuba says
+        looked = "" if os.path.isabs(name) else f"; looked for in {', '.join(str(folder) for folder in folders)}"
+        raise element.fail("filename", f"{quoted(name)}: no such file{looked}")
     if os.path.getsize(path) > free:
         raise element.fail(
             "filename", f"{path} has {in_words(os.path.getsize(path))}, and {in_words(free)} of memory are free"

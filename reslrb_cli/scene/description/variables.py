@@ -52,7 +52,8 @@ class Variables:
         missing = re.search(r"(?<!\\)\$(\w*)", text, re.ASCII)
         if missing:
             name = quoted(missing[1], "")
-            message = f"has no value and no default; set scene.options.{name}" if name else "is no variable; write \\$"
+            how = f"set scene.options.{name} (--set scene.options.{name}=VALUE)"
+            message = f"has no value and no default; {how}" if name else "is no variable; write \\$"
             raise element.fail(f"${name}", message)
         return text.replace("\\$", "$")
 
