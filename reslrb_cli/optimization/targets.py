@@ -54,9 +54,10 @@ def _check_light(problem: Problem, say: Callable[[str], None]) -> None:
         return
     which = f"sensor{'s' * (len(black) > 1)} {', '.join(map(str, black))}"
     if len(black) == len(problem.views):
-        where = "no light comes to" if problem.config.target.file is None else "the image is black of"
-        config = problem.config.source
-        raise ConfigError(config, "target", f"black everywhere: {where} {which}; `reslrb inspect` says what is seen")
+        render = problem.config.target.render
+        said = "; `reslrb inspect` says what is seen"
+        why = "" if render is None else f": no light comes there in {render.spp} spp{said}"
+        raise ConfigError(problem.config.source, "target", f"the image of {which} is black everywhere{why}")
     say(f"the target of {which} is black everywhere")
 
 

@@ -144,7 +144,9 @@ def _shares(scene: mi.Scene, index: int) -> dict[Any, float]:
     """The share of the picture that each BSDF, shape and emitter has, as the rays from the sensor meet it first."""
     sensor, lane = scene.sensors()[index], dr.arange(mi.UInt32, _RAYS**2)
     position = mi.Point2f(lane % _RAYS + 0.5, lane // _RAYS + 0.5) / _RAYS
-    ray, _ = sensor.sample_ray_differential(sensor.shutter_open(), 0.5, position, mi.Point2f(0.5), True)
+    # One for each ray: an irradiance meter makes a single direction of a single one, which Dr.Jit fails to compile.
+    aperture = dr.opaque(mi.Point2f, 0.5, shape=_RAYS**2)
+    ray, _ = sensor.sample_ray_differential(sensor.shutter_open(), 0.5, position, aperture, True)
     si = scene.ray_intersect(ray)
     graph = SceneGraph.of(scene)
     shares: dict[Any, float] = {}

@@ -203,7 +203,7 @@ ROWS: tuple[Row, ...] = (
         note="files of RGB; those of spectra Mitsuba refuses"),
     Row("bsdf", "measured", "without its file", thing(
         '<bsdf type="measured"><string name="filename" value="none.bsdf"/></bsdf>'),
-        loading='The file "none.bsdf" does not exist!'),
+        loading='`none.bsdf`: no such file'),
     Row("bsdf", "measured_polarized", scene=thing(
         '<bsdf type="measured_polarized"><string name="filename" value="paint.pbsdf"/>'
         '<float name="wavelength" value="500"/></bsdf>'), light=ONE_WAY, note="at its one wavelength"),
@@ -300,7 +300,7 @@ ROWS: tuple[Row, ...] = (
     Row("sensor", "radiancemeter", light=PINHOLE,
         scene=sensor("radiancemeter", "", film(size=1), PLACE.replace("0, 0, 0", "0, -1, 1"))),
     Row("sensor", "irradiancemeter", light=PINHOLE,
-        scene='<shape type="rectangle"><transform name="to_world"><rotate x="1" angle="-90"/><translate y="-0.9"/>'
+        scene='<shape type="disk"><transform name="to_world"><rotate x="1" angle="-90"/><translate y="-0.9"/>'
         f'</transform>{sensor("irradiancemeter", "", film(size=1), "")}</shape>'),
     Row("sensor", "batch", light=PINHOLE,
         scene=sensor("batch", 2 * f'<sensor type="perspective">{PLACE}{film()}</sensor>', film(size=32), "")),

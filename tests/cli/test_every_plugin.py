@@ -18,7 +18,7 @@ from reslrb_cli.backend.plugins import package_folder, shipped_plugins
 pytestmark = pytest.mark.usefixtures("llvm")
 
 #: Three iterations, as short as they may be.
-SHORT = settings("target={render: {spp: 4}}", "run.iterations=3", "run.spp=4", "run.reach_spp=1",
+SHORT = settings("target={render: {spp: 64}}", "run.iterations=3", "run.spp=4", "run.reach_spp=1",
                  "run.certainty=false", "integrator.max_depth=4")  # fmt: skip
 #: What a run would find out first.
 DECIDED = settings("integrator.estimator=stack", "integrator.guiding=off", "integrator.sequence=independent")

@@ -203,7 +203,7 @@ def test_a_target_without_light_is_refused(experiment, capsys):
     assert "the target of sensor 1 is black everywhere" in err
     code, _, err = reslrb(capsys, "optimize", "box.yaml", *sets[:-1], "scene.sensors=[1]")
     assert code == 2
-    assert err.splitlines()[-1].startswith("box.yaml: target: black everywhere: no light comes to sensor 1")
+    assert err.splitlines()[-1].startswith("box.yaml: target: the image of sensor 1 is black everywhere: no light")
 
 
 def test_a_target_file_gives_no_parameter_error(experiment, capsys):
