@@ -78,8 +78,9 @@ def _size_of(film: Element) -> FilmSize:
 
 
 def _check_head(element: Element, path: Path) -> None:
-    """Refuse what Git LFS leaves where a file was not brought, and a PLY mesh whose elements have names that are no text, which Mitsuba prints as they come, or that says to
-    have more of them than it has bytes, for which Mitsuba makes room."""
+    """Refuse what Git LFS leaves where a file was not brought, and a PLY mesh whose elements have names that are no
+    text, which Mitsuba prints as they come, or that says to have more of them than it has bytes, for which Mitsuba
+    makes room."""
     with path.open("rb") as file:
         head = file.read(_HEAD)
     if head.startswith(_LFS):
