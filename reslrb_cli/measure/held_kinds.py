@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 
-from reslrb_cli.backend.python import python_command
 from reslrb_cli.config import Config, Reslrb, dump
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.measure.processes import Ended, Process
@@ -24,7 +23,6 @@ VARIANT = "llvm_ad_rgb"
 #: Who takes gradients: the experiment's own integrator.
 OWN = "own"
 _ADJOINT = "adjoint.npy"
-_COMMAND = "from reslrb_cli.measure.worker import held_gradients, run\nrun(held_gradients)"
 
 
 @dataclass
@@ -114,7 +112,7 @@ def _start(config: Config, limit: int | None, by: str, adjoint: Path | None) -> 
         "by": by,
         "adjoint": None if adjoint is None else str(adjoint),
     }
-    return Process(first, python_command(_COMMAND))
+    return Process(first, "held_gradients")
 
 
 def _never() -> bool:

@@ -78,9 +78,12 @@ def abandon_all() -> None:
 
 
 class Process:
-    """One worker. `first` is its first message; `memory_limit` (bytes, or None) is in it too."""
+    """One worker. `first` is its first message; `memory_limit` (bytes, or None) is in it too.
 
-    def __init__(self, first: dict[str, Any], command: list[str] | None = None) -> None:
+    `task` is what it is for, a name of `tasks.py`; with `command` it is that in place of a worker of ours.
+    """
+
+    def __init__(self, first: dict[str, Any], task: str = "measured_steps", command: list[str] | None = None) -> None:
         self.limit: int | None = first["memory_limit"]
         self.peak_bytes = 0  # of address space
         self._buffer = b""
@@ -89,7 +92,7 @@ class Process:
             self._words = Path(self._folder.name) / "stderr"
             with self._words.open("wb") as words:
                 self._process = subprocess.Popen(
-                    command or python_command("from reslrb_cli.measure.worker import run\nrun()"),
+                    command or python_command(f"from reslrb_cli.measure.tasks import {task}, run\nrun({task})"),
                     stdin=subprocess.PIPE,
                     stdout=subprocess.PIPE,
                     stderr=words,

@@ -1,4 +1,4 @@
-"""The process of one case: `run`, in a Python of its own, started and told what to do by `processes.py`.
+"""The process of one case: `run`, in a Python of its own, started and told what to do by `processes.py` (`tasks.py`).
 
 It reads one JSON object a line from standard input and answers each with one on standard output. The first describes
 the case; each other one asks for a step. What else is printed goes to standard error.
@@ -21,56 +21,7 @@ Begun = tuple[dict[str, Any], Callable[[dict[str, Any]], dict[str, Any]]]
 Begin = Callable[[dict[str, Any]], Begun]
 
 
-def measured_steps() -> Begin:
-    """Steps as `bench` measures them. Whatever is imported for it is, here and in the function below."""
-    from reslrb_cli.config import loads
-    from reslrb_cli.measure.stepper import Stepper
-
-    def begin(first: dict[str, Any]) -> Begun:
-        config = loads(first["config"], first["source"])
-        stepper = Stepper(config, first["objective"], first.get("film_width"), first.get("texture_width"))
-        size = {"width": stepper.size[0], "height": stepper.size[1], "texels": stepper.texels}
-        return size, lambda question: stepper.step(question["round"], question["cold"], question["release"])
-
-    return begin
-
-
-def held_gradients() -> Begin:
-    """Gradients with dL/dI held, and what they are taken at."""
-    from reslrb_cli.measure.held import begin
-
-    return begin
-
-
-def surveyed() -> Begin:
-    """What `convergence` asks before it measures."""
-    from reslrb_cli.measure.convergence.survey import begin
-
-    return begin
-
-
-def sampled_steps() -> Begin:
-    """Steps as `convergence` measures them, with what they estimate."""
-    from reslrb_cli.measure.convergence.sampler import begin
-
-    return begin
-
-
-def judged_runs() -> Begin:
-    """What whole optimisations are judged by."""
-    from reslrb_cli.measure.whole_runs.judge import begin
-
-    return begin
-
-
-def whole_runs() -> Begin:
-    """A whole optimisation, bit by bit."""
-    from reslrb_cli.measure.whole_runs.runner import begin
-
-    return begin
-
-
-def main(load: Callable[[], Begin] = measured_steps) -> int:
+def main(load: Callable[[], Begin]) -> int:
     """Answer until standard input ends, or until something fails: the last answer then says what."""
     answers = os.fdopen(os.dup(sys.stdout.fileno()), "w", encoding="utf-8")
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
@@ -151,7 +102,7 @@ def _answer(answers: IO[str], message: dict[str, Any]) -> None:
     answers.flush()
 
 
-def run(load: Callable[[], Begin] = measured_steps) -> None:
+def run(load: Callable[[], Begin]) -> None:
     """Answer, and end the process."""
     code = main(load)
     sys.stderr.flush()

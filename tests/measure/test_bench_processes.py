@@ -17,7 +17,9 @@ FAILED, OUT_OF_MEMORY = BenchStatus.FAILED, BenchStatus.OUT_OF_MEMORY
 
 
 def end_of(script: str, limit: int | None = None) -> Ended:
-    process = Process({"memory_limit": limit}, [sys.executable, "-c", f"import json, os, signal, sys, time\n{script}"])
+    process = Process(
+        {"memory_limit": limit}, command=[sys.executable, "-c", f"import json, os, signal, sys, time\n{script}"]
+    )
     try:
         with pytest.raises(Ended) as caught:
             process.answer(lambda: False)
@@ -54,7 +56,7 @@ def test_a_crash_close_to_the_limit_is_one_of_memory() -> None:
 
 def test_a_refusal_holds_for_all() -> None:
     answer = {"failure": "refused", "reason": "x.yaml: scene.file: no such file", "exit_code": 2}
-    process = Process(FIRST, [sys.executable, "-c", f"import json; print(json.dumps({answer!r}))"])
+    process = Process(FIRST, command=[sys.executable, "-c", f"import json; print(json.dumps({answer!r}))"])
     with pytest.raises(Refused, match=r"scene\.file: no such file") as caught:
         process.answer(lambda: False)
     assert caught.value.exit_code == 2
@@ -62,7 +64,7 @@ def test_a_refusal_holds_for_all() -> None:
 
 
 def test_waiting_can_be_stopped() -> None:
-    process = Process(FIRST, [sys.executable, "-c", "import time; time.sleep(60)"])
+    process = Process(FIRST, command=[sys.executable, "-c", "import time; time.sleep(60)"])
     with pytest.raises(Stopped):
         process.answer(lambda: True)
     process.close()

@@ -8,5 +8,5 @@ from reslrb_cli.measure.attached.scene import AttachedScene, Differenced, compar
 __all__ = ["SCENES", "AttachedScene", "Differenced", "compare_with_differences"]
 
 SCENES: dict[str, AttachedScene] = {
-    scene.name: scene for topic in (glass, mirrors, places, rooms) for scene in topic.SCENES
+    scene.name: scene for scene in (*glass.SCENES, *mirrors.SCENES, *places.SCENES, *rooms.SCENES)
 }

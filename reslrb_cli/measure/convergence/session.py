@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 
-from reslrb_cli.backend.python import python_command
 from reslrb_cli.config import Config, dump
 from reslrb_cli.errors import ExitCode
 from reslrb_cli.measure.cases import Case
@@ -39,13 +38,13 @@ MIB = 2**20
 #: Light paths of a step of an independent reference, whose samples per pixel are its own: naive AD keeps all paths.
 INDEPENDENT_PATHS = 2**18
 
-#: Starts a process by its first message and the name of what it does, a function of `worker.py`.
+#: Starts a process by its first message and the name of what it does, a function of `tasks.py`.
 Start = Callable[[dict[str, Any], str], Any]
 
 
 def start_process(first: dict[str, Any], does: str) -> Process:
-    """A process that does what the function `does` of `worker.py` returns."""
-    return Process(first, python_command(f"from reslrb_cli.measure.worker import {does}, run\nrun({does})"))
+    """A process that does what the function `does` of `tasks.py` returns."""
+    return Process(first, does)
 
 
 class Session:

@@ -9,8 +9,6 @@ from reslrb_cli.measure.extreme.case import ExtremeCase
 from reslrb_cli.measure.extreme.runner import run_cases
 from reslrb_cli.records.gradcheck import GradcheckRecord
 
-TOPICS = (colours, lights, places, roughness, films, glass, losses, motion, unfound)
-
 
 def registry(cases: Iterable[ExtremeCase]) -> dict[str, ExtremeCase]:
     """Cases by name. Raises ValueError where two have the same."""
@@ -22,7 +20,19 @@ def registry(cases: Iterable[ExtremeCase]) -> dict[str, ExtremeCase]:
     return found
 
 
-CASES = registry(case for topic in TOPICS for case in topic.CASES)
+CASES = registry(
+    [
+        *colours.CASES,
+        *lights.CASES,
+        *places.CASES,
+        *roughness.CASES,
+        *films.CASES,
+        *glass.CASES,
+        *losses.CASES,
+        *motion.CASES,
+        *unfound.CASES,
+    ]
+)
 
 
 def run_suite(
