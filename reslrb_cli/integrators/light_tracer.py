@@ -20,7 +20,7 @@ from reslrb_cli.transport.hooks import Splat
 from reslrb_cli.transport.samples import Samples
 from reslrb_cli.transport.splat import AdjointImage, Film
 from reslrb_cli.transport.transmittance import forward_derivatives
-from reslrb_cli.transport.visible import differentiate_visible_radiance, visible_radiance, visible_tangent
+from reslrb_cli.transport.visible import differentiate_visible_radiance, primary_ray, visible_radiance, visible_tangent
 from reslrb_cli.transport.visible_lamps import moving_splats, small_splat
 from reslrb_cli.transport.walk import walk
 
@@ -42,7 +42,7 @@ def settle(scene: mi.Scene) -> None:
 def splat_visible_emission(samples: Samples, block: mi.ImageBlock, loop_mode: str = "symbolic") -> None:
     """Add C_0 to the block."""
     if samples.plan.visible_emission:
-        primary = samples.primary_ray()
+        primary = primary_ray(samples)
         radiance = visible_radiance(samples.plan, samples.scene, primary, loop_mode)
         samples.film.put(block, primary.u, radiance * primary.weight * samples.fraction, primary.active)
     if samples.plan.small_lamps:
@@ -177,7 +177,7 @@ def differentiate_visible_emission(samples: Samples, adjoint: AdjointImage) -> N
     """Add the derivatives of C_0."""
     plan = samples.plan
     if plan.visible_emission and (plan.differentiate_emission or plan.differentiate_null):
-        primary = samples.primary_ray()
+        primary = primary_ray(samples)
         delta = adjoint.lookup(primary.u, primary.active) * primary.weight * samples.fraction
         differentiate_visible_radiance(plan, samples.scene, primary, delta)
     if plan.small_lamps and plan.differentiate_emission:
@@ -199,7 +199,7 @@ def splat_tangents(samples: Samples, block: mi.ImageBlock) -> None:
             E = sample_emission(samples, samples.sampler()).weight
             [dE] = forward_derivatives(E)
         if plan.visible_emission and (plan.differentiate_emission or plan.differentiate_null):
-            primary = samples.primary_ray()
+            primary = primary_ray(samples)
             tangent = visible_tangent(plan, samples.scene, primary)
             samples.film.put(block, primary.u, tangent * primary.weight * samples.fraction, primary.active)
         if plan.small_lamps and plan.differentiate_emission:

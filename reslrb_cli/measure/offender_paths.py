@@ -14,7 +14,7 @@ from reslrb_cli.records.offender import Offender, PathVertex
 from reslrb_cli.transport.emission import Emission, sample_emission
 from reslrb_cli.transport.samples import Samples
 from reslrb_cli.transport.transmittance import forward_derivatives
-from reslrb_cli.transport.visible import visible_radiance, visible_tangent
+from reslrb_cli.transport.visible import primary_ray, visible_radiance, visible_tangent
 from reslrb_cli.transport.visible_lamps import small_points
 from reslrb_cli.transport.walk import walk
 
@@ -73,7 +73,7 @@ def _search_visible_emission(
 def _through_pixels(samples: Samples) -> tuple[Suspect, mi.Spectrum, mi.Point2f, mi.Bool]:
     """What primary rays see: radiance (C,), its tangent, film positions, and the active lanes."""
     plan, tangent = samples.plan, mi.Spectrum(0)
-    primary = samples.primary_ray()
+    primary = primary_ray(samples)
     radiance = visible_radiance(plan, samples.scene, primary)
     if plan.differentiate_emission or plan.differentiate_null:
         tangent = visible_tangent(plan, samples.scene, primary)

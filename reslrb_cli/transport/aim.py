@@ -85,6 +85,12 @@ class Pending:
         """That of a path that leaves an emitter."""
         return Pending(mi.Float(0), mi.Float(1), mi.Float(-1))
 
+    @staticmethod
+    def of(aimed: Aimed, si: mi.SurfaceInteraction3f, pdf: mi.Float, discrete: mi.Bool) -> Pending:
+        """That of an event at `si`, aimed or not, that gave a direction of this density, or one of few."""
+        distance = dr.select(aimed.active, dr.norm(aimed.point - si.p), -1)
+        return Pending(aimed.share, dr.select(discrete, dr.inf, dr.detach(pdf)), dr.detach(distance))
+
     def factor(
         self,
         aim: Aim,
@@ -116,11 +122,6 @@ class Aimed:
     point: mi.Point3f
     found: mi.Bool
     share: mi.Float
-
-    def pending(self, si: mi.SurfaceInteraction3f, pdf: mi.Float, discrete: mi.Bool) -> Pending:
-        """What the vertex after `si` is to know of a direction with this density, or one of few."""
-        distance = dr.select(self.active, dr.norm(self.point - si.p), -1)
-        return Pending(self.share, dr.select(discrete, dr.inf, dr.detach(pdf)), dr.detach(distance))
 
 
 def worthwhile(needs: SceneNeeds, max_depth: int) -> bool:

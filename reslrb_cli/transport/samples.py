@@ -16,7 +16,6 @@ from reslrb_cli.transport.nets import Net, Points
 from reslrb_cli.transport.numbers import Early
 from reslrb_cli.transport.plan import Plan
 from reslrb_cli.transport.splat import Film
-from reslrb_cli.transport.visible import PrimaryRay, primary_ray
 
 #: Names of the random streams beside the sampler's own, mixed into the seed.
 SELECTION_STREAM = 0x5E1EC7  # what hooks draw to select
@@ -116,9 +115,9 @@ class Samples:
         stream = self.stream(GUIDE_STREAM)
         return self.guide.draw(self.plan.grid, self.width, stream, choice, position, direction)
 
-    def primary_ray(self) -> PrimaryRay:
-        """Rays for C_0, from a stream of their own: the light paths are those of `ptracer` with or without them."""
-        return primary_ray(self.plan, self.sensor, _NumberStream(self.stream(VISIBLE_STREAM)), self.width)
+    def visible_numbers(self) -> Numbered:
+        """Random numbers for primary rays: the light paths are those of `ptracer` with or without them."""
+        return _NumberStream(self.stream(VISIBLE_STREAM))
 
     def small_lamp_numbers(self) -> Numbered:
         """Random numbers for points of lamps that are smaller than a pixel."""

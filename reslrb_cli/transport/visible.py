@@ -12,8 +12,9 @@ from dataclasses import dataclass, field
 import drjit as dr
 import mitsuba as mi
 
-from reslrb_cli.transport.emission import Numbered, sample_time
+from reslrb_cli.transport.emission import sample_time
 from reslrb_cli.transport.plan import Plan
+from reslrb_cli.transport.samples import Samples
 from reslrb_cli.transport.transmittance import forward_derivatives
 
 
@@ -28,8 +29,12 @@ class PrimaryRay:
     active: mi.Bool
 
 
-def primary_ray(plan: Plan, sensor: mi.Sensor, sampler: Numbered, width: int) -> PrimaryRay:
-    """Sample `width` rays, as many in each pixel of the crop window, or one more."""
+def primary_ray(samples: Samples) -> PrimaryRay:
+    """Rays for C_0, one for each path: as many in each pixel of the crop window, or one more.
+
+    Their numbers are a stream of their own.
+    """
+    plan, sensor, width, sampler = samples.plan, samples.sensor, samples.width, samples.visible_numbers()
     size = sensor.film().crop_size()
     n_pixels = int(size[0] * size[1])
     lane = dr.arange(mi.UInt32, width)

@@ -138,7 +138,9 @@ def walk(samples: Samples, hooks: Hooks, active: mi.Bool | bool = True) -> Any:
             roulette_weight = dr.select(playing, dr.rcp(q), 1)
             product, state = product.scaled(roulette_weight), hooks.survived(state, roulette_weight)
 
-        pending = [] if aimed is None else [aimed.pending(si, scattering.pdf, scattering.is_delta | scattering.is_null)]
+        pending = []
+        if aimed is not None:
+            pending = [Pending.of(aimed, si, scattering.pdf, scattering.is_delta | scattering.is_null)]
         path = replace(path, product=product, eta=eta, pending=pending)
         return _next(path, active, this.next_ray(hooks.attached)), state, sampler, selection
 

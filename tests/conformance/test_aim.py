@@ -136,10 +136,11 @@ def seen_through_others(patch: pytest.MonkeyPatch) -> None:
 
 def with_delta_lobes(patch: pytest.MonkeyPatch) -> None:
     """A mirror's direction counts as one that paths are aimed at."""
-    from reslrb_cli.transport.aim import Aimed
+    from reslrb_cli.transport.aim import Pending
 
-    right = Aimed.pending
-    patch.setattr(Aimed, "pending", lambda self, si, pdf, discrete: right(self, si, pdf, discrete & False))
+    right = Pending.of
+    faulty = staticmethod(lambda aimed, si, pdf, discrete: right(aimed, si, pdf, discrete & False))
+    patch.setattr(Pending, "of", faulty)
 
 
 def from_everywhere(patch: pytest.MonkeyPatch) -> None:
