@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import ast
+import re
 import subprocess
 import sys
+from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 import pytest
@@ -70,6 +72,62 @@ def _imports(path: Path, parts: tuple[str, ...]) -> list[tuple[int, str]]:
             base = [*(["reslrb_cli", *parts][: -node.level] if node.level else []), *filter(None, [node.module])]
             names += [(node.lineno, ".".join([*base, alias.name])) for alias in node.names]
     return names
+
+
+def circles(root: Path, package: str = "reslrb_cli") -> list[list[str]]:
+    """Files under `root` (a folder laid out as the package) that need one another, at most one circle.
+
+    All imports count, under TYPE_CHECKING and inside functions as well, and so do dotted names in text: a module that is
+    imported by its name is needed as much.
+    """
+    paths = {_module(package, path.relative_to(root)): path for path in root.rglob("*.py")}
+    needs: dict[str, set[str]] = {}
+    for name, path in paths.items():
+        parts = path.relative_to(root).with_suffix("").parts
+        found = {other for _, other in _imports(path, parts)} | set(_names_in_text(path, package))
+        modules = {other if other in paths else other.rpartition(".")[0] for other in found}
+        needs[name] = {other for other in modules if other in paths and other not in (name, package)}
+    try:
+        TopologicalSorter(needs).prepare()
+    except CycleError as error:
+        return [sorted(set(error.args[1]))]
+    return []
+
+
+def _module(package: str, path: Path) -> str:
+    return ".".join([package, *(part for part in path.with_suffix("").parts if part != "__init__")])
+
+
+def _names_in_text(path: Path, package: str) -> list[str]:
+    """Dotted names of the package that stand in the text of a module, but for docstrings."""
+    tree = ast.parse(path.read_text())
+    has_docstring = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
+    docstrings = {id(node.body[0].value) for node in ast.walk(tree)
+                  if isinstance(node, has_docstring) and node.body and isinstance(node.body[0], ast.Expr)}  # fmt: skip
+    texts = [node.value for node in ast.walk(tree)
+             if isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in docstrings]  # fmt: skip
+    return [name for text in texts for name in re.findall(rf"\b{package}(?:\.\w+)+", text)]
+
+
+def test_no_files_need_one_another() -> None:
+    assert circles(ROOT) == []
+
+
+@pytest.mark.parametrize(
+    ("one", "other", "seen"),
+    [
+        ("from reslrb_cli.two import b", "from reslrb_cli import one", True),
+        ("if TYPE_CHECKING:\n    from reslrb_cli.two import B", "from .one import a", True),
+        ("import reslrb_cli.two", "def f():\n    from reslrb_cli.one import a", True),
+        ("import reslrb_cli.two", "command = 'from reslrb_cli.one import a'", True),
+        ("import reslrb_cli.two", "'''As reslrb_cli.one has it.'''", False),
+        ("import reslrb_cli.two", "import os", False),
+    ],
+)
+def test_a_planted_circle_is_seen(tmp_path: Path, one: str, other: str, seen: bool) -> None:
+    (tmp_path / "one.py").write_text(one)
+    (tmp_path / "two.py").write_text(other)
+    assert bool(circles(tmp_path)) is seen
 
 
 def test_imports_run_one_way() -> None:

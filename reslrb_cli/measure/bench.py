@@ -24,8 +24,9 @@ from reslrb_cli.config import dump
 from reslrb_cli.measure.bench_book import Book
 from reslrb_cli.measure.bench_run import Result, Run, results
 from reslrb_cli.measure.pace import GROWTH, NO_TIME, Pace
-from reslrb_cli.measure.processes import Process, Stopped
+from reslrb_cli.measure.processes import Stopped
 from reslrb_cli.measure.sweep import WIDTHS, Sweep
+from reslrb_cli.measure.tasks import start_process
 
 #: Steps after the cold one until no new kernel comes, at most.
 MAX_WARM_UPS = 4
@@ -40,7 +41,7 @@ def bench(
     sweep: Sweep,
     stop: Callable[[], bool],
     say: Callable[[str], None],
-    start: Callable[[dict[str, Any]], Any] = Process,
+    start: Callable[[dict[str, Any]], Any] = start_process,
     book: Book | None = None,
     between: Callable[[], None] = lambda: None,
     spent_s: float = 0.0,

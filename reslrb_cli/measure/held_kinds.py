@@ -15,6 +15,7 @@ import numpy as np
 from reslrb_cli.config import Config, Reslrb, dump
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.measure.processes import Ended, Process
+from reslrb_cli.measure.tasks import start_process
 from reslrb_cli.seeds import seed
 
 MIB = 2**20
@@ -112,7 +113,7 @@ def _start(config: Config, limit: int | None, by: str, adjoint: Path | None) -> 
         "by": by,
         "adjoint": None if adjoint is None else str(adjoint),
     }
-    return Process(first, "held_gradients")
+    return start_process(first, "held_gradients")
 
 
 def _never() -> bool:

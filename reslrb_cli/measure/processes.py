@@ -16,7 +16,6 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from reslrb_cli.backend.python import python_command
 from reslrb_cli.errors import ReslrbError, mentions_memory
 from reslrb_cli.records.bench import BenchStatus
 
@@ -78,12 +77,9 @@ def abandon_all() -> None:
 
 
 class Process:
-    """One worker. `first` is its first message; `memory_limit` (bytes, or None) is in it too.
+    """One worker. `first` is its first message; `memory_limit` (bytes, or None) is in it too."""
 
-    `task` is what it is for, a name of `tasks.py`; with `command` it is that in place of a worker of ours.
-    """
-
-    def __init__(self, first: dict[str, Any], task: str = "measured_steps", command: list[str] | None = None) -> None:
+    def __init__(self, first: dict[str, Any], command: list[str]) -> None:
         self.limit: int | None = first["memory_limit"]
         self.peak_bytes = 0  # of address space
         self._buffer = b""
@@ -92,7 +88,7 @@ class Process:
             self._words = Path(self._folder.name) / "stderr"
             with self._words.open("wb") as words:
                 self._process = subprocess.Popen(
-                    command or python_command(f"from reslrb_cli.measure.tasks import {task}, run\nrun({task})"),
+                    command,
                     stdin=subprocess.PIPE,
                     stdout=subprocess.PIPE,
                     stderr=words,

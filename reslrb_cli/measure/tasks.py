@@ -1,16 +1,22 @@
-"""What processes of their own can be asked for, by the name that `processes.Process` takes.
+"""What processes of their own do: each begins with one of these functions, by its name.
 
-Nothing but a process that is to do one of these imports this file: each function imports what its task needs, and a
-process that asks for a task needs none of it.
+A function imports what its task needs, and whoever starts a process needs none of it.
 """
 
 from __future__ import annotations
 
 from typing import Any
 
+from reslrb_cli.backend.python import python_command
+from reslrb_cli.measure.processes import Process
 from reslrb_cli.measure.worker import Begin, Begun, run
 
-__all__ = ["held_gradients", "judged_runs", "measured_steps", "run", "sampled_steps", "surveyed", "whole_runs"]
+__all__ = ["run", "start_process"]
+
+
+def start_process(first: dict[str, Any], does: str = "measured_steps") -> Process:
+    """A process that does what the function `does` of this file returns; `first` is its first message."""
+    return Process(first, python_command(f"from reslrb_cli.measure.tasks import {does}, run\nrun({does})"))
 
 
 def measured_steps() -> Begin:

@@ -23,7 +23,8 @@ from reslrb_cli.measure.convergence.plan import Plan
 from reslrb_cli.measure.convergence.resuming import kept, restore, restore_facts, settings
 from reslrb_cli.measure.earlier import Earlier
 from reslrb_cli.measure.pace import Pace
-from reslrb_cli.measure.processes import Process, Refused, Stopped
+from reslrb_cli.measure.processes import Refused, Stopped
+from reslrb_cli.measure.tasks import start_process
 from reslrb_cli.records.bench import BenchStatus
 
 #: What the samples of all together may take in memory, in bytes.
@@ -40,11 +41,6 @@ INDEPENDENT_PATHS = 2**18
 
 #: Starts a process by its first message and the name of what it does, a function of `tasks.py`.
 Start = Callable[[dict[str, Any], str], Any]
-
-
-def start_process(first: dict[str, Any], does: str) -> Process:
-    """A process that does what the function `does` of `tasks.py` returns."""
-    return Process(first, does)
 
 
 class Session:

@@ -1,0 +1,202 @@
+"""Golden values: what three iterations of a score of experiments come to, bit by bit, and what commands print.
+
+They are for changes that are to change nothing: files that are merged, moved or named anew. `python tests/golden/golden.py`
+writes `values.json` beside it anew, for this processor and libLLVM; on another machine it is to be run on the commit before
+the change. `tests/test_golden.py` compares. Kernels are computed by one thread, since sums over several are not the same
+twice.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import re
+import subprocess
+import sys
+import tempfile
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+ROOT = Path(__file__).resolve().parents[2]
+VALUES = Path(__file__).with_name("values.json")
+SCHEMA = ROOT / "docs" / "config.schema.json"
+#: As little as still goes through all that a run does: gradients by a descent that hides none of their bits.
+SMALL = (
+    "run.iterations=3", "run.spp=8", "run.final_spp=8", "run.reach_spp=8", "run.certainty=false",
+    "target.render.spp=8", "loss={type: l2}", "optimizer={type: sgd, learning_rate: 10}",
+)  # fmt: skip
+#: Configuration, seed, and settings of each run, by name.
+RUNS: dict[str, tuple[str, int, tuple[str, ...]]] = {}
+
+
+def _run(name: str, config: str, *settings: str, seed: int = 0) -> None:
+    RUNS[name] = (config, seed, settings)
+
+
+def _ours(estimator: str, adjoint: str, guiding: str = "off", sequence: str = "independent", more: str = "") -> str:
+    drawn = f"guiding: {guiding}, sequence: {sequence}{more}"
+    return f"integrator={{type: reslrb, max_depth: 4, estimator: {estimator}, {drawn}}}|run.adjoint={adjoint}"
+
+
+for _number, (_estimator, _adjoint) in enumerate(
+    [("stack", "batched"), ("gather", "correlated"), ("reservoir", "independent"), ("event", "batched")]
+):
+    _run(f"floor_{_estimator}", "cornell_floor", _ours(_estimator, _adjoint), seed=_number)
+    _run(f"room_{_estimator}", "grey_room", _ours(_estimator, _adjoint, guiding="on"), seed=_number)
+    _run(f"slab_{_estimator}", "caustic_slab", _ours(_estimator, _adjoint, sequence="low_discrepancy"), seed=_number)
+_run("floor_guided", "cornell_floor", _ours("stack", "batched", "on", "low_discrepancy"))
+_run("floor_not_frozen", "cornell_floor", _ours("stack", "batched", more=", freeze: false"))
+_run("floor_adjoint", "cornell_floor", _ours("reservoir", "batched", more=", weight: adjoint, capacity: 2"))
+_run("heights_stack", "caustic_heightmap", _ours("stack", "independent"))
+_run("heights_reservoir", "caustic_heightmap", _ours("reservoir", "independent"))
+_run("pose_stack", "lens_pose", _ours("stack", "independent"))
+_run("pose_guided", "lens_pose", _ours("stack", "batched", "on"))
+_run("furnace_gather", "furnace", _ours("gather", "independent"))
+_run("lamp_event", "stiff/lamp", _ours("event", "independent"))
+_run("plate_stack", "stiff/plate", _ours("stack", "batched", "on"))
+_run("wall_gather", "stiff/wall", _ours("gather", "correlated"))
+for _type in ("ptracer", "prb", "walk_ad", "trajectory"):
+    _run(f"floor_{_type}", "cornell_floor", f"integrator={{type: {_type}, max_depth: 4}}|run.adjoint=independent")
+#: Commands whose help is compared.
+COMMANDS = (
+    "",
+    "inspect",
+    "init",
+    "optimize",
+    "render",
+    "export",
+    "gradcheck",
+    "bench",
+    "convergence",
+    "report",
+    "doctor",
+)
+#: Tiny measurements, of whose JSON lines the form is compared: names and types, at all depths.
+MEASUREMENTS = {
+    "gradcheck": ("gradcheck", "--set", "scene.options.size=8", "--set", "run.spp=4", "--seeds", "4", "--estimators", "stack"),
+    "bench": ("bench", "--set", "scene.options.size=8", "--set", "run.spp=4", "--max-depth", "2", "--rounds", "1",
+              "--integrators", "reslrb:stack"),
+    "convergence": ("convergence", "--set", "scene.options.size=8", "--set", "run.spp=4", "--methods", "reslrb:stack",
+                    "--budget", "20"),
+    "inspect": ("inspect", "configs/cornell_floor.yaml", "--json"),
+}  # fmt: skip
+_ALONE = """
+import sys
+import reslrb_cli
+sys.path.insert(0, {tests!r})
+from reslrb_cli.backend.variant import set_variant
+set_variant("llvm_ad_rgb")
+from threads import compute_alone
+compute_alone()
+from reslrb_cli.cli import main
+main.main(sys.argv[1:], prog_name="reslrb")
+"""
+
+
+def machine() -> str:
+    """What bits depend on: the processor and the version of libLLVM."""
+    sys.path.insert(0, str(ROOT))
+    import reslrb_cli  # noqa: F401  # chooses libLLVM, so it comes before Dr.Jit
+
+    words = reslrb("doctor").stdout
+    cpu = re.search(r"^model name\s*:\s*(.+)$", Path("/proc/cpuinfo").read_text(), re.MULTILINE)
+    version = re.search(r"libLLVM[^\n]*?(\d+\.\d+\.\d+)", words)
+    return f"{cpu[1] if cpu else 'unknown'}, libLLVM {version[1] if version else 'unknown'}"
+
+
+def reslrb(*words: str, alone: bool = False) -> subprocess.CompletedProcess[str]:
+    """What the command line says, in a process of its own; with `alone` kernels are computed by one thread."""
+    program = ["-c", _ALONE.format(tests=str(ROOT / "tests"))] if alone else ["-m", "reslrb_cli"]
+    environment = os.environ | {"COLUMNS": "100", "NO_COLOR": "1"}
+    return subprocess.run(
+        [sys.executable, *program, *words], cwd=ROOT, env=environment, capture_output=True, text=True, check=False
+    )
+
+
+def bits(array: np.ndarray[Any, Any]) -> str:
+    """A short name of an array's shape and bits."""
+    array = np.ascontiguousarray(array)
+    return f"{'x'.join(map(str, array.shape))} {hashlib.sha256(array.tobytes()).hexdigest()[:16]}"
+
+
+def values_of(name: str, other_seed: bool = False) -> dict[str, Any]:
+    """Loss and gradient norm of each iteration, and the bits of parameters and image after the last."""
+    config, seed, settings = RUNS[name]
+    own = [word for setting in settings for word in setting.split("|")]
+    with tempfile.TemporaryDirectory() as folder:
+        words = [
+            *SMALL,
+            f"scene.size={size(config)}",
+            f"run.seed={seed + 100 * other_seed}",
+            *own,
+            f"run.output={folder}",
+        ]
+        if config == "stiff/lamp":  # its target has an integrator of its own
+            words.append("target.render={spp: 8}")
+        sets = [part for word in words for part in ("--set", word)]
+        done = reslrb("optimize", f"configs/{config}.yaml", "--quiet", *sets, "--set", "run.name=run", alone=True)
+        if done.returncode:
+            return {"error": done.stderr.splitlines()[-1:]}
+        run = Path(folder) / "run"
+        records = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
+        found: dict[str, Any] = {key: [record[key] for record in records] for key in ("loss", "grad_norm")}
+        with np.load(run / "parameters" / "parameters.npz") as arrays:
+            found |= {key: bits(arrays[key]) for key in sorted(arrays)}
+        import OpenEXR
+
+        for image in sorted((run / "images").glob("*.exr")):
+            channels = OpenEXR.File(str(image)).channels()
+            found[image.name] = " ".join(bits(channels[channel].pixels) for channel in sorted(channels))
+    return found
+
+
+def size(config: str) -> list[int]:
+    """Pixels of the film: few, and as wide as high only where the scene's are."""
+    return [24, 18] if config == "grey_room" else [16, 16]
+
+
+def form(value: Any) -> Any:
+    """The names and types in a JSON value; of a list those of all its entries together."""
+    if isinstance(value, dict):
+        return {key: form(inner) for key, inner in sorted(value.items())}
+    if isinstance(value, list):
+        return sorted({json.dumps(form(inner), sort_keys=True) for inner in value})
+    return "number" if isinstance(value, (int, float)) and not isinstance(value, bool) else type(value).__name__
+
+
+def form_of(name: str) -> list[str]:
+    """The forms of all lines of a tiny measurement's JSON."""
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "lines.json"
+        words = [] if name == "inspect" else ["--json", str(file)]
+        done = reslrb(*MEASUREMENTS[name], *words)
+        text = done.stdout if name == "inspect" else file.read_text() if file.exists() else done.stderr
+        lines = [json.loads(line) for line in text.splitlines() if line.startswith("{")]
+    return sorted({json.dumps(form(line), sort_keys=True) for line in lines})
+
+
+def texts() -> dict[str, str]:
+    """The help of each command, and the schema of the configuration, by their digests."""
+    found = {f"help {command}".strip(): reslrb(*command.split(), "--help").stdout for command in COMMANDS}
+    found["schema"] = SCHEMA.read_text(encoding="utf-8")
+    return {name: hashlib.sha256(text.encode()).hexdigest()[:16] for name, text in found.items()}
+
+
+def main() -> None:
+    """Write the values anew: those of this machine, and what is the same on all."""
+    content = json.loads(VALUES.read_text()) if VALUES.exists() else {"machines": {}}
+    with ThreadPoolExecutor(2) as pool:
+        made = pool.map(lambda pair: values_of(*pair), [(name, other) for name in RUNS for other in (False, True)])
+        names = [f"{name}{', another seed' * other}" for name in RUNS for other in (False, True)]
+        content["machines"][machine()] = dict(zip(names, made, strict=True))
+        content["forms"] = dict(zip(MEASUREMENTS, pool.map(form_of, MEASUREMENTS), strict=True))
+    content["texts"] = texts()
+    VALUES.write_text(json.dumps(content, indent=1, sort_keys=True) + "\n")
+
+
+if __name__ == "__main__":
+    main()
