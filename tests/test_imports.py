@@ -77,8 +77,8 @@ def _imports(path: Path, parts: tuple[str, ...]) -> list[tuple[int, str]]:
 def circles(root: Path, package: str = "reslrb_cli") -> list[list[str]]:
     """Files under `root` (a folder laid out as the package) that need one another, at most one circle.
 
-    All imports count, under TYPE_CHECKING and inside functions as well, and so do dotted names in text: a module that is
-    imported by its name is needed as much.
+    All imports count, under TYPE_CHECKING and inside functions as well, and so do dotted names in text: a module that
+    is imported by its name is needed as much.
     """
     paths = {_module(package, path.relative_to(root)): path for path in root.rglob("*.py")}
     needs: dict[str, set[str]] = {}
@@ -104,9 +104,9 @@ def _names_in_text(path: Path, package: str) -> list[str]:
     has_docstring = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
     docstrings = {id(node.body[0].value) for node in ast.walk(tree)
                   if isinstance(node, has_docstring) and node.body and isinstance(node.body[0], ast.Expr)}  # fmt: skip
-    texts = [node.value for node in ast.walk(tree)
-             if isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in docstrings]  # fmt: skip
-    return [name for text in texts for name in re.findall(rf"\b{package}(?:\.\w+)+", text)]
+    texts = [node for node in ast.walk(tree) if isinstance(node, ast.Constant) and isinstance(node.value, str)]
+    said = [str(node.value) for node in texts if id(node) not in docstrings]
+    return [name for text in said for name in re.findall(rf"\b{package}(?:\.\w+)+", text)]
 
 
 def test_no_files_need_one_another() -> None:

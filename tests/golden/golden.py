@@ -1,9 +1,9 @@
 """Golden values: what three iterations of a score of experiments come to, bit by bit, and what commands print.
 
-They are for changes that are to change nothing: files that are merged, moved or named anew. `python tests/golden/golden.py`
-writes `values.json` beside it anew, for this processor and libLLVM; on another machine it is to be run on the commit before
-the change. `tests/test_golden.py` compares. Kernels are computed by one thread, since sums over several are not the same
-twice.
+They are for changes that are to change nothing: files that are merged, moved or named anew. This file, as a program,
+writes `values.json` beside it anew, for this processor and libLLVM; on another machine it is to be run on the commit
+before the change. `tests/test_golden.py` compares. Kernels are computed by one thread, since sums over several are not
+the same twice.
 """
 
 from __future__ import annotations
@@ -63,27 +63,26 @@ for _type in ("ptracer", "prb", "walk_ad", "trajectory"):
     _run(f"floor_{_type}", "cornell_floor", f"integrator={{type: {_type}, max_depth: 4}}|run.adjoint=independent")
 #: Commands whose help is compared.
 COMMANDS = (
-    "",
-    "inspect",
-    "init",
-    "optimize",
-    "render",
-    "export",
-    "gradcheck",
-    "bench",
-    "convergence",
-    "report",
-    "doctor",
+    *("", "inspect", "init", "optimize", "render", "export", "gradcheck", "bench", "convergence", "report", "doctor"),
 )
 #: Tiny measurements, of whose JSON lines the form is compared: names and types, at all depths.
+_TINY = ("--set", "scene.options.size=8", "--set", "run.spp=4")
+_FLOOR = (
+    "configs/cornell_floor.yaml",
+    "--set",
+    "scene.size=[8, 8]",
+    "--set",
+    "run.spp=4",
+    "--set",
+    "target.render.spp=4",
+)
 MEASUREMENTS = {
-    "gradcheck": ("gradcheck", "--set", "scene.options.size=8", "--set", "run.spp=4", "--seeds", "4", "--estimators", "stack"),
-    "bench": ("bench", "--set", "scene.options.size=8", "--set", "run.spp=4", "--max-depth", "2", "--rounds", "1",
-              "--integrators", "reslrb:stack"),
-    "convergence": ("convergence", "--set", "scene.options.size=8", "--set", "run.spp=4", "--methods", "reslrb:stack",
-                    "--budget", "20"),
+    "gradcheck": ("gradcheck", *_TINY, "--seeds", "4", "--estimators", "stack"),
+    "bench": ("bench", *_TINY, "--max-depth", "2", "--rounds", "1", "--integrators", "reslrb:stack"),
+    "convergence": ("convergence", *_FLOOR, "--integrators", "reslrb:stack,prb", "--rounds", "4"),
+    "runs": ("convergence", *_FLOOR, "--integrators", "reslrb:stack", "--runs", "1", "--set", "run.iterations=3"),
     "inspect": ("inspect", "configs/cornell_floor.yaml", "--json"),
-}  # fmt: skip
+}
 _ALONE = """
 import sys
 import reslrb_cli
@@ -175,7 +174,10 @@ def form_of(name: str) -> list[str]:
         words = [] if name == "inspect" else ["--json", str(file)]
         done = reslrb(*MEASUREMENTS[name], *words)
         text = done.stdout if name == "inspect" else file.read_text() if file.exists() else done.stderr
-        lines = [json.loads(line) for line in text.splitlines() if line.startswith("{")]
+        whole = name == "inspect"  # one object over several lines
+        lines = (
+            [json.loads(text)] if whole else [json.loads(line) for line in text.splitlines() if line.startswith("{")]
+        )
     return sorted({json.dumps(form(line), sort_keys=True) for line in lines})
 
 
