@@ -22,8 +22,8 @@ from typing import TYPE_CHECKING, Any  # noqa: E402
 from reslrb_cli.backend import llvm as _llvm  # noqa: E402
 
 if TYPE_CHECKING:
-    from reslrb_cli.integrators import gradient_step as step
-    from reslrb_cli.integrators import register
+    from reslrb_cli.integrators.plugin import register
+    from reslrb_cli.integrators.step import gradient_step as step
     from reslrb_cli.scene.load import load_for_script as load_scene
 
 __version__ = "0.1.0"
@@ -34,8 +34,8 @@ _llvm.prepare()
 
 _LAZY = {
     "load_scene": ("reslrb_cli.scene.load", "load_for_script"),
-    "register": ("reslrb_cli.integrators", "register"),
-    "step": ("reslrb_cli.integrators", "gradient_step"),
+    "register": ("reslrb_cli.integrators.plugin", "register"),
+    "step": ("reslrb_cli.integrators.step", "gradient_step"),
 }
 
 

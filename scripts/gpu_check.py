@@ -192,7 +192,7 @@ def _run(task: Task, variant: str, folder: Path, left: float) -> Part:
 
 
 def _write(folder: Path, variant: str, quick: bool, parts: list[Part]) -> None:
-    from reslrb_cli.backend.device import device_name
+    from reslrb_cli.backend.doctor import device_name
 
     found = {"variant": variant, "device": device_name(variant), "quick": quick, "parts": [asdict(p) for p in parts]}
     (folder / "gpu_check.json").write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")

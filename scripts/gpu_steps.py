@@ -16,7 +16,8 @@ from typing import Any
 
 import reslrb_cli  # noqa: F401  # chooses libLLVM, so it comes before Mitsuba
 from reslrb_cli.backend.variant import set_variant
-from reslrb_cli.config import Config, load
+from reslrb_cli.config.loader import load
+from reslrb_cli.config.schema import Config
 
 ROOT = Path(__file__).resolve().parent.parent
 MIB = 2**20
@@ -87,7 +88,7 @@ def _overrides(variant: str, quick: bool) -> list[str]:
 
 
 def _steps(config: Config, estimator: str, depth: int, compare: bool) -> Steps:
-    from reslrb_cli.measure.cases import parse_cases
+    from reslrb_cli.measure.methods import parse_cases
     from reslrb_cli.measure.stepper import Stepper
 
     [case] = parse_cases(f"reslrb:{estimator}")

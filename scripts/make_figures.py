@@ -72,11 +72,11 @@ def run_panels(folder: Path) -> list[tuple[str, Image]]:
 def scene_panels() -> list[tuple[str, Image]]:
     """The scenes in `scenes/`, light-traced by `reslrb`; of those in which light is moved the target."""
     from reslrb_cli.backend.variant import set_variant
-    from reslrb_cli.config import load
-    from reslrb_cli.integrators import make_integrator
-    from reslrb_cli.optimization.problem import assemble
-    from reslrb_cli.optimization.rendering import render_in_passes
-    from reslrb_cli.scene import load_scene
+    from reslrb_cli.config.loader import load
+    from reslrb_cli.integrators.step import make_integrator
+    from reslrb_cli.optimization.assemble import assemble
+    from reslrb_cli.optimization.loading import render_in_passes
+    from reslrb_cli.scene.load import load_scene
 
     set_variant("auto")
     panels = []

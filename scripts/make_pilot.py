@@ -20,10 +20,10 @@ import numpy as np
 
 import reslrb_cli  # noqa: F401  # chooses libLLVM, so it comes before Mitsuba
 from reslrb_cli.backend.variant import set_variant
-from reslrb_cli.config import load
-from reslrb_cli.optimization import assemble
-from reslrb_cli.optimization.choice import Option, find_options, measured_step, run_pilot
-from reslrb_cli.optimization.pilot_records import ITERATIONS, Candidate, Gradients, sample_variance, square
+from reslrb_cli.config.loader import load
+from reslrb_cli.optimization.assemble import assemble
+from reslrb_cli.optimization.autotune.choice import Option, find_options, measured_step, run_pilot
+from reslrb_cli.optimization.autotune.efficiency import ITERATIONS, Candidate, Gradients, sample_variance, square
 from reslrb_cli.records.clock import StepClock
 
 ROOT = Path(__file__).resolve().parent.parent

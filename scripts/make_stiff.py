@@ -22,8 +22,11 @@ from matplotlib.figure import Figure
 
 import reslrb_cli  # noqa: F401  # chooses libLLVM, so it comes before Mitsuba
 from reslrb_cli.backend.variant import set_variant
-from reslrb_cli.config import load
-from reslrb_cli.optimization import Problem, assemble, assemble_scene, find_reached, optimize
+from reslrb_cli.config.loader import load
+from reslrb_cli.optimization.assemble import assemble, assemble_scene
+from reslrb_cli.optimization.identifiability import find_reached
+from reslrb_cli.optimization.loop import optimize
+from reslrb_cli.optimization.problem import Problem
 
 ROOT = Path(__file__).resolve().parent.parent
 TITLES = {"lamp": "albedo and intensity", "plate": "roughness and radiance", "wall": "73,728 texels and one number"}

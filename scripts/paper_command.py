@@ -12,11 +12,11 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from reslrb_cli.backend.device import device_name
+from reslrb_cli.backend.doctor import device_name
 from reslrb_cli.backend.variant import choose
 from reslrb_cli.errors import ExitCode, ReslrbError, one_line
 from reslrb_cli.measure.processes import Ended
-from reslrb_cli.records.origin import Origin
+from reslrb_cli.records.measurement_files import Origin
 
 ROOT = Path(__file__).resolve().parent.parent
 #: Measures, given the options, a folder that is removed afterwards, and what tells the user of a line.

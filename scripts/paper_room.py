@@ -7,7 +7,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from reslrb_cli.config import Config, load
+from reslrb_cli.config.loader import load
+from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ConfigError
 
 #: What commands say of the argument that names it.

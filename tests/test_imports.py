@@ -17,18 +17,19 @@ ROOT = Path(reslrb_cli.__file__).parent
 # A module may import from its own row and from the rows above it.
 ROWS = [
     "errors",
-    "config",
-    "records",
     "seeds",
+    "config",
     "backend",
+    "records",
     "scene",
     "transport",
     "estimators",
+    "guiding",
     "integrators",
     "optimization",
     "measure",
     "report",
-    "recording",
+    "runs",
     "cli",
     "__main__",
 ]

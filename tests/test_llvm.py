@@ -35,7 +35,7 @@ def machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Machine:
 
     Each says what its trial does: prints a version, or exits with a message of the dynamic loader.
     """
-    trial = tmp_path / "trial.py"
+    trial = tmp_path / "forecast.py"
     trial.write_text(
         "import sys\ntext = open(sys.argv[1]).read()\n"
         "sys.exit(text) if ' ' in text else print(text)\n"

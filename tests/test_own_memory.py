@@ -7,8 +7,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from reslrb_cli.backend.own_memory import own_memory
-from reslrb_cli.optimization.arrays import like
+from reslrb_cli.backend.memory import own_memory
+from reslrb_cli.optimization.state import like
 from reslrb_cli.optimization.views import to_tensor
 from reslrb_cli.transport.guide import even_table, make_grid
 

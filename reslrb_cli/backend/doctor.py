@@ -1,18 +1,91 @@
-"""Gathers what `reslrb doctor` says: versions, libraries, device, and a trial of each backend."""
+"""Gathers what `reslrb doctor` says: versions, libraries, device, and a trial of each backend.
+
+Names of the devices that kernels run on.
+"""
 
 from __future__ import annotations
 
+import os
 import platform
 import re
+import shutil
+import subprocess
 import sys
 from dataclasses import dataclass
 from importlib import metadata
+from pathlib import Path
 
 from reslrb_cli.backend import llvm
-from reslrb_cli.backend.device import device_name
 from reslrb_cli.backend.probe import Probe, probe
 from reslrb_cli.backend.variant import missing_cuda, package_version
 from reslrb_cli.errors import BackendError
+
+#: Lanes of a vector on the CPU, at most (AVX-512); resident threads of a large GPU, where the driver does not tell.
+LLVM_LANES, LARGE_GPU = 16, 132 * 2048
+
+
+def device_name(variant: str) -> str:
+    """The device that the Mitsuba variant `variant` runs on."""
+    return gpu_name() if variant.startswith("cuda") else f"{cpu_name()}, {os.cpu_count()} threads"
+
+
+def gpu_name() -> str:
+    """The NVIDIA GPU and its driver's version, as far as `nvidia-smi` tells."""
+    command = shutil.which("nvidia-smi")
+    if command is None:
+        return "NVIDIA GPU"
+    query = [command, "--query-gpu=name,driver_version", "--format=csv,noheader"]
+    return subprocess.run(query, capture_output=True, text=True, check=False).stdout.strip().replace("\n", "; ")
+
+
+def cpu_name() -> str:
+    """The processor's model, or at least its architecture."""
+    try:
+        found = re.search(r"^model name\s*:\s*(.+)$", Path("/proc/cpuinfo").read_text(), re.MULTILINE)
+    except OSError:
+        found = None
+    return found[1] if found else platform.machine()
+
+
+def memory_bytes(variant: str) -> int:
+    """The memory that `variant` can use: the GPU's, or the machine's as far as this process may have it."""
+    if variant.startswith("cuda"):
+        return _gpu_memory()
+    total = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    try:
+        return min(total, int(Path("/sys/fs/cgroup/memory.max").read_text()))
+    except (OSError, ValueError):  # no control groups, or `max`: no limit
+        return total
+
+
+def _gpu_memory() -> int:
+    command = shutil.which("nvidia-smi")
+    query = [] if command is None else [command, "--query-gpu=memory.total", "--format=csv,noheader,nounits"]
+    output = subprocess.run(query, capture_output=True, text=True, check=False).stdout if query else ""
+    sizes = [int(line) for line in output.split() if line.isdigit()]
+    return min(sizes, default=2**20) * 2**20  # unknown: more than any has, so that it never counts as scarce
+
+
+def resident_paths() -> int:
+    """How many lanes of a kernel the current device runs at a time, each with thread-local memory of its own."""
+    import drjit as dr
+    import mitsuba as mi
+
+    if not mi.variant().startswith("cuda"):
+        return (dr.thread_count() + 1) * LLVM_LANES
+    import ctypes
+
+    try:
+        driver, count = ctypes.CDLL("nvcuda.dll" if os.name == "nt" else "libcuda.so.1"), []
+        for attribute in (16, 39):  # multiprocessors, and the most threads on each
+            value = ctypes.c_int()
+            if driver.cuDeviceGetAttribute(ctypes.byref(value), attribute, 0):
+                return LARGE_GPU
+            count.append(value.value)
+    except (OSError, AttributeError):
+        return LARGE_GPU
+    return count[0] * count[1]
+
 
 _WITHOUT_METADATA = ["mitsuba", "drjit", "numpy"]
 

@@ -1,15 +1,33 @@
-"""Mitsuba and Dr.Jit as they are installed: the real ones, of a version that is known to work, and loadable."""
+"""Mitsuba and Dr.Jit as they are installed, and processes of our own.
+
+Mitsuba and Dr.Jit as they are installed: the real ones, of a version that is known to work, and loadable.
+
+Processes of our own that run Python.
+"""
 
 from __future__ import annotations
 
-import importlib
 import importlib.util
+import os
+import sys
 from types import ModuleType
 
 from reslrb_cli.backend.shared_library import missing_library
 from reslrb_cli.errors import BackendError
 
+
+def python_command(code: str) -> list[str]:
+    """The command line of a Python that runs `code` and imports modules from where this process does.
+
+    Left to itself Python looks in the working folder first, where a scene may bring a `numpy.py` along.
+    """
+    path = [entry or os.getcwd() for entry in sys.path]
+    return [sys.executable, "-c", f"import sys\nsys.path[:] = {path!r}\n{code}"]
+
+
 MISSING_LIBRARY = "run scripts/setup, or install the package that holds it"
+
+
 #: Of each package the versions that pyproject.toml has, the first of them and the first that is too new, and functions
 #: by which it is told from another package of its name.
 _WANTED = {

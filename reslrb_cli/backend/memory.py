@@ -1,4 +1,10 @@
-"""Memory that is free now, and what a thread has for its own: what a forecast is held against."""
+"""Memory that is free now, and what a thread has for its own: what a forecast is held against.
+
+Arrays of NumPy's in Dr.Jit's own memory.
+
+Dr.Jit takes up NumPy's memory as it lies, and compiles and records for its alignment, which is random: the next array
+of the same size may lie otherwise, and then all is compiled and recorded once more.
+"""
 
 from __future__ import annotations
 
@@ -8,13 +14,21 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
-from reslrb_cli.backend.device import memory_bytes
+import drjit as dr
+import numpy as np
+
+from reslrb_cli.backend.doctor import memory_bytes
 
 #: What a thread's stack has where the system sets no limit: glibc's own.
 _UNLIMITED_STACK = 2 * 2**20
+
+
 #: What of it is in use where a kernel begins.
 _IN_USE = 2**20
+
+
 #: Lanes of a vector by what the processor knows, the widest first; the backend takes the widest.
 _LANES = (("avx512vl", 16), ("avx", 8))
 
@@ -84,3 +98,13 @@ def _vector_lanes() -> int:
         found = None
     flags = found[1].split() if found else []
     return next((lanes for name, lanes in _LANES if name in flags), 4)
+
+
+def own_memory(kind: type[Any], array: np.ndarray[Any, Any]) -> Any:
+    """`array` (n,) as a flat array of type `kind`, bit by bit, evaluated."""
+    given = kind(np.ascontiguousarray(array))
+    copy = dr.empty(kind, dr.width(given))
+    # Gathered in its own order, an array would be returned as it is.
+    dr.scatter(copy, given, dr.arange(dr.uint32_array_t(kind), dr.width(given)))
+    dr.eval(copy)
+    return copy

@@ -17,8 +17,11 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     import mitsuba as mi
 
+
 #: Takes addresses in the memory of a running Blender from its parameters.
 _UNSAFE = frozenset({"blender"})
+
+
 #: Names that Mitsuba knows without a library.
 _BUILT_IN = frozenset({"scene", "rgb", "spectrum"})
 

@@ -10,8 +10,7 @@ import json
 import subprocess
 from dataclasses import dataclass
 
-from reslrb_cli.backend.installation import MISSING_LIBRARY
-from reslrb_cli.backend.python import python_command
+from reslrb_cli.backend.installation import MISSING_LIBRARY, python_command
 from reslrb_cli.backend.shared_library import missing_library
 
 # A constant that no kernel cache has seen makes the compiler run; `minimum` is what libLLVM 15 and 16 stumble over.
@@ -47,6 +46,7 @@ ray_ms, t = timed(lambda: scene.ray_intersect(ray).t)
 assert abs(t[0] - 2) < 1e-4, f"a ray met the unit sphere at {t[0]} instead of 2"
 print(json.dumps({"compile_ms": compile_ms, "run_ms": run_ms, "ray_ms": ray_ms}))
 """
+
 
 #: What stands before the line of an error of ours in a traceback.
 _OURS = "reslrb_cli.errors.BackendError: "

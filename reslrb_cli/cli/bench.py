@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from reslrb_cli.cli.experiment import (
+from reslrb_cli.cli.options import (
     COUNT,
     Counts,
     allowance,
@@ -20,18 +20,20 @@ from reslrb_cli.cli.experiment import (
     optional_experiment_arguments,
     resume_option,
 )
-from reslrb_cli.cli.output import echo
+from reslrb_cli.cli.terminal import echo
 from reslrb_cli.errors import ConfigError, ExitCode
 
 if TYPE_CHECKING:
-    from reslrb_cli.config import Config
-    from reslrb_cli.measure.bench_book import Book
-    from reslrb_cli.measure.bench_run import Result
-    from reslrb_cli.measure.sweep import Sweep
-    from reslrb_cli.records.bench import BenchRecord
+    from reslrb_cli.config.schema import Config
+    from reslrb_cli.measure.bench import Book, Result
+    from reslrb_cli.measure.methods import Sweep
+    from reslrb_cli.records.measurements import BenchRecord
+
 
 #: What is compared where the user names nothing.
 INTEGRATORS = "ptracer,reslrb:reservoir,reslrb:event,reslrb:gather,reslrb:stack,trajectory"
+
+
 _UNITS = {"": 1, "k": 10**3, "M": 10**6, "G": 10**9, "Ki": 2**10, "Mi": 2**20, "Gi": 2**30}
 
 
@@ -102,21 +104,20 @@ def command(
     --json has written can be gone on from, however the process ended.
     """
     began = time.monotonic()
-    from reslrb_cli.backend.device import device_name, memory_bytes
+    from reslrb_cli.backend.doctor import device_name, memory_bytes
     from reslrb_cli.backend.installation import load_packages
     from reslrb_cli.backend.variant import choose
-    from reslrb_cli.config import load, loads
+    from reslrb_cli.config.loader import load, loads
 
     load_packages()  # before what follows asks for them
     from reslrb_cli.cli.keeping import read_earlier
-    from reslrb_cli.measure import cornell_box
-    from reslrb_cli.measure.bench_book import KIND, Book
-    from reslrb_cli.measure.cases import choose_baseline, depths, parse_cases
-    from reslrb_cli.measure.earlier import Earlier
-    from reslrb_cli.measure.sweep import SWEPT, Sweep, usual_values
+    from reslrb_cli.measure.bench import KIND, Book
+    from reslrb_cli.measure.methods import SWEPT, Sweep, choose_baseline, depths, parse_cases, usual_values
+    from reslrb_cli.measure.resume_store import Earlier
+    from reslrb_cli.measure.scenes import small
 
     if config_file is None:
-        config = loads(cornell_box.CONFIG, cornell_box.SOURCE, overrides)
+        config = loads(small.CORNELL_BOX, small.CORNELL_BOX_SOURCE, overrides)
     else:
         config = load(config_file, overrides)
     if (swept != "depth" or values is not None) and is_given("max_depth"):
@@ -153,7 +154,7 @@ def command(
     echo(_conditions(config, sweep))
     results, interrupted = _run(sweep, book, json_file, began)
     if plot_file is not None and results:
-        from reslrb_cli.report.bench_plot import plot_bench
+        from reslrb_cli.report.plots import plot_bench
 
         series = [(case.label, [(r.value, r.record) for r in results if r.case == case]) for case in cases]
         abscissa = "path depth" if swept == "depth" else SWEPT[swept]
@@ -165,11 +166,10 @@ def command(
 def _run(sweep: Sweep, book: Book, json_file: Path | None, began: float) -> tuple[list[Result], bool]:
     """Measure, print and write; returns all results, and whether the user interrupted."""
     from reslrb_cli.cli.interrupts import Interrupts
-    from reslrb_cli.cli.keeping import Keeper
-    from reslrb_cli.cli.measured import origin_of
+    from reslrb_cli.cli.keeping import Keeper, origin_of
     from reslrb_cli.measure.bench import bench
     from reslrb_cli.measure.processes import abandon_all
-    from reslrb_cli.report.bench_table import table_head, table_line
+    from reslrb_cli.report.tables import table_head, table_line
 
     labels, notes = [case.label for case in sweep.cases], []
 
@@ -213,7 +213,7 @@ def _conditions(config: Config, sweep: Sweep) -> str:
 
 def _exit_code(results: list[Result]) -> ExitCode:
     """A sweep in which something could be measured is done; else what kept it from that decides."""
-    from reslrb_cli.records.bench import BenchStatus
+    from reslrb_cli.records.measurements import BenchStatus
 
     states = {result.record.status for result in results}
     if BenchStatus.OK in states:

@@ -1,17 +1,26 @@
-"""`reslrb convergence`: error of the gradient, or of the image, against run time."""
+"""`reslrb convergence`: error of the gradient, or of the image, against run time.
+
+What `reslrb convergence --runs` does: whole optimisations, printed and written as they come.
+"""
 
 from __future__ import annotations
 
 import os
+import shutil
+import tempfile
 import time
 from collections.abc import Sequence
+from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
 from reslrb_cli.cli.bench import Size
-from reslrb_cli.cli.experiment import (
+from reslrb_cli.cli.interrupts import Interrupts
+from reslrb_cli.cli.keeping import Keeper, origin_of, read_earlier
+from reslrb_cli.cli.options import (
     COUNT,
     Counts,
     Factors,
@@ -21,16 +30,115 @@ from reslrb_cli.cli.experiment import (
     is_given,
     resume_option,
 )
-from reslrb_cli.cli.output import echo
+from reslrb_cli.cli.terminal import echo
 from reslrb_cli.errors import ConfigError, ExitCode
+from reslrb_cli.measure.methods import RunsPlan
+from reslrb_cli.measure.optimization_benchmark.rank import KIND, check, outcome
+from reslrb_cli.measure.optimization_benchmark.session import RunsSession
+from reslrb_cli.measure.processes import abandon_all
+from reslrb_cli.measure.resume_store import Earlier
+from reslrb_cli.records.measurement_files import Line
+from reslrb_cli.records.measurements import BenchStatus, RunBestRecord, RunMethodRecord, RunPointRecord, SummaryRecord
+from reslrb_cli.report.convergence_tables import RunsTable, best_line, runs_closing_sentence, runs_notes
+from reslrb_cli.report.format import WITHOUT_BORDER, count
+from reslrb_cli.report.plots import plot_runs
 
 if TYPE_CHECKING:
     from reslrb_cli.measure.convergence.judgement import Results
-    from reslrb_cli.measure.convergence.plan import Plan
     from reslrb_cli.measure.convergence.session import Session
-    from reslrb_cli.measure.earlier import Earlier
-    from reslrb_cli.records.convergence import MethodRecord
-    from reslrb_cli.report.convergence_table import Table
+    from reslrb_cli.measure.methods import Plan
+    from reslrb_cli.records.measurements import MethodRecord
+    from reslrb_cli.report.convergence_tables import Table
+
+
+def measure_runs(
+    plan: RunsPlan, resumed: Path | None, json_file: Path | None, plot_file: Path | None, began: float, where: str
+) -> int:
+    """Measure, print, write and draw; returns the exit code. `began` is when the command was called, by `monotonic`.
+
+    `resumed` is the JSON file that is gone on from, if any.
+    """
+    points: list[RunPointRecord] = []
+    earlier = None if resumed is None else Earlier(KIND, resumed, *read_earlier(resumed))
+    if earlier is not None:
+        check(plan, earlier, where)
+    echo(f"{where}; {allowance(plan.budget_s, None, 'run')}")
+    with ExitStack() as stack:
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="reslrb-convergence-")))
+
+        def tidy() -> None:
+            abandon_all()
+            shutil.rmtree(folder, ignore_errors=True)
+
+        interrupts = stack.enter_context(Interrupts(last_act=tidy))
+        table = RunsTable(list(plan.names))
+        spent_s = time.monotonic() - began
+        session = RunsSession(
+            plan, folder, lambda: interrupts.requested, echo, spent_s=spent_s, earlier=earlier, device=where
+        )
+        points += [point for run in session.runs for point in run.points]  # of earlier sessions
+
+        def show(point: RunPointRecord) -> None:
+            if point.elapsed_s == session.limit_s:
+                echo(table.point(point, session.run_of(point).first_s))
+
+        def found() -> tuple[list[RunMethodRecord], list[RunBestRecord], str]:
+            now = outcome(session.runs, session.limit_s, plan.names)
+            bests = [replace(record, line=best_line(record)) for record in now.bests]
+            return now.methods, bests, runs_closing_sentence(now.loss, now.error, session.limit_s)
+
+        def outcome_lines() -> list[Line]:
+            records, bests, sentence = found()
+            return [*records, *bests, SummaryRecord(sentence)]
+
+        keeper = Keeper(json_file, origin_of(plan.variant), lambda: points, outcome_lines, session.keep)
+        headed = False
+        for point in session.run():
+            if not headed:
+                headed = True
+                echo(_runs_conditions(plan, session))
+                echo(table.head())
+                for other in points:
+                    show(other)
+            points.append(point)
+            show(point)
+            keeper.refresh()
+        keeper.finish([*points, *outcome_lines()])
+        records, bests, sentence = found()
+        echo(table.head())
+        for record in records:
+            echo(table.line(record))
+        for line in [*runs_notes(records), *(best.line for best in bests), sentence]:
+            echo(line)
+        conditions = _runs_conditions(plan, session)
+    if plot_file is not None and points:
+        plot_runs(points, session.facts.get("error_of", ""), plot_file, f"{where}\n{conditions}")
+        echo(f"look at {os.path.relpath(plot_file)}")
+    return ExitCode.INTERRUPTED if interrupts.requested else _runs_exit_code(records)
+
+
+def _runs_conditions(plan: RunsPlan, session: RunsSession) -> str:
+    """What was measured, in one line."""
+    optimizer, facts = plan.config.optimizer, session.facts
+    parts = [
+        str(plan.config.source),
+        f"{count(plan.runs, 'seed')}, {session.limit_s:.3g} s each",
+        f"loss {plan.config.loss.type}",
+        f"{optimizer.type} at {optimizer.learning_rate:g}" + "".join(f", x {rate:g}" for rate in plan.rates),
+        facts.get("pictures", ""),
+        facts.get("error_of", ""),
+        WITHOUT_BORDER if facts.get("masked") else "",
+    ]
+    return ", ".join(part for part in parts if part)
+
+
+def _runs_exit_code(records: list[RunMethodRecord]) -> ExitCode:
+    """A comparison in which something was optimised is done; else what kept it from that decides."""
+    if any(record.iterations is not None and record.iterations.high > 0 for record in records):
+        return ExitCode.DONE
+    states = {record.status for record in records}
+    return ExitCode.OUT_OF_MEMORY if states == {BenchStatus.OUT_OF_MEMORY} else ExitCode.CHECK_FAILED
+
 
 #: The most seeds of --runs.
 MOST_RUNS = 100
@@ -92,18 +200,16 @@ def command(
     ended. docs/convergence.md explains the columns.
     """
     began = time.monotonic()
-    from reslrb_cli.backend.device import device_name, memory_bytes
+    from reslrb_cli.backend.doctor import device_name, memory_bytes
     from reslrb_cli.backend.installation import load_packages
     from reslrb_cli.backend.variant import choose
-    from reslrb_cli.config import load
+    from reslrb_cli.config.loader import load
 
     load_packages()  # before what follows asks for them
     from reslrb_cli.cli.keeping import read_earlier
-    from reslrb_cli.measure.cases import parse_cases
-    from reslrb_cli.measure.convergence.plan import DEFAULTS, Plan
-    from reslrb_cli.measure.convergence.resuming import KIND, check
-    from reslrb_cli.measure.earlier import Earlier
-    from reslrb_cli.measure.whole_runs.plan import DEFAULT, RunsPlan
+    from reslrb_cli.measure.convergence.session import KIND, check
+    from reslrb_cli.measure.methods import DEFAULT, DEFAULTS, Plan, RunsPlan, parse_cases
+    from reslrb_cli.measure.resume_store import Earlier
 
     config = load(config_file, overrides)
     if runs is not None:
@@ -138,8 +244,6 @@ def command(
     }
     where = f"{device_name(variant)}, {variant}"
     if runs is not None:
-        from reslrb_cli.cli.whole_runs import measure_runs
-
         whole = RunsPlan(**settings, runs=runs, rates=rates or ())
         whole.check()
         return measure_runs(whole, resumed, json_file, plot_file, began, where)
@@ -152,7 +256,7 @@ def command(
     echo(f"{where}; {allowance(budget, rounds, 'round')}")
     results, conditions, interrupted = _run(plan, json_file, began, earlier, device)
     if plot_file is not None and results.points:
-        from reslrb_cli.report.convergence_plot import plot_convergence
+        from reslrb_cli.report.plots import plot_convergence
 
         plot_convergence(results.points, results.methods, plot_file, f"{where}\n{conditions}")
         echo(f"look at {os.path.relpath(plot_file)}")
@@ -179,15 +283,13 @@ def _run(
     from contextlib import ExitStack
 
     from reslrb_cli.cli.interrupts import Interrupts
-    from reslrb_cli.cli.keeping import Keeper
-    from reslrb_cli.cli.measured import origin_of
+    from reslrb_cli.cli.keeping import Keeper, origin_of
     from reslrb_cli.measure.convergence.judgement import Judgement
-    from reslrb_cli.measure.convergence.members import Role
     from reslrb_cli.measure.convergence.session import Session
+    from reslrb_cli.measure.convergence.setup import Role
     from reslrb_cli.measure.processes import abandon_all
-    from reslrb_cli.records.convergence import SummaryRecord
-    from reslrb_cli.records.lines import Line
-    from reslrb_cli.report.convergence_table import closing_sentence, notes, reference_line
+    from reslrb_cli.records.measurements import SummaryRecord
+    from reslrb_cli.report.convergence_tables import closing_sentence, notes, reference_line
 
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="reslrb-convergence-")))
@@ -239,8 +341,8 @@ def _run(
 
 def _table(session: Session) -> Table:
     """A table whose columns fit what the session has measured, or is about to."""
-    from reslrb_cli.measure.convergence.members import Role
-    from reslrb_cli.report.convergence_table import Table
+    from reslrb_cli.measure.convergence.setup import Role
+    from reslrb_cli.report.convergence_tables import Table
 
     return Table([member.label for member in session.of(Role.CASE)], [*session.facts.get("shapes", ()), "999 rounds"])
 
@@ -253,7 +355,7 @@ def _shown(records: Sequence[MethodRecord]) -> list[str]:
 
 def _conditions(plan: Plan, session: Session) -> str:
     """What was measured, in one line."""
-    from reslrb_cli.report.words import WITHOUT_BORDER
+    from reslrb_cli.report.format import WITHOUT_BORDER
 
     config, facts = plan.config, session.facts
     depth, rr_depth = config.integrator.max_depth, config.integrator.rr_depth
@@ -267,7 +369,7 @@ def _conditions(plan: Plan, session: Session) -> str:
 
 def _exit_code(results: Results) -> ExitCode:
     """A comparison in which something could be measured is done; else what kept it from that decides."""
-    from reslrb_cli.records.bench import BenchStatus
+    from reslrb_cli.records.measurements import BenchStatus
 
     if any(record.relative_rmse is not None for record in results.methods):
         return ExitCode.DONE

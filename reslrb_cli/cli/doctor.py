@@ -8,7 +8,7 @@ import json
 import click
 
 from reslrb_cli.backend.doctor import Backend, Report, examine
-from reslrb_cli.cli.output import echo
+from reslrb_cli.cli.terminal import echo
 from reslrb_cli.errors import BackendError
 
 

@@ -8,15 +8,14 @@ from typing import TYPE_CHECKING
 
 import click
 
-from reslrb_cli.cli.experiment import overrides_option, start_variant
-from reslrb_cli.cli.output import echo
-from reslrb_cli.cli.recovered import read_recovered
+from reslrb_cli.cli.options import overrides_option, read_recovered, start_variant
+from reslrb_cli.cli.terminal import echo
 from reslrb_cli.errors import ConfigError, is_machine_fault
 
 if TYPE_CHECKING:
     import mitsuba as mi
 
-    from reslrb_cli.config import Config
+    from reslrb_cli.config.schema import Config
 
 
 @click.command("export")
@@ -37,9 +36,9 @@ def command(run: Path, overrides: tuple[str, ...], output: Path) -> None:
     start_variant(config)
 
     from reslrb_cli.optimization.loading import check_integrator, choose_sensors
-    from reslrb_cli.scene import select_parameters
-    from reslrb_cli.scene.exporting import export_scene
+    from reslrb_cli.scene.export import export_scene
     from reslrb_cli.scene.load import load_described
+    from reslrb_cli.scene.parameters import select_parameters
 
     at = config.scene
     keys = [key for spec in config.parameters for key in spec.keys]

@@ -1,35 +1,249 @@
-"""`reslrb inspect`: what a scene contains, and which of its parameters can be recovered."""
+"""`reslrb inspect`: what a scene contains, and which of its parameters can be recovered.
+
+What `inspect` is given: a scene file, a configuration (complete or not), or the folder of a run.
+
+What `inspect` says of a scene, its sensors, the plan of a step and the parameters, in lines.
+"""
 
 from __future__ import annotations
 
 import dataclasses
 import json
 import logging
+from collections.abc import Sequence
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from reslrb_cli.cli.experiment import overrides_option, start_variant
-from reslrb_cli.cli.listing import (
-    LISTED_SENSORS,
-    moving_lines,
-    parameter_lines,
-    plain,
-    plan_lines,
-    scene_lines,
-    sensor_lines,
-)
-from reslrb_cli.cli.offending import show_offenders, without_nan
-from reslrb_cli.cli.output import echo
-from reslrb_cli.cli.subject import Subject, read_subject
+from reslrb_cli.cli.nonfinite import show_offenders, without_nan
+from reslrb_cli.cli.options import overrides_option, start_variant
+from reslrb_cli.cli.terminal import echo
+from reslrb_cli.config.loader import loads, parse_override, read_text
+from reslrb_cli.config.schema import Config
+from reslrb_cli.config.yaml_text import parse, write
 from reslrb_cli.errors import ConfigError, UnsupportedScene
+from reslrb_cli.records.manifest import read_manifest
 
 if TYPE_CHECKING:
-    from reslrb_cli.config import Config
     from reslrb_cli.integrators.plan_report import PlanReport
     from reslrb_cli.measure.conditioning import Conditioning
-    from reslrb_cli.scene import SceneSummary, Selection
+    from reslrb_cli.scene.catalog import MovableSummary, ParameterInfo, SceneSummary, SensorSummary
+    from reslrb_cli.scene.parameters import Selection
+
+
+#: What stands for sections that a configuration needs and the user has not written.
+_STAND_INS = {"target": "{render: {spp: 1}}", "parameters": "[{key: '*'}]"}
+
+
+@dataclass(frozen=True)
+class Subject:
+    """A configuration, with stand-ins for the sections in `missing`.
+
+    `path` is what the user named, `run` the manifest of the run whose configuration it is, or None.
+    """
+
+    path: Path
+    config: Config
+    is_scene: bool
+    missing: tuple[str, ...]
+    run: dict[str, Any] | None
+
+
+def read_subject(path: Path, overrides: tuple[str, ...]) -> Subject:
+    """Read what `path` is, with `overrides` put in. Raises ConfigError."""
+    manifest = read_manifest(path) if path.is_dir() else None
+    if path.is_dir() and manifest is None:
+        raise ConfigError(path, "", "is a folder without a run; name a scene file, a configuration or a run folder")
+    file = path / "config.yaml" if manifest is not None else path
+    if manifest is None and file.name == "config.yaml":
+        manifest = read_manifest(file.parent)
+    is_scene = _is_scene(file)
+    text = write({"scene": {"file": str(file.absolute())}}) if is_scene else read_text(file, str(file))
+    data = parse(text, str(file))
+    given = {str(parse_override(override).location[0]) for override in overrides}
+    sections = {key for key, value in data.items() if value is not None} if isinstance(data, dict) else set(_STAND_INS)
+    if "views" in sections or "cameras" in _keys(data, "scene"):  # which bring targets along
+        sections |= {"target"}
+    missing = tuple(section for section in _STAND_INS if section not in sections | given)
+    stand_ins = [f"{section}={_STAND_INS[section]}" for section in missing]
+    config = loads(text, file, [*stand_ins, *overrides])
+    return Subject(path, config, is_scene, missing, manifest)
+
+
+def _keys(data: Any, section: str) -> set[str]:
+    """The keys of a section, of which nothing is known yet."""
+    inside = data.get(section) if isinstance(data, dict) else None
+    return set(inside) if isinstance(inside, dict) else set()
+
+
+def _is_scene(file: Path) -> bool:
+    """Whether a file is a scene rather than a configuration."""
+    if file.suffix.lower() == ".xml":
+        return True
+    try:
+        return file.is_file() and file.open("rb").read(64).lstrip(b"\xef\xbb\xbf \t\r\n").startswith(b"<")
+    except OSError:  # said when it is read
+        return False
+
+
+#: Sensors, and parameters that can be recovered, without `--all`.
+LISTED_SENSORS, _LISTED = 3, 30
+
+
+#: And what can be moved.
+_MOVED = 10
+
+
+def scene_lines(summary: SceneSummary) -> list[str]:
+    """What the scene contains."""
+    lines = [
+        f"{name}: {', '.join(f'{count} {kind}' for kind, count in counts.items()) or 'none'}"
+        for name, counts in (("emitters", summary.emitters), ("bsdfs", summary.bsdfs), ("shapes", summary.shapes))
+    ]
+    return [*lines, f"triangles: {summary.triangles}"]
+
+
+def sensor_lines(sensor: SensorSummary) -> list[str]:
+    """What one sensor is and sees."""
+    (x, y), (width, height) = sensor.crop
+    crop = "" if (x, y) == (0, 0) and (width, height) == sensor.size else f", crop {width}x{height} at ({x}, {y})"
+    lines = [f"{sensor.type}, {sensor.film} {sensor.size[0]}x{sensor.size[1]}{crop}, {sensor.filter}"]
+    if sensor.view is not None:
+        shares = dataclasses.asdict(sensor.view)
+        lines.append("sees " + ", ".join(f"{name} {100 * share:.0f} %" for name, share in shares.items()))
+    needs = [field.name for field in dataclasses.fields(sensor.needs) if getattr(sensor.needs, field.name) is True]
+    lines.append(
+        f"needs {', '.join(name.removeprefix('has_').replace('_', ' ') for name in needs) or 'nothing special'}"
+    )
+    if sensor.obstacle is not None and sensor.obstacle == sensor.camera_obstacle:
+        lines.append(f"cannot be rendered: {sensor.obstacle}")
+    else:
+        lines += [f"no light tracing: {sensor.obstacle}"] if sensor.obstacle is not None else []
+        lines += [f"no prb: {sensor.camera_obstacle}"] if sensor.camera_obstacle is not None else []
+    return lines
+
+
+def plan_lines(report: PlanReport) -> list[str]:
+    """The plan as a table: what is needed first."""
+    lines = []
+    if report.kernels is not None:
+        each = " + ".join(map(str, report.kernels))
+        lines.append(f"estimator {report.estimator}, kernels of {each} operations")
+    rows = [
+        (
+            "needed" if row.needed else "left out",
+            row.feature,
+            "" if row.operations_with is None else str(row.operations_with),
+            "" if row.operations_without is None else str(row.operations_without),
+            row.reason + (f" ({row.note})" if row.note else ""),
+        )
+        for row in sorted(report.rows, key=lambda row: not row.needed)
+    ]
+    table = [("", "", "with", "without", "")] * (report.kernels is not None) + rows
+    widths = [max(len(row[column]) for row in table) for column in range(4)]
+    for a, b, c, d, reason in table:
+        counts = f"  {c.rjust(widths[2])}  {d.rjust(widths[3])}" if report.kernels is not None else ""
+        lines.append(f"{a.ljust(widths[0])}  {b.ljust(widths[1])}{counts}  {reason}".rstrip())
+    return lines
+
+
+# --- parameters -------------------------------------------------------------------------------------------------------
+
+
+def parameter_lines(infos: Sequence[ParameterInfo], wanted: Sequence[str], everything: bool) -> list[str]:
+    """The parameters that can be recovered, with their values, then how many others there are, and why.
+
+    Those that a key or glob in `wanted` names are marked. `everything` lists the others, too.
+    """
+    usable = [info for info in infos if info.obstacle is None]
+    others = [info for info in infos if info.obstacle is not None]
+    marked = {info.key for info in usable if any(info.key == key or fnmatchcase(info.key, key) for key in wanted)}
+    shown = usable if everything else sorted(usable, key=lambda info: info.key not in marked)[:_LISTED]
+    rows = [("* " * (info.key in marked) + info.key, _noted(info)) for info in shown]
+    note = " (* in `parameters`)" if marked else ""
+    lines = [f"can be recovered: {len(usable) or 'none'}{note}", *(f"  {line}" for line in _columns(rows))]
+    if len(shown) < len(usable):
+        lines.append(f"  and {len(usable) - len(shown)} more; --all lists them")
+    if everything:
+        table = [(info.key, _value(info), _flags(info), str(info.obstacle)) for info in others]
+        return [*lines, f"others: {len(others)}", *(f"  {line}" for line in _columns(table))]
+    if others:
+        lines.append(f"others: {len(others)}; --all lists them")
+        lines += [f"  {line}" for line in _reasons(others)]
+    return lines
+
+
+def moving_lines(movable: Sequence[MovableSummary], everything: bool) -> list[str]:
+    """What can be moved, and by what."""
+    lines = [f"can be moved: {len(movable) or 'nothing'}"]
+    if everything:
+        return lines + [f"  {line}" for line in _columns([(item.id, ", ".join(item.by)) for item in movable])]
+    groups: dict[str, list[str]] = {}
+    for item in movable:
+        groups.setdefault(" and ".join(item.by), []).append(item.id)
+    for by, ids in groups.items():
+        more = f" and {len(ids) - _MOVED} more; --all lists them" if len(ids) > _MOVED else ""
+        lines.append(f"  by {by}: {', '.join(ids[:_MOVED])}{more}")
+    return lines
+
+
+def _reasons(others: Sequence[ParameterInfo]) -> list[str]:
+    """How many there are with each reason."""
+    groups: dict[str, list[str]] = {}
+    for info in others:
+        # What comes in brackets differs from one to the next.
+        groups.setdefault(str(info.obstacle).partition(" (")[0].partition(";")[0], []).append(info.key)
+    width = len(str(max(map(len, groups.values()))))
+    counted = sorted(groups.items(), key=lambda group: -len(group[1]))
+    return [f"{len(keys):{width}}  {reason}" for reason, keys in counted]
+
+
+def _columns(rows: Sequence[tuple[str, ...]]) -> list[str]:
+    if not rows:
+        return []
+    widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
+    return ["  ".join(text.ljust(width) for text, width in zip(row, widths, strict=True)).rstrip() for row in rows]
+
+
+def _value(info: ParameterInfo) -> str:
+    """The value as far as it fits: numbers as `initial` takes them, of more their count, mean and range."""
+    value = info.value
+    if value is not None and value.numbers is not None:
+        words = [f"{number:.4g}" for number in value.numbers]
+        return f"[{', '.join(words)}]" if info.shape else words[0]
+    if len(info.shape) == 3:
+        height, width, channels = info.shape
+        size = f"{width}x{height} texels" + (f" of {channels}" if channels > 1 else "")
+    else:
+        size = f"{'x'.join(map(str, info.shape))} numbers" if info.shape else info.type
+    if value is None or info.kind == "shape" or "AffineTransform" in info.type:
+        return size if info.shape else info.type
+    return f"{size}, mean {value.mean:.4g}, {value.low:.4g} to {value.high:.4g}"
+
+
+def _noted(info: ParameterInfo) -> str:
+    """The value, and what is to be known of it."""
+    return _value(info) + (f"; {info.remark}" if info.remark is not None else "")
+
+
+def _flags(info: ParameterInfo) -> str:
+    flags = ["differentiable" if info.differentiable else "not differentiable"]
+    return ", ".join([*flags, *(["discontinuous"] if info.discontinuous else [])])
+
+
+def plain(value: object) -> Any:
+    """What a dataclass holds as JSON can have it; objects of the scene, which cannot be copied, by their ids."""
+    if dataclasses.is_dataclass(value):
+        return {field.name: plain(getattr(value, field.name)) for field in dataclasses.fields(value)}
+    if isinstance(value, dict):
+        return {key: plain(entry) for key, entry in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [plain(entry) for entry in value]
+    return value.id() if hasattr(value, "id") else value
+
 
 #: Gradients that `--conditioning` takes.
 SAMPLES = 8
@@ -88,7 +302,7 @@ def command(
         return show_offenders(config, as_json)
 
     from reslrb_cli.optimization.loading import load_configured
-    from reslrb_cli.scene import summarise
+    from reslrb_cli.scene.catalog import summarise
 
     scene = load_configured(config, selects="parameters" not in subject.missing)
     summary = summarise(scene, config.integrator.hide_emitters)
@@ -125,7 +339,7 @@ def command(
     for name in edges:
         echo(f"  silhouettes and shadow edges of {name} are not in its derivatives")
     if measured is not None:
-        from reslrb_cli.report.conditioning_table import chain_lines, conditioning_lines
+        from reslrb_cli.report.tables import chain_lines, conditioning_lines
 
         echo(f"conditioning ({measured.samples} gradients of {measured.spp} spp, seed {measured.seed})")
         for line in conditioning_lines(measured):
@@ -170,7 +384,7 @@ def next_step(subject: Subject, summary: SceneSummary) -> str:
 def measure(subject: Subject, overrides: tuple[str, ...], samples: int) -> Conditioning:
     """The conditioning of the experiment; an estimator that is to be measured first makes no difference to it."""
     from reslrb_cli.measure.conditioning import measure_conditioning
-    from reslrb_cli.optimization import assemble
+    from reslrb_cli.optimization.assemble import assemble
 
     config = subject.config
     if config.integrator.options().get("estimator") == "auto":
@@ -180,7 +394,7 @@ def measure(subject: Subject, overrides: tuple[str, ...], samples: int) -> Condi
 
 def select(config: Config, scene: Any) -> Selection | str:
     """What the configuration recovers, or why that cannot be. Sets initial values in `scene`."""
-    from reslrb_cli.scene import select_parameters
+    from reslrb_cli.scene.parameters import select_parameters
 
     try:
         return select_parameters(scene, config.parameters, config.source)
@@ -190,7 +404,7 @@ def select(config: Config, scene: Any) -> Selection | str:
 
 def edges_of(scene: Any, selection: Selection) -> list[str]:
     """The shapes that the configuration moves whose edges move, too."""
-    from reslrb_cli.scene.movable import casts_edges, where_moved
+    from reslrb_cli.scene.deformation import casts_edges, where_moved
 
     moved = where_moved(selection.params, selection.scene_keys)
     return [item.id for item in moved if casts_edges(scene, item)]
@@ -198,9 +412,8 @@ def edges_of(scene: Any, selection: Selection) -> list[str]:
 
 def make_plan_report(subject: Subject, scene: Any, selection: Selection | str, counts: bool) -> PlanReport | str:
     """The plan of a step for the first sensor that is used, or why there is none."""
-    from reslrb_cli.integrators import Reslrb
-    from reslrb_cli.integrators.features import GUIDED, SEQUENCE
-    from reslrb_cli.integrators.plan_report import report_plan, with_reason
+    from reslrb_cli.integrators.plan_report import GUIDED, SEQUENCE, report_plan, with_reason
+    from reslrb_cli.integrators.reslrb import Reslrb
     from reslrb_cli.optimization.loading import choose_sensors, pass_spp
 
     config = subject.config
@@ -231,7 +444,7 @@ def make_plan_report(subject: Subject, scene: Any, selection: Selection | str, c
 def sampling_of(subject: Subject, option: str) -> tuple[str, str]:
     """`integrator.guiding`, or `sequence`, as it is, and why, where that was or is left to a run (else empty)."""
     from reslrb_cli.config.integrators import UNDECIDED
-    from reslrb_cli.records.paid import GuidedRecord, PaidRecord, SequenceRecord
+    from reslrb_cli.records.decisions import GuidedRecord, PaidRecord, SequenceRecord
 
     asked = str(subject.config.integrator.options()[option])
     if asked != "auto":

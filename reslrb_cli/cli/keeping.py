@@ -1,16 +1,32 @@
-"""What a measuring command has measured so far, on the disk while it goes on."""
+"""What a measuring command has measured so far, on the disk while it goes on.
+
+Files that the measuring commands write with `--json`: what measured, then one object a line.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from reslrb_cli.cli.output import echo
-from reslrb_cli.recording.live import LivePage
+from reslrb_cli.backend.doctor import device_name
+from reslrb_cli.cli.terminal import echo
 from reslrb_cli.records.atomic import remove_parts_of
-from reslrb_cli.records.line_file import LineFile
-from reslrb_cli.records.lines import Line
-from reslrb_cli.records.samples import Kept, are_kept, read_samples, samples_file, write_samples
+from reslrb_cli.records.measurement_files import (
+    Kept,
+    Line,
+    LineFile,
+    Origin,
+    are_kept,
+    read_samples,
+    samples_file,
+    write_samples,
+)
+from reslrb_cli.runs.recorder import LivePage
+
+
+def origin_of(variant: str) -> Origin:
+    """What this process measures on, under `variant`."""
+    return Origin(device_name(variant), variant)
 
 
 class Keeper:

@@ -10,21 +10,23 @@ from typing import Any
 
 import click
 
-from reslrb_cli.cli.experiment import (
+from reslrb_cli.cli.options import (
     COUNT,
     check_writable,
     is_given,
     optional_experiment_arguments,
     read_config,
+    read_recovered,
     start_variant,
 )
-from reslrb_cli.cli.output import echo
-from reslrb_cli.cli.recovered import read_recovered
-from reslrb_cli.config import Config
+from reslrb_cli.cli.terminal import echo
+from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ConfigError, is_machine_fault
 
 #: Formats that hold linear values; the others of `FORMATS` are written in 8-bit sRGB.
 FLOAT_FORMATS = (".exr", ".hdr", ".pfm")
+
+
 FORMATS = (*FLOAT_FORMATS, ".png", ".jpg", ".jpeg")
 
 
@@ -98,10 +100,10 @@ def command(
     check_image_path(output)
     start_variant(config)
 
-    from reslrb_cli.optimization.problem import load_for_rendering
-    from reslrb_cli.optimization.rendering import render_in_passes
+    from reslrb_cli.optimization.assemble import load_for_rendering
+    from reslrb_cli.optimization.loading import render_in_passes
     from reslrb_cli.records.images import write_file
-    from reslrb_cli.report.tone import exposure_words
+    from reslrb_cli.report.tonemap import exposure_words
 
     if sensor is not None:
         config = _of_sensor(config, sensor)
@@ -125,9 +127,9 @@ def command(
 
 def _suiting(image: Any, scene: Any, sensor: Any) -> float:
     """The exposure that suits an image of a scene."""
-    from reslrb_cli.report.tone import exposure_for
+    from reslrb_cli.report.tonemap import exposure_for
     from reslrb_cli.scene.needs import unsupported_part
-    from reslrb_cli.scene.seen import sees_lamps
+    from reslrb_cli.scene.visibility import sees_lamps
 
     return exposure_for(image, None if unsupported_part(scene, sensor) else sees_lamps(scene, sensor))
 

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import click
 
-from reslrb_cli.cli.experiment import check_writable
-from reslrb_cli.cli.output import echo
+from reslrb_cli.cli.options import check_writable
+from reslrb_cli.cli.terminal import echo
 from reslrb_cli.errors import ConfigError, ExitCode
 
 #: Runs and files on one page, at most: each has its images in it.
@@ -31,9 +31,9 @@ def command(paths: tuple[Path, ...], output: Path | None) -> int:
     from reslrb_cli.backend.installation import load_packages
 
     load_packages()  # images are read by Mitsuba
-    from reslrb_cli.cli.progress import Reading
+    from reslrb_cli.cli.terminal import Reading
     from reslrb_cli.report.page import write_page
-    from reslrb_cli.report.seen.fill import with_seen_errors
+    from reslrb_cli.report.perceptual import with_seen_errors
     from reslrb_cli.report.sources import Run, read_sources
 
     if len(paths) > MOST_SOURCES:

@@ -1,14 +1,35 @@
-"""What every section of the configuration shares: strictness, paths, and unions that are told apart by their `type`."""
+"""What every section of the configuration shares: strictness, paths, and unions that are told apart by their `type`.
+
+Names of runs, which are names of folders too.
+
+Amounts of memory as a user writes them.
+
+How often a run keeps its state.
+"""
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Discriminator, Field, Tag, ValidationInfo, WithJsonSchema
+from pydantic import (
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Discriminator,
+    Field,
+    SerializerFunctionWrapHandler,
+    Tag,
+    ValidationInfo,
+    WithJsonSchema,
+    model_serializer,
+    model_validator,
+)
 from pydantic_core import PydanticCustomError
+from typing_extensions import Self
 
-from .limits import PART_BYTES, PATH_BYTES
+from reslrb_cli.config.files import NAME_BYTES, PART_BYTES, PATH_BYTES
 
 #: Largest seed plus one: Mitsuba's seeds are uint32.
 SEED_END = 2**32
@@ -75,8 +96,11 @@ def _below_working_directory(value: Any) -> Path:
 
 _PATH_SCHEMA = WithJsonSchema({"type": "string", "format": "path"})
 
+
 #: A path relative to the folder of the config file.
 ConfigPath = Annotated[Path, BeforeValidator(_below_config), _PATH_SCHEMA]
+
+
 #: A path relative to the working directory.
 WorkPath = Annotated[Path, BeforeValidator(_below_working_directory), _PATH_SCHEMA]
 
@@ -129,5 +153,102 @@ def kind_tag(value: Any, word: str | None = None) -> str | None:
 # --- numbers ----------------------------------------------------------------------------------------------------------
 
 Positive = Annotated[float, Field(gt=0)]
+
+
 Count = Annotated[int, Field(ge=1, lt=2**31)]
+
+
 Seed = Annotated[int, Field(ge=0, lt=SEED_END)]
+
+
+#: Names that Windows takes for devices, whatever suffix they have: a folder that is called so cannot be copied there.
+_RESERVED = re.compile(r"(con|prn|aux|nul|(com|lpt)[0-9])(\..*)?", re.IGNORECASE)
+
+
+#: What begins at a root or at a home, or has `.` or `..` for a part. A slash between words is none of that.
+_PATH = re.compile(r"^([/\\~]|[A-Za-z]:[/\\])|(^|[/\\])\.\.?($|[/\\])")
+
+
+def folder_name(name: str) -> str:
+    """A run's name as the name of a folder: what is no letter, digit, `.`, `_`, `+`, `=` becomes `-`."""
+    return re.sub(r"[^\w.+=]+", "-", name).strip("-.")
+
+
+def check_name(name: str) -> str:
+    """`name`, where it can name a run; else raises an error that says what is wrong with it."""
+    folder = folder_name(name)
+    if _PATH.search(name.strip()):
+        raise wrong("must be a name and not a path; run.output says where the run's folder is")
+    if not folder:
+        raise wrong("must hold a letter or a digit")
+    if _RESERVED.fullmatch(folder):
+        raise wrong(f"must be another name: {folder} is a device on Windows, and not a folder's name there")
+    if len(folder.encode()) > NAME_BYTES:
+        raise wrong(f"must have at most {NAME_BYTES} bytes in UTF-8, not {len(folder.encode())}")
+    return name
+
+
+MIB = 2**20
+
+
+_UNITS = {"b": 1, "kb": 10**3, "mb": 10**6, "gb": 10**9, "kib": 2**10, "mib": MIB, "gib": 2**30}
+
+
+_SIZE = re.compile(r"(\d+(?:\.\d*)?|\.\d+)\s*([A-Za-z]+)")
+
+
+def memory_bytes(value: int | float | str) -> int:
+    """Bytes of a number of MiB, or of text such as "512 MiB", "2GiB", "500 MB".
+
+    Raises ValueError where it is neither, or less than one byte.
+    """
+    number, unit = float("nan"), "mib"
+    if isinstance(value, str):
+        match = _SIZE.fullmatch(value.strip())
+        if match:
+            number, unit = float(match[1]), match[2].lower()
+    elif not isinstance(value, bool):
+        number = float(value) if abs(value) < 2**63 else float("inf")  # longer integers fit into no float
+    if unit not in _UNITS or not 1 <= number * _UNITS[unit] < 2**63:
+        raise ValueError(f"{value!r} is no amount of memory")
+    return int(number * _UNITS[unit])
+
+
+def _check(value: Any) -> Any:
+    try:
+        if not isinstance(value, (int, float, str)):
+            raise ValueError
+        memory_bytes(value)
+    except ValueError:
+        raise wrong("must be a number of MiB, or text such as 512 MiB or 2GiB, and more than 0") from None
+    return value
+
+
+#: A number of MiB, or text with a unit (B, kB, KiB, MB, MiB, GB, GiB); kept as it was written.
+Memory = Annotated[
+    int | float | str,
+    BeforeValidator(_check),
+    WithJsonSchema({"anyOf": [{"type": "number", "exclusiveMinimum": 0}, {"type": "string"}]}),
+]
+
+
+class CheckpointEvery(Section):
+    """Exactly one of `iterations` and `seconds`."""
+
+    iterations: Count | None = Field(default=None, description="Iterations between two checkpoints.")
+    seconds: Positive | None = Field(default=None, description="Seconds between two checkpoints, at least.")
+
+    @model_validator(mode="after")
+    def _check_one(self) -> Self:
+        if (self.iterations is None) == (self.seconds is None):
+            has = "none" if self.seconds is None else "both"
+            raise located("", f"must have exactly one of `iterations` and `seconds`, and has {has}")
+        return self
+
+    @model_serializer(mode="wrap")
+    def _without_unused(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        return {key: value for key, value in handler(self).items() if value is not None}
+
+    def is_due(self, iterations: int, seconds: float) -> bool:
+        """Whether it is time for one, so many iterations and seconds after the last."""
+        return iterations >= self.iterations if self.iterations is not None else seconds > (self.seconds or 0.0)

@@ -12,9 +12,9 @@ from typing import Any, get_args
 from pydantic import ValidationError
 from pydantic_core import ErrorDetails
 
-from .base import MARK, Section
-from .schema import Config
-from .text import Location, format_location
+from reslrb_cli.config.base import MARK, Section
+from reslrb_cli.config.schema import Config
+from reslrb_cli.config.yaml_text import Location, format_location
 
 _EXPECTED = {
     "int_type": "an integer",

@@ -14,8 +14,8 @@ from pydantic import (
 )
 from typing_extensions import Self
 
-from .base import MARK, NEEDS_TYPE, Choice, Count, by_type, located, mark, wrong
-from .limits import CAPACITY, LOCAL_ENTRIES, PATH_LENGTH
+from reslrb_cli.config.base import MARK, NEEDS_TYPE, Choice, Count, by_type, located, mark, wrong
+from reslrb_cli.config.files import CAPACITY, LOCAL_ENTRIES, PATH_LENGTH
 
 
 def _check_depth(value: int) -> int:
@@ -99,8 +99,12 @@ ESTIMATOR_OPTIONS: dict[str, tuple[str, ...]] = {
     "event": ("capacity", "weight"),
     "stack": ("stack_size",),
 }
+
+
 #: Those that `auto` leaves to measurement beside any estimator, with what they are where nothing is measured.
 UNDECIDED: dict[str, str] = {"guiding": "off", "sequence": "independent"}
+
+
 #: Every option that says which estimator, and how.
 _ANY_ESTIMATORS = {"estimator", *(option for options in ESTIMATOR_OPTIONS.values() for option in options)}
 

@@ -11,9 +11,10 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from .schema import Config
+from reslrb_cli.config.schema import Config
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
+
 
 #: The example of the reference page, as a file in `configs/` would hold it.
 EXAMPLE = """\
@@ -43,6 +44,7 @@ run:
   spp: 16
   adjoint: correlated
 """
+
 
 _HEAD = """\
 # Configuration

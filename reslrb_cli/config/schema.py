@@ -21,17 +21,39 @@ from pydantic import (
 )
 from typing_extensions import Self
 
-from .base import ConfigPath, Count, Positive, Section, Seed, WorkPath, by_kind, located, mark, wrong
-from .checkpoints import CheckpointEvery
-from .integrators import AnyIntegrator, Integrator, Reslrb
-from .limits import KEY_LENGTH, PIXELS
-from .losses import L2, AnyLoss
-from .names import check_name, folder_name
-from .optimizers import Adam, AnyOptimizer
-from .parameters import COLOR_SPACE, ColorSpace, ParameterSpec, Value
-from .passes import largest_pass, passes_obstacle
-from .sizes import Memory, memory_bytes
-from .views import EXPOSURE, MASK, MASK_MIXED, AnyMask, Exposures, Mask, SensorName, ViewSpec, check_views
+from reslrb_cli.config.base import (
+    CheckpointEvery,
+    ConfigPath,
+    Count,
+    Memory,
+    Positive,
+    Section,
+    Seed,
+    WorkPath,
+    by_kind,
+    check_name,
+    folder_name,
+    located,
+    mark,
+    memory_bytes,
+    wrong,
+)
+from reslrb_cli.config.files import KEY_LENGTH, PIXELS, largest_pass, passes_obstacle
+from reslrb_cli.config.integrators import AnyIntegrator, Integrator
+from reslrb_cli.config.integrators import Reslrb as ReslrbConfig
+from reslrb_cli.config.optimizers import L2, Adam, AnyLoss, AnyOptimizer
+from reslrb_cli.config.parameters import COLOR_SPACE, ColorSpace, ParameterSpec, Value
+from reslrb_cli.config.views import (
+    EXPOSURE,
+    MASK,
+    MASK_MIXED,
+    AnyMask,
+    Exposures,
+    Mask,
+    SensorName,
+    ViewSpec,
+    check_views,
+)
 
 
 def _list_of_one(value: Any) -> Any:
@@ -114,6 +136,8 @@ class Rendering(Section):
 
 
 _PATH = {"type": "string", "format": "path"}
+
+
 _Files = Annotated[
     list[ConfigPath],
     Field(min_length=1),
@@ -300,7 +324,7 @@ class Config(Section):
         "not say is as `target` and `loss` have it.",
     )
     parameters: Annotated[list[ParameterSpec], Field(min_length=1)] = Field(description="What is recovered.")
-    integrator: AnyIntegrator = Field(default=Reslrb(), description="How image and gradient are computed.")
+    integrator: AnyIntegrator = Field(default=ReslrbConfig(), description="How image and gradient are computed.")
     loss: AnyLoss = Field(default=L2(), description="How image and target are compared.")
     optimizer: AnyOptimizer = Field(default=Adam(), description="How parameters follow their gradient.")
     run: RunConfig = Field(default_factory=lambda: RunConfig(), description="Iterations, samples, seed and output.")
@@ -401,7 +425,7 @@ class Config(Section):
                 "leave that at auto, or set the weight to luminance",
             )
         if self.run.memory_budget is not None:
-            if not isinstance(self.integrator, Reslrb):
+            if not isinstance(self.integrator, ReslrbConfig):
                 raise located(
                     "run.memory_budget", f"goes with integrator `reslrb` alone, not with `{self.integrator.type}`"
                 )

@@ -9,8 +9,8 @@ from typing import Annotated, Any, Literal
 from pydantic import BeforeValidator, Field, GetJsonSchemaHandler, WithJsonSchema
 from pydantic_core import CoreSchema
 
-from .base import ConfigPath, Positive, Section, located, wrong
-from .losses import AnyLoss
+from reslrb_cli.config.base import ConfigPath, Positive, Section, located, wrong
+from reslrb_cli.config.optimizers import AnyLoss
 
 _KINDS = ("specular", "border", "clipped", "alpha", "nonfinite")
 
@@ -72,10 +72,14 @@ class _OrText:
 
 #: `auto`, `none`, an image of weights, or a section that says what is left out.
 AnyMask = Annotated[Mask, BeforeValidator(_mask), _OrText()]
+
+
 MASK = (
     "Pixels that are left out of the loss, and what the others weigh: `auto` (all kinds are left out), `none`, the "
     "path of an image of weights, alone, or a section that switches kinds off and may add weights."
 )
+
+
 MASK_MIXED = (
     "Leave out, with `specular`, the pixels that see a coat, a blend or a thin pane directly, of whose light light "
     "tracing lacks a part; else they stay, and are counted."
@@ -115,6 +119,8 @@ Exposures = Annotated[
         }
     ),
 ]
+
+
 EXPOSURE = (
     "What the image is multiplied by before it is compared, target = exposure * image: a number, `auto` (recovered "
     "with the parameters, one factor), or `per_channel` (recovered, one for each channel, which is white balance)"

@@ -1,5 +1,7 @@
 """How the connections of a path enter its gradient: one file an estimator, a table from name to class."""
 
+from __future__ import annotations
+
 from reslrb_cli.estimators.base import Estimator
 from reslrb_cli.estimators.event import EventEstimator
 from reslrb_cli.estimators.gather import Gather
@@ -12,5 +14,3 @@ ESTIMATORS: dict[str, type[Estimator]] = {
     "event": EventEstimator,
     "stack": Stack,
 }
-
-__all__ = ["ESTIMATORS", "Estimator"]

@@ -25,15 +25,13 @@ import drjit as dr
 import mitsuba as mi
 
 from reslrb_cli.estimators.base import Pass, VertexHooks, entry_bytes
-from reslrb_cli.estimators.staying import Before, reach
-from reslrb_cli.estimators.surface import SurfacePoint
+from reslrb_cli.estimators.kept import Before, SurfacePoint, reach
+from reslrb_cli.transport.bsdf import Scattering
 from reslrb_cli.transport.connection import Connection
 from reslrb_cli.transport.factors import Product
-from reslrb_cli.transport.hooks import Vertex
-from reslrb_cli.transport.numbers import Numbers
 from reslrb_cli.transport.plan import Plan
-from reslrb_cli.transport.scattering import Scattering
-from reslrb_cli.transport.segment import segment
+from reslrb_cli.transport.random import Numbers
+from reslrb_cli.transport.walk import Vertex, segment
 
 
 @dataclass

@@ -10,15 +10,13 @@ from typing import Any, ClassVar
 import drjit as dr
 import mitsuba as mi
 
-from reslrb_cli.transport.connection import Connection, stand_in
+from reslrb_cli.transport.connection import Connection, stand_in, transmittance
 from reslrb_cli.transport.emission import Emission, sample_emission
 from reslrb_cli.transport.factors import NO_ZERO, Product, showing
-from reslrb_cli.transport.hooks import Hooks, Vertex
+from reslrb_cli.transport.film import AdjointImage
 from reslrb_cli.transport.plan import Plan
 from reslrb_cli.transport.samples import Samples
-from reslrb_cli.transport.splat import AdjointImage
-from reslrb_cli.transport.transmittance import transmittance
-from reslrb_cli.transport.walk import walk
+from reslrb_cli.transport.walk import Hooks, Vertex, walk
 
 
 @dataclass

@@ -21,7 +21,7 @@ from typing import Any, ClassVar
 import drjit as dr
 import mitsuba as mi
 
-from reslrb_cli.config.limits import CAPACITY
+from reslrb_cli.config.files import CAPACITY
 from reslrb_cli.estimators.base import (
     Estimator,
     Pass,
@@ -32,13 +32,13 @@ from reslrb_cli.estimators.base import (
     differentiate_emission,
     one_of,
 )
-from reslrb_cli.estimators.events import Event, differentiate_event
+from reslrb_cli.estimators.kept import Event, differentiate_event
 from reslrb_cli.estimators.reservoir import defended, is_taken, selection_weight, slot_adjoint
+from reslrb_cli.transport.bsdf import Scattering
 from reslrb_cli.transport.connection import Connection
 from reslrb_cli.transport.factors import Product
-from reslrb_cli.transport.hooks import Vertex
 from reslrb_cli.transport.plan import Plan
-from reslrb_cli.transport.scattering import Scattering
+from reslrb_cli.transport.walk import Vertex
 
 
 @dataclass

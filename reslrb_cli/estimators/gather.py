@@ -25,13 +25,12 @@ from reslrb_cli.estimators.base import (
     differentiate_emission,
     differentiate_passage,
 )
-from reslrb_cli.estimators.sums import AdjointSum
+from reslrb_cli.estimators.kept import AdjointSum
+from reslrb_cli.transport.bsdf import Scattering, tracked_factors
 from reslrb_cli.transport.connection import Connection, Seen, stand_in
 from reslrb_cli.transport.factors import NO_ZERO, Product
-from reslrb_cli.transport.hooks import Vertex
 from reslrb_cli.transport.plan import Plan
-from reslrb_cli.transport.scattering import Scattering
-from reslrb_cli.transport.tracked import tracked_factors
+from reslrb_cli.transport.walk import Vertex
 
 WORDS = 2  # of visibility bits, 32 vertices each
 

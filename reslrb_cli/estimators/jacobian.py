@@ -19,11 +19,10 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from reslrb_cli.estimators.staying import Before, is_staying, reach
-from reslrb_cli.transport.hooks import Vertex
-from reslrb_cli.transport.numbers import Numbers
+from reslrb_cli.estimators.kept import Before, is_staying, reach
 from reslrb_cli.transport.plan import Plan
-from reslrb_cli.transport.segment import segment
+from reslrb_cli.transport.random import Numbers
+from reslrb_cli.transport.walk import Vertex, segment
 
 AXES = 4
 

@@ -20,8 +20,9 @@ from typing import Any, ClassVar, Protocol
 import drjit as dr
 import mitsuba as mi
 
-from reslrb_cli.config.limits import CAPACITY
-from reslrb_cli.estimators import chain, chain_replay
+from reslrb_cli.config.files import CAPACITY
+from reslrb_cli.estimators import chain
+from reslrb_cli.estimators import chain as chain_replay
 from reslrb_cli.estimators.base import (
     Estimator,
     Pass,
@@ -33,15 +34,16 @@ from reslrb_cli.estimators.base import (
     differentiate_emission,
     one_of,
 )
-from reslrb_cli.estimators.events import Event, differentiate_event
+from reslrb_cli.estimators.kept import Event, differentiate_event
+from reslrb_cli.transport.bsdf import Scattering, tracked_factor
 from reslrb_cli.transport.connection import Connection
 from reslrb_cli.transport.factors import Product
-from reslrb_cli.transport.hooks import Vertex
 from reslrb_cli.transport.plan import Plan
-from reslrb_cli.transport.scattering import Scattering
-from reslrb_cli.transport.tracked import tracked_factor
+from reslrb_cli.transport.walk import Vertex
 
 JACOBIAN_DAMPING = 0.1  # of attached derivatives: `estimators.jacobian`
+
+
 SHARE = 0.01  # the least share of a candidate in the weights up to it
 
 

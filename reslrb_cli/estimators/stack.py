@@ -33,14 +33,12 @@ from reslrb_cli.estimators.base import (
     entry_bytes,
 )
 from reslrb_cli.estimators.gather import Gather, GatherState, Taking, Visibility, vertices
-from reslrb_cli.estimators.sums import AdjointSum, PlainSum
-from reslrb_cli.estimators.surface import SurfacePoint, blank_lobe, event, lobe
+from reslrb_cli.estimators.kept import AdjointSum, PlainSum, SurfacePoint, blank_lobe, event, lobe
+from reslrb_cli.transport.bsdf import Scattering, tracked_factors
 from reslrb_cli.transport.connection import Connection, Seen, stand_in
 from reslrb_cli.transport.factors import NO_ZERO, Product
-from reslrb_cli.transport.hooks import Splat, Vertex
 from reslrb_cli.transport.plan import Plan
-from reslrb_cli.transport.scattering import Scattering
-from reslrb_cli.transport.tracked import tracked_factors
+from reslrb_cli.transport.walk import Splat, Vertex
 
 STACK_SIZE = 64  # vertices
 

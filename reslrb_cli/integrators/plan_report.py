@@ -1,25 +1,278 @@
-"""The plan of a step in numbers: how many operations its kernels have with each feature, and how many without."""
+"""The plan of a step in numbers: how many operations its kernels have with each feature, and how many without.
+
+What a plan is made of, feature by feature: whether the scene and its parameters call for it, and the same plan with
+the feature the other way round, for a comparison of kernels.
+"""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
+from reslrb_cli.guiding.tables import grid_for, sensor_bytes
 from reslrb_cli.integrators import light_tracer as lt
-from reslrb_cli.integrators.features import FEATURES, Feature
 from reslrb_cli.integrators.reslrb import Reslrb
 from reslrb_cli.scene.catalog import list_parameters
-from reslrb_cli.transport.blocks import film_blocks
+from reslrb_cli.transport.film import film_blocks
 from reslrb_cli.transport.guide import even_table
-from reslrb_cli.transport.plan import Plan
+from reslrb_cli.transport.plan import UNBOUNDED, Plan
+from reslrb_cli.transport.random import make_coordinates
 from reslrb_cli.transport.samples import passes
 
+#: The feature that guiding is.
+GUIDED = "guided emission"
+
+
+#: And that which evenly spread numbers are.
+SEQUENCE = "low-discrepancy numbers"
+
+
+#: Kinds of parameters that features come with.
+EMITTERS, BSDFS = "emitter", "bsdf"
+
+
+@dataclass(frozen=True)
+class Feature:
+    """One feature of a plan.
+
+    `needed(plan)` says whether it is part of it; `present` (of a plan that has it) and `absent` say why. `toggle(plan)`
+    is the plan without it,
+    or with it, or the reason why there is no such plan; None: the step has it once all `parameters` of that kind are
+    differentiated.
+    """
+
+    name: str
+    needed: Callable[[Plan], bool]
+    present: str | Callable[[Plan], str]
+    absent: str
+    toggle: Callable[[Plan], Plan | str | None]
+    parameters: str | None = None
+
+
+def _needs(member: str, **along: Any) -> Callable[[Plan], Plan]:
+    """Toggle one of the scene's needs; `along` are members of the plan that go with it when it is left out."""
+
+    def toggle(plan: Plan) -> Plan:
+        change: dict[str, Any] = {member: not getattr(plan.needs, member)}
+        return replace(plan, needs=replace(plan.needs, **change), **({} if change[member] else along))
+
+    return toggle
+
+
+def _visible(plan: Plan) -> Plan | str:
+    if plan.visible_emission:
+        return replace(plan, hide_emitters=True)
+    if plan.max_depth == 0:
+        return "paths have no edge"
+    return replace(plan, hide_emitters=False, needs=replace(plan.needs, has_visible_emitters=True))
+
+
+def _roulette(plan: Plan) -> Plan | str:
+    if plan.roulette:
+        return replace(plan, rr_depth=UNBOUNDED)
+    return replace(plan, rr_depth=1) if plan.max_depth > 2 else "paths are too short for it"
+
+
+def _environment(plan: Plan) -> Plan | str:
+    if plan.environment_map:
+        return replace(plan, needs=replace(plan.needs, environment=None))
+    return "there is no environment map to place rays of"
+
+
+def _zeros(plan: Plan) -> Plan | str:
+    if not (plan.differentiate_bsdfs or plan.differentiate_emission):
+        return "nothing is differentiated"
+    return replace(plan, track_zeros=not plan.track_zeros)
+
+
+def _delta(plan: Plan) -> Plan | str:
+    if not (plan.needs.has_delta_lobes and plan.differentiate_bsdfs):
+        return "there are no delta lobes, or no BSDF is differentiated"
+    return replace(plan, differentiate_delta=not plan.differentiate_delta)
+
+
+def _null(plan: Plan) -> Plan | str:
+    if not (plan.needs.has_null and plan.differentiate_bsdfs):
+        return "there are no such surfaces, or no BSDF is differentiated"
+    return replace(plan, differentiate_null=not plan.differentiate_null)
+
+
+def _attached(plan: Plan) -> Plan | str:
+    if not plan.attached:
+        return "nothing moves"
+    return "without them parameters that move light have no derivative"
+
+
+def _at_rest(plan: Plan) -> Plan | str:
+    return replace(plan, moving_emitters=()) if plan.moving_emission else "no emitter has a parameter that moves it"
+
+
+def _seen_moving(plan: Plan) -> Plan | str:
+    if not plan.visible_moving_lamps:
+        return "no lamp moves, or none is to be seen"
+    return "goes with visible emitters, and with moving ones"
+
+
+def _small(plan: Plan) -> Plan | str:
+    if plan.small_lamps:
+        return replace(plan, needs=replace(plan.needs, small_lamps=()))
+    lamps = tuple(lamp for lamp in plan.needs.lamps if not lamp.parallel)
+    if not (lamps and plan.visible_emission):
+        return "no lamp is to be seen"
+    if plan.differentiate_null:
+        return "masks have derivatives, which rays through the pixels take"
+    return replace(plan, needs=replace(plan.needs, small_lamps=lamps))
+
+
+def _evened(plan: Plan) -> Plan | str:
+    if plan.evened_lamps:
+        return replace(plan, evened_lamps=())
+    textured = tuple(lamp for lamp in plan.needs.lamps if lamp.texture is not None)
+    return replace(plan, evened_lamps=textured) if textured else "no lamp has a texture"
+
+
+def _placed(plan: Plan) -> Plan | str:
+    return "what Mitsuba makes of them is wrong" if plan.placed_lamps else "there are none"
+
+
+def _normalization(plan: Plan) -> Plan | str:
+    if not plan.attached:
+        return "nothing moves"
+    return replace(plan, attached_normalization=not plan.attached_normalization)
+
+
+def _staying(plan: Plan) -> Plan | str:
+    if not plan.attached:
+        return "nothing moves"
+    if plan.stays:
+        return replace(plan, stays=False, glossy_follows=False)
+    return "all follow" if plan.max_depth <= 2 else replace(plan, stays=True)
+
+
+def _tables(plan: Plan) -> str:
+    assert plan.grid is not None
+    size = f"{plan.grid.cells} cells, {sensor_bytes(plan.grid, plan.aims) / 2**20:.1f} MiB of tables"
+    return f"light paths start, and go on, where earlier ones had something to say: {size}"
+
+
+def _aimed(plan: Plan) -> Plan | str:
+    if plan.grid is None:
+        return "emission is not guided"
+    return replace(plan, aims=not plan.aims) if not plan.attached else "something moves"
+
+
+def _guided(plan: Plan) -> Plan:
+    if plan.grid is not None:
+        return replace(plan, grid=None, aims=False)
+    return replace(plan, grid=grid_for([True] * 4, [1.0] * len(plan.needs.emitters), 1))
+
+
+def _sequence(plan: Plan) -> Plan:
+    if plan.sequence is not None:
+        return replace(plan, sequence=None)
+    return replace(plan, sequence=make_coordinates([True] * 4, len(plan.needs.emitters), plan.max_depth))
+
+
+def _several(plan: Plan) -> Plan | str:
+    return "follows from the number of emitters, in Mitsuba itself"
+
+
+def _emission(plan: Plan) -> Plan | None:
+    return replace(plan, differentiate_emission=False) if plan.differentiate_emission else None
+
+
+def _bsdfs(plan: Plan) -> Plan | None:
+    if plan.differentiate_bsdfs:
+        return plan.differentiating(False, plan.differentiate_emission, plan.track_zeros)
+    return None
+
+
+def _all_bsdfs(plan: Plan) -> str | None:
+    if not plan.differentiate_bsdfs:
+        return "no BSDF is differentiated"
+    return None if plan.only_bsdfs else "all are asked for"
+
+
+FEATURES = (
+    Feature("visible emitters", lambda p: p.visible_emission, "an emitter may be seen directly",
+            "hidden, or points and directions alone", _visible),
+    Feature("several emitters", lambda p: len(p.needs.emitters) > 1, "one is drawn for each path",
+            "the only one is sampled", _several),
+    Feature("environment map", lambda p: p.environment_map, "its rays are placed by the walk",
+            "none emits", _environment),
+    Feature("roulette", lambda p: p.roulette, "rr_depth is below max_depth", "max_depth ends paths first", _roulette),
+    Feature("shading-normal correction", lambda p: p.needs.has_shading_normals,
+            "shapes have interpolated normals", "all normals are geometric", _needs("has_shading_normals")),
+    Feature("bump and normal maps", lambda p: p.needs.has_perturbed_normals,
+            "smooth lobes are evaluated with exchanged directions", "no BSDF perturbs normals",
+            _needs("has_perturbed_normals")),
+    Feature("delta lobes", lambda p: p.needs.has_delta_lobes, "mirrors or clear glass", "no BSDF has any",
+            _needs("has_delta_lobes", differentiate_delta=False)),
+    Feature("null surfaces", lambda p: p.needs.has_null, "shadow rays pass through masks",
+            "every surface stops a shadow ray", _needs("has_null", differentiate_null=False)),
+    Feature("instances", lambda p: p.needs.has_instances, "shapes are instanced", "no shape is instanced",
+            _needs("has_instances")),
+    Feature("lens sampling", lambda p: p.needs.thin_lens, "the aperture has a size", "the sensor is a pinhole",
+            _needs("thin_lens")),
+    Feature("time sampling", lambda p: p.needs.moving_shutter, "the shutter is open for some time",
+            "the shutter opens for an instant", _needs("moving_shutter")),
+    Feature("shifted principal point", lambda p: p.needs.principal_point, "the film is off the axis",
+            "the film is on the axis", _needs("principal_point")),
+    Feature("near clip plane", lambda p: p.needs.near_clip, "shadow rays end there: something may stand before it",
+            "nothing stands before it", _needs("near_clip")),
+    Feature("clip planes of a thin lens", lambda p: p.needs.lens_clip,
+            "something may stand outside of them, or it focuses there", "the scene is between them, or none is a lens",
+            _needs("lens_clip")),
+    Feature("derivatives of emission", lambda p: p.differentiate_emission, "parameters of emitters",
+            "no parameter of an emitter", _emission, EMITTERS),
+    Feature("derivatives of BSDFs", lambda p: p.differentiate_bsdfs, "parameters of BSDFs",
+            "no parameter of a BSDF: no path is replayed", _bsdfs, BSDFS),
+    Feature("derivatives of all BSDFs", lambda p: p.differentiate_bsdfs and not p.only_bsdfs,
+            "each has a parameter", "others have no parameter", _all_bsdfs, BSDFS),
+    Feature("derivatives of delta lobes", lambda p: p.differentiate_delta, "a BSDF with parameters has such lobes",
+            "no BSDF with parameters has any", _delta),
+    Feature("derivatives of null surfaces", lambda p: p.differentiate_null, "a BSDF with parameters is see-through",
+            "no BSDF with parameters is", _null),
+    Feature("attached derivatives", lambda p: p.attached, "a parameter moves what light leaves from or meets",
+            "nothing moves: directions and film positions are constants", _attached),
+    Feature("vertices that stay", lambda p: p.attached and p.stays,
+            "behind diffuse bounces light goes on to the same place, so that edges at rest count",
+            "all follow: nothing that moves is seen behind a diffuse bounce, or attached_sampling: follow", _staying),
+    Feature("moving emitters", lambda p: p.moving_emission, "rays have the derivative of where they start",
+            "emitters are at rest", _at_rest),
+    Feature("moving lamps in view", lambda p: bool(p.visible_moving_lamps),
+            "their outline moves in the image; what they cover, and shadows, do not", "no lamp that moves is seen",
+            _seen_moving),
+    Feature("small lamps in view", lambda p: bool(p.small_lamps), "found by points on them, not by rays through pixels",
+            "no lamp in view is smaller than a pixel", _small),
+    Feature("placed lamps", lambda p: bool(p.placed_lamps), "spheres, parallel lamps, meshes that move: by the walk",
+            "Mitsuba samples all emitters", _placed),
+    Feature("black texels of lamps", lambda p: bool(p.evened_lamps), "drawn too, since their derivative counts",
+            "no texture of a lamp is differentiated: texels are drawn by their radiance", _evened),
+    Feature(GUIDED, lambda p: p.grid is not None, _tables, "guiding: off", _guided),
+    Feature("aimed scattering", lambda p: p.aimed, "a quarter of scattered paths go where the sensor looks",
+            "only guided paths are, in scenes with glossy surfaces, where nothing moves", _aimed),
+    Feature(SEQUENCE, lambda p: p.sequence is not None,
+            "where paths start, and how they first scatter, is evenly spread", "sequence: independent", _sequence),
+    Feature("derivative of the filter's normalization", lambda p: p.attached and p.attached_normalization,
+            "as finite differences have it", "nothing moves, or it is detached", _normalization),
+    Feature("zero-factor bookkeeping", lambda p: p.track_zeros, "a parameter is zero somewhere, or nearly so",
+            "no parameter is nearly zero", _zeros),
+    Feature("geometry read by BSDFs", lambda p: p.needs.bsdfs_read_geometry,
+            "kept vertices are found again on their surface", "texture coordinates and directions are enough",
+            _needs("bsdfs_read_geometry")),
+)  # fmt: skip
+
+
 PATHS = 64  # traced to have kernels compiled
+
+
 LARGE = 100  # operations; smaller kernels develop images and prepare textures
 
 

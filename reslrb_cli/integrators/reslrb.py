@@ -8,13 +8,13 @@ from typing import Any, ClassVar
 import drjit as dr
 import mitsuba as mi
 
-from reslrb_cli.estimators import ESTIMATORS, Estimator
-from reslrb_cli.estimators.base import one_of
+from reslrb_cli.estimators import ESTIMATORS
+from reslrb_cli.estimators.base import Estimator, one_of
+from reslrb_cli.guiding.tables import Purpose
 from reslrb_cli.integrators import light_tracer as lt
-from reslrb_cli.integrators.guiding import Purpose
-from reslrb_cli.integrators.interface import Derivative, Job
-from reslrb_cli.integrators.preparation import Motion
-from reslrb_cli.integrators.tracer import LightTracer
+from reslrb_cli.integrators.context import Motion
+from reslrb_cli.integrators.light_tracer import LightTracer
+from reslrb_cli.integrators.protocol import Derivative, Job
 from reslrb_cli.transport.samples import Samples
 
 

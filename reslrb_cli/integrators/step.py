@@ -16,15 +16,20 @@ import drjit as dr
 import mitsuba as mi
 
 from reslrb_cli.backend.variant import check_variant
-from reslrb_cli.config.limits import PASS_SAMPLES, PASSES
+from reslrb_cli.config.files import PASS_SAMPLES, PASSES
 from reslrb_cli.estimators.base import one_of
-from reslrb_cli.integrators.adapter import TRACERS, interface_of, make_tracer, resolve_sensor
-from reslrb_cli.integrators.interface import Job, StepIntegrator
-from reslrb_cli.integrators.refusal import Refused
+from reslrb_cli.integrators.plugin import TRACERS, interface_of, make_tracer, resolve_sensor
+from reslrb_cli.integrators.protocol import Job, Refused, StepIntegrator
 
 Adjoint = Literal["correlated", "independent", "batched"]
+
+
 FirstBatch = Literal["image", "again"]
+
+
 Objective = Callable[[Any], Any]
+
+
 #: Told of an image and of the dL/dI that its samples were differentiated with.
 OnSamples: TypeAlias = "Callable[[mi.TensorXf, mi.TensorXf], None]"
 

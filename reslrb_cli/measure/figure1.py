@@ -12,14 +12,12 @@ from pathlib import Path
 
 import numpy as np
 
-from reslrb_cli.config import Config
+from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ConfigError
-from reslrb_cli.measure.comparison import Comparison, Family, compare_expectations
-from reslrb_cli.measure.entries import entry_count
+from reslrb_cli.measure.comparison import Comparison, Family, compare_expectations, entry_count
 from reslrb_cli.measure.held_kinds import OWN, Kind, check_config, sample, take_pictures
 from reslrb_cli.measure.noise import Fall, fall, relative_noise
-from reslrb_cli.records.bench import BenchStatus
-from reslrb_cli.records.gradcheck import Verdict
+from reslrb_cli.records.measurements import BenchStatus, Verdict
 
 
 @dataclass(frozen=True)

@@ -18,21 +18,29 @@ from typing import Any
 
 import numpy as np
 
-from reslrb_cli.config import Config
+from reslrb_cli.config.schema import Config
 from reslrb_cli.estimators import ESTIMATORS
-from reslrb_cli.measure.comparison import ROUNDING, Comparison, Family, compare_equal_seeds, compare_expectations
-from reslrb_cli.measure.earlier import Earlier
-from reslrb_cli.measure.entries import entry_count
-from reslrb_cli.measure.pace import NO_TIME
+from reslrb_cli.measure.comparison import (
+    ROUNDING,
+    Comparison,
+    Family,
+    compare_equal_seeds,
+    compare_expectations,
+    entry_count,
+    paired_z_scores,
+)
 from reslrb_cli.measure.participants import Settings
+from reslrb_cli.measure.resume_store import Earlier
 from reslrb_cli.measure.sampling import NAIVE, Name, Sampling
-from reslrb_cli.measure.statistics import paired_z_scores
-from reslrb_cli.records.gradcheck import GradcheckRecord, Kind, Reference, Verdict
-from reslrb_cli.records.samples import Kept
+from reslrb_cli.measure.workers import NO_TIME
+from reslrb_cli.records.measurement_files import Kept
+from reslrb_cli.records.measurements import GradcheckRecord, Kind, Reference, Verdict
 
 #: What a stock integrator on the same paths differs by from this one, relative to the entries: whether a point is
 #: visible is another matter of rounding to each.
 STOCK_ROUNDING = 1e-3
+
+
 #: References that know the gradient along a few directions alone.
 ALONG_DIRECTIONS = (Reference.FINITE_DIFFERENCE, Reference.FORWARD_MODE)
 

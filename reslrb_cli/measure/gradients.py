@@ -1,19 +1,247 @@
-"""Gradients of a scene over many seeds, derivatives in forward mode, and finite differences.
+"""Gradients of a scene over many seeds, in forward mode and by finite differences; what of it moves light.
+
+Gradients of a scene over many seeds, derivatives in forward mode, and finite differences.
 
 An objective is sum(image * weights) with fixed random weights, so dL/dI is the same for every estimator. A gradient is
 one flat vector over all parameters of a case.
+
+Parameters that move light, as a gradient check needs them: which do, by what, and how smoothly.
+
+The values that a measurement varies, and the way between them and a scene.
+
+Finite differences of the objective at common random numbers, along a few directions of one parameter.
+
+The step h is chosen by a sweep. Central differences, and the one-sided ones of three nodes, are wrong by c h^2 + ...,
+so that two steps tell the truncation error of the smaller one (L. F. Richardson, 1911),
+
+    D(h) - F' ~ (D(r h) - D(h)) / (r^2 - 1),
+
+while noise that grows as h shrinks, from paths that flip, shows in how much D(r h) - D(h) varies between seeds. Where
+light is moved, rounding can be the same for all seeds, for it is the scene that is rounded: a change that does not
+shrink with h is no truncation, and counts in full. The step with the least sum is taken, and its error comes with it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
-from typing import Any
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import Any, Protocol
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 
-from reslrb_cli.integrators import Job, first_channels, gradient_step, make_integrator, render_image
-from reslrb_cli.measure.small_scenes import load
-from reslrb_cli.measure.values import SceneValues, Values
+from reslrb_cli.integrators.protocol import Job, first_channels
+from reslrb_cli.integrators.step import gradient_step, make_integrator, render_image
+from reslrb_cli.measure.scenes.small import load
+from reslrb_cli.scene.catalog import parameter_kind
+from reslrb_cli.scene.values import settle
+
+#: How far the largest step of finite differences moves things, relative to their size, in units of the step.
+REACH = 0.1
+
+
+#: The same of a heightmap, relative to the scene's size.
+RELIEF = 0.02
+
+
+#: The same of what makes up a motion: a turn is in degrees; None stands for `REACH` of the scene's size.
+UNITS = {"translation": None, "rotation": 10.0, "scale": REACH}
+
+
+#: Waves that have room in what is displaced, at most.
+WAVES = 1.5
+
+
+def moves_light(params: mi.SceneParameters, key: str) -> bool:
+    """Whether a parameter moves what light meets or leaves from.
+
+    What the scene itself does not have is a function of such: a motion, or a heightmap.
+    """
+    if key not in params.properties:
+        return True
+    kind = parameter_kind(params, key)
+    return kind == "shape" or (kind == "emitter" and key.rpartition(".")[2] in ("position", "to_world"))
+
+
+def smooth_weights(height: int, width: int, channels: int = 3) -> np.ndarray:
+    """A smooth dL/dI of mean 1 that vanishes at the film's border: light that lands beyond says nothing.
+
+    Finite differences of what moves over the film need it: within each pixel of noise they would have to be small.
+    """
+    y, x = (np.mgrid[0:height, 0:width] + 0.5) / np.array([height, width]).reshape(2, 1, 1)
+    value = np.stack([np.sin(5 * x) * np.cos(4 * y) + 1.5, np.cos(3 * x + 2 * y) + 1.2, x + y], -1)[:, :, :channels]
+    inside = np.clip((np.minimum.reduce([x, 1 - x, y, 1 - y]) - 0.08) / 0.2, 0, 1)
+    value *= (inside**2 * (3 - 2 * inside))[:, :, None]
+    return np.asarray(value / value.mean())
+
+
+def smooth_rows(key: str, value: Any, extent: float, count: int, seed: int = 3) -> list[np.ndarray]:
+    """Directions in which a parameter moves smoothly, each a row, in units of which a fraction is a step.
+
+    Vertices are displaced by waves in all directions, a heightmap by waves over its texels; of what is not so many
+    numbers (a position, a rotation) each is moved. `extent` is the scene's size.
+    """
+    random, found, name = np.random.default_rng(seed), [], key.rpartition(".")[2]
+    shape = np.shape(value)
+    for _ in range(count):
+        if name == "vertex_positions":
+            points = np.array(value, float).reshape(-1, 3)
+            size = float(np.linalg.norm(np.ptp(points, axis=0)))
+            wave = _waves(points / (size or 1.0), random)
+            towards = random.normal(size=3)
+            row = REACH * size * wave[:, None] * towards / np.linalg.norm(towards)
+        elif name not in UNITS and len(shape) >= 2:
+            grid = np.stack(np.meshgrid(*(np.linspace(0, 1, n) for n in shape[:2]), indexing="ij"), -1)
+            wave = _waves(grid.reshape(-1, 2), random).reshape(shape[:2])
+            row = RELIEF * extent * np.broadcast_to(wave.reshape(*shape[:2], *(1 for _ in shape[2:])), shape)
+        else:
+            unit = UNITS.get(name) or REACH * extent
+            row = unit * random.uniform(0.5, 1, shape) * random.choice([-1.0, 1.0], shape)
+        found.append(np.ravel(row))
+    return found
+
+
+def _waves(points: np.ndarray, random: np.random.Generator) -> np.ndarray:
+    """A wave (N,) over points (N, D) of about unit extent."""
+    wave = random.normal(size=points.shape[1])
+    wave *= random.uniform(0.5, 1) * WAVES * 2 * np.pi / np.linalg.norm(wave)
+    return np.asarray(np.cos(points @ wave + random.uniform(0, 2 * np.pi)))
+
+
+class Values(Protocol):
+    """What `scene.Selection` has of this kind: the parameters of a scene, or what they are functions of."""
+
+    @property
+    def params(self) -> mi.SceneParameters:
+        """All of the scene's `mi.traverse`."""
+        ...
+
+    def value(self, key: str) -> Any:
+        """The current value of `key`, as Dr.Jit has it."""
+        ...
+
+    def hand_over(self, values: Mapping[str, Any]) -> None:
+        """Give the scene these values, and evaluate what follows from them, derivatives included."""
+        ...
+
+    def collect(self) -> None:
+        """Bring the gradients of what is in the scene on to the values that were handed over."""
+        ...
+
+    def push(self) -> None:
+        """Bring tangents of the values that were handed over, once propagated, on to what is in the scene."""
+        ...
+
+
+class SceneValues:
+    """A scene's own parameters."""
+
+    def __init__(self, scene: mi.Scene) -> None:
+        self.params = mi.traverse(scene)
+
+    def value(self, key: str) -> Any:
+        """The parameter `key`."""
+        return self.params[key]
+
+    def hand_over(self, values: Mapping[str, Any]) -> None:
+        """Set parameters. Textures pad their storage, and the normals of meshes follow, ahead of the next step."""
+        for key, value in values.items():
+            self.params[key] = value
+        self.params.update()
+        dr.eval([self.params[key] for key in values], settle(self.params, values))
+
+    def collect(self) -> None:
+        """They are in the scene: nothing is to be done."""
+
+    def push(self) -> None:
+        """They are in the scene: nothing is to be done."""
+
+
+#: Steps that are tried, in units of the direction.
+STEPS = (0.1, 0.01, 0.001)
+
+
+#: How many seeds the comparison may have, by which the noise of a single one is judged.
+PLANNED_SEEDS = 16
+
+
+@dataclass(frozen=True)
+class Direction:
+    """A direction in the space of all parameters (P,), whose entries are in the parameters' own units.
+
+    `sides` are as in `Case.difference`; `step` is in units of `vector`, `truncation` the error that it brings, a bound
+    on its absolute value, in units of the difference.
+    """
+
+    vector: np.ndarray
+    sides: str
+    step: float = STEPS[0]
+    truncation: float = 0.0
+
+    def difference(self, case: Case, integrator: Any, seed: int, spp: int) -> float:
+        """The objective's derivative along the direction."""
+        return case.difference(integrator, self.vector, seed, spp, self.step, self.sides)
+
+
+def directions(case: Case, key: str, bounds: tuple[float, float], count: int, seed: int = 3) -> list[Direction]:
+    """Up to `count` directions along which the parameter `key` alone changes, and can without leaving its `bounds`.
+
+    All entries of the first grow, so that nothing cancels; in the others signs are random. Where some entry is too near
+    to a bound for the largest step, differences are one-sided, and every entry moves away from the bound it is nearer
+    to. Entries are 0.5 to 1 of the width of the bounds, or of the parameter's own size where these are infinite.
+    """
+    random, found = np.random.default_rng(seed), []
+    values, (low, high) = case.initial[key], bounds
+    scale = high - low if np.isfinite(high - low) else float(np.sqrt(np.mean(values**2))) or 1.0
+    reach = STEPS[0] * scale
+    near_a_bound = bool(np.any(values - reach < low) or np.any(values + reach > high))
+    inward = np.where(high - values >= values - low, 1.0, -1.0)
+    for number in range(min(count, len(values))):
+        size = scale * random.uniform(0.5, 1.0, len(values))
+        signs = np.ones(len(values)) if number == 0 else random.choice([-1.0, 1.0], len(values))
+        row = size * (inward if near_a_bound else signs)
+        found.append(Direction(_embed(case, key, row), "up" if near_a_bound else "both"))
+    return found
+
+
+def moving_directions(case: Case, key: str, extent: float, count: int) -> list[Direction]:
+    """Directions along which a parameter that moves light changes smoothly (`moving.smooth_rows`)."""
+    rows = smooth_rows(key, case.values.value(key), extent, count)
+    return [Direction(_embed(case, key, row), "both") for row in rows]
+
+
+def choose_step(case: Case, integrator: Any, direction: Direction, seeds: Sequence[int], spp: int) -> Direction:
+    """The same direction with the step of the least error, estimated from differences at these seeds, two at least."""
+    samples = {
+        step: np.array([replace(direction, step=step).difference(case, integrator, seed, spp) for seed in seeds])
+        for step in STEPS
+    }
+    best, least, before = direction, np.inf, np.inf
+    for larger, smaller in pairwise(STEPS):
+        change = samples[larger] - samples[smaller]
+        spread = float(change.std(ddof=1))
+        changed = abs(float(change.mean())) + spread / np.sqrt(len(seeds))
+        # Kinks make errors that shrink as h does, no slower.
+        truncation = changed / ((larger / smaller) ** 2 - 1) if changed <= before * smaller / larger else changed
+        before = changed
+        error = truncation + spread / np.sqrt(PLANNED_SEEDS)
+        if error < least:
+            best, least = replace(direction, step=smaller, truncation=truncation), error
+    return best
+
+
+def natural_bounds(kind: str, values: np.ndarray) -> tuple[float, float]:
+    """What a parameter of this kind (`ParameterInfo.kind`) may be: 0 to 1 for what a BSDF has, where it is so now."""
+    if kind != "emitter" and np.all((values >= 0) & (values <= 1)):
+        return 0.0, 1.0
+    return (0.0, np.inf) if np.all(values >= 0) else (-np.inf, np.inf)
+
+
+def _embed(case: Case, key: str, row: np.ndarray) -> np.ndarray:
+    """A row of one parameter among zeros for the others."""
+    return np.concatenate([row if other == key else np.zeros(len(v)) for other, v in case.initial.items()])
 
 
 class Case:
@@ -65,7 +293,7 @@ class Case:
         """A row of values as the parameter's type."""
         import drjit as dr
 
-        from reslrb_cli.backend.own_memory import own_memory
+        from reslrb_cli.backend.memory import own_memory
 
         now, array = self.values.value(key), np.asarray(row, np.float32)
         kind = type(now)

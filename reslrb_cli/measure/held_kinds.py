@@ -1,7 +1,7 @@
 """Kinds of gradients that have one dL/dI, each sampled in a process of its own: what figures of the paper compare.
 
-The processes load `held.py`, which holds dL/dI at a reference image's; this module knows no Mitsuba. Seeds differ
-between kinds, but for those that are asked to share them.
+The processes load `fixed_adjoint.py`, which holds dL/dI at a reference image's; this module knows no Mitsuba. Seeds
+differ between kinds, but for those that are asked to share them.
 """
 
 from __future__ import annotations
@@ -12,17 +12,25 @@ from typing import Any
 
 import numpy as np
 
-from reslrb_cli.config import Config, Reslrb, dump
+from reslrb_cli.config.integrators import Reslrb as ReslrbConfig
+from reslrb_cli.config.loader import dump
+from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.measure.processes import Ended, Process
 from reslrb_cli.measure.tasks import start_process
 from reslrb_cli.seeds import seed
 
 MIB = 2**20
+
+
 #: On a GPU address space says nothing of the memory that arrays take.
 VARIANT = "llvm_ad_rgb"
+
+
 #: Who takes gradients: the experiment's own integrator.
 OWN = "own"
+
+
 _ADJOINT = "adjoint.npy"
 
 
@@ -59,7 +67,7 @@ def check_config(config: Config) -> str:
     integrator = config.integrator
     if config.variant not in ("auto", VARIANT):
         raise ConfigError(config.source, "variant", f"must be auto or {VARIANT}: the limit bounds address space alone")
-    if not isinstance(integrator, Reslrb) or integrator.estimator == "auto":
+    if not isinstance(integrator, ReslrbConfig) or integrator.estimator == "auto":
         raise ConfigError(config.source, "integrator.estimator", "must name an estimator of `reslrb`")
     if integrator.max_depth < 0:
         raise ConfigError(config.source, "integrator.max_depth", "must be a limit: paths are traced without roulette")

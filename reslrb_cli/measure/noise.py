@@ -7,11 +7,13 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import stats
 
-from reslrb_cli.measure.statistics import ALPHA
-from reslrb_cli.records.gradcheck import Verdict
+from reslrb_cli.measure.comparison import ALPHA
+from reslrb_cli.records.measurements import Verdict
 
 #: Of the interval that is told; whether the expected ratio holds is asked at `ALPHA`.
 CONFIDENCE = 0.95
+
+
 #: A ratio that is known no better than by this factor, less 1, says nothing.
 WIDEST = 0.2
 

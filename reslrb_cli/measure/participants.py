@@ -9,40 +9,56 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
-from reslrb_cli.config import Config
+from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.estimators import ESTIMATORS
-from reslrb_cli.integrators import known_step, make_integrator
-from reslrb_cli.integrators.interface import StepIntegrator
-from reslrb_cli.measure import cornell_box
-from reslrb_cli.measure.cases import Case as Listed
-from reslrb_cli.measure.differences import Direction, choose_step, directions, moving_directions, natural_bounds
-from reslrb_cli.measure.film import shrink
-from reslrb_cli.measure.gradients import Case, seeds
-from reslrb_cli.measure.known import known_gradient
-from reslrb_cli.measure.moving import moves_light, smooth_weights
+from reslrb_cli.integrators.protocol import StepIntegrator
+from reslrb_cli.integrators.step import known_step, make_integrator
+from reslrb_cli.measure.gradients import (
+    Case,
+    Direction,
+    choose_step,
+    directions,
+    moves_light,
+    moving_directions,
+    natural_bounds,
+    seeds,
+    smooth_weights,
+)
+from reslrb_cli.measure.methods import Case as Listed
 from reslrb_cli.measure.references import (
     Situation,
     ends,
-    interior,
+    known_gradient,
     path_image,
     prb_gradient,
     prb_image,
     ptracer_gradient,
     ptracer_image,
 )
-from reslrb_cli.optimization.problem import assemble_scene
-from reslrb_cli.records.gradcheck import Reference
+from reslrb_cli.measure.scenes import small
+from reslrb_cli.measure.stepper import shrink
+from reslrb_cli.optimization.assemble import assemble_scene
+from reslrb_cli.records.measurements import Reference
 from reslrb_cli.scene.catalog import parameter_kind, value_shape
+from reslrb_cli.scene.visibility import interior
 
 #: Light paths of one gradient, as near as whole samples per pixel come.
 PATHS = 2**16
+
+
 #: Directions of finite differences and of forward mode for each parameter.
 DIRECTIONS = 2
+
+
 #: The same of parameters that move light.
 MOVING_DIRECTIONS = 3
+
+
 #: A depth at which roulette never begins.
 NEVER = 1_000_000
+
+
 #: What attached derivatives that are compared with each reference have, where that is not as the user has it. Naive AD
 #: follows everywhere, and `ptracer` does not differentiate the filter's normalisation, as differences do.
 ALIKE: dict[Reference, dict[str, str]] = {
@@ -50,10 +66,16 @@ ALIKE: dict[Reference, dict[str, str]] = {
     Reference.PTRACER: {"attached_sampling": "follow", "filter_normalization": "detached"},
     Reference.FINITE_DIFFERENCE: {"filter_normalization": "attached"},
 }
+
+
 #: References that trace paths from the sensor, of which the film's border takes nothing.
 CAMERA_PATHS = {Reference.PRB, Reference.PATH}
+
+
 #: The integrator whose images are differenced: ours, without roulette where paths end without.
 DIFFERENCED = "differenced"
+
+
 #: Seeds that the step of finite differences is chosen with.
 PILOT_SEEDS = 2
 
@@ -99,8 +121,8 @@ class Participants:
         # Whatever moves, an estimator that follows it can be made.
         able = [case.label for case in settings.integrators if ESTIMATORS[case.options["estimator"]].attaches]
         first = (configs[able[0]] if able else next(iter(configs.values()))).with_exposures_fixed()
-        built_in = config.scene.file == cornell_box.FILE
-        problem = assemble_scene(first, cornell_box.build(config.scene.options) if built_in else None)
+        built_in = config.scene.file == small.FILE
+        problem = assemble_scene(first, small.build(config.scene.options) if built_in else None)
         scene, sensor = problem.scene, problem.sensors[0]
         shrink(scene, sensor, PATHS)
         self.case = Case.of(scene, problem.selection.keys, sensor, problem.selection)

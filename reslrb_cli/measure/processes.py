@@ -17,13 +17,19 @@ from pathlib import Path
 from typing import Any
 
 from reslrb_cli.errors import ReslrbError, mentions_memory
-from reslrb_cli.records.bench import BenchStatus
+from reslrb_cli.records.measurements import BenchStatus
 
 POLL_SECONDS = 0.05
+
+
 #: How long the end of a killed process is waited for: it may still be writing into its folder.
 ABANDON_SECONDS = 5.0
+
+
 #: A process that crashes with as much of its limit in use is taken to have died of it.
 CLOSE_TO_LIMIT = 0.75
+
+
 #: Signals by which a program ends when it goes on after an allocation that failed.
 _CRASHES = (signal.SIGSEGV, signal.SIGABRT, signal.SIGBUS)
 
@@ -55,25 +61,6 @@ class Refused(ReslrbError):
     def __init__(self, line: str, exit_code: int) -> None:
         super().__init__(line)
         self.exit_code = exit_code  # type: ignore[assignment]
-
-
-#: Those that have not been closed.
-_at_work: list[Process] = []
-#: Held while one is made, and from `abandon_all` on.
-_making = threading.Lock()
-
-
-def abandon_all() -> None:
-    """End all processes and remove their folders, in a program that is about to end; from any thread.
-
-    None is made from then on.
-    """
-    _making.acquire(timeout=ABANDON_SECONDS)
-    for process in list(_at_work):
-        with contextlib.suppress(subprocess.TimeoutExpired):
-            process._process.kill()
-            process._process.wait(timeout=ABANDON_SECONDS)
-        shutil.rmtree(process._folder.name, ignore_errors=True)
 
 
 class Process:
@@ -160,6 +147,27 @@ class Process:
             reason += f" ({self.peak_bytes >> 20} of {self.limit >> 20} MiB in use)"  # type: ignore[operator]
         memory = code == -signal.SIGKILL or mentions_memory(text) or (close and -code in _CRASHES)
         return (BenchStatus.OUT_OF_MEMORY if memory else BenchStatus.FAILED), reason
+
+
+#: Those that have not been closed.
+_at_work: list[Process] = []
+
+
+#: Held while one is made, and from `abandon_all` on.
+_making = threading.Lock()
+
+
+def abandon_all() -> None:
+    """End all processes and remove their folders, in a program that is about to end; from any thread.
+
+    None is made from then on.
+    """
+    _making.acquire(timeout=ABANDON_SECONDS)
+    for process in list(_at_work):
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            process._process.kill()
+            process._process.wait(timeout=ABANDON_SECONDS)
+        shutil.rmtree(process._folder.name, ignore_errors=True)
 
 
 def last_words(text: str) -> str:

@@ -7,21 +7,20 @@ from __future__ import annotations
 
 from typing import Any
 
-from reslrb_cli.backend.python import python_command
+from reslrb_cli.backend.installation import python_command
 from reslrb_cli.measure.processes import Process
-from reslrb_cli.measure.worker import Begin, Begun, run
-
-__all__ = ["run", "start_process"]
+from reslrb_cli.measure.workers import Begin, Begun
 
 
 def start_process(first: dict[str, Any], does: str = "measured_steps") -> Process:
     """A process that does what the function `does` of this file returns; `first` is its first message."""
-    return Process(first, python_command(f"from reslrb_cli.measure.tasks import {does}, run\nrun({does})"))
+    imports = f"from reslrb_cli.measure.tasks import {does}\nfrom reslrb_cli.measure.workers import run"
+    return Process(first, python_command(f"{imports}\nrun({does})"))
 
 
 def measured_steps() -> Begin:
     """Steps as `bench` measures them. Whatever is imported for it is, here and in the function below."""
-    from reslrb_cli.config import loads
+    from reslrb_cli.config.loader import loads
     from reslrb_cli.measure.stepper import Stepper
 
     def begin(first: dict[str, Any]) -> Begun:
@@ -35,34 +34,34 @@ def measured_steps() -> Begin:
 
 def held_gradients() -> Begin:
     """Gradients with dL/dI held, and what they are taken at."""
-    from reslrb_cli.measure.held import begin
+    from reslrb_cli.measure.fixed_adjoint import begin_holding
 
-    return begin
+    return begin_holding
 
 
 def surveyed() -> Begin:
     """What `convergence` asks before it measures."""
-    from reslrb_cli.measure.convergence.survey import begin
+    from reslrb_cli.measure.convergence.setup import begin_survey
 
-    return begin
+    return begin_survey
 
 
 def sampled_steps() -> Begin:
     """Steps as `convergence` measures them, with what they estimate."""
-    from reslrb_cli.measure.convergence.sampler import begin
+    from reslrb_cli.measure.convergence.setup import begin_sampling
 
-    return begin
+    return begin_sampling
 
 
 def judged_runs() -> Begin:
     """What whole optimisations are judged by."""
-    from reslrb_cli.measure.whole_runs.judge import begin
+    from reslrb_cli.measure.optimization_benchmark.evaluate import begin_judging
 
-    return begin
+    return begin_judging
 
 
 def whole_runs() -> Begin:
     """A whole optimisation, bit by bit."""
-    from reslrb_cli.measure.whole_runs.runner import begin
+    from reslrb_cli.measure.optimization_benchmark.evaluate import begin_run
 
-    return begin
+    return begin_run

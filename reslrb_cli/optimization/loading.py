@@ -1,18 +1,79 @@
-"""What an experiment works with: scene, sensors and integrator, loaded and checked."""
+"""What an experiment works with: scene, sensors and integrator, loaded and checked.
+
+Images with many samples, in passes that fit into memory.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
+import drjit as dr
 import mitsuba as mi
+import numpy as np
 
-from reslrb_cli.config import Config, Integrator, Reslrb
+from reslrb_cli.config.integrators import Integrator
+from reslrb_cli.config.integrators import Reslrb as ReslrbConfig
+from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ConfigError, UnsupportedScene
-from reslrb_cli.integrators import StepIntegrator, make_integrator
-from reslrb_cli.scene import check_camera_paths, check_supported, load_scene, scene_needs, stock_clip
-from reslrb_cli.scene.description import Description
-from reslrb_cli.scene.load import warn_once
+from reslrb_cli.integrators.freezing import MOST_PATHS_APART
+from reslrb_cli.integrators.protocol import StepIntegrator
+from reslrb_cli.integrators.reslrb import Reslrb
+from reslrb_cli.integrators.step import make_integrator, render_image
+from reslrb_cli.scene.load import load_scene, warn_once
+from reslrb_cli.scene.needs import check_camera_paths, check_supported, scene_needs, stock_clip
+from reslrb_cli.scene.xml.read import Description
+from reslrb_cli.seeds import seed
+
+#: Paths in one pass. Baselines keep the state of every path in memory; 2**22 of them stay below 2 GB.
+PATHS_PER_PASS = 2**22
+
+
+#: Samples per pixel of images that are saved between the first and the last, at least.
+BETWEEN_SPP = 64
+
+
+def passes(spp: int, pixels: int, multiple: int | None, paths_per_pass: int = PATHS_PER_PASS) -> Iterator[int]:
+    """Yield the samples per pixel of each pass; they sum to `spp`.
+
+    `multiple` is the integrator's `samples_per_pass`, which must divide the samples of every pass (None: no matter);
+    it divides `spp`.
+    """
+    unit = multiple or 1
+    most = max(paths_per_pass // (pixels * unit), 1) * unit
+    while spp > 0:
+        yield min(most, spp)
+        spp -= most
+
+
+def render_in_passes(
+    integrator: Any,
+    scene: Any,
+    sensor: int,
+    spp: int,
+    run_seed: int,
+    iteration: int,
+    purpose: str,
+    multiple: int | None,
+) -> np.ndarray[Any, Any]:
+    """Render `sensor` with `spp` samples per pixel; return the image, (H, W, C) float32.
+
+    Each pass has its own seed, from `run_seed`, `iteration`, `sensor`, `purpose` and the number of the pass; the mean
+    is taken in double precision.
+    """
+    width, height = scene.sensors()[sensor].film().crop_size()
+    pixels = int(width) * int(height)
+    if isinstance(integrator, Reslrb) and min(spp * pixels, PATHS_PER_PASS) > MOST_PATHS_APART:
+        integrator = integrator.with_options(samples_per_pass=integrator.samples_per_pass, freeze=False)
+    total: np.ndarray[Any, Any] | None = None
+    for number, part in enumerate(passes(spp, pixels, multiple)):
+        pass_seed = seed(run_seed, iteration, sensor, f"{purpose}, pass {number}")
+        with dr.suspend_grad():
+            image = np.array(render_image(integrator, scene, sensor, pass_seed, part), dtype=np.float64) * (part / spp)
+        total = image if total is None else total + image
+    assert total is not None, "spp is at least 1"
+    return total.astype(np.float32)
+
 
 #: Types of integrators that trace from the light, and so cannot render every scene.
 LIGHT_TRACERS = ("reslrb", "ptracer", "walk_ad", "trajectory")
@@ -90,7 +151,7 @@ def make_configured(integrator: Integrator) -> StepIntegrator:
 
     What is not decided yet (`guiding`, `sequence`) is off.
     """
-    if isinstance(integrator, Reslrb):
+    if isinstance(integrator, ReslrbConfig):
         auto = integrator.estimator == "auto"
         integrator = integrator.chosen(estimator="reservoir") if auto else integrator.undecided_off()
     options: dict[str, Any] = integrator.options()

@@ -1,4 +1,7 @@
-"""The optimisation loop: it yields records and opens no file."""
+"""The optimisation loop: it yields records and opens no file.
+
+Learning-rate schedules: the factor of iteration i of n, from 1 at the first to `final_fraction` at the last.
+"""
 
 from __future__ import annotations
 
@@ -11,17 +14,50 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from reslrb_cli.integrators import Refused, gradient_step
-from reslrb_cli.optimization.constraints import count_nonfinite, finite_square_norm
+from reslrb_cli.integrators.protocol import Refused
+from reslrb_cli.integrators.step import gradient_step
 from reslrb_cli.optimization.nonfinite import Findings, RefusedAt, zero_nonfinite
+from reslrb_cli.optimization.optimizers import count_nonfinite, finite_square_norm
 from reslrb_cli.optimization.problem import Problem
-from reslrb_cli.optimization.scaling import rescale
-from reslrb_cli.optimization.schedules import learning_rate_factor
+from reslrb_cli.optimization.sensitivity import rescale
 from reslrb_cli.optimization.state import State
 from reslrb_cli.optimization.views import View
 from reslrb_cli.records.clock import peak_mib, reset_peak
 from reslrb_cli.records.metrics import Record
 from reslrb_cli.seeds import seed
+
+
+def constant(progress: float, final_fraction: float) -> float:
+    """1 throughout."""
+    return 1.0
+
+
+def cosine(progress: float, final_fraction: float) -> float:
+    """Half a period of a cosine (Loshchilov and Hutter 2017, without restarts)."""
+    return final_fraction + (1.0 - final_fraction) * 0.5 * (1.0 + math.cos(math.pi * progress))
+
+
+def exponential(progress: float, final_fraction: float) -> float:
+    """The same factor from each iteration to the next."""
+    return float(final_fraction**progress)
+
+
+SCHEDULES: dict[str, Callable[[float, float], float]] = {
+    "constant": constant,
+    "cosine": cosine,
+    "exponential": exponential,
+}
+
+
+def learning_rate_factor(
+    schedule: str, iteration: int, iterations: int, final_fraction: float, least: float = 0.0
+) -> float:
+    """Return the factor of `iteration` (0-based) of `iterations`. Raises KeyError for an unknown schedule.
+
+    `least` (0 to 1) is how far a run is at least, of which less than all iterations will be made.
+    """
+    return SCHEDULES[schedule](max(iteration / max(iterations - 1, 1), least), final_fraction)
+
 
 #: Iterations between two looks at what is held out.
 HELD_OUT_EVERY = 10

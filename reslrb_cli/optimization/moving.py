@@ -1,19 +1,127 @@
-"""Checks of experiments whose parameters move light: located where an integrator, or the scene, cannot follow them."""
+"""Checks of experiments whose parameters move light: located where an integrator, or the scene, cannot follow them.
+
+Light that moves at the film's border, where its derivative is cut off.
+
+A splat that moves across the border leaves the film, or enters it: no sample knows of that, since what lies outside is
+not traced. How much of the derivative is missing goes with how much of what moves lands there.
+
+A word before an optimisation whose moving light crosses the film's border.
+"""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Callable
+from dataclasses import dataclass
 
+import drjit as dr
 import mitsuba as mi
 
-from reslrb_cli.config import Reslrb
+from reslrb_cli.config.integrators import Reslrb as ReslrbConfig
 from reslrb_cli.errors import ConfigError, UnsupportedScene
-from reslrb_cli.integrators import Reslrb as Tracer
-from reslrb_cli.integrators.tracer import LightTracer
-from reslrb_cli.scene.movable import where_moved
+from reslrb_cli.integrators.light_tracer import LightTracer
+from reslrb_cli.integrators.protocol import Job
+from reslrb_cli.integrators.reslrb import Reslrb as Tracer
+from reslrb_cli.optimization.problem import Problem
+from reslrb_cli.scene.deformation import where_moved
+from reslrb_cli.seeds import seed
+from reslrb_cli.transport.bsdf import Scattering
+from reslrb_cli.transport.connection import Connection
+from reslrb_cli.transport.emission import sample_emission
+from reslrb_cli.transport.factors import Product
+from reslrb_cli.transport.samples import Samples
+from reslrb_cli.transport.visible import moving_splats
+from reslrb_cli.transport.walk import Hooks, Vertex, walk
 
-if TYPE_CHECKING:
-    from reslrb_cli.optimization.problem import Problem
+
+def border_share(tracer: LightTracer, job: Job) -> float:
+    """Of the light that a job's parameters move, the share that lands at the film's border: 0 to 1.
+
+    At the border is what the reconstruction filter spreads beyond it. 0 where nothing moves.
+    """
+    with dr.suspend_grad():
+        at_border, total = 0.0, 0.0
+        for samples in tracer.passes(job):
+            if not samples.plan.attached:
+                return 0.0
+            sums: Sums = walk(samples, BorderLight(samples))
+            for u, C, active in moving_splats(samples):
+                sums = sums.plus(samples, u, C, active)
+            at_border += float(dr.sum(sums.at_border)[0])
+            total += float(dr.sum(sums.total)[0])
+    return at_border / total if total > 0 else 0.0
+
+
+@dataclass
+class Sums:
+    """Loop state: whether the path has met anything that moves, and what it has added, at the border and in all."""
+
+    moved: mi.Bool
+    at_border: mi.Float
+    total: mi.Float
+
+    def plus(self, samples: Samples, u: mi.Point2f, C: mi.Spectrum, active: mi.Bool) -> Sums:
+        """The sums with one more contribution (C,) at film position `u`."""
+        light = dr.select(active, dr.sum(dr.abs(C)), 0)
+        return Sums(self.moved, self.at_border + dr.select(is_at_border(samples, u), light, 0), self.total + light)
+
+
+class BorderLight(Hooks):
+    """Sum the contributions behind anything that moves."""
+
+    def __init__(self, samples: Samples) -> None:
+        self.samples, self.plan = samples, samples.plan
+
+    def start(self, product: Product) -> Sums:
+        moved = mi.Bool(False)
+        if self.plan.moving_emitters:
+            emitter = sample_emission(self.samples, self.samples.sampler()).emitter
+            for moving in self.plan.moving_emitters:
+                moved |= emitter == mi.EmitterPtr(moving)
+        return Sums(moved, mi.Float(0), mi.Float(0))
+
+    def connection(self, state: Sums, vertex: Vertex, connection: Connection, numbers: list[mi.Float]) -> Sums:
+        C = vertex.product.times(connection.c, vertex.depth).scaled(self.samples.scale).value()
+        moved = state.moved | self.plan.moves(vertex.si.shape)
+        return state.plus(self.samples, connection.u, C, connection.active & moved)
+
+    def scattering(self, state: Sums, vertex: Vertex, connection: Connection, scattering: Scattering) -> Sums:
+        turned = self.plan.moves(vertex.si.shape) | self.plan.differentiates(vertex.bsdf)
+        return Sums(state.moved | turned, state.at_border, state.total)
+
+
+def is_at_border(samples: Samples, u: mi.Point2f) -> mi.Bool:
+    """Whether film position `u` (pixels, relative to the crop window) is within the filter's radius of the border.
+
+    That is the border of the crop window: sensors see no light beyond it.
+    """
+    radius, size = samples.film.film.rfilter().radius(), samples.film.size
+    inside = dr.minimum(dr.minimum(u.x, int(size.x) - u.x), dr.minimum(u.y, int(size.y) - u.y))
+    return inside < radius
+
+
+#: The share of moving light at the border from which on it is worth a word.
+NOTICED = 0.01
+
+
+#: Samples per pixel that it is measured with.
+SPP = 8
+
+
+def warn_of_border(problem: Problem, warn: Callable[[str], None]) -> None:
+    """Call `warn` with a line for each view in which more than NOTICED of the light that moves lands at the border."""
+    if not isinstance(problem.integrator, LightTracer):
+        return
+    tracer = problem.integrator.with_options(samples_per_pass=None, freeze=False)
+    for index in problem.sensors:
+        sensor = problem.scene.sensors()[index]
+        number = dr.opaque(mi.UInt32, seed(problem.config.run.seed, 0, index, "border"))
+        share = border_share(tracer, Job(problem.scene, sensor, number, SPP, problem.selection.params))
+        if share > NOTICED:
+            warn(
+                f"view {index}: {share:.0%} of the light that moves lands at the film's border, where its derivative "
+                "is cut off; a view in which all of it stays inside has none of that"
+            )
+
 
 #: The estimator of those that `auto` chooses from that has derivatives of what moves light.
 ATTACHED = "stack"
@@ -39,7 +147,7 @@ def check_moving(problem: Problem) -> None:
             f"{kind} has no derivatives of what moves light, as `{moved[0].key}` does; take reslrb or ptracer",
         )
     tracer = problem.integrator
-    if isinstance(config.integrator, Reslrb) and config.integrator.estimator == "auto":
+    if isinstance(config.integrator, ReslrbConfig) and config.integrator.estimator == "auto":
         tracer = Tracer.of(**config.integrator.chosen(estimator=ATTACHED).options())
     for index in problem.sensors:
         sensor = problem.scene.sensors()[index]

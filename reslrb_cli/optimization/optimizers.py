@@ -2,19 +2,142 @@
 
 One optimiser for each parameter rather than one for all, so that a parameter whose gradient is not finite can sit an
 iteration out with its moments and its count of steps as they were.
+
+Reparameterisations: the optimiser moves an unconstrained variable u, the scene gets x = T(u).
+
+    none      x = u
+    sigmoid   x = low + (high - low) / (1 + exp(-u))     between the bounds, which it never reaches
+    log       x = exp(u)                                 positive; a step is a relative change
+    softplus  x = log(1 + exp(u))                        positive; relative well below 1, absolute well above
+
+By the chain rule dL/du = dL/dx T'(u), which is applied to the gradient once it is there: a step's kernels know nothing
+of it. T is increasing, entry by entry.
+
+What a parameter must satisfy: finite values, within its bounds.
+
+A clamp against outliers in gradients: less variance, at the price of a bias, which is measured.
+
+    m_e  running mean of |g_e| over the iterations before (of clamped gradients), decay DECAY
+    r_e = max(m_e, mean of m over the parameter's entries)
+    g_e  is brought into [-k r_e, k r_e]
+
+Rare large values of a Monte Carlo gradient are part of its mean. What the clamp takes of them, R = g - clamped g, is a
+bias as far as it does not cancel over iterations:
+
+    bias = sum_e |sum of R_e| / sum_e |sum of g_e|      inner sums over the iterations so far
+
+The entries' mean stands beside m_e since an entry that few paths reach may have had nothing but zeros. Absolute values
+rather than squares: those of large gradients overflow.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
 import drjit.opt as dropt
+import mitsuba as mi
 import numpy as np
 
-from reslrb_cli.optimization.constraints import clamp, count_nonfinite
-from reslrb_cli.optimization.transforms import Transform, Variable
+from reslrb_cli.records.metrics import Clamped
+
+Bounds = tuple[float, float] | None
+
+
+#: Where u ends: x keeps off the sigmoid's bounds by 1e-7 of their distance, and neither under- nor overflows.
+SIGMOID_END, EXPONENT_END = 16.0, 80.0
+
+
+@dataclass(frozen=True)
+class Transform:
+    """T, its inverse and its derivative T'(u), on arrays of any Dr.Jit type, and the least and greatest u."""
+
+    forward: Callable[[Any], Any]
+    inverse: Callable[[Any], Any]
+    derivative: Callable[[Any], Any]
+    low: float
+    high: float
+
+
+def make_transform(name: str, bounds: Bounds) -> Transform | None:
+    """The transform of that name; None for `none`. `bounds` are those of x. Raises KeyError for an unknown name."""
+    low, high = bounds or (-math.inf, math.inf)
+    if name == "none":
+        return None
+    if name == "sigmoid":
+        return Transform(
+            forward=lambda u: low + (high - low) * _logistic(u),
+            inverse=lambda x: dr.log((x - low) / (high - x)),
+            derivative=lambda u: (high - low) * _logistic(u) * _logistic(-u),
+            low=-SIGMOID_END,
+            high=SIGMOID_END,
+        )
+    forward, inverse, derivative, end = {
+        "log": (dr.exp, dr.log, dr.exp, EXPONENT_END),
+        "softplus": (_softplus, _inverse_softplus, _logistic, math.inf),
+    }[name]
+    least = -EXPONENT_END if low <= 0 else max(float(inverse(low)), -EXPONENT_END)
+    return Transform(forward, inverse, derivative, least, end if math.isinf(high) else min(float(inverse(high)), end))
+
+
+def _logistic(u: Any) -> Any:
+    return 1 / (1 + dr.exp(-u))
+
+
+def _softplus(u: Any) -> Any:
+    small = dr.exp(-dr.abs(u))
+    return dr.maximum(u, 0.0) + 2 * dr.atanh(small / (2 + small))  # log(1 + s), exact for a small s too
+
+
+def _inverse_softplus(x: Any) -> Any:
+    half = 0.5 * dr.minimum(x, 60.0)  # beyond, the logarithm of exp(x) - 1 = 2 sinh(x/2) exp(x/2) is x
+    return x + dr.log(2 * dr.sinh(half)) - half
+
+
+@dataclass
+class Variable:
+    """What the optimiser moves in place of a parameter x: v, with x = T(length * v), x within its bounds.
+
+    The gradient that it is given is `gain` times dL/dv. Both numbers are 1 until they are measured (`sensitivity.py`),
+    and reach kernels as data, so that their values compile nothing.
+    """
+
+    transform: Transform | None
+    bounds: Bounds
+    length: float = 1.0
+    gain: float = 1.0
+
+    def to_scene(self, v: Any) -> Any:
+        """x of v."""
+        u = v * _opaque(v, self.length)
+        x = u if self.transform is None else self.transform.forward(u)
+        return x if self.bounds is None else dr.clip(x, self.bounds[0], self.bounds[1])  # rounding may have left them
+
+    def from_scene(self, x: Any) -> Any:
+        """v of x."""
+        u = x if self.transform is None else self.transform.inverse(x)
+        return self.clamp(u * _opaque(x, 1 / self.length))
+
+    def clamp(self, v: Any) -> Any:
+        """v where its x is within the bounds, else the nearest that is."""
+        ends = self.bounds if self.transform is None else (self.transform.low, self.transform.high)
+        if ends is None:
+            return v
+        return dr.clip(v, *(_opaque(v, end / self.length) for end in ends))
+
+    def chain(self, v: Any, gradient: Any) -> Any:
+        """`gain` times dL/dv, of dL/dx."""
+        result = gradient * _opaque(v, self.length) * _opaque(v, self.gain)
+        if self.transform is None:
+            return result
+        return result * self.transform.derivative(v * _opaque(v, self.length))
+
+
+def _opaque(like: Any, number: float) -> Any:
+    return dr.opaque(dr.leaf_t(like), number)
 
 
 def adam(learning_rate: float, beta_1: float = 0.9, beta_2: float = 0.999, epsilon: float = 1e-8) -> Any:
@@ -45,6 +168,7 @@ def sgd(learning_rate: float, momentum: float = 0.0) -> Any:
 
 #: Yields a stored array, by its name, of the type and shape of another.
 Take = Callable[[str, Any], Any]
+
 
 OPTIMIZERS: dict[str, Callable[..., Any]] = {"adam": adam, "adamw": adamw, "rmsprop": rmsprop, "sgd": sgd}
 
@@ -254,3 +378,83 @@ def _leaf(value: Any) -> Any:
     dr.make_opaque(copy)
     dr.enable_grad(copy)
     return copy
+
+
+def clamp(value: Any, bounds: tuple[float, float] | None) -> Any:
+    """Project `value` onto `bounds` (low, high), after an update. None, or an infinite side, is no bound."""
+    return value if bounds is None else dr.clip(value, bounds[0], bounds[1])
+
+
+def flat(value: Any) -> Any:
+    """All entries of a tensor or a (nested) array in a row."""
+    return value.array if dr.is_tensor_v(value) else dr.ravel(value)
+
+
+def count_nonfinite(value: Any) -> Any:
+    """The number of NaN and infinite entries of a tensor or a (nested) array, as a width-1 array."""
+    return dr.count(~dr.isfinite(flat(value)))
+
+
+def finite_square_norm(value: Any) -> Any:
+    """The sum of squares of the finite entries, as a width-1 array."""
+    entries = flat(value)
+    return dr.sum(dr.select(dr.isfinite(entries), dr.square(entries), 0.0))
+
+
+DECAY = 0.95
+
+
+class GradientClamp:
+    """Clamps gradients at `factor` (k) times what is usual for them; the first iteration is only looked at."""
+
+    def __init__(self, factor: float) -> None:
+        self.factor = factor
+        #: By parameter: iterations, m (which starts at 0, corrected for as in Adam), and the sums of R and g.
+        self._state: dict[str, tuple[int, Any, Any, Any]] = {}
+
+    def state(self) -> tuple[dict[str, int], dict[str, Any]]:
+        """What it knows: the iterations of each parameter, and arrays by `<key>/<what>`."""
+        names = ("usual", "removed", "total")
+        arrays = {
+            f"{key}/{name}": value
+            for key, state in self._state.items()
+            for name, value in zip(names, state[1:], strict=True)
+        }
+        return {key: state[0] for key, state in self._state.items()}, arrays
+
+    def restore(self, iterations: Mapping[str, int], parameters: Mapping[str, Any], take: Take) -> None:
+        """Go on from what `state` said of these parameters; `take(name, like)` is the array of a name."""
+        for key, count in iterations.items():
+            like = dr.detach(parameters[key])
+            usual, removed, total = (take(f"{key}/{name}", like) for name in ("usual", "removed", "total"))
+            self._state[key] = count, usual, removed, total
+
+    def apply(self, parameters: Mapping[str, Any]) -> Clamped:
+        """Clamp the gradients of these parameters, which are finite, in place; what was done, and its bias so far."""
+        counts, sums = {}, {}
+        for key, parameter in parameters.items():
+            g = clamped = dr.grad(parameter)
+            zero = dr.zeros(type(g), dr.shape(g))
+            iterations, m, removed, total = self._state.get(key, (0, zero, zero, zero))
+            if iterations:
+                # Opaque: as a literal it would compile a kernel each iteration.
+                usual = m * dr.opaque(mi.Float, 1 / (1 - DECAY**iterations))
+                limit = self.factor * dr.maximum(usual, dr.mean(flat(usual)))
+                clamped = dr.clip(g, -limit, limit)
+                dr.set_grad(parameter, clamped)
+            R = g - clamped
+            m = m + (dr.abs(clamped) - m) * (1 - DECAY)
+            self._state[key] = iterations + 1, m, removed + R, total + g
+            counts[key] = dr.count(flat(R) != 0)
+            sums[key] = [dr.sum(dr.abs(flat(value))) for value in (R, g, *self._state[key][2:])]
+        dr.eval(counts, sums, [state[1:] for state in self._state.values()])
+        values = {key: [float(value[0]) for value in row] for key, row in sums.items()}
+        return Clamped(
+            entries=sum(int(count[0]) for count in counts.values()),
+            share={key: _ratio(row[0], row[1]) for key, row in values.items()},
+            bias={key: _ratio(row[2], row[3]) for key, row in values.items()},
+        )
+
+
+def _ratio(part: float, whole: float) -> float:
+    return part / whole if part else 0.0

@@ -12,56 +12,75 @@ up to what single precision resolves). `length` is how far the parameter would h
 target hold, by least squares over those pixels that it changes at all: for a light alone in its scene its own
 intensity, for a wall its own albedo, whatever share of the picture they have. h is chosen so that the image changes by
 about 3 %, so that neither rounding nor curvature decides.
+
+Gradient samples: steps that measure, and leave the parameters as they are.
+
+Units in which one learning rate serves parameters of any sensitivity (`scale: auto`).
+
+Step lengths from `Sensitivity.length` make all parameters equally fast, and dividing gradients by the root mean square
+of a sample keeps an absolute epsilon, as Adam has it, out of the matter.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from reslrb_cli.integrators import first_channels, render_image
-from reslrb_cli.optimization.samples import sample_gradient, take_gradient
+from reslrb_cli.integrators.protocol import first_channels
+from reslrb_cli.integrators.step import gradient_step, render_image
+from reslrb_cli.optimization.decisions import Scaled, Sensitivity
+from reslrb_cli.optimization.optimizers import Bounds, Transform, Variable
 from reslrb_cli.seeds import seed
 
 if TYPE_CHECKING:
     from reslrb_cli.optimization.problem import Problem
 
+
+def sample_gradient(problem: Problem, integrator: Any, round: int, purpose: str, spp: int) -> dict[str, Any]:
+    """One step of all views, evaluated, with the seeds of `round` and `purpose`.
+
+    Returns the gradient of each parameter as it is accumulated in `problem.optimizer`; `take_gradient` has to follow.
+    """
+    run = problem.config.run
+    for view in problem.trained:
+        step = gradient_step(
+            integrator, problem.scene, view.sensor, view.objective, seed=seed(run.seed, round, view.sensor, purpose),
+            **{**problem.config.step_options(), "spp": spp}, params=problem.selection.params,
+            on_samples=problem.on_samples(view),
+        )  # fmt: skip
+        gradients = problem.gradients()
+        dr.eval(step.loss, gradients)
+    return gradients
+
+
+def take_gradient(problem: Problem) -> dict[str, np.ndarray[Any, Any]]:
+    """The gradients that have been accumulated, each in a row, 0 where they are not finite; they are cleared."""
+    taken = {}
+    for key, value in problem.gradients().items():
+        gradient = np.array(value, dtype=np.float32)
+        taken[key] = np.nan_to_num(gradient, nan=0.0, posinf=0.0, neginf=0.0).ravel()
+        problem.optimizer.clear_gradient(key)
+    return taken
+
+
 Array = np.ndarray[Any, Any]
+
 
 #: The part of the image that a change of h replaces: aimed at, and good enough.
 AIM, LEAST, MOST = 0.03, 0.003, 0.3
+
+
 #: Renderings for each parameter, at most, until h is found.
 TRIALS = 8
+
+
 _PURPOSE = "conditioning"
-
-
-@dataclass(frozen=True)
-class Sensitivity:
-    """What was measured of one parameter of `entries` numbers, in the scene's units.
-
-    `value`, `gradient` and `noise` are root mean squares over the entries: of the values, of the gradient (0 where the
-    samples do not tell it from noise), of the standard deviation of one sample (one step's gradient). `change` is
-    relative, per unit; it, `curvature` (loss per unit²) and `length` are None where no change of the image was seen.
-    """
-
-    key: str
-    entries: int
-    value: float
-    gradient: float
-    noise: float
-    change: float | None = None
-    curvature: float | None = None
-    length: float | None = None
-
-    def to_json(self) -> dict[str, Any]:
-        """As a mapping for JSON."""
-        return asdict(self)
 
 
 def measure_sensitivities(problem: Problem, samples: int) -> list[Sensitivity]:
@@ -156,3 +175,75 @@ def see_images(problem: Problem) -> list[Array]:
 def rms(values: Array) -> float:
     """The root mean square of all entries."""
     return float(np.sqrt(np.mean(np.square(values, dtype=np.float64))))
+
+
+#: Gradient samples that a run takes.
+SAMPLES = 4
+
+
+#: What the optimiser moves in place of a parameter x, by transform.
+_MOVED = {
+    "none": "",
+    "log": " in its logarithm",
+    "sigmoid": " in its logit between the bounds",
+    "softplus": " in log(exp(x) - 1)",
+}
+
+
+def rescale(problem: Problem) -> list[Scaled]:
+    """Measure, and let the optimiser move each parameter in units of what was found; return that.
+
+    A parameter without an effect on the image stays as it is.
+    """
+    optimizer = problem.optimizer
+    measured = [Scaled(**row.to_json()) for row in measure_sensitivities(problem, SAMPLES)]
+    for place, row in enumerate(measured):
+        size = math.hypot(row.gradient, row.noise)  # of what one step hands the optimiser
+        if row.length is None or size == 0:
+            continue
+        variable, value = optimizer.variable(row.key), dr.detach(optimizer[row.key])
+        length = own_length(variable.transform, variable.bounds, value, row.length)
+        unit = Variable(variable.transform, variable.bounds, length)
+        slope = np.array(unit.chain(unit.from_scene(value), type(value)(size)), dtype=np.float64)
+        unit.gain = 1 / rms(slope)
+        optimizer.set_variable(row.key, unit)
+        rate = problem.selection.spec(row.key).learning_rate or problem.config.optimizer.learning_rate
+        measured[place] = replace(row, own_length=length, first_step=_first_step(unit, value, rate))
+    problem.apply()
+    return measured
+
+
+def _first_step(unit: Variable, value: Any, rate: float) -> float:
+    """How far a step of `rate` moves the scene's `value`, upwards or downwards, whichever is farther."""
+    v = unit.from_scene(value)
+    up, down = (dr.abs(unit.to_scene(v + side * rate) - value) for side in (1, -1))
+    return rms(np.array(dr.maximum(up, down)))
+
+
+def own_length(transform: Transform | None, bounds: Bounds, value: Any, length: float) -> float:
+    """What `length`, of the scene's `value`, is in the optimiser's variable: a mean over the entries."""
+    if transform is None:
+        return length
+    low, high = bounds or (-math.inf, math.inf)
+    if math.isfinite(low) and math.isfinite(high):  # half way to the farther bound, at most
+        room = dr.select(value < 0.5 * (low + high), high - value, low - value)
+        moved = value + dr.clip(room, -2 * length, 2 * length) / 2
+    else:
+        moved = value + length
+    distance = np.array(dr.abs(transform.inverse(moved) - transform.inverse(value)), dtype=np.float64)
+    return float(distance.mean())
+
+
+def step_line(row: Scaled, transform: str, learning_rate: float) -> str:
+    """What the user is told of one parameter; `transform` and `learning_rate` are those of its configuration.
+
+    A step is in units of what the optimiser moves; what that is of the parameter itself is told for the first one.
+    """
+    if row.own_length is None:
+        lacks = "no effect on the image" if row.length is None else "no gradient"
+        return f"{row.key} has {lacks} where it starts; it is not scaled"
+    first = f"about {row.first_step or 0.0:.3g}"
+    if transform == "log":
+        first = f"a factor of {math.exp(min(row.own_length * learning_rate, 700.0)):.3g}, up or down"
+    steps = f"{row.own_length:.3g} times the learning rate{_MOVED[transform]}"
+    return f"{row.key} moves in steps of {steps}, at first by {first}"

@@ -5,30 +5,217 @@ place, with its unit and gain (transforms, `scale: auto`); what the clamp knows 
 been finite; what guided emission has learned; the number of iterations done, from which seeds, views and the schedule's
 factor follow; the clock and the memory's peak. Nothing else decides what the next iteration does: from equal states
 equal ones follow.
+
+Values of the optimisation as NumPy arrays, and back, bit by bit.
+
+A state that was stored, read strictly: each value is of the kind, the shape and the range that a run can have.
+
+What an earlier process has settled for a run: where it began, estimator, passes, masks, how samples are drawn.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import drjit as dr
 import numpy as np
 
-from reslrb_cli.integrators import Reslrb
-from reslrb_cli.integrators.guiding import Guiding
-from reslrb_cli.optimization.arrays import to_array
-from reslrb_cli.optimization.clamping import GradientClamp
+from reslrb_cli.backend.memory import own_memory
+from reslrb_cli.errors import ConfigError
+from reslrb_cli.guiding.tables import Guiding
+from reslrb_cli.integrators.reslrb import Reslrb
+from reslrb_cli.optimization.autotune import sampling
+from reslrb_cli.optimization.autotune.choice import Option, is_auto
+from reslrb_cli.optimization.autotune.efficiency import Outcome
+from reslrb_cli.optimization.decisions import Estimate, MemoryPlan, Scaled, Sensitivity
 from reslrb_cli.optimization.nonfinite import NonFinitePolicy
-from reslrb_cli.optimization.scaling import Scaled
-from reslrb_cli.optimization.stored import Stored, stored_value
+from reslrb_cli.optimization.optimizers import GradientClamp
+from reslrb_cli.records.checkpoint import Archive
 from reslrb_cli.records.clock import StepClock
+from reslrb_cli.records.decisions import GuidedRecord, PaidRecord, SequenceRecord
 
 if TYPE_CHECKING:
     from reslrb_cli.optimization.problem import Problem
 
+
 Array = np.ndarray[Any, Any]
+
+
+def to_array(value: Any) -> Array:
+    """A Dr.Jit value, of any type, without derivatives; a number for one that is one."""
+    return np.array(dr.detach(value) if dr.is_array_v(value) else value)
+
+
+def like(value: Any, array: Array) -> Any:
+    """`array` as a value of the type of `value`, in Dr.Jit's own memory.
+
+    `value` and `array` have one shape (`to_array`). A number that was part of a kernel's code (a literal, as Adam's
+    count of steps) is so again, so that the same kernel results.
+    """
+    kind = type(value)
+    if not dr.is_array_v(value):
+        return kind(array)
+    if dr.depth_v(kind) == 1 and not dr.is_tensor_v(kind):
+        if value.state == dr.VarState.Literal:
+            return kind(array.ravel()[0].item())
+        return own_memory(kind, array)
+    if dr.is_tensor_v(kind):
+        return kind(own_memory(dr.array_t(kind), array.ravel()), tuple(array.shape))
+    parts = [like(part, np.ascontiguousarray(each)) for part, each in zip(value, array, strict=True)]
+    return kind(*parts)
+
+
+T = TypeVar("T")
+
+
+_TYPES = {dr.VarType.Float32: "float32", dr.VarType.Float64: "float64", dr.VarType.UInt32: "uint32"}
+
+
+class Stored:
+    """The arrays of an archive and the JSON beside them. Whatever asks for what is not so raises ConfigError, located
+    in the file and by the name of the value."""
+
+    def __init__(self, archive: Archive, values: Mapping[str, Any]) -> None:
+        self.archive, self._values = archive, values
+
+    @property
+    def path(self) -> Path:
+        """The file."""
+        return self.archive.path
+
+    def wrong(self, name: str, message: str) -> ConfigError:
+        """The error for a value."""
+        return ConfigError(self.path, name, f"{message}: not as a run writes it")
+
+    # --- arrays -------------------------------------------------------------------------------------------------------
+
+    def take(self, name: str, other: T) -> T:
+        """The array of a name, of the type and shape of `other`; what is added up may be infinite, never NaN."""
+        wanted = np.dtype(_TYPES[dr.type_v(other)])
+        head = self.archive.heads.get(name)
+        if head is not None and head.dtype != wanted:
+            raise self.wrong(name, f"is {head.dtype} in place of {wanted}")
+        result: T = like(other, self.archive.array(name, tuple(dr.shape(other)), values="no NaN"))
+        return result
+
+    def scene_value(self, problem: Problem, prefix: str, key: str) -> Any:
+        """The value of the parameter `key` that is stored as `<prefix>/<key>`, finite and within its bounds, as the
+        optimiser has it."""
+        now = dr.detach(problem.optimizer[key])
+        name, shape = f"{prefix}/{key}", problem.selection.array(key).shape
+        if math.prod(shape) != math.prod(dr.shape(now)):  # an environment map, whose halo the value does not show
+            name, shape = f"{prefix} with halo/{key}", tuple(dr.shape(now))
+        array = self.archive.array(name, shape, "f")
+        if array.dtype != np.float32:
+            raise self.wrong(name, f"is {array.dtype} in place of float32")
+        self.check_bounds(problem, name, key, array)
+        return like(now, array.reshape(dr.shape(now)))
+
+    def check_bounds(self, problem: Problem, name: str, key: str, array: Array) -> None:
+        """Raise ConfigError where an entry of the value `name` of the parameter `key` is none that a run comes to.
+
+        A run goes on with the bounds that it began with, and each of its updates ends within them: what lies outside
+        was not written by it. (Bounds cannot change: `recording.changes`.)
+        """
+        spec = problem.selection.spec(key)
+        low, high = spec.bounds or (-math.inf, math.inf)
+        if spec.transform in ("log", "softplus"):
+            low = max(low, np.finfo(np.float32).tiny)  # these yield nothing else
+        outside = (array < np.float32(low)) | (array > np.float32(high))
+        if outside.any():
+            raise self.wrong(name, f"holds {array[outside].flat[0]:g}, outside of {low:g} to {high:g}, its bounds")
+
+    # --- plain values -------------------------------------------------------------------------------------------------
+
+    def value(self, *path: str) -> Any:
+        """What stands at a place of the JSON; None where nothing does."""
+        at: Any = self._values
+        for part in path:
+            at = at.get(part) if isinstance(at, dict) else None
+        return at
+
+    def keys_of(self, name: str, known: Mapping[str, Any]) -> list[str]:
+        """The keys of a mapping, all of which are known."""
+        found = self.value(name)
+        if not isinstance(found, dict):
+            raise self.wrong(name, "is no mapping")
+        for key in found:
+            if key not in known:
+                raise self.wrong(f"{name}.{key}", "is of a parameter that the run does not have")
+        return list(found)
+
+    def count(self, *path: str, least: int = 1) -> int:
+        """An integer of 31 bits, at least `least`."""
+        value = self.value(*path)
+        if type(value) is not int or not least <= value < 2**31:
+            raise self.wrong(".".join(path), "is no count")
+        return value
+
+    def number(self, *path: str) -> float:
+        """A number that is finite and not negative."""
+        value = self.value(*path)
+        if not is_number(value) or value < 0:
+            raise self.wrong(".".join(path), "is no number")
+        return float(value)
+
+    def numbers(self, *path: str) -> list[float]:
+        """A list of numbers; NaN in place of null, as which JSON has what was not finite."""
+        value = self.value(*path)
+        if not isinstance(value, list) or not all(each is None or is_number(each) for each in value):
+            raise self.wrong(".".join(path), "is no list of numbers")
+        return [math.nan if each is None else float(each) for each in value]
+
+    def pair(self, *path: str) -> tuple[float, float]:
+        """Two positive numbers."""
+        found = self.numbers(*path)
+        if len(found) != 2 or not min(found) > 0:
+            raise self.wrong(".".join(path), "is no pair of positive numbers")
+        return found[0], found[1]
+
+    def text(self, *path: str) -> str:
+        """Text."""
+        value = self.value(*path)
+        if not isinstance(value, str):
+            raise self.wrong(".".join(path), "is no text")
+        return value
+
+    def texts(self, *path: str) -> list[str]:
+        """A list of texts."""
+        value = self.value(*path)
+        if not isinstance(value, list) or not all(isinstance(each, str) for each in value):
+            raise self.wrong(".".join(path), "is no list of texts")
+        return value
+
+    def scaling(self, keys: Sequence[str]) -> list[dict[str, Any]] | None:
+        """What `scale: auto` measured of each parameter; None where it has not."""
+        rows = self.value("scaling")
+        if rows is None:
+            return None
+        names = {field.name for field in fields(Sensitivity)} | {"own_length", "first_step"}
+        if not isinstance(rows, list) or [isinstance(row, dict) and row.get("key") for row in rows] != list(keys):
+            raise self.wrong("scaling", "does not have the run's parameters")
+        for row in rows:
+            others = [value for name, value in row.items() if name != "key"]
+            if set(row) != names or not all(value is None or is_number(value) for value in others):
+                raise self.wrong("scaling", f"of {row['key']} is not what is measured")
+        return rows
+
+
+def is_number(value: Any) -> bool:
+    """Whether a value of JSON is a finite number."""
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1e300
+
+
+def stored_value(problem: Problem, prefix: str, key: str, value: Any) -> dict[str, Array]:
+    """The arrays that `scene_value` reads, of a value as the optimiser has it."""
+    shown: Array = problem.selection.shown(key, value)
+    own = to_array(value)
+    arrays = {f"{prefix}/{key}": shown}
+    return arrays if own.size == shown.size else arrays | {f"{prefix} with halo/{key}": own}
 
 
 @dataclass
@@ -153,3 +340,88 @@ class Snapshot:
             stored = stored_value(problem, "parameter", key, value)
             found |= {name: array for name, array in stored.items() if name != f"parameter/{key}"}
         return found
+
+
+Paid = TypeVar("Paid", bound=PaidRecord)
+
+
+@dataclass(frozen=True)
+class Settled:
+    """By `stored`, a run's state; its parts are taken up as a problem is assembled again, in the same order."""
+
+    stored: Stored
+
+    def begin(self, problem: Problem) -> None:
+        """Give the parameters the values that the run began with."""
+        keys = problem.selection.keys
+        found = [name for name in self.stored.archive.names("parameter/") if name not in keys]
+        if found:
+            raise self.stored.wrong(f"parameter/{found[0]}", "is no parameter of this run")
+        values = {key: self.stored.scene_value(problem, "initial", key) for key in keys}
+        problem.selection.set_arrays({key: problem.selection.shown(key, value) for key, value in values.items()})
+        for key in keys:
+            problem.optimizer.set_value(key, values[key])
+        problem.apply()
+
+    def settle(self, problem: Problem, options: Sequence[Option]) -> None:
+        """Choose what the run had chosen: the pilot's estimator, the samples of a pass, and how samples are drawn."""
+        self._estimator(problem, options)
+        if is_auto(problem.config, "guiding"):
+            problem.guided = self._paid(GuidedRecord, "guided", "guiding")
+            sampling.take_up_guiding(problem)
+        if is_auto(problem.config, "sequence"):
+            problem.sequence = self._paid(SequenceRecord, "sequence", "the sequence")
+            sampling.take_up_sequence(problem)
+
+    def _paid(self, kind: type[Paid], name: str, what: str) -> Paid | None:
+        """What was measured, where it was."""
+        try:
+            return None if self.stored.value(name) is None else kind.from_json(self.stored.value(name))
+        except (TypeError, AttributeError):
+            raise self.stored.wrong(name, f"is not what measuring whether {what} pays finds") from None
+
+    def _estimator(self, problem: Problem, options: Sequence[Option]) -> None:
+        chosen = options[0] if options else None
+        if self.stored.value("pilot") is not None:
+            problem.pilot = self._outcome()
+            chosen = next((option for option in options if option.options == problem.pilot.chosen), None)
+            if chosen is None:
+                raise self.stored.wrong("pilot.chosen", "is nothing that this run can choose")
+        if chosen is None:
+            return
+        problem.integrator, problem.memory = chosen.integrator, chosen.memory
+        if chosen.memory is not None:
+            problem.memory = memory = self._memory(problem, chosen.memory)
+            problem.samples_per_pass = memory.samples_per_pass
+            size = memory.samples_per_pass if memory.passes > 1 else None
+            problem.integrator = chosen.integrator.with_options(samples_per_pass=size, freeze=chosen.integrator.freeze)
+
+    def reach(self, problem: Problem) -> None:
+        """Take up what light and sensor reach, of the parameters whose true value is known."""
+        for key in problem.truth:
+            shape = problem.selection.array(key).shape
+            name = f"mask/{key}"
+            problem.masks[key] = self.stored.archive.array(name, shape[:2] if len(shape) == 3 else shape, "b")
+
+    def _outcome(self) -> Outcome:
+        data = self.stored.value("pilot")
+        try:
+            outcome = Outcome.from_json(data)
+            rows = [isinstance(row.estimator, str) and isinstance(row.options, dict) for row in outcome.rows]
+            if not isinstance(outcome.chosen, dict) or not isinstance(outcome.label, str) or not all(rows):
+                raise TypeError
+        except (TypeError, KeyError, AttributeError):
+            raise self.stored.wrong("pilot", "is not what a pilot finds") from None
+        return outcome
+
+    def _memory(self, problem: Problem, now: MemoryPlan) -> MemoryPlan:
+        """The plan of the run, whose passes decide in what order samples are summed up."""
+        size, passes = (self.stored.count("memory", name) for name in ("samples_per_pass", "passes"))
+        if size * passes != now.samples_per_pass * now.passes:
+            raise self.stored.wrong("memory", f"has {passes} passes of {size} samples")
+        names = [each.name for each in fields(Estimate)]
+        expected = [self.stored.value("memory", "expected_bytes", name) for name in names]
+        if not all(is_number(each) and math.floor(each) == each for each in expected):
+            raise self.stored.wrong("memory.expected_bytes", "is no estimate")
+        estimate: dict[str, Any] = dict(zip(names, expected, strict=True))
+        return MemoryPlan(now.budget_bytes, size, passes, Estimate(**estimate))

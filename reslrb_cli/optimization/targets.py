@@ -1,4 +1,7 @@
-"""The images that views are to see: read from files, or rendered with the true values of the parameters."""
+"""The images that views are to see: read from files, or rendered with the true values of the parameters.
+
+Pixels that are left out of a view's loss, each kind counted, and what the others weigh.
+"""
 
 from __future__ import annotations
 
@@ -9,19 +12,95 @@ from typing import TYPE_CHECKING, Any
 import mitsuba as mi
 import numpy as np
 
-from reslrb_cli.config import Config
+from reslrb_cli.config.schema import Config
+from reslrb_cli.config.views import Mask
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.optimization.errors import comparison_grid
-from reslrb_cli.optimization.loading import are_upright, check_integrator, load_configured, make_configured
-from reslrb_cli.optimization.masking import mask_line, mask_of
-from reslrb_cli.optimization.rendering import render_in_passes
-from reslrb_cli.optimization.views import View, color_channels
-from reslrb_cli.scene import Photo, Selection, check_photo, read_photo, set_values, turned_line
+from reslrb_cli.optimization.loading import (
+    LIGHT_TRACERS,
+    are_upright,
+    check_integrator,
+    load_configured,
+    make_configured,
+    render_in_passes,
+)
+from reslrb_cli.optimization.views import Masked, View, color_channels
+from reslrb_cli.scene.images import Photo, check_photo, read_photo, read_weights, turned_line
+from reslrb_cli.scene.parameters import Selection, set_values
+from reslrb_cli.scene.visibility import interior, sees_specular
 
 if TYPE_CHECKING:
     from reslrb_cli.optimization.problem import Problem
 
+
 Array = np.ndarray[Any, Any]
+
+
+#: What pixels of each kind are said to do.
+WORDS = {
+    "specular": "see smooth glass or mirrors",
+    "mixed": "see coats, blends or thin panes",
+    "border": "lie at the film's border",
+    "clipped": "are clipped",
+    "alpha": "have alpha 0",
+    "nonfinite": "are not finite",
+    "file": "have weight 0 in the mask's file",
+}
+
+
+def mask_of(config: Config, mask: Mask, mixed: bool, key: str, scene: mi.Scene, sensor: int, photo: Photo | None
+            ) -> Masked:  # fmt: skip
+    """Find the pixels of the view through `sensor` that `mask` leaves out; `key` is where it stands in `config`.
+
+    `photo` is the target's file, None of a rendered one. Raises ConfigError where the file of weights is wrong.
+    """
+    film = scene.sensors()[sensor].film()
+    width, height = (int(n) for n in film.crop_size())
+    found = Masked()
+    if _lacks_light(config, photo is None):
+        if mask.specular or mixed:
+            seen = sees_specular(scene, scene.sensors()[sensor])
+            if mask.specular:
+                found.left_out["specular"] = seen.alone
+            if mixed:
+                found.left_out["mixed"] = seen.mixed
+            elif (count := int(seen.mixed.sum())) > 0:
+                found.stay["mixed"] = count
+        if mask.border:
+            found.left_out["border"] = ~interior((height, width), scene.sensors()[sensor])
+    if photo is not None:
+        kinds = {"clipped": photo.clipped, "alpha": photo.transparent, "nonfinite": photo.nonfinite}
+        found.left_out |= {kind: pixels for kind, pixels in kinds.items() if getattr(mask, kind)}
+    if mask.file is not None:
+        try:
+            found.weights = read_weights(mask.file, (width, height), are_upright(config))
+        except ConfigError as error:
+            raise ConfigError(config.source, f"{key}.file", error.message) from None
+        found.left_out["file"] = found.weights == 0
+    return found
+
+
+def mask_line(name: str, masked: Masked, weights: Array) -> str | None:
+    """What the user is told of a view's mask, None where nothing is left out, weighed or counted."""
+    counts = masked.counts()
+    stay = [f"{count} {WORDS[kind]} and stay (mask_mixed: true leaves them out)" for kind, count in masked.stay.items()]
+    if not counts and not stay and masked.weights is None:
+        return None
+    left, total = int((weights == 0).sum()), weights.size
+    parts = [f"{count} {WORDS[kind]}" for kind, count in counts.items()]
+    line = f"{name}: {left} of {total} pixels ({left / total:.1%}) are left out"
+    return "; ".join([line + (f": {', '.join(parts)}" if parts else ""), *stay])
+
+
+def _lacks_light(config: Config, rendered: bool) -> bool:
+    """Whether target and image differ by what light tracing lacks: one of the two is light traced, the other is not.
+
+    A photograph has all light.
+    """
+    render = config.target.render
+    maker = (render.integrator or config.integrator).type if rendered and render is not None else "camera"
+    return (maker in LIGHT_TRACERS) != (config.integrator.type in LIGHT_TRACERS)
+
 
 #: Weights of linear sRGB in luminance, as Mitsuba has them.
 LUMINANCE = np.array([0.212671, 0.715160, 0.072169], dtype=np.float32)

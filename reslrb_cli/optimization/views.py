@@ -1,26 +1,288 @@
-"""A view: one sensor, the image that it is to see, and how the two are compared."""
+"""A view: one sensor, the image that it is to see, and how the two are compared.
+
+Losses: how an image is compared with its target.
+
+Each takes the image I, (H, W, C) and attached to the AD graph, the target T of the same shape, both in linear radiance,
+and what each entry weighs, of that shape too with a mean of 1 (None: all the same). It returns a width-1 array: a mean
+over pixels and channels, so that it depends neither on the resolution nor on how many pixels are left out.
+
+What a view's image is multiplied by before it is compared: a number, or one that is recovered with the rest.
+
+The model is  target = exposure * image,  with one exposure E for all channels or one for each. The derivative of a loss
+L(E I) with respect to E is the sum over pixels of dL/dI I / E: it takes the samples that the other parameters'
+derivatives are made of, and no more. Where dL/dI comes from other samples than I, it is as unbiased as those are.
+
+What an experiment says of its views, in `views` or in the short forms, `scene.sensors` and `target`.
+"""
 
 from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
-from typing import Any
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Protocol
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from reslrb_cli.backend.own_memory import own_memory
-from reslrb_cli.config import Config
-from reslrb_cli.integrators import first_channels
-from reslrb_cli.optimization.exposure import Exposure, add_exposure
-from reslrb_cli.optimization.losses import Loss, make_loss
-from reslrb_cli.optimization.masking import Masked
-from reslrb_cli.optimization.wanted import Wanted, wanted_views
-from reslrb_cli.scene import Selection
+from reslrb_cli.backend.memory import own_memory
+from reslrb_cli.config.optimizers import Loss as LossConfig
+from reslrb_cli.config.parameters import Settings
+from reslrb_cli.config.schema import Config
+from reslrb_cli.config.views import Mask
+from reslrb_cli.errors import ConfigError
+from reslrb_cli.integrators.protocol import first_channels
+from reslrb_cli.optimization.loading import choose_sensors
+from reslrb_cli.scene.cameras import read_cameras
+from reslrb_cli.scene.parameters import Selection
+
+
+class Loss(Protocol):
+    """A loss with its options bound."""
+
+    def __call__(self, image: mi.TensorXf, target: mi.TensorXf, weights: mi.TensorXf | None = None, /) -> mi.Float: ...
+
+
+def _mean(values: mi.TensorXf, weights: mi.TensorXf | None) -> mi.Float:
+    return dr.mean(values if weights is None else values * weights, axis=None).array
+
+
+def l1(image: mi.TensorXf, target: mi.TensorXf, weights: mi.TensorXf | None = None, /) -> mi.Float:
+    """mean |I - T|. Its gradient is 0 where I = T."""
+    return _mean(dr.abs(image - target), weights)
+
+
+def l2(image: mi.TensorXf, target: mi.TensorXf, weights: mi.TensorXf | None = None, /) -> mi.Float:
+    """mean (I - T)²."""
+    return _mean(dr.square(image - target), weights)
+
+
+def relative_l2(
+    image: mi.TensorXf, target: mi.TensorXf, weights: mi.TensorXf | None = None, /, epsilon: float = 1e-2
+) -> mi.Float:
+    """mean (I - T)² / (T² + ε), ε in squared units of radiance.
+
+    The denominator holds the target, not the image: a constant, so the gradient is that of the loss itself. With the
+    (detached) noisy image in its place the noise of one pixel would stand in numerator and denominator at once.
+    """
+    return _mean(dr.square(image - target) / (dr.square(target) + epsilon), weights)
+
+
+def log_l2(
+    image: mi.TensorXf, target: mi.TensorXf, weights: mi.TensorXf | None = None, /, epsilon: float = 1e-2
+) -> mi.Float:
+    """mean (log(I + ε) - log(T + ε))², ε in units of radiance.
+
+    Negative values, as filters with negative lobes make them, count as 0.
+    """
+    difference = dr.log(dr.maximum(image, 0.0) + epsilon) - dr.log(dr.maximum(target, 0.0) + epsilon)
+    return _mean(dr.square(difference), weights)
+
+
+LOSSES: dict[str, Callable[..., mi.Float]] = {"l1": l1, "l2": l2, "relative_l2": relative_l2, "log_l2": log_l2}
+
+
+def make_loss(type: str, **options: float) -> Loss:
+    """Return the loss of that name with its options bound. Raises KeyError for an unknown name."""
+    function = LOSSES[type]
+    return lambda image, target, weights=None: function(image, target, weights, **options)
+
 
 Array = np.ndarray[Any, Any]
+
+
+#: The key of an exposure that all views share.
+SHARED = "exposure"
+
+
+@dataclass
+class Exposure:
+    """The exposure of one view: `fixed`, or where `key` is not empty the value of that key in `values`."""
+
+    fixed: float = 1.0
+    key: str = ""
+    values: Mapping[str, Any] = field(default_factory=dict)
+
+    def now(self) -> mi.Float | mi.Color3f | float:
+        """The exposure as it stands, without derivatives: of width 1, one for each channel, or the fixed number."""
+        return dr.detach(self.values[self.key]) if self.key else self.fixed
+
+    def applied(self, image: mi.TensorXf) -> mi.TensorXf:
+        """E I of an image (H, W, C), attached to what the image is attached to."""
+        value = self.now()
+        if isinstance(value, (int, float)):
+            return image if value == 1 else image * value
+        if dr.size_v(value) == 3:
+            channel = dr.arange(mi.UInt32, dr.width(image.array)) % image.shape[2]
+            factor = dr.select(channel == 0, value.x, dr.select(channel == 1, value.y, value.z))
+            return mi.TensorXf(image.array * factor, image.shape)
+        return mi.TensorXf(image.array * value, image.shape)
+
+    def of_array(self, image: Array) -> Array:
+        """E I of an image (H, W, C or more), its alpha as it is."""
+        value = np.atleast_1d(np.array(self.now(), np.float32).ravel())
+        if np.all(value == 1):
+            return image
+        factor = np.ones(image.shape[2], np.float32)
+        colors = 1 if image.shape[2] <= 2 else 3
+        factor[:colors] = value
+        return image * factor
+
+    def add_gradient(self, leaf: Any, channels: int, image: mi.TensorXf, gradient: mi.TensorXf) -> None:
+        """Add dL/dE to the gradient of `leaf`, of an image (H, W, `channels` or more) and its dL/dI."""
+        product = first_channels(image, channels) * first_channels(gradient, channels)
+        # A pixel that is left out may hold anything, and has no derivative.
+        each = dr.select(first_channels(gradient, channels).array != 0, product.array, 0)
+        if dr.size_v(leaf) == 3:
+            pixel = dr.arange(mi.UInt32, dr.width(each) // 3)
+            total = mi.Color3f(*(dr.sum(dr.gather(mi.Float, each, 3 * pixel + channel)) for channel in range(3)))
+        else:
+            total = dr.sum(each)
+        dr.accum_grad(leaf, total / dr.detach(leaf))
+
+
+def add_exposure(selection: Selection, key: str, kind: str, channels: int) -> None:
+    """Recover an exposure, in its logarithm, from 1 on: `auto`, or `per_channel` of a film with that many channels."""
+    if key in selection.factors:
+        return
+    one = mi.Color3f(1) if kind == "per_channel" and channels == 3 else mi.Float(1)
+    value = one + dr.opaque(mi.Float, 0)
+    selection.add_factor(key, value, Settings(initial=1.0, transform="log"))
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """What an experiment says of the view through `sensor`: its target's file, None of a rendered one, and its mask.
+
+    `file_key` and `mask_key` are where they stand in the configuration. `exposure` is a number, or how it is recovered,
+    by which key; `weight` is the view's part of the loss, relative to the others', and `loss` its own, if it has one.
+    """
+
+    sensor: int = 0
+    file: Path | None = None
+    file_key: str = "target.file"
+    mask: Mask = field(default_factory=Mask)
+    mask_mixed: bool = False
+    mask_key: str = "target.mask"
+    exposure: float | str = 1.0
+    exposure_key: str = SHARED
+    weight: float = 1.0
+    loss: LossConfig | None = None
+    held_out: bool = False
+
+
+def wanted_views(config: Config, scene: mi.Scene) -> list[Wanted]:
+    """What is wanted of every view. Raises ConfigError for a sensor that is not there, or cannot be held out."""
+    sensors = choose_sensors(config, scene)
+    wanted = _of_views(config) if config.views is not None else _of_sensors(config, sensors)
+    if config.scene.cameras is not None and config.target.render is None:
+        images = [camera.image for camera in read_cameras(config.scene.cameras)]
+        wanted = [
+            replace(one, file=images[one.sensor], file_key="scene.cameras") if one.file is None else one
+            for one in wanted
+        ]
+    held_out = _held_out(config, scene, sensors)
+    if held_out == set(sensors):
+        raise ConfigError(config.source, "run.held_out", "leaves no view to train on")
+    for one in wanted:
+        if one.sensor in held_out and isinstance(one.exposure, str) and one.exposure_key != SHARED:
+            raise ConfigError(
+                config.source,
+                "run.held_out",
+                f"has sensor {one.sensor}, whose own exposure nothing else tells; give it a number, or all views one",
+            )
+    trained = len(wanted) - len(held_out)
+    if (config.run.views_per_iteration or 1) > trained:
+        raise ConfigError(
+            config.source,
+            "run.views_per_iteration",
+            f"is {config.run.views_per_iteration}; views that are trained on: {trained}",
+        )
+    return [replace(one, held_out=one.sensor in held_out) for one in wanted]
+
+
+def _held_out(config: Config, scene: mi.Scene, sensors: list[int]) -> set[int]:
+    """The indices of the sensors that `run.held_out` names. Raises ConfigError for one that has no view."""
+    names, found = {scene.sensors()[sensor].id(): sensor for sensor in sensors}, set()
+    for place, given in enumerate(config.run.held_out):
+        sensor = names.get(given, -1) if isinstance(given, str) else given
+        if sensor not in sensors:
+            raise ConfigError(config.source, f"run.held_out[{place}]", f"is {given}, which is the sensor of no view")
+        found.add(sensor)
+    return found
+
+
+def _of_sensors(config: Config, sensors: list[int]) -> list[Wanted]:
+    """What the short forms, `scene.sensors` and `target`, say of each view."""
+    target = config.target
+    files, exposures = target.file or [], target.exposure
+    if isinstance(exposures, list) and len(exposures) != len(sensors):
+        raise ConfigError(
+            config.source,
+            "target.exposure",
+            f"must have one entry for each sensor; entries: {len(exposures)}, sensors: {len(sensors)}",
+        )
+    return [
+        Wanted(
+            sensor,
+            file=files[number] if number < len(files) else None,
+            file_key="target.file" if len(files) == 1 else f"target.file[{number}]",
+            mask=target.mask,
+            mask_mixed=target.mask_mixed,
+            exposure=exposures[number] if isinstance(exposures, list) else exposures,
+            exposure_key=f"{SHARED}.{sensor}" if isinstance(exposures, list) else SHARED,
+        )
+        for number, sensor in enumerate(sensors)
+    ]
+
+
+def _of_views(config: Config) -> list[Wanted]:
+    """What `views` say of each view, and `target` of what they leave open."""
+    assert config.views is not None
+    assert not isinstance(config.target.exposure, list), "checked with the configuration"
+    target, found = config.target, []
+    for number, spec in enumerate(config.views):
+        own = spec.exposure is not None
+        found.append(
+            Wanted(
+                spec.sensor,
+                file=spec.target,
+                file_key=f"views[{number}].target",
+                mask=target.mask if spec.mask is None else spec.mask,
+                mask_mixed=target.mask_mixed if spec.mask_mixed is None else spec.mask_mixed,
+                mask_key="target.mask" if spec.mask is None else f"views[{number}].mask",
+                exposure=config.target.exposure if spec.exposure is None else spec.exposure,
+                exposure_key=f"{SHARED}.{spec.sensor}" if own else SHARED,
+                weight=spec.weight,
+                loss=spec.loss,
+            )
+        )
+    return found
+
+
+@dataclass
+class Masked:
+    """The pixels of one view, boolean (H, W) by kind, that `left_out` leaves out; a pixel may be of several kinds.
+
+    `weights` (H, W) are what the file gives, None without one; `stay` are the pixels of a kind that was only counted.
+    """
+
+    left_out: dict[str, Array] = field(default_factory=dict)
+    stay: dict[str, int] = field(default_factory=dict)
+    weights: Array | None = None
+
+    def total(self, shape: tuple[int, int]) -> Array:
+        """What each pixel weighs, float32 (H, W): 0 where it is left out, and 1 elsewhere without a file."""
+        total = np.ones(shape, np.float32) if self.weights is None else self.weights.astype(np.float32)
+        for pixels in self.left_out.values():
+            total = np.where(pixels, np.float32(0), total)
+        return total
+
+    def counts(self) -> dict[str, int]:
+        """How many pixels each kind leaves out, of those that leave out any."""
+        return {kind: count for kind, pixels in self.left_out.items() if (count := int(pixels.sum()))}
 
 
 @dataclass

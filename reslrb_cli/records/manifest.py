@@ -1,10 +1,21 @@
-"""`manifest.json`: what ran, on what, and how it ended."""
+"""`manifest.json`: what ran, on what, and how it ended.
+
+`manifest.json` on the disk: written whole, readable whatever happens, and with an end that fits on a full disk.
+
+Run folders whose process has gone without ending the run: killed, out of memory, the machine switched off.
+"""
 
 from __future__ import annotations
 
+import contextlib
+import enum
+import errno
+import json
+import os
 import platform
 import sys
 import threading
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from datetime import datetime, timezone
 from importlib import metadata
@@ -12,14 +23,15 @@ from pathlib import Path
 from typing import Any
 
 from reslrb_cli import __version__
-from reslrb_cli.errors import printable
-from reslrb_cli.records.abandoned import is_abandoned, put_right
-from reslrb_cli.records.lock import Holder
-from reslrb_cli.records.manifest_file import FILE_NAME, PROGRAM, Status, read_content, write_content
-
-__all__ = ["FILE_NAME", "Manifest", "Status", "now", "read_manifest", "versions"]
+from reslrb_cli.config.files import read_file
+from reslrb_cli.errors import ConfigError, printable
+from reslrb_cli.records import metrics
+from reslrb_cli.records.atomic import remove_parts, write_atomically
+from reslrb_cli.records.lock import READER_WAIT_SECONDS, FolderLock, Holder, InUse
 
 PACKAGES = ("mitsuba", "drjit", "numpy")
+
+
 #: Held while a manifest is written; a process that is about to end takes it for good, after so many seconds at most.
 _WRITING, LAST_WAIT_SECONDS = threading.Lock(), 5.0
 
@@ -38,6 +50,15 @@ def versions() -> dict[str, str]:
         except metadata.PackageNotFoundError:
             found[name] = "not installed as a package"
     return found
+
+
+class Status(str, enum.Enum):
+    """How far a run has come."""
+
+    RUNNING = "running"
+    FINISHED = "finished"
+    INTERRUPTED = "interrupted"
+    FAILED = "failed"
 
 
 @dataclass
@@ -110,3 +131,117 @@ def read_manifest(folder: Path) -> dict[str, Any] | None:
     """
     content = read_content(folder)
     return put_right(folder, content) if content is not None and is_abandoned(folder, content) else content
+
+
+MANIFEST_FILE = "manifest.json"
+
+
+PROGRAM = "reslrb"
+
+
+#: Bytes of a manifest; the largest part of one is a pilot's table, of some kB.
+MOST_BYTES = 2**24
+
+
+#: Bytes of white space behind a manifest that is not the last one, at least: room for how the run ends.
+ROOM = 1024
+
+
+#: What file systems allocate at once, or a multiple of it.
+_BLOCK = 4096
+
+
+#: What is kept of an error's line where there is no room for more.
+_SHORT = 300
+
+
+def read_content(folder: Path) -> dict[str, Any] | None:
+    """What the manifest in `folder` says; None where there is none that `reslrb` wrote."""
+    try:
+        content = json.loads(read_file(folder / MANIFEST_FILE, MOST_BYTES))
+    except (ConfigError, ValueError, RecursionError):
+        return None
+    return content if isinstance(content, dict) and content.get("program") == PROGRAM else None
+
+
+def write_content(folder: Path, content: Mapping[str, Any]) -> None:
+    """Write a manifest into `folder`, atomically; on a full disk over the one that is there. Raises OSError."""
+    text = _text(content)
+    if content["status"] == Status.RUNNING or content.get("missing"):
+        text = _padded(text, -(-(len(text) + ROOM) // _BLOCK) * _BLOCK)
+    try:
+        write_atomically(folder / MANIFEST_FILE, lambda file: file.write(text), durable=True)
+    except OSError as error:
+        if error.errno not in (errno.ENOSPC, errno.EDQUOT) or not _overwrite(folder / MANIFEST_FILE, content):
+            raise
+
+
+def _overwrite(path: Path, content: Mapping[str, Any]) -> bool:
+    """Write a manifest into the blocks of the one at `path`; return whether that went well.
+
+    One that is too large for them leaves what is there, and changes how the run ended.
+    """
+    end = {key: content.get(key) for key in ("status", "ended", "missing", "error")}
+    shortest = end | {"missing": {}, "error": (content.get("error") or "")[:_SHORT] or None}
+    try:
+        with path.open("r+b") as file:
+            before = file.read()
+            there = json.loads(before)
+            for changed in (content, there | end, there | shortest):
+                text = _text(changed)
+                if len(text) <= len(before):
+                    file.seek(0)
+                    file.write(_padded(text, len(before)))
+                    file.flush()
+                    os.fsync(file.fileno())
+                    return True
+    except (OSError, ValueError):
+        pass
+    return False
+
+
+def _text(content: Mapping[str, Any]) -> bytes:
+    return json.dumps(content, indent=2, allow_nan=False).encode() + b"\n"
+
+
+def _padded(text: bytes, size: int) -> bytes:
+    return text[:-1].ljust(size - 1) + b"\n"
+
+
+#: What the manifest of such a run gives as its error.
+REASON = "its process ended before the run did"
+
+
+def is_abandoned(folder: Path, content: Mapping[str, Any]) -> bool:
+    """Whether the manifest in `folder`, `content`, says `running` and the process that wrote it has surely gone."""
+    if content.get("status") != Status.RUNNING:
+        return False
+    holder = Holder.from_json(content.get("process"))
+    return holder is None or holder.is_gone(folder)
+
+
+def put_right(folder: Path, content: Mapping[str, Any]) -> dict[str, Any]:
+    """What the manifest of an abandoned run should say; written into `folder` too, if that can be.
+
+    What the run never finished is removed then.
+    """
+    right = dict(content) | {
+        "status": Status.INTERRUPTED.value,
+        "ended": _last_sign(folder) or content.get("ended"),
+        "error": REASON,
+    }
+    with contextlib.suppress(InUse, OSError), FolderLock(folder, READER_WAIT_SECONDS):
+        if read_content(folder) == content:  # nobody was faster
+            metrics.mend(folder)
+            remove_parts(folder)
+            write_content(folder, right)
+    return right
+
+
+def _last_sign(folder: Path) -> str | None:
+    """When the run last wrote something, as far as that can be told."""
+    times = []
+    for name in (MANIFEST_FILE, metrics.METRICS_FILE, "checkpoint", "images", "parameters"):
+        with contextlib.suppress(OSError):
+            times.append(os.stat(folder / name).st_mtime)
+    return datetime.fromtimestamp(max(times), timezone.utc).isoformat(timespec="seconds") if times else None

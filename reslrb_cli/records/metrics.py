@@ -1,4 +1,9 @@
-"""`metrics.jsonl`: one object a line, one line an iteration."""
+"""`metrics.jsonl`: one object a line, one line an iteration.
+
+The part of `metrics.jsonl` that a run goes on from: the iterations that its checkpoint contains, and no others.
+
+What of a whole run was not finite, or clamped, added up from its records.
+"""
 
 from __future__ import annotations
 
@@ -7,14 +12,18 @@ import errno
 import json
 import math
 import os
-from dataclasses import asdict, dataclass, field
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import MISSING, asdict, dataclass, field, fields
 from pathlib import Path
 from types import TracebackType
 from typing import Any
 
+from reslrb_cli.config.files import read_file
+from reslrb_cli.errors import ConfigError
 from reslrb_cli.records.atomic import write_atomically
 
-FILE_NAME = "metrics.jsonl"
+METRICS_FILE = "metrics.jsonl"
 
 
 @dataclass(frozen=True)
@@ -81,7 +90,7 @@ class MetricsWriter:
     """Appends records to `metrics.jsonl`; each line is in the file once `write` returns, and whole whatever happens."""
 
     def __init__(self, folder: Path) -> None:
-        self._path = folder / FILE_NAME
+        self._path = folder / METRICS_FILE
         self._descriptor: int | None = None
         mend(folder)
 
@@ -122,7 +131,7 @@ class MetricsWriter:
 def mend(folder: Path) -> None:
     """Cut off a last line that a process did not come to finish. Raises OSError where that cannot be done."""
     try:
-        with (folder / FILE_NAME).open("r+b") as file:
+        with (folder / METRICS_FILE).open("r+b") as file:
             text = file.read()
             whole = text.rfind(b"\n") + 1
             if whole < len(text):
@@ -134,7 +143,7 @@ def mend(folder: Path) -> None:
 def read_metrics(folder: Path) -> list[dict[str, Any]]:
     """Return the records in `folder`, oldest first; a last line that a crash cut short is left out."""
     try:
-        lines = (folder / FILE_NAME).read_text(encoding="utf-8").splitlines()
+        lines = (folder / METRICS_FILE).read_text(encoding="utf-8").splitlines()
     except FileNotFoundError:
         return []
     records = []
@@ -145,3 +154,152 @@ def read_metrics(folder: Path) -> list[dict[str, Any]]:
             if number + 1 < len(lines):
                 raise
     return records
+
+
+_NULL_IS_NAN = {"loss", "grad_norm"}  # numbers that may be not finite, which JSON does not have
+
+
+_NAMES = {field.name: field for field in fields(Record)}
+
+
+def read_records(folder: Path, count: int, last: Mapping[str, Any] | None) -> tuple[list[Record], int]:
+    """The first `count` records in `folder`, and the bytes that they take; the rest was not kept by a checkpoint.
+
+    A full disk may have taken the line of the last one, which the checkpoint has too: `last`. Raises ConfigError,
+    located in the file and the line, where others are missing or are not what a run writes.
+    """
+    path = folder / METRICS_FILE
+    content = read_file(path, MOST_BYTES) if count and os.path.lexists(path) else b""
+    records: list[Record] = []
+    size = 0
+    for number, line in enumerate(content.splitlines(keepends=True)[:count]):
+        if line.endswith(b"\n"):
+            records.append(_record(line, number, path))
+            size += len(line)
+    if len(records) == count - 1 and last is not None:
+        records.append(_record(json.dumps(last).encode(), count - 1, path))
+    if len(records) < count:
+        raise ConfigError(
+            path,
+            "",
+            f"holds {len(records)} of the {count} iterations of the checkpoint; put it back, or begin anew from "
+            "`initial: {run: ...}`",
+        )
+    return records, size
+
+
+def cut_back(folder: Path, records: list[Record], size: int) -> None:
+    """Leave `records` alone in `folder`, of which the first `size` bytes hold all but the last one or none."""
+    path = folder / METRICS_FILE
+    if not records:
+        path.unlink(missing_ok=True)
+        return
+    if size == 0:  # of a run of one iteration, whose line was lost: it is never seen empty
+        write_atomically(path, lambda file: file.write(records[-1].to_json().encode() + b"\n"), durable=True)
+        return
+    with path.open("r+b") as file:
+        file.truncate(size)
+        file.seek(0)
+        written = sum(1 for _ in file)
+        if written < len(records):
+            file.write(records[-1].to_json().encode() + b"\n")
+        file.flush()
+        os.fsync(file.fileno())
+
+
+def _record(line: bytes, number: int, path: Path) -> Record:
+    """The record of iteration `number`. Raises ConfigError."""
+    try:
+        found = json.loads(line)
+        if not isinstance(found, dict) or found.get("iteration") != number:
+            raise ValueError("another iteration, or none")
+        absent = {name for name, field in _NAMES.items() if name not in found and field.default is MISSING}
+        if absent - {"parameter_errors", "nonfinite_by_parameter"} or set(found) - set(_NAMES):
+            raise ValueError("other names")
+        values: dict[str, Any] = {name: _value(name, value) for name, value in found.items()}
+        return Record(**values)
+    except (ValueError, TypeError, RecursionError) as error:
+        reason = f"is not what a run writes ({error or type(error).__name__})"
+        raise ConfigError(path, f"line {number + 1}", reason) from None
+
+
+def _value(name: str, value: Any) -> Any:
+    if name == "clamped" and value is not None:
+        shares = {each: _numbers(value[each]) for each in ("share", "bias")}
+        return Clamped(int(_number(value["entries"])), **shares)
+    if name in ("parameter_errors", "nonfinite_by_parameter"):
+        return _numbers(value, int if name.startswith("nonfinite") else float)
+    if value is None:
+        return math.nan if name in _NULL_IS_NAN else None
+    return _number(value)
+
+
+def _numbers(value: Any, kind: type = float) -> dict[str, Any]:
+    if not isinstance(value, dict):
+        raise ValueError("a mapping is missing")
+    return {str(key): math.nan if each is None else kind(_number(each)) for key, each in value.items()}
+
+
+def _number(value: Any) -> float | int:
+    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < 1e308:
+        raise ValueError("a number is missing")
+    return value
+
+
+@dataclass
+class NonFiniteTally:
+    """Iterations with values that were not finite, the number of these values, and those of each parameter."""
+
+    iterations: int = 0
+    values: int = 0
+    by_parameter: Counter[str] = field(default_factory=Counter)
+
+    def add(self, record: Record) -> None:
+        """Count one iteration."""
+        self.iterations += record.nonfinite > 0
+        self.values += record.nonfinite
+        self.by_parameter.update(record.nonfinite_by_parameter)
+
+    def to_json(self) -> dict[str, Any]:
+        """For the manifest."""
+        return {"iterations": self.iterations, "values": self.values, "by_parameter": dict(self.by_parameter)}
+
+    def __str__(self) -> str:
+        """For the last line of a run; empty where all was finite."""
+        if not self.iterations:
+            return ""
+        parameters = ", ".join(f"{key} {count}" for key, count in self.by_parameter.items())
+        where = f" ({parameters})" if parameters else ""
+        return f"{self.values} values not finite{where} in {self.iterations} iterations"
+
+
+@dataclass
+class ClampTally:
+    """Iterations in which gradients were clamped, the number of entries, and the bias over the run by parameter."""
+
+    iterations: int = 0
+    entries: int = 0
+    bias: dict[str, float] = field(default_factory=dict)
+
+    def add(self, record: Record) -> None:
+        """Count one iteration."""
+        if record.clamped is not None:
+            self.iterations += record.clamped.entries > 0
+            self.entries += record.clamped.entries
+            self.bias |= record.clamped.bias
+
+    def to_json(self) -> dict[str, Any]:
+        """For the manifest."""
+        bias = {key: value if math.isfinite(value) else None for key, value in self.bias.items()}
+        return {"iterations": self.iterations, "entries": self.entries, "bias": bias}
+
+    def __str__(self) -> str:
+        """For the last line of a run; empty where nothing was clamped."""
+        if not self.iterations:
+            return ""
+        shares = ", ".join(f"{100 * value:.2g} % of that of {key}" for key, value in self.bias.items())
+        return f"{self.entries} entries of gradients clamped in {self.iterations} iterations: a bias of {shares}"
+
+
+#: Bytes of such a file. A million iterations of a run with ten parameters take as much.
+MOST_BYTES = 2**30

@@ -1,26 +1,79 @@
-"""The folder of one run: where it is made, what may be replaced, and who works in it."""
+"""The folder of one run: where it is made, what may be replaced, and who works in it.
+
+The values to which a run brought its parameters, whether it is finished, interrupted or still at work.
+
+Run folders that are gone on with: opened under their lock, or copied into a new one.
+"""
 
 from __future__ import annotations
 
 import contextlib
+import difflib
 import errno
 import itertools
 import os
 import shutil
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import TracebackType
+from typing import Any
+
+import numpy as np
 
 from reslrb_cli.errors import ConfigError, MachineError, is_machine_fault
 from reslrb_cli.records import manifest as manifests
 from reslrb_cli.records import metrics
-from reslrb_cli.records.atomic import FOLDER_PREFIX, remove_parts, unfinished_folder
+from reslrb_cli.records.atomic import FOLDER_PREFIX, remove_parts, unfinished, unfinished_folder, write_atomically
+from reslrb_cli.records.checkpoint import STATE_FILE, Archive, newest_checkpoint
 from reslrb_cli.records.lock import READER_WAIT_SECONDS, FolderLock, Holder, InUse
-from reslrb_cli.records.manifest import Manifest, Status
+from reslrb_cli.records.manifest import Manifest, Status, read_manifest
+
+Array = np.ndarray[Any, Any]
+
+
+#: Keys that an error names.
+_SHOWN = 3
+
+
+def read_value(run: Path, key: str) -> Array:
+    """The value of `key` in the newest checkpoint of the run folder `run`.
+
+    Shapes as in `parameters.npz`: a texture (H, W, C), a colour (C,), a buffer (N,), a number (). It may hold
+    values that are not finite: who uses it says where. Raises ConfigError, located in the folder or a file of it, where
+    it is no run's, damaged, or the run did not recover `key`.
+    """
+    path = checkpoint_of(run)
+    with Archive(path, whole=False) as archive:
+        known = archive.names("parameter/")
+        if key in known:
+            return archive.array(f"parameter/{key}", kind="f", values="any")
+    near = difflib.get_close_matches(key, known, n=_SHOWN, cutoff=0.5) or known[:_SHOWN]
+    has = " and ".join(f"`{name}`" for name in near) or "nothing"
+    more = f" and {len(known) - len(near)} more" if len(known) > len(near) else ""
+    raise ConfigError(run, "", f"did not recover `{key}`; it has {has}{more}")
+
+
+def checkpoint_of(run: Path) -> Path:
+    """The file of the newest checkpoint of the run folder `run`. Raises ConfigError where there is none."""
+    if not run.is_dir():
+        what = "is a file, not the folder of a run" if os.path.lexists(run) else "no such folder"
+        raise ConfigError(run, "", what)
+    if read_manifest(run) is None:
+        raise ConfigError(run, "", "is no run's folder: it has no manifest.json that a run wrote")
+    path = newest_checkpoint(run / "checkpoint")
+    if path is None:
+        raise ConfigError(run, "", f"has no checkpoint/{STATE_FILE}: the run ended before it kept anything")
+    return path
+
 
 SUBFOLDERS = ("images", "parameters", "checkpoint")
-OWN_ENTRIES = ("config.yaml", manifests.FILE_NAME, metrics.FILE_NAME, "report.html", *SUBFOLDERS)
+
+
+OWN_ENTRIES = ("config.yaml", manifests.MANIFEST_FILE, metrics.METRICS_FILE, "report.html", *SUBFOLDERS)
+
+
 #: An unfinished folder without a process is removed when it is so old: nobody is just about to lock it.
 LEFT_SECONDS = 60.0
 
@@ -122,7 +175,7 @@ class RunFolder:
                 continue
             try:
                 # The manifest comes first: whatever happens from here on, the folder says whose run it is.
-                os.replace(self.path / manifests.FILE_NAME, path / manifests.FILE_NAME)
+                os.replace(self.path / manifests.MANIFEST_FILE, path / manifests.MANIFEST_FILE)
                 self._replace_others(path, manifest)
             except BaseException:
                 lock.release()
@@ -144,7 +197,7 @@ class RunFolder:
             entry = path / name
             if entry.is_dir() and not entry.is_symlink():
                 shutil.rmtree(entry)
-            elif name != manifests.FILE_NAME:
+            elif name != manifests.MANIFEST_FILE:
                 entry.unlink(missing_ok=True)
         for name in ("config.yaml", *SUBFOLDERS):
             os.replace(self.path / name, path / name)
@@ -239,3 +292,109 @@ def _umask() -> int:
     mask = os.umask(0)
     os.umask(mask)
     return mask
+
+
+@contextlib.contextmanager
+def opened(path: Path) -> Iterator[tuple[RunFolder, dict[str, Any]]]:
+    """The run folder `path`, locked while the block works, and what its manifest says.
+
+    Raises ConfigError, located in the folder, where it is no run's, or a run is at work in it.
+    """
+    if not path.is_dir():
+        what = "is a file, not the folder of a run" if os.path.lexists(path) else "no such folder"
+        raise ConfigError(path, "", what)
+    content = read_manifest(path)  # which puts that of a killed run right
+    if content is None:
+        raise ConfigError(path, "", "is no run's folder: it has no manifest.json that a run wrote")
+    try:
+        lock = FolderLock(Path(os.path.realpath(path)))
+    except InUse:
+        raise _worked_in(path, content) from None
+    except OSError as error:
+        raise ConfigError(path, "", f"cannot be opened: {error.strerror}") from None
+    with RunFolder(path, lock) as folder:
+        if not lock.real and content.get("status") == Status.RUNNING:
+            raise _worked_in(path, content)
+        yield folder, read_manifest(path) or content
+
+
+def check_writable(folder: RunFolder) -> None:
+    """Raise ConfigError, located in the folder, where nothing can be written to it, MachineError for a full disk.
+
+    What is written has to stay in the folder, so that links in it are refused, which no run makes. What a process that
+    is no more never came to finish is removed.
+    """
+    _check_links(folder.path)
+    try:
+        for name in SUBFOLDERS:
+            (folder.path / name).mkdir(exist_ok=True)
+        for place in (folder.path, *(folder.path / name for name in SUBFOLDERS)):
+            _write_and_remove(place / f".resume.{os.getpid()}.part")
+        metrics.mend(folder.path)
+        remove_parts(folder.path)
+    except OSError as error:
+        if is_machine_fault(error):
+            raise MachineError(f"{folder.path}: {error.strerror}; nothing of the run was changed") from None
+        raise ConfigError(
+            folder.path,
+            "",
+            f"cannot be written to ({error.strerror}); to go on in another folder, add --set run.output=FOLDER",
+        ) from None
+
+
+def _check_links(folder: Path) -> None:
+    """Raise ConfigError for links in a run's folder by which it would write elsewhere: those to folders, and that of
+    the metrics, which are added to. All other files are replaced, links and all."""
+    entries = [folder / metrics.METRICS_FILE, *(folder / name for name in SUBFOLDERS)]
+    for name in SUBFOLDERS:
+        entries += [Path(parent, below) for parent, folders, _ in os.walk(folder / name) for below in folders]
+    for entry in entries:
+        if entry.is_symlink():
+            reason = "is a link, by which the run would write elsewhere; put what it leads to in its place"
+            raise ConfigError(entry, "", f"{reason}, or add --set run.output=FOLDER")
+
+
+def copy_into(folder: RunFolder, earlier: Path) -> None:
+    """Copy what a run has written from the folder `earlier` into a new one, but for its page and its configuration.
+
+    Raises OSError.
+    """
+    for name in SUBFOLDERS:
+        for path in sorted((earlier / name).rglob("*")):
+            target = folder.path / name / path.relative_to(earlier / name)
+            if path.is_symlink() or not (path.is_file() or path.is_dir()):
+                continue  # nothing that a run writes
+            if path.is_dir():
+                target.mkdir(exist_ok=True)
+            else:
+                _copy(path, target)
+    if (earlier / metrics.METRICS_FILE).is_file():
+        _copy(earlier / metrics.METRICS_FILE, folder.path / metrics.METRICS_FILE)
+
+
+def _copy(path: Path, target: Path) -> None:
+    with path.open("rb") as file:
+        write_atomically(target, lambda copy: shutil.copyfileobj(file, copy))
+
+
+def _write_and_remove(path: Path) -> None:
+    unfinished.add(path)
+    try:
+        path.write_bytes(b"is there room?")
+    finally:
+        with contextlib.suppress(OSError):
+            path.unlink(missing_ok=True)
+        unfinished.discard(path)
+
+
+def write_beginning(folder: RunFolder, config: str, manifest: Manifest) -> None:
+    """Write configuration and manifest of a run that goes on in `folder`. Raises OSError."""
+    write_atomically(folder.path / "config.yaml", lambda file: file.write(config.encode()))
+    manifest.process = Holder.here(locked=folder.lock is not None and folder.lock.real)
+    manifest.write(folder.path)
+
+
+def _worked_in(path: Path, content: dict[str, Any]) -> ConfigError:
+    holder = Holder.from_json(content.get("process"))
+    who = f"{holder}, since {content.get('started')}" if holder is not None else "another process"
+    return ConfigError(path, "", f"is in use by a run ({who}); end that first")

@@ -6,27 +6,44 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from reslrb_cli.records.paid import PaidRecord
-from reslrb_cli.records.rival import RivalRecord
-from reslrb_cli.report.words import count, duration, number, shorten
+from reslrb_cli.records.decisions import PaidRecord, RivalRecord
+from reslrb_cli.report.format import count, duration, number, shorten
 
 #: The verdict on a value that can be relied on, as recorded; all others say what keeps it from that.
 SETTLED, MOVING, UNDETERMINED = "settled", "still moving", "not determined"
+
+
 NOISE, UNSEEN = "below the noise", "not seen"
+
+
 #: What of a spread the target's noise makes, at least, where that is what hides a value.
 OF_TARGET = 0.7
+
+
 #: Where a value has gone and has to go farther than this share of what its steps allow, they are too short.
 REACHED = 0.5
+
+
 #: More iterations than this many times those of a run are not proposed, nor fewer.
 LEAST_LONGER, MOST_LONGER = 2, 5
+
+
 #: What a rate is divided by where the loss rose, and the samples of a noisy target are multiplied by.
 LOWER, MORE_SAMPLES = 3, 16
+
+
 #: What is proposed, that which makes the others of no use first.
 ORDER = ("a lower rate", "scale: auto", "a higher rate", "more iterations", "more samples for it")
+
+
 #: Quantities of what emits, which may be of any size.
 EMITTED = ("radiance", "irradiance", "intensity")
+
+
 #: Parameters with one verdict that are named.
 MOST_NAMED = 3
+
+
 #: A key in a line of text has at most so many characters, and beside a verdict.
 KEY_WIDTH, PARTNER_WIDTH = 60, 40
 

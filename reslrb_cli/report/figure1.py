@@ -13,13 +13,19 @@ from reslrb_cli.measure.figure1 import Result
 from reslrb_cli.measure.held_kinds import MIB, Kind
 from reslrb_cli.measure.noise import CONFIDENCE
 from reslrb_cli.records.metrics import finite
-from reslrb_cli.report.tone import encode
+from reslrb_cli.report.tonemap import encode
 
 #: Inches: a panel's side, what is between two, and above one.
 PANEL, GAP, TITLE = 2.1, 0.08, 0.24
+
+
 DPI = 100
+
+
 #: Blue where heights are to rise, red where they are to fall; white where nothing is to be gained.
 COLORS = ("#053061", "#4393c3", "#ffffff", "#d6604d", "#67001f")
+
+
 #: Of the texels of our gradient with the most samples, so many go beyond the scale.
 BEYOND = 0.01
 

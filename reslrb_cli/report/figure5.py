@@ -13,13 +13,19 @@ from reslrb_cli.measure.figure5 import Result
 from reslrb_cli.measure.noise import relative_noise
 from reslrb_cli.records.metrics import finite
 from reslrb_cli.report.figure1 import write
-from reslrb_cli.report.tone import encode
+from reslrb_cli.report.tonemap import encode
 
 #: Inches: a panel's width, what is between two, and above one.
 PANEL, GAP, TITLE = 3.6, 0.08, 0.24
+
+
 DPI = 100
+
+
 #: As in the paper: blue negative, grey zero, red positive.
 COLORS = ("#0a2fb0", "#8a8a8a", "#c01818")
+
+
 #: Of the texels, so many go beyond the scale; and so many standard errors are its end in the z map.
 BEYOND, FAR = 0.01, 5.0
 

@@ -7,16 +7,23 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from reslrb_cli.errors import ConfigError, one_line
 from reslrb_cli.records import metrics
 from reslrb_cli.records.manifest import read_manifest
-from reslrb_cli.records.origin import Origin, read_origin
-from reslrb_cli.records.reading import Tell, read_lines
-from reslrb_cli.report.tone import Array
+from reslrb_cli.records.measurement_files import Origin, Tell, read_lines, read_origin
+
+Array = np.ndarray[Any, Any]
+
 
 #: Figures that a record of a run has, or it is none; and those that it may have.
 _FIGURES = ("iteration", "elapsed_s", "step_ms", "codegen_ms", "peak_mib", "spp")
+
+
 _MORE = ("loss", "primal_ms", "adjoint_ms", "parameter_rmse")
+
+
 #: Layers of a map of a gradient, as `gradcheck --images` writes them.
 MAP_LAYERS = ("gradient", "reference", "z")
 
@@ -102,7 +109,7 @@ def read_sources(paths: Sequence[Path], tell: Tell | None = None) -> list[Source
 def read_run(folder: Path, name: str | None = None, tell: Tell | None = None) -> Run:
     """The run in `folder`, as far as it can be read; of another folder, one that says nothing."""
     try:
-        lines = read_lines(folder / metrics.FILE_NAME, tell)
+        lines = read_lines(folder / metrics.METRICS_FILE, tell)
         damaged = lines.damaged
         records = [record for entry in lines.objects if (record := _record(entry)) is not None]
     except ConfigError:  # there are none yet
@@ -113,7 +120,7 @@ def read_run(folder: Path, name: str | None = None, tell: Tell | None = None) ->
 def _read_folder(path: Path, name: str, tell: Tell | None) -> Source:
     if read_manifest(path) is not None:
         return read_run(path, name, tell)
-    from reslrb_cli.records.layers import read_layer_names
+    from reslrb_cli.records.images import read_layer_names
 
     try:
         maps = [file for file in sorted(path.glob("*.exr")) if set(MAP_LAYERS) <= read_layer_names(file)]

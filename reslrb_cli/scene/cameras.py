@@ -16,16 +16,19 @@ from typing import Any
 
 import numpy as np
 
-from ..config.files import read_file
-from ..errors import ConfigError
-from .description import Description
-from .description.element import Element
-from .image_file import FORMATS, image_size
+from reslrb_cli.config.files import read_file
+from reslrb_cli.errors import ConfigError
+from reslrb_cli.scene.images import FORMATS, image_size
+from reslrb_cli.scene.xml.read import Description, Element
 
 #: Bytes of such a file, at most.
 MOST_BYTES = 2**26
+
+
 #: By how much the focal lengths of rows and columns may differ, relative to them.
 SQUARE = 1e-3
+
+
 #: COLMAP's models without a fisheye, and the names of their parameters; `f` is both focal lengths.
 MODELS = {
     "SIMPLE_PINHOLE": ("f", "cx", "cy"),
@@ -35,7 +38,11 @@ MODELS = {
     "OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2"),
     "FULL_OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
 }
+
+
 _DISTORTION = re.compile(r"[kp]\d")
+
+
 #: From a camera's axes to the sensor's: of NeRF (x right, y up, looking along -z) and of COLMAP (y down, along +z).
 _NERF, _COLMAP = np.diag([-1.0, 1.0, -1.0, 1.0]), np.diag([-1.0, -1.0, 1.0, 1.0])
 

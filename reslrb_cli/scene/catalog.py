@@ -1,8 +1,13 @@
-"""What parameters a scene has, and which of them can be recovered."""
+"""What parameters a scene has, and which of them can be recovered.
+
+What a scene contains, for `reslrb inspect`; printing is up to the caller.
+"""
 
 from __future__ import annotations
 
 import re
+from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -10,7 +15,23 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .motion import moving_emitter_obstacle, moving_shape_obstacle
+from reslrb_cli.scene.deformation import (
+    Movable,
+    heightmap_obstacle,
+    list_movable,
+    moving_emitter_obstacle,
+    moving_shape_obstacle,
+)
+from reslrb_cli.scene.graph import SceneGraph
+from reslrb_cli.scene.needs import (
+    SceneNeeds,
+    View,
+    camera_obstacle,
+    light_obstacle,
+    look,
+    scene_needs,
+    unsupported_part,
+)
 
 #: Emitter parameters that Mitsuba flags as differentiable, but that change where light goes and not how much it is.
 _BEAM_SHAPES = {
@@ -18,8 +39,12 @@ _BEAM_SHAPES = {
     "beam_width": "shapes the beam",
     "sun_direction": "moves the light",
 }
+
+
 #: Spectra by wavelength, which RGB variants cannot evaluate: their numbers describe what stands in the scene file.
 _SPECTRA = ("RegularSpectrum", "IrregularSpectrum", "BlackBodySpectrum")
+
+
 #: What a mesh has besides attributes such as `vertex_color`.
 _MESH_GEOMETRY = ("vertex_positions", "vertex_normals", "vertex_texcoords", "vertex_count", "face_count", "faces")
 
@@ -222,3 +247,95 @@ def _storage_bits(value: Any) -> int | None:
     if dr.is_matrix_v(value) or not dr.is_arithmetic_v(value):
         return None
     return bits.get(dr.type_v(value))
+
+
+@dataclass(frozen=True)
+class SensorSummary:
+    """One sensor: its film in pixels (`crop` is offset and size), what it sees, and what light tracing needs for it.
+
+    `obstacle` is the reason why light tracing cannot render for it, or None, and `camera_obstacle` the same of paths
+    from the sensor (`prb`). `view` is None where the reason lies
+    in the scene's parts and not in what the sensor sees.
+    """
+
+    index: int
+    id: str
+    type: str
+    film: str
+    size: tuple[int, int]
+    crop: tuple[tuple[int, int], tuple[int, int]]
+    filter: str
+    channels: int
+    needs: SceneNeeds
+    view: View | None
+    obstacle: str | None
+    camera_obstacle: str | None
+
+
+@dataclass(frozen=True)
+class MovableSummary:
+    """A shape or an emitter by its id, and what can move it: `motion`, `heightmap`."""
+
+    id: str
+    by: list[str]
+
+
+@dataclass(frozen=True)
+class SceneSummary:
+    """What a scene contains: class names and how often each occurs, sensors, all parameters, and what can be moved."""
+
+    emitters: dict[str, int]
+    bsdfs: dict[str, int]
+    shapes: dict[str, int]
+    triangles: int
+    sensors: list[SensorSummary]
+    parameters: list[ParameterInfo]
+    movable: list[MovableSummary]
+
+
+def summarise(scene: Any, hide_emitters: bool = False, sensors: Sequence[int] | None = None) -> SceneSummary:
+    """Look `scene` over; `sensors` are the indices of those to describe, None for all."""
+    graph = SceneGraph.of(scene)
+    shapes = graph.shapes()
+    indices = range(len(scene.sensors())) if sensors is None else sensors
+    params = mi.traverse(scene)
+    return SceneSummary(
+        emitters=_count(scene.emitters()),
+        bsdfs=_count(graph.of_type(mi.BSDF)),
+        shapes=_count(shapes),
+        triangles=sum(int(shape.face_count()) for shape in shapes if shape.is_mesh()),
+        sensors=[_sensor(scene, index, hide_emitters) for index in indices],
+        parameters=list_parameters(params, values=True),
+        movable=[MovableSummary(item.id, _moved_by(item)) for item in list_movable(params)],
+    )
+
+
+def _moved_by(item: Movable) -> list[str]:
+    return ["motion"] if heightmap_obstacle(item) else ["motion", "heightmap"]
+
+
+def _count(objects: Sequence[Any]) -> dict[str, int]:
+    return dict(Counter(item.class_name() for item in objects).most_common())
+
+
+def _sensor(scene: Any, index: int, hide_emitters: bool) -> SensorSummary:
+    sensor = scene.sensors()[index]
+    film = sensor.film()
+    return SensorSummary(
+        index=index,
+        id=sensor.id(),
+        type=sensor.class_name(),
+        film=film.class_name(),
+        size=_pair(film.size()),
+        crop=(_pair(film.crop_offset()), _pair(film.crop_size())),
+        filter=film.rfilter().class_name(),
+        channels=int(film.base_channels_count()),
+        needs=scene_needs(scene, sensor),
+        view=look(scene, sensor) if unsupported_part(scene, sensor) is None else None,
+        obstacle=light_obstacle(scene, sensor, hide_emitters),
+        camera_obstacle=camera_obstacle(scene, sensor),
+    )
+
+
+def _pair(values: Any) -> tuple[int, int]:
+    return int(values[0]), int(values[1])

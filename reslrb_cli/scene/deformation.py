@@ -9,10 +9,20 @@ An analytic shape, and an emitter without a surface, is placed by M after its ow
 place alone. What the scene gets are values without a graph (leaves): a step adds its gradient to these, and `collect`
 brings it on to what is recovered, once, however many views, batches and passes the step has. In forward mode `push`
 takes tangents the other way.
+
+What may move: which shapes and emitters have derivatives of where they are, and why others have none.
+
+Shapes and emitters that a motion or a heightmap can move: found by id, with the scene parameter that places each.
+
+The sphere that light from infinitely far away falls into, kept around shapes that move.
+
+Emitters without a place (a constant sky, parallel light) send their rays through a sphere around the scene. Mitsuba
+gives it to them when the scene is loaded: what moves out of it later would be in the dark.
 """
 
 from __future__ import annotations
 
+import difflib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -21,8 +31,208 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..config import HEIGHTMAP
-from .movable import Movable
+from reslrb_cli.config.parameters import HEIGHTMAP
+
+#: Analytic shapes whose `to_world` moves their surface interactions and their samples.
+MOVING_SHAPES = ("Rectangle", "Disk", "Sphere", "Cylinder")
+
+
+#: What of a mesh moves light.
+MOVING_MESH = ("vertex_positions", "vertex_normals")
+
+
+#: Emitters without a surface that can move, and what moves them.
+MOVING_EMITTERS = {"PointLight": "position", "SpotLight": "to_world", "Projector": "to_world",
+                   "DirectionalEmitter": "to_world"}  # fmt: skip
+
+
+#: Parameters that say where an emitter is.
+PLACES = ("position", "to_world")
+
+
+#: Parameters of emitters that are flagged as differentiable, and change where light goes as well.
+BEAMS = ("cutoff_angle", "beam_width", "sun_direction", "sun_aperture")
+
+
+def moving_shape_obstacle(shape: mi.Shape, key: str) -> str | None:
+    """Why there is no derivative of the parameter `key` of a shape; None where there is one."""
+    name = key.rpartition(".")[2]
+    if shape.is_mesh() and shape.class_name() not in MOVING_SHAPES:  # Mitsuba takes a rectangle for a mesh, too
+        if name not in MOVING_MESH:
+            return f"of a mesh, {' and '.join(MOVING_MESH)} have derivatives, not {name}"
+        return None
+    if shape.class_name() not in MOVING_SHAPES or name != "to_world":
+        kinds = ", ".join(kind.lower() for kind in MOVING_SHAPES)
+        return f"meshes (by their vertices) and {kinds} (by `to_world`) have derivatives, not a {shape.class_name()}"
+    return None
+
+
+def moving_emitter_obstacle(emitter: mi.Emitter, key: str | None = None) -> str | None:
+    """Why there is no derivative of the parameter `key` of an emitter without a surface, which says where it is or
+    where its light goes (None: of whatever moves it); None where there is one."""
+    kind = emitter.class_name()
+    name = MOVING_EMITTERS.get(kind, "") if key is None else key.rpartition(".")[2]
+    if name and name == MOVING_EMITTERS.get(kind):
+        return None
+    if name in BEAMS:
+        return f"{name} changes where the light of a {kind} goes, which has no derivative here"
+    if kind in ("EnvironmentMapEmitter", "SunskyEmitter"):
+        return f"a {kind} that turns has no derivative here: its directions are drawn from what it shows in each"
+    return f"a {kind} that moves has no derivative here"
+
+
+@dataclass(frozen=True)
+class Movable:
+    """An object with this `id`, and the `key` of the scene parameter that says where it is.
+
+    That is a mesh's `vertex_positions`, an analytic shape's or an emitter's `to_world`, or a point light's `position`.
+    """
+
+    id: str
+    key: str
+    node: mi.Shape | mi.Emitter
+
+    @property
+    def by_vertices(self) -> bool:
+        """Whether it is a mesh, which moves by its vertices."""
+        return self.key.endswith(".vertex_positions")
+
+    @property
+    def is_point(self) -> bool:
+        """Whether it is a point without extent and direction, so that nothing turns or scales it."""
+        return self.key.endswith(".position")
+
+    @property
+    def is_shape(self) -> bool:
+        """Whether it has a surface."""
+        return isinstance(self.node, mi.Shape)
+
+
+def find_movable(params: mi.SceneParameters, id: str) -> Movable | str:
+    """The object with this id, or the reason why it cannot be moved."""
+    for name in ("to_world", "vertex_positions", "position"):  # a rectangle has its vertices besides
+        key = f"{id}.{name}"
+        if key not in params.properties:
+            continue
+        node = params.properties[key][2]
+        if isinstance(node, mi.Emitter):
+            reason = moving_emitter_obstacle(node)
+        elif isinstance(node, mi.Shape):
+            reason = moving_shape_obstacle(node, key)
+        else:
+            return f"`{id}` is a {node.class_name()}; shapes and emitters can be moved"
+        return Movable(id, key, node) if reason is None else f"`{id}` cannot be moved: {reason}"
+    if any(key.startswith(f"{id}.") for key in params.properties):
+        return f"`{id}` has neither vertices nor a place in the scene that can be moved"
+    known = [item.id for item in list_movable(params)]
+    near = difflib.get_close_matches(id, known, n=3, cutoff=0.4) or known[:3]
+    hint = f"; did you mean {' or '.join(f'`{name}`' for name in near)}?" if near else "; nothing here can be moved"
+    return f"there is no `{id}` in the scene{hint}"
+
+
+def list_movable(params: mi.SceneParameters) -> list[Movable]:
+    """All that can be moved, in the scene's order."""
+    found: dict[str, Movable] = {}
+    for key in params.properties:
+        id, _, name = key.rpartition(".")
+        if id and id not in found and name in ("to_world", "vertex_positions", "position"):
+            item = find_movable(params, id)
+            if isinstance(item, Movable):
+                found[id] = item
+    return list(found.values())
+
+
+def heightmap_obstacle(item: Movable) -> str | None:
+    """Why no heightmap can displace an object; None where one can."""
+    if not item.by_vertices:
+        return f"`{item.id}` is a {item.node.class_name()}; a heightmap displaces the vertices of a mesh"
+    if not item.node.has_vertex_texcoords():
+        return f"`{item.id}` has no texture coordinates, over which a heightmap is laid; give the mesh some"
+    return None
+
+
+def casts_edges(scene: mi.Scene, item: Movable) -> bool:
+    """Whether what moves can have a silhouette or throw a shadow: a shape that does not enclose all others."""
+    if not item.is_shape:
+        return False
+    own = item.node.bbox()
+    others = [shape.bbox() for shape in scene.shapes() if shape.ptr != item.node.ptr]
+    return not all(own.contains(box, strict=True) for box in others)
+
+
+def where_moved(params: mi.SceneParameters, keys: list[str]) -> list[Movable]:
+    """The objects that the scene parameters `keys` move."""
+    kinds = (*MOVING_SHAPES, *MOVING_EMITTERS)
+    found = []
+    for key in keys:
+        id, _, name = key.rpartition(".")
+        node = params.properties[key][2]
+        if name == "vertex_positions" or (name in ("to_world", "position") and node.class_name() in kinds):
+            found.append(Movable(id, key, node))
+    return found
+
+
+#: By how much a sphere that has become too small is larger than need be: kernels are compiled for each one.
+MARGIN = 1.25
+
+
+#: A sphere this many times as large as need be wastes light paths.
+TOO_LARGE = 2.0
+
+
+@dataclass(frozen=True)
+class Horizon:
+    """A sphere."""
+
+    center: tuple[float, float, float]
+    radius: float
+
+    def holds(self, box: mi.ScalarBoundingBox3f) -> bool:
+        """Whether the box lies within the sphere."""
+        farthest = np.maximum(np.abs(np.subtract(box.min, self.center)), np.abs(np.subtract(box.max, self.center)))
+        return float(np.linalg.norm(farthest)) <= self.radius * (1 + 1e-6)
+
+
+class Surroundings:
+    """The horizon of one scene: the last that was asked for."""
+
+    def __init__(self) -> None:
+        self._scene = 0  # its address
+        self._horizon: Horizon | None = None
+
+    def follow(self, scene: mi.Scene) -> Horizon:
+        """A sphere that holds all shapes of the scene as they are now; the scene's emitters know it, too.
+
+        It stays as it is while that is so.
+        """
+        around, before = bounds(scene), self._horizon if self._scene == scene.ptr else None
+        if before is not None and before.holds(scene.bbox()) and before.radius < TOO_LARGE * around.radius:
+            return before
+        if before is None:
+            self._horizon = around
+            tell(scene, scene)
+        else:
+            self._horizon = Horizon(around.center, MARGIN * around.radius)
+            # An emitter asks a scene for its bounds, and nothing else; this one has those that it is to know.
+            half = [self._horizon.radius / 3**0.5] * 3
+            corner = mi.ScalarTransform4f().translate(list(self._horizon.center)) @ mi.ScalarTransform4f().scale(half)
+            tell(scene, mi.load_dict({"type": "scene", "box": {"type": "cube", "to_world": corner}}))
+        self._scene = scene.ptr
+        return self._horizon
+
+
+def bounds(scene: mi.Scene) -> Horizon:
+    """The smallest sphere around the box around all shapes."""
+    sphere = scene.bbox().bounding_sphere()
+    x, y, z = (float(value) for value in sphere.center)
+    return Horizon((x, y, z), float(sphere.radius))
+
+
+def tell(scene: mi.Scene, bounded: mi.Scene) -> None:
+    """Have the emitters of `scene` that are infinitely far away light what `bounded` has bounds around."""
+    for emitter in scene.emitters():
+        if mi.has_flag(emitter.flags(), mi.EmitterFlags.Infinite):
+            emitter.set_scene(bounded)
 
 
 @dataclass(frozen=True)
@@ -80,6 +290,20 @@ class _Moved:
     texcoords: Any = None
     tracked: Any = None
     leaf: Any = None
+
+
+def _corners(uv: mi.Point2f, width: int, height: int) -> tuple[list[mi.UInt32], list[mi.Float]]:
+    """Indices and weights of the four texels about each of `uv`; row 0 is at v = 0, as in Mitsuba's textures."""
+    x = dr.clip(uv.x * width - 0.5, 0, width - 1)
+    y = dr.clip(uv.y * height - 0.5, 0, height - 1)
+    x0 = dr.minimum(mi.UInt32(x), width - 2)
+    y0 = dr.minimum(mi.UInt32(y), height - 2)
+    a, b = x - x0, y - y0
+    first = y0 * width + x0
+    indices = [first, first + 1, first + width, first + width + 1]
+    weights = [(1 - a) * (1 - b), a * (1 - b), (1 - a) * b, a * b]
+    dr.make_opaque(indices, weights)
+    return indices, weights
 
 
 @dataclass
@@ -216,20 +440,6 @@ class _Lookup(dr.CustomOp):
 
     def name(self) -> str:
         return "heightmap"
-
-
-def _corners(uv: mi.Point2f, width: int, height: int) -> tuple[list[mi.UInt32], list[mi.Float]]:
-    """Indices and weights of the four texels about each of `uv`; row 0 is at v = 0, as in Mitsuba's textures."""
-    x = dr.clip(uv.x * width - 0.5, 0, width - 1)
-    y = dr.clip(uv.y * height - 0.5, 0, height - 1)
-    x0 = dr.minimum(mi.UInt32(x), width - 2)
-    y0 = dr.minimum(mi.UInt32(y), height - 2)
-    a, b = x - x0, y - y0
-    first = y0 * width + x0
-    indices = [first, first + 1, first + width, first + width + 1]
-    weights = [(1 - a) * (1 - b), a * (1 - b), (1 - a) * b, a * b]
-    dr.make_opaque(indices, weights)
-    return indices, weights
 
 
 def _vertex_normals(mesh: mi.Mesh) -> mi.Normal3f:

@@ -1,11 +1,23 @@
-"""The graph of a scene's objects: what there is, and what uses what."""
+"""The graph of a scene's objects: what there is, and what uses what.
+
+Shapes that emit light, and what their emitters do.
+
+Rays as the emitters of a scene send them out, where Mitsuba can sample them.
+
+Lamps in view that are smaller than a pixel, which rays through the pixels hardly ever hit.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any
 
+import drjit as dr
 import mitsuba as mi
+import numpy as np
+
+from reslrb_cli.errors import UnsupportedScene
 
 
 @dataclass
@@ -76,3 +88,122 @@ class SceneGraph:
                 owners[current] = None
             waiting += above
         return list(owners)
+
+
+@dataclass(frozen=True)
+class Lamp:
+    """A shape that emits; `emitter` is its emitter, and `index` the number of that in `scene.emitters()`.
+
+    `parallel`: light leaves along the normal alone (`directionalarea`). `texture`: what its points are sampled in
+    proportion to; None: evenly over its area.
+    """
+
+    shape: mi.Shape
+    emitter: mi.Emitter
+    index: int
+    parallel: bool
+    texture: mi.Texture | None
+
+    @property
+    def is_sphere(self) -> bool:
+        """Whether the shape is a sphere."""
+        return self.shape.class_name() == "Sphere"
+
+    @property
+    def faces_by_area(self) -> bool:
+        """Whether one of its faces is drawn in proportion to its area, as Mitsuba has it now."""
+        return self.has_faces and self.texture is None
+
+    @property
+    def has_faces(self) -> bool:
+        """Whether the shape is a mesh of which each vertex can move."""
+        return self.shape.is_mesh() and self.shape.class_name() != "Rectangle"
+
+
+def find_lamps(scene: mi.Scene, graph: SceneGraph) -> tuple[Lamp, ...]:
+    """All shapes of `scene` that emit, in the order of `scene.emitters()`."""
+    found = []
+    for index, emitter in enumerate(scene.emitters()):
+        shape = emitter.get_shape()
+        if shape is None:
+            continue
+        parallel = emitter.class_name() == "DirectionalArea"
+        textures = [item for item in graph.of_type(mi.Texture) if emitter in graph.parents[item]]
+        varying = [texture for texture in textures if texture.is_spatially_varying()]
+        found.append(Lamp(shape, emitter, index, parallel, varying[0] if varying and not parallel else None))
+    return tuple(found)
+
+
+def emitted_rays(
+    scene: mi.Scene, wavelength: mi.Float, place: mi.Point2f, direction: mi.Point2f
+) -> tuple[mi.Ray3f, mi.Spectrum]:
+    """Rays from all emitters, and their weights, of random numbers in [0, 1).
+
+    Raises UnsupportedScene, which names it, where there is an emitter that Mitsuba cannot sample, such as a lamp or a
+    spot with a checkerboard.
+    """
+    try:
+        ray, weight, _ = scene.sample_emitter_ray(0, wavelength, place, direction, True)
+    except RuntimeError as error:
+        if "not implemented" not in str(error):
+            raise
+        names = ", ".join(emitter.id() for emitter in scene.emitters() if not _can_be_sampled(emitter))
+        reason = " ".join(str(error).split())
+        raise UnsupportedScene(
+            f"Mitsuba cannot sample the rays of emitter {names}: {reason}; give it a `bitmap`"
+        ) from None
+    return ray, weight
+
+
+def _can_be_sampled(emitter: mi.Emitter) -> bool:
+    try:
+        emitter.sample_ray(0, 0.5, mi.Point2f(0.5), mi.Point2f(0.5), True)
+    except RuntimeError:
+        return False
+    return True
+
+
+#: What a lamp's diameter on the film is below, in pixels.
+SMALL = 1.0
+
+
+#: Lamps, at the most: of those, light is told from all other by comparing each in turn.
+MOST = 64
+
+
+#: Points of a lamp along each side of a grid, by which it is found to be in view.
+POINTS = 16
+
+
+def small_lamps(scene: mi.Scene, sensor: mi.Sensor, lamps: Iterable[Lamp]) -> tuple[Lamp, ...]:
+    """Those of the lamps that `sensor` sees directly as less than a pixel; none where there are more than MOST.
+
+    Lamps that shine along their normal alone are not seen at all.
+    """
+    found = [lamp for lamp in lamps if not lamp.parallel and _pixels(sensor, lamp.shape) < SMALL]
+    if len(found) > MOST:
+        return ()
+    return tuple(lamp for lamp in found if _is_in_view(scene, sensor, lamp.shape))
+
+
+def _pixels(sensor: mi.Sensor, shape: mi.Shape) -> float:
+    """The diameter on the film, in pixels, of the sphere around the shape's bounding box, wherever the sensor looks."""
+    box = shape.bbox()
+    radius = float(np.linalg.norm(np.ravel(box.max) - np.ravel(box.min))) / 2
+    eye = np.ravel(sensor.world_transform().translation())
+    distance = float(np.linalg.norm((np.ravel(box.max) + np.ravel(box.min)) / 2 - eye))
+    if not distance > radius:
+        return np.inf
+    half = np.tan(np.deg2rad(float(mi.traverse(sensor)["x_fov"][0])) / 2)
+    return float(radius / distance / half * int(sensor.film().size()[0]))
+
+
+def _is_in_view(scene: mi.Scene, sensor: mi.Sensor, shape: mi.Shape) -> bool:
+    """Whether any of a grid of points on the shape is before the lens, with nothing in between."""
+    lane = dr.arange(mi.UInt32, POINTS**2)
+    sample = (mi.Point2f(lane % POINTS, lane // POINTS) + 0.5) / POINTS
+    with dr.suspend_grad():
+        si = mi.SurfaceInteraction3f(shape.sample_position(sensor.shutter_open(), sample), mi.Color0f())
+        ds, _ = sensor.sample_direction(si, mi.Point2f(0.5), True)
+        seen = ds.pdf > 0
+        return bool(dr.any(seen & ~scene.ray_test(si.spawn_ray_to(ds.p), seen)))

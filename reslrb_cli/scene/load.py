@@ -13,26 +13,16 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
-from ..backend.variant import check_variant
-from ..errors import ConfigError
-from .cameras import read_cameras, replace_sensors
-from .catalog import coarse_bits
-from .description import (
-    Description,
-    build,
-    check,
-    check_sizes,
-    mend,
-    name_objects,
-    notes,
-    place_textures,
-    read_description,
-    resize_films,
-)
-from .description.element import Element, quoted
-from .description.naming import Owners
-from .extent import coincident, lost_light
-from .thin_glass import thin_glass
+from reslrb_cli.backend.variant import check_variant
+from reslrb_cli.errors import ConfigError
+from reslrb_cli.scene.cameras import read_cameras, replace_sensors
+from reslrb_cli.scene.catalog import coarse_bits
+from reslrb_cli.scene.extent import coincident, lost_light, thin_glass
+from reslrb_cli.scene.xml import mend as notes
+from reslrb_cli.scene.xml.build import Owners, build, name_objects
+from reslrb_cli.scene.xml.check import check, check_sizes, resize_films
+from reslrb_cli.scene.xml.mend import mend, place_textures
+from reslrb_cli.scene.xml.read import Description, Element, quoted, read_description
 
 logger = logging.getLogger(__name__)
 

@@ -10,11 +10,11 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..config import RunValue, Settings
-from ..errors import ConfigError
-from ..records.run_values import read_value
-from .catalog import halo
-from .target import read_image
+from reslrb_cli.config.parameters import RunValue, Settings
+from reslrb_cli.errors import ConfigError
+from reslrb_cli.records.run_folder import read_value
+from reslrb_cli.scene.catalog import halo
+from reslrb_cli.scene.images import read_image
 
 Array = np.ndarray[Any, Any]
 

@@ -28,44 +28,21 @@ from typing import TYPE_CHECKING
 
 import drjit as dr
 import mitsuba as mi
-import numpy as np
-from numpy.typing import NDArray
 
-from reslrb_cli.backend.own_memory import own_memory
-from reslrb_cli.transport.blocks import Blocks, film_blocks
-from reslrb_cli.transport.numbers import Numbers
+from reslrb_cli.transport.bsdf import Aimed
+from reslrb_cli.transport.film import film_blocks
+from reslrb_cli.transport.guide import AIM_SLOTS, Aim
+from reslrb_cli.transport.random import Numbers
 
 if TYPE_CHECKING:
     from reslrb_cli.scene.needs import SceneNeeds
     from reslrb_cli.transport.connection import Connection
 
+
 SHARE = 0.25  # of the paths that scatter
-UNIFORM = 0.2  # of these, how many are sent to places drawn evenly on the film, at least
-SLOTS = 1 << 17
+
+
 REACHED = 1 - 1e-3  # of the distance to a point, where nothing stands in the way: as far as shadow rays look
-
-
-@dataclass
-class Aim:
-    """Where on the film paths are sent: the block of each slot (SLOTS), and the density of each block's positions,
-    relative to an even one."""
-
-    slots: mi.UInt32
-    density: mi.Float
-
-    @staticmethod
-    def of(blocks: Blocks, wanted: NDArray[np.float64]) -> Aim:
-        """Blocks in proportion to `wanted` (rows * columns), nowhere negative, and UNIFORM of them evenly."""
-        even = blocks.areas() / blocks.areas().sum()
-        total = wanted.sum()
-        density = UNIFORM * even + (1 - UNIFORM) * (wanted / total if np.isfinite(total) and total > 0 else even)
-        # One each, so that there is none that no path is sent to; the others rounded along the blocks' order.
-        ends = np.rint(np.cumsum(density) * ((SLOTS - len(even)) / density.sum()))
-        counts = 1 + np.diff(ends, prepend=0).astype(np.int64)
-        return Aim(
-            own_memory(mi.UInt32, np.repeat(np.arange(len(counts), dtype=np.uint32), counts)),
-            own_memory(mi.Float, (counts / SLOTS / even).astype(np.float32)),
-        )
 
 
 @dataclass
@@ -114,16 +91,6 @@ class Pending:
         return dr.detach(dr.select(missed, 0, r))
 
 
-@dataclass
-class Aimed:
-    """Which lanes of an event are aimed, where to (`point`), whether there is anything, and their `share`."""
-
-    active: mi.Bool
-    point: mi.Point3f
-    found: mi.Bool
-    share: mi.Float
-
-
 def worthwhile(needs: SceneNeeds, max_depth: int) -> bool:
     """Whether paths are aimed in such a scene: where there are glossy surfaces, and a pinhole that sees them.
 
@@ -154,7 +121,7 @@ def choose(
     active = numbers.bsdf_1d < share
     own = dr.select(active, numbers.bsdf_1d / share, (numbers.bsdf_1d - share) / (1 - share))
     film = film_blocks(sensor)
-    block = dr.gather(mi.UInt32, aim.slots, dr.minimum(mi.UInt32(slot * SLOTS), SLOTS - 1), active)
+    block = dr.gather(mi.UInt32, aim.slots, dr.minimum(mi.UInt32(slot * AIM_SLOTS), AIM_SLOTS - 1), active)
     begin = mi.Vector2f(block % film.columns, block // film.columns) * film.side
     end = dr.minimum(begin + film.side, mi.Vector2f(film.width, film.height))
     u = dr.fma(numbers.bsdf_2d, end - begin, begin) / mi.Vector2f(film.width, film.height)

@@ -10,11 +10,24 @@ Drawing takes one look-up: of M slots, cell k owns m_k, and p_k = m_k / M exactl
 from the i-th n-th of all slots: what is left of the noise is that within cells, and paths that start alike are traced
 side by side. At least UNIFORM of all slots are shared out evenly, so that no table makes a weight larger than
 1 / UNIFORM.
+
+Russian roulette by what a path can still say: paths that go where earlier ones had little left to say end early.
+
+The scene's bounding box is cut into cubes, and the directions of each cube into octants. A path that leaves a vertex
+with throughput w (the largest channel, emission and the weights of earlier roulette included) goes on with probability
+
+    q = min(1, max(LEAST, w s))        s: the number of the cell that the vertex and the new direction lie in
+
+and counts for 1 / q if it does. The mean of whatever is computed from paths stays what it was for any s that does not
+depend on the random numbers that it is used with. How s is learned says `guiding/collect.py`.
+
+The more a path has been weighted up, the larger is its w, and so its q: since q is at least w s where it is below 1, no
+throughput is raised beyond 1 / s_0, where s is nowhere below s_0. Roulette on throughput alone is played beside it from
+`rr_depth` on, so that paths end that nothing else would end.
 """
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -22,96 +35,84 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from numpy.typing import NDArray
 
-from reslrb_cli.backend.own_memory import own_memory
-from reslrb_cli.transport.aim import Aim
-from reslrb_cli.transport.blocks import Blocks
-from reslrb_cli.transport.survival import Survival
+from reslrb_cli.backend.memory import own_memory
+from reslrb_cli.transport.film import Blocks
+from reslrb_cli.transport.plan import Grid, _least_slots
 
 Array = np.ndarray[Any, Any]
 
-UNIFORM = 0.25  # share of paths that start evenly, at least
+
+BITS = 4  # cubes along each axis of the box, log2
+
+
+OCTANTS = 8
+
+
+CELLS = OCTANTS << (3 * BITS)
+
+
+SHAPE = (1 << BITS, 1 << BITS, 1 << BITS, OCTANTS)  # of an array of all cells
+
+
+LEAST = 0.5  # the smallest probability of going on
+
+
+@dataclass
+class Survival:
+    """`chances` (CELLS) are s of all cells; `corner` is where the box begins, `cubes` how many there are to a unit of
+    length along each axis. The latter two are opaque."""
+
+    chances: mi.Float
+    corner: mi.Point3f
+    cubes: mi.Vector3f
+
+    @staticmethod
+    def of(box: Array, chances: Array) -> Survival:
+        """For a box (2, 3), its lower and its upper corner."""
+        cubes = (1 << BITS) / np.where(box[1] > box[0], box[1] - box[0], np.inf)
+        own = own_memory(mi.Float, chances.astype(np.float32))
+        corner, per_unit = (
+            kind(*(dr.opaque(mi.Float, float(x)) for x in values))
+            for kind, values in ((mi.Point3f, box[0]), (mi.Vector3f, cubes))
+        )
+        return Survival(own, corner, per_unit)
+
+    @staticmethod
+    def certain() -> Survival:
+        """That of somebody who has learned nothing: all paths go on."""
+        return Survival.of(np.zeros((2, 3)), np.full(CELLS, np.inf))
+
+    def cell(self, o: mi.Point3f, d: mi.Vector3f) -> mi.UInt32:
+        """The cell of a ray that leaves `o`; what lies outside of the box counts to the nearest cube."""
+        place, most = dr.detach((o - self.corner) * self.cubes), (1 << BITS) - 1
+        result = mi.UInt32(0)
+        for k in range(3):
+            # A second bound in integers: what NaN becomes is not defined, and may not leave the table.
+            result = (result << BITS) | dr.minimum(mi.UInt32(dr.clip(place[k], 0, most)), most)
+        for k in range(3):
+            result = (result << 1) | dr.select(d[k] > 0, mi.UInt32(1), 0)
+        return result
+
+    def probability(self, o: mi.Point3f, d: mi.Vector3f, throughput: mi.Float) -> mi.Float:
+        """q of a ray that leaves `o` along `d`; detached."""
+        # A throughput that is not a number has q = LEAST: it is to be seen, not to vanish.
+        chance = dr.gather(mi.Float, self.chances, self.cell(o, d))
+        return dr.fmin(dr.fmax(dr.detach(throughput) * chance, LEAST), 1)
+
+
+def box_of(scene: mi.Scene) -> Array:
+    """The box (2, 3) of a scene's shapes, float32; of size 0 where it has none."""
+    bounds = scene.bbox()
+    box = np.array([np.array(bounds.min).ravel(), np.array(bounds.max).ravel()], np.float32)
+    return box if np.isfinite(box).all() and (box[1] >= box[0]).all() else np.zeros((2, 3), np.float32)
+
+
 CELL_BITS = 19  # cells of all emitters together, log2
+
+
 MOST_EMITTERS = 1024  # that have cells of their own; of more, neighbours share theirs
-SLOTS_PER_CELL = 4  # one of them is the even share
-SLOTS_OF_SEVERAL = 8  # where emitters have unequal shares, which are rounded up to whole slots
-
-
-@dataclass(frozen=True)
-class Grid:
-    """How the cube is cut: into 2^bits along each of its four numbers, those of the place first.
-
-    `edges` (E + 1) are where the share of each emitter (or of some together) in the choosing number begins and ends.
-    """
-
-    bits: tuple[int, int, int, int]
-    edges: tuple[float, ...]
-
-    @property
-    def emitters(self) -> int:
-        """How many emitters, or groups of them, have cells of their own."""
-        return len(self.edges) - 1
-
-    @property
-    def cells(self) -> int:
-        """Cells of all emitters; those of one stand together."""
-        return self.emitters << sum(self.bits)
-
-    @property
-    def slots(self) -> int:
-        """Slots, a power of two."""
-        each = SLOTS_PER_CELL if self.emitters == 1 else SLOTS_OF_SEVERAL
-        return 1 << (each * self.cells - 1).bit_length()
-
-    @property
-    def shape(self) -> tuple[int, ...]:
-        """Of an array of all cells: the emitter, then the four numbers, the last of which comes first in a cell's index
-        and so last here."""
-        return (self.emitters, *(1 << bits for bits in reversed(self.bits)))
-
-    def measures(self) -> Array:
-        """v_k of all cells, float64, not to be written to; they sum to 1."""
-        return _measures(self)
-
-    def coarser(self, cells: float) -> Grid:
-        """The same cut into at most so many cells, or one of each emitter; each is made of this one's."""
-        bits = list(self.bits)
-        while sum(bits) > 0 and self.emitters << sum(bits) > cells:
-            bits[3 - bits[::-1].index(max(bits))] -= 1  # the one that was cut last
-        return Grid((bits[0], bits[1], bits[2], bits[3]), self.edges)
-
-    def summed(self, values: Array, coarser: Grid) -> Array:
-        """Of values for these cells (cells,) the sums over each coarser one's, of the same type."""
-        result = values.reshape(self.shape)
-        for axis, few in enumerate(coarser.shape):
-            while result.shape[axis] > few:
-                rows = np.moveaxis(result, axis, 0)
-                result = np.moveaxis(rows[::2] + rows[1::2], 0, axis)
-        return result.ravel()
-
-    def shared_out(self, values: Array, coarser: Grid) -> Array:
-        """Of values for coarser cells, each one's spread evenly over its own; the inverse of `summed`."""
-        result = values.reshape(coarser.shape) * (coarser.cells / self.cells)
-        for axis, (fine, few) in enumerate(zip(self.shape, coarser.shape, strict=True)):
-            result = result.repeat(fine // few, axis)
-        return result.ravel()
-
-
-@functools.lru_cache(maxsize=4)
-def _measures(grid: Grid) -> Array:
-    # Every table that is made asks for them, several times.
-    result = np.repeat(np.diff(grid.edges) / (1 << sum(grid.bits)), 1 << sum(grid.bits))
-    result.setflags(write=False)
-    return result
-
-
-@functools.lru_cache(maxsize=4)
-def _least_slots(grid: Grid) -> Array:
-    """Slots that each cell has at least, float64: UNIFORM of its measure."""
-    measures = grid.measures()
-    result = np.where(measures > 0, np.maximum(np.ceil(UNIFORM * grid.slots * measures - 1e-6), 1), 0)
-    result.setflags(write=False)
-    return result
 
 
 def make_grid(used: Sequence[bool], weights: Sequence[float], cell_bits: int = CELL_BITS) -> Grid:
@@ -141,6 +142,31 @@ def apportion(grid: Grid, density: Array) -> Array:
     counts[1:] += ends[1:]
     counts[1:] -= ends[:-1]
     return counts.astype(np.int64)
+
+
+@dataclass
+class Aim:
+    """Where on the film paths are sent: the block of each slot (SLOTS), and the density of each block's positions,
+    relative to an even one."""
+
+    slots: mi.UInt32
+    density: mi.Float
+
+    @staticmethod
+    def of(blocks: Blocks, wanted: NDArray[np.float64]) -> Aim:
+        """Blocks in proportion to `wanted` (rows * columns), nowhere negative, and UNIFORM of them evenly."""
+        even = blocks.areas() / blocks.areas().sum()
+        total = wanted.sum()
+        density = AIM_UNIFORM * even + (1 - AIM_UNIFORM) * (
+            wanted / total if np.isfinite(total) and total > 0 else even
+        )
+        # One each, so that there is none that no path is sent to; the others rounded along the blocks' order.
+        ends = np.rint(np.cumsum(density) * ((AIM_SLOTS - len(even)) / density.sum()))
+        counts = 1 + np.diff(ends, prepend=0).astype(np.int64)
+        return Aim(
+            own_memory(mi.UInt32, np.repeat(np.arange(len(counts), dtype=np.uint32), counts)),
+            own_memory(mi.Float, (counts / AIM_SLOTS / even).astype(np.float32)),
+        )
 
 
 @dataclass
@@ -223,3 +249,9 @@ class Guide:
             begin, end = (dr.gather(mi.Float, self.table.edges, emitter + k) for k in (0, 1))
             choice = dr.minimum(dr.fma(choice, end - begin, begin), end * below)
         return Drawn(choice, mi.Point2f(numbers[0], numbers[1]), mi.Point2f(numbers[2], numbers[3]), cell, weight)
+
+
+AIM_UNIFORM = 0.2  # of these, how many are sent to places drawn evenly on the film, at least
+
+
+AIM_SLOTS = 1 << 17

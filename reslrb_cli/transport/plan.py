@@ -2,15 +2,106 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass, replace
+from typing import Any
 
 import mitsuba as mi
+import numpy as np
 
-from reslrb_cli.scene.horizon import Horizon
-from reslrb_cli.scene.lamps import Lamp
+from reslrb_cli.scene.deformation import Horizon
+from reslrb_cli.scene.graph import Lamp
 from reslrb_cli.scene.needs import SceneNeeds
-from reslrb_cli.transport.guide import Grid
-from reslrb_cli.transport.nets import Coordinates
+from reslrb_cli.transport.random import Coordinates
+
+Array = np.ndarray[Any, Any]
+
+
+GUIDE_UNIFORM = 0.25  # share of paths that start evenly, at least
+
+
+SLOTS_PER_CELL = 4  # one of them is the even share
+
+
+SLOTS_OF_SEVERAL = 8  # where emitters have unequal shares, which are rounded up to whole slots
+
+
+@dataclass(frozen=True)
+class Grid:
+    """How the cube is cut: into 2^bits along each of its four numbers, those of the place first.
+
+    `edges` (E + 1) are where the share of each emitter (or of some together) in the choosing number begins and ends.
+    """
+
+    bits: tuple[int, int, int, int]
+    edges: tuple[float, ...]
+
+    @property
+    def emitters(self) -> int:
+        """How many emitters, or groups of them, have cells of their own."""
+        return len(self.edges) - 1
+
+    @property
+    def cells(self) -> int:
+        """Cells of all emitters; those of one stand together."""
+        return self.emitters << sum(self.bits)
+
+    @property
+    def slots(self) -> int:
+        """Slots, a power of two."""
+        each = SLOTS_PER_CELL if self.emitters == 1 else SLOTS_OF_SEVERAL
+        return 1 << (each * self.cells - 1).bit_length()
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Of an array of all cells: the emitter, then the four numbers, the last of which comes first in a cell's index
+        and so last here."""
+        return (self.emitters, *(1 << bits for bits in reversed(self.bits)))
+
+    def measures(self) -> Array:
+        """v_k of all cells, float64, not to be written to; they sum to 1."""
+        return _measures(self)
+
+    def coarser(self, cells: float) -> Grid:
+        """The same cut into at most so many cells, or one of each emitter; each is made of this one's."""
+        bits = list(self.bits)
+        while sum(bits) > 0 and self.emitters << sum(bits) > cells:
+            bits[3 - bits[::-1].index(max(bits))] -= 1  # the one that was cut last
+        return Grid((bits[0], bits[1], bits[2], bits[3]), self.edges)
+
+    def summed(self, values: Array, coarser: Grid) -> Array:
+        """Of values for these cells (cells,) the sums over each coarser one's, of the same type."""
+        result = values.reshape(self.shape)
+        for axis, few in enumerate(coarser.shape):
+            while result.shape[axis] > few:
+                rows = np.moveaxis(result, axis, 0)
+                result = np.moveaxis(rows[::2] + rows[1::2], 0, axis)
+        return result.ravel()
+
+    def shared_out(self, values: Array, coarser: Grid) -> Array:
+        """Of values for coarser cells, each one's spread evenly over its own; the inverse of `summed`."""
+        result = values.reshape(coarser.shape) * (coarser.cells / self.cells)
+        for axis, (fine, few) in enumerate(zip(self.shape, coarser.shape, strict=True)):
+            result = result.repeat(fine // few, axis)
+        return result.ravel()
+
+
+@functools.lru_cache(maxsize=4)
+def _measures(grid: Grid) -> Array:
+    # Every table that is made asks for them, several times.
+    result = np.repeat(np.diff(grid.edges) / (1 << sum(grid.bits)), 1 << sum(grid.bits))
+    result.setflags(write=False)
+    return result
+
+
+@functools.lru_cache(maxsize=4)
+def _least_slots(grid: Grid) -> Array:
+    """Slots that each cell has at least, float64: UNIFORM of its measure."""
+    measures = grid.measures()
+    result = np.where(measures > 0, np.maximum(np.ceil(GUIDE_UNIFORM * grid.slots * measures - 1e-6), 1), 0)
+    result.setflags(write=False)
+    return result
+
 
 UNBOUNDED = 0xFFFFFFFF
 

@@ -1,29 +1,106 @@
-"""The samples of one pass over a light-traced image: which random numbers, how many light paths, for which film."""
+"""The samples of one pass over a light-traced image: which random numbers, how many light paths, for which film.
+
+Images and gradients of several passes, added up.
+
+In single precision a sum over all samples would lose the last of them (1e8 samples: a quarter of a pixel), so each pass
+has a block and gradients of its own, and these are added to one another.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import drjit as dr
 import mitsuba as mi
 
-from reslrb_cli.config.limits import PASS_PATHS, PASS_SAMPLES, PASSES
-from reslrb_cli.scene.lamps import Lamp
-from reslrb_cli.transport.emission import Numbered
+from reslrb_cli.config.files import PASS_PATHS, PASS_SAMPLES, PASSES
+from reslrb_cli.scene.graph import Lamp
+from reslrb_cli.transport.film import Film
 from reslrb_cli.transport.guide import Drawn, Guide, Table
-from reslrb_cli.transport.lamps import sums_of_areas
-from reslrb_cli.transport.nets import Net, Points
-from reslrb_cli.transport.numbers import Early
 from reslrb_cli.transport.plan import Plan
-from reslrb_cli.transport.splat import Film
+from reslrb_cli.transport.random import Early, Net, Numbered, Points
+
+
+def in_passes(
+    samples: list[Samples],
+    work: Callable[[Samples, mi.ImageBlock | None], None],
+    block: mi.ImageBlock | None,
+    params: mi.SceneParameters | None = None,
+) -> None:
+    """Call `work(part, block)` for each pass. It splats into the block (None: nothing), and differentiates `params`
+    (None: nothing)."""
+    if len(samples) == 1:
+        work(samples[0], block)
+        return
+    sums = None if params is None else GradientSum(params)
+    for part in samples:
+        own = None if block is None else part.film.block()
+        work(part, own)
+        if block is not None:
+            block.put_block(own)
+        finish_pass([] if block is None else block.tensor())
+        if sums is not None:
+            sums.take()
+    if sums is not None:
+        sums.put()
+
+
+class GradientSum:
+    """Sums the parameters' gradients over passes, apart from where each pass adds its own."""
+
+    def __init__(self, params: mi.SceneParameters) -> None:
+        with dr.resume_grad():  # where gradients are suspended, nothing says that it tracks them
+            enabled = [value for _, value in params.items() if dr.grad_enabled(value)]
+            self.values = [array for value in enabled for array in _arrays(value)]
+        self.totals: list[dr.ArrayBase] = []
+
+    def take(self) -> None:
+        """Take what has been added to the gradients since the last time."""
+        with dr.resume_grad():
+            found = [dr.detach(dr.grad(value)) for value in self.values]
+            self.totals = [a + b for a, b in zip(self.totals, found, strict=True)] if self.totals else found
+            for value in self.values:
+                dr.clear_grad(value)
+        finish_pass(self.totals)
+
+    def put(self) -> None:
+        """Give the sums to the parameters."""
+        with dr.resume_grad():
+            for value, total in zip(self.values, self.totals, strict=True):
+                dr.accum_grad(value, total)
+
+
+def _arrays(value: dr.ArrayBase | mi.AffineTransform4f) -> list[dr.ArrayBase]:
+    """The arrays of a parameter that gradients can be added to: a transform, which cannot be added, has two."""
+    return [value.matrix, value.inverse_transpose] if isinstance(value, mi.AffineTransform4f) else [value]
+
+
+def finish_pass(*results: object) -> None:
+    """Evaluate what a pass yields, and wait for it: memory of passes that are still queued would pile up."""
+    dr.eval(*results)
+    dr.sync_thread()
+
 
 #: Names of the random streams beside the sampler's own, mixed into the seed.
 SELECTION_STREAM = 0x5E1EC7  # what hooks draw to select
+
+
 VISIBLE_STREAM = 0xD1EC7  # primary rays
+
+
 LAMP_STREAM = 0x1A3B5 << 12  # points of lamps; the lamp's number is added
+
+
 PASS_STREAM = 0x9A55E5  # seeds of the second pass and those after it
+
+
 SMALL_LAMP_STREAM = 0x57A25  # points of lamps that are smaller than a pixel
+
+
 GUIDE_STREAM = 0x6D1DE  # cells of emission
+
+
 NET_STREAM = 0x5EC0E  # scrambles of numbers of low discrepancy
 
 
@@ -193,3 +270,17 @@ def _parts(spp: int) -> list[int]:
     """The fewest parts of at most PASS_SAMPLES samples, of sizes that differ by 1 at most."""
     count = -(-spp // PASS_SAMPLES)
     return [spp // count + (part < spp % count) for part in range(count)]
+
+
+def sums_of_areas(lamps: Sequence[Lamp]) -> list[mi.Float]:
+    """Of each lamp, a mesh, the areas of its first faces, summed: (F,), evaluated and detached."""
+    with dr.suspend_grad():
+        found = [dr.cumsum(face_area(lamp.shape, dr.arange(mi.UInt32, lamp.shape.face_count()))) for lamp in lamps]
+        dr.eval(found)
+        return found
+
+
+def face_area(mesh: mi.Mesh, face: mi.UInt32) -> mi.Float:
+    """The area of a face of a mesh."""
+    a, b, c = (mesh.vertex_position(vertex) for vertex in mesh.face_indices(face))
+    return 0.5 * dr.norm(dr.cross(b - a, c - a))

@@ -3,6 +3,14 @@ and no estimator or integrator repeats the loop.
 
 Random numbers are drawn in the order of Mitsuba's `ptracer`, so that both trace the same paths from the same seed.
 Those that hooks need for a selection come from a stream of their own: a replay that selects nothing stays in step.
+
+What an estimator sees of a walk, and what it may do along it.
+
+One segment of a light path: from the ray that reaches a vertex to the connection from there, the scattering event,
+and the next ray.
+
+A segment depends on nothing but the ray, what it hits, the segment's random numbers and the scene. So it can be done
+again, wherever these are known.
 """
 
 from __future__ import annotations
@@ -14,17 +22,175 @@ import drjit as dr
 import mitsuba as mi
 
 from reslrb_cli.transport.aim import Pending, aims_from, choose
-from reslrb_cli.transport.connection import Seen, connect, passage
+from reslrb_cli.transport.bsdf import Aimed, Scattering, evaluate, scatter, tracked_factor
+from reslrb_cli.transport.connection import Connection, Seen, connect, passage
 from reslrb_cli.transport.emission import sample_emission
 from reslrb_cli.transport.factors import Product
-from reslrb_cli.transport.hooks import Hooks, Vertex
-from reslrb_cli.transport.numbers import Early, Numbers
 from reslrb_cli.transport.plan import Plan
+from reslrb_cli.transport.random import Early, Numbers
 from reslrb_cli.transport.samples import SELECTION_STREAM, Samples
-from reslrb_cli.transport.scattering import evaluate
-from reslrb_cli.transport.segment import find_vertex, segment
+
+
+@dataclass
+class Vertex:
+    """The current vertex as hooks see it; `product` does not include the vertex's own scattering."""
+
+    pi: mi.PreliminaryIntersection3f
+    si: mi.SurfaceInteraction3f
+    bsdf: mi.BSDFPtr
+    ray: mi.Ray3f
+    depth: mi.UInt32
+    product: Product
+    active: mi.Bool
+
+
+class Hooks:
+    """What an estimator does along a walk. All are pure: state in, state out; none draws a random number.
+
+    `numbers` says how many random numbers `connection` wants at each vertex; without `connects` no connection is
+    evaluated, and `connection` is not called. A walk whose hooks are `replaying` follows a path that is known to get as
+    far as `goes_on` asks, so that neither its throughput nor its roulette is computed.
+    Hooks that are `tracked` keep derivatives of the factors in the loop state, which is then evaluated vertex by vertex
+    (naive AD); with `max_iterations` the loop stays symbolic, and Dr.Jit itself reverses it, from a record of the loop
+    state in thread-local memory. Where they are `attached` too, so are the rays.
+    """
+
+    numbers: int = 0
+    connects: bool = True
+    replaying: bool = False
+    tracked: bool = False
+    attached: bool = False
+    max_iterations: int | None = None
+
+    def start(self, product: Product) -> Any:
+        """State before the first vertex, any PyTree; `product` is E."""
+        return []
+
+    def seen(self, vertex: Vertex) -> Seen | None:
+        """What is known of the sensor's visibility from this vertex."""
+        return None
+
+    def wants(self, state: Any, vertex: Vertex) -> mi.Bool:
+        """Lanes whose connection from this vertex is of use; others trace no shadow ray."""
+        return mi.Bool(True)
+
+    def connection(self, state: Any, vertex: Vertex, connection: Connection, numbers: list[mi.Float]) -> Any:
+        """Called at each vertex with its connection to the sensor."""
+        return state
+
+    def goes_on(self, state: Any, vertex: Vertex) -> mi.Bool:
+        """Lanes that scatter on from this vertex, as far as the hooks care."""
+        return mi.Bool(True)
+
+    def is_followed(self, state: Any, vertex: Vertex) -> mi.Bool:
+        """In a replay: lanes that `goes_on` let scatter, and whose next vertex is wanted as well."""
+        return mi.Bool(True)
+
+    def scattering(self, state: Any, vertex: Vertex, connection: Connection, scattering: Scattering) -> Any:
+        """Called at each vertex with the sampled scattering event, also in lanes that `goes_on` ended."""
+        return state
+
+    def survived(self, state: Any, weight: mi.Float) -> Any:
+        """Called with the weight that roulette has just given the path's product, 1 where it was not played."""
+        return state
+
+    def aimed(self, state: Any, factor: mi.Float) -> Any:
+        """Called, where paths are aimed (`aim.py`), with the factor r that the path's product has just been given."""
+        return self.survived(state, factor)
+
+
+class Splat(Hooks):
+    """Splat every connection, and keep nothing."""
+
+    def __init__(self, samples: Samples, block: mi.ImageBlock) -> None:
+        self.samples, self.block = samples, block
+
+    def connection(self, state: Any, vertex: Vertex, connection: Connection, numbers: list[mi.Float]) -> Any:
+        s = self.samples
+        C = vertex.product.times(connection.c, vertex.depth).scaled(s.scale)
+        normalization = self.attached and s.plan.attached_normalization
+        s.film.put(self.block, connection.u, C.value(), connection.active, normalization)
+        return state
+
+
+@dataclass
+class Segment:
+    """What follows from a vertex. Visibility is not known here: `connection.c` is not set, and `connection.active` says
+    where the sensor would be seen if nothing stood in the way."""
+
+    si: mi.SurfaceInteraction3f
+    connection: Connection
+    scattering: Scattering
+
+    def next_ray(self, attached: bool = False) -> mi.Ray3f:
+        """The ray that leaves in the sampled direction; its derivatives go with it if `attached`."""
+        ray = self.si.spawn_ray(self.scattering.d)
+        return ray if attached else dr.detach(ray)
+
+
+def find_vertex(
+    ray: mi.Ray3f, pi: mi.PreliminaryIntersection3f, active: mi.Bool
+) -> tuple[mi.SurfaceInteraction3f, mi.BSDFPtr]:
+    """The surface interaction where `ray` hits what `pi` says, and its BSDF."""
+    si = pi.compute_surface_interaction(ray, mi.RayFlags.All, active)
+    return si, si.bsdf()
+
+
+def find_following_vertex(
+    ray: mi.Ray3f, pi: mi.PreliminaryIntersection3f, active: mi.Bool
+) -> tuple[mi.SurfaceInteraction3f, mi.Ray3f, mi.Float]:
+    """The surface interaction of a vertex that stays where it is on its surface, and moves with that alone.
+
+    Also the ray that reaches it, whose direction turns with both ends, and by what factor (1, with a derivative) a
+    measure of directions at its origin becomes one of places on the surface: |cos| / distance^2 times the surface's
+    own stretching.
+    """
+    si = pi.compute_surface_interaction(ray, mi.RayFlags.All | mi.RayFlags.FollowShape, active)
+    there = si.p - ray.o
+    distance = dr.norm(there)
+    reaching = mi.Ray3f(ray)
+    reaching.d = there / distance
+    si.t = distance
+    si.wi = si.to_local(-reaching.d)
+    measure = dr.abs(dr.dot(si.n, reaching.d)) / dr.square(distance) * dr.norm(dr.cross(si.dp_du, si.dp_dv))
+    return si, reaching, dr.select(active & (measure > 0), measure / dr.detach(measure), 1)
+
+
+def segment(
+    plan: Plan,
+    sensor: mi.Sensor,
+    ray: mi.Ray3f,
+    si: mi.SurfaceInteraction3f,
+    bsdf: mi.BSDFPtr,
+    numbers: Numbers,
+    connected: mi.Bool,
+    scattered: mi.Bool,
+    evaluates: bool = True,
+    tracked: bool = False,
+    attached: bool = False,
+    aimed: Aimed | None = None,
+) -> Segment:
+    """The segment from the vertex `si`, which `ray` reaches: connected in some lanes, scattered in some.
+
+    Without `evaluates` the BSDF is not evaluated towards the sensor. With `tracked` the scattering weight carries the
+    derivatives of the scene's parameters, where gradients are enabled, and the connection is left to be evaluated where
+    it turns out to be visible; directions, densities and film positions have no derivatives then. With `attached` they
+    have, and so has everything else. Lanes that are `aimed` scatter to their points.
+    """
+    connection = connect(plan, sensor, si, ray, numbers.aperture, connected, attached)
+    wanted = connection.active if evaluates and not tracked else None
+    scattering, connection.f = scatter(
+        plan, si, bsdf, ray, numbers.bsdf_1d, numbers.bsdf_2d, scattered, connection.wo, wanted, attached, aimed
+    )
+    if tracked and not attached:
+        f = tracked_factor(plan, si, bsdf, scattering, scattering.active)
+        scattering.weight = dr.replace_grad(scattering.weight, f * (scattering.correction / scattering.pdf))
+    return Segment(si, connection, scattering)
+
 
 ROULETTE_LIMIT = 0.95  # the largest probability of going on, as in `ptracer`
+
+
 DIMMEST = 1e-30  # the least emission that roulette knows, well above what single precision rounds to zero
 
 

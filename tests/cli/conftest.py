@@ -8,11 +8,11 @@ from collections.abc import Iterator, Sequence
 import pytest
 from cli.tiny import write_experiment
 
-from reslrb_cli.cli import main, progress
-from reslrb_cli.recording import run as recording
-from reslrb_cli.report.page import curves
-from reslrb_cli.report.page.drawing import Curve, diagram
-from reslrb_cli.report.seen import flip
+from reslrb_cli.cli import main, terminal
+from reslrb_cli.report import perceptual
+from reslrb_cli.report.page import values
+from reslrb_cli.report.page.markup import Curve, diagram
+from reslrb_cli.runs import recorder as recording
 
 #: What was drawn before, by labels.
 DRAWN: dict[tuple[str, str], str] = {}
@@ -32,9 +32,9 @@ def _own_log_and_cache(tmp_path_factory: pytest.TempPathFactory, monkeypatch: py
     """A command logs to the standard error that it finds first, which the next test closes."""
     monkeypatch.setenv("RESLRB_CACHE", str(tmp_path_factory.mktemp("cache")))
     # HDR-FLIP takes longer than all else that these runs do at their end; tests/report looks at it.
-    monkeypatch.setattr(flip, "is_installed", lambda: False)
+    monkeypatch.setattr(perceptual, "is_installed", lambda: False)
     # Neither are diagrams looked at here, but in tests/report too.
-    monkeypatch.setattr(curves, "diagram", drawn_once)
+    monkeypatch.setattr(values, "diagram", drawn_once)
     logger = logging.getLogger("reslrb_cli")
     logger.handlers.clear()
     yield
@@ -65,12 +65,12 @@ def during(monkeypatch):
     """A function that has `act(record)` called after each iteration."""
 
     def install(act):
-        show = progress.Progress.show
+        show = terminal.Progress.show
 
         def acting(self, record):
             show(self, record)
             act(record)
 
-        monkeypatch.setattr(progress.Progress, "show", acting)
+        monkeypatch.setattr(terminal.Progress, "show", acting)
 
     return install

@@ -5,8 +5,8 @@ from __future__ import annotations
 import errno
 from pathlib import Path
 
-from reslrb_cli.recording import course
-from reslrb_cli.recording import run as recording
+from reslrb_cli.runs import prepare
+from reslrb_cli.runs import recorder as recording
 
 RUN = Path("runs/tiny")
 
@@ -24,7 +24,7 @@ def lines(text):
 
 def failing_last(monkeypatch, name, failure=full, calls=1):
     """Have `recording.<name>`, or what keeps the state, fail, but for its first `calls` calls."""
-    holder = course if name == "save_checkpoint" else recording
+    holder = prepare if name == "save_checkpoint" else recording
     real, seen = getattr(holder, name), []
 
     def sometimes(*args, **options):

@@ -76,7 +76,7 @@ def test_auto_measures_once_and_remembers(experiment, capsys):
 
 def test_a_short_run_measures_nothing_and_says_so(experiment, capsys, monkeypatch):
     """Where a tenth of the run has no room for it, what is `auto` is decided by the scene; with more room it is not."""
-    from reslrb_cli.optimization import choice
+    from reslrb_cli.optimization.autotune import choice
 
     options = ["integrator={max_depth: 4}", "run.measuring=0.1", "run.iterations=3"]
     with monkeypatch.context() as patch:
@@ -103,9 +103,9 @@ def test_a_short_run_measures_nothing_and_says_so(experiment, capsys, monkeypatc
 
 @pytest.mark.parametrize(("light", "parallel"), [("point", True), ("area", False)])
 def test_what_the_scene_has_decides_where_nothing_is_measured(experiment, light, parallel):
-    from reslrb_cli.config import load
-    from reslrb_cli.optimization import choice
-    from reslrb_cli.optimization.problem import assemble_scene
+    from reslrb_cli.config.loader import load
+    from reslrb_cli.optimization.assemble import assemble_scene
+    from reslrb_cli.optimization.autotune import choice
 
     if light == "point":
         lamp = SCENE[SCENE.index('<shape type="rectangle" id="lamp">') : SCENE.index("</scene>")]
@@ -117,10 +117,10 @@ def test_what_the_scene_has_decides_where_nothing_is_measured(experiment, light,
 
 def test_other_settings_are_another_situation(experiment):
     """And what changes neither a step's samples nor what it differentiates is none."""
-    from reslrb_cli.config import load
-    from reslrb_cli.optimization.choice import situation
-    from reslrb_cli.optimization.problem import assemble_scene
-    from reslrb_cli.records.pilot_cache import key_of
+    from reslrb_cli.config.loader import load
+    from reslrb_cli.optimization.assemble import assemble_scene
+    from reslrb_cli.optimization.autotune.choice import situation
+    from reslrb_cli.records.decisions import key_of
 
     def key(*settings):
         return key_of(situation(assemble_scene(load("box.yaml", settings))))
@@ -142,8 +142,9 @@ def test_auto_measures_anew_in_another_situation(experiment, capsys):
 def test_the_pilot_leaves_the_run_as_it_was(experiment):
     import drjit as dr
 
-    from reslrb_cli.config import load
-    from reslrb_cli.optimization import assemble, loop
+    from reslrb_cli.config.loader import load
+    from reslrb_cli.optimization import loop
+    from reslrb_cli.optimization.assemble import assemble
 
     def first_step(*settings):
         problem = assemble(load("box.yaml", settings))
@@ -163,9 +164,10 @@ def test_the_pilot_leaves_the_run_as_it_was(experiment):
 
 
 def test_the_pilot_has_seeds_of_its_own(experiment, monkeypatch):
-    from reslrb_cli.config import load
-    from reslrb_cli.optimization import choice, samples
-    from reslrb_cli.optimization.problem import assemble_scene
+    from reslrb_cli.config.loader import load
+    from reslrb_cli.optimization import sensitivity
+    from reslrb_cli.optimization.assemble import assemble_scene
+    from reslrb_cli.optimization.autotune import choice
 
     drawn = []
 
@@ -173,8 +175,8 @@ def test_the_pilot_has_seeds_of_its_own(experiment, monkeypatch):
         drawn.append((run_seed, iteration, view, purpose))
         return len(drawn)
 
-    monkeypatch.setattr(samples, "seed", spy)
-    monkeypatch.setattr(samples, "gradient_step", lambda *args, **options: pytest.fail("stop", pytrace=False))
+    monkeypatch.setattr(sensitivity, "seed", spy)
+    monkeypatch.setattr(sensitivity, "gradient_step", lambda *args, **options: pytest.fail("stop", pytrace=False))
     problem = assemble_scene(load("box.yaml", ["run.seed=7"]))
     from reslrb_cli.records.clock import StepClock
 
@@ -186,8 +188,8 @@ def test_the_pilot_has_seeds_of_its_own(experiment, monkeypatch):
 
 @pytest.mark.parametrize("adjoint", ["auto", "independent", "batched"])
 def test_candidates_know_delta_where_it_is_known(experiment, adjoint):
-    from reslrb_cli.config import load
-    from reslrb_cli.optimization.choice import candidates
+    from reslrb_cli.config.loader import load
+    from reslrb_cli.optimization.autotune.choice import candidates
 
     assert not any("weight" in options for options in candidates(load("box.yaml", ["run.adjoint=correlated"])))
     options = candidates(load("box.yaml", [f"run.adjoint={adjoint}"]))
@@ -202,7 +204,7 @@ def test_auto_works_with_batches_and_several_views(experiment, capsys):
 
 
 def test_auto_is_no_option_of_the_plugin(llvm):
-    from reslrb_cli.integrators import make_integrator
+    from reslrb_cli.integrators.step import make_integrator
 
     with pytest.raises(Exception, match="name one of reservoir"):
         make_integrator("reslrb", estimator="auto")
@@ -265,7 +267,7 @@ def test_auto_under_a_budget(experiment, capsys):
 
 
 def test_a_budget_that_is_exceeded_is_a_warning(experiment, capsys, monkeypatch):
-    from reslrb_cli.optimization import budget
+    from reslrb_cli.optimization import memory as budget
 
     monkeypatch.setattr(budget, "allocated", lambda size: 0)
     settings = wide("integrator={max_depth: 4, estimator: event}", "run.spp=256", "run.memory_budget=3")
@@ -289,8 +291,9 @@ def test_a_budget_that_nothing_can_keep_is_one_located_line(experiment, capsys):
 
 @pytest.mark.parametrize("adjoint", a_few(["correlated", "independent", "batched"], ["correlated"]))
 def test_peak_memory_is_flat_in_samples_under_a_budget(experiment, adjoint):
-    from reslrb_cli.config import load
-    from reslrb_cli.optimization import assemble, optimize
+    from reslrb_cli.config.loader import load
+    from reslrb_cli.optimization.assemble import assemble
+    from reslrb_cli.optimization.loop import optimize
 
     peaks = {}
     for spp in (256, 1024, 4096):
@@ -308,10 +311,11 @@ def test_peak_memory_is_flat_in_samples_under_a_budget(experiment, adjoint):
 
 @taking_turns("estimator", ["reservoir", "gather", "event", "stack"], "zeros", [True, False])
 def test_what_is_kept_of_a_path_is_what_is_counted(experiment, monkeypatch, estimator, zeros):
-    from reslrb_cli.config import load
+    from reslrb_cli.config.loader import load
     from reslrb_cli.estimators.base import entry_bytes
     from reslrb_cli.integrators import light_tracer
-    from reslrb_cli.optimization import assemble, loop
+    from reslrb_cli.optimization import loop
+    from reslrb_cli.optimization.assemble import assemble
 
     states, forward = [], light_tracer.forward
 
@@ -336,8 +340,9 @@ def test_what_is_kept_of_a_path_is_what_is_counted(experiment, monkeypatch, esti
 @taking_turns("estimator", ["reservoir", "gather", "event", "stack"], "adjoint", ["batched", "correlated"])
 def test_all_sample_counts_have_the_same_kernels(experiment, estimator, adjoint):
     """The pilot's would otherwise be compiled for nothing."""
-    from reslrb_cli.config import load
-    from reslrb_cli.optimization import assemble, choice
+    from reslrb_cli.config.loader import load
+    from reslrb_cli.optimization.assemble import assemble
+    from reslrb_cli.optimization.autotune import choice
     from reslrb_cli.records.clock import StepClock
 
     settings = [f"integrator={{max_depth: 4, estimator: {estimator}}}", f"run.adjoint={adjoint}"]

@@ -15,7 +15,7 @@ import pytest
 from compilation import search_path
 
 from reslrb_cli.cli import _Main, main
-from reslrb_cli.cli.console import Forgiving, forgiving_output
+from reslrb_cli.cli.terminal import Forgiving, forgiving_output
 
 ROOT = Path(__file__).resolve().parents[2]
 PROGRAM = "from reslrb_cli.cli import main; main(prog_name='reslrb')"
@@ -110,7 +110,7 @@ def test_python_has_nothing_to_add_at_its_end(tmp_path: Path, streams: str, argu
 
 
 def test_a_reader_that_has_gone_ends_nothing() -> None:
-    script = "from reslrb_cli.cli.console import forgiving_output\nimport sys\nsys.stdin.read()\n"
+    script = "from reslrb_cli.cli.terminal import forgiving_output\nimport sys\nsys.stdin.read()\n"
     script += (
         "with forgiving_output():\n  for number in range(10000): print(number)\n  print('error', file=sys.stderr)\n"
     )
@@ -125,7 +125,7 @@ def test_a_reader_that_has_gone_ends_nothing() -> None:
 
 @pytest.mark.skipif(os.name != "posix", reason="closes descriptors")
 def test_no_file_takes_the_place_of_a_closed_stream(tmp_path: Path) -> None:
-    script = "from reslrb_cli.cli.console import forgiving_output\n"
+    script = "from reslrb_cli.cli.terminal import forgiving_output\n"
     script += f"with forgiving_output(): print(open({str(tmp_path / 'file')!r}, 'w').fileno() > 2)"
     command = f'"{sys.executable}" -c "{script}" 2>&- <&-'
     environment = {**os.environ, "PYTHONPATH": search_path(ROOT)}

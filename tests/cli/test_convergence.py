@@ -16,7 +16,7 @@ from cli.tiny import KEY, ROOT, write_experiment
 from compilation import search_path
 
 from reslrb_cli.cli import main
-from reslrb_cli.records.convergence import TARGETS
+from reslrb_cli.records.measurements import TARGETS
 
 pytestmark = pytest.mark.usefixtures("llvm")
 

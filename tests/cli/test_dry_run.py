@@ -14,16 +14,15 @@ import pytest
 from cli.tiny import write_experiment
 
 from reslrb_cli.cli import main
-from reslrb_cli.config import load
-from reslrb_cli.config.files import in_words
-from reslrb_cli.config.passes import largest_pass, passes_obstacle
-from reslrb_cli.optimization import trial
+from reslrb_cli.config.files import in_words, largest_pass, passes_obstacle
+from reslrb_cli.config.loader import load
+from reslrb_cli.optimization import forecast as trial
+from reslrb_cli.optimization.assemble import assemble
 from reslrb_cli.optimization.forecast import make_forecast
-from reslrb_cli.optimization.problem import assemble
 from reslrb_cli.records.clock import MIB, rough_duration
+from reslrb_cli.records.decisions import RivalRecord
 from reslrb_cli.records.manifest import read_manifest
 from reslrb_cli.records.metrics import read_metrics
-from reslrb_cli.records.rival import RivalRecord
 
 pytestmark = pytest.mark.usefixtures("llvm")
 
@@ -122,7 +121,7 @@ def test_what_comes_before_the_iterations_is_measured_once(
 ) -> None:
     """Pilot and `prb` beside its choice: now, for the run that follows; or in the run again, whose time has both."""
     few = [{"estimator": "stack"}, {"estimator": "gather"}]
-    monkeypatch.setattr("reslrb_cli.optimization.choice.candidates", lambda config: few)
+    monkeypatch.setattr("reslrb_cli.optimization.autotune.choice.candidates", lambda config: few)
     cache = experiment / "cache"
     monkeypatch.setenv("RESLRB_CACHE", str(cache))
     if not keeps:

@@ -13,9 +13,9 @@ from cli.tiny import COMPLETE, KEY, faults, files
 
 from reslrb_cli.cli import main
 from reslrb_cli.cli.interrupts import SIGNALS
-from reslrb_cli.recording import run as recording
 from reslrb_cli.records import metrics
-from reslrb_cli.records.manifest_file import read_content
+from reslrb_cli.records.manifest import read_content
+from reslrb_cli.runs import recorder as recording
 
 
 @pytest.mark.parametrize("optimize", ["real page"], indirect=True)

@@ -48,7 +48,7 @@ def folder(files: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path
     for file in files.iterdir():
         (tmp_path / file.name).symlink_to(file)
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("reslrb_cli.recording.run.write_report", lambda folder, *now: None)
+    monkeypatch.setattr("reslrb_cli.runs.recorder.write_report", lambda folder, *now: None)
     return tmp_path
 
 

@@ -12,7 +12,7 @@ import pytest
 from cli.failing import RUN, failing_last, lines
 from cli.tiny import KEY, faults
 
-from reslrb_cli.records.manifest_file import read_content
+from reslrb_cli.records.manifest import read_content
 
 
 def test_a_folder_that_is_removed_ends_the_run(optimize, during):

@@ -12,16 +12,17 @@ from click.testing import CliRunner, Result
 
 from reslrb_cli.cli import main
 from reslrb_cli.cli.export import choose_integrator
-from reslrb_cli.cli.recovered import read_recovered
-from reslrb_cli.config import ParameterSpec, RunValue, load
+from reslrb_cli.cli.options import read_recovered
+from reslrb_cli.config.loader import load
+from reslrb_cli.config.parameters import ParameterSpec, RunValue
 from reslrb_cli.errors import ConfigError
-from reslrb_cli.measure.statistics import compare
-from reslrb_cli.optimization.problem import assemble_scene
-from reslrb_cli.records.checkpoint import FILE_NAME, save_checkpoint
-from reslrb_cli.records.images import read_exr
-from reslrb_cli.records.parameters import read_parameters
-from reslrb_cli.records.run_values import read_value
-from reslrb_cli.scene import load_scene, select_parameters
+from reslrb_cli.measure.comparison import compare
+from reslrb_cli.optimization.assemble import assemble_scene
+from reslrb_cli.records.checkpoint import STATE_FILE, save_checkpoint
+from reslrb_cli.records.images import read_exr, read_parameters
+from reslrb_cli.records.run_folder import read_value
+from reslrb_cli.scene.load import load_scene
+from reslrb_cli.scene.parameters import select_parameters
 from reslrb_cli.scene.values import resample
 
 pytestmark = pytest.mark.usefixtures("llvm")
@@ -171,7 +172,7 @@ def test_a_run_that_lacks_a_value_or_has_a_bad_one_is_refused_in_a_line(folder: 
     assert "all values must be finite" in refusal()
     save_checkpoint(run / "checkpoint", 1, values | {tiny.KEY: np.full((4, 4, 3), 2, np.float32)}, {})
     assert "exclude the initial value" in refusal()
-    (run / "checkpoint" / FILE_NAME).write_bytes(b"PK\x03\x04 and then nothing")
+    (run / "checkpoint" / STATE_FILE).write_bytes(b"PK\x03\x04 and then nothing")
     assert "is damaged, cut off, or not written by a run" in refusal()
 
 

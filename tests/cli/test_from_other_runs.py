@@ -11,12 +11,12 @@ import pytest
 from click.testing import CliRunner, Result
 
 from reslrb_cli.cli import main
-from reslrb_cli.cli.recovered import read_recovered
-from reslrb_cli.config import load
-from reslrb_cli.measure.statistics import compare
-from reslrb_cli.optimization.problem import assemble_scene
+from reslrb_cli.cli.options import read_recovered
+from reslrb_cli.config.loader import load
+from reslrb_cli.measure.comparison import compare
+from reslrb_cli.optimization.assemble import assemble_scene
 from reslrb_cli.records.images import read_exr
-from reslrb_cli.records.run_values import read_value
+from reslrb_cli.records.run_folder import read_value
 
 pytestmark = pytest.mark.usefixtures("llvm")
 

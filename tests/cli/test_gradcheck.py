@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 
 from reslrb_cli.cli import main
-from reslrb_cli.records.gradcheck import GradcheckRecord, Kind, Reference, Verdict
+from reslrb_cli.records.measurements import GradcheckRecord, Kind, Reference, Verdict
 
 pytestmark = pytest.mark.usefixtures("llvm")
 

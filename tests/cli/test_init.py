@@ -13,13 +13,14 @@ from cli.photographs import write_noise
 from click.testing import Result
 from turns import a_few
 
-from reslrb_cli.cli.first_config import PIXELS
-from reslrb_cli.config import Config, TargetConfig, load
-from reslrb_cli.optimization.problem import assemble_scene
+from reslrb_cli.cli.init import PIXELS
+from reslrb_cli.config.loader import load
+from reslrb_cli.config.schema import Config, TargetConfig
+from reslrb_cli.optimization.assemble import assemble_scene
 from reslrb_cli.records.manifest import read_manifest
-from reslrb_cli.scene import load_scene
+from reslrb_cli.scene.images import decode_srgb
+from reslrb_cli.scene.load import load_scene
 from reslrb_cli.scene.proposal import propose
-from reslrb_cli.scene.target import decode_srgb
 
 pytestmark = pytest.mark.usefixtures("llvm")
 

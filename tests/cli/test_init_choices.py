@@ -11,9 +11,8 @@ from cli.calling import reslrb, settings
 from cli.photographs import write_noise
 from click.testing import Result
 
-from reslrb_cli.config import load
-from reslrb_cli.scene.image_file import image_size, orientation_of
-from reslrb_cli.scene.target import decode_srgb
+from reslrb_cli.config.loader import load
+from reslrb_cli.scene.images import decode_srgb, image_size, orientation_of
 
 pytestmark = pytest.mark.usefixtures("llvm")
 

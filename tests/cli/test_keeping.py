@@ -11,10 +11,10 @@ import pytest
 
 from reslrb_cli.cli.keeping import Keeper, read_earlier
 from reslrb_cli.errors import ConfigError
-from reslrb_cli.recording import live
-from reslrb_cli.records import samples
-from reslrb_cli.records.convergence import SummaryRecord
-from reslrb_cli.records.line_file import LineFile
+from reslrb_cli.records import measurement_files
+from reslrb_cli.records.measurement_files import LineFile
+from reslrb_cli.records.measurements import SummaryRecord
+from reslrb_cli.runs import recorder
 
 
 def lines(*words: str) -> list[SummaryRecord]:
@@ -35,18 +35,18 @@ class Measurement:
         self.final, self.now, self.rows = lines(), lines(), np.zeros(0)
         self.keeper = Keeper(file, *lines("here"), lambda: self.final, lambda: self.now, self.kept)
 
-    def kept(self) -> samples.Kept | None:
+    def kept(self) -> measurement_files.Kept | None:
         return ({"rows": len(self.rows)}, {"rows": self.rows}) if len(self.rows) else None
 
 
 def test_both_files_are_current_and_those_of_another_measurement_go(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(live, "PAGE_SECONDS", 0.0)
-    monkeypatch.setattr(live, "PAGE_SHARE", 0.0)
+    monkeypatch.setattr(recorder, "PAGE_SECONDS", 0.0)
+    monkeypatch.setattr(recorder, "PAGE_SHARE", 0.0)
     file = tmp_path / "c.jsonl"
     file.write_text("old\n")
-    samples.write_samples(samples.samples_file(file), {"rows": 9}, {})
+    measurement_files.write_samples(measurement_files.samples_file(file), {"rows": 9}, {})
     (tmp_path / ".c.samples.npz.999999999.part").write_bytes(b"what a killed process left")
     measured = Measurement(file)
     assert (file.read_text(), read_earlier(file)[0]) == ("old\n", {"rows": 9})  # until there is something
@@ -67,7 +67,7 @@ def test_both_files_are_current_and_those_of_another_measurement_go(
 
 def test_it_is_written_every_few_seconds_and_costs_a_twentieth(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     now, written = [100.0], []
-    monkeypatch.setattr(live.time, "monotonic", lambda: now[0])
+    monkeypatch.setattr(recorder.time, "monotonic", lambda: now[0])
     measured = Measurement(tmp_path / "c.jsonl")
 
     def slowly(path: Path, head: object, arrays: object) -> None:
@@ -93,7 +93,7 @@ def test_what_cannot_be_written_on_the_way_ends_nothing_and_is_told_in_the_end(
     def full(*_: object) -> None:
         raise OSError(28, "No space left on device", str(file))
 
-    monkeypatch.setattr("reslrb_cli.records.line_file.write_atomically", full)
+    monkeypatch.setattr("reslrb_cli.records.measurement_files.write_atomically", full)
     measured.keeper.refresh()
     with pytest.raises(OSError, match="No space left"):
         measured.keeper.finish(lines("a"))
@@ -102,12 +102,12 @@ def test_what_cannot_be_written_on_the_way_ends_nothing_and_is_told_in_the_end(
 def test_samples_that_are_too_large_are_not_kept_and_that_is_said(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(samples, "MOST_BYTES", 100)
+    monkeypatch.setattr(measurement_files, "MOST_BYTES", 100)
     measured = Measurement(tmp_path / "c.jsonl")
     measured.rows = np.ones(13)
     measured.keeper.finish(lines("a"))
     assert "--resume cannot go on from it" in capsys.readouterr().out
-    assert not samples.samples_file(tmp_path / "c.jsonl").exists()
+    assert not measurement_files.samples_file(tmp_path / "c.jsonl").exists()
 
 
 @pytest.mark.skipif(os.name != "posix", reason="makes a pipe")

@@ -11,11 +11,11 @@ import pytest
 from cli.tiny import KEY, write_experiment
 
 from reslrb_cli.cli import main
-from reslrb_cli.recording import live
-from reslrb_cli.recording import run as recording
-from reslrb_cli.recording.live import LivePage
-from reslrb_cli.records.manifest_file import read_content
+from reslrb_cli.records.manifest import read_content
 from reslrb_cli.records.metrics import read_metrics
+from reslrb_cli.runs import recorder
+from reslrb_cli.runs import recorder as recording
+from reslrb_cli.runs.recorder import LivePage
 
 RUN, PAGE = Path("runs/tiny"), Path("runs/tiny/report.html")
 REFRESH = 'http-equiv="refresh"'
@@ -26,8 +26,8 @@ def optimize(llvm, tmp_path, monkeypatch, capsys):
     """A function that runs `reslrb optimize tiny.yaml`, with a page after every iteration; returns standard error."""
     write_experiment(tmp_path)
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(live, "PAGE_SECONDS", 0.0)
-    monkeypatch.setattr(live, "PAGE_SHARE", 0.0)
+    monkeypatch.setattr(recorder, "PAGE_SECONDS", 0.0)
+    monkeypatch.setattr(recorder, "PAGE_SHARE", 0.0)
 
     def call(*args):
         with pytest.raises(SystemExit) as end:
@@ -114,7 +114,7 @@ def test_where_the_last_page_cannot_be_written_none_says_that_the_run_is_at_work
 def test_pages_take_no_more_than_their_share(monkeypatch):
     """One that takes 1 s is written every 20 s, a quick one every 5 s; one that fails is not tried again."""
     now, cost, written = [100.0], [1.0], []
-    monkeypatch.setattr(live.time, "monotonic", lambda: now[0])
+    monkeypatch.setattr(recorder.time, "monotonic", lambda: now[0])
 
     def write():
         written.append(now[0])

@@ -11,11 +11,11 @@ import pytest
 from cli.test_nonfinite import experiment, inspect, optimize  # noqa: F401 (a fixture)
 from turns import a_few
 
-from reslrb_cli.cli import replaying
-from reslrb_cli.integrators import tracer
-from reslrb_cli.integrators.guiding import Guiding
-from reslrb_cli.measure import offender
-from reslrb_cli.measure.offender_tables import Witness
+from reslrb_cli.cli import nonfinite
+from reslrb_cli.guiding.tables import Guiding
+from reslrb_cli.integrators import light_tracer
+from reslrb_cli.measure import nonfinite_trace
+from reslrb_cli.measure.nonfinite_trace import Witness
 
 #: So few paths that the spoilt texel is met for the first time behind many iterations.
 SETTINGS = ["integrator.guiding=on", "scene.options={wall: spoilt.exr}", "run.iterations=60", "run.on_nonfinite=stop"]
@@ -50,7 +50,7 @@ def note(monkeypatch: pytest.MonkeyPatch, module: ModuleType) -> Drawn:
 
 def differences(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], way: str) -> list[str]:
     """What is not of the run's last step in what its replay looked at."""
-    taken, looked_at = note(monkeypatch, tracer), note(monkeypatch, offender)
+    taken, looked_at = note(monkeypatch, light_tracer), note(monkeypatch, nonfinite_trace)
     for seed in SEEDS.get(way, [1, 2, 3, 4, 5, 6, 7, 8]):
         taken.clear()
         _, err = optimize(capsys, *SETTINGS, *WAYS[way], f"run.seed={seed}")
@@ -88,7 +88,7 @@ def test_it_is_the_step_of_the_run(experiment, capsys, monkeypatch, way):  # noq
 def test_other_tables_are_seen(experiment, capsys, fault, monkeypatch):  # noqa: F811
     """Tables that know nothing, that do not learn between the batches of a step, or that are those of another batch."""
     if fault == "untaught":
-        monkeypatch.setattr(replaying, "_teach", lambda problem, saved, archive: None)
+        monkeypatch.setattr(nonfinite, "_teach", lambda problem, saved, archive: None)
     elif fault == "not learned on":
         monkeypatch.setattr(Witness, "learn", lambda self, number, samples, adjoint: self.drawn.pop())
     else:

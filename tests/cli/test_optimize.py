@@ -219,8 +219,9 @@ def test_a_target_file_gives_no_parameter_error(experiment, capsys):
 def test_later_iterations_compile_nothing(experiment, freeze):
     import drjit as dr
 
-    from reslrb_cli.config import load
-    from reslrb_cli.optimization import assemble, loop
+    from reslrb_cli.config.loader import load
+    from reslrb_cli.optimization import loop
+    from reslrb_cli.optimization.assemble import assemble
     from reslrb_cli.records.clock import StepClock
 
     problem = assemble(load("box.yaml", ["run.iterations=1", f"integrator={{type: reslrb, freeze: {freeze}}}"]))

@@ -13,10 +13,10 @@ import numpy as np
 import pytest
 from records.test_metrics import make_record
 
-from reslrb_cli.cli import progress as module
-from reslrb_cli.cli.progress import Progress, Reading, descriptions
+from reslrb_cli.cli import terminal as module
+from reslrb_cli.cli.terminal import Progress, Reading, descriptions
 from reslrb_cli.optimization.errors import ErrorMeter
-from reslrb_cli.records.reading import read_lines
+from reslrb_cli.records.measurement_files import read_lines
 
 LAMP = "a_lamp_with_a_name_of_some_length.emitter.radiance.value"
 

@@ -14,7 +14,7 @@ from cli.calling import done, settings
 from cli.test_three_commands import COLOUR, EXPOSURE, check_mask, keep, misses
 from rooms import real_room
 
-from reslrb_cli.scene import load_scene
+from reslrb_cli.scene.load import load_scene
 
 pytestmark = [pytest.mark.usefixtures("llvm"), pytest.mark.long]
 

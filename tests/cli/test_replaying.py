@@ -16,7 +16,7 @@ import pytest
 from cli.test_nonfinite import CONFIG, KEY, PLAIN, SCENE, reslrb
 
 from reslrb_cli.cli import main
-from reslrb_cli.records.paid import GuidedRecord
+from reslrb_cli.records.decisions import GuidedRecord
 
 ARCHIVE, MANIFEST, TARGET = "checkpoint/nonfinite.npz", "manifest.json", "images/target.exr"
 
@@ -66,9 +66,9 @@ def test_a_whole_folder_is_replayed(run, capsys):
 
 
 def test_paths_are_of_the_run_s_sequence(run):
-    from reslrb_cli.cli.replaying import load_replay
-    from reslrb_cli.config import load
-    from reslrb_cli.measure.offender import _parts
+    from reslrb_cli.cli.nonfinite import load_replay
+    from reslrb_cli.config.loader import load
+    from reslrb_cli.measure.nonfinite_trace import _parts
 
     config = (run / "config.yaml").read_text()
     for sequence in ("independent", "low_discrepancy"):
@@ -80,10 +80,10 @@ def test_paths_are_of_the_run_s_sequence(run):
 
 
 def test_paths_are_of_the_sequence_that_was_measured_to_pay(run, capsys):
-    from reslrb_cli.cli.replaying import load_replay
-    from reslrb_cli.config import load
-    from reslrb_cli.measure.offender import _parts
-    from reslrb_cli.records.paid import SequenceRecord
+    from reslrb_cli.cli.nonfinite import load_replay
+    from reslrb_cli.config.loader import load
+    from reslrb_cli.measure.nonfinite_trace import _parts
+    from reslrb_cli.records.decisions import SequenceRecord
 
     config = (run / "config.yaml").read_text()
     assert "sequence: independent" in config

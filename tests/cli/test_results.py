@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from cli.test_optimize import CONFIG, KEY, SCENE, read_manifest, read_metrics, reslrb
 
-from reslrb_cli.records.layers import read_layers
+from reslrb_cli.records.images import read_layers
 
 LAMP, WALL = "lamp.emitter.radiance.value", "wall.reflectance.value"
 
@@ -42,10 +42,10 @@ def read(path):
 
 def test_correlated_samples_tell_of_their_bias(capsys, monkeypatch):
     from reslrb_cli.optimization.correlated_bias import Bias, CorrelatedBias
-    from reslrb_cli.recording import preparing
+    from reslrb_cli.runs import prepare
 
     bias = CorrelatedBias(8, 4, [Bias(KEY, -0.38, 0.06, along=True, exceeds=False)])
-    monkeypatch.setattr(preparing, "measure_correlated_bias", lambda problem, say: bias)
+    monkeypatch.setattr(prepare, "measure_correlated_bias", lambda problem, say: bias)
     code, _, err = reslrb(capsys, "optimize", "box.yaml", "--quiet", "--set", "run.iterations=2")
     assert code == 0
     assert err.strip() == bias.line()

@@ -10,9 +10,9 @@ import pytest
 from cli.calling import reslrb
 from cli.elsewhere import write_studio, write_terrace
 
-from reslrb_cli.config import load
-from reslrb_cli.optimization.problem import assemble_scene
-from reslrb_cli.scene import load_scene
+from reslrb_cli.config.loader import load
+from reslrb_cli.optimization.assemble import assemble_scene
+from reslrb_cli.scene.load import load_scene
 
 pytestmark = pytest.mark.usefixtures("llvm")
 

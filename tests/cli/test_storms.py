@@ -22,8 +22,7 @@ from cli.tiny import COMPLETE, faults, files, start, write_experiment
 from compilation import search_path
 
 from reslrb_cli.cli.interrupts import SIGNALS
-from reslrb_cli.records.manifest import read_manifest
-from reslrb_cli.records.manifest_file import read_content
+from reslrb_cli.records.manifest import read_content, read_manifest
 
 pytestmark = [
     pytest.mark.skipif(os.name != "posix", reason="sends signals"),

@@ -15,7 +15,7 @@ from cli.test_convergence import call, read
 from cli.tiny import ROOT, write_experiment
 from compilation import search_path
 
-from reslrb_cli.measure.whole_runs.run import POINTS
+from reslrb_cli.measure.optimization_benchmark.rank import POINTS
 
 pytestmark = pytest.mark.usefixtures("llvm")
 

@@ -12,8 +12,7 @@ from typing import Any
 
 from compilation import search_path
 
-from reslrb_cli.records.manifest import read_manifest
-from reslrb_cli.records.manifest_file import read_content
+from reslrb_cli.records.manifest import read_content, read_manifest
 
 ROOT = Path(__file__).resolve().parents[2]
 KEY = "poster.reflectance.data"

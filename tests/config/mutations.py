@@ -12,7 +12,7 @@ from typing import Any
 import yaml
 
 from reslrb_cli.config.reference import DOCS, EXAMPLE
-from reslrb_cli.config.text import parse
+from reslrb_cli.config.yaml_text import parse
 from reslrb_cli.errors import ConfigError
 
 #: Every section, every kind of value.

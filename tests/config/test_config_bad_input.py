@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from reslrb_cli.config import load
+from reslrb_cli.config.loader import load
 from reslrb_cli.errors import ConfigError, ExitCode
 
 GOOD = """\

@@ -10,7 +10,8 @@ from pathlib import Path
 import pytest
 from config.test_config_bad_input import GOOD, line_of
 
-from reslrb_cli.config import Prb, load
+from reslrb_cli.config.integrators import Prb
+from reslrb_cli.config.loader import load
 from reslrb_cli.errors import ConfigError
 
 #: Of processor time; a second or two on a quiet machine, and half a minute to hours where nothing bounds it.

@@ -9,8 +9,11 @@ from pathlib import Path
 
 import pytest
 
-from reslrb_cli.config import Adam, Config, ImageFile, Prb, Reslrb, RMSProp, dump, load
-from reslrb_cli.config.overrides import FREE_MAPPINGS
+from reslrb_cli.config.integrators import Prb, Reslrb
+from reslrb_cli.config.loader import FREE_MAPPINGS, dump, load
+from reslrb_cli.config.optimizers import Adam, RMSProp
+from reslrb_cli.config.parameters import ImageFile
+from reslrb_cli.config.schema import Config
 
 GOOD = """\
 scene: {file: scene.xml}

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from config import mutations
 
-from reslrb_cli.config import dump, load, loads
+from reslrb_cli.config.loader import dump, load, loads
 from reslrb_cli.errors import LINE_LENGTH, ConfigError
 
 SECONDS, MIB = 5.0, 200.0

@@ -7,7 +7,8 @@ from pathlib import Path
 import pytest
 from config.test_config_bad_input import PARAMETER, changed, line_of
 
-from reslrb_cli.config import ParameterSpec, dump, load
+from reslrb_cli.config.loader import dump, load
+from reslrb_cli.config.parameters import ParameterSpec
 
 POSE = """\
 motion: {of: [lens, cap], free: [translation, rotation, scale]}

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from reslrb_cli.config import load
+from reslrb_cli.config.loader import load
 from reslrb_cli.config.reference import DOCS, EXAMPLE, json_schema, markdown, write
 
 HINT = "run `python -m reslrb_cli.config.reference`"

@@ -26,7 +26,7 @@ from conformance.moving import (
     under_glass,
 )
 
-from reslrb_cli.measure.small_scenes import bitmap, diffuse, rgb
+from reslrb_cli.measure.scenes.small import bitmap, diffuse, rgb
 
 #: Relative L2 distance at equal seeds that rounding makes, through smooth glass and mirrors, and through rough ones.
 SMOOTH, ROUGH = 5e-5, 5e-4

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from reslrb_cli.measure.small_scenes import bitmap, camera, diffuse, lamp, rgb, room, texture, transform
+from reslrb_cli.measure.scenes.small import bitmap, camera, diffuse, lamp, rgb, room, texture, transform
 
 
 @dataclass(frozen=True)

@@ -11,9 +11,9 @@ import pytest
 
 def hole(patch: pytest.MonkeyPatch) -> None:
     """The cells of a hundredth that would be drawn most are never drawn; others have their slots."""
-    from reslrb_cli.integrators import guiding
+    from reslrb_cli.guiding import tables
 
-    whole = guiding.apportion
+    whole = tables.apportion
 
     def holed(grid: Any, density: np.ndarray) -> np.ndarray:
         counts = whole(grid, density)
@@ -23,7 +23,7 @@ def hole(patch: pytest.MonkeyPatch) -> None:
         counts[lost] = 0
         return counts
 
-    patch.setattr(guiding, "apportion", holed)
+    patch.setattr(tables, "apportion", holed)
 
 
 def without_weight(patch: pytest.MonkeyPatch) -> None:
@@ -100,16 +100,16 @@ def _redraw(patch: pytest.MonkeyPatch, change: Any) -> None:
 
 def same_numbers(patch: pytest.MonkeyPatch) -> None:
     """Tables learn from the numbers of the step itself."""
-    from reslrb_cli.integrators import tracer
+    from reslrb_cli.integrators import light_tracer
 
-    patch.setattr(tracer, "learning_seed", lambda seed: seed)
+    patch.setattr(light_tracer, "learning_seed", lambda seed: seed)
 
 
 def learned_in_its_midst(patch: pytest.MonkeyPatch) -> None:
     """Tables learn from an image's samples before these are replayed, and so with another table."""
+    from reslrb_cli.guiding.collect import hear
+    from reslrb_cli.guiding.tables import Purpose
     from reslrb_cli.integrators import light_tracer as lt
-    from reslrb_cli.integrators.guiding import Purpose
-    from reslrb_cli.integrators.hearing import hear
     from reslrb_cli.integrators.reslrb import Reslrb
 
     right = Reslrb._replay
@@ -117,12 +117,12 @@ def learned_in_its_midst(patch: pytest.MonkeyPatch) -> None:
     def wrong(self: Reslrb, trace: Any, gradient: Any, params: Any) -> None:
         import drjit as dr
 
-        guiding = self.preparation.guiding
-        assert guiding is not None
+        tables = self.preparation.guiding
+        assert tables is not None
         [samples] = trace.samples
         with dr.suspend_grad():
-            guiding.learn(0, samples.width, hear(samples, gradient))
-        again = replace(samples, guide=replace(samples.guide, table=guiding.table(0, Purpose.BOTH)))
+            tables.learn(0, samples.width, hear(samples, gradient))
+        again = replace(samples, guide=replace(samples.guide, table=tables.table(0, Purpose.BOTH)))
         right(self, lt.Trace([again], trace.image, trace.state), gradient, params)
 
     patch.setattr(Reslrb, "_replay", wrong)

@@ -14,9 +14,9 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from reslrb_cli.integrators import known_step, render_image
-from reslrb_cli.integrators.interface import StepIntegrator
-from reslrb_cli.measure.small_scenes import diffuse, load, rgb, texture, transform
+from reslrb_cli.integrators.protocol import StepIntegrator
+from reslrb_cli.integrators.step import known_step, render_image
+from reslrb_cli.measure.scenes.small import diffuse, load, rgb, texture, transform
 
 SIZE = 32
 #: Slopes that bend light, and do not fold: amplitude, wave vector and phase of each wave.

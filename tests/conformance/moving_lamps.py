@@ -15,7 +15,7 @@ import mitsuba as mi
 import numpy as np
 from conformance.moving import Latents, Moving, camera, flat, sheet
 
-from reslrb_cli.measure.small_scenes import bitmap, diffuse, rgb, transform
+from reslrb_cli.measure.scenes.small import bitmap, diffuse, rgb, transform
 
 PIVOT = (0.1, 4.5, 0.2)
 RADIANCE = rgb(3, 2, 4)

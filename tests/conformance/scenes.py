@@ -12,8 +12,8 @@ import mitsuba as mi
 import numpy as np
 
 import reslrb_cli
-from reslrb_cli.integrators import make_integrator, render_image
-from reslrb_cli.measure.statistics import Agreement, compare
+from reslrb_cli.integrators.step import make_integrator, render_image
+from reslrb_cli.measure.comparison import Agreement, compare
 
 #: Largest relative difference between images of the same random numbers.
 SAME = 3e-4

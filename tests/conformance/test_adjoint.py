@@ -11,10 +11,10 @@ import pytest
 from conformance.gradient_cases import FLOOR, floor
 from turns import a_few
 
-from reslrb_cli.integrators import gradient_step, known_step, render_image, sample_sets
+from reslrb_cli.integrators.step import gradient_step, known_step, render_image, sample_sets
+from reslrb_cli.measure.comparison import Agreement, compare
 from reslrb_cli.measure.gradients import Case, integrator, seeds
-from reslrb_cli.measure.small_scenes import texture
-from reslrb_cli.measure.statistics import Agreement, compare
+from reslrb_cli.measure.scenes.small import texture
 
 pytestmark = pytest.mark.usefixtures("llvm")
 

@@ -12,14 +12,15 @@ from conformance.test_survival import replayed_from, replays_agree
 from turns import a_few
 
 from reslrb_cli.estimators import ESTIMATORS
-from reslrb_cli.integrators import guiding, preparation
-from reslrb_cli.integrators.guiding import NOW, Purpose
-from reslrb_cli.integrators.learned import Learned
+from reslrb_cli.guiding import tables as guiding
+from reslrb_cli.guiding.tables import NOW, Learned, Purpose
+from reslrb_cli.integrators import context
+from reslrb_cli.measure.comparison import compare
 from reslrb_cli.measure.gradients import Case, relative
-from reslrb_cli.measure.statistics import compare
 from reslrb_cli.transport import aim
-from reslrb_cli.transport.aim import SLOTS, UNIFORM, Aim, Pending
-from reslrb_cli.transport.blocks import BLOCKS, Blocks
+from reslrb_cli.transport.aim import Pending
+from reslrb_cli.transport.film import BLOCKS, Blocks
+from reslrb_cli.transport.guide import AIM_SLOTS, AIM_UNIFORM, Aim
 
 pytestmark = pytest.mark.usefixtures("llvm")
 
@@ -44,7 +45,7 @@ FEW = ["roughplastic", "crop", "plastic_beside_mask"]
 @pytest.fixture(autouse=True)
 def everywhere(monkeypatch: pytest.MonkeyPatch) -> None:
     """Aim in scenes without glossy surfaces, too."""
-    monkeypatch.setattr(preparation, "worthwhile", lambda needs, max_depth: max_depth > 2)
+    monkeypatch.setattr(context, "worthwhile", lambda needs, max_depth: max_depth > 2)
 
 
 def aimed(name: str, **options: Any) -> tuple[Case, Any, Any]:
@@ -217,11 +218,11 @@ def test_blocks_part_the_film_and_their_densities_are_those_of_their_slots(size:
     counts = np.bincount(np.array(table.slots), minlength=len(areas))
     density = np.array(table.density, np.float64)
     even = areas / areas.sum()
-    assert counts.sum() == SLOTS
+    assert counts.sum() == AIM_SLOTS
     assert counts.min() > 0
-    assert np.allclose(density * even, counts / SLOTS, rtol=1e-5)
-    assert (density > 0.85 * UNIFORM).all()
-    assert np.abs(density * even - UNIFORM * even - (1 - UNIFORM) * wanted / wanted.sum()).sum() < 0.3
+    assert np.allclose(density * even, counts / AIM_SLOTS, rtol=1e-5)
+    assert (density > 0.85 * AIM_UNIFORM).all()
+    assert np.abs(density * even - AIM_UNIFORM * even - (1 - AIM_UNIFORM) * wanted / wanted.sum()).sum() < 0.3
     nothing = np.array(Aim.of(film, 0 * wanted).density)
     assert nothing.min() > 0.4
     assert nothing.max() < 2.5
@@ -248,11 +249,11 @@ def test_paths_of_a_gradient_are_sent_where_its_own_dl_di_is_large(purpose: Purp
     delta[3, 2] = 1.0  # a single pixel of an image was far too bright
     known = np.array(tables.table(0, purpose, mi.TensorXf(delta)).aim.density, np.float64)
     before = np.array(tables.table(0, purpose).aim.density, np.float64)
-    expected = (1 - purpose.value * NOW * (1 - UNIFORM)) * before
-    expected[3 * film.width + 2] += purpose.value * NOW * (1 - UNIFORM) * film.count
+    expected = (1 - purpose.value * NOW * (1 - AIM_UNIFORM)) * before
+    expected[3 * film.width + 2] += purpose.value * NOW * (1 - AIM_UNIFORM) * film.count
     # What is there evenly stays as it was, of the rest a share is the pixel's.
     assert np.isclose(known[3 * film.width + 2], expected[3 * film.width + 2], rtol=0.05)
-    assert known.min() > 0.85 * UNIFORM
+    assert known.min() > 0.85 * AIM_UNIFORM
 
 
 @pytest.mark.parametrize("size", [(9, 7), (1000, 30)])
@@ -275,7 +276,7 @@ def test_means_of_blocks(size: tuple[int, int]) -> None:
 
 
 def test_only_scenes_with_glossy_surfaces_pay_for_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(preparation, "worthwhile", aim.worthwhile)
+    monkeypatch.setattr(context, "worthwhile", aim.worthwhile)
     for name, expected in (("roughplastic", True), ("texture", False), ("thin_lens", False), ("bumpmap", False)):
         scene, ours, _ = guided(name, 1)
         assert ours.preparation.plan(scene.scene, scene.scene.sensors()[0], scene.params).aimed is expected

@@ -18,10 +18,10 @@ from conformance.attached_faults import FAULTS, AttachedFault
 from conformance.moving import Moving, enclosed
 from measure.test_mutations import plant
 
-from reslrb_cli.integrators.interface import StepIntegrator
+from reslrb_cli.integrators.protocol import StepIntegrator
 from reslrb_cli.measure.comparison import Family, compare_expectations
 from reslrb_cli.measure.gradients import integrator, relative, seeds
-from reslrb_cli.records.gradcheck import Verdict
+from reslrb_cli.records.measurements import Verdict
 
 pytestmark = pytest.mark.usefixtures("llvm")
 

@@ -13,7 +13,7 @@ import pytest
 from conformance.moving import WHITE, Moving, Place, beam, camera, enclosed, flat, sheet, under_glass
 
 from reslrb_cli.measure.gradients import integrator, relative
-from reslrb_cli.measure.small_scenes import bitmap, diffuse, rgb, transform
+from reslrb_cli.measure.scenes.small import bitmap, diffuse, rgb, transform
 
 pytestmark = pytest.mark.usefixtures("llvm")
 

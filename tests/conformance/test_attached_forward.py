@@ -15,8 +15,8 @@ from turns import taking_turns
 
 from reslrb_cli import register
 from reslrb_cli.errors import UnsupportedScene
-from reslrb_cli.measure.attached import SCENES
 from reslrb_cli.measure.gradients import integrator, relative
+from reslrb_cli.measure.scenes.moving_light import SCENES
 
 pytestmark = pytest.mark.usefixtures("llvm")
 
@@ -61,7 +61,7 @@ class Fault:
 
     right: str
     wrong: str
-    where: str = "integrators.tangents:AttachedTangentSplat.scattering"
+    where: str = "integrators.forward:AttachedTangentSplat.scattering"
 
 
 FAULTS = {

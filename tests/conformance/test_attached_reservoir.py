@@ -17,12 +17,11 @@ from conformance.moving_lamps import CASES as LAMPS
 from measure.test_mutations import plant
 
 from reslrb_cli.estimators import chain, jacobian
-from reslrb_cli.integrators import gradient_step
-from reslrb_cli.measure.attached import AttachedScene
-from reslrb_cli.measure.attached.amplitudes import Pose
-from reslrb_cli.measure.attached.rooms import moved, room, shelf, wall
+from reslrb_cli.integrators.step import gradient_step
 from reslrb_cli.measure.gradients import integrator, relative, seeds
-from reslrb_cli.measure.small_scenes import diffuse
+from reslrb_cli.measure.scenes.moving import AttachedScene, Pose
+from reslrb_cli.measure.scenes.moving_light import moved, room, shelf, wall
+from reslrb_cli.measure.scenes.small import diffuse
 
 pytestmark = pytest.mark.usefixtures("llvm")
 
@@ -210,14 +209,14 @@ class Fault:
     wrong: str
 
 
-SELECTION, REPLAY = "estimators.chain:ChainSelection", "estimators.chain_replay:ChainReplay"
+SELECTION, REPLAY = "estimators.chain:ChainSelection", "estimators.chain:ChainReplay"
 FAULTS = {
     "no_G": Fault(f"{SELECTION}.scattering",
                   "row_times(row, J) + before for row, before in zip(jacobian.log_c",
                   "row_times(row, J) for row, before in zip(jacobian.log_c"),
     "factors_passed_stay": Fault(f"{REPLAY}.scattering", "ahead = row - sum", "ahead = row + 0 * sum"),
     "no_inverse": Fault(f"{REPLAY}.scattering", "row_times(ahead, inverse)", "ahead"),
-    "film_position_stays": Fault("estimators.chain_replay:Kept.of", "[*by_u, *A]", "[*(0 * by_u), *A]"),
+    "film_position_stays": Fault("estimators.chain:Kept.of", "[*by_u, *A]", "[*(0 * by_u), *A]"),
     "own_vertex_left_out": Fault(f"{REPLAY}._differentiate", "own_part + later", "later"),
     "rays_left_out": Fault(f"{REPLAY}._differentiate", "moved + dr.dot(by_s", "0 * moved + dr.dot(by_s"),
 }  # fmt: skip

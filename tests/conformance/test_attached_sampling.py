@@ -12,15 +12,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from reslrb_cli.integrators.preparation import stays
-from reslrb_cli.measure.attached import SCENES, AttachedScene, compare_with_differences
-from reslrb_cli.measure.attached.amplitudes import Move, Pose
-from reslrb_cli.measure.attached.glass import smooth_texture
-from reslrb_cli.measure.attached.places import point
-from reslrb_cli.measure.attached.rooms import moved, room, wall
+from reslrb_cli.integrators.context import stays
 from reslrb_cli.measure.comparison import Family, compare_expectations
 from reslrb_cli.measure.gradients import integrator, seeds
-from reslrb_cli.measure.small_scenes import diffuse
+from reslrb_cli.measure.scenes.moving import AttachedScene, Move, Pose, compare_with_differences
+from reslrb_cli.measure.scenes.moving_light import SCENES, moved, point, room, smooth_texture, wall
+from reslrb_cli.measure.scenes.small import diffuse
 
 pytestmark = pytest.mark.usefixtures("llvm")
 

@@ -11,10 +11,9 @@ import pytest
 from conformance.moving import SIZE, Moving, camera
 from conformance.moving_lamps import over_floor, surface
 
-from reslrb_cli.integrators import Job
-from reslrb_cli.integrators.border import border_share
+from reslrb_cli.integrators.protocol import Job
 from reslrb_cli.measure.gradients import integrator
-from reslrb_cli.optimization.border import warn_of_border
+from reslrb_cli.optimization.moving import border_share, warn_of_border
 
 pytestmark = pytest.mark.usefixtures("llvm")
 

@@ -13,7 +13,7 @@ import pytest
 
 from reslrb_cli.estimators import gather, reservoir, stack
 from reslrb_cli.measure.gradients import Case, integrator, seeds
-from reslrb_cli.measure.small_scenes import diffuse, room
+from reslrb_cli.measure.scenes.small import diffuse, room
 
 pytestmark = pytest.mark.usefixtures("llvm")
 

@@ -11,8 +11,8 @@ import pytest
 from conformance.gradient_cases import AT_EQUAL_SEEDS, CASES, GradientCase
 from turns import a_few, taking_turns
 
+from reslrb_cli.measure.comparison import compare
 from reslrb_cli.measure.gradients import Case, integrator, relative, seeds
-from reslrb_cli.measure.statistics import compare
 
 pytestmark = pytest.mark.usefixtures("llvm")
 

@@ -13,7 +13,7 @@ from turns import a_few, taking_turns
 from reslrb_cli.errors import UnsupportedScene
 from reslrb_cli.integrators import freezing
 from reslrb_cli.measure.gradients import Case, integrator, relative
-from reslrb_cli.measure.small_scenes import camera
+from reslrb_cli.measure.scenes.small import camera
 
 pytestmark = pytest.mark.usefixtures("llvm")
 

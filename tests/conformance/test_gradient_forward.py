@@ -10,8 +10,8 @@ from conformance.gradient_cases import CASES
 from conformance.scenes import plugin
 from turns import a_few
 
+from reslrb_cli.measure.comparison import compare
 from reslrb_cli.measure.gradients import Case, integrator, relative, seeds
-from reslrb_cli.measure.statistics import compare
 
 pytestmark = pytest.mark.usefixtures("llvm")
 

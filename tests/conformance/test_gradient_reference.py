@@ -7,8 +7,8 @@ import pytest
 from conformance.gradient_cases import CASES, IN_EXPECTATION, GradientCase
 from turns import a_few
 
+from reslrb_cli.measure.comparison import Agreement, compare
 from reslrb_cli.measure.gradients import Case, integrator, seeds
-from reslrb_cli.measure.statistics import Agreement, compare
 
 pytestmark = pytest.mark.usefixtures("llvm")
 

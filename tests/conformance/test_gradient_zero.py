@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 from conformance.gradient_cases import _IN_VIEW, FLOOR, _mask, floor
 
+from reslrb_cli.measure.comparison import compare
 from reslrb_cli.measure.gradients import Case, integrator, relative, seeds
-from reslrb_cli.measure.small_scenes import bitmap, diffuse, lamp, rgb, room
-from reslrb_cli.measure.statistics import compare
+from reslrb_cli.measure.scenes.small import bitmap, diffuse, lamp, rgb, room
 
 pytestmark = pytest.mark.usefixtures("llvm")
 

@@ -15,9 +15,9 @@ from turns import a_few
 
 import reslrb_cli
 from reslrb_cli.estimators import ESTIMATORS
-from reslrb_cli.integrators import known_step, render_image
+from reslrb_cli.integrators.step import known_step, render_image
+from reslrb_cli.measure.comparison import compare
 from reslrb_cli.measure.gradients import Case, integrator, relative, seeds
-from reslrb_cli.measure.statistics import compare
 
 pytestmark = pytest.mark.usefixtures("llvm")
 
@@ -96,7 +96,7 @@ def means_hold(name: str, steps: int, count: int) -> None:
 
 def strength(ours: Any) -> float:
     """How much more often the cell that is drawn most is drawn than it would be evenly."""
-    from reslrb_cli.integrators.guiding import Purpose
+    from reslrb_cli.guiding.tables import Purpose
 
     guiding = ours.preparation.guiding
     measures = guiding.grid.measures()
@@ -195,7 +195,7 @@ def drawn_evenly() -> Any:
     those of even numbers."""
     import mitsuba as mi
 
-    from reslrb_cli.integrators import guiding
+    from reslrb_cli.guiding import tables as guiding
     from reslrb_cli.transport.guide import Guide, Table, make_grid
 
     grid = make_grid([True] * 4, [1.0, 2.0, 0.5])
@@ -234,7 +234,7 @@ def test_tables_learn_from_other_numbers_and_change_between_steps(fault: Any, mo
 def learns_apart(patch: pytest.MonkeyPatch) -> bool:
     """Whether the walks of two steps have one table each, and what is learned has seeds that no other walk has."""
     from reslrb_cli.estimators import base
-    from reslrb_cli.integrators import hearing
+    from reslrb_cli.guiding import collect
 
     walks: dict[bool, list[tuple[int, int]]] = {True: [], False: []}
     right, tables = base.walk, []  # held, so that no other has their addresses
@@ -248,7 +248,7 @@ def learns_apart(patch: pytest.MonkeyPatch) -> bool:
         return walk
 
     patch.setattr(base, "walk", seen(False))
-    patch.setattr(hearing, "walk", seen(True))
+    patch.setattr(collect, "walk", seen(True))
     scene, ours, _ = guided("two_emitters", 0, estimator="gather")
     del ours.preparation.guiding.due
     for seed in (1, 2):

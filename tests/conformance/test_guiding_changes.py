@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from reslrb_cli.integrators.guiding import EVERY
+from reslrb_cli.guiding.tables import EVERY
 from reslrb_cli.measure.gradients import Case, integrator, seeds
-from reslrb_cli.measure.small_scenes import SIZE, diffuse, rgb, texture, transform
+from reslrb_cli.measure.scenes.small import SIZE, diffuse, rgb, texture, transform
 
 pytestmark = pytest.mark.usefixtures("llvm")
 
@@ -70,12 +70,12 @@ def slide(scene: Case, x: float) -> None:
 
 def rows(scene: Case, ours: Any, count: int, block: int) -> np.ndarray:
     """Gradients of so many steps from which no table learns, (count, P)."""
-    guiding = ours.preparation.guiding
-    if guiding is not None:
-        guiding.held = True
+    tables = ours.preparation.guiding
+    if tables is not None:
+        tables.held = True
     found = scene.gradients(ours, seeds(count, block), SPP, adjoint="correlated")
-    if guiding is not None:
-        guiding.held = False
+    if tables is not None:
+        tables.held = False
     return found
 
 
@@ -83,7 +83,7 @@ def errors(count: int, before: int = BEFORE) -> tuple[tuple[float, float], ...]:
     """Root mean square errors of guided steps, in those of unguided ones, with their standard errors: before the
     shutter slides, in the first step after that, and WITHIN steps later."""
     scene = Case(chamber(), [KEY])
-    ours, plain = (integrator("reslrb", 5, 1000, estimator="stack", guiding=guiding) for guiding in ("on", "off"))
+    ours, plain = (integrator("reslrb", 5, 1000, estimator="stack", guiding=tables) for tables in ("on", "off"))
     found, blocks = [], iter(range(100))
 
     def compared() -> tuple[float, float]:
@@ -134,15 +134,15 @@ def test_tables_that_know_much_forget_it_as_soon() -> None:
 
 @pytest.mark.long
 def test_tables_that_do_not_look_again_in_time_are_too_wrong(monkeypatch: pytest.MonkeyPatch) -> None:
-    from reslrb_cli.integrators import guiding
+    from reslrb_cli.guiding import tables
 
-    monkeypatch.setattr(guiding, "EVERY", 2 * EVERY)
+    monkeypatch.setattr(tables, "EVERY", 2 * EVERY)
     assert not holds(errors(32))
 
 
 @pytest.mark.long
 def test_tables_that_learn_no_more_stay_wrong(monkeypatch: pytest.MonkeyPatch) -> None:
-    from reslrb_cli.integrators.guiding import Guiding
+    from reslrb_cli.guiding.tables import Guiding
 
     right = Guiding.due
 

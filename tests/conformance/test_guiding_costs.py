@@ -6,8 +6,7 @@ import pytest
 from conformance.test_guiding import guided, learn
 from conformance.test_kernels import Kernels, nothing_is_compiled_without
 
-from reslrb_cli.integrators.features import GUIDED
-from reslrb_cli.integrators.plan_report import LARGE
+from reslrb_cli.integrators.plan_report import GUIDED, LARGE
 
 pytestmark = pytest.mark.usefixtures("llvm")
 

@@ -10,11 +10,12 @@ import numpy as np
 import pytest
 from conformance.test_guiding import SPP, guided, sample
 
+from reslrb_cli.guiding.collect import KEEP
+from reslrb_cli.guiding.tables import BLUR, FINE, Learned, _blurred, grid_for, learnings, most_cells
 from reslrb_cli.integrators import freezing
-from reslrb_cli.integrators.guiding import grid_for, learnings
-from reslrb_cli.integrators.learned import BLUR, FINE, KEEP, Learned, _blurred, most_cells
 from reslrb_cli.measure.gradients import relative
-from reslrb_cli.transport.guide import Grid, Table, apportion, make_grid
+from reslrb_cli.transport.guide import Table, apportion, make_grid
+from reslrb_cli.transport.plan import Grid
 
 pytestmark = pytest.mark.usefixtures("llvm")
 

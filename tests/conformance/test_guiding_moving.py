@@ -10,9 +10,9 @@ from conformance import attached_cases, moving_lamps
 from conformance.test_survival import by_harsh_table
 from turns import a_few
 
-from reslrb_cli.integrators import make_integrator
+from reslrb_cli.integrators.step import make_integrator
+from reslrb_cli.measure.comparison import compare
 from reslrb_cli.measure.gradients import seeds
-from reslrb_cli.measure.statistics import compare
 
 pytestmark = pytest.mark.usefixtures("llvm")
 

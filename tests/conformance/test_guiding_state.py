@@ -7,11 +7,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from reslrb_cli.integrators.guiding import Guiding
-from reslrb_cli.integrators.learned import Learned
-from reslrb_cli.integrators.onward import Onward
-from reslrb_cli.transport.guide import make_grid
-from reslrb_cli.transport.survival import CELLS
+from reslrb_cli.guiding.collect import Onward
+from reslrb_cli.guiding.tables import Guiding, Learned
+from reslrb_cli.transport.guide import CELLS, make_grid
 
 GRID = make_grid([True] * 4, [1.0, 3.0], 9)
 

@@ -10,7 +10,8 @@ import pytest
 from conformance.gradient_cases import CASES
 
 from reslrb_cli.measure.gradients import Case, integrator
-from reslrb_cli.transport.guide import UNIFORM, Grid, Guide, Table, apportion, even_table, make_grid
+from reslrb_cli.transport.guide import Guide, Table, apportion, even_table, make_grid
+from reslrb_cli.transport.plan import GUIDE_UNIFORM, Grid
 
 pytestmark = pytest.mark.usefixtures("llvm")
 
@@ -31,11 +32,11 @@ def test_slots_are_all_shared_out_and_a_quarter_evenly(name: str) -> None:
     counts = apportion(grid, density)
     even = grid.measures() * grid.slots
     assert counts.sum() == grid.slots
-    assert (counts >= UNIFORM * even - 1e-3).all()
+    assert (counts >= GUIDE_UNIFORM * even - 1e-3).all()
     assert (counts[even > 0] > 0).all()
     assert (counts[even == 0] == 0).all()
     weights = np.array(Table.of(grid, counts).weights, np.float64)
-    assert weights.max() <= 1 / UNIFORM * (1 + 1e-3)
+    assert weights.max() <= 1 / GUIDE_UNIFORM * (1 + 1e-3)
     assert np.sum(weights * counts) / grid.slots == pytest.approx(1, abs=1e-6)
     assert np.isclose(np.diff(grid.edges).sum(), 1)
     assert grid.cells <= 2**19
@@ -103,8 +104,7 @@ def heard(*rows: Any) -> np.ndarray:
 
 
 def test_no_voice_drowns_another_and_none_that_is_not_finite_is_heard() -> None:
-    from reslrb_cli.integrators.guiding import Purpose
-    from reslrb_cli.integrators.learned import Learned
+    from reslrb_cli.guiding.tables import Learned, Purpose
 
     draws, first, other = np.ones(SMALL.cells), np.zeros(SMALL.cells), np.zeros(SMALL.cells)
     first[:16], other[16:] = 1, 1
@@ -175,7 +175,7 @@ def test_each_cell_is_drawn_as_often_as_its_weight_says_and_numbers_lie_in_it(we
 
 def test_cells_are_as_fine_as_there_are_paths_to_tell_them_apart() -> None:
     """A few paths say nothing of single cells; what many say of one is not spread over others."""
-    from reslrb_cli.integrators.learned import FINE, Learned
+    from reslrb_cli.guiding.tables import FINE, Learned
 
     grid = GRIDS["one"]
     loud = np.zeros(grid.cells, np.float32)
@@ -193,8 +193,7 @@ def test_cells_are_as_fine_as_there_are_paths_to_tell_them_apart() -> None:
 
 
 def test_what_was_heard_long_ago_counts_for_little() -> None:
-    from reslrb_cli.integrators.guiding import Purpose
-    from reslrb_cli.integrators.learned import Learned
+    from reslrb_cli.guiding.tables import Learned, Purpose
 
     draws, before, now = np.ones(SMALL.cells), np.zeros(SMALL.cells), np.zeros(SMALL.cells)
     before[:16], now[16:] = 1, 1
@@ -205,7 +204,7 @@ def test_what_was_heard_long_ago_counts_for_little() -> None:
 
 
 def test_tables_of_any_number_of_sensors_take_64_mib() -> None:
-    from reslrb_cli.integrators.guiding import Guiding, grid_for
+    from reslrb_cli.guiding.tables import Guiding, grid_for
 
     for emitters, sensors in ((1, 1), (1, 3), (2, 1), (3, 2), (3000, 1), (3, 1000)):
         guiding = Guiding()

@@ -24,8 +24,8 @@ from conformance.scenes import (
 )
 from turns import a_few, taking_turns
 
-from reslrb_cli.integrators import gradient_step, make_integrator
-from reslrb_cli.measure.statistics import compare, renders
+from reslrb_cli.integrators.step import gradient_step, make_integrator
+from reslrb_cli.measure.comparison import compare, renders
 
 pytestmark = pytest.mark.usefixtures("samples")
 

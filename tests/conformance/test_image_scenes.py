@@ -10,10 +10,10 @@ from conformance.scenes import SAME, agreement, difference_from_ptracer, images
 from rooms import real_room
 from turns import a_few
 
-from reslrb_cli.measure.references import Situation, interior, ptracer_image
-from reslrb_cli.measure.statistics import compare
-from reslrb_cli.scene import load_scene
-from reslrb_cli.scene.seen import sees_specular
+from reslrb_cli.measure.comparison import compare
+from reslrb_cli.measure.references import Situation, ptracer_image
+from reslrb_cli.scene.load import load_scene
+from reslrb_cli.scene.visibility import interior, sees_specular
 
 ROOT = Path(__file__).resolve().parents[2]
 #: What judges each scene, and how many samples a pixel it takes. `path` cannot see a caustic of parallel light.

@@ -11,10 +11,9 @@ import pytest
 from conformance.gradient_cases import CASES
 from turns import a_few, taking_turns
 
-from reslrb_cli.integrators.features import FEATURES
-from reslrb_cli.integrators.plan_report import count, tracking
+from reslrb_cli.integrators.plan_report import FEATURES, count, tracking
 from reslrb_cli.measure.gradients import Case, integrator
-from reslrb_cli.scene import load_scene
+from reslrb_cli.scene.load import load_scene
 
 pytestmark = pytest.mark.usefixtures("llvm")
 
@@ -158,7 +157,7 @@ def test_zero_texels_come_and_go():
 
 
 def test_image_seeds_compile_nothing():
-    from reslrb_cli.integrators import render_image
+    from reslrb_cli.integrators.step import render_image
 
     case = next(case for case in CASES if case.name == "texture")
     scene = Case(case.scene(), case.keys)

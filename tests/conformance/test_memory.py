@@ -7,7 +7,7 @@ import gc
 import pytest
 
 from reslrb_cli.measure.gradients import Case, integrator
-from reslrb_cli.measure.small_scenes import diffuse, room, texture
+from reslrb_cli.measure.scenes.small import diffuse, room, texture
 
 pytestmark = pytest.mark.usefixtures("llvm")
 

@@ -9,7 +9,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from reslrb_cli.integrators import gradient_step, make_integrator
+from reslrb_cli.integrators.step import gradient_step, make_integrator
 
 pytestmark = pytest.mark.usefixtures("llvm")
 

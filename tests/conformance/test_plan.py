@@ -13,11 +13,10 @@ import pytest
 from conformance.gradient_cases import FLOOR
 from turns import taking_turns
 
-from reslrb_cli.integrators import known_step
-from reslrb_cli.integrators.features import FEATURES
-from reslrb_cli.integrators.plan_report import count, report_plan, tracking
+from reslrb_cli.integrators.plan_report import FEATURES, count, report_plan, tracking
+from reslrb_cli.integrators.step import known_step
 from reslrb_cli.measure.gradients import Case, integrator
-from reslrb_cli.measure.small_scenes import camera, diffuse, rgb, room, texture, transform
+from reslrb_cli.measure.scenes.small import camera, diffuse, rgb, room, texture, transform
 
 pytestmark = pytest.mark.usefixtures("llvm")
 

@@ -16,10 +16,10 @@ from conformance.scenes import plugin
 
 from reslrb_cli import step
 from reslrb_cli.errors import UnsupportedScene
-from reslrb_cli.integrators import render_image
+from reslrb_cli.integrators.step import render_image
+from reslrb_cli.measure.comparison import compare
 from reslrb_cli.measure.gradients import Case, integrator, relative, seeds
-from reslrb_cli.measure.small_scenes import camera, lamp, rgb, room
-from reslrb_cli.measure.statistics import compare
+from reslrb_cli.measure.scenes.small import camera, lamp, rgb, room
 
 pytestmark = pytest.mark.usefixtures("llvm")
 
@@ -119,7 +119,7 @@ def shown(llvm: str) -> Case:
 
 
 def _facing() -> Any:
-    from reslrb_cli.measure.small_scenes import transform
+    from reslrb_cli.measure.scenes.small import transform
 
     return transform(translate=[0.2, -0.1, 1.2], rotate=([0, 1, 0], 15), scale=0.4)
 
@@ -166,7 +166,7 @@ def test_walk_ad_knows_no_estimators(name: str):
 
 
 def test_an_option_that_an_integrator_does_not_have_is_refused():
-    from reslrb_cli.integrators import make_integrator
+    from reslrb_cli.integrators.step import make_integrator
 
     for type in ("reslrb", "ptracer", "prb"):
         with pytest.raises(ValueError, match=f"{type} has no option colour"):
@@ -262,7 +262,7 @@ def test_several_sensors_accumulate(llvm: str):
     import drjit as dr
     import mitsuba as mi
 
-    from reslrb_cli.integrators import gradient_step
+    from reslrb_cli.integrators.step import gradient_step
 
     other = camera() | {
         "to_world": mi.ScalarTransform4f().look_at(origin=[0.2, 1.2, 4], target=[0, 0, 0], up=[0, 1, 0])
@@ -286,7 +286,7 @@ def test_one_latent_for_several_sensors(llvm: str):
     import drjit as dr
     import mitsuba as mi
 
-    from reslrb_cli.integrators import gradient_step
+    from reslrb_cli.integrators.step import gradient_step
 
     scene = Case(_textured(other=camera()), (FLOOR,))
     for name in ("reslrb", "walk_ad", "ptracer", "prb"):
@@ -312,7 +312,7 @@ def test_one_latent_for_several_sensors(llvm: str):
 def test_what_moves_is_refused_with_the_reason(name: str, options: dict[str, str], key: str):
     import drjit as dr
 
-    from reslrb_cli.integrators import gradient_step
+    from reslrb_cli.integrators.step import gradient_step
 
     case = Case(_textured(), (FLOOR,))  # its sensor has a box filter
     dr.enable_grad(case.params[key])
@@ -402,7 +402,7 @@ def test_samples_per_pass(case: Case):
 
 def test_retained_image_has_the_same_expectation(case: Case):
     every, retained = (integrator("reslrb", image=image) for image in ("all", "retained"))
-    from reslrb_cli.integrators import gradient_step
+    from reslrb_cli.integrators.step import gradient_step
 
     def images(tracer: Any, block: int) -> np.ndarray:
         steps = [gradient_step(tracer, case.scene, 0, case.objective, seed=s, spp=64) for s in seeds(16, block)]

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 from conformance.gradient_cases import FLOOR, floor
 
-from reslrb_cli.integrators import first_channels, gradient_step, known_step, render_image
+from reslrb_cli.integrators.protocol import first_channels
+from reslrb_cli.integrators.step import gradient_step, known_step, render_image
 from reslrb_cli.measure.gradients import Case, integrator
-from reslrb_cli.measure.small_scenes import bitmap, camera, diffuse, lamp, load, rgb, texture
+from reslrb_cli.measure.scenes.small import bitmap, camera, diffuse, lamp, load, rgb, texture
 
 pytestmark = pytest.mark.usefixtures("llvm")
 

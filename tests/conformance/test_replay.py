@@ -10,11 +10,11 @@ from conformance.gradient_cases import CASES
 
 from reslrb_cli.estimators.base import Pass
 from reslrb_cli.estimators.reservoir import ReservoirSelection
-from reslrb_cli.integrators import Job
+from reslrb_cli.integrators.protocol import Job
 from reslrb_cli.measure.gradients import Case, integrator
-from reslrb_cli.measure.small_scenes import room
+from reslrb_cli.measure.scenes.small import room
 from reslrb_cli.transport.emission import sample_emission
-from reslrb_cli.transport.hooks import Hooks
+from reslrb_cli.transport.walk import Hooks
 
 pytestmark = pytest.mark.usefixtures("llvm")
 
@@ -127,7 +127,7 @@ def test_replay_meets_the_same_vertices(name: str):
 
 def test_no_light_no_replay():
     """A scene whose light reaches nothing keeps nothing, and its gradient is zero."""
-    from reslrb_cli.measure.small_scenes import rgb, transform
+    from reslrb_cli.measure.scenes.small import rgb, transform
 
     lamp = room()["lamp"] | {"to_world": transform(translate=[0, 5, 0], rotate=([1, 0, 0], -90))}
     case = Case(room(lamp=lamp | {"emitter": {"type": "area", "radiance": rgb(1, 1, 1)}}),

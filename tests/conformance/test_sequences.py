@@ -17,10 +17,10 @@ from turns import a_few
 
 import reslrb_cli
 from reslrb_cli.estimators import ESTIMATORS
-from reslrb_cli.integrators import make_integrator
-from reslrb_cli.integrators.features import SEQUENCE
+from reslrb_cli.integrators.plan_report import SEQUENCE
+from reslrb_cli.integrators.step import make_integrator
+from reslrb_cli.measure.comparison import compare
 from reslrb_cli.measure.gradients import Case, integrator, relative, seeds
-from reslrb_cli.measure.statistics import compare
 
 pytestmark = pytest.mark.usefixtures("llvm")
 
@@ -135,8 +135,8 @@ def evenly(guiding: str) -> Any:
     import drjit as dr
     import mitsuba as mi
 
-    from reslrb_cli.integrators import Job
-    from reslrb_cli.transport.nets import Net
+    from reslrb_cli.integrators.protocol import Job
+    from reslrb_cli.transport.random import Net
 
     case = Case(BY_NAME["two_emitters"].scene(), [])
     ours = integrator("reslrb", guiding=guiding, samples_per_pass=1, **ON)

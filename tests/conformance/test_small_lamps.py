@@ -14,14 +14,12 @@ from conformance.test_kernels import Kernels
 from measure.faults import Fault
 from measure.test_mutations import plant
 
-from reslrb_cli.integrators.features import FEATURES
-from reslrb_cli.integrators.plan_report import count
-from reslrb_cli.measure.analytic_lamps import RADIANCE, speck_in_view
-from reslrb_cli.measure.extreme.case import Exact, ExtremeCase, Stock
-from reslrb_cli.measure.extreme.runner import run_cases
+from reslrb_cli.integrators.plan_report import FEATURES, count
+from reslrb_cli.measure.extreme.suite import Exact, ExtremeCase, Stock, run_cases
 from reslrb_cli.measure.gradients import Case, integrator, relative
-from reslrb_cli.measure.small_scenes import camera, diffuse, load, rgb, room, transform
-from reslrb_cli.scene import small_lamps
+from reslrb_cli.measure.scenes.analytic import RADIANCE, speck_in_view
+from reslrb_cli.measure.scenes.small import camera, diffuse, load, rgb, room, transform
+from reslrb_cli.scene import graph
 
 pytestmark = pytest.mark.usefixtures("llvm")
 
@@ -138,7 +136,7 @@ def test_which_are_small(make: Callable[[], dict[str, Any]], number: int):
 
 
 def test_too_many_are_left_to_primary_rays(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(small_lamps, "MOST", 1)
+    monkeypatch.setattr(graph, "MOST", 1)
     assert found(two()) == ()
 
 
@@ -185,7 +183,7 @@ def test_radiance_counts_once_where_its_lamp_moves_too(size: float):
 
 # ---- The code broken on purpose ----
 
-SPLAT = "transport.visible_lamps:small_points"
+SPLAT = "transport.visible:small_points"
 FAULTS = [
     Fault("left_out", "third", "integrators.light_tracer:splat_visible_emission", "if samples.plan.small_lamps",
           "if False", frozenset({("stack", "ptracer")})),
@@ -194,7 +192,7 @@ FAULTS = [
     Fault("primary_rays_find_them_too", "third", "transport.visible:_radiance",
           "emitter != mi.EmitterPtr(lamp.emitter)", "mi.Bool(True)",
           frozenset({("stack", "analytic"), ("stack", "ptracer")})),
-    Fault("cosine_forgotten", "two", "transport.visible_lamps:_points", "cos * weight", "weight",
+    Fault("cosine_forgotten", "two", "transport.visible:_points", "cos * weight", "weight",
           frozenset({("stack", "ptracer")})),
     Fault("turns_not_counted", "two", SPLAT, "(mi.Float(count) / mi.Float(lanes))", "1",
           frozenset({("stack", "ptracer")})),

@@ -12,11 +12,10 @@ from conformance.test_guiding import SPP, guided, sample, samples, seeds
 from turns import a_few
 
 from reslrb_cli.estimators import ESTIMATORS
-from reslrb_cli.integrators.guiding import Guiding, Purpose
+from reslrb_cli.guiding.tables import Guiding, Purpose
+from reslrb_cli.measure.comparison import compare
 from reslrb_cli.measure.gradients import Case, relative
-from reslrb_cli.measure.statistics import compare
-from reslrb_cli.transport.guide import Table
-from reslrb_cli.transport.survival import CELLS, Survival
+from reslrb_cli.transport.guide import CELLS, Survival, Table
 
 pytestmark = pytest.mark.usefixtures("llvm")
 

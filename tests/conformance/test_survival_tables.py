@@ -11,12 +11,12 @@ import pytest
 from conformance.test_guiding import SPP, guided, seeds
 from conformance.test_survival import BOX, harsh
 
-from reslrb_cli.integrators.guiding import Purpose, learning_seed
-from reslrb_cli.integrators.interface import Job
-from reslrb_cli.integrators.onward import FLOOR, LEAN, SURE, Onward, Walked
+from reslrb_cli.guiding.collect import FLOOR, LEAN, SURE, Onward, Walked
+from reslrb_cli.guiding.tables import Purpose, learning_seed
+from reslrb_cli.integrators.protocol import Job
+from reslrb_cli.measure.comparison import compare
 from reslrb_cli.measure.gradients import Case
-from reslrb_cli.measure.statistics import compare
-from reslrb_cli.transport.survival import BITS, CELLS, LEAST, SHAPE, Survival
+from reslrb_cli.transport.guide import BITS, CELLS, LEAST, SHAPE, Survival
 
 pytestmark = pytest.mark.usefixtures("llvm")
 
@@ -117,7 +117,7 @@ def test_what_is_known_does_not_depend_on_the_unit_of_light() -> None:
 
 def walk_of(scene: Case, ours: Any, seed: int) -> Walked:
     """What a walk shows that a table would learn from."""
-    from reslrb_cli.integrators.hearing import hear
+    from reslrb_cli.guiding.collect import hear
 
     leaves = scene.leaves()
     job = Job(scene.scene, scene.scene.sensors()[0], learning_seed(seed), SPP, scene.params)
@@ -148,12 +148,12 @@ def certain(scene: Case, ours: Any) -> None:
 @pytest.mark.parametrize("fault", [None, "square", "length"])
 def test_what_is_heard_is_what_there_is_whatever_roulette_ends(fault: str | None, monkeypatch: Any) -> None:
     """Weights of roulette are taken out again: a table that learned its own weights would feed on itself."""
-    from reslrb_cli.integrators import trail
+    from reslrb_cli.guiding import collect
 
     if fault is not None:
-        right = trail.Trail.survives
+        right = collect.Trail.survives
         power = {"square": 3.0, "length": 0.0}[fault]
-        monkeypatch.setattr(trail.Trail, "survives", lambda self, weight: right(self, weight**power))
+        monkeypatch.setattr(collect.Trail, "survives", lambda self, weight: right(self, weight**power))
     result = compare(heard("two_emitters", harsh, 24, 0), heard("two_emitters", certain, 24, 1), block=None)
     print(fault, result)
     assert bool(result) == (fault is None)
@@ -164,8 +164,7 @@ def test_what_follows_a_bounce_is_heard_where_its_ray_left() -> None:
     import drjit as dr
     import mitsuba as mi
 
-    from reslrb_cli.transport.hooks import Hooks
-    from reslrb_cli.transport.walk import walk
+    from reslrb_cli.transport.walk import Hooks, walk
 
     class Keeping(Hooks):
         """Of each path: where it leaves the first vertex, its throughput then, and what the second one says."""
@@ -208,12 +207,12 @@ def test_what_follows_a_bounce_is_heard_where_its_ray_left() -> None:
 
 def test_vertices_that_find_no_room_are_summed(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of walks of two bounces rays leave the first vertex alone: there is room for that, or for both."""
-    from reslrb_cli.integrators import trail
+    from reslrb_cli.guiding import collect
 
     scene, ours, _ = guided("two_emitters", 1, max_depth=3)
     found = []
     for places in (32, 1):
-        monkeypatch.setattr(trail, "PLACES", places)
+        monkeypatch.setattr(collect, "PLACES", places)
         found.append(walk_of(scene, ours, 5))
     assert found[0].left.sum() > 0
     for name in ("squares", "followed", "left"):

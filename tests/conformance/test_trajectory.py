@@ -8,9 +8,9 @@ from conformance.gradient_cases import CASES, GradientCase
 from turns import taking_turns
 
 from reslrb_cli.errors import UnsupportedScene
-from reslrb_cli.integrators import gradient_step, known_step, make_integrator
+from reslrb_cli.integrators.step import gradient_step, known_step, make_integrator
 from reslrb_cli.measure.gradients import Case, integrator, relative
-from reslrb_cli.measure.small_scenes import diffuse, room, transform
+from reslrb_cli.measure.scenes.small import diffuse, room, transform
 
 pytestmark = pytest.mark.usefixtures("llvm")
 

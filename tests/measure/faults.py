@@ -7,13 +7,14 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
-from reslrb_cli.config import Config, loads
-from reslrb_cli.measure import cornell_box
-from reslrb_cli.measure.cases import parse_estimators
+from reslrb_cli.config.loader import loads
+from reslrb_cli.config.schema import Config
 from reslrb_cli.measure.extreme import run_suite
 from reslrb_cli.measure.gradcheck import Gradcheck
+from reslrb_cli.measure.methods import parse_estimators
 from reslrb_cli.measure.participants import Settings
-from reslrb_cli.records.gradcheck import GradcheckRecord
+from reslrb_cli.measure.scenes import small
+from reslrb_cli.records.measurements import GradcheckRecord
 
 Check = Callable[[], Iterable[GradcheckRecord]]
 SMALL = ["scene.options.size=32", "scene.options.texture=4", "run.spp=8", "integrator.max_depth=4"]
@@ -41,7 +42,7 @@ def checked(config: Config, estimators: str, seeds: int) -> list[GradcheckRecord
 
 def cornell(*overrides: str, estimators: str, seeds: int = 8) -> Check:
     """`reslrb gradcheck` on the built-in Cornell box, small."""
-    return lambda: checked(loads(cornell_box.CONFIG, cornell_box.SOURCE, [*SMALL, *overrides]), estimators, seeds)
+    return lambda: checked(loads(small.CORNELL_BOX, small.CORNELL_BOX_SOURCE, [*SMALL, *overrides]), estimators, seeds)
 
 
 def moving(name: str, key: str) -> Check:
@@ -123,38 +124,38 @@ MOVED = ("walk_ad", "ptracer", "finite_difference")  # of a mesh that moves
 
 FAULTS = [
     # ---- Light paths: naive AD and differences share the fault, a stock integrator does not ----
-    Fault("cosine_of_connection", "cornell", "transport.scattering:scatter",
+    Fault("cosine_of_connection", "cornell", "transport.bsdf:scatter",
           "return evaluate(plan, si, self, wo, connected), bs.wo",
           "return evaluate(plan, si, self, wo, connected) / dr.maximum(mi.Frame3f.cos_theta(wo), 1e-3), bs.wo",
           by("gather stack", "walk_ad", "ptracer", "finite_difference") | by("image", "ptracer")),
     Fault("roulette_without_weight", "cornell_roulette", WALK,
           "dr.select(playing, dr.rcp(q), 1)", "dr.select(playing, mi.Float(1), 1)",
           by("image stack", "ptracer")),
-    Fault("shading_normals_uncorrected", "shading_normals", "transport.scattering:shading_correction",
+    Fault("shading_normals_uncorrected", "shading_normals", "transport.bsdf:shading_correction",
           "dr.abs((cos_i * wo_dot_n) / (cos_o * wi_dot_n))", "mi.Float(1)", by("stack", "prb", "path")),
-    Fault("radiance_at_refraction", "refraction", "transport.scattering:importance_context",
+    Fault("radiance_at_refraction", "refraction", "transport.bsdf:importance_context",
           "TransportMode.Importance", "TransportMode.Radiance", by("stack", "analytic", "ptracer")),
-    Fault("crop_offset_dropped", "crop", "transport.splat:Film.put", "u + mi.Vector2f(self.offset)", "u",
+    Fault("crop_offset_dropped", "crop", "transport.film:Film.put", "u + mi.Vector2f(self.offset)", "u",
           by("stack", "ptracer")),
     Fault("density_of_sky_without_uniform_part", "sky", "transport.emission:_any_direction",
           "(1 - DEFENSIVE) * own + DEFENSIVE * dr.inv_four_pi", "own", by("stack", "prb")),
-    Fault("density_of_texels_too_high", "black_texels_of_lamp", "transport.lamps:_any_uv",
+    Fault("density_of_texels_too_high", "black_texels_of_lamp", "transport.emission:_any_uv",
           "(1 - DEFENSIVE) * own + DEFENSIVE", "own + DEFENSIVE", by("stack", "analytic")),
-    Fault("black_texels_not_drawn", "black_texels_of_lamp", "integrators.preparation:Preparation.plan",
+    Fault("black_texels_not_drawn", "black_texels_of_lamp", "integrators.context:Preparation.plan",
           "lamp.texture in which.emission_nodes", "False", by("stack", "analytic")),
-    Fault("black_lamp_drawn_as_others", "black_lamp", "transport.lamps:_any_uv",
+    Fault("black_lamp_drawn_as_others", "black_lamp", "transport.emission:_any_uv",
           "dr.select(even | black, sample, uv)", "dr.select(even, sample, uv)", by("stack", "analytic")),
     # ---- Adjoints and derivatives: paths are right, and naive AD of them is a reference ----
-    Fault("adjoint_without_filter", "wide_filter", "transport.splat:AdjointImage.lookup",
+    Fault("adjoint_without_filter", "wide_filter", "transport.film:AdjointImage.lookup",
           "self.filter.is_box_filter()", "True", by("gather stack", "walk_ad", "ptracer")),
-    Fault("channels_of_adjoint_swapped", "cornell", "transport.splat:AdjointImage._pixel",
+    Fault("channels_of_adjoint_swapped", "cornell", "transport.film:AdjointImage._pixel",
           "mi.Spectrum(*color)", "mi.Spectrum(*color[::-1])", by("gather stack", "walk_ad", "ptracer")),
     Fault("emission_not_differentiated", "lamp", "estimators.base:differentiate_emission",
           "p.plan.differentiate_emission", "False", by("reservoir event gather stack", "walk_ad", "ptracer")),
     Fault("zero_factor_dropped", "black_texels", "estimators.base:adjoint_of_factor",
           "at_zero = dr.select(zero == mi.Int32(index), value[c] * rest[c], 0)", "at_zero = mi.Float(0)",
           by("reservoir event gather stack", "walk_ad", "finite_difference")),
-    Fault("zero_factor_of_prefix_dropped", "black_texels", "estimators.sums:AdjointSum.adjoint_of_factor",
+    Fault("zero_factor_of_prefix_dropped", "black_texels", "estimators.kept:AdjointSum.adjoint_of_factor",
           "(f[c] == 0) & (zero == NO_ZERO)", "mi.Bool(False)", by("gather stack", "walk_ad")),
     Fault("second_zero_factor_forgotten", "pure_colours", "transport.factors:Product.times",
           "dr.select(z == NO_ZERO, mi.Int32(index), MANY_ZEROS)", "mi.Int32(index)",
@@ -162,7 +163,7 @@ FAULTS = [
     Fault("stand_in_without_cosine", "black_texels", "transport.connection:stand_in",
           "connection.weight * f", "connection.weight * dr.inv_pi",
           by("reservoir event gather stack", "walk_ad", "finite_difference")),
-    Fault("delta_lobe_without_probability", "delta_lobes", "transport.tracked:_singular_factor",
+    Fault("delta_lobe_without_probability", "delta_lobes", "transport.bsdf:_singular_factor",
           "weight * pdf", "weight", by("reservoir stack", "ptracer")),
     Fault("veil_not_differentiated", "veil", "estimators.base:differentiate_passage",
           "differentiate if p.plan.differentiate_null else None", "None",
@@ -179,12 +180,12 @@ FAULTS = [
           "rest_c *= differentiate_passage(", "differentiate_passage(", by("stack", "walk_ad", "finite_difference")),
     Fault("opacity_not_differentiated", "opacity", "estimators.base:differentiate_passage",
           "differentiate if p.plan.differentiate_null else None", "None", by("stack", "walk_ad", "finite_difference")),
-    Fault("instance_forgotten", "instance", "estimators.surface:SurfacePoint.of",
+    Fault("instance_forgotten", "instance", "estimators.kept:SurfacePoint.of",
           "_index(pi.instance)", "mi.UInt32(0)", by("stack", "walk_ad")),
     Fault("mask_in_view_not_differentiated", "glow", "transport.visible:differentiate_visible_radiance",
           "adjoint * behind", "mi.Spectrum(0)", by("event stack", "walk_ad", "forward_mode")),
     # ---- Estimators: the others are right ----
-    Fault("another_point_of_the_lens", "behind_lens", "estimators.events:differentiate_event",
+    Fault("another_point_of_the_lens", "behind_lens", "estimators.kept:differentiate_event",
           "kept.point.ray(), sample,", "kept.point.ray(), mi.Point2f(0),", by("event", "walk_ad")),
     Fault("w_of_previous_step", "cornell_reservoir", "estimators.reservoir:ReservoirSelection.connection",
           "is_taken(number, w, W)", "is_taken(number, w, state.W)", by("reservoir", *GRADIENT, "ptracer")),
@@ -239,23 +240,23 @@ FAULTS = [
     Fault("last_vertex_of_the_attached_stack", "wavy_glass", "estimators.attached:Pushing.scattering",
           "dr.select(seen & pushed, count, state.needed)", "dr.select(seen & pushed, state.count, state.needed)",
           by("stack", *MOVED)),
-    Fault("next_ray_detached", "wavy_glass", "transport.segment:Segment.next_ray",
+    Fault("next_ray_detached", "wavy_glass", "transport.walk:Segment.next_ray",
           "ray if attached else dr.detach(ray)", "dr.detach(ray)", by("stack", "ptracer", "finite_difference")),
-    Fault("shape_detached", "wavy_glass", "transport.segment:find_vertex",
+    Fault("shape_detached", "wavy_glass", "transport.walk:find_vertex",
           "mi.RayFlags.All", "mi.RayFlags.All | mi.RayFlags.DetachShape", by("stack", "ptracer", "finite_difference")),
     Fault("connection_detached", "wavy_glass", "transport.connection:connect",
           "dr.suspend_grad(when=not attached)", "dr.suspend_grad()", by("stack", "ptracer", "finite_difference")),
-    Fault("shading_correction_without_its_jumps", "sliding", "transport.scattering:shading_correction",
+    Fault("shading_correction_without_its_jumps", "sliding", "transport.bsdf:shading_correction",
           "dr.detach(correction) if plan.attached_normalization else correction", "correction",
           by("stack", "finite_difference")),
     Fault("lamp_left_where_it_is", "moved_lamp", "estimators.attached:differentiate_start",
           "dr.dot(adjoint.origin, emission.ray.o) + ", "", by("stack", "walk_ad", "finite_difference")),
     # ---- Forward mode: all estimators share it ----
-    Fault("forward_without_emission", "glow", "integrators.hooks:TangentSplat.start",
+    Fault("forward_without_emission", "glow", "integrators.forward:TangentSplat.start",
           "mi.Spectrum(self.dE)", "mi.Spectrum(0)", by("event stack", "forward_mode")),
-    Fault("forward_without_prefix", "cornell", "integrators.hooks:TangentSplat.scattering",
+    Fault("forward_without_prefix", "cornell", "integrators.forward:TangentSplat.scattering",
           "state.d_product * c + P * dc", "P * dc", by("gather stack", "forward_mode")),
-    Fault("forward_without_veil", "veil", "integrators.hooks:TangentSplat.scattering",
+    Fault("forward_without_veil", "veil", "integrators.forward:TangentSplat.scattering",
           "(df_c * passed + f_c * d_passed)", "df_c * passed",
           by("gather stack", "forward_mode")),
 ]  # fmt: skip

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from reslrb_cli.config import loads
+from reslrb_cli.config.loader import loads
 from reslrb_cli.measure.processes import Ended, Refused, Stopped
-from reslrb_cli.records.bench import BenchStatus
+from reslrb_cli.records.measurements import BenchStatus
 
 
 class Pretended:

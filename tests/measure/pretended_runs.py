@@ -9,15 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from reslrb_cli.config import loads
-from reslrb_cli.measure.cases import parse_cases
+from reslrb_cli.config.loader import loads
+from reslrb_cli.measure.methods import RunsPlan, parse_cases
+from reslrb_cli.measure.optimization_benchmark.evaluate import Advance, load, save
+from reslrb_cli.measure.optimization_benchmark.session import RunsSession
 from reslrb_cli.measure.processes import Ended, Refused, Stopped
-from reslrb_cli.measure.whole_runs.plan import RunsPlan
-from reslrb_cli.measure.whole_runs.runner import Advance, load, save
-from reslrb_cli.measure.whole_runs.session import RunsSession
-from reslrb_cli.records.bench import BenchStatus
+from reslrb_cli.records.measurements import BenchStatus, RunPointRecord
 from reslrb_cli.records.metrics import Record
-from reslrb_cli.records.whole_runs import RunPointRecord
 
 #: Seconds that a process takes until it loads the scene.
 STARTUP_S = 1.0

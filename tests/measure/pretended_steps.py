@@ -10,14 +10,12 @@ from typing import Any
 
 import numpy as np
 
-from reslrb_cli.config import loads
-from reslrb_cli.measure.cases import parse_cases
+from reslrb_cli.config.loader import loads
 from reslrb_cli.measure.convergence.judgement import Judgement, Results
-from reslrb_cli.measure.convergence.plan import Plan
 from reslrb_cli.measure.convergence.session import Session
+from reslrb_cli.measure.methods import Plan, parse_cases
 from reslrb_cli.measure.processes import Ended, Refused, Stopped
-from reslrb_cli.records.bench import BenchStatus
-from reslrb_cli.records.convergence import MethodRecord
+from reslrb_cli.records.measurements import BenchStatus, MethodRecord
 
 #: What all unbiased methods estimate: two parameters, one of them of colours.
 SHAPES = {"a": [4, 5, 3], "b": [3]}

@@ -6,17 +6,21 @@ import numpy as np
 import pytest
 from turns import taking_turns
 
-from reslrb_cli.integrators import render_image
-from reslrb_cli.measure.analytic import beam_through_slab, fresnel, furnace, plane_points, point_through_surface
-from reslrb_cli.measure.analytic_scenes import (
+from reslrb_cli.integrators.step import render_image
+from reslrb_cli.measure.comparison import compare, renders
+from reslrb_cli.measure.gradients import Case, integrator, seeds
+from reslrb_cli.measure.scenes.analytic import (
     KnownScene,
+    beam_through_slab,
+    fresnel,
+    furnace,
     furnace_scene,
+    plane_points,
     plane_scene,
+    point_through_surface,
     refraction_scene,
     slab_scene,
 )
-from reslrb_cli.measure.gradients import Case, integrator, seeds
-from reslrb_cli.measure.statistics import compare, renders
 
 SCENES = {
     "furnace": (lambda: furnace_scene((0.5, 0.8, 0.9), (1, 2, 0.5), 16, 8), 64, "path"),

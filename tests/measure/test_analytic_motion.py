@@ -8,11 +8,11 @@ import drjit as dr
 import numpy as np
 import pytest
 
-from reslrb_cli.measure.analytic_motion import KnownMotion, ball_lens, lamp_over_plane, tilted_surface
 from reslrb_cli.measure.comparison import Family, compare_expectations
 from reslrb_cli.measure.gradients import integrator, seeds
-from reslrb_cli.records.gradcheck import Verdict
-from reslrb_cli.transport.segment import Segment
+from reslrb_cli.measure.scenes.analytic_motion import KnownMotion, ball_lens, lamp_over_plane, tilted_surface
+from reslrb_cli.records.measurements import Verdict
+from reslrb_cli.transport.walk import Segment
 
 MOTIONS: dict[str, Callable[[], KnownMotion]] = {
     "tilted_surface": tilted_surface,

@@ -9,13 +9,11 @@ import drjit as dr
 import numpy as np
 import pytest
 
-from reslrb_cli.measure.attached import SCENES, Differenced, compare_with_differences
-from reslrb_cli.measure.attached.amplitudes import Displacement, Move
-from reslrb_cli.measure.attached.glass import TOP, vertices
-from reslrb_cli.measure.attached.meshes import smooth_fields
-from reslrb_cli.measure.attached.rooms import SCENES as ROOMS
-from reslrb_cli.transport import connection, scattering
-from reslrb_cli.transport.segment import Segment
+from reslrb_cli.measure.scenes.moving import Differenced, Displacement, Move, compare_with_differences, smooth_fields
+from reslrb_cli.measure.scenes.moving_light import ROOMS_SCENES as ROOMS
+from reslrb_cli.measure.scenes.moving_light import SCENES, TOP, vertices
+from reslrb_cli.transport import bsdf, connection
+from reslrb_cli.transport.walk import Segment
 
 #: Of the root mean square of the derivatives.
 ERROR, STANDARD_ERROR = 5e-3, 1e-3
@@ -68,14 +66,14 @@ def test_a_receiver_that_moves():
 
 def test_slopes_of_the_shading_correction_without_its_jumps(monkeypatch: pytest.MonkeyPatch):
     """Faces that slide through the light: within each the correction has a slope, at their edges it jumps back."""
-    right = scattering.shading_correction
+    right = bsdf.shading_correction
 
     def tracked(plan: Any, *rest: Any) -> Any:
         return right(replace(plan, attached_normalization=False), *rest)
 
     slides = (1, 0, 1)
     assert beam(slides).error < ERROR
-    for module in (scattering, connection):
+    for module in (bsdf, connection):
         monkeypatch.setattr(module, "shading_correction", tracked)
     assert beam(slides).error > 2 * ERROR
 

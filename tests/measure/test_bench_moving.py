@@ -9,7 +9,7 @@ import mitsuba as mi
 import pytest
 from measure.faults import room
 
-from reslrb_cli.measure.cases import parse_cases
+from reslrb_cli.measure.methods import parse_cases
 from reslrb_cli.measure.stepper import Stepper
 from reslrb_cli.records.clock import peak_mib, reset_peak
 

@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 
 from reslrb_cli.measure.processes import Ended, Process, Refused, Stopped, last_words
-from reslrb_cli.measure.scratch import scratch_bytes
-from reslrb_cli.records.bench import BenchStatus
+from reslrb_cli.measure.workers import scratch_bytes
+from reslrb_cli.records.measurements import BenchStatus
 
 FIRST = {"memory_limit": None}
 FAILED, OUT_OF_MEMORY = BenchStatus.FAILED, BenchStatus.OUT_OF_MEMORY

@@ -12,14 +12,12 @@ import pytest
 from measure.pretended import Pretended
 from measure.test_bench_sweep import CONFIG, sweep
 
-from reslrb_cli.config import loads
+from reslrb_cli.config.loader import loads
 from reslrb_cli.errors import ConfigError
-from reslrb_cli.measure.bench import bench
-from reslrb_cli.measure.bench_book import KIND, Book
-from reslrb_cli.measure.cases import parse_cases
-from reslrb_cli.measure.earlier import Earlier
-from reslrb_cli.measure.sweep import Sweep
-from reslrb_cli.records.bench import BenchStatus
+from reslrb_cli.measure.bench import KIND, Book, bench
+from reslrb_cli.measure.methods import Sweep, parse_cases
+from reslrb_cli.measure.resume_store import Earlier
+from reslrb_cli.records.measurements import BenchStatus
 
 
 @pytest.fixture(autouse=True)

@@ -9,14 +9,13 @@ from typing import Any
 import pytest
 from measure.pretended import Pretended
 
-from reslrb_cli.config import loads
+from reslrb_cli.config.loader import loads
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.measure.bench import Result, bench
-from reslrb_cli.measure.cases import choose_baseline, depths, parse_cases
-from reslrb_cli.measure.pace import MAX_ROUNDS, MIN_ROUNDS, Pace
+from reslrb_cli.measure.methods import Sweep, choose_baseline, depths, parse_cases
 from reslrb_cli.measure.processes import Refused, Stopped
-from reslrb_cli.measure.sweep import Sweep
-from reslrb_cli.records.bench import BenchStatus, Spread
+from reslrb_cli.measure.workers import MAX_ROUNDS, MIN_ROUNDS, Pace
+from reslrb_cli.records.measurements import BenchStatus, Spread
 
 CONFIG = """\
 scene: {file: scene.xml}

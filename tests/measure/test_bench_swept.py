@@ -10,14 +10,13 @@ from measure.pretended import Pretended
 from measure.test_bench_sweep import CONFIG, LIST
 
 from reslrb_cli.cli import main
-from reslrb_cli.config import loads
+from reslrb_cli.config.loader import loads
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.measure.bench import Result, bench
-from reslrb_cli.measure.cases import choose_baseline, parse_cases
-from reslrb_cli.measure.sweep import Sweep, usual_values
-from reslrb_cli.records.bench import BenchStatus
-from reslrb_cli.report.bench_plot import plot_bench
-from reslrb_cli.report.bench_table import table_head, table_line
+from reslrb_cli.measure.methods import Sweep, choose_baseline, parse_cases, usual_values
+from reslrb_cli.records.measurements import BenchStatus
+from reslrb_cli.report.plots import plot_bench
+from reslrb_cli.report.tables import table_head, table_line
 
 
 class Sized(Pretended):

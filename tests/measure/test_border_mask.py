@@ -12,10 +12,10 @@ import pytest
 from measure import pretended_runs, pretended_steps
 from measure.test_convergence_survey import GAUSSIAN, problem
 
-from reslrb_cli.config import dump
-from reslrb_cli.measure.border_mask import leave_out_border
-from reslrb_cli.measure.cases import parse_cases
-from reslrb_cli.measure.whole_runs import judge, runner
+from reslrb_cli.config.loader import dump
+from reslrb_cli.measure.methods import parse_cases
+from reslrb_cli.measure.optimization_benchmark import evaluate
+from reslrb_cli.measure.references import leave_out_border
 from reslrb_cli.optimization.views import set_targets
 
 
@@ -63,11 +63,11 @@ def test_all_processes_of_whole_runs_leave_it_out(llvm: None, tmp_path: Path, ca
     """The judge says so, also one that takes over; a run that is told so optimises without it."""
     what = problem(tmp_path, GAUSSIAN)
     first: dict[str, Any] = {"config": dump(what.config), "source": "tiny.yaml", "targets": str(tmp_path / "t.npz")}
-    _, ask = judge.begin(first)
+    _, ask = evaluate.begin_judging(first)
     prepared = {"budget_s": 0.1, "image_s": 0.01, "camera": camera, "named": True}
     facts = ask({"prepare": prepared, "out": first["targets"]})
     assert facts["masked"] is camera
-    _, again = judge.begin(first)
+    _, again = evaluate.begin_judging(first)
     taken = again({"restore": {"spp": facts["spp"], "masked": camera}, "targets": first["targets"]})
     assert taken["loss"] == pytest.approx(facts["loss"], rel=1e-4)
     assert taken["error"] == pytest.approx(facts["error"], rel=1e-4)
@@ -78,7 +78,7 @@ def test_all_processes_of_whole_runs_leave_it_out(llvm: None, tmp_path: Path, ca
             set_targets(other.views, targets)
         if masked:
             leave_out_border(other)
-        losses[masked] = judge.Judge(other, facts["spp"]).loss(runner.copies(other))
+        losses[masked] = evaluate.Judge(other, facts["spp"]).loss(evaluate.copies(other))
     assert facts["loss"] == pytest.approx(losses[camera], rel=1e-4)
     assert losses[True] != pytest.approx(losses[False], rel=1e-2)
 
@@ -91,8 +91,8 @@ def test_all_processes_of_whole_runs_leave_it_out(llvm: None, tmp_path: Path, ca
         return iter(())
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(runner, "optimize", optimize)
-        runner.begin(first | {"masked": camera})
+        patch.setattr(evaluate, "optimize", optimize)
+        evaluate.begin_run(first | {"masked": camera})
     assert seen == [camera]
     dr.sync_thread()
 

@@ -9,9 +9,10 @@ import pytest
 from click.testing import CliRunner
 
 from reslrb_cli.cli import main
-from reslrb_cli.config import load
-from reslrb_cli.measure.chain_conditions import ChainConditions, measure_chains
-from reslrb_cli.optimization.problem import Problem, assemble
+from reslrb_cli.config.loader import load
+from reslrb_cli.measure.conditioning import ChainConditions, measure_chains
+from reslrb_cli.optimization.assemble import assemble
+from reslrb_cli.optimization.problem import Problem
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 UNGUIDED = ["integrator.guiding=off", "integrator.sequence=independent"]

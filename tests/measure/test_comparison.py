@@ -12,11 +12,14 @@ from reslrb_cli.measure.comparison import (
     Family,
     compare_equal_seeds,
     compare_expectations,
+    divisions,
+    entry_count,
+    overall,
+    parts,
     tail_weight,
 )
-from reslrb_cli.measure.entries import divisions, entry_count, overall, parts
-from reslrb_cli.records.gradcheck import GradcheckRecord, Kind, Reference, Verdict
-from reslrb_cli.report.gradcheck_table import Table, failure_line, markdown_table
+from reslrb_cli.records.measurements import GradcheckRecord, Kind, Reference, Verdict
+from reslrb_cli.report.tables import Table, failure_line, markdown_table
 
 FAMILY = Family(rows=20, entries=400, alpha=1e-4)
 TRUTH = np.linspace(-2, 3, 24)

@@ -10,9 +10,9 @@ import pytest
 from measure.pretended_steps import SHAPES, Pretence, Stage, of, plan, play
 
 from reslrb_cli.measure.convergence.judgement import HEAVY, Judgement
-from reslrb_cli.measure.convergence.members import Role
-from reslrb_cli.records.bench import BenchStatus
-from reslrb_cli.report.convergence_table import closing_sentence, notes
+from reslrb_cli.measure.convergence.setup import Role
+from reslrb_cli.records.measurements import BenchStatus
+from reslrb_cli.report.convergence_tables import closing_sentence, notes
 
 
 def test_cost_error_slope_and_efficiency_are_those_of_the_methods(tmp_path: Path) -> None:

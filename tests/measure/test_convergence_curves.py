@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from reslrb_cli.measure.convergence.curves import Reference, Samples
+from reslrb_cli.measure.convergence.statistics import Reference, Samples
 
 REPETITIONS = 200
 #: How many of the repetitions may cover the truth where each does with a probability of 95 %: all but one in 1000.

@@ -11,8 +11,8 @@ from cli.tiny import write_experiment
 from scipy import stats
 
 from reslrb_cli.cli import main
-from reslrb_cli.config import load
-from reslrb_cli.measure.convergence.curves import GROUPS, Reference, Samples
+from reslrb_cli.config.loader import load
+from reslrb_cli.measure.convergence.statistics import GROUPS, Reference, Samples
 
 pytestmark = [pytest.mark.usefixtures("llvm"), pytest.mark.long]
 
@@ -77,9 +77,8 @@ def test_what_correlated_samples_do_to_the_loss(tmp_path: Path) -> None:
 
 def test_the_intervals_cover_what_they_say_on_a_scene(tmp_path: Path) -> None:
     """200 repetitions with the noise of real steps; the truth is that of all steps together. No clock takes part."""
-    from reslrb_cli.measure.convergence.sampler import Sampler
-    from reslrb_cli.measure.convergence.survey import survey
-    from reslrb_cli.optimization.problem import assemble_scene
+    from reslrb_cli.measure.convergence.setup import Sampler, survey
+    from reslrb_cli.optimization.assemble import assemble_scene
 
     write_experiment(tmp_path)
     config = load(tmp_path / "tiny.yaml")

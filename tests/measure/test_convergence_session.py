@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 from measure.pretended_steps import CONFIG, LIST, Pretence, Stage, of, plan, play
 
-from reslrb_cli.config import loads
+from reslrb_cli.config.loader import loads
 from reslrb_cli.errors import ConfigError
-from reslrb_cli.measure.convergence.members import MOST_REFERENCE_STEPS, MOST_STEPS, Role
-from reslrb_cli.measure.convergence.resuming import KIND, check
-from reslrb_cli.measure.earlier import Earlier
-from reslrb_cli.records.bench import BenchStatus
-from reslrb_cli.records.samples import read_samples, write_samples
-from reslrb_cli.report.convergence_table import closing_sentence, notes
+from reslrb_cli.measure.convergence.session import KIND, check
+from reslrb_cli.measure.convergence.setup import MOST_REFERENCE_STEPS, MOST_STEPS, Role
+from reslrb_cli.measure.resume_store import Earlier
+from reslrb_cli.records.measurement_files import read_samples, write_samples
+from reslrb_cli.records.measurements import BenchStatus
+from reslrb_cli.report.convergence_tables import closing_sentence, notes
 
 
 def test_steps_go_on_from_those_that_compiled_and_no_two_share_seeds(tmp_path: Path) -> None:

@@ -9,11 +9,10 @@ import numpy as np
 import pytest
 from cli.tiny import KEY, write_experiment
 
-from reslrb_cli.config import load
-from reslrb_cli.measure.convergence.plan import IMAGES
-from reslrb_cli.measure.convergence.sampler import Sampler
-from reslrb_cli.measure.convergence.survey import survey
-from reslrb_cli.optimization.problem import assemble_scene
+from reslrb_cli.config.loader import load
+from reslrb_cli.measure.convergence.setup import Sampler, survey
+from reslrb_cli.measure.methods import IMAGES
+from reslrb_cli.optimization.assemble import assemble_scene
 
 pytestmark = pytest.mark.usefixtures("llvm")
 GAUSSIAN = ('<rfilter type="box"/>', '<rfilter type="gaussian"/>')

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from reslrb_cli.measure.extreme import CASES, registry, run_suite
-from reslrb_cli.records.gradcheck import GradcheckRecord
+from reslrb_cli.records.measurements import GradcheckRecord
 
 #: By default: no path that connects, values that are not finite; roulette and its fault, and a furnace, stand below.
 FEW = ("no_connection", "nan_loss")
@@ -96,5 +96,5 @@ def test_a_replay_leaves_nothing_because_its_sums_are_compensated(monkeypatch: p
         return value + term, rest
 
     assert left() < 1e-10
-    monkeypatch.setattr("reslrb_cli.estimators.sums.AdjointSum._add", staticmethod(add))
+    monkeypatch.setattr("reslrb_cli.estimators.kept.AdjointSum._add", staticmethod(add))
     assert left() > 1e-8

@@ -8,16 +8,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from reslrb_cli.config import Config, load
+from reslrb_cli.config.loader import load
+from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ConfigError
-from reslrb_cli.measure.comparison import Family, compare_expectations
-from reslrb_cli.measure.entries import entry_count
+from reslrb_cli.measure.comparison import Family, compare_expectations, entry_count
 from reslrb_cli.measure.figure1 import Plan, Result, check, measure
 from reslrb_cli.measure.held_kinds import OWN, Kind, sample
 from reslrb_cli.measure.noise import fall, relative_noise
 from reslrb_cli.measure.processes import Ended
-from reslrb_cli.records.bench import BenchStatus
-from reslrb_cli.records.gradcheck import Verdict
+from reslrb_cli.records.measurements import BenchStatus, Verdict
 from reslrb_cli.report.figure1 import draw, table, to_json
 
 CONFIG = Path(__file__).resolve().parents[2] / "configs" / "paper" / "figure1.yaml"
@@ -119,7 +118,7 @@ def test_what_is_written(config: Config, tmp_path: Path) -> None:
 @pytest.mark.long
 def test_what_is_compared_has_one_expectation(config: Config) -> None:
     """Whatever of ours naive AD does not have is left out."""
-    from reslrb_cli.measure.held import Held, comparable
+    from reslrb_cli.measure.fixed_adjoint import Held, comparable
 
     y, x = np.mgrid[0:16, 0:16] / 16
     adjoint = np.repeat((np.sin(5 * x) * np.cos(4 * y) + 1.5)[:, :, None], 3, 2).astype(np.float32)

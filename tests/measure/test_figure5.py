@@ -10,12 +10,13 @@ import pytest
 from paper_figure5 import main
 from paper_room import FLOOR, room_config
 
-from reslrb_cli.config import Config, load
+from reslrb_cli.config.loader import load
+from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.measure.comparison import compare_equal_seeds
 from reslrb_cli.measure.figure5 import CLOSE, Plan, Result, check, measure, tile_sums
 from reslrb_cli.measure.held_kinds import OWN, Kind
-from reslrb_cli.records.gradcheck import Verdict
+from reslrb_cli.records.measurements import Verdict
 from reslrb_cli.report.figure5 import draw, table, to_json
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"

@@ -9,27 +9,26 @@ import pytest
 from conformance.gradient_cases import CASES
 from turns import a_few
 
-from reslrb_cli.config import loads
+from reslrb_cli.config.loader import loads
 from reslrb_cli.errors import ConfigError
-from reslrb_cli.integrators import hooks
-from reslrb_cli.measure import cornell_box
-from reslrb_cli.measure.cases import all_estimators, parse_estimators
-from reslrb_cli.measure.differences import choose_step, directions, natural_bounds
+from reslrb_cli.integrators import forward
 from reslrb_cli.measure.gradcheck import Gradcheck, Result
-from reslrb_cli.measure.gradients import Case, integrator
+from reslrb_cli.measure.gradients import Case, choose_step, directions, integrator, natural_bounds
+from reslrb_cli.measure.methods import all_estimators, parse_estimators
 from reslrb_cli.measure.participants import Participants, Settings
 from reslrb_cli.measure.references import (
     Situation,
-    interior,
     path_image,
     prb_gradient,
     prb_image,
     ptracer_gradient,
     ptracer_image,
 )
-from reslrb_cli.measure.small_scenes import camera, diffuse, rgb, room, transform
-from reslrb_cli.records.gradcheck import Kind, Reference, Verdict
-from reslrb_cli.report.gradcheck_table import summary_lines
+from reslrb_cli.measure.scenes import small
+from reslrb_cli.measure.scenes.small import camera, diffuse, rgb, room, transform
+from reslrb_cli.records.measurements import Kind, Reference, Verdict
+from reslrb_cli.report.tables import summary_lines
+from reslrb_cli.scene.visibility import interior
 
 pytestmark = pytest.mark.usefixtures("llvm")
 
@@ -37,7 +36,7 @@ SMALL = ["scene.options.size=32", "scene.options.texture=4", "run.spp=8", "integ
 
 
 def check(*overrides: str, estimators: str = "reservoir,event,gather,stack", seeds: int = 8) -> list[Result]:
-    config = loads(cornell_box.CONFIG, cornell_box.SOURCE, [*SMALL, *overrides])
+    config = loads(small.CORNELL_BOX, small.CORNELL_BOX_SOURCE, [*SMALL, *overrides])
     made = Gradcheck(Settings(config, parse_estimators(estimators), 0, seeds))
     return list(made.run(lambda: False, lambda line: None))
 
@@ -96,13 +95,13 @@ def test_a_derivative_that_is_wrong_by_little(monkeypatch: pytest.MonkeyPatch):
 
 
 def test_forward_mode_without_the_weight_of_roulette(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(hooks.TangentSplat, "survived", lambda self, state, weight: state)
+    monkeypatch.setattr(forward.TangentSplat, "survived", lambda self, state, weight: state)
     assert failures(check("integrator.rr_depth=1", estimators="stack")) == {("stack", "forward_mode")}
 
 
 def test_a_fault_of_the_walk_is_none_of_its_own_references(monkeypatch: pytest.MonkeyPatch):
     """Connections that are a third too strong: image and stock reference differ, naive AD and differences do not."""
-    from reslrb_cli.transport import segment
+    from reslrb_cli.transport import walk as segment
 
     right = segment.connect
 
@@ -117,7 +116,7 @@ def test_a_fault_of_the_walk_is_none_of_its_own_references(monkeypatch: pytest.M
 
 def test_rows_come_as_they_are_measured():
     """The first is there before the last estimator has taken a step, and what one row measured the next one uses."""
-    config = loads(cornell_box.CONFIG, cornell_box.SOURCE, SMALL)
+    config = loads(small.CORNELL_BOX, small.CORNELL_BOX_SOURCE, SMALL)
     made = Gradcheck(Settings(config, parse_estimators("event,stack"), 0, 3))
     said: list[str] = []
     rows = made.run(lambda: False, said.append)
@@ -134,7 +133,7 @@ def test_rows_come_as_they_are_measured():
 
 
 def test_what_the_budget_does_not_suffice_for_is_named():
-    config = loads(cornell_box.CONFIG, cornell_box.SOURCE, SMALL)
+    config = loads(small.CORNELL_BOX, small.CORNELL_BOX_SOURCE, SMALL)
     ticks = iter(range(10_000))
     made = Gradcheck(Settings(config, parse_estimators("stack,event"), 40), now=lambda: next(ticks))
     records = [result.record for result in made.run(lambda: False, lambda line: None)]
@@ -149,7 +148,7 @@ def test_what_the_budget_does_not_suffice_for_is_named():
 
 
 def test_what_is_interrupted_is_compared_with_what_is_done():
-    config = loads(cornell_box.CONFIG, cornell_box.SOURCE, SMALL)
+    config = loads(small.CORNELL_BOX, small.CORNELL_BOX_SOURCE, SMALL)
     asked = iter(range(10_000))
     made = Gradcheck(Settings(config, parse_estimators("stack"), 0, 8))
     records = [result.record for result in made.run(lambda: next(asked) > 32, lambda line: None)]
@@ -162,7 +161,9 @@ def test_what_is_interrupted_is_compared_with_what_is_done():
 
 
 def test_estimators_have_the_options_of_the_configuration():
-    config = loads(cornell_box.CONFIG, cornell_box.SOURCE, ["integrator.estimator=reservoir", "integrator.capacity=4"])
+    config = loads(
+        small.CORNELL_BOX, small.CORNELL_BOX_SOURCE, ["integrator.estimator=reservoir", "integrator.capacity=4"]
+    )
     assert [case.label for case in all_estimators(config)] == [
         "reslrb:reservoir(capacity=4)", "reslrb:gather", "reslrb:event", "reslrb:stack"
     ]  # fmt: skip

@@ -8,17 +8,16 @@ import numpy as np
 import pytest
 from measure.faults import checked, room
 
-from reslrb_cli.config import load
+from reslrb_cli.config.loader import load
 from reslrb_cli.errors import ConfigError
-from reslrb_cli.measure.cases import all_estimators, parse_estimators
 from reslrb_cli.measure.gradcheck import Gradcheck
-from reslrb_cli.measure.gradients import Case
-from reslrb_cli.measure.moving import moves_light, smooth_rows, smooth_weights
+from reslrb_cli.measure.gradients import Case, moves_light, smooth_rows, smooth_weights
+from reslrb_cli.measure.methods import all_estimators, parse_estimators
 from reslrb_cli.measure.participants import Participants, Settings
 from reslrb_cli.measure.references import Situation, prb_gradient, ptracer_gradient
-from reslrb_cli.measure.small_scenes import camera, diffuse, lamp
-from reslrb_cli.measure.small_scenes import room as corner
-from reslrb_cli.records.gradcheck import Kind, Reference, Verdict
+from reslrb_cli.measure.scenes.small import camera, diffuse, lamp
+from reslrb_cli.measure.scenes.small import room as corner
+from reslrb_cli.records.measurements import Kind, Reference, Verdict
 
 pytestmark = pytest.mark.usefixtures("llvm")
 

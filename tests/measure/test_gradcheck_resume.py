@@ -12,24 +12,24 @@ import pytest
 from measure.test_gradcheck import SMALL  # the same kernels
 from measure.test_sampling import NAMES, Pretended
 
-from reslrb_cli.config import loads
+from reslrb_cli.config.loader import loads
 from reslrb_cli.errors import ConfigError
-from reslrb_cli.measure import cornell_box, sampling
-from reslrb_cli.measure.cases import parse_estimators
-from reslrb_cli.measure.earlier import Earlier
+from reslrb_cli.measure import sampling
 from reslrb_cli.measure.gradcheck import Gradcheck
-from reslrb_cli.measure.gradcheck_resuming import KIND, settings
+from reslrb_cli.measure.methods import parse_estimators
 from reslrb_cli.measure.participants import Settings
-from reslrb_cli.measure.sampling import FEWEST, Sampling
-from reslrb_cli.records.gradcheck import GradcheckRecord, Reference, Verdict
-from reslrb_cli.records.samples import read_samples, write_samples
+from reslrb_cli.measure.resume_store import Earlier
+from reslrb_cli.measure.sampling import FEWEST, KIND, Sampling, settings
+from reslrb_cli.measure.scenes import small
+from reslrb_cli.records.measurement_files import read_samples, write_samples
+from reslrb_cli.records.measurements import GradcheckRecord, Reference, Verdict
 
 
 def check(
     seeds: int, file: Path, earlier: Earlier | None = None, after: int = 10**6
 ) -> tuple[list[GradcheckRecord], Earlier]:
     """The records, and what the check keeps, by way of the disk; it is stopped after so many looks at the clock."""
-    config = loads(cornell_box.CONFIG, cornell_box.SOURCE, SMALL)
+    config = loads(small.CORNELL_BOX, small.CORNELL_BOX_SOURCE, SMALL)
     what = Settings(config, parse_estimators("stack"), 0, seeds)
     made, looks = Gradcheck(what, earlier=earlier), iter(range(10**6))
     records = [result.record for result in made.run(lambda: next(looks) > after, lambda line: None)]
@@ -62,11 +62,11 @@ def test_more_seeds_are_added_to_those_of_the_file(llvm: None, tmp_path: Path) -
     [
         ({"spp": 8}, "spp is None there, 8 here"),
         ({"integrators": parse_estimators("event")}, "estimators is ['reslrb:stack'] there"),
-        ({"config": loads(cornell_box.CONFIG, cornell_box.SOURCE, ["run.seed=3"])}, "run.seed is 0 there, 3 here"),
+        ({"config": loads(small.CORNELL_BOX, small.CORNELL_BOX_SOURCE, ["run.seed=3"])}, "run.seed is 0 there, 3 here"),
     ],
 )
 def test_only_the_same_is_gone_on_from(change: dict[str, Any], line: str) -> None:
-    what = Settings(loads(cornell_box.CONFIG, cornell_box.SOURCE), parse_estimators("stack"), 0, 4)
+    what = Settings(loads(small.CORNELL_BOX, small.CORNELL_BOX_SOURCE), parse_estimators("stack"), 0, 4)
     head = {"version": 2, "kind": KIND, "settings": settings(what, "llvm_ad_rgb", "")}
     with pytest.raises(ConfigError) as caught:
         Earlier(KIND, Path("g.jsonl"), head, {}).check(settings(replace(what, **change), "llvm_ad_rgb", ""))

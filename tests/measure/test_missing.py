@@ -13,20 +13,17 @@ from measure.faults import room
 
 from reslrb_cli.cli import main
 from reslrb_cli.errors import ConfigError
-from reslrb_cli.integrators import gradient_step
-from reslrb_cli.measure import missing_check
-from reslrb_cli.measure.analytic import fresnel
-from reslrb_cli.measure.analytic_motion import centre_of_gravity, parallel
-from reslrb_cli.measure.attached.amplitudes import Pose
-from reslrb_cli.measure.attached.glass import setting
-from reslrb_cli.measure.attached.scene import AttachedScene
-from reslrb_cli.measure.differences import Direction
-from reslrb_cli.measure.gradients import Case, integrator, seeds
-from reslrb_cli.measure.missing import Missing
-from reslrb_cli.measure.missing_check import MissingCheck
-from reslrb_cli.measure.small_scenes import transform
-from reslrb_cli.records.missing import LEAST, NOTHING, MissingRecord
-from reslrb_cli.transport.splat import AdjointImage
+from reslrb_cli.integrators.step import gradient_step
+from reslrb_cli.measure import missing as missing_check
+from reslrb_cli.measure.gradients import Case, Direction, integrator, seeds
+from reslrb_cli.measure.missing import Missing, MissingCheck
+from reslrb_cli.measure.scenes.analytic import fresnel
+from reslrb_cli.measure.scenes.analytic_motion import centre_of_gravity, parallel
+from reslrb_cli.measure.scenes.moving import AttachedScene, Pose
+from reslrb_cli.measure.scenes.moving_light import setting
+from reslrb_cli.measure.scenes.small import transform
+from reslrb_cli.records.measurements import LEAST, NOTHING, MissingRecord
+from reslrb_cli.transport.film import AdjointImage
 
 HALF, EDGE, HEIGHT, TILT, IOR, SLAB = 0.6, 0.2, 1.4, 0.5, 1.5, 0.3
 SPP, SEEDS = 64, 24

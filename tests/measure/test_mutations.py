@@ -12,7 +12,7 @@ from operator import attrgetter
 import pytest
 from measure.faults import CHECKS, FAULTS, Fault
 
-from reslrb_cli.records.gradcheck import GradcheckRecord, Verdict
+from reslrb_cli.records.measurements import GradcheckRecord, Verdict
 
 #: Of the default suite: it shows that the machinery works, and all others take minutes.
 QUICK = ("stack_without_last_vertex",)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from reslrb_cli.measure import sampling
-from reslrb_cli.measure.differences import Direction
+from reslrb_cli.measure.gradients import Direction
 from reslrb_cli.measure.sampling import FEWEST, LEAST_SEEDS, MOST_SEEDS, Name, Sampling
 
 NAMES: list[Name] = [

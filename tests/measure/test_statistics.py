@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from reslrb_cli.measure.statistics import (
+from reslrb_cli.measure.comparison import (
     blocks,
     combined_z_rms,
     compare,

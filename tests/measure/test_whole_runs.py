@@ -11,16 +11,15 @@ import numpy as np
 import pytest
 from measure.pretended_runs import CONFIG, STARTUP_S, Pretence, Stage, plan, play
 
-from reslrb_cli.cli.whole_runs import _exit_code
-from reslrb_cli.config import loads
+from reslrb_cli.cli.convergence import _runs_exit_code
+from reslrb_cli.config.loader import loads
 from reslrb_cli.errors import ExitCode
-from reslrb_cli.measure.whole_runs.run import POINTS, times
-from reslrb_cli.measure.whole_runs.runner import Advance
-from reslrb_cli.measure.whole_runs.session import GRACE, GRACE_S
-from reslrb_cli.measure.whole_runs.verdict import finals, find_best, method_records
-from reslrb_cli.records.bench import BenchStatus
-from reslrb_cli.report.whole_runs_plot import curve, plot_runs
-from reslrb_cli.report.whole_runs_table import RunsTable, closing_sentence, notes
+from reslrb_cli.measure.optimization_benchmark.evaluate import Advance
+from reslrb_cli.measure.optimization_benchmark.rank import POINTS, finals, find_best, method_records, times
+from reslrb_cli.measure.optimization_benchmark.session import GRACE, GRACE_S
+from reslrb_cli.records.measurements import BenchStatus
+from reslrb_cli.report.convergence_tables import RunsTable, runs_closing_sentence, runs_notes
+from reslrb_cli.report.plots import curve, plot_runs
 
 
 def iterations_by(seconds: float, played: Pretence) -> int:
@@ -112,10 +111,10 @@ def test_a_method_that_ends_is_recorded_and_the_rest_goes_on(tmp_path: Path) -> 
     assert len([line for line in said if line.startswith("ptracer")]) == 1  # another seed would need as much
     ended, sound = method_records(session.runs, session.limit_s)
     assert (ended.status, ended.runs, ended.loss) == (BenchStatus.OUT_OF_MEMORY, 0, None)
-    assert notes([ended, sound]) == ["ptracer: 1 of 1 ended before their time: ended by SIGKILL"]
+    assert runs_notes([ended, sound]) == ["ptracer: 1 of 1 ended before their time: ended by SIGKILL"]
     assert sound.runs == 3
     verdict = find_best(finals(session.runs, session.limit_s, "loss"))
-    assert "reslrb:stack, the only one that was measured" in closing_sentence(verdict, None, session.limit_s)
+    assert "reslrb:stack, the only one that was measured" in runs_closing_sentence(verdict, None, session.limit_s)
 
 
 def test_what_cannot_do_the_scene_is_left_out_of_the_default_list_alone(tmp_path: Path) -> None:
@@ -156,7 +155,7 @@ def test_runs_that_all_compile_for_too_long_end_after_the_first_seed(tmp_path: P
     session, points, said = play(tmp_path, Stage(ptracer=played, reslrb_stack=played), plan())
     assert {point.seed for point in points} == {0}
     assert find_best(finals(session.runs, session.limit_s, "loss")) is None
-    assert _exit_code(method_records(session.runs, session.limit_s)) == ExitCode.CHECK_FAILED
+    assert _runs_exit_code(method_records(session.runs, session.limit_s)) == ExitCode.CHECK_FAILED
     assert said[-1].startswith("no method came to an iteration in the")
 
 
@@ -209,7 +208,7 @@ def test_who_is_told_apart() -> None:
     few = find_best({"a": low[:3], "b": high[:3]})
     assert few is not None
     assert (few.tied, few.too_few, few.enough) == (["b"], True, 4)
-    assert closing_sentence(few, verdict, 9.5) == (
+    assert runs_closing_sentence(few, verdict, 9.5) == (
         "After 9.5 s of each run, all costs counted: best by the loss is a, tied with b; best by the error of the "
         "parameters is a, tied with c, ahead of b. Told apart by the Mann-Whitney test at 5%, corrected for the number "
         "of methods; so few runs are too few for that, 4 of each could do."

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from optimization.deciding import begin, fix_times
 
-from reslrb_cli.config import dump, load
-from reslrb_cli.measure.whole_runs import runner
-from reslrb_cli.optimization import assemble
+from reslrb_cli.config.loader import dump, load
+from reslrb_cli.measure.optimization_benchmark import evaluate
+from reslrb_cli.optimization.assemble import assemble
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.views import target_arrays
 
@@ -37,10 +37,10 @@ def begun(experiment: Path, monkeypatch: pytest.MonkeyPatch, *settings: str) -> 
         given.append(problem)
         return iter(())
 
-    monkeypatch.setattr(runner, "optimize", spy)
+    monkeypatch.setattr(evaluate, "optimize", spy)
     config = load("tiny.yaml", [*SIZE, *settings])
     first = {"config": dump(config), "source": str(config.source), "targets": str(targets), "masked": False}
-    said, _ = runner.begin(first)
+    said, _ = evaluate.begin_run(first)
     return said, given[0]
 
 

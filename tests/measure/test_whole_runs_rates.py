@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 from measure.pretended_runs import CONFIG, LIST, Pretence, Stage, plan, play
 
-from reslrb_cli.config import loads
-from reslrb_cli.measure.whole_runs import rates
-from reslrb_cli.measure.whole_runs.outcome import outcome
-from reslrb_cli.measure.whole_runs.rates import at_rate, best_of, ratio
-from reslrb_cli.measure.whole_runs.runner import Advance, State
-from reslrb_cli.optimization.schedules import learning_rate_factor
-from reslrb_cli.report.whole_runs_table import best_line
+from reslrb_cli.config.loader import loads
+from reslrb_cli.measure.methods import at_rate
+from reslrb_cli.measure.optimization_benchmark import rank
+from reslrb_cli.measure.optimization_benchmark.evaluate import Advance, State
+from reslrb_cli.measure.optimization_benchmark.rank import best_of, outcome, ratio
+from reslrb_cli.optimization.loop import learning_rate_factor
+from reslrb_cli.report.convergence_tables import best_line
 
 RATES = (0.5, 1.0, 4.0)
 
@@ -115,14 +115,14 @@ def coverage(count: int, seeds: int, spread: float, true: float, levels: tuple[f
 def test_intervals_hold_the_truth_as_often_as_they_say(
     levels: tuple[float, ...], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(rates, "RESAMPLES", 600)
+    monkeypatch.setattr(rank, "RESAMPLES", 600)
     assert coverage(300, 8, 0.2, 0.6, levels) > 0.92
 
 
 def test_an_interval_without_the_resampling_is_seen(monkeypatch: pytest.MonkeyPatch) -> None:
     """One that is of half the width does not hold the truth so often."""
-    monkeypatch.setattr(rates, "RESAMPLES", 600)
-    monkeypatch.setattr(rates, "CONFIDENCE", 0.6)
+    monkeypatch.setattr(rank, "RESAMPLES", 600)
+    monkeypatch.setattr(rank, "CONFIDENCE", 0.6)
     assert coverage(300, 8, 0.2, 0.6, (1.0,)) < 0.92
 
 

@@ -9,17 +9,14 @@ from typing import Any
 import pytest
 from measure.pretended_runs import CONFIG, Pretence, Stage, plan
 
-from reslrb_cli.config import loads
+from reslrb_cli.config.loader import loads
 from reslrb_cli.errors import ConfigError
-from reslrb_cli.measure.cases import parse_cases
-from reslrb_cli.measure.earlier import Earlier
-from reslrb_cli.measure.whole_runs.plan import RunsPlan
-from reslrb_cli.measure.whole_runs.resuming import KIND, check
-from reslrb_cli.measure.whole_runs.run import POINTS
-from reslrb_cli.measure.whole_runs.session import RunsSession
-from reslrb_cli.measure.whole_runs.verdict import method_records
-from reslrb_cli.records.bench import BenchStatus
-from reslrb_cli.records.samples import read_samples, write_samples
+from reslrb_cli.measure.methods import RunsPlan, parse_cases
+from reslrb_cli.measure.optimization_benchmark.rank import KIND, POINTS, check, method_records
+from reslrb_cli.measure.optimization_benchmark.session import RunsSession
+from reslrb_cli.measure.resume_store import Earlier
+from reslrb_cli.records.measurement_files import read_samples, write_samples
+from reslrb_cli.records.measurements import BenchStatus
 
 
 def play(

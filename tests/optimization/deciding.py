@@ -14,15 +14,15 @@ import pytest
 from cli import tiny
 
 from reslrb_cli.cli import main
-from reslrb_cli.optimization import loop, step_trial
-from reslrb_cli.optimization.guiding_pilot import LONGER, SHARE, GuidingPilot
+from reslrb_cli.optimization import loop
+from reslrb_cli.optimization.autotune import steps
+from reslrb_cli.optimization.autotune.choice import GUIDING_SHARE
+from reslrb_cli.optimization.autotune.sampling import GUIDING_LONGER, GuidingPilot
+from reslrb_cli.optimization.autotune.steps import Sizes, StepPilot, StepTrial, Taken
 from reslrb_cli.optimization.problem import Problem
-from reslrb_cli.optimization.step_pilot import StepPilot, Taken
-from reslrb_cli.optimization.step_sizes import Sizes
-from reslrb_cli.optimization.step_trial import StepTrial
 from reslrb_cli.records.clock import StepClock
 
-SIZES = Sizes(step=64, call=16, part=16, alone=False, entries=200, lessons=1 / 7, longer=LONGER)
+SIZES = Sizes(step=64, call=16, part=16, alone=False, entries=200, lessons=1 / 7, longer=GUIDING_LONGER)
 
 
 @dataclass
@@ -69,7 +69,7 @@ class World:
         noise = (random.poisson(4, self.entries) - 4) / 2 if self.sparse else random.normal(size=self.entries)
         return 1 + np.sqrt(variance) * noise
 
-    def run(self, sizes: Sizes = SIZES, share: float = 2 * SHARE) -> Any:
+    def run(self, sizes: Sizes = SIZES, share: float = 2 * GUIDING_SHARE) -> Any:
         """The record of what is decided."""
         return self.pilot(self, replace(sizes, entries=self.entries, alone=self.alone), 1.0, share).run()
 
@@ -85,7 +85,7 @@ def begin(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def fix_times(monkeypatch: pytest.MonkeyPatch, other_ms: Mapping[str, float]) -> None:
     """Have a step take 1 ms, one of the other kind what is given for what is decided, and a walk to learn from 1 ms."""
-    monkeypatch.setattr(step_trial, "_taken", lambda times: Taken(kernel_ms=1.0, wall_ms=1.0))
+    monkeypatch.setattr(steps, "_taken", lambda times: Taken(kernel_ms=1.0, wall_ms=1.0))
     take = StepTrial.take
 
     def timed(self: StepTrial, other: bool, round: int, spp: int) -> Taken:

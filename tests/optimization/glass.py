@@ -77,7 +77,7 @@ def write_experiment(folder: Path) -> Path:
 
 def assemble(folder: Path, *sets: str) -> Any:
     """The problem of the experiment, without targets."""
-    from reslrb_cli.config import load
-    from reslrb_cli.optimization import assemble_scene
+    from reslrb_cli.config.loader import load
+    from reslrb_cli.optimization.assemble import assemble_scene
 
     return assemble_scene(load(write_experiment(folder), list(sets)))

@@ -10,9 +10,11 @@ from pathlib import Path
 
 import numpy as np
 
-from reslrb_cli.config import load
-from reslrb_cli.optimization import assemble, optimize
-from reslrb_cli.optimization.certainty import Certainty, CertaintyRecord
+from reslrb_cli.config.loader import load
+from reslrb_cli.optimization.assemble import assemble
+from reslrb_cli.optimization.loop import optimize
+from reslrb_cli.optimization.uncertainty.measuring import Certainty
+from reslrb_cli.optimization.uncertainty.verdicts import CertaintyRecord
 
 LEFT, RIGHT, HIDDEN = (f"{name}.emitter.radiance.value" for name in ("left", "right", "hidden"))
 TWIN, OTHER_TWIN = (f"{name}.emitter.radiance.value" for name in ("twin", "other_twin"))

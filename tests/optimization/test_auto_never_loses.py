@@ -15,20 +15,21 @@ import numpy as np
 import pytest
 from optimization.deciding import operations
 
-from reslrb_cli.config import Config, load, loads
-from reslrb_cli.integrators import render_image
-from reslrb_cli.measure.extreme import CASES, ExtremeCase
+from reslrb_cli.config.loader import load, loads
+from reslrb_cli.config.schema import Config
+from reslrb_cli.integrators.step import render_image
+from reslrb_cli.measure.extreme import CASES
+from reslrb_cli.measure.extreme.suite import ExtremeCase
 from reslrb_cli.measure.gradients import integrator
-from reslrb_cli.measure.small_scenes import load as load_scene
-from reslrb_cli.optimization.choice import find_options, is_auto, settle_integrator
-from reslrb_cli.optimization.guiding_pilot import GuidingPilot
-from reslrb_cli.optimization.pilot import SHARE
-from reslrb_cli.optimization.problem import Problem, assemble_scene
-from reslrb_cli.optimization.sequence_choice import settle_sampling
-from reslrb_cli.optimization.sequence_pilot import SequencePilot
+from reslrb_cli.measure.scenes.small import load as load_scene
+from reslrb_cli.optimization.assemble import assemble_scene
+from reslrb_cli.optimization.autotune.choice import find_options, is_auto, settle_integrator
+from reslrb_cli.optimization.autotune.estimators import SHARE
+from reslrb_cli.optimization.autotune.sampling import GuidingPilot, SequencePilot, settle_sampling
+from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.targets import make_targets
+from reslrb_cli.records.decisions import LEAST_IMAGE, PaidRecord
 from reslrb_cli.records.images import write_file
-from reslrb_cli.records.paid import LEAST_IMAGE, PaidRecord
 
 pytestmark = [pytest.mark.usefixtures("llvm"), pytest.mark.long]
 

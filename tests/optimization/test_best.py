@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from records.test_earlier_metrics import RECORD
 
-from reslrb_cli.optimization.best import WINDOW, Best
+from reslrb_cli.optimization.results import WINDOW, Best
 
 
 def seen(losses, held_out=None):

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from optimization.toy import make_problem
 
-from reslrb_cli.optimization.certainty import LEAST_ITERATIONS, Certainty, measuring
+from reslrb_cli.optimization.uncertainty import measuring
+from reslrb_cli.optimization.uncertainty.measuring import LEAST_ITERATIONS, Certainty
 
 
 def test_short_runs_and_stopped_ones_go_without(tmp_path, monkeypatch):

@@ -9,9 +9,9 @@ import pytest
 from optimization.toy import make_problem
 
 from reslrb_cli.optimization import loop
-from reslrb_cli.optimization.clamping import DECAY, GradientClamp
+from reslrb_cli.optimization.optimizers import DECAY, GradientClamp
 from reslrb_cli.records.clock import StepClock
-from reslrb_cli.records.tally import ClampTally
+from reslrb_cli.records.metrics import ClampTally
 
 
 def leaf(kind, shape):

@@ -8,14 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from reslrb_cli.config import load
-from reslrb_cli.integrators import cross_step, gradient_step, make_integrator
-from reslrb_cli.integrators.step import second_seed
+from reslrb_cli.config.loader import load
+from reslrb_cli.integrators.step import cross_step, gradient_step, make_integrator, second_seed
 from reslrb_cli.measure.gradients import Case, relative
-from reslrb_cli.measure.small_scenes import room
-from reslrb_cli.optimization import assemble, correlated_rounds
-from reslrb_cli.optimization.correlated_bias import Bias, CorrelatedBias, find_bias
-from reslrb_cli.optimization.correlated_rounds import measure_correlated_bias
+from reslrb_cli.measure.scenes.small import room
+from reslrb_cli.optimization import correlated_bias
+from reslrb_cli.optimization.assemble import assemble
+from reslrb_cli.optimization.correlated_bias import Bias, CorrelatedBias, find_bias, measure_correlated_bias
 from reslrb_cli.seeds import seed
 
 ROUNDS, ENTRIES = 8, 200
@@ -134,9 +133,9 @@ def test_the_bias_of_a_scene_is_that_of_many_steps(problem, monkeypatch: pytest.
     assert said == ["adjoint correlated: measuring its bias, 8 rounds of 4 spp"]
     [row] = found.parameters
     assert row.along
-    monkeypatch.setattr(correlated_rounds, "PART", 1)
-    monkeypatch.setattr(correlated_rounds, "SHARE", 10.0)
-    monkeypatch.setattr(correlated_rounds, "ROUNDS", 40)
+    monkeypatch.setattr(correlated_bias, "PART", 1)
+    monkeypatch.setattr(correlated_bias, "SHARE", 10.0)
+    monkeypatch.setattr(correlated_bias, "ROUNDS", 40)
     [expected] = measure_correlated_bias(problem, said.append).parameters
     assert expected.error < row.error
     assert abs(row.share - expected.share) < 4 * np.hypot(row.error, expected.error)
@@ -146,7 +145,7 @@ def test_the_bias_of_a_scene_is_that_of_many_steps(problem, monkeypatch: pytest.
 
 def test_batched_has_none(problem) -> None:
     """The same statistic, of `batched` in place of `correlated`."""
-    from reslrb_cli.optimization.samples import take_gradient
+    from reslrb_cli.optimization.sensitivity import take_gradient
 
     def gradient(number: int, adjoint: str, purpose: str) -> np.ndarray:
         problem.apply()
@@ -166,6 +165,6 @@ def test_batched_has_none(problem) -> None:
 @pytest.mark.parametrize("setting", ["run.adjoint=batched", "run.adjoint=auto", "run.iterations=20"])
 def test_other_runs_pay_nothing(setting: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "a.yaml").write_text(CONFIG)
-    monkeypatch.setattr(correlated_rounds, "cross_step", None)
+    monkeypatch.setattr(correlated_bias, "cross_step", None)
     config = load(tmp_path / "a.yaml", [setting])
     assert measure_correlated_bias(types.SimpleNamespace(config=config, samples_per_pass=None), print) is None

@@ -16,9 +16,10 @@ from cli.tiny import write_experiment
 from optimization.endurance import watch
 from optimization.toy import make_problem
 
-from reslrb_cli.config import load
+from reslrb_cli.config.loader import load
 from reslrb_cli.estimators import ESTIMATORS
-from reslrb_cli.optimization import assemble, loop
+from reslrb_cli.optimization import loop
+from reslrb_cli.optimization.assemble import assemble
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
 

@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 from cli.tiny import KEY, write_experiment
 
-from reslrb_cli.config import load
+from reslrb_cli.config.loader import load
 from reslrb_cli.errors import ConfigError
-from reslrb_cli.measure.statistics import compare
-from reslrb_cli.optimization import assemble, optimize
-from reslrb_cli.optimization.ambiguity import check_exposures, find_ambiguous
-from reslrb_cli.optimization.samples import sample_gradient, take_gradient
+from reslrb_cli.measure.comparison import compare
+from reslrb_cli.optimization.assemble import assemble
+from reslrb_cli.optimization.identifiability import check_exposures, find_ambiguous
+from reslrb_cli.optimization.loop import optimize
+from reslrb_cli.optimization.sensitivity import sample_gradient, take_gradient
 
 #: Exposures that gradients are taken at.
 AT = {"auto": [1.3], "per_channel": [1.3, 0.7, 2.0]}

@@ -16,18 +16,18 @@ from optimization.deciding import begin, fix_times, inspected, operations
 from recording.going_on import begin_alone, differences, left_over, optimize, run_and_kill
 from turns import a_few
 
-from reslrb_cli.config import load
+from reslrb_cli.config.loader import load
 from reslrb_cli.errors import ConfigError
-from reslrb_cli.integrators.guiding import Purpose
-from reslrb_cli.measure.cases import parse_cases
+from reslrb_cli.guiding.tables import Purpose
+from reslrb_cli.measure.methods import parse_cases
 from reslrb_cli.optimization import problem as problem_module
-from reslrb_cli.optimization.guiding_choice import table_bytes
-from reslrb_cli.optimization.problem import Problem, assemble
-from reslrb_cli.optimization.step_pilot import Taken
-from reslrb_cli.optimization.step_trial import StepTrial
-from reslrb_cli.records.checkpoint import FILE_NAME, open_state
+from reslrb_cli.optimization.assemble import assemble
+from reslrb_cli.optimization.autotune.sampling import table_bytes
+from reslrb_cli.optimization.autotune.steps import StepTrial, Taken
+from reslrb_cli.optimization.problem import Problem
+from reslrb_cli.records.checkpoint import STATE_FILE, open_state
+from reslrb_cli.records.decisions import PilotCache
 from reslrb_cli.records.manifest import read_manifest
-from reslrb_cli.records.pilot_cache import PilotCache
 
 pytestmark = pytest.mark.usefixtures("llvm")
 
@@ -160,7 +160,7 @@ def test_faults_of_that_are_seen(fault: str, experiment: Path, monkeypatch: pyte
         learned, judged = seeds_of_parts(monkeypatch, experiment)
         assert learned & judged
     else:
-        from reslrb_cli.integrators.guiding import Guiding
+        from reslrb_cli.guiding.tables import Guiding
 
         monkeypatch.setattr(Guiding, "due", lambda self, number: True)
         with pytest.raises(AssertionError):
@@ -180,7 +180,7 @@ def test_a_run_says_so_once_remembers_it_and_writes_it_down(
     assert f"guiding on: {found['gain']:.2g} times the efficiency here ({found['low']:.2g} to " in said
     assert "guiding: auto" in (RUN / "config.yaml").read_text()
     assert f"guiding on: {found['gain']:.2g} times" in (RUN / "report.html").read_text()
-    archive, values = open_state(RUN / "checkpoint" / FILE_NAME)
+    archive, values = open_state(RUN / "checkpoint" / STATE_FILE)
     archive.close()
     assert values["guided"] == found
     assert values["guiding"]["0"] > 0
@@ -260,7 +260,7 @@ def test_what_is_compared_is_named() -> None:
 
 
 def test_a_script_is_told_that_it_has_to_say() -> None:
-    from reslrb_cli.integrators import make_integrator
+    from reslrb_cli.integrators.step import make_integrator
 
     with pytest.raises(ValueError, match="say on or off"):
         make_integrator("reslrb", guiding="auto")

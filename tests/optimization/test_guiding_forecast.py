@@ -7,12 +7,12 @@ from pathlib import Path
 import pytest
 from optimization.deciding import begin
 
-from reslrb_cli.config import load
-from reslrb_cli.integrators.guiding import Guiding
+from reslrb_cli.config.loader import load
+from reslrb_cli.guiding.tables import Guiding
 from reslrb_cli.optimization import loop
-from reslrb_cli.optimization.problem import assemble
-from reslrb_cli.optimization.step_trial import lessons, sizes
-from reslrb_cli.optimization.trial import _with_learning
+from reslrb_cli.optimization.assemble import assemble
+from reslrb_cli.optimization.autotune.steps import lessons, sizes
+from reslrb_cli.optimization.forecast import _with_learning
 
 
 @pytest.mark.parametrize("iterations", [1, 3, 23])

@@ -9,12 +9,11 @@ import numpy as np
 import pytest
 from optimization.deciding import SIZES, World
 
-from reslrb_cli.optimization.guiding_pilot import LONGER, SHARE, GuidingPilot
-from reslrb_cli.optimization.pilot import TIMING_NOISE
-from reslrb_cli.optimization.pilot_records import ITERATIONS
-from reslrb_cli.optimization.step_pilot import LEARNINGS, LEAST_ROUNDS, LOOKS
-from reslrb_cli.optimization.step_sizes import Sizes
-from reslrb_cli.records.paid import GuidedRecord
+from reslrb_cli.optimization.autotune.choice import GUIDING_SHARE
+from reslrb_cli.optimization.autotune.efficiency import ITERATIONS, TIMING_NOISE
+from reslrb_cli.optimization.autotune.sampling import GUIDING_LONGER, GuidingPilot
+from reslrb_cli.optimization.autotune.steps import LEARNINGS, LEAST_ROUNDS, LOOKS, Sizes
+from reslrb_cli.records.decisions import GuidedRecord
 
 
 def gain(world: World, sizes: Sizes = SIZES) -> float:
@@ -102,7 +101,7 @@ def test_a_run_pays_for_as_much_learning_as_it_has() -> None:
 @pytest.mark.parametrize("time", [1.0, 3.0, 10.0])
 def test_its_share_is_kept(spp: int, overhead: float, python: float, time: float) -> None:
     world = World(0.1, time, overhead=overhead, python=python, walk=1.5)
-    record = world.run(Sizes(spp, spp, spp, False, 200, 1 / 7, LONGER), SHARE)
+    record = world.run(Sizes(spp, spp, spp, False, 200, 1 / 7, GUIDING_LONGER), GUIDING_SHARE)
     taken = [call for call in world.calls if call[0] is not False]
     assert all(call[2] <= spp for call in world.calls)
     if record.gain is None:
@@ -112,7 +111,7 @@ def test_its_share_is_kept(spp: int, overhead: float, python: float, time: float
         assert record.rounds >= LEAST_ROUNDS
         assert 1 <= [call[0] for call in taken].count("learn") <= LEARNINGS
     # The last round may be longer than those before.
-    assert record.share <= SHARE * 1.05
+    assert record.share <= GUIDING_SHARE * 1.05
     assert record.share * ITERATIONS * (spp + overhead) == pytest.approx(1e3 * record.measure_s, rel=1e-6)
 
 
@@ -132,10 +131,10 @@ def test_what_a_step_takes_beside_its_kernels_counts_as_often_as_a_run_has_it() 
 @pytest.mark.parametrize(("python", "walks"), [(10.0, 2), (30.0, 1), (60.0, 0)])
 def test_a_second_walk_is_left_out_where_there_is_no_time_for_it(python: float, walks: int) -> None:
     world = World(0.1, 1.0, overhead=1.0, python=python, walk=1.5)
-    record = world.run(Sizes(16, 16, 16, False, 200, 1 / 7, LONGER), SHARE)
+    record = world.run(Sizes(16, 16, 16, False, 200, 1 / 7, GUIDING_LONGER), GUIDING_SHARE)
     assert [call[0] for call in world.calls].count("learn") == max(walks, 1)  # one, to see what it takes
     assert (record.rounds >= LEAST_ROUNDS) == (walks > 0)
-    assert record.share <= SHARE * 1.05
+    assert record.share <= GUIDING_SHARE * 1.05
 
 
 def test_samples_are_no_more_than_those_of_a_pass() -> None:
@@ -169,7 +168,7 @@ def test_what_is_not_clear_is_looked_at_longer() -> None:
     assert World(3.0, 1.0).run().rounds == SIZES.rounds
     close = World(0.8, 1.0, walk=0.1)
     assert close.run().rounds == LOOKS * SIZES.rounds
-    assert close.run(share=0.3 * SHARE).rounds < SIZES.rounds
+    assert close.run(share=0.3 * GUIDING_SHARE).rounds < SIZES.rounds
 
 
 def test_no_noise_is_no_gain() -> None:

@@ -11,7 +11,7 @@ import pytest
 from optimization.toy import make_problem
 
 from reslrb_cli.optimization import loop
-from reslrb_cli.optimization.constraints import count_nonfinite, finite_square_norm
+from reslrb_cli.optimization.optimizers import count_nonfinite, finite_square_norm
 from reslrb_cli.records.clock import StepClock
 
 

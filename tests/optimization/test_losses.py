@@ -7,7 +7,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from reslrb_cli.optimization.losses import LOSSES, make_loss
+from reslrb_cli.optimization.views import LOSSES, make_loss
 
 EPSILON = 0.02
 REFERENCES = {

@@ -8,13 +8,11 @@ import numpy as np
 import pytest
 from cli.tiny import write_experiment
 
-from reslrb_cli.config import load
+from reslrb_cli.config.loader import load
 from reslrb_cli.errors import ConfigError
-from reslrb_cli.optimization import assemble
-from reslrb_cli.optimization.losses import LOSSES, make_loss
-from reslrb_cli.optimization.samples import sample_gradient, take_gradient
-from reslrb_cli.optimization.sensitivity import measure_sensitivities, see_images
-from reslrb_cli.optimization.views import View, view_records
+from reslrb_cli.optimization.assemble import assemble
+from reslrb_cli.optimization.sensitivity import measure_sensitivities, sample_gradient, see_images, take_gradient
+from reslrb_cli.optimization.views import LOSSES, View, make_loss, view_records
 
 #: Pixels (y, x) of the target that are not to be trusted, one of each kind.
 CLIPPED, CLEAR, BROKEN = (1, 2), (3, 4), (5, 6)

@@ -11,12 +11,12 @@ import pytest
 from optimization import glass
 from turns import a_few
 
-from reslrb_cli.config import load
+from reslrb_cli.config.loader import load
 from reslrb_cli.errors import ConfigError
-from reslrb_cli.integrators import known_step, render_image
-from reslrb_cli.optimization import assemble, assemble_scene
+from reslrb_cli.integrators.step import known_step, render_image
+from reslrb_cli.optimization.assemble import assemble, assemble_scene
+from reslrb_cli.optimization.identifiability import find_reached
 from reslrb_cli.optimization.loop import optimize
-from reslrb_cli.optimization.reach import find_reached
 
 SEED, SPP = 3, 256
 MOTIONS = "parameters=[{motion: {of: slab, free: [translation, rotation, scale], pivot: [0.2, 1.5, 0.1]}}, "

@@ -7,9 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from reslrb_cli.config import load
-from reslrb_cli.optimization import assemble, optimize
-from reslrb_cli.optimization.reach import find_reached
+from reslrb_cli.config.loader import load
+from reslrb_cli.optimization.assemble import assemble
+from reslrb_cli.optimization.identifiability import find_reached
+from reslrb_cli.optimization.loop import optimize
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 

@@ -9,9 +9,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from reslrb_cli.optimization.optimizers import OPTIMIZERS, Optimizer
-from reslrb_cli.optimization.schedules import SCHEDULES, learning_rate_factor
-from reslrb_cli.optimization.transforms import make_transform
+from reslrb_cli.optimization.loop import SCHEDULES, learning_rate_factor
+from reslrb_cli.optimization.optimizers import OPTIMIZERS, Optimizer, make_transform
 from reslrb_cli.records.clock import StepClock
 
 RATE = 0.05

@@ -8,9 +8,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from reslrb_cli.optimization.guiding_pilot import SHARE as GUIDING_SHARE
-from reslrb_cli.optimization.pilot import SHARE, Pilot
-from reslrb_cli.optimization.pilot_records import ITERATIONS, Allowance, Candidate, Measured, Outcome
+from reslrb_cli.optimization.autotune.choice import GUIDING_SHARE
+from reslrb_cli.optimization.autotune.efficiency import ITERATIONS, Allowance, Candidate, Measured, Outcome
+from reslrb_cli.optimization.autotune.estimators import SHARE, Pilot
 
 STACK, GATHER = Candidate({"estimator": "stack"}, True), Candidate({"estimator": "gather"}, True)
 RESERVOIR = Candidate({"estimator": "reservoir", "capacity": 1}, False)

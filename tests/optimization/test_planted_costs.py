@@ -18,10 +18,10 @@ from optimization.toy import make_problem
 
 from reslrb_cli.cli import main
 from reslrb_cli.optimization import loop
-from reslrb_cli.recording import course
-from reslrb_cli.recording import run as recording
 from reslrb_cli.records.clock import MIB, StepClock, peak_mib, reset_peak
 from reslrb_cli.records.metrics import read_metrics
+from reslrb_cli.runs import prepare
+from reslrb_cli.runs import recorder as recording
 
 #: Lanes of the kernels, and turns of the loop of the cheaper one: some ten milliseconds.
 LANES, TURNS = 2**16, 256
@@ -98,7 +98,7 @@ def test_files_that_take_long_are_in_no_time_of_a_run(
     """A disk that takes 0.2 s for every line, or every checkpoint, which are written after each iteration here."""
     write_experiment(tmp_path)
     monkeypatch.chdir(tmp_path)
-    holder: Any = recording.MetricsWriter if what == "MetricsWriter.write" else course
+    holder: Any = recording.MetricsWriter if what == "MetricsWriter.write" else prepare
     name = what.rpartition(".")[2]
     written, slept = getattr(holder, name), []
 

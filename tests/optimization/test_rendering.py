@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from reslrb_cli.config import load, loads
-from reslrb_cli.optimization import rendering
-from reslrb_cli.optimization.problem import assemble_scene
+from reslrb_cli.config.loader import load, loads
+from reslrb_cli.optimization import loading
+from reslrb_cli.optimization.assemble import assemble_scene
 
 CONFIG = Path(__file__).resolve().parents[2] / "configs" / "stiff" / "lamp.yaml"
 TINY = ["scene.options={resx: 12, resy: 12}", "integrator.max_depth=2", "integrator.freeze=true"]
@@ -18,7 +18,7 @@ TINY = ["scene.options={resx: 12, resy: 12}", "integrator.max_depth=2", "integra
 @pytest.mark.parametrize(("most", "recorded"), [(12 * 12 * 8, True), (12 * 12 * 8 - 1, False)])
 def test_only_small_images_are_recorded(monkeypatch, most, recorded):
     """The trials of a recording render an image three times more: no gain where that takes long, and it comes once."""
-    monkeypatch.setattr(rendering, "MOST_PATHS_APART", most)
+    monkeypatch.setattr(loading, "MOST_PATHS_APART", most)
     problem = assemble_scene(load(CONFIG, TINY))
     image = problem.render(0, 8, 0, "saved image")
     assert bool(problem.integrator.preparation.recordings.counts()) == recorded
@@ -28,8 +28,8 @@ def test_only_small_images_are_recorded(monkeypatch, most, recorded):
 
 def test_passes_of_a_large_image_are_not_recorded(monkeypatch):
     """However small the last of them is."""
-    monkeypatch.setattr(rendering, "PATHS_PER_PASS", 12 * 12 * 4)
-    monkeypatch.setattr(rendering, "MOST_PATHS_APART", 12 * 12 * 3)
+    monkeypatch.setattr(loading, "PATHS_PER_PASS", 12 * 12 * 4)
+    monkeypatch.setattr(loading, "MOST_PATHS_APART", 12 * 12 * 3)
     problem = assemble_scene(load(CONFIG, TINY))
     problem.render(0, 5, 0, "saved image")
     assert not problem.integrator.preparation.recordings.counts()

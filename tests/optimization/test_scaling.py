@@ -10,12 +10,13 @@ import numpy as np
 import pytest
 from turns import a_few
 
-from reslrb_cli.config import load
-from reslrb_cli.optimization import assemble, find_reached, optimize
-from reslrb_cli.optimization.optimizers import Optimizer
-from reslrb_cli.optimization.scaling import Scaled, own_length, rescale, step_line
-from reslrb_cli.optimization.sensitivity import measure_sensitivities
-from reslrb_cli.optimization.transforms import Variable, make_transform
+from reslrb_cli.config.loader import load
+from reslrb_cli.optimization.assemble import assemble
+from reslrb_cli.optimization.decisions import Scaled
+from reslrb_cli.optimization.identifiability import find_reached
+from reslrb_cli.optimization.loop import optimize
+from reslrb_cli.optimization.optimizers import Optimizer, Variable, make_transform
+from reslrb_cli.optimization.sensitivity import measure_sensitivities, own_length, rescale, step_line
 
 CONFIG = Path(__file__).resolve().parents[2] / "configs" / "stiff" / "lamp.yaml"
 TINY = ["scene.options={resx: 12, resy: 12}", "integrator.max_depth=2", "run.spp=32", "run.reach_spp=16",

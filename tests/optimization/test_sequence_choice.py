@@ -15,14 +15,15 @@ from optimization.deciding import begin, fix_times, inspected, operations
 from recording.going_on import optimize
 from turns import a_few
 
-from reslrb_cli.config import load
+from reslrb_cli.config.loader import load
 from reslrb_cli.errors import ConfigError
-from reslrb_cli.measure.cases import parse_cases
-from reslrb_cli.optimization.problem import Problem, assemble
-from reslrb_cli.optimization.step_trial import StepTrial
-from reslrb_cli.records.checkpoint import FILE_NAME, open_state
+from reslrb_cli.measure.methods import parse_cases
+from reslrb_cli.optimization.assemble import assemble
+from reslrb_cli.optimization.autotune.steps import StepTrial
+from reslrb_cli.optimization.problem import Problem
+from reslrb_cli.records.checkpoint import STATE_FILE, open_state
+from reslrb_cli.records.decisions import PilotCache
 from reslrb_cli.records.manifest import read_manifest
-from reslrb_cli.records.pilot_cache import PilotCache
 
 pytestmark = pytest.mark.usefixtures("llvm")
 
@@ -169,7 +170,7 @@ def test_alone_it_takes_the_place_of_guiding_where_that_is_better(
 
 
 def test_a_table_of_its_own_for_either_is_seen(experiment: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from reslrb_cli.integrators.preparation import Preparation
+    from reslrb_cli.integrators.context import Preparation
 
     monkeypatch.setattr(Preparation, "draw_from", lambda self, guiding, scene: None)
     with pytest.raises(AssertionError):
@@ -190,7 +191,7 @@ def test_a_run_says_so_once_remembers_it_and_writes_it_down(
     assert f"{line}{found['low']:.2g} to {found['high']:.2g})" in said
     assert "sequence: auto" in (RUN / "config.yaml").read_text()
     assert line in (RUN / "report.html").read_text()
-    archive, values = open_state(RUN / "checkpoint" / FILE_NAME)
+    archive, values = open_state(RUN / "checkpoint" / STATE_FILE)
     archive.close()
     assert values["sequence"] == found
     told: list[str] = []
@@ -232,7 +233,7 @@ def test_what_is_compared_is_named() -> None:
 
 
 def test_a_script_is_told_that_it_has_to_say() -> None:
-    from reslrb_cli.integrators import make_integrator
+    from reslrb_cli.integrators.step import make_integrator
 
     with pytest.raises(ValueError, match="say independent or low_discrepancy"):
         make_integrator("reslrb", sequence="auto")

@@ -10,14 +10,13 @@ import numpy as np
 import pytest
 from optimization.deciding import SIZES, World
 
-from reslrb_cli.optimization import choice
-from reslrb_cli.optimization.guiding_pilot import SHARE as GUIDING_SHARE
-from reslrb_cli.optimization.pilot import SHARE as PILOT_SHARE
-from reslrb_cli.optimization.pilot_records import ITERATIONS
-from reslrb_cli.optimization.sequence_pilot import LONGER, SHARE, SequencePilot, planned
-from reslrb_cli.optimization.step_pilot import LEARNINGS, LEAST_ROUNDS, LOOKS
-from reslrb_cli.optimization.step_sizes import PLANNED, Sizes
-from reslrb_cli.records.paid import GuidedRecord, SequenceRecord
+from reslrb_cli.optimization.autotune import choice
+from reslrb_cli.optimization.autotune.choice import GUIDING_SHARE, SEQUENCE_SHARE
+from reslrb_cli.optimization.autotune.efficiency import ITERATIONS
+from reslrb_cli.optimization.autotune.estimators import SHARE as PILOT_SHARE
+from reslrb_cli.optimization.autotune.sampling import SEQUENCE_LONGER, SequencePilot, planned
+from reslrb_cli.optimization.autotune.steps import LEARNINGS, LEAST_ROUNDS, LOOKS, PLANNED, Sizes
+from reslrb_cli.records.decisions import GuidedRecord, SequenceRecord
 
 
 def world(variance: float, time: float, **options: Any) -> World:
@@ -26,7 +25,7 @@ def world(variance: float, time: float, **options: Any) -> World:
 
 
 def sizes(share: float, step: int = 64) -> Sizes:
-    return replace(SIZES, step=step, call=step, part=step, longer=LONGER, planned=planned(share))
+    return replace(SIZES, step=step, call=step, part=step, longer=SEQUENCE_LONGER, planned=planned(share))
 
 
 @pytest.mark.parametrize(
@@ -81,7 +80,7 @@ def test_a_table_that_has_yet_to_learn_does_so_before_all_steps_that_count() -> 
     assert record.gain == pytest.approx(1 / (0.1 * 1.1), rel=0.2)
 
 
-@pytest.mark.parametrize("share", [0.0, SHARE, 0.01, 0.02, PILOT_SHARE])
+@pytest.mark.parametrize("share", [0.0, SEQUENCE_SHARE, 0.01, 0.02, PILOT_SHARE])
 @pytest.mark.parametrize("step", [8, 64, 1024])
 @pytest.mark.parametrize("overhead", [0.0, 0.1, 10.0])
 @pytest.mark.parametrize("time", [0.9, 1.1, 3.0])
@@ -102,12 +101,12 @@ def test_its_share_is_kept(share: float, step: int, overhead: float, time: float
 
 
 def test_the_more_is_left_the_longer_steps_are() -> None:
-    trials = [sizes(share, 1024).trial for share in (0.0, SHARE, 0.01, 0.02, 0.05)]
+    trials = [sizes(share, 1024).trial for share in (0.0, SEQUENCE_SHARE, 0.01, 0.02, 0.05)]
     assert trials == sorted(trials)
     assert trials[0] == 1
     assert 30 < trials[1] < trials[2] < trials[3]
     assert sizes(0.05, 1024).planned == PLANNED
-    assert world(0.1, 1.1).run(sizes(SHARE, 1024), SHARE).low_discrepancy
+    assert world(0.1, 1.1).run(sizes(SEQUENCE_SHARE, 1024), SEQUENCE_SHARE).low_discrepancy
 
 
 class Spent:
@@ -122,11 +121,11 @@ class Spent:
 @pytest.mark.parametrize("pilot", [None, 0.02, PILOT_SHARE - GUIDING_SHARE])
 def test_all_that_is_measured_takes_one_share(pilot: float | None) -> None:
     """What guiding may take, then what the sequence may, and what both have, come what may."""
-    for_guiding = choice.share_left(Spent(pilot, None), SHARE)  # type: ignore[arg-type]
-    assert for_guiding == pytest.approx(PILOT_SHARE - SHARE - (pilot or 0))
-    assert for_guiding >= GUIDING_SHARE - SHARE - 1e-12
+    for_guiding = choice.share_left(Spent(pilot, None), SEQUENCE_SHARE)  # type: ignore[arg-type]
+    assert for_guiding == pytest.approx(PILOT_SHARE - SEQUENCE_SHARE - (pilot or 0))
+    assert for_guiding >= GUIDING_SHARE - SEQUENCE_SHARE - 1e-12
     left = choice.share_left(Spent(pilot, for_guiding))  # type: ignore[arg-type]
-    assert left == pytest.approx(SHARE)
+    assert left == pytest.approx(SEQUENCE_SHARE)
     assert choice.share_left(Spent(pilot, 0.5)) == 0  # type: ignore[arg-type]
 
 

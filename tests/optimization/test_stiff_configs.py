@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from reslrb_cli.config import load
+from reslrb_cli.config.loader import load
 from reslrb_cli.measure.conditioning import measure_conditioning
-from reslrb_cli.optimization import assemble
+from reslrb_cli.optimization.assemble import assemble
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs" / "stiff"
 SMALL = ["scene.options={resx: 16, resy: 16}", "target.render.spp=16"]

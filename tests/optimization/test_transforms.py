@@ -7,8 +7,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from reslrb_cli.optimization.optimizers import OPTIMIZERS, Optimizer
-from reslrb_cli.optimization.transforms import Variable, make_transform
+from reslrb_cli.optimization.optimizers import OPTIMIZERS, Optimizer, Variable, make_transform
 from reslrb_cli.records.clock import StepClock
 
 #: Transform, bounds, values.

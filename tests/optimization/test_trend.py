@@ -7,7 +7,7 @@ import collections
 import numpy as np
 import pytest
 
-from reslrb_cli.optimization.trend import Change, find_trend, got_worse, window
+from reslrb_cli.optimization.results import Change, find_trend, got_worse, window
 
 ROUNDS = 400
 

@@ -7,11 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from reslrb_cli.optimization.certainty.coordinates import noise_covariance
-from reslrb_cli.optimization.certainty.curvature import smooth
-from reslrb_cli.optimization.certainty.measured import Measured
-from reslrb_cli.optimization.certainty.posterior import alone, driven_alone, joint
-from reslrb_cli.optimization.certainty.verdicts import Evidence, Verdict, judge, shares, summarise
+from reslrb_cli.optimization.uncertainty.curvature import smooth
+from reslrb_cli.optimization.uncertainty.posterior import Measured, alone, driven_alone, joint
+from reslrb_cli.optimization.uncertainty.verdicts import Evidence, Verdict, judge, noise_covariance, shares, summarise
 
 
 def evidence(**changes: float | bool) -> Evidence:

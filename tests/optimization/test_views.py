@@ -8,10 +8,12 @@ import pytest
 from cli.tiny import KEY, SCENE, write_experiment
 from optimization.toy import make_problem
 
-from reslrb_cli.config import dump, load, loads
+from reslrb_cli.config.loader import dump, load, loads
 from reslrb_cli.errors import ConfigError
-from reslrb_cli.optimization import assemble, loop, optimize
-from reslrb_cli.optimization.samples import sample_gradient, take_gradient
+from reslrb_cli.optimization import loop
+from reslrb_cli.optimization.assemble import assemble
+from reslrb_cli.optimization.loop import optimize
+from reslrb_cli.optimization.sensitivity import sample_gradient, take_gradient
 
 SENSOR = SCENE[SCENE.index("    <sensor") : SCENE.index("    <bsdf")]
 EYES = ["0, 0, 4", "1, 0.5, 4", "-1, 1, 3"]

@@ -8,11 +8,10 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from reslrb_cli.config import load
-from reslrb_cli.optimization.losses import make_loss
+from reslrb_cli.config.loader import load
 from reslrb_cli.optimization.optimizers import Optimizer
 from reslrb_cli.optimization.problem import Problem
-from reslrb_cli.optimization.views import View
+from reslrb_cli.optimization.views import View, make_loss
 
 CONFIG = """
 scene: {file: scene.xml}

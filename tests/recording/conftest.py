@@ -9,7 +9,7 @@ import pytest
 from cli import tiny
 from recording.going_on import optimize
 
-from reslrb_cli.recording import run as recording
+from reslrb_cli.runs import recorder as recording
 
 
 @pytest.fixture(scope="module")

@@ -24,9 +24,9 @@ from recording.going_on import (
 from turns import a_few
 
 from reslrb_cli.cli import main
-from reslrb_cli.integrators.learned import Learned
+from reslrb_cli.guiding.tables import Learned
 from reslrb_cli.optimization import loop, optimizers
-from reslrb_cli.records.checkpoint import FILE_NAME, open_state
+from reslrb_cli.records.checkpoint import STATE_FILE, open_state
 
 RUN = Path("runs/tiny")
 #: Enough for the best to be known when the run is killed.
@@ -122,7 +122,7 @@ def test_a_run_goes_on_whose_tables_were_just_found_wrong(experiment: Path, monk
     settings = [*CASES["guided"], "run.iterations=9", "run.checkpoint_every={iterations: 5}"]
     sets = [word for setting in settings for word in ("--set", setting)]
     whole, left = run_and_kill(monkeypatch, 7, *ITERATIONS, *sets)
-    archive, values = open_state(left / "checkpoint" / FILE_NAME)
+    archive, values = open_state(left / "checkpoint" / STATE_FILE)
     archive.close()
     assert values["guiding"] == {"0": 0}
     assert optimize("--resume", str(left), "--quiet") == 0
@@ -159,9 +159,10 @@ def _another_seed(run_seed, iteration, view, purpose):
 )
 def test_what_is_not_taken_up_is_missed(fault: str, experiment: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Planted: each part of the state is left out in turn."""
-    from reslrb_cli.optimization import best, clamping
-    from reslrb_cli.optimization.certainty import Certainty
-    from reslrb_cli.recording import resuming
+    from reslrb_cli.optimization import optimizers as clamping
+    from reslrb_cli.optimization import results
+    from reslrb_cli.optimization.uncertainty.measuring import Certainty
+    from reslrb_cli.runs import resume
 
     # A state in the last fifth of the run has all parts; and losses that fall have the best of the run after it.
     sets = ["--set", "optimizer.clamp_gradient=1.5", "--set", "run.checkpoint_every={iterations: 15}"]
@@ -170,9 +171,9 @@ def test_what_is_not_taken_up_is_missed(fault: str, experiment: Path, monkeypatc
         "no moments": (optimizers.Optimizer, "restore", _without_moments),
         "no clamp": (clamping.GradientClamp, "restore", lambda self, *given: None),
         "another seed": (loop, "seed", _another_seed),
-        "no best": (best.Best, "recall", lambda self, records: None),
+        "no best": (results.Best, "recall", lambda self, records: None),
         "no squares": (Certainty, "restore", lambda self, *given: None),
-        "metrics not cut back": (resuming, "cut_back", lambda folder, records, size: None),
+        "metrics not cut back": (resume, "cut_back", lambda folder, records, size: None),
     }
     monkeypatch.setattr(*places[fault])
     assert optimize("--resume", str(left), "--quiet") == 0

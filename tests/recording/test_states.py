@@ -23,8 +23,7 @@ from turns import a_few
 
 from reslrb_cli.cli import main
 from reslrb_cli.errors import ConfigError
-from reslrb_cli.records.archive import Archive
-from reslrb_cli.records.checkpoint import open_state, save_checkpoint
+from reslrb_cli.records.checkpoint import Archive, open_state, save_checkpoint
 from reslrb_cli.records.lock import FolderLock
 
 STATE, PREVIOUS = "checkpoint/state.npz", "checkpoint/previous.npz"

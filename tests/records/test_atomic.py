@@ -7,8 +7,14 @@ from pathlib import Path
 
 import pytest
 
-from reslrb_cli.records.atomic import remove_parts, remove_unfinished, unfinished_folder, write_atomically
-from reslrb_cli.records.reserve import Reserve, size_of
+from reslrb_cli.records.atomic import (
+    Reserve,
+    remove_parts,
+    remove_unfinished,
+    size_of,
+    unfinished_folder,
+    write_atomically,
+)
 
 
 def names(folder: Path) -> list[str]:

@@ -13,7 +13,8 @@ import numpy as np
 import pytest
 
 from reslrb_cli.errors import ConfigError
-from reslrb_cli.records import archive, checkpoint
+from reslrb_cli.records import checkpoint
+from reslrb_cli.records import checkpoint as archive
 from reslrb_cli.records.atomic import remove_parts
 from reslrb_cli.records.checkpoint import newest_checkpoint, open_state, save_checkpoint
 

@@ -10,8 +10,7 @@ from pathlib import Path
 import pytest
 
 from reslrb_cli.errors import ConfigError
-from reslrb_cli.records.earlier_metrics import cut_back, read_records
-from reslrb_cli.records.metrics import Clamped, MetricsWriter, Record, finite
+from reslrb_cli.records.metrics import Clamped, MetricsWriter, Record, cut_back, finite, read_records
 
 RECORD = Record(
     iteration=0, loss=0.1 + 0.2, step_ms=1.5, primal_ms=None, adjoint_ms=None, codegen_ms=0.0, elapsed_s=1 / 3,

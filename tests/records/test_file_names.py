@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from reslrb_cli.records.file_names import MOST_BYTES, file_stem
+from reslrb_cli.records.images import MOST_BYTES, file_stem
 
 
 @pytest.mark.parametrize("key", ["wall.reflectance.data", "Sphere_3.emitter.radiance.value", "Wände.alpha-2"])

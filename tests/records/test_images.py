@@ -47,7 +47,7 @@ def test_an_image_that_does_not_fit_is_not_there(tmp_path, file_size_limit, suff
 
 
 def test_parameters_and_masks_are_written_like_that(tmp_path, file_size_limit):
-    from reslrb_cli.records.parameters import write_mask, write_parameters
+    from reslrb_cli.records.images import write_mask, write_parameters
 
     with file_size_limit(300), pytest.raises(OSError, match=r"wall\.data\.exr"):
         write_parameters(tmp_path, {"wall.data": make_image()})
@@ -60,8 +60,7 @@ def test_parameters_and_masks_are_written_like_that(tmp_path, file_size_limit):
 def test_a_heightmap_is_seen_from_its_lowest_point_to_its_highest(tmp_path):
     from matplotlib.image import imread
 
-    from reslrb_cli.records.images import read_exr
-    from reslrb_cli.records.parameters import write_parameters
+    from reslrb_cli.records.images import read_exr, write_parameters
 
     heights = np.linspace(-1e-3, 2e-3, 12, dtype=np.float32).reshape(3, 4, 1)
     write_parameters(tmp_path, {"face.heightmap": heights, "wall.data": np.abs(heights)})

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from reslrb_cli.records.layers import read_layers, write_layers
+from reslrb_cli.records.images import read_layers, write_layers
 
 
 def layers():

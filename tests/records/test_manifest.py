@@ -11,11 +11,10 @@ from pathlib import Path
 
 import pytest
 
+from reslrb_cli.records import manifest as manifest_file
 from reslrb_cli.records import manifest as manifests
-from reslrb_cli.records import manifest_file
 from reslrb_cli.records.lock import FolderLock, Holder
-from reslrb_cli.records.manifest import Manifest, Status, read_manifest
-from reslrb_cli.records.manifest_file import FILE_NAME, read_content
+from reslrb_cli.records.manifest import MANIFEST_FILE, Manifest, Status, read_content, read_manifest
 
 
 def make_manifest(**changes):
@@ -30,7 +29,7 @@ def abandoned(folder: Path) -> Manifest:
 
 
 def stored(folder: Path):
-    return json.loads((folder / FILE_NAME).read_text())
+    return json.loads((folder / MANIFEST_FILE).read_text())
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="no locks")
@@ -46,7 +45,7 @@ def test_a_run_that_was_killed_is_interrupted(tmp_path):
     # on the disk too, with what the process left behind
     assert stored(tmp_path) == content == read_manifest(tmp_path)
     assert (tmp_path / "metrics.jsonl").read_text() == '{"iteration": 0}\n'
-    assert sorted(os.listdir(tmp_path)) == [FILE_NAME, "metrics.jsonl"]
+    assert sorted(os.listdir(tmp_path)) == [MANIFEST_FILE, "metrics.jsonl"]
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="no locks")
@@ -79,7 +78,7 @@ def test_what_has_ended_stays_as_it_ended(tmp_path, status):
 
 @pytest.mark.parametrize("text", ["", "{", "[]", '{"program": "other"}', "[" * 100_000, "\udcff"])
 def test_what_is_no_manifest_of_ours(tmp_path, text):
-    (tmp_path / FILE_NAME).write_bytes(text.encode(errors="surrogateescape"))
+    (tmp_path / MANIFEST_FILE).write_bytes(text.encode(errors="surrogateescape"))
     assert read_manifest(tmp_path) is None
     assert read_manifest(tmp_path / "nowhere") is None
 
@@ -115,7 +114,7 @@ def full_disk(monkeypatch):
 def test_the_end_fits_on_a_full_disk(tmp_path, full_disk):
     manifest = make_manifest()
     manifest.write(tmp_path)
-    size = (tmp_path / FILE_NAME).stat().st_size
+    size = (tmp_path / MANIFEST_FILE).stat().st_size
     assert size % 4096 == 0
     full_disk()
     manifest.results = {"iterations": 12}
@@ -124,7 +123,7 @@ def test_the_end_fits_on_a_full_disk(tmp_path, full_disk):
     content = read_manifest(tmp_path)
     assert (content["status"], content["error"]) == ("failed", "the disk is full")
     assert (content["results"], content["missing"]) == ({"iterations": 12}, {"page": "no room"})
-    assert (tmp_path / FILE_NAME).stat().st_size == size
+    assert (tmp_path / MANIFEST_FILE).stat().st_size == size
     assert stored(tmp_path)["ended"]
 
 
@@ -158,4 +157,4 @@ def test_the_last_manifest_has_no_padding(tmp_path):
     for missing, padded in (({"page": "not written yet"}, True), ({}, False)):
         manifest.missing = missing
         manifest.end(tmp_path, Status.FINISHED)
-        assert (tmp_path / FILE_NAME).read_bytes().endswith(b" \n") is padded
+        assert (tmp_path / MANIFEST_FILE).read_bytes().endswith(b" \n") is padded

@@ -9,10 +9,10 @@ import math
 import pytest
 
 from reslrb_cli.errors import ConfigError
-from reslrb_cli.records import reading
+from reslrb_cli.records import measurement_files
 from reslrb_cli.records.checkpoint import save_checkpoint
+from reslrb_cli.records.measurement_files import read_lines
 from reslrb_cli.records.metrics import MetricsWriter, Record, read_metrics
-from reslrb_cli.records.reading import read_lines
 
 KEYS = [
     "iteration", "loss", "step_ms", "primal_ms", "adjoint_ms", "codegen_ms", "elapsed_s", "peak_mib", "spp", "lr",
@@ -121,9 +121,9 @@ def test_what_is_not_finite_or_no_line_is_told_when_a_file_is_read(tmp_path):
 def test_a_file_that_grows_too_large_while_it_is_read_is_refused(tmp_path, monkeypatch):
     file = tmp_path / "metrics.jsonl"
     file.write_text("{}\n" * 10)
-    monkeypatch.setattr(reading, "MOST_BYTES", 20)
+    monkeypatch.setattr(measurement_files, "MOST_BYTES", 20)
     with pytest.raises(ConfigError, match="has 30 B"):
         read_lines(file)
-    monkeypatch.setattr(reading, "open_file", lambda path, most: path.open("rb"))
+    monkeypatch.setattr(measurement_files, "open_file", lambda path, most: path.open("rb"))
     with pytest.raises(ConfigError, match="has more than 20 B"):
         read_lines(file)

@@ -8,7 +8,7 @@ import sys
 import pytest
 
 from reslrb_cli.records.manifest import versions
-from reslrb_cli.records.origin import Origin, read_origin
+from reslrb_cli.records.measurement_files import Origin, read_origin
 
 EMPTY = Origin(device="", variant="", command=[], versions={}, platform="", written="")
 

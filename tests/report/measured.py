@@ -6,11 +6,18 @@ import json
 
 import numpy as np
 
-from reslrb_cli.records.bench import BenchRecord, BenchStatus, Spread
-from reslrb_cli.records.gradcheck import GradcheckRecord, Kind, Reference, Verdict
-from reslrb_cli.records.layers import write_layers
-from reslrb_cli.records.missing import MissingRecord
-from reslrb_cli.records.origin import Origin
+from reslrb_cli.records.images import write_layers
+from reslrb_cli.records.measurement_files import Origin
+from reslrb_cli.records.measurements import (
+    BenchRecord,
+    BenchStatus,
+    GradcheckRecord,
+    Kind,
+    MissingRecord,
+    Reference,
+    Spread,
+    Verdict,
+)
 
 ORIGIN = Origin("a machine, 3 threads", "llvm_ad_rgb", ["reslrb", "bench", "my <box>.yaml"], {"mitsuba": "3.9.1"},
                 "Plan 9", "2026-01-02T03:04:05+00:00")  # fmt: skip

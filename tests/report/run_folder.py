@@ -8,11 +8,10 @@ import numpy as np
 from records.test_metrics import make_record
 
 from reslrb_cli.optimization.results import summary
-from reslrb_cli.records.images import write_image
+from reslrb_cli.records.images import write_image, write_mask, write_parameters
 from reslrb_cli.records.manifest import Manifest, Status
 from reslrb_cli.records.metrics import MetricsWriter
-from reslrb_cli.records.parameters import write_mask, write_parameters
-from reslrb_cli.report.error_map import write_error_map
+from reslrb_cli.report.tonemap import write_error_map
 
 FLOOR, LAMP = "floor.reflectance.data", "lamp.intensity.value"
 PILOT = {

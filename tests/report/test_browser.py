@@ -7,11 +7,10 @@ from report.chromium import Chromium, find_chromium
 from report.measured import write_bench, write_convergence, write_gradcheck, write_maps
 from report.run_folder import MEMORY, PILOT, SCALING, make_run
 
-import reslrb_cli.report.page as page_module
 from reslrb_cli.records.manifest import Status, read_manifest
-from reslrb_cli.report import write_report
-from reslrb_cli.report.page import write_page
-from reslrb_cli.report.seen.fill import with_seen_errors
+from reslrb_cli.report import page as page_module
+from reslrb_cli.report.page import write_page, write_report
+from reslrb_cli.report.perceptual import with_seen_errors
 from reslrb_cli.report.sources import read_sources
 
 LONG = "wall_of_the_north_western_corridor_behind_the_second_door_0123456789_" * 3 + ".brdf_0.reflectance.value"

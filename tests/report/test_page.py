@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 from report.run_folder import FLOOR, LAMP, MEMORY, PILOT, SCALING, make_run
 
-from reslrb_cli.records.layers import read_layers
+from reslrb_cli.records.images import read_layers
 from reslrb_cli.records.manifest import Status
 from reslrb_cli.report.page import render_page, write_report
 from reslrb_cli.report.page.values import parameter_table, texture_pictures
-from reslrb_cli.report.tone import exposure_for, exposure_words, shown_exposures
+from reslrb_cli.report.tonemap import exposure_for, exposure_words, shown_exposures
 
 
 class Page(html.parser.HTMLParser):

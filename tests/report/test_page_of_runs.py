@@ -10,7 +10,7 @@ from report.test_page import Page
 from report.test_several import lines_drawn
 
 from reslrb_cli.report.page import render
-from reslrb_cli.report.page.drawing import COLORS
+from reslrb_cli.report.page.markup import COLORS
 from reslrb_cli.report.sources import read_sources
 
 
@@ -32,7 +32,7 @@ def test_whole_runs(tmp_path):
 
 def test_curves_of_whole_runs_are_medians_with_bands_from_the_least_to_the_greatest(tmp_path, monkeypatch):
     drawn = []
-    monkeypatch.setattr("reslrb_cli.report.page.whole_runs.diagram", lambda curves, *_: drawn.append(curves) or "")
+    monkeypatch.setattr("reslrb_cli.report.page.measured.diagram", lambda curves, *_: drawn.append(curves) or "")
     (tmp_path / "c.jsonl").write_text("".join(json.dumps(line) + "\n" for line in runs_lines()))
     render(read_sources([tmp_path / "c.jsonl"]))
     losses, errors = drawn

@@ -9,10 +9,21 @@ import pytest
 from report.run_folder import FLOOR, LAMP, make_run, texture
 
 from reslrb_cli.records.images import read_exr
-from reslrb_cli.report.seen import flip, seen_errors
-from reslrb_cli.report.seen.colors import color_errors, is_color
-from reslrb_cli.report.seen.difference import WHITE, ciede2000, ciede2000_of_lab, itp, to_lab, told
-from reslrb_cli.report.seen.images import image_errors, psnr, ssim
+from reslrb_cli.report import perceptual
+from reslrb_cli.report.perceptual import (
+    WHITE,
+    ciede2000,
+    ciede2000_of_lab,
+    color_errors,
+    image_errors,
+    is_color,
+    itp,
+    psnr,
+    seen_errors,
+    ssim,
+    to_lab,
+    told,
+)
 
 #: From Sharma, Wu, Dalal 2005, Table 1: two colours in L*a*b* and their difference.
 SHARMA = [
@@ -133,7 +144,7 @@ def test_recovered_colours():
     assert not is_color("lens.translation", "length")
 
 
-needs_flip = pytest.mark.skipif(not flip.is_installed(), reason="flip-evaluator is not installed")
+needs_flip = pytest.mark.skipif(not perceptual.is_installed(), reason="flip-evaluator is not installed")
 
 
 @needs_flip
@@ -143,15 +154,15 @@ def test_flip_has_the_exposures_and_the_error_that_its_package_has():
     target = (texture(48, 40) ** 3) * np.float32(50)
     image = target * np.float32(1.2)
     _, mean, chosen = flip_evaluator.evaluate(target.copy(), image.copy(), "HDR", applyMagma=False)
-    low, high = flip.find_exposures(target)
+    low, high = perceptual.find_exposures(target)
     assert (low, high) == (
         pytest.approx(chosen["startExposure"], abs=0.01),
         pytest.approx(chosen["stopExposure"], abs=0.01),
     )
-    ours = flip.flip_map(image, target)
+    ours = perceptual.flip_map(image, target)
     assert ours.shape == (48, 40)
     assert ours.mean() == pytest.approx(mean, rel=0.02)
-    assert flip.flip_map(target, target).max() == 0
+    assert perceptual.flip_map(target, target).max() == 0
 
 
 @needs_flip
@@ -162,7 +173,7 @@ def test_flip_never_ends_the_process(kind):
     target[:4] = {"black": 0, "enormous": 1e38, "not finite": np.nan}.get(kind, 3)
     target = np.full_like(target, 2) if kind == "even" else target[:2, :3] if kind == "tiny" else target
     image = -target if kind == "negative" else target + np.float32(0.5)
-    error = flip.flip_map(image, target)
+    error = perceptual.flip_map(image, target)
     if kind in ("black", "not finite"):
         assert error is None
     else:
@@ -174,7 +185,7 @@ def test_flip_never_ends_the_process(kind):
 def test_without_its_package_flip_is_named_and_everything_else_is_there(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "flip_evaluator", None)
     found = seen_errors(make_run(tmp_path / "lamp"), {})
-    assert found["note"] == flip.MISSING
+    assert found["note"] == perceptual.MISSING
     assert "pip install reslrb[flip]" in found["note"]
     assert found["images"][""]["final"]["ssim"] > found["images"][""]["initial"]["ssim"]
     assert "flip" not in found["images"][""]["final"]

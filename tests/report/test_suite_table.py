@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from reslrb_cli.records.gradcheck import GradcheckRecord, Kind, Reference, Verdict
-from reslrb_cli.report.suite_table import suite_table
+from reslrb_cli.records.measurements import GradcheckRecord, Kind, Reference, Verdict
+from reslrb_cli.report.tables import suite_table
 
 
 def record(case: str, estimator: str, **figures: Any) -> GradcheckRecord:

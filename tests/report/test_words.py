@@ -7,9 +7,8 @@ import re
 import pytest
 
 from reslrb_cli.errors import printable
-from reslrb_cli.report.run_table import parameter_lines
-from reslrb_cli.report.verdict import last_line, warnings
-from reslrb_cli.report.words import count, duration, number, shorten, with_error
+from reslrb_cli.report.format import count, duration, number, shorten, with_error
+from reslrb_cli.report.run_summary import last_line, parameter_lines, warnings
 
 
 @pytest.mark.parametrize(

@@ -52,7 +52,7 @@ def resume(run: str) -> dict[str, object]:
     """Go on with a run, whose page is not drawn: that takes longer than all else."""
     from unittest.mock import patch
 
-    from reslrb_cli.recording import run as recording
+    from reslrb_cli.runs import recorder as recording
 
     with patch.object(recording, "write_report", lambda folder, *now: None):
         return call(["optimize", "--resume", run, "--quiet"])

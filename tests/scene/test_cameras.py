@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from cli.tiny import CONFIG, write_experiment
 
-from reslrb_cli.config import loads
+from reslrb_cli.config.loader import loads
 from reslrb_cli.errors import ConfigError
-from reslrb_cli.optimization import assemble
-from reslrb_cli.scene import load_scene
+from reslrb_cli.optimization.assemble import assemble
 from reslrb_cli.scene.cameras import read_cameras
+from reslrb_cli.scene.load import load_scene
 
 WIDTH, HEIGHT, FOCAL, CENTER = 40, 24, 50.0, (23.0, 9.0)
 #: A pose: from the axes x right, y down, z forward to the world.

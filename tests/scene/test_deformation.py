@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from reslrb_cli.config import ImageFile, ParameterSpec
+from reslrb_cli.config.parameters import ImageFile, ParameterSpec
 from reslrb_cli.errors import ConfigError
-from reslrb_cli.scene import select_parameters, set_values
+from reslrb_cli.scene.parameters import select_parameters, set_values
 
 WORDS = ["translation", "rotation", "scale"]
 MESH = "box.vertex_positions"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import mitsuba as mi
 import pytest
 
-from reslrb_cli.scene.depth import DEPTHS, LOST, find_depth
+from reslrb_cli.scene.visibility import DEPTHS, LOST, find_depth
 
 pytestmark = pytest.mark.usefixtures("llvm")
 

@@ -10,13 +10,14 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from reslrb_cli.config import ParameterSpec
+from reslrb_cli.config.parameters import ParameterSpec
 from reslrb_cli.errors import ConfigError
-from reslrb_cli.measure.statistics import compare
-from reslrb_cli.scene import Selection, load, select_parameters
-from reslrb_cli.scene.description import Description
-from reslrb_cli.scene.exporting import export_scene
+from reslrb_cli.measure.comparison import compare
+from reslrb_cli.scene import load
+from reslrb_cli.scene.export import export_scene
 from reslrb_cli.scene.load import load_described
+from reslrb_cli.scene.parameters import Selection, select_parameters
+from reslrb_cli.scene.xml.read import Description
 
 pytestmark = pytest.mark.usefixtures("llvm")
 
@@ -249,7 +250,7 @@ def test_what_cannot_be_said_is_refused_and_nothing_is_left(key: str, reason: st
 def test_what_mitsuba_reads_otherwise_is_refused_and_nothing_is_left(
     file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from reslrb_cli.scene.exporting import replacing
+    from reslrb_cli.scene import export as replacing
 
     write = replacing.write_file
     monkeypatch.setattr(replacing, "write_file", lambda path, image, linear: write(path, image[::-1], linear))

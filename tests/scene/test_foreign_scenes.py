@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from reslrb_cli.errors import ConfigError
-from reslrb_cli.scene import load_scene
+from reslrb_cli.scene.load import load_scene
 
 pytestmark = pytest.mark.usefixtures("llvm")
 

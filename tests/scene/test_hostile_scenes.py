@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from reslrb_cli.errors import ConfigError
-from reslrb_cli.scene import load_scene
-from reslrb_cli.scene.description import reading
+from reslrb_cli.scene.load import load_scene
+from reslrb_cli.scene.xml import read
 
 pytestmark = pytest.mark.usefixtures("llvm")
 
@@ -172,12 +172,12 @@ def test_what_is_no_regular_file(tmp_path):
 
 
 def test_files_are_bounded_together(tmp_path, monkeypatch):
-    monkeypatch.setattr(reading, "MAX_BYTES", 3000)
+    monkeypatch.setattr(read, "MAX_BYTES", 3000)
     write(tmp_path, f'<scene version="3.0.0"><!-- {"x" * 1000} --></scene>', "part.xml")
     file = write(tmp_path, HEAD + '<include filename="part.xml"/>\n' * 9 + "</scene>")
     with pytest.raises(ConfigError, match=f"{file}:4: includes {tmp_path}/part.xml, which is too large: a scene"):
         load_scene(file)
-    monkeypatch.setattr(reading, "MAX_BYTES", 10)
+    monkeypatch.setattr(read, "MAX_BYTES", 10)
     with pytest.raises(ConfigError, match=f"{file}: has .* B are not read"):
         load_scene(file)
 

@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 
 from reslrb_cli.errors import ConfigError, OutOfMemory
-from reslrb_cli.scene import image_file, read_image
-from reslrb_cli.scene.image_file import orientation_of, read_bitmap, read_upright
+from reslrb_cli.scene import images
+from reslrb_cli.scene.images import orientation_of, read_bitmap, read_image, read_upright
 
 pytestmark = pytest.mark.usefixtures("llvm")
 
@@ -104,7 +104,7 @@ def test_what_libjpeg_says_is_heard_where_standard_error_is_closed(tmp_path, mon
     def closed(_number):
         raise OSError(9, "Bad file descriptor")
 
-    monkeypatch.setattr(image_file.os, "dup", closed)
+    monkeypatch.setattr(images.os, "dup", closed)
     assert read_image(path).shape == (96, 128, 3)
 
 
@@ -143,7 +143,7 @@ def exr(right, bottom):
 def test_what_says_that_it_is_huge_is_not_decoded(tmp_path, monkeypatch, name, data):
     path = tmp_path / name
     path.write_bytes(data)
-    monkeypatch.setattr(image_file, "mi", None)  # so that nothing can be
+    monkeypatch.setattr(images, "mi", None)  # so that nothing can be
     assert refused(path) == "is 60000x60000 pixels; more than 134217728 are not read"
     assert refused(path, size=(6, 4)) == "is 60000x60000 pixels; it must be 6x4"
 
@@ -170,7 +170,7 @@ def test_heads_that_say_nothing(tmp_path, data):
 
 
 def test_a_jpeg_of_empty_parts_takes_no_time(tmp_path, monkeypatch):
-    monkeypatch.setattr(image_file, "_MOST_PARTS", 1000)
+    monkeypatch.setattr(images, "_MOST_PARTS", 1000)
     path = tmp_path / "a.jpg"
     path.write_bytes(b"\xff\xd8" + b"\xff\xe0\0\x02" * 2000)
     assert refused(path).startswith("is not an image")
@@ -197,7 +197,7 @@ def test_an_allocation_that_fails_is_no_damage(tmp_path, monkeypatch):
     path = tmp_path / "a.png"
     path.write_bytes(png(2, 2, bytes(14)))
     assert read_bitmap(path).width() == 2
-    monkeypatch.setattr(image_file, "mi", Full())
+    monkeypatch.setattr(images, "mi", Full())
     with pytest.raises((MemoryError, OutOfMemory)):
         read_bitmap(path)
 
@@ -224,8 +224,8 @@ def test_the_lines_of_a_radiance_image_are_looked_at_before_they_are_decoded(wid
     ):
         path.write_bytes(data[:place] + there + data[place + 1 :])
         assert refused(path).startswith(("is cut off", "is damaged or cut off"))
-        with pytest.raises(image_file.DamagedImage):
-            image_file.image_size(path)
+        with pytest.raises(images.DamagedImage):
+            images.image_size(path)
 
 
 # --- EXIF -------------------------------------------------------------------------------------------------------------

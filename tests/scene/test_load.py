@@ -8,11 +8,12 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from reslrb_cli.config import ParameterSpec
+from reslrb_cli.config.parameters import ParameterSpec
 from reslrb_cli.errors import ConfigError
-from reslrb_cli.scene import list_parameters, load_scene, select_parameters
-from reslrb_cli.scene.description import sizes
-from reslrb_cli.scene.load import warn_once
+from reslrb_cli.scene.catalog import list_parameters
+from reslrb_cli.scene.load import load_scene, warn_once
+from reslrb_cli.scene.parameters import select_parameters
+from reslrb_cli.scene.xml import check
 
 pytestmark = pytest.mark.usefixtures("llvm")
 
@@ -257,7 +258,7 @@ def test_nothing_is_built_anew_where_nothing_of_few_bits_is_selected(walls):
 @pytest.mark.parametrize("walls", ["RGB"], indirect=True)
 def test_floats_that_are_more_than_is_free_are_refused(walls, monkeypatch):
     """What is free holds the texture with 8 bits, and not as floats."""
-    monkeypatch.setattr(sizes, "free_bytes", lambda variant: 64 * 64 * 11)
+    monkeypatch.setattr(check, "free_bytes", lambda variant: 64 * 64 * 11)
     load_scene(walls, keys=["wall.*"])
     with pytest.raises(ConfigError, match=r"scene.xml:\d+: filename: .*other.png is 64x64 pixels, which take 48 KiB"):
         load_scene(walls, keys=["*.reflectance.data"])

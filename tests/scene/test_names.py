@@ -12,7 +12,7 @@ from cli.calling import reslrb
 
 import reslrb_cli
 from reslrb_cli.errors import ConfigError
-from reslrb_cli.scene import load_scene
+from reslrb_cli.scene.load import load_scene
 
 pytestmark = pytest.mark.usefixtures("llvm")
 

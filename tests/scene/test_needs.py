@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from reslrb_cli.errors import UnsupportedScene
-from reslrb_cli.scene import check_camera_paths, check_supported, look, scene_needs, summarise
-from reslrb_cli.scene.needs import light_obstacle
+from reslrb_cli.scene.catalog import summarise
+from reslrb_cli.scene.needs import check_camera_paths, check_supported, light_obstacle, look, scene_needs
 
 GLASS = {"type": "dielectric"}
 

@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from reslrb_cli.config import ImageFile, ParameterSpec
+from reslrb_cli.config.parameters import ImageFile, ParameterSpec
 from reslrb_cli.errors import ConfigError
-from reslrb_cli.scene import list_parameters, select_parameters
+from reslrb_cli.scene.catalog import list_parameters
+from reslrb_cli.scene.parameters import select_parameters
 
 TEXTURE = "floor.reflectance.data"
 LAMP = "lamp.intensity.value"

@@ -8,9 +8,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from reslrb_cli.scene import read_image
-from reslrb_cli.scene.photograph import open_photograph, write_smaller
-from reslrb_cli.scene.target import decode_srgb
+from reslrb_cli.scene.images import decode_srgb, read_image
+from reslrb_cli.scene.proposal import open_photograph, write_smaller
 
 pytestmark = pytest.mark.usefixtures("llvm")
 

@@ -10,9 +10,9 @@ from pathlib import Path
 import pytest
 
 from reslrb_cli.backend import plugins
-from reslrb_cli.backend.python import python_command
+from reslrb_cli.backend.installation import python_command
 from reslrb_cli.errors import ConfigError
-from reslrb_cli.scene import load_scene
+from reslrb_cli.scene.load import load_scene
 
 pytestmark = pytest.mark.usefixtures("llvm")
 

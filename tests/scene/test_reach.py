@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from reslrb_cli.scene import visible_texels
+from reslrb_cli.scene.visibility import visible_texels
 
 KEY = "floor.reflectance.data"
 

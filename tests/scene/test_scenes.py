@@ -9,16 +9,11 @@ import numpy as np
 import pytest
 from turns import a_few
 
-from reslrb_cli.config import load
-from reslrb_cli.scene import (
-    check_supported,
-    load_scene,
-    look,
-    scene_needs,
-    select_parameters,
-    set_values,
-    visible_texels,
-)
+from reslrb_cli.config.loader import load
+from reslrb_cli.scene.load import load_scene
+from reslrb_cli.scene.needs import check_supported, look, scene_needs
+from reslrb_cli.scene.parameters import select_parameters, set_values
+from reslrb_cli.scene.visibility import visible_texels
 
 ROOT = Path(__file__).resolve().parents[2]
 NAMES = ("cornell_floor", "grey_room", "caustic_slab", "furnace", "lens_pose", "caustic_heightmap")

@@ -6,7 +6,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from reslrb_cli.scene.seen import SeenSpecular, sees_lamps, sees_specular
+from reslrb_cli.scene.visibility import SeenSpecular, sees_lamps, sees_specular
 
 #: Columns of a film of 16x8 pixels, in a view of 4 by 2, that a pane from 0 to 1 covers.
 COVERED = slice(8, 12)

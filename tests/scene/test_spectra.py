@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from reslrb_cli.errors import ConfigError
-from reslrb_cli.scene import list_parameters, load_scene
+from reslrb_cli.scene.catalog import list_parameters
+from reslrb_cli.scene.load import load_scene
 
 pytestmark = pytest.mark.usefixtures("llvm")
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from reslrb_cli.errors import ConfigError
-from reslrb_cli.scene import read_image
+from reslrb_cli.scene.images import read_image
 
 pytestmark = pytest.mark.usefixtures("llvm")
 

@@ -7,8 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from reslrb_cli.scene import load_scene
-from reslrb_cli.scene.load import warn_once
+from reslrb_cli.scene.load import load_scene, warn_once
 
 OFFSET = 8.94e-5 * (1 + 3)  # of a ray, where the slab is
 

@@ -6,19 +6,34 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from reslrb_cli.measure.comparison import ROUNDING, TAIL, Comparison, Family, compare_expectations, tail_weight
-from reslrb_cli.measure.convergence.curves import FEWEST, Estimate, Reference, Samples
-from reslrb_cli.measure.convergence.members import Member, Role
-from reslrb_cli.measure.convergence.plan import ALL, IMAGES
+from reslrb_cli.measure.comparison import (
+    ROUNDING,
+    TAIL,
+    Comparison,
+    Family,
+    compare_expectations,
+    entry_count,
+    tail_weight,
+)
 from reslrb_cli.measure.convergence.session import Session
-from reslrb_cli.measure.entries import entry_count
-from reslrb_cli.records.bench import BenchStatus
-from reslrb_cli.records.convergence import TARGETS, MethodRecord, PointRecord, Range, ReferenceRecord
-from reslrb_cli.records.gradcheck import Verdict
+from reslrb_cli.measure.convergence.setup import Member, Role
+from reslrb_cli.measure.convergence.statistics import FEWEST, Estimate, Reference, Samples
+from reslrb_cli.measure.methods import ALL, IMAGES
+from reslrb_cli.records.measurements import (
+    TARGETS,
+    BenchStatus,
+    MethodRecord,
+    PointRecord,
+    Range,
+    ReferenceRecord,
+    Verdict,
+)
 
 #: What a stock integrator differs by on the same paths, relative to the entries: whether a point is visible is another
 #: matter of rounding to each.
 STOCK_ROUNDING = 1e-3
+
+
 #: What is said of noise with heavy tails.
 HEAVY = "single steps carry the variance: intervals are too narrow, and more steps may show more"
 

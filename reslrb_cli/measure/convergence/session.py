@@ -2,42 +2,132 @@
 
 A drift of the machine so hits all alike. What errors are taken from takes its turns too, and so does what biases are
 judged by, where it is not among what is compared. All have seeds of their own: no two share noise.
+
+Going on from the steps that an earlier session of a `convergence` has taken, with the same dL/dI.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from reslrb_cli.config import Config, dump
+from reslrb_cli.config.loader import dump
+from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ExitCode
-from reslrb_cli.measure.cases import Case
-from reslrb_cli.measure.contestant import Contestant
-from reslrb_cli.measure.convergence.curves import FEWEST, FEWEST_FOR_SLOPE
-from reslrb_cli.measure.convergence.members import Member, Role, share_turns
-from reslrb_cli.measure.convergence.plan import Plan
-from reslrb_cli.measure.convergence.resuming import kept, restore, restore_facts, settings
-from reslrb_cli.measure.earlier import Earlier
-from reslrb_cli.measure.pace import Pace
-from reslrb_cli.measure.processes import Refused, Stopped
+from reslrb_cli.measure import resume_store
+from reslrb_cli.measure.convergence.setup import Member, Role, share_turns
+from reslrb_cli.measure.convergence.statistics import FEWEST, FEWEST_FOR_SLOPE
+from reslrb_cli.measure.methods import Case, Plan
+from reslrb_cli.measure.processes import Ended, Refused, Stopped
+from reslrb_cli.measure.resume_store import Earlier
 from reslrb_cli.measure.tasks import start_process
-from reslrb_cli.records.bench import BenchStatus
+from reslrb_cli.measure.workers import Contestant, Pace
+from reslrb_cli.records.measurement_files import Kept
+from reslrb_cli.records.measurements import BenchStatus
+
+#: What is kept says that it is of this.
+KIND = "convergence"
+
+
+def settings(plan: Plan, device: str = "") -> dict[str, Any]:
+    """What has to be the same in all sessions."""
+    return resume_store.settings(
+        plan.config,
+        plan.variant,
+        device,
+        objective=plan.objective,
+        integrators=[case.label for case in plan.cases],
+        reference=plan.reference.label,
+        spp=list(plan.spps),
+        **{"memory limit": plan.memory_limit},
+    )
+
+
+def check(plan: Plan, before: Earlier, device: str = "") -> None:
+    """Raise ConfigError where a session cannot go on from an earlier one, or has nothing to add to it."""
+    before.check(settings(plan, device))
+    if plan.rounds is not None and before.head["rounds"] >= plan.rounds:
+        rounds = before.head["rounds"]
+        raise before.complete(f"{rounds} rounds", "more with --rounds")
+
+
+def restore_facts(before: Earlier, arrays_file: Path) -> dict[str, Any]:
+    """The survey's facts; its arrays are written to `arrays_file`."""
+    found = {name.removeprefix("survey/"): a for name, a in before.arrays.items() if name.startswith("survey/")}
+    np.savez(arrays_file, **found)  # type: ignore[arg-type]
+    facts: dict[str, Any] = before.head["facts"]
+    return facts
+
+
+def restore(before: Earlier, members: list[Member]) -> int:
+    """Hand the members their steps; returns the number of rounds. Raises ConfigError where they are others.
+
+    One whose process has ended, or refused, is not asked again.
+    """
+    entries = before.head["members"]
+    if [name_of(member) for member in members] != [entry["name"] for entry in entries]:
+        raise before.other("its methods are others: " + ", ".join(entry["name"] for entry in entries))
+    for number, (member, entry) in enumerate(zip(members, entries, strict=True)):
+        if entry["config"] != dump(member.config):
+            raise before.other(f"its settings are not those of {member.label} here")
+        member.taken, member.turns, member.seconds = entry["taken"], entry["turns"], entry["seconds"]
+        member.message, member.cold = entry["message"], entry["cold"]
+        member.rows = list(before.arrays[f"rows/{number}"])
+        member.end = Ended.restored(entry["end"])
+        if member.end is not None:
+            member.process.close()
+    rounds: int = before.head["rounds"]
+    return rounds
+
+
+def name_of(member: Member) -> str:
+    """A member's role and label."""
+    return f"{member.role.value} {member.label}"
+
+
+def kept(
+    settings: Mapping[str, Any], facts: dict[str, Any], arrays_file: Path, members: list[Member], rounds: int
+) -> Kept:
+    """What a later session needs to go on: a head that JSON can hold, and arrays."""
+    with np.load(arrays_file) as survey:
+        arrays = {f"survey/{name}": survey[name] for name in survey.files}
+    entries = []
+    for number, member in enumerate(members):
+        # A round that was broken off is not: the next session begins it anew, with other seeds.
+        turns = [turn for turn in member.turns if turn < rounds]
+        entries.append({"name": name_of(member), "config": dump(member.config), "taken": member.taken,
+                        "turns": turns, "seconds": member.seconds[: len(set(turns))], "message": member.message,
+                        "cold": member.cold, "end": member.end and member.end.kept()})  # fmt: skip
+        arrays[f"rows/{number}"] = np.array(member.rows[: len(turns)], np.float32)
+    return resume_store.head(KIND, settings, facts=facts, rounds=rounds, members=entries), arrays
+
 
 #: What the samples of all together may take in memory, in bytes.
 MEMORY = 2**30
+
+
 #: The most rounds.
 MOST_ROUNDS = 256
+
+
 #: Share of the budget, and seconds beside it, that are left for the statistics and the picture.
 AFTERWARDS, AFTERWARDS_S = 0.03, 2.0
+
+
 #: Where all together hold more than this share of the memory, each releases its own after a step.
 MEMORY_SHARE = 0.7
+
+
 MIB = 2**20
+
+
 #: Light paths of a step of an independent reference, whose samples per pixel are its own: naive AD keeps all paths.
 INDEPENDENT_PATHS = 2**18
+
 
 #: Starts a process by its first message and the name of what it does, a function of `tasks.py`.
 Start = Callable[[dict[str, Any], str], Any]

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 
-from reslrb_cli.measure.extreme import colours, films, glass, lights, losses, motion, places, roughness, unfound
-from reslrb_cli.measure.extreme.case import ExtremeCase
-from reslrb_cli.measure.extreme.runner import run_cases
-from reslrb_cli.records.gradcheck import GradcheckRecord
+from reslrb_cli.measure.extreme import geometry, light
+from reslrb_cli.measure.extreme.suite import ExtremeCase, run_cases
+from reslrb_cli.records.measurements import GradcheckRecord
 
 
 def registry(cases: Iterable[ExtremeCase]) -> dict[str, ExtremeCase]:
@@ -22,15 +21,15 @@ def registry(cases: Iterable[ExtremeCase]) -> dict[str, ExtremeCase]:
 
 CASES = registry(
     [
-        *colours.CASES,
-        *lights.CASES,
-        *places.CASES,
-        *roughness.CASES,
-        *films.CASES,
-        *glass.CASES,
-        *losses.CASES,
-        *motion.CASES,
-        *unfound.CASES,
+        *light.COLOURS_CASES,
+        *light.LIGHTS_CASES,
+        *geometry.PLACES_CASES,
+        *geometry.ROUGHNESS_CASES,
+        *light.FILMS_CASES,
+        *geometry.GLASS_CASES,
+        *light.LOSSES_CASES,
+        *geometry.MOTION_CASES,
+        *light.UNFOUND_CASES,
     ]
 )
 

@@ -8,12 +8,16 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from reslrb_cli.records.atomic import write_atomically
 from reslrb_cli.report.page.markup import document, section
+from reslrb_cli.report.page.measured import several_parts
 from reslrb_cli.report.page.run import guarded, header, run_parts
-from reslrb_cli.report.page.several import several_parts
 from reslrb_cli.report.sources import Run, Source, read_run
-from reslrb_cli.report.tone import Array
+
+Array = np.ndarray[Any, Any]
+
 
 #: Seconds after which the page of a run that is still at work loads itself again.
 REFRESH_SECONDS = 5

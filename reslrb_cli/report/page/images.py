@@ -1,24 +1,244 @@
-"""The images on the page: start, end, target and maps of every sensor."""
+"""The images on the page: start, end, target and maps of every sensor.
+
+Arrays of linear values as pictures that a page holds in itself.
+
+Maps of gradients of textures: the gradient, its reference, and their difference in standard errors.
+
+What of every view counts: its share of the loss, its exposure, and the pixels that are left out.
+
+Errors as people see them, as tables: of images, and of recovered colours.
+"""
 
 from __future__ import annotations
 
+import base64
+import io
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from reslrb_cli.records.images import load_image
-from reslrb_cli.report.error_map import color_stops, colored, read_comparison, signed_end
-from reslrb_cli.report.page.markup import figure, figures, text
-from reslrb_cli.report.page.pictures import Array, embed, fit, show
+from reslrb_cli.optimization.targets import WORDS
+from reslrb_cli.records.images import load_image, read_layers
+from reslrb_cli.report.format import number
+from reslrb_cli.report.page.markup import breakable, figure, figures, soft, table, text
 from reslrb_cli.report.sources import Run
-from reslrb_cli.report.tone import exposure_for, exposure_words, shown_exposures
-from reslrb_cli.report.words import number
+from reslrb_cli.report.tonemap import (
+    color_stops,
+    colored,
+    encode,
+    exposure_for,
+    exposure_words,
+    read_comparison,
+    shown_exposures,
+    signed_end,
+)
+
+Array = np.ndarray[Any, Any]
+
+
+#: Pixels of a picture's longer side, at most: a page is sent around.
+MOST_PIXELS = 640
+
+
+#: A picture with fewer pixels at its longer side is shown with squares for pixels.
+FEW_PIXELS = 256
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A picture as a `data:` address, with its size, (width, height), in its own pixels."""
+
+    uri: str
+    size: tuple[int, int]
+
+    @property
+    def smooth(self) -> bool:
+        """Whether it has pixels enough to be enlarged smoothly."""
+        return max(self.size) >= FEW_PIXELS
+
+
+def show(values: Array, exposure: float = 1.0) -> Picture:
+    """Linear values (H, W, C) times `exposure` as an sRGB picture; fewer channels than three are shown as grey."""
+    values = fit(np.nan_to_num(values[:, :, :3] if values.shape[2] >= 3 else values[:, :, :1], posinf=1e30))
+    encoded = np.round(255 * encode(np.clip(values * exposure, 0.0, 1.0))).astype(np.uint8)
+    return embed(_png(np.broadcast_to(encoded, (*encoded.shape[:2], 3))), encoded.shape)
+
+
+def embed(png: bytes, shape: tuple[int, ...]) -> Picture:
+    """A PNG of an array of `shape`, (H, W, ...)."""
+    return Picture(f"data:image/png;base64,{base64.b64encode(png).decode()}", (shape[1], shape[0]))
+
+
+def fit(values: Array) -> Array:
+    """`values` (H, W, C), shrunk to `MOST_PIXELS` where they are more."""
+    together = max(values.shape[:2]) // MOST_PIXELS
+    if together > 1:  # means of whole blocks first, since resampling smooths at the size that there is
+        rows, columns = (max(size // together, 1) for size in values.shape[:2])
+        blocks = values[: rows * together, : columns * together]
+        values = blocks.reshape(rows, -1, columns, blocks.shape[1] // columns, values.shape[2]).mean(axis=(1, 3))
+    longest = max(values.shape[:2])
+    if longest <= MOST_PIXELS:
+        return values
+    from reslrb_cli.scene.values import resample
+
+    height, width = (max(round(size * MOST_PIXELS / longest), 1) for size in values.shape[:2])
+    return resample(values, (width, height))
+
+
+def _png(pixels: Array) -> bytes:
+    from matplotlib.image import imsave
+
+    buffer = io.BytesIO()
+    imsave(buffer, np.ascontiguousarray(pixels), format="png")
+    return buffer.getvalue()
+
+
+#: z at the ends of the scale.
+MOST_Z = 5.0
+
+
+#: Maps on a page, at most: of a folder with more, the first.
+MOST_MAPS = 40
+
+
+def gradient_maps(paths: Sequence[Path]) -> str:
+    """A row for each file of layers; of both gradients the sum over channels, on one scale."""
+    rows = []
+    for path in paths[:MOST_MAPS]:
+        try:
+            layers = read_layers(path)
+        except (OSError, ValueError):
+            rows.append(f"<h3>{breakable(path.stem)}</h3>" + soft("This file is damaged."))
+            continue
+        sums = {name: np.nan_to_num(layers[name].astype(np.float64)).sum(-1, keepdims=True)
+                for name in ("gradient", "reference", "z")}  # fmt: skip
+        end = signed_end(np.stack([sums["gradient"], sums["reference"]]))
+        shown = [
+            map_figure(sums["gradient"], end, "gradient", "<b>gradient</b>, sum over channels", signed=True),
+            map_figure(sums["reference"], end, "reference", "<b>reference</b>, sum over channels", signed=True),
+            map_figure(sums["z"], MOST_Z, "z", "<b>difference</b> in standard errors", signed=True),
+        ]
+        rows.append(f"<h3>{breakable(path.stem)}</h3>{figures(shown)}")
+    if len(paths) > MOST_MAPS:
+        rows.append(soft(f"{len(paths) - MOST_MAPS} more maps are not shown."))
+    return "".join(rows)
+
+
+def view_table(views: Sequence[Mapping[str, Any]] | None, results: Mapping[str, Any]) -> str:
+    """A row for each view, and the loss of those that are held out.
+
+    Nothing where there is but one, of which every pixel counts alike as it is.
+    """
+    if not views or (len(views) == 1 and not _is_special(views[0])):
+        return ""
+    cells = [
+        [
+            text(view["sensor"]),
+            "held out" if view["held_out"] else text(number(view["share"])),
+            text(_exposure(view, results)),
+            text(f"{view['left_out']} of {view['pixels']}"),
+            text("; ".join(_kinds(view))),
+        ]
+        for view in views
+    ]
+    held_out = results.get("held_out") or {}
+    losses = " → ".join(number(held_out[moment]) for moment in ("initial", "final") if moment in held_out)
+    words = soft(f"Loss of the views that are held out: {losses}.") if losses else ""
+    return table(("sensor", "share of the loss", "exposure", "pixels left out", "of which"), cells) + words
+
+
+def _is_special(view: Mapping[str, Any]) -> bool:
+    return bool(view["left_out"] or view["kinds"] or view["counted"] or view["exposure"] != 1)
+
+
+def _exposure(view: Mapping[str, Any], results: Mapping[str, Any]) -> str:
+    """The number, or what was recovered."""
+    exposure = view["exposure"]
+    if not isinstance(exposure, str):
+        return number(exposure)
+    final = ((results.get("parameters") or {}).get(exposure) or {}).get("final") or {}
+    value = final.get("value")
+    values = value if isinstance(value, list) else [value]
+    return "recovered" if value is None else f"{', '.join(map(number, values))} (recovered)"
+
+
+def _kinds(view: Mapping[str, Any]) -> list[str]:
+    left_out = [f"{count} {WORDS[kind]}" for kind, count in view["kinds"].items()]
+    return left_out + [f"{count} {WORDS[kind]} and stay" for kind, count in view["counted"].items()]
+
+
+_HEAD = ("image", "PSNR", "SSIM", "CIEDE2000", "ΔE ITP", "HDR-FLIP", "|image − target|")
+
+
+_TOLD = "Each line: mean; median, 95 %, 99 % of the pixels or texels are below; the greatest."
+
+
+_MEASURES = {"ciede2000": "CIEDE2000", "itp": "ΔE ITP"}
+
+
+def seen_tables(runs: Sequence[Run]) -> str:
+    """The errors of the images and colours of runs, a line for each at the start and at the end."""
+    rows: list[list[str]] = []
+    colors: list[list[str]] = []
+    notes, several = [], len(runs) > 1
+    for run in runs:
+        seen = run.results.get("seen") or {}
+        before = f"{breakable(run.name)} " if several else ""
+        for suffix, about in (seen.get("images") or {}).items():
+            sensor = f"sensor {suffix[1:]}, " if suffix else ""
+            rows += [_image_row(f"{before}{text(sensor)}{title}", about[moment]) for title, moment in _moments(about)]
+        for key, about in (seen.get("colors") or {}).items():
+            measure = _MEASURES.get(about.get("measure"), "")
+            pair = [_spread(about.get(moment)) for moment in ("initial", "final")]
+            colors.append([f"{before}{breakable(key)}", text(measure), *pair])
+        notes += [seen["note"]] if seen.get("note") and seen["note"] not in notes else []
+    if not rows and not colors:
+        return ""
+    drop = 5 if rows and not any(row[5] for row in rows) else None  # no column for what nobody measured
+    head = [title for place, title in enumerate(_HEAD) if place != drop]
+    shown = [[cell for place, cell in enumerate(row) if place != drop] for row in rows]
+    parts = [table(head, shown, "spreads"), table(("colour", "in", "start", "end"), colors, "spreads")]
+    return "".join(parts) + soft(_TOLD) + "".join(map(soft, notes))
+
+
+def _moments(about: Mapping[str, Any]) -> list[tuple[str, str]]:
+    return [(title, moment) for title, moment in (("start", "initial"), ("end", "final")) if moment in about]
+
+
+def _image_row(markup: str, errors: Mapping[str, Any]) -> list[str]:
+    ratio = errors.get("psnr_db")
+    psnr = f"{number(ratio, 4)} dB" if ratio is not None else "∞"
+    bad = errors.get("not_finite")
+    note = f'<br><span class="worse small">{text(bad)} pixels not finite</span>' if bad else ""
+    ssim = errors.get("ssim")
+    spreads = [_spread(errors.get(name)) for name in ("ciede2000", "itp", "flip", "absolute")]
+    return [
+        markup + note,
+        f'<span class="number">{text(psnr)}</span>',
+        "too small" if ssim is None else text(number(ssim, 4)),
+        *spreads,
+    ]
+
+
+def _spread(told: Mapping[str, float] | None) -> str:
+    """Mean, percentiles and maximum, in two lines; where all are the same, that."""
+    if not told:
+        return ""
+    if told["mean"] == told["max"]:
+        return text(number(told["max"], 3))
+    shown = {name: f'<span class="number">{text(number(value, 3))}</span>' for name, value in told.items()}
+    rest = " ".join(shown[name] for name in ("p50", "p95", "p99", "max") if name in shown)
+    return f'{shown["mean"]}<br><span class="soft small">{rest}</span>'
+
 
 #: Images between the first and the last that are shown of a sensor, at most.
 MOST_BETWEEN = 12
+
+
 _OF_A_SENSOR = re.compile(r"(?:initial|final|target)(-\d+)?\.exr")
 
 

@@ -1,24 +1,423 @@
-"""What a page shows of a file of measurements, by the command that wrote it, and of a folder of maps."""
+"""What a page shows of a file of measurements, by the command that wrote it, and of a folder of maps.
+
+What `bench` measured: time and memory of a step against what was varied, and all of it as a table.
+
+What `convergence` measured: error against run time, by method.
+
+What `convergence --runs` measured: whole optimisations against run time, medians and bands over the seeds.
+
+What a page shows of several runs and measurements: what can be compared in one picture, then each by itself.
+"""
 
 from __future__ import annotations
 
+import statistics
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Any
 
-from reslrb_cli.records.gradcheck import Verdict
-from reslrb_cli.records.measured import gradcheck_record, missing_record
-from reslrb_cli.report.gradcheck_table import HEAD, cells, failure_line, summary_lines
-from reslrb_cli.report.page.bench import bench
-from reslrb_cli.report.page.convergence import convergence
-from reslrb_cli.report.page.facts import origin_facts
-from reslrb_cli.report.page.maps import gradient_maps
-from reslrb_cli.report.page.markup import breakable, note, soft, table, text
-from reslrb_cli.report.sources import Maps, Measurements
-from reslrb_cli.report.words import count
+from reslrb_cli.records.measurements import Verdict, gradcheck_record, missing_record
+from reslrb_cli.report.format import count, duration, number
+from reslrb_cli.report.page.images import gradient_maps, image_rows, seen_tables
+from reslrb_cli.report.page.markup import (
+    Curve,
+    breakable,
+    diagram,
+    diagrams,
+    folded,
+    legend,
+    mark,
+    note,
+    soft,
+    table,
+    text,
+)
+from reslrb_cli.report.page.run import StepParts, bars, guarded, origin_facts, problems, record_parts
+from reslrb_cli.report.page.values import convergence_of_all, parameter_table, texture_pictures
+from reslrb_cli.report.run_summary import worst
+from reslrb_cli.report.sources import Maps, Measurements, Run, Source
+from reslrb_cli.report.tables import HEAD, cells, failure_line, summary_lines
+
+Entry = Mapping[str, Any]
+
+
+#: What can be varied: its name in the records, in words, and what they are called where they are fixed.
+SWEPT = {"max_depth": "path depth", "spp": "samples per pixel", "pixels": "pixels of the film", "texels": "texels"}
+
+
+_ENDED = {"out_of_memory": "out of memory", "failed": "failed"}
+
+
+def bench(objects: Sequence[Entry]) -> tuple[str, int]:
+    """Diagrams and a table; and how many lines are no records of a bench."""
+    entries = [_with_sizes(entry) for entry in objects if "integrator" in entry and "status" in entry]
+    labels = list(dict.fromkeys(map(label, entries)))
+    varied = [name for name in SWEPT if len({entry[name] for entry in entries if entry.get(name)}) > 1] or ["max_depth"]
+    parts = [legend([Curve(name, (), (), place) for place, name in enumerate(labels)])]
+    for name in varied:
+        chosen = [
+            entry for entry in entries if all(_is_usual(entry, other, entries) for other in varied if other != name)
+        ]
+        curves = [_curves(chosen, labels, name, what) for what in ("step_ms", "peak_mib")]
+        drawn = zip(curves, ("time of a step (ms)", "peak memory (MiB)"), strict=True)
+        parts.append(diagrams(*(diagram(made, SWEPT[name], axis, log_x=2) for made, axis in drawn)))
+        others = [f"{SWEPT[other]} {number(_usual(other, entries))}" for other in varied if other != name]
+        parts.append(soft(f"At {', '.join(others)}." if others else ""))
+    parts += [soft(_conditions(entries, varied)), _bench_table(entries, labels, varied)]
+    return "".join(parts), len(objects) - len(entries)
+
+
+def label(entry: Entry) -> str:
+    """What names an integrator with what makes it another than by default, `reslrb:reservoir, capacity 4`."""
+    parts = ":".join(str(entry[name]) for name in ("integrator", "estimator") if entry.get(name))
+    return parts + (f", capacity {entry['capacity']}" if entry.get("capacity") not in (None, 1) else "")
+
+
+def _with_sizes(entry: Entry) -> dict[str, Any]:
+    width, height = entry.get("width"), entry.get("height")
+    pixels = width * height if isinstance(width, int) and isinstance(height, int) else None
+    return {"pixels": pixels, "texels": entry.get("texels")} | dict(entry)
+
+
+def _usual(name: str, entries: Sequence[Entry]) -> Any:
+    """The value that most of the records have."""
+    values = [entry[name] for entry in entries if entry.get(name)]
+    return max(dict.fromkeys(values), key=values.count) if values else None
+
+
+def _is_usual(entry: Entry, name: str, entries: Sequence[Entry]) -> bool:
+    return bool(entry.get(name) == _usual(name, entries))
+
+
+def _curves(entries: Sequence[Entry], labels: Sequence[str], abscissa: str, what: str) -> list[Curve]:
+    curves = []
+    for place, name in enumerate(labels):
+        rows = [entry for entry in entries if label(entry) == name and entry.get("step_ms") and entry.get(abscissa)]
+        rows.sort(key=lambda entry: entry[abscissa])
+        xs = [entry[abscissa] for entry in rows]
+        if what == "peak_mib":
+            curves.append(Curve(name, xs, [entry.get(what) for entry in rows], place, points=True))
+        else:
+            low, median, high = ([entry[what][end] for entry in rows] for end in ("min", "median", "max"))
+            curves.append(Curve(name, xs, median, place, (low, high), points=True))
+    return curves
+
+
+def _conditions(entries: Sequence[Entry], varied: Sequence[str]) -> str:
+    fixed = [f"{SWEPT[name]} {number(_usual(name, entries))}" for name in SWEPT
+             if name not in varied and _usual(name, entries)]  # fmt: skip
+    words = f"Fixed: {', '.join(fixed)}. " if fixed else ""
+    return f"{words}Medians; bands and brackets go from the least to the greatest."
+
+
+def _bench_table(entries: Sequence[Entry], labels: Sequence[str], varied: Sequence[str]) -> str:
+    head = (
+        ["integrator"] + [SWEPT[name] for name in varied] + ["step", "kernels", "first step", "peak memory", "scratch"]
+    )
+    rows = []
+    for entry in sorted(entries, key=lambda entry: [entry.get(name) or 0 for name in varied]):
+        cells = [breakable(label(entry)), *(text(number(entry.get(name), 6)) for name in varied)]
+        if entry["status"] in _ENDED:
+            rows.append([*cells, f'<span class="worse">{_ENDED[entry["status"]]}</span>', "", "", "", ""])
+            continue
+        cold, scratch = entry.get("cold_ms"), entry.get("scratch_bytes")
+        rows.append([
+            *cells, _spread(entry.get("step_ms")), _spread(entry.get("kernel_ms")),
+            "" if cold is None else text(duration(cold / 1e3)),
+            "" if entry.get("peak_mib") is None else text(f"{entry['peak_mib']:.4g} MiB"),
+            "" if scratch is None else text(f"{scratch} B"),
+        ])  # fmt: skip
+    return table(head, rows, "dense")
+
+
+def _spread(times: Mapping[str, float] | None) -> str:
+    if not times:
+        return ""
+    ends = f"[{number(times['min'], 3)}, {number(times['max'], 3)}]"
+    return f'{text(number(times["median"], 3))} ms <span class="soft small">{text(ends)}</span>'
+
+
+Naming = Callable[[Entry], str]
+
+
+#: Quantities that are drawn, at most: all parameters together, the image, then single ones.
+MOST_DRAWN = 8
+
+
+_SHARES = {"0.1": "to 10 %", "0.03": "to 3 %", "0.01": "to 1 %"}
+
+
+def convergence(objects: Sequence[Entry]) -> tuple[str, int]:
+    """All that was measured of gradients, of whole runs, and in words; and how many lines are none of that."""
+    kinds = {kind: [entry for entry in objects if entry.get("kind") == kind]
+             for kind in ("point", "method", "reference", "run_point", "run_method")}  # fmt: skip
+    said = [entry for entry in objects if entry.get("kind") not in kinds and isinstance(entry.get("line"), str)]
+    known = [entry for entries in kinds.values() for entry in entries]
+    spps = len({entry.get("spp") for entry in known if entry.get("status", "ok") == "ok"})
+    name = partial(method_label, with_spp=spps > 1)
+    markup = "".join(f"<p>{text(entry['line'])}</p>" for entry in said)
+    if kinds["point"] or kinds["method"]:
+        markup += _steps(kinds["point"], kinds["method"], name)
+    if kinds["run_point"] or kinds["run_method"]:
+        markup += whole_runs(kinds["run_point"], kinds["run_method"], name)
+        markup += "".join(soft(f"{name(entry)}: {entry['message']}") for entry in kinds["run_method"]
+                          if entry.get("message"))  # fmt: skip
+    return markup, len(objects) - len(known) - len(said)
+
+
+def _steps(points: Sequence[Entry], methods: Sequence[Entry], name: Naming) -> str:
+    """A diagram for each quantity, and a table of the methods."""
+    labels = list(dict.fromkeys(map(name, [*methods, *points])))
+    quantities = list(dict.fromkeys(map(quantity, [*points, *methods])))
+    quantities.sort(key=lambda what: {"all": 0, "image": 1}.get(what, 2))
+    if len(quantities) == 2 and quantities[0] == "all":  # the only parameter is all of them
+        del quantities[0]
+    drawn = [_error_diagram(points, labels, what, name) for what in quantities[:MOST_DRAWN]]
+    parts = [legend([Curve(title, (), (), place) for place, title in enumerate(labels)]), diagrams(*drawn)]
+    if points:
+        parts.append(soft("Dots across: the standard error of the reference itself, below which nothing can be told."))
+    if len(quantities) > MOST_DRAWN:
+        parts.append(soft(f"{len(quantities) - MOST_DRAWN} more parameters are in the table alone."))
+    told = [entry for entry in methods if quantity(entry) in quantities]
+    parts.append(_error_table(told, quantities, name))
+    parts += [soft(f"{name(entry)}: {entry['message']}") for entry in told if entry.get("message")]
+    return "".join(parts)
+
+
+def quantity(entry: Entry) -> str:
+    """What the error is of: a parameter's key, `all` or `image`."""
+    return str(entry.get("parameter") or "all")
+
+
+def method_label(entry: Entry, with_spp: bool = False) -> str:
+    """A method's name as the user wrote it, or its integrator and estimator; and how it takes its samples, if known."""
+    parts = [str(entry.get("label") or label(entry)), str(entry.get("adjoint") or "")]
+    parts += [f"{entry['spp']} spp"] if with_spp and entry.get("spp") else []
+    return ", ".join(part for part in parts if part)
+
+
+def _error_diagram(points: Sequence[Entry], labels: Sequence[str], what: str, naming: Naming) -> str:
+    of_it = [entry for entry in points if quantity(entry) == what]
+    curves = []
+    for place, name in enumerate(labels):
+        rows = sorted((entry for entry in of_it if naming(entry) == name and _time(entry)), key=_time)
+        curves.append(Curve(name, [_time(entry) for entry in rows], [entry.get("relative_rmse") for entry in rows],
+                            place, points=True))  # fmt: skip
+    floors = [value for entry in of_it if isinstance(value := entry.get("reference_rmse"), int | float) and value > 0]
+    markup = diagram(curves, "time (s)", "relative error", 10, sorted(floors)[len(floors) // 2 :][:1])
+    words = {"all": "all parameters", "image": "the image"}.get(what)
+    title = text(words) if words else breakable(what)
+    return f"<div><h3>{title}</h3>{markup}</div>" if markup else ""
+
+
+def _time(entry: Entry) -> float:
+    return float(entry.get("elapsed_s") or 0.0)
+
+
+def _error_table(methods: Sequence[Entry], quantities: Sequence[str], naming: Naming) -> str:
+    several = len(quantities) > 1
+    head = ["method", *["of"] * several, "slope", "efficiency", "bias, z", *_SHARES.values()]
+    rows = []
+    for entry in sorted(methods, key=lambda entry: quantities.index(quantity(entry))):
+        biased = ' <span class="worse">biased</span>' if entry.get("biased") else ""
+        name = [breakable(naming(entry)) + biased, *[breakable(quantity(entry))] * several]
+        if entry.get("status", "ok") != "ok":
+            ended = f'<span class="worse">{text(str(entry["status"]).replace("_", " "))}</span>'
+            rows.append([*name, ended, *[""] * (len(head) - len(name) - 1)])
+            continue
+        seconds, beyond = entry.get("seconds_to") or {}, entry.get("extrapolated") or ()
+        rows.append([
+            *name, figure_of(entry.get("slope")), figure_of(entry.get("efficiency")), _bias(entry),
+            *(seconds_of(seconds.get(share), share in beyond) for share in _SHARES),
+        ])  # fmt: skip
+    return table(head, rows, "dense")
+
+
+def _bias(entry: Entry) -> str:
+    """The largest deviation in standard errors, and the limit that it keeps or exceeds."""
+    z, limit = entry.get("bias_z"), entry.get("bias_z_limit")
+    if not isinstance(z, int | float) or not isinstance(limit, int | float):
+        return figure_of(z)
+    return text(f"{abs(z):.2g} {'<' if abs(z) < limit else '>'} {limit:.2g}")
+
+
+def figure_of(value: Any) -> str:
+    """A figure, and its interval where it has one: a number, or `{value, low, high}`."""
+    if isinstance(value, Mapping):
+        ends = [number(value.get(end), 3) for end in ("low", "high")]
+        interval = f' <span class="soft small">[{text(", ".join(ends))}]</span>' if all(ends) else ""
+        return text(number(value.get("value"), 3)) + interval
+    return text(number(value, 3)) if isinstance(value, int | float) else ""
+
+
+def seconds_of(value: Any, extrapolated: bool) -> str:
+    """A time; one that was extrapolated is marked, one that is never reached is a dash."""
+    if not isinstance(value, int | float):
+        return "—"
+    return text(duration(value)) + (' <span class="soft small">extrapolated</span>' if extrapolated else "")
+
+
+#: What is drawn against time: its name in the records, and in words.
+_DRAWN = {"loss": "loss", "parameter_error": "parameter error"}
+
+
+def whole_runs(points: Sequence[Entry], methods: Sequence[Entry], naming: Naming) -> str:
+    """A diagram of the loss, one of the parameters' error where that is known, and a table; `naming` names a method."""
+    labels = list(dict.fromkeys(map(naming, [*methods, *points])))
+    parts = [legend([Curve(title, (), (), place) for place, title in enumerate(labels)])]
+    parts.append(diagrams(*(_runs_diagram(points, labels, of, naming) for of in _DRAWN)))
+    if points:
+        parts.append(soft("Whole optimisations at equal wall time, all costs counted. Medians over the seeds; bands "
+                          "and brackets go from the least to the greatest."))  # fmt: skip
+    return "".join([*parts, _runs_table(methods, naming)])
+
+
+def _runs_diagram(points: Sequence[Entry], labels: Sequence[str], of: str, naming: Naming) -> str:
+    curves = []
+    for place, name in enumerate(labels):
+        found: dict[float, list[float]] = {}
+        for entry in points:
+            if naming(entry) == name and _is_number(entry.get(of)) and _is_number(entry.get("elapsed_s")):
+                found.setdefault(float(entry["elapsed_s"]), []).append(float(entry[of]))
+        times = sorted(found)
+        medians = [statistics.median(found[time]) for time in times]
+        band = [min(found[time]) for time in times], [max(found[time]) for time in times]
+        curves.append(Curve(name, times, medians, place, band, points=True))
+    markup = diagram(curves, "time of a run (s)", _DRAWN[of])
+    return f"<div><h3>{text(_DRAWN[of])}</h3>{markup}</div>" if markup else ""
+
+
+def _runs_table(methods: Sequence[Entry], naming: Naming) -> str:
+    rows = []
+    for entry in methods:
+        name = breakable(naming(entry))
+        if entry.get("status", "ok") != "ok":
+            name += f' <span class="worse">{text(str(entry["status"]).replace("_", " "))}</span>'
+        seconds = entry.get("elapsed_s")
+        rows.append([
+            name, text(number(entry["runs"])) if _is_number(entry.get("runs")) else "",
+            text(duration(float(seconds))) if isinstance(seconds, int | float) else "",
+            *(_band(entry.get(what)) for what in ("iterations", "first_s", "loss", "parameter_error")),
+        ])  # fmt: skip
+    return table(["method", "runs", "time of each", "iterations", "s to the first", "final loss", "final error"], rows,
+                 "dense")  # fmt: skip
+
+
+def _band(value: Any) -> str:
+    """A median, and the least and the greatest."""
+    if not isinstance(value, Mapping) or not all(_is_number(value.get(end)) for end in ("median", "low", "high")):
+        return ""
+    ends = ", ".join(number(value[end], 3) for end in ("low", "high"))
+    return text(number(value["median"], 3)) + f' <span class="soft small">[{text(ends)}]</span>'
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+#: Names in the title of a page.
+MOST_NAMED = 3
+
+
+Parts = list[tuple[str, str]]
+
+
+def several_parts(sources: Sequence[Source]) -> tuple[str, str, Parts]:
+    """The title of a page about `sources`, its head, and its parts: titles and markup."""
+    names = [source.name for source in sources]
+    more = f" and {len(names) - MOST_NAMED} more" if len(names) > MOST_NAMED else ""
+    title = ", ".join(names[:MOST_NAMED]) + more
+    runs = [source for source in sources if isinstance(source, Run)]
+    parts = run_comparison(runs) if runs else []
+    for source in sources:
+        if not isinstance(source, Run):
+            parts.append((f"{HEADINGS[source.kind]}: {source.name}", guarded(partial(measured, source))))
+    for run in runs:
+        own = record_parts(run)
+        facts = own.pop("Run")
+        folds = [folded(name, markup) for name, markup in own.items()]
+        parts.append((f"Run {run.name}", guarded(partial(problems, run)) + facts + "".join(folds)))
+    return title, f"<header><h1>{text(title)}</h1></header>", parts
+
+
+def run_comparison(runs: Sequence[Run]) -> Parts:
+    """The parts in which runs lie beside each other."""
+    made: dict[str, Callable[[], str]] = {
+        "Runs": lambda: overview(runs),
+        "Convergence": lambda: convergence_of_all(runs),
+        "Time of an iteration": lambda: bars(runs),
+        "Images": lambda: _each(runs, image_rows),
+        "Errors as people see them": lambda: seen_tables(runs),
+        "Parameters": lambda: _each(runs, lambda run: parameter_table(run.results)),
+        "Textures": lambda: _each(runs, lambda run: texture_pictures(run.path / "parameters", run.results)),
+    }
+    return [(title, guarded(make)) for title, make in made.items()]
+
+
+def overview(runs: Sequence[Run]) -> str:
+    """A line for each run: how it ended, what it came to, and what an iteration took."""
+    head = (
+        "run",
+        "status",
+        "estimator",
+        "iterations",
+        "time",
+        "loss",
+        "parameter error",
+        "an iteration",
+        "peak memory",
+    )
+    return table(head, [_line(run, place) for place, run in enumerate(runs)], "overview")
+
+
+def _line(run: Run, place: int) -> list[str]:
+    records, results, step = run.records, run.results, StepParts.of(run.records)
+    losses = [record["loss"] for record in records if record["loss"] is not None]
+    loss = results["loss"] if results.get("loss") is not None else losses[-1] if losses else None
+    cells: list[Any] = [
+        run.manifest.get("status", "unknown"),
+        _estimator(run),
+        len(records),
+        duration(records[-1]["elapsed_s"]) if records else "",
+        number(loss),
+        _final_error(run),
+        "" if step is None else duration(step.step / 1e3),
+        f"{max(record['peak_mib'] for record in records):.4g} MiB" if records else "",
+    ]
+    return [mark(place) + breakable(run.name), *map(text, cells)]
+
+
+def _estimator(run: Run) -> str:
+    """What computed the gradients, as far as the manifest says."""
+    pilot, plan = run.manifest.get("pilot"), run.manifest.get("plan")
+    if isinstance(pilot, dict):
+        return str(pilot.get("label", ""))
+    return str(plan.get("estimator") or plan.get("integrator") or "") if isinstance(plan, dict) else ""
+
+
+def _final_error(run: Run) -> str:
+    """The error of all parameters at the end; where their units differ, that of the worst as a share of the truth."""
+    total = run.results.get("rmse") or {}
+    if total.get("final") is not None:
+        return f"RMSE {number(total['final'], 3)}"
+    key = worst(run.results)
+    if key is not None:
+        return f"{number(run.results['relative_error'][key]['final'], 3)} of the truth at worst"
+    known = [record["parameter_rmse"] for record in run.records if record["parameter_rmse"] is not None]
+    return f"RMSE {number(known[-1], 3)}" if known else ""
+
+
+def _each(runs: Sequence[Run], make: Callable[[Run], str]) -> str:
+    """What is made of each run, below its name; where that is damaged, a line that says so."""
+    made = [(run, guarded(partial(make, run))) for run in runs]
+    return "".join(f"<h3>{breakable(run.name)}</h3>{markup}" for run, markup in made if markup)
+
 
 #: What stands above a source, before its name.
 HEADINGS = {"bench": "Cost of a step", "gradcheck": "Gradients against references",
             "convergence": "Error against run time", "maps": "Maps of gradients"}  # fmt: skip
+
+
 #: Verdicts that are told as a failure is.
 _BAD = (Verdict.FAILS,)
 

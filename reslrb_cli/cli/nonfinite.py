@@ -1,0 +1,202 @@
+"""`reslrb inspect --nonfinite`: where a run first met a value that is not finite.
+
+The problem of a run as it stood in the first iteration with a value that was not finite.
+
+What `inspect --nonfinite` says: where a run first met a value that is not finite.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+import mitsuba as mi
+import numpy as np
+
+from reslrb_cli.cli.terminal import echo
+from reslrb_cli.config.integrators import Reslrb as ReslrbConfig
+from reslrb_cli.config.loader import with_integrator
+from reslrb_cli.config.schema import Config
+from reslrb_cli.errors import ConfigError, ExitCode
+from reslrb_cli.guiding.tables import KNOWN
+from reslrb_cli.optimization.assemble import assemble_scene
+from reslrb_cli.optimization.autotune.sampling import take_up_guiding
+from reslrb_cli.optimization.problem import Problem
+from reslrb_cli.optimization.state import guiding_of, restore_tables
+from reslrb_cli.optimization.views import color_channels, to_tensor
+from reslrb_cli.records.checkpoint import NONFINITE_FILE_NAME, NonFiniteStep, load_nonfinite
+from reslrb_cli.records.decisions import GuidedRecord, SequenceRecord
+from reslrb_cli.records.manifest import MANIFEST_FILE as MANIFEST
+from reslrb_cli.records.manifest import read_manifest
+from reslrb_cli.records.run_folder import RunFolder
+from reslrb_cli.scene.images import read_bitmap
+
+if TYPE_CHECKING:
+    from reslrb_cli.records.decisions import Offender
+
+
+OPTION = "--nonfinite"
+
+
+@dataclass
+class Replay:
+    """A problem whose parameters and targets are those of the step of `iteration`."""
+
+    problem: Problem
+    iteration: int
+
+
+def load_replay(config: Config) -> Replay:
+    """The replay of the run in whose folder `config` lies. Raises ConfigError where there is none.
+
+    What lies in the folder may be damaged, or of another run: whatever is read is checked against the configuration.
+    """
+    path = config.source.parent
+    manifest = read_manifest(path)
+    if manifest is None:
+        raise ConfigError(config.source, OPTION, "is not in a run folder; give the config.yaml of a run")
+    folder = RunFolder(path)
+    saved = load_nonfinite(folder.checkpoint)
+    if saved is None:
+        raise ConfigError(config.source, OPTION, "this run met no value that was not finite")
+    iteration, values = saved.iteration, saved.parameters
+    archive, written = folder.checkpoint / NONFINITE_FILE_NAME, path / MANIFEST
+    guided = _guided(config, manifest, written)
+    if not 0 <= iteration < config.run.iterations:
+        raise ConfigError(archive, "iteration", f"is {iteration}; the run has {config.run.iterations} iterations")
+    config = _chosen(_with_sequence(config, manifest, written), manifest, written)
+    try:
+        problem = assemble_scene(config, values=values)
+    except ValueError as error:
+        raise ConfigError(archive, "", f"does not fit to {config.source}: {error}") from None
+    if manifest.get("memory"):
+        problem.samples_per_pass = _samples_per_pass(manifest["memory"], written)
+        problem.integrator = problem.integrator.with_options(
+            samples_per_pass=problem.samples_per_pass, freeze=problem.integrator.freeze
+        )
+    problem.guided = guided
+    take_up_guiding(problem)
+    _teach(problem, saved, archive)
+    for view in problem.views:
+        suffix = "" if len(problem.views) == 1 else f"-{view.sensor}"
+        view.made = _read_image(folder.images / f"target{suffix}.exr", problem, view.sensor)
+        weights = folder.images / f"weights{suffix}.exr"
+        view.weights = _read_image(weights, problem, view.sensor) if weights.exists() else None
+    return Replay(problem, iteration)
+
+
+def _chosen(config: Config, manifest: dict[str, Any], path: Path) -> Config:
+    """The configuration with the estimator that the run's pilot chose, by the manifest at `path`."""
+    if not manifest.get("pilot") or not isinstance(config.integrator, ReslrbConfig):
+        return config
+    try:
+        options = config.integrator.chosen(**manifest["pilot"]["chosen"]).options()
+    except (TypeError, KeyError, ValueError):  # pydantic's error is a ValueError
+        raise ConfigError(path, "pilot.chosen", "is not an estimator with its options, as a run writes it") from None
+    return with_integrator(config, {"type": config.integrator.type} | options, str(path), {})
+
+
+def _with_sequence(config: Config, manifest: dict[str, Any], path: Path) -> Config:
+    """The configuration with the sequence that the run measured to pay, by the manifest at `path`."""
+    options = config.integrator.options()
+    if options.get("sequence") != "auto":
+        return config
+    try:
+        options["sequence"] = SequenceRecord.from_json(manifest["sequence"]).setting
+    except (TypeError, KeyError, AttributeError):
+        raise ConfigError(path, "sequence", "is not whether a sequence paid, as a run writes it") from None
+    return with_integrator(config, {"type": config.integrator.type} | options, str(path), {})
+
+
+def _guided(config: Config, manifest: dict[str, Any], path: Path) -> GuidedRecord | None:
+    """Whether guided emission was measured to pay, by the manifest at `path`; None where that was not measured."""
+    if config.integrator.options().get("guiding") != "auto" or manifest.get("guided") is None:
+        return None
+    try:
+        return GuidedRecord.from_json(manifest["guided"])
+    except (TypeError, AttributeError):
+        raise ConfigError(path, "guided", "is not whether guiding paid, as a run writes it") from None
+
+
+def _teach(problem: Problem, saved: NonFiniteStep, archive: Path) -> None:
+    """Have the tables of a guided run's integrator know what they knew when the step began."""
+    guiding = guiding_of(problem)
+    if guiding is None:
+        return
+    if saved.calls is None:
+        raise ConfigError(archive, "calls", "is missing: what the paths of a guided step were drawn from")
+    sensors = [str(number) for number in range(len(problem.scene.sensors()))]
+    names = {f"{number}/{what}" for number in saved.calls for what in KNOWN}
+    known = names == set(saved.learned) and set(saved.calls) <= set(sensors)
+    wrong = restore_tables(problem, guiding, saved.calls, lambda name: saved.learned[name]) if known else ""
+    if wrong is not None:
+        where = f"guiding/{wrong}" if wrong else "guiding"
+        raise ConfigError(archive, where, "is not what was learned of this scene")
+
+
+def _samples_per_pass(memory: Any, path: Path) -> int:
+    count = memory.get("samples_per_pass") if isinstance(memory, dict) else None
+    if type(count) is not int or not 1 <= count < 2**31:
+        raise ConfigError(path, "memory.samples_per_pass", "is not a number of samples, as a run writes it")
+    return count
+
+
+def _read_image(path: Path, problem: Problem, sensor: int) -> mi.TensorXf:
+    """The target, or its weights, that a run wrote. Raises ConfigError where it is not one for this sensor."""
+    film = problem.scene.sensors()[sensor].film()
+    width, height = film.crop_size()
+    array = np.array(read_bitmap(path, (int(width), int(height))), dtype=np.float32)
+    array = array if array.ndim == 3 else array[:, :, None]
+    colors = color_channels(film)
+    if array.shape[2] != colors:
+        raise ConfigError(path, "", f"must have the film's channels; its own: {array.shape[2]}, the film's: {colors}")
+    return to_tensor(array)
+
+
+def show_offenders(config: Config, as_json: bool) -> int:
+    """Print where the run of `config` first met a value that is not finite; exit code 1 where it does not again."""
+    from reslrb_cli.measure.nonfinite_trace import find_offenders
+
+    replay = load_replay(config)
+    found = find_offenders(replay.problem, replay.iteration)
+    if as_json:
+        report = {"iteration": replay.iteration, "offenders": [dataclasses.asdict(entry) for entry in found]}
+        click.echo(json.dumps(without_nan(report), indent=2, allow_nan=False))
+    else:
+        lines = [line for entry in found for line in offender_lines(entry, replay.iteration)]
+        for line in lines or [f"iteration {replay.iteration}: all is finite this time"]:
+            echo(line)
+    return ExitCode.DONE if found else ExitCode.CHECK_FAILED
+
+
+def offender_lines(offender: Offender, iteration: int) -> list[str]:
+    """One view's offender, in lines."""
+    place = "" if offender.pixel is None else f", pixel {offender.pixel}"
+    value = f": {_numbers(offender.value)}" if offender.value else ""
+    lines = [f"iteration {iteration}, sensor {offender.sensor}{place}", f"  {offender.quantity}{value}"]
+    at = offender.where
+    if at is not None:
+        on = "" if at.surface is None else f", on {at.surface}"
+        lines.append(f"  path {at.path} of {at.paths}, samples of {at.samples}, sampler seed {at.seed}")
+        lines.append(f"  vertex {at.vertex}, at {_numbers(list(at.position))}{on}")
+    if offender.image is not None and offender.target is not None:
+        lines.append(f"  image {_numbers(offender.image)}, target {_numbers(offender.target)}")
+    return lines
+
+
+def without_nan(value: Any) -> Any:
+    """The same with numbers that are not finite as text, "nan", "inf" and "-inf": JSON has none."""
+    if isinstance(value, dict):
+        return {key: without_nan(entry) for key, entry in value.items()}
+    if isinstance(value, list | tuple):
+        return [without_nan(entry) for entry in value]
+    return str(value) if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _numbers(values: list[float]) -> str:
+    return f"({', '.join(f'{value:.6g}' for value in values)})"

@@ -1,0 +1,151 @@
+"""What the commands about one experiment share: their options, and the way from a file to a problem.
+
+The experiment of a run with the values to which the run brought its parameters, for what goes on from there.
+
+What the commands about one experiment share: their arguments, and the way from a file to a variant.
+"""
+
+from __future__ import annotations
+
+import errno
+import logging
+import math
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import click
+
+from reslrb_cli.config.loader import load
+from reslrb_cli.config.parameters import RunValue
+from reslrb_cli.config.schema import Config
+from reslrb_cli.errors import ConfigError
+from reslrb_cli.records.run_folder import checkpoint_of
+
+
+def read_recovered(run: Path, overrides: tuple[str, ...]) -> Config:
+    """The configuration of the run in the folder `run`, its parameters beginning where that run has brought them.
+
+    Raises ConfigError, located in the folder, where it is no run's or holds no values.
+    """
+    checkpoint_of(run)
+    config = read_config(run / "config.yaml", overrides)
+    start = RunValue(run=run.absolute())
+    specs = [spec.model_copy(update={"initial": start}) for spec in config.parameters]
+    return config.model_copy(update={"parameters": specs})
+
+
+logger = logging.getLogger(__name__)
+
+
+#: Type of an option that counts something: samples, depths, seeds. As in a configuration, 31 bits.
+COUNT = click.IntRange(min=1, max=2**31 - 1)
+
+
+class Counts(click.ParamType):
+    """Different numbers of samples, such as `4,16,64`."""
+
+    name = "list"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[int, ...]:
+        parts: list[Any] = str(value).split(",")
+        counts = [COUNT.convert(part, param, ctx) for part in parts]
+        if len(set(counts)) < len(counts):
+            self.fail(f"`{value}` names a number twice", param, ctx)
+        return tuple(counts)
+
+
+class Factors(click.ParamType):
+    """Different positive factors, such as `0.3,1,3`; they come in ascending order."""
+
+    name = "list"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[float, ...]:
+        parts: list[Any] = str(value).split(",")
+        factors = [float(click.FLOAT.convert(part, param, ctx)) for part in parts]
+        for factor in factors:
+            if not (math.isfinite(factor) and factor > 0):
+                self.fail(f"{factor:g} is no factor above 0", param, ctx)
+        if len(set(factors)) < len(factors):
+            self.fail(f"`{value}` names a factor twice", param, ctx)
+        return tuple(sorted(factors))
+
+
+def experiment_arguments(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Add CONFIG (`config_file`) and `--set` (`overrides`) to a command."""
+    return _arguments(function, required=True)
+
+
+def optional_experiment_arguments(function: Callable[..., Any]) -> Callable[..., Any]:
+    """The same for a command that has a scene of its own: `config_file` is None where CONFIG is left out."""
+    return _arguments(function, required=False)
+
+
+def overrides_option(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Add `--set` (`overrides`) to a command."""
+    return click.option(
+        "--set",
+        "overrides",
+        multiple=True,
+        metavar="KEY=VALUE",
+        help="Override a setting, e.g. --set run.spp=32; the value is YAML. May be repeated.",
+    )(function)
+
+
+def resume_option(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Add `--resume` (`resumed`) to a command that measures."""
+    return click.option(
+        "--resume",
+        "resumed",
+        type=click.Path(path_type=Path, dir_okay=False),
+        metavar="FILE",
+        help="Go on from what another call has written with --json FILE, all else as it was; that call may also have "
+        "been killed. FILE is written anew unless --json names another.",
+    )(function)
+
+
+def allowance(budget_s: float, number: int | None, of: str) -> str:
+    """What ends a measurement, in words: its budget, or a `number` of what it is made `of`."""
+    if number is not None:
+        return f"{number} {of}{'' if number == 1 else 's'}, whatever time that takes"
+    return f"budget {budget_s:g} s for the whole, loading and compiling included"
+
+
+def _arguments(function: Callable[..., Any], required: bool) -> Callable[..., Any]:
+    metavar = "CONFIG" if required else "[CONFIG]"
+    argument = click.argument("config_file", metavar=metavar, required=required, type=click.Path(path_type=Path))
+    return argument(overrides_option(function))
+
+
+def is_given(name: str) -> bool:
+    """Whether the user gave an option of the command that runs, by its parameter's name."""
+    return click.get_current_context().get_parameter_source(name) is click.core.ParameterSource.COMMANDLINE
+
+
+def read_config(config_file: Path, overrides: tuple[str, ...]) -> Config:
+    """Load and check the configuration. Raises ConfigError."""
+    return load(config_file, list(overrides))
+
+
+def start_variant(config: Config) -> str:
+    """Set the Mitsuba variant that `config` asks for; return its name. Raises BackendError."""
+    from reslrb_cli.backend.variant import set_variant
+
+    return set_variant(config.variant)
+
+
+def check_writable(option: str, path: Path | None) -> None:
+    """Raise ConfigError, located by the option, where the file `path` cannot be written; it is left as it was."""
+    if path is None:
+        return
+    existed = os.path.lexists(path)
+    try:  # without waiting: a pipe that nobody reads from would make wait for ever
+        os.close(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND | getattr(os, "O_NONBLOCK", 0), 0o666))
+    except (OSError, ValueError) as error:
+        reason = "nobody reads from that pipe" if getattr(error, "errno", None) == errno.ENXIO else None
+        raise ConfigError(
+            option, "", f"cannot write {path}: {reason or getattr(error, 'strerror', None) or error}"
+        ) from None
+    if not existed:
+        path.unlink()

@@ -1,0 +1,348 @@
+"""The terminal: streams on which nothing fails, progress, and what an error comes to.
+
+What commands print and log: keys, names and paths are a user's or a file's, and must not command the terminal.
+
+Standard output and error of a command, as streams on which nothing fails.
+
+A terminal that was closed, a disk that is full behind a redirection, a pipe whose reader has gone, a stream that was
+closed before the program began: none of them is a reason to end a run of hours. While `forgiving_output` is entered,
+`sys.stdout` and `sys.stderr` take everything (of `click.echo`, of the log, of a progress bar), pass on what can be
+passed on, and drop the rest without a word.
+
+Progress of an optimisation, and of reading long files: a bar on a terminal, plain lines elsewhere.
+
+What an error comes to on the command line: those of its own arguments, and all others (`recording.telling`).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import io
+import logging
+import os
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import TracebackType
+from typing import Any, TextIO
+
+import click
+
+from reslrb_cli.config.files import in_words
+from reslrb_cli.errors import ExitCode, one_line, printable
+from reslrb_cli.optimization.errors import ErrorMeter
+from reslrb_cli.records.metrics import Record
+from reslrb_cli.report.format import shorten
+from reslrb_cli.runs import ending
+
+
+def echo(line: object) -> None:
+    """Print one line on standard output, with what is not printable in it escaped."""
+    click.echo(printable(line))
+
+
+class LineFormatter(logging.Formatter):
+    """Formats a record as its message alone, in one line, with what is not printable in it escaped."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        """The line."""
+        return printable(record.getMessage())
+
+
+#: Errors of a stream after which nothing will ever be written to it again.
+_GONE = {errno.EPIPE, errno.EIO, errno.EBADF, errno.ENXIO, errno.ENODEV}
+
+
+class Forgiving(io.TextIOBase):
+    """Passes text on to `stream`, and goes on where that fails; None takes everything and shows nothing.
+
+    It has no `buffer`, so that nobody writes past it.
+    """
+
+    def __init__(self, stream: TextIO | None) -> None:
+        self._stream = stream
+
+    def write(self, text: str) -> int:
+        """Write what can be written; characters that the stream's encoding lacks become `\\u...`."""
+        if self._stream is not None:
+            try:
+                try:
+                    self._stream.write(text)
+                except UnicodeEncodeError:
+                    encoding = self._stream.encoding or "ascii"
+                    self._stream.write(text.encode(encoding, "backslashreplace").decode(encoding))
+            except (OSError, ValueError) as error:
+                self._failed(error)
+        return len(text)
+
+    def flush(self) -> None:
+        """Pass on what is held back, if it can be."""
+        if self._stream is not None:
+            try:
+                self._stream.flush()
+            except (OSError, ValueError) as error:
+                self._failed(error)
+
+    def settle(self) -> None:
+        """Flush for the last time: what still cannot be written is dropped, so that Python does not try it again."""
+        if self._stream is not None:
+            try:
+                self._stream.flush()
+            except (OSError, ValueError):
+                self._drop()
+
+    def _failed(self, error: OSError | ValueError) -> None:
+        if isinstance(error, OSError) and error.errno in _GONE:
+            self._drop()
+
+    def _drop(self) -> None:
+        """Lead the stream to nowhere, with all that it holds back."""
+        stream, self._stream = self._stream, None
+        # ValueError: it is closed, or has no descriptor at all.
+        with contextlib.suppress(OSError, ValueError, AttributeError):
+            nowhere = os.open(os.devnull, os.O_WRONLY)
+            os.dup2(nowhere, stream.fileno())  # type: ignore[union-attr]
+            os.close(nowhere)
+
+    # What others ask a stream for.
+
+    def isatty(self) -> bool:
+        try:
+            return self._stream is not None and self._stream.isatty()
+        except ValueError:  # closed
+            return False
+
+    def fileno(self) -> int:
+        if self._stream is None:
+            raise io.UnsupportedOperation("fileno")
+        return self._stream.fileno()
+
+    def writable(self) -> bool:
+        return True
+
+    @property
+    def encoding(self) -> str:  # type: ignore[override]
+        return getattr(self._stream, "encoding", None) or "utf-8"
+
+    @property
+    def errors(self) -> str | None:  # type: ignore[override]
+        return getattr(self._stream, "errors", None)
+
+
+@contextmanager
+def forgiving_output() -> Iterator[None]:
+    """Have `sys.stdout` and `sys.stderr` forgive everything, until the end of the block."""
+    _occupy_closed()
+    before = sys.stdout, sys.stderr
+    forgiving = Forgiving(before[0]), Forgiving(before[1])
+    sys.stdout, sys.stderr = forgiving
+    try:
+        yield
+    finally:
+        for stream in forgiving:
+            stream.settle()
+        sys.stdout, sys.stderr = before
+
+
+def _occupy_closed() -> None:
+    """Open standard descriptors that the program was started without.
+
+    The next file to be opened would take their numbers, and what libraries print would end up in it.
+    """
+    for descriptor in (0, 1, 2):
+        try:
+            os.fstat(descriptor)
+        except OSError:
+            with contextlib.suppress(OSError):
+                os.open(os.devnull, os.O_RDWR)  # the lowest number that is free: this one
+
+
+class LogLines(logging.Handler):
+    """Writes each message as a line on what is the standard error at that moment."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        try:
+            click.echo(self.format(record), err=True)
+        except Exception:
+            self.handleError(record)
+
+
+#: Without a terminal a line is written after each tenth of the iterations, and when this many seconds have passed.
+SECONDS_PER_LINE = 10.0
+
+
+#: What takes less has no bar.
+LEAST_SECONDS = 1.0
+
+
+#: A key in a line has at most so many characters.
+KEY_WIDTH = 32
+
+
+#: Cells that the bar has at least; what would leave it fewer is said in fewer words.
+LEAST_BAR = 8
+
+
+#: The line around the bar, the most telling first; `{desc}` is what `descriptions` says.
+FRAMES = (
+    "{percentage:3.0f}%|{bar}| {n_fmt}/{total_fmt} [{elapsed}<{remaining}, {rate_fmt}] {desc}",
+    "{percentage:3.0f}%|{bar}| {n_fmt}/{total_fmt}, {remaining} left, {desc}",
+    "{percentage:3.0f}%|{bar}| {desc}",
+)
+
+
+#: Where there is no room for any of them.
+LEAST_FRAME = "{percentage:3.0f}%|{bar}|"
+
+
+def descriptions(record: Record, meter: ErrorMeter) -> list[str]:
+    """The record's loss, and its parameters' error where that is known, in ever fewer words.
+
+    Where the parameters' units differ, the error is the largest relative one.
+    """
+    loss = f"loss {record.loss:.4g}"
+    if record.parameter_rmse is not None:
+        rmse = f"RMSE {record.parameter_rmse:.4g}"
+        return [f"{loss}, parameter {rmse}", f"{loss}, {rmse}", loss]
+    relative = meter.relative(record.parameter_errors)
+    if not relative:
+        return [loss]
+    key = max(relative, key=lambda key: relative[key])
+    error = f"error {relative[key]:.4g}"
+    return [f"{loss}, relative {error} at worst ({shorten(key, KEY_WIDTH)})", f"{loss}, relative {error}", loss]
+
+
+class Progress:
+    """Shows each record of `total` on standard error; as a context manager it tidies the terminal up at the end.
+
+    `done` of them were before, in a run that goes on.
+    `meter` is what measured the parameters' errors. While a bar is shown, the log goes above it.
+    """
+
+    def __init__(self, total: int, quiet: bool, meter: ErrorMeter, done: int = 0) -> None:
+        self._total, self._quiet, self._meter = total, quiet, meter
+        self._stream = sys.stderr
+        self._bar: Any = None
+        self._width: int | None = None
+        self._choice = 0
+        self._around = contextlib.ExitStack()
+        self._last_line, self._tenth = time.monotonic(), 10 * done // total
+        if not quiet and self._stream.isatty():
+            from tqdm import tqdm
+
+            self._bar = tqdm(
+                total=total, initial=done, file=self._stream, unit="it", dynamic_ncols=True, bar_format=LEAST_FRAME
+            )
+
+    def show(self, record: Record) -> None:
+        """Show that the iteration of `record` is done."""
+        if self._bar is not None:
+            self._fit(descriptions(record, self._meter))
+            self._bar.update()
+            if record.iteration + 1 == self._total:  # what follows is no iteration
+                self._bar.close()
+            return
+        done, now = record.iteration + 1, time.monotonic()
+        tenth = 10 * done // self._total
+        if self._quiet or (tenth == self._tenth and now - self._last_line < SECONDS_PER_LINE):
+            return
+        self._tenth, self._last_line = tenth, now
+        text = descriptions(record, self._meter)[0]
+        click.echo(f"{done}/{self._total}: {text}, {record.elapsed_s:.1f} s", file=self._stream)
+
+    def _fit(self, texts: list[str]) -> None:
+        """Give the bar the first combination of frame and text that leaves it room.
+
+        Numbers change their lengths from one iteration to the next: as long as the terminal keeps its width, a longer
+        combination is not tried again, so that the line does not flicker.
+        """
+        facts = self._bar.format_dict
+        full, *short = texts
+        choices = [(frame, full) for frame in (FRAMES[:-1] if short else FRAMES)]
+        choices += [(frame, text) for text in short for frame in FRAMES]
+        if facts["ncols"] != self._width:
+            self._width, self._choice = facts["ncols"], 0
+        for place in range(self._choice, len(choices)):
+            frame, text = choices[place]
+            around = self._bar.format_meter(**{**facts, "bar_format": frame.replace("{bar}", ""), "prefix": text})
+            if self._width is None or len(around) + LEAST_BAR <= self._width:
+                self._choice, self._bar.bar_format = place, frame
+                self._bar.set_description_str(text, refresh=False)
+                return
+        self._choice, self._bar.bar_format = len(choices), LEAST_FRAME
+
+    def __enter__(self) -> Progress:
+        if self._bar is not None:
+            from tqdm.contrib.logging import logging_redirect_tqdm
+
+            self._around.enter_context(logging_redirect_tqdm([logging.getLogger("reslrb_cli")]))
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._bar is not None:
+            self._bar.close()
+        self._around.close()
+
+
+class Reading:
+    """Shows how far the reading of long files has come, on standard error: called as `records.reading.Tell` is.
+
+    As a context manager it tidies the terminal up, and says, where reading took long, that what follows takes its time
+    too.
+    """
+
+    def __init__(self) -> None:
+        self._stream = sys.stderr
+        self._path: Path | None = None
+        self._bar: Any = None
+        self._began = self._said = time.monotonic()
+
+    def __call__(self, path: Path, done: int, size: int) -> None:
+        """Show that `done` of the `size` bytes of `path` are read."""
+        now, name = time.monotonic(), shorten(str(path), KEY_WIDTH)
+        if not self._stream.isatty():
+            if now - self._said >= SECONDS_PER_LINE:
+                self._said = now
+                click.echo(f"reading {name}: {in_words(done)} of {in_words(size)}", file=self._stream)
+            return
+        if path != self._path:
+            from tqdm import tqdm
+
+            self._end()
+            self._path = path
+            self._bar = tqdm(
+                total=size, file=self._stream, unit="B", unit_scale=True, unit_divisor=1024, dynamic_ncols=True,
+                desc=f"reading {name}", delay=LEAST_SECONDS, leave=False,
+            )  # fmt: skip
+        self._bar.total = size
+        self._bar.update(done - self._bar.n)
+
+    def _end(self) -> None:
+        if self._bar is not None:
+            self._bar.close()
+
+    def __enter__(self) -> Reading:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._end()
+        if error is None and time.monotonic() - self._began >= LEAST_SECONDS:
+            click.echo("drawing", file=self._stream)
+
+
+def tell(error: BaseException) -> tuple[str, int] | None:
+    """The line and the exit code for `error`; None for a fault of ours, whose traceback is wanted."""
+    if isinstance(error, click.Abort):
+        return "interrupted", ExitCode.INTERRUPTED
+    if isinstance(error, click.ClickException):
+        context = getattr(error, "ctx", None)
+        where = context.command_path if context else "reslrb"
+        return f"{where}: {one_line(error.format_message()).rstrip('.')}. See `{where} --help`.", ExitCode.USAGE
+    return ending.tell(error)

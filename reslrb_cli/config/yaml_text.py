@@ -1,0 +1,272 @@
+"""YAML 1.2 to plain data and back, bounded before anything of it is built.
+
+PyYAML as configurations want it: the rules of YAML 1.2, plain data alone, bounded before anything is built.
+
+PyYAML alone reads YAML 1.1, where `1e-3` is text, `no` is false, `010` is 8 and `1:30` is 90.
+
+YAML to plain data and back, by the rules of YAML 1.2.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from typing import Any
+
+import yaml
+
+from reslrb_cli.config.files import DEPTH, INTEGER_END, NODES
+from reslrb_cli.errors import ConfigError
+
+#: Text, lists, mappings, null: what PyYAML builds of its own that is plain data in YAML 1.2 too.
+_KEPT = ("str", "seq", "map", "null", "bool")
+
+
+_TAG = "tag:yaml.org,2002:"
+
+
+#: Tags that a key may have: it is text, or `<<`.
+TEXT_TAGS = (f"{_TAG}str", f"{_TAG}merge")
+
+
+FLOAT = re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?$|[-+]?\.(inf|Inf|INF)$|\.(nan|NaN|NAN)$")
+
+
+INTEGER = re.compile(r"[-+]?[0-9]+$|0o[0-7]+$|0x[0-9a-fA-F]+$")
+
+
+DIGITS = list("-+.0123456789")
+
+
+class Loader(yaml.SafeLoader):
+    """One text being read; `at` names a line of it in errors."""
+
+    yaml_implicit_resolvers: dict[str, list[Any]] = {}  # noqa: RUF012 (PyYAML's own convention)
+    yaml_constructors = {  # noqa: RUF012
+        tag: function
+        for tag, function in yaml.SafeLoader.yaml_constructors.items()
+        if str(tag).removeprefix(_TAG) in _KEPT
+    }
+
+    def __init__(self, text: str, at: Callable[[int], str]) -> None:
+        super().__init__(text)
+        self._at = at
+        self._nodes = self._depth = 0
+        #: Of each node that is complete, by its identity, the number of nodes that it stands for.
+        self._sizes: dict[int, int] = {}
+
+    def fail(self, mark: yaml.Mark | None, message: str) -> ConfigError:
+        """The error for what stands at `mark`."""
+        return ConfigError(self._at(0 if mark is None else mark.line + 1), "", message)
+
+    def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
+        """The next node, as PyYAML makes it, unless it is too deep or one too many."""
+        mark, before, is_alias = self.peek_event().start_mark, self._nodes, self.check_event(yaml.AliasEvent)
+        self._depth += 1
+        if self._depth > DEPTH:
+            raise self.fail(mark, f"nested too deeply: more than {DEPTH} lists and mappings within each other")
+        node = super().compose_node(parent, index)
+        self._depth -= 1
+        if not is_alias:
+            self._nodes += 1
+            self._sizes[id(node)] = self._nodes - before
+        elif id(node) not in self._sizes:
+            raise self.fail(mark, "an alias (*name) of a list or mapping that it stands in itself")
+        else:
+            self._nodes += self._sizes[id(node)]
+        if self._nodes > NODES:
+            raise self.fail(mark, f"holds more than {NODES} values, aliases (*name) spelt out")
+        return node
+
+
+def _construct_text(loader: Loader, node: yaml.ScalarNode) -> str:
+    text: str = loader.construct_scalar(node)
+    if any("\ud800" <= c <= "\udfff" for c in text):
+        raise loader.fail(node.start_mark, f"{text!r} holds half of a surrogate pair, which is no character")
+    return text
+
+
+def _construct_integer(loader: Loader, node: yaml.ScalarNode) -> int:
+    text = loader.construct_scalar(node)
+    try:
+        value = int(text, {"0o": 8, "0x": 16}.get(text[:2], 10))
+    except ValueError:
+        if not INTEGER.match(text):
+            raise loader.fail(node.start_mark, f"{text} is no integer, as its tag !!int has it") from None
+        value = INTEGER_END  # more digits than Python converts
+    if abs(value) >= INTEGER_END:
+        raise loader.fail(node.start_mark, f"the integer {text[:20]}... has more than 64 bits; write it as in 1e30")
+    return value
+
+
+def _construct_float(loader: Loader, node: yaml.ScalarNode) -> float:
+    text = loader.construct_scalar(node)
+    try:
+        return float(text.lower().replace(".inf", "inf").replace(".nan", "nan"))
+    except ValueError:
+        raise loader.fail(node.start_mark, f"{text} is no number, as its tag !!float has it") from None
+
+
+def _refuse(loader: Loader, node: yaml.Node) -> None:
+    tag = node.tag.replace(_TAG, "!!")
+    raise loader.fail(node.start_mark, f"not valid YAML: the tag {tag} stands for nothing that a configuration holds")
+
+
+Loader.add_implicit_resolver(f"{_TAG}null", re.compile(r"(~|null|Null|NULL)?$"), ["~", "n", "N", ""])
+
+
+Loader.add_implicit_resolver(f"{_TAG}bool", re.compile(r"(true|True|TRUE|false|False|FALSE)$"), list("tTfF"))
+
+
+Loader.add_implicit_resolver(f"{_TAG}int", INTEGER, DIGITS)
+
+
+Loader.add_implicit_resolver(f"{_TAG}float", FLOAT, DIGITS)
+
+
+Loader.add_implicit_resolver(f"{_TAG}merge", re.compile(r"<<$"), ["<"])
+
+
+Loader.add_constructor(f"{_TAG}str", _construct_text)
+
+
+Loader.add_constructor(f"{_TAG}int", _construct_integer)
+
+
+Loader.add_constructor(f"{_TAG}float", _construct_float)
+
+
+Loader.add_constructor(None, _refuse)
+
+
+Location = tuple["str | int", ...]
+
+
+#: What no key holds: control characters, and halves of surrogate pairs.
+UNFIT = re.compile(r"[\x00-\x1f\x7f-\x9f\ud800-\udfff]")
+
+
+#: What an alias begins with, up to where YAML or a reader would take it to end.
+_ALIAS = re.compile(r"\*[^\s,\]}]*")
+
+
+def format_location(location: Location) -> str:
+    """A place in the file as it is written in messages and in `--set`: `parameters[0].bounds`."""
+    text = ""
+    for part in location:
+        if isinstance(part, int):
+            text += f"[{part}]"
+        else:
+            text += ("." if text else "") + (part if part.isprintable() else repr(part))
+    return text
+
+
+def parse(text: str, source: str, name_line: bool = True, example: Callable[[str], str] | None = None) -> Any:
+    """Plain data from YAML `text`; `source` names it in errors, with the line where `name_line` says so.
+
+    The keys of all mappings are text without control characters. `example` shows how a mended text is to be written
+    where it came from. Raises ConfigError where the text is not YAML, holds a tag that is not plain data, a key twice,
+    or one that is no text; where it is too deep, and where it holds more than NODES values.
+    """
+
+    def at(line: int) -> str:
+        return f"{source}:{line}" if name_line and line else source
+
+    try:
+        loader = Loader(text, at)
+        try:
+            node = loader.get_single_node()
+            if node is None:
+                return None
+            _check_keys(node, at, (), set())
+            return loader.construct_document(node)
+        finally:
+            loader.dispose()
+    except yaml.MarkedYAMLError as error:
+        mark = error.problem_mark or error.context_mark
+        place = source if mark is None else at(mark.line + 1)
+        raise ConfigError(place, "", _problem(error, text, example)) from None
+    except yaml.reader.ReaderError as error:
+        line = text.count("\n", 0, error.position) + 1
+        reason = "holds a control character, or bytes that are not UTF-8"
+        raise ConfigError(at(line), "", f"not valid YAML: {reason}") from None
+    except (ValueError, KeyError, AttributeError, TypeError):  # PyYAML on `!!bool x`
+        raise ConfigError(source, "", "not valid YAML: a value contradicts its explicit !! tag") from None
+
+
+def _problem(error: yaml.MarkedYAMLError, text: str, example: Callable[[str], str] | None) -> str:
+    """What is wrong, in a line; where it is text that wants quotes, with the quotes."""
+    problem = ", ".join(part for part in (error.context, error.problem) if part)
+    mark = error.context_mark or error.problem_mark
+    word = None if mark is None else _ALIAS.match(text, mark.index)
+    if word is not None and "alias" in problem:
+        quoted = f'"{word[0]}"'
+        mended = quoted if example is None else example(text[: word.start()] + quoted + text[word.end() :])
+        return f"{word[0]} is an alias in YAML, and names nothing here; text that begins with * wants quotes: {mended}"
+    hint = "; put text that begins with it in quotes" if "cannot start any token" in problem else ""
+    return f"not valid YAML: {problem}{hint}"
+
+
+def count_values(data: Any, most: int) -> int:
+    """How many values and keys plain `data` holds, where the same list stands twice counted twice; at most `most`."""
+    count, waiting = 0, [data]
+    while waiting and count < most:
+        value = waiting.pop()
+        count += 1
+        if isinstance(value, dict):
+            count += len(value)
+            waiting += value.values()
+        elif isinstance(value, list):
+            waiting += value
+    return min(count, most)
+
+
+def _check_keys(node: yaml.Node, at: Callable[[int], str], location: Location, seen: set[int]) -> None:
+    """Raise where a key is no text, or stands twice in its mapping."""
+    if id(node) in seen:  # an alias
+        return
+    seen.add(id(node))
+    if isinstance(node, yaml.SequenceNode):
+        for i, child in enumerate(node.value):
+            _check_keys(child, at, (*location, i), seen)
+    elif isinstance(node, yaml.MappingNode):
+        lines: dict[str, int] = {}
+        for key, child in node.value:
+            source = at(key.start_mark.line + 1)
+            if not isinstance(key, yaml.ScalarNode):
+                raise ConfigError(source, format_location(location), "has a key that is a list or a mapping, not text")
+            here = (*location, key.value)
+            if key.tag not in TEXT_TAGS:
+                raise ConfigError(source, format_location(here), "a key must be text; put it in quotes")
+            if UNFIT.search(key.value):
+                raise ConfigError(source, format_location(here), "a key must not hold control characters")
+            if key.value in lines:
+                raise ConfigError(source, format_location(here), f"given twice, first in line {lines[key.value]}")
+            lines[key.value] = key.start_mark.line + 1
+            _check_keys(child, at, here, seen)
+
+
+class _Dumper(yaml.SafeDumper):
+    """Quotes what any reader of YAML 1.1 or 1.2 would take for something else than text."""
+
+    def ignore_aliases(self, data: Any) -> bool:
+        return True
+
+
+def _represent_list(dumper: _Dumper, data: list[Any]) -> yaml.SequenceNode:
+    short = not any(isinstance(item, (dict, list)) for item in data)
+    return dumper.represent_sequence("tag:yaml.org,2002:seq", data, flow_style=short)
+
+
+_Dumper.add_implicit_resolver("tag:yaml.org,2002:float", FLOAT, DIGITS)
+
+
+_Dumper.add_implicit_resolver("tag:yaml.org,2002:int", INTEGER, DIGITS)
+
+
+_Dumper.add_representer(list, _represent_list)
+
+
+def write(data: Any) -> str:
+    """YAML of plain `data`, mappings in block style in their own order, lists of scalars on one line."""
+    return yaml.dump(data, Dumper=_Dumper, sort_keys=False, allow_unicode=True, default_flow_style=False)

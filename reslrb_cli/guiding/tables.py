@@ -1,0 +1,443 @@
+"""Tables of where light paths start, for each sensor, learned from steps that are done.
+
+What light paths for one sensor have said, by the cell that they started in, and how cells are drawn by that.
+
+What the variance of a sum over paths is made of is the mean square of what those of a cell say; it is least where cells
+are drawn in proportion to its root (`collect.py` says what is heard). Each voice is scaled to a total of 1, so that no
+parameter drowns another.
+
+Cells are as fine as there are paths to tell them apart: of a few thousand paths they are put together by hundreds. The
+more have been heard, the finer they are, up to the grid's own.
+
+Guiding of a scene's emission: tables for each sensor, learned from steps that are done, for those to come.
+
+Cells are drawn by what their paths have said (`tables.py`). Samples that serve image and gradient both are drawn half
+for the one, half for the other.
+
+Which of emission's random numbers the emitters of a scene make anything of.
+"""
+
+from __future__ import annotations
+
+import enum
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from reslrb_cli.guiding.collect import KEEP, NAMES, Onward, Said
+from reslrb_cli.transport.emission import emission_of
+from reslrb_cli.transport.film import BLOCKS, Blocks
+from reslrb_cli.transport.guide import AIM_SLOTS, CELL_BITS, CELLS, Aim, Survival, Table, apportion, box_of, make_grid
+from reslrb_cli.transport.plan import Grid
+from reslrb_cli.transport.samples import Samples
+
+Array = np.ndarray[Any, Any]
+
+
+#: Of neighbouring cells, along each number. A quarter in place of the twentieth leaves a cell a sixteenth of what was
+#: heard of it, and rooms 1.3 to 1.4 times the squares; with none, cells that few paths have met count for what these
+#: few said.
+BLUR = (0.05, 0.9, 0.05)
+
+
+FINE = 2.0  # cells, at most, for each path that has been heard
+
+
+def most_cells(paths: int) -> float:
+    """More cells than can ever be told apart where each walk that is learned from has so many paths: what counts of all
+    of them stays below the sum of the past's geometric series."""
+    return FINE * paths / (1 - KEEP) * (1 - 1e-6)
+
+
+@dataclass
+class Learned:
+    """What the paths for one sensor have said: sums of squares (2, cells), about the gradient and about the image, and
+    how many started in each cell.
+
+    `calls` is the number of gradients so far, or since what was learned was found to be wrong. Arrays are float32, and
+    never changed. `onward` is what paths went on to say from where they were; None where nothing of that is known.
+    `worse` is the mean square of what the newest paths said, in that of evenly drawn ones: far above 1 the table that
+    they were drawn from did harm, as it does where a scene has changed. `film` (2, blocks) are sums of squares too, by
+    where on the film paths said it (`transport/aim.py`); without blocks where none is aimed.
+    """
+
+    sums: Array
+    draws: Array
+    calls: int = 0
+    onward: Onward | None = None
+    film: Array = field(default_factory=lambda: np.zeros((2, 0), np.float32))
+    worse: float = 1.0
+    _densities: tuple[Grid, list[Array]] | None = field(default=None, init=False, repr=False, compare=False)
+
+    @staticmethod
+    def nothing(grid: Grid) -> Learned:
+        """Before the first gradient."""
+        return Learned(np.zeros((2, grid.cells), np.float32), np.zeros(grid.cells, np.float32))
+
+    def with_more(
+        self, grid: Grid, heard: Array, draws: Array, onward: Onward | None = None, film: Array | None = None
+    ) -> Learned:
+        """With what newer paths have said (voices, cells), the image last, `draws` (cells) of them.
+
+        Each voice is scaled to a total of 1. `onward` has learned from the same paths already.
+        """
+        sums = np.float32(KEEP) * self.sums
+        means = np.zeros(grid.cells, np.float32)
+        np.divide(grid.measures(), draws, out=means, where=draws > 0, casting="same_kind")
+        guided = _add(sums, heard, means)
+        started = np.float32(KEEP) * self.draws
+        started += draws
+        worse = float(draws.sum() * np.mean(guided)) if guided else 1.0
+        return Learned(sums, started, self.calls, onward, self._places(film), worse)
+
+    def _places(self, heard: Array | None) -> Array:
+        """`film` with what newer paths have said by block (voices, blocks), the image last."""
+        if heard is None:
+            return self.film
+        shape = 2, heard.shape[1]
+        film = np.float32(KEEP) * self.film if self.film.shape == shape else np.zeros(shape, np.float32)
+        _add(film, heard, np.ones(shape[1], np.float32))
+        return film
+
+    def on(self, grid: Grid, before: Grid) -> Learned:
+        """The same about the cells of another grid, of which those of the one before are made, spread evenly."""
+        sums = np.stack([grid.shared_out(row, before) for row in self.sums])
+        draws = grid.shared_out(self.draws, before).astype(np.float32)
+        return Learned(sums.astype(np.float32), draws, self.calls, self.onward, self.film)
+
+    def density(self, grid: Grid, share: float) -> Array:
+        """How cells are to be drawn (cells,), normalised, before any are shared out evenly: `share` of them by what was
+        said about the gradient, the others by what was said about the image.
+
+        Cells that few paths have been heard of are put together, all of them alike.
+        """
+        if self._densities is None:
+            self._densities = self._both(grid)
+        coarser, (gradient, image) = self._densities
+        return grid.shared_out(np.float32(share) * gradient + np.float32(1 - share) * image, coarser)
+
+    def _both(self, grid: Grid) -> tuple[Grid, list[Array]]:
+        """The densities by the gradient and by the image, float32, and the cells that they are of."""
+        coarser = grid.coarser(FINE * self.draws.sum(dtype=np.float64))
+        measures, found = coarser.measures().astype(np.float32), []
+        draws = _blurred(coarser, grid.summed(self.draws, coarser))
+        for row in self.sums:
+            square, loud = _blurred(coarser, grid.summed(row, coarser)), np.zeros(coarser.cells, np.float32)
+            np.divide(square, draws, out=loud, where=draws > 0)
+            np.sqrt(loud, out=loud)
+            loud *= measures
+            total = loud.sum()
+            found.append(loud / total if np.isfinite(total) and total > 0 else measures / measures.sum())
+        return coarser, found
+
+
+def _add(sums: Array, heard: Array, means: Array) -> list[float]:
+    """Add to `sums` (2, n), about the gradient and about the image, what each of the voices (voices, n) has said, the
+    image last, scaled to a total of 1; `means` (n) are what a thing said at each counts for in the total.
+
+    Returns the mean of `means` over what each voice has said; a voice without a finite total is left out.
+    """
+    found = []
+    for voice, said in enumerate(heard.astype(np.float32, copy=False)):
+        total = said @ means
+        if np.isfinite(total) and total > 0:
+            sums[int(voice == len(heard) - 1)] += said / total
+            found.append(float(said @ np.square(means)) / float(total))
+    return found
+
+
+def _blurred(grid: Grid, values: Array) -> Array:
+    """Sums over neighbouring cells, weighted; the cells of one emitter are none of another's neighbours."""
+    from scipy import ndimage  # here: few commands ever learn, and all import this module
+
+    result = values.reshape(grid.shape)
+    for axis in range(1, result.ndim):
+        if result.shape[axis] > 1:
+            result = ndimage.convolve1d(result, BLUR, axis, mode="nearest")
+    return result.ravel()
+
+
+EVERY = 16  # gradients of a sensor from one time that its table learns to the next; at first after 1, 2, 4 and 8
+
+
+WRONG = 1.5  # `Learned.worse` of a table that does harm; one that is worth nothing, and right, has 1
+
+
+LEAST_BITS = 16  # cells, log2, however many sensors there are
+
+
+MOST_BYTES = 2**26  # of all tables together; sensors for which there is no room share
+
+
+NOW = 0.2  # of the paths aimed for a gradient: by its own dL/dI, where that is known; the others by what was said
+
+
+LEARNING_STREAM = 0x1EA2  # seeds of the samples that tables learn from
+
+
+#: Names of the arrays of each sensor in what has been learned.
+KNOWN = ("sums", "draws", "film", *NAMES)
+
+
+class Purpose(enum.Enum):
+    """What samples are for; the value is the gradient's share in what they are drawn by, the rest is the image's."""
+
+    IMAGE = 0.0
+    GRADIENT = 1.0
+    BOTH = 0.5
+
+
+def sensor_bytes(grid: Grid, aims: bool = True) -> int:
+    """Bytes for one sensor: a table for each purpose, and what has been learned; `aims`: where paths are sent, too, of
+    which a gradient has one of its own."""
+    emission = len(Purpose) * (grid.slots + 2 * grid.cells) + 3 * grid.cells
+    aim = (len(Purpose) + 1) * (AIM_SLOTS + BLOCKS) + 2 * BLOCKS
+    return 4 * (emission + (len(Purpose) + 4) * CELLS + (aim if aims else 0))
+
+
+def grid_for(used: Sequence[bool], weights: Sequence[float], sensors: int, paths: int | None = None) -> Grid:
+    """A grid of which so many sensors have tables of their own, as fine as these leave room for; of more they share.
+
+    No finer than walks of so many `paths` can ever tell; None: nobody knows how many they will have.
+    """
+    grids = (make_grid(used, weights, bits) for bits in range(CELL_BITS, LEAST_BITS, -1))
+    fitting = (grid for grid in grids if sensors * sensor_bytes(grid) <= MOST_BYTES)
+    grid = next(fitting, make_grid(used, weights, LEAST_BITS))
+    return grid if paths is None else grid.coarser(most_cells(paths))
+
+
+class Guiding:
+    """Grid and tables of one scene, as a light tracer keeps them.
+
+    `images` says whether samples that serve an image alone are guided. Tables that are `held` learn no more. `lessons`
+    counts how often any have learned.
+    """
+
+    def __init__(self) -> None:
+        self.images, self.held, self.lessons = True, False, 0
+        self.grid: Grid | None = None
+        self._emission: tuple[list[bool], list[float], int] | None = None  # what `grid_for` is to know of a scene
+        self.box = np.zeros((2, 3), np.float32)  # of the scene, as it was first seen
+        self.learned: dict[int, Learned] = {}  # by the number of their sensor
+        self.films: dict[int, Blocks] = {}  # of sensors whose paths may be aimed
+        self._tables: dict[tuple[int, Purpose], tuple[Table, Array]] = {}
+
+    def clear(self) -> None:
+        """Forget everything, for a new scene."""
+        self.grid = self._emission = None
+        self.films.clear()
+        self.forget()
+
+    def forget(self) -> None:
+        """Forget what has been learned."""
+        self.learned.clear()
+        self._tables.clear()
+
+    def grid_of(self, samples: Samples, paths: int | None) -> Grid:
+        """The grid of the samples' scene for walks of so many paths.
+
+        Where it was another before, that had been made for fewer, or for nobody knew how many and nothing was learned:
+        what was learned is kept.
+        """
+        if self._emission is None:
+            weights = [float(emitter.sampling_weight()) for emitter in samples.scene.emitters()]
+            self._emission = used_numbers(samples), weights, len(samples.scene.sensors())
+            self.box = box_of(samples.scene)
+        before, self.grid = self.grid, grid_for(*self._emission, paths)
+        if before is not None and before != self.grid:
+            kept = {number: one for number, one in self.learned.items() if number == self._shared(number)}
+            self.learned = {number: one.on(self.grid, before) for number, one in kept.items()}
+            self._tables.clear()
+        return self.grid
+
+    def serves(self, purpose: Purpose) -> bool:
+        """Whether samples for this are guided."""
+        return self.images or purpose is not Purpose.IMAGE
+
+    def table(self, number: int, purpose: Purpose, delta: mi.TensorXf | None = None) -> Table:
+        """What samples for sensor `number` are drawn from; of the places on the film that paths are aimed at, some are
+        those of dL/dI `delta` (H, W, C), where it is known before the samples are."""
+        table = self._table(number, purpose)[0]
+        if delta is None or table.aim is None:
+            return table
+        number = self._shared(number)
+        return replace(table, aim=self._aim(number, purpose, self.learned.get(number), delta))
+
+    def counts(self, number: int, purpose: Purpose) -> Array:
+        """Slots of each cell of that table."""
+        return self._table(number, purpose)[1]
+
+    def _table(self, number: int, purpose: Purpose) -> tuple[Table, Array]:
+        assert self.grid is not None
+        number = self._shared(number)
+        if (number, purpose) not in self._tables:
+            learned = self.learned.get(number)
+            density = self.grid.measures() if learned is None else learned.density(self.grid, purpose.value)
+            counts = apportion(self.grid, density).astype(np.uint32)
+            onward = self._onward(number)
+            survival = Survival.of(onward.box, onward.chances(purpose.value))
+            aim = self._aim(number, purpose, learned)
+            self._tables[number, purpose] = Table.of(self.grid, counts, survival, aim), counts
+        return self._tables[number, purpose]
+
+    def aims(self, number: int, film: Blocks) -> bool:
+        """Have the paths for a sensor with this film be aimed; not where it shares its tables with others."""
+        assert self._emission is not None
+        if max(number + 1, self._emission[2]) > self._apart:
+            return False
+        self.films[number] = film
+        return True
+
+    def _aim(
+        self, number: int, purpose: Purpose, learned: Learned | None, delta: mi.TensorXf | None = None
+    ) -> Aim | None:
+        """Where on the film of a sensor paths are sent, by what was said there, and where dL/dI is large now."""
+        if number not in self.films:
+            return None
+        film, said = self.films[number], np.zeros((2, 0)) if learned is None else learned.film
+        even = film.areas() / film.areas().sum()
+        loud = list(np.sqrt(said, dtype=np.float64)) if said.shape == (2, film.count) else [even, even]
+        gradient, image = (_shares(row, even) for row in loud)
+        if delta is not None:
+            gradient = (1 - NOW) * gradient + NOW * _shares(film.root_means(delta), even)
+        return Aim.of(film, purpose.value * gradient + (1 - purpose.value) * image)
+
+    def _onward(self, number: int) -> Onward:
+        """What is known of where the paths for a sensor go on to, `number` being what its tables are kept under."""
+        learned = self.learned.get(number)
+        return Onward.nothing(self.box) if learned is None or learned.onward is None else learned.onward
+
+    def _shared(self, number: int) -> int:
+        """The number of the sensor that the tables are kept under."""
+        return number % self._apart
+
+    @property
+    def _apart(self) -> int:
+        """How many sensors have tables of their own."""
+        return max(MOST_BYTES // self._each, 1)
+
+    @property
+    def _each(self) -> int:
+        assert self.grid is not None
+        return sensor_bytes(self.grid)
+
+    def bytes(self, sensors: int) -> int:
+        """What the tables for so many sensors take."""
+        return min(sensors, self._apart) * self._each
+
+    def state(self) -> tuple[dict[str, int], dict[str, Array]]:
+        """What has been learned: the number of gradients of each sensor, and arrays by `<sensor>/<what>`."""
+        arrays: dict[str, Array] = {}
+        for number, learned in self.learned.items():
+            found = {"sums": learned.sums, "draws": learned.draws, "film": learned.film}
+            found |= self._onward(number).arrays()
+            arrays |= {f"{number}/{name}": array for name, array in found.items()}
+        return {str(number): learned.calls for number, learned in self.learned.items()}, arrays
+
+    def restore(self, calls: Mapping[str, int], take: Callable[[str], Array]) -> str | None:
+        """Go on from what `state` said, and nothing else; `take(name)` is the array of a name.
+
+        Returns the name of an array that is not of this scene's grid; then nothing has changed.
+        """
+        assert self.grid is not None
+        found = {}
+        for number, count in calls.items():
+            sums, draws = (take(f"{number}/{name}") for name in ("sums", "draws"))
+            for name, array, rows in (("sums", sums, (2,)), ("draws", draws, ())):
+                if array.shape != (*rows, self.grid.cells) or not (np.isfinite(array) & (array >= 0)).all():
+                    return f"{number}/{name}"
+            onward = Onward.taken({name: take(f"{number}/{name}") for name in NAMES})
+            if isinstance(onward, str):
+                return f"{number}/{onward}"
+            film = take(f"{number}/film")
+            if film.ndim != 2 or len(film) != 2 or not (np.isfinite(film) & (film >= 0)).all():
+                return f"{number}/film"
+            sums, draws, film = (array.astype(np.float32) for array in (sums, draws, film))
+            found[int(number)] = Learned(sums, draws, count, onward, film)
+        self.learned, self._tables = found, {}
+        return None
+
+    def due(self, number: int) -> bool:
+        """Count one more gradient for a sensor, and say whether its table is to learn from that."""
+        if self.held:
+            return False
+        learned = self.learned.get(self._shared(number))
+        calls = 1 if learned is None else learned.calls + 1
+        if learned is not None:
+            learned.calls = calls
+        return learned is None or learns_after(calls)
+
+    def learn(self, number: int, paths: int, said: Said) -> None:
+        """Have the table of a sensor learn from what so many paths said (`collect.py`).
+
+        They are drawn from its table for BOTH, and serve nothing else.
+        """
+        assert self.grid is not None
+        counts, number = self.counts(number, Purpose.BOTH), self._shared(number)
+        before = self.learned.get(number)
+        if before is None:
+            before = Learned.nothing(self.grid)
+            before.calls = 1
+        onward = self._onward(number).with_more(said.walked(paths))
+        draws = paths * (counts / self.grid.slots)
+        heard = said.by_start(self.grid.cells)
+        learned = before.with_more(self.grid, heard, draws, onward, said.by_block())
+        if learned.worse > WRONG and learned.calls % EVERY == 0:
+            learned.calls = 0  # the scene has changed: it learns as often as it did at first
+        self.learned[number] = learned
+        self.lessons += 1
+        for purpose in Purpose:
+            self._tables.pop((number, purpose), None)
+
+
+def _shares(row: Array, even: Array) -> Array:
+    """What each has of the sum of all; as much as is `even` where there is nothing."""
+    return row / row.sum() if row.sum() > 0 else even
+
+
+def learns_after(gradients: int) -> bool:
+    """Whether a table learns from the gradient of this number, counted from 1.
+
+    What it knows doubles each time at first. Later it has to look again soon enough for a scene that has changed; if it
+    finds one, counting begins anew.
+    """
+    return gradients % EVERY == 0 or (gradients < EVERY and gradients.bit_count() == 1)
+
+
+def learnings(gradients: int) -> int:
+    """How often a table has learned after so many gradients of its sensor."""
+    return min(gradients, EVERY - 1).bit_length() + gradients // EVERY
+
+
+def learning_seed(seed: mi.UInt32 | int) -> mi.UInt32:
+    """The seed of the samples that are learned from, beside those of a gradient."""
+    result = mi.sample_tea_32(mi.UInt32(seed), mi.UInt32(LEARNING_STREAM))[0]
+    dr.make_opaque(result)
+    return result
+
+
+PROBES = 1024  # light paths that are looked at
+
+
+def used_numbers(samples: Samples) -> list[bool]:
+    """Which of the four numbers (place, direction) the emission of any emitter depends on."""
+    random = np.random.default_rng(1)
+    first, other = (random.random((4, PROBES), np.float32) for _ in range(2))
+    choice = random.random(PROBES, np.float32)
+    # All cases are lanes of one call, which has the code of every emitter in it: as they are, and one number changed.
+    cases = np.stack([np.where(np.arange(4)[:, None] == changed, other, first) for changed in range(-1, 4)])
+    x = [mi.Float(cases[:, k].ravel()) for k in range(4)]
+    with dr.suspend_grad():
+        chosen = mi.Float(np.tile(choice, len(cases)))
+        e = emission_of(samples, mi.Float(0), chosen, mi.Point2f(x[0], x[1]), mi.Point2f(x[2], x[3]))
+        dr.eval(e.ray.o, e.ray.d, e.weight)
+    parts = [
+        np.broadcast_to(np.array(part), (np.shape(part)[0], cases.shape[0] * PROBES))
+        for part in (e.ray.o, e.ray.d, e.weight)
+    ]
+    found = np.concatenate(parts).reshape(-1, len(cases), PROBES)
+    return [not np.array_equal(found[:, 0], found[:, case], equal_nan=True) for case in range(1, len(cases))]

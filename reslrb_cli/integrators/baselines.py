@@ -1,0 +1,157 @@
+"""Integrators to compare with: Mitsuba's own, and the walk of `reslrb` differentiated in other ways.
+
+Mitsuba's own integrators, as a gradient step takes them.
+
+The walk of `reslrb` differentiated in other ways, to compare with: by naive AD, and by Dr.Jit's own reversal.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from typing import Any, ClassVar
+
+import drjit as dr
+import mitsuba as mi
+
+from reslrb_cli.errors import UnsupportedScene
+from reslrb_cli.integrators import light_tracer as lt
+from reslrb_cli.integrators.context import Motion
+from reslrb_cli.integrators.light_tracer import Reversed
+from reslrb_cli.integrators.protocol import Derivative, Job
+from reslrb_cli.scene.deformation import Surroundings
+from reslrb_cli.transport.samples import Samples, in_passes
+
+
+@contextmanager
+def _no_word_of_signals() -> Iterator[None]:
+    """While its own C++ code renders, Mitsuba hears of Ctrl-C, too, and says so on stdout, in red, whatever that is."""
+    logger = mi.logger()
+    level = logger.log_level()
+    logger.set_log_level(mi.LogLevel.Error)
+    try:
+        yield
+    finally:
+        logger.set_log_level(level)
+
+
+class Replayed:
+    """An integrator whose gradient is a pass of its own, such as `prb`."""
+
+    image_apart = True
+
+    def __init__(self, plugin: mi.Integrator) -> None:
+        self.plugin = plugin
+        self.surroundings = Surroundings()
+
+    def image(self, job: Job) -> mi.TensorXf:
+        """The image, without derivatives."""
+        self.surroundings.follow(job.scene)
+        with dr.suspend_grad(), _no_word_of_signals():
+            return self.plugin.render(job.scene, job.sensor, job.seed, job.spp)
+
+    def backward(self, job: Job, gradient: mi.TensorXf) -> None:
+        """Add the gradient of the objective with dL/dI `gradient`."""
+        self.surroundings.follow(job.scene)
+        # Isolated, so that another view's propagation finds the edges above the scene's parameters intact.
+        with dr.isolate_grad():
+            self.plugin.render_backward(job.scene, job.params, gradient, job.sensor, job.seed, job.spp)
+
+    def correlated(self, job: Job, derivative: Derivative) -> mi.TensorXf:
+        """The image, and the gradient of the same samples."""
+        image = self.image(job)
+        self.backward(job, derivative(image))
+        return image
+
+    def known(self, job: Job, gradient: mi.TensorXf) -> mi.TensorXf:
+        """The same with a dL/dI that is known."""
+        return self.correlated(job, lambda image: gradient)
+
+
+class NaiveAD(Replayed):
+    """An integrator that is differentiated with the whole graph of its image, such as `ptracer`: a "sweep".
+
+    Stock light tracing is differentiable in evaluated loops alone.
+    """
+
+    image_apart = False
+
+    def backward(self, job: Job, gradient: mi.TensorXf) -> None:
+        self.correlated(job, lambda image: gradient)  # as Mitsuba does, which raises where no path meets anything
+
+    def correlated(self, job: Job, derivative: Derivative) -> mi.TensorXf:
+        self.surroundings.follow(job.scene)
+        with dr.scoped_set_flag(dr.JitFlag.SymbolicLoops, False), dr.isolate_grad():
+            with _no_word_of_signals():
+                image = self.plugin.render(job.scene, job.sensor, job.seed, job.spp, develop=True, evaluate=False)
+            # Where no path of a few meets anything, evaluated loops end before the image depends on a parameter.
+            flags = dr.ADFlag.Default | dr.ADFlag.AllowNoGrad
+            dr.backward_from(image * derivative(dr.detach(image)), flags=flags)
+        return dr.detach(image)
+
+
+#: No light may reach what is differentiated.
+_MAY_LACK = dr.ADFlag.Default | dr.ADFlag.AllowNoGrad
+
+
+class WalkAd(Reversed):
+    """The same walk under naive AD: for comparisons at equal seeds."""
+
+    OPTIONS: ClassVar[Mapping[str, Any]] = {
+        **Reversed.OPTIONS,
+        "attached": False,
+        "filter_normalization": "attached",
+    }
+    image_apart = False
+
+    def __init__(self, attached: bool = False, filter_normalization: str = "attached", **common: Any) -> None:
+        """`attached`: rays and film positions have their derivatives too."""
+        super().__init__(motion=Motion(attached, filter_normalization), **common)
+
+    def graph(self, job: Job) -> mi.TensorXf:
+        """The image (H, W, C) with its whole graph; to be called where gradients are enabled."""
+        parts = self.passes(job)
+        film = parts[0].film
+        block = film.block()
+        for samples in parts:
+            lt.splat_tracked(samples, block)
+        return film.develop(block)
+
+    def correlated(self, job: Job, derivative: Derivative) -> mi.TensorXf:
+        with dr.isolate_grad():
+            image = self.graph(job)
+            dr.backward_from(image * derivative(dr.detach(image)), flags=_MAY_LACK)
+        return dr.detach(image)
+
+    def backward(self, job: Job, gradient: mi.TensorXf) -> None:
+        with dr.resume_grad(), dr.isolate_grad():
+            dr.backward_from(self.graph(job) * gradient, flags=_MAY_LACK)
+
+    def tangent(self, job: Job) -> mi.TensorXf:
+        with dr.resume_grad():
+            return dr.forward_to(self.graph(job))
+
+
+class Trajectory(Reversed):
+    """The same walk in a loop that Dr.Jit itself reverses, from a record of its state in thread-local memory."""
+
+    def __init__(self, max_depth: int = -1, **common: Any) -> None:
+        super().__init__(max_depth, motion=Motion(attached=False), **common)
+        if max_depth == -1:
+            raise ValueError('"max_depth" must be given: it is the size of the record')
+
+    def backward(self, job: Job, gradient: mi.TensorXf) -> None:
+        with dr.suspend_grad():
+            parts = self.passes(job)
+            if parts[0].plan.differentiate_null:
+                raise UnsupportedScene(
+                    "trajectory: Dr.Jit cannot reverse the loop through masks within that of the path; give "
+                    "parameters to other surfaces than masks alone"
+                )
+            adjoint = parts[0].film.adjoint(gradient)
+
+            def differentiate(part: Samples, block: mi.ImageBlock | None) -> None:
+                with dr.isolate_grad():  # as in `replay_all`; without it the derivatives of textures are lost
+                    lt.reverse_recorded(part, adjoint)
+
+            in_passes(parts, differentiate, None, job.params)

@@ -1,0 +1,163 @@
+"""Forward mode: hooks of walks that keep nothing of a path.
+
+Hooks of walks that keep nothing of a path: the image alone, its forward-mode derivative, and naive AD.
+
+Forward mode where light moves: the derivative of every connection and of where it lands, splatted as it is found.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from reslrb_cli.estimators.kept import Before, reach
+from reslrb_cli.transport.bsdf import Scattering, evaluate, tracked_factor
+from reslrb_cli.transport.connection import Connection, forward_derivatives, passage, transmittance
+from reslrb_cli.transport.factors import Product
+from reslrb_cli.transport.film import AdjointImage
+from reslrb_cli.transport.random import Numbers
+from reslrb_cli.transport.samples import Samples
+from reslrb_cli.transport.walk import Hooks, Splat, Vertex, segment
+
+
+class TrackedSplat(Splat):
+    """Splat every connection, derivatives of its factors tracked, and those of rays and film positions if `attached`
+    (walk_ad)."""
+
+    tracked = True
+
+    def __init__(self, samples: Samples, block: mi.ImageBlock, attached: bool) -> None:
+        super().__init__(samples, block)
+        self.attached = attached
+
+
+class RecordedObjective(Hooks):
+    """Sum each path's share of the objective, S = sum_i delta_i C_i, derivatives tracked (trajectory).
+
+    A splat in a loop that is reversed would have no derivative: side effects are none of the loop's state.
+    """
+
+    tracked = True
+
+    def __init__(self, samples: Samples, adjoint: AdjointImage) -> None:
+        self.samples, self.adjoint = samples, adjoint
+        self.max_iterations = max(samples.plan.max_depth - 1, 1)
+
+    def start(self, product: Product) -> mi.Float:
+        return mi.Float(0)
+
+    def connection(self, state: mi.Float, vertex: Vertex, connection: Connection, numbers: list[mi.Float]) -> mi.Float:
+        C = vertex.product.times(connection.c, vertex.depth).scaled(self.samples.scale).value()
+        delta = self.adjoint.lookup(connection.u, connection.active)
+        return state + dr.select(connection.active, dr.dot(delta, C), 0)
+
+
+@dataclass
+class Tangent:
+    """Derivative of the product of the factors so far, (C,)."""
+
+    d_product: mi.Spectrum
+
+
+class TangentSplat(Hooks):
+    """Splat the derivative of every connection in the direction of the parameters' tangents.
+
+    By the product rule along the path, d(P s) = dP s + P ds and dC_i = dP c_i + P dc_i: nothing is divided, so that
+    zero factors need no care.
+    """
+
+    connects = False  # it evaluates them itself, with their derivatives
+
+    def __init__(self, samples: Samples, block: mi.ImageBlock, dE: mi.Spectrum) -> None:
+        self.samples, self.block, self.dE = samples, block, dE
+
+    def start(self, product: Product) -> Tangent:
+        return Tangent(mi.Spectrum(self.dE))
+
+    def scattering(self, state: Tangent, vertex: Vertex, connection: Connection, scattering: Scattering) -> Tangent:
+        s, P, scattered = self.samples, vertex.product.value(), scattering.active
+        if s.plan.needs.has_null:
+            limit = s.plan.max_depth - vertex.depth - 1
+            through = transmittance(s.scene, vertex.si, connection.target, limit, connection.active, tangents=True)
+            seen, passed, d_passed = through.reached, through.value, through.tangent[0]
+        else:
+            (seen, passed), d_passed = passage(s.plan, s.scene, vertex.si, vertex.depth, connection), mi.Spectrum(0)
+        with dr.resume_grad(when=s.plan.differentiate_bsdfs):
+            # Two indirect calls: Dr.Jit cannot forward-propagate through one of our own (`tracked_factors`) that reads
+            # several parameters.
+            f_c = evaluate(s.plan, vertex.si, vertex.bsdf, connection.wo, seen)
+            f_s = tracked_factor(s.plan, vertex.si, vertex.bsdf, scattering, scattered)
+            df_c, df = forward_derivatives(f_c, f_s)
+            f_c = dr.detach(f_c)
+        c = f_c * passed * connection.weight
+        dc = (df_c * passed + f_c * d_passed) * connection.weight
+        s.film.put(self.block, connection.u, (state.d_product * c + P * dc) * s.scale, seen)
+        ds = dr.select(scattered, df * (scattering.correction / scattering.pdf), 0)
+        return Tangent(state.d_product * scattering.weight + P * ds)
+
+    def survived(self, state: Tangent, weight: mi.Float) -> Tangent:
+        return Tangent(state.d_product * weight)
+
+
+@dataclass
+class AttachedTangent:
+    """Derivatives along the parameters' tangents: of the product of the factors so far, (C,), and of the ray."""
+
+    d_product: mi.Spectrum
+    d_origin: mi.Vector3f
+    d_direction: mi.Vector3f
+    before: list[Before]
+
+
+class AttachedTangentSplat(Hooks):
+    """As `TangentSplat`, with rays, hit points and film positions that move:
+
+    d(k_p(u) C) = dk_p/du du C + k_p dC,   dC = dP c + P dc         k_p: the filter's weight of pixel p
+
+    A segment's derivatives are those by its ray, whose tangents are at hand, and by the scene's parameters, in one
+    propagation.
+    """
+
+    connects = False  # it evaluates them itself, with their derivatives
+
+    def __init__(self, samples: Samples, block: mi.ImageBlock, dE: mi.Spectrum) -> None:
+        self.samples, self.block, self.dE = samples, block, dE
+
+    def start(self, product: Product) -> AttachedTangent:
+        before = Before.start(self.samples.plan)
+        return AttachedTangent(mi.Spectrum(self.dE), mi.Vector3f(0), mi.Vector3f(0), before)
+
+    def scattering(
+        self, state: AttachedTangent, vertex: Vertex, connection: Connection, scattering: Scattering
+    ) -> AttachedTangent:
+        s, P, scattered = self.samples, vertex.product.value(), scattering.active
+        plan = s.plan
+        seen, _ = passage(plan, s.scene, vertex.si, vertex.depth, connection)
+        numbers = Numbers(connection.sample, scattering.sample_2, scattering.sample_1)
+        with dr.resume_grad():
+            ray = mi.Ray3f(vertex.ray)
+            ray.o, ray.d = mi.Point3f(ray.o), mi.Vector3f(ray.d)
+            dr.enable_grad(ray.o, ray.d)
+            dr.set_grad(ray.o, mi.Point3f(state.d_origin))
+            dr.set_grad(ray.d, state.d_direction)
+            si, bsdf, reaching, reached = reach(plan, state.before, ray, vertex.pi, seen | scattered)
+            this = segment(plan, s.sensor, reaching, si, bsdf, numbers, seen, scattered, attached=True)
+            following, taps = this.next_ray(attached=True), s.film.taps(this.connection.u, plan.attached_normalization)
+            # Selected: no other of these hangs on what that makes, which would be cleared on the way.
+            connection, scattering = this.connection, this.scattering
+            c, weight = reached * connection.f * connection.weight, reached * scattering.weight
+            outputs = [dr.select(seen, c, 0)]
+            outputs += [dr.select(scattered, value, 0) for value in (weight, following.o, following.d)]
+            found = forward_derivatives(*outputs, *(k for _, k in taps))
+        dc, ds, d_origin, d_direction, *d_weights = found
+        c, weight = dr.detach(c), dr.detach(weight)
+        C, dC = P * c * s.scale, (state.d_product * c + P * dc) * s.scale
+        for (pixel, k), dk in zip(taps, d_weights, strict=True):
+            s.film.add(self.block, pixel, dr.detach(k) * dC + dk * C, seen)
+        d_product = dr.select(scattered, state.d_product * weight + P * ds, 0)
+        return AttachedTangent(d_product, mi.Vector3f(d_origin), d_direction, Before.of(plan, vertex, scattering))
+
+    def survived(self, state: AttachedTangent, weight: mi.Float) -> AttachedTangent:
+        return AttachedTangent(state.d_product * weight, state.d_origin, state.d_direction, state.before)

@@ -1,0 +1,139 @@
+"""Our light tracers as Mitsuba plugins: `mi.load_dict({"type": "reslrb", ...})` after `reslrb_cli.register()`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from numbers import Integral
+from typing import Any, NoReturn
+
+import mitsuba as mi
+
+from reslrb_cli.backend.variant import check_variant, works_under
+from reslrb_cli.estimators import ESTIMATORS
+from reslrb_cli.integrators.baselines import NaiveAD, Replayed, Trajectory, WalkAd
+from reslrb_cli.integrators.protocol import Job, StepIntegrator
+from reslrb_cli.integrators.reslrb import Reslrb
+
+#: Our integrators by the names of their plugins.
+TRACERS = ("reslrb", "walk_ad", "trajectory")
+
+
+_registered_with_callback = False
+
+
+def register() -> None:
+    """Make our integrators known to Mitsuba, in the current variant and in any that is set later.
+
+    Raises BackendError, with the variants that work, where the current one does not. Under one that is set later and
+    does not, loading one of the integrators says so.
+    """
+    global _registered_with_callback
+    if not _registered_with_callback:
+        mi.detail.add_variant_callback(_on_variant)
+        _registered_with_callback = True
+    if mi.variant() is not None:
+        _on_variant(None, mi.variant())
+        check_variant()
+
+
+def make_tracer(type: str, options: Mapping[str, Any]) -> Reslrb | WalkAd | Trajectory:
+    """One of our integrators. Raises ValueError where an option is wrong."""
+    unknown = [name for name in options if name not in _option_names(type, options.get("estimator"))]
+    if unknown:
+        raise ValueError(f"{type} has no option {', '.join(unknown)}")
+    if type == "reslrb":
+        return Reslrb.of(**options)
+    return WalkAd(**options) if type == "walk_ad" else Trajectory(**options)
+
+
+def interface_of(integrator: StepIntegrator | mi.Integrator) -> StepIntegrator:
+    """What a gradient step works with, of a plugin or of what already is that."""
+    if not isinstance(integrator, mi.Integrator):
+        return integrator
+    tracer: StepIntegrator | None = getattr(integrator, "tracer", None)  # of the plugins that are made here
+    if tracer is not None:
+        return tracer
+    return NaiveAD(integrator) if isinstance(integrator, mi.AdjointIntegrator) else Replayed(integrator)
+
+
+def resolve_sensor(scene: mi.Scene, sensor: mi.Sensor | int) -> mi.Sensor:
+    """A sensor of the scene, given as itself or as its index. Raises ValueError for an index of none."""
+    if not isinstance(sensor, Integral):
+        return sensor
+    index, count = int(sensor), len(scene.sensors())
+    if not 0 <= index < count:
+        has = "one sensor, index 0" if count == 1 else f"{count} sensors, indices 0 to {count - 1}"
+        raise ValueError(f'"sensor" is {index}, but the scene has {has}')
+    return scene.sensors()[index]
+
+
+def _on_variant(old: str | None, new: str) -> None:
+    plugin = _plugin_class() if works_under(new) else _refuse
+    for name in TRACERS:
+        mi.register_integrator(name, lambda props, name=name: plugin(name, props))
+
+
+def _refuse(type: str, props: mi.Properties) -> NoReturn:
+    """In place of a plugin under a variant that has none: that there is no such plugin would be no help."""
+    check_variant()
+    raise AssertionError("called under such variants only")
+
+
+def _plugin_class() -> type[mi.CppADIntegrator]:
+    """The class of our plugins. It derives from one of the variant's, so that there is one for each variant."""
+
+    class LightTracerPlugin(mi.CppADIntegrator):
+        """One of our light tracers, under `mi.render`."""
+
+        def __init__(self, type: str, props: mi.Properties) -> None:
+            options = _take_options(type, props)
+            # Before the base class sees it, which has another idea of a pass and warns.
+            if "samples_per_pass" in props:
+                del props["samples_per_pass"]
+            super().__init__(props)
+            self.type = type
+            self.tracer = make_tracer(type, options)
+            self.max_depth, self.rr_depth = self.tracer.max_depth, self.tracer.rr_depth
+            self.samples_per_pass = self.tracer.samples_per_pass
+
+        def render(self, scene: mi.Scene, sensor: mi.Sensor | int = 0, seed: mi.UInt32 | int = 0, spp: int = 0,
+                   develop: bool = True, evaluate: bool = True) -> mi.TensorXf:  # fmt: skip
+            if not develop:
+                raise ValueError("develop=True must be specified when invoking AD integrators")
+            return self.tracer.image(Job(scene, resolve_sensor(scene, sensor), seed, spp), evaluate)
+
+        def render_forward(self, scene: mi.Scene, params: Any, sensor: mi.Sensor | int = 0, seed: mi.UInt32 | int = 0,
+                           spp: int = 0) -> mi.TensorXf:  # fmt: skip
+            return self.tracer.tangent(_job(scene, params, sensor, seed, spp))
+
+        def render_backward(self, scene: mi.Scene, params: Any, grad_in: mi.TensorXf, sensor: mi.Sensor | int = 0,
+                            seed: mi.UInt32 | int = 0, spp: int = 0) -> None:  # fmt: skip
+            self.tracer.backward(_job(scene, params, sensor, seed, spp), grad_in)
+
+        def aov_names(self) -> list[str]:
+            return []
+
+        def to_string(self) -> str:
+            return f"{self.type}[max_depth = {self.max_depth}, rr_depth = {self.rr_depth}]"
+
+    return LightTracerPlugin
+
+
+def _take_options(type: str, props: mi.Properties) -> dict[str, Any]:
+    """The options that an integrator of this type has. What stays unread Mitsuba reports as an error."""
+    estimator = props.get("estimator", None) if type == "reslrb" else None  # what is asked for counts as read
+    return {name: props.get(name) for name in _option_names(type, estimator) if name in props}
+
+
+def _option_names(type: str, estimator: str | None) -> list[str]:
+    """The names of an integrator's options, those of its estimator among them."""
+    if type != "reslrb":
+        return list(WalkAd.OPTIONS if type == "walk_ad" else Trajectory.OPTIONS)
+    kind = ESTIMATORS.get(Reslrb.OPTIONS["estimator"] if estimator is None else estimator)
+    return [*Reslrb.OPTIONS, *(kind.OPTIONS if kind is not None else ())]
+
+
+def _job(scene: mi.Scene, params: Any, sensor: mi.Sensor | int, seed: mi.UInt32 | int, spp: int) -> Job:
+    """A job that differentiates the user's parameters, or all of the scene's."""
+    params = params if isinstance(params, mi.SceneParameters) else mi.traverse(scene)
+    return Job(scene, resolve_sensor(scene, sensor), seed, spp, params)

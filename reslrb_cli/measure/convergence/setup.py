@@ -1,0 +1,413 @@
+"""Who takes part in a `convergence`, what is found out before, and the steps of one.
+
+Those that take steps: the methods compared, what errors are taken from, and what biases are judged by.
+
+Before anything is measured: the images that dL/dI is held at, and which stock integrators count as references.
+
+Runs in a process of its own (`workers.py`), with the integrator that errors are taken from.
+
+Steps of one method, timed and kept: gradients or images, in a process of its own (`workers.py`).
+"""
+
+from __future__ import annotations
+
+import enum
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from reslrb_cli.config.loader import loads
+from reslrb_cli.config.schema import Config
+from reslrb_cli.integrators.protocol import first_channels
+from reslrb_cli.integrators.step import gradient_step, known_step, render_image
+from reslrb_cli.measure.gradients import moves_light
+from reslrb_cli.measure.methods import IMAGES
+from reslrb_cli.measure.participants import ALIKE
+from reslrb_cli.measure.references import Situation, prb_gradient, prb_image, ptracer_gradient, ptracer_image
+from reslrb_cli.measure.workers import Begun, Contestant
+from reslrb_cli.optimization.assemble import assemble_scene
+from reslrb_cli.optimization.problem import Problem
+from reslrb_cli.optimization.targets import make_targets
+from reslrb_cli.optimization.views import View, set_targets, target_arrays, to_tensor
+from reslrb_cli.records.clock import StepClock, StepTimes, peak_mib, reset_peak
+from reslrb_cli.records.measurements import Method, Reference
+from reslrb_cli.scene.catalog import value_shape
+from reslrb_cli.scene.visibility import interior
+from reslrb_cli.seeds import seed
+
+#: Steps after the first until no new kernel comes, at most.
+MAX_WARM_UPS = 4
+
+
+#: A turn of one that compares is as long as a step of the slowest, but no longer than so many seconds.
+TURN_S = 2.0
+
+
+#: Steps of less than so many seconds are taken at least two a turn: the first makes good what others did to the caches.
+SHORT_S = 1.0
+
+
+#: The most steps of one turn.
+MOST_STEPS = 8
+
+
+#: Turns of references, in those of all that are compared together.
+SHARES = {"reference": 0.5, "independent": 0.35}
+
+
+#: Steps of a turn where their number is not to depend on time.
+FIXED = {"case": 2, "reference": 8, "independent": 4}
+
+
+#: The most steps of a reference's turn.
+MOST_REFERENCE_STEPS = 64
+
+
+class Role(str, enum.Enum):
+    """What a member is there for."""
+
+    CASE = "case"
+    REFERENCE = "reference"
+    INDEPENDENT = "independent"
+
+
+@dataclass(kw_only=True)
+class Member(Contestant):
+    """One process, the steps that it is to take, and those that it has taken.
+
+    `rows` are samples (P,), `turns` says in which round each was taken, `seconds` are those of one step in each turn.
+    `count` is the number of steps of a turn, `taken` of all that were ever asked for, whose numbers make the seeds.
+    """
+
+    role: Role
+    method: Method
+    config: Config
+    spp: int
+    out: Path
+    count: int = 1
+    taken: int = 0
+    cold: dict[str, Any] | None = None
+    step_s: float = 0.0
+    rows: list[np.ndarray] = field(default_factory=list)
+    turns: list[int] = field(default_factory=list)
+    seconds: list[float] = field(default_factory=list)
+    message: str = ""
+
+    @property
+    def label(self) -> str:
+        """What it is called."""
+        return self.method.label
+
+    @property
+    def cold_s(self) -> float | None:
+        """Seconds of the first step, which compiles."""
+        return None if self.cold is None else self.cold["step_ms"][0] / 1e3
+
+    def warm_up(self, tight: bool, stop: Callable[[], bool], over: Callable[[], bool]) -> bool:
+        """Take steps until nothing is compiled any more; whether it came to that."""
+        self.cold = self._steps(1, 0, True, False, stop, over)
+        answer = self.cold
+        for _ in range(MAX_WARM_UPS):
+            if answer is None:
+                return False
+            answer = self._steps(1, 0, False, tight, stop, over)
+            if answer is not None:
+                self.step_s = answer["step_ms"][0] / 1e3
+                if not answer["new_kernels"]:
+                    return True
+        return answer is not None
+
+    def turn(self, round: int, tight: bool, stop: Callable[[], bool]) -> None:
+        """Take a turn's steps and keep them. Raises Stopped."""
+        answer = self._steps(self.count, round, False, tight, stop)
+        if answer is None:
+            return
+        rows = np.load(self.out)
+        if not np.isfinite(rows).all() and not self.message:
+            self.message = f"{np.count_nonzero(~np.isfinite(rows))} entries of step {len(self.rows) + 1} are not finite"
+        self.rows += list(rows)
+        self.turns += [round] * len(rows)
+        times = answer["step_ms"]
+        self.seconds.append(float(np.mean(times[1:] if len(times) > 1 else times)) / 1e3)
+
+    def _steps(
+        self, count: int, image: int, cold: bool, release: bool, stop: Callable[[], bool],
+        over: Callable[[], bool] = lambda: False,
+    ) -> dict[str, Any] | None:  # fmt: skip
+        question = {"start": self.taken, "count": count, "spp": self.spp, "image": image, "out": str(self.out)}
+        self.taken += count
+        return self.ask(question | {"cold": cold, "release": release}, stop, over)
+
+    def means(self, key: slice, groups: int | None = None) -> np.ndarray:
+        """Means over turns, or over every so many-th of them together, of some entries: (K, P)."""
+        turns, rows = np.array(self.turns), np.stack(self.rows)[:, key].astype(np.float64)
+        if groups is not None:
+            turns = turns % groups
+        return np.stack([rows[turns == turn].mean(0) for turn in np.unique(turns)])
+
+
+def share_turns(members: list[Member], fixed: bool) -> None:
+    """Set how many steps each takes in a turn: about equal times, since what is fast has steps to spare.
+
+    With `fixed`, so many whatever time they take.
+    """
+    for member in members if fixed else ():
+        member.count = FIXED[member.role.value]
+    if fixed:
+        return
+    cases = [member for member in members if member.role is Role.CASE]
+    turn_s = min(max((member.step_s for member in cases), default=0.0), TURN_S)
+    for member in cases:
+        least = 2 if member.step_s < SHORT_S else 1
+        member.count = _fitting(turn_s, member.step_s, least, MOST_STEPS)
+    together = sum(member.count * member.step_s for member in cases)
+    for member in members:
+        if member.role is not Role.CASE:
+            member.count = _fitting(SHARES[member.role.value] * together, member.step_s, 1, MOST_REFERENCE_STEPS)
+
+
+def _fitting(turn_s: float, step_s: float, least: int, most: int) -> int:
+    return min(max(round(turn_s / max(step_s, 1e-4)), least), most)
+
+
+#: Light paths of the target, and of all images that dL/dI is held at together, where time does not count.
+PATHS = {"fixed": 2**21, "loss": 2**23}
+
+
+#: The most of them where it does.
+MOST_PATHS = 2**24
+
+
+#: Share of the time that they may take, target and images.
+SHARE = {"fixed": 0.1, "loss": 0.25}
+
+
+#: Light paths that their speed is measured with.
+TRIAL = 2**16
+
+
+#: The purpose of those images' samples.
+_PURPOSE = "convergence, dL/dI"
+
+
+def begin_survey(first: dict[str, Any]) -> Begun:
+    """Begin the process. The one question names the file for arrays, `out`; its answer is `survey`'s facts."""
+    problem = assemble_scene(loads(first["config"], first["source"]).with_exposures_fixed())
+
+    def answer(question: dict[str, Any]) -> dict[str, Any]:
+        facts, arrays = survey(problem, first["objective"], **question["ask"])
+        np.savez(question["out"], **arrays)  # type: ignore[arg-type]
+        return facts
+
+    return {}, answer
+
+
+def survey(
+    problem: Problem, objective: str, camera: bool, named: bool, budget_s: float | None
+) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """What is known of a problem, targets not made yet, and arrays that its samples are taken with.
+
+    The facts: `keys`, `shapes` of what is estimated (of the parameters, or `image`), `independent` (key to the name of
+    a stock integrator, or None), `why` (key to what keeps others from it), `without` (stock integrators that are right
+    for nothing here, with the reason), `masked` (whether pixels along the border are left out), `pixels`, and in words
+    what was rendered, `pictures`. The arrays: `mask` (H, W, 1), and unless the image is the objective the first
+    view's `target_arrays` and `adjoints` (B, H, W, C). `camera`: paths from the camera take part, where they are right
+    or `named`, which lose nothing by the film's border; `budget_s` is the time of the whole measurement, if it
+    counts.
+    """
+    film = problem.scene.sensors()[problem.sensors[0]].film()
+    width, height = (int(n) for n in film.crop_size())
+    facts = find_references(problem, objective)
+    inside = np.ones((height, width), bool)
+    pixels = width * height
+    if (camera and (named or "prb" not in facts["without"])) or Reference.PRB.value in facts["independent"].values():
+        inside = interior((height, width), problem.scene.sensors()[problem.sensors[0]])
+    mask = inside[:, :, None].astype(np.float32)
+    facts |= {"masked": not inside.all(), "pictures": "", "pixels": pixels}
+    if objective == "image":
+        return facts | {"shapes": {"image": [height, width, int(film.base_channels_count())]}}, {"mask": mask}
+    paths = PATHS[objective] if budget_s is None else affordable_paths(problem, pixels, SHARE[objective] * budget_s / 2)
+    shortened = shorten_target(problem, paths // pixels)
+    make_targets(problem, lambda line: None)
+    count = IMAGES if objective == "loss" else 1
+    spp = multiple_of(paths // (count * pixels), problem.samples_per_pass)
+    adjoints = []
+    for number in range(count):
+        image = problem.render(problem.sensors[0], spp, number, _PURPOSE)
+        adjoints.append(adjoint(problem, image, mask))
+    facts["pictures"] = f"dL/dI at {'an image' if count == 1 else f'{count} images'} of {spp} spp{shortened}"
+    return facts, {"mask": mask, "adjoints": np.stack(adjoints), **target_arrays(problem.views[:1])}
+
+
+def adjoint(problem: Problem, image: np.ndarray, mask: np.ndarray) -> np.ndarray:
+    """dL/dI (H, W, C) at an image of that shape, the pixels that `mask` (H, W, 1) has as 0 left out of the loss."""
+    leaf = mi.TensorXf(image)
+    dr.enable_grad(leaf)
+    dr.backward(masked_loss(problem.views[0], leaf, None if mask.all() else mi.TensorXf(mask)))
+    return np.array(dr.grad(leaf))
+
+
+def masked_loss(view: View, image: mi.TensorXf, mask: mi.TensorXf | None) -> mi.Float:
+    """The view's loss of an attached image (H, W, C): what `mask` (H, W, 1) has as 0 is as the target has it."""
+    if mask is None:
+        return view.compare(image)
+    target = view.target
+    return view.compare(first_channels(image, target.shape[2]) * mask + target * (1 - mask))
+
+
+def find_references(problem: Problem, objective: str) -> dict[str, Any]:
+    """Keys, shapes, and which stock integrator counts for each."""
+    params, config = problem.selection.params, problem.config
+    moved = tuple(key for key in problem.selection.scene_keys if moves_light(params, key))
+    attached = config.integrator.options().get("attached") is True or bool(moved)
+    sensor = problem.scene.sensors()[problem.sensors[0]]
+    at = Situation.of(
+        problem.scene, sensor, params, config.integrator.max_depth, config.integrator.hide_emitters, attached, moved
+    )
+    keys = ["image"] if objective == "image" else list(problem.selection.keys)
+    independent: dict[str, str | None] = {}
+    why, reasons = {}, {}
+    for key in keys:
+        if objective == "image":
+            found = {"ptracer": ptracer_image(at), "prb": prb_image(at)}
+        else:
+            unlike = _unlike(config) if attached else None
+            found = {"ptracer": unlike or ptracer_gradient(at, key), "prb": prb_gradient(at, key)}
+        reasons[key] = found
+        independent[key] = next((name for name, reason in found.items() if reason is None), None)
+        why[key] = "; ".join(f"not {name}: {reason}" for name, reason in found.items() if reason is not None)
+    without = {
+        name: str(reasons[keys[0]][name])
+        for name in ("ptracer", "prb")
+        if all(found[name] is not None for found in reasons.values())
+    }
+    shapes = {key: list(value_shape(problem.selection.value(key))) for key in keys if key != "image"}
+    return {"keys": keys, "shapes": shapes, "independent": independent, "why": why, "without": without}
+
+
+def _unlike(config: Config) -> str | None:
+    """Why naive AD has other derivatives of what moves light than the experiment asks for."""
+    options, alike = config.integrator.options(), ALIKE[Reference.PTRACER]
+    if all(options.get(name, value) == value for name, value in alike.items()):
+        return None
+    return "its attached derivatives are those of " + ", ".join(f"{name}: {value}" for name, value in alike.items())
+
+
+def affordable_paths(problem: Problem, pixels: int, seconds: float) -> int:
+    """So many light paths take so long: a power of 2, so that machines of about the same speed have the same images."""
+    spp = multiple_of(TRIAL // pixels, problem.samples_per_pass)
+    for _ in range(2):  # the first one compiles
+        began = time.perf_counter()
+        problem.render(problem.sensors[0], spp, 0, "convergence, trial")
+        taken = time.perf_counter() - began
+    paths = pixels * spp * seconds / max(taken, 1e-6)
+    return 2 ** int(np.log2(np.clip(paths, TRIAL, MOST_PATHS)))
+
+
+def shorten_target(problem: Problem, most: int) -> str:
+    """Bound the samples per pixel of a target that has to be rendered; returns what to say of it."""
+    render = problem.config.target.render
+    if render is None:
+        return ""
+    own = (render.integrator or problem.config.integrator).options().get("samples_per_pass")
+    spp = multiple_of(most, own)
+    if spp >= render.spp:
+        return ""
+    target = problem.config.target.model_copy(update={"render": render.model_copy(update={"spp": spp})})
+    problem.config = problem.config.model_copy(update={"target": target})
+    return f", the target of {spp}, not {render.spp}"
+
+
+def multiple_of(spp: int, unit: int | None) -> int:
+    """The greatest multiple of a pass's samples up to `spp`, at least one."""
+    unit = unit or 1
+    return max(spp // unit, 1) * unit
+
+
+class Sampler:
+    """Takes steps through the first sensor; the parameters keep their initial values.
+
+    `mode` says what is sampled: `known`, the gradient with dL/dI held at one of `adjoints`; `loss`, the gradient of the
+    experiment's own loss with its `run.adjoint`; `image`. `arrays` are the survey's.
+    """
+
+    def __init__(self, config: Any, mode: str, arrays: dict[str, np.ndarray]) -> None:
+        self.problem, self.mode, self.clock = assemble_scene(config.with_exposures_fixed()), mode, StepClock()
+        self.sensor = self.problem.sensors[0]
+        self.view = self.problem.views[0]
+        if "adjoints" in arrays:
+            set_targets([self.view], arrays)
+        self.mask = None if arrays["mask"].all() else to_tensor(arrays["mask"])
+        self.adjoints = [to_tensor(array) for array in arrays.get("adjoints", ())]
+        self.inside = arrays["mask"] != 0
+
+    def step(self, seed: int, spp: int, image: int) -> tuple[np.ndarray, StepTimes]:
+        """One sample, all parameters (or pixels) in a row, float32; what it took is of the step alone."""
+        problem = self.problem
+        if self.mode == "image":
+            with dr.suspend_grad(), self.clock.step() as times:
+                picture = render_image(problem.integrator, problem.scene, self.sensor, seed, spp)
+                dr.eval(picture)
+            return (np.array(picture, np.float32) * self.inside).ravel(), times
+        problem.apply()
+        for key in problem.selection.keys:
+            dr.clear_grad(problem.optimizer[key])
+        with self.clock.step() as times:
+            result = self._gradient(seed, spp, image)
+            gradients = problem.gradients()
+            dr.eval(result.image, result.loss, gradients)
+        row = [np.array(gradients[key], np.float32).ravel() for key in problem.selection.keys]
+        return np.concatenate(row), times
+
+    def _gradient(self, seed: int, spp: int, image: int) -> Any:
+        problem = self.problem
+        common: dict[str, Any] = {"seed": seed, "params": problem.selection.params}
+        if self.mode == "known":
+            adjoint = self.adjoints[image % len(self.adjoints)]
+            return known_step(problem.integrator, problem.scene, self.sensor, adjoint, spp=spp, **common)
+
+        def loss(picture: mi.TensorXf) -> mi.Float:
+            return masked_loss(self.view, picture, self.mask)
+
+        options = problem.config.step_options() | {"spp": spp}
+        return gradient_step(problem.integrator, problem.scene, self.sensor, loss, **options, **common)
+
+
+def begin_sampling(first: dict[str, Any]) -> Begun:
+    """Begin the process. A question asks for `count` steps from number `start` on, with `spp` samples per pixel.
+
+    Its answer has `step_ms` of each and the number of `new_kernels`; the samples (count, P) go to the file `out`. Where
+    `cold`, also the peak of Dr.Jit's arrays. Seeds are those of the `purpose`; `image` says which dL/dI.
+    """
+    config = loads(first["config"], first["source"])
+    with np.load(first["arrays"]) as arrays:
+        sampler = Sampler(config, first["mode"], {name: arrays[name] for name in arrays.files})
+
+    def answer(question: dict[str, Any]) -> dict[str, Any]:
+        if question["cold"]:
+            reset_peak()
+        rows, taken = [], []
+        for number in range(question["start"], question["start"] + question["count"]):
+            number_seed = seed(config.run.seed, number, sampler.sensor, first["purpose"])
+            row, times = sampler.step(number_seed, question["spp"], question["image"])
+            rows.append(row)
+            taken.append(times)
+        np.save(question["out"], np.stack(rows))
+        reply: dict[str, Any] = {
+            "step_ms": [times.wall_ms for times in taken],
+            "new_kernels": sum(times.new_kernels for times in taken),
+        }
+        if question["cold"]:
+            reply["peak_mib"] = peak_mib(dr.backend_v(mi.Float))
+        sampler.clock.history = []
+        if question["release"]:
+            dr.flush_malloc_cache()
+        return reply
+
+    return {}, answer

@@ -1,0 +1,503 @@
+"""Cases of the extreme suite: glass, roughness, places and motion at the ends of their range.
+
+Glass and masks: what light passes, straight or bent, wholly or not at all.
+
+What moves light: slopes from none to total reflection, grazing light, thin glass, indices, sizes of scenes.
+
+Where things stand: scale, distance from the origin, grazing views, sides and normals.
+
+Microfacet BSDFs from fully rough to nearly smooth: a plate throws light on a floor, and the camera sees that alone.
+
+The plate itself stays out of view: a nearly smooth lobe that is connected to the sensor has a variance that no number
+of samples settles.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+from reslrb_cli.measure.extreme.suite import Differences, Exact, Extrapolated, ExtremeCase, Stock, Twin
+from reslrb_cli.measure.scenes.analytic import camera, refraction_scene, slab_scene
+from reslrb_cli.measure.scenes.analytic import camera as pinhole
+from reslrb_cli.measure.scenes.moving import FILTER, Displacement, Move, Number, Pose, grid, mesh, smooth_fields, waves
+from reslrb_cli.measure.scenes.moving_light import TOP, vertices
+from reslrb_cli.measure.scenes.small import bitmap, diffuse, rgb, room, transform
+
+FLOOR = "floor.brdf_0.reflectance.value"
+
+
+WALL = "wall.brdf_0.reflectance.value"
+
+
+LAMP = "lamp.emitter.radiance.value"
+
+
+VEIL = "veil.bsdf.nested_bsdf.brdf_0.reflectance.value"
+
+
+OPACITY = "veil.bsdf.opacity.value"
+
+
+def veiled(opacity: Any, **changes: Any) -> dict:
+    """A sheet between lamp and floor, and between camera and wall."""
+    bsdf = {"type": "mask", "opacity": opacity, "id": "veil_bsdf",
+            "bsdf": {"type": "twosided", "bsdf": diffuse(0.7, 0.6, 0.3)}}  # fmt: skip
+    place = transform(translate=[0.1, 0.2, 0.2], rotate=([1, 0, 0], -80), scale=0.5)
+    return room(veil={"type": "rectangle", "to_world": place, "bsdf": bsdf}, **changes)
+
+
+def nested() -> dict:
+    """A ball of glass in a ball of water, out of the camera's view of the floor below."""
+    water = {"type": "dielectric", "int_ior": 1.33, "ext_ior": 1.0, "specular_transmittance": rgb(0.9, 0.8, 0.7)}
+    glass = {"type": "dielectric", "int_ior": 1.5, "ext_ior": 1.33, "specular_transmittance": rgb(0.7, 0.8, 0.9),
+             "specular_reflectance": rgb(0.9, 0.6, 0.8)}  # fmt: skip
+    return {
+        "type": "scene",
+        "camera": pinhole([0, 0.3, 0], [0, 0, 0], [0, 0, -1], 80),
+        "floor": {"type": "rectangle", "bsdf": diffuse(0.7, 0.5, 0.6),
+                  "to_world": transform(rotate=([1, 0, 0], -90), scale=2)},
+        "water": {"type": "sphere", "center": [0, 1, 0], "radius": 0.6, "bsdf": water},
+        "glass": {"type": "sphere", "center": [0.1, 1, 0], "radius": 0.35, "bsdf": glass},
+        "lamp": {"type": "rectangle", "bsdf": diffuse(0, 0, 0), "emitter": {"type": "area", "radiance": rgb(9, 8, 7)},
+                 "to_world": transform(translate=[0, 2.2, 0], rotate=([1, 0, 0], 90), scale=0.5)},
+    }  # fmt: skip
+
+
+def critical() -> dict:
+    """A beam in a medium of index 1.5 that meets its flat surface, y = 0, at the critical angle, and the bottom that
+    total reflection lights."""
+    import mitsuba as mi
+
+    theta = float(np.arcsin(1 / 1.5))
+    start = [-float(np.sin(theta)), -float(np.cos(theta)), 0.0]
+    aim = mi.ScalarTransform4f().look_at(origin=start, target=[0, 0, 0], up=[0, 0, 1])
+    below = [4 * float(np.tan(theta)), -4.0, 0.0]
+    surface = {"type": "dielectric", "int_ior": 1.5, "ext_ior": 1.0, "specular_reflectance": rgb(0.9, 0.7, 0.5)}
+    return {
+        "type": "scene",
+        "camera": pinhole([below[0], -3, 2], below, [0, 1, 0], 20),
+        "surface": {"type": "rectangle", "bsdf": surface,
+                    "to_world": transform(rotate=([1, 0, 0], -90), scale=3)},
+        "floor": {"type": "rectangle", "bsdf": diffuse(0.7, 0.5, 0.6),
+                  "to_world": transform(translate=below, rotate=([1, 0, 0], -90), scale=2)},
+        "lamp": {"type": "rectangle", "bsdf": diffuse(0, 0, 0), "to_world": aim @ mi.ScalarTransform4f().scale(0.5),
+                 "emitter": {"type": "directionalarea", "radiance": rgb(3, 2, 4)}},
+    }  # fmt: skip
+
+
+def refraction(ior: float) -> Any:
+    return refraction_scene(ior=ior)
+
+
+def slab(ior: float, degrees: float, max_depth: int) -> Any:
+    return slab_scene(ior=ior, degrees=degrees, max_depth=max_depth)
+
+
+SURFACE = ("plane.bsdf.reflectance.value", "light.intensity.value", "surface.bsdf.specular_transmittance.value")
+
+
+SLAB = ("plane.bsdf.reflectance.value", "lamp.emitter.radiance.value", "top.bsdf.specular_transmittance.value",
+        "top.bsdf.specular_reflectance.value")  # fmt: skip
+
+
+def _exact(name: str, about: str, known: Any, keys: tuple[str, ...], max_depth: int, **more: Any) -> ExtremeCase:
+    return ExtremeCase(name, about, lambda: known().scene(), keys, Exact(known), image="ptracer", spp=512,
+                       options={"max_depth": max_depth}, **more)  # fmt: skip
+
+
+GLASS_CASES = [
+    ExtremeCase("opacity_0", "a mask that is not there", lambda: veiled(0.0), (FLOOR, LAMP), Stock("prb"), spp=128),
+    ExtremeCase("opacity_1", "a mask that hides all", lambda: veiled(1.0), (FLOOR, LAMP, VEIL), Stock("prb"), spp=128),
+    ExtremeCase("opacity_texture_0_and_1", "a mask of opaque and of clear texels",
+                lambda: veiled(bitmap(np.array([[[0.0], [1.0]], [[1.0], [0.0]]]))), (FLOOR, LAMP, VEIL), Stock("prb"),
+                spp=128),
+    ExtremeCase("opacity_0.4", "the opacity of a mask, at a depth at which the image is quadratic in it",
+                lambda: veiled(0.4), (OPACITY,), Differences(0.3), spp=1024, options={"max_depth": 3}, signed=True),
+    ExtremeCase("albedo_0_behind_mask", "a wall that is 0 in one channel behind a mask: what the mask lets pass is "
+                "a factor of a derivative that no contribution shows",
+                lambda: veiled(0.4, wall={"type": "twosided", "bsdf": diffuse(0, 0.7, 0.4)}), (WALL, VEIL),
+                Differences(0.05, "up"), spp=128),
+    ExtremeCase("nested_dielectrics", "a ball of glass in a ball of water", nested,
+                ("water.bsdf.specular_transmittance.value", "glass.bsdf.specular_transmittance.value",
+                 "floor.bsdf.reflectance.value"), Stock("ptracer"), image="ptracer", spp=512,
+                options={"max_depth": 8}),
+    ExtremeCase("critical_angle", "a beam that is totally reflected at the critical angle", critical,
+                ("surface.bsdf.specular_reflectance.value", "floor.bsdf.reflectance.value"), Stock("ptracer"),
+                image="ptracer", spp=512),
+    _exact("refraction", "a point light over a pool", lambda: refraction(1.5), SURFACE, 3),
+    _exact("index_1", "the same without a change of index", lambda: refraction(1.0), SURFACE, 3),
+    _exact("index_3", "the same with index 3", lambda: refraction(3.0), SURFACE, 3),
+    _exact("slab", "a beam through a glass slab, reflected inside it up to six times", lambda: slab(1.5, 40, 10), SLAB,
+           10, seeds=24),
+    _exact("slab_index_3_grazing", "index 3 at 85 degrees: most of the light is reflected",
+           lambda: slab(3.0, 85, 10), SLAB, 10),
+]  # fmt: skip
+
+
+SIZE = 24
+
+
+#: Ten ray offsets where a thin slab is: 8.9e-5 (1 + max |p|) each.
+THIN = 10 * 8.9e-5 * (1 + 2.5)
+
+
+Moves = Callable[[Any], Sequence[Move]]
+
+
+def glass(ior: float = 1.5, alpha: float = 0) -> dict:
+    """Smooth glass, or rough."""
+    index = {"int_ior": ior, "ext_ior": 1.0}
+    return {"type": "roughdielectric", "alpha": alpha} | index if alpha else {"type": "dielectric"} | index
+
+
+def beam(origin: tuple[float, float], target: tuple[float, float], half: float, scale: float = 1) -> dict:
+    """Parallel light in the plane z = 0, from (x, y) to (x, y), with a square cross-section."""
+    import mitsuba as mi
+
+    start, end = ([scale * x, scale * y, 0.0] for x, y in (origin, target))
+    aim = mi.ScalarTransform4f().look_at(origin=start, target=end, up=[0, 0, 1])
+    return {
+        "type": "rectangle",
+        "to_world": aim @ mi.ScalarTransform4f().scale(scale * half),
+        "bsdf": diffuse(0, 0, 0),
+        "emitter": {"type": "directionalarea", "radiance": rgb(9, 8, 7)},
+    }
+
+
+def steep(scale: float = 1) -> dict:
+    """Light from above, at twenty degrees."""
+    return beam((0.5, 3), (0.05, 1.8), 0.25, scale)
+
+
+def pool(
+    bsdf: dict,
+    light: dict,
+    slope: float = 1,
+    height: float = 1.8,
+    thickness: float = 0,
+    scale: float = 1,
+    cells: int = 128,
+) -> dict:
+    """A receiver in glass, whose surface has waves; with a `thickness` it is a slab, and the receiver below it.
+
+    `slope` is that of the waves, as a multiple of one tenth. Everything is `scale` times as large. The faces of its
+    `cells` leave an error of their own, which falls with the square of their number (docs/method.md).
+    """
+    seen = camera([0, scale, 0], [0, 0, 0], [0, 0, -1], 90, SIZE)
+    seen["film"]["rfilter"] = FILTER
+    seen |= {"near_clip": 1e-2 * scale, "far_clip": 1e3 * scale}
+    positions, faces, uv = grid(cells, lambda x, z: height + slope * waves(x, z), 2.5)
+    floor = transform(rotate=([1, 0, 0], -90), scale=20 * scale)
+    scene = {
+        "type": "scene",
+        "camera": seen,
+        "floor": {"type": "rectangle", "bsdf": diffuse(0.8, 0.7, 0.6), "to_world": floor},
+        "lamp": light,
+        "top": mesh(scale * positions, faces, bsdf, uv),
+    }
+    if thickness:
+        place = transform(translate=[0, scale * (height - thickness), 0], rotate=([1, 0, 0], 90), scale=3 * scale)
+        scene["bottom"] = {"type": "rectangle", "bsdf": bsdf, "to_world": place}
+    return scene
+
+
+def bending(size: float = 1, scale: float = 1) -> Moves:
+    """The surface, by three smooth displacements of this size."""
+
+    def moves(scene: Any) -> Sequence[Move]:
+        fields = size * scale * smooth_fields(vertices(scene, "top") / scale, 3, 1.0)
+        return [Displacement(TOP, fields)]
+
+    return moves
+
+
+def sliding(scene: Any) -> Sequence[Move]:
+    """The surface, within itself."""
+    return [Displacement(TOP, smooth_fields(vertices(scene, "top"), 3, 1.0) * np.array([1, 0, 1]))]
+
+
+def with_lamp(scene: Any) -> Sequence[Move]:
+    """The surface, and the lamp."""
+    return [*bending()(scene), Pose("lamp.to_world", ("tx", "rz"), (0.5, 3, 0))]
+
+
+def moving_slab(slope: float = 1, thickness: float = 0.2, scale: float = 1) -> Callable[[], dict]:
+    return lambda: pool(glass(), steep(scale), slope, thickness=thickness, scale=scale)
+
+
+def surface(ior: float = 1.5, alpha: float = 0, slope: float = 1) -> Callable[[], dict]:
+    return lambda: pool(glass(ior, alpha), steep(), slope)
+
+
+def totally_reflected() -> dict:
+    """Light in glass that meets its surface from below, beyond the critical angle, and lights the receiver."""
+    return pool(glass(), beam((-1.87, 1.0), (-1.6, 1.2), 0.12), slope=0.1, height=1.2, cells=256)
+
+
+def grazing(degrees: float) -> dict:
+    """Light at so many degrees from the surface's normal."""
+    theta = float(np.deg2rad(degrees))
+    at = -1.2 * float(np.tan(np.arcsin(np.sin(theta) / 1.5)))
+    start = (at - 2 * float(np.sin(theta)), 1.2 + 2 * float(np.cos(theta)))
+    return pool(glass(), beam(start, (at, 1.2), 0.02), slope=0.1, height=1.2)
+
+
+def moved(name: str, about: str, scene: Callable[[], dict], step: float = 0.01, depth: int = 3,
+          moves: Moves | None = None, left: float = 1e-3, **more: Any) -> ExtremeCase:  # fmt: skip
+    return ExtremeCase(name, about, scene, (), Extrapolated(step, left), image="ptracer", seeds=8, signed=True,
+                       options={"max_depth": depth}, moves=moves or bending(), **more)  # fmt: skip
+
+
+MOTION_CASES = [
+    moved("slope_0", "a flat surface of glass that begins to bend", surface(slope=0)),
+    moved("slope_1e-6", "slopes of a millionth", surface(slope=1e-5)),
+    moved("slope_0.3", "slopes of a third", surface(slope=3), 0.005),
+    moved("sliding_faces", "a surface whose faces slide through the light", surface(), moves=sliding),
+    moved("total_reflection", "a surface with waves, beyond the critical angle", totally_reflected, 0.0015),
+    moved("grazing_85", "light at 85 degrees on glass", lambda: grazing(85), 0.005, moves=bending(0.1)),
+    moved("parallel_faces", "a slab with flat faces that begins to bend", moving_slab(0), depth=4),
+    moved(
+        "thin_slab", "a slab of ten ray offsets", moving_slab(0, THIN), depth=4, moves=bending(THIN), step=0.1, spp=256
+    ),
+    moved("moved_index_1", "glass of index 1, and the lamp over it", surface(1.0), moves=with_lamp),
+    moved("moved_index_3", "glass of index 3", surface(3.0)),
+    moved("moved_rough_1.001", "rough glass of index 1.001, and the lamp over it", surface(1.001, 0.1),
+          moves=with_lamp, equal=1e-3),
+    moved("moved_rough_3", "rough glass of index 3", surface(3.0, 0.1), equal=1e-3),
+    moved("millimetres", "a slab a thousand times its size", moving_slab(scale=1e3), depth=4, moves=bending(1, 1e3)),
+    moved("shrunk_to_0.03", "a slab three hundredths of its size", moving_slab(scale=0.03), depth=4,
+          moves=bending(1, 0.03), left=5e-3),
+]  # fmt: skip
+
+
+AWAY = [60.0, 60.0, 52.9]  # 100 from the origin
+
+
+def placed(scale: float = 1, offset: Any = (0, 0, 0)) -> dict:
+    """The room, scaled about the origin and then moved; radiance makes its image the same."""
+    import mitsuba as mi
+
+    scene = room()
+    move = transform(translate=list(offset), scale=scale)
+    for name, item in scene.items():
+        if isinstance(item, dict) and "to_world" in item:
+            scene[name] = item | {"to_world": move @ item["to_world"]}
+    view = np.array(room()["camera"]["to_world"].matrix)
+    view[:3, 3] = scale * view[:3, 3] + np.asarray(offset)
+    scene["camera"] |= {"to_world": mi.ScalarTransform4f(view), "near_clip": 1e-2 * scale, "far_clip": 1e4 * scale}
+    return scene
+
+
+def low_view() -> dict:
+    """A camera close above the floor, which looks along it."""
+    return room(camera=pinhole([0.9, -0.95, 0.9], [-0.9, -0.96, -0.2], [0, 1, 0], 25))
+
+
+def turned_panes() -> dict:
+    """Two sheets that scatter on one side: one turns its back on the camera, the other on the lamp."""
+
+    def pane(tilt: float, **place: Any) -> dict:
+        return {"type": "rectangle", "bsdf": diffuse(0.8, 0.6, 0.7),
+                "to_world": transform(**place, rotate=([1, 0, 0], tilt), scale=0.35)}  # fmt: skip
+
+    return room(first=pane(160, translate=[0.4, -0.2, 0.6]), second=pane(40, translate=[-0.4, -0.3, 0.5]))
+
+
+def octahedron(*reflectance: float) -> dict:
+    """A solid of eight flat faces that is shaded as a sphere."""
+    import mitsuba as mi
+
+    properties = mi.Properties()
+    properties["mesh_bsdf"] = mi.load_dict(diffuse(*reflectance))
+    mesh = mi.Mesh("solid", 6, 8, has_vertex_normals=True, props=properties)
+    corners = np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]], np.float32)
+    faces = [(x, y, z) if (x + y + z) % 2 == 0 else (y, x, z) for x in (0, 1) for y in (2, 3) for z in (4, 5)]
+    params = mi.traverse(mesh)
+    params["vertex_positions"] = (0.5 * corners + [0.1, -0.3, 0.2]).ravel().tolist()
+    params["vertex_normals"] = corners.ravel().tolist()
+    params["faces"] = np.array(faces).ravel().tolist()
+    params.update()
+    return room(solid=mesh)
+
+
+def normal_map() -> dict:
+    """A floor whose normals lean by up to 60 degrees."""
+    random = np.random.default_rng(5)
+    lean = np.concatenate([random.uniform(0.2, 0.8, (4, 4, 2)), np.full((4, 4, 1), 0.75)], -1)
+    return room(floor={"type": "normalmap", "normalmap": bitmap(lean, "bilinear"), "bsdf": diffuse(0.7, 0.5, 0.6)})
+
+
+def vertical_light() -> dict:
+    """A lamp that stands on the floor's edge: nearly all its light on the floor arrives at grazing angles."""
+    side = {
+        "type": "rectangle",
+        "bsdf": diffuse(0, 0, 0),
+        "emitter": {"type": "area", "radiance": rgb(9, 8, 7)},
+        "to_world": transform(translate=[0, -0.99, 0.999], rotate=([0, 1, 0], 180), scale=[1, 0.01, 1]),
+    }
+    return room(lamp=side)
+
+
+PLACES_CASES = [
+    ExtremeCase("scaled_1e-2", "the room a hundredth of its size", lambda: placed(1e-2), (FLOOR, WALL, LAMP),
+                Twin(room)),
+    ExtremeCase("scaled_1e+4", "the room ten thousand times its size", lambda: placed(1e4), (FLOOR, WALL, LAMP),
+                Twin(room)),
+    ExtremeCase("moved_100", "the room 100 from the origin, fifty times its own size", lambda: placed(1, AWAY),
+                (FLOOR, WALL, LAMP), Twin(room)),
+    ExtremeCase("grazing_sensor", "a camera that looks along the floor", low_view, (FLOOR, WALL, LAMP),
+                Stock("ptracer"), spp=512),
+    ExtremeCase("grazing_lamp", "a lamp on the floor's edge, at right angles to it", vertical_light,
+                (FLOOR, WALL, LAMP), Stock("ptracer"), spp=128),
+    ExtremeCase("back_facing", "sheets that turn their backs on camera and lamp", turned_panes,
+                ("first.bsdf.reflectance.value", "second.bsdf.reflectance.value", FLOOR), Stock("ptracer"), spp=256),
+    ExtremeCase("shading_normals", "eight flat faces shaded as a sphere", lambda: octahedron(0.7, 0.5, 0.8),
+                ("solid.bsdf.reflectance.value", FLOOR), Stock("prb"), spp=256),
+    ExtremeCase("shading_normals_albedo_0", "the same in black: the derivative alone shows how its normals are treated",
+                lambda: octahedron(0, 0, 0), ("solid.bsdf.reflectance.value", FLOOR), Differences(0.05, "up"),
+                spp=256),
+    ExtremeCase("normal_map", "normals that lean by up to 60 degrees", normal_map,
+                ("floor.nested_bsdf.reflectance.value", WALL), Stock("prb"), spp=512),
+]  # fmt: skip
+
+
+RECEIVER = "floor.bsdf.reflectance.value"
+
+
+def _horizontal(y: float, half: float, turn: float = -90) -> Any:
+    return transform(translate=[0, y, 0], rotate=([1, 0, 0], turn), scale=half)
+
+
+def reflected(bsdf: dict) -> dict:
+    """A lamp shines on an upright plate, which reflects it on the floor."""
+    return {
+        "type": "scene",
+        "camera": camera([0, 0.9, 0], [0, 0, 0], [0, 0, -1], 60),
+        "floor": {"type": "rectangle", "bsdf": diffuse(0.7, 0.5, 0.6), "to_world": _horizontal(0, 2)},
+        "plate": {"type": "rectangle", "bsdf": bsdf,
+                  "to_world": transform(translate=[-1, 1, 0], rotate=([0, 1, 0], 90))},
+        "lamp": {"type": "rectangle", "bsdf": diffuse(0, 0, 0), "emitter": {"type": "area", "radiance": rgb(5, 6, 4)},
+                 "to_world": transform(translate=[0.8, 1.3, 0], rotate=([0, 1, 0], -90), scale=0.4)},
+    }  # fmt: skip
+
+
+def transmitted(bsdf: dict) -> dict:
+    """A lamp shines through a horizontal plate on the floor; the camera stands between the two."""
+    return reflected(bsdf) | {
+        "plate": {"type": "rectangle", "bsdf": bsdf, "to_world": _horizontal(1, 2)},
+        "lamp": {"type": "rectangle", "bsdf": diffuse(0, 0, 0), "emitter": {"type": "area", "radiance": rgb(5, 6, 4)},
+                 "to_world": _horizontal(1.8, 0.5, 90)},
+    }  # fmt: skip
+
+
+def close() -> dict:
+    """A narrow beam that falls on the floor, and a camera that looks at nothing else."""
+    return {
+        "camera": camera([0, 0.9, 0], [0, 0, 0], [0, 0, -1], 4),
+        "lamp": {"type": "rectangle", "bsdf": diffuse(0, 0, 0), "to_world": _horizontal(1.8, 0.01, 90),
+                 "emitter": {"type": "directionalarea", "radiance": rgb(5, 6, 4)}},
+    }  # fmt: skip
+
+
+def conductor(alpha: float) -> dict:
+    return reflected({"type": "roughconductor", "alpha": alpha, "specular_reflectance": rgb(0.9, 0.7, 0.5)})
+
+
+def dielectric(alpha: float) -> dict:
+    return transmitted({"type": "roughdielectric", "alpha": alpha, "specular_transmittance": rgb(0.9, 0.7, 0.5)})
+
+
+def plastic(alpha: float) -> dict:
+    return reflected({"type": "roughplastic", "alpha": alpha, "diffuse_reflectance": rgb(0.1, 0.2, 0.3),
+                      "specular_reflectance": rgb(0.9, 0.7, 0.5)})  # fmt: skip
+
+
+def principled(roughness: float) -> dict:
+    return reflected({"type": "principled", "roughness": roughness, "metallic": 0.9, "base_color": rgb(0.9, 0.7, 0.5)})
+
+
+#: Maker, colour of the lobe, and roughness, where that is a parameter.
+KINDS = {
+    "roughconductor": (conductor, "specular_reflectance", "alpha"),
+    "roughdielectric": (dielectric, "specular_transmittance", "alpha"),
+    "roughplastic": (plastic, "specular_reflectance", None),
+    "principled": (principled, "base_color", "roughness"),
+}
+
+
+ROUGHNESS = ("1", "0.1", "1e-2", "1e-4")
+
+
+#: Roughnesses whose derivative is decided where light follows them. `principled` chooses a lobe: it has none such.
+FOLLOWED = [(kind, roughness) for kind in ("roughconductor", "roughdielectric") for roughness in ("0.1", "1e-2")]
+
+
+NOISE = "the noise of a roughness's derivative grows as 1 / roughness: equal seeds decide"
+
+
+def followed(kind: str, roughness: str) -> str:
+    """Name of the case in which light follows a roughness."""
+    return f"{kind}_{roughness}_followed"
+
+
+def _case(kind: str, roughness: str) -> ExtremeCase:
+    make, colour, own = KINDS[kind]
+    colour, keys = f"plate.bsdf.{colour}.value", [RECEIVER]
+    open_ended, elsewhere = {}, {}
+    if own is not None:
+        keys.append(f"plate.bsdf.{own}.value")
+        if (kind, roughness) in FOLLOWED:
+            elsewhere[keys[-1]] = followed(kind, roughness)
+        elif float(roughness) <= 0.1:
+            open_ended[keys[-1]] = NOISE
+    return ExtremeCase(
+        f"{kind}_{roughness}",
+        f"light by way of a {kind} of roughness {roughness}",
+        lambda: make(float(roughness)),
+        (colour, *keys),
+        Stock("prb"),
+        spp=256,
+        signed=own is not None,
+        open_ended=open_ended,
+        elsewhere=elsewhere,
+    )
+
+
+def _followed(kind: str, roughness: str) -> ExtremeCase:
+    """The derivative by the roughness, of light that follows it: quiet, and known by finite differences.
+
+    What nearly smooth glass blurs is less than a pixel of the camera above, and next to nothing of its derivative is
+    left: a closer one looks at a narrow beam.
+    """
+    make, _, own = KINDS[kind]
+
+    def scene() -> dict:
+        made = make(float(roughness))
+        if (kind, roughness) == ("roughdielectric", "1e-2"):
+            made |= close()
+        made["camera"]["film"]["rfilter"] = FILTER  # a box filter has no derivative by where light lands
+        return made
+
+    return ExtremeCase(
+        followed(kind, roughness),
+        f"how light follows the roughness {roughness} of a {kind}",
+        scene,
+        (),
+        Extrapolated(0.05 * float(roughness), 2e-3),
+        image="",
+        spp=256,
+        signed=True,
+        options={"max_depth": 3},  # from the plate to the floor, and no farther: beyond it are edges at rest
+        ours={"attached": True},
+        equal=5e-4,
+        moves=lambda scene: [Number(f"plate.bsdf.{own}.value")],
+    )
+
+
+ROUGHNESS_CASES = [_case(kind, roughness) for kind in KINDS for roughness in ROUGHNESS]
+
+
+ROUGHNESS_CASES += [_followed(kind, roughness) for kind, roughness in FOLLOWED]

@@ -1,0 +1,437 @@
+"""What measurements compare and vary, as their options say it. Knows no Mitsuba.
+
+What a measurement compares: a list such as `ptracer,reslrb:reservoir(capacity=4)`, and the depths of a bench.
+
+What `bench` varies, and over which values. Knows no Mitsuba.
+
+What `convergence` measures, and what it takes its errors from. Knows no Mitsuba.
+
+What `convergence --runs` measures. Knows no Mitsuba.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+from reslrb_cli.config.base import SEED_END
+from reslrb_cli.config.integrators import ESTIMATOR_OPTIONS, UNDECIDED, Prb, Ptracer, Trajectory, WalkAd
+from reslrb_cli.config.integrators import Reslrb as ReslrbConfig
+from reslrb_cli.config.loader import with_integrator
+from reslrb_cli.config.parameters import ByWord, ParameterSpec
+from reslrb_cli.config.schema import Config
+from reslrb_cli.config.yaml_text import parse
+from reslrb_cli.errors import ConfigError
+from reslrb_cli.records.measurements import Method
+
+#: Options that a case takes over from the configuration's integrator, where it knows them.
+SHARED = (
+    *("rr_depth", "hide_emitters", "samples_per_pass", "attached", "filter_normalization", "attached_sampling"),
+    *UNDECIDED,
+)
+
+
+#: The estimator of a case that names none, as that of the plugin.
+PLUGIN_ESTIMATOR = "reservoir"
+
+
+#: Options of a case that are those of `run`, for itself alone.
+ADJOINT = ("adjoint", "batches", "first_batch")
+
+
+_TYPES = {str(kind.model_fields["type"].default): kind for kind in (ReslrbConfig, Ptracer, Prb, WalkAd, Trajectory)}
+
+
+#: Options that make an estimator another one, in records.
+_ESTIMATOR_OPTIONS = {option for options in ESTIMATOR_OPTIONS.values() for option in options} - {"capacity"}
+
+
+_ESTIMATOR_OPTIONS |= set(UNDECIDED)
+
+
+_OPTION = "--integrators"
+
+
+_ITEM = re.compile(r"(?P<type>\w+)(?::(?P<estimator>\w+))?(?:\((?P<options>.*)\))?")
+
+
+@dataclass(frozen=True)
+class Case:
+    """One integrator with its options, at no depth yet; `label` is how the user wrote it, `source` where."""
+
+    label: str
+    type: str
+    options: dict[str, Any]
+    source: str = _OPTION
+
+    def at(self, config: Config, max_depth: int, known: bool, auto: bool = False) -> Config:
+        """The experiment with this integrator at this depth. Raises ConfigError where the integrator cannot be.
+
+        `known`: dL/dI is, before the image, so that `run.adjoint` has no part in it. `auto`: the estimator may be left
+        to a pilot, as what is measured has one.
+        """
+        blame = f"{self.source} {self.label}"
+        adjoint = {name: value for name, value in self.options.items() if name in ADJOINT}
+        if known and adjoint:
+            raise ConfigError(blame, next(iter(adjoint)), "has no effect where dL/dI is known; change --objective")
+        if known:
+            adjoint = {"adjoint": "independent"}  # which goes with any weight
+        shared, own = config.integrator.options(), _TYPES[self.type].model_fields if self.type in _TYPES else {}
+        values = {"type": self.type} | {name: shared[name] for name in SHARED if name in shared and name in own}
+        # Of the experiment, whose pilot decides it; what is named here has none.
+        values = {name: value for name, value in values.items() if name not in UNDECIDED or value != "auto"}
+        values |= {name: value for name, value in self.options.items() if name not in ADJOINT}
+        if self.type == "reslrb" and values.setdefault("estimator", PLUGIN_ESTIMATOR) == "auto" and not auto:
+            raise ConfigError(blame, "estimator", "`auto` measures which to take; name those to compare")
+        for option, compared in (("guiding", "`on` with `off`"), ("sequence", "`independent` with `low_discrepancy`")):
+            if values.get(option) == "auto" and not auto:
+                raise ConfigError(blame, option, f"`auto` measures whether it pays; compare {compared}")
+        return with_integrator(config, values | {"max_depth": max_depth}, blame, adjoint)
+
+    @property
+    def estimator(self) -> str | None:
+        """Name of the estimator, with the options that make it another than the default one, but for `capacity`."""
+        if self.type != "reslrb":
+            return None
+        name = str(self.options.get("estimator", PLUGIN_ESTIMATOR))
+        usual = {option: ReslrbConfig.model_fields[option].default for option in _ESTIMATOR_OPTIONS}
+        usual |= dict.fromkeys(UNDECIDED, "auto") if name == "auto" else UNDECIDED
+        other = [
+            f"{option}={value}"
+            for option, value in self.options.items()
+            if option in ADJOINT or (option in usual and value != usual[option])
+        ]
+        return f"{name}({','.join(other)})" if other else name
+
+
+def parse_cases(text: str, source: str = _OPTION, deep: bool = True) -> list[Case]:
+    """The cases in a list. Raises ConfigError where one is not written as it must be, or stands there twice.
+
+    `source` is the option that the list was given by; `deep`: depths are what is varied. What an option means is not
+    looked at here, but in `Case.at`.
+    """
+    return _parse(_split(text), source, "", "integrator; write TYPE[:ESTIMATOR][(OPTION=VALUE,...)]", deep)
+
+
+def parse_estimators(text: str) -> list[Case]:
+    """The cases in a list of estimators of `reslrb`, such as `stack,reservoir(capacity=4)`; raises as `parse_cases`."""
+    return _parse(_split(text), "--estimators", "reslrb:", "estimator; write ESTIMATOR[(OPTION=VALUE,...)]", False)
+
+
+def all_estimators(config: Config) -> list[Case]:
+    """Every estimator of `reslrb`; that of the configuration has the options that stand there."""
+    cases, own = [], config.integrator
+    for name in ESTIMATOR_OPTIONS:
+        if name != "auto":
+            mine = isinstance(own, ReslrbConfig) and own.estimator == name
+            names = [option for option in ESTIMATOR_OPTIONS[name] if mine and option in own.model_fields_set]
+            options = {option: getattr(own, option) for option in names}
+            text = ",".join(f"{option}={value}" for option, value in options.items())
+            label = f"reslrb:{name}({text})" if text else f"reslrb:{name}"
+            cases.append(Case(label, "reslrb", {"estimator": name} | options))
+    return cases
+
+
+def _parse(items: list[str], source: str, prefix: str, wanted: str, deep: bool) -> list[Case]:
+    cases: list[Case] = []
+    for item in items:
+        match = _ITEM.fullmatch(prefix + item)
+        if match is None or (prefix and not match["estimator"]):
+            raise ConfigError(source, "", f"`{item}` is no {wanted}")
+        options = {} if match["estimator"] is None else {"estimator": match["estimator"]}
+        for pair in _split(match["options"] or "") if match["options"] else []:
+            name, equals, value = pair.partition("=")
+            if not equals or not name.strip():
+                raise ConfigError(source, item, f"`{pair}` must be OPTION=VALUE")
+            if name.strip() == "max_depth" and deep:
+                raise ConfigError(source, item, "max_depth is what is varied; --max-depth says how far")
+            if name.strip() == "max_depth" or (name.strip() in ADJOINT and prefix):
+                section = "run" if name.strip() in ADJOINT else "integrator"
+                raise ConfigError(source, item, f"all share one {name.strip()}; take --set {section}.{pair}")
+            options[name.strip()] = parse(value, f"{source} {item}", name_line=False)
+        case = Case(prefix + item, match["type"], options, source)
+        if case.label in [other.label for other in cases]:
+            raise ConfigError(source, "", f"`{item}` is named twice")
+        cases.append(case)
+    return cases
+
+
+def _split(text: str) -> list[str]:
+    """The parts between commas that stand in no parentheses."""
+    parts, depth = [""], 0
+    for character in text:
+        depth += {"(": 1, ")": -1}.get(character, 0)
+        if character == "," and depth == 0:
+            parts.append("")
+        else:
+            parts[-1] += character
+    return [part.strip() for part in parts]
+
+
+def choose_baseline(cases: Sequence[Case], name: str | None) -> Case:
+    """The case that the others are compared with: that of this label, else `ptracer` where it is there, or the first.
+
+    Raises ConfigError where none has the label.
+    """
+    for case in cases:
+        if case.label == name or (name is None and case.type == "ptracer"):
+            return case
+    if name is not None:
+        labels = ", ".join(case.label for case in cases)
+        raise ConfigError("--baseline", "", f"`{name}` is none of {labels}")
+    return cases[0]
+
+
+def depths(max_depth: int) -> list[int]:
+    """2, 4, 8, ... up to `max_depth`, which comes last."""
+    powers = [2**k for k in range(1, max_depth.bit_length()) if 2**k < max_depth]
+    return [*powers, max_depth]
+
+
+#: What can be swept, and what it is called where a single value of it is named.
+SWEPT = {"depth": "depth", "spp": "spp", "film": "film width", "texture": "texture width"}
+
+
+#: Samples per pixel that are measured where the user names none, as shares of those of the experiment.
+SHARES = (0.25, 0.5, 1, 2, 4)
+
+
+#: Widths that are measured where the user names none, in pixels or texels.
+WIDTHS = {"film": (32, 64, 128, 256), "texture": (16, 64, 256, 1024)}
+
+
+def usual_values(swept: str, config: Config) -> list[int]:
+    """What is measured of anything but depth, where the user names nothing."""
+    if swept == "spp":
+        return sorted({max(round(share * config.run.spp), 1) for share in SHARES})
+    return list(WIDTHS[swept])
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """What is measured: at each of `values` of what is `swept`.
+
+    `memory_limit` is of each process, None: none; `memory` is what the machine has, in bytes.
+
+    `rounds` is None where `budget_s` decides their number; else there are so many, whatever time they take. Of the
+    `cases`, those that cannot do what the scene asks for are left out where they are the `default` ones.
+    """
+
+    config: Config
+    variant: str
+    cases: Sequence[Case]
+    baseline: Case
+    values: Sequence[int]
+    objective: str
+    memory_limit: int | None
+    memory: int
+    budget_s: float
+    rounds: int | None = None
+    default: bool = False
+    swept: str = "depth"
+
+    def may_refuse(self, case: Case) -> bool:
+        """Whether the rest goes on without this case, where it refuses the scene."""
+        return self.default and case != self.baseline
+
+    def at(self, case: Case, value: int) -> Config:
+        """The experiment of one case, all but the sizes of film and textures. Raises ConfigError."""
+        config, depth = self.config, self.config.integrator.max_depth
+        if self.swept == "spp":
+            config = config.model_copy(update={"run": config.run.model_copy(update={"spp": value})})
+        return case.at(config, value if self.swept == "depth" else depth, known=self.objective == "fixed")
+
+    def name(self, *values: int) -> str:
+        """Some values of what is swept, in words: `depth 2, 4`."""
+        return f"{SWEPT[self.swept]} {', '.join(map(str, values))}"
+
+    def check(self) -> None:
+        """Raise ConfigError where an integrator of the list cannot be."""
+        for case in self.cases:
+            for value in self.values if self.swept == "spp" else self.values[:1]:
+                self.at(case, value)
+
+
+#: What is estimated: the gradient with dL/dI held, the gradient of the configuration's loss, or the image.
+OBJECTIVES = ("fixed", "loss", "image")
+
+
+#: What is compared where the user names nothing, by objective.
+DEFAULTS = {
+    "fixed": "ptracer,prb,reslrb:reservoir,reslrb:event,reslrb:gather,reslrb:stack",
+    "loss": "reslrb:stack(adjoint=correlated),reslrb:stack(adjoint=independent),reslrb:stack(adjoint=batched)",
+    "image": "ptracer,prb,reslrb:stack",
+}
+
+
+#: What errors are taken from where the user names nothing.
+REFERENCE = "reslrb:stack"
+
+
+#: A depth at which roulette never begins.
+NEVER = 1_000_000
+
+
+#: Images that dL/dI is held at in turn where the loss is the configuration's: the noise of a single one would look like
+#: a bias of those that take dL/dI from images of their own.
+IMAGES = 8
+
+
+#: All parameters together.
+ALL = "all"
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What is measured; `memory_limit` is of each process, None: none; `memory` is what the machine has, in bytes.
+
+    Of the `cases` those that cannot do what the scene asks for are left out where they are the `default` ones. `rounds`
+    is None where `budget_s` decides their number; `spps` are samples per pixel of a step, nothing for those of `run`.
+    """
+
+    config: Config
+    variant: str
+    cases: Sequence[Case]
+    reference: Case
+    objective: str
+    memory_limit: int | None
+    memory: int
+    budget_s: float
+    rounds: int | None = None
+    default: bool = False
+    spps: Sequence[int] = ()
+
+    @property
+    def known(self) -> bool:
+        """Whether dL/dI is known before the image, or not asked for."""
+        return self.objective != "loss"
+
+    @property
+    def camera(self) -> dict[str, bool]:
+        """Whether paths from the `camera` take part, and whether that is so in any case, `named`, as `survey` asks."""
+        named = self.reference.type == "prb"  # what errors are taken from is a side too
+        return {"camera": named or any(case.type == "prb" for case in self.cases), "named": named or not self.default}
+
+    @property
+    def entries(self) -> list[tuple[Case, int]]:
+        """What is compared: cases, each with its samples per pixel."""
+        return [(case, spp) for case in self.cases for spp in self.spps or [self.config.run.spp]]
+
+    def config_of(self, case: Case, spp: int) -> Config:
+        """The experiment with the integrator of a case, and so many samples per pixel. Raises ConfigError."""
+        run = self.config.run.model_copy(update={"spp": spp})
+        config = self.config.model_copy(update={"run": run})
+        return case.at(config, config.integrator.max_depth, self.known)
+
+    @property
+    def reference_config(self) -> Config:
+        """The experiment with the integrator that errors are taken from, dL/dI known. Raises ConfigError."""
+        return self.reference.at(self.config, self.config.integrator.max_depth, True)
+
+    def independent_config(self, name: str) -> Config:
+        """The experiment with a stock integrator: without roulette, which naive AD does not differentiate rightly."""
+        depth = self.config.integrator.max_depth
+        roulette = depth < 0 or self.config.integrator.rr_depth <= depth
+        case = Case(
+            name, name, {"rr_depth": NEVER} if name == "ptracer" and roulette else {}, "the independent reference"
+        )
+        return case.at(self.config, depth, True)
+
+    def check(self) -> None:
+        """Raise ConfigError where an integrator of the list, or the reference, cannot be."""
+        for case, spp in self.entries:
+            self.config_of(case, spp)
+        _ = self.reference_config
+
+    def method(self, case: Case, config: Config, spp: int, known: bool, reference: bool) -> Method:
+        """How a case, or a `reference`, stands in records."""
+        options: dict[str, Any] = config.integrator.options()
+        adjoint = None if known else config.adjoint
+        own = {name: value for name, value in case.options.items() if name not in ADJOINT}
+        estimator = replace(case, options=own).estimator
+        label = f"{case.label}, {spp} spp" if self.spps and not reference else case.label
+        return Method(label, case.type, estimator, options.get("capacity"), adjoint, spp)
+
+
+#: What is compared where the user names nothing.
+DEFAULT = "ptracer,prb,reslrb:stack,reslrb:auto"
+
+
+@dataclass(frozen=True)
+class Side:
+    """What has runs of its own: a case, samples per pixel, and what learning rates are multiplied by, None: nothing."""
+
+    case: Case
+    spp: int
+    rate: float | None = None
+
+
+@dataclass(frozen=True)
+class RunsPlan(Plan):
+    """What is measured; see `Plan`. `runs` is the number of seeds, which all methods have in common.
+
+    `reference` is what renders the images that losses are taken of. Each method has runs with all its learning rates
+    times each of `rates`, of which its best then counts; without any, with those of the configuration.
+    """
+
+    runs: int = 3
+    rates: Sequence[float] = ()
+
+    @property
+    def sides(self) -> list[Side]:
+        """What has runs of its own, all rates of a method beside each other."""
+        return [Side(case, spp, rate) for case, spp in self.entries for rate in self.rates or (None,)]
+
+    @property
+    def names(self) -> dict[str, str]:
+        """The method's label by that of each of its rates."""
+        return {self.method_of(side).label: self.method_of(replace(side, rate=None)).label for side in self.sides}
+
+    @property
+    def seeds(self) -> list[int]:
+        """`run.seed` of each run: that of the configuration, and those after it."""
+        return [(self.config.run.seed + number) % SEED_END for number in range(self.runs)]
+
+    def config_of(self, case: Case, spp: int) -> Config:
+        """The experiment with the integrator of a case, which may be `auto`, and so many samples per pixel.
+
+        Raises ConfigError.
+        """
+        run = self.config.run.model_copy(update={"spp": spp})
+        config = self.config.model_copy(update={"run": run})
+        return case.at(config, config.integrator.max_depth, False, auto=True)
+
+    def seeded(self, config: Config, seed: int) -> Config:
+        """The same experiment with another `run.seed`."""
+        return config.model_copy(update={"run": config.run.model_copy(update={"seed": seed})})
+
+    def config_at(self, side: Side) -> Config:
+        """The experiment as a side has it. Raises ConfigError."""
+        config = self.config_of(side.case, side.spp)
+        return config if side.rate is None else at_rate(config, side.rate)
+
+    def method_of(self, side: Side) -> Method:
+        """How a side stands in records."""
+        config = self.config_of(side.case, side.spp)
+        method = self.method(side.case, config, side.spp, known=False, reference=False)
+        return method if side.rate is None else replace(method, label=f"{method.label}, rates x {side.rate:g}")
+
+
+def at_rate(config: Config, factor: float) -> Config:
+    """The experiment with every learning rate, the optimiser's and those of single parameters, times `factor`."""
+    optimizer = config.optimizer.model_copy(update={"learning_rate": config.optimizer.learning_rate * factor})
+    parameters = [_at_rate(spec, factor) for spec in config.parameters]
+    return config.model_copy(update={"optimizer": optimizer, "parameters": parameters})
+
+
+def _at_rate(spec: ParameterSpec, factor: float) -> ParameterSpec:
+    rate: Any = spec.learning_rate
+    if rate is None:  # the optimiser's
+        return spec
+    if isinstance(rate, ByWord):
+        rate = rate.model_copy(update={word: value * factor for word, value in rate.words().items()})
+    else:
+        rate = rate * factor
+    return spec.model_copy(update={"learning_rate": rate})

@@ -1,0 +1,455 @@
+"""The trace of a value that is not finite: the path, its vertex and the factor.
+
+Which tables the samples of a guided step were drawn from, noted while the step is taken again.
+
+A walk that looks for the first value on each path that is not finite, and that reaches the image or a gradient.
+
+Looks along the paths of one set of samples for the first value that is not finite.
+
+Finds where a step came upon a value that is not finite: the path, its vertex and the factor, or the loss's pixel.
+
+The paths of the step are traced again from their seeds, and every factor is looked at, with its derivative in the
+direction in which all entries of the parameters grow alike: what is not finite in one direction is not in this one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from reslrb_cli.guiding.collect import Said
+from reslrb_cli.guiding.tables import Guiding, Purpose
+from reslrb_cli.integrators.reslrb import Reslrb
+from reslrb_cli.integrators.step import gradient_step, sample_sets
+from reslrb_cli.optimization.loading import LIGHT_TRACERS, pass_spp
+from reslrb_cli.optimization.moving import is_attached
+from reslrb_cli.optimization.problem import Problem
+from reslrb_cli.optimization.state import guiding_of
+from reslrb_cli.optimization.views import View
+from reslrb_cli.records.decisions import Offender, PathVertex
+from reslrb_cli.seeds import seed
+from reslrb_cli.transport.bsdf import Scattering, evaluate, tracked_factor
+from reslrb_cli.transport.connection import Connection, forward_derivatives
+from reslrb_cli.transport.emission import Emission, sample_emission
+from reslrb_cli.transport.factors import Product
+from reslrb_cli.transport.film import Film
+from reslrb_cli.transport.guide import Table
+from reslrb_cli.transport.samples import Samples, passes
+from reslrb_cli.transport.visible import primary_ray, small_points, visible_radiance, visible_tangent
+from reslrb_cli.transport.walk import Hooks, Vertex, walk
+
+
+class Witness(Guiding):
+    """What another has learned, which goes on learning, and notes which tables samples are drawn from.
+
+    `drawn` are the tables of the samples so far, in order, those of samples that were learned from left out.
+    """
+
+    def __init__(self, other: Guiding) -> None:
+        super().__init__()
+        self.images, self.held, self.grid = other.images, other.held, other.grid
+        self.learned, self.films = dict(other.learned), dict(other.films)
+        self.drawn: list[Table] = []
+
+    def table(self, number: int, purpose: Purpose, delta: mi.TensorXf | None = None) -> Table:
+        """What samples for sensor `number` are drawn from."""
+        found = super().table(number, purpose, delta)
+        self.drawn.append(found)
+        return found
+
+    def learn(self, number: int, paths: int, said: Said) -> None:
+        """Have the table of a sensor learn from paths that were drawn for this alone."""
+        self.drawn.pop()
+        super().learn(number, paths, said)
+
+
+def purposes(problem: Problem, view: View) -> list[tuple[int, str, Purpose]]:
+    """What a step draws samples for, in order: the place of each among `sample_sets`, a word to its name, what for."""
+    options = problem.config.step_options()
+    gradient = Purpose.GRADIENT if problem.on_samples(view) is None else Purpose.BOTH
+    if options["adjoint"] == "correlated":
+        return [(0, "", Purpose.BOTH)]
+    if options["adjoint"] == "independent":
+        return [(0, "", Purpose.IMAGE), (1, "", gradient)]
+    found = [(0, "", Purpose.IMAGE), *((b, "", Purpose.BOTH) for b in range(1, options["batches"]))]
+    return [*found, (0, ", again", gradient)] if options["first_batch"] == "again" else found
+
+
+#: What may not be finite; `Suspect.kind` is the index.
+QUANTITIES = (
+    "nothing",
+    "emission E",
+    "derivative of emission, dE",
+    "scattering weight s",
+    "derivative of the scattering factor, ds",
+    "product of the factors E s_1 ... s_j",
+    "connection factor c",
+    "derivative of the connection factor, dc",
+    "contribution C = E s_1 ... s_{i-1} c_i",
+)
+
+
+_E, _DE, _S, _DS, _PRODUCT, _C, _DC, _CONTRIBUTION = range(1, len(QUANTITIES))
+
+
+@dataclass
+class Suspect:
+    """A value (C,), its kind (0: none), and the vertex at which it stands."""
+
+    kind: Any
+    vertex: Any
+    p: Any
+    shape: Any
+    value: Any
+
+    @staticmethod
+    def none() -> Suspect:
+        """Nothing found."""
+        return Suspect(mi.UInt32(0), mi.UInt32(0), mi.Point3f(0), mi.UInt32(0), mi.Spectrum(0))
+
+    def otherwise(self, other: Suspect, active: Any) -> Suspect:
+        """This, or where there is none, in `active` lanes, `other` if it is not finite."""
+        take: Suspect = dr.select((self.kind == 0) & active & is_bad(other.value), other, self)
+        return take
+
+
+def is_bad(value: Any) -> Any:
+    """Lanes in which a channel of `value` (C,) is not finite."""
+    return ~dr.all(dr.isfinite(value))
+
+
+def reaches(film: Film, u: Any, pixel: tuple[int, int] | None) -> Any:
+    """Lanes whose film position `u` is within the filter's reach of `pixel`."""
+    if pixel is None:
+        return mi.Bool(False)
+    centre = mi.Point2f(pixel[0] + 0.5, pixel[1] + 0.5)
+    return dr.all(dr.abs(u - centre) <= film.film.rfilter().radius())
+
+
+@dataclass
+class Search:
+    """Loop state.
+
+    `first` is the first suspect of the path so far, and `found` the one that was first when a connection took it to
+    film position `u`: the first such connection, or, where there is one, the first whose pixel is the wanted one
+    (`there`). `largest` is the largest contribution (its `value`), which lands at `largest_u`.
+    """
+
+    first: Suspect
+    found: Suspect
+    u: Any
+    there: Any
+    largest: Suspect
+    largest_u: Any
+
+
+class SearchHooks(Hooks):
+    """Looks at every factor that a connection passes on, at its derivative along the parameters' tangents, and at the
+    product of them all."""
+
+    def __init__(self, samples: Samples, emission: Any, derivative: Any, pixel: tuple[int, int] | None) -> None:
+        """`emission` is a ray of each path, with E; `derivative` is dE (C,); `pixel` the one that is wanted, if any."""
+        self.samples, self.emission, self.derivative, self.pixel = samples, emission, derivative, pixel
+
+    def start(self, product: Product) -> Search:
+        first = Suspect.none()
+        for kind, value in ((_E, dr.detach(self.emission.weight)), (_DE, self.derivative)):
+            here = Suspect(mi.UInt32(kind), mi.UInt32(0), self.emission.ray.o, mi.UInt32(0), mi.Spectrum(value))
+            first = first.otherwise(here, mi.Bool(True))
+        return Search(first, Suspect.none(), mi.Point2f(0), mi.Bool(False), Suspect.none(), mi.Point2f(0))
+
+    def scattering(self, state: Search, vertex: Vertex, connection: Connection, scattering: Scattering) -> Search:
+        plan, seen, scattered = self.samples.plan, connection.active, scattering.active
+        shape = dr.reinterpret_array(mi.UInt32, vertex.si.shape)
+
+        def here(kind: int, value: Any) -> Suspect:
+            return Suspect(mi.UInt32(kind), vertex.depth, vertex.si.p, shape, mi.Spectrum(value))
+
+        with dr.resume_grad(when=plan.differentiate_bsdfs):
+            f_c = evaluate(plan, vertex.si, vertex.bsdf, connection.wo, seen)
+            f_s = tracked_factor(plan, vertex.si, vertex.bsdf, scattering, scattered)
+            df_c, df_s = forward_derivatives(f_c, f_s)
+        useful = plan.differentiates(vertex.bsdf)
+        C = vertex.product.times(connection.c, vertex.depth).scaled(self.samples.scale).value()
+        found = state.first.otherwise(here(_C, connection.c), seen).otherwise(here(_DC, df_c), seen & useful)
+        found = found.otherwise(here(_CONTRIBUTION, C), seen)
+        there = reaches(self.samples.film, connection.u, self.pixel)
+        new = seen & (found.kind != 0) & ((state.found.kind == 0) | (there & ~state.there))
+        larger = seen & (dr.max(dr.abs(C)) > dr.max(dr.abs(state.largest.value)))
+
+        first = state.first.otherwise(here(_S, scattering.weight), scattered)
+        first = first.otherwise(here(_DS, df_s), scattered & useful)
+        product = vertex.product.times(scattering.weight, vertex.depth).value()
+        first = first.otherwise(here(_PRODUCT, product), scattered)
+        return Search(
+            first,
+            dr.select(new, found, state.found),
+            dr.select(new, connection.u, state.u),
+            state.there | (new & there),
+            dr.select(larger, here(_CONTRIBUTION, C), state.largest),
+            dr.select(larger, connection.u, state.largest_u),
+        )
+
+
+Array = np.ndarray[Any, Any]
+
+
+@dataclass
+class Found:
+    """The offender of the first path that has one, whether it reaches the wanted pixel, the largest contribution."""
+
+    offender: Offender | None
+    there: bool
+    largest: Offender | None
+
+
+def search_paths(samples: Samples, sensor: int, label: str, pixel: tuple[int, int] | None) -> Found:
+    """Look at every path of these samples; those that reach `pixel` come first. Parameters have their tangents set."""
+    plan = samples.plan
+    with dr.suspend_grad():
+        with dr.resume_grad():
+            E = sample_emission(samples, samples.sampler())
+            [dE] = forward_derivatives(E.weight) if plan.differentiate_emission else [mi.Spectrum(0)]
+        state = walk(samples, SearchHooks(samples, Emission(E.ray, dr.detach(E.weight), E.emitter), dE, pixel))
+        dr.eval(state)
+    describe = Describe(samples, sensor, label)
+    size = np.array(dr.max(dr.abs(state.largest.value)))
+    brightest = int(np.argmax(np.where(np.isfinite(size), size, 0)))
+    largest = describe(state.largest, state.largest_u, brightest) if size[brightest] > 0 else None
+    lane, there = _first(np.array(state.found.kind) != 0, np.array(state.there))
+    if lane is not None:
+        return Found(describe(state.found, state.u, lane), there, largest)
+    return _search_visible_emission(samples, describe, pixel, largest)
+
+
+def _search_visible_emission(
+    samples: Samples, describe: Describe, pixel: tuple[int, int] | None, largest: Offender | None
+) -> Found:
+    if not samples.plan.visible_emission:
+        return Found(None, False, largest)
+    with dr.suspend_grad():
+        for seen in (_through_pixels, _on_small_lamps) if samples.plan.small_lamps else (_through_pixels,):
+            suspect, tangent, u, active = seen(samples)
+            there = np.array(reaches(samples.film, u, pixel))
+            for name, value in (
+                ("emission E towards the sensor", suspect.value),
+                ("derivative of emission, dE", tangent),
+            ):
+                bad = np.broadcast_to(np.array(active & is_bad(value)), samples.width)
+                lane, at_pixel = _first(bad, there)
+                if lane is not None:
+                    offender = describe(replace(suspect, value=mi.Spectrum(value)), u, lane, name)
+                    return Found(offender, at_pixel, largest)
+    return Found(None, False, largest)
+
+
+def _through_pixels(samples: Samples) -> tuple[Suspect, mi.Spectrum, mi.Point2f, mi.Bool]:
+    """What primary rays see: radiance (C,), its tangent, film positions, and the active lanes."""
+    plan, tangent = samples.plan, mi.Spectrum(0)
+    primary = primary_ray(samples)
+    radiance = visible_radiance(plan, samples.scene, primary)
+    if plan.differentiate_emission or plan.differentiate_null:
+        tangent = visible_tangent(plan, samples.scene, primary)
+    si = samples.scene.ray_intersect(primary.ray, primary.active)
+    p, shape = dr.select(si.is_valid(), si.p, primary.ray.o), dr.reinterpret_array(mi.UInt32, si.shape)
+    return Suspect(mi.UInt32(0), mi.UInt32(0), p, shape, radiance), tangent, primary.u, primary.active
+
+
+def _on_small_lamps(samples: Samples) -> tuple[Suspect, mi.Spectrum, mi.Point2f, mi.Bool]:
+    """The same of points on lamps that are smaller than a pixel."""
+    tangent = mi.Spectrum(0)
+    point = small_points(samples)
+    with dr.resume_grad():
+        radiance = point.radiance()
+        if samples.plan.differentiate_emission:
+            [tangent] = forward_derivatives(radiance)
+    shape = dr.reinterpret_array(mi.UInt32, point.emitter.get_shape())
+    suspect = Suspect(mi.UInt32(0), mi.UInt32(0), point.si.p, shape, dr.detach(radiance))
+    return suspect, tangent, point.u, point.active
+
+
+def _first(bad: Array, there: Array) -> tuple[int | None, bool]:
+    """The first of the bad lanes, of those that are `there` if any are; and whether it is."""
+    lanes = np.flatnonzero(bad)
+    preferred = np.flatnonzero(bad & there)
+    if preferred.size:
+        return int(preferred[0]), True
+    return (int(lanes[0]) if lanes.size else None), False
+
+
+@dataclass
+class Describe:
+    """Makes a record of one lane's suspect."""
+
+    samples: Samples
+    sensor: int
+    label: str
+
+    def __call__(self, suspect: Suspect, u: Any, lane: int, quantity: str | None = None) -> Offender:
+        def number(value: Any) -> Any:
+            return np.array(value).ravel()[lane % dr.width(value)]
+
+        where = PathVertex(
+            samples=self.label,
+            seed=int(self.samples.seed[0]),
+            path=lane,
+            paths=self.samples.width,
+            vertex=int(number(suspect.vertex)),
+            position=(float(number(suspect.p.x)), float(number(suspect.p.y)), float(number(suspect.p.z))),
+            surface=_shape_name(self.samples.scene, int(number(suspect.shape))),
+        )
+        pixel = (int(np.floor(number(u.x))), int(np.floor(number(u.y))))
+        value = [float(number(channel)) for channel in suspect.value]
+        return Offender(self.sensor, pixel, quantity or QUANTITIES[int(number(suspect.kind))], value, where)
+
+
+def _shape_name(scene: Any, index: int) -> str | None:
+    for shape in scene.shapes():
+        if int(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))[0]) == index:
+            return str(shape.id())
+    return None
+
+
+SUM = "sum of contributions, each of which is finite; the largest"
+
+
+LOSS = "derivative of the loss, dL/dI"
+
+
+IMAGE = "image (of this integrator no paths are looked at)"
+
+
+GRADIENT = "gradient (of this integrator no paths are looked at) of"
+
+
+def find_offenders(problem: Problem, iteration: int) -> list[Offender]:
+    """The first value that is not finite of each view in which there is any; the parameters are those of `problem`."""
+    found = []
+    guided = guiding_of(problem) is not None
+    # What is not drawn in this iteration has taught no table anything.
+    for view in [view for view, _ in problem.drawn(iteration)] if guided else problem.views:
+        offender = _of_view(problem, iteration, view)
+        if offender is not None:
+            found.append(offender)
+    return found
+
+
+def _of_view(problem: Problem, iteration: int, view: View) -> Offender | None:
+    step_seed = seed(problem.config.run.seed, iteration, view.sensor, "image")
+    guiding = guiding_of(problem)
+    witness = None if guiding is None else Witness(guiding)
+    if witness is not None:
+        problem.integrator.preparation.draw_from(witness, problem.scene)
+    step = _take_step(problem, view, step_seed)
+    if problem.config.integrator.type not in LIGHT_TRACERS:
+        return _of_step(step, view.sensor, view.target, None)
+    if not is_attached(problem):
+        _set_tangents(problem)
+    found = [search_paths(*part, step.pixel) for part in _parts(problem, view, step_seed, witness)]
+    problem.apply()
+    offenders = sorted((part for part in found if part.offender is not None), key=lambda part: not part.there)
+    if offenders:
+        return offenders[0].offender
+    largest = [part.largest for part in found if part.largest is not None]
+    most = max(largest, key=lambda entry: max(map(abs, entry.value)), default=None)
+    return _of_step(step, view.sensor, view.target, most)
+
+
+def _parts(
+    problem: Problem, view: View, step_seed: int, witness: Witness | None = None
+) -> Iterator[tuple[Samples, int, str]]:
+    """The samples of a step, pass by pass, with the sensor's index and a name; light paths are those of the run.
+
+    Of a guided one the `witness` knows what it was drawn from.
+    """
+    scene, sensor = problem.scene, problem.scene.sensors()[view.sensor]
+    options = problem.config.integrator.options()
+    names = ("max_depth", "rr_depth", "hide_emitters", "sequence")
+    shared = {name: options[name] for name in names if name in options}
+    tracer = Reslrb.of(estimator="gather", **shared)
+    # Of what moves light, contributions alone are looked at: `gather` has no derivatives of it.
+    params = None if is_attached(problem) else problem.selection.params
+    sets = sample_sets(step_seed, problem.config.step_options())
+    tables: list[Table | None] = [None] * len(sets)
+    if witness is not None:
+        tracer.expect(pass_spp(problem.config))
+        tracer.preparation.draw_from(witness, scene)  # for the sake of its grid
+        wanted, noted = purposes(problem, view), iter(witness.drawn[:])
+        tables = [next(noted) if witness.serves(purpose) else None for _, _, purpose in wanted]
+        sets = [(sets[place][0] + word, *sets[place][1:]) for place, word, _ in wanted]
+    plan = tracer.plan(scene, sensor, params)
+    for (name, samples_seed, spp), table in zip(sets, tables, strict=True):
+        parts = passes(plan, scene, sensor, samples_seed, spp, problem.samples_per_pass, table)
+        for number, samples in enumerate(parts):
+            yield samples, view.sensor, name if len(parts) == 1 else f"{name}, pass {number + 1}"
+
+
+def _set_tangents(problem: Problem) -> None:
+    """Give every entry of every parameter the tangent 1, as far as what of the scene holds it."""
+    params, keys = problem.selection.params, problem.selection.keys
+    keys = [key for key in keys if key in params]  # an exposure is no part of any path
+    for key in keys:
+        leaf = problem.optimizer[key]
+        dr.set_grad(leaf, 1.0)
+        params[key] = leaf
+    params.update()
+    for key in keys:
+        dr.enqueue(dr.ADMode.Forward, problem.optimizer[key])
+    dr.traverse(dr.ADMode.Forward, dr.ADFlag.ClearEdges)
+
+
+@dataclass
+class Step:
+    """Image (H, W, C) and gradients of a step, and the first entry (x, y, channel) of dL/dI that was refused."""
+
+    image: Array
+    gradients: dict[str, Array]
+    refused: tuple[int, int, int] | None
+
+    @property
+    def pixel(self) -> tuple[int, int] | None:
+        """The pixel of that entry."""
+        return None if self.refused is None else self.refused[:2]
+
+
+def _take_step(problem: Problem, view: View, step_seed: int) -> Step:
+    """The view's step, as the run took it; leaves no gradient behind."""
+    optimizer, keys = problem.optimizer, problem.selection.keys
+    step = gradient_step(
+        problem.integrator, problem.scene, view.sensor, view.objective,
+        seed=step_seed, **problem.config.step_options(), params=problem.selection.params,
+        on_samples=problem.on_samples(view),
+    )  # fmt: skip
+    gradients = {key: np.array(gradient) for key, gradient in problem.gradients().items()}
+    for key in keys:
+        optimizer.clear_gradient(key)
+    return Step(np.array(step.image), gradients, step.refused.entry())
+
+
+def _of_step(step: Step, sensor: int, target: Any, largest: Offender | None) -> Offender | None:
+    """What is left where no path has anything: sums that overflow, and the loss."""
+    image = step.image
+    if step.refused is not None:
+        x, y, channel = step.refused
+        if np.isfinite(image[y, x]).all():
+            here, wanted = (np.array(array)[y, x].tolist() for array in (image, target))
+            return Offender(sensor, (x, y), f"{LOSS}, channel {channel}", [], None, here, wanted)
+    if all(np.isfinite(array).all() for array in [image, *step.gradients.values()]):
+        return None
+    if largest is not None:
+        return Offender(sensor, largest.pixel, SUM, largest.value, largest.where)
+    return _without_paths(sensor, image, np.array(target), step.gradients)
+
+
+def _without_paths(sensor: int, image: Array, target: Array, gradients: dict[str, Array]) -> Offender:
+    """What there is to say where paths were not looked at: the pixel, or else the parameter."""
+    if not np.isfinite(image).all():
+        y, x, _ = (int(index) for index in np.argwhere(~np.isfinite(image))[0])
+        return Offender(sensor, (x, y), IMAGE, image[y, x].tolist(), None, image[y, x].tolist(), target[y, x].tolist())
+    [key, *_] = [key for key, gradient in gradients.items() if not np.isfinite(gradient).all()]
+    return Offender(sensor, None, f"{GRADIENT} {key}", [], None)

@@ -1,0 +1,371 @@
+"""The processes of whole optimisations: seed after seed, the methods of one seed take turns, one computing at a time.
+
+A drift of the machine so hits all methods of a seed alike. Each run starts from an empty cache of kernels, and has the
+same time as every other; where it stands at some times, which all have in common, is judged by another process
+meanwhile. That the others wait for this costs them nothing but what it does to the caches.
+
+The process that judges whole runs, as the session sees it: it makes the target, or takes over an earlier one's.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from reslrb_cli.config.loader import dump
+from reslrb_cli.config.schema import Config
+from reslrb_cli.errors import ExitCode
+from reslrb_cli.measure.convergence.session import AFTERWARDS, AFTERWARDS_S, MEMORY_SHARE, MIB, Start
+from reslrb_cli.measure.methods import RunsPlan, Side
+from reslrb_cli.measure.optimization_benchmark.rank import (
+    POINTS,
+    Run,
+    check_judge,
+    kept,
+    restore,
+    restore_targets,
+    settings,
+    times,
+)
+from reslrb_cli.measure.processes import Refused, Stopped
+from reslrb_cli.measure.resume_store import Earlier
+from reslrb_cli.measure.tasks import start_process
+from reslrb_cli.measure.workers import NO_TIME, Contestant, Pace
+from reslrb_cli.records.measurement_files import Kept
+from reslrb_cli.records.measurements import BenchStatus, Method, RunPointRecord
+
+
+class Judging:
+    """A `process` under way that answers until `stop()`, or until time is up, `over()`; `label` names its integrator.
+
+    `late` says that time was up over one of its answers.
+    """
+
+    def __init__(self, process: Any, label: str, stop: Callable[[], bool], over: Callable[[], bool]) -> None:
+        self._contestant = Contestant(process, False)
+        self._label, self._stop, self._over = label, stop, over
+
+    @property
+    def late(self) -> bool:
+        """Whether time was up over one of its answers."""
+        return self._contestant.late
+
+    def open(self) -> dict[str, Any] | None:
+        """What it says first, its scene loaded; None where time was up."""
+        return self._contestant.answer(self._stop, self._over)
+
+    def prepare(self, targets: Path, **ask: float | bool) -> dict[str, Any]:
+        """Have it make the targets, and write them; `ask` and the facts that it returns are those of `judge.prepare`.
+
+        There are none where time was up.
+        """
+        return self.ask({"prepare": ask, "out": str(targets)}) or {}
+
+    def restore(self, targets: Path, earlier: Earlier) -> dict[str, Any]:
+        """Have it judge as that of an earlier session; returns its facts, with what a judgement takes now.
+
+        Raises ConfigError where it finds another loss of the initial values.
+        """
+        restore_targets(earlier, targets)
+        facts: dict[str, Any] = earlier.head["facts"]
+        ask = {"spp": facts["spp"], "masked": facts["masked"]}
+        found = self.ask({"restore": ask, "targets": str(targets)})
+        if found is None:
+            return facts
+        check_judge(earlier, found)
+        return facts | {"judge_s": found["judge_s"]}
+
+    def ask(self, question: dict[str, Any]) -> dict[str, Any] | None:
+        """An answer; None where the budget was spent over it. Raises Refused where the process ended."""
+        judge = self._contestant
+        answer = judge.ask(question, self._stop, self._over)
+        if judge.end is not None:
+            memory = judge.end.status is BenchStatus.OUT_OF_MEMORY
+            line = f"--reference {self._label}: {judge.end.reason}"
+            raise Refused(line, ExitCode.OUT_OF_MEMORY if memory else ExitCode.CHECK_FAILED)
+        return answer
+
+    def close(self) -> None:
+        """End the process."""
+        self._contestant.process.close()
+
+
+#: The share of the time that judging is to take, unless that leaves images with too few samples.
+JUDGED = 0.15
+
+
+#: No run has less time than this, in seconds.
+LEAST_S = 0.5
+
+
+#: What is left for a run's being late: a share of its time, and seconds beside it. One that has not come to its first
+#: iteration by then is cut off.
+GRACE, GRACE_S = 0.05, 0.5
+
+
+#: The share of its time by which any other run may be late before it is cut off: it ends by itself, and copies of its
+#: values, which take none of its time, take some of ours.
+CUT = 0.5
+
+
+class RunsSession:
+    """Runs under way, and where they stood; what they write goes to `folder`, which is the caller's to remove.
+
+    `facts` are the judge's, `limit_s` is the time of each run, once it is known; of the budget `spent_s` have gone
+    before. What an `earlier` session, which `resuming.check` has accepted, has made counts, and is gone on from; each
+    run has as much time as there. `device` is what computes, in words.
+    """
+
+    def __init__(
+        self,
+        plan: RunsPlan,
+        folder: Path,
+        stop: Callable[[], bool],
+        say: Callable[[str], None],
+        start: Start = start_process,
+        now: Callable[[], float] = time.monotonic,
+        spent_s: float = 0.0,
+        earlier: Earlier | None = None,
+        device: str = "",
+    ) -> None:
+        self._earlier, self.device = earlier, device
+        self.plan, self.folder, self.runs, self.limit_s = plan, folder, list[Run](), 0.0
+        self.facts: dict[str, Any] = {}
+        self._stop, self._say, self._start, self._now, self._began = stop, say, start, now, now() - spent_s
+        self._budget_s = max((1 - AFTERWARDS) * plan.budget_s - AFTERWARDS_S - spent_s, 0.0)
+        self._pace, self._end = Pace(self._budget_s, 1, None, now), now() + self._budget_s
+        self._judge: Judging | None = None
+        self._startup_s = self._wave_s = 0.0
+        self._said: set[str] = set()
+        self._seeds = 0  # those of which all runs are over
+        if earlier is not None:
+            self.facts, self.limit_s, self._seeds = (
+                earlier.head["facts"],
+                earlier.head["limit_s"],
+                earlier.head["seeds"],
+            )
+            self.runs = restore(earlier, plan)
+
+    def keep(self) -> Kept | None:
+        """What a later session needs to go on; None where no seed is over."""
+        if self._earlier is None and not self._seeds:
+            return None
+        targets = self.folder / "targets.npz"
+        if self._earlier is not None and not targets.exists():
+            return self._earlier.head, self._earlier.arrays
+        return kept(settings(self.plan, self.device), self.facts, targets, self.limit_s, self.runs, self._seeds)
+
+    def run(self) -> Iterator[RunPointRecord]:
+        """Measure; yield where runs stand as it is known. Ends early, with what is done, once `stop()`.
+
+        Raises Refused where what may not be left out cannot begin.
+        """
+        try:
+            if self._prepare():
+                sides = self._sides()
+                if self._divide(len(sides)):
+                    yield from self._waves(sides)
+        except Stopped:
+            return
+        finally:
+            for run in self.runs:
+                if run.process is not None:
+                    run.process.close()
+            if self._judge is not None:
+                self._judge.close()
+
+    def run_of(self, point: RunPointRecord) -> Run:
+        """The run that a point is of."""
+        return next(run for run in self.runs if (run.method, run.seed) == (point.method, point.seed))
+
+    # --- before the runs ----------------------------------------------------------------------------------------------
+
+    def _first(self, config: Config) -> dict[str, Any]:
+        return {"config": dump(config), "source": str(config.source), "variant": self.plan.variant,
+                "memory_limit": self.plan.memory_limit, "targets": str(self.folder / "targets.npz"),
+                "masked": self.facts.get("masked", False)}  # fmt: skip
+
+    def _prepare(self) -> bool:
+        """Start what judges, and have it make the target; False where time is up over it."""
+        plan, began, targets = self.plan, self._now(), self.folder / "targets.npz"
+        process = self._start(self._first(plan.reference_config), "judged_runs")
+        judge = self._judge = Judging(process, plan.reference.label, self._stop, self._pace.over)
+        opening = judge.open()
+        if opening is not None:
+            self._warn(opening)
+            self._startup_s = max(self._now() - began - opening["loading_s"], 0.0)
+            if self._earlier is not None:
+                self.facts = judge.restore(targets, self._earlier)
+            else:
+                image_s = JUDGED * self._budget_s / (len(plan.sides) * plan.runs * POINTS)
+                self.facts = judge.prepare(targets, budget_s=self._budget_s, image_s=image_s, **plan.camera)
+        if judge.late:
+            self._say(f"the budget of {plan.budget_s:g} s was spent before there was a target; allow several times it")
+        return not judge.late
+
+    def _sides(self) -> list[Side]:
+        """What is compared: of the default list, what cannot do the scene is left out, and named."""
+        plan, without = self.plan, self.facts["without"] if self.plan.default else {}
+        for case in plan.cases:
+            if case.type in without:
+                self._say(f"left out: {case.label}: {without[case.type]}")
+        return [side for side in plan.sides if side.case.type not in without]
+
+    def _divide(self, methods: int) -> bool:
+        """Give each run its time; False where there is too little."""
+        count = methods * self.plan.runs
+        if count == 0:
+            return False
+        apart_s = POINTS * self.facts["judge_s"] + self._startup_s + GRACE_S  # what of its share a run cannot have
+        if self._earlier is not None:
+            return self._has_room(methods * ((1 + GRACE) * self.limit_s + apart_s))
+        each = max(self._end - self._now(), 0.0) / count
+        self.limit_s = (each - apart_s) / (1 + GRACE)
+        if self.limit_s >= LEAST_S:
+            return True
+        needed = self._needed(count * (LEAST_S * (1 + GRACE) + apart_s))
+        self._say(
+            f"the budget of {self.plan.budget_s:g} s leaves no time for {count} runs: allow more than {needed:.0f} s "
+            "with --budget, or fewer --runs or --integrators"
+        )
+        return False
+
+    def _needed(self, seconds: float) -> float:
+        """The budget that leaves so many seconds from now on."""
+        return (self._now() - self._began + seconds + AFTERWARDS_S) / (1 - AFTERWARDS)
+
+    def _has_room(self, wave_s: float) -> bool:
+        """Whether all runs of one seed, which have the time of those before them, are done within the budget."""
+        self._wave_s = wave_s
+        if self._pace.fits(wave_s):
+            return True
+        self._say(
+            f"the budget of {self.plan.budget_s:g} s leaves no time for runs of {self.limit_s:.3g} s, as the earlier "
+            f"ones: allow more than {self._needed(wave_s):.0f} s with --budget"
+        )
+        return False
+
+    # --- the runs -----------------------------------------------------------------------------------------------------
+
+    def _waves(self, sides: list[Side]) -> Iterator[RunPointRecord]:
+        if self._earlier is not None:
+            sides = [side for side in sides if self.plan.method_of(side) not in self._gone(self.runs)]
+        for number, seed in enumerate(self.plan.seeds):
+            if number < self._seeds:
+                continue
+            if self._earlier is not None and not self._pace.fits(self._wave_s):
+                self._say(f"not measured: runs from seed {seed} on: {NO_TIME}")
+                return
+            wave = []
+            for side in sides:
+                run = self._begin(side, seed)
+                wave.append(run)
+                self._open(run)
+            for turn, until_s in enumerate(times(self.limit_s)):
+                start = turn % max(len(wave), 1)
+                for run in wave[start:] + wave[:start]:
+                    point = self._advance(run, until_s, wave)
+                    if point is not None:
+                        run.points.append(point)
+                        if all(other.complete(self.limit_s) or other.end or other.refusal for other in wave):
+                            self._seeds = number + 1
+                        yield point
+            for run in wave:
+                run.process.close()
+            if self._pace.over() and any(not run.complete(self.limit_s) and run.end is None for run in wave):
+                self._say(f"not measured: runs from seed {seed} on: {NO_TIME}")
+                return
+            if number == 0 and not any(run.state.iteration for run in wave):
+                self._say(f"no method came to an iteration in the {self.limit_s:.3g} s of a run; allow several times "
+                          "as much with --budget, or fewer --runs or --integrators")  # fmt: skip
+                return
+            sides = [side for side in sides if self.plan.method_of(side) not in self._gone(wave)]
+
+    def _gone(self, runs: Sequence[Run]) -> set[Method]:
+        """The methods that need not be tried with another seed: they refused, or need more memory than there is."""
+        return {run.method for run in runs if run.refusal or (run.end and run.end.status is BenchStatus.OUT_OF_MEMORY)}
+
+    def _begin(self, side: Side, seed: int) -> Run:
+        plan, config = self.plan, self.plan.seeded(self.plan.config_at(side), seed)
+        run = Run(
+            process=self._start(self._first(config), "whole_runs"),
+            may_refuse=plan.default,
+            method=plan.method_of(side),
+            seed=seed,
+            out=self.folder / f"values-{len(self.runs)}.npz",
+            state=RunPointRecord(plan.method_of(side), seed, 0.0, 0, self.facts["loss"], self.facts["error"]),
+        )
+        self.runs.append(run)
+        return run
+
+    def _open(self, run: Run) -> None:
+        """Have it load the scene, and measure where there is a pilot: before the next one starts, for that is timed."""
+        opening = run.answer(self._stop, self._late(2 * self._startup_s + self.limit_s))
+        if opening is None:
+            self._say_end(run)
+            return
+        self._warn(opening)
+        run.counted_s = opening["loading_s"]
+        for line in opening["chose"]:
+            self._once(f"{run.method.label}: {line}")
+
+    def _late(self, left_s: float, grace: float = GRACE) -> Callable[[], bool]:
+        """Whether the whole is over, or a run has been waited for longer than what is left of its time."""
+        allowed_s, began = left_s + grace * self.limit_s + GRACE_S, self._now()
+        return lambda: self._pace.over() or self._now() - began > allowed_s
+
+    def _advance(self, run: Run, until_s: float, wave: list[Run]) -> RunPointRecord | None:
+        """Where a run stands at some time; None where that cannot be known any more."""
+        if run.alive:
+            held = sum(other.peak_mib for other in wave if other.alive) * MIB
+            question = {"until_s": until_s, "limit_s": self.limit_s, "out": str(run.out),
+                        "release": held > MEMORY_SHARE * self.plan.memory}  # fmt: skip
+            left_s = max(self.limit_s - run.counted_s, 0.0)
+            late = self._late(left_s, GRACE if run.first_s is None else CUT)
+            answer = run.ask(question, self._stop, late)
+            if answer is not None:
+                run.counted_s = max(run.counted_s, until_s)
+                taken = self._take(run, answer)
+                return replace(run.state, elapsed_s=until_s) if taken else None
+            self._say_end(run)
+        if run.end is not None or run.refusal is not None or self._pace.over():
+            return None
+        # One that was cut off has not come any further: what it was at was not done by the end of its time.
+        return replace(run.state, elapsed_s=until_s)
+
+    def _take(self, run: Run, answer: dict[str, Any]) -> bool:
+        """Keep an answer, and have new values judged; False where the budget was spent over that."""
+        run.first_s, run.peak_mib = answer["first_s"], answer["peak_mib"]
+        if answer["finished_s"] is not None:
+            self._once(f"{run.method.label}: all iterations were done after {answer['finished_s']:.3g} s; "
+                       "raise run.iterations to have it go on")  # fmt: skip
+        if answer["iteration"] == run.state.iteration:
+            return True
+        assert self._judge is not None, "it is started first"
+        judged = self._judge.ask({"values": str(run.out)})
+        if judged is None:
+            return False
+        run.state = replace(
+            run.state, iteration=answer["iteration"], loss=judged["loss"], parameter_error=judged["error"]
+        )
+        return True
+
+    def _say_end(self, run: Run) -> None:
+        if run.refusal is not None:
+            self._say(f"left out: {run.method.label}: {run.refusal}")
+        elif run.end is not None:
+            self._say(f"{run.method.label}, seed {run.seed}: {run.end.status.value}: {run.end.reason}")
+        elif not self._pace.over():
+            self._say(f"{run.method.label}, seed {run.seed}: cut off in iteration {run.state.iteration + 1}")
+
+    def _warn(self, opening: dict[str, Any]) -> None:
+        for line in opening.get("warnings", ()):
+            self._once(line)
+
+    def _once(self, line: str) -> None:
+        if line not in self._said:
+            self._said.add(line)
+            self._say(line)

@@ -1,0 +1,143 @@
+"""Motions whose derivatives are known in closed form: a tilted surface of glass, a ball lens, a lamp over a plane.
+
+The receiver is the plane y = 0 of `attached.glass.setting`, which its camera sees from x, z = -1 to 1. Of every path
+that lands there the image shows, in all pixels together,
+
+    sum_p A I_p = rho / pi * flux          A: area of a pixel on the receiver
+
+whatever the place: cosines and distance to a pinhole that looks straight down cancel. So the mean place at which light
+lands is that of the image's centre of gravity, and its derivative is one of geometrical optics.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from reslrb_cli.measure.gradients import smooth_weights
+from reslrb_cli.measure.scenes.analytic import fresnel
+from reslrb_cli.measure.scenes.moving import FILTER, SIZE, AttachedScene, Pose
+from reslrb_cli.measure.scenes.moving_light import point, setting, square_lamp
+from reslrb_cli.measure.scenes.small import rgb, transform
+
+Array = NDArray[np.float64]
+
+
+#: Reflectance of the receiver, as `setting` has it.
+RHO = np.array([0.8, 0.7, 0.6])
+
+
+#: Area of a pixel on the receiver.
+PIXEL = (2 / SIZE) ** 2
+
+
+@dataclass(frozen=True)
+class KnownMotion:
+    """A scene, dL/dI `weights` (H, W, 3), and the derivative of the objective by each amplitude, (K,).
+
+    `tolerance` is what the formula leaves out, relative to the largest derivative.
+    """
+
+    scene: AttachedScene
+    weights: Array
+    derivatives: Array
+    tolerance: float
+
+
+def centre_of_gravity() -> Array:
+    """Weights by which the objective is the integral of x over the light that lands: (H, W, 3)."""
+    x = 2 * (np.arange(SIZE) + 0.5) / SIZE - 1
+    return np.broadcast_to(PIXEL * x[None, :, None], (SIZE, SIZE, 3)).copy()
+
+
+def parallel(half: float, x: float, y: float, radiance: float) -> dict:
+    """Light straight down from a square around (x, 0), whose flux is `radiance` * (2 half)^2."""
+    place = transform(translate=[x, y, 0], rotate=([1, 0, 0], 90), scale=half)
+    light = {"type": "directionalarea", "radiance": rgb(radiance, radiance, radiance)}
+    return square_lamp() | {"to_world": place, "emitter": light}
+
+
+def tilted_surface(tilt: float = 0.3, ior: float = 1.5, height: float = 1.4, half: float = 0.2) -> KnownMotion:
+    """Parallel light on a flat surface of glass, tilted by `tilt` about z, over a receiver inside of the glass.
+
+    What falls on it at (0, height) leaves at an angle of a = tilt - arcsin(sin(tilt) / ior) from the vertical, and
+    lands at height * tan(a); the mean of a beam does, since the others' distances cancel. By Snell and Fresnel,
+
+        objective = rho / pi * flux * (1 - R(tilt)) * height * tan(a)
+    """
+
+    def objective(angle: float) -> float:
+        away = angle - np.arcsin(np.sin(angle) / ior)
+        return float((1 - fresnel(np.array(angle), ior)) * height * np.tan(away))
+
+    flux, h = 50.0 * (2 * half) ** 2, 1e-5
+    slope = (objective(tilt + h) - objective(tilt - h)) / (2 * h)
+    glass = {"type": "dielectric", "int_ior": ior, "ext_ior": 1.0}
+    place = transform(translate=[0, height, 0]) @ transform(rotate=([0, 0, 1], float(np.rad2deg(tilt))))
+    surface = {"type": "rectangle", "bsdf": glass, "to_world": place @ transform(rotate=([1, 0, 0], -90), scale=2)}
+    scene = AttachedScene(
+        "tilted_surface", "parallel light on a tilted surface of glass",
+        lambda: setting(lamp=parallel(half, 0, 3, 50.0), top=surface),
+        lambda scene: [Pose("top.to_world", ("rz",), (0, height, 0))], options={"max_depth": 3},
+    )  # fmt: skip
+    known = np.array([RHO.sum() / np.pi * flux * slope])
+    return KnownMotion(scene, centre_of_gravity(), known, 1e-3)
+
+
+def ball_lens(radius: float = 2.4, ior: float = 1.5, offset: float = 0.04, half: float = 0.016) -> KnownMotion:
+    """A thin parallel beam near the axis of a ball of glass whose focus is on the receiver.
+
+    A ray at x from the axis lands at x (1 - d / f), d from the ball's centre, f = n R / (2 (n - 1)) (E. Hecht, Optics,
+    Section 5.2). Of a ball that moves by t across, s along the axis, and grows by 1 + g, at d = f:
+
+        dx/dt = d / f = 1        dx/ds = -x / f        dx/dg = x d / f
+    """
+    f = ior * radius / (2 * (ior - 1))
+    passed = (1 - ((ior - 1) / (ior + 1)) ** 2) ** 2
+    flux = 5e4 * (2 * half) ** 2
+    slopes = np.array([1.0, -offset / f, offset])
+    scene = AttachedScene(
+        "ball_lens", "a thin beam through a ball of glass with its focus on the receiver",
+        lambda: setting(lamp=parallel(half, offset, f + radius + 1, 5e4),
+                        lens={"type": "sphere", "center": [0, f, 0], "radius": radius,
+                              "bsdf": {"type": "dielectric", "int_ior": ior, "ext_ior": 1.0}}),
+        lambda scene: [Pose("lens.to_world", ("tx", "ty", "s"), (0, f, 0))],
+    )  # fmt: skip
+    return KnownMotion(scene, centre_of_gravity(), RHO.sum() / np.pi * flux * passed * slopes, 2e-3)
+
+
+def lamp_over_plane(position: tuple[float, float, float] = (0.1, 0.7, 0.2), nodes: int = 8) -> KnownMotion:
+    """A point light over the receiver: E = I h / d^3 by Lambert's laws, moved along each axis.
+
+    The objective is the integral of what E reflects times g(u) = sum_p filter_p(u) G_p, by quadrature over the film.
+    """
+    G = smooth_weights(SIZE, SIZE)
+    at, weight = np.polynomial.legendre.leggauss(nodes)
+    u = (np.arange(SIZE)[:, None] + (at + 1) / 2).ravel()  # pixels
+    g = np.einsum("ip,jq,pqc->ijc", _filter(u), _filter(u), G, optimize=True)
+    x = 2 * u / SIZE - 1
+    dx, dz, h = position[0] - x[None, :], position[2] - x[:, None], position[1]
+    d = np.sqrt(dx**2 + dz**2 + h**2)
+    intensity = np.array([3.0, 2.0, 4.0])
+    slopes = np.stack([-3 * h * dx / d**5, 1 / d**3 - 3 * h**2 / d**5, -3 * h * dz / d**5])
+    area = np.outer(np.tile(weight, SIZE), np.tile(weight, SIZE)) / 4
+    known = np.einsum("kij,ij,ijc,c->k", slopes, area, g, RHO / np.pi * intensity)
+    scene = AttachedScene(
+        "lamp_over_plane", "a point light over a plane", lambda: setting(lamp=point(position)),
+        lambda scene: [Pose("lamp.position", ("tx", "ty", "tz"))], options={"max_depth": 2},
+    )  # fmt: skip
+    return KnownMotion(scene, G, known, 1e-3)
+
+
+def _filter(u: Array) -> Array:
+    """Weights (N, SIZE) of a row of pixels for film positions (N,), with the film's filter.
+
+    A Gaussian that ends, without a step, at four standard deviations; normalised over all pixels, off the film too.
+    """
+    sigma = float(str(FILTER["stddev"]))
+    pixels = np.arange(-8, SIZE + 8) + 0.5
+    distance = u[:, None] - pixels
+    value = np.maximum(np.exp(-(distance**2) / (2 * sigma**2)) - np.exp(-8.0), 0)
+    return np.asarray(value / value.sum(1, keepdims=True))[:, 8:-8]

@@ -1,8 +1,0 @@
-"""How certain the values are that a run ends with: their spread about the optimum, and a verdict on each parameter."""
-
-from __future__ import annotations
-
-from reslrb_cli.optimization.certainty.measuring import LEAST_ITERATIONS, Certainty
-from reslrb_cli.optimization.certainty.records import CertaintyRecord
-
-__all__ = ["LEAST_ITERATIONS", "Certainty", "CertaintyRecord"]

@@ -1,0 +1,204 @@
+"""What the images tell of the parameters, asked before the first iteration.
+
+Which entries of a parameter the images tell something about.
+
+Whether the images tell exposures from parameters, asked before the first iteration.
+
+Let D_k be how all views' images, exposed and without what their masks leave out, change with the logarithm of parameter
+k, all its entries at once: (J((1 + h) x_k) - J(x_k)) / h, at common random numbers. An exposure's own is its views'
+images themselves. With all emission unknown, for example, the sum over the lamps is the exposure's. In general there
+are combinations without an effect where the matrix of cosines
+
+    G_kl = <D_k, D_l> / (|D_k| |D_l|)
+
+has an eigenvalue near 0; its eigenvector says which values are in the combination.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from reslrb_cli.errors import ConfigError
+from reslrb_cli.integrators.freezing import MOST_PATHS
+from reslrb_cli.integrators.light_tracer import LightTracer
+from reslrb_cli.integrators.step import known_step
+from reslrb_cli.optimization.loading import passes, samples_per_pass
+from reslrb_cli.optimization.sensitivity import see_images
+from reslrb_cli.optimization.views import SHARED
+from reslrb_cli.scene.visibility import visible_texels
+from reslrb_cli.seeds import seed
+
+if TYPE_CHECKING:
+    from reslrb_cli.optimization.problem import Problem
+
+
+Array = np.ndarray[Any, Any]
+
+
+#: Paths in one pass of the gradient where naive AD keeps every vertex of each of them; light tracing keeps none.
+PATHS_PER_PASS = 2**18
+
+
+def find_reached(problem: Problem, say: Callable[[str], None] = lambda line: None) -> None:
+    """Fill `problem.masks` for the parameters whose true value is known.
+
+    An entry counts as reached where light reaches it (the gradient of the image's sum with respect to it, over
+    `run.reach_spp` samples per pixel, is not 0 in some channel) and, for a texel, where some sensor also sees its
+    centre: a texel that only lights others is held by interreflection alone.
+    """
+    if not problem.truth:
+        return
+    say(f"finding what light and sensor reach: {problem.config.run.reach_spp} spp")
+    sensitive = sensitivity(problem)
+    for key in problem.truth:
+        mask: Array = sensitive[key] | (key in problem.selection.factors)  # every image shows its exposure
+        if mask.ndim == 3:
+            mask = np.any(mask, axis=2)
+            if key in problem.selection.params:  # a heightmap is no texture to be seen
+                sensors = [problem.scene.sensors()[view.sensor] for view in problem.trained]
+                mask = mask & _without_halo(visible_texels(problem.scene, sensors, key), mask.shape[1])
+        problem.masks[key] = mask
+
+
+def shown_texels(problem: Problem, key: str) -> Array | None:
+    """Which texels (H, W) of a texture some view that is trained on shows in pixels that count; None of what is no
+    texture to be seen."""
+    if key not in problem.selection.params or problem.selection.array(key).ndim != 3:
+        return None
+    sensors = [problem.scene.sensors()[view.sensor] for view in problem.trained]
+    pixels = [None if view.weights is None else np.array(view.weights)[:, :, 0] > 0 for view in problem.trained]
+    width = problem.selection.array(key).shape[1]
+    return _without_halo(visible_texels(problem.scene, sensors, key, pixels), width)
+
+
+def sensitivity(problem: Problem) -> dict[str, Array]:
+    """For each parameter whether the mean image depends on an entry, boolean, of the parameter's shape."""
+    run, optimizer = problem.config.run, problem.optimizer
+    integrator, paths_per_pass = problem.integrator, PATHS_PER_PASS
+    if isinstance(integrator, LightTracer):  # a recording takes as long as some passes, of which there is mostly one
+        integrator = integrator.with_options(samples_per_pass=integrator.samples_per_pass, freeze=False)
+        paths_per_pass = MOST_PATHS
+    found: dict[str, Array] = {}
+    for sensor in [view.sensor for view in problem.trained]:
+        film = problem.scene.sensors()[sensor].film()
+        width, height = (int(n) for n in film.crop_size())
+        # dL/dI of the mean image: known before any path is traced, which some estimators ask for.
+        ones = dr.ones(mi.TensorXf, (height, width, int(film.base_channels_count())))
+        dr.make_opaque(ones)
+        multiple = samples_per_pass(problem.config)
+        spp = -(-run.reach_spp // multiple) * multiple if multiple else run.reach_spp
+        for number, part in enumerate(passes(spp, width * height, multiple, paths_per_pass)):
+            known_step(
+                integrator,
+                problem.scene,
+                sensor,
+                ones,
+                seed=seed(run.seed, 0, sensor, f"reach, pass {number}"),
+                spp=part,
+                params=problem.selection.params,
+            )
+            for key, gradient in problem.gradients().items():
+                nonzero = np.array(gradient != 0.0)
+                optimizer.clear_gradient(key)
+                found[key] = found[key] | nonzero if key in found else nonzero
+    return {key: _like(problem.selection.array(key), value) for key, value in found.items()}
+
+
+def _like(array: Array, mask: Array) -> Array:
+    """`mask` in the shape of `array`, without the halo columns that an environment map's tensor has."""
+    if array.ndim == 3 and mask.ndim == 3:
+        mask = _without_halo(mask, array.shape[1])
+    return mask.reshape(array.shape)
+
+
+def _without_halo(mask: Array, width: int) -> Array:
+    """The middle `width` columns of a mask (H, W, ...)."""
+    halo = (mask.shape[1] - width) // 2
+    return mask[:, halo : halo + width]
+
+
+#: The relative step h.
+STEP = 0.02
+
+
+#: Eigenvalues below it are taken for 0: two directions at less than a degree to each other.
+LEAST = 1e-4
+
+
+#: A value whose part in the eigenvector is smaller has none in the combination.
+PART = 0.1
+
+
+@dataclasses.dataclass(frozen=True)
+class Ambiguous:
+    """Values that can change together without the images showing it: exposures, and parameters."""
+
+    exposures: list[str]
+    parameters: list[str]
+
+
+def check_exposures(problem: Problem) -> None:
+    """Raise ConfigError where the images cannot tell an exposure from parameters, which it names.
+
+    Takes one image of each view for every parameter; nothing where no exposure is recovered. The problem has its
+    targets, and is left as it was.
+    """
+    found = find_ambiguous(problem) if problem.selection.factors else None
+    if found is None:
+        return
+    both = " and ".join(f"`{key}`" for key in found.exposures), ", ".join(f"`{key}`" for key in found.parameters)
+    raise ConfigError(
+        problem.config.source,
+        _place(problem, found.exposures[0]),
+        f"the images cannot tell {both[0]} from {both[1]}: changed together, they look the same; give one of them a "
+        "number, such as exposure: 1, or remove a parameter whose value is known",
+    )
+
+
+def find_ambiguous(problem: Problem) -> Ambiguous | None:
+    """The first combination of exposures and parameters that the images do not show; None where there is none."""
+    problem.apply()
+    base = _row(problem)
+    factors, rows, keys = problem.selection.factors, [], []
+    for key in problem.selection.keys:
+        value = dr.detach(problem.optimizer[key])
+        moved = value * dr.opaque(dr.leaf_t(value), 1 + STEP)
+        problem.apply({key: moved})
+        row = (_row(problem) - base) / STEP
+        if np.isfinite(row).all() and (norm := float(np.linalg.norm(row))) > 0:
+            rows.append(row / norm)
+            keys.append(key)
+    problem.apply()
+    if not rows:
+        return None
+    matrix = np.stack(rows)
+    values, vectors = np.linalg.eigh(matrix @ matrix.T)
+    for value, vector in zip(values, vectors.T, strict=True):
+        parts = [key for key, part in zip(keys, vector, strict=True) if abs(part) > PART]
+        exposures = [key for key in parts if key in factors]
+        parameters = [key for key in parts if key not in factors]
+        if value < LEAST and exposures and parameters:
+            return Ambiguous(exposures, parameters)
+    return None
+
+
+def _place(problem: Problem, key: str) -> str:
+    """Where the exposure of that key stands in the configuration."""
+    for number, spec in enumerate(problem.config.views or ()):
+        if spec.exposure is not None and key == f"{SHARED}.{spec.sensor}":
+            return f"views[{number}].exposure"
+    return "target.exposure"
+
+
+def _row(problem: Problem) -> np.ndarray:
+    """The images of all views in a row, each by the root of its share of the loss."""
+    images = see_images(problem)
+    return np.concatenate(
+        [np.sqrt(view.share) * image.ravel() for view, image in zip(problem.trained, images, strict=True)]
+    )

@@ -1,0 +1,449 @@
+"""The Gauss-Newton curvature of the loss, and the directions in which it is measured.
+
+The Gauss-Newton curvature H = J^T W J of the loss at the parameters' values: J of the image, W = d2L/dI2, by pixel.
+
+    along directions    J by differences of images at common random numbers, from two independent sets of samples a, b:
+                        H = (J_a^T W J_b + J_b^T W J_a) / 2, whose noise has no bias
+    by entry            random signs v over the pixels: with p_s = J_s^T (sqrt(W) v), the mean of p_a p_b is the
+                        diagonal of H (Hutchinson 1989; Bekas et al. 2007), again from two sets of samples
+
+Of the first kind a standard error is taken off, by the terms of its sum over the pixels: too much curvature would make
+results look too sure. The second kind is noise for the most part at each entry alone. Entries whose gradients have
+alike noise have alike curvature, so it is averaged over those: `smooth`.
+
+Noise of a rendered target is in all gradients alike: b = J^T d, d what it makes of dL/dI. It is sampled by images of
+the target's own integrator (`_noises`). `d_even` is its mean, which pulls all pixels the same way (a relative loss
+weighs what noise darkens), `d_odd` the rest, taken in blocks of pixels, which the film's filter may have mixed. Then
+the second moment of b is
+
+    B = sum over blocks (J_a^T d_odd) (J_b^T d_odd)^T + (J^T d_even) (J^T d_even)^T
+
+Directions in which images are differentiated: entries of small parameters, and textures brightened as a whole.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from reslrb_cli.integrators.light_tracer import LightTracer
+from reslrb_cli.integrators.step import known_step, render_image
+from reslrb_cli.optimization.loading import make_configured, render_in_passes
+from reslrb_cli.optimization.sensitivity import take_gradient
+from reslrb_cli.optimization.views import View, slope, to_tensor
+from reslrb_cli.seeds import seed
+
+if TYPE_CHECKING:
+    from reslrb_cli.optimization.problem import Problem
+
+
+Array = np.ndarray[Any, Any]
+
+
+#: A parameter of at most so many entries is looked at entry by entry.
+MOST_ENTRIES = 4
+
+
+#: Parts of keys of what mixes channels: a number is read out of such textures.
+MIXING = ("alpha", "roughness", "weight", "opacity", "normalmap", "bump", "metallic", "anisotropic")
+
+
+@dataclass(frozen=True)
+class Direction:
+    """One coordinate: `vector`, in the layout of a gradient in a row, is what a unit of it adds to the parameter `key`.
+
+    `channel` is the only channel of images that it changes, or None. `scale` is the size of the coordinate. `entry` is
+    that of a small parameter; None where all of a texture's channel change together, in proportion to what they are.
+    """
+
+    key: str
+    vector: Array
+    scale: float
+    channel: int | None = None
+    entry: int | None = None
+
+
+@dataclass(frozen=True)
+class Change:
+    """A rendering of `values` (by key, as `Selection.array` has them), `amount` of each of these directions away."""
+
+    values: dict[str, Array]
+    amount: float
+    directions: list[Direction]
+
+
+def row_of(problem: Problem, key: str) -> Array:
+    """A parameter's value in a row, as its gradient is (`samples.take_gradient`), an environment map's halo in it."""
+    return np.array(dr.detach(problem.optimizer[key]), dtype=np.float64).ravel()
+
+
+def separates(problem: Problem, key: str) -> bool:
+    """Whether each channel of a parameter changes that channel of images alone, as colours do where there are three."""
+    if not mi.is_rgb or any(view.target.shape[2] != 3 for view in problem.trained):
+        return False
+    if any(part in MIXING for part in key.replace("_", ".").split(".")):
+        return False
+    array = problem.selection.array(key)
+    if array.ndim == 3:
+        return array.shape[2] == 3 and not problem.selection.quantity(key)
+    return isinstance(problem.optimizer[key], mi.Color3f)
+
+
+def plan_changes(problem: Problem, scales: Mapping[str, float], share: float, most: int) -> list[Change]:
+    """The renderings that the directions of all parameters take, `share` of the scale away, small parameters first.
+
+    At most `most` of them: parameters that are left have no directions.
+    """
+    small = [key for key in problem.selection.keys if problem.selection.array(key).size <= MOST_ENTRIES]
+    textures = [key for key in problem.selection.keys if problem.selection.array(key).ndim == 3]
+    changes: list[Change] = []
+    for key in (*small, *(key for key in textures if key not in small)):
+        made = _entries(problem, key, scales[key], share) if key in small else _wholes(problem, key, share)
+        if len(changes) + len(made) <= most:
+            changes += made
+    return changes
+
+
+def _entries(problem: Problem, key: str, scale: float, share: float) -> list[Change]:
+    row, array = row_of(problem, key), problem.selection.array(key)
+    directions = [
+        Direction(key, unit, scale, channel if separates(problem, key) else None, channel)
+        for channel, unit in enumerate(np.eye(row.size))
+    ]
+    groups = [directions] if separates(problem, key) else [[direction] for direction in directions]
+    low, high = problem.selection.spec(key).bounds or (-np.inf, np.inf)
+    changes = []
+    for group in groups:
+        step = sum(direction.vector for direction in group) * scale * share
+        up = _within(row + step, low, high)
+        side = 1.0 if up >= _within(row - step, low, high) else -1.0
+        moved = (row + side * step).reshape(array.shape)
+        changes.append(Change({key: moved}, side * scale * share, group))
+    return changes
+
+
+def _wholes(problem: Problem, key: str, share: float) -> list[Change]:
+    array, row = problem.selection.array(key), row_of(problem, key)
+    channels = array.shape[2]
+    if not np.any(row) or (channels > 1 and not separates(problem, key)):
+        return []
+    # Darker, so that no bound is passed but by what is negative.
+    values = {key: array * (1 - share)}
+    of = [np.where(np.arange(row.size) % channels == channel, row, 0.0) for channel in range(channels)]
+    single = channels == 1
+    return [
+        Change(values, -share, [Direction(key, v, 1.0, None if single else c) for c, v in enumerate(of) if v.any()])
+    ]
+
+
+def _within(moved: Array, low: float, high: float) -> int:
+    """How many entries are within the bounds."""
+    return int(np.sum((moved >= low) & (moved <= high)))
+
+
+def units(directions: Iterable[Direction], gradients: Mapping[str, Array]) -> Array:
+    """Derivatives along directions (M, ...) of gradients by key (..., N)."""
+    return np.array([gradients[direction.key] @ direction.vector for direction in directions])
+
+
+_PURPOSE = "curvature"
+
+
+#: Entries over which curvature is averaged, at least.
+GROUP = 64
+
+
+#: A pixel shows a texture where it changes by this share of the most that any does.
+SHOWN = 0.05
+
+
+#: So many standard errors are taken off.
+SURE = 1.0
+
+
+#: Values of the images that enter H along directions: of more, so many at random, the same for all. And blocks of B.
+MOST_VALUES = 2**18
+
+
+#: Images by which the target's noise is sampled, of as many samples where those are at most so many times a step's.
+REPLICAS, AGAIN = 4, 4
+
+
+#: By this factor they are made brighter or darker, at most.
+MOST_ASTRAY = 10.0
+
+
+#: Samples of it by which large parameters are probed.
+PROBED = 2
+
+
+@dataclass
+class TargetNoise:
+    """What the noise of one view's target makes of dL/dI, (H, W, C): `even` on average, and `odd` in one sample of it
+    besides; `side` is that of the blocks of pixels that share noise."""
+
+    odd: Array
+    even: Array
+    side: int
+
+    def in_blocks(self, slope: Array) -> Array:
+        """The sums over each block of what an image's derivative (H, W, C) makes of the odd part, in a row."""
+        product = np.sum(slope * self.odd, axis=2)
+        rows, columns = (np.arange(0, size, self.side) for size in product.shape)
+        return np.asarray(np.add.reduceat(np.add.reduceat(product, rows, axis=0), columns, axis=1).ravel())
+
+    def signed(self, random: np.random.Generator) -> Array:
+        """The odd part with a random sign for each block."""
+        height, width = self.odd.shape[:2]
+        signs = random.choice([-1.0, 1.0], size=(-(-height // self.side), -(-width // self.side)))
+        spread = np.repeat(np.repeat(signs, self.side, axis=0), self.side, axis=1)[:height, :width, None]
+        return self.odd * spread
+
+
+class Curvature:
+    """Measures it where `problem`, which has its targets, stands, with `spp` samples per pixel in each of two sets."""
+
+    def __init__(self, problem: Problem, spp: int) -> None:
+        self.problem, self.spp = problem, spp
+        #: What was done so far.
+        self.changes = self.probes = 0
+        #: By how many values of the images each texture is seen, of those that were changed as a whole.
+        self.pixels: dict[str, int] = {}
+        self.integrator = problem.integrator
+        if isinstance(self.integrator, LightTracer):  # a recording would cost more than so few probes save
+            per_pass = self.integrator.samples_per_pass
+            self.integrator = self.integrator.with_options(samples_per_pass=per_pass, freeze=False)
+        self._base = [self._images(half) for half in (0, 1)]
+        self._weights = [self._weight(place, view) for place, view in enumerate(problem.trained)]
+        values = sum(weight.size for weight in self._weights)
+        random = np.random.default_rng(self._seed(0, 0))
+        self._picked = None if values <= MOST_VALUES else np.sort(random.choice(values, MOST_VALUES, replace=False))
+        self._thinned = max(values / MOST_VALUES, 1.0)
+        #: Samples of the targets' noise, by view; nothing where no target was rendered.
+        self.noises = self._target_noises()
+
+    def along(self, changes: Sequence[Change], go_on: Callable[[], bool]) -> tuple[list[Direction], Array, Array]:
+        """The directions of the changes that were rendered before `go_on` said no, and H and B of those (M, M)."""
+        directions: list[Direction] = []
+        columns: list[list[Array]] = [[], []]
+        odd: list[list[Array]] = [[], []]
+        even: list[float] = []
+        for change in changes:
+            if not go_on():
+                break
+            self.problem.selection.set_arrays(change.values)
+            images = [self._images(half) for half in (0, 1)]
+            self.changes += 1
+            self.problem.apply()
+            for direction in change.directions:
+                directions.append(direction)
+                pulled = 0.0
+                for half in (0, 1):
+                    pairs = zip(images[half], self._base[half], strict=True)
+                    slopes = [_of_channel((a - b) / change.amount, direction.channel) for a, b in pairs]
+                    columns[half].append(self._in_a_row(slopes))
+                    if self.noises:
+                        blocks, sums = self._pulls(slopes)
+                        odd[half].append(blocks)
+                        pulled += 0.5 * sums
+                even.append(pulled)
+                if direction.entry is None:
+                    self.pixels[direction.key] = self.pixels.get(direction.key, 0) + _changed(slopes)
+        if not directions:
+            return [], np.zeros((0, 0)), np.zeros((0, 0))
+        a, b = (np.nan_to_num(np.array(rows)) for rows in columns)
+        a = a * self._in_a_row(self._weights)
+        sure = _sure_share(a * b)
+        product = a @ b.T * self._thinned * np.sqrt(np.outer(sure, sure))
+        return directions, 0.5 * (product + product.T), _second_moment(odd, even, len(self.noises))
+
+    def by_entry(self, probes: int, go_on: Callable[[], bool]) -> dict[str, Array]:
+        """For each parameter the diagonal of H in a row, unsmoothed; nothing where `go_on` said no at once."""
+        total: dict[str, Array] = {}
+        random = np.random.default_rng(self._seed(0, probes))
+        for probe in range(probes):
+            if not go_on():
+                break
+            roots = [np.sqrt(weight) * random.choice([-1.0, 1.0], size=weight.shape) for weight in self._weights]
+            self._add_probe(total, roots, 2 * probe)
+            self.probes += 1
+        return {key: value / self.probes for key, value in total.items()}
+
+    def by_entry_of_target(self, first: int, go_on: Callable[[], bool]) -> dict[str, Array]:
+        """The diagonal of B in the same way, by probes of which `first` is the number; nothing without a rendered
+        target."""
+        odd: dict[str, Array] = {}
+        even: dict[str, Array] = {}
+        random = np.random.default_rng(self._seed(1, first))
+        views = self.noises[:PROBED]
+        for number, noises in enumerate(views):
+            if not go_on():
+                return {}
+            self._add_probe(odd, [noise.signed(random) for noise in noises], 2 * (first + number))
+            self.probes += 1
+        if odd:
+            self._add_probe(even, [noise.even for noise in views[0]], 2 * (first + PROBED))
+            self.probes += 1
+        return {key: value / len(views) + even[key] for key, value in odd.items()}
+
+    def _add_probe(self, total: dict[str, Array], gradients: Sequence[Array], number: int) -> None:
+        """Add what two sets of samples make of dL/dI, by view, multiplied."""
+        a, b = (self._probe(gradients, number + half) for half in (0, 1))
+        for key in a:
+            total[key] = total.get(key, 0.0) + a[key].astype(np.float64) * b[key]
+
+    def _pulls(self, slopes: Sequence[Array]) -> tuple[Array, float]:
+        """What derivatives of the views' images make of the target's noise: of the odd part by sample and block in a
+        row, and of the mean of the even one."""
+        blocks = [noise.in_blocks(slope) for views in self.noises for noise, slope in zip(views, slopes, strict=True)]
+        sums = [
+            float(np.sum(slope * noise.even))
+            for views in self.noises
+            for noise, slope in zip(views, slopes, strict=True)
+        ]
+        return np.concatenate(blocks), sum(sums) / len(self.noises)
+
+    def _target_noises(self) -> list[list[TargetNoise]]:
+        config, trained = self.problem.config, self.problem.trained
+        render = config.target.render
+        if render is None or all(view.wanted.file is not None for view in trained):
+            return []
+        chosen = render.integrator or config.integrator
+        integrator = make_configured(chosen)
+        multiple = chosen.options().get("samples_per_pass")
+        by_view = [self._noises(view, integrator, render.spp, multiple) for view in trained]
+        return [list(sample) for sample in zip(*by_view, strict=True)]
+
+    def _noises(self, view: View, integrator: Any, spp: int, multiple: int | None) -> list[TargetNoise]:
+        """Samples of what the noise of a view's target, of `spp` samples, makes of dL/dI; nothing of one that was read.
+
+        Of images with as many samples each is the target in turn, and the mean of the others what it shows. Where that
+        would cost too much, and noise is small, differences of images of few samples are added to the target. All
+        samples are multiples of `multiple`.
+        """
+        true = np.array(view.target, dtype=np.float64)
+        if view.wanted.file is not None:
+            return [TargetNoise(np.zeros_like(true), np.zeros_like(true), 1)] * REPLICAS
+        run, unit = self.problem.config.run, multiple or 1
+        again, few = spp <= AGAIN * run.spp, max(self.spp // unit, 1) * unit
+        images = []
+        for number in range(REPLICAS):
+            image = render_in_passes(
+                integrator, self.problem.scene, view.sensor, spp if again else few, run.seed, number,
+                f"{_PURPOSE}, target", multiple,
+            )  # fmt: skip
+            images.append(view.kept(np.nan_to_num(image[:, :, : true.shape[2]].astype(np.float64))))
+        # Where noise has led the values astray the images are not as bright as the target.
+        bright = np.sum(view.kept(true)) * REPLICAS / max(float(np.sum(images)), 1e-300)
+        images = [image * np.clip(bright, 1 / MOST_ASTRAY, MOST_ASTRAY) for image in images]
+        if again:
+            total = np.sum(images, axis=0)
+            found = [self._slope(view, image, (total - image) / (REPLICAS - 1)) for image in images]
+            even = np.mean(found, axis=0)
+            odd = [(each - even) * np.sqrt(REPLICAS / (REPLICAS - 1)) for each in found]
+        else:
+            noises = [(a - b) * np.sqrt(few / spp / 2) for a, b in zip(images[::2], images[1::2], strict=True)]
+            sides = [[self._slope(view, true + side * noise, true) for side in (1, -1)] for noise in noises]
+            odd = [0.5 * (up - down) for up, down in sides] * 2
+            even = np.mean(sides, axis=(0, 1))
+        mixed = max(round(2 * self.problem.scene.sensors()[view.sensor].film().rfilter().radius()), 1)
+        side = max(mixed, round(np.ceil(np.sqrt(true.shape[0] * true.shape[1] / MOST_VALUES))))
+        return [TargetNoise(each, even, side) for each in odd]
+
+    def _slope(self, view: View, target: Array, image: Array) -> Array:
+        """dL/dI of an exposed image with another target, both (H, W, C)."""
+        return np.nan_to_num(slope(replace(view, made=to_tensor(target)).judge, image)) * view.share
+
+    def _in_a_row(self, images: Sequence[Array]) -> Array:
+        row = np.concatenate([image.ravel() for image in images])
+        return row if self._picked is None else row[self._picked]
+
+    def _probe(self, gradients: Sequence[Array], number: int) -> dict[str, Array]:
+        """What dL/dI of the views' exposed images (H, W, C) is in the parameters, by one set of samples."""
+        problem = self.problem
+        for place, view in enumerate(problem.trained):
+            channels = int(problem.scene.sensors()[view.sensor].film().base_channels_count())
+            v = view.exposure.of_array(gradients[place])
+            v = np.pad(v, ((0, 0), (0, 0), (0, channels - v.shape[2]))).astype(np.float32)
+            gradient = mi.TensorXf(v) + dr.opaque(mi.Float, 0)
+            dr.make_opaque(gradient)
+            known_step(
+                self.integrator, problem.scene, view.sensor, gradient, seed=self._seed(view.sensor, number),
+                spp=self.spp, params=problem.selection.params,
+            )  # fmt: skip
+        return take_gradient(problem)
+
+    def _images(self, half: int) -> list[Array]:
+        """Every view that is trained on as the scene stands, exposed, without alpha, from the seeds of that set."""
+        images = []
+        for view in self.problem.trained:
+            number = self._seed(view.sensor, -1 - half)
+            image = render_image(self.problem.integrator, self.problem.scene, view.sensor, number, self.spp)
+            colors = np.array(image, dtype=np.float64)[:, :, : view.target.shape[2]]
+            images.append(view.kept(view.exposure.of_array(colors)))
+        return images
+
+    def _weight(self, place: int, view: View) -> Array:
+        """d2L/dI2 of a view's exposed image, for its pixels (H, W, C): differences of dL/dI over the residual's size.
+
+        Where L has a kink (`l1`), this is its curvature as noise of that size sees it.
+        """
+        image = 0.5 * (self._base[0][place] + self._base[1][place])
+        true = view.kept(np.array(view.target, dtype=np.float64))
+        step = max(_rms(image - true), 1e-3 * _rms(true), 1e-6)
+        up, down = (slope(view.judge, image + side * step).astype(np.float64) for side in (1, -1))
+        return np.maximum(np.nan_to_num(up - down), 0.0) / (2 * step) * view.share
+
+    def _seed(self, sensor: int, number: int) -> int:
+        return seed(self.problem.config.run.seed, number, sensor, _PURPOSE)
+
+
+def smooth(diagonal: Array, noise: Array) -> Array:
+    """`diagonal` (N,) averaged over groups of entries whose gradients have alike `noise`, at least GROUP of them."""
+    order = np.argsort(noise, kind="stable")
+    result = np.empty_like(diagonal)
+    for group in np.array_split(order, max(len(order) // GROUP, 1)):
+        result[group] = max(float(diagonal[group].mean()), 0.0)
+    return result
+
+
+def _second_moment(odd: Sequence[Sequence[Array]], even: Sequence[float], samples: int) -> Array:
+    """B (M, M) of what M directions make of the noise: by half of the samples and by direction in blocks, and as a
+    whole."""
+    if not samples:
+        return np.zeros((len(even), len(even)))
+    a, b = (np.nan_to_num(np.array(rows)) for rows in odd)
+    product = a @ b.T / samples
+    return np.asarray(0.5 * (product + product.T) + np.outer(even, even))
+
+
+def _of_channel(image: Array, channel: int | None) -> Array:
+    if channel is None:
+        return image
+    kept = np.zeros_like(image)
+    kept[:, :, channel] = image[:, :, channel]
+    return kept
+
+
+def _sure_share(terms: Array) -> Array:
+    """What of the sums of (M, N) terms is left once SURE of their standard errors are taken off, as a share, (M,).
+
+    A few bright pixels may make up all of a curvature, and be an accident.
+    """
+    sums, errors = terms.sum(axis=1), np.sqrt(np.square(terms).sum(axis=1))
+    result: Array = np.clip(1 - SURE * errors / np.maximum(sums, 1e-300), 0, 1)
+    return result
+
+
+def _changed(slopes: Sequence[Array]) -> int:
+    most = max(float(np.abs(slope).max()) for slope in slopes)
+    return sum(int(np.sum(np.abs(slope) > SHOWN * most)) for slope in slopes) if most else 0
+
+
+def _rms(values: Array) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))

@@ -1,0 +1,253 @@
+"""Measures, after the last iteration, how certain the values are: gradients and curvature where the run stands."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import drjit as dr
+import numpy as np
+
+from reslrb_cli.optimization.identifiability import shown_texels
+from reslrb_cli.optimization.loop import learning_rate_factor
+from reslrb_cli.optimization.sensitivity import rms, sample_gradient, take_gradient
+from reslrb_cli.optimization.uncertainty.curvature import MOST_ENTRIES, Curvature, Direction, plan_changes, row_of
+from reslrb_cli.optimization.uncertainty.posterior import Measured
+from reslrb_cli.optimization.uncertainty.verdicts import CertaintyRecord, Gradients, ParameterCertainty, weigh
+from reslrb_cli.records.clock import StepClock
+
+if TYPE_CHECKING:
+    from reslrb_cli.optimization.problem import Problem
+
+
+Array = np.ndarray[Any, Any]
+
+
+#: A run of fewer iterations is not judged: what it would cost is no small part of it.
+LEAST_ITERATIONS = 20
+
+
+#: Gradients at the final values: one for so many iterations, within these. They have the samples of a step, so that no
+#: kernel is compiled for them.
+ITERATIONS_A_SAMPLE, LEAST_SAMPLES, MOST_SAMPLES = 40, 3, 16
+
+
+#: Random probes for parameters of many entries; renderings along directions, at most: so many, or one for so many
+#: iterations.
+PROBES, LEAST_CHANGES, ITERATIONS_A_CHANGE = 4, 20, 10
+
+
+#: Share of the samples of a step that each of the two sets of samples has that curvature is measured with, and
+#: samples per pixel that are enough to have all of them.
+PART, FEW = 4, 4
+
+
+#: Directions are differentiated over this share of a parameter's scale.
+STEP = 0.05
+
+
+#: Part of a run whose gradients, the last ones, are asked for their noise.
+RECENT = 0.2
+
+
+#: Where curvature takes longer than this share of the run's time in iterations, and than so many of them, the rest is
+#: left out.
+SHARE, MOST_STEPS = 0.25, 50
+
+
+_PURPOSE = "certainty"
+
+
+class Certainty:
+    """Of one run of `problem`: made before its first iteration, `measure` after the last."""
+
+    def __init__(self, problem: Problem) -> None:
+        self.problem = problem
+        self._initial = {key: row_of(problem, key) for key in problem.selection.keys}
+        self._squares: dict[str, tuple[Any, float] | None] = {}
+        self._seen = 0
+        #: The texels (H, W) of each texture that some view shows and light reaches, once that was asked.
+        self.shown: dict[str, Array] = {}
+
+    def see(self, iterations: int) -> None:
+        """Take note of a run that has done so many iterations; it costs nothing."""
+        if iterations == int((1 - RECENT) * self.problem.config.run.iterations):
+            self._seen = iterations
+            self._squares = {key: self.problem.optimizer.squares(key) for key in self._initial}
+
+    def state(self) -> tuple[int, dict[str, Any]]:
+        """What it took note of: after how many iterations (0: not yet), and by key what the optimiser kept then."""
+        return self._seen, {key: found[0] for key, found in self._squares.items() if found is not None}
+
+    def restore(self, seen: int, squares: Mapping[str, Any]) -> None:
+        """Go on from what `state` said."""
+        self._seen = seen
+        for key, array in squares.items():
+            now = self.problem.optimizer.squares(key)
+            self._squares[key] = None if now is None else (array, now[1])
+
+    def _recent(self, key: str, iterations: int) -> Array | None:
+        """The mean square of the gradients since `see` took note, (N,); None where the optimiser keeps none."""
+        before, now = self._squares.get(key), self.problem.optimizer.squares(key)
+        if before is None or now is None or iterations <= self._seen:
+            return None
+        first, last = (np.array(mean, dtype=np.float64).ravel() for mean, _ in (before, now))
+        kept = now[1] ** (iterations - self._seen)
+        slope = self.problem.optimizer.slope(key)
+        squares = np.maximum(last - kept * first, 0) / max(1 - kept, 1e-300)
+        result: Array = squares / np.maximum(slope**2, 1e-300)
+        return result
+
+    def measure(self, iterations: int, elapsed_s: float, stop: Callable[[], bool]) -> CertaintyRecord | None:
+        """Measure after so many iterations, which took `elapsed_s`; None after too few, or where `stop()` says so.
+
+        Parameters and optimiser are left as they were.
+        """
+        if iterations < LEAST_ITERATIONS:
+            return None
+        problem, clock, compiled_ms = self.problem, StepClock(), 0.0
+        try:
+            problem.apply()
+            rows: dict[str, list[Array]] = {key: [] for key in problem.selection.keys}
+            count = min(max(iterations // ITERATIONS_A_SAMPLE, LEAST_SAMPLES), MOST_SAMPLES)
+            for number in range(count):
+                if stop():
+                    return None
+                with clock.step() as times:
+                    sample_gradient(problem, problem.integrator, number, _PURPOSE, problem.config.run.spp)
+                    for key, row in take_gradient(problem).items():
+                        rows[key].append(row.astype(np.float64))
+                compiled_ms += times.codegen_ms
+            gradients = {key: np.array(samples) for key, samples in rows.items()}
+            budget = _Budget(max(SHARE * elapsed_s, MOST_STEPS * elapsed_s / iterations), stop)
+            most = max(LEAST_CHANGES, iterations // ITERATIONS_A_CHANGE)
+            with clock.step() as times:
+                curvature = self._curvature()
+                found = self._measure_curvature(curvature, gradients, most, budget)
+            compiled_ms += times.codegen_ms
+            if stop():
+                return None
+            directions, H, B, diagonal, of_target = found
+            measured = self._measured(gradients, iterations)
+            weighed = weigh(measured, directions, H, diagonal, curvature.pixels, B, of_target)
+            parameters = {key: self._with_course(key, about, measured[key]) for key, about in weighed.items()}
+            measure_s = max(clock.elapsed_s - compiled_ms / 1e3, 0.0)
+            return CertaintyRecord(
+                parameters=parameters,
+                gradients=count,
+                changes=curvature.changes,
+                probes=curvature.probes,
+                measure_s=measure_s,
+                compile_s=compiled_ms / 1e3,
+                share=measure_s / max(elapsed_s, 1e-9),
+                iterations=iterations,
+                scale=problem.config.optimizer.scale,
+                learning_rate=problem.config.optimizer.learning_rate,
+                target_noise=self._target_noise(),
+                target_spp=render.spp if (render := problem.config.target.render) is not None else None,
+            )
+        finally:
+            take_gradient(problem)
+            problem.apply()
+
+    def _curvature(self) -> Curvature:
+        unit = self.problem.samples_per_pass or 1
+        spp = self.problem.config.run.spp
+        return Curvature(self.problem, max(max(spp // PART, min(spp, FEW)) // unit, 1) * unit)
+
+    def _measure_curvature(
+        self, curvature: Curvature, gradients: Gradients, most: int, budget: _Budget
+    ) -> tuple[list[Direction], Array, Array, Gradients, Gradients]:
+        """Directions, H and B along them; and, unsmoothed, their diagonals by entry, of parameters that have none of
+        them."""
+        scales = {key: self.scale(key) for key in self.problem.selection.keys}
+        directions, H, B = curvature.along(plan_changes(self.problem, scales, STEP, most), budget)
+        seen = {direction.key for direction in directions if direction.entry is not None}
+        left = [key for key, rows in gradients.items() if np.any(rows) and key not in seen]
+        diagonal = curvature.by_entry(PROBES, budget) if left else {}
+        of_target = curvature.by_entry_of_target(PROBES, budget) if diagonal else {}
+        kept = ({key: found[key] for key in left if key in found} for found in (diagonal, of_target))
+        return directions, H, B, next(kept), next(kept)
+
+    def _target_noise(self) -> str:
+        """Whether the noise of the targets is in the spreads, as `CertaintyRecord` has it."""
+        read = [view.wanted.file is not None for view in self.problem.trained]
+        return "left out" if all(read) else "in part" if any(read) else "measured"
+
+    def _with_course(self, key: str, about: ParameterCertainty, own: Measured) -> ParameterCertainty:
+        """With how far it went, how far it could have gone, and what of it is seen."""
+        optimizer = self.problem.optimizer
+        step = optimizer.first_step(key)
+        reach = None if step is None else step * float(sum(own.rates))
+        kept = np.any(own.gradients, axis=0) & (True if own.seen is None else own.seen)
+        moved = rms((own.value - self._initial[key])[kept]) if kept.any() else 0.0
+        seen = None if own.seen is None else float(own.seen.mean())
+        return replace(about, moved=moved, reach=reach, rate=optimizer.rate(key), seen=seen)
+
+    def scale(self, key: str) -> float:
+        """The size of a parameter, in its unit: the largest root mean square of its values at the start and at the end
+        and of what lies between them, or, without a unit of light, half of its range; where all are 0, 1."""
+        first, last = self._initial[key], row_of(self.problem, key)
+        sizes = [rms(first), rms(last), rms(last - first)]
+        low, high = self.problem.selection.spec(key).bounds or (-np.inf, np.inf)
+        emits = self.problem.quantities.get(key, "") in ("radiance", "irradiance", "intensity")
+        if np.isfinite(high - low) and (not emits or not any(sizes)):
+            sizes.append(0.5 * (high - low))
+        return max(sizes) or 1.0
+
+    def _seen_entries(self, key: str, gradients: Array) -> Array | None:
+        """Which entries of a texture some view shows, in a row as gradients are; None of what is no texture."""
+        shown = shown_texels(self.problem, key)
+        if shown is None:
+            return None
+        halo = dr.shape(self.problem.optimizer[key])[1] - shown.shape[1]  # of an environment map
+        channels = self.problem.selection.array(key).shape[2]
+        touched = np.any(gradients, axis=0).reshape(shown.shape[0], -1, channels).any(axis=2)
+        self.shown[key] = shown & touched[:, halo // 2 : halo // 2 + shown.shape[1]]
+        wide = np.pad(shown, ((0, 0), (halo // 2, halo - halo // 2)), mode="wrap")
+        return np.repeat(wide.ravel(), channels)
+
+    def _measured(self, gradients: Gradients, iterations: int) -> dict[str, Measured]:
+        config, optimizer = self.problem.config, self.problem.optimizer
+        factors = [
+            learning_rate_factor(
+                config.optimizer.schedule, iteration, config.run.iterations, config.optimizer.final_fraction
+            )
+            for iteration in range(iterations)
+        ]
+        found = {}
+        for key, rows in gradients.items():
+            low, high = self.problem.selection.spec(key).bounds or (-np.inf, np.inf)
+            value = row_of(self.problem, key)
+            found[key] = Measured(
+                value=value,
+                bounds=(low, high),
+                scale=self.scale(key),
+                gradients=rows,
+                response=np.nan_to_num(optimizer.response(key) * optimizer.rate(key)),
+                rates=factors,
+                is_small=value.size <= MOST_ENTRIES,
+                recent=self._recent(key, iterations),
+                seen=self._seen_entries(key, rows),
+            )
+        return found
+
+
+class _Budget:
+    """Whether there is time for more; what compiles at first is in it, so that the first call always says yes."""
+
+    def __init__(self, seconds: float, stop: Callable[[], bool]) -> None:
+        self._seconds, self._stop = seconds, stop
+        self._last: float | None = None
+        self._longest = self._spent = 0.0
+
+    def __call__(self) -> bool:
+        now = time.perf_counter()
+        if self._last is not None:
+            # The longest is taken for one that compiled.
+            step = now - self._last
+            self._longest, self._spent = max(self._longest, step), self._spent + step
+        self._last = now
+        return not self._stop() and self._spent - self._longest <= self._seconds

@@ -1,0 +1,234 @@
+"""How far final values may be from the optimum.
+
+How far final values may be from the optimum: what the run's steps leave open, less what gradients at the end say.
+
+Near the optimum the loss is quadratic with curvature H, and the offset d = x - x* of the values x follows the steps
+
+    d <- d - eta_t P (H d + noise)        P: how far a step moves an entry per unit of gradient (`Optimizer.response`)
+
+so that the covariance C of the offset goes from that of the start, the square of each entry's scale (nothing is known
+of where the optimum is), to that of the end:
+
+    C <- (1 - eta_t P H) C (1 - eta_t P H)^T + eta_t^2 P Sigma P
+
+It holds what too few iterations have not forgotten of the start, what the view does not tell (H has no curvature there,
+and the start stays), and the noise of the steps. K gradients at the final values, of mean g, then measure H d (Kalman):
+
+    gain = C H (H C H + Sigma / K)^-1,   to go = gain g,   C <- C - gain H C
+
+Noise of the target is in every gradient alike: H d + b + noise, d now the offset from what a target without noise would
+have. With B the second moment of b, and D how far a constant gradient drives the steps,
+
+    D <- (1 - eta_t P H) D + eta_t P
+    E = C + D B D^T,   cov(d, g) = E H - D B,   cov(g) = H E H - H D B - B D^T H + B + Sigma / K
+
+take the places of C, C H and H C H + Sigma / K. Where the run has converged, D = H^-1, what b does is in no gradient,
+and H^-1 B H^-1 is left.
+
+Momentum is left out: over many steps it moves as far. P is that of the end.
+
+What was measured of one parameter at the end of a run.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+#: A way to go of so many standard errors is no accident; and so are gradients.
+SURE = 2.0
+
+
+#: A value within this share of its scale of a bound is at it, however small the steps are.
+AT_BOUND = 1e-3
+
+
+#: Steps that a value at its bound may have been driven off it by noise.
+STEPS_OFF = 3.0
+
+
+def at_bound(value: Array, low: Array, high: Array, scale: Array, gradient: Array, error: Array, step: Array) -> Array:
+    """Which entries stand at a bound; the arguments are those of `Evidence`.
+
+    The gradient of the loss points upwards: at the lower bound one above 0 holds the value there.
+    """
+    near = np.maximum(AT_BOUND * scale, STEPS_OFF * step)
+    back = SURE * error
+    lower = (value - low <= near) & (gradient >= np.where(value <= low, -back, back))
+    upper = (high - value <= near) & (gradient <= np.where(value >= high, back, -back))
+    result: Array = lower | upper
+    return result
+
+
+Array = np.ndarray[Any, Any]
+
+
+@dataclass(frozen=True)
+class Measured:
+    """One parameter of N entries at the end of a run: its values (N,), bounds, scale, and K gradients (K, N).
+
+    `response` is how far a step moves an entry per unit of gradient, at the factor 1, and `rates` are the schedule's
+    factors of all iterations. `seen` (N,) says which entries of a texture some view shows; None of what is no texture.
+    """
+
+    value: Array
+    bounds: tuple[float, float]
+    scale: float
+    gradients: Array
+    response: Array
+    rates: Sequence[float]
+    is_small: bool
+    #: The mean square of the gradients of the run's last iterations, (N,), where the optimiser kept it.
+    recent: Array | None = None
+    seen: Array | None = None
+    mean: Array = field(init=False)
+    noise: Array = field(init=False)
+
+    def __post_init__(self) -> None:
+        noise = np.var(self.gradients, axis=0, ddof=1)
+        if self.is_small and self.recent is None:  # few samples: those of all entries
+            noise = np.where(noise > 0, noise.mean(), 0.0)
+        mean = self.gradients.mean(axis=0)
+        if self.recent is not None:  # more of them, which few samples of heavy-tailed ones understate
+            noise = np.maximum(noise, self.recent - mean**2)
+        object.__setattr__(self, "mean", mean)
+        object.__setattr__(self, "noise", noise)
+
+    @property
+    def prior(self) -> float:
+        """The standard deviation of the offset of an entry at the start: between bounds, at most that of any place."""
+        low, high = self.bounds
+        return min(self.scale, (high - low) / np.sqrt(12))
+
+    def within(self, to_go: Array) -> Array:
+        """Ways to the optimum, cut off at the bounds: what is far off is not as the curvature here has it."""
+        low, high = self.bounds
+        return np.clip(to_go, np.minimum(self.value - high, 0), np.maximum(self.value - low, 0)).astype(np.float64)
+
+    @property
+    def error(self) -> Array:
+        """The standard error of the mean gradient, (N,)."""
+        return np.sqrt(self.noise / len(self.gradients))
+
+    @property
+    def step(self) -> Array:
+        """How far noise moved an entry in the last iteration, (N,)."""
+        return self.response * self.rates[-1] * np.sqrt(self.noise)
+
+    @property
+    def at_bound(self) -> Array:
+        """Which entries stand at a bound, (N,)."""
+        (low, high), scale = self.bounds, np.full(self.value.shape, self.scale)
+        return at_bound(self.value, np.float32(low), np.float32(high), scale, self.mean, self.error, self.step)
+
+
+@dataclass(frozen=True)
+class Posterior:
+    """The offset of each of M entries from the optimum, as estimated: its mean (`to_go`, M), and covariance (M, M)."""
+
+    to_go: Array
+    covariance: Array
+    #: What of the spread is the target's, (M,).
+    of_target: Array
+
+    @property
+    def error(self) -> Array:
+        """The standard error of `to_go`, (M,)."""
+        return np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
+
+    @property
+    def spread(self) -> Array:
+        """The root mean square of the offset, (M,): one standard deviation of a final value about the optimum."""
+        return np.hypot(self.to_go, self.error)
+
+
+def joint(
+    curvature: Array, response: Array, scale: Array, noise: Array, gradient: Array, samples: int,
+    rates: Sequence[float], fixed: Array | None = None,
+) -> Posterior:  # fmt: skip
+    """The offset of M entries together.
+
+    `curvature` is H (M, M), `noise` the covariance of one gradient (M, M), `gradient` the mean of `samples` of them,
+    `response` the diagonal of P, `scale` the standard deviation of the offset at the start, all (M,), `rates` the eta
+    of all iterations, `fixed` the B (M, M) of what all gradients share; None: nothing. Each entry is taken in units of
+    its scale, so that those of different units have well-conditioned matrices.
+    """
+    H = curvature * scale[:, None] * scale[None, :]
+    H = _positive(0.5 * (H + H.T))
+    Sigma = _positive(noise * scale[:, None] * scale[None, :])
+    C, driven = _after(H, response / scale**2, Sigma, rates)
+    B = np.zeros_like(H) if fixed is None else _positive(fixed * scale[:, None] * scale[None, :])
+    E, pulled = C + driven @ B @ driven.T, H @ driven @ B
+    seen = H @ E @ H - pulled - pulled.T + B + Sigma / samples
+    seen = seen + np.eye(len(scale)) * max(1e-9 * float(np.trace(seen)), 1e-30)
+    shared = E @ H - driven @ B
+    gain = np.linalg.solve(seen, shared.T).T
+    to_go = gain @ (gradient * scale)
+    of_target = np.sqrt(np.maximum(np.diag(driven @ B @ driven.T), 0.0))
+    return Posterior(to_go * scale, _positive(E - gain @ shared.T) * np.outer(scale, scale), of_target * scale)
+
+
+def alone(
+    curvature: Array, response: Array, scale: Array, noise: Array, gradient: Array, samples: int,
+    rates: Sequence[float], fixed: Array | float = 0.0,
+) -> tuple[Array, Array]:  # fmt: skip
+    """`to_go` and its standard error of each entry as if all others were known; everything is (M,), as in `joint`."""
+    h = np.maximum(curvature, 0.0)
+    C, D = scale**2, np.zeros_like(h)
+    for rate in rates:
+        left = np.clip(1 - rate * response * h, 0, 1)
+        C = left**2 * C + (rate * response) ** 2 * noise
+        D = left * D + _driven(rate * response, h)
+    E = C + D**2 * fixed
+    seen = h**2 * E - 2 * h * D * fixed + fixed + np.maximum(noise / samples, 1e-300)
+    shared = E * h - D * fixed
+    gain = shared / seen
+    return gain * gradient, np.sqrt(np.maximum(E - gain * shared, 0.0))
+
+
+def driven_alone(curvature: Array, response: Array, rates: Sequence[float]) -> Array:
+    """D of each entry as if all others were known, (M,)."""
+    h = np.maximum(curvature, 0.0)
+    D = np.zeros_like(h)
+    for rate in rates:
+        D = np.clip(1 - rate * response * h, 0, 1) * D + _driven(rate * response, h)
+    return D
+
+
+def _driven(step: Array, curvature: Array) -> Array:
+    """How far one step goes per unit of a constant gradient: not beyond where curvature makes up for that."""
+    result: Array = np.minimum(step, 1 / np.maximum(curvature, 1e-300))
+    return result
+
+
+def _after(H: Array, response: Array, noise: Array, rates: Sequence[float]) -> tuple[Array, Array]:
+    """The covariance after all steps from a start of unit variances, and how far a constant gradient has driven them.
+
+    An entry that no step moves stays where it was.
+    """
+    C, D, moved = np.eye(len(response)), np.zeros_like(H), response > 0
+    if not moved.any():
+        return C, D
+    # Steps are symmetric in units of the root of the response.
+    q, free = np.sqrt(response[moved]), np.ix_(moved, moved)
+    values, vectors = np.linalg.eigh(H[free] * q[:, None] * q[None, :])
+    now = vectors.T @ np.diag(q**-2) @ vectors
+    shaken = vectors.T @ (noise[free] * q[:, None] * q[None, :]) @ vectors
+    values, driven = np.maximum(values, 0.0), np.zeros(len(values))
+    for rate in rates:
+        left = np.clip(1 - rate * values, 0, 1)
+        now = left[:, None] * now * left[None, :] + rate**2 * shaken
+        driven = left * driven + _driven(np.full_like(values, rate), values)
+    back = q[:, None] * vectors
+    C[free], D[free] = back @ now @ back.T, (back * driven) @ back.T
+    return C, D
+
+
+def _positive(matrix: Array) -> Array:
+    """The nearest symmetric matrix without negative eigenvalues: what noise made negative is nothing."""
+    values, vectors = np.linalg.eigh(0.5 * (matrix + matrix.T))
+    result: Array = (vectors * np.maximum(values, 0.0)) @ vectors.T
+    return result

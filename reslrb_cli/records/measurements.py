@@ -1,0 +1,484 @@
+"""What measuring commands write with `--json`, one object a line: the records of each command.
+
+`reslrb bench --json FILE`: one object a line, one line a case and depth, or what else is swept.
+
+`reslrb convergence --json FILE`: one object a line: measured points, methods, and the references of their errors.
+
+`reslrb gradcheck --json FILE`: one object a line, one line for each comparison of a gradient with a reference.
+
+`reslrb convergence --runs N --json FILE`: one object a line: whole optimisations against run time, and methods.
+
+What `gradcheck --missing` finds of one parameter.
+
+Lines of `gradcheck --json` as the records that they were, where they are whole.
+"""
+
+from __future__ import annotations
+
+import enum
+import json
+import math
+import statistics
+from collections.abc import Mapping, Sequence
+from dataclasses import MISSING, asdict, dataclass, field, fields
+from typing import Any
+
+from reslrb_cli.records.metrics import finite
+
+
+class BenchStatus(str, enum.Enum):
+    """How a case ended."""
+
+    OK = "ok"
+    OUT_OF_MEMORY = "out_of_memory"
+    FAILED = "failed"
+
+
+@dataclass(frozen=True)
+class Spread:
+    """Median, least and greatest of repeated measurements."""
+
+    median: float
+    min: float
+    max: float
+
+    @classmethod
+    def of(cls, values: Sequence[float]) -> Spread:
+        """The spread of at least one value."""
+        return cls(statistics.median(values), min(values), max(values))
+
+
+@dataclass(frozen=True)
+class BenchRecord:
+    """Cost of a step of one integrator at one depth, number of samples, size of film, and size of textures.
+
+    `estimator` is None where the integrator has none; what makes it another than by default, but for `capacity`, stands
+    behind its name, `reservoir(weight=adjoint)`. `step_ms` is wall time, `kernel_ms` what kernels took of it,
+    `codegen_ms` their generation (and the look into the cache of kernels), `tracing_ms` the rest: Python and what it
+    calls; all of warm steps. `cold_ms` is the wall time of the first step in a new process with an empty kernel cache,
+    `cold_codegen_ms` its part in which kernels were generated and compiled. `peak_mib` is the most that the allocator
+    held in that step, the scene included. `scratch_bytes` is thread-local memory of a path. `texels` are those of all
+    textures that are parameters. What was not measured is None: everything, where `status` is not ok.
+    """
+
+    integrator: str
+    estimator: str | None
+    capacity: int | None
+    max_depth: int
+    rr_depth: int
+    spp: int
+    width: int | None
+    height: int | None
+    status: BenchStatus
+    step_ms: Spread | None
+    kernel_ms: Spread | None
+    codegen_ms: Spread | None
+    tracing_ms: Spread | None
+    cold_ms: float | None
+    cold_codegen_ms: float | None
+    peak_mib: float | None
+    scratch_bytes: int | None
+    repeats: int
+    texels: int | None = None
+
+    def to_json(self) -> str:
+        """The record as one line of JSON."""
+        return json.dumps(asdict(self), allow_nan=False)
+
+
+#: Relative errors whose time is told.
+TARGETS = (0.1, 0.03, 0.01)
+
+
+@dataclass(frozen=True)
+class Range:
+    """An estimate and the ends of its 95 % interval."""
+
+    value: float
+    low: float
+    high: float
+
+
+@dataclass(frozen=True)
+class Method:
+    """What was measured: an integrator, and how its steps take their samples.
+
+    `estimator` is None where the integrator has none, `capacity` where the estimator has none; `adjoint` is
+    `run.adjoint`, None where dL/dI is held or nothing is differentiated. `label` is how the user wrote it, `spp` are
+    samples per pixel of a step.
+    """
+
+    label: str
+    integrator: str
+    estimator: str | None
+    capacity: int | None
+    adjoint: str | None
+    spp: int
+
+
+@dataclass(frozen=True)
+class PointRecord:
+    """The error of the average of `steps` steps, which take `elapsed_s` seconds.
+
+    `parameter` is a parameter's key, `all` (of them together) or `image`. Errors are relative to the size of what is
+    estimated, in L2 over all its entries. `relative_rmse` has the reference's own error, `reference_rmse`, subtracted,
+    and is the root of the mean square over `repeats` such averages; None where it drowns in the reference's.
+    """
+
+    method: Method
+    parameter: str
+    steps: int
+    elapsed_s: float
+    relative_rmse: float | None
+    reference_rmse: float | None
+    repeats: int
+
+    def to_json(self) -> str:
+        """The record as one line of JSON."""
+        return _convergence_line("point", self)
+
+
+@dataclass(frozen=True)
+class MethodRecord:
+    """What the points of one method and parameter come to; `repeats` is the number of steps.
+
+    `relative_rmse` is that of one step, from their variance, which takes `step_s` seconds; `cold_s` is the first step
+    in a new process, which compiles. `slope` is d log error / d log seconds. `efficiency` is 1 / (relative variance *
+    seconds), of a `biased` method with squared bias + variance. `bias_z` is the largest deviation from
+    `bias_reference`, in standard errors, `bias_z_limit` what it exceeds by chance with probability 1e-4 anywhere in the
+    table; `bias` its relative size, where there is one; `biased` is None where the question is open, as `message`
+    says. `independent` says whether that reference shares no code with what it judges. `seconds_to` has for each error
+    (`0.1`, `0.03`, `0.01`) the time until averages are as good, None where a bias keeps them from it; those in
+    `extrapolated` lie beyond the steps that were taken, or below the reference's error. What was not measured is None.
+    """
+
+    method: Method
+    parameter: str
+    status: BenchStatus
+    repeats: int = 0
+    step_s: float | None = None
+    cold_s: float | None = None
+    relative_rmse: float | None = None
+    reference_rmse: float | None = None
+    slope: Range | None = None
+    efficiency: Range | None = None
+    bias_z: float | None = None
+    bias_z_limit: float | None = None
+    bias: float | None = None
+    bias_reference: str | None = None
+    independent: bool = False
+    biased: bool | None = None
+    seconds_to: dict[str, float | None] = field(default_factory=lambda: {f"{target:g}": None for target in TARGETS})
+    extrapolated: list[str] = field(default_factory=list)
+    message: str = ""
+
+    def to_json(self) -> str:
+        """The record as one line of JSON."""
+        return _convergence_line("method", self)
+
+
+@dataclass(frozen=True)
+class ReferenceRecord:
+    """What errors are taken from: the mean of `repeats` steps, with the relative standard error `reference_rmse`.
+
+    `bias_z` is its own largest deviation from an independent reference, as of a `MethodRecord`; None where there is
+    none.
+    """
+
+    method: Method
+    parameter: str
+    repeats: int
+    reference_rmse: float | None
+    bias_z: float | None = None
+    bias_z_limit: float | None = None
+    bias_reference: str | None = None
+    biased: bool | None = None
+    message: str = ""
+
+    def to_json(self) -> str:
+        """The record as one line of JSON."""
+        return _convergence_line("reference", self)
+
+
+@dataclass(frozen=True)
+class SummaryRecord:
+    """Which method is the best, in words."""
+
+    line: str
+
+    def to_json(self) -> str:
+        """The record as one line of JSON."""
+        return json.dumps({"kind": "summary", "line": self.line})
+
+
+def _convergence_line(kind: str, record: PointRecord | MethodRecord | ReferenceRecord) -> str:
+    """One line: the method's fields beside the others; figures that are not finite become null."""
+    values = asdict(record)
+    method = values.pop("method")
+    return json.dumps({"kind": kind} | method | finite(values), allow_nan=False)
+
+
+class Reference(str, enum.Enum):
+    """What a gradient is compared with; `forward_mode` by the dot product <w, J v> = <J^T w, v>."""
+
+    PTRACER = "ptracer"
+    WALK_AD = "walk_ad"
+    PATH = "path"
+    PRB = "prb"
+    FINITE_DIFFERENCE = "finite_difference"
+    ANALYTIC = "analytic"
+    FORWARD_MODE = "forward_mode"
+
+
+class Kind(str, enum.Enum):
+    """How it is compared.
+
+    `equal_seeds`: by relative L2, where both compute the same numbers but for rounding. `expectation`: by z scores over
+    many seeds. `image`: so too, but not the gradient, the image it belongs to.
+    """
+
+    EQUAL_SEEDS = "equal_seeds"
+    EXPECTATION = "expectation"
+    IMAGE = "image"
+
+
+class Verdict(str, enum.Enum):
+    """What came of it. All but `holds` and `fails` leave the question open, and `message` says why.
+
+    `heavy_tailed`: single seeds carry the variance, so that z scores prove nothing. `unresolved`: noise hides
+    deviations as large as the gradient itself. `unreached`: gradient and reference are exactly zero.
+    `no_reference`: nothing here counts as one. `not_measured`: time was up before there were samples.
+    """
+
+    HOLDS = "holds"
+    FAILS = "fails"
+    HEAVY_TAILED = "heavy_tailed"
+    UNRESOLVED = "unresolved"
+    UNREACHED = "unreached"
+    NO_REFERENCE = "no_reference"
+    NOT_MEASURED = "not_measured"
+
+
+@dataclass(frozen=True)
+class GradcheckRecord:
+    """One comparison: the gradient of a parameter by an integrator, against a reference.
+
+    `case` names the scene: the configuration, or a case of a suite. `parameter` is None where all are compared
+    together, or the image; `estimator` where the integrator has none. `seeds` is how many gradients each side has.
+    `relative_l2` is the distance from the reference over its norm: at equal seeds of the samples, else of the
+    means. `z_rms` and `z_max` are in standard errors; each has its limit, corrected for the number of comparisons.
+    `cosine` is that of the angle between the means, `variance_ratio` the variance over that of the reference.
+    `detectable` is the least deviation, as a fraction of the reference, that would have been seen. `message` says what
+    the figures do not. What does not apply is None.
+    """
+
+    case: str
+    parameter: str | None
+    integrator: str
+    estimator: str | None
+    reference: Reference
+    kind: Kind
+    seeds: int
+    verdict: Verdict
+    relative_l2: float | None = None
+    relative_l2_limit: float | None = None
+    z_rms: float | None = None
+    z_rms_limit: float | None = None
+    z_max: float | None = None
+    z_max_limit: float | None = None
+    cosine: float | None = None
+    variance_ratio: float | None = None
+    detectable: float | None = None
+    message: str = ""
+
+    @property
+    def holds(self) -> bool | None:
+        """True or False where the comparison decides; None where it does not."""
+        return {Verdict.HOLDS: True, Verdict.FAILS: False}.get(self.verdict)
+
+    @classmethod
+    def of(cls, values: Mapping[str, Any]) -> GradcheckRecord:
+        """The record of these values, by name. Raises TypeError and ValueError where they are none of a record."""
+        names = {"reference": Reference, "kind": Kind, "verdict": Verdict}
+        return cls(**{key: names[key](value) if key in names else value for key, value in values.items()})
+
+    def to_json(self) -> str:
+        """The record as one line of JSON; figures that are not finite become null."""
+        values = {key: _finite(value) for key, value in asdict(self).items()}
+        return json.dumps(values | {"holds": self.holds}, allow_nan=False)
+
+
+def _finite(value: Any) -> Any:
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+@dataclass(frozen=True)
+class Band:
+    """The median of several runs, and the least and the greatest of them."""
+
+    median: float
+    low: float
+    high: float
+
+    @classmethod
+    def of(cls, values: Sequence[float]) -> Band | None:
+        """The band of some values; None where there are none."""
+        return cls(statistics.median(values), min(values), max(values)) if values else None
+
+
+@dataclass(frozen=True)
+class RunPointRecord:
+    """Where one run stands after `elapsed_s` seconds, all its costs counted: `iteration` of them are done by then.
+
+    `loss` is that of an image which all methods share the samples of. `parameter_error` is the root mean square error
+    over all parameters whose true value is known, or, where these have no common unit, the root mean square of their
+    relative errors; None where no true value is known. What is not finite becomes null in JSON.
+    """
+
+    method: Method
+    seed: int
+    elapsed_s: float
+    iteration: int
+    loss: float
+    parameter_error: float | None
+
+    def to_json(self) -> str:
+        """The record as one line of JSON."""
+        return _runs_line("run_point", self)
+
+
+@dataclass(frozen=True)
+class RunMethodRecord:
+    """What the runs of one method came to after `elapsed_s` seconds each.
+
+    `runs` is the number of those that came so far, which the bands are over; `status` is not ok where one of them ended
+    before, as `message` says. `first_s` are the seconds until the first iteration was done: loading, pilot, compiling.
+    What was not measured is None.
+    """
+
+    method: Method
+    status: BenchStatus
+    runs: int
+    elapsed_s: float
+    iterations: Band | None = None
+    first_s: Band | None = None
+    loss: Band | None = None
+    parameter_error: Band | None = None
+    message: str = ""
+
+    def to_json(self) -> str:
+        """The record as one line of JSON."""
+        return _runs_line("run_method", self)
+
+
+@dataclass(frozen=True)
+class RunBestRecord:
+    """A method at the best of its learning rates, and over the method that was named first.
+
+    `of` is what is compared at the end of the runs, `loss` or `parameter_error`; `value` is that of the best rate,
+    `at`, which is None where there is one alone; at the `outermost` of those that were tried a better one may lie
+    beyond. `ratio` is the median over that of the method `to` at its own best; None where that is not known. `line`
+    is the record in words.
+    """
+
+    label: str
+    of: str
+    at: str | None
+    outermost: bool
+    runs: int
+    value: Band
+    ratio: Range | None
+    to: str | None
+    line: str = ""
+
+    def to_json(self) -> str:
+        """The record as one line of JSON."""
+        return json.dumps({"kind": "run_best"} | finite(asdict(self)), allow_nan=False)
+
+
+def _runs_line(kind: str, record: RunPointRecord | RunMethodRecord) -> str:
+    """One line: the method's fields beside the others; figures that are not finite become null."""
+    values = asdict(record)
+    method = values.pop("method")
+    return json.dumps({"kind": kind} | method | finite(values), allow_nan=False)
+
+
+#: Standard errors within which a share counts as none.
+NOTHING = 3
+
+
+#: A share that single precision may have made.
+LEAST = 1e-4
+
+
+@dataclass(frozen=True)
+class MissingRecord:
+    """The share of a parameter's derivative that is not in the attached gradient, relative to finite differences.
+
+    `share` and `standard_error` are None where the derivative itself is lost in its noise.
+    """
+
+    case: str
+    parameter: str
+    share: float | None
+    standard_error: float | None
+    directions: int
+    seeds: int
+    kind: str = "missing"
+
+    def to_json(self) -> str:
+        """The record as one line of JSON."""
+        values = asdict(self)
+        return json.dumps({k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in values.items()})
+
+    def line(self) -> str:
+        """What it says, in one line."""
+        if self.share is None or self.standard_error is None:
+            return f"{self.parameter}: the derivative itself is less than what {self.seeds} seeds could see"
+        figures = f"{_percent(self.share)} +- {_percent(self.standard_error)}"
+        if self.share <= max(NOTHING * self.standard_error, LEAST):
+            return f"{self.parameter}: nothing is missing that {self.seeds} seeds could see ({figures})"
+        return (
+            f"{self.parameter}: {figures} of the derivative is missing (silhouettes, edges of shadows, light that "
+            "leaves the film)"
+        )
+
+
+def _percent(share: float) -> str:
+    return f"{share:.1%}" if share < 0.0995 else f"{share:.0%}"
+
+
+def gradcheck_record(entry: Mapping[str, Any]) -> GradcheckRecord | None:
+    """The record that a line holds; None where it holds none."""
+    kinds: dict[str, tuple[type, ...]] = {"int": (int,), "str": (str,)}
+    found: dict[str, Any] = {}
+    try:
+        for field in fields(GradcheckRecord):
+            if field.name not in entry and field.default is not MISSING:
+                continue
+            value = entry[field.name]
+            enums: dict[str, Any] = {"reference": Reference, "kind": Kind, "verdict": Verdict}
+            optional = "None" in str(field.type)
+            if field.name in enums:
+                value = enums[field.name](value)
+            elif not (optional and value is None):
+                name = str(field.type).partition(" ")[0]
+                if not isinstance(value, kinds.get(name, (int, float))):
+                    return None
+            found[field.name] = value
+    except (KeyError, ValueError):
+        return None
+    return GradcheckRecord(**found)
+
+
+def missing_record(entry: Mapping[str, Any]) -> MissingRecord | None:
+    """The record that a line holds; None where it holds none."""
+    if entry.get("kind") != "missing":
+        return None
+    texts = [entry.get(name) for name in ("case", "parameter")]
+    figures = [entry.get(name) for name in ("share", "standard_error")]
+    counts = [entry.get(name) for name in ("directions", "seeds")]
+    whole = all(isinstance(text, str) for text in texts) and all(isinstance(count, int) for count in counts)
+    if not whole or any(not isinstance(figure, int | float | None) for figure in figures):
+        return None
+    return MissingRecord(*texts, *figures, *counts)  # type: ignore[arg-type]

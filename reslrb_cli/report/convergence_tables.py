@@ -1,0 +1,264 @@
+"""Convergence and whole optimisations as aligned tables, and what they come to in a sentence.
+
+The methods of a convergence as an aligned table, and what it comes to in a sentence.
+
+Whole optimisations as an aligned table, and which method is the best in a sentence.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+from reslrb_cli.measure.optimization_benchmark.rank import ALPHA, Verdict
+from reslrb_cli.records.measurements import (
+    TARGETS,
+    Band,
+    BenchStatus,
+    MethodRecord,
+    Range,
+    ReferenceRecord,
+    RunBestRecord,
+    RunMethodRecord,
+    RunPointRecord,
+)
+from reslrb_cli.report.format import count, number, shorten
+
+#: Characters that a parameter's key may take.
+KEY_WIDTH = 28
+
+
+_FIGURES = ("step s", "steps", "error", "slope", "efficiency", "max |z| (limit)")
+
+
+_HEAD = ("", "parameter", *_FIGURES, *(f"s to {target:.0%}" for target in TARGETS))
+
+
+_WIDTHS = (0, 0, 8, 5, 8, 20, 24, 16) + (9,) * len(TARGETS)
+
+
+class Table:
+    """Lines that stand below each other, whose first columns fit `labels` and `parameters`."""
+
+    def __init__(self, labels: Sequence[str], parameters: Sequence[str]) -> None:
+        self._widths = (
+            max(map(len, labels), default=0),
+            max([len("parameter"), *(len(shorten(key, KEY_WIDTH)) for key in parameters)]),
+        )
+
+    def head(self) -> str:
+        """The first line."""
+        return self._line(_HEAD)
+
+    def line(self, record: MethodRecord, parameter: str | None = None) -> str:
+        """The line of one record, `parameter` in place of its own where it is given."""
+        name = shorten(parameter or record.parameter, KEY_WIDTH)
+        if record.relative_rmse is None:
+            reason = record.message if record.status is BenchStatus.OK else record.status.value
+            return self._line((record.method.label, name, reason))
+        cells = (
+            record.method.label,
+            name,
+            number(record.step_s, 3),
+            str(record.repeats),
+            f"{record.relative_rmse:.3g}",
+            _range(record.slope),
+            _range(record.efficiency),
+            _deviation(record),
+            *(_seconds(record, f"{target:g}") for target in TARGETS),
+        )
+        return self._line(cells)
+
+    def _line(self, cells: tuple[str, ...]) -> str:
+        parts = [f"{cell:<{width}}" for cell, width in zip(cells, self._widths, strict=False)]
+        parts += [f"{cell:>{width}}" for cell, width in zip(cells[2:], _WIDTHS[2:], strict=False)]
+        return "  ".join(parts).rstrip()
+
+
+def _range(value: Range | None) -> str:
+    return "" if value is None else f"{value.value:.3g} [{value.low:.3g}, {value.high:.3g}]"
+
+
+def _deviation(record: MethodRecord) -> str:
+    if record.bias_z is None:
+        return ""
+    word = {True: " biased", False: "", None: " open"}[record.biased]
+    return f"{abs(record.bias_z):.1f} ({record.bias_z_limit or 0:.1f}){word}"
+
+
+def _seconds(record: MethodRecord, target: str) -> str:
+    """A time; `~` before one that is extrapolated, a dash where a bias keeps the error from being so small."""
+    seconds = record.seconds_to[target]
+    if seconds is None:
+        return "-"
+    return ("~" if target in record.extrapolated else "") + number(seconds, 3)
+
+
+def notes(records: Sequence[MethodRecord]) -> list[str]:
+    """What the table does not say, one line each: how large biases are, and why questions stay open."""
+    lines = []
+    for record in records:
+        where = f"{record.method.label}, {shorten(record.parameter, KEY_WIDTH)}"
+        if record.biased:
+            size = "" if not record.bias else f" by {record.bias:.2g} of the whole"
+            lines.append(f"{where}: biased{size}, against {record.bias_reference}")
+        elif (record.message and record.relative_rmse is not None) or (
+            record.message and record.status is not BenchStatus.OK
+        ):
+            lines.append(f"{where}: {record.message}")
+    return lines
+
+
+def reference_line(record: ReferenceRecord) -> str:
+    """What stands behind the errors of one parameter."""
+    floor = record.message if record.reference_rmse is None else f"known to {record.reference_rmse:.2g}"
+    line = f"{shorten(record.parameter, KEY_WIDTH)}: {floor}, {record.repeats} steps of {record.method.label}"
+    if record.bias_z is not None:
+        verdict = {True: "DIFFERS from", False: "agrees with", None: "not decided against"}[record.biased]
+        line += (
+            f"; {verdict} {record.bias_reference}: max |z| {abs(record.bias_z):.1f} (limit {record.bias_z_limit:.1f})"
+        )
+    return line
+
+
+# --- the closing sentence ---------------------------------------------------------------------------------------------
+
+
+def closing_sentence(records: Sequence[MethodRecord]) -> str:
+    """Which method is the best for this scene, of all parameters together, and by how much.
+
+    A biased one is never called the best without that word, and a lead that the intervals do not show is none.
+    """
+    together = [record for record in records if record.parameter in ("all", "image") and record.efficiency is not None]
+    if not together:
+        return "Nothing can be said of which method is the best: there are too few steps."
+    sound = sorted((r for r in together if r.biased is not True), key=_efficiency, reverse=True)
+    biased = sorted((r for r in together if r.biased is True), key=_efficiency, reverse=True)
+    if not sound:
+        return f"All methods are biased; of them the biased {biased[0].method.label} has the highest efficiency."
+    best = sound[0]
+    sentence = f"Best for this scene: {best.method.label}"
+    if best.biased is None:
+        sentence += " (whether it is biased is open)"
+    if len(sound) == 1:
+        sentence += "; of all others a bias was found" if biased else ", the only one that was measured"
+    else:
+        level = [record for record in sound[1:] if _ratio(best, record)[1] <= 1]
+        if level:
+            names = ", ".join(f"{record.method.label} ({_times(best, record)})" for record in level)
+            sentence += f"; not told apart from it: {names}"
+        beaten = next((record for record in sound[1:] if record not in level), None)
+        if beaten is not None:
+            sentence += f"; {_times(best, beaten)} times as efficient as {beaten.method.label}"
+    sentence += "."
+    if biased and _efficiency(biased[0]) > _efficiency(best):
+        first = biased[0]
+        sentence += (
+            f" The biased {first.method.label} has {_efficiency(first) / _efficiency(best):.2g} times its efficiency"
+        )
+        sentence += f", but its error stays above {first.bias:.2g}." if first.bias else "."
+    return sentence
+
+
+def _efficiency(record: MethodRecord) -> float:
+    assert record.efficiency is not None, "others are left out"
+    return record.efficiency.value
+
+
+def _ratio(one: MethodRecord, other: MethodRecord) -> tuple[float, float, float]:
+    """Ratio of efficiencies with its interval: logarithms of independent estimates, whose half widths add up."""
+    a, b = one.efficiency, other.efficiency
+    assert a is not None, "others are left out"
+    assert b is not None, "others are left out"
+    ratio = a.value / b.value
+    down = math.hypot(math.log(a.value / a.low), math.log(b.high / b.value))
+    up = math.hypot(math.log(a.high / a.value), math.log(b.value / b.low))
+    return ratio, ratio * math.exp(-down), ratio * math.exp(up)
+
+
+def _times(one: MethodRecord, other: MethodRecord) -> str:
+    ratio, low, high = _ratio(one, other)
+    return f"{ratio:.2g} [{low:.2g}, {high:.2g}]"
+
+
+_RUNS_HEAD = ("", "seed", "iterations", "first s", "loss", "error")
+
+
+_RUNS_WIDTHS = (0, 8, 20, 20, 30, 30)
+
+
+class RunsTable:
+    """Lines that stand below each other, whose first column fits `labels`."""
+
+    def __init__(self, labels: Sequence[str]) -> None:
+        self._width = max(map(len, labels), default=0)
+
+    def head(self) -> str:
+        """The first line."""
+        return self._line(_RUNS_HEAD)
+
+    def point(self, point: RunPointRecord, first_s: float | None) -> str:
+        """The line of one run, at the end of its time."""
+        return self._line((point.method.label, str(point.seed), str(point.iteration), number(first_s, 3),
+                           number(point.loss, 4), number(point.parameter_error, 4)))  # fmt: skip
+
+    def line(self, record: RunMethodRecord) -> str:
+        """The line of one method: medians, and the least and the greatest of its runs."""
+        if record.runs == 0:
+            ended = "not measured" if record.status is BenchStatus.OK else record.status.value
+            return self._line((record.method.label, "", ended))
+        return self._line((record.method.label, count(record.runs, "run"), band(record.iterations, 3),
+                           band(record.first_s, 3), band(record.loss, 4), band(record.parameter_error, 4)))  # fmt: skip
+
+    def _line(self, cells: tuple[str, ...]) -> str:
+        parts = [f"{cells[0]:<{self._width}}"]
+        parts += [f"{cell:>{width}}" for cell, width in zip(cells[1:], _RUNS_WIDTHS[1:], strict=False)]
+        return "  ".join(parts).rstrip()
+
+
+def band(value: Band | None, digits: int) -> str:
+    """A median with its band; nothing for None."""
+    return "" if value is None else (
+        f"{value.median:.{digits}g} [{value.low:.{digits}g}, {value.high:.{digits}g}]"
+    )  # fmt: skip
+
+
+def best_line(record: RunBestRecord) -> str:
+    """A method at its best in one line."""
+    words = f"{'loss' if record.of == 'loss' else 'error'} of {record.at or record.label}: {band(record.value, 4)}"
+    if record.at is not None:
+        words += ", the best of its rates"
+        words += ", and the outermost that was tried" if record.outermost else ""
+    if record.ratio is not None:
+        apart = f"{number(record.ratio.value, 3)} [{number(record.ratio.low, 3)}, {number(record.ratio.high, 3)}]"
+        words += f"; {apart} times that of {record.to}{' at its best' if record.at else ''}"
+    return words
+
+
+def runs_notes(records: Sequence[RunMethodRecord]) -> list[str]:
+    """What ended before its time, one line a method."""
+    return [f"{record.method.label}: {record.message}" for record in records if record.message]
+
+
+def runs_closing_sentence(loss: Verdict | None, error: Verdict | None, limit_s: float) -> str:
+    """Which method is the best for this scene at the end of the time of a run, by the loss and by the error."""
+    if loss is None:
+        return "Nothing can be said of which method is the best: none came to an iteration and to the end of its time."
+    sentence = f"After {number(limit_s, 3)} s of each run, all costs counted: " + _of(loss, "the loss")
+    if error is not None:
+        sentence += "; " + _of(error, "the error of the parameters")
+    if not (loss.tied or loss.beats):
+        return sentence + "."
+    sentence += f". Told apart by the Mann-Whitney test at {ALPHA:.0%}, corrected for the number of methods"
+    return sentence + (f"; so few runs are too few for that, {loss.enough} of each could do." if loss.too_few else ".")
+
+
+def _of(verdict: Verdict, what: str) -> str:
+    words = f"best by {what} is {verdict.best}"
+    if not (verdict.tied or verdict.beats):
+        return f"{words}, the only one that was measured"
+    if verdict.tied:
+        words += f", tied with {', '.join(verdict.tied)}"
+    if verdict.beats:
+        words += f", ahead of {', '.join(verdict.beats)}"
+    return words

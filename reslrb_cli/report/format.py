@@ -1,0 +1,61 @@
+"""Numbers, times and keys in words, as the terminal and the page have them."""
+
+from __future__ import annotations
+
+import math
+
+from reslrb_cli.errors import printable
+
+#: What stands in place of the middle of a shortened key.
+ELLIPSIS = "..."
+
+
+#: What is said of a comparison of paths from the camera with paths from the lights.
+WITHOUT_BORDER = "without the film's border, where light paths lose what camera paths see"
+
+
+def number(value: float | None, digits: int = 4) -> str:
+    """A number with so many significant digits; empty for None."""
+    return "" if value is None else f"{value:.{digits}g}"
+
+
+def with_error(value: float, error: float, sign: str = "+-") -> str:
+    """A value and its standard error, both to the error's first digit: `0.0131 +- 0.0004`."""
+    if not (error > 0 and math.isfinite(error) and math.isfinite(value)):
+        return number(value)
+    exponent = math.floor(math.log10(max(abs(value), error)))
+    scale = 0 if -4 <= exponent < 5 else exponent
+    last = math.floor(math.log10(error)) - scale  # the place of the error's first digit
+    value, error, decimals = value / 10.0**scale, error / 10.0**scale, max(-last, 0)
+    text = f"{value:.{decimals}f} {sign} {error:.{decimals}f}"
+    return text if scale == 0 else f"({text})e{scale:+03d}"
+
+
+def duration(seconds: float) -> str:
+    """A time in the units that a person would choose: `12.3 ms`, `4.56 s`, `3 min 20 s`, `2 h 5 min`."""
+    if seconds < 1:
+        return f"{1e3 * seconds:.3g} ms"
+    if seconds < 59.95:
+        return f"{seconds:.3g} s"
+    whole = round(seconds)
+    if whole < 3600:
+        return f"{whole // 60} min {whole % 60} s"
+    minutes = round(seconds / 60)
+    return f"{minutes // 60} h {minutes % 60} min"
+
+
+def count(amount: int, what: str) -> str:
+    """An amount of things whose plural ends in s."""
+    return f"{amount} {what}" if amount == 1 else f"{amount} {what}s"
+
+
+def shorten(text: str, width: int) -> str:
+    """`text` in at most `width` characters, on one line: what is too long loses its middle, since keys differ at both
+    ends."""
+    text = printable(text)
+    if len(text) <= width:
+        return text
+    kept = width - len(ELLIPSIS)
+    if kept < 2:
+        return text[: max(width, 0)]
+    return text[: kept - kept // 2] + ELLIPSIS + text[-(kept // 2) :]

@@ -1,0 +1,237 @@
+"""A finished run in a few lines: its parameters, and how it ended.
+
+How a run ended, in a line: its loss, its errors, and what did not work.
+
+The parameters of a finished run in a few aligned lines, for a terminal.
+"""
+
+from __future__ import annotations
+
+import shutil
+import sys
+from collections.abc import Mapping, Sequence
+from textwrap import wrap
+from typing import Any
+
+from reslrb_cli.report.certainty import certainty_lines, noise_line, spread_words, verdict_words
+from reslrb_cli.report.format import count, number, shorten, with_error
+
+#: Parameters that got worse, named one by one.
+MOST_NAMED = 3
+
+
+#: What of its loss an image that came closer has left, at most.
+IMPROVED = 0.9
+
+
+#: In a run that is too short to know the noise of its loss, by how much that of the saved images has to rise; and a
+#: target that has fewer samples than so many steps is noisy itself.
+ROSE_IF_SHORT, FEW_STEPS = 1.1, 16
+
+
+#: In a run of fewer iterations losses tell nothing.
+LEAST_JUDGED = 20
+
+
+#: A key in a line of text has at most so many characters.
+KEY_WIDTH = 60
+
+
+def last_line(status: str, results: Mapping[str, Any], tallies: Sequence[str], report: str) -> str:
+    """What the terminal says last: how the run ended, what it came to, what went wrong, and where its page is.
+
+    `results` is the manifest's.
+    """
+    parts = [f"{status} after {count(results['iterations'], 'iteration')}"]
+    parts += [] if results["loss"] is None else [f"loss {number(results['loss'])}"]
+    parts += [line for line in (error_line(results), *tallies) if line]
+    return "; ".join([", ".join(parts), *warnings(results), f"look at {report}"])
+
+
+def error_line(results: Mapping[str, Any]) -> str | None:
+    """The error of all parameters at start and end; where their units differ, that of the worst, as a share of it.
+
+    `results` is what `Results.to_json` made. None where no true value is known.
+    """
+    total = results.get("rmse") or {}
+    if total.get("final") is not None:
+        return f"parameter RMSE {_from_to(total)}"
+    key = worst(results)
+    if key is None:
+        return None
+    return f"relative error {_from_to(results['relative_error'][key])} at worst ({shorten(key, KEY_WIDTH)})"
+
+
+def worst(results: Mapping[str, Any]) -> str | None:
+    """The key with the largest relative error at the end."""
+    errors = {key: pair.get("final") for key, pair in (results.get("relative_error") or {}).items()}
+    known = {key: error for key, error in errors.items() if error is not None}
+    return max(known, key=lambda key: known[key]) if known else None
+
+
+def warnings(results: Mapping[str, Any], sign: str = "+-") -> list[str]:
+    """What went wrong in a run that did not fail, plainly: a loss that did not fall, errors that rose, and values that
+    cannot be relied on."""
+    lines = []
+    trend = results.get("loss_trend") or {}
+    if trend.get("change") in ("rose", "flat") and not _image_improved(results):
+        start, end = (with_error(trend[at]["mean"], trend[at]["error"], sign) for at in ("start", "end"))
+        less = trend["end"]["mean"] < trend["start"]["mean"]
+        flat = "fell by no more than its noise" if less else "did not fall"
+        lines.append(
+            f"the loss {'rose' if trend['change'] == 'rose' else flat} ({start} at the start, {end} at the end)"
+        )
+    if not trend and _image_rose(results):
+        start, end = (number(results["image_loss"][at], 3) for at in ("initial", "final"))
+        lines.append(f"the images got farther from their targets (loss {start} to {end})")
+    worse = [key for key in results.get("worse") or () if key in results["parameter_rmse"]]
+    worse.sort(key=lambda key: -_growth(results["parameter_rmse"][key]))
+    for key in worse[:MOST_NAMED]:
+        lines.append(f"{shorten(key, KEY_WIDTH)} got worse (RMSE {_from_to(results['parameter_rmse'][key])})")
+    if len(worse) > MOST_NAMED:
+        lines.append(f"and so did {count(len(worse) - MOST_NAMED, 'more parameter')}")
+    if lines:
+        lines += _reasons(results)
+    return [*lines, *certainty_lines(results)]
+
+
+def _reasons(results: Mapping[str, Any]) -> list[str]:
+    """What may have kept a run from getting better, as far as its settings tell."""
+    samples, found = results.get("samples") or {}, []
+    step, target = samples.get("step"), samples.get("target")
+    if step and target and target < FEW_STEPS * step:
+        found.append(
+            f"the target itself has {count(target, 'sample')} per pixel only: --set target.render.spp="
+            f"{max(FEW_STEPS * step, 4 * target)} makes a cleaner one"
+        )
+    if (results.get("iterations") or LEAST_JUDGED) < LEAST_JUDGED:
+        found.append(f"{count(results.get('iterations') or 0, 'iteration')} are few: --set run.iterations=200")
+    return found
+
+
+def _image_rose(results: Mapping[str, Any]) -> bool:
+    """Whether the saved images ended well farther from their targets than they began."""
+    losses = results.get("image_loss") or {}
+    initial, final = losses.get("initial"), losses.get("final")
+    return initial is not None and final is not None and final > ROSE_IF_SHORT * initial
+
+
+def _image_improved(results: Mapping[str, Any]) -> bool:
+    """Whether the saved images, which have less noise than those of the iterations, came closer to their targets."""
+    losses = results.get("image_loss") or {}
+    initial, final = losses.get("initial"), losses.get("final")
+    return initial is not None and final is not None and final < IMPROVED * initial
+
+
+def _growth(pair: Mapping[str, float]) -> float:
+    return pair["final"] / max(pair["initial"], 1e-30)
+
+
+def _from_to(pair: Mapping[str, float | None]) -> str:
+    start, end = number(pair.get("initial"), 3), number(pair.get("final"), 3)
+    return f"{start} to {end}" if start else end
+
+
+#: Parameters that are listed; a run with more says so, and its page has them all.
+MOST_LISTED = 12
+
+
+#: A key in the table has at most so many characters, and at least.
+WIDEST_KEY, NARROWEST_KEY = 48, 24
+
+
+#: Columns where there is no terminal.
+NO_TERMINAL = 200
+
+
+#: What stands over the keys, and between two columns.
+HEAD, GAP = "parameter", "  "
+
+
+#: Columns of values: what stands above each, and its name in the results.
+MOMENTS = (("start", "initial"), ("end", "final"), ("true", "true"))
+
+
+def terminal_width() -> int:
+    """Columns of standard output; what stands in a file or a pipe may be wider than most terminals."""
+    return shutil.get_terminal_size().columns if sys.stdout.isatty() else NO_TERMINAL
+
+
+def parameter_lines(results: Mapping[str, Any], width: int) -> list[str]:
+    """Values at start and end, true values, errors, spreads and verdicts, in lines of at most `width` characters.
+
+    Textures are told by mean and range. A table where that fits, else a block for each parameter. `results` is what
+    `Results.to_json` made.
+    """
+    parameters = results.get("parameters") or {}
+    shown = [key for key, about in parameters.items() if about.get("initial")]
+    listed = shown[:MOST_LISTED]
+    if not listed:
+        return []
+    relative = units_differ(results)
+    titles = [title for title, moment in MOMENTS if any(parameters[key].get(moment) for key in listed)]
+    rows = [[_value(parameters[key].get(moment)) for title, moment in MOMENTS if title in titles] for key in listed]
+    errors = {key: error_words(results, key, relative) for key in listed}
+    if any(errors.values()):
+        titles.append("relative error" if relative else "RMSE")
+        rows = [[*row, errors[key]] for row, key in zip(rows, listed, strict=True)]
+    verdicts = {key: verdict_words(results, key) for key in listed}
+    if any(verdicts.values()):
+        titles += ["spread", "verdict"]
+        rows = [[*row, spread_words(results, key), verdicts[key]] for row, key in zip(rows, listed, strict=True)]
+    lines = _table(listed, titles, rows, width) or _blocks(listed, titles, rows, width)
+    if len(shown) > len(listed):
+        lines.append(shorten(f"and {count(len(shown) - len(listed), 'more parameter')}, on the page", width))
+    return [*lines, *wrap(noise_line(results), width)]
+
+
+def units_differ(results: Mapping[str, Any]) -> bool:
+    """Whether the errors of a run have no common unit, so that they compare as shares of the truth alone."""
+    return bool(results.get("parameter_rmse")) and (results.get("rmse") or {}).get("initial") is None
+
+
+def error_words(results: Mapping[str, Any], key: str, relative: bool) -> str:
+    """The error of one parameter at start and end, `0.189 to 0.222`; empty where it is not known."""
+    pair = (results.get("relative_error" if relative else "parameter_rmse") or {}).get(key)
+    if pair is None or pair.get("initial") is None:
+        return ""
+    worse = ", worse" if key in (results.get("worse") or ()) else ""
+    return f"{number(pair['initial'], 3)} to {number(pair.get('final'), 3)}{worse}"
+
+
+def _value(about: Mapping[str, Any] | None) -> str:
+    """All numbers of a small parameter; mean and range of a large one."""
+    if not about:
+        return ""
+    if "value" in about:
+        values = about["value"] if isinstance(about["value"], list) else [about["value"]]
+        return " ".join(number(value, 3) for value in values)
+    if about["min"] == about["max"]:
+        return number(about["min"], 3)
+    mean = " ".join(number(value, 3) for value in about["mean"])
+    return f"{mean} ({number(about['min'], 3)} to {number(about['max'], 3)})"
+
+
+def _table(keys: Sequence[str], titles: Sequence[str], rows: Sequence[Sequence[str]], width: int) -> list[str]:
+    """One line a parameter; nothing where that does not fit."""
+    widths = [max(len(title), *(len(row[column]) for row in rows)) for column, title in enumerate(titles)]
+    left = width - sum(widths) - len(GAP) * len(widths)
+    first = min(max(map(len, (HEAD, *keys))), WIDEST_KEY, left)
+    if first < min(max(map(len, keys)), NARROWEST_KEY):
+        return []
+    lines = []
+    for key, row in [(HEAD, titles), *zip(keys, rows, strict=True)]:
+        cells = [shorten(key, first).ljust(first), *(cell.ljust(size) for cell, size in zip(row, widths, strict=True))]
+        lines.append(GAP.join(cells).rstrip())
+    return lines
+
+
+def _blocks(keys: Sequence[str], titles: Sequence[str], rows: Sequence[Sequence[str]], width: int) -> list[str]:
+    """A line for the key, and one for each value; long ones go on below their beginning."""
+    lines, indent = [], max(map(len, titles)) + 2 * len(GAP)
+    for key, row in zip(keys, rows, strict=True):
+        lines.append(shorten(key, width))
+        for title, cell in zip(titles, row, strict=True):
+            head = f"{GAP}{title}".ljust(indent)
+            lines += wrap(cell, max(width, indent + 20), initial_indent=head, subsequent_indent=" " * indent)
+    return lines

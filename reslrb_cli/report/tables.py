@@ -1,0 +1,290 @@
+"""Measurements as aligned tables: bench, conditioning, gradcheck and its suite.
+
+The results of a bench as an aligned table.
+
+Conditioning as an aligned table.
+
+The results of a gradcheck as an aligned table, and as Markdown.
+
+The results of a suite of cases: one line for each case, with what each estimator came to.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+
+from reslrb_cli.measure.conditioning import QUANTITIES, Conditioning
+from reslrb_cli.records.measurements import BenchRecord, GradcheckRecord, Kind, Reference, Spread, Verdict
+
+_BENCH_HEAD = (
+    "depth", "", "step ms", "over baseline", "kernel ms", "over baseline", "codegen", "tracing", "cold ms", "peak MiB",
+    "scratch B", "n",
+)  # fmt: skip
+
+
+_BENCH_WIDTHS = (7, 0, 9, 19, 9, 19, 7, 7, 8, 9, 9, 3)
+
+
+def table_head(labels: list[str], swept: str = "depth") -> str:
+    """The first line; `labels` are all that will stand in the second column, what is `swept` stands in the first."""
+    return _line((swept, *_BENCH_HEAD[1:]), max(map(len, labels)))
+
+
+def table_line(
+    label: str,
+    value: int,
+    record: BenchRecord,
+    step_ratio: Spread | None,
+    kernel_ratio: Spread | None,
+    labels: list[str],
+) -> str:
+    """The line of one result, at a value of what is swept: medians, and ratios with their least and greatest."""
+    width = max(map(len, labels))
+    if record.step_ms is None or record.kernel_ms is None:
+        return _line((str(value), label, record.status.value), width)
+    cells = (
+        str(value),
+        label,
+        f"{record.step_ms.median:.1f}",
+        _ratio(step_ratio),
+        f"{record.kernel_ms.median:.1f}",
+        _ratio(kernel_ratio),
+        _milliseconds(record.codegen_ms),
+        _milliseconds(record.tracing_ms),
+        f"{record.cold_ms or 0:.0f}",
+        f"{record.peak_mib or 0:.1f}",
+        str(record.scratch_bytes),
+        str(record.repeats),
+    )
+    return _line(cells, width)
+
+
+def _milliseconds(time: Spread | None) -> str:
+    return "" if time is None else f"{time.median:.1f}"
+
+
+def _ratio(ratio: Spread | None) -> str:
+    return "" if ratio is None else f"{ratio.median:.2f} [{ratio.min:.2f}, {ratio.max:.2f}]"
+
+
+def _line(cells: tuple[str, ...], label_width: int) -> str:
+    parts = [
+        f"{cell:<{label_width}}" if column == 1 else f"{cell:>{_BENCH_WIDTHS[column]}}"
+        for column, cell in enumerate(cells)
+    ]
+    return "  ".join(parts).rstrip()
+
+
+_CHAIN_HEAD = ("vertices", "paths", "median", "99 %", "largest")
+
+
+_CONDITIONING_HEAD = ("parameter", "entries", "value", "gradient", "noise", "image / unit", "curvature", "length")
+
+
+def conditioning_lines(measured: Conditioning) -> list[str]:
+    """One line a parameter, in its units, and the spread of what differs between them; `-` where nothing was seen."""
+    rows: list[tuple[str, ...]] = [_CONDITIONING_HEAD]
+    for row in measured.rows:
+        numbers = (row.value, row.gradient, row.noise, row.change, row.curvature, row.length)
+        rows.append((row.key, str(row.entries), *map(_number, numbers)))
+    gradient, change, curvature, length = (_number(measured.spread(quantity)) for quantity in QUANTITIES)
+    rows.append(("largest / smallest", "", "", gradient, "", change, curvature, length))
+    return _aligned(rows)
+
+
+def chain_lines(measured: Conditioning) -> list[str]:
+    """One line for each length of a chain of Jacobians: how many, and their condition numbers."""
+    rows: list[tuple[str, ...]] = [_CHAIN_HEAD]
+    for chain in measured.chains:
+        numbers = (chain.median, chain.percentile_99, chain.largest)
+        rows.append((str(chain.vertices), str(chain.paths), *map(_number, numbers)))
+    return _aligned(rows)
+
+
+def _aligned(rows: list[tuple[str, ...]]) -> list[str]:
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    return [
+        "  ".join(
+            [row[0].ljust(widths[0]), *(text.rjust(width) for text, width in zip(row[1:], widths[1:], strict=True))]
+        ).rstrip()
+        for row in rows
+    ]
+
+
+def _number(value: float | None) -> str:
+    return "-" if value is None else f"{value:.3g}"
+
+
+HEAD = ("parameter", "integrator", "reference", "seeds", "rel. L2", "z rms", "max |z|", "cosine", "variance",
+        "detectable", "verdict")  # fmt: skip
+
+
+#: The first three columns are text; 0 is as wide as what stands in it.
+_GRADCHECK_WIDTHS = (0, 0, 0, 5, 17, 11, 11, 8, 8, 10, 0)
+
+
+_REFERENCES = {Reference.FINITE_DIFFERENCE: "differences", Reference.FORWARD_MODE: "forward mode"}
+
+
+_KINDS = {Kind.EQUAL_SEEDS: ", equal seeds"}
+
+
+def cells(record: GradcheckRecord) -> tuple[str, ...]:
+    """What stands in the columns of HEAD; limits follow the figures that have one."""
+    return (
+        parameter_name(record),
+        integrator_name(record),
+        reference_name(record),
+        str(record.seeds),
+        _limited(record.relative_l2, record.relative_l2_limit, ".1e"),
+        _limited(record.z_rms, record.z_rms_limit, ".2f"),
+        _limited(record.z_max, record.z_max_limit, ".1f"),
+        "" if record.cosine is None else f"{record.cosine:.4f}",
+        "" if record.variance_ratio is None else f"{record.variance_ratio:.3g}",
+        "" if record.detectable is None else f"{record.detectable:.1%}" if record.detectable >= 1e-3
+        else f"{record.detectable:.0e}",
+        record.verdict.value.replace("_", "-"),
+    )  # fmt: skip
+
+
+def parameter_name(record: GradcheckRecord) -> str:
+    """The parameter; `image` or `all` where there is none."""
+    return record.parameter or ("image" if record.kind is Kind.IMAGE else "all")
+
+
+def integrator_name(record: GradcheckRecord) -> str:
+    """`reslrb:stack`, or the type alone."""
+    return record.integrator if record.estimator is None else f"{record.integrator}:{record.estimator}"
+
+
+def reference_name(record: GradcheckRecord) -> str:
+    """The reference, and how it is compared with, where that is not by expectation."""
+    return _REFERENCES.get(record.reference, record.reference.value) + _KINDS.get(record.kind, "")
+
+
+def failure_line(record: GradcheckRecord) -> str:
+    """One line about a comparison that does not hold: which, and by how much."""
+    parts = []
+    for name, value, limit in (
+        ("relative L2", record.relative_l2, record.relative_l2_limit),
+        ("z rms", record.z_rms, record.z_rms_limit),
+        ("max |z|", record.z_max, record.z_max_limit),
+    ):
+        if value is not None and limit is not None and not value < limit:
+            parts.append(f"{name} {value:.3g}, limit {limit:.3g}")
+    if record.relative_l2 is not None and record.relative_l2_limit is None:
+        parts.append(f"the means differ by {record.relative_l2:.2%}")
+    parts += [record.message] if record.message else []
+    what = f"{parameter_name(record)}: {integrator_name(record)} against {reference_name(record)}"
+    return f"{record.case}: {what}: {'; '.join(parts)}"
+
+
+def summary_lines(records: Sequence[GradcheckRecord]) -> list[str]:
+    """What it comes to: how many comparisons hold, what failed and by how much, and what was left open, and why."""
+    count = {verdict: sum(record.verdict is verdict for record in records) for verdict in Verdict}
+    open_ = [record for record in records if record.holds is None]
+    line = f"{count[Verdict.HOLDS]} of {len(records)} comparisons hold, {count[Verdict.FAILS]} fail"
+    lines = [line + (f", {len(open_)} leave the question open" if open_ else "")]
+    if count[Verdict.NOT_MEASURED]:
+        message = next(record.message for record in open_ if record.verdict is Verdict.NOT_MEASURED)
+        lines.append(f"open: {count[Verdict.NOT_MEASURED]} not measured: {message}")
+    reasons: dict[tuple[str, str], list[GradcheckRecord]] = {}
+    for record in (record for record in open_ if record.verdict is not Verdict.NOT_MEASURED):
+        reasons.setdefault((parameter_name(record), record.message), []).append(record)
+    for (what, message), group in reasons.items():
+        pairs = dict.fromkeys(f"{integrator_name(r)} against {reference_name(r)}" for r in group)
+        which = "" if group[0].verdict is Verdict.NO_REFERENCE else f"{', '.join(pairs)}: "
+        lines.append(f"open: {what}: {which}{message}")
+    return lines + [f"FAILS: {failure_line(record)}" for record in records if record.verdict is Verdict.FAILS]
+
+
+class Table:
+    """Lines of a table of these records; its columns of text are as wide as theirs."""
+
+    def __init__(self, records: Iterable[GradcheckRecord]) -> None:
+        columns = zip(*(cells(record)[:3] for record in records), strict=True)
+        self._widths = [max(map(len, (head, *column))) for head, column in zip(HEAD, columns, strict=False)]
+
+    def head(self) -> str:
+        """The first line."""
+        return self._line(HEAD)
+
+    def line(self, record: GradcheckRecord) -> str:
+        """The line of one record."""
+        return self._line(cells(record))
+
+    def _line(self, values: Sequence[str]) -> str:
+        parts = [f"{value:<{width}}" for value, width in zip(values, self._widths, strict=False)]
+        parts += [f"{value:>{width}}" for value, width in zip(values[3:], _GRADCHECK_WIDTHS[3:], strict=True)]
+        return "  ".join(parts).rstrip()
+
+
+def markdown_table(records: Iterable[GradcheckRecord], cases: bool = False) -> str:
+    """The same as a Markdown table; with a first column of the records' cases if `cases`."""
+    head = ("case", *HEAD) if cases else HEAD
+    rows = [(record.case, *cells(record)) if cases else cells(record) for record in records]
+    lines = [head, ["---"] * len(head), *rows]
+    return "".join(f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in line)} |\n" for line in lines)
+
+
+def _limited(value: float | None, limit: float | None, spec: str) -> str:
+    if value is None:
+        return ""
+    return f"{value:{spec}}" if limit is None else f"{value:{spec}} < {limit:{spec}}" if value < limit else (
+        f"{value:{spec}} > {limit:{spec}}")  # fmt: skip
+
+
+_NAMES = {Reference.FINITE_DIFFERENCE: "differences"}
+
+
+def suite_table(records: Iterable[GradcheckRecord], about: Mapping[str, str]) -> str:
+    """A Markdown table; `about` says by case what it is about.
+
+    Under each estimator stand the largest deviation in standard errors of all comparisons over many seeds, then the
+    largest relative L2 distance of all comparisons at equal seeds, and what did not hold or could not be decided; a
+    dash where it cannot do the case.
+    """
+    cases: dict[str, list[GradcheckRecord]] = {}
+    for record in records:
+        cases.setdefault(record.case, []).append(record)
+    estimators = list(dict.fromkeys(r.estimator or r.integrator for rows in cases.values() for r in rows))
+    head = ("case", "what it is about", "references", "seeds", *estimators)
+    lines = [head, ["---"] * len(head)]
+    for case, rows in cases.items():
+        found = [_cell([r for r in rows if (r.estimator or r.integrator) == name]) for name in estimators]
+        lines.append([f"`{case}`", about.get(case, ""), _references(rows), str(rows[0].seeds), *found])
+    return "".join(f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in line)} |\n" for line in lines)
+
+
+def limits(records: Iterable[GradcheckRecord]) -> tuple[float, float]:
+    """The limit of |z| that all cases share, and the largest of relative L2 at equal seeds; 0 where there is none."""
+    found = list(records)
+    z = max((r.z_max_limit for r in found if r.z_max_limit is not None), default=0.0)
+    return z, max((r.relative_l2_limit for r in found if r.relative_l2_limit is not None), default=0.0)
+
+
+def _references(rows: Sequence[GradcheckRecord]) -> str:
+    gradients = [r.reference for r in rows if r.kind is not Kind.IMAGE]
+    images = [r.reference for r in rows if r.kind is Kind.IMAGE]
+    parts = [_NAMES.get(name, name.value) for name in dict.fromkeys(gradients)]
+    return ", ".join(parts + [f"image: {name.value}" for name in dict.fromkeys(images)])
+
+
+def _cell(rows: Sequence[GradcheckRecord]) -> str:
+    if not rows:
+        return "-"
+    z = max((r.z_max for r in rows if r.z_max is not None and r.verdict is Verdict.HOLDS), default=None)
+    distance = max((r.relative_l2 or 0.0 for r in rows if r.relative_l2_limit is not None), default=None)
+    parts = [] if z is None else [f"{z:.1f}"]
+    parts += [] if distance is None else [f"{distance:.0e}"]
+    parts += [f"**{name}**" for name in dict.fromkeys(_verdict(r) for r in rows) if name]
+    return ", ".join(parts) or "exact"
+
+
+def _verdict(record: GradcheckRecord) -> str:
+    """What to say of a record that does not hold."""
+    if record.verdict is Verdict.HOLDS:
+        return ""
+    which = (record.parameter or record.kind.value).split(".")
+    name = which[-2] if len(which) > 1 and which[-1] in ("value", "data") else which[-1]
+    return f"{record.verdict.value.replace('_', ' ')}: {name}"

@@ -1,0 +1,312 @@
+"""The course of a run: what its iterations go on from, and what has been found on the way; kept, and taken up again.
+
+What a run's manifest says of the plan of its step.
+
+What of an experiment may change while its run goes on, and what may not.
+
+From a configuration to a problem that is ready to run, and the manifest that says what was settled on the way.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from reslrb_cli.backend.doctor import device_name
+from reslrb_cli.config.files import IMAGE_BYTES, read_file
+from reslrb_cli.config.integrators import Reslrb as ReslrbConfig
+from reslrb_cli.config.loader import dump
+from reslrb_cli.config.schema import Config
+from reslrb_cli.errors import ConfigError, printable
+from reslrb_cli.integrators.plan_report import GUIDED, SEQUENCE, plan_rows, with_reason
+from reslrb_cli.integrators.reslrb import Reslrb
+from reslrb_cli.measure.prb_comparison import measure_rival
+from reslrb_cli.optimization.assemble import assemble
+from reslrb_cli.optimization.correlated_bias import measure_correlated_bias
+from reslrb_cli.optimization.moving import warn_of_border
+from reslrb_cli.optimization.problem import Problem
+from reslrb_cli.optimization.results import Best, Results
+from reslrb_cli.optimization.state import State, Stored, stored_value
+from reslrb_cli.optimization.uncertainty.measuring import Certainty
+from reslrb_cli.optimization.views import view_records
+from reslrb_cli.records.checkpoint import save_checkpoint
+from reslrb_cli.records.decisions import PilotCache
+from reslrb_cli.records.manifest import Manifest
+from reslrb_cli.records.metrics import ClampTally, NonFiniteTally, Record, finite
+from reslrb_cli.report.tonemap import exposure_for
+from reslrb_cli.scene.needs import unsupported_part
+from reslrb_cli.scene.visibility import sees_lamps
+
+
+def plan_record(problem: Problem) -> dict[str, Any]:
+    """The integrator, its estimator, and for the first view what its kernels contain and leave out, and why.
+
+    `rows` is empty for integrators that plan nothing, and `estimator` None for those that have none.
+    """
+    config, integrator = problem.config.integrator, problem.integrator
+    if not isinstance(integrator, Reslrb):
+        return {"integrator": config.type, "estimator": None, "rows": []}
+    plan = integrator.plan(problem.scene, problem.scene.sensors()[problem.sensors[0]], problem.selection.params)
+    found = plan_rows(plan)
+    if problem.guided is not None:
+        found = with_reason(found, GUIDED, f"guiding: auto, {problem.guided.why()}")
+    if problem.sequence is not None:
+        found = with_reason(found, SEQUENCE, f"sequence: auto, {problem.sequence.why()}")
+    rows = [{"feature": row.feature, "needed": row.needed, "reason": row.reason} for row in found]
+    estimator = type(integrator.estimator).__name__.removesuffix("Estimator").lower()
+    assert isinstance(config, ReslrbConfig)
+    return {"integrator": config.type, "estimator": estimator, "rows": rows}
+
+
+#: Settings that decide nothing of what the iterations until then were. All others would make it another run.
+MAY_CHANGE = re.compile(
+    r"run\.(iterations|name|output|checkpoint_every|images_every|certainty|on_nonfinite)(\..*)?"
+    r"|optimizer\.learning_rate|parameters\[\d+\]\.learning_rate(\..*)?"
+)
+
+
+#: Those that say where a run is written, which its folder says itself.
+_PLACE = ("run.name", "run.output")
+
+
+#: Differing settings that an error names.
+_SHOWN = 3
+
+
+Change = tuple[Any, Any]
+
+
+def changes(before: Config, now: Config) -> dict[str, Change]:
+    """The settings that differ, by key, as they were and as they are; None where there was or is none."""
+    first, second = flat(before), flat(now)
+    return {
+        key: (first.get(key), second.get(key))
+        for key in dict.fromkeys((*first, *second))
+        if first.get(key) != second.get(key)
+    }
+
+
+def check_changes(found: Mapping[str, Change], blame: Callable[[str], object], run: Path) -> dict[str, Change]:
+    """Of the settings that differ those that may, where the run is written left out.
+
+    Raises ConfigError, located by the first key that must not and by who is to `blame` for it, with the first few of
+    them.
+    """
+    wrong = [key for key in found if not MAY_CHANGE.fullmatch(key)]
+    if wrong:
+        first, *others = [f"{_shown(found[key][1])}, {_shown(found[key][0])} in the run" for key in wrong[:_SHOWN]]
+        more = [f"{key} is {what}" for key, what in zip(wrong[1:], others, strict=False)]
+        more += [f"{len(wrong) - _SHOWN} more"] if len(wrong) > _SHOWN else []
+        also = f"; also {'; '.join(more)}" if more else ""
+        raise ConfigError(
+            blame(wrong[0]),
+            wrong[0],
+            f"is {first}{also}; {run} goes on as it began, but for iterations and learning rates",
+        )
+    return {key: change for key, change in found.items() if key not in _PLACE}
+
+
+def flat(config: Config) -> dict[str, Any]:
+    """All settings by their keys, as `--set` names them; those of None left out."""
+    found: dict[str, Any] = {}
+
+    def add(key: str, value: Any) -> None:
+        if isinstance(value, dict):
+            for name, each in value.items():
+                add(f"{key}.{name}" if key else str(name), each)
+        elif isinstance(value, (list, tuple)) and any(isinstance(each, dict) for each in value):
+            for place, each in enumerate(value):
+                add(f"{key}[{place}]", each)
+        elif value is not None:
+            found[key] = value
+
+    add("", config.model_dump(mode="json", exclude_none=True))
+    return found
+
+
+def _shown(value: Any) -> str:
+    text = "not set" if value is None else str(value)
+    return text if len(text) <= 60 else f"{text[:57]}..."
+
+
+Say = Callable[[str], None]
+
+
+def prepare(config: Config, variant: str, say: Say, warn: Say) -> tuple[Course, Manifest]:
+    """Assemble a new run, and measure what is to be known before it; a variant must be set.
+
+    `say` is told what takes long, `warn` what to look at. Raises ConfigError and UnsupportedScene.
+    """
+    cache = PilotCache()
+    problem = assemble(config, say, cache, to_run=True)
+    bias = measure_correlated_bias(problem, say)
+    line = None if bias is None else bias.line()
+    if line is not None:
+        warn(line)
+    warn_of_border(problem, warn)
+    rival = measure_rival(problem, cache, say)
+    if problem.allowance is not None and problem.allowance.spent_s:
+        say(problem.allowance.line())
+    if rival is not None and rival.is_better:
+        warn(f"{rival.line()}; --set integrator.type={rival.integrator}")
+    manifest = manifest_of(problem, variant, config.source)
+    manifest.rival = None if rival is None else rival.to_json()
+    manifest.correlated_bias = None if bias is None else bias.to_json()
+    return Course(problem, fixed_of(problem, variant)), manifest
+
+
+def manifest_of(problem: Problem, variant: str, config_file: Path) -> Manifest:
+    """The manifest of a run of `problem`, as far as the problem tells."""
+    manifest = Manifest(
+        variant=variant, device=device_name(variant), seed=problem.config.run.seed, config=printable(config_file)
+    )
+    manifest.plan = plan_record(problem)
+    manifest.views = view_records(problem.views)
+    for record, view in zip(manifest.views, problem.views, strict=True):
+        sensor = problem.scene.sensors()[view.sensor]
+        # What no light path can deal with, primary rays may not either.
+        lamps = sees_lamps(problem.scene, sensor) if unsupported_part(problem.scene, sensor) is None else None
+        record["shown"] = exposure_for(np.array(view.target), lamps)
+    manifest.pilot = None if problem.pilot is None else problem.pilot.to_json()
+    manifest.guided = None if problem.guided is None else problem.guided.to_json()
+    manifest.sequence = None if problem.sequence is None else problem.sequence.to_json()
+    manifest.memory = None if problem.memory is None else problem.memory.to_json()
+    return manifest
+
+
+def fixed_of(problem: Problem, variant: str) -> dict[str, Any]:
+    """What every checkpoint says of the experiment: by it another process assembles the same problem."""
+    return {
+        "config": dump(problem.config),
+        "variant": variant,
+        "files": digests(problem.config),
+        "pilot": None if problem.pilot is None else problem.pilot.to_json(),
+        "guided": None if problem.guided is None else problem.guided.to_json(),
+        "sequence": None if problem.sequence is None else problem.sequence.to_json(),
+        "memory": None if problem.memory is None else problem.memory.to_json(),
+    }
+
+
+def digests(config: Config) -> dict[str, str]:
+    """What is in the files that the experiment names, in short, by the keys that name them: scene, cameras, targets."""
+    named: dict[str, Path | None] = {"scene.file": config.scene.file, "scene.cameras": config.scene.cameras}
+    named |= {f"target.file[{place}]": path for place, path in enumerate(config.target.file or ())}
+    named |= {f"views[{place}].target": view.target for place, view in enumerate(config.views or ())}
+    return {
+        key: hashlib.blake2b(read_file(path, IMAGE_BYTES), digest_size=16).hexdigest()
+        for key, path in named.items()
+        if path is not None and path.is_file()
+    }
+
+
+Array = np.ndarray[Any, Any]
+
+
+class Course:
+    """Of one run of `problem`, whose parameters stand at their initial values when this is made.
+
+    `fixed` are plain values that go into every checkpoint: by them another process assembles the same problem.
+    """
+
+    def __init__(self, problem: Problem, fixed: Mapping[str, Any]) -> None:
+        self.problem, self._fixed = problem, dict(fixed)
+        self.state, self.results = State(problem), Results(problem)
+        self.certainty = Certainty(problem)
+        self.best = Best(any(view.held_out for view in problem.views))
+        self.nonfinite, self.clamped = NonFiniteTally(), ClampTally()
+        self.last: Record | None = None
+        self._snapshot = self.state.capture()
+        #: The values of the start, in the host's memory.
+        self._initial: dict[str, Array] = {}
+        for key, value in self._snapshot.moved.items():
+            self._initial |= stored_value(problem, "initial", key, value)
+        self.results.begin()
+
+    @property
+    def done(self) -> int:
+        """The number of finished iterations."""
+        return 0 if self.last is None else self.last.iteration + 1
+
+    def add(self, record: Record) -> None:
+        """Take one iteration, of which `state` is what it leaves."""
+        self.best.see(record, self._snapshot.moved)
+        self._take(record)
+        self.certainty.see(self.done)
+        self._snapshot = self.state.capture()
+
+    def _take(self, record: Record) -> None:
+        self.last = record
+        self.results.add(record)
+        self.nonfinite.add(record)
+        self.clamped.add(record)
+
+    def learned(self) -> tuple[dict[str, int] | None, dict[str, Array]]:
+        """What guided emission knew before the iteration that is at work, which may have taught it more by now.
+
+        That is the number of gradients by sensor, and arrays by `<sensor>/<what>`; None and nothing where it is off.
+        """
+        prefix = "guiding/"
+        arrays = {name.removeprefix(prefix): a for name, a in self._snapshot.arrays.items() if name.startswith(prefix)}
+        return self._snapshot.values.get("guiding"), arrays
+
+    def best_values(self) -> dict[str, Array]:
+        """The best parameters so far, as `problem.values()` has them; nothing where there are none yet."""
+        shown = self.problem.selection.shown
+        return {
+            key: value if isinstance(value, np.ndarray) else shown(key, value)
+            for key, value in self.best.values.items()
+        }
+
+    # --- kept and taken up again --------------------------------------------------------------------------------------
+
+    def save(self, folder: Path) -> int:
+        """Keep it in `folder` as it was after its last whole iteration; return how many it had. Raises OSError."""
+        problem, snapshot = self.problem, self._snapshot
+        others = snapshot.others(problem) | self._initial
+        others |= {f"best/{key}": value for key, value in self.best_values().items()}
+        others |= {f"mask/{key}": mask for key, mask in problem.masks.items()}
+        seen, squares = self.certainty.state()
+        others |= {f"squares/{key}": np.array(value) for key, value in squares.items()}
+        best = self.best.to_json()
+        values = self._fixed | snapshot.values
+        values |= {
+            "best": best and {"iteration": best["iteration"], "loss": best["loss"]},
+            "images": self.results.images_seen(),
+            "certainty": {"seen": seen, "keys": list(squares)},
+            "last": None if self.last is None else asdict(self.last),
+        }
+        save_checkpoint(folder, snapshot.iteration, snapshot.parameters(problem), others, finite(values))
+        return snapshot.iteration
+
+    def restore(self, stored: Stored, records: Sequence[Record]) -> None:
+        """Go on from what was stored, and from the records of all iterations until then.
+
+        Raises ConfigError, located in the file, where something there is not what this run can have left.
+        """
+        problem = self.problem
+        self.state.restore(stored)
+        for record in records:
+            self._take(record)
+        self.best.recall(list(records))
+        if stored.value("best") is not None:
+            values = {
+                key: stored.archive.array(f"best/{key}", problem.selection.array(key).shape, "f")
+                for key in problem.selection.keys
+            }
+            for key, array in values.items():
+                stored.check_bounds(problem, f"best/{key}", key, array)
+            self.best.restore(stored.count("best", "iteration", least=0), stored.number("best", "loss"), values)
+        self.results.recall({name: stored.numbers("images", name) for name in ("trained", "held_out")})
+        squares = {}
+        for key in stored.texts("certainty", "keys"):
+            kept = problem.optimizer.squares(key) if key in problem.selection.keys else None
+            if kept is not None:
+                squares[key] = stored.take(f"squares/{key}", kept[0])
+        self.certainty.restore(stored.count("certainty", "seen", least=0), squares)
+        self._snapshot = self.state.capture()

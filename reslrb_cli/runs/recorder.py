@@ -1,0 +1,362 @@
+"""Runs an optimisation and writes its run folder; one that is gone on with goes on where it was.
+
+What is written of a run or a measurement while it is at work: its page, its file.
+
+What a run says, and notes in its manifest, of scales and memory while it is at work.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import shlex
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from reslrb_cli.errors import NonFinite
+from reslrb_cli.optimization.decisions import Scaled
+from reslrb_cli.optimization.loop import optimize
+from reslrb_cli.optimization.nonfinite import Findings
+from reslrb_cli.optimization.problem import Problem, saved_spp
+from reslrb_cli.optimization.sensitivity import step_line
+from reslrb_cli.optimization.uncertainty.measuring import LEAST_ITERATIONS
+from reslrb_cli.optimization.uncertainty.verdicts import CertaintyRecord
+from reslrb_cli.records.atomic import Reserve, size_of
+from reslrb_cli.records.checkpoint import NONFINITE_FILE_NAME, STATE_FILE, NonFiniteStep, save_nonfinite
+from reslrb_cli.records.images import write_image, write_mask, write_parameters
+from reslrb_cli.records.manifest import Manifest, Status
+from reslrb_cli.records.metrics import MetricsWriter, Record, finite
+from reslrb_cli.records.run_folder import RunFolder
+from reslrb_cli.report.page import write_report
+from reslrb_cli.report.perceptual import seen_errors
+from reslrb_cli.report.run_summary import warnings
+from reslrb_cli.report.tonemap import shown_exposures, write_error_map
+from reslrb_cli.runs.ending import Ending, describe, what_is_kept
+from reslrb_cli.runs.prepare import Course
+
+logger = logging.getLogger(__name__)
+
+
+#: Seconds between two pages, at least; and the times as long as the last page took: pages take a twentieth of a run.
+PAGE_SECONDS, PAGE_SHARE = 5.0, 20.0
+
+
+class LivePage:
+    """Has `write` write the page, or `what` else, anew, at once and then now and then; called outside of iterations.
+
+    A page that cannot be written ends no run, and is not tried again: the last one, at the run's end, says why.
+    """
+
+    def __init__(self, write: Callable[[], object], what: str = "the page of the run") -> None:
+        self._write, self._what = write, what
+        self._next: float | None = 0.0
+
+    def refresh(self) -> None:
+        """Write the page if it is time to."""
+        start = time.monotonic()
+        if self._next is None or start < self._next:
+            return
+        try:
+            self._write()
+        except Exception as error:
+            logger.debug("%s is not kept current: %s", self._what, error)
+            self._next = None
+        else:
+            end = time.monotonic()
+            self._next = end + max(PAGE_SECONDS, PAGE_SHARE * (end - start))
+
+
+def note_scaling(manifest: Manifest, problem: Problem, measured: Sequence[Scaled]) -> None:
+    """Note what was measured for `scale: auto`, and say what it makes of a step."""
+    manifest.scaling = [row.to_json() for row in measured]
+    for row in measured:
+        spec = problem.selection.spec(row.key)
+        line = step_line(row, spec.transform, spec.learning_rate or problem.config.optimizer.learning_rate)
+        (logger.warning if row.own_length is None else logger.info)(f"scale auto: {line}")
+
+
+def check_memory(manifest: Manifest, problem: Problem, record: Record) -> None:
+    """Note the memory that was used, where there is a budget; warn the first time that it is above that."""
+    if problem.memory is not None:
+        warning = problem.memory.check(record.peak_mib)
+        if warning is not None:
+            logger.warning(warning)
+        manifest.memory = problem.memory.to_json()
+
+
+#: Images with more pixels take some seconds to be compared, and that is said.
+MANY_PIXELS = 5e5
+
+
+#: What the end of a run writes beside checkpoint and parameters, for which room is kept: a manifest, and lists.
+RESERVE_BYTES = 1 << 16
+
+
+@dataclass
+class Recording:
+    """One run being recorded: `course` is what it has come to, from where it began or was gone on with."""
+
+    course: Course
+    folder: RunFolder
+    manifest: Manifest
+    page: LivePage = field(init=False)
+    error_maps: dict[str, Any] = field(default_factory=dict)
+    seen: dict[str, Any] = field(default_factory=dict)
+    certainty: CertaintyRecord | None = None
+    _saved_nonfinite: bool = field(init=False)
+    #: Iterations that the newest checkpoint contains; None before the first one.
+    _saved: int | None = None
+
+    def __post_init__(self) -> None:
+        self._stop: Callable[[], bool] = lambda: False
+        self._saved_nonfinite = (self.folder.checkpoint / NONFINITE_FILE_NAME).exists()
+        self.page = LivePage(self._write_live_page)
+
+    @property
+    def problem(self) -> Problem:
+        """What is optimised."""
+        return self.course.problem
+
+    @property
+    def last(self) -> Record | None:
+        """The newest record."""
+        return self.course.last
+
+    @property
+    def done(self) -> int:
+        """The number of finished iterations."""
+        return self.course.done
+
+    def run(self, show: Callable[[Record], None], stop: Callable[[], bool]) -> Status:
+        """Iterate until the end or until `stop()`, and complete the folder; return how it ended.
+
+        Whatever ends the run, its folder has a manifest that says so, the parameters, a checkpoint and the report, and
+        final images where it did not fail; what could not be written is noted in the manifest. Raises what the run
+        failed of, a MachineError where the folder could not be written to.
+        """
+        self._stop = stop
+        reserve = Reserve(self.folder.checkpoint)
+        status: Status = Status.FAILED
+        failure: BaseException | None = None
+        try:
+            if self.done:
+                self._go_on(reserve)
+            else:
+                self._begin(reserve)
+            self._iterate(show, stop)
+            status = Status.INTERRUPTED if self.done < self.problem.config.run.iterations else Status.FINISHED
+        except KeyboardInterrupt:
+            status = Status.INTERRUPTED
+        except NonFinite as error:
+            failure = NonFinite(f"{error}; where: {self._inspection()}") if self._saved_nonfinite else error
+        except BaseException as error:
+            failure = error
+        reserve.release()
+        return self._end(status, failure)
+
+    def abandon(self) -> None:
+        """Note in the manifest that the run was interrupted, in a process that is about to end in the midst of it."""
+        if not self.manifest.results and self.last is not None:
+            self.manifest.results = {"iterations": self.done, "elapsed_s": self.last.elapsed_s}
+        if self.folder.is_there:
+            self.manifest.end_for_good(self.folder.path, Status.INTERRUPTED)
+
+    def _begin(self, reserve: Reserve) -> None:
+        problem, parameters = self.problem, self.folder.parameters
+        self.page.refresh()
+        self._save_checkpoint()
+        for view in problem.views:
+            self._write_image("target", view.sensor, np.array(view.target))
+            if view.weights is not None:
+                write_image(self.folder.images / self._image_name("weights", view.sensor), np.array(view.weights))
+        self._write_images("initial")
+        write_parameters(parameters / "initial", problem.values())
+        if problem.truth:
+            write_parameters(parameters / "true", problem.truth)
+        for key, mask in problem.masks.items():
+            write_mask(parameters, key, mask)
+        # the state at the end has the best values too, and what the clamp and the optimiser then know
+        reserve.hold(2 * size_of(self.folder.checkpoint) + size_of(parameters / "initial") + RESERVE_BYTES)
+
+    def _go_on(self, reserve: Reserve) -> None:
+        """What `_begin` writes is there: a run has a state after an iteration only then."""
+        self._saved = self.done
+        self.page.refresh()
+        reserve.hold(2 * size_of(self.folder.checkpoint) + size_of(self.folder.parameters) + RESERVE_BYTES)
+
+    def _iterate(self, show: Callable[[Record], None], stop: Callable[[], bool]) -> None:
+        run, saved, saved_at = self.problem.config.run, self.done, time.monotonic()
+        every, told = run.images_every, self.done > 0
+        if stop():
+            return
+        with MetricsWriter(self.folder.path) as metrics:
+            for record in optimize(self.problem, self._on_nonfinite, self.course.state):
+                if not told and self.problem.sensitivities is not None:
+                    note_scaling(self.manifest, self.problem, self.problem.sensitivities)
+                told = True
+                self.course.add(record)
+                metrics.write(record)
+                show(record)
+                check_memory(self.manifest, self.problem, record)
+                if (fault := self.folder.fault) is not None:  # another run's may have taken its name
+                    raise fault
+                if stop():
+                    return
+                if every and self.done % every == 0 and self.done < run.iterations:
+                    self._write_images(f"iteration-{self.done:06d}")
+                if run.checkpoint_every.is_due(self.done - saved, time.monotonic() - saved_at):
+                    metrics.sync()  # first: a checkpoint counts on the lines of its iterations
+                    self._save_checkpoint()
+                    saved, saved_at = self.done, time.monotonic()
+                self.page.refresh()
+
+    def _on_nonfinite(self, found: Findings) -> None:
+        """Keep what the first step that met a value that is not finite began with, and say how to look into it."""
+        if self._saved_nonfinite:
+            return
+        step = NonFiniteStep(found.iteration, self.problem.values(), *self.course.learned())
+        save_nonfinite(self.folder.checkpoint, step)
+        self._saved_nonfinite = True
+        if self.problem.config.run.on_nonfinite != "stop":  # which says so when it ends
+            logger.warning(f"{found}; where: {self._inspection()}")
+
+    def _inspection(self) -> str:
+        return f"reslrb inspect {shlex.quote(os.path.relpath(self.folder.path / 'config.yaml'))} --nonfinite"
+
+    def _end(self, status: Status, failure: BaseException | None) -> Status:
+        ending = Ending(self.folder.path, self.manifest, status, failure, self._kept)
+        if (fault := self.folder.fault) is not None:
+            return ending.give_up(fault)
+        ending.part("results", self._note_results)
+        ending.part("folder", self.folder.make_whole)
+        ending.begin(["checkpoint", "parameters", "final images"])
+        ending.part("checkpoint", self._save_last_checkpoint)
+        ending.part("parameters", self._write_parameters)
+        if failure is None:
+            ending.part("final images", self._write_final_images)
+            if status is Status.FINISHED:  # who interrupts does not want to wait; `reslrb report` finds them as well
+                self._note_certainty()
+                self._note_seen_errors()
+        else:
+            ending.leave_out("final images", "the run failed")
+        return ending.finish(self._write_page)
+
+    def _write_parameters(self) -> None:
+        """Write the last values, and beside them the best so far, where there are any."""
+        write_parameters(self.folder.parameters, self.problem.values())
+        best = self.course.best_values()
+        if best:
+            write_parameters(self.folder.parameters / "best", best)
+
+    def _write_page(self) -> None:
+        """Write the page for the last time; where that fails, none is left that says the run is at work."""
+        try:
+            write_report(self.folder.path)
+        except Exception:
+            with contextlib.suppress(OSError):
+                (self.folder.path / "report.html").unlink(missing_ok=True)
+            raise
+
+    def _write_live_page(self) -> None:
+        if self.last is None:  # nothing is there to be drawn, so that this takes no time
+            write_report(self.folder.path, self.manifest.content(), {})
+        else:
+            write_report(self.folder.path, self.manifest.content() | {"results": self._found()}, self.problem.values())
+
+    def _note_certainty(self) -> None:
+        """Add to the results how certain they are. The run is what it is without that."""
+        if self.last is None or self.done < LEAST_ITERATIONS or not self.problem.config.run.certainty:
+            return
+        logger.info("measuring how certain the values are")
+        try:
+            self.certainty = self.course.certainty.measure(self.done, self.last.elapsed_s, self._stop)
+            for key, shown in self.course.certainty.shown.items():
+                if key not in self.problem.masks:  # of which it was found out before
+                    write_mask(self.folder.parameters, key, shown)
+        except Exception as error:
+            logger.warning("how certain the values are was not measured: %s", describe(error))
+        else:
+            self._note_results()
+
+    def _note_seen_errors(self) -> None:
+        """Add errors as people see them to the results. The run is what it is without them."""
+        pixels = sum(view.target.shape[0] * view.target.shape[1] for view in self.problem.views)
+        if pixels > MANY_PIXELS:
+            logger.info(f"comparing images of {pixels / 1e6:.2g} million pixels as people see them")
+        try:
+            self.seen = finite(seen_errors(self.folder.path, self.manifest.results, self.manifest.views))
+        except Exception as error:
+            logger.warning("errors as people see them were not measured: %s", describe(error))
+        else:
+            self._note_results()
+
+    def _write_final_images(self) -> None:
+        self._write_images("final")
+        self._note_results()
+
+    def _note_results(self) -> None:
+        self.manifest.results = self._found()
+
+    def _found(self) -> dict[str, Any]:
+        """What the run came to, or has come to by now."""
+        self.course.results.end()
+        found = self.course.results.to_json()
+        if self.certainty is not None:
+            found["certainty"] = finite(self.certainty.to_json())
+        found["warnings"] = warnings({"iterations": self.done, **found})
+        return {
+            "iterations": self.done,
+            "loss": self.last and _json_number(self.last.loss),
+            "elapsed_s": self.last and self.last.elapsed_s,
+            **found,
+            "error_maps": self.error_maps,
+            **({"seen": self.seen} if self.seen else {}),
+            "nonfinite": self.course.nonfinite.to_json(),
+            "clamped": self.course.clamped.to_json(),
+            "best": finite(self.course.best.to_json()),
+        }
+
+    def _kept(self) -> str:
+        """What of the run a reader will find."""
+        written = "parameters" not in self.manifest.missing
+        return what_is_kept(self.folder, self._saved, self.done, written)
+
+    def _save_last_checkpoint(self) -> None:
+        """Keep the state, unless it is there already: the one before it then is an earlier one."""
+        if self._saved != self.done or not (self.folder.checkpoint / STATE_FILE).exists():
+            self._save_checkpoint()
+
+    def _save_checkpoint(self) -> None:
+        self._saved = self.course.save(self.folder.checkpoint)
+
+    def _write_images(self, name: str) -> None:
+        spp = saved_spp(self.problem, between=name.startswith("iteration"))
+        if name == "final":
+            logger.info(f"rendering the final image: {spp} spp")
+        for view in self.problem.views:
+            image = self.problem.render(view.sensor, spp, self.done, "saved image")
+            exposed = view.exposure.of_array(image)  # as the target is
+            self._write_image(name, view.sensor, exposed)
+            self.course.results.see(name, view, image)
+            if name == "final":
+                suffix = self._image_name("", view.sensor)
+                towards = self.problem.image_gradient(view, image)
+                about = write_error_map(self.folder.images, suffix, exposed, np.array(view.target), towards)
+                self.error_maps[f"error{suffix}"] = about
+
+    def _write_image(self, name: str, sensor: int, image: np.ndarray[Any, Any]) -> None:
+        """Write an image of a sensor, to look at with the exposure that suits its target, whatever is in it."""
+        exposure = shown_exposures(self.manifest.views).get(self._image_name("", sensor), 1.0)
+        write_image(self.folder.images / self._image_name(name, sensor), image, image * np.float32(exposure))
+
+    def _image_name(self, name: str, sensor: int) -> str:
+        return name if len(self.problem.views) == 1 else f"{name}-{sensor}"
+
+
+def _json_number(value: float) -> Any:
+    return value if np.isfinite(value) else None

@@ -1,0 +1,216 @@
+"""A run that goes on exactly where it was: its folder opened, its state read, its problem assembled again."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, get_args
+
+from reslrb_cli.config.files import CONFIG_BYTES
+from reslrb_cli.config.loader import dump, load, loads
+from reslrb_cli.config.schema import Config
+from reslrb_cli.errors import ConfigError, MachineError, is_machine_fault
+from reslrb_cli.optimization.assemble import assemble
+from reslrb_cli.optimization.state import Settled, Stored
+from reslrb_cli.records.checkpoint import PREVIOUS_FILE_NAME, STATE_FILE, open_state
+from reslrb_cli.records.manifest import Manifest, Status, now, versions
+from reslrb_cli.records.metrics import Record, cut_back, read_records
+from reslrb_cli.records.run_folder import RunFolder, check_writable, copy_into, opened, write_beginning
+from reslrb_cli.runs.prepare import Change, Course, changes, check_changes, digests, fixed_of, manifest_of
+
+Say = Callable[[str], None]
+
+
+#: The variants that `variant` may name, `auto` left out.
+VARIANTS = [name for name in get_args(Config.model_fields["variant"].annotation) if name != "auto"]
+
+
+#: Characters of the settings in a state, which has every default written out: those of a file are fewer.
+_MOST_CONFIG = 4 * CONFIG_BYTES
+
+
+@dataclass
+class Earlier:
+    """A run that is to go on: its folder, which is locked, what its manifest says, its state, and what is now asked.
+
+    `changed` are the settings that differ from those that it began with; `elsewhere` says whether it goes on in a new
+    folder, with this one left as it is; `records` are those of its iterations, `size` the bytes that they take.
+    """
+
+    folder: RunFolder
+    manifest: dict[str, Any]
+    stored: Stored
+    config: Config
+    changed: dict[str, Change]
+    elsewhere: bool
+    records: list[Record]
+    size: int
+    said: list[str] = field(default_factory=list)
+
+    @property
+    def iteration(self) -> int:
+        """The number of iterations that are done."""
+        return len(self.records)
+
+    @property
+    def variant(self) -> str:
+        """The variant that the run began with, whatever `auto` would choose here. Raises ConfigError."""
+        variant = self.stored.text("variant")
+        if variant not in VARIANTS:
+            raise self.stored.wrong("variant", "is none of those that a run can have")
+        return variant
+
+    @property
+    def is_done(self) -> bool:
+        """Whether nothing is left to do."""
+        finished = self.manifest.get("status") == Status.FINISHED
+        return finished and self.config.run.iterations == self.iteration
+
+    def prepare(self, variant: str, say: Say) -> tuple[Course, Manifest]:
+        """Assemble the problem as it was, and bring it to where it is; a variant must be set.
+
+        Raises ConfigError, UnsupportedScene.
+        """
+        problem = assemble(self.config, say, to_run=True, settled=Settled(self.stored))
+        manifest = self._manifest(manifest_of(problem, variant, self.config.source))
+        course = Course(problem, fixed_of(problem, variant))
+        course.restore(self.stored, self.records)
+        measured = problem.sensitivities
+        manifest.scaling = None if measured is None else [row.to_json() for row in measured]
+        return course, manifest
+
+    def _manifest(self, manifest: Manifest) -> Manifest:
+        before = self.manifest
+        started, resumed = before.get("started"), before.get("resumed")
+        manifest.started = started if isinstance(started, str) else manifest.started
+        manifest.resumed = [each for each in resumed if isinstance(each, dict)] if isinstance(resumed, list) else []
+        for name in ("rival", "correlated_bias"):
+            if isinstance(before.get(name), dict):
+                setattr(manifest, name, before[name])
+        earlier, here = before.get("versions"), versions()
+        others = {name: [version, here.get(name)] for name, version in earlier.items() if version != here.get(name)} \
+            if isinstance(earlier, dict) else {}  # fmt: skip
+        if others:
+            names = ", ".join(f"{name} {was} then, {is_} now" for name, (was, is_) in others.items())
+            self.said.append(f"other versions than those that the run began with: {names}; it may go on differently")
+        manifest.resumed.append(
+            {
+                "iteration": self.iteration,
+                "at": now(),
+                "command_line": manifest.command_line,
+                "from": str(self.stored.path.absolute()),
+                "changed": {key: list(change) for key, change in self.changed.items()},
+                "versions": others,
+            }
+        )
+        return manifest
+
+    @contextlib.contextmanager
+    def take_over(self, manifest: Manifest) -> Iterator[RunFolder]:
+        """The folder in which the run goes on, with its metrics as far as its state, and `manifest`; locked.
+
+        Raises ConfigError and MachineError where it cannot be written to.
+        """
+        text, run = dump(self.config), self.config.run
+        if self.elsewhere:
+            with RunFolder.create("--set", run.output, run.folder_name, False, text, manifest) as folder:
+                with _written(folder):
+                    copy_into(folder, self.folder.path)
+                    self._put_first(folder)
+                yield folder
+        else:
+            with _written(self.folder):
+                write_beginning(self.folder, text, manifest)
+                self._put_first(self.folder)
+            yield self.folder
+
+    def _put_first(self, folder: RunFolder) -> None:
+        """Leave what the state has, and that state as the newest: a damaged one is not to take its place."""
+        cut_back(folder.path, self.records, self.size)
+        if self.stored.path.name == PREVIOUS_FILE_NAME:
+            (folder.checkpoint / PREVIOUS_FILE_NAME).replace(folder.checkpoint / STATE_FILE)
+
+
+@contextlib.contextmanager
+def open_earlier(run: Path, config_file: Path | None, overrides: tuple[str, ...]) -> Iterator[Earlier]:
+    """The run in the folder `run`, to go on, locked while the block works.
+
+    `config_file` is what it is to agree with, in place of the `config.yaml` in its folder. Raises ConfigError: where it
+    is no run, or one at work; where its state is damaged, and the one before that too; where the settings differ in
+    what cannot change.
+    """
+    with opened(run) as (folder, manifest), contextlib.ExitStack() as stack:
+        said: list[str] = []
+        stored = _read_state(folder, said)
+        stack.callback(stored.archive.close)
+        if len(stored.text("config")) > _MOST_CONFIG:
+            raise stored.wrong("config", "is too long")
+        began = loads(stored.text("config"), stored.path)
+        config, source = _read_config(run, config_file, overrides, stored)
+        elsewhere = config.run.output != source.run.output or config.run.name != source.run.name
+        found = changes(began, config)
+        asked = changes(source, config)
+        changed = check_changes(found, lambda key: "--set" if key in asked else config.source, run)
+        iteration, last = stored.count("iteration", least=0), stored.value("last")
+        if config.run.iterations < iteration:
+            reason = f"is {config.run.iterations}; the run has done {iteration} already"
+            raise ConfigError(config.source, "run.iterations", reason)
+        _check_files(stored, config, run)
+        records, size = read_records(folder.path, iteration, last if isinstance(last, dict) else None)
+        earlier = Earlier(folder, manifest, stored, config, changed, elsewhere, records, size, said)
+        if not (elsewhere or earlier.is_done):
+            check_writable(folder)
+        yield earlier
+
+
+def _read_state(folder: RunFolder, said: list[str]) -> Stored:
+    """The newest state in the folder that is whole."""
+    failures: list[ConfigError] = []
+    for name in (STATE_FILE, PREVIOUS_FILE_NAME):
+        path = folder.checkpoint / name
+        if not path.exists():
+            continue
+        try:
+            stored = Stored(*open_state(path))
+        except ConfigError as error:
+            failures.append(error)
+            continue
+        if failures or name == PREVIOUS_FILE_NAME:
+            why = str(failures[0]) if failures else f"{folder.checkpoint / STATE_FILE}: is missing"
+            said.append(f"{why}; going on from the state before, after {stored.count('iteration', least=0)} iterations")
+        return stored
+    if failures:
+        raise failures[0]
+    raise ConfigError(folder.path, "", f"has no checkpoint/{STATE_FILE}: the run ended before it kept anything")
+
+
+def _read_config(
+    run: Path, config_file: Path | None, overrides: tuple[str, ...], stored: Stored
+) -> tuple[Config, Config]:
+    """The configuration that the run is to go on with, and the same without overrides."""
+    own = run / "config.yaml"
+    if config_file is not None or own.exists():
+        path = own if config_file is None else config_file
+        return load(path, list(overrides)), load(path)
+    text = stored.text("config")
+    return loads(text, own, list(overrides)), loads(text, own)
+
+
+def _check_files(stored: Stored, config: Config, run: Path) -> None:
+    before, here = stored.value("files"), digests(config)
+    for key, digest in before.items() if isinstance(before, dict) else ():
+        if here.get(key) != digest:
+            what = "has changed" if key in here else "has gone"
+            raise ConfigError(config.source, key, f"{what} since {run} began; put it back, or begin anew")
+
+
+@contextlib.contextmanager
+def _written(folder: RunFolder) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        if is_machine_fault(error):
+            raise MachineError(f"{folder.path}: {error.strerror}; the run did not go on") from None
+        raise

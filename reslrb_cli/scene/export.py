@@ -1,0 +1,382 @@
+"""Writes a scene, with the values that its parameters have, into a new folder.
+
+Values as elements of a scene description.
+
+A mesh as it stands in a loaded scene, as a PLY file in place of what its element names.
+
+The files beside an exported scene: those that it refers to, copied, and those that hold recovered values.
+
+Puts the values that a scene's parameters have into the description that the scene was built from.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+
+from reslrb_cli.backend.plugins import looking_in
+from reslrb_cli.errors import ConfigError
+from reslrb_cli.records.atomic import unfinished_folder
+from reslrb_cli.records.images import file_stem, write_file
+from reslrb_cli.scene.catalog import parameter_kind
+from reslrb_cli.scene.values import Slot
+from reslrb_cli.scene.xml.build import Owners
+from reslrb_cli.scene.xml.read import Description, Element, tag_lines
+
+Array = np.ndarray[tuple[int, ...], np.dtype[np.float32]]
+
+
+def child(owner: Element, tag: str, **attributes: str) -> Element:
+    """A new element with these attributes, `type_` for `type`, which is not among the children of `owner` yet."""
+    return Element(tag, {key.rstrip("_"): value for key, value in attributes.items()}, owner.source, owner.line)
+
+
+def replace(owner: Element, new: Element, *instead_of: str) -> None:
+    """Put `new` among the children of `owner`, in place of those of its name and of the names in `instead_of`."""
+    gone = {new.name, *instead_of}
+    owner.children[:] = [other for other in owner.children if other.name not in gone]
+    owner.children.insert(0, new)
+
+
+def remove(owner: Element, names: set[str]) -> None:
+    """Remove the parameters of these names."""
+    owner.children[:] = [other for other in owner.children if other.name not in names]
+
+
+def numbers(values: Array) -> str:
+    """Numbers as text from which the same 32-bit floats are read."""
+    return " ".join(f"{float(value):.9g}" for value in values.ravel())
+
+
+def number(owner: Element, name: str, value: float) -> Element:
+    """A number, or a spectrum that is the same at all wavelengths."""
+    return child(owner, "float", name=name, value=numbers(np.array(value, dtype=np.float32)))
+
+
+def colour(owner: Element, name: str, value: Array, bounded: bool) -> Element:
+    """A colour (3,), or a grey of one number; where it is `bounded`, Mitsuba's <rgb> has values from 0 to 1 only."""
+    if value.size == 1:
+        return number(owner, name, float(value.ravel()[0]))
+    rgb = child(owner, "rgb", name=name, value=numbers(value))
+    if not bounded or bool(((value >= 0) & (value <= 1)).all()):
+        return rgb
+    rgb.attributes["name"] = "color"
+    whole = child(owner, "texture", type_="srgb", name=name)
+    whole.children += [rgb, child(owner, "boolean", name="unbounded", value="true")]
+    return whole
+
+
+def transform(owner: Element, name: str, value: mi.AffineTransform4f) -> Element:
+    """A transform by its 4x4 matrix."""
+    whole = child(owner, "transform", name=name)
+    matrix = np.array(value.matrix, dtype=np.float32).reshape(4, 4)
+    whole.children.append(child(owner, "matrix", value=numbers(matrix)))
+    return whole
+
+
+def triple(owner: Element, tag: str, name: str, value: Array) -> Element:
+    """Three numbers: a <point> or a <vector>, by `tag`."""
+    x, y, z = (numbers(value.reshape(3)[k : k + 1]) for k in range(3))
+    return child(owner, tag, name=name, x=x, y=y, z=z)
+
+
+#: Parameters of a mesh that a PLY file does not hold.
+_KEPT = ("face_normals", "flip_normals")
+
+
+def put_mesh(owner: Element, mesh: mi.Mesh, parts: Parts, key: str) -> None:
+    """Have the element of `mesh`, which has the parameter `key`, name a file that holds the mesh.
+
+    That has vertices as they stand in the world, faces and attributes.
+    """
+    owner.children[:] = [item for item in owner.children if not item.is_value or item.name in _KEPT]
+    owner.attributes["type"] = "ply"
+    parts.add(owner, file_stem(key.rpartition(".")[0]), ".ply", lambda path: mesh.write_ply(str(path)))
+
+
+#: The exported scene, in its folder.
+SCENE = "scene.xml"
+
+
+#: Folders beside it: of recovered values, and of files from elsewhere than the scene's own folder.
+RECOVERED, ELSEWHERE = "recovered", "assets"
+
+
+@dataclass
+class Parts:
+    """Files by their path in the exported folder, with `/`, and who writes each into a path that is new."""
+
+    writers: dict[str, Callable[[Path], object]] = field(default_factory=dict)
+    _copies: dict[Path, str] = field(default_factory=dict)
+    _made: set[Element] = field(default_factory=set)
+
+    def add(self, owner: Element, stem: str, suffix: str, write: Callable[[Path], object]) -> None:
+        """Have `owner` name a file of recovered values in place of the one that it names."""
+        name = f"{RECOVERED}/{stem}{suffix}"
+        self.writers[name] = write
+        element = child(owner, "string", name="filename", value=name)
+        self._made.add(element)
+        replace(owner, element)
+
+    def copy_assets(self, description: Description) -> None:
+        """Have every file that elements name copied, and named by where its copy is.
+
+        A file in the folder of the scene keeps its path relative to that, any other goes to a folder of its own.
+        """
+        own = {name.casefold() for name in (SCENE, *self.writers)}
+        home = description.root.source.file.absolute().parent
+        for element in description.root.walk():
+            attribute = _file_attribute(element)
+            if attribute is None or element in self._made:
+                continue
+            source = _found(element.attributes[attribute], description.folders)
+            if source is not None:
+                if source not in self._copies:
+                    self._copies[source] = _free(_wanted(source, home), own)
+                    own.add(self._copies[source].casefold())
+                element.attributes[attribute] = self._copies[source]
+        for source, name in self._copies.items():
+            self.writers[name] = _copier(source)
+
+    def write(self, folder: Path) -> None:
+        """Write all files into `folder`, which has none of them. Raises OSError."""
+        for name, write in self.writers.items():
+            path = folder / name
+            path.parent.mkdir(parents=True, exist_ok=True)
+            write(path)
+
+
+def _copier(source: Path) -> Callable[[Path], object]:
+    return lambda path: shutil.copyfile(source, path)
+
+
+def _file_attribute(element: Element) -> str | None:
+    """The attribute of an element that names a file; None of one that names none."""
+    if element.tag == "spectrum" and "filename" in element.attributes:
+        return "filename"
+    return (
+        "value" if element.tag == "string" and element.name == "filename" and element.attributes.get("value") else None
+    )
+
+
+def _found(name: str, folders: list[Path]) -> Path | None:
+    """The file that Mitsuba opens by this name; None where there is none."""
+    candidates = [folder / name for folder in folders] + [Path(name).absolute()]
+    return next((path.resolve() for path in candidates if path.is_file()), None)
+
+
+def _wanted(source: Path, home: Path) -> str:
+    if source.is_relative_to(home.resolve()):
+        return str(PurePosixPath(*source.relative_to(home.resolve()).parts))
+    return f"{ELSEWHERE}/{source.name}"
+
+
+def _free(wanted: str, taken: set[str]) -> str:
+    """`wanted`, or with a number before its suffix where that is taken, by whatever case it is written in."""
+    path, name, number = PurePosixPath(wanted), wanted, 1
+    while name.casefold() in taken:
+        number += 1
+        name = str(path.with_name(f"{path.stem}-{number}{path.suffix}"))
+    return name
+
+
+#: What gives a place in another way than `to_world`, by tag.
+_OTHER_PLACES = {
+    "shape": ("center", "radius", "p0", "p1"),
+    "emitter": ("direction", "position"),
+}
+
+
+#: BSDFs whose `eta` is that of the inside over that of the outside.
+_RELATIVE_INDEX = ("dielectric", "roughdielectric", "thindielectric", "plastic", "roughplastic")
+
+
+#: What Mitsuba leaves out of a `principled` BSDF for good where it begins at 0.
+LOBES = (
+    *("anisotropic", "clearcoat", "diff_trans", "flatness", "metallic"),
+    *("sheen", "sheen_tint", "spec_tint", "spec_trans"),
+)
+
+
+_CONDUCTORS = ("conductor", "roughconductor")
+
+
+class Replacing:
+    """The description of a scene, whose `params` have the values that it is to get; `parts` are the files beside it."""
+
+    def __init__(self, root: Element, params: mi.SceneParameters, parts: Parts, source: object) -> None:
+        self.params, self.parts, self.source = params, parts, source
+        self._owners = Owners(root)
+
+    def put(self, key: str) -> None:
+        """Put the value of the scene parameter `key` in. Raises ConfigError where the description cannot say it."""
+        node = self.params.properties[key][2]
+        place = self._owners.place(self.params, key)
+        if place is None:
+            raise self._fail(key, "what it belongs to does not stand in the scene's files")
+        owner, (*below, name) = place
+        if below:
+            self._put_nested(owner, below, name, key)
+        elif isinstance(node, mi.Mesh) and name != "to_world":
+            put_mesh(owner, node, self.parts, key)
+        elif name == "to_world":
+            replace(owner, transform(owner, name, self.params[key]), *_OTHER_PLACES.get(owner.tag, ()))
+        elif name == "position":
+            replace(owner, triple(owner, "point", name, self._array(key)), "to_world")
+        elif name == "data":
+            self._put_image(owner, key)
+        elif name == "value" and owner.type == "srgb":
+            replace(owner, colour(owner, "color", self._array(key), bounded=False))
+        elif name == "value" and owner.type == "rawconstant" and self._array(key).size == 3:
+            replace(owner, triple(owner, "vector", name, self._array(key)))
+        else:
+            self._put_number(owner, name, self._array(key), key)
+
+    def _put_nested(self, owner: Element, below: list[str], name: str, key: str) -> None:
+        """A value of something below `owner` that is no object in the scene's files."""
+        if name == "value" and len(below) == 1:
+            self._put_spectrum(owner, below[0], key)
+        elif name == "value" and below[0] == "bsdf" and len(below) == 2 and owner.tag == "shape":
+            bsdf = child(owner, "bsdf", type_="diffuse")  # Mitsuba's own, where a shape has none
+            bsdf.children.append(colour(bsdf, below[1], self._array(key), bounded=True))
+            owner.children.append(bsdf)
+        else:
+            raise self._fail(key, "what it belongs to does not stand in the scene's files")
+
+    def _put_number(self, owner: Element, name: str, value: Any, key: str) -> None:
+        if value.size != 1:
+            raise self._fail(key, f"{owner.type} has no way to be given {value.size} numbers as its {name}")
+        if name == "eta" and owner.type in _RELATIVE_INDEX:
+            replace(owner, number(owner, "ext_ior", 1.0))
+            replace(owner, number(owner, "int_ior", float(value)))
+        elif owner.type == "principled" and name in ("eta", "specular"):
+            replace(owner, number(owner, name, float(value)), "eta", "specular")
+        else:
+            replace(owner, number(owner, name, float(value)))
+
+    def _put_spectrum(self, owner: Element, name: str, key: str) -> None:
+        if owner.type == "spot" and name == "texture":
+            raise self._fail(key, "a spot's texture is an image for Mitsuba; recover its intensity in place of it")
+        if owner.type in _CONDUCTORS and name in ("eta", "k"):
+            # A material's name gives both, and either stands in its place with the other alone.
+            stem = key.rpartition(f".{name}.value")[0]
+            for each in ("eta", "k"):
+                replace(owner, colour(owner, each, self._array(f"{stem}.{each}.value"), bounded=False), "material")
+            return
+        if owner.type in ("principled", "principledthin") and name in LOBES and self._array(key).any():
+            given = next((item for item in owner.children if item.name == name), None)
+            if given is None or (given.tag == "float" and float(given.attributes["value"]) == 0):
+                why = f"a {owner.type} has no such lobe where its file has no {name}, or 0, and so it had no effect"
+                raise self._fail(key, why)
+        bounded = parameter_kind(self.params, key) == "bsdf"
+        replace(owner, colour(owner, name, self._array(key), bounded))
+
+    def _put_image(self, owner: Element, key: str) -> None:
+        image = self._array(key)
+        self.parts.add(owner, file_stem(key), ".exr", lambda path: write_file(path, image, linear=True))
+        if owner.tag == "texture":
+            # Its values are linear as they stand, in a file of floats, and not to be rounded to fewer bits.
+            replace(owner, child(owner, "string", name="format", value="variant"))
+            remove(owner, {"color_space", "gamma"})
+
+    def _array(self, key: str) -> Any:
+        return Slot(self.params, key).get()
+
+    def _fail(self, key: str, why: str) -> ConfigError:
+        return ConfigError(self.source, key, f"cannot be exported: {why}")
+
+
+def same_values(a: Any, b: Any) -> bool:
+    """Whether two values of a parameter agree but for rounding; a grey agrees with the same number in each channel."""
+    x, y = _numbers(a), _numbers(b)
+    if x is None or y is None:
+        return x is y
+    if x.shape != y.shape and 1 not in (x.size, y.size):
+        return False
+    scale = max(float(np.abs(x).max(initial=0)), 1e-30)
+    return bool(np.allclose(x, y, rtol=1e-5, atol=1e-6 * scale))
+
+
+def _numbers(value: Any) -> Any:
+    """A parameter's value as an array; None of what is no number."""
+    try:
+        array = np.array(value.matrix if "AffineTransform" in type(value).__name__ else value)
+    except (RuntimeError, TypeError):
+        return None
+    return array.astype(np.float64) if array.dtype.kind in "buif" else None
+
+
+#: What of a scene is no part of what it looks like.
+_ASIDE = ("silhouette_sampling_weight", "sampling_weight")
+
+
+#: How Mitsuba names what has lost its id, as bitmaps do that nothing uses: by where it lies in memory.
+_ADDRESS = re.compile(r"object_\d+\.")
+
+
+def export_scene(
+    description: Description,
+    params: mi.SceneParameters,
+    keys: Iterable[str],
+    integrator: Mapping[str, object],
+    folder: Path,
+    source: object,
+) -> None:
+    """Write what `description` says, with the values that `params` have of `keys`, and an integrator, to `folder`.
+
+    `params` are of a scene that was built from the description, which is changed. `integrator` has its type and
+    options. The folder appears once it is whole, and Mitsuba has read the same values back from it. Raises ConfigError,
+    located in `source` and the key, where a value cannot be said, and OSError.
+    """
+    parts = Parts()
+    replacing = Replacing(description.root, params, parts, source)
+    for key in keys:
+        replacing.put(key)
+    parts.copy_assets(description)
+    _put_integrator(description, integrator)
+    lines = ["<!-- Written by `reslrb export`. -->", *(line for line, _ in tag_lines(description.root)), ""]
+    parts.writers[SCENE] = lambda path: path.write_text("\n".join(lines), encoding="utf-8")
+    folder = folder.absolute()
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    with unfinished_folder(folder.parent) as part:
+        inner = part / "scene"  # since the folder of an unfinished one is the user's alone
+        inner.mkdir()
+        parts.write(inner)
+        _check(inner, params, source)
+        os.replace(inner, folder)
+
+
+def _put_integrator(description: Description, integrator: Mapping[str, object]) -> None:
+    root = description.root
+    element = child(root, "integrator", type_=str(integrator["type"]))
+    for name, value in integrator.items():
+        if name != "type":
+            tag = {bool: "boolean", int: "integer"}.get(type(value), "float")
+            element.children.append(child(root, tag, name=name, value=str(value).lower()))
+    root.children.insert(0, element)
+
+
+def _check(folder: Path, params: mi.SceneParameters, source: object) -> None:
+    """Raise ConfigError where Mitsuba does not read from `folder` what `params` are."""
+    with looking_in([folder]):  # for plugins, which it would take from the working folder as well
+        try:
+            found = mi.traverse(mi.load_file(str(folder / SCENE), optimize=False))
+        except Exception as error:
+            raise ConfigError(source, "", f"cannot be exported: Mitsuba does not read it back ({error})") from None
+    for key in params.properties:
+        if key.rpartition(".")[2] in _ASIDE or key.startswith("integrator."):
+            continue
+        if params.properties[key][0] is None:  # what the files do not give, and Mitsuba does not hand out
+            continue
+        if key not in found.properties and not _ADDRESS.match(key):
+            raise ConfigError(source, key, "cannot be exported: Mitsuba does not find it in what was written")
+        if key in found.properties and not same_values(params[key], found[key]):
+            raise ConfigError(source, key, "cannot be exported: Mitsuba reads another value from what was written")

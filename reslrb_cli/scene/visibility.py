@@ -1,0 +1,266 @@
+"""What the sensors see of a scene: texels, what light tracing lacks, and how long its paths have to be.
+
+Pixels of which light tracing lacks something: at the film's border, and where the sensor sees glass, mirrors, coats.
+
+From the smooth lobes of those light paths cannot connect to the sensor. And those that see lamps.
+
+Which texels the sensors see.
+
+How long light's paths have to be that a picture of a scene lacks next to nothing of what a camera would see.
+
+A photograph has light of any number of bounces. An image of paths of at most d segments is darker, which an exposure or
+a colour would make up for.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from reslrb_cli.scene.graph import SceneGraph
+from reslrb_cli.scene.needs import CROSSINGS, LOOK, what_is_seen
+
+#: Primary rays are spread over a pixel in so many rows and columns of cells.
+CELLS = 4
+
+
+#: Points of the aperture, in [0, 1]^2, from which a lens looks for lamps.
+_APERTURE = ((0.5, 0.5), (0.05, 0.5), (0.95, 0.5), (0.5, 0.05), (0.5, 0.95))
+
+
+def interior(shape: tuple[int, ...], sensor: mi.Sensor) -> np.ndarray:
+    """Where light tracing loses nothing by the film's border: boolean (H, W), for a sensor whose film is so large.
+
+    Samples just outside of the film are lost, so that pixels within the filter's radius of its border lack what they
+    would have added; paths from the sensor lose none.
+    """
+    margin = int(np.ceil(float(sensor.film().rfilter().radius()) - 0.5))
+    inside = np.zeros(shape[:2], dtype=bool)
+    inside[margin : shape[0] - margin, margin : shape[1] - margin] = True
+    return inside
+
+
+@dataclass(frozen=True)
+class SeenSpecular:
+    """Pixels (H, W) of a sensor's crop window that smooth specular lobes reach, by way of the reconstruction filter.
+
+    `alone`: of surfaces that have no others (glass, mirrors), which stay black under light tracing. `mixed`: of those
+    that have others beside them (coats, blends, thin panes), of which light tracing lacks a part.
+    """
+
+    alone: np.ndarray
+    mixed: np.ndarray
+
+
+def sees_specular(scene: mi.Scene, sensor: mi.Sensor) -> SeenSpecular:
+    """Trace CELLS^2 primary rays a pixel, through see-through surfaces, and mark the pixels that their filter reaches.
+
+    What is smaller than a cell may be missed. The rays are the same at every call.
+    """
+    film = sensor.film()
+    width, height = (int(n) for n in film.crop_size())
+    count = width * height
+    lane = dr.arange(mi.UInt32, count)
+    corner = mi.Point2f(lane % width, lane // width)
+    random = mi.PCG32(count)
+    alone, mixed = dr.zeros(mi.Bool, count), dr.zeros(mi.Bool, count)
+    for cell in range(CELLS * CELLS):
+        # Opaque, so that all cells have one kernel.
+        row, column = dr.opaque(mi.Float, cell // CELLS), dr.opaque(mi.Float, cell % CELLS)
+        jitter = mi.Point2f(random.next_float32(), random.next_float32())
+        u = (corner + (mi.Point2f(column, row) + jitter) / CELLS) / mi.Vector2f(width, height)
+        aperture = mi.Point2f(random.next_float32(), random.next_float32())
+        ray, _ = sensor.sample_ray(sensor.shutter_open(), 0.5, u, aperture)
+        only, beside = _first_surfaces(scene, ray, count)
+        alone, mixed = alone | only, mixed | beside
+        dr.eval(alone, mixed, random)
+    from scipy.ndimage import maximum_filter  # here: a run that is refused does not wait for it
+
+    # A sample that lies within the radius of a pixel's centre is at most so many pixels away.
+    size = 2 * int(np.ceil(float(film.rfilter().radius()) - 0.5)) + 1
+
+    def reached(mask: mi.Bool) -> np.ndarray:
+        return np.asarray(maximum_filter(np.array(mask, dtype=bool).reshape(height, width), size))
+
+    return SeenSpecular(reached(alone), reached(mixed))
+
+
+def sees_lamps(scene: mi.Scene, sensor: mi.Sensor) -> np.ndarray:
+    """Pixels (H, W) of a sensor's crop window that see an emitter directly, by way of the reconstruction filter too.
+
+    A lamp smaller than the cells of a grid of LOOK^2 may be missed.
+    """
+    film = sensor.film()
+    width, height = (int(n) for n in film.crop_size())
+    cells = np.zeros((LOOK, LOOK), dtype=bool)
+    for point in _APERTURE if sensor.needs_aperture_sample() else (None,):
+        cells |= np.array(what_is_seen(scene, sensor, point)[2]).reshape(LOOK, LOOK)
+    if not cells.any():
+        return np.zeros((height, width), dtype=bool)
+    from scipy.ndimage import maximum_filter  # here: a scene that shows no lamp does not wait for it
+
+    cells = np.asarray(maximum_filter(cells, 3))  # an edge may be anywhere between the centres of two cells
+    for axis, size in enumerate((height, width)):
+        first = np.arange(size) * LOOK // size
+        cells = np.maximum.reduceat(cells, first, axis=axis) if size < LOOK else np.take(cells, first, axis=axis)
+    return np.asarray(maximum_filter(cells, 2 * int(np.ceil(float(film.rfilter().radius()) - 0.5)) + 1))
+
+
+def _first_surfaces(scene: mi.Scene, ray: mi.Ray3f, count: int) -> tuple[mi.Bool, mi.Bool]:
+    """Whether delta lobes are all that a surface has, or some of it, up to the first that is not see-through."""
+    lobes = int(mi.BSDFFlags.DeltaReflection | mi.BSDFFlags.DeltaTransmission)
+    active, alone, mixed = dr.full(mi.Bool, True, count), dr.zeros(mi.Bool, count), dr.zeros(mi.Bool, count)
+    for _ in range(CROSSINGS):
+        si = scene.ray_intersect(ray, active)
+        hit = active & si.is_valid()
+        flags = si.bsdf().flags()
+        see_through = hit & mi.has_flag(flags, mi.BSDFFlags.Null)
+        specular = hit & ((flags & lobes) != 0)
+        beside = specular & (see_through | mi.has_flag(flags, mi.BSDFFlags.Smooth))
+        alone, mixed = alone | (specular & ~beside), mixed | beside
+        ray, active = si.spawn_ray(ray.d), see_through
+        dr.eval(ray, active, alone, mixed)
+        if dr.none(active):
+            break
+    return alone, mixed
+
+
+#: Primary rays for each pixel and for each texel, and in one pass.
+_RAYS_PER_CELL, _MAX_RAYS, _RAYS_PER_PASS = 64, 2**25, 2**20
+
+
+_CROSSINGS = 8
+
+
+def visible_texels(
+    scene: Any, sensors: Sequence[Any], key: str, pixels: Sequence[np.ndarray[Any, Any] | None] = ()
+) -> np.ndarray[Any, Any]:
+    """Which texels of the texture `key` some sensor sees: boolean (H, W).
+
+    `pixels` (H, W) are those of each sensor that count; None, or none at all, where all do.
+
+    A texel counts as seen if a primary ray hits the inner quarter of its cell, after see-through surfaces (masks), but
+    not through glass or in mirrors, from where light paths cannot connect to the sensor. For a texture that is not on a
+    surface (an environment map, emission), every texel counts. Texture coordinates outside of [0, 1] are taken to
+    repeat.
+    """
+    params = mi.traverse(scene)
+    node = params.properties[key][2]
+    height, width = params[key].shape[:2]
+    owners = SceneGraph.of(scene).owning_bsdfs(node)
+    to_uv = key.removesuffix("data") + "to_uv"
+    if not owners or to_uv not in params:
+        return np.ones((height, width), dtype=bool)
+    transform = np.array(params[to_uv].matrix, dtype=np.float64)
+
+    seen = dr.zeros(mi.UInt32, height * width)
+    for place, sensor in enumerate(sensors):
+        count = int(np.prod(sensor.film().crop_size()))
+        kept = pixels[place] if place < len(pixels) else None
+        rays = min(_RAYS_PER_CELL * max(count, height * width), _MAX_RAYS)
+        for number in range(-(-rays // _RAYS_PER_PASS)):
+            random = mi.PCG32(size=min(rays, _RAYS_PER_PASS), initstate=dr.opaque(mi.UInt64, number))
+            _mark_seen(scene, sensor, owners, transform, random, seen, width, height, kept)
+            dr.eval(seen)
+    return np.array(seen).reshape(height, width) > 0
+
+
+def _mark_seen(
+    scene: Any, sensor: Any, owners: Sequence[Any], transform: Any, random: Any, seen: Any, width: int, height: int,
+    kept: np.ndarray[Any, Any] | None,
+) -> None:  # fmt: skip
+    """Cast one primary ray per lane, through pixels (H, W) that are `kept`, and mark in `seen` the texels whose inner
+    quarter it hits."""
+    time = sensor.shutter_open() + random.next_float32() * sensor.shutter_open_time()
+    film = mi.Point2f(random.next_float32(), random.next_float32())
+    aperture = mi.Point2f(random.next_float32(), random.next_float32())
+    ray, _ = sensor.sample_ray(time, 0.5, film, aperture, True)
+    active = mi.Mask(True)
+    if kept is not None:
+        rows, columns = kept.shape
+        x, y = (mi.UInt32(dr.minimum(c * size, size - 1)) for c, size in ((film.x, columns), (film.y, rows)))
+        active = dr.gather(mi.UInt32, mi.UInt32(kept.ravel().astype(np.uint32)), y * columns + x) > 0
+    for _ in range(_CROSSINGS):
+        si = scene.ray_intersect(ray, active)
+        active &= si.is_valid()
+        bsdf = si.bsdf()
+        is_owner = mi.Mask(False)
+        for owner in owners:
+            is_owner |= bsdf == mi.BSDFPtr(owner)
+        u, v = (row[0] * si.uv.x + row[1] * si.uv.y + row[2] for row in transform.tolist()[:2])
+        cell = mi.Point2f(u * width, v * height)
+        inside = mi.Vector2f(cell - dr.floor(cell))
+        inner = (dr.abs(inside.x - 0.5) < 0.25) & (dr.abs(inside.y - 0.5) < 0.25)
+        x, y = (mi.Int32(dr.floor(c)) for c in (cell.x, cell.y))
+        index = _modulo(y, height) * width + _modulo(x, width)
+        dr.scatter(seen, mi.UInt32(1), mi.UInt32(index), active & is_owner & inner)
+        active &= mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null)
+        ray = si.spawn_ray(ray.d)
+        dr.eval(seen, active, ray)
+        if dr.none(active):
+            break
+
+
+def _modulo(value: Any, size: int) -> Any:
+    remainder = value % size
+    return dr.select(remainder < 0, remainder + size, remainder)
+
+
+#: Depths that are tried; the last one stands for all light.
+DEPTHS = (8, 16, 32, 64)
+
+
+#: What may be missing of a pixel's light, on average.
+LOST = 0.01
+
+
+#: Rays along each axis of the film, and paths for each of them.
+_RAYS, _PATHS = 48, 32
+
+
+@dataclass(frozen=True)
+class Depth:
+    """A path depth in segments, and the share of a pixel's light that longer paths have, on average; None of the
+    greatest depth, to which nothing was compared."""
+
+    segments: int
+    missing: float | None
+
+
+def find_depth(scene: mi.Scene, sensor: int) -> Depth:
+    """The least of `DEPTHS` at which the view through the sensor of this index has all but `LOST` of its light.
+
+    By camera paths of equal random numbers without roulette, so that those of one depth begin those of the next.
+    """
+    whole = _pixels(scene, sensor, DEPTHS[-1])
+    for segments in DEPTHS[:-1]:
+        missing = _missing(_pixels(scene, sensor, segments), whole)
+        if missing <= LOST:
+            return Depth(segments, missing)
+    return Depth(DEPTHS[-1], None)
+
+
+def _missing(pixels: np.ndarray, whole: np.ndarray) -> float:
+    """The mean over lit pixels of what they lack: no few bright ones decide."""
+    lit = np.isfinite(whole) & (whole > 0)
+    return float(np.mean(1 - pixels[lit] / whole[lit])) if lit.any() else 0.0
+
+
+def _pixels(scene: mi.Scene, index: int, segments: int) -> np.ndarray:
+    """What the sensor sees of paths of at most so many segments, by ray: (N,) float64."""
+    sensor, count = scene.sensors()[index], _RAYS**2 * _PATHS
+    sampler = mi.load_dict({"type": "independent"})
+    sampler.seed(0, count)
+    pixel = dr.arange(mi.UInt32, count) // _PATHS
+    corner = mi.Point2f(pixel % _RAYS, pixel // _RAYS)
+    position = (corner + sampler.next_2d()) / _RAYS
+    ray, weight = sensor.sample_ray_differential(sensor.shutter_open(), 0.5, position, sampler.next_2d())
+    integrator = mi.load_dict({"type": "path", "max_depth": segments, "rr_depth": DEPTHS[-1] + 1})
+    light, _, _ = integrator.sample(scene, sampler, ray)
+    rows = np.array(mi.luminance(mi.Color3f(weight * light)), dtype=np.float64).reshape(_RAYS**2, _PATHS)
+    return np.asarray(rows.mean(axis=1))

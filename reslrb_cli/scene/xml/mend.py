@@ -1,0 +1,552 @@
+"""What other versions of Mitsuba and exporters wrote, said as Mitsuba 3 has it.
+
+What was mended, or left out, so that a scene could be loaded.
+
+How other versions of Mitsuba, and exporters for them, say what Mitsuba 3 says in another way: tables.
+
+Colours as Mitsuba 0.6 let them be written, and spectra that RGB variants lack, in a form that has a colour there.
+
+The plugins `regular`, `irregular` and `blackbody` can be evaluated by wavelength alone. Of the same spectrum written as
+`<spectrum value="400:0.1, 700:0.9"/>` Mitsuba computes the colour, by the CIE's matching functions: that of light where
+it is what an emitter emits, elsewhere that of a surface under D65.
+
+Texture coordinates as Mitsuba 0.6 let them be scaled and shifted.
+
+Puts textures that stand by themselves where they are used, so that their parameters belong to what uses them.
+
+Mends what other versions of Mitsuba and exporters for them wrote, where it can be said in Mitsuba 3's own way.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+import os
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from reslrb_cli.backend.plugins import is_known
+from reslrb_cli.errors import ConfigError
+from reslrb_cli.scene.xml.read import Description, Element, quoted
+
+#: Lines that one warning names, and warnings of one scene.
+_LINES, _WARNINGS = 5, 30
+
+
+@dataclass(frozen=True)
+class Note:
+    """One thing in a scene's files that Mitsuba would refuse: `wrong` says what, `done` what was made of it.
+
+    `owner` is the object that has the element among its children and no use for it, where that is what is wrong.
+    """
+
+    element: Element
+    wrong: str
+    done: str
+    owner: Element | None = None
+
+
+def in_order(notes: Iterable[Note], root: Element) -> list[Note]:
+    """The notes in the order of lines, those on the file of `root` first."""
+    return sorted(notes, key=lambda note: (note.element.source != root.source, *_place(note)))
+
+
+def _place(note: Note) -> tuple[str, int]:
+    return str(note.element.source.file), note.element.line
+
+
+def warnings(notes: Sequence[Note]) -> list[str]:
+    """A line for each kind of thing, located where it is first met."""
+    kinds: dict[tuple[str, str, object], list[Element]] = {}
+    for note in notes:
+        kinds.setdefault((note.wrong, note.done, note.element.source.file), []).append(note.element)
+    lines = []
+    for (wrong, done, _), elements in kinds.items():
+        others = list(dict.fromkeys(element.line for element in elements[1:]))
+        more = ", ".join(map(str, others[:_LINES])) + (f" and {len(others) - _LINES} more" * (len(others) > _LINES))
+        lines.append(f"{elements[0].place}: {wrong}: {done}" + (f" (also in line {more})" if others else ""))
+    if len(lines) > _WARNINGS:
+        rest = len(lines) - _WARNINGS
+        lines = [
+            *lines[:_WARNINGS],
+            f"{notes[0].element.source.file}: {rest} more kinds of things were mended or left out",
+        ]
+    return lines
+
+
+def refuse(notes: Sequence[Note]) -> None:
+    """Raise ConfigError for the first of `notes`, if there is any."""
+    if notes:
+        first = notes[0]
+        more = f" (and {len(notes) - 1} more)" if len(notes) > 1 else ""
+        raise ConfigError(
+            first.element.place, "", f"{first.wrong}; with scene.strict: false it would be {first.done}{more}"
+        )
+
+
+#: Spellings of elements.
+ELEMENTS = {"lookAt": "lookat", "srgb": "rgb"}
+
+
+#: Elements of Mitsuba 0.x that mean what Mitsuba 3 cannot be told, and what to do.
+LOST_ELEMENTS = {
+    "camera": "an element of Mitsuba before 0.4, whose axes pointed elsewhere; save the scene with Mitsuba 0.6",
+    "luminaire": "an element of Mitsuba before 0.4, whose axes pointed elsewhere; save the scene with Mitsuba 0.6",
+    "subsurface": "an element of Mitsuba 0.6 that Mitsuba 3 does not have; remove it, or take a medium",
+    "blackbody": "an element of Mitsuba 0.6 that Mitsuba 3 does not have; write its colour as <rgb>",
+    "animation": "an element of Mitsuba 0.6; nothing moves in Mitsuba 3: write one of its transforms",
+}
+
+
+#: Attributes of elements other than objects.
+ATTRIBUTES = {
+    **dict.fromkeys(("float", "integer", "boolean", "string", "rgb"), ("name", "value")),
+    **dict.fromkeys(("point", "vector"), ("name", "value", "x", "y", "z")),
+    **dict.fromkeys(("translate", "scale"), ("value", "x", "y", "z")),
+    "spectrum": ("name", "value", "filename"),
+    "ref": ("id", "name"),
+    "alias": ("id", "as"),
+    "transform": ("name",),
+    "rotate": ("angle", "value", "x", "y", "z"),
+    "lookat": ("origin", "target", "up"),
+    "matrix": ("value",),
+}
+
+
+OBJECT_ATTRIBUTES = ("type", "id", "name")
+
+
+#: Plugins by other names, for elements of one kind.
+PLUGINS = {
+    ("bsdf", "bump"): "bumpmap",
+    ("film", "exrfilm"): "hdrfilm",
+    ("film", "pngfilm"): "hdrfilm",
+    ("film", "ldrfilm"): "hdrfilm",
+    ("film", "tiledhdrfilm"): "hdrfilm",
+    ("film", "mfilm"): "hdrfilm",
+}
+
+
+#: Objects without which the same light reaches the same film, and what takes their place.
+REPLACEABLE = {
+    "sampler": "an `independent` one takes its place",
+    "rfilter": "the film's default takes its place",
+}
+
+
+#: Plugins of Mitsuba 0.6 that Mitsuba 3 does not have, and what comes near them.
+LOST_PLUGINS = {
+    ("bsdf", "coating"): "`principled` with a clearcoat comes near",
+    ("bsdf", "roughcoating"): "`principled` with a clearcoat comes near",
+    ("bsdf", "mixturebsdf"): "nested `blendbsdf` say the same",
+    ("bsdf", "phong"): "`roughplastic` comes near",
+    ("bsdf", "ward"): "`roughconductor` or `roughplastic` comes near",
+    ("bsdf", "roughdiffuse"): "`diffuse` comes near",
+    ("bsdf", "difftrans"): "`principledthin` comes near",
+    ("bsdf", "hk"): "a medium comes near",
+    ("bsdf", "irawan"): "a texture comes near",
+    ("emitter", "sky"): "`sunsky` comes near, with z for its up axis in place of y",
+    ("emitter", "sun"): "`sunsky` comes near, with z for its up axis in place of y",
+    ("emitter", "collimated"): "`directionalarea` comes near",
+    ("shape", "heightfield"): "write it as a mesh",
+    ("texture", "scale"): "multiply the texture itself",
+    ("texture", "gridtexture"): "`bitmap` or `checkerboard` comes near",
+    ("texture", "wireframe"): "`bitmap` comes near",
+    ("texture", "curvature"): "`mesh_attribute` comes near",
+    ("texture", "vertexcolors"): "`mesh_attribute` says the same",
+}
+
+
+#: Plugins that Mitsuba 3 has, and that no scene file can use here.
+REFUSED_PLUGINS = {
+    ("shape", "hair"): "is a plugin of Mitsuba 0.6 that Mitsuba 3 does not have; `bsplinecurve` draws strands",
+    ("shape", "blender"): "reads the memory of a running Blender; export the mesh as `ply` or `obj`",
+    ("sensor", "flat_sensor"): "belongs to Mitsuba's own RayDataLoader; take a `perspective` one",
+}
+
+
+#: Values of text parameters, by plugin and parameter.
+VALUES = {
+    ("bitmap", "filter_type"): {"trilinear": "bilinear", "ewa": "bilinear"},
+    ("hdrfilm", "pixel_format"): {
+        "spectrum": "rgb",
+        "spectrumAlpha": "rgba",
+        "luminanceAlpha": "luminance_alpha",
+        "xyzAlpha": "xyza",
+    },
+}
+
+
+#: Formats of files that `hdrfilm` knows; nothing here is written by the film, so that another can be left out.
+FORMATS = {
+    "file_format": frozenset({"openexr", "exr", "rgbe", "pfm"}),
+    "component_format": frozenset({"float16", "float32", "uint32"}),
+}
+
+
+def snake_case(name: str) -> str:
+    """A parameter's name as it is spelled since Mitsuba 2: `toWorld` is `to_world`, `intIOR` is `int_ior`."""
+    return re.sub(r"(?<=[a-z])[A-Z]+", lambda capitals: "_" + capitals[0].lower(), name)
+
+
+#: Spectra by wavelength, by plugin.
+SPECTRA = ("regular", "irregular", "blackbody")
+
+
+#: Wavelengths, in nm, of what Mitsuba takes for visible, and how far apart a black body's are taken.
+_VISIBLE, _STEP = (360.0, 830.0), 5.0
+
+
+#: Planck's constant times the speed of light squared, twice (W m^2), and times it over Boltzmann's (m K), as Mitsuba's.
+_FIRST, _SECOND = 2 * 6.62607004e-34 * 2.99792458e8**2, 6.62607004e-34 * 2.99792458e8 / 1.38064852e-23
+
+
+def hexadecimal(element: Element) -> str:
+    """The three numbers of `#rrggbb`, each a fraction of 255. Raises ConfigError where it is none."""
+    text = element.attributes.get("value", "").strip()
+    if re.fullmatch(r"#[0-9a-fA-F]{6}", text) is None:
+        raise element.fail(element.name, f"must be a colour such as #80ff00, not {quoted(text)}")
+    return " ".join(f"{int(text[i : i + 2], 16) / 255:.9g}" for i in (1, 3, 5))
+
+
+def linear(element: Element) -> str:
+    """The value of an <srgb> element, one or three numbers or `#rrggbb`, as linear Rec. 709. Raises ConfigError."""
+    text = element.attributes.get("value", "")
+    words = (hexadecimal(element) if text.strip().startswith("#") else text).replace(",", " ").split()
+    try:
+        encoded = [float(word) for word in words]
+    except ValueError:
+        encoded = []
+    if len(encoded) not in (1, 3):
+        raise element.fail(element.name, f"must be one or three numbers or #rrggbb, not {quoted(text)}")
+    # IEC 61966-2-1
+    return " ".join(f"{c / 12.92 if c <= 0.04045 else ((c + 0.055) / 1.055) ** 2.4:.9g}" for c in encoded)
+
+
+def by_wavelength(spectrum: Element, owner: Element) -> dict[str, str]:
+    """The attributes of the <spectrum> that says what a plugin of `SPECTRA` says, as a parameter of `owner`.
+
+    Raises ConfigError where it is no spectrum, or a black body that is not what an emitter emits.
+    """
+    inner = next((child for child in spectrum.children if child.tag == "spectrum" and child.name == "value"), None)
+    if inner is not None and spectrum.type != "blackbody":
+        return {key: value for key, value in inner.attributes.items() if key in ("value", "filename")}
+    if spectrum.type == "blackbody":
+        if owner.tag != "emitter":
+            raise spectrum.fail("", f"a blackbody is what an emitter emits; a {owner.tag} can have <rgb>")
+        pairs = _black_body(spectrum)
+    elif spectrum.type == "regular":
+        values, (first, last) = _numbers(spectrum, "values"), _range(spectrum, required=True)
+        step = (last - first) / max(len(values) - 1, 1)
+        pairs = [(first + step * place, value) for place, value in enumerate(values)]
+    else:
+        wavelengths, values = _numbers(spectrum, "wavelengths"), _numbers(spectrum, "values")
+        if len(wavelengths) != len(values):
+            raise spectrum.fail("", f"irregular has {len(wavelengths)} wavelengths and {len(values)} values")
+        pairs = list(zip(wavelengths, values, strict=True))
+    if len(pairs) < 2 or any(left >= right for (left, _), (right, _) in itertools.pairwise(pairs)):
+        raise spectrum.fail("", f"{spectrum.type} needs two wavelengths or more, in ascending order")
+    return {"value": ", ".join(f"{wavelength:.9g}:{value:.9g}" for wavelength, value in pairs)}
+
+
+def _black_body(spectrum: Element) -> list[tuple[float, float]]:
+    """Wavelengths in nm, and the radiance of a black body in W/(m^2 sr nm)."""
+    [temperature, *more] = _numbers(spectrum, "temperature")
+    if more or temperature <= 0:
+        raise spectrum.fail("temperature", "must be a number of kelvin above 0")
+    first, last = _range(spectrum, required=False)
+    count = max(math.ceil((last - first) / _STEP), 1)
+    pairs = []
+    for place in range(count + 1):
+        metres = 1e-9 * (first + (last - first) * place / count)
+        exponent = min(_SECOND / (metres * temperature), 700.0)  # beyond it is 0 to a float, and the other overflows
+        pairs.append((1e9 * metres, 1e-9 * _FIRST / (metres**5 * math.expm1(exponent))))
+    return pairs
+
+
+def _range(spectrum: Element, required: bool) -> tuple[float, float]:
+    names = ("wavelength_min", "wavelength_max")
+    given = {child.name for child in spectrum.children}
+    ends = [
+        _numbers(spectrum, name)[0] if required or name in given else default
+        for name, default in zip(names, _VISIBLE, strict=True)
+    ]
+    if not 0 < ends[0] < ends[1]:
+        raise spectrum.fail("", f"{spectrum.type}: wavelength_max must be above wavelength_min, and both above 0")
+    return ends[0], ends[1]
+
+
+def _numbers(spectrum: Element, name: str) -> Sequence[float]:
+    """The numbers of a parameter, one or more, none of them negative or not finite."""
+    text = next((child.attributes.get("value", "") for child in spectrum.children if child.name == name), None)
+    if text is None:
+        raise spectrum.fail("", f"{spectrum.type} needs a parameter `{name}`")
+    try:
+        numbers = [float(word) for word in text.replace(",", " ").split()]
+    except ValueError:
+        numbers = []
+    if not numbers or not all(math.isfinite(number) and number >= 0 for number in numbers):
+        raise spectrum.fail(name, f"must be numbers from 0 on, not {quoted(text)}")
+    return numbers
+
+
+#: The steps of a transform, in their order, and the parameters that give them along u and v.
+_STEPS = {"translate": ("uoffset", "voffset"), "scale": ("uscale", "vscale")}
+
+
+def transform_coordinates(texture: Element) -> Element | None:
+    """Write what a texture says of `uscale` and its like as the transform that they mean; return the first of them."""
+    names = [name for pair in _STEPS.values() for name in pair]
+    given = {child.name: child for child in texture.children if child.tag == "float" and child.name in names}
+    if not given:
+        return None
+    first = next(iter(given.values()))
+    steps = []
+    for tag, pair in _STEPS.items():
+        values = {
+            axis: given[name].attributes.get("value", "")
+            for axis, name in zip("xy", pair, strict=True)
+            if name in given
+        }
+        if values:
+            steps.append(Element(tag, values, first.source, first.line))
+    texture.children[:] = [child for child in texture.children if child not in given.values()]
+    texture.children.append(Element("transform", {"name": "to_uv"}, first.source, first.line, steps))
+    return first
+
+
+def place_textures(root: Element) -> None:
+    """Move each texture right below `root` into the place of the first reference to it; other references stay.
+
+    Mitsuba lists the parameters of what stands right below the scene as the scene's own, by the id of a texture, which
+    some lose: nothing would say that they are properties of a material or a light.
+    """
+    textures = {child.attributes.get("id", ""): child for child in root.children if child.tag == "texture"}
+    textures.pop("", None)
+    aliased = {element.attributes.get("id") for element in root.walk() if element.tag == "alias"}
+    for element in list(root.walk()):
+        for index, child in enumerate(element.children):
+            texture = textures.get(child.attributes.get("id", "")) if child.tag == "ref" else None
+            if texture is None or element is root or element is texture or texture.attributes["id"] in aliased:
+                continue
+            del textures[texture.attributes["id"]]
+            root.children.remove(texture)
+            texture.attributes.pop("name", None)
+            if child.name:
+                texture.attributes["name"] = child.name
+            element.children[index] = texture
+
+
+CURRENT_VERSION = "3.0.0"
+
+
+def mend(description: Description) -> list[Note]:
+    """Bring the elements of a scene to Mitsuba 3's spelling, in place; say what its parser would have refused.
+
+    What Mitsuba itself upgrades, in files of before version 2, is brought over without a word. Materials, lights and
+    shapes keep their meaning: those that Mitsuba 3 does not have stay as they are, to be refused. Parameters that no
+    plugin asks for show only when the scene is built.
+    """
+    mender = _Mender(description.folders)
+    root = description.root
+    if root.source.version is None:
+        given = root.attributes.get("version")
+        wrong = "the version is missing" if given is None else f"version {quoted(given)} is not three numbers"
+        mender.note(root, wrong, f"taken for {CURRENT_VERSION}")
+    mender.mend_root(root)
+    root.attributes["version"] = CURRENT_VERSION
+    return mender.notes
+
+
+class _Mender:
+    def __init__(self, folders: list[Path]) -> None:
+        self.folders = folders
+        self.notes: list[Note] = []
+        self.gone: set[str] = set()
+
+    def note(self, element: Element, wrong: str, done: str) -> None:
+        self.notes.append(Note(element, wrong, done))
+
+    def mend_root(self, root: Element) -> None:
+        """Mend the whole scene."""
+        root.attributes.pop("version", None)
+        if root.is_object:
+            self._element(root)
+        self.mend(root)
+        self._spectra(root)
+        # What refers to something that was left out goes with it.
+        for element in root.walk() if self.gone else ():
+            element.children[:] = [
+                child for child in element.children if child.tag != "ref" or child.attributes.get("id") not in self.gone
+            ]
+
+    def mend(self, element: Element) -> None:
+        """Mend all below `element`, which is mended itself."""
+        kept = []
+        names = {child.name for child in element.children}
+        for child in element.children:
+            if self._is_kept(child):
+                if element.is_object:
+                    self._parameter(child, element, names)
+                if not self._is_needless_format(child, element):
+                    kept.append(child)
+            else:
+                self.gone.update(other.attributes.get("id", "") for other in child.walk() if other.is_object)
+        element.children[:] = kept
+        if element.is_object:
+            self._repetitions(element)
+            self._texture_coordinates(element)
+        for child in element.children:
+            self.mend(child)
+
+    def _is_kept(self, element: Element) -> bool:
+        """Mend an element and its plugin; False where it is to be left out."""
+        if element.tag == "integrator":  # the experiment's own takes its place
+            return False
+        return self._element(element) and (not element.is_object or self._plugin(element))
+
+    # --- elements and plugins -----------------------------------------------------------------------------------------
+
+    def _element(self, element: Element) -> bool:
+        """Mend tag and attributes; False where the element is to be left out."""
+        tag = element.tag
+        if tag == "srgb":
+            element.attributes["value"] = linear(element)
+        if tag in ELEMENTS:
+            element.tag = ELEMENTS[tag]
+            self.note(element, f"{quoted(f'<{tag}>')} is unknown to Mitsuba 3", f"read as <{element.tag}>")
+        known = ATTRIBUTES.get(element.tag)
+        if element.is_object:
+            known = OBJECT_ATTRIBUTES
+        if known is None:
+            if tag in LOST_ELEMENTS:
+                raise element.fail("", f"<{tag}> is {LOST_ELEMENTS[tag]}")
+            self.note(element, f"{quoted(f'<{tag}>')} is unknown to Mitsuba 3", "left out")
+            return False
+        for attribute in [name for name in element.attributes if name not in known]:
+            self.note(element, f"<{tag}> has no attribute {quoted(attribute)} in Mitsuba 3", "left out")
+            del element.attributes[attribute]
+        return True
+
+    def _plugin(self, element: Element) -> bool:
+        """Mend the name of an object's plugin; False where the object is to be left out."""
+        type = element.type
+        if is_known(type):
+            if element.tag == "sampler" and type != "independent":
+                # Others round the number of samples, which is the experiment's, and fail where it is split otherwise.
+                element.attributes["type"] = "independent"
+                element.children[:] = [child for child in element.children if child.name == "sample_count"]
+            return True
+        other = PLUGINS.get((element.tag, type), type.lower())
+        if is_known(other):
+            self.note(element, f"there is no {element.tag} {quoted(type)} in Mitsuba 3", f"read as `{other}`")
+            element.attributes["type"] = other
+            return True
+        replacement = REPLACEABLE.get(element.tag)
+        if replacement is None:
+            return True
+        self.note(element, f"there is no {element.tag} {quoted(type)} in Mitsuba 3", f"left out ({replacement})")
+        return False
+
+    # --- parameters ---------------------------------------------------------------------------------------------------
+
+    def _parameter(self, element: Element, owner: Element, names: set[str]) -> None:
+        """Mend the name and the value of a parameter of `owner`, whose parameters have these `names`."""
+        if owner.tag == "scene" and element.is_object:
+            # A name says nothing here, but of two objects with the same one Mitsuba drops the first.
+            element.attributes.pop("name", None)
+            return
+        self._name(element, owner, names)
+        value = element.attributes.get("value", "")
+        if element.tag == "spectrum" and "type" not in element.attributes and _is_colour(value):
+            self.note(element, "a <spectrum> of three numbers is unknown to Mitsuba 3", "read as <rgb>")
+            element.tag = "rgb"
+        elif element.tag == "rgb" and value.startswith("#"):
+            element.attributes["value"] = hexadecimal(element)
+            self.note(element, f"a colour cannot be written as {quoted(value)} in Mitsuba 3", "read as three numbers")
+        elif element.tag == "string":
+            self._text(element, owner, value)
+
+    def _name(self, element: Element, owner: Element, names: set[str]) -> None:
+        old, name = element.name, snake_case(element.name)
+        if owner.type == "diffuse" and name == "diffuse_reflectance":
+            name = "reflectance"
+        # An attribute of a mesh has a name of the user's own.
+        is_attribute = owner.tag == "shape" and old.startswith(("vertex_", "face_"))
+        if name == old or is_attribute or name in names:
+            return
+        element.attributes["name"], element.written = name, old
+        if not element.source.is_old:
+            self.note(element, f"{quoted(old)} is spelled as before Mitsuba 2", f"read as {quoted(name)}")
+
+    def _text(self, element: Element, owner: Element, value: str) -> None:
+        other = VALUES.get((owner.type, element.name), {}).get(value)
+        if (owner.type, element.name) == ("hdrfilm", "pixel_format") and "," in value:
+            other = value.partition(",")[0].strip()  # one for each of several images
+        wrong = f"{owner.type} has no {element.name} {quoted(value)} in Mitsuba 3"
+        slashed = value.replace("\\", "/")
+        if element.name == "filename" and slashed != value and not self._exists(value) and self._exists(slashed):
+            other, wrong = slashed, f"there is no file {quoted(value)}"
+        if other is not None:
+            element.attributes["value"] = other
+            self.note(element, wrong, f"read as {quoted(other)}")
+
+    def _exists(self, file: str) -> bool:
+        return any(os.path.exists(folder / file) for folder in self.folders)
+
+    def _is_needless_format(self, element: Element, owner: Element) -> bool:
+        """Whether `element` asks `hdrfilm` for a format that it does not know: images are written without it."""
+        known = FORMATS.get(element.name)
+        value = element.attributes.get("value", "")
+        if owner.type != "hdrfilm" or known is None or element.tag != "string" or value.lower() in known:
+            return False
+        self.note(element, f"hdrfilm has no {element.name} {quoted(value)} in Mitsuba 3", "left out")
+        return True
+
+    def _repetitions(self, owner: Element) -> None:
+        """Of parameters that are given more than once keep the last, as Mitsuba 0.6 did."""
+        last: dict[str, Element] = {}
+        dropped: set[Element] = set()
+        for child in owner.children:
+            earlier = last.get(child.name) if child.name else None
+            if earlier is not None and (earlier.is_value or child.is_value):
+                self.note(earlier, f"{quoted(child.name)} is given again in line {child.line}", "left out")
+                dropped.add(earlier)
+            last[child.name] = child
+        owner.children[:] = [child for child in owner.children if child not in dropped]
+
+    def _spectra(self, root: Element) -> None:
+        """Write spectra by wavelength as parameters of what has them, since RGB variants have no such plugins."""
+        named = {
+            element.attributes["id"]: element
+            for element in root.walk()
+            if element.tag in ("spectrum", "texture") and element.type in SPECTRA and "id" in element.attributes
+        }
+        for alias in [element for element in root.walk() if element.tag == "alias"]:
+            if alias.attributes.get("id") in named:
+                named[alias.attributes.get("as", "")] = named[alias.attributes["id"]]
+        for owner in [element for element in root.walk() if element.is_object and element.type != "specfilm"]:
+            kept = []
+            for child in owner.children:
+                meant = named.get(child.attributes.get("id", ""))
+                if meant is None:
+                    kept.append(child)
+                elif owner is not root:
+                    name = child.name or meant.name
+                    if not name:
+                        raise child.fail("", f"<{meant.tag}> `{meant.type}` needs a name: that of what it is for")
+                    attributes = {"name": name, **by_wavelength(meant, owner)}
+                    kept.append(Element("spectrum", attributes, child.source, child.line))
+                    self.note(meant, f"RGB variants have no spectrum `{meant.type}`", "read as the colour of it")
+            owner.children[:] = kept
+
+    def _texture_coordinates(self, owner: Element) -> None:
+        replaced = transform_coordinates(owner) if owner.tag == "texture" else None
+        if replaced is not None and not owner.source.is_old:
+            self.note(replaced, f"`{replaced.name}` is unknown to Mitsuba 3", "read as `to_uv`")
+
+
+def _is_colour(value: str) -> bool:
+    return ":" not in value and len(value.replace(",", " ").split()) == 3

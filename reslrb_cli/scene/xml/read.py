@@ -1,0 +1,414 @@
+"""Scene files as elements: read, included files and variables put in, and written for Mitsuba's parser.
+
+What a scene's XML consists of: elements that know the line that they come from.
+
+Reads one XML file into elements, and refuses what would take the parser down or never end.
+
+The `$name` variables of a scene file, put in as Mitsuba's parser does.
+
+Brings a scene together from its files: includes are followed, variables put in, folders to look in collected.
+
+A scene's elements as the XML that Mitsuba's own parser reads.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+from xml.parsers import expat
+from xml.sax.saxutils import quoteattr
+
+from reslrb_cli.config.files import read_file
+from reslrb_cli.errors import ConfigError
+
+#: Elements that are objects, made by plugins; a <spectrum> with a type is one, too.
+OBJECTS = frozenset(
+    (
+        *("scene", "sensor", "film", "sampler", "rfilter", "integrator", "emitter"),
+        *("shape", "bsdf", "texture", "medium", "phase", "volume"),
+    )
+)
+
+
+#: Elements that are values of parameters; a <spectrum> without a type is one, too.
+VALUES = frozenset(("float", "integer", "boolean", "string", "point", "vector", "rgb", "transform"))
+
+
+#: Characters of a quotation.
+_QUOTED = 60
+
+
+def quoted(text: str, mark: str = "`") -> str:
+    """What a file says, as it can stand in a message: not too long, and nothing in it that a terminal would obey."""
+    text = text if len(text) <= _QUOTED else text[: _QUOTED - 3] + "..."
+    return f"{mark}{text if text.isprintable() else repr(text)[1:-1]}{mark}"
+
+
+@dataclass(frozen=True)
+class Source:
+    """One file of a scene; `version` is that of Mitsuba which it says that it was written for, None without one."""
+
+    file: Path
+    version: tuple[int, ...] | None
+
+    @property
+    def is_old(self) -> bool:
+        """Whether it was written for Mitsuba before 2, which spelled parameters in another way."""
+        return self.version is not None and self.version < (2,)
+
+
+@dataclass(slots=True, eq=False)
+class Element:
+    """One element, with its attributes and children in their order.
+
+    `written` is its name as the file has it, where that is another.
+    """
+
+    tag: str
+    attributes: dict[str, str]
+    source: Source
+    line: int
+    children: list[Element] = field(default_factory=list)
+    written: str = ""
+
+    @property
+    def place(self) -> str:
+        """File and line, as errors name them."""
+        return f"{self.source.file}:{self.line}"
+
+    @property
+    def is_object(self) -> bool:
+        """Whether a plugin is to be made of it."""
+        return self.tag in OBJECTS or (self.tag == "spectrum" and "type" in self.attributes)
+
+    @property
+    def is_value(self) -> bool:
+        """Whether it is the value of a parameter."""
+        return self.tag in VALUES or (self.tag == "spectrum" and "type" not in self.attributes)
+
+    @property
+    def name(self) -> str:
+        """The name of the parameter that it is, or empty."""
+        return self.attributes.get("name", "")
+
+    @property
+    def type(self) -> str:
+        """The name of its plugin; empty where it has none."""
+        return self.attributes.get("type", "scene" if self.tag == "scene" else "")
+
+    def fail(self, key: str, message: str) -> ConfigError:
+        """The error for this element."""
+        return ConfigError(self.place, key, message)
+
+    def walk(self) -> Iterator[Element]:
+        """This element and all below it, in the order of the file."""
+        waiting = [self]
+        while waiting:
+            element = waiting.pop()
+            yield element
+            waiting += reversed(element.children)
+
+    def objects(self) -> list[Element]:
+        """The objects among them: the nodes that Mitsuba's parser makes, in its order."""
+        return [element for element in self.walk() if element.is_object]
+
+
+#: XML of all files of a scene together, each counted as often as it is included.
+MAX_BYTES = 64 * 2**20
+
+
+#: Elements within one another. Mitsuba's parser calls itself for each level, until the stack is full.
+MAX_DEPTH = 100
+
+
+_COMMENT = re.compile(r"<!--.*?-->", re.DOTALL)
+
+
+#: An ampersand that begins none of XML's own references: Mitsuba's parser takes it for itself.
+_BARE_AMPERSAND = re.compile(r"&(?!(?:amp|lt|gt|quot|apos|#\d+|#x[0-9a-fA-F]+);)")
+
+
+_DECLARED_ENCODING = re.compile(rb"""^\s*<\?xml[^>]*\bencoding\s*=\s*["']([\w.-]+)["']""")
+
+
+def read_document(file: Path, max_bytes: int) -> tuple[Element, int]:
+    """The root element of an XML file, and the file's size in bytes.
+
+    Raises ConfigError, located in the file, where it cannot be read, is no regular file or larger than `max_bytes`, is
+    not XML, is nested more than MAX_DEPTH levels deep, or declares entities.
+    """
+    data = read_file(file, MAX_BYTES)
+    if len(data) > max_bytes:
+        raise ConfigError(
+            file, "", f"is too large: a scene may have {MAX_BYTES >> 20} MiB of XML, with all that it includes"
+        )
+    text = _COMMENT.sub(lambda comment: "\n" * comment[0].count("\n"), _decode(data))
+    return _parse(file, _BARE_AMPERSAND.sub("&amp;", text)), len(data)
+
+
+def _decode(data: bytes) -> str:
+    """The text of a file; Mitsuba's parser takes bytes that are not of their encoding as they come."""
+    declared = _DECLARED_ENCODING.match(data)
+    if data.startswith((b"\xff\xfe", b"\xfe\xff")):
+        encodings = ["utf-16"]
+    else:
+        encodings = ["utf-8-sig", *([declared[1].decode("ascii")] if declared else []), "latin-1"]
+    for encoding in encodings:
+        try:
+            return data.decode(encoding)
+        except (LookupError, UnicodeError):
+            continue
+    return data.decode("latin-1")
+
+
+def _parse(file: Path, text: str) -> Element:
+    parser = expat.ParserCreate("utf-8")
+    stack: list[Element] = []
+    roots: list[Element] = []
+
+    def start(tag: str, attributes: dict[str, str]) -> None:
+        line = parser.CurrentLineNumber
+        source = stack[0].source if stack else Source(file, _version(attributes.get("version")))
+        element = Element(tag, attributes, source, line)
+        if len(stack) == MAX_DEPTH:
+            raise element.fail("", f"elements are nested more than {MAX_DEPTH} levels deep")
+        (stack[-1].children if stack else roots).append(element)
+        stack.append(element)
+
+    def end(tag: str) -> None:
+        stack.pop()
+
+    def declare_entity(*_: Any) -> None:
+        place = f"{file}:{parser.CurrentLineNumber}"
+        raise ConfigError(
+            place, "", "declares an XML entity, which no Mitsuba scene needs; write out what it stands for"
+        )
+
+    parser.StartElementHandler = start
+    parser.EndElementHandler = end
+    parser.EntityDeclHandler = declare_entity
+    try:
+        parser.Parse(text.encode("utf-8"), True)
+    except expat.ExpatError as error:
+        raise ConfigError(f"{file}:{error.lineno}", "", f"not valid XML: {expat.ErrorString(error.code)}") from None
+    return roots[0]
+
+
+def _version(text: str | None) -> tuple[int, ...] | None:
+    """A version as numbers; None where there is none, or it is not three numbers, which Mitsuba asks for."""
+    return tuple(map(int, text.split("."))) if text is not None and re.fullmatch(r"\d+\.\d+\.\d+", text) else None
+
+
+#: Characters of one attribute, after its variables are put in: variables of variables can grow at each step.
+MAX_LENGTH = 2**20
+
+
+#: Characters of a variable's name; longer ones are never found.
+_LONGEST_NAME = 256
+
+
+class Variables:
+    """Values by name: those that the user gives, and the file's defaults as they are met."""
+
+    def __init__(self, options: Mapping[str, str]) -> None:
+        self._values = dict(options)
+        self._unused = set(options)
+
+    def add_default(self, name: str, value: str) -> None:
+        """Set the value of `name` where it has none yet."""
+        self._values.setdefault(name, value)
+
+    def values(self) -> dict[str, str]:
+        """All values so far, those of the user first."""
+        return dict(self._values)
+
+    def put_into(self, element: Element) -> None:
+        """Replace the variables in the attributes of `element`. Raises ConfigError for one without a value."""
+        for key, text in element.attributes.items():
+            if "$" in text:
+                element.attributes[key] = self._replace(text, element)
+
+    def _replace(self, text: str, element: Element) -> str:
+        # The longest name first, since a name may be the beginning of another; and each once.
+        done: set[str] = set()
+        longest = _LONGEST_NAME
+        while names := [name for name in self._named(text, longest) if name not in done]:
+            name = max(names, key=len)
+            done.add(name)
+            longest = len(name)
+            value, parts = self._values[name], re.split(r"(?<!\\)" + re.escape(f"${name}"), text)
+            if len(parts) > 1:
+                self._unused.discard(name)
+            if len(text) + len(parts) * len(value) > MAX_LENGTH:
+                raise element.fail(f"${name}", f"makes a text of more than {MAX_LENGTH} characters")
+            text = value.join(parts)
+        missing = re.search(r"(?<!\\)\$(\w*)", text, re.ASCII)
+        if missing:
+            name = quoted(missing[1], "")
+            how = f"set scene.options.{name} (--set scene.options.{name}=VALUE)"
+            message = f"has no value and no default; {how}" if name else "is no variable; write \\$"
+            raise element.fail(f"${name}", message)
+        return text.replace("\\$", "$")
+
+    def _named(self, text: str, longest: int) -> set[str]:
+        """The names of at most so many characters that stand behind a `$` in `text`."""
+        longest = min(longest, max(map(len, self._values), default=0))
+        behind = (text[place.end() : place.end() + longest] for place in re.finditer(r"\$", text))
+        return {run[:n] for run in behind for n in range(1, len(run) + 1) if run[:n] in self._values}
+
+    def check_used(self, source: object) -> None:
+        """Raise ConfigError, located in `source`, where a value that the user gives was never put in."""
+        if self._unused:
+            names = ", ".join(f"${name}" for name in self._values if name in self._unused)
+            raise ConfigError(source, quoted(names, ""), "is set in scene.options, but the scene file does not use it")
+
+
+MAX_INCLUDES = 1000
+
+
+#: Includes within one another; that of Mitsuba's parser.
+MAX_INCLUDE_DEPTH = 15
+
+
+@dataclass
+class Description:
+    """A scene as its files describe it, with nothing left to include or to put in.
+
+    `folders` are those in which the files that it names are looked for, first to last; `variables` are the values of
+    its `$name` variables, those that it has itself among them. `hides_emitters`: whether the integrator that it names,
+    of which nothing else is kept, leaves lights out of the picture.
+    """
+
+    root: Element
+    folders: list[Path]
+    variables: dict[str, str]
+    hides_emitters: bool
+
+
+def read_description(file: Path, options: Mapping[str, str]) -> Description:
+    """Read the scene in `file` and all that it includes; `options` are the values of its `$name` variables.
+
+    Raises ConfigError, located by file and line, for what cannot be read, for variables without a value, and for
+    options without a variable.
+    """
+    reader = _Reader(Variables(options))
+    folders = [file.absolute().parent]
+    root = reader.read(file, folders, None)
+    reader.variables.check_used(file)
+    return Description(root, folders, reader.variables.values(), _hides_emitters(root))
+
+
+def _hides_emitters(root: Element) -> bool:
+    """Whether an integrator of the scene says so, in the spelling of any version."""
+    found = [value for child in root.children if child.tag == "integrator" for value in child.walk()]
+    return any(
+        value.name in ("hide_emitters", "hideEmitters") and value.attributes.get("value", "").strip() == "true"
+        for value in found
+    )
+
+
+@dataclass
+class _Reader:
+    """What the files of one scene share."""
+
+    variables: Variables
+    bytes_left: int = field(default_factory=lambda: MAX_BYTES)
+    includes: list[Path] = field(default_factory=list)
+    including: list[Path] = field(default_factory=list)
+
+    def read(self, file: Path, folders: list[Path], include: Element | None, depth: int = 0) -> Element:
+        """The root of `file`, complete. `folders` grows by what its <path> elements name."""
+        if include is not None:
+            self.includes.append(file)
+            if len(self.including) + 1 >= MAX_INCLUDE_DEPTH:
+                raise include.fail("", f"files are included more than {MAX_INCLUDE_DEPTH} levels deep")
+            if len(self.includes) > MAX_INCLUDES:
+                raise include.fail("", f"more than {MAX_INCLUDES} files are included")
+        try:
+            root, size = read_document(file, self.bytes_left)
+        except ConfigError as error:
+            if include is None or error.source != str(file):
+                raise
+            raise include.fail("", f"includes {file}, which {error.message}") from None
+        self.bytes_left -= size
+        self.including.append(file)
+        self._complete(root, root, folders, depth)
+        self.including.pop()
+        return root
+
+    def _complete(self, element: Element, root: Element, folders: list[Path], depth: int) -> None:
+        """Put variables into `element` and all below it, and what is included in the place of its includes."""
+        if depth >= MAX_DEPTH:
+            raise element.fail("", f"elements are nested more than {MAX_DEPTH} levels deep")
+        self.variables.put_into(element)
+        if element.tag == "spectrum" and "filename" in element.attributes:
+            # Mitsuba opens it while it parses, from the folder of the file that is being parsed.
+            element.attributes["filename"] = str(_find(element.attributes["filename"], folders))
+        children: list[Element] = []
+        for child in element.children:
+            if child.tag == "default":
+                self.variables.put_into(child)
+                self.variables.add_default(_required(child, "name"), _required(child, "value"))
+            elif child.tag == "path":
+                self.variables.put_into(child)
+                if element is not root:
+                    raise child.fail("", "<path> can only stand directly below the root")
+                folders.insert(0, _folder(child, folders))
+            elif child.tag == "include":
+                self.variables.put_into(child)
+                children += self._include(child, element, folders, depth)
+            else:
+                self._complete(child, root, folders, depth + 1)
+                children.append(child)
+        element.children[:] = children
+
+    def _include(self, include: Element, parent: Element, folders: list[Path], depth: int) -> list[Element]:
+        """What stands in the place of `include`: the objects of a scene, or the one object that a file holds."""
+        here = [include.source.file.absolute().parent, *folders]
+        file = _find(_required(include, "filename"), here)
+        if not os.path.exists(file):
+            raise include.fail("", f"included file {quoted(include.attributes['filename'])} not found")
+        root = self.read(file, here, include, depth)
+        if root.type == "scene":
+            # Parameters of the included <scene> itself, and references right below it, are nobody's: so with Mitsuba.
+            return [child for child in root.children if not child.is_value and child.tag != "ref"]
+        root.attributes.pop("version", None)
+        root.attributes.pop("name", None)
+        if include.name:
+            root.attributes["name"] = include.name
+        return [root]
+
+
+def _required(element: Element, attribute: str) -> str:
+    if not element.attributes.get(attribute):
+        raise element.fail("", f"<{element.tag}> needs the attribute `{attribute}`")
+    return element.attributes[attribute]
+
+
+def _find(name: str, folders: list[Path]) -> Path:
+    """The first file of that name in `folders`, or what the name says by itself."""
+    return next((folder / name for folder in folders if os.path.exists(folder / name)), Path(name))
+
+
+def _folder(element: Element, folders: list[Path]) -> Path:
+    name = _required(element, "value")
+    folder = _find(name, [element.source.file.absolute().parent, *folders])
+    if not folder.is_dir():
+        raise element.fail("", f"<path>: folder {quoted(name)} not found")
+    return folder.absolute()
+
+
+def tag_lines(element: Element, depth: int = 0) -> Iterator[tuple[str, Element]]:
+    """The XML of `element` and all below it, a tag a line, each with the element that it belongs to."""
+    # `$` begins a variable for Mitsuba's parser; here all are put in already.
+    attributes = "".join(f" {key}={quoteattr(value)}" for key, value in element.attributes.items())
+    indent, end = "    " * depth, "" if element.children else "/"
+    yield f"{indent}<{element.tag}{attributes.replace('$', chr(92) + '$')}{end}>", element
+    for child in element.children:
+        yield from tag_lines(child, depth + 1)
+    if element.children:
+        yield f"{indent}</{element.tag}>", element

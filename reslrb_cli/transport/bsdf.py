@@ -1,0 +1,370 @@
+"""BSDFs along a light path: scattering, evaluation, and the derivatives of both.
+
+Derivatives of both kinds of BSDF factor of a light path, s_j (along the path) and c_i (towards the sensor).
+
+Sampling is detached: directions and densities do not depend on the parameters. A factor is then f / pdf, where only
+
+    f = bsdf * cos        a smooth lobe, evaluated for a given direction
+    f = weight * pdf      a delta lobe, which has a weight and a discrete probability, and no value
+    f = transmission      passing straight through (a mask, a thin sheet)
+
+has a derivative.
+
+One scattering event of a light path: a direction sampled from the BSDF, and its weight (derivatives: `bsdf.py`).
+
+Bump and normal maps perturb the shading frame inside of the BSDF, where Veach's correction cannot see it. In scenes
+that have them a smooth lobe is evaluated as a path from the camera would, with its two directions exchanged,
+
+    f = bsdf(wo -> wi) * cos_p wi * |n . wo| / |n . wi|        n: geometric normal, p: perturbed one
+
+which is the adjoint BSDF by definition, and needs neither p nor reciprocity.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from reslrb_cli.transport.plan import Plan
+
+
+def tracked_factor(
+    plan: Plan, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, scattering: Scattering, active: mi.Bool
+) -> mi.Spectrum:
+    """f (C,) with derivatives, of the event that `scattering` is.
+
+    Call under `dr.resume_grad()`. What the scene has no lobes for is not compiled.
+    """
+    f = evaluate(plan, si, bsdf, scattering.wo, active & ~(scattering.is_delta | scattering.is_null))
+    return _singular_factor(plan, si, bsdf, scattering, active, f)
+
+
+def tracked_factors(
+    plan: Plan,
+    si: mi.SurfaceInteraction3f,
+    bsdf: mi.BSDFPtr,
+    connection_wo: mi.Vector3f,
+    connected: mi.Bool,
+    scattering: Scattering,
+    scattered: mi.Bool,
+) -> tuple[mi.Spectrum, mi.Spectrum]:
+    """f (C,) towards the sensor and f along the path, both with derivatives, from one indirect call.
+
+    Call under `dr.resume_grad()`.
+    """
+
+    def both(
+        self: mi.BSDF,
+        si: mi.SurfaceInteraction3f,
+        wo_c: mi.Vector3f,
+        wo_s: mi.Vector3f,
+        connected: mi.Bool,
+        smooth: mi.Bool,
+        any_: mi.Bool,
+    ) -> tuple[mi.Spectrum, mi.Spectrum]:
+        return evaluate(plan, si, self, wo_c, connected), evaluate(plan, si, self, wo_s, smooth)
+
+    smooth = scattered & ~(scattering.is_delta | scattering.is_null)
+    f_c, f_s = dr.dispatch(bsdf, both, si, connection_wo, scattering.wo, connected, smooth, connected | scattered)
+    return f_c, _singular_factor(plan, si, bsdf, scattering, scattered, f_s)
+
+
+def _singular_factor(
+    plan: Plan,
+    si: mi.SurfaceInteraction3f,
+    bsdf: mi.BSDFPtr,
+    scattering: Scattering,
+    active: mi.Bool,
+    f: mi.Spectrum,
+) -> mi.Spectrum:
+    """`f`, replaced where a delta lobe was sampled or light passed straight through, where that has derivatives."""
+    if plan.differentiate_delta:
+        delta = active & scattering.is_delta
+        bs, weight = bsdf.sample(importance_context(), si, scattering.sample_1, scattering.sample_2, delta)
+        pdf = bs.pdf
+        if plan.differentiate_null:
+            # A mask's weight carries the derivative of its opacity already, and so does its density. Other BSDFs divide
+            # by a density that may depend on their parameters (plastic).
+            pdf = dr.select(mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null), dr.detach(pdf), pdf)
+        f = dr.select(delta, weight * pdf, f)
+    if plan.differentiate_null:
+        null = active & scattering.is_null
+        f = dr.select(null, bsdf.eval_null_transmission(si, null), f)
+    return f
+
+
+DEFENSIVE = 0.2  # share of samples that a perturbed BSDF does not draw itself
+
+
+def importance_context() -> mi.BSDFContext:
+    """BSDF queries of a path that carries importance towards the sensor, so that eta^2 is not applied twice."""
+    return mi.BSDFContext(mi.TransportMode.Importance)
+
+
+@dataclass
+class Scattering:
+    """What happened at a vertex. `weight` is s_j (C,), with Veach's correction; `f` (C,) is what of it has derivatives,
+    weight = f correction / pdf; `wo` is local, `d` in world space."""
+
+    weight: mi.Spectrum
+    f: mi.Spectrum
+    wo: mi.Vector3f
+    d: mi.Vector3f
+    pdf: mi.Float
+    eta: mi.Float
+    correction: mi.Float
+    is_delta: mi.Bool
+    is_null: mi.Bool
+    sample_1: mi.Float
+    sample_2: mi.Point2f
+    active: mi.Bool
+
+
+def shading_correction(
+    plan: Plan, si: mi.SurfaceInteraction3f, wi_world: mi.Vector3f, wo_world: mi.Vector3f, wo: mi.Vector3f
+) -> tuple[mi.Float, mi.Bool]:
+    """Veach's factor for shading normals (thesis, p. 155) and whether both directions are on consistent sides.
+
+    Without shading normals the factor is 1 and both sides are consistent by construction: neither is computed. With
+    perturbed ones, it is |n . wo| / |n . wi|, what is left of it beside the exchanged BSDF. n is taken on the side of
+    the shading normal: faces of a mesh that a transform mirrors wind the other way, and paths from the sensor, which
+    know the shading normal alone, see nothing of that.
+    """
+    if not (plan.needs.has_shading_normals or plan.needs.has_perturbed_normals):
+        return mi.Float(1), mi.Bool(True)
+    n = dr.mulsign(si.n, dr.dot(si.n, si.sh_frame.n))
+    wi_dot_n, wo_dot_n = dr.dot(n, wi_world), dr.dot(n, wo_world)
+    cos_i, cos_o = mi.Frame3f.cos_theta(si.wi), mi.Frame3f.cos_theta(wo)
+    valid = (wi_dot_n * cos_i > 0) & (wo_dot_n * cos_o > 0)
+    if plan.needs.has_perturbed_normals:
+        return dr.select(valid, dr.abs(wo_dot_n / wi_dot_n), 0), valid
+    correction = dr.select(valid, dr.abs((cos_i * wo_dot_n) / (cos_o * wi_dot_n)), 0)
+    # On a mesh it swings about 1 within each face and jumps at its edges, however fine the mesh is. A derivative that
+    # knows the slopes and not the jumps is wrong by several percent where faces move through the light; without either
+    # it is right. `ptracer` has the slopes.
+    return (dr.detach(correction) if plan.attached_normalization else correction), valid
+
+
+def scatter(
+    plan: Plan,
+    si: mi.SurfaceInteraction3f,
+    bsdf: mi.BSDFPtr,
+    ray: mi.Ray3f,
+    sample_1: mi.Float,
+    sample_2: mi.Point2f,
+    active: mi.Bool,
+    connection_wo: mi.Vector3f,
+    connected: mi.Bool | None,
+    attached: bool = False,
+    aimed: Aimed | None = None,
+) -> tuple[Scattering, mi.Spectrum | None]:
+    """Sample the next direction, and evaluate f (C,) towards `connection_wo` in `connected` lanes (None: in no lane).
+
+    Detached, unless `attached`; `bsdf.py` has the derivatives of the factors alone. Both queries share one
+    indirect call, and in it what they have in common (looking up textures, mostly). Lanes that are `aimed` have the
+    direction of their point, and the BSDF's own density of it.
+    """
+    context = importance_context()
+
+    def both(
+        self: mi.BSDF,
+        si: mi.SurfaceInteraction3f,
+        wo: mi.Vector3f,
+        sample_1: mi.Float,
+        sample_2: mi.Point2f,
+        connected: mi.Bool,
+        active: mi.Bool,
+        any_: mi.Bool,
+    ) -> tuple[mi.Spectrum, mi.Vector3f, mi.Float, mi.Float, mi.UInt32, mi.Spectrum]:
+        bs, weight = self.sample(context, si, sample_1, sample_2, active)
+        return evaluate(plan, si, self, wo, connected), bs.wo, bs.pdf, bs.eta, bs.sampled_type, weight
+
+    with dr.suspend_grad(when=not attached):
+        if plan.needs.has_perturbed_normals:
+            defensive = sample_1 < DEFENSIVE
+            sample_1 = dr.select(defensive, sample_1 / DEFENSIVE, (sample_1 - DEFENSIVE) / (1 - DEFENSIVE))
+        if connected is None:
+            bs, weight = bsdf.sample(context, si, sample_1, sample_2, active)
+            f_connection, wo, pdf, eta, lobe = None, bs.wo, bs.pdf, bs.eta, bs.sampled_type
+        else:
+            # The last argument is taken for the mask of the call as a whole.
+            f_connection, wo, pdf, eta, lobe, weight = dr.dispatch(
+                bsdf, both, si, connection_wo, sample_1, sample_2, connected, active, active | connected
+            )
+        if plan.needs.has_perturbed_normals:
+            wo, pdf, eta, lobe = _mixed(si, bsdf, sample_2, defensive, active, wo, pdf, eta, lobe)
+        if aimed is not None:
+            wo, pdf, weight, eta, lobe = _to_point(si, bsdf, aimed, wo, pdf, weight, eta, lobe)
+        if attached and plan.stays:
+            wo, pdf, weight = staying(plan, si, bsdf, active, wo, pdf, lobe, weight)
+        elif attached:
+            wo, pdf, weight = following(plan, si, bsdf, active, wo, pdf, lobe, weight)
+        d = si.to_world(wo)
+        correction, valid = shading_correction(plan, si, -ray.d, d, wo)
+        is_null = mi.has_flag(lobe, mi.BSDFFlags.Null) if plan.needs.has_null else mi.Bool(False)
+        # BSDFFlags.Delta holds Null too.
+        is_delta = mi.has_flag(lobe, mi.BSDFFlags.Delta) & ~is_null if plan.needs.has_delta_lobes else mi.Bool(False)
+        if plan.needs.has_perturbed_normals:
+            correction = dr.select(is_delta, correction * _delta_correction(si.wi, wo, eta), correction)
+            singular = is_delta | is_null
+            f = evaluate(plan, si, bsdf, wo, active & ~singular)
+            weight = dr.select(singular, weight / (1 - DEFENSIVE), dr.select(pdf > 0, f / pdf, 0))
+        scattering = Scattering(
+            weight=weight * correction,
+            f=weight * pdf,
+            wo=wo,
+            d=d,
+            pdf=pdf,
+            eta=eta,
+            correction=correction,
+            is_delta=is_delta,
+            is_null=is_null,
+            sample_1=sample_1,
+            sample_2=sample_2,
+            active=active & valid & (pdf > 0),
+        )
+        return scattering, f_connection
+
+
+def following(
+    plan: Plan,
+    si: mi.SurfaceInteraction3f,
+    bsdf: mi.BSDFPtr,
+    active: mi.Bool,
+    wo: mi.Vector3f,
+    pdf: mi.Float,
+    lobe: mi.UInt32,
+    weight: mi.Spectrum,
+) -> tuple[mi.Vector3f, mi.Float, mi.Spectrum]:
+    """Direction, density and weight (C,) of a sample whose derivative is that of the integral it stands for.
+
+    Where all that a BSDF does to make a sample is smooth (or its choice of a lobe is weighed accordingly, as Mitsuba's
+    dielectrics do), that is the derivative of the sample itself: the direction follows the surface, and a roughness.
+    Other BSDFs choose a lobe by a probability that depends on their parameters and on the incident direction, and the
+    derivative of a sample knows nothing of the choice. Their smooth lobes keep their direction, in the local frame, and
+    f / pdf is differentiated by f alone; their delta lobes keep the probability.
+    """
+    if not plan.needs.unfollowed:
+        return wo, pdf, weight
+    delta = mi.has_flag(lobe, mi.BSDFFlags.Delta)
+    fixed = mi.Bool(False)
+    for other in plan.needs.unfollowed:
+        fixed |= bsdf == mi.BSDFPtr(other)
+    kept = dr.detach(pdf)
+    weight = dr.select(fixed & delta & (kept > 0), weight * (pdf / kept), weight)
+    fixed = active & fixed & ~delta & (kept > 0)
+    wo, pdf = dr.select(fixed, dr.detach(wo), wo), dr.select(fixed, kept, pdf)
+    f = evaluate(plan, si, bsdf, wo, fixed)
+    return wo, pdf, dr.select(fixed, dr.replace_grad(weight, f / kept), weight)
+
+
+def stays_behind(plan: Plan, bsdf: mi.BSDFPtr, is_delta: mi.Bool) -> mi.Bool:
+    """Lanes in which the vertex behind a scattering event stays where it is on its surface.
+
+    Where glossy BSDFs follow, one that has such a lobe beside a diffuse one follows with both.
+    """
+    if not plan.glossy_follows:
+        return ~is_delta
+    return ~is_delta & ~mi.has_flag(bsdf.flags(), mi.BSDFFlags.Glossy)
+
+
+def staying(
+    plan: Plan,
+    si: mi.SurfaceInteraction3f,
+    bsdf: mi.BSDFPtr,
+    active: mi.Bool,
+    wo: mi.Vector3f,
+    pdf: mi.Float,
+    lobe: mi.UInt32,
+    weight: mi.Spectrum,
+) -> tuple[mi.Vector3f, mi.Float, mi.Spectrum]:
+    """The same where a smooth lobe's direction goes to a point that does not move with this vertex.
+
+    That the direction changes with either end is left to the vertex at its far end (`estimators.attached`): here it
+    stands still in the world, and f / pdf changes by f alone. Delta lobes are as in `following`.
+    """
+    followed = following(plan, si, bsdf, active, wo, pdf, lobe, weight)
+    kept = dr.detach(pdf)
+    smooth = active & stays_behind(plan, bsdf, mi.has_flag(lobe, mi.BSDFFlags.Delta)) & (kept > 0)
+    there = si.to_local(dr.detach(si.to_world(wo)))
+    f = evaluate(plan, si, bsdf, there, smooth)
+    stayed = there, kept, dr.replace_grad(weight, f / kept)
+    wo, pdf, weight = (dr.select(smooth, a, b) for a, b in zip(stayed, followed, strict=True))
+    return wo, pdf, weight
+
+
+def _mixed(
+    si: mi.SurfaceInteraction3f,
+    bsdf: mi.BSDFPtr,
+    sample_2: mi.Point2f,
+    defensive: mi.Bool,
+    active: mi.Bool,
+    wo: mi.Vector3f,
+    pdf: mi.Float,
+    eta: mi.Float,
+    lobe: mi.UInt32,
+) -> tuple[mi.Vector3f, mi.Float, mi.Float, mi.UInt32]:
+    """A BSDF's sample, replaced by one of the cosine-weighted hemisphere in `defensive` lanes; the mixture's density.
+
+    A BSDF with a perturbed normal samples around the normal as it is turned to wi, and its exchanged evaluation turns
+    it to wo: there are directions in which the latter is not zero and that the former never samples.
+    """
+    hemisphere = mi.warp.square_to_cosine_hemisphere(sample_2)
+    hemisphere.z = dr.mulsign(hemisphere.z, mi.Frame3f.cos_theta(si.wi))
+    singular = mi.has_flag(lobe, mi.BSDFFlags.Delta) & ~defensive  # holds Null too
+    wo = dr.select(defensive, hemisphere, wo)
+    same_side = mi.Frame3f.cos_theta(wo) * mi.Frame3f.cos_theta(si.wi) > 0
+    other = dr.select(same_side, dr.abs(mi.Frame3f.cos_theta(wo)) * dr.inv_pi, 0)
+    own = dr.select(defensive, bsdf.pdf(importance_context(), si, wo, active & defensive), pdf)
+    pdf = (1 - DEFENSIVE) * own + dr.select(singular, 0, DEFENSIVE * other)
+    eta = dr.select(defensive, 1, eta)
+    return wo, pdf, eta, dr.select(defensive, mi.UInt32(int(mi.BSDFFlags.GlossyReflection)), lobe)
+
+
+def _to_point(
+    si: mi.SurfaceInteraction3f,
+    bsdf: mi.BSDFPtr,
+    aimed: Aimed,
+    wo: mi.Vector3f,
+    pdf: mi.Float,
+    weight: mi.Spectrum,
+    eta: mi.Float,
+    lobe: mi.UInt32,
+) -> tuple[mi.Vector3f, mi.Float, mi.Spectrum, mi.Float, mi.UInt32]:
+    """A BSDF's sample (direction, density, weight (C,), eta, lobe), replaced by one towards their point in lanes that
+    are aimed; of density 0 where there is no point, or none of the BSDF's own samples goes there."""
+    there = si.to_local(dr.normalize(aimed.point - si.p))
+    f, own = bsdf.eval_pdf(importance_context(), si, there, aimed.active & aimed.found)
+    own = dr.select(aimed.found, own, 0)
+    weight = dr.select(aimed.active, dr.select(own > 0, f / own, 0), weight)
+    wo, pdf, eta = (dr.select(aimed.active, a, b) for a, b in ((there, wo), (own, pdf), (mi.Float(1), eta)))
+    return wo, pdf, weight, eta, dr.select(aimed.active, mi.UInt32(int(mi.BSDFFlags.GlossyReflection)), lobe)
+
+
+def _delta_correction(wi: mi.Vector3f, wo: mi.Vector3f, eta: mi.Float) -> mi.Float:
+    """cos_p wi / cos_p wo of a mirror or refraction, whose normal p is along wi + eta wo."""
+    h = dr.fma(eta, wo, wi)
+    return dr.abs(dr.dot(h, wi) / dr.dot(h, wo))
+
+
+def evaluate(
+    plan: Plan, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr | mi.BSDF, wo: mi.Vector3f, active: mi.Bool
+) -> mi.Spectrum:
+    """A smooth lobe's bsdf * cos (C,) towards `wo`, for a path that carries importance."""
+    if not plan.needs.has_perturbed_normals:
+        return bsdf.eval(importance_context(), si, wo, active)
+    exchanged = type(si)(si)
+    exchanged.wi = wo
+    return bsdf.eval(mi.BSDFContext(mi.TransportMode.Radiance), exchanged, si.wi, active)
+
+
+@dataclass
+class Aimed:
+    """Which lanes of an event are aimed, where to (`point`), whether there is anything, and their `share`."""
+
+    active: mi.Bool
+    point: mi.Point3f
+    found: mi.Bool
+    share: mi.Float

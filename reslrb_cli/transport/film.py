@@ -1,0 +1,226 @@
+"""The film: splatting through its filter, the exact adjoint of that, and blocks of its pixels.
+
+Splatting onto the film through its reconstruction filter, and its exact adjoint: looking up dL/dI at a splat.
+
+splat:   I_p += filter_p(u) C        filter_p(u): weight of pixel p for film position u, summing to 1 over pixels
+lookup:  delta = sum_p filter_p(u) dL/dI_p
+
+Blocks of pixels that a film is divided into, where what is said at a place of it is learned.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+
+from reslrb_cli.transport.factors import showing
+
+N_COLOR = 3  # a film's block holds R, G, B, perhaps alpha, and a weight that light tracing leaves at 0
+
+
+class Film:
+    """The film of one sensor as light tracing uses it: image blocks to splat into, adjoint images to look up."""
+
+    def __init__(self, sensor: mi.Sensor) -> None:
+        self.film = sensor.film()
+        self.film.prepare([])
+        self.size = self.film.crop_size()
+        self.offset = self.film.crop_offset()
+
+    def block(self) -> mi.ImageBlock:
+        """An empty image block that covers the crop window; filter weights are normalised per splat."""
+        block = self.film.create_block(normalize=True, borders=False)
+        block.set_offset(self.offset)
+        block.set_coalesce(False)  # splats of neighbouring lanes land anywhere
+        return block
+
+    def put(
+        self, block: mi.ImageBlock, u: mi.Point2f, value: mi.Spectrum, active: mi.Bool, normalization: bool = False
+    ) -> None:
+        """Add `value` (C,) at film position `u` (pixels, relative to the crop window) through the filter.
+
+        Under naive AD the weights of the pixels move with `u`. Mitsuba divides them by their sum, which it detaches;
+        with `normalization` the sum has its derivative too.
+        """
+        if normalization:
+            total = filter_weights(self.film.rfilter(), u)[2]
+            value = value * dr.select(total != 0, dr.detach(total) / total, 1)
+        color = [value[c % len(value)] for c in range(N_COLOR)]  # a mono variant fills all three
+        if block.channel_count() != len("RGBW"):
+            color = [showing(c) for c in color]  # they are added up one by one, not as a packet
+        block.put(u + mi.Vector2f(self.offset), color + [mi.Float(0)] * (block.channel_count() - N_COLOR), active)
+
+    def taps(self, u: mi.Point2f, normalization: bool) -> list[tuple[mi.Point2u, mi.Float]]:
+        """The pixels that a splat at film position `u` touches, some of them off the film, and the weight of each."""
+        first, (weights_x, weights_y), total = filter_weights(self.film.rfilter(), u)
+        if not normalization:
+            total = dr.detach(total)
+        scale = dr.select(total != 0, dr.rcp(total), 0)
+        return [
+            (mi.Point2u(mi.Point2i(first.x + x, first.y + y)), weights_x[x] * weights_y[y] * scale)
+            for y in range(len(weights_y))
+            for x in range(len(weights_x))
+        ]
+
+    def add(self, block: mi.ImageBlock, pixel: mi.Point2u, value: mi.Spectrum, active: mi.Bool) -> None:
+        """Add `value` (C,) to one pixel, where that is on the film."""
+        inside = active & (pixel.x < self.size.x) & (pixel.y < self.size.y)
+        index, channels = dr.fma(pixel.y, mi.UInt32(self.size.x), pixel.x), block.channel_count()
+        for c in range(N_COLOR):
+            at, one = index * channels + c, showing(value[c % len(value)])
+            dr.scatter_reduce(dr.ReduceOp.Add, block.tensor().array, one, at, inside)
+
+    def develop(self, block: mi.ImageBlock) -> mi.TensorXf:
+        """The image (H, W, channels) in the film's own pixel format; differentiable with respect to the block."""
+        self.film.prepare([])
+        if block.channel_count() == len("RGBAW"):
+            # Light tracing has no notion of coverage: every pixel is opaque.
+            alpha = dr.arange(mi.UInt32, dr.prod(self.size)) * block.channel_count() + N_COLOR
+            dr.scatter(block.tensor().array, mi.Float(1), alpha)
+        self.film.put_block(block)
+        return self.film.develop()
+
+    def develop_tangent(self, block: mi.ImageBlock) -> mi.TensorXf:
+        """Derivative of the image from that of the block: `develop` is linear but for the opaque alpha channel."""
+        self.film.prepare([])
+        self.film.put_block(block)
+        return self.film.develop()
+
+    def adjoint(self, image_gradient: mi.TensorXf) -> AdjointImage:
+        """dL/d(block) from dL/d(developed image): what `AdjointImage` looks up."""
+        with dr.resume_grad():
+            block = self.block()
+            dr.enable_grad(block.tensor())
+            before = type(block.tensor())(block.tensor())  # `develop` overwrites an alpha channel
+            image = self.develop(block)
+            dr.backward_from(image * dr.detach(image_gradient))
+            gradient = dr.grad(before)
+        dr.eval(gradient)  # not in the midst of tracing, where it would cut a kernel in two
+        return AdjointImage(self, mi.Float(gradient.array), block.channel_count())
+
+
+class AdjointImage:
+    """dL/dI on the film's pixels, looked up through the pixel filter at film positions.
+
+    `image` is a flat array, H * W * `channels` values, in the order of the film's block.
+    """
+
+    def __init__(self, film: Film, image: mi.Float, channels: int) -> None:
+        self.image, self.channels, self.film = image, channels, film
+        self.filter = film.film.rfilter()
+
+    def lookup(self, u: mi.Point2f, active: mi.Bool, normalization: bool = True) -> mi.Spectrum:
+        """delta (C,) at film position `u` (pixels, relative to the crop window), with its derivative by `u` if any.
+
+        Without `normalization` the sum that the filter's weights are divided by has no derivative, as in Mitsuba.
+        """
+        if self.filter.is_box_filter():
+            pixel = mi.Point2u(mi.Point2i(dr.floor(u)))
+            inside = active & (pixel.x < self.film.size.x) & (pixel.y < self.film.size.y)
+            return self._pixel(pixel, inside)
+        return self._filtered(u, active, normalization)
+
+    def _pixel(self, pixel: mi.Point2u, active: mi.Bool) -> mi.Spectrum:
+        index = dr.fma(pixel.y, mi.UInt32(self.film.size.x), pixel.x)
+        if self.channels == len("RGBW"):
+            color = dr.gather(mi.Vector4f, self.image, index, active)  # one packet
+        else:
+            color = [dr.gather(mi.Float, self.image, index * self.channels + c, active) for c in range(N_COLOR)]
+        color = [color[c] for c in range(N_COLOR)]
+        return mi.Spectrum(*color) if len(mi.Spectrum(0)) == N_COLOR else mi.Spectrum(sum(color))
+
+    def _filtered(self, u: mi.Point2f, active: mi.Bool, normalization: bool) -> mi.Spectrum:
+        first, (weights_x, weights_y), total = filter_weights(self.filter, u)
+        if not normalization:
+            total = dr.detach(total)
+        delta = mi.Spectrum(0)
+        for y in range(len(weights_y)):
+            for x in range(len(weights_x)):
+                pixel = mi.Point2u(mi.Point2i(first.x + x, first.y + y))
+                inside = active & (pixel.x < self.film.size.x) & (pixel.y < self.film.size.y)
+                delta += self._pixel(pixel, inside) * (weights_x[x] * weights_y[y])
+        return delta * dr.select(total != 0, dr.rcp(total), 0)
+
+
+def filter_weights(
+    rfilter: mi.ReconstructionFilter, u: mi.Point2f
+) -> tuple[mi.Point2i, tuple[list[mi.Float], list[mi.Float]], mi.Float]:
+    """What `ImageBlock.put` does at film position `u`: the first pixel that is touched, weights by column and by row,
+    and their sum over all pixels, off the film too."""
+    radius = rfilter.radius()
+    taps = int(dr.ceil(2 * radius))
+    center = u - 0.5
+    first = mi.Point2i(dr.ceil(center - radius))
+    columns = [rfilter.eval(mi.Float(first.x + i) - center.x) for i in range(taps)]
+    rows = [rfilter.eval(mi.Float(first.y + i) - center.y) for i in range(taps)]
+    return first, (columns, rows), sum(columns) * sum(rows)
+
+
+BLOCKS = 1 << 14  # of pixels, at most
+
+
+@dataclass(frozen=True)
+class Blocks:
+    """Blocks of `side` x `side` pixels that cover a film (crop window) of `width` x `height`, cut off at its end."""
+
+    width: int
+    height: int
+    side: int
+
+    @staticmethod
+    def of(size: tuple[int, int]) -> Blocks:
+        """The smallest that are not more than BLOCKS."""
+        side = 1
+        while -(-size[0] // side) * -(-size[1] // side) > BLOCKS:
+            side += 1
+        return Blocks(*size, side)
+
+    @property
+    def columns(self) -> int:
+        return -(-self.width // self.side)
+
+    @property
+    def rows(self) -> int:
+        return -(-self.height // self.side)
+
+    @property
+    def count(self) -> int:
+        return self.rows * self.columns
+
+    def block(self, u: mi.Point2f) -> mi.UInt32:
+        """The block that a film position (pixels) lies in, or is nearest to."""
+        column, row = (mi.UInt32(dr.clip(x, 0, n - 1)) // self.side for x, n in ((u.x, self.width), (u.y, self.height)))
+        return row * self.columns + column
+
+    def areas(self) -> NDArray[np.float64]:
+        """Pixels of each block (rows * columns)."""
+        across, down = (np.minimum(self.side, n - np.arange(0, n, self.side)) for n in (self.width, self.height))
+        return np.outer(down, across).ravel().astype(np.float64)
+
+    def root_means(self, image: mi.TensorXf) -> NDArray[np.float64]:
+        """Of an image (height, width, C) the root of the mean square in each block (rows * columns), times its area.
+
+        The unit is the image's largest value; what is not finite counts as 0.
+        """
+        channels, values = image.shape[2], dr.abs(image.array)
+        values = dr.select(dr.isfinite(values), values, 0)
+        largest = dr.max(values)
+        values = dr.select(largest > 0, values / largest, 0)
+        pixel = dr.arange(mi.UInt32, self.width * self.height)
+        square = mi.Float(0)
+        for channel in range(channels):
+            square += dr.square(dr.gather(mi.Float, values, pixel * channels + channel))
+        sums = dr.zeros(mi.Float, self.count)
+        position = mi.Point2f(pixel % self.width, pixel // self.width)
+        dr.scatter_reduce(dr.ReduceOp.Add, sums, square, self.block(position))
+        return np.sqrt(np.array(sums, np.float64) * self.areas())
+
+
+def film_blocks(sensor: mi.Sensor) -> Blocks:
+    """The blocks of a sensor's film."""
+    size = sensor.film().crop_size()
+    return Blocks.of((int(size[0]), int(size[1])))

@@ -1,0 +1,193 @@
+"""The random numbers of a light path, independent or of low discrepancy.
+
+The random numbers of a light path, drawn in the order of Mitsuba's `ptracer`, used or not: from one seed both trace
+the same paths.
+
+Numbers of low discrepancy: where light paths start, and how they first scatter, evenly spread over all paths.
+
+The first number is stratified: lane i of n has it in the i-th n-th of [0, 1). So n need be no power of two, and paths
+that start alike are traced side by side. The others are Sobol's points with the lanes' numbers for indices. Of 2^k
+lanes in a row that begin at a multiple of 2^k, every box of area 2^-k along the first two of these, whose sides are
+[a, a + 1) times powers of two, holds exactly one point; along more of them boxes hold few points each.
+
+Points are scrambled anew for every pass: binary digits are permuted, each by a permutation that those before it choose
+(Owen 1995), which keeps the boxes. The permutations are hashes, as Laine and Karras (2011), Burley (2020) and Vegdahl
+(2022) have them. Whatever the hash is worth, each point is evenly distributed in the cube on its own, since a random
+number is added to each coordinate. Hence a sum over the lanes is unbiased, and sums of different seeds are independent.
+Direction numbers are those of Joe and Kuo (2008).
+
+Digits are kept in reverse order, the first one lowest: sums and products carry from each digit to later ones alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cache
+from typing import Protocol
+
+import drjit as dr
+import mitsuba as mi
+
+
+@dataclass
+class Numbers:
+    """What one segment draws: a point on the sensor's aperture, then two numbers and one for the BSDF."""
+
+    aperture: mi.Point2f
+    bsdf_2d: mi.Point2f
+    bsdf_1d: mi.Float
+
+    @staticmethod
+    def draw(sampler: mi.Sampler, active: mi.Bool) -> Numbers:
+        """The numbers of the next segment. Roulette's follows them, and is drawn by the walk."""
+        return Numbers(sampler.next_2d(active), sampler.next_2d(active), sampler.next_1d(active))
+
+    def of_early(self, early: list[Early], depth: mi.UInt32) -> Numbers:
+        """The same, but those for the BSDF as `early` has them for the first vertices; the first is of depth 1."""
+        bsdf = Early(self.bsdf_2d, self.bsdf_1d)
+        for bounce, own in enumerate(early):
+            bsdf = dr.select(depth == bounce + 1, own, bsdf)
+        return replace(self, bsdf_2d=bsdf.bsdf_2d, bsdf_1d=bsdf.bsdf_1d)
+
+
+@dataclass
+class Early:
+    """What the BSDF of one of the first vertices has, known before the path is traced."""
+
+    bsdf_2d: mi.Point2f
+    bsdf_1d: mi.Float
+
+
+DIGITS = 32
+
+
+#: Of each coordinate behind the first: the inner coefficients of its polynomial, one bit each, and its first numbers m.
+JOE_KUO: tuple[tuple[int, tuple[int, ...]], ...] = (
+    (0, (1,)),
+    (1, (1, 3)),
+    (1, (1, 3, 1)),
+    (2, (1, 1, 1)),
+    (1, (1, 1, 3, 3)),
+    (4, (1, 3, 5, 13)),
+    (2, (1, 1, 5, 5, 17)),
+    (4, (1, 1, 5, 5, 5)),
+    (7, (1, 1, 7, 11, 19)),
+)
+
+
+#: Scattering events whose numbers are coordinates: through a pane of glass, or around a corner.
+BOUNCES = 2
+
+
+@cache
+def directions(coordinate: int) -> tuple[int, ...]:
+    """What each binary digit of an index, the lowest first, adds (modulo 2) to the point's 32 digits."""
+    if coordinate == 0:
+        return tuple(1 << k for k in range(DIGITS))
+    inner, numbers = JOE_KUO[coordinate - 1]
+    m, degree = list(numbers), len(numbers)
+    for k in range(degree, DIGITS):
+        new = m[k - degree] ^ (m[k - degree] << degree)
+        for j in range(1, degree):
+            if inner >> (degree - 1 - j) & 1:
+                new ^= m[k - j] << j
+        m.append(new)
+    return tuple(_reversed(m[k] << (DIGITS - 1 - k)) for k in range(DIGITS))
+
+
+def _reversed(digits: int) -> int:
+    return int(f"{digits:0{DIGITS}b}"[::-1], 2)
+
+
+def point(index: mi.UInt32, coordinate: int, digits: int = DIGITS) -> mi.UInt32:
+    """The digits of a coordinate of Sobol's points with these indices, which have at most `digits` binary digits."""
+    if coordinate == 0:
+        return mi.UInt32(index)
+    result = mi.UInt32(0)
+    for k, direction in enumerate(directions(coordinate)[:digits]):
+        result ^= dr.select((index & (1 << k)) != 0, mi.UInt32(direction), 0)
+    return result
+
+
+def scrambled(point: mi.UInt32, shift: mi.UInt32, key: mi.UInt32) -> mi.UInt32:
+    """The same digits permuted, each as those before it say; evenly distributed over all `shift`."""
+    x = point ^ (point * 0x3D20ADEA)
+    x = (x + shift) * (key | 1)
+    x ^= x * 0x05526C56
+    return x ^ (x * 0x53A22864)
+
+
+@dataclass(frozen=True)
+class Coordinates:
+    """Which numbers of a path are coordinates: of emission those that emitters use, the choice of one, the two of the
+    place and those of the direction; and three of each of the first `bounces` scattering events."""
+
+    choice: bool
+    place: tuple[bool, bool]
+    direction: tuple[bool, bool]
+    bounces: int
+
+
+def make_coordinates(used: Sequence[bool], emitters: int, max_depth: int) -> Coordinates:
+    """Of scenes with so many emitters, which use these of the four numbers of place and direction."""
+    bounces = min(max(max_depth - 2, 0), BOUNCES)
+    return Coordinates(emitters > 1, (used[0], used[1]), (used[2], used[3]), bounces)
+
+
+@dataclass
+class Net:
+    """How far apart lanes are in the first coordinate, in 2^-64 (opaque, width 1)."""
+
+    step: mi.UInt64
+
+    @staticmethod
+    def of(width: int) -> Net:
+        """For a pass of `width` light paths."""
+        return Net(dr.opaque(mi.UInt64, min(2**64 // width, 2**64 - 1)))
+
+    def stratified(self, lane: mi.UInt32, jitter: mi.Float) -> mi.Float:
+        """The first coordinate: `jitter` in [0, 1) is where in its stratum."""
+        within = mi.UInt64(mi.UInt32(jitter * 2.0**24)) * (self.step >> 24)
+        return _float(mi.UInt32((mi.UInt64(lane) * self.step + within) >> 32))
+
+
+class Points:
+    """Coordinates of the lanes' points, handed out in their order, from `used` on; `seed` is opaque.
+
+    With `net` the first that is asked for is stratified; without, as where a guide has stratified the lanes, none is.
+    """
+
+    def __init__(self, seed: mi.UInt32, width: int, net: Net | None, used: int = 0) -> None:
+        self.seed, self.lane, self.net, self.used = seed, dr.arange(mi.UInt32, width), net, used
+        # In coarse steps: another number of paths is to be no other kernel.
+        self.digits = 24 if width <= 2**24 else DIGITS
+
+    def next_1d(self, independent: mi.Float | None = None) -> mi.Float:
+        """The next coordinate, in [0, 1), in place of a random number, `independent`, which strata need."""
+        if self.net is not None:
+            assert independent is not None
+            net, self.net = self.net, None
+            return net.stratified(self.lane, independent)
+        shift, key = mi.sample_tea_32(self.seed, mi.UInt32(self.used))
+        digits = point(self.lane, self.used, self.digits)
+        self.used += 1
+        return _float(dr.brev(scrambled(digits, shift, key)))
+
+    def next_2d(self, independent: mi.Point2f | None = None, used: tuple[bool, bool] = (True, True)) -> mi.Point2f:
+        """Two of them, in place of those that are `used`."""
+        own = mi.Point2f(0.5) if independent is None else independent
+        return mi.Point2f(*(self.next_1d(u) if used[k] else u for k, u in enumerate((own.x, own.y))))
+
+
+def _float(digits: mi.UInt32) -> mi.Float:
+    """In [0, 1), of digits of which the first is the highest bit."""
+    return mi.Float(digits >> 8) * 2.0**-24
+
+
+class Numbered(Protocol):
+    """What draws random numbers: a sampler, or a stream beside it."""
+
+    def next_1d(self) -> mi.Float: ...
+
+    def next_2d(self) -> mi.Point2f: ...
