@@ -1,6 +1,7 @@
-"""Gathers what `reslrb doctor` says: versions, libraries, device, and a trial of each backend.
+"""The examination that `reslrb doctor` reports: versions, libraries, device, and a trial of each backend.
 
-Names of the devices that kernels run on.
+First what is known of the devices that kernels run on: their names, their memory, and how many paths they trace at a
+time.
 """
 
 from __future__ import annotations

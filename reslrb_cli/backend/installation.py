@@ -1,8 +1,6 @@
-"""Mitsuba and Dr.Jit as they are installed, and processes of our own.
+"""Mitsuba and Dr.Jit as they are installed: the real ones, of a version that is known to work, and loadable.
 
-Mitsuba and Dr.Jit as they are installed: the real ones, of a version that is known to work, and loadable.
-
-Processes of our own that run Python.
+Also the command line of a Python process of our own, which has to find the same packages.
 """
 
 from __future__ import annotations

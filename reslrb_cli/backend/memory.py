@@ -1,9 +1,9 @@
-"""Memory that is free now, and what a thread has for its own: what a forecast is held against.
+"""Memory: what is free now, what a thread has for its own, and arrays of NumPy's copied into Dr.Jit's own.
 
-Arrays of NumPy's in Dr.Jit's own memory.
+`free_bytes`, `resident_bytes` and `local_bytes` are what a forecast is held against.
 
-Dr.Jit takes up NumPy's memory as it lies, and compiles and records for its alignment, which is random: the next array
-of the same size may lie otherwise, and then all is compiled and recorded once more.
+`own_memory` copies, since Dr.Jit takes up NumPy's memory as it lies, and compiles and records for its alignment, which
+is random: the next array of the same size may lie otherwise, and then all is compiled and recorded once more.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""The command line: `main` finds the commands, and is the one place where an error becomes an exit code; `run` is the
-program, which is `main` under signals.
+"""The command line: `main` finds the commands, `run` is the program, which is `main` under signals.
 
-Each command is one module here that holds a click command named `command`; it is loaded when it is called.
+`main` is the one place where an error becomes an exit code. Each command is one module here that holds a click command
+named `command`; it is loaded when it is called.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """`reslrb convergence`: error of the gradient, or of the image, against run time.
 
-What `reslrb convergence --runs` does: whole optimisations, printed and written as they come.
+With `--runs` it is whole optimisations, printed and written as they come (`measure_runs`).
 """
 
 from __future__ import annotations

@@ -1,8 +1,7 @@
 """`reslrb gradcheck`: whether the gradients of a scene can be trusted.
 
-`reslrb gradcheck --missing`: what of a scene's derivatives is in no attached gradient.
-
-`reslrb gradcheck --suite`: cases of its own in place of a configuration.
+- `--missing` (`run_missing`): what of a scene's derivatives is in no attached gradient.
+- `--suite` (`run_suite_command`): cases of its own in place of a configuration.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """`reslrb init`: a configuration for a scene, to begin with.
 
-The text of a configuration for a scene, to begin with: what is set, what could be, and why, in comments.
+`FirstConfig` has its text: what is set, what could be, and why, in comments.
 """
 
 from __future__ import annotations

@@ -1,8 +1,7 @@
 """`reslrb inspect`: what a scene contains, and which of its parameters can be recovered.
 
-What `inspect` is given: a scene file, a configuration (complete or not), or the folder of a run.
-
-What `inspect` says of a scene, its sensors, the plan of a step and the parameters, in lines.
+It is given a scene file, a configuration (complete or not), or the folder of a run (`read_subject`), and says in lines
+what it finds of the scene, its sensors, the plan of a step and the parameters (`scene_lines` and those after it).
 """
 
 from __future__ import annotations

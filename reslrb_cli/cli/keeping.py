@@ -1,6 +1,6 @@
-"""What a measuring command has measured so far, on the disk while it goes on.
+"""Files that the measuring commands write with `--json`, on the disk while they go on.
 
-Files that the measuring commands write with `--json`: what measured, then one object a line.
+A file says what measured, then has one object a line: what has been measured so far.
 """
 
 from __future__ import annotations

@@ -1,8 +1,7 @@
 """`reslrb inspect --nonfinite`: where a run first met a value that is not finite.
 
-The problem of a run as it stood in the first iteration with a value that was not finite.
-
-What `inspect --nonfinite` says: where a run first met a value that is not finite.
+`load_replay` makes the problem of the run as it stood in the first iteration with such a value; `show_offenders` says
+what is found there.
 """
 
 from __future__ import annotations

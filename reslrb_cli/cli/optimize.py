@@ -1,6 +1,6 @@
 """`reslrb optimize`: from a configuration to recovered parameters, or from a run to more of it.
 
-`reslrb optimize --dry-run`: the forecast of a run, in lines.
+With `--dry-run` it prints the forecast of a run, in lines (`show_forecast`).
 """
 
 from __future__ import annotations

@@ -1,8 +1,7 @@
-"""What the commands about one experiment share: their options, and the way from a file to a problem.
+"""The options and arguments that commands about one experiment share, and the way from a file to a variant.
 
-The experiment of a run with the values to which the run brought its parameters, for what goes on from there.
-
-What the commands about one experiment share: their arguments, and the way from a file to a variant.
+`read_recovered` makes the experiment of a run with the values to which the run brought its parameters, for what goes on
+from there.
 """
 
 from __future__ import annotations

@@ -1,17 +1,17 @@
 """The terminal: streams on which nothing fails, progress, and what an error comes to.
 
-What commands print and log: keys, names and paths are a user's or a file's, and must not command the terminal.
+What commands print and log (`echo`, `LineFormatter`): keys, names and paths are a user's or a file's, and must not
+command the terminal.
 
-Standard output and error of a command, as streams on which nothing fails.
+Standard output and error of a command, as streams on which nothing fails: a terminal that was closed, a disk that is
+full behind a redirection, a pipe whose reader has gone, a stream that was closed before the program began: none of them
+is a reason to end a run of hours. While `forgiving_output` is entered, `sys.stdout` and `sys.stderr` take everything
+(of `click.echo`, of the log, of a progress bar), pass on what can be passed on, and drop the rest without a word.
 
-A terminal that was closed, a disk that is full behind a redirection, a pipe whose reader has gone, a stream that was
-closed before the program began: none of them is a reason to end a run of hours. While `forgiving_output` is entered,
-`sys.stdout` and `sys.stderr` take everything (of `click.echo`, of the log, of a progress bar), pass on what can be
-passed on, and drop the rest without a word.
+Progress of an optimisation, and of reading long files (`Progress`, `Reading`): a bar on a terminal, plain lines
+elsewhere.
 
-Progress of an optimisation, and of reading long files: a bar on a terminal, plain lines elsewhere.
-
-What an error comes to on the command line: those of its own arguments, and all others (`recording.telling`).
+What an error comes to on the command line (`tell`): those of its own arguments, and all others (`runs.ending.tell`).
 """
 
 from __future__ import annotations

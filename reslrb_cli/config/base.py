@@ -1,10 +1,7 @@
-"""What every section of the configuration shares: strictness, paths, and unions that are told apart by their `type`.
+"""The basis of all sections of the configuration: strictness, paths, unions told apart by their `type`, shared values.
 
-Names of runs, which are names of folders too.
-
-Amounts of memory as a user writes them.
-
-How often a run keeps its state.
+The values that several sections share are names of runs, which are names of folders too; amounts of memory as a user
+writes them; and how often a run keeps its state.
 """
 
 from __future__ import annotations

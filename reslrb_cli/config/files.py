@@ -1,8 +1,8 @@
-"""The one door for files that a user names: regular, not too large, and else one located line.
+"""The bounds of what a user hands in, and the one door for files that a user names.
 
-How large what a user hands in may be: each bound with its reason. Beyond one, input is refused at once.
-
-How the samples of a step are split into passes, and what is too many of them; known before a scene is loaded.
+Each bound stands with its reason; beyond one, input is refused at once. A file that is named has to be regular and not
+too large, or there is one located line. How the samples of a step are split into passes, and what is too many of them,
+is known before a scene is loaded.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
-"""Reads a configuration from its file and from `--set`, and writes it as resolved.
+"""The reader of configurations, from a file and from `--set`; it also writes them as resolved.
 
-`--set a.b=value`: a value, typed as YAML, at a place in the configuration.
+`--set a.b=value` is a value, typed as YAML, at a place in the configuration.
 """
 
 from __future__ import annotations

@@ -1,7 +1,4 @@
-"""The optimisers, each with the options that it knows.
-
-The losses, each with the options that it knows.
-"""
+"""The losses and the optimisers, each with the options that it knows."""
 
 from __future__ import annotations
 

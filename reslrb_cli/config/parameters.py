@@ -1,6 +1,6 @@
-"""What is recovered: scene parameters by key, heightmaps on meshes, and motions of shapes and emitters.
+"""The parameters that are recovered: those of the scene by key, heightmaps on meshes, motions of shapes and emitters.
 
-What moves, as a configuration says it: heightmaps on meshes, and motions with their settings by word.
+Settings of a motion are said by word (translation, rotation, scale), or for all of it at once.
 """
 
 from __future__ import annotations

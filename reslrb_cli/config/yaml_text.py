@@ -1,10 +1,7 @@
 """YAML 1.2 to plain data and back, bounded before anything of it is built.
 
-PyYAML as configurations want it: the rules of YAML 1.2, plain data alone, bounded before anything is built.
-
-PyYAML alone reads YAML 1.1, where `1e-3` is text, `no` is false, `010` is 8 and `1:30` is 90.
-
-YAML to plain data and back, by the rules of YAML 1.2.
+PyYAML alone reads YAML 1.1, where `1e-3` is text, `no` is false, `010` is 8 and `1:30` is 90. `Loader` has it read by
+the rules of YAML 1.2, and build plain data alone; `parse` and `write` are the two ways.
 """
 
 from __future__ import annotations

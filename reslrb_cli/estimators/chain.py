@@ -1,37 +1,32 @@
 """Attached derivatives of the connections that a reservoir keeps, by chains of Jacobians: constant memory, no stack.
 
-Let p_i be the coordinates of the ray that reaches vertex i (`estimators.jacobian`), J_i = dp_{i+1}/dp_i, and J_{0->i}
-their product from the first vertex on that a parameter has a part in. Beside it each channel carries what the factors
-so far change by,
+Chain: let p_i be the coordinates of the ray that reaches vertex i (`estimators.jacobian`), J_i = dp_{i+1}/dp_i, and
+J_{0->i} their product from the first vertex on that a parameter has a part in. Beside it each channel carries what the
+factors so far change by,
 
     G_i = sum_{m<i} dlog s_m/dp_m J_{0->m}
 
 Of a connection I that is kept, so are du_I/dp_I J_{0->I} and dlog c_I/dp_I J_{0->I} + G_I; with delta they make the
-adjoint of the first ray, which the replay takes to every other (`estimators.chain_replay`).
+adjoint of the first ray (W / (m w_I), which stands before all of it, is left out here),
+
+    a_0 = <d delta/du, C_I> du_I/dp_I J_{0->I} + delta C_I (dlog c_I/dp_I J_{0->I} + G_I)
 
 Damping (`segment_jacobian`) makes an inverse of what has none, at the price of digits: one for every vertex that is not
 specular. So such paths are taken in blocks of BLOCK of these vertices. A chain begins with one block, chosen with equal
 probability among those that are there when a connection is met, and replaying takes the adjoint through this one alone,
 times their number. Radiometric derivatives, which need no chain, are taken at every vertex of a path all the same.
 
-Source: the ResLRB paper, Section 2.5, which has neither G nor blocks, and says of vertices that are not specular that
-the inverse is regularised. With a random sign in the regularisation there is no bias.
-
-The replay of connections that were kept with chains of Jacobians: the adjoint of a path's first ray, taken on.
-
-With delta, what `estimators.chain` keeps makes the adjoint of the first ray (W / (m w_I), which stands before all of
-it, is left out here),
-
-    a_0 = <d delta/du, C_I> du_I/dp_I J_{0->I} + delta C_I (dlog c_I/dp_I J_{0->I} + G_I)
-
-A replay takes it to every vertex through the inverse of what it passes, and differentiates each segment on its own:
+Replay: it takes a_0 to every vertex through the inverse of what it passes, and differentiates each segment on its own:
 
     a_{j+1} = (a_j - delta C_I dlog s_j/dp_j) J_j^{-1}
     dS     += a_{j+1} dp_{j+1}/dtheta + delta C_I ds_j/s_j          at I:   d<delta(u_I), C_I> by c_I and u_I
 
-This is J_{j+1->I} = J_{0->I} J_{0->j+1}^{-1} of the paper's Section 2.5, one factor of the inverse after the other.
-Both chain and replay compute the same J_j to the last bit, so that the inverse undoes it however badly conditioned it
-is.
+This is J_{j+1->I} = J_{0->I} J_{0->j+1}^{-1} of the ResLRB paper's Section 2.5, one factor of the inverse after the
+other. Both chain and replay compute the same J_j to the last bit, so that the inverse undoes it however badly
+conditioned it is.
+
+Source: the ResLRB paper, Section 2.5, which has neither G nor blocks, and says of vertices that are not specular that
+the inverse is regularised. With a random sign in the regularisation there is no bias.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """How one segment of a light path answers when the ray that reaches it is shifted and turned: its Jacobians.
 
 A ray has four coordinates, p = (q, w): q shifts its origin across it, w turns its direction, both in the two axes s,
-t of a frame about the ray. Of one that leads to a vertex that stays where it is (`staying`) the direction is of no
+t of a frame about the ray. Of one that leads to a vertex that stays where it is (`kept.py`) the direction is of no
 account, and that its origin is shifted along it is: the third coordinate is that shift, and the fourth is not used. A
 segment maps p_i of the ray that reaches vertex i to p_{i+1} of the next one, to its scattering factor s_i, and to its
 connection, c_i at film position u_i. (The ResLRB paper, Section 2.5, takes the coordinates of both ends of a segment.

@@ -1,18 +1,17 @@
-"""What estimators keep of a path, in few words, and sums over its connections.
+"""The memory of a path that estimators keep, in few words: sums over its connections, vertices, and single factors.
 
-Sums of delta_i C_i over the connections of a path, to which contributions are added, and from which they are taken.
+AdjointSum: sums of delta_i C_i over the connections of a path, to which contributions are added, and from which they
+are taken. Each channel is a pair (value, rest): what rounding loses is kept beside the value (Knuth's two-sum), so that
+taking off what was added leaves zero also after a thousand vertices. Contributions whose prefix holds exactly one zero
+factor are summed apart, without it: their value is nothing, and their derivative with respect to that factor is the
+sum.
 
-Each channel is a pair (value, rest): what rounding loses is kept beside the value (Knuth's two-sum), so that taking off
-what was added leaves zero also after a thousand vertices. Contributions whose prefix holds exactly one zero factor are
-summed apart, without it: their value is nothing, and their derivative with respect to that factor is the sum.
+SurfacePoint: a surface interaction, kept of a vertex whose BSDF will be evaluated again.
 
-A surface interaction in few words: what an estimator keeps of a vertex whose BSDF it will evaluate again.
-
-Vertices that stay where they are on their surfaces, instead of going where a turned direction meets them.
-
-Behind a vertex i-1 that is not specular, light goes to all places. `follow` has the sampled direction turn with surface
-i-1, so that x_i slides over whatever it meets. `stay` integrates over places instead: x_i moves with its own surface
-alone, and the factor of the scattering carries what that changes,
+Before: what is kept of the vertex before the current one where vertices stay where they are on their surfaces, instead
+of going where a turned direction meets them. Behind a vertex i-1 that is not specular, light goes to all places.
+`follow` has the sampled direction turn with surface i-1, so that x_i slides over whatever it meets. `stay` integrates
+over places instead: x_i moves with its own surface alone, and the factor of the scattering carries what that changes,
 
     s_{i-1} = f_{i-1}(x_{i-2}, x_{i-1}, x_i) |cos_i| / |x_i - x_{i-1}|^2 dA_i / (the same density, detached)
 
@@ -23,7 +22,7 @@ Source: Worchel et al. 2025, "Radiative Backpropagation with Non-Static Geometry
 is. Edges at rest are not swept over, so that their part in the derivative is not lost; visibility's part is, in
 either form.
 
-Single factors of a path, kept so that their derivative needs no replay.
+Event: a single factor of a path, kept so that its derivative needs no replay.
 """
 
 from __future__ import annotations

@@ -1,16 +1,14 @@
-"""What light paths have to say, told to the cell that they start in: the words that guiding learns from.
+"""The words that guiding learns from: what light paths say, by the cells that they start in and go on through.
 
-The vertices of a path, kept until it ends: only then is it known what it went on to say behind each of them.
-
+Trail: the vertices of a path, kept until it ends, as only then is it known what it went on to say behind each of them.
 They lie in thread-local memory, the first PLACES of them; what later ones say is summed. From the last one back the sum
 over all later vertices is at hand when a vertex is reached, as in `estimators/stack.py`.
 
-What light paths go on to say from where they are, and whether they are worth following by that.
-
-Of every cell of place and direction (`transport/guide.py`) two means are learned over the rays that leave a vertex
-there: the square of what the path still says behind it if its throughput is 1 (m), and how many vertices still follow
-(c). A ray that leaves with throughput w goes on with probability q = min(1, max(LEAST, w s)). Of all q those make
-variance times work least for which
+Onward: what light paths go on to say from where they are, and whether they are worth following by that. Of every cell
+of place and direction (`transport/guide.py`) two means are learned over the rays that leave a vertex there: the square
+of what the path still says behind it if its throughput is 1 (m), and how many vertices still follow (c). A ray that
+leaves with throughput w goes on with probability q = min(1, max(LEAST, w s)). Of all q those make variance times work
+least for which
 
     s = sqrt(m W / (c V))        V: the mean square of what a whole path says; W: the mean number of its vertices
 
@@ -21,9 +19,8 @@ there too often makes for much more noise than what goes on too long makes for w
 For the same reason a cell leans on the larger cube that it lies in, with the weight of LEAN rays, that one on the next,
 and so on up to the whole scene; and no cell has less than FLOOR of the scene's own m / c.
 
-What light paths have to say, by the cell that they start in: how much they would move gradient and image.
-
-A walk of its own, with random numbers that nothing else has. Of each path and each BSDF that is differentiated
+Hearing: what light paths have to say, by the cell that they start in: how much they would move gradient and image. It
+is a walk of its own, with random numbers that nothing else has. Of each path and each BSDF that is differentiated
 
     G = sum_i delta_i C_i n_i        n_i: how many factors of C_i are this BSDF's
 

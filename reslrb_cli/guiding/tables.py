@@ -1,20 +1,14 @@
-"""Tables of where light paths start, for each sensor, learned from steps that are done.
+"""Tables of where light paths start, for each sensor, learned from steps that are done, for those to come.
 
-What light paths for one sensor have said, by the cell that they started in, and how cells are drawn by that.
-
-What the variance of a sum over paths is made of is the mean square of what those of a cell say; it is least where cells
-are drawn in proportion to its root (`collect.py` says what is heard). Each voice is scaled to a total of 1, so that no
-parameter drowns another.
+Cells are drawn by what the paths that started in them have said. What the variance of a sum over paths is made of is
+the mean square of what those of a cell say; it is least where cells are drawn in proportion to its root (`collect.py`
+says what is heard). Each voice is scaled to a total of 1, so that no parameter drowns another.
 
 Cells are as fine as there are paths to tell them apart: of a few thousand paths they are put together by hundreds. The
 more have been heard, the finer they are, up to the grid's own.
 
-Guiding of a scene's emission: tables for each sensor, learned from steps that are done, for those to come.
-
-Cells are drawn by what their paths have said (`tables.py`). Samples that serve image and gradient both are drawn half
-for the one, half for the other.
-
-Which of emission's random numbers the emitters of a scene make anything of.
+`Guiding` keeps the tables of one scene. Samples that serve image and gradient both are drawn half for the one, half for
+the other. `used_numbers` says which of emission's random numbers the emitters of a scene make anything of.
 """
 
 from __future__ import annotations

@@ -1,8 +1,7 @@
 """Integrators to compare with: Mitsuba's own, and the walk of `reslrb` differentiated in other ways.
 
-Mitsuba's own integrators, as a gradient step takes them.
-
-The walk of `reslrb` differentiated in other ways, to compare with: by naive AD, and by Dr.Jit's own reversal.
+`Replayed` and `NaiveAD` take Mitsuba's own as a gradient step does. `WalkAd` and `Trajectory` differentiate the walk by
+naive AD, and by Dr.Jit's own reversal.
 """
 
 from __future__ import annotations

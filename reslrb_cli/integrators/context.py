@@ -1,14 +1,12 @@
-"""What a light tracer finds out about a scene, its sensors and what is differentiated, and keeps.
+"""Findings about a scene, its sensors and what is differentiated: what a light tracer finds out once, and keeps.
 
-Which parameters of a scene are being differentiated, and what that asks of a walk.
-
-Whether light that moves is scattered by a surface that is not specular, and then comes to be seen from another one.
-
-Only there do the two ways of `estimators.staying` differ. In a caustic of few segments light ends where it lands first.
-
-What was found out about a scene, and is no longer so once shapes have moved.
-
-What a light tracer finds out about a scene once, and keeps while that scene is traced.
+- `Differentiated`: which parameters of the scene are being differentiated, and what that asks of a walk.
+- `bounces`: whether light that moves is scattered by a surface that is not specular, and then comes to be seen from
+  another one. Only there do the two ways of `attached_sampling`, `follow` and `stay` (`estimators/kept.py`), differ. In
+  a caustic of few segments light ends where it lands first.
+- `Renewal`: what was found out about the scene, and is no longer so once shapes have moved.
+- `attach`: the plan with attached derivatives, as `Motion` asks for them.
+- `Preparation`: all that was found out about one scene, kept while that scene is traced.
 """
 
 from __future__ import annotations

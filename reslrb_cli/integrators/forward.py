@@ -1,8 +1,10 @@
-"""Forward mode: hooks of walks that keep nothing of a path.
+"""Forward mode and naive AD: hooks of walks that keep nothing of a path.
 
-Hooks of walks that keep nothing of a path: the image alone, its forward-mode derivative, and naive AD.
-
-Forward mode where light moves: the derivative of every connection and of where it lands, splatted as it is found.
+- `TrackedSplat`, `RecordedObjective`: the image, or the objective, with derivatives tracked (naive AD, and Dr.Jit's own
+  reversal).
+- `TangentSplat`: the image's forward-mode derivative.
+- `AttachedTangentSplat`: the same where light moves: the derivative of every connection and of where it lands, splatted
+  as it is found.
 """
 
 from __future__ import annotations

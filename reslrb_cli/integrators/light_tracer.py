@@ -1,8 +1,8 @@
-"""What is done with the samples of a light-traced image: image pass, replay, forward mode, naive AD.
+"""Light tracers: what ours have in common, and what is done with the samples of an image.
 
-What our light tracers have in common: `ptracer`'s options, a plan, passes, the image and its tangent.
-
-They know nothing of Mitsuba's plugins; `plugin.py` makes plugins of them.
+In common they have `ptracer`'s options, a plan, passes, the image and its tangent (`LightTracer`, `Reversed`). With the
+samples an image pass, a replay, forward mode or naive AD is done. They know nothing of Mitsuba's plugins; `plugin.py`
+makes plugins of them.
 """
 
 from __future__ import annotations

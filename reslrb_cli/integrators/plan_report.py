@@ -1,7 +1,7 @@
-"""The plan of a step in numbers: how many operations its kernels have with each feature, and how many without.
+"""The plan of a step, feature by feature: what calls for each, and what it costs in operations of the step's kernels.
 
-What a plan is made of, feature by feature: whether the scene and its parameters call for it, and the same plan with
-the feature the other way round, for a comparison of kernels.
+A `Feature` says whether the scene and its parameters call for it, and has the same plan with the feature the other way
+round. `report_plan` counts how many operations the kernels have with each feature, and how many without.
 """
 
 from __future__ import annotations

@@ -1,11 +1,8 @@
-"""What a gradient step asks of an integrator, and the refusal of dL/dI that is not finite.
+"""The interface of an integrator, ours or a stock one, for a step, and the refusal of dL/dI that is not finite.
 
-What a gradient step asks of an integrator, ours or a stock one.
-
-Derivatives of a loss that are not finite: refused, which is to say taken for 0, and counted.
-
-One NaN in dL/dI would make a gradient NaN wherever a path of that pixel passes, and some estimators would lose it on
-the way. Both are done in the kernel that computes dL/dI, and nobody waits for the count but who reads it.
+Derivatives of a loss that are not finite are refused, which is to say taken for 0, and counted. One NaN in dL/dI would
+make a gradient NaN wherever a path of that pixel passes, and some estimators would lose it on the way. Both are done in
+the kernel that computes dL/dI, and nobody waits for the count but who reads it.
 """
 
 from __future__ import annotations

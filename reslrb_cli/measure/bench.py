@@ -1,5 +1,9 @@
 """Time and memory of a step against path depth, for several integrators side by side; or against something else.
 
+- `Book`: everything that a `bench` has measured so far, in this session and in earlier ones
+- `Run`: one case at one value of what is swept: what is measured of it, its record, and what is kept of it
+- `bench`: the measurement
+
 At each depth (or number of samples, or size of the film or of textures: `sweep` says which) every case has a process
 of its own, and all live at once. They load the scene, take a cold step each, then as many as it takes until no new
 kernel comes (stock integrators need a few), and then steps in rounds, one each in turn, so that a drift of the machine
@@ -13,10 +17,6 @@ A case that nobody named, but the default list, and that refuses the scene, is l
 
 The budget covers loading and compiling. Once it is spent, what is not warm is left out, and named, with what it would
 take; what is takes one round, if it had none.
-
-Everything that a `bench` has measured so far, in this session and in earlier ones.
-
-One case of a `bench` at one value of what is swept: what is measured of it, its record, and what is kept of it.
 """
 
 from __future__ import annotations

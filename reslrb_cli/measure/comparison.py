@@ -1,18 +1,6 @@
-"""Whether gradients agree with a reference: over many seeds by z scores, or at equal seeds by relative L2.
+"""Comparisons of Monte Carlo estimates: two sets of images with each other, and gradients with a reference.
 
-Samples are (N, P): N seeds, P entries. Where both sides have the same seeds the test is on their differences, which is
-valid whatever noise they share, and the sharper the more they share:
-
-    t_k = mean_k(a - b) / sqrt(var_k(a - b) / N + floor_k^2)         to z, the normal deviate of the same probability
-
-Two criteria must hold, as in `statistics.compare`. The largest |z| stays under Sidak's threshold for all entries of
-all rows of a table, and the root mean square of a row's z under that of nu normal deviates, nu the row's effective
-number of independent entries (Satterthwaite, with the mean squared correlation r^2 of its entries' samples, chance
-taken off):
-
-    nu = E / (1 + (E - 1) r^2)
-
-Whether two Monte Carlo estimators agree: Welch's test for each block of pixels, corrected for how many there are.
+Whether two estimators agree (`compare`): Welch's test for each block of pixels, corrected for how many there are.
 
     t = (mean_a - mean_b) / sqrt(s_a^2 / N + s_b^2 / M)        per block and channel, over N and M independent renders
 
@@ -22,13 +10,25 @@ small shows there. Two sides must hold: max |z| under Sidak's threshold for all 
 square of z under that of as many normal deviates as there are blocks (channels may be fully correlated), or, entry by
 entry, as the correlated entries are worth.
 
-The entries in which a gradient is compared: those of a small parameter, tiles and projections of a large one.
-
-A texel that few paths meet has a gradient whose noise is far from normal, and z scores of thousands of them raise false
+The entries in which a gradient is compared are those of a small parameter, tiles and projections of a large one. A
+texel that few paths meet has a gradient whose noise is far from normal, and z scores of thousands of them raise false
 alarms. So a large texture is compared in tiles, each the sum over its texels, per channel; any other large parameter in
 runs of consecutive entries. What sums hide, an error that cancels within a tile, shows in projections on random signs,
 which take every texel in, and whose noise is nearer to normal than a texel's. The sum of all comes last, where small
 errors of all entries add up.
+
+Whether gradients agree with a reference: over many seeds by z scores (`compare_expectations`), or at equal seeds by
+relative L2 (`compare_equal_seeds`). Samples are (N, P): N seeds, P entries. Where both sides have the same seeds the
+test of expectations is on their differences, which is valid whatever noise they share, and the sharper the more they
+share:
+
+    t_k = mean_k(a - b) / sqrt(var_k(a - b) / N + floor_k^2)         to z, the normal deviate of the same probability
+
+Two criteria must hold, as in `compare`. The largest |z| stays under Sidak's threshold for all entries of all rows of a
+table, and the root mean square of a row's z under that of nu normal deviates, nu the row's effective number of
+independent entries (Satterthwaite, with the mean squared correlation r^2 of its entries' samples, chance taken off):
+
+    nu = E / (1 + (E - 1) r^2)
 """
 
 from __future__ import annotations

@@ -1,6 +1,4 @@
-"""Gradients with dL/dI held at a reference image's.
-
-Gradients of an experiment with dL/dI held at a reference image's, one by one, at the parameters' initial values.
+"""Gradients of an experiment with dL/dI held at a reference image's, one by one, at the parameters' initial values.
 
 From their own images gradients of different noise, or of different numbers of samples, have different expectations:
 noise in the image biases each by its own amount. With one dL/dI for all they have the same, and can be compared.

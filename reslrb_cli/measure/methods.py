@@ -1,12 +1,10 @@
-"""What measurements compare and vary, as their options say it. Knows no Mitsuba.
+"""The methods that measurements compare, and what they vary, as their options say it. Knows no Mitsuba.
 
-What a measurement compares: a list such as `ptracer,reslrb:reservoir(capacity=4)`, and the depths of a bench.
-
-What `bench` varies, and over which values. Knows no Mitsuba.
-
-What `convergence` measures, and what it takes its errors from. Knows no Mitsuba.
-
-What `convergence --runs` measures. Knows no Mitsuba.
+- `Case`: what a measurement compares, by a list such as `ptracer,reslrb:reservoir(capacity=4)`; and the depths of a
+  bench.
+- `Sweep`: what `bench` varies, and over which values.
+- `Plan`: what `convergence` measures, and what it takes its errors from.
+- `RunsPlan`: what `convergence --runs` measures.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""How much of a derivative attached gradients lack: silhouettes, edges of shadows, light that leaves the film.
+"""The part of a derivative that attached gradients lack: silhouettes, edges of shadows, light that leaves the film.
 
-Differences of the image at common random numbers have all of it. Along each of K directions, with F_k the difference
-and g_k the attached gradient's,
+Differences of the image at common random numbers have all of it (`Missing`). Along each of K directions, with F_k the
+difference and g_k the attached gradient's,
 
     m_k = F_k - g_k,   share = sqrt(sum_k m_k^2 / sum_k F_k^2)
 
@@ -14,7 +14,8 @@ lost in rounding, which is the same for all seeds where it is the scene that is 
 much E changes there counts as error where it stands out of its noise. What noise adds to the squares is subtracted; the
 standard error is that of the mean over seeds.
 
-`gradcheck --missing` on an experiment: its scene, the dL/dI of its own loss, and directions for each parameter.
+`MissingCheck` is `gradcheck --missing` on an experiment: its scene, the dL/dI of its own loss, and directions for each
+parameter.
 """
 
 from __future__ import annotations

@@ -1,12 +1,11 @@
-"""Which stock integrators count as references: of images `ptracer`, `path` and `prb`, of gradients `ptracer` and `prb`.
+"""Stock integrators that count as references: of images `ptracer`, `path` and `prb`, of gradients `ptracer` and `prb`.
 
-Each function returns why it does not count, or None where it does. docs/method.md, Baselines, has the reasons.
+Each public function after `Situation` returns why one does not count, or None where it does. docs/method.md, Baselines,
+has the reasons.
 
-The film's border, left out where paths from the camera and paths from the lights are compared.
-
-Light tracing loses there what samples just outside of the film would have added (`scene.seen.interior`).
-
-Scenes that are recognised as one whose gradient is known in closed form.
+Two things come before: `leave_out_border` leaves out the film's border where paths from the camera and paths from the
+lights are compared, since light tracing loses there what samples just outside of the film would have added
+(`scene.visibility.interior`); `known_gradient` recognises scenes whose gradient is known in closed form.
 """
 
 from __future__ import annotations

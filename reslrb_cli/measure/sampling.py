@@ -1,6 +1,6 @@
 """Samples of what takes part in a gradcheck, taken when they are first needed, until they are enough or time is up.
 
-Going on from the samples that an earlier session of a `gradcheck` has taken: the seeds after theirs.
+A session may go on from the samples that an earlier one has taken, with the seeds after theirs (`restore`, `kept`).
 """
 
 from __future__ import annotations

@@ -1,7 +1,4 @@
-"""Steps of one experiment, measured one by one.
-
-Films and textures of other sizes, for a measurement.
-"""
+"""Steps of one experiment, measured one by one (`Stepper`), and films and textures of other sizes to measure with."""
 
 from __future__ import annotations
 

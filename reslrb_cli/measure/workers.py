@@ -1,15 +1,11 @@
-"""Workers: processes that measure, one of several side by side.
+"""Workers: processes that measure, one of several side by side, from both ends; and how a sweep's time is spent.
 
-Thread-local memory of kernels, which the allocator does not see, read off the kernels themselves.
-
-The process of one case: `run`, in a Python of its own, started and told what to do by `processes.py` (`tasks.py`).
-
-It reads one JSON object a line from standard input and answers each with one on standard output. The first describes
-the case; each other one asks for a step. What else is printed goes to standard error.
-
-One of several that are measured side by side, each in a process of its own, and how it came to its end.
-
-How the time of a sweep is spent: so much for each depth, and as many rounds there as fit.
+- `scratch_bytes`: thread-local memory of kernels, which the allocator does not see, read off the kernels themselves.
+- `run`: the process of one case, in a Python of its own, started and told what to do by `processes.py` (`tasks.py`). It
+  reads one JSON object a line from standard input and answers each with one on standard output. The first describes the
+  case; each other one asks for a step. What else is printed goes to standard error.
+- `Contestant`: one of several that are measured side by side, each in a process of its own, and how it came to its end.
+- `Pace`: how the time of a sweep is spent: so much for each depth, and as many rounds there as fit.
 """
 
 from __future__ import annotations

@@ -1,24 +1,24 @@
-"""What `run.adjoint: correlated` does to a gradient: its bias, from rounds of few samples (`correlated_bias.py`).
+"""The bias that `run.adjoint: correlated` makes in a gradient, seen in rounds of few samples before a run begins.
 
 With delta(I) = dL/dI and J the derivative of the image by the parameters, each of its samples,
 
     g = J(samples)^T delta(I(samples))          correlated: noise of I meets its own in J
     h = J(samples)^T delta(I(other samples))    independent
 
-have expectations that differ by the bias b = E[g - h]. Rounds r of independent samples give d_r = g_r - h_r and h_r.
-Inner products of expectations are estimated without bias from pairs of different rounds (U-statistics)
+have expectations that differ by the bias b = E[g - h].
+
+The bias of a loss that is quadratic in the image is inversely proportional to the samples per pixel, whatever their
+number: there rounds have fewer than the run's steps, which makes the bias larger beside its noise, and the result is
+brought back to those of the run.
+
+Rounds r of independent samples give d_r = g_r - h_r and h_r. Inner products of expectations are estimated without bias
+from pairs of different rounds (U-statistics)
 
     <a, c> = mean over r != s of <a_r, c_s>
 
 and their standard errors by the jackknife over rounds. Two things are asked of each parameter: what share of the
 gradient the bias makes, <b, h> / <h, h>, where noise does not hide the gradient; and whether the bias is longer than
 the gradient, <b, b> > <h, h>, which keeps its sense where the gradient vanishes.
-
-Rounds of samples that show the bias of `run.adjoint: correlated` before a run begins.
-
-The bias of a loss that is quadratic in the image is inversely proportional to the samples per pixel, whatever their
-number: there rounds have fewer than the run's steps, which makes the bias larger beside its noise, and the result is
-brought back to those of the run.
 """
 
 from __future__ import annotations

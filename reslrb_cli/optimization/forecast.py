@@ -1,6 +1,4 @@
-"""What a run will take, memory and time: measured on a few of its own steps, with a target of few samples.
-
-A few steps of a run, for a forecast: what one takes, and the memory of all.
+"""The forecast of a run, its memory and its time: measured on a few of its own steps, with a target of few samples.
 
 Where a step takes long, steps of fewer samples per pixel stand for it: time and memory are a constant and a part that
 is proportional to the samples, which two sizes tell apart. Memory is given out in powers of two, which such a line

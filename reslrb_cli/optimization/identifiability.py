@@ -1,13 +1,12 @@
-"""What the images tell of the parameters, asked before the first iteration.
+"""The identifiability of parameters: what the images tell of them, asked before the first iteration.
 
-Which entries of a parameter the images tell something about.
+Two things are asked: which entries of a parameter the images tell something about (`find_reached`), and whether they
+tell exposures from parameters (`check_exposures`).
 
-Whether the images tell exposures from parameters, asked before the first iteration.
-
-Let D_k be how all views' images, exposed and without what their masks leave out, change with the logarithm of parameter
-k, all its entries at once: (J((1 + h) x_k) - J(x_k)) / h, at common random numbers. An exposure's own is its views'
-images themselves. With all emission unknown, for example, the sum over the lamps is the exposure's. In general there
-are combinations without an effect where the matrix of cosines
+For the second let D_k be how all views' images, exposed and without what their masks leave out, change with the
+logarithm of parameter k, all its entries at once: (J((1 + h) x_k) - J(x_k)) / h, at common random numbers. An
+exposure's own is its views' images themselves. With all emission unknown, for example, the sum over the lamps is the
+exposure's. In general there are combinations without an effect where the matrix of cosines
 
     G_kl = <D_k, D_l> / (|D_k| |D_l|)
 

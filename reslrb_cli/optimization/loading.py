@@ -1,6 +1,6 @@
-"""What an experiment works with: scene, sensors and integrator, loaded and checked.
+"""Scene, sensors and integrator of an experiment, loaded and checked; images of many samples, in passes.
 
-Images with many samples, in passes that fit into memory.
+A pass is so small that it fits into memory.
 """
 
 from __future__ import annotations

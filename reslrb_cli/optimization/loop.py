@@ -1,6 +1,6 @@
-"""The optimisation loop: it yields records and opens no file.
+"""The optimisation loop, which yields records and opens no file, and its learning-rate schedules.
 
-Learning-rate schedules: the factor of iteration i of n, from 1 at the first to `final_fraction` at the last.
+A schedule is the factor of iteration i of n, from 1 at the first to `final_fraction` at the last.
 """
 
 from __future__ import annotations

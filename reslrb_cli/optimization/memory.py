@@ -1,12 +1,10 @@
-"""Memory of a run: whether there is room, said before anything is allocated, and passes within a budget.
+"""The memory of a run: whether there is room, said before anything is allocated, and passes within a budget.
 
-How much memory a step takes, and the passes that keep it within a budget.
-
-Whether there is room for what a configuration and a scene's file say of their sizes, before anything is built.
-
-Films and textures of a hundred million entries take a minute to make; that there is no room for them is known before.
-
-Whether there is room for what a configuration asks for: said before anything is allocated, with the reason.
+- How much memory a step takes, and the passes that keep it within a budget: `estimate`, `choose_samples`.
+- Whether there is room for what a configuration and a scene's file say of their sizes, before anything is built:
+  `check_announced`, `check_described`. Films and textures of a hundred million entries take a minute to make; that
+  there is no room for them is known before.
+- Whether there is room for what a configuration asks for, with the reason where there is none: the other checks.
 
 Held against what is free are lower bounds, so that nothing is refused that the machine can hold.
 """

@@ -1,11 +1,12 @@
-"""Checks of experiments whose parameters move light: located where an integrator, or the scene, cannot follow them.
+"""Experiments whose parameters move light: what the film's border cuts off, and checks of what cannot be followed.
 
-Light that moves at the film's border, where its derivative is cut off.
+Light that moves at the film's border has its derivative cut off there. A splat that moves across the border leaves the
+film, or enters it: no sample knows of that, since what lies outside is not traced. How much of the derivative is
+missing goes with how much of what moves lands there (`border_share`); where that is much, a word is said before the
+optimisation (`warn_of_border`).
 
-A splat that moves across the border leaves the film, or enters it: no sample knows of that, since what lies outside is
-not traced. How much of the derivative is missing goes with how much of what moves lands there.
-
-A word before an optimisation whose moving light crosses the film's border.
+Where an integrator, or the scene, cannot follow what moves, an error says so, located in the configuration
+(`check_moving`).
 """
 
 from __future__ import annotations

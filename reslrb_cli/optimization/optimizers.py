@@ -1,9 +1,6 @@
-"""Optimisers: Dr.Jit's, one for each parameter, behind one interface.
+"""Optimisers behind one interface: Dr.Jit's, one for each parameter, with reparameterisations, bounds and a clamp.
 
-One optimiser for each parameter rather than one for all, so that a parameter whose gradient is not finite can sit an
-iteration out with its moments and its count of steps as they were.
-
-Reparameterisations: the optimiser moves an unconstrained variable u, the scene gets x = T(u).
+Reparameterisations (`Transform`, `Variable`): the optimiser moves an unconstrained variable u, the scene gets x = T(u).
 
     none      x = u
     sigmoid   x = low + (high - low) / (1 + exp(-u))     between the bounds, which it never reaches
@@ -13,9 +10,12 @@ Reparameterisations: the optimiser moves an unconstrained variable u, the scene 
 By the chain rule dL/du = dL/dx T'(u), which is applied to the gradient once it is there: a step's kernels know nothing
 of it. T is increasing, entry by entry.
 
-What a parameter must satisfy: finite values, within its bounds.
+Updates (`Optimizer`): one optimiser for each parameter rather than one for all, so that a parameter whose gradient is
+not finite can sit an iteration out with its moments and its count of steps as they were.
 
-A clamp against outliers in gradients: less variance, at the price of a bias, which is measured.
+What a parameter must satisfy: finite values, within its bounds (`clamp`, `count_nonfinite`).
+
+A clamp against outliers in gradients (`GradientClamp`): less variance, at the price of a bias, which is measured.
 
     m_e  running mean of |g_e| over the iterations before (of clamped gradients), decay DECAY
     r_e = max(m_e, mean of m over the parameter's entries)

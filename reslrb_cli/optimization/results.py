@@ -1,15 +1,14 @@
-"""What a run found: values and errors of its parameters at its start and its end, and whether its loss fell.
+"""The results of a run: its best parameters, whether its loss fell, and values and errors at its start and its end.
 
-The best parameters that a run has had, beside the last.
+`Best`, the best parameters that a run has had, beside the last: the loss of an iteration is noise for the most part, so
+that the least of all would be the luckiest. Where views are held out, the best parameters are those of the least loss
+of these, which always has the same samples; otherwise those at the end of the WINDOW iterations whose losses have the
+least mean.
 
-The loss of an iteration is noise for the most part, so that the least of all would be the luckiest. Where views are
-held out, the best parameters are those of the least loss of these, which always has the same samples; otherwise those
-at the end of the WINDOW iterations whose losses have the least mean.
-
-Whether a run moved anything: its loss and its errors at the start and at the end, told from their noise.
-
-Compared are the first and the last tenth of the iterations, since a single loss is noise for the most part. Nothing is
-said of a run that is too short or too noisy: whoever reads that the loss did not fall has to be able to rely on it.
+`find_trend` and `got_worse`, whether a run moved anything: its loss and its errors at the start and at the end, told
+from their noise. Compared are the first and the last tenth of the iterations, since a single loss is noise for the most
+part. Nothing is said of a run that is too short or too noisy: whoever reads that the loss did not fall has to be able
+to rely on it.
 
 - It fell, if the last tenth is surely below the first, by its mean or by its median. A fall is often over within a few
   iterations of the first tenth, so that its spread is no noise; the noise of one iteration is taken from the
@@ -17,6 +16,8 @@ said of a run that is too short or too noisy: whoever reads that the loss did no
 - It rose, if the last tenth is surely above the first, by mean and median, of which the latter does not know of single
   outliers (fireflies); or surely above the very first value, from where some runs leap before they come down again.
 - It was flat, if it did neither, and surely fell by no more than `MOST_FALL`.
+
+`Results` puts these together with the parameters' values and errors at the start and at the end.
 """
 
 from __future__ import annotations

@@ -1,7 +1,10 @@
-"""How sensitive image and loss are to each parameter, from samples.
+"""The sensitivity of image and loss to each parameter, from samples, and the units that it gives (`scale: auto`).
 
-Let g be the mean of some gradient samples, and z = -sign(g), the direction of Adam's first step, in one parameter x
-alone, all its entries at once. With I(x) the image at common random numbers and T the target,
+Gradient samples are steps that measure, and leave the parameters as they are (`sample_gradient`).
+
+Sensitivities (`measure_sensitivities`): let g be the mean of some gradient samples, and z = -sign(g), the direction of
+Adam's first step, in one parameter x alone, all its entries at once. With I(x) the image at common random numbers and T
+the target,
 
     D = I(x + h z) - I(x)
     change = |D| / (h |M|),   length = h sum |D| M / sum D²,   M = max(|I|, |T|)
@@ -13,12 +16,9 @@ target hold, by least squares over those pixels that it changes at all: for a li
 intensity, for a wall its own albedo, whatever share of the picture they have. h is chosen so that the image changes by
 about 3 %, so that neither rounding nor curvature decides.
 
-Gradient samples: steps that measure, and leave the parameters as they are.
-
-Units in which one learning rate serves parameters of any sensitivity (`scale: auto`).
-
-Step lengths from `Sensitivity.length` make all parameters equally fast, and dividing gradients by the root mean square
-of a sample keeps an absolute epsilon, as Adam has it, out of the matter.
+Units in which one learning rate serves parameters of any sensitivity (`rescale`): step lengths from
+`Sensitivity.length` make all parameters equally fast, and dividing gradients by the root mean square of a sample keeps
+an absolute epsilon, as Adam has it, out of the matter.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The state of a run's iterations: all that one of them hands on to the next.
+"""The state of a run's iterations, all that one of them hands on to the next; stored, read strictly, and restored.
 
 It is this: the values of the parameters; of the optimiser its moments, and of each parameter what is moved in its
 place, with its unit and gain (transforms, `scale: auto`); what the clamp knows of gradients; how long something has not
@@ -6,11 +6,12 @@ been finite; what guided emission has learned; the number of iterations done, fr
 factor follow; the clock and the memory's peak. Nothing else decides what the next iteration does: from equal states
 equal ones follow.
 
-Values of the optimisation as NumPy arrays, and back, bit by bit.
-
-A state that was stored, read strictly: each value is of the kind, the shape and the range that a run can have.
-
-What an earlier process has settled for a run: where it began, estimator, passes, masks, how samples are drawn.
+- `to_array`, `like`: values of the optimisation as NumPy arrays, and back, bit by bit.
+- `Stored`: a state that was stored, read strictly: each value is of the kind, the shape and the range that a run can
+  have.
+- `State`, and `Snapshot`, which is one at a moment.
+- `Settled`: what an earlier process has settled for a run: where it began, estimator, passes, masks, how samples are
+  drawn.
 """
 
 from __future__ import annotations

@@ -1,6 +1,7 @@
-"""The images that views are to see: read from files, or rendered with the true values of the parameters.
+"""The images that views are to see, and the pixels that are left out of a view's loss.
 
-Pixels that are left out of a view's loss, each kind counted, and what the others weigh.
+Such pixels are counted by kind, and the others have weights (`mask_of`). Images are read from files, or rendered with
+the true values of the parameters (`make_targets`).
 """
 
 from __future__ import annotations

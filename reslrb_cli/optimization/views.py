@@ -1,18 +1,16 @@
 """A view: one sensor, the image that it is to see, and how the two are compared.
 
-Losses: how an image is compared with its target.
-
-Each takes the image I, (H, W, C) and attached to the AD graph, the target T of the same shape, both in linear radiance,
-and what each entry weighs, of that shape too with a mean of 1 (None: all the same). It returns a width-1 array: a mean
-over pixels and channels, so that it depends neither on the resolution nor on how many pixels are left out.
-
-What a view's image is multiplied by before it is compared: a number, or one that is recovered with the rest.
-
-The model is  target = exposure * image,  with one exposure E for all channels or one for each. The derivative of a loss
-L(E I) with respect to E is the sum over pixels of dL/dI I / E: it takes the samples that the other parameters'
-derivatives are made of, and no more. Where dL/dI comes from other samples than I, it is as unbiased as those are.
-
-What an experiment says of its views, in `views` or in the short forms, `scene.sensors` and `target`.
+- `Loss`: how an image is compared with its target. Each takes the image I, (H, W, C) and attached to the AD graph, the
+  target T of the same shape, both in linear radiance, and what each entry weighs, of that shape too with a mean of 1
+  (None: all the same). It returns a width-1 array: a mean over pixels and channels, so that it depends neither on the
+  resolution nor on how many pixels are left out.
+- `Exposure`: what a view's image is multiplied by before it is compared: a number, or one that is recovered with the
+  rest. The model is  target = exposure * image,  with one exposure E for all channels or one for each. The derivative
+  of a loss L(E I) with respect to E is the sum over pixels of dL/dI I / E: it takes the samples that the other
+  parameters' derivatives are made of, and no more. Where dL/dI comes from other samples than I, it is as unbiased as
+  those are.
+- `Wanted`: what an experiment says of its views, in `views` or in the short forms, `scene.sensors` and `target`.
+- `Masked`, the pixels of a view that are left out, and `View` itself.
 """
 
 from __future__ import annotations

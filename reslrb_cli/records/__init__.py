@@ -1,4 +1,4 @@
 """What a run writes down: its folder, manifest, metrics, checkpoints, images and parameters, and its clock readings.
 
-`clock`, `images` and `parameters` need Mitsuba, the other modules do not; so nothing is imported here.
+`clock` needs Dr.Jit and `images` Mitsuba, the other modules neither; so nothing is imported here.
 """

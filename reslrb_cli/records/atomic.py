@@ -1,9 +1,9 @@
-"""Files that are either whole or absent, however the process ends.
+"""Files that are either whole or absent, however the process ends, and room on the disk for the last of them.
 
 What is under way has a name of its own (`.NAME.PID.part`, `.reslrb-*` for folders). A process that fails removes it,
 one that is ended at once does so by `remove_unfinished`, and what a killed process leaves is found by its name.
 
-Room on the disk for the last things that a run writes.
+`Reserve` keeps room on the disk for the last things that a run writes.
 """
 
 from __future__ import annotations

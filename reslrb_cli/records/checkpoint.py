@@ -1,15 +1,15 @@
-"""`checkpoint/`: the state of a run after some iteration, and what it met that was not finite.
+"""Archives of arrays (`.npz`), read as if an enemy had made them, and `checkpoint/`, a run's folder of them.
+
+An entry's data are read when they are asked for, and only if they are what the caller says they must be. Nothing is
+allocated by what a head claims: entries are stored, not compressed, so that none is larger than the file itself, and an
+array has to fill its entry to the byte. No entry's name is ever the name of a file.
+
+`checkpoint/` holds the state of a run after some iteration, and what it met that was not finite:
 
 `state.npz`      the newest state; `iteration`, `parameter/<key>`, what else the iterations carry on as arrays, and
                  `state`, the rest of it as JSON
 `previous.npz`   the state before that
 `nonfinite.npz`  parameters in the first iteration with a value that was not finite, and what guided emission knew then
-
-Archives of arrays (`.npz`), read as if an enemy had made them.
-
-An entry's data are read when they are asked for, and only if they are what the caller says they must be. Nothing is
-allocated by what a head claims: entries are stored, not compressed, so that none is larger than the file itself, and an
-array has to fill its entry to the byte. No entry's name is ever the name of a file.
 """
 
 from __future__ import annotations

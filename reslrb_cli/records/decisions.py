@@ -1,12 +1,10 @@
-"""What a run says of what it found out before its first iteration, and keeps for the next one.
+"""The findings of a run: what it measured before its first iteration, values not finite, and what the next run reuses.
 
-What a run says of ways of drawing samples that were left to measurement: whether they pay, and how that was seen.
-
-What a run says of another integrator that would have been the better choice.
-
-Where a step came upon a value that is not finite.
-
-What pilots learned, kept for the next run of the same scene and parameters.
+GuidedRecord, SequenceRecord   ways of drawing samples that were left to measurement: whether they pay, and how that was
+                               seen
+RivalRecord                    another integrator that would have been the better choice
+Offender                       where a step came upon a value that is not finite
+PilotCache                     what pilots learned, kept for the next run of the same scene and parameters
 """
 
 from __future__ import annotations

@@ -1,10 +1,8 @@
-"""Images as EXR (linear, 32-bit) and PNG (8-bit sRGB, to look at).
+"""Images and recovered parameters on the disk, in formats that other tools read.
 
-Names of files that are made from the keys of parameters, which are as long as a scene's author likes.
-
-OpenEXR files of named layers: several arrays of one size in one file, so that a viewer flips between them.
-
-`parameters/`: what was optimised, in formats that other tools read.
+Names of files are made from the keys of parameters, which are as long as a scene's author likes. Images are written as
+EXR (linear, 32-bit) and PNG (8-bit sRGB, to look at). OpenEXR files of named layers hold several arrays of one size, so
+that a viewer flips between them. `parameters/` holds what was optimised.
 """
 
 from __future__ import annotations

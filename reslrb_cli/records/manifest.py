@@ -1,8 +1,8 @@
-"""`manifest.json`: what ran, on what, and how it ended.
+"""The manifest of a run, `manifest.json`: what ran, on what, and how it ended.
 
-`manifest.json` on the disk: written whole, readable whatever happens, and with an end that fits on a full disk.
-
-Run folders whose process has gone without ending the run: killed, out of memory, the machine switched off.
+On the disk it is written whole, is readable whatever happens, and has room for an end that fits on a full disk. Where
+the process has gone without ending the run (killed, out of memory, the machine switched off), `read_manifest` puts
+right what it left.
 """
 
 from __future__ import annotations

@@ -1,14 +1,8 @@
 """Files of measurements, JSON with one object a line: written as they come, and read as far as they are whole.
 
-Files of measurements, JSON with one object a line.
-
-Files of one JSON object a line that someone names: read as far as they are whole.
-
-A file of measurements that is current while they are made: whole at every moment, however the process ends.
-
-Where a file of measurements comes from: its first line, before what was measured.
-
-`NAME.samples.npz` beside the JSON file of a measurement: what its figures were made of, to go on from.
+`LineFile` is current while measurements are made, and whole at every moment, however the process ends. Its first line,
+before what was measured, is an `Origin`: where the file comes from. `read_lines` reads any such file that someone
+names. `NAME.samples.npz` beside it is what its figures were made of, to go on from.
 """
 
 from __future__ import annotations

@@ -1,16 +1,12 @@
-"""What measuring commands write with `--json`, one object a line: the records of each command.
+"""The records that measuring commands write with `--json`, one object a line.
 
-`reslrb bench --json FILE`: one object a line, one line a case and depth, or what else is swept.
+`reslrb bench`                one line a case and depth, or what else is swept
+`reslrb convergence`          measured points, methods, and the references of their errors
+`reslrb gradcheck`            one line for each comparison of a gradient with a reference
+`reslrb convergence --runs`   whole optimisations against run time, and methods
+`reslrb gradcheck --missing`  what it finds of one parameter
 
-`reslrb convergence --json FILE`: one object a line: measured points, methods, and the references of their errors.
-
-`reslrb gradcheck --json FILE`: one object a line, one line for each comparison of a gradient with a reference.
-
-`reslrb convergence --runs N --json FILE`: one object a line: whole optimisations against run time, and methods.
-
-What `gradcheck --missing` finds of one parameter.
-
-Lines of `gradcheck --json` as the records that they were, where they are whole.
+Lines of `gradcheck` are read back as the records that they were, where they are whole.
 """
 
 from __future__ import annotations

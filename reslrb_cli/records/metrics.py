@@ -1,8 +1,7 @@
-"""`metrics.jsonl`: one object a line, one line an iteration.
+"""The metrics of a run, `metrics.jsonl`: one object a line, one line an iteration.
 
-The part of `metrics.jsonl` that a run goes on from: the iterations that its checkpoint contains, and no others.
-
-What of a whole run was not finite, or clamped, added up from its records.
+A run that is resumed goes on from a part of the file: the iterations that its checkpoint contains, and no others. The
+tallies add up from the records what of a whole run was not finite, or clamped.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
-"""The folder of one run: where it is made, what may be replaced, and who works in it.
+"""The folder of one run: where it is made, what may be replaced, who works in it, and how a run goes on in it.
 
-The values to which a run brought its parameters, whether it is finished, interrupted or still at work.
-
-Run folders that are gone on with: opened under their lock, or copied into a new one.
+`read_value` reads the values to which a run brought its parameters, whether it is finished, interrupted or still at
+work. `RunFolder` makes and replaces folders. Those that are gone on with are opened under their lock (`opened`), or
+copied into a new one (`copy_into`).
 """
 
 from __future__ import annotations

@@ -1,8 +1,7 @@
 """Convergence and whole optimisations as aligned tables, and what they come to in a sentence.
 
-The methods of a convergence as an aligned table, and what it comes to in a sentence.
-
-Whole optimisations as an aligned table, and which method is the best in a sentence.
+The methods of a convergence are lines of a `Table`, and `closing_sentence` is what they come to; whole optimisations
+have a `RunsTable`, and `runs_closing_sentence` says which method is the best.
 """
 
 from __future__ import annotations

@@ -1,20 +1,15 @@
 """Errors as people see them: of images against their targets, and of recovered colours.
 
-Differences between colours, by colour-science, and what is told of many of them.
-
 Colours are linear sRGB (BT.709 primaries, D65), as Mitsuba's RGB variants have them. Arrays are (..., 3).
 
-How far recovered colours are from the true ones, as a person sees it.
-
-HDR-FLIP: how an error strikes someone who flips between two images, at all exposures that show something.
-
-From the package `flip-evaluator`, which is an extra: `pip install reslrb[flip]`.
-
-The error of an image against its target, as a person sees it.
-
-The errors of a run as people see them, from the images and parameters in its folder.
-
-Runs of which errors as people see them were never recorded: they are found in what the folder holds.
+- `ciede2000`, `itp`, `told`: differences between colours, by colour-science, and what is told of many of them.
+- `color_errors`: how far recovered colours are from the true ones.
+- `flip_map`: HDR-FLIP: how an error strikes someone who flips between two images, at all exposures that show something.
+  From the package `flip-evaluator`, which is an extra: `pip install reslrb[flip]`.
+- `image_errors`: the error of an image against its target.
+- `seen_errors`: the errors of a run, from the images and parameters in its folder.
+- `with_seen_errors`: the same for runs of which such errors were never recorded: they are found in what the folder
+  holds.
 """
 
 from __future__ import annotations

@@ -1,8 +1,7 @@
-"""A finished run in a few lines: its parameters, and how it ended.
+"""A finished run in a few lines, for a terminal: how it ended, and its parameters.
 
-How a run ended, in a line: its loss, its errors, and what did not work.
-
-The parameters of a finished run in a few aligned lines, for a terminal.
+How it ended is a line: its loss, its errors, and what did not work (`last_line`). The parameters are a few aligned
+lines (`parameter_lines`).
 """
 
 from __future__ import annotations

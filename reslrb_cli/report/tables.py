@@ -1,12 +1,9 @@
 """Measurements as aligned tables: bench, conditioning, gradcheck and its suite.
 
-The results of a bench as an aligned table.
-
-Conditioning as an aligned table.
-
-The results of a gradcheck as an aligned table, and as Markdown.
-
-The results of a suite of cases: one line for each case, with what each estimator came to.
+- `table_head`, `table_line`: the results of a bench.
+- `conditioning_lines`, `chain_lines`: conditioning.
+- `Table`, `markdown_table`: the results of a gradcheck, aligned and as Markdown; `summary_lines`, what they come to.
+- `suite_table`: the results of a suite of cases: one line for each case, with what each estimator came to.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Linear values and errors as a screen shows them.
 
-Linear values as a screen shows them: which exposure suits them, and their encoding in sRGB.
-
-Where an image differs from its target: as layers of a file, and as a picture whose colours have a scale.
+Linear values have an exposure that suits them, and are encoded in sRGB (`exposure_for`, `encode`). Where an image
+differs from its target is shown as layers of a file, and as a picture whose colours have a scale (`write_error_map`,
+`colored`).
 """
 
 from __future__ import annotations

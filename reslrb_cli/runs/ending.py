@@ -1,6 +1,6 @@
 """The end of a run, part by part: each stands alone, the manifest comes first, and it says what is missing.
 
-What an error comes to: the one line that a user sees, and the exit code.
+`tell` says what an error comes to: the one line that a user sees, and the exit code.
 """
 
 from __future__ import annotations

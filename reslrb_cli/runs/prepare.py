@@ -1,10 +1,10 @@
 """The course of a run: what its iterations go on from, and what has been found on the way; kept, and taken up again.
 
-What a run's manifest says of the plan of its step.
-
-What of an experiment may change while its run goes on, and what may not.
-
-From a configuration to a problem that is ready to run, and the manifest that says what was settled on the way.
+- `plan_record`: what a run's manifest says of the plan of its step.
+- `changes`, `check_changes`: what of an experiment may change while its run goes on, and what may not.
+- `prepare`, `manifest_of`: from a configuration to a problem that is ready to run, and the manifest that says what was
+  settled on the way.
+- `Course`: the course itself.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
-"""Runs an optimisation and writes its run folder; one that is gone on with goes on where it was.
+"""The recording of a run: its optimisation is run, and its folder written; one that is resumed goes on where it was.
 
-What is written of a run or a measurement while it is at work: its page, its file.
-
-What a run says, and notes in its manifest, of scales and memory while it is at work.
+- `LivePage`: what is written of a run or a measurement while it is at work: its page, its file.
+- `note_scaling`, `check_memory`: what a run says, and notes in its manifest, of scales and memory while it is at work.
+- `Recording`: one run being recorded.
 """
 
 from __future__ import annotations

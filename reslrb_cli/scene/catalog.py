@@ -1,6 +1,6 @@
-"""What parameters a scene has, and which of them can be recovered.
+"""The catalogue of a scene: its parameters and which of them can be recovered, and what `reslrb inspect` says of it.
 
-What a scene contains, for `reslrb inspect`; printing is up to the caller.
+Printing is up to the caller.
 """
 
 from __future__ import annotations

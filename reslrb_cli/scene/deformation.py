@@ -1,7 +1,14 @@
 """Scene parameters as functions of what is recovered: motions of shapes and emitters, and heightmaps on meshes.
 
-A mesh has positions p = M(p0 + h n0), p0 and n0 its own positions and normals, h the heightmap where it has one, at the
-vertex's texture coordinates, and M the motion where it has one,
+Obstacles and movables: which shapes and emitters have derivatives of where they are, and why others have none; what a
+motion or a heightmap can move is found by id, with the scene parameter that places each.
+
+Surroundings: the sphere that light from infinitely far away falls into, kept around shapes that move. Emitters without
+a place (a constant sky, parallel light) send their rays through a sphere around the scene. Mitsuba gives it to them
+when the scene is loaded: what moves out of it later would be in the dark.
+
+Deformation: a mesh has positions p = M(p0 + h n0), p0 and n0 its own positions and normals, h the heightmap where it
+has one, at the vertex's texture coordinates, and M the motion where it has one,
 
     M(p) = c + t + Rz Ry Rx s (p - c)      c the pivot, t the translation, R the rotation about each axis, s the scale
 
@@ -9,15 +16,6 @@ An analytic shape, and an emitter without a surface, is placed by M after its ow
 place alone. What the scene gets are values without a graph (leaves): a step adds its gradient to these, and `collect`
 brings it on to what is recovered, once, however many views, batches and passes the step has. In forward mode `push`
 takes tangents the other way.
-
-What may move: which shapes and emitters have derivatives of where they are, and why others have none.
-
-Shapes and emitters that a motion or a heightmap can move: found by id, with the scene parameter that places each.
-
-The sphere that light from infinitely far away falls into, kept around shapes that move.
-
-Emitters without a place (a constant sky, parallel light) send their rays through a sphere around the scene. Mitsuba
-gives it to them when the scene is loaded: what moves out of it later would be in the dark.
 """
 
 from __future__ import annotations

@@ -1,12 +1,10 @@
-"""Writes a scene, with the values that its parameters have, into a new folder.
+"""The export of a scene, with the values that its parameters have, into a new folder.
 
-Values as elements of a scene description.
-
-A mesh as it stands in a loaded scene, as a PLY file in place of what its element names.
-
-The files beside an exported scene: those that it refers to, copied, and those that hold recovered values.
-
-Puts the values that a scene's parameters have into the description that the scene was built from.
+- Values as elements of a scene description.
+- A mesh as it stands in a loaded scene, as a PLY file in place of what its element names.
+- `Parts`, the files beside the exported scene: those that it refers to, copied, and those that hold recovered values.
+- `Replacing` puts the values that a scene's parameters have into the description that the scene was built from.
+- `export_scene` does all of it, and checks that Mitsuba reads the same values back.
 """
 
 from __future__ import annotations

@@ -1,6 +1,9 @@
-"""Where a scene and its parts stand, as far as single precision cares, and a sensor's clip planes.
+"""The place and size of a scene and its parts, where single precision or a sensor's clip planes lose light by them.
 
-Whether glass is so thin that rays, which start off the surface that they leave, jump over its other side.
+- `lost_light`: a scene far from the origin, or tiny.
+- `clipped`: parts before a sensor's near clip plane or beyond its far one.
+- `coincident`: different faces at the same place.
+- `thin_glass`: glass so thin that rays, which start off the surface that they leave, jump over its other side.
 """
 
 from __future__ import annotations

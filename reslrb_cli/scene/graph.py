@@ -1,10 +1,9 @@
-"""The graph of a scene's objects: what there is, and what uses what.
+"""The graph of a scene's objects, and its lamps: what there is, what uses what, and what emits.
 
-Shapes that emit light, and what their emitters do.
-
-Rays as the emitters of a scene send them out, where Mitsuba can sample them.
-
-Lamps in view that are smaller than a pixel, which rays through the pixels hardly ever hit.
+- `SceneGraph`: the objects and all parents of each.
+- `Lamp`: a shape that emits light, and what its emitter does.
+- `emitted_rays`: rays as the emitters of a scene send them out, where Mitsuba can sample them.
+- `small_lamps`: lamps in view that are smaller than a pixel, which rays through the pixels hardly ever hit.
 """
 
 from __future__ import annotations

@@ -1,14 +1,10 @@
-"""Image files, and images to compare with or to use as textures.
+"""Image files: examined before they are decoded, and read as images to compare with or as textures.
 
-Image files before they are decoded: how large they say they are, whether they end where they should, and how the
-camera was held.
-
-A file of some kilobytes can say that it is an image of gigabytes, and Mitsuba's reader fills what a JPEG lacks with
-grey. A file that was cut off and then padded is told as well where its format is compressed, but for the last lines of
-an EXR, which has no check sums. Cameras and phones write the pixels as the sensor has them, and say beside it (EXIF, in
-JPEG and PNG) how these are to be turned to stand upright, which Mitsuba's reader does not look at.
-
-Images to compare with, and images as textures.
+Examined is how large they say they are, whether they end where they should, and how the camera was held. A file of some
+kilobytes can say that it is an image of gigabytes, and Mitsuba's reader fills what a JPEG lacks with grey. A file that
+was cut off and then padded is told as well where its format is compressed, but for the last lines of an EXR, which has
+no check sums. Cameras and phones write the pixels as the sensor has them, and say beside it (EXIF, in JPEG and PNG) how
+these are to be turned to stand upright, which Mitsuba's reader does not look at.
 """
 
 from __future__ import annotations

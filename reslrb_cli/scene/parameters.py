@@ -1,6 +1,6 @@
 """The parameters that are recovered: selected by key or glob, checked, and set to where they start.
 
-What is recovered of a scene, and the way between its values and the scene.
+A `Selection` has their settings, and is the way between their values and the scene.
 """
 
 from __future__ import annotations

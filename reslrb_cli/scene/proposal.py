@@ -1,6 +1,6 @@
-"""Which parameters of a scene someone may want to recover from a photograph: what is large in view first.
+"""Proposals for recovering a scene from a photograph: which of its parameters someone may want, large in view first.
 
-A photograph at the size of a film: what it is, and a copy of it with fewer pixels.
+Also the photograph at the size of a film: what it is, and a copy of it with fewer pixels.
 """
 
 from __future__ import annotations

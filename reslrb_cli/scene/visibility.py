@@ -1,15 +1,14 @@
-"""What the sensors see of a scene: texels, what light tracing lacks, and how long its paths have to be.
+"""The view that sensors have of a scene: pixels and texels of use to light tracing, and how long its paths have to be.
 
-Pixels of which light tracing lacks something: at the film's border, and where the sensor sees glass, mirrors, coats.
+Pixels: light tracing lacks something at the film's border (`interior`), and where the sensor sees glass, mirrors, coats
+(`sees_specular`), from the smooth lobes of which light paths cannot connect to the sensor. `sees_lamps` has the pixels
+that see lamps.
 
-From the smooth lobes of those light paths cannot connect to the sensor. And those that see lamps.
+Texels: those that the sensors see (`visible_texels`).
 
-Which texels the sensors see.
-
-How long light's paths have to be that a picture of a scene lacks next to nothing of what a camera would see.
-
-A photograph has light of any number of bounces. An image of paths of at most d segments is darker, which an exposure or
-a colour would make up for.
+Depth: how long light's paths have to be that a picture of a scene lacks next to nothing of what a camera would see
+(`find_depth`). A photograph has light of any number of bounces. An image of paths of at most d segments is darker,
+which an exposure or a colour would make up for.
 """
 
 from __future__ import annotations

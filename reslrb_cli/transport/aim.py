@@ -17,8 +17,8 @@ has the weight f cos / p_b with either way, and at z the factor
 which is at most 1 / (1 - SHARE). A path that was aimed and meets something else on its way, or a point that the sensor
 does not see, ends. r has no derivative, as little as a weight of roulette.
 
-Positions on the film are drawn by blocks of pixels, UNIFORM of them evenly, the others by what earlier steps have found
-and by the step's own dL/dI, where that is known before its samples are drawn (`Aim`).
+Positions on the film are drawn by blocks of pixels, AIM_UNIFORM of them evenly, the others by what earlier steps have
+found and by the step's own dL/dI, where that is known before its samples are drawn (`guide.Aim`).
 """
 
 from __future__ import annotations

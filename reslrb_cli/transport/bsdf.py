@@ -1,16 +1,14 @@
-"""BSDFs along a light path: scattering, evaluation, and the derivatives of both.
+"""BSDFs along a light path: sampling a scattering event, evaluation, and the derivatives of both.
 
-Derivatives of both kinds of BSDF factor of a light path, s_j (along the path) and c_i (towards the sensor).
-
-Sampling is detached: directions and densities do not depend on the parameters. A factor is then f / pdf, where only
+A path has BSDF factors of two kinds, s_j (along the path) and c_i (towards the sensor). Sampling is detached:
+directions and densities do not depend on the parameters. A factor is then f / pdf, where only
 
     f = bsdf * cos        a smooth lobe, evaluated for a given direction
     f = weight * pdf      a delta lobe, which has a weight and a discrete probability, and no value
     f = transmission      passing straight through (a mask, a thin sheet)
 
-has a derivative.
-
-One scattering event of a light path: a direction sampled from the BSDF, and its weight (derivatives: `bsdf.py`).
+has a derivative (`tracked_factor`, `tracked_factors`). A scattering event (`scatter`) is a direction sampled from the
+BSDF, and its weight.
 
 Bump and normal maps perturb the shading frame inside of the BSDF, where Veach's correction cannot see it. In scenes
 that have them a smooth lobe is evaluated as a path from the camera would, with its two directions exchanged,

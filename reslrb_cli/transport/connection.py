@@ -1,6 +1,6 @@
-"""Connecting a vertex of a light path to the sensor.
+"""Connections of a light path's vertex to the sensor, straight through surfaces that only mask or filter light.
 
-Straight passage through surfaces that only mask or filter light (Mitsuba's `Null` lobes).
+Those are Mitsuba's `Null` lobes; `transmittance` passes them. `connect` finds where on the film a vertex appears.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
-"""Where light paths start: rays from the emitters.
+"""The start of light paths: rays from the emitters.
 
-Light that leaves surfaces, where Mitsuba's own samples of it are wrong, or lack a derivative.
+Light that leaves surfaces is sampled here (`lamp_ray`) where Mitsuba's own samples are wrong, or lack a derivative:
 
 sphere             Mitsuba turns the points of a sphere with its `to_world`, and not their normals
 directionalarea    it remembers the area that the shape had when it was loaded

@@ -1,11 +1,11 @@
-"""The film: splatting through its filter, the exact adjoint of that, and blocks of its pixels.
+"""The film: splatting through its reconstruction filter, the exact adjoint of that, and blocks of its pixels.
 
-Splatting onto the film through its reconstruction filter, and its exact adjoint: looking up dL/dI at a splat.
+The adjoint of a splat is looking up dL/dI where it lands:
 
 splat:   I_p += filter_p(u) C        filter_p(u): weight of pixel p for film position u, summing to 1 over pixels
 lookup:  delta = sum_p filter_p(u) dL/dI_p
 
-Blocks of pixels that a film is divided into, where what is said at a place of it is learned.
+Into blocks of pixels a film is divided where what is said at a place of it is learned.
 """
 
 from __future__ import annotations

@@ -1,20 +1,8 @@
-"""Guided emission: light paths start where earlier ones had something to say, and count for less there.
+"""Guided emission and guided roulette: light paths start and go on where earlier ones had something to say.
 
-A path's start is a point of the unit cube in four dimensions (two numbers for a place or a disk, two for a direction)
-and a number that chooses an emitter. The cube is cut into cells, for each emitter its own. A cell k of measure v_k is
-drawn with probability p_k; within it numbers stay evenly spread, and the path's weight is multiplied by v_k / p_k.
-Whatever an emitter makes of its numbers, the mean of what a path contributes stays what it was, as long as every cell
-can be drawn and p does not depend on the numbers that it is used with.
-
-Drawing takes one look-up: of M slots, cell k owns m_k, and p_k = m_k / M exactly. Lanes draw stratified, lane i of n
-from the i-th n-th of all slots: what is left of the noise is that within cells, and paths that start alike are traced
-side by side. At least UNIFORM of all slots are shared out evenly, so that no table makes a weight larger than
-1 / UNIFORM.
-
-Russian roulette by what a path can still say: paths that go where earlier ones had little left to say end early.
-
-The scene's bounding box is cut into cubes, and the directions of each cube into octants. A path that leaves a vertex
-with throughput w (the largest channel, emission and the weights of earlier roulette included) goes on with probability
+Roulette: paths that go where earlier ones had little left to say end early. The scene's bounding box is cut into cubes,
+and the directions of each cube into octants. A path that leaves a vertex with throughput w (the largest channel,
+emission and the weights of earlier roulette included) goes on with probability
 
     q = min(1, max(LEAST, w s))        s: the number of the cell that the vertex and the new direction lie in
 
@@ -24,6 +12,17 @@ depend on the random numbers that it is used with. How s is learned says `guidin
 The more a path has been weighted up, the larger is its w, and so its q: since q is at least w s where it is below 1, no
 throughput is raised beyond 1 / s_0, where s is nowhere below s_0. Roulette on throughput alone is played beside it from
 `rr_depth` on, so that paths end that nothing else would end.
+
+Emission: a path's start is a point of the unit cube in four dimensions (two numbers for a place or a disk, two for a
+direction) and a number that chooses an emitter. The cube is cut into cells, for each emitter its own. A cell k of
+measure v_k is drawn with probability p_k; within it numbers stay evenly spread, and the path's weight is multiplied by
+v_k / p_k. Whatever an emitter makes of its numbers, the mean of what a path contributes stays what it was, as long as
+every cell can be drawn and p does not depend on the numbers that it is used with.
+
+Drawing takes one look-up: of M slots, cell k owns m_k, and p_k = m_k / M exactly. Lanes draw stratified, lane i of n
+from the i-th n-th of all slots: what is left of the noise is that within cells, and paths that start alike are traced
+side by side. At least GUIDE_UNIFORM of all slots are shared out evenly, so that no table makes a weight larger than
+1 / GUIDE_UNIFORM.
 """
 
 from __future__ import annotations

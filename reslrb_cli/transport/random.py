@@ -1,11 +1,9 @@
 """The random numbers of a light path, independent or of low discrepancy.
 
-The random numbers of a light path, drawn in the order of Mitsuba's `ptracer`, used or not: from one seed both trace
-the same paths.
+Independent ones are drawn in the order of Mitsuba's `ptracer`, used or not: from one seed both trace the same paths.
 
-Numbers of low discrepancy: where light paths start, and how they first scatter, evenly spread over all paths.
-
-The first number is stratified: lane i of n has it in the i-th n-th of [0, 1). So n need be no power of two, and paths
+Numbers of low discrepancy have where light paths start, and how they first scatter, evenly spread over all paths. The
+first number is stratified: lane i of n has it in the i-th n-th of [0, 1). So n need be no power of two, and paths
 that start alike are traced side by side. The others are Sobol's points with the lanes' numbers for indices. Of 2^k
 lanes in a row that begin at a multiple of 2^k, every box of area 2^-k along the first two of these, whose sides are
 [a, a + 1) times powers of two, holds exactly one point; along more of them boxes hold few points each.

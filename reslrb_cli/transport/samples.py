@@ -1,9 +1,8 @@
-"""The samples of one pass over a light-traced image: which random numbers, how many light paths, for which film.
+"""The samples of a light-traced image, in passes: which random numbers, how many light paths, for which film.
 
-Images and gradients of several passes, added up.
-
-In single precision a sum over all samples would lose the last of them (1e8 samples: a quarter of a pixel), so each pass
-has a block and gradients of its own, and these are added to one another.
+Images and gradients of several passes are added up. In single precision a sum over all samples would lose the last of
+them (1e8 samples: a quarter of a pixel), so each pass has a block and gradients of its own, and these are added to one
+another.
 """
 
 from __future__ import annotations

@@ -1,9 +1,6 @@
-"""Emitters that the sensor sees directly: C_0, one primary ray per light path, a sample of its own.
+"""Emitters that the sensor sees directly: C_0, by points on lamps that move or are small, and by primary rays.
 
-Lanes are spread evenly over the pixels, so that a constant background is free of noise; connecting random points of the
-emitters to the sensor, as `ptracer` does, is the noisier the larger the emitter.
-
-Lamps that are seen directly by points on them, in place of primary rays, which hit them or not.
+By points on lamps, in place of primary rays, which hit them or not:
 
     C_0 = Le(x) |n . w| W(x) / p(x)        at film position u(x)
 
@@ -12,6 +9,10 @@ lamp. Its own outline needs no care then: the points at the rim move, too. What 
 so is what it covers. Their light itself, and its derivative by their radiance, is that of primary rays.
 
 Of lamps smaller than a pixel primary rays hit few or none: there this form is the light itself.
+
+By primary rays, one per light path, a sample of its own: lanes are spread evenly over the pixels, so that a constant
+background is free of noise; connecting random points of the emitters to the sensor, as `ptracer` does, is the noisier
+the larger the emitter.
 """
 
 from __future__ import annotations

@@ -1,16 +1,14 @@
-"""The one light-path loop: numbers, segment, hooks, roulette. What is done with the connections is the hooks' to say,
-and no estimator or integrator repeats the loop.
+"""The one light-path loop: numbers, segment, hooks, roulette.
+
+What is done with the connections is the hooks' to say (`Hooks`: what an estimator sees of a walk, and what it may do
+along it), and no estimator or integrator repeats the loop.
+
+One segment of a light path leads from the ray that reaches a vertex to the connection from there, the scattering event,
+and the next ray. It depends on nothing but the ray, what it hits, the segment's random numbers and the scene. So it can
+be done again, wherever these are known.
 
 Random numbers are drawn in the order of Mitsuba's `ptracer`, so that both trace the same paths from the same seed.
 Those that hooks need for a selection come from a stream of their own: a replay that selects nothing stays in step.
-
-What an estimator sees of a walk, and what it may do along it.
-
-One segment of a light path: from the ray that reaches a vertex to the connection from there, the scattering event,
-and the next ray.
-
-A segment depends on nothing but the ray, what it hits, the segment's random numbers and the scene. So it can be done
-again, wherever these are known.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 """The processes of a `convergence`, side by side: each compiles, then they take turns, one computing at a time.
 
-A drift of the machine so hits all alike. What errors are taken from takes its turns too, and so does what biases are
-judged by, where it is not among what is compared. All have seeds of their own: no two share noise.
+A session may go on from the steps that an earlier one has taken, with the same dL/dI (`restore`, `kept`).
 
-Going on from the steps that an earlier session of a `convergence` has taken, with the same dL/dI.
+As they take turns, a drift of the machine hits all alike. What errors are taken from takes its turns too, and so does
+what biases are judged by, where it is not among what is compared. All have seeds of their own: no two share noise.
 """
 
 from __future__ import annotations

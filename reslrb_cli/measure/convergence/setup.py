@@ -1,12 +1,10 @@
-"""Who takes part in a `convergence`, what is found out before, and the steps of one.
+"""The members of a `convergence`, what is found out before it measures, and the steps of one.
 
-Those that take steps: the methods compared, what errors are taken from, and what biases are judged by.
-
-Before anything is measured: the images that dL/dI is held at, and which stock integrators count as references.
-
-Runs in a process of its own (`workers.py`), with the integrator that errors are taken from.
-
-Steps of one method, timed and kept: gradients or images, in a process of its own (`workers.py`).
+- `Member`: one of those that take steps: the methods compared, what errors are taken from, and what biases are judged
+  by.
+- `begin_survey`, before anything is measured: the images that dL/dI is held at, and which stock integrators count as
+  references. It runs in a process of its own (`workers.py`), with the integrator that errors are taken from.
+- `begin_sampling`: steps of one method, timed and kept: gradients or images, in a process of its own.
 """
 
 from __future__ import annotations

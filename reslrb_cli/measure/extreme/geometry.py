@@ -1,15 +1,12 @@
-"""Cases of the extreme suite: glass, roughness, places and motion at the ends of their range.
+"""Cases of the extreme suite: glass, motion, places and roughness at the ends of their range.
 
-Glass and masks: what light passes, straight or bent, wholly or not at all.
-
-What moves light: slopes from none to total reflection, grazing light, thin glass, indices, sizes of scenes.
-
-Where things stand: scale, distance from the origin, grazing views, sides and normals.
-
-Microfacet BSDFs from fully rough to nearly smooth: a plate throws light on a floor, and the camera sees that alone.
-
-The plate itself stays out of view: a nearly smooth lobe that is connected to the sensor has a variance that no number
-of samples settles.
+- `GLASS_CASES`, glass and masks: what light passes, straight or bent, wholly or not at all.
+- `MOTION_CASES`, what moves light: slopes from none to total reflection, grazing light, thin glass, indices, sizes of
+  scenes.
+- `PLACES_CASES`, where things stand: scale, distance from the origin, grazing views, sides and normals.
+- `ROUGHNESS_CASES`, microfacet BSDFs from fully rough to nearly smooth: a plate throws light on a floor, and the camera
+  sees that alone. The plate itself stays out of view: a nearly smooth lobe that is connected to the sensor has a
+  variance that no number of samples settles.
 """
 
 from __future__ import annotations

@@ -1,14 +1,11 @@
-"""Cases of the extreme suite: light, colours, films and losses at the ends of their range.
+"""Cases of the extreme suite: colours, films, light and losses at the ends of their range.
 
-Colours at the ends of their range: albedos of 0 and 1, pure light on pure walls.
-
-Films and textures of the least size, borders and crops.
-
-Light: very dim and very bright, small, grazing, seen a thousand times, or not at all.
-
-Losses whose derivative changes sign or is not finite, and sums over very many samples.
-
-Lamps that no sample finds, or one in a thousand: smaller than a pixel in view, and with black texels.
+- `COLOURS_CASES`: albedos of 0 and 1, pure light on pure walls.
+- `FILMS_CASES`: films and textures of the least size, borders and crops.
+- `LIGHTS_CASES`: light very dim and very bright, small, grazing, seen a thousand times, or not at all.
+- `LOSSES_CASES`: losses whose derivative changes sign or is not finite, and sums over very many samples.
+- `UNFOUND_CASES`: lamps that no sample finds, or one in a thousand: smaller than a pixel in view, and with black
+  texels.
 """
 
 from __future__ import annotations

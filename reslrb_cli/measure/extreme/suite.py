@@ -1,12 +1,10 @@
 """The extreme suite: what a case is, and how its estimators are run against references.
 
-What a case of the extreme suite is: a scene, its parameters, and what their gradient is known by.
-
-What `gather`'s replay leaves of its sum: nothing but rounding, once every contribution has been taken off again.
-
-Going on with a suite: its cases are whole or not there.
-
-Runs cases of the extreme suite: every estimator against naive AD of the same paths, and each case's reference.
+- `ExtremeCase`: a scene, its parameters, and what their gradient is known by (`Source`).
+- `residual`: what `gather`'s replay leaves of its sum: nothing but rounding, once every contribution has been taken off
+  again.
+- `restore`, `kept`: going on with a suite, whose cases are whole or not there.
+- `run_cases`: every estimator of a case against naive AD of the same paths, and against the case's reference.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
 """Whole optimisations by several methods, some seeds each, at equal wall time: loss and error against run time.
 
-`plan` says what is measured, `runner` and `judge` are what the processes do, `session` has them take turns, `verdict`
-says who is the best.
+`evaluate` is what the processes do, `session` has them take turns, `rank` says what the runs come to and who is the
+best. What is measured is the `RunsPlan` of `measure/methods.py`.
 """

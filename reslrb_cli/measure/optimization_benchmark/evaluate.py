@@ -1,15 +1,12 @@
-"""One whole optimisation, and what judges all of them: each in a process of its own.
+"""One whole optimisation, and what judges all of them: each in a process of its own (`workers.py`).
 
-What all runs are judged by, in a process of its own (`workers.py`): one target, and images of the same samples.
+What all runs are judged by (`begin_judging`) has one target, and images of the same samples. A method's own loss is of
+the image that it renders itself: its noise, and where `run.adjoint` takes it from, are part of it. So losses are taken
+here, of images by one integrator with the same seeds for all values; none of it is in the time of any method.
 
-A method's own loss is of the image that it renders itself: its noise, and where `run.adjoint` takes it from, are part
-of it. So losses are taken here, of images by one integrator with the same seeds for all values; none of it is in the
-time of any method.
-
-One whole optimisation by one method, in a process of its own (`workers.py`), which goes on as far as it is asked to.
-
-Its time is what a user of the method waits for: loading the scene, what is left to measurement, compiling, steps and
-updates. Starting Python is not in it, nor is the target, which all methods have from the one that judges them.
+One whole optimisation by one method (`begin_run`) goes on as far as it is asked to. Its time is what a user of the
+method waits for: loading the scene, what is left to measurement, compiling, steps and updates. Starting Python is not
+in it, nor is the target, which all methods have from the one that judges them.
 """
 
 from __future__ import annotations

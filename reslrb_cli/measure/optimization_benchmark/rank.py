@@ -1,14 +1,11 @@
-"""What whole optimisations come to: each method at its best learning rate, and which is the best.
+"""The results of whole optimisations: each method at its best learning rate, and which is the best.
 
-One run of one method, as the session sees it, and the times at which all of them are looked at.
-
-Several learning rates for each method of whole runs: which is the best, and how methods compare at theirs.
-
-What whole runs come to: a record of each method, and which of them is the best, by a test.
-
-Going on from the whole runs that an earlier session has made: the same target, the same time for each.
-
-All that whole runs come to: a record of each method, each at the best of its learning rates, and who is the best.
+- `Run`: one run of one method, as the session sees it; `times` are those at which all of them are looked at.
+- `best_of`, `ratio`: of several learning rates of a method, which is the best, and how methods compare at theirs.
+- `method_records`, `find_best`: a record of each method, and which of them is the best, by a test.
+- `restore`, `kept`: going on from the whole runs that an earlier session has made: the same target, the same time for
+  each.
+- `outcome`: all that whole runs come to.
 """
 
 from __future__ import annotations

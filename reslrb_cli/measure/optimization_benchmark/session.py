@@ -4,7 +4,7 @@ A drift of the machine so hits all methods of a seed alike. Each run starts from
 same time as every other; where it stands at some times, which all have in common, is judged by another process
 meanwhile. That the others wait for this costs them nothing but what it does to the caches.
 
-The process that judges whole runs, as the session sees it: it makes the target, or takes over an earlier one's.
+That process is `Judging`, as the session sees it: it makes the target, or takes over an earlier one's.
 """
 
 from __future__ import annotations

@@ -3,9 +3,10 @@
 An image is what a box filter gives: the mean radiance over each pixel. All parameters here are colours, and each
 channel of the image depends on the same channel of a parameter alone.
 
-The scenes that `analytic` knows the images of, as `mi.load_dict` takes them, each beside its reference.
-
-Lamps that samples hardly find, or not at all, and whose images are known: specks, and those with black texels.
+- `KnownScene`: a scene, as `mi.load_dict` takes it, beside its reference: `furnace_scene` and those after it.
+- `speck_in_view`, `texels_over_plane`: lamps that samples hardly find, or not at all, and whose images are known:
+  specks, and those with black texels.
+- `furnace`, `point_over_plane`, `point_through_surface`, `beam_through_slab`: the images, in closed form.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Motions whose derivatives are known in closed form: a tilted surface of glass, a ball lens, a lamp over a plane.
 
-The receiver is the plane y = 0 of `attached.glass.setting`, which its camera sees from x, z = -1 to 1. Of every path
+The receiver is the plane y = 0 of `moving_light.setting`, which its camera sees from x, z = -1 to 1. Of every path
 that lands there the image shows, in all pixels together,
 
     sum_p A I_p = rho / pi * flux          A: area of a pixel on the receiver

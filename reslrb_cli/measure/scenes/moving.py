@@ -1,10 +1,9 @@
-"""Scenes in which parameters move light, and the derivatives that finite differences find there.
+"""Test scenes in which parameters move light, what they are made of, and what finite differences find there.
 
-Smooth meshes, and fields that displace their vertices smoothly.
-
-What a test scene is in which parameters move light, and the derivatives that finite differences give of it.
-
-Scenes that move along a few directions: amplitudes as parameters, of which what moves is a function.
+- Smooth meshes, and fields that displace their vertices smoothly: `mesh`, `smooth_fields`.
+- What such a scene is, and the derivatives that finite differences give of it: `AttachedScene`, `Differenced`.
+- Motions along a few directions: amplitudes as parameters, of which what moves is a function: `Displacement`, `Pose`,
+  `Number`, `Displaced`.
 """
 
 from __future__ import annotations

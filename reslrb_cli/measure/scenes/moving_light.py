@@ -1,15 +1,11 @@
 """Scenes in which parameters move light, so made that finite differences hold.
 
-Light through glass onto a receiver: what bends it is displaced, tilted and moved.
-
-Light by way of mirrors onto a receiver: what reflects it is displaced, and rough.
-
-Lamps, receivers and rooms that move.
-
-Light through glass onto a floor, and from there onto walls that alone are seen: what follows a diffuse bounce.
-
-On the wall there are edges at rest, over which a direction that turns with the floor, from a point that moves on it,
-sweeps.
+- `GLASS_SCENES`: light through glass onto a receiver: what bends it is displaced, tilted and moved.
+- `MIRRORS_SCENES`: light by way of mirrors onto a receiver: what reflects it is displaced, and rough.
+- `PLACES_SCENES`: lamps and receivers that move.
+- `ROOMS_SCENES`: rooms: light through glass onto a floor, and from there onto walls that alone are seen: what follows a
+  diffuse bounce. On the wall there are edges at rest, over which a direction that turns with the floor, from a point
+  that moves on it, sweeps.
 """
 
 from __future__ import annotations

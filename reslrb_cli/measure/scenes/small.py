@@ -1,8 +1,7 @@
-"""Small scenes to measure in: a Cornell box, a corner of a room.
+"""Small scenes to measure in, and to check gradients in: a Cornell box, and a corner of a room.
 
-The scene that is measured where no configuration is given: a Cornell box with a texture on its white surfaces.
-
-Small scenes to check gradients in: a corner of a room and what to put into it, as `mi.load_dict` takes them.
+The Cornell box, with a texture on its white surfaces, is measured where no configuration is given (`build`). The corner
+of a room, and what to put into it, as `mi.load_dict` takes them, are to check gradients in (`room`).
 """
 
 from __future__ import annotations

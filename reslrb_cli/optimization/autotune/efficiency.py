@@ -1,13 +1,14 @@
-"""How efficient ways of sampling a gradient are: what is tried, measured and may be spent.
+"""The efficiency of ways of sampling a gradient: two compared, and what a pilot tries, may spend and finds.
 
-How much more efficient one way of sampling a gradient is than another, by steps of both, and how sure that is.
+How much more efficient one way is than another, by steps of both, and how sure that is (`compare`):
 
     gain = (variance * time of the one) / (variance * time of the other)
 
 Variance is summed over the parameters, each over its gradient's mean square. The interval is that of the logarithm of
 the variances' quotient by the jackknife over the steps, and of times by what a single one may be off.
 
-What a pilot tries, measures, may spend and finds; the statistics of gradients that it judges by.
+The rest is what a pilot tries (`Candidate`), measures (`Measured`), may spend (`Allowance`) and finds (`Outcome`), and
+the statistics of gradients that it judges by.
 """
 
 from __future__ import annotations

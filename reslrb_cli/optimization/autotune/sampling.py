@@ -1,25 +1,18 @@
-"""Whether a run's paths are guided, and which numbers they have, settled before its first iteration.
+"""The sampling of a run, settled before its first iteration: guided emission, and the sequence of numbers.
 
-Whether guided emission pays here: a table is learned, and held; then steps with it take turns with steps without.
+Each is settled where it is left to measurement, guiding first. Steps drawn one way take turns with steps drawn the
+other:
 
-To a guided step's time is added its part of what a run of that length learns: each time one more walk of one pass, with
-what Python does for a new table, often at first and then rarely.
-
-Short steps make the table less worth than a run's, which has learned from more, and draws more paths from each of its
-cells. So the gain is rather more than what is found here, and what pays here pays there.
-
-Whether low-discrepancy numbers pay here: steps with them take turns with steps without, guided if the run's are.
-
-Both draw from one table, where they are guided. What a run goes on learning takes both the same time; it is left out,
-which makes more of the time that such numbers take.
-
-Noise of evenly spread numbers falls faster than with one over the samples, or as fast. So short steps find less of the
-gain than whole ones have, and what pays here pays there.
-
-Whether a run's emission is guided, settled before its first iteration where that is left to measurement.
-
-Whether a run's paths have low-discrepancy numbers, settled before its first iteration where that is left to
-measurement; and, before that, whether they are guided.
+- `GuidingPilot`: whether guided emission pays here. A table is learned, and held; then steps with it take turns with
+  steps without. To a guided step's time is added its part of what a run of that length learns: each time one more walk
+  of one pass, with what Python does for a new table, often at first and then rarely. Short steps make the table less
+  worth than a run's, which has learned from more, and draws more paths from each of its cells. So the gain is rather
+  more than what is found here, and what pays here pays there.
+- `SequencePilot`: whether low-discrepancy numbers pay here. Steps with them take turns with steps without, guided if
+  the run's are; then both draw from one table. What a run goes on learning takes both the same time; it is left out,
+  which makes more of the time that such numbers take. Noise of evenly spread numbers falls faster than with one over
+  the samples, or as fast. So short steps find less of the gain than whole ones have, and what pays here pays there.
+- `InsteadPilot`: whether low-discrepancy numbers pay in place of guided emission.
 """
 
 from __future__ import annotations

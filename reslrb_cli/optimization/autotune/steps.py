@@ -1,10 +1,8 @@
-"""Steps of a run taken two ways in turns, before its first iteration: whether one pays.
+"""Steps of a run taken two ways in turns, before its first iteration, with dL/dI held: whether one way pays.
 
-How many samples, and how often, the steps have that a `StepPilot` takes.
-
-Steps of a run, taken two ways in turns before its first iteration, with dL/dI held: what a `StepPilot` measures.
-
-Whether another way of drawing samples pays here: steps that draw so take turns with steps as they are.
+- `Sizes`: how many samples these steps have, and how often tables of guided emission learn
+- `StepTrial`: the steps of a problem, as they are or by another way of drawing samples
+- `StepPilot`: whether that other way pays, decided from steps of both that take turns
 
 Gradients have dL/dI held at one image's, so that both kinds estimate the same. Times are those of kernels, and, alike
 for both kinds, what goes on beside them in a run for as many samples: it counts where iterations take milliseconds.

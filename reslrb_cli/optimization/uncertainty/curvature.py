@@ -1,6 +1,9 @@
 """The Gauss-Newton curvature of the loss, and the directions in which it is measured.
 
-The Gauss-Newton curvature H = J^T W J of the loss at the parameters' values: J of the image, W = d2L/dI2, by pixel.
+Directions are those in which images are differentiated: entries of small parameters, and textures brightened as a whole
+(`plan_changes`).
+
+The curvature (`Curvature`) is H = J^T W J at the parameters' values: J of the image, W = d2L/dI2, by pixel.
 
     along directions    J by differences of images at common random numbers, from two independent sets of samples a, b:
                         H = (J_a^T W J_b + J_b^T W J_a) / 2, whose noise has no bias
@@ -17,8 +20,6 @@ weighs what noise darkens), `d_odd` the rest, taken in blocks of pixels, which t
 the second moment of b is
 
     B = sum over blocks (J_a^T d_odd) (J_b^T d_odd)^T + (J^T d_even) (J^T d_even)^T
-
-Directions in which images are differentiated: entries of small parameters, and textures brightened as a whole.
 """
 
 from __future__ import annotations

@@ -1,6 +1,7 @@
-"""How far final values may be from the optimum.
+"""The distance of final values from the optimum: what the run's steps leave open, less what gradients at the end say.
 
-How far final values may be from the optimum: what the run's steps leave open, less what gradients at the end say.
+What was measured of one parameter at the end of a run is a `Measured`; what follows from it is a `Posterior`, of
+entries together (`joint`), or of each as if all others were known, the way and its error (`alone`).
 
 Near the optimum the loss is quadratic with curvature H, and the offset d = x - x* of the values x follows the steps
 
@@ -26,8 +27,6 @@ take the places of C, C H and H C H + Sigma / K. Where the run has converged, D 
 and H^-1 B H^-1 is left.
 
 Momentum is left out: over many steps it moves as far. P is that of the end.
-
-What was measured of one parameter at the end of a run.
 """
 
 from __future__ import annotations

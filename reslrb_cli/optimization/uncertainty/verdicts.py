@@ -1,4 +1,9 @@
-"""What can be said of a final value, by rules on what was measured. Nothing here knows of scenes.
+"""Verdicts on final values, by rules on what was measured, and their record. Nothing here knows of scenes.
+
+- `judge_together`: all directions judged together, and which of them make up for each other
+- `ParameterCertainty`, `CertaintyRecord`: what is recorded of how certain final values are
+- `weigh`: from gradients and curvature to spreads and verdicts
+- `Verdict`, `judge`, `summarise`: what can be said of a final value, by the rules below
 
 The first rule that holds of an entry decides; `spread` is the standard deviation of its final value about the optimum,
 `alone` the same with all other parameters known, `to_go` the estimated way to the optimum, and tau `TOLERANCE` of the
@@ -16,12 +21,6 @@ entry's scale. All but `spread` are of the optimum of the loss with the target a
 
 A parameter of several entries is what `SETTLED_SHARE` of those that are seen and have an effect are, if that is
 `settled`; otherwise what most of the others are.
-
-All directions judged together: which of them make up for each other.
-
-What is recorded of how certain final values are.
-
-From gradients and curvature to spreads and verdicts.
 """
 
 from __future__ import annotations

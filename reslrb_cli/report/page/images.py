@@ -1,12 +1,10 @@
-"""The images on the page: start, end, target and maps of every sensor.
+"""The images on the page: start, end, target and maps of every sensor, and tables of what they come to.
 
-Arrays of linear values as pictures that a page holds in itself.
-
-Maps of gradients of textures: the gradient, its reference, and their difference in standard errors.
-
-What of every view counts: its share of the loss, its exposure, and the pixels that are left out.
-
-Errors as people see them, as tables: of images, and of recovered colours.
+- `show`, `embed`: arrays of linear values as pictures that a page holds in itself.
+- `gradient_maps`: maps of gradients of textures: the gradient, its reference, and their difference in standard errors.
+- `view_table`: what of every view counts: its share of the loss, its exposure, and the pixels that are left out.
+- `seen_tables`: errors as people see them, as tables: of images, and of recovered colours.
+- `image_rows`: a row for every sensor.
 """
 
 from __future__ import annotations

@@ -1,9 +1,10 @@
-"""Pieces of HTML. What comes from outside is escaped here, and nowhere else: `text`, `breakable` and the rest yield
-markup, and take plain text where their arguments are not called `markup`.
+"""Pieces of HTML: the page's look, text and tables, and diagrams.
 
-How the page looks: on a phone and on a wide screen, in light and dark, and on paper.
+What comes from outside is escaped here, and nowhere else: `text`, `breakable` and the rest yield markup, and take plain
+text where their arguments are not called `markup`.
 
-Diagrams of curves as SVG, in the page's own colours.
+The look (`STYLE`) is for a phone and a wide screen, for light and dark, and for paper. Diagrams of curves are SVG, in
+the page's own colours (`diagram`).
 """
 
 from __future__ import annotations

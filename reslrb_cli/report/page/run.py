@@ -1,8 +1,8 @@
 """The parts of the page that one run has.
 
-What an iteration takes, by part, in words and as bars.
-
-What ran, on what, how long, and what was measured before it, as tables.
+- `bars`: what an iteration takes, by part, in words and as bars.
+- `run_facts`, and the tables after it: what ran, on what, how long, and what was measured before it.
+- `run_parts`: all parts of a run, by title.
 """
 
 from __future__ import annotations

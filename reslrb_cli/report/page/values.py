@@ -1,6 +1,7 @@
-"""The parameters on the page: numbers with swatches, textures as pictures, and their errors.
+"""The parameters on the page, with their errors, and curves of loss and errors.
 
-Loss and errors of one run, or of several in one picture, against iterations and time.
+Parameters are numbers with swatches, and textures as pictures (`parameter_table`, `texture_pictures`). Curves are loss
+and errors of one run, or of several in one picture, against iterations and time (`convergence`, `convergence_of_all`).
 """
 
 from __future__ import annotations

@@ -1,10 +1,8 @@
-"""From elements to Mitsuba's objects, under names that last.
+"""The way from a scene's elements to Mitsuba's objects, under names that last, and back.
 
-Lasting names for objects without an id: their kind, and their number among all of that kind; and the way back.
-
-Mitsuba names an object without an id by its address in memory, which differs each time that the scene is loaded.
-
-From the elements of a scene to Mitsuba's objects, by way of its own parser.
+Mitsuba names an object without an id by its address in memory, which differs each time that the scene is loaded. Its
+lasting name is its kind, and its number among all of that kind; `Owners` leads from names back to elements. Objects are
+made by way of Mitsuba's own parser.
 """
 
 from __future__ import annotations

@@ -1,10 +1,7 @@
-"""What a scene's files must not say, and sizes: refused before Mitsuba sees any of it.
+"""The refusals of what a scene's files must not say, before Mitsuba sees any of it.
 
-What a scene's files must not say: plugins that are not Mitsuba's, endless files, chains without end.
-
-What a scene's files say of their sizes: refused where no machine has room for it, before Mitsuba allocates any.
-
-Gives films another size than their files say.
+`check` refuses plugins that are not Mitsuba's, endless files, and chains without end; `check_sizes`, before Mitsuba
+allocates any, sizes for which no machine has room. `resize_films` gives films another size than their files say.
 """
 
 from __future__ import annotations

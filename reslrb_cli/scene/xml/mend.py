@@ -1,20 +1,14 @@
-"""What other versions of Mitsuba and exporters wrote, said as Mitsuba 3 has it.
+"""The mending of what other versions of Mitsuba and exporters for them wrote, where Mitsuba 3 can say it.
 
-What was mended, or left out, so that a scene could be loaded.
+In the order of the code: notes of what was mended, or left out, so that a scene could be loaded; tables of how those
+versions and exporters say what Mitsuba 3 says in another way; colours and spectra; texture coordinates as Mitsuba 0.6
+let them be scaled and shifted; textures that stand by themselves, put where they are used, so that their parameters
+belong to what uses them; and `mend`, which goes through the elements.
 
-How other versions of Mitsuba, and exporters for them, say what Mitsuba 3 says in another way: tables.
-
-Colours as Mitsuba 0.6 let them be written, and spectra that RGB variants lack, in a form that has a colour there.
-
-The plugins `regular`, `irregular` and `blackbody` can be evaluated by wavelength alone. Of the same spectrum written as
+Colours as Mitsuba 0.6 let them be written, and spectra that RGB variants lack, get a form that has a colour there. The
+plugins `regular`, `irregular` and `blackbody` can be evaluated by wavelength alone. Of the same spectrum written as
 `<spectrum value="400:0.1, 700:0.9"/>` Mitsuba computes the colour, by the CIE's matching functions: that of light where
 it is what an emitter emits, elsewhere that of a surface under D65.
-
-Texture coordinates as Mitsuba 0.6 let them be scaled and shifted.
-
-Puts textures that stand by themselves where they are used, so that their parameters belong to what uses them.
-
-Mends what other versions of Mitsuba and exporters for them wrote, where it can be said in Mitsuba 3's own way.
 """
 
 from __future__ import annotations

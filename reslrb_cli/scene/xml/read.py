@@ -1,14 +1,11 @@
 """Scene files as elements: read, included files and variables put in, and written for Mitsuba's parser.
 
-What a scene's XML consists of: elements that know the line that they come from.
-
-Reads one XML file into elements, and refuses what would take the parser down or never end.
-
-The `$name` variables of a scene file, put in as Mitsuba's parser does.
-
-Brings a scene together from its files: includes are followed, variables put in, folders to look in collected.
-
-A scene's elements as the XML that Mitsuba's own parser reads.
+- `Element` knows the file and the line that it comes from.
+- `read_document` reads one XML file, and refuses what would take the parser down or never end.
+- `Variables` puts in the `$name` variables of a scene file as Mitsuba's parser does.
+- `read_description` brings a scene together from its files: includes are followed, variables put in, folders to look in
+  collected.
+- `tag_lines` writes the elements as the XML that Mitsuba's own parser reads.
 """
 
 from __future__ import annotations
