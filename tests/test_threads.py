@@ -18,7 +18,7 @@ from reslrb_cli.backend.variant import set_variant
 set_variant("llvm_ad_rgb")
 from threads import compute_alone
 import drjit as dr, mitsuba as mi, numpy as np
-from reslrb_cli.scene import load_scene
+from reslrb_cli.scene.load import load_scene
 print(compute_alone(), dr.thread_count(), flush=True)
 image = np.random.default_rng(1).uniform(size=(40, 30, 3)).astype(np.float32)
 file = sys.argv[1] + "/image.exr"

@@ -31,7 +31,7 @@ def command(paths: tuple[Path, ...], output: Path | None) -> int:
     from reslrb_cli.backend.installation import load_packages
 
     load_packages()  # images are read by Mitsuba
-    from reslrb_cli.cli.terminal import Reading
+    from reslrb_cli.cli.progress import Reading
     from reslrb_cli.report.page import write_page
     from reslrb_cli.report.perceptual import with_seen_errors
     from reslrb_cli.report.sources import Run, read_sources

@@ -1,4 +1,4 @@
-"""The terminal: streams on which nothing fails, progress, and what an error comes to.
+"""The terminal: streams on which nothing fails, and what an error comes to.
 
 What commands print and log (`echo`, `LineFormatter`): keys, names and paths are a user's or a file's, and must not
 command the terminal.
@@ -8,10 +8,7 @@ full behind a redirection, a pipe whose reader has gone, a stream that was close
 is a reason to end a run of hours. While `forgiving_output` is entered, `sys.stdout` and `sys.stderr` take everything
 (of `click.echo`, of the log, of a progress bar), pass on what can be passed on, and drop the rest without a word.
 
-Progress of an optimisation, and of reading long files (`Progress`, `Reading`): a bar on a terminal, plain lines
-elsewhere.
-
-What an error comes to on the command line (`tell`): those of its own arguments, and all others (`runs.ending.tell`).
+What an error comes to on the command line (`tell`): those of its own arguments, and all others (`errors.tell`).
 """
 
 from __future__ import annotations
@@ -22,21 +19,14 @@ import io
 import logging
 import os
 import sys
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
-from types import TracebackType
-from typing import Any, TextIO
+from typing import TextIO
 
 import click
 
-from reslrb_cli.config.files import in_words
+from reslrb_cli import errors
 from reslrb_cli.errors import ExitCode, one_line, printable
-from reslrb_cli.optimization.errors import ErrorMeter
-from reslrb_cli.records.metrics import Record
-from reslrb_cli.report.format import shorten
-from reslrb_cli.runs import ending
 
 
 def echo(line: object) -> None:
@@ -170,173 +160,6 @@ class LogLines(logging.Handler):
             self.handleError(record)
 
 
-#: Without a terminal a line is written after each tenth of the iterations, and when this many seconds have passed.
-SECONDS_PER_LINE = 10.0
-
-
-#: What takes less has no bar.
-LEAST_SECONDS = 1.0
-
-
-#: A key in a line has at most so many characters.
-KEY_WIDTH = 32
-
-
-#: Cells that the bar has at least; what would leave it fewer is said in fewer words.
-LEAST_BAR = 8
-
-
-#: The line around the bar, the most telling first; `{desc}` is what `descriptions` says.
-FRAMES = (
-    "{percentage:3.0f}%|{bar}| {n_fmt}/{total_fmt} [{elapsed}<{remaining}, {rate_fmt}] {desc}",
-    "{percentage:3.0f}%|{bar}| {n_fmt}/{total_fmt}, {remaining} left, {desc}",
-    "{percentage:3.0f}%|{bar}| {desc}",
-)
-
-
-#: Where there is no room for any of them.
-LEAST_FRAME = "{percentage:3.0f}%|{bar}|"
-
-
-def descriptions(record: Record, meter: ErrorMeter) -> list[str]:
-    """The record's loss, and its parameters' error where that is known, in ever fewer words.
-
-    Where the parameters' units differ, the error is the largest relative one.
-    """
-    loss = f"loss {record.loss:.4g}"
-    if record.parameter_rmse is not None:
-        rmse = f"RMSE {record.parameter_rmse:.4g}"
-        return [f"{loss}, parameter {rmse}", f"{loss}, {rmse}", loss]
-    relative = meter.relative(record.parameter_errors)
-    if not relative:
-        return [loss]
-    key = max(relative, key=lambda key: relative[key])
-    error = f"error {relative[key]:.4g}"
-    return [f"{loss}, relative {error} at worst ({shorten(key, KEY_WIDTH)})", f"{loss}, relative {error}", loss]
-
-
-class Progress:
-    """Shows each record of `total` on standard error; as a context manager it tidies the terminal up at the end.
-
-    `done` of them were before, in a run that goes on.
-    `meter` is what measured the parameters' errors. While a bar is shown, the log goes above it.
-    """
-
-    def __init__(self, total: int, quiet: bool, meter: ErrorMeter, done: int = 0) -> None:
-        self._total, self._quiet, self._meter = total, quiet, meter
-        self._stream = sys.stderr
-        self._bar: Any = None
-        self._width: int | None = None
-        self._choice = 0
-        self._around = contextlib.ExitStack()
-        self._last_line, self._tenth = time.monotonic(), 10 * done // total
-        if not quiet and self._stream.isatty():
-            from tqdm import tqdm
-
-            self._bar = tqdm(
-                total=total, initial=done, file=self._stream, unit="it", dynamic_ncols=True, bar_format=LEAST_FRAME
-            )
-
-    def show(self, record: Record) -> None:
-        """Show that the iteration of `record` is done."""
-        if self._bar is not None:
-            self._fit(descriptions(record, self._meter))
-            self._bar.update()
-            if record.iteration + 1 == self._total:  # what follows is no iteration
-                self._bar.close()
-            return
-        done, now = record.iteration + 1, time.monotonic()
-        tenth = 10 * done // self._total
-        if self._quiet or (tenth == self._tenth and now - self._last_line < SECONDS_PER_LINE):
-            return
-        self._tenth, self._last_line = tenth, now
-        text = descriptions(record, self._meter)[0]
-        click.echo(f"{done}/{self._total}: {text}, {record.elapsed_s:.1f} s", file=self._stream)
-
-    def _fit(self, texts: list[str]) -> None:
-        """Give the bar the first combination of frame and text that leaves it room.
-
-        Numbers change their lengths from one iteration to the next: as long as the terminal keeps its width, a longer
-        combination is not tried again, so that the line does not flicker.
-        """
-        facts = self._bar.format_dict
-        full, *short = texts
-        choices = [(frame, full) for frame in (FRAMES[:-1] if short else FRAMES)]
-        choices += [(frame, text) for text in short for frame in FRAMES]
-        if facts["ncols"] != self._width:
-            self._width, self._choice = facts["ncols"], 0
-        for place in range(self._choice, len(choices)):
-            frame, text = choices[place]
-            around = self._bar.format_meter(**{**facts, "bar_format": frame.replace("{bar}", ""), "prefix": text})
-            if self._width is None or len(around) + LEAST_BAR <= self._width:
-                self._choice, self._bar.bar_format = place, frame
-                self._bar.set_description_str(text, refresh=False)
-                return
-        self._choice, self._bar.bar_format = len(choices), LEAST_FRAME
-
-    def __enter__(self) -> Progress:
-        if self._bar is not None:
-            from tqdm.contrib.logging import logging_redirect_tqdm
-
-            self._around.enter_context(logging_redirect_tqdm([logging.getLogger("reslrb_cli")]))
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        if self._bar is not None:
-            self._bar.close()
-        self._around.close()
-
-
-class Reading:
-    """Shows how far the reading of long files has come, on standard error: called as `records.reading.Tell` is.
-
-    As a context manager it tidies the terminal up, and says, where reading took long, that what follows takes its time
-    too.
-    """
-
-    def __init__(self) -> None:
-        self._stream = sys.stderr
-        self._path: Path | None = None
-        self._bar: Any = None
-        self._began = self._said = time.monotonic()
-
-    def __call__(self, path: Path, done: int, size: int) -> None:
-        """Show that `done` of the `size` bytes of `path` are read."""
-        now, name = time.monotonic(), shorten(str(path), KEY_WIDTH)
-        if not self._stream.isatty():
-            if now - self._said >= SECONDS_PER_LINE:
-                self._said = now
-                click.echo(f"reading {name}: {in_words(done)} of {in_words(size)}", file=self._stream)
-            return
-        if path != self._path:
-            from tqdm import tqdm
-
-            self._end()
-            self._path = path
-            self._bar = tqdm(
-                total=size, file=self._stream, unit="B", unit_scale=True, unit_divisor=1024, dynamic_ncols=True,
-                desc=f"reading {name}", delay=LEAST_SECONDS, leave=False,
-            )  # fmt: skip
-        self._bar.total = size
-        self._bar.update(done - self._bar.n)
-
-    def _end(self) -> None:
-        if self._bar is not None:
-            self._bar.close()
-
-    def __enter__(self) -> Reading:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._end()
-        if error is None and time.monotonic() - self._began >= LEAST_SECONDS:
-            click.echo("drawing", file=self._stream)
-
-
 def tell(error: BaseException) -> tuple[str, int] | None:
     """The line and the exit code for `error`; None for a fault of ours, whose traceback is wanted."""
     if isinstance(error, click.Abort):
@@ -345,4 +168,4 @@ def tell(error: BaseException) -> tuple[str, int] | None:
         context = getattr(error, "ctx", None)
         where = context.command_path if context else "reslrb"
         return f"{where}: {one_line(error.format_message()).rstrip('.')}. See `{where} --help`.", ExitCode.USAGE
-    return ending.tell(error)
+    return errors.tell(error)

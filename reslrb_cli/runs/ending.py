@@ -9,49 +9,12 @@ import logging
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from reslrb_cli.errors import (
-    LINE_LENGTH,
-    ExitCode,
-    MachineError,
-    ReslrbError,
-    is_machine_fault,
-    is_out_of_memory,
-    one_line,
-)
+from reslrb_cli.errors import MachineError, describe, is_machine_fault, tell
 from reslrb_cli.records.atomic import remove_parts
 from reslrb_cli.records.checkpoint import STATE_FILE, newest_checkpoint
 from reslrb_cli.records.images import PARAMETERS_FILE as PARAMETERS_FILE_NAME
 from reslrb_cli.records.manifest import Manifest, Status
 from reslrb_cli.records.run_folder import RunFolder
-
-#: Characters that are shown of what a library says.
-QUOTED_LENGTH = 200
-
-
-def tell(error: BaseException) -> tuple[str, int] | None:
-    """The line and the exit code for `error`; None for a fault of ours, whose traceback is wanted."""
-    if isinstance(error, ReslrbError):
-        return str(error), error.exit_code
-    if isinstance(error, KeyboardInterrupt):
-        return "interrupted", ExitCode.INTERRUPTED
-    if is_out_of_memory(error):
-        advice = "lower run.spp or the size of the film, or set run.memory_budget or integrator.samples_per_pass"
-        return f"out of memory ({one_line(error, QUOTED_LENGTH) or 'host'}); {advice}", ExitCode.OUT_OF_MEMORY
-    if isinstance(error, OSError) and (error.filename is not None or is_machine_fault(error)):
-        code = ExitCode.MACHINE if is_machine_fault(error) else ExitCode.USAGE
-        return ": ".join(str(part) for part in (error.filename, error.strerror) if part is not None), code
-    if is_machine_fault(error):
-        return f"the driver or its compiler failed: {one_line(error, QUOTED_LENGTH)}", ExitCode.MACHINE
-    return None
-
-
-def describe(error: BaseException) -> str:
-    """One printable line for `error`, whatever it is."""
-    told = tell(error)
-    if told is None:
-        return f"{type(error).__name__}: {one_line(error, QUOTED_LENGTH)}".rstrip(": ")
-    return one_line(told[0], LINE_LENGTH)
-
 
 logger = logging.getLogger(__name__)
 

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from reslrb_cli.errors import NonFinite
+from reslrb_cli.errors import NonFinite, describe
 from reslrb_cli.optimization.decisions import Scaled
 from reslrb_cli.optimization.loop import optimize
 from reslrb_cli.optimization.nonfinite import Findings
@@ -36,7 +36,7 @@ from reslrb_cli.report.page import write_report
 from reslrb_cli.report.perceptual import seen_errors
 from reslrb_cli.report.run_summary import warnings
 from reslrb_cli.report.tonemap import shown_exposures, write_error_map
-from reslrb_cli.runs.ending import Ending, describe, what_is_kept
+from reslrb_cli.runs.ending import Ending, what_is_kept
 from reslrb_cli.runs.prepare import Course
 
 logger = logging.getLogger(__name__)

@@ -38,7 +38,7 @@ from numpy.typing import NDArray
 
 from reslrb_cli.backend.memory import own_memory
 from reslrb_cli.transport.film import Blocks
-from reslrb_cli.transport.plan import Grid, _least_slots
+from reslrb_cli.transport.plan import Grid, least_slots
 
 Array = np.ndarray[Any, Any]
 
@@ -131,7 +131,7 @@ def make_grid(used: Sequence[bool], weights: Sequence[float], cell_bits: int = C
 
 def apportion(grid: Grid, density: Array) -> Array:
     """Slots of each cell (int64), at least UNIFORM of its measure, the others in proportion to `density`."""
-    least = _least_slots(grid)
+    least = least_slots(grid)
     # Rounded along the cells' order, so that what one loses a neighbour gains.
     ends = np.cumsum(density, dtype=np.float64)
     ends *= (grid.slots - least.sum()) / ends[-1]

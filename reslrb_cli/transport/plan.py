@@ -95,7 +95,7 @@ def _measures(grid: Grid) -> Array:
 
 
 @functools.lru_cache(maxsize=4)
-def _least_slots(grid: Grid) -> Array:
+def least_slots(grid: Grid) -> Array:
     """Slots that each cell has at least, float64: UNIFORM of its measure."""
     measures = grid.measures()
     result = np.where(measures > 0, np.maximum(np.ceil(GUIDE_UNIFORM * grid.slots * measures - 1e-6), 1), 0)

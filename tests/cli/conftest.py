@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 import pytest
 from cli.tiny import write_experiment
 
-from reslrb_cli.cli import main, terminal
+from reslrb_cli.cli import main, progress
 from reslrb_cli.report import perceptual
 from reslrb_cli.report.page import values
 from reslrb_cli.report.page.markup import Curve, diagram
@@ -65,12 +65,12 @@ def during(monkeypatch):
     """A function that has `act(record)` called after each iteration."""
 
     def install(act):
-        show = terminal.Progress.show
+        show = progress.Progress.show
 
         def acting(self, record):
             show(self, record)
             act(record)
 
-        monkeypatch.setattr(terminal.Progress, "show", acting)
+        monkeypatch.setattr(progress.Progress, "show", acting)
 
     return install

@@ -102,7 +102,7 @@ def test_what_cannot_be_written_on_the_way_ends_nothing_and_is_told_in_the_end(
 def test_samples_that_are_too_large_are_not_kept_and_that_is_said(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(measurement_files, "MOST_BYTES", 100)
+    monkeypatch.setattr(measurement_files, "MOST_SAMPLES_BYTES", 100)
     measured = Measurement(tmp_path / "c.jsonl")
     measured.rows = np.ones(13)
     measured.keeper.finish(lines("a"))

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 from records.test_metrics import make_record
 
-from reslrb_cli.cli import terminal as module
-from reslrb_cli.cli.terminal import Progress, Reading, descriptions
+from reslrb_cli.cli import progress as module
+from reslrb_cli.cli.progress import Progress, Reading, descriptions
 from reslrb_cli.optimization.errors import ErrorMeter
 from reslrb_cli.records.measurement_files import read_lines
 

@@ -22,6 +22,7 @@ from reslrb_cli.measure.scenes.analytic_motion import centre_of_gravity, paralle
 from reslrb_cli.measure.scenes.moving import AttachedScene, Pose
 from reslrb_cli.measure.scenes.moving_light import setting
 from reslrb_cli.measure.scenes.small import transform
+from reslrb_cli.optimization import targets
 from reslrb_cli.records.measurements import LEAST, NOTHING, MissingRecord
 from reslrb_cli.transport.film import AdjointImage
 
@@ -234,8 +235,9 @@ def test_what_does_not_go_together(
     assert message in capsys.readouterr().err
 
 
-def test_a_loss_without_a_derivative():
-    """Without a segment to the floor all images are black."""
+def test_a_loss_without_a_derivative(monkeypatch: pytest.MonkeyPatch):
+    """Without a segment to the floor all images are black, the target too, which is refused before."""
+    monkeypatch.setattr(targets, "_check_light", lambda problem, say: None)
     config = room("lamp_over_floor.xml", "floor.bsdf.reflectance.value")
     config = config.model_copy(update={"integrator": config.integrator.model_copy(update={"max_depth": 1})})
     with pytest.raises(ConfigError, match="no derivative"):

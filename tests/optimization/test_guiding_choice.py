@@ -20,7 +20,7 @@ from reslrb_cli.config.loader import load
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.guiding.tables import Purpose
 from reslrb_cli.measure.methods import parse_cases
-from reslrb_cli.optimization import problem as problem_module
+from reslrb_cli.optimization import assemble as assembling
 from reslrb_cli.optimization.assemble import assemble
 from reslrb_cli.optimization.autotune.sampling import table_bytes
 from reslrb_cli.optimization.autotune.steps import StepTrial, Taken
@@ -211,7 +211,7 @@ def test_it_goes_on_as_it_was_decided_bit_by_bit(tmp_path: Path, monkeypatch: py
         "run.certainty=false",
     ]
     whole, left = run_and_kill(monkeypatch, 7, *(word for text in settings for word in ("--set", text)))
-    monkeypatch.setattr(problem_module, "settle_sampling", lambda *args: pytest.fail("measured again"))
+    monkeypatch.setattr(assembling, "settle_sampling", lambda *args: pytest.fail("measured again"))
     (tmp_path / "cache" / "pilot.json").unlink()
     assert optimize("--resume", str(left), "--quiet") == 0
     assert read_manifest(left)["guided"]["guided"]

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from cli import tiny
 
-from reslrb_cli.cli import main, terminal
+from reslrb_cli.cli import main, progress
 from reslrb_cli.optimization import loop, optimizers, problem, sensitivity, targets
 from reslrb_cli.optimization.uncertainty import measuring
 from reslrb_cli.records.metrics import Record
@@ -94,10 +94,10 @@ def run_and_kill(
     monkeypatch: pytest.MonkeyPatch, at: int, *args: str, act: Callable[[Path], object] = lambda run: None
 ) -> tuple[Path, Path]:
     """A whole run, and a copy of what a process that was killed after iteration `at` would have left."""
-    show = terminal.Progress.show
+    show = progress.Progress.show
     run, left = Path("runs/tiny"), Path("runs/killed")
 
-    def copying(self: terminal.Progress, record: Record) -> None:
+    def copying(self: progress.Progress, record: Record) -> None:
         show(self, record)
         if record.iteration + 1 == at and not left.exists():
             shutil.copytree(run, left)
@@ -105,7 +105,7 @@ def run_and_kill(
                 file.write('{"iteration": ')  # in the midst of a line
 
     with monkeypatch.context() as patch:
-        patch.setattr(terminal.Progress, "show", copying)
+        patch.setattr(progress.Progress, "show", copying)
         assert optimize("tiny.yaml", "--quiet", *args) == 0
     act(left)
     return run, left

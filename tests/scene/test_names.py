@@ -107,7 +107,7 @@ def test_names_are_the_same_in_every_load_and_process(tmp_path):
         "from reslrb_cli.backend.variant import set_variant\n"
         "set_variant('llvm_ad_rgb')\n"
         "import mitsuba as mi\n"
-        "from reslrb_cli.scene import load_scene\n"
+        "from reslrb_cli.scene.load import load_scene\n"
         "print(json.dumps(list(mi.traverse(load_scene(Path(sys.argv[1]))).properties)))"
     )
     command = [sys.executable, "-c", script, str(file)]

@@ -47,6 +47,14 @@ LEARNING_SHARE = 0.4
 PLANNED = 3.4
 
 
+def lessons(problem: Problem) -> float:
+    """How often tables of guided emission learn in an iteration of the run, in the mean over all of it."""
+    run, sensors = problem.config.run, len(problem.trained)
+    each = run.batches - (run.first_batch == "image") if problem.config.adjoint == "batched" else 1
+    gradients = run.iterations * each * len(problem.drawn(0)) / sensors
+    return learnings(max(round(gradients), 1)) * sensors / run.iterations
+
+
 @dataclass(frozen=True)
 class Sizes:
     """Samples per pixel: of a step of the run (`step`), of each set of its samples that has one dL/dI (`call`), and of
@@ -98,14 +106,6 @@ def sizes(problem: Problem, longer: float, planned: float = PLANNED) -> Sizes:
     entries = sum(problem.selection.array(key).size for key in problem.selection.keys)
     sets = run.spp / call * len(problem.drawn(0))
     return Sizes(run.spp, call, part, adjoint == "independent", entries, lessons(problem) / sets, longer, planned)
-
-
-def lessons(problem: Problem) -> float:
-    """How often tables of guided emission learn in an iteration of the run, in the mean over all of it."""
-    run, sensors = problem.config.run, len(problem.trained)
-    each = run.batches - (run.first_batch == "image") if problem.config.adjoint == "batched" else 1
-    gradients = run.iterations * each * len(problem.drawn(0)) / sensors
-    return learnings(max(round(gradients), 1)) * sensors / run.iterations
 
 
 class StepTrial:

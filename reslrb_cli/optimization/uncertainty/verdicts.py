@@ -129,6 +129,11 @@ def _partner(row: Array, place: int, chosen: Array, directions: Sequence[Directi
     return directions[max(pool, key=lambda other: pool[other])].key if pool else None
 
 
+def shares(verdicts: Sequence[Verdict]) -> dict[Verdict, float]:
+    """The share of the entries that each verdict has, of those that occur."""
+    return {verdict: verdicts.count(verdict) / len(verdicts) for verdict in Verdict if verdict in verdicts}
+
+
 @dataclass(frozen=True)
 class ParameterCertainty:
     """Of one parameter: its verdict, and the share of its entries that each verdict has.
@@ -358,11 +363,6 @@ def judge(e: Evidence) -> list[Verdict]:
     ]
     first = np.argmax([holds for holds, _ in rules], axis=0)
     return [rules[place][1] for place in first]
-
-
-def shares(verdicts: Sequence[Verdict]) -> dict[Verdict, float]:
-    """The share of the entries that each verdict has, of those that occur."""
-    return {verdict: verdicts.count(verdict) / len(verdicts) for verdict in Verdict if verdict in verdicts}
 
 
 def summarise(found: Mapping[Verdict, float]) -> Verdict:
