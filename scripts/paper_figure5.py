@@ -19,8 +19,8 @@ from pathlib import Path
 from paper_command import add_sampling, figure_parser, run
 from paper_room import ROOM, room_config
 
-from reslrb_cli.measure.figure5 import Plan, Result, measure
-from reslrb_cli.report import figure5 as report
+from paper_figure5_measure import Plan, Result, measure
+import paper_figure5_report as report
 
 #: The fewest seeds of which tails can be told.
 LEAST = 8

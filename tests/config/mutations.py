@@ -11,7 +11,7 @@ from typing import Any
 
 import yaml
 
-from reslrb_cli.config.reference import DOCS, EXAMPLE
+from make_reference import DOCS, EXAMPLE
 from reslrb_cli.config.yaml_text import parse
 from reslrb_cli.errors import ConfigError
 

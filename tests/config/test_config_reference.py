@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 
 from reslrb_cli.config.loader import load
-from reslrb_cli.config.reference import DOCS, EXAMPLE, json_schema, markdown, write
+from make_reference import DOCS, EXAMPLE, json_schema, markdown, write
 
-HINT = "run `python -m reslrb_cli.config.reference`"
+HINT = "run `python scripts/make_reference.py`"
 
 
 def test_pages_are_up_to_date() -> None:

@@ -12,12 +12,12 @@ from reslrb_cli.config.loader import load
 from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.measure.comparison import Family, compare_expectations, entry_count
-from reslrb_cli.measure.figure1 import Plan, Result, check, measure
-from reslrb_cli.measure.held_kinds import OWN, Kind, sample
-from reslrb_cli.measure.noise import fall, relative_noise
+from paper_figure1_measure import Plan, Result, check, measure
+from paper_kinds import OWN, Kind, sample
+from paper_noise import fall, relative_noise
 from reslrb_cli.measure.processes import Ended
 from reslrb_cli.records.measurements import BenchStatus, Verdict
-from reslrb_cli.report.figure1 import draw, table, to_json
+from paper_figure1_report import draw, table, to_json
 
 CONFIG = Path(__file__).resolve().parents[2] / "configs" / "paper" / "figure1.yaml"
 SMALL = [

@@ -1,6 +1,6 @@
 """Figure 5: the gradient of an image's loss with respect to a room's floor, by naive AD and by ours, and their z map.
 
-All have one dL/dI (`held_kinds.py`), which is 0 where light paths find less than paths from the sensor do: where the
+All have one dL/dI (`paper_kinds.py`), which is 0 where light paths find less than paths from the sensor do: where the
 sensor sees glass, mirrors or coats, and at the film's border. Naive AD is that of our own walk: stock `ptracer` emits
 wrongly from the room's environment map, which is turned. The experiment's own estimator is compared at other seeds, in
 standard errors, with naive AD and with `prb`, which shares nothing with us; the exact estimators with naive AD at equal
@@ -24,7 +24,7 @@ from reslrb_cli.measure.comparison import (
     entry_count,
     z_scores,
 )
-from reslrb_cli.measure.held_kinds import OWN, Kind, check_config, sample, take_pictures
+from paper_kinds import OWN, Kind, check_config, sample, take_pictures
 from reslrb_cli.records.measurements import Verdict
 
 #: Estimators that equal naive AD of the same paths but for rounding; and how far they may be from it, in relative L2.

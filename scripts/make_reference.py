@@ -1,6 +1,6 @@
 """Writes the reference of the configuration: docs/config.schema.json and docs/config.md.
 
-`python -m reslrb_cli.config.reference [FOLDER]`, after every change of the schema; a test holds the two together.
+`python scripts/make_reference.py [FOLDER]`, after every change of the schema; a test holds the two together.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import Any
 
 from reslrb_cli.config.schema import Config
 
-DOCS = Path(__file__).resolve().parents[2] / "docs"
+DOCS = Path(__file__).resolve().parents[1] / "docs"
 
 
 #: The example of the reference page, as a file in `configs/` would hold it.
@@ -49,7 +49,7 @@ run:
 _HEAD = """\
 # Configuration
 
-<!-- Written by `python -m reslrb_cli.config.reference` from reslrb_cli/config; edit the descriptions there. -->
+<!-- Written by `python scripts/make_reference.py` from reslrb_cli/config; edit the descriptions there. -->
 
 One YAML file is one experiment. Unknown keys are errors. Paths are relative to the file they stand in, except
 `run.output`, which is relative to the working directory. The file is read as YAML 1.2: `1e-3` is a number, `yes` and

@@ -1,6 +1,6 @@
 """Figure 1: gradients of a caustic's loss by naive AD and by ours, with few samples and with many, and their memory.
 
-Each kind of gradient is sampled under the same limit of memory, and all have the same dL/dI (`held_kinds.py`), so that
+Each kind of gradient is sampled under the same limit of memory, and all have the same dL/dI (`paper_kinds.py`), so that
 their means are to agree within standard errors, and the noise of ours is to fall with the root of the samples.
 """
 
@@ -15,8 +15,8 @@ import numpy as np
 from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.measure.comparison import Comparison, Family, compare_expectations, entry_count
-from reslrb_cli.measure.held_kinds import OWN, Kind, check_config, sample, take_pictures
-from reslrb_cli.measure.noise import Fall, fall, relative_noise
+from paper_kinds import OWN, Kind, check_config, sample, take_pictures
+from paper_noise import Fall, fall, relative_noise
 from reslrb_cli.records.measurements import BenchStatus, Verdict
 
 

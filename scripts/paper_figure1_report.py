@@ -1,4 +1,4 @@
-"""Figure 1 as it is shown: its picture, its table, and its figures as JSON, from `measure/figure1.py`."""
+"""Figure 1 as it is shown: its picture, its table, and its figures as JSON, from `paper_figure1_measure.py`."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from reslrb_cli.measure.figure1 import Result
-from reslrb_cli.measure.held_kinds import MIB, Kind
-from reslrb_cli.measure.noise import CONFIDENCE
+from paper_figure1_measure import Result
+from paper_kinds import MIB, Kind
+from paper_noise import CONFIDENCE
 from reslrb_cli.records.metrics import finite
 from reslrb_cli.report.tonemap import encode
 

@@ -1,4 +1,4 @@
-"""Figure 5 as it is shown: its picture, its table, and its figures as JSON, from `measure/figure5.py`."""
+"""Figure 5 as it is shown: its picture, its table, and its figures as JSON, from `paper_figure5_measure.py`."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from reslrb_cli.measure.figure5 import Result
-from reslrb_cli.measure.noise import relative_noise
+from paper_figure5_measure import Result
+from paper_noise import relative_noise
 from reslrb_cli.records.metrics import finite
-from reslrb_cli.report.figure1 import write
+from paper_figure1_report import write
 from reslrb_cli.report.tonemap import encode
 
 #: Inches: a panel's width, what is between two, and above one.
