@@ -16,11 +16,11 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
+import paper_figure1_report as report
 from paper_command import ROOT, add_sampling, figure_parser, run
+from paper_figure1_measure import Plan, Result, measure
 
 from reslrb_cli.config.loader import load
-from paper_figure1_measure import Plan, Result, measure
-import paper_figure1_report as report
 
 CONFIG = ROOT / "configs" / "paper" / "figure1.yaml"
 #: Seeds with few samples for each of those with many; and the fewest, of which the spread of few can be told.

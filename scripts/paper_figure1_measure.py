@@ -11,12 +11,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
+from paper_kinds import OWN, Kind, check_config, sample, take_pictures
+from paper_noise import Fall, fall, relative_noise
 
 from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.measure.comparison import Comparison, Family, compare_expectations, entry_count
-from paper_kinds import OWN, Kind, check_config, sample, take_pictures
-from paper_noise import Fall, fall, relative_noise
 from reslrb_cli.records.measurements import BenchStatus, Verdict
 
 

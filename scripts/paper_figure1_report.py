@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-
 from paper_figure1_measure import Result
 from paper_kinds import MIB, Kind
 from paper_noise import CONFIDENCE
+
 from reslrb_cli.records.metrics import finite
 from reslrb_cli.report.tonemap import encode
 

@@ -16,11 +16,10 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
-from paper_command import add_sampling, figure_parser, run
-from paper_room import ROOM, room_config
-
-from paper_figure5_measure import Plan, Result, measure
 import paper_figure5_report as report
+from paper_command import add_sampling, figure_parser, run
+from paper_figure5_measure import Plan, Result, measure
+from paper_room import ROOM, room_config
 
 #: The fewest seeds of which tails can be told.
 LEAST = 8

@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
+from paper_kinds import OWN, Kind, check_config, sample, take_pictures
 
 from reslrb_cli.config.schema import Config
 from reslrb_cli.measure.comparison import (
@@ -24,7 +25,6 @@ from reslrb_cli.measure.comparison import (
     entry_count,
     z_scores,
 )
-from paper_kinds import OWN, Kind, check_config, sample, take_pictures
 from reslrb_cli.records.measurements import Verdict
 
 #: Estimators that equal naive AD of the same paths but for rounding; and how far they may be from it, in relative L2.

@@ -8,11 +8,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-
+from paper_figure1_report import write
 from paper_figure5_measure import Result
 from paper_noise import relative_noise
+
 from reslrb_cli.records.metrics import finite
-from paper_figure1_report import write
 from reslrb_cli.report.tonemap import encode
 
 #: Inches: a panel's width, what is between two, and above one.

@@ -110,7 +110,7 @@ def command(
     from reslrb_cli.config.loader import load, loads
 
     load_packages()  # before what follows asks for them
-    from reslrb_cli.cli.keeping import read_earlier
+    from reslrb_cli.cli.options import read_earlier
     from reslrb_cli.measure.bench import KIND, Book
     from reslrb_cli.measure.methods import SWEPT, Sweep, choose_baseline, depths, parse_cases, usual_values
     from reslrb_cli.measure.resume_store import Earlier
@@ -166,7 +166,7 @@ def command(
 def _run(sweep: Sweep, book: Book, json_file: Path | None, began: float) -> tuple[list[Result], bool]:
     """Measure, print and write; returns all results, and whether the user interrupted."""
     from reslrb_cli.cli.interrupts import Interrupts
-    from reslrb_cli.cli.keeping import Keeper, origin_of
+    from reslrb_cli.cli.options import Keeper, origin_of
     from reslrb_cli.measure.bench import bench
     from reslrb_cli.measure.processes import abandon_all
     from reslrb_cli.report.tables import table_head, table_line

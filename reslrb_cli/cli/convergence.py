@@ -19,15 +19,17 @@ import click
 
 from reslrb_cli.cli.bench import Size
 from reslrb_cli.cli.interrupts import Interrupts
-from reslrb_cli.cli.keeping import Keeper, origin_of, read_earlier
 from reslrb_cli.cli.options import (
     COUNT,
     Counts,
     Factors,
+    Keeper,
     allowance,
     check_writable,
     experiment_arguments,
     is_given,
+    origin_of,
+    read_earlier,
     resume_option,
 )
 from reslrb_cli.cli.terminal import echo
@@ -206,7 +208,7 @@ def command(
     from reslrb_cli.config.loader import load
 
     load_packages()  # before what follows asks for them
-    from reslrb_cli.cli.keeping import read_earlier
+    from reslrb_cli.cli.options import read_earlier
     from reslrb_cli.measure.convergence.session import KIND, check
     from reslrb_cli.measure.methods import DEFAULT, DEFAULTS, Plan, RunsPlan, parse_cases
     from reslrb_cli.measure.resume_store import Earlier
@@ -283,7 +285,7 @@ def _run(
     from contextlib import ExitStack
 
     from reslrb_cli.cli.interrupts import Interrupts
-    from reslrb_cli.cli.keeping import Keeper, origin_of
+    from reslrb_cli.cli.options import Keeper, origin_of
     from reslrb_cli.measure.convergence.judgement import Judgement
     from reslrb_cli.measure.convergence.session import Session
     from reslrb_cli.measure.convergence.setup import Role

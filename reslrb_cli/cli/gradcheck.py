@@ -54,7 +54,7 @@ def run_missing(
     """Measure, print and write; returns the exit code. `variant` must be set."""
     from reslrb_cli.backend.doctor import device_name
     from reslrb_cli.cli.interrupts import Interrupts
-    from reslrb_cli.cli.keeping import Keeper, origin_of, read_earlier
+    from reslrb_cli.cli.options import Keeper, origin_of, read_earlier
     from reslrb_cli.measure.missing import KIND, MissingCheck
     from reslrb_cli.measure.resume_store import Earlier, settings
 
@@ -115,7 +115,7 @@ def run_suite_command(
     from reslrb_cli.backend.doctor import device_name
     from reslrb_cli.backend.variant import set_variant
     from reslrb_cli.cli.interrupts import Interrupts
-    from reslrb_cli.cli.keeping import Keeper, origin_of, read_earlier
+    from reslrb_cli.cli.options import Keeper, origin_of, read_earlier
     from reslrb_cli.report.tables import summary_lines
 
     chosen = _estimators(estimators)
@@ -278,7 +278,7 @@ def command(
     from reslrb_cli.backend.doctor import device_name
     from reslrb_cli.backend.installation import load_packages
     from reslrb_cli.backend.variant import set_variant
-    from reslrb_cli.cli.keeping import read_earlier
+    from reslrb_cli.cli.options import read_earlier
     from reslrb_cli.config.loader import load, loads
 
     load_packages()  # before what follows asks for them
@@ -337,7 +337,7 @@ def _run(
 ) -> tuple[list[GradcheckRecord], bool]:
     """Measure, print and write; returns all records, and whether the user interrupted."""
     from reslrb_cli.cli.interrupts import Interrupts
-    from reslrb_cli.cli.keeping import Keeper, origin_of
+    from reslrb_cli.cli.options import Keeper, origin_of
     from reslrb_cli.records.measurements import Verdict
     from reslrb_cli.report.tables import Table
 

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 def show_forecast(config: Config) -> None:
     """Measure what a run of `config` will take, and print it; a variant must be set, and nothing is written but the
     caches of kernels and pilots."""
-    from reslrb_cli.measure.prb_comparison import RIVAL, measure_rival
+    from reslrb_cli.measure.references import RIVAL, measure_rival
     from reslrb_cli.optimization.correlated_bias import measure_correlated_bias
     from reslrb_cli.optimization.forecast import make_forecast
     from reslrb_cli.records.decisions import PilotCache

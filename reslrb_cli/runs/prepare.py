@@ -26,7 +26,7 @@ from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ConfigError, printable
 from reslrb_cli.integrators.plan_report import GUIDED, SEQUENCE, plan_rows, with_reason
 from reslrb_cli.integrators.reslrb import Reslrb
-from reslrb_cli.measure.prb_comparison import measure_rival
+from reslrb_cli.measure.references import measure_rival
 from reslrb_cli.optimization.assemble import assemble
 from reslrb_cli.optimization.correlated_bias import measure_correlated_bias
 from reslrb_cli.optimization.moving import warn_of_border

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from reslrb_cli.cli.keeping import Keeper, read_earlier
+from reslrb_cli.cli.options import Keeper, read_earlier
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.records import measurement_files
 from reslrb_cli.records.measurement_files import LineFile
@@ -74,7 +74,7 @@ def test_it_is_written_every_few_seconds_and_costs_a_twentieth(tmp_path: Path, m
         written.append(now[0])
         now[0] += 1.0
 
-    monkeypatch.setattr("reslrb_cli.cli.keeping.write_samples", slowly)
+    monkeypatch.setattr("reslrb_cli.cli.options.write_samples", slowly)
     measured.rows = np.ones(1)
     for _ in range(100):
         measured.keeper.refresh()

@@ -10,8 +10,8 @@ from collections.abc import Sequence
 from typing import Any
 
 import yaml
-
 from make_reference import DOCS, EXAMPLE
+
 from reslrb_cli.config.yaml_text import parse
 from reslrb_cli.errors import ConfigError
 

@@ -6,9 +6,9 @@ import json
 from pathlib import Path
 
 import pytest
+from make_reference import DOCS, EXAMPLE, json_schema, markdown, write
 
 from reslrb_cli.config.loader import load
-from make_reference import DOCS, EXAMPLE, json_schema, markdown, write
 
 HINT = "run `python scripts/make_reference.py`"
 

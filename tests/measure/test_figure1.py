@@ -7,17 +7,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from paper_figure1_measure import Plan, Result, check, measure
+from paper_figure1_report import draw, table, to_json
+from paper_kinds import OWN, Kind, sample
+from paper_noise import fall, relative_noise
 
 from reslrb_cli.config.loader import load
 from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.measure.comparison import Family, compare_expectations, entry_count
-from paper_figure1_measure import Plan, Result, check, measure
-from paper_kinds import OWN, Kind, sample
-from paper_noise import fall, relative_noise
 from reslrb_cli.measure.processes import Ended
 from reslrb_cli.records.measurements import BenchStatus, Verdict
-from paper_figure1_report import draw, table, to_json
 
 CONFIG = Path(__file__).resolve().parents[2] / "configs" / "paper" / "figure1.yaml"
 SMALL = [

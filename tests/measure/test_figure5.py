@@ -8,16 +8,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 from paper_figure5 import main
+from paper_figure5_measure import CLOSE, Plan, Result, check, measure, tile_sums
+from paper_figure5_report import draw, table, to_json
+from paper_kinds import OWN, Kind
 from paper_room import FLOOR, room_config
 
 from reslrb_cli.config.loader import load
 from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.measure.comparison import compare_equal_seeds
-from paper_figure5_measure import CLOSE, Plan, Result, check, measure, tile_sums
-from paper_kinds import OWN, Kind
 from reslrb_cli.records.measurements import Verdict
-from paper_figure5_report import draw, table, to_json
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 SMALL = ["scene.options={resx: 24, resy: 24}", "target.render.spp=16", "integrator.estimator=reservoir", "run.spp=16"]

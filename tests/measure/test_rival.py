@@ -11,7 +11,7 @@ from cli.test_optimize import CONFIG, KEY, SCENE
 
 from reslrb_cli.cli import main
 from reslrb_cli.config.loader import load
-from reslrb_cli.measure import prb_comparison
+from reslrb_cli.measure import references
 from reslrb_cli.optimization.assemble import assemble
 from reslrb_cli.optimization.autotune import efficiency
 from reslrb_cli.records.decisions import RivalRecord
@@ -52,7 +52,7 @@ def test_it_is_measured_once_and_remembered(experiment, capsys):
     assert "measuring prb beside it" in err
     if found.advantage is not None:
         assert found.low < found.advantage < found.high
-        assert prb_comparison.LEAST_ROUNDS <= found.rounds <= prb_comparison.MOST_ROUNDS
+        assert references.LEAST_ROUNDS <= found.rounds <= references.MOST_ROUNDS
         assert (found.line() in err) == found.is_better
         assert found.line().replace("&", "&amp;") in Path("runs/box/report.html").read_text()
     err, again = optimize(capsys)
@@ -63,7 +63,7 @@ def test_it_is_measured_once_and_remembered(experiment, capsys):
 def test_the_tables_of_a_guided_run_learn_nothing_from_it(experiment: None) -> None:
     """A run begins alike whether this was measured now or by an earlier one."""
     problem = assemble(load("box.yaml", ["integrator.guiding=on"]))
-    assert prb_comparison.measure_rival(problem, None, lambda line: None) is not None
+    assert references.measure_rival(problem, None, lambda line: None) is not None
     assert problem.integrator.preparation.guiding.learned == {}
 
 
@@ -89,7 +89,7 @@ def test_it_is_tried_where_it_finds_the_light(experiment, extra, applies):
     from reslrb_cli.optimization.assemble import assemble_scene
 
     Path("scene.xml").write_text(SCENE.replace("</scene>", f"{extra}</scene>"))
-    assert (prb_comparison.why_not(assemble_scene(load("box.yaml", []))) is None) == applies
+    assert (references.why_not(assemble_scene(load("box.yaml", []))) is None) == applies
 
 
 def samples(sd, count, seed, entries=200):

@@ -20,12 +20,11 @@ from reslrb_cli.optimization.autotune.efficiency import Outcome
 from reslrb_cli.optimization.correlated_bias import CorrelatedBias, share_words
 from reslrb_cli.records.decisions import GuidedRecord, SequenceRecord
 from reslrb_cli.records.measurement_files import Origin
-from reslrb_cli.report.certainty import certainty_words, paid_line, rival_line
 from reslrb_cli.report.format import count, duration, number
 from reslrb_cli.report.page.images import image_rows, seen_tables, view_table
 from reslrb_cli.report.page.markup import COLORS, breakable, facts, mark, note, soft, table, text
 from reslrb_cli.report.page.values import convergence, parameter_table, texture_pictures
-from reslrb_cli.report.run_summary import error_line, units_differ, warnings
+from reslrb_cli.report.run_summary import certainty_words, error_line, paid_line, rival_line, units_differ, warnings
 from reslrb_cli.report.sources import Run
 
 #: Steps that are left out of medians: the first ones compile kernels.

@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 
 from reslrb_cli.records.images import finite_range, read_mask, read_parameters
-from reslrb_cli.report.certainty import is_settled, spread_words, verdict_words
 from reslrb_cli.report.format import number
 from reslrb_cli.report.page.images import show
 from reslrb_cli.report.page.markup import (
@@ -33,7 +32,7 @@ from reslrb_cli.report.page.markup import (
     text,
 )
 from reslrb_cli.report.perceptual import PLACES, is_color
-from reslrb_cli.report.run_summary import units_differ
+from reslrb_cli.report.run_summary import is_settled, spread_words, units_differ, verdict_words
 from reslrb_cli.report.sources import Run
 from reslrb_cli.report.tonemap import encode, exposure_for, exposure_words
 
