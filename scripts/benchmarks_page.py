@@ -9,7 +9,6 @@ from pathlib import Path
 import benchmarks_tables as tables
 from benchmarks_list import CHECKED, EXPERIMENTS, MEASUREMENTS, OTHERS, RECORDS, ROOT, experiment_record
 from gpu_report import gpu_section
-from paper_page import figure1_summary
 
 PAGE, README, TEMPLATE = ROOT / "docs" / "benchmarks.md", ROOT / "README.md", "page.md"
 #: Where a table stands in the template, in a line of its own, and between what in the README.
@@ -48,7 +47,6 @@ class Blocks:
             "others": self.others,
             "runs": self.runs,
             "gpu": lambda: gpu_section(self.folder),
-            "figure1": figure1_summary,
         }
 
     def make(self, name: str) -> str:

@@ -26,12 +26,6 @@ def page(folder: Path = RECORDS) -> str:
     return PLACE.sub(lambda match: made[match[1]](folder), (RECORDS / TEMPLATE).read_text(encoding="utf-8"))
 
 
-def figure1_summary(folder: Path = RECORDS) -> str:
-    """What Figure 1 shows, for the README: the gradients, and how they compare."""
-    record = json.loads((folder / "figure1.json").read_text(encoding="utf-8"))
-    return f"{_gradients(record)}\n\n{_comparisons(record['comparisons'])}\n\n{_fall(record)}"
-
-
 def _figure1(folder: Path) -> str:
     record = json.loads((folder / "figure1.json").read_text(encoding="utf-8"))
     limit = record["plan"]["limit"] / 2**30
