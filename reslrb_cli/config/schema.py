@@ -1,6 +1,6 @@
 """The configuration: one file is one experiment.
 
-Units, defaults and meanings stand in the fields' descriptions, of which `scripts/make_reference.py` writes docs/config.md.
+Units, defaults and meanings stand in the fields' descriptions; `scripts/make_reference.py` makes docs/config.md of them.
 """
 
 from __future__ import annotations
