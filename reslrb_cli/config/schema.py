@@ -1,6 +1,6 @@
 """The configuration: one file is one experiment.
 
-Units, defaults and meanings stand in the fields' descriptions; `scripts/make_reference.py` makes docs/config.md of them.
+Units, defaults and meanings stand in the fields' descriptions; `scripts/make_reference.py` writes docs/config.md.
 """
 
 from __future__ import annotations
