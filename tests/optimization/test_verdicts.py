@@ -183,6 +183,8 @@ def test_curvature_is_averaged_over_entries_of_alike_noise():
     found = smooth(measured[order], noise[order])
     assert np.abs(found / truth[order] - 1).max() < 0.6
     assert smooth(np.full(3, -1.0), np.ones(3)).tolist() == [0, 0, 0]
+    few = np.array([-2.0, 1.0, 1.0, 2.0])
+    assert smooth(few, np.ones(4), 1.0) == pytest.approx(0.5 + few.std() / 2)
 
 
 def test_entries_of_a_motion_have_noise_of_their_own():

@@ -20,6 +20,9 @@ weighs what noise darkens), `d_odd` the rest, taken in blocks of pixels, which t
 the second moment of b is
 
     B = sum over blocks (J_a^T d_odd) (J_b^T d_odd)^T + (J^T d_even) (J^T d_even)^T
+
+By entry its diagonal is probed and averaged as that of H is, and a standard error is added: of few entries the average
+may come out as next to nothing, and too little noise would make results look too sure as well.
 """
 
 from __future__ import annotations
@@ -163,8 +166,8 @@ GROUP = 64
 SHOWN = 0.05
 
 
-#: So many standard errors are taken off.
-SURE = 1.0
+#: So many standard errors are taken off curvature, and added to noise of the target.
+MARGIN = 1.0
 
 
 #: Values of the images that enter H along directions: of more, so many at random, the same for all. And blocks of B.
@@ -404,12 +407,16 @@ class Curvature:
         return seed(self.problem.config.run.seed, number, sensor, _PURPOSE)
 
 
-def smooth(diagonal: Array, noise: Array) -> Array:
-    """`diagonal` (N,) averaged over groups of entries whose gradients have alike `noise`, at least GROUP of them."""
+def smooth(diagonal: Array, noise: Array, sure: float = 0.0) -> Array:
+    """`diagonal` (N,) averaged over groups of entries whose gradients have alike `noise`, at least GROUP of them.
+
+    `sure` standard errors of each average are added to it.
+    """
     order = np.argsort(noise, kind="stable")
     result = np.empty_like(diagonal)
     for group in np.array_split(order, max(len(order) // GROUP, 1)):
-        result[group] = max(float(diagonal[group].mean()), 0.0)
+        margin = sure * float(diagonal[group].std()) / len(group) ** 0.5
+        result[group] = max(float(diagonal[group].mean()) + margin, 0.0)
     return result
 
 
@@ -432,12 +439,12 @@ def _of_channel(image: Array, channel: int | None) -> Array:
 
 
 def _sure_share(terms: Array) -> Array:
-    """What of the sums of (M, N) terms is left once SURE of their standard errors are taken off, as a share, (M,).
+    """What of the sums of (M, N) terms is left once MARGIN of their standard errors are taken off, as a share, (M,).
 
     A few bright pixels may make up all of a curvature, and be an accident.
     """
     sums, errors = terms.sum(axis=1), np.sqrt(np.square(terms).sum(axis=1))
-    result: Array = np.clip(1 - SURE * errors / np.maximum(sums, 1e-300), 0, 1)
+    result: Array = np.clip(1 - MARGIN * errors / np.maximum(sums, 1e-300), 0, 1)
     return result
 
 

@@ -32,7 +32,7 @@ from typing import Any
 
 import numpy as np
 
-from reslrb_cli.optimization.uncertainty.curvature import Direction, smooth
+from reslrb_cli.optimization.uncertainty.curvature import MARGIN, Direction, smooth
 from reslrb_cli.optimization.uncertainty.posterior import SURE, Measured, alone, at_bound, driven_alone, joint
 
 Array = np.ndarray[Any, Any]
@@ -254,7 +254,7 @@ def _large(
         h, B = np.zeros(own.value.shape), np.zeros(own.value.shape)
         h[touched] = smooth(diagonal[touched], own.noise[touched])
         if fixed is not None:
-            B[touched] = smooth(fixed[touched], own.noise[touched])
+            B[touched] = smooth(fixed[touched], own.noise[touched], MARGIN)
         given = (own.response, prior, own.noise, own.mean)
         to_go, error = alone(h, *given, len(own.gradients), own.rates)
         whole, left = alone(h, *given, len(own.gradients), own.rates, B)
