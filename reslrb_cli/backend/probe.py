@@ -18,7 +18,7 @@ _SCRIPT = """
 import json, sys, time
 import reslrb_cli
 from reslrb_cli.backend.installation import load_packages
-from reslrb_cli.backend.plugins import prefer_own_plugins
+from reslrb_cli.backend.installation import prefer_own_plugins
 
 dr, mi = load_packages()
 mi.set_variant(sys.argv[1])

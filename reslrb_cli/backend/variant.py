@@ -8,8 +8,7 @@ import os
 from importlib import metadata
 
 from reslrb_cli.backend import llvm
-from reslrb_cli.backend.installation import load_packages
-from reslrb_cli.backend.plugins import prefer_own_plugins
+from reslrb_cli.backend.installation import load_packages, prefer_own_plugins
 from reslrb_cli.backend.probe import probe
 from reslrb_cli.errors import BackendError
 

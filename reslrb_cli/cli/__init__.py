@@ -18,8 +18,7 @@ from typing import Any
 import click
 
 from reslrb_cli import __version__
-from reslrb_cli.cli.interrupts import Interrupts
-from reslrb_cli.cli.terminal import LineFormatter, LogLines, forgiving_output, tell
+from reslrb_cli.cli.terminal import Interrupts, LineFormatter, LogLines, forgiving_output, tell
 from reslrb_cli.errors import LINE_LENGTH, ExitCode, one_line
 
 # What `reslrb --help` says of each command, so that it need not load them; in the order of a user's work.

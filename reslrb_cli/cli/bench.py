@@ -165,8 +165,8 @@ def command(
 
 def _run(sweep: Sweep, book: Book, json_file: Path | None, began: float) -> tuple[list[Result], bool]:
     """Measure, print and write; returns all results, and whether the user interrupted."""
-    from reslrb_cli.cli.interrupts import Interrupts
     from reslrb_cli.cli.options import Keeper, origin_of
+    from reslrb_cli.cli.terminal import Interrupts
     from reslrb_cli.measure.bench import bench
     from reslrb_cli.measure.processes import abandon_all
     from reslrb_cli.report.tables import table_head, table_line

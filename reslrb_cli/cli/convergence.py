@@ -18,7 +18,6 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from reslrb_cli.cli.bench import Size
-from reslrb_cli.cli.interrupts import Interrupts
 from reslrb_cli.cli.options import (
     COUNT,
     Counts,
@@ -32,7 +31,7 @@ from reslrb_cli.cli.options import (
     read_earlier,
     resume_option,
 )
-from reslrb_cli.cli.terminal import echo
+from reslrb_cli.cli.terminal import Interrupts, echo
 from reslrb_cli.errors import ConfigError, ExitCode
 from reslrb_cli.measure.methods import RunsPlan
 from reslrb_cli.measure.optimization_benchmark.rank import KIND, check, outcome
@@ -284,8 +283,8 @@ def _run(
     import tempfile
     from contextlib import ExitStack
 
-    from reslrb_cli.cli.interrupts import Interrupts
     from reslrb_cli.cli.options import Keeper, origin_of
+    from reslrb_cli.cli.terminal import Interrupts
     from reslrb_cli.measure.convergence.judgement import Judgement
     from reslrb_cli.measure.convergence.session import Session
     from reslrb_cli.measure.convergence.setup import Role

@@ -53,8 +53,8 @@ def run_missing(
 ) -> int:
     """Measure, print and write; returns the exit code. `variant` must be set."""
     from reslrb_cli.backend.doctor import device_name
-    from reslrb_cli.cli.interrupts import Interrupts
     from reslrb_cli.cli.options import Keeper, origin_of, read_earlier
+    from reslrb_cli.cli.terminal import Interrupts
     from reslrb_cli.measure.missing import KIND, MissingCheck
     from reslrb_cli.measure.resume_store import Earlier, settings
 
@@ -114,8 +114,8 @@ def run_suite_command(
     """
     from reslrb_cli.backend.doctor import device_name
     from reslrb_cli.backend.variant import set_variant
-    from reslrb_cli.cli.interrupts import Interrupts
     from reslrb_cli.cli.options import Keeper, origin_of, read_earlier
+    from reslrb_cli.cli.terminal import Interrupts
     from reslrb_cli.report.tables import summary_lines
 
     chosen = _estimators(estimators)
@@ -336,8 +336,8 @@ def _run(
     check: Gradcheck, variant: str, to_keep: dict[str, Any], json_file: Path | None, folder: Path | None
 ) -> tuple[list[GradcheckRecord], bool]:
     """Measure, print and write; returns all records, and whether the user interrupted."""
-    from reslrb_cli.cli.interrupts import Interrupts
     from reslrb_cli.cli.options import Keeper, origin_of
+    from reslrb_cli.cli.terminal import Interrupts
     from reslrb_cli.records.measurements import Verdict
     from reslrb_cli.report.tables import Table
 

@@ -205,8 +205,8 @@ def _run(
     quiet: bool,
 ) -> int:
     """Run it in the folder, which is not made before signals are watched: from then on it is to say how it ended."""
-    from reslrb_cli.cli.interrupts import Interrupts
     from reslrb_cli.cli.progress import Progress
+    from reslrb_cli.cli.terminal import Interrupts
     from reslrb_cli.records.manifest import Status
     from reslrb_cli.report.run_summary import last_line, parameter_lines, terminal_width
     from reslrb_cli.runs.recorder import Recording

@@ -20,7 +20,7 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
-from reslrb_cli.backend.plugins import looking_in
+from reslrb_cli.backend.installation import looking_in
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.records.atomic import unfinished_folder
 from reslrb_cli.records.images import file_stem, write_file

@@ -12,7 +12,7 @@ from cli.failing import RUN, failing_last, full, lines
 from cli.tiny import COMPLETE, KEY, faults, files
 
 from reslrb_cli.cli import main
-from reslrb_cli.cli.interrupts import SIGNALS
+from reslrb_cli.cli.terminal import SIGNALS
 from reslrb_cli.records import metrics
 from reslrb_cli.records.manifest import read_content
 from reslrb_cli.runs import recorder as recording

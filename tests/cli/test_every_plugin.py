@@ -13,7 +13,7 @@ from cli.calling import reslrb, settings
 from cli.every_plugin import FEW, PAGE, ROWS, Row, page, write_files
 from turns import a_few
 
-from reslrb_cli.backend.plugins import package_folder, shipped_plugins
+from reslrb_cli.backend.installation import package_folder, shipped_plugins
 
 pytestmark = pytest.mark.usefixtures("llvm")
 

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 from compilation import search_path
 
-from reslrb_cli.cli.interrupts import SIGNALS, Interrupts
+from reslrb_cli.cli.terminal import SIGNALS, Interrupts
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="sends signals")
 ROOT = Path(__file__).resolve().parents[2]
@@ -91,7 +91,7 @@ def test_a_signal_in_a_recording_does_not_break_it(llvm):
         assert interrupts.requested
 
 
-WITHIN = "from reslrb_cli.cli.interrupts import Interrupts\n"
+WITHIN = "from reslrb_cli.cli.terminal import Interrupts\n"
 FIRST = WITHIN + "with Interrupts(tolerated=0): print('ready', flush=True); time.sleep(60)"
 
 

@@ -21,7 +21,7 @@ import pytest
 from cli.tiny import COMPLETE, faults, files, start, write_experiment
 from compilation import search_path
 
-from reslrb_cli.cli.interrupts import SIGNALS
+from reslrb_cli.cli.terminal import SIGNALS
 from reslrb_cli.records.manifest import read_content, read_manifest
 
 pytestmark = [

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from reslrb_cli.backend import plugins
+from reslrb_cli.backend import installation
 from reslrb_cli.backend.installation import python_command
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.scene.load import load_scene
@@ -45,7 +45,7 @@ class Trap:
         self.folder, self._ran, library = folder, folder / "ran", folder / "evil.so"
         (folder / "evil.c").write_text(LIBRARY % self._ran)
         subprocess.run([compiler, "-shared", "-fPIC", "-o", library, folder / "evil.c"], check=True)
-        self.names = ["evil", "reslrb", "walk_ad", "trajectory", "prb", *sorted(plugins.shipped_plugins())]
+        self.names = ["evil", "reslrb", "walk_ad", "trajectory", "prb", *sorted(installation.shipped_plugins())]
         for place in ("scene", "work"):
             (folder / place / "plugins").mkdir(parents=True)
             shutil.copy(library, folder / place)
@@ -186,8 +186,8 @@ def test_modules_of_the_working_folder_are_not_imported(trap):
 def test_what_this_process_has_registered_is_known():
     import mitsuba as mi
 
-    assert plugins.is_known("prb")
-    assert not plugins.is_known("mine")
+    assert installation.is_known("prb")
+    assert not installation.is_known("mine")
     mi.register_texture("mine", lambda props: mi.Texture(props))
-    assert plugins.is_known("mine")
-    assert not plugins.is_known("blender")
+    assert installation.is_known("mine")
+    assert not installation.is_known("blender")

@@ -15,7 +15,7 @@ from typing import Any
 
 import mitsuba as mi
 
-from reslrb_cli.backend.plugins import likely_parameters, looking_in
+from reslrb_cli.backend.installation import likely_parameters, looking_in
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.scene.xml.mend import Note
 from reslrb_cli.scene.xml.read import Description, Element, quoted, tag_lines

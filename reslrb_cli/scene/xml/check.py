@@ -15,8 +15,8 @@ from pathlib import Path
 
 import mitsuba as mi
 
+from reslrb_cli.backend.installation import is_known, nearest_plugin, plugin_type
 from reslrb_cli.backend.memory import free_bytes
-from reslrb_cli.backend.plugins import is_known, nearest_plugin, plugin_type
 from reslrb_cli.config.files import PIXELS, in_words
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.scene.images import DamagedImage, image_size

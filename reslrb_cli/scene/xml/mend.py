@@ -21,7 +21,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from reslrb_cli.backend.plugins import is_known
+from reslrb_cli.backend.installation import is_known
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.scene.xml.read import Description, Element, quoted
 
