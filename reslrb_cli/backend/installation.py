@@ -2,8 +2,9 @@
 
 `python_command` is the command line of a Python process of our own, which has to find the same packages.
 
-Plugins are loaded from Mitsuba's own folder alone. A plugin is a shared library, and loading it runs its code. Mitsuba looks for `plugins/NAME.so` in the folder of the
-scene and in the working folder before its own, and takes any NAME that a scene file says.
+Plugins are loaded from Mitsuba's own folder alone. A plugin is a shared library, and loading it runs its code. Mitsuba
+looks for `plugins/NAME.so` in the folder of the scene and in the working folder before its own, and takes any NAME that
+a scene file says.
 """
 
 from __future__ import annotations
