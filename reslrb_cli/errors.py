@@ -113,10 +113,11 @@ class MachineError(ReslrbError):
     exit_code = ExitCode.MACHINE
 
 
-#: What backends, the C++ library, the loader and NumPy write where memory is out.
+#: What backends, the C++ library, the loader and NumPy write where memory is out. The last is what Dr.Jit says of the
+#: address that stands for a mapping that failed, when it tidies up.
 _MEMORY_WORDS = (
     "out of memory", "bad alloc", "cannot allocate memory", "could not allocate", "unable to allocate",
-    "failed to map segment",
+    "failed to map segment", "unknown address <0xffffffffffffffff>",
 )  # fmt: skip
 
 

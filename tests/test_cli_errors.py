@@ -60,6 +60,7 @@ failing: list[BaseException] = []
         (click.FileError("x.yaml", "gone"), 2, "x.yaml"),
         (MemoryError(), 4, "out of memory (host)"),
         (RuntimeError("jit_malloc(): out of memory! Could not\nallocate"), 4, "Could not allocate"),
+        (RuntimeError("jit_free(): unknown address <0xffffffffffffffff>!"), 4, "out of memory"),
         (RuntimeError("CUDA_ERROR_OUT_OF_MEMORY"), 4, "out of memory"),
         (PermissionError(13, "Permission denied", "runs/x"), 2, "runs/x: Permission denied"),
         (MachineError("runs/x: the disk is full"), 6, "runs/x: the disk is full"),

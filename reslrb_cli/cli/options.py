@@ -28,6 +28,7 @@ from reslrb_cli.records.measurement_files import (
     Kept,
     Line,
     LineFile,
+    LivePage,
     Origin,
     are_kept,
     read_samples,
@@ -35,7 +36,6 @@ from reslrb_cli.records.measurement_files import (
     write_samples,
 )
 from reslrb_cli.records.run_folder import checkpoint_of
-from reslrb_cli.runs.recorder import LivePage
 
 
 def origin_of(variant: str) -> Origin:

@@ -9,10 +9,12 @@ from __future__ import annotations
 
 import gc
 import json
+import logging
 import math
 import os
 import platform
 import sys
+import time
 import zipfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -27,6 +29,8 @@ from reslrb_cli.errors import ConfigError, printable
 from reslrb_cli.records.atomic import remove_parts_of, write_atomically
 from reslrb_cli.records.manifest import now, versions
 from reslrb_cli.records.metrics import MOST_BYTES
+
+logger = logging.getLogger(__name__)
 
 
 class Line(Protocol):
@@ -225,3 +229,32 @@ def read_samples(path: Path) -> Kept:
     except Exception as error:  # of many kinds, from the readers of archives, arrays and their heads
         reason = str(error) or type(error).__name__
         raise ConfigError(path, "", f"is damaged, cut off, or not written beside --json ({reason})") from None
+
+
+#: Seconds between two pages, at least; and the times as long as the last page took: pages take a twentieth of a run.
+PAGE_SECONDS, PAGE_SHARE = 5.0, 20.0
+
+
+class LivePage:
+    """Has `write` write the page, or `what` else, anew, at once and then now and then; called outside of iterations.
+
+    A page that cannot be written ends no run, and is not tried again: the last one, at the run's end, says why.
+    """
+
+    def __init__(self, write: Callable[[], object], what: str = "the page of the run") -> None:
+        self._write, self._what = write, what
+        self._next: float | None = 0.0
+
+    def refresh(self) -> None:
+        """Write the page if it is time to."""
+        start = time.monotonic()
+        if self._next is None or start < self._next:
+            return
+        try:
+            self._write()
+        except Exception as error:
+            logger.debug("%s is not kept current: %s", self._what, error)
+            self._next = None
+        else:
+            end = time.monotonic()
+            self._next = end + max(PAGE_SECONDS, PAGE_SHARE * (end - start))

@@ -1,6 +1,5 @@
 """The recording of a run: its optimisation is run, and its folder written; one that is resumed goes on where it was.
 
-- `LivePage`: what is written of a run or a measurement while it is at work: its page, its file.
 - `note_scaling`, `check_memory`: what a run says, and notes in its manifest, of scales and memory while it is at work.
 - `Recording`: one run being recorded.
 - `Ending`: the end of a run, part by part. Each stands alone, the manifest comes first, and it says what is missing.
@@ -39,6 +38,7 @@ from reslrb_cli.records.checkpoint import (
 from reslrb_cli.records.images import PARAMETERS_FILE as PARAMETERS_FILE_NAME
 from reslrb_cli.records.images import write_image, write_mask, write_parameters
 from reslrb_cli.records.manifest import Manifest, Status
+from reslrb_cli.records.measurement_files import LivePage
 from reslrb_cli.records.metrics import MetricsWriter, Record, finite
 from reslrb_cli.records.run_folder import RunFolder
 from reslrb_cli.report.page import write_report
@@ -158,35 +158,6 @@ def what_is_kept(folder: RunFolder, saved: int | None, done: int, parameters: bo
     if parameters and (folder.parameters / PARAMETERS_FILE_NAME).exists():
         return f"kept: the values after {done} iterations, in {folder.parameters}; no state to go on from"
     return "nothing of the run was kept"
-
-
-#: Seconds between two pages, at least; and the times as long as the last page took: pages take a twentieth of a run.
-PAGE_SECONDS, PAGE_SHARE = 5.0, 20.0
-
-
-class LivePage:
-    """Has `write` write the page, or `what` else, anew, at once and then now and then; called outside of iterations.
-
-    A page that cannot be written ends no run, and is not tried again: the last one, at the run's end, says why.
-    """
-
-    def __init__(self, write: Callable[[], object], what: str = "the page of the run") -> None:
-        self._write, self._what = write, what
-        self._next: float | None = 0.0
-
-    def refresh(self) -> None:
-        """Write the page if it is time to."""
-        start = time.monotonic()
-        if self._next is None or start < self._next:
-            return
-        try:
-            self._write()
-        except Exception as error:
-            logger.debug("%s is not kept current: %s", self._what, error)
-            self._next = None
-        else:
-            end = time.monotonic()
-            self._next = end + max(PAGE_SECONDS, PAGE_SHARE * (end - start))
 
 
 def note_scaling(manifest: Manifest, problem: Problem, measured: Sequence[Scaled]) -> None:

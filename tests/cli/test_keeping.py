@@ -42,8 +42,8 @@ class Measurement:
 def test_both_files_are_current_and_those_of_another_measurement_go(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(recorder, "PAGE_SECONDS", 0.0)
-    monkeypatch.setattr(recorder, "PAGE_SHARE", 0.0)
+    monkeypatch.setattr(measurement_files, "PAGE_SECONDS", 0.0)
+    monkeypatch.setattr(measurement_files, "PAGE_SHARE", 0.0)
     file = tmp_path / "c.jsonl"
     file.write_text("old\n")
     measurement_files.write_samples(measurement_files.samples_file(file), {"rows": 9}, {})

@@ -11,11 +11,12 @@ import pytest
 from cli.tiny import KEY, write_experiment
 
 from reslrb_cli.cli import main
+from reslrb_cli.records import measurement_files
 from reslrb_cli.records.manifest import read_content
+from reslrb_cli.records.measurement_files import LivePage
 from reslrb_cli.records.metrics import read_metrics
 from reslrb_cli.runs import recorder
 from reslrb_cli.runs import recorder as recording
-from reslrb_cli.runs.recorder import LivePage
 
 RUN, PAGE = Path("runs/tiny"), Path("runs/tiny/report.html")
 REFRESH = 'http-equiv="refresh"'
@@ -26,8 +27,8 @@ def optimize(llvm, tmp_path, monkeypatch, capsys):
     """A function that runs `reslrb optimize tiny.yaml`, with a page after every iteration; returns standard error."""
     write_experiment(tmp_path)
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(recorder, "PAGE_SECONDS", 0.0)
-    monkeypatch.setattr(recorder, "PAGE_SHARE", 0.0)
+    monkeypatch.setattr(measurement_files, "PAGE_SECONDS", 0.0)
+    monkeypatch.setattr(measurement_files, "PAGE_SHARE", 0.0)
 
     def call(*args):
         with pytest.raises(SystemExit) as end:
