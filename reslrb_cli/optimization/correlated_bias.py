@@ -32,6 +32,7 @@ import numpy as np
 from reslrb_cli.integrators.light_tracer import LightTracer
 from reslrb_cli.integrators.step import cross_step
 from reslrb_cli.optimization.sensitivity import take_gradient
+from reslrb_cli.optimization.views import QUADRATIC
 from reslrb_cli.seeds import seed
 
 if TYPE_CHECKING:
@@ -46,8 +47,8 @@ ROUNDS, FEWEST_ROUNDS = 8, 6
 SHARE = 1 / 16
 
 
-#: Part of the run's samples that a round has, and the losses that this is right for.
-PART, QUADRATIC = 4, ("l2", "relative_l2")
+#: Part of the run's samples that a round has where the loss is quadratic, for which alone that is right.
+PART = 4
 
 
 def measure_correlated_bias(problem: Problem, say: Callable[[str], None]) -> CorrelatedBias | None:
