@@ -62,7 +62,7 @@ class Integrator(Choice):
     )
 
 
-class LightTracer(Integrator):
+class LightTracerOptions(Integrator):
     """Options of integrators that trace from the emitters; `prb` traces all samples in one pass."""
 
     samples_per_pass: Count | None = Field(
@@ -72,7 +72,7 @@ class LightTracer(Integrator):
     )
 
 
-class AttachingTracer(LightTracer):
+class AttachingTracer(LightTracerOptions):
     """Options of light tracers that have derivatives of what moves light."""
 
     attached: Annotated[
@@ -223,7 +223,7 @@ class Reslrb(AttachingTracer):
         return _ANY_ESTIMATORS - {"estimator", *ESTIMATOR_OPTIONS[self.estimator]}
 
 
-class Ptracer(LightTracer):
+class Ptracer(LightTracerOptions):
     """Mitsuba's own light tracer under naive reverse-mode differentiation: memory grows with depth."""
 
     model_config = NEEDS_TYPE
@@ -244,7 +244,7 @@ class WalkAd(AttachingTracer):
     type: Literal["walk_ad"] = Field(default="walk_ad", description="The walk of `reslrb`, naively differentiated.")
 
 
-class Trajectory(LightTracer):
+class Trajectory(LightTracerOptions):
     """The same walk, reversed by Dr.Jit itself: it records each path's loop state in thread-local memory."""
 
     model_config = NEEDS_TYPE

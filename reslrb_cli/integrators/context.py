@@ -18,7 +18,7 @@ import drjit as dr
 import mitsuba as mi
 
 from reslrb_cli.errors import UnsupportedScene
-from reslrb_cli.guiding.tables import Guiding, used_numbers
+from reslrb_cli.guiding.tables import Guiding
 from reslrb_cli.integrators.freezing import Recordings
 from reslrb_cli.scene.catalog import parameter_kind
 from reslrb_cli.scene.deformation import BEAMS, PLACES, Surroundings, moving_emitter_obstacle, moving_shape_obstacle
@@ -27,7 +27,7 @@ from reslrb_cli.scene.needs import check_supported, interpolates_normals, scene_
 from reslrb_cli.transport.aim import worthwhile
 from reslrb_cli.transport.bsdf import Scattering, stays_behind
 from reslrb_cli.transport.connection import Connection
-from reslrb_cli.transport.emission import sample_emission
+from reslrb_cli.transport.emission import sample_emission, used_numbers
 from reslrb_cli.transport.factors import Product
 from reslrb_cli.transport.film import film_blocks
 from reslrb_cli.transport.plan import Plan, make_plan

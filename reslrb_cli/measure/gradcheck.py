@@ -30,9 +30,9 @@ from reslrb_cli.measure.comparison import (
     paired_z_scores,
 )
 from reslrb_cli.measure.participants import Settings
+from reslrb_cli.measure.processes import NO_TIME
 from reslrb_cli.measure.resume_store import Earlier
 from reslrb_cli.measure.sampling import NAIVE, Name, Sampling
-from reslrb_cli.measure.workers import NO_TIME
 from reslrb_cli.records.measurement_files import Kept
 from reslrb_cli.records.measurements import GradcheckRecord, Kind, Reference, Verdict
 

@@ -1,11 +1,9 @@
-"""Workers: processes that measure, one of several side by side, from both ends; and how a sweep's time is spent.
+"""Workers: processes that measure, as they are from within.
 
 - `scratch_bytes`: thread-local memory of kernels, which the allocator does not see, read off the kernels themselves.
 - `run`: the process of one case, in a Python of its own, started and told what to do by `processes.py` (`tasks.py`). It
   reads one JSON object a line from standard input and answers each with one on standard output. The first describes the
   case; each other one asks for a step. What else is printed goes to standard error.
-- `Contestant`: one of several that are measured side by side, each in a process of its own, and how it came to its end.
-- `Pace`: how the time of a sweep is spent: so much for each depth, and as many rounds there as fit.
 """
 
 from __future__ import annotations
@@ -15,13 +13,10 @@ import logging
 import os
 import re
 import sys
-import time
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
 from typing import IO, Any
 
 from reslrb_cli.errors import BackendError, ConfigError, is_out_of_memory, mentions_memory
-from reslrb_cli.measure.processes import Ended, Refused, Stopped
 
 _BITS = {"i1": 8, "half": 16, "float": 32, "double": 64, "ptr": 64}
 
@@ -154,117 +149,3 @@ def run(load: Callable[[], Begin]) -> None:
     code = main(load)
     sys.stderr.flush()
     os._exit(code)  # what is left to tidy up may take long, or fail where memory is out
-
-
-@dataclass
-class Contestant:
-    """A process under way (`processes.Process`); whoever may not refuse ends the whole where it does."""
-
-    process: Any
-    may_refuse: bool
-    end: Ended | None = None
-    refusal: Refused | None = None
-    late: bool = False
-
-    @property
-    def alive(self) -> bool:
-        """Whether it can be asked for more."""
-        return self.end is None and self.refusal is None and not self.late
-
-    def ask(
-        self, question: dict[str, Any], stop: Callable[[], bool], over: Callable[[], bool] = lambda: False
-    ) -> dict[str, Any] | None:
-        """One answer; None where the process ended over it, or time was up. Raises Stopped once `stop()`."""
-        self.process.ask(question)
-        return self.answer(stop, over)
-
-    def answer(self, stop: Callable[[], bool], over: Callable[[], bool] = lambda: False) -> dict[str, Any] | None:
-        """The next answer, as of `ask`; the first is what a process says without being asked."""
-        try:
-            result: dict[str, Any] = self.process.answer(lambda: stop() or over())
-            return result
-        except Ended as end:
-            self.end = end
-        except Refused as refusal:
-            if not self.may_refuse:
-                raise
-            self.refusal = refusal
-        except Stopped:
-            if stop():
-                raise
-            self.late = True
-        self.process.close()  # what it held is for the others
-        return None
-
-
-MIN_ROUNDS = 3
-
-
-MAX_ROUNDS = 25
-
-
-#: How much more of the time is for the next depth, whose kernels take longer to compile and to run.
-GROWTH = 1.3
-
-
-#: What is said of what a budget did not suffice for.
-NO_TIME = "the budget was spent; allow more with --budget"
-
-
-class Pace:
-    """Divides the time among depths, each of which gets GROWTH times as much as the one before it.
-
-    What a depth leaves is for the others. None gets fewer than MIN_ROUNDS rounds while there is time at all, whatever
-    its own share, nor more than `most`. With `rounds` time does not count. Rounds of earlier sessions count.
-    """
-
-    def __init__(
-        self,
-        budget_s: float,
-        depths: int,
-        rounds: int | None = None,
-        now: Callable[[], float] = time.monotonic,
-        most: int = MAX_ROUNDS,
-    ) -> None:
-        self._now, self._end, self._left, self._rounds, self._most = now, now() + budget_s, depths, rounds, most
-        self._start = self._rounds_start = self._depth_start = self._depth_end = now()
-        self._before = 0
-
-    @property
-    def spent_s(self) -> float:
-        """Seconds since the beginning."""
-        return self._now() - self._start
-
-    @property
-    def depth_s(self) -> float:
-        """Seconds since the depth began."""
-        return self._now() - self._depth_start
-
-    def over(self) -> bool:
-        """Whether the time is up."""
-        return self._rounds is None and self._now() >= self._end
-
-    def fits(self, seconds: float) -> bool:
-        """Whether there is so much time left."""
-        return self._rounds is not None or self._now() + seconds <= self._end
-
-    def begin_depth(self) -> None:
-        """A depth begins."""
-        now = self._depth_start = self._now()
-        self._depth_end = now + (self._end - now) / sum(GROWTH**k for k in range(self._left))
-        self._left -= 1
-
-    def begin_rounds(self, before: int = 0) -> None:
-        """Its processes are warm; `before` rounds were done by earlier sessions."""
-        self._rounds_start, self._before = self._now(), before
-
-    def another(self, done: int) -> bool:
-        """Whether there is time for another round after `done` of them in this session."""
-        if self._rounds is not None:
-            return self._before + done < self._rounds
-        if self._before + done >= self._most:
-            return False
-        if done == 0:
-            return True
-        now = self._now()
-        return now + (now - self._rounds_start) / done <= (self._end if done < MIN_ROUNDS else self._depth_end)

@@ -80,6 +80,8 @@ def log_l2(
 
 
 LOSSES: dict[str, Callable[..., mi.Float]] = {"l1": l1, "l2": l2, "relative_l2": relative_l2, "log_l2": log_l2}
+
+
 #: Those whose derivative is linear in the image, so that its noise averages out.
 QUADRATIC = ("l2", "relative_l2")
 

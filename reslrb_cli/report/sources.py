@@ -21,7 +21,7 @@ Array = np.ndarray[Any, Any]
 _FIGURES = ("iteration", "elapsed_s", "step_ms", "codegen_ms", "peak_mib", "spp")
 
 
-_MORE = ("loss", "primal_ms", "adjoint_ms", "parameter_rmse")
+_OPTIONAL_FIGURES = ("loss", "primal_ms", "adjoint_ms", "parameter_rmse")
 
 
 #: Layers of a map of a gradient, as `gradcheck --images` writes them.
@@ -160,7 +160,7 @@ def _record(entry: dict[str, Any]) -> dict[str, Any] | None:
     for key in _FIGURES:
         if not _is_number(entry.get(key)):
             return None
-    for key in _MORE:
+    for key in _OPTIONAL_FIGURES:
         if not _is_number(entry.get(key)):
             entry[key] = None
     errors = entry.get("parameter_errors")

@@ -13,8 +13,7 @@ from reslrb_cli.config.loader import loads
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.measure.bench import Result, bench
 from reslrb_cli.measure.methods import Sweep, choose_baseline, depths, parse_cases
-from reslrb_cli.measure.processes import Refused, Stopped
-from reslrb_cli.measure.workers import MAX_ROUNDS, MIN_ROUNDS, Pace
+from reslrb_cli.measure.processes import MAX_ROUNDS, MIN_ROUNDS, Pace, Refused, Stopped
 from reslrb_cli.records.measurements import BenchStatus, Spread
 
 CONFIG = """\

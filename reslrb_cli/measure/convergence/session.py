@@ -22,10 +22,9 @@ from reslrb_cli.measure import resume_store
 from reslrb_cli.measure.convergence.setup import Member, Role, share_turns
 from reslrb_cli.measure.convergence.statistics import FEWEST, FEWEST_FOR_SLOPE
 from reslrb_cli.measure.methods import Case, Plan
-from reslrb_cli.measure.processes import Ended, Refused, Stopped
+from reslrb_cli.measure.processes import Contestant, Ended, Pace, Refused, Stopped
 from reslrb_cli.measure.resume_store import Earlier
 from reslrb_cli.measure.tasks import start_process
-from reslrb_cli.measure.workers import Contestant, Pace
 from reslrb_cli.records.measurement_files import Kept
 from reslrb_cli.records.measurements import BenchStatus
 

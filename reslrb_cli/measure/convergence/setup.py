@@ -27,8 +27,9 @@ from reslrb_cli.integrators.step import gradient_step, known_step, render_image
 from reslrb_cli.measure.gradients import moves_light
 from reslrb_cli.measure.methods import IMAGES
 from reslrb_cli.measure.participants import ALIKE
+from reslrb_cli.measure.processes import Contestant
 from reslrb_cli.measure.references import Situation, prb_gradient, prb_image, ptracer_gradient, ptracer_image
-from reslrb_cli.measure.workers import Begun, Contestant
+from reslrb_cli.measure.workers import Begun
 from reslrb_cli.optimization.assemble import assemble_scene
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.targets import make_targets

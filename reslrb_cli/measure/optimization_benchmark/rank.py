@@ -21,9 +21,8 @@ from scipy import stats
 
 from reslrb_cli.measure import resume_store
 from reslrb_cli.measure.methods import RunsPlan
-from reslrb_cli.measure.processes import Ended, Refused
+from reslrb_cli.measure.processes import Contestant, Ended, Refused
 from reslrb_cli.measure.resume_store import Earlier
-from reslrb_cli.measure.workers import Contestant
 from reslrb_cli.records.measurement_files import Kept
 from reslrb_cli.records.measurements import (
     Band,

@@ -30,10 +30,9 @@ from reslrb_cli.measure.optimization_benchmark.rank import (
     settings,
     times,
 )
-from reslrb_cli.measure.processes import Refused, Stopped
+from reslrb_cli.measure.processes import NO_TIME, Contestant, Pace, Refused, Stopped
 from reslrb_cli.measure.resume_store import Earlier
 from reslrb_cli.measure.tasks import start_process
-from reslrb_cli.measure.workers import NO_TIME, Contestant, Pace
 from reslrb_cli.records.measurement_files import Kept
 from reslrb_cli.records.measurements import BenchStatus, Method, RunPointRecord
 
