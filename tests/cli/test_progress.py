@@ -5,6 +5,7 @@ from __future__ import annotations
 import fcntl
 import os
 import re
+import select
 import struct
 import sys
 import termios
@@ -126,7 +127,9 @@ def test_reading_a_long_file_has_a_bar(monkeypatch, tmp_path):
         monkeypatch.setattr(sys, "stderr", terminal)
         with Reading() as tell:
             assert len(read_lines(write_metrics(tmp_path), tell).objects) == 20_000
-        text = os.read(master, 1 << 16).decode()
+        text = ""
+        while not text.endswith("\n") and select.select([master], [], [], 5)[0]:  # what was written arrives in pieces
+            text += os.read(master, 1 << 16).decode()
     os.close(master)
     assert re.search(r"reading .*metrics.jsonl: +\d+%\|.*/605k ", text)
     assert text.endswith("drawing\r\n")
