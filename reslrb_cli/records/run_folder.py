@@ -14,7 +14,7 @@ import itertools
 import os
 import shutil
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import TracebackType
@@ -264,11 +264,15 @@ def _check_replaceable(source: object, path: Path) -> None:
 
 
 def _in_use(source: object, path: Path) -> ConfigError:
-    content = manifests.read_manifest(path) or {}
-    holder = Holder.from_json(content.get("process"))
-    who = f"{holder}, since {content.get('started')}" if holder is not None else "another process"
+    who = _who_works(manifests.read_manifest(path) or {})
     reason = f"{path} is in use by a run ({who}), so --force does not replace it; end that run, or give another name"
     return ConfigError(source, "run.name", reason)
+
+
+def _who_works(content: Mapping[str, Any]) -> str:
+    """The process that has a folder, as its manifest's content names it."""
+    holder = Holder.from_json(content.get("process"))
+    return f"{holder}, since {content.get('started')}" if holder is not None else "another process"
 
 
 def _output_error(source: object, folder: Path, error: OSError) -> ConfigError | MachineError:
@@ -395,6 +399,4 @@ def write_beginning(folder: RunFolder, config: str, manifest: Manifest) -> None:
 
 
 def _worked_in(path: Path, content: dict[str, Any]) -> ConfigError:
-    holder = Holder.from_json(content.get("process"))
-    who = f"{holder}, since {content.get('started')}" if holder is not None else "another process"
-    return ConfigError(path, "", f"is in use by a run ({who}); end that first")
+    return ConfigError(path, "", f"is in use by a run ({_who_works(content)}); end that first")
