@@ -22,9 +22,10 @@ import reslrb_cli  # noqa: F401  # chooses libLLVM, so it comes before Mitsuba
 from reslrb_cli.backend.variant import set_variant
 from reslrb_cli.config.loader import load
 from reslrb_cli.optimization.assemble import assemble
-from reslrb_cli.optimization.autotune.choice import Option, find_options, measured_step, run_pilot
-from reslrb_cli.optimization.autotune.efficiency import ITERATIONS, Candidate, Gradients, sample_variance, square
+from reslrb_cli.optimization.autotune.estimators import Candidate, Option, find_options, run_pilot, sample_variance
+from reslrb_cli.optimization.autotune.race import ITERATIONS, Gradients, measured_step
 from reslrb_cli.records.clock import StepClock
+from reslrb_cli.statistics import sum_of_squares
 
 ROOT = Path(__file__).resolve().parent.parent
 CONFIGS = ("furnace", "caustic_slab", "cornell_floor", "grey_room")
@@ -55,7 +56,7 @@ def variance(own: list[Gradients], exact: list[Gradients]) -> float:
     """Variance of a gradient, in units of the exact one's mean square, summed over the parameters."""
     total = 0.0
     for key in exact[0]:
-        scale = np.mean([square(g[key]) for g in exact])
+        scale = np.mean([sum_of_squares(g[key]) for g in exact])
         if scale > 0:
             total += sample_variance([g[key] for g in own]) / scale
     return max(float(total), 1e-12)
@@ -69,7 +70,7 @@ def report(path: Path, seeds: int, pilots: int) -> None:
     ranked = sorted(found.items(), key=lambda item: -item[1])
     print(f"{path.stem}: " + ", ".join(f"{label} {value:.2f}" for label, value in ranked), flush=True)
     for _ in range(pilots):
-        outcome = run_pilot(problem, options)
+        outcome = run_pilot(problem, options, problem.allowance)
         worth, share = found[outcome.label], 100 * outcome.share
         print(
             f"  pilot: {outcome.label}, {worth:.2f} of the best; {share:.1f} % of {ITERATIONS} iterations", flush=True

@@ -9,6 +9,7 @@ from scipy import stats
 
 from reslrb_cli.measure.comparison import ALPHA
 from reslrb_cli.records.measurements import Verdict
+from reslrb_cli.statistics import jackknife_variance
 
 #: Of the interval that is told; whether the expected ratio holds is asked at `ALPHA`.
 CONFIDENCE = 0.95
@@ -63,4 +64,4 @@ def _log_deviation(samples: np.ndarray) -> tuple[float, float]:
     total = deviations.sum()
     # Without sample k the sum of squares is smaller by N / (N - 1) of its own.
     left = 0.5 * np.log((total - deviations * count / (count - 1)) / (count - 2))
-    return float(0.5 * np.log(total / (count - 1))), float((count - 1) / count * np.square(left - left.mean()).sum())
+    return float(0.5 * np.log(total / (count - 1))), float(jackknife_variance(left))

@@ -18,6 +18,7 @@ ROOT = Path(reslrb_cli.__file__).parent
 ROWS = [
     "errors",
     "seeds",
+    "statistics",
     "config",
     "backend",
     "records",
@@ -38,6 +39,7 @@ FOREIGN = {
     "errors": {"mitsuba", "drjit"},
     "config": {"mitsuba", "drjit"},
     "seeds": {"mitsuba", "drjit"},
+    "statistics": {"mitsuba", "drjit"},
     "records": {"matplotlib"},
 }
 

@@ -24,7 +24,7 @@ from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ConfigError, ExitCode
 from reslrb_cli.guiding.tables import KNOWN
 from reslrb_cli.optimization.assemble import assemble_scene
-from reslrb_cli.optimization.autotune.sampling import take_up_guiding
+from reslrb_cli.optimization.autotune.sampling import as_decided
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.state import guiding_of, restore_tables
 from reslrb_cli.optimization.views import color_channels, to_tensor
@@ -36,7 +36,7 @@ from reslrb_cli.records.run_folder import RunFolder
 from reslrb_cli.scene.images import read_bitmap
 
 if TYPE_CHECKING:
-    from reslrb_cli.records.decisions import Offender
+    from reslrb_cli.measure.nonfinite_trace import Offender
 
 
 OPTION = "--nonfinite"
@@ -79,7 +79,7 @@ def load_replay(config: Config) -> Replay:
             samples_per_pass=problem.samples_per_pass, freeze=problem.integrator.freeze
         )
     problem.guided = guided
-    take_up_guiding(problem)
+    problem.integrator = as_decided(problem.integrator, guided, None)
     _teach(problem, saved, archive)
     for view in problem.views:
         suffix = "" if len(problem.views) == 1 else f"-{view.sensor}"

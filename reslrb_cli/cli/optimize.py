@@ -36,17 +36,17 @@ if TYPE_CHECKING:
 def show_forecast(config: Config) -> None:
     """Measure what a run of `config` will take, and print it; a variant must be set, and nothing is written but the
     caches of kernels and pilots."""
-    from reslrb_cli.measure.references import RIVAL, measure_rival
+    from reslrb_cli.measure.prb_comparison import RIVAL, measure_rival
     from reslrb_cli.optimization.correlated_bias import measure_correlated_bias
     from reslrb_cli.optimization.forecast import make_forecast
-    from reslrb_cli.records.decisions import PilotCache
+    from reslrb_cli.records.cache import PilotCache
 
     cache, say = PilotCache(), logging.getLogger(__name__).info
     measured: list[Before] = []
 
     def measure_before(problem: Problem) -> None:
         begin = time.perf_counter()
-        if measure_correlated_bias(problem, say) is not None:
+        if measure_correlated_bias(problem) is not None:
             measured.append(Before("bias of correlated", time.perf_counter() - begin, kept=False))
         begin = time.perf_counter()
         rival = measure_rival(problem, cache, say)
@@ -137,16 +137,23 @@ logger = logging.getLogger(__name__)
     "--set may change iterations, learning rates, and with run.output or run.name the folder.",
 )
 @click.option("--quiet", is_flag=True, help="Print the last line only.")
+@click.option("-v", "--verbose", is_flag=True, help="Say more of what is measured before the first iteration.")
 def command(
-    config_file: Path | None, overrides: tuple[str, ...], force: bool, dry_run: bool, resumed: Path | None, quiet: bool
+    config_file: Path | None,
+    overrides: tuple[str, ...],
+    force: bool,
+    dry_run: bool,
+    resumed: Path | None,
+    quiet: bool,
+    verbose: bool,
 ) -> int:
     """Recover the parameters that CONFIG names from its target images.
 
     Writes a run folder; the last line says where it is. Ctrl-C, SIGTERM and SIGHUP end the run after the current
     iteration, with its folder complete; a second signal ends it at once. However it ended, --resume RUN goes on.
     """
-    if quiet:
-        logging.getLogger("reslrb_cli").setLevel(logging.WARNING)
+    if quiet or verbose:
+        logging.getLogger("reslrb_cli").setLevel(logging.WARNING if quiet else logging.DEBUG)
     if resumed is not None:
         if force:
             raise click.UsageError("--force replaces a run, --resume goes on with one; give one of the two")

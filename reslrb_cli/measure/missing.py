@@ -49,6 +49,7 @@ from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.records.measurement_files import Kept
 from reslrb_cli.records.measurements import NOTHING, MissingRecord
 from reslrb_cli.scene.catalog import parameter_kind
+from reslrb_cli.statistics import jackknife_variance
 
 #: Seeds that steps are chosen with, and the fewest that a share is made of.
 PILOT_SEEDS, FEWEST = 4, 4
@@ -106,7 +107,7 @@ class Missing:
             return found, float(np.sqrt((np.square(error) + left).sum() / size))
         # The part's own noise and that of the whole: by leaving out one seed after the other (jackknife).
         without = [_ratio(np.delete(missing, i, 0), np.delete(whole, i, 0)) for i in range(self.count)]
-        variance = (self.count - 1) * np.var(without)
+        variance = jackknife_variance(np.array(without))
         truncation = (np.square(part) @ left) / np.square(part).sum() / size
         return found, float(np.sqrt(variance + truncation))
 

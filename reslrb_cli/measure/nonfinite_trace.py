@@ -8,7 +8,7 @@ not in this one.
 - `SearchHooks`: a walk that looks for the first value on each path that is not finite, and that reaches the image or a
   gradient.
 - `search_paths`: the first such value along the paths of one set of samples.
-- `find_offenders`: where the step came upon one.
+- `find_offenders`: where the step came upon one, an `Offender`.
 """
 
 from __future__ import annotations
@@ -30,7 +30,6 @@ from reslrb_cli.optimization.moving import is_attached
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.state import guiding_of
 from reslrb_cli.optimization.views import View
-from reslrb_cli.records.decisions import Offender, PathVertex
 from reslrb_cli.seeds import seed
 from reslrb_cli.transport.bsdf import Scattering, evaluate, tracked_factor
 from reslrb_cli.transport.connection import Connection, forward_derivatives
@@ -41,6 +40,41 @@ from reslrb_cli.transport.guide import Table
 from reslrb_cli.transport.samples import Samples, passes
 from reslrb_cli.transport.visible import primary_ray, small_points, visible_radiance, visible_tangent
 from reslrb_cli.transport.walk import Hooks, Vertex, walk
+
+
+@dataclass(frozen=True)
+class PathVertex:
+    """A vertex of a path, and all that the path can be traced again from.
+
+    `samples` says which of the step's samples it belongs to, `seed` is their sampler's, `path` its index among `paths`.
+    `vertex` counts from the emitter, 0; `position` is in world space; `surface` is the id of the shape there.
+    """
+
+    samples: str
+    seed: int
+    path: int
+    paths: int
+    vertex: int
+    position: tuple[float, float, float]
+    surface: str | None
+
+
+@dataclass(frozen=True)
+class Offender:
+    """The first value that is not finite of one view, in the order of the paths and of their vertices.
+
+    `quantity` is what it is, `value` one number a channel, none for a derivative of the loss. `pixel`, (x, y), is where
+    it reaches the film. `where` is None for a derivative of the loss; `image` and `target`, what the loss compares
+    there, are None for a path.
+    """
+
+    sensor: int
+    pixel: tuple[int, int] | None
+    quantity: str
+    value: list[float]
+    where: PathVertex | None
+    image: list[float] | None = None
+    target: list[float] | None = None
 
 
 class Witness(Guiding):

@@ -10,8 +10,8 @@ import numpy as np
 
 from reslrb_cli.config.schema import Config
 from reslrb_cli.integrators.light_tracer import LightTracer
-from reslrb_cli.optimization.autotune.choice import find_options, settle_integrator
-from reslrb_cli.optimization.autotune.sampling import settle_sampling
+from reslrb_cli.optimization.autotune.estimators import find_options
+from reslrb_cli.optimization.autotune.sampling import settle
 from reslrb_cli.optimization.decisions import Cache
 from reslrb_cli.optimization.errors import quantity
 from reslrb_cli.optimization.identifiability import check_exposures, find_reached
@@ -60,11 +60,10 @@ def assemble(
         settled.settle(problem, options)
         settled.reach(problem)
         return problem
-    settle_integrator(problem, options, say, cache)
-    settle_sampling(problem, say, cache)
+    problem = settle(problem, options, say, cache)
     if to_run:
         check_exposures(problem)
-        find_reached(problem, say)
+        find_reached(problem)
     return problem
 
 

@@ -5,11 +5,9 @@ With delta(I) = dL/dI and J the derivative of the image by the parameters, each 
     g = J(samples)^T delta(I(samples))          correlated: noise of I meets its own in J
     h = J(samples)^T delta(I(other samples))    independent
 
-have expectations that differ by the bias b = E[g - h].
-
-The bias of a loss that is quadratic in the image is inversely proportional to the samples per pixel, whatever their
-number: there rounds have fewer than the run's steps, which makes the bias larger beside its noise, and the result is
-brought back to those of the run.
+have expectations that differ by the bias b = E[g - h]. That of a loss that is quadratic in the image is inversely
+proportional to the samples per pixel: there rounds have fewer than the run's steps, which makes the bias larger beside
+its noise, and the result is brought back to those of the run.
 
 Rounds r of independent samples give d_r = g_r - h_r and h_r. Inner products of expectations are estimated without bias
 from pairs of different rounds (U-statistics)
@@ -23,80 +21,29 @@ the gradient, <b, b> > <h, h>, which keeps its sense where the gradient vanishes
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass
 
 import numpy as np
 
 from reslrb_cli.integrators.light_tracer import LightTracer
 from reslrb_cli.integrators.step import cross_step
+from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.sensitivity import take_gradient
 from reslrb_cli.optimization.views import QUADRATIC
+from reslrb_cli.records.decisions import Jsonable
 from reslrb_cli.seeds import seed
+from reslrb_cli.statistics import Array, jackknife_variance
 
-if TYPE_CHECKING:
-    from reslrb_cli.optimization.problem import Problem
-
+logger = logging.getLogger(__name__)
 
 #: Rounds, and fewer than which say nothing. A round costs two steps of the samples that it has.
 ROUNDS, FEWEST_ROUNDS = 8, 6
-
-
 #: Share of the samples of a run's iterations that the rounds may cost.
 SHARE = 1 / 16
-
-
 #: Part of the run's samples that a round has where the loss is quadratic, for which alone that is right.
 PART = 4
-
-
-def measure_correlated_bias(problem: Problem, say: Callable[[str], None]) -> CorrelatedBias | None:
-    """Measure the bias of `correlated` at the parameters' values; None where a run has something else, or is too short.
-
-    Needs targets, and leaves neither gradient nor change behind.
-    """
-    run = problem.config.run
-    if problem.config.adjoint != "correlated":
-        return None
-    unit = problem.samples_per_pass or 1
-    part = PART if problem.config.loss.type in QUADRATIC else 1
-    spp = max(run.spp // part // unit * unit, unit)
-    rounds = min(ROUNDS, int(SHARE * run.iterations * run.spp / (2 * spp)))
-    if rounds < FEWEST_ROUNDS:
-        return None
-    say(f"adjoint correlated: measuring its bias, {rounds} rounds of {spp} spp")
-    differences: dict[str, list[Array]] = {key: [] for key in problem.selection.keys}
-    gradients: dict[str, list[Array]] = {key: [] for key in problem.selection.keys}
-    for number in range(rounds):
-        own, other = (_gradient(problem, number, purpose, spp) for purpose in ("bias", "bias of another"))
-        for key in problem.selection.keys:
-            differences[key].append(own[key] - other[key])
-            gradients[key].append(other[key])
-    count, scale = len(differences), spp / run.spp
-    rows = [find_bias(key, differences[key], gradients[key], scale, count) for key in differences]
-    return CorrelatedBias(rounds, spp, rows)
-
-
-def _gradient(problem: Problem, number: int, image: str, spp: int) -> dict[str, Array]:
-    """The gradient by samples of a round, with dL/dI from those of `image` in that round: `bias` are the same ones."""
-    run, integrator = problem.config.run, problem.integrator
-    if isinstance(integrator, LightTracer):  # a recording would cost more than so few steps save
-        integrator = integrator.with_options(samples_per_pass=integrator.samples_per_pass, freeze=False)
-    problem.apply()
-    for view in problem.trained:
-        cross_step(
-            integrator, problem.scene, view.sensor, view.objective,
-            seed=seed(run.seed, number, view.sensor, "bias"),
-            image_seed=seed(run.seed, number, view.sensor, image), spp=spp, params=problem.selection.params,
-            on_samples=problem.on_samples(view),
-        )  # fmt: skip
-    return take_gradient(problem)
-
-
-Array = np.ndarray[Any, Any]
-
-
 #: Probability that a run without bias is told of one: that of three standard errors.
 ALPHA = 0.0027
 
@@ -116,33 +63,23 @@ class Bias:
 
 
 @dataclass(frozen=True)
-class CorrelatedBias:
+class CorrelatedBias(Jsonable):
     """What was measured, by parameter, in so many rounds of `spp` samples per pixel."""
 
     rounds: int
     spp: int
     parameters: list[Bias]
 
-    def to_json(self) -> dict[str, Any]:
-        """As a mapping for JSON."""
-        return asdict(self)
-
-    @staticmethod
-    def from_json(data: dict[str, Any]) -> CorrelatedBias:
-        """The same again. Raises TypeError or KeyError where `data` is nothing that `to_json` made."""
-        return CorrelatedBias(**{**data, "parameters": [Bias(**row) for row in data["parameters"]]})
-
     def line(self) -> str | None:
         """What the user is told, of the parameter that has the largest bias; None where none was seen."""
-        seen = sorted((row for row in self.parameters if row.along or row.exceeds), key=_size)
+        seen = [row for row in self.parameters if row.along or row.exceeds]
         if not seen:
             return None
-        worst, others = seen[-1], len(seen) - 1
-        more = f" ({others} more {'has' if others == 1 else 'have'} one)" if others else ""
-        what = f"is larger than the gradient of `{worst.key}` itself"
-        if worst.along:
-            what = f"is {share_words(worst)} of the gradient of `{worst.key}`"
-        return f"run.adjoint: correlated: at the start its bias {what}{more}; `batched` has none of it"
+        worst = max(seen, key=lambda row: abs(row.share) if row.along and row.share is not None else np.inf)
+        more = f" ({len(seen) - 1} more {'has' if len(seen) == 2 else 'have'} one)" if len(seen) > 1 else ""
+        what = f"{share_words(worst)} of the gradient of" if worst.along else "larger than the gradient of"
+        name = f"`{worst.key}`" if worst.along else f"`{worst.key}` itself"
+        return f"run.adjoint: correlated: at the start its bias is {what} {name}{more}; `batched` has none of it"
 
 
 def share_words(row: Bias, sign: str = "+-") -> str:
@@ -151,6 +88,49 @@ def share_words(row: Bias, sign: str = "+-") -> str:
         return ""
     digits = 0 if row.error >= 0.005 else 1
     return f"{100 * row.share:+.{digits}f} % {sign} {max(100 * row.error, 10**-digits):.{digits}f} %"
+
+
+def measure_correlated_bias(problem: Problem) -> CorrelatedBias | None:
+    """Measure the bias of `correlated` at the parameters' values; None where a run has something else, or is too short.
+
+    Needs targets, and leaves neither gradient nor change behind.
+    """
+    run = problem.config.run
+    if problem.config.adjoint != "correlated":
+        return None
+    unit = problem.samples_per_pass or 1
+    part = PART if problem.config.loss.type in QUADRATIC else 1
+    spp = max(run.spp // part // unit * unit, unit)
+    rounds = min(ROUNDS, int(SHARE * run.iterations * run.spp / (2 * spp)))
+    if rounds < FEWEST_ROUNDS:
+        return None
+    logger.debug(f"adjoint correlated: measuring its bias, {rounds} rounds of {spp} spp")
+    own, other = ([_gradient(problem, number, image, spp) for number in range(rounds)] for image in _IMAGES)
+    rows, keys = [], problem.selection.keys
+    for key in keys:
+        differences = [a[key] - b[key] for a, b in zip(own, other, strict=True)]
+        rows.append(find_bias(key, differences, [b[key] for b in other], spp / run.spp, len(keys)))
+    return CorrelatedBias(rounds, spp, rows)
+
+
+#: The seeds of the image that dL/dI is of: those of the gradient's own samples, and others.
+_IMAGES = ("bias", "bias of another")
+
+
+def _gradient(problem: Problem, number: int, image: str, spp: int) -> dict[str, Array]:
+    """The gradient by samples of a round, with dL/dI from those of `image` in that round."""
+    run, integrator = problem.config.run, problem.integrator
+    if isinstance(integrator, LightTracer):  # a recording would cost more than so few steps save
+        integrator = integrator.with_options(samples_per_pass=integrator.samples_per_pass, freeze=False)
+    problem.apply()
+    for view in problem.trained:
+        cross_step(
+            integrator, problem.scene, view.sensor, view.objective,
+            seed=seed(run.seed, number, view.sensor, _IMAGES[0]),
+            image_seed=seed(run.seed, number, view.sensor, image), spp=spp, params=problem.selection.params,
+            on_samples=problem.on_samples(view),
+        )  # fmt: skip
+    return take_gradient(problem)
 
 
 def find_bias(
@@ -166,35 +146,28 @@ def find_bias(
     d = d * scale
     products = np.array([d @ h.T, h @ h.T, d @ d.T])
     limit = float(stats.t.isf(ALPHA / (4 * parameters), len(d) - 1))
-    (_, gradient, _), (_, gradient_error, _) = _jackknife(products, lambda u: u)
-    [share], [error] = _jackknife(products, lambda u: u[:1] / np.where(u[1:2] == 0, np.inf, u[1:2]))
-    [excess], [excess_error] = _jackknife(products, lambda u: u[2:] - u[1:2])
+    gradient, gradient_error = _with_error(products, lambda u: u[1])
+    share, error = _with_error(products, lambda u: u[0] / (u[1] or np.inf))
+    excess, excess_error = _with_error(products, lambda u: u[2] - u[1])
     known = gradient > limit * gradient_error
     return Bias(
         key,
-        share=float(share) if known else None,
-        error=float(error) if known else None,
-        along=bool(known and abs(share) > limit * error),
-        exceeds=bool(excess > limit * excess_error),
+        share=share if known else None,
+        error=error if known else None,
+        along=known and abs(share) > limit * error,
+        exceeds=excess > limit * excess_error,
     )
 
 
-def _jackknife(products: Array, function: Callable[[Array], Array]) -> tuple[Array, Array]:
-    """`function` of the means over r != s of (K, R, R) inner products (K,), and its standard errors."""
+def _with_error(products: Array, function: Callable[[Array], float]) -> tuple[float, float]:
+    """`function` of the means over r != s of (K, R, R) inner products (K,), and its standard error."""
     rounds = products.shape[1]
-    without = np.array([
-        function(_off_diagonal_mean(np.delete(np.delete(products, r, axis=1), r, axis=2))) for r in range(rounds)
-    ])  # fmt: skip
-    errors = np.sqrt((rounds - 1) / rounds * np.sum(np.square(without - without.mean(0)), axis=0))
-    return function(_off_diagonal_mean(products)), errors
+    parts = [np.delete(np.delete(products, r, axis=1), r, axis=2) for r in range(rounds)]
+    found, *without = (float(function(_off_diagonal_mean(each))) for each in (products, *parts))
+    return found, float(np.sqrt(jackknife_variance(np.array(without))))
 
 
 def _off_diagonal_mean(products: Array) -> Array:
     rounds = products.shape[1]
     total = products.sum(axis=(1, 2)) - np.trace(products, axis1=1, axis2=2)
-    mean: Array = total / (rounds * (rounds - 1))
-    return mean
-
-
-def _size(row: Bias) -> float:
-    return abs(row.share) if row.along and row.share is not None else np.inf
+    return np.asarray(total / (rounds * (rounds - 1)))

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
 from typing import Any, Protocol
 
 from reslrb_cli.records.clock import MIB
+from reslrb_cli.records.decisions import Jsonable
 
 
 @dataclass(frozen=True)
@@ -25,7 +29,7 @@ class Estimate:
 
 
 @dataclass
-class MemoryPlan:
+class MemoryPlan(Jsonable):
     """How a budget is kept: the samples of a pass, what is expected, and, after the first iterations, what was used."""
 
     budget_bytes: int
@@ -45,9 +49,53 @@ class MemoryPlan:
         allowed = f"{self.budget_bytes / MIB:.1f} MiB"
         return f"run.memory_budget: {used / MIB:.1f} MiB were used, more than the {allowed} that it allows"
 
-    def to_json(self) -> dict[str, Any]:
-        """For the manifest."""
-        return asdict(self)
+
+@dataclass
+class Allowance:
+    """Seconds that all measuring before the first iteration may take: a share of what the run itself will.
+
+    `run_s` is that: kernels compiled (`compile_s`, what those of one step took), and iterations of `iteration_s` each,
+    by two first steps of few samples. `spent_s` grows; these first steps, which the run would take as well, are no
+    part of it.
+    """
+
+    share: float
+    run_s: float
+    compile_s: float
+    iteration_s: float
+    spent_s: float = 0.0
+
+    @property
+    def left_s(self) -> float:
+        """What has not been spent."""
+        return max(self.share * self.run_s - self.spent_s, 0.0)
+
+    def affords(self, *needs: tuple[float, float]) -> bool:
+        """Whether there is time for all of these: kernels of so many steps to compile, and so many iterations' worth
+        of work."""
+        return sum(k * self.compile_s + n * self.iteration_s for k, n in needs) <= self.left_s
+
+    def iterations_left(self, kernels: float) -> float:
+        """The iterations' worth of work that there is time for, once the kernels of so many steps are compiled."""
+        return max(self.left_s - kernels * self.compile_s, 0.0) / max(self.iteration_s, 1e-9)
+
+    @contextmanager
+    def counted(self) -> Iterator[None]:
+        """Count the block's time."""
+        start = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.spent_s += time.perf_counter() - start
+
+    def note(self) -> str:
+        """The words for what there was no time to measure."""
+        return f"not measured (over {100 * self.share:.3g} % of this run)"
+
+    def line(self) -> str:
+        """The words for what was spent."""
+        part = 100 * self.spent_s / max(self.run_s, 1e-9)
+        return f"measuring took {self.spent_s:.1f} s, {part:.2g} % of what this run is expected to take"
 
 
 class Cache(Protocol):
@@ -59,7 +107,7 @@ class Cache(Protocol):
 
 
 @dataclass(frozen=True)
-class Sensitivity:
+class Sensitivity(Jsonable):
     """What was measured of one parameter of `entries` numbers, in the scene's units.
 
     `value`, `gradient` and `noise` are root mean squares over the entries: of the values, of the gradient (0 where the
@@ -75,10 +123,6 @@ class Sensitivity:
     change: float | None = None
     curvature: float | None = None
     length: float | None = None
-
-    def to_json(self) -> dict[str, Any]:
-        """As a mapping for JSON."""
-        return asdict(self)
 
 
 @dataclass(frozen=True)

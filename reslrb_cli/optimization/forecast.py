@@ -22,9 +22,8 @@ from reslrb_cli.backend.memory import free_bytes
 from reslrb_cli.config.schema import Config
 from reslrb_cli.integrators.reslrb import Reslrb as Tracer
 from reslrb_cli.optimization.assemble import assemble_scene
-from reslrb_cli.optimization.autotune.choice import find_options, settle_integrator
-from reslrb_cli.optimization.autotune.sampling import settle_sampling
-from reslrb_cli.optimization.autotune.steps import lessons
+from reslrb_cli.optimization.autotune.estimators import find_options
+from reslrb_cli.optimization.autotune.sampling import lessons, settle
 from reslrb_cli.optimization.decisions import Cache
 from reslrb_cli.optimization.loop import optimize
 from reslrb_cli.optimization.problem import Problem, saved_spp
@@ -192,8 +191,7 @@ def make_forecast(
     buffers = _buffers(problem)
     make_targets(problem, say)
     problem.truth.clear()  # errors are no part of a step
-    settle_integrator(problem, options, say, cache)
-    settle_sampling(problem, say, cache)
+    problem = settle(problem, options, say, cache)
     image_s = _image_seconds(problem)
     before(problem)
     say("measuring a few steps")

@@ -16,7 +16,7 @@ has an eigenvalue near 0; its eigenvector says which values are in the combinati
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+import logging
 from typing import TYPE_CHECKING, Any
 
 import drjit as dr
@@ -39,12 +39,13 @@ if TYPE_CHECKING:
 
 Array = np.ndarray[Any, Any]
 
+logger = logging.getLogger(__name__)
 
 #: Paths in one pass of the gradient where naive AD keeps every vertex of each of them; light tracing keeps none.
 PATHS_PER_PASS = 2**18
 
 
-def find_reached(problem: Problem, say: Callable[[str], None] = lambda line: None) -> None:
+def find_reached(problem: Problem) -> None:
     """Fill `problem.masks` for the parameters whose true value is known.
 
     An entry counts as reached where light reaches it (the gradient of the image's sum with respect to it, over
@@ -53,7 +54,7 @@ def find_reached(problem: Problem, say: Callable[[str], None] = lambda line: Non
     """
     if not problem.truth:
         return
-    say(f"finding what light and sensor reach: {problem.config.run.reach_spp} spp")
+    logger.debug(f"finding what light and sensor reach: {problem.config.run.reach_spp} spp")
     sensitive = sensitivity(problem)
     for key in problem.truth:
         mask: Array = sensitive[key] | (key in problem.selection.factors)  # every image shows its exposure

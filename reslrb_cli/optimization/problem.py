@@ -12,13 +12,12 @@ import numpy as np
 from reslrb_cli.config.schema import Config
 from reslrb_cli.integrators.light_tracer import LightTracer
 from reslrb_cli.integrators.step import OnSamples
-from reslrb_cli.optimization.autotune.efficiency import Allowance, Outcome
-from reslrb_cli.optimization.decisions import MemoryPlan, Scaled
+from reslrb_cli.optimization.decisions import Allowance, MemoryPlan, Scaled
 from reslrb_cli.optimization.errors import ErrorMeter
 from reslrb_cli.optimization.loading import BETWEEN_SPP, render_in_passes
 from reslrb_cli.optimization.optimizers import Optimizer, make_transform
 from reslrb_cli.optimization.views import View, slope, to_tensor
-from reslrb_cli.records.decisions import GuidedRecord, SequenceRecord
+from reslrb_cli.records.decisions import EstimatorRecord, GuidedRecord, SequenceRecord
 from reslrb_cli.scene.parameters import Selection
 from reslrb_cli.seeds import seed
 
@@ -61,7 +60,7 @@ class Problem:
     #: What measuring before the first iteration may take, where anything was left to it, and was not known already.
     allowance: Allowance | None = None
     #: What was measured and planned before the first iteration, where it was.
-    pilot: Outcome | None = None
+    pilot: EstimatorRecord | None = None
     guided: GuidedRecord | None = None
     sequence: SequenceRecord | None = None
     memory: MemoryPlan | None = None

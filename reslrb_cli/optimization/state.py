@@ -29,15 +29,15 @@ from reslrb_cli.backend.memory import own_memory
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.guiding.tables import Guiding
 from reslrb_cli.integrators.reslrb import Reslrb
-from reslrb_cli.optimization.autotune import sampling
-from reslrb_cli.optimization.autotune.choice import Option, is_auto
-from reslrb_cli.optimization.autotune.efficiency import Outcome
+from reslrb_cli.optimization.autotune.estimators import Option
+from reslrb_cli.optimization.autotune.race import is_auto
+from reslrb_cli.optimization.autotune.sampling import as_decided
 from reslrb_cli.optimization.decisions import Estimate, MemoryPlan, Scaled, Sensitivity
 from reslrb_cli.optimization.nonfinite import NonFinitePolicy
 from reslrb_cli.optimization.optimizers import GradientClamp
 from reslrb_cli.records.checkpoint import Archive
 from reslrb_cli.records.clock import StepClock
-from reslrb_cli.records.decisions import GuidedRecord, PaidRecord, SequenceRecord
+from reslrb_cli.records.decisions import EstimatorRecord, Finding, GuidedRecord, SequenceRecord
 
 if TYPE_CHECKING:
     from reslrb_cli.optimization.problem import Problem
@@ -343,7 +343,7 @@ class Snapshot:
         return found
 
 
-Paid = TypeVar("Paid", bound=PaidRecord)
+Found = TypeVar("Found", bound=Finding)
 
 
 @dataclass(frozen=True)
@@ -368,23 +368,23 @@ class Settled:
         """Choose what the run had chosen: the pilot's estimator, the samples of a pass, and how samples are drawn."""
         self._estimator(problem, options)
         if is_auto(problem.config, "guiding"):
-            problem.guided = self._paid(GuidedRecord, "guided", "guiding")
-            sampling.take_up_guiding(problem)
+            problem.guided = self._found(GuidedRecord, "guided", "is not what measuring whether guiding pays finds")
         if is_auto(problem.config, "sequence"):
-            problem.sequence = self._paid(SequenceRecord, "sequence", "the sequence")
-            sampling.take_up_sequence(problem)
+            wrong = "is not what measuring whether the sequence pays finds"
+            problem.sequence = self._found(SequenceRecord, "sequence", wrong)
+        problem.integrator = as_decided(problem.integrator, problem.guided, problem.sequence)
 
-    def _paid(self, kind: type[Paid], name: str, what: str) -> Paid | None:
+    def _found(self, kind: type[Found], name: str, wrong: str) -> Found | None:
         """What was measured, where it was."""
         try:
             return None if self.stored.value(name) is None else kind.from_json(self.stored.value(name))
-        except (TypeError, AttributeError):
-            raise self.stored.wrong(name, f"is not what measuring whether {what} pays finds") from None
+        except TypeError:
+            raise self.stored.wrong(name, wrong) from None
 
     def _estimator(self, problem: Problem, options: Sequence[Option]) -> None:
         chosen = options[0] if options else None
-        if self.stored.value("pilot") is not None:
-            problem.pilot = self._outcome()
+        problem.pilot = self._found(EstimatorRecord, "pilot", "is not what a pilot finds")
+        if problem.pilot is not None:
             chosen = next((option for option in options if option.options == problem.pilot.chosen), None)
             if chosen is None:
                 raise self.stored.wrong("pilot.chosen", "is nothing that this run can choose")
@@ -403,17 +403,6 @@ class Settled:
             shape = problem.selection.array(key).shape
             name = f"mask/{key}"
             problem.masks[key] = self.stored.archive.array(name, shape[:2] if len(shape) == 3 else shape, "b")
-
-    def _outcome(self) -> Outcome:
-        data = self.stored.value("pilot")
-        try:
-            outcome = Outcome.from_json(data)
-            rows = [isinstance(row.estimator, str) and isinstance(row.options, dict) for row in outcome.rows]
-            if not isinstance(outcome.chosen, dict) or not isinstance(outcome.label, str) or not all(rows):
-                raise TypeError
-        except (TypeError, KeyError, AttributeError):
-            raise self.stored.wrong("pilot", "is not what a pilot finds") from None
-        return outcome
 
     def _memory(self, problem: Problem, now: MemoryPlan) -> MemoryPlan:
         """The plan of the run, whose passes decide in what order samples are summed up."""

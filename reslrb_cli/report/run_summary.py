@@ -174,7 +174,7 @@ def noise_line(results: Mapping[str, Any]) -> str:
 def rival_line(measured: Mapping[str, Any] | None) -> str:
     """How another integrator did beside the run's own; empty where none was tried."""
     try:
-        return RivalRecord.from_json(dict(measured or {})).line()
+        return RivalRecord.from_json(dict(measured or {})).line(cost=True)
     except TypeError:  # there was none, or another version's
         return ""
 
@@ -182,7 +182,7 @@ def rival_line(measured: Mapping[str, Any] | None) -> str:
 def paid_line(kind: type[PaidRecord], measured: Mapping[str, Any] | None) -> str:
     """Whether another way of drawing samples paid; empty where that was not left to measurement."""
     try:
-        return kind.from_json(dict(measured or {})).line()
+        return kind.from_json(dict(measured or {})).line(cost=True)
     except TypeError:  # as above
         return ""
 

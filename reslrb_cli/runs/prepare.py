@@ -26,7 +26,7 @@ from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ConfigError, printable
 from reslrb_cli.integrators.plan_report import GUIDED, SEQUENCE, plan_rows, with_reason
 from reslrb_cli.integrators.reslrb import Reslrb
-from reslrb_cli.measure.references import measure_rival
+from reslrb_cli.measure.prb_comparison import measure_rival
 from reslrb_cli.optimization.assemble import assemble
 from reslrb_cli.optimization.correlated_bias import measure_correlated_bias
 from reslrb_cli.optimization.moving import warn_of_border
@@ -35,8 +35,8 @@ from reslrb_cli.optimization.results import Best, Results
 from reslrb_cli.optimization.state import State, Stored, stored_value
 from reslrb_cli.optimization.uncertainty.measuring import Certainty
 from reslrb_cli.optimization.views import view_records
+from reslrb_cli.records.cache import PilotCache
 from reslrb_cli.records.checkpoint import save_checkpoint
-from reslrb_cli.records.decisions import PilotCache
 from reslrb_cli.records.manifest import Manifest
 from reslrb_cli.records.metrics import ClampTally, NonFiniteTally, Record, finite
 from reslrb_cli.report.tonemap import exposure_for
@@ -145,14 +145,12 @@ def prepare(config: Config, variant: str, say: Say, warn: Say) -> tuple[Course, 
     """
     cache = PilotCache()
     problem = assemble(config, say, cache, to_run=True)
-    bias = measure_correlated_bias(problem, say)
+    bias = measure_correlated_bias(problem)
     line = None if bias is None else bias.line()
     if line is not None:
         warn(line)
     warn_of_border(problem, warn)
     rival = measure_rival(problem, cache, say)
-    if problem.allowance is not None and problem.allowance.spent_s:
-        say(problem.allowance.line())
     if rival is not None and rival.is_better:
         warn(f"{rival.line()}; --set integrator.type={rival.integrator}")
     manifest = manifest_of(problem, variant, config.source)

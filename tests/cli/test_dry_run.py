@@ -121,7 +121,7 @@ def test_what_comes_before_the_iterations_is_measured_once(
 ) -> None:
     """Pilot and `prb` beside its choice: now, for the run that follows; or in the run again, whose time has both."""
     few = [{"estimator": "stack"}, {"estimator": "gather"}]
-    monkeypatch.setattr("reslrb_cli.optimization.autotune.choice.candidates", lambda config: few)
+    monkeypatch.setattr("reslrb_cli.optimization.autotune.estimators.candidates", lambda config: few)
     cache = experiment / "cache"
     monkeypatch.setenv("RESLRB_CACHE", str(cache))
     if not keeps:

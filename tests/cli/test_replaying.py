@@ -114,7 +114,7 @@ def test_a_guided_run_without_its_tables_is_refused(run, capsys):
     for measured, line in (
         (GuidedRecord(guided=True).to_json(), refused),
         (None, ""),
-        ({"guided": True}, "manifest.json: guided: is not whether guiding paid, as a run writes it"),
+        ({"guided": "on"}, "manifest.json: guided: is not whether guiding paid, as a run writes it"),
     ):
         (run / "manifest.json").write_text(json.dumps(manifest | {"guided": measured}))
         if line:

@@ -11,9 +11,9 @@ from cli.test_optimize import CONFIG, KEY, SCENE
 
 from reslrb_cli.cli import main
 from reslrb_cli.config.loader import load
-from reslrb_cli.measure import references
+from reslrb_cli.measure import prb_comparison
 from reslrb_cli.optimization.assemble import assemble
-from reslrb_cli.optimization.autotune import efficiency
+from reslrb_cli.optimization.autotune import race
 from reslrb_cli.records.decisions import RivalRecord
 from reslrb_cli.records.manifest import read_manifest
 
@@ -49,21 +49,20 @@ def test_it_is_measured_once_and_remembered(experiment, capsys):
     err, manifest = optimize(capsys)
     found = RivalRecord.from_json(manifest["rival"])
     assert found.integrator == "prb"
-    assert "measuring prb beside it" in err
     if found.advantage is not None:
         assert found.low < found.advantage < found.high
-        assert references.LEAST_ROUNDS <= found.rounds <= references.MOST_ROUNDS
-        assert (found.line() in err) == found.is_better
-        assert found.line().replace("&", "&amp;") in Path("runs/box/report.html").read_text()
+        assert prb_comparison.LEAST_ROUNDS <= found.rounds <= prb_comparison.MOST_ROUNDS
+        assert (f"{found.line()}; --set" in err) == found.is_better
+        assert found.line(cost=True).replace("&", "&amp;") in Path("runs/box/report.html").read_text()
     err, again = optimize(capsys)
     assert again["rival"] == {**manifest["rival"], "cached": True}
-    assert "measuring prb" not in err
+    assert "measuring" not in err
 
 
 def test_the_tables_of_a_guided_run_learn_nothing_from_it(experiment: None) -> None:
     """A run begins alike whether this was measured now or by an earlier one."""
     problem = assemble(load("box.yaml", ["integrator.guiding=on"]))
-    assert references.measure_rival(problem, None, lambda line: None) is not None
+    assert prb_comparison.measure_rival(problem, None, lambda line: None) is not None
     assert problem.integrator.preparation.guiding.learned == {}
 
 
@@ -74,13 +73,14 @@ def test_it_is_not_tried_where_nobody_chose_an_estimator(experiment, capsys, mon
     err, manifest = optimize(capsys, "integrator.estimator=stack")
     assert manifest["rival"] is None
     assert "prb" not in err
-    better = RivalRecord("prb", 8, 4, 5.0, 3.0, 8.0, 1.5, 2.0)
+    better = RivalRecord(integrator="prb", rounds=8, spp=4, advantage=5.0, low=3.0, high=8.0, measure_s=1.5)
     monkeypatch.setattr(prepare, "measure_rival", lambda problem, cache, say: better)
     err, manifest = optimize(capsys, "integrator.estimator=stack")
     assert f"{better.line()}; --set integrator.type=prb" in err
-    assert "prb has 5 times the efficiency here (3 to 8; measured in 1.5 s" in better.line()
+    assert better.line(cost=True).startswith("prb: 5 times the efficiency here (3 to 8) (measured in 1.5 s")
     assert manifest["rival"] == better.to_json()
-    monkeypatch.setattr(prepare, "measure_rival", lambda problem, cache, say: RivalRecord("prb", 8, 4, 1.5, 0.9, 2.5))
+    no_better = RivalRecord(integrator="prb", rounds=8, advantage=1.5, low=0.9, high=2.5)
+    monkeypatch.setattr(prepare, "measure_rival", lambda problem, cache, say: no_better)
     assert "prb" not in optimize(capsys, "integrator.estimator=stack")[0]
 
 
@@ -89,7 +89,7 @@ def test_it_is_tried_where_it_finds_the_light(experiment, extra, applies):
     from reslrb_cli.optimization.assemble import assemble_scene
 
     Path("scene.xml").write_text(SCENE.replace("</scene>", f"{extra}</scene>"))
-    assert (references.why_not(assemble_scene(load("box.yaml", []))) is None) == applies
+    assert (prb_comparison.why_not(assemble_scene(load("box.yaml", []))) is None) == applies
 
 
 def samples(sd, count, seed, entries=200):
@@ -103,8 +103,8 @@ def test_the_interval_holds_the_truth_as_often_as_it_says(entries):
     inside = 0
     for seed in range(200):
         own, other = samples(2.0, 8, 2 * seed, entries), samples(1.0, 8, 2 * seed + 1, entries)
-        value, low, high = efficiency.compare(own, [2.0] * 8, other, [4.0] * 8)
-        low, high = low * efficiency.TIMING_NOISE, high / efficiency.TIMING_NOISE
+        value, low, high = race.compare(own, [2.0] * 8, other, [4.0] * 8)
+        low, high = low * race.TIMING_NOISE, high / race.TIMING_NOISE
         assert low < value < high
         inside += low < 2.0 < high
     # 190 of 200 are expected; fewer than 176 have a probability of 1e-4.
@@ -113,7 +113,7 @@ def test_the_interval_holds_the_truth_as_often_as_it_says(entries):
 
 def test_equals_are_hardly_ever_called_better():
     better = sum(
-        efficiency.compare(samples(1.0, 8, 2 * seed), [3.0] * 8, samples(1.0, 8, 2 * seed + 1), [3.0] * 8)[1] > 1
+        race.compare(samples(1.0, 8, 2 * seed), [3.0] * 8, samples(1.0, 8, 2 * seed + 1), [3.0] * 8)[1] > 1
         for seed in range(200)
     )
     assert better <= 13  # 5 are expected on this side without what times may be off
@@ -121,9 +121,9 @@ def test_equals_are_hardly_ever_called_better():
 
 def test_no_noise_is_no_comparison():
     still = [{KEY: np.ones(4, np.float32)}] * 6
-    assert efficiency.compare(still, [1.0] * 6, samples(1.0, 6, 1, 4), [1.0] * 6) == (None, None, None)
+    assert race.compare(still, [1.0] * 6, samples(1.0, 6, 1, 4), [1.0] * 6) == (None, None, None)
 
 
 def test_gradients_of_no_light_tell_nothing():
     none = [{KEY: np.zeros(3, dtype=np.float32)} for _ in range(8)]
-    assert efficiency.compare(none, [1.0] * 8, none, [1.0] * 8) == (None, None, None)
+    assert race.compare(none, [1.0] * 8, none, [1.0] * 8) == (None, None, None)

@@ -15,10 +15,10 @@ from cli import tiny
 
 from reslrb_cli.cli import main
 from reslrb_cli.optimization import loop
-from reslrb_cli.optimization.autotune import steps
-from reslrb_cli.optimization.autotune.choice import GUIDING_SHARE
-from reslrb_cli.optimization.autotune.sampling import GUIDING_LONGER, GuidingPilot
-from reslrb_cli.optimization.autotune.steps import Sizes, StepPilot, StepTrial, Taken
+from reslrb_cli.optimization.autotune import sampling
+from reslrb_cli.optimization.autotune.estimators import GUIDING_SHARE
+from reslrb_cli.optimization.autotune.race import Sizes, Step, Turns
+from reslrb_cli.optimization.autotune.sampling import GUIDING_LONGER, GuidingPilot, StepTrial
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.records.clock import StepClock
 
@@ -45,20 +45,20 @@ class World:
     calls: list[Any] = field(default_factory=list)
 
     learns: bool = True
-    pilot: type[StepPilot[Any]] = GuidingPilot
+    pilot: type[Turns[Any]] = GuidingPilot
 
-    def learn(self, round: int, spp: int) -> Taken:
+    def learn(self, round: int, spp: int) -> Step:
         self.calls.append(("learn", round, spp))
-        return Taken(kernel_ms=self.walk * spp, wall_ms=self.walk * spp + self.python, compile_ms=5.0)
+        return Step(kernel_ms=self.walk * spp, wall_ms=self.walk * spp + self.python, compile_ms=5.0)
 
-    def take(self, other: bool, round: int, spp: int) -> Taken:
+    def take(self, other: bool, round: int, spp: int) -> Step:
         self.calls.append((other, round, spp))
         random = np.random.default_rng([self.seed, round, other])
         factor = self.variance if other else 1.0
         picture = factor if self.image is None else (self.image if other else 1.0)
         kernel = spp * (self.time if other else 1.0)
         apart = spp * (self.image_time if other else 1.0) if self.alone else 0.0
-        return Taken(
+        return Step(
             {"a": self._noisy(random, factor / spp), "b": 1000 * self._noisy(random, factor / spp)},
             {"0": self._noisy(random, picture / spp)},
             kernel, apart, kernel + apart + self.overhead, 0.0,
@@ -85,10 +85,10 @@ def begin(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def fix_times(monkeypatch: pytest.MonkeyPatch, other_ms: Mapping[str, float]) -> None:
     """Have a step take 1 ms, one of the other kind what is given for what is decided, and a walk to learn from 1 ms."""
-    monkeypatch.setattr(steps, "_taken", lambda times: Taken(kernel_ms=1.0, wall_ms=1.0))
+    monkeypatch.setattr(sampling, "timed", lambda times: Step(kernel_ms=1.0, wall_ms=1.0))
     take = StepTrial.take
 
-    def timed(self: StepTrial, other: bool, round: int, spp: int) -> Taken:
+    def timed(self: StepTrial, other: bool, round: int, spp: int) -> Step:
         taken = take(self, other, round, spp)
         if other:
             taken.kernel_ms = taken.image_ms = other_ms[self._what]

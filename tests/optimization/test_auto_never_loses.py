@@ -7,8 +7,9 @@ the extreme suite have so many samples that there is time to measure.
 
 from __future__ import annotations
 
+import dataclasses
 import gc
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -23,9 +24,9 @@ from reslrb_cli.measure.extreme.suite import ExtremeCase
 from reslrb_cli.measure.gradients import integrator
 from reslrb_cli.measure.scenes.small import load as load_scene
 from reslrb_cli.optimization.assemble import assemble_scene
-from reslrb_cli.optimization.autotune.choice import find_options, is_auto, settle_integrator
-from reslrb_cli.optimization.autotune.estimators import SHARE
-from reslrb_cli.optimization.autotune.sampling import GuidingPilot, SequencePilot, settle_sampling
+from reslrb_cli.optimization.autotune.estimators import SHARE, Option, find_options
+from reslrb_cli.optimization.autotune.race import is_auto
+from reslrb_cli.optimization.autotune.sampling import GuidingPilot, SequencePilot, settle
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.targets import make_targets
 from reslrb_cli.records.decisions import LEAST_IMAGE, PaidRecord
@@ -50,8 +51,8 @@ PATHS = 2**20
 #: The last round is begun while there is time for one like that before it. Beside others' work on the machine it may
 #: take so many times as long as the mean of all: where steps take milliseconds, that is a part that counts.
 OVERRUN = 2
-#: What decides how samples are drawn.
-SETTLE: dict[str, Callable[[Problem, Callable[[str], None]], None]] = {"sampling": settle_sampling}
+#: What decides on the integrator.
+SETTLE: dict[str, Callable[[Problem, Sequence[Option], Callable[[str], None]], Problem]] = {"settle": settle}
 
 
 @pytest.fixture(autouse=True)
@@ -65,9 +66,7 @@ def decided(config: Config, case: ExtremeCase | None) -> Problem:
     problem = assemble_scene(config, None if case is None else load_scene(case.scene()))
     options = find_options(problem)
     make_targets(problem, lambda line: None)
-    settle_integrator(problem, options, lambda line: None)
-    SETTLE["sampling"](problem, lambda line: None)
-    return problem
+    return SETTLE["settle"](problem, options, lambda line: None)
 
 
 def extreme(case: ExtremeCase, folder: Path) -> str:
@@ -142,11 +141,11 @@ def test_losses_are_seen(fault: str, tmp_path: Path, monkeypatch: pytest.MonkeyP
         monkeypatch.setattr(SequencePilot, "_record", lambda self, on, images, *rest: other(self, False, False, *rest))
     else:
 
-        def settle(problem: Problem, say: Callable[[str], None]) -> None:
-            settle_sampling(problem, say)
-            if is_auto(problem.config, "guiding"):
-                problem.integrator = problem.integrator.afresh(guided=True)
+        def wrong(problem: Problem, options: Sequence[Option], say: Callable[[str], None]) -> Problem:
+            found = settle(problem, options, say)
+            on = is_auto(found.config, "guiding")
+            return dataclasses.replace(found, integrator=found.integrator.afresh(guided=True)) if on else found
 
-        monkeypatch.setitem(SETTLE, "sampling", settle)
+        monkeypatch.setitem(SETTLE, "settle", wrong)
     with pytest.raises(AssertionError):
         test_no_scene_loses("stiff/wall", tmp_path)

@@ -22,11 +22,11 @@ from reslrb_cli.guiding.tables import Purpose
 from reslrb_cli.measure.methods import parse_cases
 from reslrb_cli.optimization import assemble as assembling
 from reslrb_cli.optimization.assemble import assemble
-from reslrb_cli.optimization.autotune.sampling import table_bytes
-from reslrb_cli.optimization.autotune.steps import StepTrial, Taken
+from reslrb_cli.optimization.autotune.race import Step
+from reslrb_cli.optimization.autotune.sampling import StepTrial, table_bytes
 from reslrb_cli.optimization.problem import Problem
+from reslrb_cli.records.cache import PilotCache
 from reslrb_cli.records.checkpoint import STATE_FILE, open_state
-from reslrb_cli.records.decisions import PilotCache
 from reslrb_cli.records.manifest import read_manifest
 
 pytestmark = pytest.mark.usefixtures("llvm")
@@ -95,7 +95,7 @@ def test_the_sequence_is_the_same_with_guiding_and_without(experiment: Path, mon
 def test_images_that_guiding_does_not_pay_for_are_not_guided(experiment: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     take = StepTrial.take
 
-    def slow(self: StepTrial, other: bool, round: int, spp: int) -> Taken:
+    def slow(self: StepTrial, other: bool, round: int, spp: int) -> Step:
         taken = take(self, other, round, spp)
         taken.image_ms = 1000.0 if other else 1.0
         return taken
@@ -186,9 +186,10 @@ def test_a_run_says_so_once_remembers_it_and_writes_it_down(
     assert values["guiding"]["0"] > 0
     told: list[str] = []
     again = assemble(load("tiny.yaml", AUTO), told.append, PilotCache())
-    assert told[-1].endswith("(as an earlier run measured)")
     assert again.guided is not None
     assert again.guided.to_json() == {**found, "cached": True}
+    assert told[-1] == again.guided.line()
+    assert again.guided.line(cost=True) == f"{told[-1]} (as an earlier run measured)"
     row = next(line for line in inspected(capsys, str(RUN)) if "guided emission" in line)
     assert row.split()[0] == "needed"
     assert "65536 cells, 6.1 MiB" in row  # no more than the 16,384 paths of a batch can tell apart
@@ -211,7 +212,7 @@ def test_it_goes_on_as_it_was_decided_bit_by_bit(tmp_path: Path, monkeypatch: py
         "run.certainty=false",
     ]
     whole, left = run_and_kill(monkeypatch, 7, *(word for text in settings for word in ("--set", text)))
-    monkeypatch.setattr(assembling, "settle_sampling", lambda *args: pytest.fail("measured again"))
+    monkeypatch.setattr(assembling, "settle", lambda *args: pytest.fail("measured again"))
     (tmp_path / "cache" / "pilot.json").unlink()
     assert optimize("--resume", str(left), "--quiet") == 0
     assert read_manifest(left)["guided"]["guided"]
@@ -247,7 +248,7 @@ def test_a_damaged_outcome_is_measured_anew(experiment: Path, monkeypatch: pytes
     problem = decided(monkeypatch, 1.0, say=said.append, cache=Damaged())
     assert problem.guided is not None
     assert not problem.guided.cached
-    assert "guiding auto: measuring" in said
+    assert any(line.startswith("measuring ") for line in said)
 
 
 def test_what_is_compared_is_named() -> None:

@@ -11,7 +11,7 @@ from reslrb_cli.config.loader import load
 from reslrb_cli.guiding.tables import Guiding
 from reslrb_cli.optimization import loop
 from reslrb_cli.optimization.assemble import assemble
-from reslrb_cli.optimization.autotune.steps import lessons, sizes
+from reslrb_cli.optimization.autotune.sampling import lessons, sizes
 from reslrb_cli.optimization.forecast import _with_learning
 
 

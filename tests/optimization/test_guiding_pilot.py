@@ -9,10 +9,9 @@ import numpy as np
 import pytest
 from optimization.deciding import SIZES, World
 
-from reslrb_cli.optimization.autotune.choice import GUIDING_SHARE
-from reslrb_cli.optimization.autotune.efficiency import ITERATIONS, TIMING_NOISE
+from reslrb_cli.optimization.autotune.estimators import GUIDING_SHARE
+from reslrb_cli.optimization.autotune.race import ITERATIONS, LEARNINGS, LEAST_ROUNDS, LOOKS, TIMING_NOISE, Sizes
 from reslrb_cli.optimization.autotune.sampling import GUIDING_LONGER, GuidingPilot
-from reslrb_cli.optimization.autotune.steps import LEARNINGS, LEAST_ROUNDS, LOOKS, Sizes
 from reslrb_cli.records.decisions import GuidedRecord
 
 

@@ -8,9 +8,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from reslrb_cli.optimization.autotune.choice import GUIDING_SHARE
-from reslrb_cli.optimization.autotune.efficiency import ITERATIONS, Allowance, Candidate, Measured, Outcome
-from reslrb_cli.optimization.autotune.estimators import SHARE, Pilot
+from reslrb_cli.optimization.autotune.estimators import GUIDING_SHARE, SHARE, Candidate, Pilot
+from reslrb_cli.optimization.autotune.race import ITERATIONS, Step
+from reslrb_cli.optimization.decisions import Allowance
+from reslrb_cli.records.decisions import EstimatorRecord
 
 STACK, GATHER = Candidate({"estimator": "stack"}, True), Candidate({"estimator": "gather"}, True)
 RESERVOIR = Candidate({"estimator": "reservoir", "capacity": 1}, False)
@@ -30,7 +31,7 @@ class World:
         self.times, self.selection, self.overhead = times, selection, overhead
         self.calls: list[tuple[str, int, int]] = []
 
-    def step(self, candidate: Candidate, round: int, spp: int) -> Measured:
+    def step(self, candidate: Candidate, round: int, spp: int) -> Step:
         name = candidate.label
         self.calls.append((name, round, spp))
         paths = np.random.default_rng(round)
@@ -39,9 +40,9 @@ class World:
         choice = np.random.default_rng([round, *name.encode()])
         small = small + choice.normal(size=400) * np.sqrt(self.selection.get(name, 0) / spp)
         kernel = self.times[name] * spp
-        return Measured({"small": small, "large": large}, kernel, kernel + self.overhead)
+        return Step({"small": small, "large": large}, kernel_ms=kernel, wall_ms=kernel + self.overhead)
 
-    def run(self, candidates=ALL, spp: int = 64, share: float = SHARE) -> Outcome:
+    def run(self, candidates=ALL, spp: int = 64, share: float = SHARE) -> EstimatorRecord:
         return Pilot(candidates, self.step, spp, share=share).run()
 
 
@@ -79,7 +80,7 @@ def test_the_most_efficient_is_picked(table: str) -> None:
     assert outcome.advantage is not None
     assert outcome.advantage >= 1
     assert [row.estimator for row in outcome.rows] == [candidate.options["estimator"] for candidate in ALL]
-    assert outcome.line().startswith(f"estimator {best}, ")
+    assert outcome.line().startswith(f"estimator {best}: ")
 
 
 def test_what_cannot_win_is_not_measured() -> None:
@@ -165,15 +166,15 @@ def test_equal_rounds_are_measured_with_equal_seeds_from_the_first() -> None:
 
 
 def test_no_noise_at_all_is_no_division_by_zero() -> None:
-    def step(candidate: Candidate, round: int, spp: int) -> Measured:
-        return Measured({"a": np.zeros(3)}, 1.0 if candidate is GATHER else 2.0, 3.0)
+    def step(candidate: Candidate, round: int, spp: int) -> Step:
+        return Step({"a": np.zeros(3)}, kernel_ms=1.0 if candidate is GATHER else 2.0, wall_ms=3.0)
 
     assert Pilot(ALL, step, 16).run().label == "gather"
 
 
 def test_an_outcome_survives_json() -> None:
     outcome = World(times(), {RESERVOIR.label: 1.0, EVENT.label: 1.0}).run()
-    assert Outcome.from_json(outcome.to_json()) == outcome
+    assert EstimatorRecord.from_json(outcome.to_json()) == outcome
 
 
 def test_few_steps_that_python_makes_dear_are_all_used() -> None:
@@ -181,11 +182,12 @@ def test_few_steps_that_python_makes_dear_are_all_used() -> None:
     right, steps = 0, []
     for world in range(100):
 
-        def step(candidate: Candidate, round: int, spp: int, world: int = world) -> Measured:
+        def step(candidate: Candidate, round: int, spp: int, world: int = world) -> Step:
             steps.append(candidate)
             path, choice = (np.random.default_rng([world, round, k]).normal() for k in (0, len(candidate.label)))
             value = (path + (0.2 * choice if candidate is EVENT else 0)) / np.sqrt(spp)
-            return Measured({"a": np.array([10 + value])}, (0.1 if candidate is EVENT else 0.2) * spp, 10.0 + 0.2 * spp)
+            kernel = (0.1 if candidate is EVENT else 0.2) * spp
+            return Step({"a": np.array([10 + value])}, kernel_ms=kernel, wall_ms=10.0 + 0.2 * spp)
 
         right += Pilot([STACK, EVENT], step, 16).run().chosen == EVENT.options
     assert right >= 95

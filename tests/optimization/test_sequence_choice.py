@@ -19,10 +19,10 @@ from reslrb_cli.config.loader import load
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.measure.methods import parse_cases
 from reslrb_cli.optimization.assemble import assemble
-from reslrb_cli.optimization.autotune.steps import StepTrial
+from reslrb_cli.optimization.autotune.sampling import StepTrial
 from reslrb_cli.optimization.problem import Problem
+from reslrb_cli.records.cache import PilotCache
 from reslrb_cli.records.checkpoint import STATE_FILE, open_state
-from reslrb_cli.records.decisions import PilotCache
 from reslrb_cli.records.manifest import read_manifest
 
 pytestmark = pytest.mark.usefixtures("llvm")
@@ -196,9 +196,9 @@ def test_a_run_says_so_once_remembers_it_and_writes_it_down(
     assert values["sequence"] == found
     told: list[str] = []
     again = made(AUTO, say=told.append, cache=PilotCache())
-    assert told[-1].endswith("(as an earlier run measured)")
     assert again.sequence is not None
     assert again.sequence.to_json() == {**found, "cached": True}
+    assert told[-1] == again.sequence.line()
     assert is_even(again)
     row = next(line for line in inspected(capsys, str(RUN)) if "low-discrepancy numbers" in line)
     assert row.split()[0] == "needed"

@@ -10,12 +10,11 @@ import numpy as np
 import pytest
 from optimization.deciding import SIZES, World
 
-from reslrb_cli.optimization.autotune import choice
-from reslrb_cli.optimization.autotune.choice import GUIDING_SHARE, SEQUENCE_SHARE
-from reslrb_cli.optimization.autotune.efficiency import ITERATIONS
+from reslrb_cli.optimization.autotune.estimators import GUIDING_SHARE, SEQUENCE_SHARE
 from reslrb_cli.optimization.autotune.estimators import SHARE as PILOT_SHARE
-from reslrb_cli.optimization.autotune.sampling import SEQUENCE_LONGER, SequencePilot, planned
-from reslrb_cli.optimization.autotune.steps import LEARNINGS, LEAST_ROUNDS, LOOKS, PLANNED, Sizes
+from reslrb_cli.optimization.autotune.race import ITERATIONS, LEARNINGS, LEAST_ROUNDS, LOOKS, PLANNED, Sizes
+from reslrb_cli.optimization.autotune.sampling import SEQUENCE_LONGER, SequencePilot, planned, share_left
+from reslrb_cli.optimization.decisions import Allowance
 from reslrb_cli.records.decisions import GuidedRecord, SequenceRecord
 
 
@@ -115,18 +114,18 @@ class Spent:
     def __init__(self, pilot: float | None, guided: float | None) -> None:
         self.pilot = None if pilot is None else SimpleNamespace(share=pilot)
         self.guided = None if guided is None else GuidedRecord(guided=True, share=guided)
-        self.allowance = None
 
 
 @pytest.mark.parametrize("pilot", [None, 0.02, PILOT_SHARE - GUIDING_SHARE])
 def test_all_that_is_measured_takes_one_share(pilot: float | None) -> None:
     """What guiding may take, then what the sequence may, and what both have, come what may."""
-    for_guiding = choice.share_left(Spent(pilot, None), SEQUENCE_SHARE)  # type: ignore[arg-type]
+    ample = Allowance(1.0, 1e9, 0.0, 1.0)
+    for_guiding = share_left(Spent(pilot, None), ample, SEQUENCE_SHARE)  # type: ignore[arg-type]
     assert for_guiding == pytest.approx(PILOT_SHARE - SEQUENCE_SHARE - (pilot or 0))
     assert for_guiding >= GUIDING_SHARE - SEQUENCE_SHARE - 1e-12
-    left = choice.share_left(Spent(pilot, for_guiding))  # type: ignore[arg-type]
+    left = share_left(Spent(pilot, for_guiding), ample)  # type: ignore[arg-type]
     assert left == pytest.approx(SEQUENCE_SHARE)
-    assert choice.share_left(Spent(pilot, 0.5)) == 0  # type: ignore[arg-type]
+    assert share_left(Spent(pilot, 0.5), ample) == 0  # type: ignore[arg-type]
 
 
 def test_a_record_survives_json_and_nothing_else_is_one() -> None:

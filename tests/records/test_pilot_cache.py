@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from reslrb_cli.records.decisions import MOST, PilotCache, cache_folder, key_of
+from reslrb_cli.records.cache import MOST, PilotCache, cache_folder, key_of
 
 
 def test_entries_are_kept(tmp_path: Path) -> None:

@@ -22,6 +22,8 @@ from functools import cached_property
 import numpy as np
 from scipy import stats
 
+from reslrb_cli.statistics import jackknife_variance
+
 #: Of all intervals.
 CONFIDENCE = 0.95
 
@@ -243,7 +245,7 @@ def _error(squares: np.ndarray, sums: np.ndarray, counts: np.ndarray | int, nois
 def _joined(value: float, left: np.ndarray, right: np.ndarray) -> Estimate:
     """With the jackknife's variances of both sides, by Welch and Satterthwaite."""
     sides = [side for side in (left, right) if len(side) > 1]
-    variances = [(len(side) - 1) / len(side) * float(np.square(side - side.mean()).sum()) for side in sides]
+    variances = [float(jackknife_variance(side)) for side in sides]
     total = sum(variances)
     spread = sum(v**2 / (len(side) - 1) for v, side in zip(variances, sides, strict=True))
     return Estimate(value, float(np.sqrt(total)), total**2 / spread if spread > 0 else float(len(left) - 1))

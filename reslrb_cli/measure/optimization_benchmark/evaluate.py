@@ -26,8 +26,8 @@ from reslrb_cli.measure.convergence.setup import affordable_paths, find_referenc
 from reslrb_cli.measure.references import leave_out_border
 from reslrb_cli.measure.workers import Begun
 from reslrb_cli.optimization.assemble import assemble_scene
-from reslrb_cli.optimization.autotune.choice import find_options, settle_integrator
-from reslrb_cli.optimization.autotune.sampling import settle_sampling
+from reslrb_cli.optimization.autotune.estimators import find_options
+from reslrb_cli.optimization.autotune.sampling import settle
 from reslrb_cli.optimization.errors import ErrorMeter
 from reslrb_cli.optimization.identifiability import find_reached
 from reslrb_cli.optimization.loop import optimize
@@ -240,8 +240,7 @@ def begin_run(first: dict[str, Any]) -> Begun:
     if first["masked"]:
         leave_out_border(problem)
     # Nothing is remembered of earlier pilots: what a pilot costs is to be seen.
-    settle_integrator(problem, options, lambda line: None, None)
-    settle_sampling(problem, lambda line: None, None)
+    problem = settle(problem, options, lambda line: None)
     dr.sync_thread()
     loading_s = time.perf_counter() - start
     records = optimize(problem, progress=lambda: advance.progress())  # first asked for in its first iteration

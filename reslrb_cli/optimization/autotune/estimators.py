@@ -1,4 +1,4 @@
-"""Which estimator is the most efficient here: a short pilot measures each, and leaves out what cannot win.
+"""The estimator of a run, settled before its first iteration: a short pilot measures each, leaving out what cannot win.
 
     efficiency = 1 / (variance * time)
 
@@ -9,48 +9,240 @@ that selects has the exact one's gradient as its expectation, so that
     Var = Var_exact + E |g - g_exact|^2,   with m independent slots   Var_m = Var_exact + (Var_1 - Var_exact) / m,
 
 which few seeds estimate well, and which tells what a candidate can reach at best before its kernels are compiled.
+
+What a budget of memory allows is found before (`find_options`): which candidates, with how many samples to a pass.
 """
 
 from __future__ import annotations
 
 import math
 import statistics
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
-from reslrb_cli.optimization.autotune.efficiency import (
+from reslrb_cli.config.integrators import Reslrb as ReslrbConfig
+from reslrb_cli.config.schema import Config
+from reslrb_cli.errors import ConfigError
+from reslrb_cli.estimators import ESTIMATORS
+from reslrb_cli.integrators.reslrb import Reslrb as Tracer
+from reslrb_cli.optimization.autotune.race import (
     ITERATIONS,
     TIMING_NOISE,
-    Candidate,
+    Asked,
     Gradients,
-    Measured,
-    Outcome,
-    Row,
-    sample_variance,
-    square,
+    Race,
+    Step,
+    Tuner,
+    is_auto,
+    measured_step,
+    sets_of,
 )
+from reslrb_cli.optimization.decisions import Allowance, MemoryPlan
+from reslrb_cli.optimization.loading import pass_spp
+from reslrb_cli.optimization.memory import check_baseline, check_memory, choose_samples, standing
+from reslrb_cli.optimization.moving import ATTACHED, is_attached
+from reslrb_cli.optimization.problem import Problem
+from reslrb_cli.records.clock import MIB, StepClock
+from reslrb_cli.records.decisions import EstimatorRecord, TriedEstimator
+from reslrb_cli.statistics import Array, sum_of_squares
 
-#: Share of a run of ITERATIONS that the pilot may cost, compilation apart.
-SHARE = 0.05
+#: Share of a run of ITERATIONS that all measuring but for that of `prb` may cost, compilation apart; that of whether
+#: guiding pays is planned for (where it is not clear by then, it may take what the pilot has left of its own), and that
+#: of the sequence is left by what is measured before.
+SHARE, GUIDING_SHARE, SEQUENCE_SHARE = 0.05, 0.025, 0.005
+#: What measurements take at least that say anything: kernels to compile, in those of one step, and iterations' worth of
+#: work. Compiling is that of both kinds of steps, and of walks that are learned from.
+ESTIMATOR_NEEDS, GUIDING_NEEDS, SEQUENCE_NEEDS = (4.0, 4.0), (2.5, 3.0), (2.5, 1.0)
+#: What is measured once the estimator is settled.
+LATER = {"guiding": (GUIDING_NEEDS, GUIDING_SHARE), "sequence": (SEQUENCE_NEEDS, SEQUENCE_SHARE)}
 
 
-#: How much of that it plans for: a step may take longer than those before it, and a later candidate's run less time.
+@dataclass
+class Option:
+    """A candidate, ready to run; `memory` where there is a budget."""
+
+    options: dict[str, Any]
+    integrator: Tracer
+    memory: MemoryPlan | None
+
+
+def find_options(problem: Problem) -> list[Option]:
+    """What the run may use in place of `problem.integrator`, where that is left to measurement; else nothing.
+
+    Needs no targets. Raises ConfigError where no estimator keeps the memory budget.
+    """
+    config = problem.config
+    if not isinstance(config.integrator, ReslrbConfig):
+        check_baseline(problem)
+        return []
+    if config.integrator.estimator == "auto":
+        choices = [{"estimator": ATTACHED}] if is_attached(problem) else candidates(config)
+        return _fitting(problem, config.integrator, choices)
+    if config.run.memory_budget is None:
+        check_memory(problem, problem.integrator)
+        return []
+    return _fitting(problem, config.integrator, [{}])
+
+
+def candidates(config: Config) -> list[dict[str, Any]]:
+    """Options of all estimators that apply, those first that others are judged by."""
+    found: list[dict[str, Any]] = [{"estimator": "stack"}, {"estimator": "gather"}]
+    found += [{"estimator": name, "capacity": m} for m in (1, 4) for name in ("reservoir", "event")]
+    if config.adjoint != "correlated":
+        found += [{"estimator": "reservoir", "capacity": m, "weight": "adjoint"} for m in (1, 4)]
+    return found
+
+
+def _fitting(problem: Problem, integrator: ReslrbConfig, choices: list[dict[str, Any]]) -> list[Option]:
+    """The candidates that keep the budget, each with the samples of its passes."""
+    run, budget, least, options = problem.config.run, problem.config.run.budget_bytes, [], []
+    fixed = 0 if budget is None else standing()
+    for choice in choices:
+        own = (integrator.chosen(**choice) if choice else integrator.undecided_off()).options()
+        made = Tracer.of(**own)
+        made.expect(pass_spp(problem.config))
+        check_memory(problem, made)
+        if budget is None:
+            options.append(Option(choice, made, None))
+            continue
+        samples = run.spp // sets_of(problem.config)
+        size, expected = choose_samples(problem, made, samples, budget, fixed)
+        if size == 0:
+            least.append(expected.total)
+            continue
+        if size < samples:
+            made = made.with_options(samples_per_pass=size, freeze=made.freeze)
+        options.append(Option(choice, made, MemoryPlan(budget, size, samples // size, expected)))
+    if not options:
+        mib = -(-min(least) // MIB)
+        reason = f"one sample per pixel takes about {mib:.0f} MiB (scene, targets, images of a step, parameters, paths)"
+        reason += f"; allow at least {mib:.0f} MiB, beside which Python, libraries and kernels are not counted"
+        raise ConfigError(problem.config.source, "run.memory_budget", reason)
+    return options
+
+
+def settle_estimator(tuner: Tuner, options: Sequence[Option]) -> None:
+    """Have the integrator of the tuner's problem be the best of the options; of several a pilot finds it.
+
+    What moves light leaves one estimator, which needs no pilot.
+    """
+    if not options:
+        return
+    problem, chosen = tuner.problem, options[0]
+    if len(options) > 1 and chosen.options:
+
+        def usual(note: str) -> EstimatorRecord:
+            """It has been the best, or within a few percent of it, wherever that was measured (docs/benchmarks.md)."""
+            found = _candidate(options[0])
+            note += "; every connection, in one traversal"
+            return EstimatorRecord(chosen=found.options, label=found.label, note=note)
+
+        pilot = tuner.decide(
+            Asked(
+                EstimatorRecord,
+                of={},
+                needs=(ESTIMATOR_NEEDS, *(LATER[option][0] for option in _later(problem.config))),
+                integrator=options[0].integrator,
+                measure=lambda allowance: run_pilot(problem, options, allowance),
+                unmeasured=usual,
+                fits=lambda record: any(option.options == record.chosen for option in options),
+            )
+        )
+        tuner.take(pilot=pilot)
+        chosen = next(option for option in options if option.options == pilot.chosen)
+    tuner.take(integrator=chosen.integrator, memory=chosen.memory)
+    if chosen.memory is not None:
+        tuner.take(samples_per_pass=chosen.memory.samples_per_pass)
+
+
+def _later(config: Config) -> list[str]:
+    """The options that are measured once the estimator is settled."""
+    return [option for option in LATER if is_auto(config, option)]
+
+
+# --- the pilot --------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """An estimator and its options. `exact`: it uses every connection. `passes` are those of a step in the pilot; other
+    passes are other paths. `parent`: the label of a candidate than which it is no faster; where it is the same
+    estimator with more slots for connections, `varies_slots`."""
+
+    options: dict[str, Any]
+    exact: bool
+    passes: int = 1
+    parent: str | None = None
+    varies_slots: bool = False
+
+    @property
+    def label(self) -> str:
+        """The estimator in words."""
+        name, *rest = (str(value) if key == "estimator" else f"{key} {value}" for key, value in self.options.items())
+        return ", ".join([name, *rest])
+
+
+def _candidate(option: Option) -> Candidate:
+    """As the pilot sees it: with two passes where the run has more, which take as many traversals."""
+    options = option.options
+    name, slots, parent = options["estimator"], options.get("capacity", 1) > 1, None
+    if slots or "weight" in options:
+        parent = Candidate({"estimator": name, "capacity": 1}, exact=False).label
+    elif name in ("gather", "reservoir"):  # which trace their paths twice, where `event` traces them once
+        parent = Candidate({"estimator": "event", "capacity": 1}, exact=False).label
+    several = option.memory is not None and option.memory.passes > 1
+    return Candidate(options, ESTIMATORS[name].exact, 2 if several else 1, parent, slots and "weight" not in options)
+
+
+def run_pilot(problem: Problem, options: Sequence[Option], allowance: Allowance) -> EstimatorRecord:
+    """Measure the options, and say which is the most efficient."""
+    run, sets, clock = problem.config.run, sets_of(problem.config), StepClock()
+    made = [_candidate(option) for option in options]
+    integrators = {c.label: option.integrator.to_measure() for c, option in zip(made, options, strict=True)}
+
+    def step(candidate: Candidate, round: int, spp: int) -> Step:
+        integrator = integrators[candidate.label]
+        samples = integrator.samples_per_pass if candidate.passes == 1 else spp // (sets * candidate.passes)
+        # Few steps of each sample count: a recording would cost more than it saves.
+        integrator = integrator.with_options(samples_per_pass=samples, freeze=False)
+        return measured_step(problem, integrator, clock, round, spp)
+
+    unit = sets * max(candidate.passes for candidate in made)
+    if problem.samples_per_pass is not None:  # the user's own passes
+        unit = sets * min(problem.samples_per_pass, run.spp // sets)
+    # What is measured later has its part of what it may cost; guiding leaves some of its own for the sequence.
+    later = [LATER[option] for option in _later(problem.config)]
+    reserved = max((share for _, share in later), default=0.0)
+    kernels, began = sum(needs[0] for needs, _ in later), time.perf_counter()
+    share = min(SHARE, allowance.iterations_left(ESTIMATOR_NEEDS[0] + kernels) / ITERATIONS) - reserved
+
+    def compiles() -> bool:
+        """Whether there is time for the kernels of one more candidate, with those of what is measured later."""
+        spent = replace(allowance, spent_s=allowance.spent_s + time.perf_counter() - began)
+        return spent.affords((1 + kernels, reserved * ITERATIONS))
+
+    return Pilot(made, step, run.spp, unit, share, compiles).run()
+
+
+def sample_variance(values: list[Array]) -> float:
+    """Sum over the entries; the mean square where there is one sample only."""
+    if len(values) < 2:
+        return sum_of_squares(values[0])
+    return float(np.sum(np.var(np.array(values, dtype=np.float64), axis=0, ddof=1)))
+
+
+#: How much of its share the pilot plans for: a step may take longer than those before it, and a later candidate's run
+#: less time.
 PLANNED = 0.95
-
-
-#: Steps that the pilot plans for, the most first: the first that its share suffices for.
+#: Steps that it plans for, the most first: the first that its share suffices for.
 PLANNED_STEPS = (24, 18, 12, 9)
-
-
 #: A candidate is dropped once the best is so many times as efficient, after at least so many rounds.
 DROPPED = ((2, 1.5), (4, 1.25))
-
-
 MOST_ROUNDS = 12
-
-
 #: Share of a step's other costs that kernels may have for nothing.
 FREE = 0.25
 
@@ -73,7 +265,7 @@ class _Entry:
         return max(statistics.median(self.wall) - self.time, 0.0)
 
 
-class Pilot:
+class Pilot(Race):
     """One pilot. `step(candidate, round, spp)` takes a step; equal rounds have equal seeds.
 
     `spp` are those of the run, of which the pilot uses a multiple of `unit`, and `share` is what it may cost of one.
@@ -83,12 +275,13 @@ class Pilot:
     def __init__(
         self,
         candidates: Sequence[Candidate],
-        step: Callable[[Candidate, int, int], Measured],
+        step: Callable[[Candidate, int, int], Step],
         spp: int,
         unit: int = 1,
         share: float = SHARE,
         compiles: Callable[[], bool] = lambda: True,
     ) -> None:
+        super().__init__()
         labels = {candidate.label for candidate in candidates}
         # What a budget of memory left out says nothing of others.
         self._candidates = [c if c.parent in {None, *labels} else replace(c, parent=None) for c in candidates]
@@ -96,10 +289,9 @@ class Pilot:
         self._spp, self._unit, self._pilot_spp = spp, unit, unit
         self._entries: list[_Entry] = []
         self._notes: dict[str, str] = {}
-        self._spent_ms = self._compile_ms = 0.0
         self._first_steps_count = False
 
-    def run(self) -> Outcome:
+    def run(self) -> EstimatorRecord:
         """Measure, and choose."""
         first, *others = [c for c in self._candidates if c.parent is None]
         alive = [self._warm_up(first)]
@@ -125,8 +317,7 @@ class Pilot:
     def _warm_up(self, candidate: Candidate) -> _Entry:
         """Compile the kernels of a candidate, and keep its gradient if that counts."""
         counts = self._first_steps_count
-        first = self._step(candidate, 0, self._pilot_spp if counts else self._unit)
-        self._compile_ms += first.wall_ms + first.compile_ms
+        first = self._first(self._step(candidate, 0, self._pilot_spp if counts else self._unit))
         entry = _Entry(candidate, gradients=[first.gradients] if counts else [])
         self._entries.append(entry)
         return entry
@@ -135,10 +326,9 @@ class Pilot:
         round = len(entry.gradients)
         measured = self._step(entry.candidate, round, self._pilot_spp)
         if measured.compile_ms > measured.wall_ms:  # a first step after all, whose times say nothing
-            self._compile_ms += measured.wall_ms + measured.compile_ms
+            self._first(measured)
             measured = self._step(entry.candidate, round, self._pilot_spp)
-        self._compile_ms += measured.compile_ms
-        self._spent_ms += measured.wall_ms
+        self._spend(measured)
         entry.kernel.append(measured.kernel_ms)
         entry.wall.append(measured.wall_ms)
         entry.gradients.append(measured.gradients)
@@ -151,7 +341,7 @@ class Pilot:
         """
         first = self._step(entry.candidate, 0, self._unit)
         self._spent_ms += first.wall_ms
-        overhead, slope = max(first.wall_ms - first.kernel_ms, 0.0), max(first.kernel_ms, 1e-6) / self._unit
+        overhead, slope = first.beside_ms, max(first.kernel_ms, 1e-6) / self._unit
         budget = PLANNED * self._share * ITERATIONS * (overhead + slope * self._spp) - first.wall_ms
         for steps in PLANNED_STEPS:
             fits = int((budget / steps - overhead) / slope) // self._unit * self._unit
@@ -180,7 +370,7 @@ class Pilot:
         """Mean square norm of each parameter's gradient."""
         every = [g for e in self._entries if e.candidate.exact for g in e.gradients]
         every = every or [g for e in self._entries for g in e.gradients]
-        return {key: float(np.mean([square(g[key]) for g in every])) for key in every[0]}
+        return {key: float(np.mean([sum_of_squares(g[key]) for g in every])) for key in every[0]}
 
     def _variance(self, entry: _Entry) -> float:
         scales = {key: scale for key, scale in self._scales().items() if scale > 0}
@@ -192,7 +382,7 @@ class Pilot:
             total += sample_variance(exact if len(exact) > 1 else own) / scale
             if exact and not entry.candidate.exact:
                 pairs = list(zip(own, exact, strict=False))
-                total += sum(square(a - b) for a, b in pairs) / (len(pairs) * scale)
+                total += sum(sum_of_squares(a - b) for a, b in pairs) / (len(pairs) * scale)
         return max(total, 1e-12)  # a furnace has none at all
 
     def _efficiency(self, entry: _Entry) -> float:
@@ -256,23 +446,26 @@ class Pilot:
             least += (self._variance(relative) - least) / candidate.options["capacity"]
         return 1 / (least * max(relative.time, 1e-6))
 
-    def _outcome(self) -> Outcome:
+    def _outcome(self) -> EstimatorRecord:
         ranked = sorted(self._entries, key=self._efficiency, reverse=True)
-        best = ranked[0]
-        measured = {entry.candidate.label: entry for entry in self._entries}
+        best, measured = ranked[0], {entry.candidate.label: entry for entry in self._entries}
         rows = []
         for candidate in self._candidates:
-            entry = measured.get(candidate.label)
-            options = {key: value for key, value in candidate.options.items() if key != "estimator"}
-            row = Row(candidate.options["estimator"], options, 0, note=self._notes.get(candidate.label, ""))
+            name, options = candidate.options["estimator"], {**candidate.options}
+            del options["estimator"]
+            entry, row = measured.get(candidate.label), TriedEstimator(name, options, 0)
             if entry is not None:
-                row.rounds, row.kernel_ms = len(entry.kernel), entry.time
-                row.variance, row.efficiency = self._variance(entry), self._efficiency(entry)
-            rows.append(row)
-        outcome = Outcome(best.candidate.options, best.candidate.label, rows, self._pilot_spp)
-        if len(ranked) > 1:
-            outcome.advantage = self._efficiency(best) / self._efficiency(ranked[1])
-            outcome.next_label = ranked[1].candidate.label
-        outcome.measure_s, outcome.compile_s = self._spent_ms / 1e3, self._compile_ms / 1e3
-        outcome.share = self._spent_ms / self._run_ms()
-        return outcome
+                time, variance = entry.time, self._variance(entry)
+                row = TriedEstimator(name, options, len(entry.kernel), time, variance, self._efficiency(entry))
+            rows.append(replace(row, note=self._notes.get(candidate.label, "")))
+        return EstimatorRecord(
+            chosen=best.candidate.options,
+            label=best.candidate.label,
+            rows=rows,
+            spp=self._pilot_spp,
+            advantage=self._efficiency(best) / self._efficiency(ranked[1]) if len(ranked) > 1 else None,
+            next_label=ranked[1].candidate.label if len(ranked) > 1 else None,
+            share=self._spent_ms / self._run_ms(),
+            measure_s=self._spent_ms / 1e3,
+            compile_s=self._compile_ms / 1e3,
+        )

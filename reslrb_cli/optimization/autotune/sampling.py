@@ -1,7 +1,7 @@
 """The sampling of a run, settled before its first iteration: guided emission, and the sequence of numbers.
 
 Each is settled where it is left to measurement, guiding first. Steps drawn one way take turns with steps drawn the
-other:
+other (`race.Turns`), with dL/dI held at one image's (`StepTrial`):
 
 - `GuidingPilot`: whether guided emission pays here. A table is learned, and held; then steps with it take turns with
   steps without. To a guided step's time is added its part of what a run of that length learns: each time one more walk
@@ -12,41 +12,164 @@ other:
   the run's are; then both draw from one table. What a run goes on learning takes both the same time; it is left out,
   which makes more of the time that such numbers take. Noise of evenly spread numbers falls faster than with one over
   the samples, or as fast. So short steps find less of the gain than whole ones have, and what pays here pays there.
-- `InsteadPilot`: whether low-discrepancy numbers pay in place of guided emission.
+  Where guiding pays, they are tried in place of it first.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
 
 from reslrb_cli.config.files import in_words
-from reslrb_cli.optimization.autotune.choice import (
+from reslrb_cli.guiding.tables import Guiding, Purpose, learnings
+from reslrb_cli.integrators.protocol import Job
+from reslrb_cli.integrators.reslrb import Reslrb as Tracer
+from reslrb_cli.integrators.step import render_image
+from reslrb_cli.optimization.autotune.estimators import (
     GUIDING_NEEDS,
     SEQUENCE_NEEDS,
     SEQUENCE_SHARE,
-    Say,
-    allowance_of,
-    is_auto,
-    recall,
-    share_left,
-    situation,
-    suits_even_numbers,
+    SHARE,
+    Option,
+    settle_estimator,
 )
-from reslrb_cli.optimization.autotune.efficiency import ITERATIONS
-from reslrb_cli.optimization.autotune.steps import PLANNED, StepPilot, StepTrial, sizes
-from reslrb_cli.optimization.decisions import Cache
-from reslrb_cli.records.decisions import GuidedRecord, SequenceRecord, key_of
+from reslrb_cli.optimization.autotune.race import (
+    ITERATIONS,
+    PLANNED,
+    Asked,
+    Say,
+    Sizes,
+    Step,
+    Tuner,
+    Turns,
+    is_auto,
+    timed,
+)
+from reslrb_cli.optimization.decisions import Allowance, Cache
+from reslrb_cli.optimization.moving import is_attached
+from reslrb_cli.optimization.problem import Problem
+from reslrb_cli.optimization.sensitivity import take_gradient
+from reslrb_cli.optimization.views import View, slope, to_tensor
+from reslrb_cli.records.clock import StepClock, StepTimes
+from reslrb_cli.records.decisions import GuidedRecord, SequenceRecord
+from reslrb_cli.seeds import seed
+from reslrb_cli.statistics import Array
 
-if TYPE_CHECKING:
-    from reslrb_cli.optimization.problem import Problem
+#: A guided step, or one with low-discrepancy numbers, may take so many times as long as another.
+GUIDING_LONGER, SEQUENCE_LONGER = 3.0, 1.25
+#: What of the share the rounds of the sequence are planned for; the first step takes a part too, and is no round.
+ROUNDS_SHARE = 0.8
+#: Views that are looked at, spread over those that are trained on, and values of each one's image.
+MOST_VIEWS, MOST_VALUES = 4, 2**15
+#: Samples of the image that dL/dI is held at, as a share of a step's.
+IMAGE_SHARE = 0.25
 
 
-#: A guided step may take so many times as long as another.
-GUIDING_LONGER = 3.0
+def settle(problem: Problem, options: Sequence[Option], say: Say, cache: Cache | None = None) -> Problem:
+    """`problem` with its integrator settled: the best of the `options` (`find_options`), drawing samples as pays here.
+
+    Needs the targets. Fields of the problem say what was measured; `say` is told, and `cache` holds what earlier runs
+    measured.
+    """
+    tuner = Tuner(problem, say, cache)
+    settle_estimator(tuner, options)
+    settle_sampling(tuner)
+    tuner.tell(tuner.problem.pilot, tuner.problem.guided, tuner.problem.sequence)
+    return tuner.problem
 
 
-class GuidingPilot(StepPilot[GuidedRecord]):
+def settle_sampling(tuner: Tuner) -> None:
+    """Have the integrator, whose estimator is settled, draw samples as pays here, as far as that is left to
+    measurement: guided or not; then from which sequence, in place of being guided, or else as the integrator is then.
+    """
+    config, plain, memory = tuner.problem.config, tuner.problem.integrator, tuner.problem.memory
+    trials: list[StepTrial] = []  # what was measured on so far
+    if is_auto(config, "guiding"):
+        guided = _guided(tuner, trials)
+        tuner.take(guided=guided, integrator=as_decided(plain, guided, None))
+        if guided.guided and memory is not None:
+            expected = replace(memory.expected_bytes, fixed=memory.expected_bytes.fixed + table_bytes(tuner.problem))
+            tuner.take(memory=replace(memory, expected_bytes=expected))
+    if is_auto(config, "sequence"):
+        sequence, found = _sequence(tuner, trials), tuner.problem.guided
+        if found is not None and sequence.alone and sequence.low_discrepancy:
+            note = f"low-discrepancy numbers without it have {sequence.gain:.2g} times that"
+            found = replace(found, guided=False, images=False, note=note)
+            integrator = tuner.problem.integrator.afresh(guided=False)
+            tuner.take(guided=found, integrator=integrator, memory=memory)
+        tuner.take(sequence=sequence, integrator=as_decided(tuner.problem.integrator, None, sequence))
+
+
+def as_decided(integrator: Any, guided: GuidedRecord | None, sequence: SequenceRecord | None) -> Any:
+    """An integrator of the settled estimator that draws samples as was decided, where it was."""
+    if guided is not None and guided.guided:
+        integrator = integrator.afresh(guided=True, images=guided.images)
+    if sequence is not None and sequence.low_discrepancy:
+        integrator = integrator.afresh(low_discrepancy=True)
+    return integrator
+
+
+def table_bytes(problem: Problem) -> int:
+    """Bytes of the tables of all sensors, if `problem.integrator` is guided, or were."""
+    made = problem.integrator.afresh(guided=True)
+    made.plan(problem.scene, problem.scene.sensors()[problem.sensors[0]])  # cuts the grid
+    return int(made.preparation.guiding.bytes(len(problem.sensors)))
+
+
+def suits_even_numbers(problem: Problem) -> str | None:
+    """Why evenly spread numbers are likely to do better here than guided paths, by what the scene has; None where it is
+    not known. docs/sequences.md has what this was seen on."""
+    if is_attached(problem):
+        return "of what moves light, evenly spread numbers say most"
+    for emitter in problem.scene.emitters():
+        if not mi.has_flag(emitter.flags(), mi.EmitterFlags.Delta) and emitter.class_name() != "DirectionalArea":
+            return None
+    return "of light from points and beams, evenly spread numbers say most"
+
+
+def lessons(problem: Problem) -> float:
+    """How often tables of guided emission learn in an iteration of the run, in the mean over all of it."""
+    run, sensors = problem.config.run, len(problem.trained)
+    each = run.batches - (run.first_batch == "image") if problem.config.adjoint == "batched" else 1
+    gradients = run.iterations * each * len(problem.drawn(0)) / sensors
+    return learnings(max(round(gradients), 1)) * sensors / run.iterations
+
+
+def sizes(problem: Problem, longer: float, planned: float = PLANNED) -> Sizes:
+    """The samples of the run's steps, and what is planned of those that are taken here."""
+    run, adjoint = problem.config.run, problem.config.adjoint
+    call = run.spp // run.batches if adjoint == "batched" else run.spp
+    part = min(problem.samples_per_pass or call, call)
+    entries = sum(problem.selection.array(key).size for key in problem.selection.keys)
+    sets = run.spp / call * len(problem.drawn(0))
+    return Sizes(run.spp, call, part, adjoint == "independent", entries, lessons(problem) / sets, longer, planned)
+
+
+def planned(share: float) -> float:
+    """Steps' worth of time that the sequence's rounds are planned for: the longer, the more of the gain is seen."""
+    return min(ROUNDS_SHARE * share * ITERATIONS, PLANNED)
+
+
+def share_left(problem: Problem, allowance: Allowance, reserved: float = 0.0, kernels: float = 0.0) -> float:
+    """What earlier measurements left of the share of 200 iterations that all of them may cost, but for what is
+    `reserved`, and no more than there is time for in a run as short as this, with `kernels` to compile."""
+    spent = sum(each.share for each in (problem.pilot, problem.guided) if each is not None)
+    return max(min(SHARE - spent, allowance.iterations_left(kernels) / ITERATIONS) - reserved, 0.0)
+
+
+def _chosen(problem: Problem) -> dict[str, Any] | None:
+    return None if problem.pilot is None else problem.pilot.chosen
+
+
+# --- guiding ----------------------------------------------------------------------------------------------------------
+
+
+class GuidingPilot(Turns[GuidedRecord]):
     """One decision: guided, or not."""
 
     @property
@@ -63,173 +186,219 @@ class GuidingPilot(StepPilot[GuidedRecord]):
         return GuidedRecord(guided=other, images=images, **found)
 
 
-#: A step with such numbers may take so many times as long as another.
-SEQUENCE_LONGER = 1.25
+def _guided(tuner: Tuner, trials: list[StepTrial]) -> GuidedRecord:
+    """Whether the problem's integrator, whose estimator is settled, is to be guided."""
+    problem = tuner.problem
+    if problem.memory is not None:
+        free, needed = problem.memory.budget_bytes - problem.memory.expected_bytes.total, table_bytes(problem)
+        if needed > free:
+            note = f"run.memory_budget has no room for tables of {in_words(needed)}"
+            return GuidedRecord(guided=False, note=note)
+    sequence = is_auto(problem.config, "sequence")
+    why = suits_even_numbers(problem) if sequence else None
+    plan = sizes(problem, GUIDING_LONGER)
+
+    def measure(allowance: Allowance) -> GuidedRecord:
+        plain, guided = (problem.integrator.afresh(guided=on) for on in (False, True))
+        trials.append(StepTrial(problem, "guiding", plain, guided))
+        share = share_left(problem, allowance, SEQUENCE_SHARE if sequence else 0.0, GUIDING_NEEDS[0])
+        return GuidingPilot(trials[-1], plan, trials[-1].part_of_views(), share).run()
+
+    return tuner.decide(
+        Asked(
+            GuidedRecord,
+            # Learning is a larger part of a short run, where tables learn most often at first.
+            of={"guiding": 4, "of": _chosen(problem), "lessons": plan.lessons},
+            # Where even numbers are likely to do better, to measure guiding alone would mislead.
+            needs=(GUIDING_NEEDS, *([] if why is None else 2 * [SEQUENCE_NEEDS])),
+            integrator=problem.integrator,
+            measure=measure,
+            unmeasured=lambda note: GuidedRecord(guided=False, note=f"{note}; {why or 'it pays in long runs'}"),
+        )
+    )
 
 
-#: What of the share the rounds are planned for; the first step takes a part too, and is no round.
-ROUNDS_SHARE = 0.8
+# --- the sequence -----------------------------------------------------------------------------------------------------
 
 
-def planned(share: float) -> float:
-    """Steps' worth of time that the rounds are planned for: the longer they are, the more of the gain is seen."""
-    return min(ROUNDS_SHARE * share * ITERATIONS, PLANNED)
-
-
-class SequencePilot(StepPilot[SequenceRecord]):
+class SequencePilot(Turns[SequenceRecord]):
     """One decision: low-discrepancy numbers, or independent ones."""
 
     def _decide(self, other: bool, images: bool, found: dict[str, Any]) -> SequenceRecord:
         return SequenceRecord(low_discrepancy=other, **found)
 
 
-class InsteadPilot(SequencePilot):
-    """One decision: low-discrepancy numbers in place of guided emission, or that with independent ones."""
+def _sequence(tuner: Tuner, trials: list[StepTrial]) -> SequenceRecord:
+    """Which sequence the problem's integrator, guided or not, is to have; `trials`: what guiding was measured on."""
+    problem, found = tuner.problem, tuner.problem.guided
+    plain = problem.integrator
 
-    def _decide(self, other: bool, images: bool, found: dict[str, Any]) -> SequenceRecord:
-        return replace(super()._decide(other, images, found), alone=True)
+    def pilot(name: str, guided: bool | None, share: float) -> SequenceRecord:
+        """What is found in that share of the run; `guided`: with the other numbers, None: as the run is."""
+        even = plain.afresh(guided=guided, low_discrepancy=True)
+        earlier = trials[-1] if trials else None
+        trials.append(StepTrial(problem, name, plain.afresh(low_discrepancy=False), even, earlier))
+        plan = sizes(problem, SEQUENCE_LONGER, planned(share))
+        return SequencePilot(trials[-1], plan, trials[-1].part_of_views(), share).run()
 
-
-def settle_guiding(problem: Problem, say: Say, cache: Cache | None = None) -> StepTrial | None:
-    """Have `problem.integrator`, whose estimator is settled, guided where that is left to measurement, and pays.
-
-    Needs the targets. `problem.guided` is what was measured. Returns what it was measured on, where it was now.
-    """
-    if not is_auto(problem.config, "guiding"):
-        return None
-    problem.guided, trial = _guided_record(problem, say, cache)
-    say(problem.guided.line())
-    if take_up_guiding(problem) and problem.memory is not None:
-        plan = problem.memory
-        expected = replace(plan.expected_bytes, fixed=plan.expected_bytes.fixed + table_bytes(problem))
-        problem.memory = replace(plan, expected_bytes=expected)
-    return trial
-
-
-def take_up_guiding(problem: Problem) -> bool:
-    """Do as `problem.guided` says; whether that makes `problem.integrator` a guided one."""
-    if problem.guided is None or not problem.guided.guided:
-        return False
-    problem.integrator = problem.integrator.afresh(guided=True, images=problem.guided.images)
-    return True
-
-
-def table_bytes(problem: Problem) -> int:
-    """Bytes of the tables of all sensors, if `problem.integrator` is guided, or were."""
-    made = problem.integrator.afresh(guided=True)
-    made.plan(problem.scene, problem.scene.sensors()[problem.sensors[0]])  # cuts the grid
-    return int(made.preparation.guiding.bytes(len(problem.sensors)))
-
-
-def _guided_record(problem: Problem, say: Say, cache: Cache | None) -> tuple[GuidedRecord, StepTrial | None]:
-    """What an earlier run measured, or what is measured now."""
-    if problem.memory is not None:
-        free, needed = problem.memory.budget_bytes - problem.memory.expected_bytes.total, table_bytes(problem)
-        if needed > free:
-            note = f"run.memory_budget has no room for tables of {in_words(needed)}"
-            return GuidedRecord(guided=False, note=note), None
-    chosen = None if problem.pilot is None else problem.pilot.chosen
-    plan = sizes(problem, GUIDING_LONGER)
-    # Learning is a larger part of a short run, where tables learn most often at first.
-    of = {"guiding": 4, "of": chosen, "lessons": plan.lessons}
-    key = "" if cache is None else key_of({**of, **situation(problem)})
-    known = recall(GuidedRecord, cache, key)
-    if known is not None:
-        return known, None
-    allowance = allowance_of(problem, problem.integrator)
-    sequence = is_auto(problem.config, "sequence")
-    why = suits_even_numbers(problem) if sequence else None
-    # Where these are likely to do better, to measure guiding alone would mislead.
-    if not allowance.affords(GUIDING_NEEDS, *([] if why is None else 2 * [SEQUENCE_NEEDS])):
-        note = f"{allowance.note()}; {why or 'it pays in long runs'}"
-        return GuidedRecord(guided=False, note=note), None
-    say("guiding auto: measuring")
-    with allowance.counted():
-        plain, guided = (problem.integrator.afresh(guided=on) for on in (False, True))
-        trial = StepTrial(problem, "guiding", plain, guided)
-        share = share_left(problem, SEQUENCE_SHARE if sequence else 0.0, GUIDING_NEEDS[0])
-        record = GuidingPilot(trial, plan, trial.part_of_views(), share).run()
-    if cache is not None:
-        cache.put(key, record.to_json())
-    return record, trial
-
-
-def settle_sampling(problem: Problem, say: Say, cache: Cache | None = None) -> None:
-    """Have `problem.integrator`, whose estimator is settled, draw samples as pays here, as far as that is left to
-    measurement: guided or not; then from which sequence, in place of being guided, or else as the integrator is then.
-
-    Needs the targets. `problem.guided` and `problem.sequence` are what was measured.
-    """
-    memory = problem.memory
-    earlier = settle_guiding(problem, say, cache)
-    if not is_auto(problem.config, "sequence"):
-        return
-    problem.sequence = _sequence_record(problem, say, cache, earlier)
-    say(problem.sequence.line())
-    if problem.guided is not None and problem.sequence.alone and problem.sequence.low_discrepancy:
-        note = f"low-discrepancy numbers without it have {problem.sequence.gain:.2g} times that"
-        problem.guided = replace(problem.guided, guided=False, images=False, note=note)
-        problem.integrator, problem.memory = problem.integrator.afresh(guided=False), memory
-    take_up_sequence(problem)
-
-
-def take_up_sequence(problem: Problem) -> None:
-    """Do as `problem.sequence` says."""
-    if problem.sequence is not None and problem.sequence.low_discrepancy:
-        problem.integrator = problem.integrator.afresh(low_discrepancy=True)
-
-
-def _sequence_record(problem: Problem, say: Say, cache: Cache | None, earlier: StepTrial | None) -> SequenceRecord:
-    """What an earlier run measured, or what is measured now; `earlier`: what guiding was measured on."""
-    chosen = None if problem.pilot is None else problem.pilot.chosen
-    guided = None if problem.guided is None else [problem.guided.guided, problem.guided.images]
-    key = "" if cache is None else key_of({"sequence": 1, "of": [chosen, guided], **situation(problem)})
-    known = recall(SequenceRecord, cache, key)
-    if known is not None:
-        return known
-    allowance = allowance_of(problem, problem.integrator)
-    if not allowance.affords(SEQUENCE_NEEDS):
-        is_guided = problem.integrator.preparation.guiding is not None
-        why = "guided paths gain little by others" if is_guided else suits_even_numbers(problem)
-        note = f"{allowance.note()}; {why or 'evenly spread ones have been no loss in any scene'}"
-        return SequenceRecord(low_discrepancy=not is_guided, note=note)
-    say("sequence auto: measuring")
-    with allowance.counted():
-        record = _measure(problem, earlier)
-    if cache is not None:
-        cache.put(key, record.to_json())
-    return record
-
-
-def _measure(problem: Problem, earlier: StepTrial | None) -> SequenceRecord:
-    """What is measured now; `earlier`: what guiding was measured on."""
-    alone = None
-    if problem.guided is not None and problem.guided.guided:
-        # Guided paths start in cells of their own, within which little is left to spread evenly: where numbers that are
-        # say nearly all, as under a beam through glass, they do better alone.
-        share = share_left(problem, kernels=2 * SEQUENCE_NEEDS[0])
-        alone, earlier = _measured(problem, InsteadPilot, earlier, share / 2)
-    if alone is not None and alone.low_discrepancy:
-        record = alone
-    else:
+    def measure(allowance: Allowance) -> SequenceRecord:
+        alone = None
+        if found is not None and found.guided:
+            # Guided paths start in cells of their own, within which little is left to spread evenly: where numbers
+            # that are say nearly all, as under a beam through glass, they do better alone.
+            share = share_left(problem, allowance, kernels=2 * SEQUENCE_NEEDS[0])
+            alone = replace(pilot("sequence alone", False, share / 2), alone=True)
+            if alone.low_discrepancy:
+                return alone
         spent = 0.0 if alone is None else alone.share
-        record, _ = _measured(problem, SequencePilot, earlier, share_left(problem, spent, SEQUENCE_NEEDS[0]))
-        record = record if alone is None else _added(record, alone)
-    return record
+        record = pilot("sequence", None, share_left(problem, allowance, spent, SEQUENCE_NEEDS[0]))
+        costs = ("measure_s", "compile_s", "share") if alone is not None else ()
+        return replace(record, **{name: getattr(record, name) + getattr(alone, name) for name in costs})
+
+    def unmeasured(note: str) -> SequenceRecord:
+        is_guided = plain.preparation.guiding is not None
+        why = "guided paths gain little by others" if is_guided else suits_even_numbers(problem)
+        note = f"{note}; {why or 'evenly spread ones have been no loss in any scene'}"
+        return SequenceRecord(low_discrepancy=not is_guided, note=note)
+
+    guided = None if found is None else [found.guided, found.images]
+    of = {"sequence": 1, "of": [_chosen(problem), guided]}
+    return tuner.decide(Asked(SequenceRecord, of, [SEQUENCE_NEEDS], plain, measure, unmeasured))
 
 
-def _measured(
-    problem: Problem, kind: type[SequencePilot], earlier: StepTrial | None, share: float
-) -> tuple[SequenceRecord, StepTrial]:
-    """What a pilot finds in that share of the run, and on what."""
-    guided = False if kind is InsteadPilot else None  # None: as the run is
-    plain, even = problem.integrator, problem.integrator.afresh(guided=guided, low_discrepancy=True)
-    name = "sequence alone" if kind is InsteadPilot else "sequence"
-    trial = StepTrial(problem, name, plain.afresh(low_discrepancy=False), even, earlier)
-    return kind(trial, sizes(problem, SEQUENCE_LONGER, planned(share)), trial.part_of_views(), share).run(), trial
+# --- steps ------------------------------------------------------------------------------------------------------------
 
 
-def _added(record: SequenceRecord, before: SequenceRecord) -> SequenceRecord:
-    """A record with what was measured before it counted in its cost."""
-    names = ("measure_s", "compile_s", "share")
-    return replace(record, **{name: getattr(record, name) + getattr(before, name) for name in names})
+class StepTrial:
+    """Steps of a problem by `plain`, or by `other`; they leave neither gradient nor change behind.
+
+    `views` are those that are looked at. Where either is guided, both that are draw from one table: that of `earlier`,
+    if it has learned, else one that `learn` has learn. `what` is decided here, and `earlier` what was before, with the
+    same estimator; dL/dI is held where it was held there.
+    """
+
+    def __init__(
+        self, problem: Problem, what: str, plain: Tracer, other: Tracer, earlier: StepTrial | None = None
+    ) -> None:
+        self._problem, self._what, self._clock = problem, what, StepClock()
+        self._adjoint = problem.config.adjoint
+        # Of their own: tables and recordings of other sample counts end with them.
+        made = {False: plain, True: other}
+        self._tracers = {o: one.with_options(samples_per_pass=None, freeze=one.freeze) for o, one in made.items()}
+        self._guided = [one for one in self._tracers.values() if one.preparation.guiding is not None]
+        self.table: Guiding | None = self._one_table(None if earlier is None else earlier.table)
+        problem.apply()
+        if earlier is not None:
+            self.views: list[View] = earlier.views
+            self._slopes: list[mi.TensorXf] = earlier._slopes
+            return
+        trained = problem.trained
+        count = min(len(trained), MOST_VIEWS)
+        self.views = [trained[k * len(trained) // count] for k in range(count)]
+        self._slopes = [self._slope(view) for view in self.views]
+        take_gradient(problem)  # recovered exposures have some of these
+
+    def _one_table(self, learned: Guiding | None) -> Guiding | None:
+        """What all that are guided draw from; None where none is."""
+        if not self._guided:
+            return None
+        own = self._guided[0].preparation.guiding
+        assert own is not None
+        table = learned or own
+        table.images, table.held = own.images, True  # steps are not to teach it
+        for tracer in self._guided:
+            tracer.preparation.draw_from(table, self._problem.scene)
+        return table
+
+    def part_of_views(self) -> float:
+        """How many times the views of an iteration are those of a step here."""
+        return len(self._problem.drawn(0)) / len(self.views)
+
+    @property
+    def learns(self) -> bool:
+        """Whether there is a table that has yet to learn."""
+        return self.table is not None and not self.table.learned
+
+    def _slope(self, view: View) -> mi.TensorXf:
+        """dL/dI, which is held; 0 where it is not finite."""
+        spp = max(int(IMAGE_SHARE * self._problem.config.run.spp), 1)
+        image = render_image(self._tracers[False], self._problem.scene, view.sensor, self._seed(0, view, "image"), spp)
+        return to_tensor(np.nan_to_num(slope(view.objective, np.array(image)), nan=0.0, posinf=0.0, neginf=0.0))
+
+    def learn(self, round: int, spp: int) -> Step:
+        """Have the table learn, and be ready to be drawn from, as it is from then on.
+
+        The first time all of it is done before as well, and forgotten: what that compiles and records is no part of the
+        time.
+        """
+        jobs = [self._job(view, self._seed(round, view, "learned from"), spp) for view in self.views]
+        compile_ms = 0.0
+        assert self.table is not None
+        if self.learns:
+            compile_ms = self._teach(self.table, jobs).wall_ms
+            self.table.forget()
+        taken = timed(self._teach(self.table, jobs))
+        taken.compile_ms += compile_ms
+        return taken
+
+    def _teach(self, table: Guiding, jobs: list[Job]) -> StepTimes:
+        with self._clock.step() as times:
+            for view, job, gradient in zip(self.views, jobs, self._slopes, strict=True):
+                self._guided[0].learn_now(job, gradient)
+                for purpose in Purpose if self._adjoint == "independent" else (Purpose.BOTH, Purpose.IMAGE):
+                    table.table(view.sensor, purpose)
+        return times
+
+    def take(self, other: bool, round: int, spp: int) -> Step:
+        """One step of all views."""
+        problem, images = self._problem, {}
+        tracer, name = self._tracers[other], "on" if other else "off"
+        problem.apply()
+        with self._clock.step() as times:
+            for view, gradient in zip(self.views, self._slopes, strict=True):
+                job = self._job(view, self._seed(round, view, name), spp)
+                image = self._differentiate(tracer, view, job, gradient)
+                gradients = problem.gradients()
+                dr.eval(image, gradients)
+                images[str(view.sensor)] = image
+        taken = timed(times)
+        taken.gradients = take_gradient(problem)
+        if self._adjoint == "independent":
+            with self._clock.step() as times:
+                for view in self.views:
+                    job = self._job(view, self._seed(round, view, f"image, {name}"), spp)
+                    images[str(view.sensor)] = tracer.image(job)
+            apart = timed(times)
+            taken.image_ms = apart.kernel_ms
+            taken.wall_ms, taken.compile_ms = taken.wall_ms + apart.wall_ms, taken.compile_ms + apart.compile_ms
+        taken.images = {name: _few(image) for name, image in images.items()}
+        return taken
+
+    def _differentiate(self, tracer: Tracer, view: View, job: Job, gradient: mi.TensorXf) -> mi.TensorXf | None:
+        """Add the gradient of a job's samples, as a step of the run does; their image, where there is one."""
+        on_samples = self._problem.on_samples(view)
+        if self._adjoint == "correlated":
+            image = tracer.correlated(job, lambda image: gradient)
+        elif self._adjoint == "independent" and on_samples is None:
+            tracer.backward(job, gradient)
+            return None
+        else:
+            image = tracer.known(job, gradient)
+        if on_samples is not None:
+            on_samples(image, gradient)
+        return image
+
+    def _job(self, view: View, number: int, spp: int) -> Job:
+        scene = self._problem.scene
+        opaque = dr.opaque(mi.UInt32, number)
+        return Job(scene, scene.sensors()[view.sensor], opaque, spp, self._problem.selection.params)
+
+    def _seed(self, round: int, view: View, what: str) -> int:
+        return seed(self._problem.config.run.seed, round, view.sensor, f"{self._what}, {what}")
+
+
+def _few(image: mi.TensorXf) -> Array:
+    """Values of an image, spread over it, 0 where they are not finite."""
+    values = np.array(image, dtype=np.float32).ravel()
+    values = values[:: -(-values.size // MOST_VALUES)]
+    return np.nan_to_num(values, nan=0.0, posinf=0.0, neginf=0.0)

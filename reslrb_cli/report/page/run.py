@@ -16,9 +16,8 @@ from pathlib import Path
 from typing import Any
 
 from reslrb_cli.errors import ConfigError
-from reslrb_cli.optimization.autotune.efficiency import Outcome
 from reslrb_cli.optimization.correlated_bias import CorrelatedBias, share_words
-from reslrb_cli.records.decisions import GuidedRecord, SequenceRecord
+from reslrb_cli.records.decisions import EstimatorRecord, GuidedRecord, SequenceRecord
 from reslrb_cli.records.measurement_files import Origin
 from reslrb_cli.report.format import count, duration, number
 from reslrb_cli.report.page.images import image_rows, seen_tables, view_table
@@ -191,8 +190,8 @@ def plan_table(plan: Mapping[str, Any] | None) -> str:
 def pilot_table(pilot: Mapping[str, Any] | None) -> str:
     """What the pilot measured of each estimator, the most efficient first, and what it chose."""
     try:
-        outcome = Outcome.from_json(dict(pilot or {}))
-    except (TypeError, KeyError):  # there was none, or another version's
+        outcome = EstimatorRecord.from_json(dict(pilot or {}))
+    except TypeError:  # there was none, or another version's
         return ""
     rows = sorted(outcome.rows, key=lambda row: -(row.efficiency or 0.0))
     best = rows[0].efficiency or 1.0 if rows else 1.0
@@ -203,7 +202,7 @@ def pilot_table(pilot: Mapping[str, Any] | None) -> str:
         time = "" if row.kernel_ms is None else duration(row.kernel_ms / 1e3)
         cells.append([text(name), *map(text, (number(share, 3), number(row.variance, 3), time, row.rounds, row.note))])
     head = ("estimator", "efficiency over the best", "variance", "kernels", "rounds", "note")
-    return f"<p>{text(outcome.line())}</p>" + table(head, cells)
+    return f"<p>{text(outcome.line(cost=True))}</p>" + table(head, cells)
 
 
 def correlated_bias_table(measured: Mapping[str, Any] | None) -> str:

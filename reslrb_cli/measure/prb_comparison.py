@@ -1,0 +1,139 @@
+"""Whether `prb` would have been the better choice: its gradients beside those of the run's integrator, in turns.
+
+Steps are those of the run's own loss and adjoint, so that both estimate the same; `race.compare` says how much more
+efficient it is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from reslrb_cli.integrators.step import make_integrator
+from reslrb_cli.measure.gradients import moves_light
+from reslrb_cli.measure.references import Situation, prb_gradient
+from reslrb_cli.optimization.autotune.race import (
+    CONFIDENCE,
+    ITERATIONS,
+    Asked,
+    Gain,
+    Sizes,
+    Step,
+    Tuner,
+    Turns,
+    compare,
+    measured_step,
+    sets_of,
+)
+from reslrb_cli.optimization.decisions import Allowance, Cache
+from reslrb_cli.optimization.problem import Problem
+from reslrb_cli.records.clock import StepClock
+from reslrb_cli.records.decisions import RivalRecord
+
+RIVAL = "prb"
+#: Rounds, at most, and fewer than which say nothing.
+MOST_ROUNDS, LEAST_ROUNDS = 12, 6
+#: Share of a run of ITERATIONS that the rounds may cost, and that LEAST_ROUNDS may where that is more.
+SHARE, MOST_SHARE = 0.05, 0.1
+#: What it takes at least: kernels to compile, in those of one step of the run, and iterations' worth of work.
+NEEDS = (2.0, 2.0)
+#: A step of `prb` may take so many times as long as one of the run.
+LONGER = 2.0
+
+
+def measure_rival(problem: Problem, cache: Cache | None, say: Callable[[str], None]) -> RivalRecord | None:
+    """Measure `prb` beside the estimator that a pilot chose; None where no pilot did, or `prb` does not apply.
+
+    `say` is told what takes long, `cache` holds what earlier runs measured. Leaves neither gradient nor change behind.
+    """
+    pilot, guided, sequence = problem.pilot, problem.guided, problem.sequence
+    # A budget of memory is kept by passes, of which `prb` has none.
+    if pilot is None or problem.samples_per_pass is not None or why_not(problem) is not None:
+        return None
+
+    def measure(allowance: Allowance) -> RivalRecord:
+        left = allowance.iterations_left(NEEDS[0])
+        spp, run = pilot.spp or _samples(problem, left), problem.config.run
+        entries = sum(problem.selection.array(key).size for key in problem.selection.keys)
+        sizes = Sizes(run.spp, spp, spp, False, entries, 0.0, LONGER, planned=float(run.spp * MOST_ROUNDS))
+        share, most = (min(each, left / ITERATIONS) for each in (SHARE, MOST_SHARE))
+        return RivalTurns(RivalTrial(problem), sizes, 1.0, share, most).run()
+
+    beside = [pilot.chosen, guided and guided.guided, sequence and sequence.low_discrepancy]
+    return Tuner(problem, say, cache).decide(
+        Asked(
+            RivalRecord,
+            of={"rival": RIVAL, "beside": beside},
+            needs=[NEEDS],
+            integrator=problem.integrator,
+            measure=measure,
+            unmeasured=lambda note: RivalRecord(integrator=RIVAL, note=note),
+        )
+    )
+
+
+def why_not(problem: Problem) -> str | None:
+    """Why `prb` has no such gradient of some parameter, or no such image of some view; None where it has all."""
+    options, params = problem.config.integrator.options(), problem.selection.params
+    moved = tuple(key for key in problem.selection.scene_keys if moves_light(params, key))
+    for index in problem.sensors:
+        sensor = problem.scene.sensors()[index]
+        at = Situation.of(
+            problem.scene, sensor, params, options["max_depth"], options["hide_emitters"], bool(moved), moved
+        )
+        for key in problem.selection.scene_keys:
+            reason = prb_gradient(at, key)
+            if reason is not None:
+                return reason
+    return None
+
+
+def _samples(problem: Problem, iterations: float) -> int:
+    """Samples per pixel of steps, with which the rounds that there are to be take so many iterations' worth of time."""
+    run, unit = problem.config.run, sets_of(problem.config)
+    share = min(iterations / ((1 + LONGER) * MOST_ROUNDS), 1.0)
+    return max(int(share * run.spp) // unit, 1) * unit
+
+
+class RivalTrial:
+    """Steps of the run, as they are or by `prb`."""
+
+    learns = False
+
+    def __init__(self, problem: Problem) -> None:
+        options = problem.config.integrator.options()
+        rival = make_integrator(RIVAL, **{name: options[name] for name in ("max_depth", "rr_depth", "hide_emitters")})
+        # A recording would cost more than so few steps save.
+        own = problem.integrator.to_measure().with_options(samples_per_pass=None, freeze=False)
+        self._problem, self._clock, self._integrators = problem, StepClock(), {True: rival, False: own}
+
+    def learn(self, round: int, spp: int) -> Step:
+        """Nothing is learned here."""
+        raise NotImplementedError
+
+    def take(self, other: bool, round: int, spp: int) -> Step:
+        """One step of all views."""
+        return measured_step(self._problem, self._integrators[other], self._clock, round, spp)
+
+
+class RivalTurns(Turns[RivalRecord]):
+    """One decision: whether `prb` is the more efficient. What Python takes beside the kernels is left out."""
+
+    LEAST = LEAST_ROUNDS
+
+    @property
+    def _most_rounds(self) -> int:
+        return MOST_ROUNDS
+
+    def _is_clear(self) -> bool:
+        return False
+
+    def _gain(self, images: bool, confidence: float = CONFIDENCE) -> Gain:
+        own, other = self._steps[False], self._steps[True]
+        times = [[step.kernel_ms for step in steps] for steps in (own, other)]
+        gradients = [[step.gradients for step in steps] for steps in (own, other)]
+        return compare(gradients[0], times[0], gradients[1], times[1], confidence)
+
+    def _record(self, other: bool, images: bool, gain: Gain, picture: Gain, note: str) -> RivalRecord:
+        found: dict[str, Any] = dict(zip(("advantage", "low", "high"), gain, strict=True)) | self._cost()
+        return RivalRecord(integrator=RIVAL, rounds=len(self._steps[True]), spp=self._sizes.trial, note=note, **found)

@@ -1,0 +1,490 @@
+"""Races of candidates before a run's first iteration: what they may cost, how they compare, what is kept of them.
+
+- `Tuner.decide`: one decision, of which an `Asked` says what it depends on, takes and is without measuring. It is what
+  an earlier run kept, else what is measured now, where the run is long enough for that.
+- `compare`: how much more efficient one way of sampling a gradient is than another, by steps of both, and how sure:
+
+      gain = (variance * time of the one) / (variance * time of the other)
+
+  Variance is summed over the parameters, each over its gradient's mean square. The interval is that of the logarithm of
+  the variances' quotient by the jackknife over the steps, and of times by what a single one may be off.
+- `Turns`: whether another way of taking steps pays, decided from steps of both that take turns. Gradients estimate the
+  same. Times are those of kernels, and, alike for both kinds, what goes on beside them in a run for as many samples: it
+  counts where iterations take milliseconds. Where steps draw from a table that paths before them have made, it is
+  learned first, and held: none of the steps' paths is one that it learned from.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import math
+import statistics
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Generic, Protocol, TypeVar
+
+import mitsuba as mi
+import numpy as np
+
+from reslrb_cli.backend.doctor import device_name
+from reslrb_cli.config.schema import Config
+from reslrb_cli.integrators.reslrb import Reslrb as Tracer
+from reslrb_cli.optimization.decisions import Allowance, Cache
+from reslrb_cli.optimization.problem import Problem
+from reslrb_cli.optimization.sensitivity import sample_gradient, take_gradient
+from reslrb_cli.records.cache import key_of
+from reslrb_cli.records.clock import StepClock, StepTimes
+from reslrb_cli.records.decisions import LEAST_IMAGE, Finding
+from reslrb_cli.records.manifest import versions
+from reslrb_cli.statistics import Array, jackknife_variance, sum_of_squares
+
+#: Iterations of the run that what measuring costs is a share of.
+ITERATIONS = 200
+#: Relative error of a single time that must not decide anything.
+TIMING_NOISE = 1.1
+CONFIDENCE = 0.95
+#: What is left of a sum where nothing should be, as a share of it.
+ROUNDING = 1e-12
+
+Say = Callable[[str], None]
+Record = TypeVar("Record", bound=Finding)
+Gradients = dict[str, Array]
+#: A gain and the ends of its interval; nothing where it cannot be told.
+Gain = tuple[float, float, float] | tuple[None, None, None]
+
+logger = logging.getLogger(__name__)
+
+
+# --- one decision -----------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Asked(Generic[Record]):
+    """A question that `measure` answers, by steps of `integrator` and others.
+
+    `of` is what the answer depends on besides the situation, `needs` what measuring takes at least that says anything
+    (`Allowance.affords`), `unmeasured` the answer without, with a note. What was kept answers it if it `fits`.
+    """
+
+    kind: type[Record]
+    of: dict[str, Any]
+    needs: Sequence[tuple[float, float]]
+    integrator: Tracer
+    measure: Callable[[Allowance], Record]
+    unmeasured: Callable[[str], Record]
+    fits: Callable[[Record], bool] = lambda record: True
+
+
+class Tuner:
+    """Decides; `problem` is the one that was given, with what has been decided since.
+
+    `say` is told what is decided, and once that something is measured; `cache` holds what earlier runs measured.
+    """
+
+    def __init__(self, problem: Problem, say: Say, cache: Cache | None = None) -> None:
+        self.problem, self.say, self._cache = problem, say, cache
+        self._unmeasured: list[Finding] = []
+
+    def take(self, **decided: Any) -> None:
+        """Have fields of `problem` from now on."""
+        self.problem = replace(self.problem, **decided)
+
+    def tell(self, *records: Finding | None) -> None:
+        """Say what was decided, where something was: in one line all that there was no time to measure."""
+        verbose, found = logger.isEnabledFor(logging.DEBUG), [each for each in records if each is not None]
+        brief = [each for each in found if each in self._unmeasured and not verbose]
+        if brief and self.problem.allowance is not None:
+            self.say(f"{self.problem.allowance.note()}: {', '.join(each.decision() for each in brief)}")
+        for each in found:
+            if each not in brief:
+                self.say(each.line(cost=verbose))
+
+    def decide(self, asked: Asked[Record]) -> Record:
+        """What an earlier run measured and kept, else what is measured now, and kept."""
+        key = ""
+        if self._cache is not None:
+            key = key_of({**asked.of, **situation(self.problem)})
+            try:
+                kept = replace(asked.kind.from_json(self._cache.get(key)), cached=True)
+                if asked.fits(kept):
+                    return kept
+            except TypeError:
+                pass  # nothing there, or nothing that this version wrote
+        allowance = self.allowance(asked.integrator)
+        if not allowance.affords(*asked.needs):
+            record = asked.unmeasured(allowance.note())
+            self._unmeasured.append(record)
+            return record
+        if not allowance.spent_s:
+            self.say("measuring what pays here, before the first iteration")
+        with allowance.counted():
+            record = asked.measure(allowance)
+        logger.debug(allowance.line())
+        if self._cache is not None:
+            self._cache.put(key, record.to_json())
+        return record
+
+    def allowance(self, integrator: Tracer) -> Allowance:
+        """What may be spent: as begun before, or by two first steps of `integrator` now, of few samples."""
+        problem, run = self.problem, self.problem.config.run
+        if problem.allowance is not None:
+            return problem.allowance
+        unit = sets_of(problem.config)
+        own = integrator.to_measure().with_options(samples_per_pass=None, freeze=False)
+        clock = StepClock()
+        first, second = (measured_step(problem, own, clock, 0, unit) for _ in range(2))
+        compile_ms = max(first.wall_ms + first.compile_ms - second.wall_ms, 0.0)
+        iteration_ms = second.beside_ms + second.kernel_ms * run.spp / unit
+        run_ms = compile_ms + run.iterations * iteration_ms
+        found = Allowance(run.measuring, run_ms / 1e3, compile_ms / 1e3, iteration_ms / 1e3)
+        self.take(allowance=found)
+        return found
+
+
+def is_auto(config: Config, option: str) -> bool:
+    """Whether this option of the integrator is left to measurement."""
+    return bool(config.integrator.options().get(option) == "auto")
+
+
+def sets_of(config: Config) -> int:
+    """The sets of a step's samples that have one dL/dI each."""
+    return config.run.batches if config.adjoint == "batched" else 1
+
+
+def situation(problem: Problem) -> dict[str, Any]:
+    """All that the choice of an estimator depends on, as plain values."""
+    config = problem.config
+    dump = config.model_dump(mode="json")
+    run = config.step_options() | {"memory_budget": dump["run"]["memory_budget"]}
+    return {
+        "scene": hashlib.blake2b(Path(config.scene.file).read_bytes()).hexdigest(),
+        "options": dump["scene"]["options"],
+        "cameras": config.scene.cameras and hashlib.blake2b(config.scene.cameras.read_bytes()).hexdigest(),
+        "sensors": problem.sensors,
+        "views": [view.situation() for view in problem.views],
+        "parameters": {key: list(problem.selection.array(key).shape) for key in problem.selection.keys},
+        "integrator": dump["integrator"],
+        "loss": dump["loss"],
+        "run": run,
+        "versions": versions(),
+        "variant": mi.variant(),
+        "device": device_name(mi.variant()),
+    }
+
+
+# --- steps, and how they compare --------------------------------------------------------------------------------------
+
+
+@dataclass
+class Step:
+    """A step, or a walk that was learned from: its gradients, its image by view, and milliseconds: of the kernels, of
+    those of an image that has samples of its own, and all that was waited for but for `compile_ms`, in which kernels
+    were generated and compiled."""
+
+    gradients: Gradients = field(default_factory=dict)
+    images: Gradients = field(default_factory=dict)
+    kernel_ms: float = 0.0
+    image_ms: float = 0.0
+    wall_ms: float = 0.0
+    compile_ms: float = 0.0
+
+    @property
+    def beside_ms(self) -> float:
+        """What was waited for beside the kernels."""
+        return max(self.wall_ms - self.kernel_ms - self.image_ms, 0.0)
+
+
+def timed(times: StepTimes, wall_ms: float | None = None) -> Step:
+    """A step that took so long; `wall_ms` where more was waited for than the clock saw."""
+    # Kernels are compiled side by side: their times can add up to more than was waited for.
+    waited_ms = max((times.wall_ms if wall_ms is None else wall_ms) - times.codegen_ms, times.kernel_ms)
+    return Step(kernel_ms=times.kernel_ms, wall_ms=waited_ms, compile_ms=times.codegen_ms)
+
+
+def measured_step(problem: Problem, integrator: Any, clock: StepClock, round: int, spp: int) -> Step:
+    """One step of all views, with seeds of the pilot's own; leaves neither gradient nor change behind."""
+    start = time.perf_counter()
+    problem.apply()
+    with clock.step() as times:
+        sample_gradient(problem, integrator, round, "pilot", spp)
+    gradients = take_gradient(problem)
+    return replace(timed(times, 1e3 * (time.perf_counter() - start)), gradients=gradients)
+
+
+def compare(
+    own: Sequence[Gradients],
+    own_ms: Sequence[float],
+    other: Sequence[Gradients],
+    other_ms: Sequence[float],
+    confidence: float = CONFIDENCE,
+) -> Gain:
+    """The efficiency of the other over that of the own, and its interval; nothing where one has no noise.
+
+    Gradients are those of each step by parameter (three steps or more), times those of steps in any unit.
+    """
+    scales = {key: float(np.mean([sum_of_squares(g[key]) for g in (*own, *other)])) for key in own[0]}
+    scales = {key: scale for key, scale in scales.items() if scale > 0}
+    found = [_log_variances(gradients, scales) for gradients in (own, other)] if scales else [None]  # of no light, say
+    known = [each for each in found if each is not None]
+    if len(known) < 2:
+        return None, None, None
+    from scipy.special import stdtrit  # late: every run imports this module, and few come here
+
+    times = statistics.median(own_ms) / max(statistics.median(other_ms), 1e-6)
+    advantage = math.exp(known[0][0] - known[1][0]) * times
+    variance = sum(float(jackknife_variance(without)) for _, without in known)
+    half = float(stdtrit(min(len(own), len(other)) - 1, (1 + confidence) / 2)) * math.sqrt(variance)
+    factor = math.exp(min(half, 50.0)) * TIMING_NOISE
+    return advantage, advantage / factor, advantage * factor
+
+
+def _log_variances(gradients: Sequence[Gradients], scales: dict[str, float]) -> tuple[float, Array] | None:
+    """The logarithm of the variance of all parameters, and that without each of the rounds in turn."""
+    rows = np.array([
+        np.concatenate([g[key].astype(np.float64) / math.sqrt(scale) for key, scale in scales.items()])
+        for g in gradients
+    ])  # fmt: skip
+    count = len(rows)
+    squares = np.square(rows - rows.mean(axis=0)).sum(axis=1) if rows.size else np.zeros(count)
+    whole = float(squares.sum())
+    # What a row takes with it is its own distance, and that of the mean of the others from that of all.
+    without = whole - squares * count / (count - 1)
+    if not without.min() > ROUNDING * whole:
+        return None
+    return math.log(whole / (count - 1)), np.log(without / (count - 2))
+
+
+class Race:
+    """What measuring has cost so far."""
+
+    def __init__(self) -> None:
+        self._spent_ms = self._compile_ms = 0.0
+
+    def _first(self, step: Step) -> Step:
+        """Count a step that had its kernels compiled, whose times tell nothing else."""
+        self._compile_ms += step.wall_ms + step.compile_ms
+        return step
+
+    def _spend(self, step: Step) -> Step:
+        """Count a step."""
+        self._spent_ms += step.wall_ms
+        self._compile_ms += step.compile_ms
+        return step
+
+    def _cost(self) -> dict[str, float]:
+        """Of the record."""
+        return {"measure_s": self._spent_ms / 1e3, "compile_s": self._compile_ms / 1e3}
+
+
+# --- two ways in turns ------------------------------------------------------------------------------------------------
+
+#: Rounds that are planned for, of gradients of many entries, and of few, which tell less each.
+ROUNDS, ROUNDS_OF_FEW, FEW_ENTRIES = 8, 16, 64
+#: Fewer rounds than these say nothing.
+LEAST_ROUNDS = 4
+#: Whenever as many rounds have been taken as are planned for it is asked whether it is clear, so often at the most.
+LOOKS = 3
+#: What is on before the last of these looks has to be surer than it would have to be at the end: looking again and
+#: again must not make what is worth nothing pass.
+CLEAR = 0.99
+#: Steps' worth of time that the rounds are planned for.
+PLANNED = 3.4
+#: Samples of each walk that a table learns from, as a share of a step's, and walks that it learns from before it is
+#: tried, where there is time for more than one.
+LEARNING_SHARE, LEARNINGS = 0.4, 2
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """Samples per pixel: of a step of the run (`step`), of each set of its samples that has one dL/dI (`call`), and of
+    a pass of these (`part`). `alone`: images have samples of their own. `entries` are those of all gradients.
+    `lessons` says how often tables of guided emission learn for each such set, in the mean over the run. A step of the
+    other kind may take `longer` times as long as one of this; `planned` are PLANNED, or less."""
+
+    step: int
+    call: int
+    part: int
+    alone: bool
+    entries: int
+    lessons: float
+    longer: float
+    planned: float = PLANNED
+
+    @property
+    def rounds(self) -> int:
+        """How many rounds are planned for."""
+        return ROUNDS_OF_FEW if self.entries < FEW_ENTRIES else ROUNDS
+
+    @property
+    def trial(self) -> int:
+        """Samples of each step that is taken here."""
+        return max(min(int(self.planned * self.step / ((1 + self.longer) * self.rounds)), self.part), 1)
+
+    @property
+    def learning(self) -> int:
+        """Samples of each walk that is learned from here."""
+        return max(min(int(LEARNING_SHARE * self.step), self.part), 1)
+
+
+class Trial(Protocol):
+    """What is measured. Equal rounds have equal seeds, others than those of any walk that is learned from."""
+
+    @property
+    def learns(self) -> bool:
+        """Whether there is a table that has yet to learn."""
+        ...
+
+    def learn(self, round: int, spp: int) -> Step:
+        """Have the table learn, from a walk of `spp` samples per pixel; what is not given is left at 0."""
+        ...
+
+    def take(self, other: bool, round: int, spp: int) -> Step:
+        """A step as it is, or one the other way; from what the table has learned, which stays as it is."""
+        ...
+
+
+class Turns(Race, Generic[Record]):
+    """One decision. `views` is how many times the views of an iteration are those of a step here, `share` what of
+    ITERATIONS this may cost, and `most` what of them the least number of rounds may, where that is more."""
+
+    LEAST = LEAST_ROUNDS
+
+    def __init__(self, trial: Trial, sizes: Sizes, views: float, share: float, most: float = 0.0) -> None:
+        super().__init__()
+        self._trial, self._sizes, self._views, self._share, self._most = trial, sizes, views, share, max(share, most)
+        self._plain: list[Step] = []  # all steps as they are whose times count
+        self._steps: dict[bool, list[Step]] = {False: [], True: []}
+        self._walk = Step()
+
+    def run(self) -> Record:
+        """Measure, and decide."""
+        spp = self._sizes.trial
+        self._first(self._trial.take(False, 0, spp))
+        plain = self._spend(self._trial.take(False, 0, spp))
+        self._plain.append(plain)
+        # What Python takes is the same for both.
+        kernels = (1 + self._sizes.longer) * (plain.kernel_ms + plain.image_ms)
+        if not self._learned(kernels + 2 * plain.beside_ms):
+            return self._off(f"to measure it would cost more than {100 * self._most:.2g} % of {ITERATIONS} iterations")
+        self._first(self._trial.take(True, 0, spp))
+        for round in range(1, 1 + self._most_rounds):
+            both = [self._spend(self._trial.take(other, round, spp)) for other in (False, True)]
+            for other, step in zip((False, True), both, strict=True):
+                self._steps[other].append(step)
+            self._plain.append(both[0])
+            if not self._affords(sum(step.wall_ms for step in both)):
+                break
+            if round % self._sizes.rounds == 0 and self._is_clear():
+                break
+        return self._decided()
+
+    @property
+    def _most_rounds(self) -> int:
+        return LOOKS * self._sizes.rounds
+
+    def _learned(self, round_ms: float) -> bool:
+        """Have the table learn, if it has not; False where that, and rounds of so long, cannot be afforded."""
+        if not self._trial.learns:
+            return self._affords(self.LEAST * round_ms)
+        walk = self._trial.learn(0, self._sizes.learning)
+        if not self._affords(walk.wall_ms + self.LEAST * round_ms):
+            self._first(walk)
+            return False
+        self._walk = self._spend(walk)
+        # What one walk more would gain is little beside what rounds that are too few leave open.
+        rounds = max(self._sizes.rounds // 2, self.LEAST)
+        for number in range(1, LEARNINGS):
+            if self._affords(self._walk.wall_ms + rounds * round_ms):
+                self._walk = self._spend(self._trial.learn(number, self._sizes.learning))
+        return True
+
+    @property
+    def _iteration_ms(self) -> float:
+        """Of the run: kernels of all its samples, and what goes on beside them for each set that has one dL/dI."""
+        kernels = statistics.median(step.kernel_ms + step.image_ms for step in self._plain)
+        return self._views * (kernels + self._python_ms) * self._sizes.step / self._sizes.trial
+
+    @property
+    def _python_ms(self) -> float:
+        """What goes on beside the kernels of `trial` samples in a run, which has it once for each `call`."""
+        beside = statistics.median(step.beside_ms for step in self._plain)
+        return beside * self._sizes.trial / self._sizes.call
+
+    def _affords(self, more_ms: float) -> bool:
+        share = self._share if len(self._steps[True]) >= self.LEAST else self._most
+        return self._spent_ms + more_ms <= share * ITERATIONS * self._iteration_ms
+
+    # What decisions differ in.
+
+    @property
+    def _apart(self) -> bool:
+        """Whether it is decided apart for images that have samples of their own."""
+        return False
+
+    def _more_ms(self) -> float:
+        """What a step of the other kind, of `trial` samples, takes in a run beside its own kernels."""
+        return 0.0
+
+    def _decide(self, other: bool, images: bool, found: dict[str, Any]) -> Record:
+        """The record of a decision, `found` what all of them hold."""
+        raise NotImplementedError
+
+    def _gain(self, images: bool, confidence: float = CONFIDENCE) -> Gain:
+        """Of the gradient, as part of steps whose images, where they have samples of their own, are drawn so or not."""
+        plain, other = self._steps[False], self._steps[True]
+        beside = self._python_ms, self._python_ms + self._more_ms()
+        if self._sizes.alone:
+            own = [statistics.median(step.image_ms for step in steps) for steps in (plain, other)]
+            beside = beside[0] + own[0], beside[1] + own[images]
+        times = [[s.kernel_ms + more for s in steps] for steps, more in zip((plain, other), beside, strict=True)]
+        gradients = [[step.gradients for step in steps] for steps in (plain, other)]
+        return compare(gradients[0], times[0], gradients[1], times[1], confidence)
+
+    def _image_gain(self) -> Gain:
+        """Of the image: of samples of its own, where it has them, else of those that serve the gradient too."""
+        plain, other = self._steps[False], self._steps[True]
+        images = [[step.images for step in steps] for steps in (plain, other)]
+        times = [[s.image_ms if self._sizes.alone else s.kernel_ms for s in steps] for steps in (plain, other)]
+        if not self._sizes.alone:  # else both count once, with the gradient
+            more = self._python_ms, self._python_ms + self._more_ms()
+            times = [[ms + one for ms in row] for row, one in zip(times, more, strict=True)]
+        return compare(images[0], times[0], images[1], times[1])
+
+    def _is_clear(self) -> bool:
+        """Whether no more steps are needed: it is not on by accident, or off at all events."""
+        _, low, high = self._gain(not self._apart or self._images(self._image_gain()), CLEAR)
+        return low is None or high is None or low > 1 or high < 1
+
+    def _images(self, gain: Gain) -> bool:
+        """Whether images are to be drawn so too; where that is not decided apart, whether no harm to them is seen."""
+        if self._apart:
+            return gain[1] is not None and gain[1] > 1
+        return gain[2] is None or gain[2] >= LEAST_IMAGE
+
+    def _decided(self) -> Record:
+        if len(self._steps[False]) < self.LEAST:
+            return self._off(f"{len(self._steps[False])} steps of both are too few to tell")
+        picture = self._image_gain()
+        images = self._images(picture)
+        gain = self._gain(images or not self._apart)
+        if gain[1] is None:
+            return self._off("gradients have no noise")
+        note = ""
+        if gain[1] > 1 and not (images or self._apart):
+            whose = "images have" if self._sizes.alone else "the image, of the same samples, has"
+            note = f"{whose} {picture[0]:.2g} times the efficiency"
+        on = gain[1] > 1 and not note
+        return self._record(on, on and images, gain, picture, note)
+
+    def _off(self, note: str) -> Record:
+        return self._record(False, False, (None, None, None), (None, None, None), note)
+
+    def _record(self, other: bool, images: bool, gain: Gain, picture: Gain, note: str) -> Record:
+        found = dict(zip(("gain", "low", "high"), gain, strict=True))
+        found |= dict(zip(("image_gain", "image_low", "image_high"), picture, strict=True)) | self._cost()
+        share = self._spent_ms / (ITERATIONS * self._iteration_ms)
+        beside = {"rounds": len(self._steps[True]), "spp": self._sizes.trial, "share": share, "note": note}
+        return self._decide(other, images, {**found, **beside})

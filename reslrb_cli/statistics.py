@@ -1,0 +1,28 @@
+"""Statistics that several rows have need of."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+Array = np.ndarray[Any, Any]
+
+
+def jackknife_variance(without: Array) -> Array:
+    """The variance (...) of an estimate, by its values (N, ...) with each of N independent samples left out in turn.
+
+    Efron, The Jackknife, the Bootstrap and Other Resampling Plans, 1982: its root is the standard error.
+    """
+    count = len(without)
+    return np.asarray((count - 1) / count * np.sum(np.square(without - without.mean(axis=0)), axis=0))
+
+
+def rms(values: Array) -> float:
+    """The root mean square of all entries, in double precision."""
+    return float(np.sqrt(np.mean(np.square(values, dtype=np.float64))))
+
+
+def sum_of_squares(values: Array) -> float:
+    """The sum of the squares of all entries, in double precision."""
+    return float(np.sum(np.square(values, dtype=np.float64)))
