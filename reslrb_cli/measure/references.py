@@ -79,12 +79,8 @@ def _is_inside(sphere: mi.Shape, sensor: mi.Sensor) -> bool:
 
 #: Longest paths that are traced without roulette; naive AD of stock integrators keeps all of them.
 DEEPEST = 64
-
-
 #: BSDFs whose sampling does not depend on their parameters, but for a roughness.
 _FIXED_SAMPLING = ("SmoothDiffuse", "TwoSidedBRDF", "SmoothConductor", "RoughConductor", "SmoothDielectric")
-
-
 _ROUGHNESS = ("alpha", "alpha_u", "alpha_v")
 
 

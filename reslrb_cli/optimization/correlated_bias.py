@@ -27,10 +27,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from reslrb_cli.integrators.light_tracer import LightTracer
 from reslrb_cli.integrators.step import cross_step
 from reslrb_cli.optimization.problem import Problem
-from reslrb_cli.optimization.sensitivity import take_gradient
+from reslrb_cli.optimization.sensitivity import take_gradient, unrecorded
 from reslrb_cli.optimization.views import QUADRATIC
 from reslrb_cli.records.decisions import Jsonable
 from reslrb_cli.seeds import seed
@@ -119,9 +118,7 @@ _IMAGES = ("bias", "bias of another")
 
 def _gradient(problem: Problem, number: int, image: str, spp: int) -> dict[str, Array]:
     """The gradient by samples of a round, with dL/dI from those of `image` in that round."""
-    run, integrator = problem.config.run, problem.integrator
-    if isinstance(integrator, LightTracer):  # a recording would cost more than so few steps save
-        integrator = integrator.with_options(samples_per_pass=integrator.samples_per_pass, freeze=False)
+    run, integrator = problem.config.run, unrecorded(problem.integrator)
     problem.apply()
     for view in problem.trained:
         cross_step(

@@ -125,12 +125,8 @@ def _without_halo(mask: Array, width: int) -> Array:
 
 #: The relative step h.
 STEP = 0.02
-
-
 #: Eigenvalues below it are taken for 0: two directions at less than a degree to each other.
 LEAST = 1e-4
-
-
 #: A value whose part in the eigenvector is smaller has none in the combination.
 PART = 0.1
 

@@ -26,20 +26,20 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from reslrb_cli.integrators.light_tracer import LightTracer
 from reslrb_cli.integrators.protocol import first_channels
 from reslrb_cli.integrators.step import gradient_step, render_image
 from reslrb_cli.optimization.decisions import Scaled, Sensitivity
 from reslrb_cli.optimization.optimizers import Bounds, Transform, Variable
+from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.seeds import seed
-
-if TYPE_CHECKING:
-    from reslrb_cli.optimization.problem import Problem
+from reslrb_cli.statistics import Array, rms
 
 
 def sample_gradient(problem: Problem, integrator: Any, round: int, purpose: str, spp: int) -> dict[str, Any]:
@@ -59,7 +59,7 @@ def sample_gradient(problem: Problem, integrator: Any, round: int, purpose: str,
     return gradients
 
 
-def take_gradient(problem: Problem) -> dict[str, np.ndarray[Any, Any]]:
+def take_gradient(problem: Problem) -> dict[str, Array]:
     """The gradients that have been accumulated, each in a row, 0 where they are not finite; they are cleared."""
     taken = {}
     for key, value in problem.gradients().items():
@@ -69,17 +69,17 @@ def take_gradient(problem: Problem) -> dict[str, np.ndarray[Any, Any]]:
     return taken
 
 
-Array = np.ndarray[Any, Any]
+def unrecorded(integrator: Any) -> Any:
+    """The integrator without recordings of its steps, which would cost more than a few of these save."""
+    if not isinstance(integrator, LightTracer):
+        return integrator
+    return integrator.with_options(samples_per_pass=integrator.samples_per_pass, freeze=False)
 
 
 #: The part of the image that a change of h replaces: aimed at, and good enough.
 AIM, LEAST, MOST = 0.03, 0.003, 0.3
-
-
 #: Renderings for each parameter, at most, until h is found.
 TRIALS = 8
-
-
 _PURPOSE = "conditioning"
 
 
@@ -170,11 +170,6 @@ def see_images(problem: Problem) -> list[Array]:
         exposed = view.exposure.applied(first_channels(image, view.target.shape[2]))
         images.append(view.kept(np.array(exposed, dtype=np.float64)))
     return images
-
-
-def rms(values: Array) -> float:
-    """The root mean square of all entries."""
-    return float(np.sqrt(np.mean(np.square(values, dtype=np.float64))))
 
 
 #: Gradient samples that a run takes.

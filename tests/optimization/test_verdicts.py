@@ -2,25 +2,27 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
 from reslrb_cli.optimization.uncertainty.curvature import smooth
-from reslrb_cli.optimization.uncertainty.posterior import Measured, alone, driven_alone, joint
-from reslrb_cli.optimization.uncertainty.verdicts import Evidence, Verdict, judge, noise_covariance, shares, summarise
+from reslrb_cli.optimization.uncertainty.posterior import Measured, alone, joint
+from reslrb_cli.optimization.uncertainty.verdicts import Verdict, judge, noise_covariance, shares, summarise
 
 
-def evidence(**changes: float | bool) -> Evidence:
-    """One entry that is settled, with changes."""
-    own = {
-        "value": 0.5, "low": 0.0, "high": 1.0, "scale": 0.5, "touched": True, "gradient": 0.0, "error": 1.0,
-        "step": 0.01, "spread": 0.01, "alone": 0.01, "to_go": 0.0, "to_go_error": 0.01,
-    }  # fmt: skip
-    own |= changes
-    own.setdefault("of_run", own["spread"])
-    return Evidence(**{name: np.array([value]) for name, value in own.items()})
+def judged(*entries: dict[str, float | bool]) -> list[Verdict]:
+    """The verdicts of entries that are settled, but for these changes, of two gradients whose noise has either sign."""
+    usual = {"value": 0.5, "low": 0.0, "high": 1.0, "touched": True, "gradient": 0.0, "error": 1.0, "step": 0.01}
+    usual |= {"spread": 0.01, "alone": 0.01, "to_go": 0.0, "to_go_error": 0.01}
+    every = [usual | changes for changes in entries]
+    e = {name: np.array([each[name] for each in every]) for name in usual}
+    of_run = np.array([each.get("of_run", each["spread"]) for each in every])
+    gradients = np.array([e["gradient"] + sign * e["error"] for sign in (1, -1)]) * e["touched"]
+    own = Measured(
+        e["value"], (e["low"][0], e["high"][0]), 0.5, gradients, e["step"] / e["error"] / 2**0.5, [1.0], False
+    )
+    np.testing.assert_array_equal(own.touched, e["touched"])
+    return judge(own, e["spread"], of_run, e["alone"], e["to_go"], e["to_go_error"])
 
 
 @pytest.mark.parametrize(("changes", "verdict"), [
@@ -48,13 +50,11 @@ def evidence(**changes: float | bool) -> Evidence:
     ({"value": 3.0, "low": -np.inf, "high": np.inf}, Verdict.SETTLED),
 ])  # fmt: skip
 def test_the_rules(changes, verdict):
-    assert judge(evidence(**changes)) == [verdict]
+    assert judged(changes) == [verdict]
 
 
 def test_entries_are_judged_one_by_one():
-    one, other = evidence(), evidence(touched=False)
-    both = replace(one, **{name: np.append(getattr(one, name), getattr(other, name)) for name in vars(one)})
-    assert judge(both) == [Verdict.SETTLED, Verdict.NO_EFFECT]
+    assert judged({}, {"touched": False}) == [Verdict.SETTLED, Verdict.NO_EFFECT]
 
 
 @pytest.mark.parametrize(("entries", "verdict"), [
@@ -127,12 +127,10 @@ def test_alone_is_joint_where_nothing_is_shared():
     given = np.array([0.03, 0.05]), np.array([2.0, 0.3])
     noise, gradient = np.array([0.2, 0.5]), np.array([0.1, -0.4])
     for fixed in (np.zeros(2), np.array([0.3, 2.0])):
-        to_go, error = alone(H, *given, noise, gradient, 4, rates, fixed)
+        each = alone(H, *given, noise, gradient, 4, rates, fixed)
         both = joint(np.diag(H), *given, np.diag(noise), gradient, 4, rates, np.diag(fixed))
-        np.testing.assert_allclose(to_go, both.to_go, rtol=1e-5)
-        np.testing.assert_allclose(error, both.error, rtol=1e-5)
-        of_target = driven_alone(H, given[0], rates) * np.sqrt(fixed)
-        np.testing.assert_allclose(of_target, both.of_target, rtol=1e-5)
+        for name in ("to_go", "error", "of_target"):
+            np.testing.assert_allclose(getattr(each, name), getattr(both, name), rtol=1e-5)
 
 
 def test_noise_of_the_target_is_left_where_the_run_has_converged():
@@ -151,9 +149,8 @@ def test_what_the_view_does_not_tell_stays_as_it_was():
     total, difference = (np.sqrt(v @ found.covariance @ v) for v in (np.array([1, 1]), np.array([1, -1])))
     assert total < 0.02
     assert difference == pytest.approx(np.sqrt(2), rel=0.02)
-    assert (
-        alone(np.full(2, 5.0), np.full(2, 0.1), np.ones(2), np.full(2, 1e-4), np.zeros(2), 5, [1.0] * 200)[1][0] < 0.02
-    )
+    known = alone(np.full(2, 5.0), np.full(2, 0.1), np.ones(2), np.full(2, 1e-4), np.zeros(2), 5, [1.0] * 200)
+    assert known.error[0] < 0.02
 
 
 def test_an_entry_that_no_step_moves_is_as_far_as_it_was():

@@ -27,47 +27,53 @@ may come out as next to nothing, and too little noise would make results look to
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from reslrb_cli.integrators.light_tracer import LightTracer
 from reslrb_cli.integrators.step import known_step, render_image
 from reslrb_cli.optimization.loading import make_configured, render_in_passes
-from reslrb_cli.optimization.sensitivity import take_gradient
+from reslrb_cli.optimization.problem import Problem
+from reslrb_cli.optimization.sensitivity import take_gradient, unrecorded
 from reslrb_cli.optimization.views import View, slope, to_tensor
 from reslrb_cli.seeds import seed
+from reslrb_cli.statistics import Array, rms
 
-if TYPE_CHECKING:
-    from reslrb_cli.optimization.problem import Problem
-
-
-Array = np.ndarray[Any, Any]
-
-
+_PURPOSE = "curvature"
 #: A parameter of at most so many entries is looked at entry by entry.
 MOST_ENTRIES = 4
-
-
 #: Parts of keys of what mixes channels: a number is read out of such textures.
 MIXING = ("alpha", "roughness", "weight", "opacity", "normalmap", "bump", "metallic", "anisotropic")
+#: Entries over which curvature is averaged, at least.
+GROUP = 64
+#: A pixel shows a texture where it changes by this share of the most that any does.
+SHOWN = 0.05
+#: So many standard errors are taken off curvature, and added to noise of the target.
+MARGIN = 1.0
+#: Values of the images that enter H along directions: of more, so many at random, the same for all. And blocks of B.
+MOST_VALUES = 2**18
+#: Images by which the target's noise is sampled, of as many samples where those are at most so many times a step's.
+REPLICAS, AGAIN = 4, 4
+#: By this factor they are made brighter or darker, at most.
+MOST_ASTRAY = 10.0
+#: Samples of it by which large parameters are probed.
+PROBED = 2
 
 
 @dataclass(frozen=True)
 class Direction:
     """One coordinate: `vector`, in the layout of a gradient in a row, is what a unit of it adds to the parameter `key`.
 
-    `channel` is the only channel of images that it changes, or None. `scale` is the size of the coordinate. `entry` is
-    that of a small parameter; None where all of a texture's channel change together, in proportion to what they are.
+    `channel` is the only channel of images that it changes, or None. `entry` is that of a small parameter; None where
+    all of a texture's channel change together, in proportion to what they are.
     """
 
     key: str
     vector: Array
-    scale: float
     channel: int | None = None
     entry: int | None = None
 
@@ -114,19 +120,15 @@ def plan_changes(problem: Problem, scales: Mapping[str, float], share: float, mo
 
 
 def _entries(problem: Problem, key: str, scale: float, share: float) -> list[Change]:
-    row, array = row_of(problem, key), problem.selection.array(key)
-    directions = [
-        Direction(key, unit, scale, channel if separates(problem, key) else None, channel)
-        for channel, unit in enumerate(np.eye(row.size))
-    ]
-    groups = [directions] if separates(problem, key) else [[direction] for direction in directions]
+    row, together = row_of(problem, key), separates(problem, key)
+    directions = [Direction(key, unit, k if together else None, k) for k, unit in enumerate(np.eye(row.size))]
     low, high = problem.selection.spec(key).bounds or (-np.inf, np.inf)
     changes = []
-    for group in groups:
+    for group in [directions] if together else [[direction] for direction in directions]:
         step = sum(direction.vector for direction in group) * scale * share
-        up = _within(row + step, low, high)
-        side = 1.0 if up >= _within(row - step, low, high) else -1.0
-        moved = (row + side * step).reshape(array.shape)
+        inside = [np.sum((moved >= low) & (moved <= high)) for moved in (row + step, row - step)]
+        side = 1.0 if inside[0] >= inside[1] else -1.0
+        moved = (row + side * step).reshape(problem.selection.array(key).shape)
         changes.append(Change({key: moved}, side * scale * share, group))
     return changes
 
@@ -136,54 +138,10 @@ def _wholes(problem: Problem, key: str, share: float) -> list[Change]:
     channels = array.shape[2]
     if not np.any(row) or (channels > 1 and not separates(problem, key)):
         return []
-    # Darker, so that no bound is passed but by what is negative.
-    values = {key: array * (1 - share)}
     of = [np.where(np.arange(row.size) % channels == channel, row, 0.0) for channel in range(channels)]
-    single = channels == 1
-    return [
-        Change(values, -share, [Direction(key, v, 1.0, None if single else c) for c, v in enumerate(of) if v.any()])
-    ]
-
-
-def _within(moved: Array, low: float, high: float) -> int:
-    """How many entries are within the bounds."""
-    return int(np.sum((moved >= low) & (moved <= high)))
-
-
-def units(directions: Iterable[Direction], gradients: Mapping[str, Array]) -> Array:
-    """Derivatives along directions (M, ...) of gradients by key (..., N)."""
-    return np.array([gradients[direction.key] @ direction.vector for direction in directions])
-
-
-_PURPOSE = "curvature"
-
-
-#: Entries over which curvature is averaged, at least.
-GROUP = 64
-
-
-#: A pixel shows a texture where it changes by this share of the most that any does.
-SHOWN = 0.05
-
-
-#: So many standard errors are taken off curvature, and added to noise of the target.
-MARGIN = 1.0
-
-
-#: Values of the images that enter H along directions: of more, so many at random, the same for all. And blocks of B.
-MOST_VALUES = 2**18
-
-
-#: Images by which the target's noise is sampled, of as many samples where those are at most so many times a step's.
-REPLICAS, AGAIN = 4, 4
-
-
-#: By this factor they are made brighter or darker, at most.
-MOST_ASTRAY = 10.0
-
-
-#: Samples of it by which large parameters are probed.
-PROBED = 2
+    directions = [Direction(key, v, None if channels == 1 else c) for c, v in enumerate(of) if v.any()]
+    # Darker, so that no bound is passed but by what is negative.
+    return [Change({key: array * (1 - share)}, -share, directions)]
 
 
 @dataclass
@@ -218,10 +176,7 @@ class Curvature:
         self.changes = self.probes = 0
         #: By how many values of the images each texture is seen, of those that were changed as a whole.
         self.pixels: dict[str, int] = {}
-        self.integrator = problem.integrator
-        if isinstance(self.integrator, LightTracer):  # a recording would cost more than so few probes save
-            per_pass = self.integrator.samples_per_pass
-            self.integrator = self.integrator.with_options(samples_per_pass=per_pass, freeze=False)
+        self.integrator = unrecorded(problem.integrator)
         self._base = [self._images(half) for half in (0, 1)]
         self._weights = [self._weight(place, view) for place, view in enumerate(problem.trained)]
         values = sum(weight.size for weight in self._weights)
@@ -246,16 +201,16 @@ class Curvature:
             self.problem.apply()
             for direction in change.directions:
                 directions.append(direction)
-                pulled = 0.0
+                even.append(0.0)
                 for half in (0, 1):
                     pairs = zip(images[half], self._base[half], strict=True)
                     slopes = [_of_channel((a - b) / change.amount, direction.channel) for a, b in pairs]
                     columns[half].append(self._in_a_row(slopes))
-                    if self.noises:
-                        blocks, sums = self._pulls(slopes)
-                        odd[half].append(blocks)
-                        pulled += 0.5 * sums
-                even.append(pulled)
+                    pulls = [(n, each) for views in self.noises for n, each in zip(views, slopes, strict=True)]
+                    if pulls:
+                        odd[half].append(np.concatenate([noise.in_blocks(each) for noise, each in pulls]))
+                        sums = sum(float(np.sum(each * noise.even)) for noise, each in pulls)
+                        even[-1] += 0.5 * sums / len(self.noises)
                 if direction.entry is None:
                     self.pixels[direction.key] = self.pixels.get(direction.key, 0) + _changed(slopes)
         if not directions:
@@ -263,8 +218,11 @@ class Curvature:
         a, b = (np.nan_to_num(np.array(rows)) for rows in columns)
         a = a * self._in_a_row(self._weights)
         sure = _sure_share(a * b)
-        product = a @ b.T * self._thinned * np.sqrt(np.outer(sure, sure))
-        return directions, 0.5 * (product + product.T), _second_moment(odd, even, len(self.noises))
+        H = _symmetric(a @ b.T * self._thinned * np.sqrt(np.outer(sure, sure)))
+        if not self.noises:
+            return directions, H, np.zeros_like(H)
+        a, b = (np.nan_to_num(np.array(rows)) for rows in odd)
+        return directions, H, _symmetric(a @ b.T / len(self.noises)) + np.outer(even, even)
 
     def by_entry(self, probes: int, go_on: Callable[[], bool]) -> dict[str, Array]:
         """For each parameter the diagonal of H in a row, unsmoothed; nothing where `go_on` said no at once."""
@@ -300,17 +258,6 @@ class Curvature:
         a, b = (self._probe(gradients, number + half) for half in (0, 1))
         for key in a:
             total[key] = total.get(key, 0.0) + a[key].astype(np.float64) * b[key]
-
-    def _pulls(self, slopes: Sequence[Array]) -> tuple[Array, float]:
-        """What derivatives of the views' images make of the target's noise: of the odd part by sample and block in a
-        row, and of the mean of the even one."""
-        blocks = [noise.in_blocks(slope) for views in self.noises for noise, slope in zip(views, slopes, strict=True)]
-        sums = [
-            float(np.sum(slope * noise.even))
-            for views in self.noises
-            for noise, slope in zip(views, slopes, strict=True)
-        ]
-        return np.concatenate(blocks), sum(sums) / len(self.noises)
 
     def _target_noises(self) -> list[list[TargetNoise]]:
         config, trained = self.problem.config, self.problem.trained
@@ -399,7 +346,7 @@ class Curvature:
         """
         image = 0.5 * (self._base[0][place] + self._base[1][place])
         true = view.kept(np.array(view.target, dtype=np.float64))
-        step = max(_rms(image - true), 1e-3 * _rms(true), 1e-6)
+        step = max(rms(image - true), 1e-3 * rms(true), 1e-6)
         up, down = (slope(view.judge, image + side * step).astype(np.float64) for side in (1, -1))
         return np.maximum(np.nan_to_num(up - down), 0.0) / (2 * step) * view.share
 
@@ -420,22 +367,14 @@ def smooth(diagonal: Array, noise: Array, sure: float = 0.0) -> Array:
     return result
 
 
-def _second_moment(odd: Sequence[Sequence[Array]], even: Sequence[float], samples: int) -> Array:
-    """B (M, M) of what M directions make of the noise: by half of the samples and by direction in blocks, and as a
-    whole."""
-    if not samples:
-        return np.zeros((len(even), len(even)))
-    a, b = (np.nan_to_num(np.array(rows)) for rows in odd)
-    product = a @ b.T / samples
-    return np.asarray(0.5 * (product + product.T) + np.outer(even, even))
+def _symmetric(product: Array) -> Array:
+    return np.asarray(0.5 * (product + product.T))
 
 
 def _of_channel(image: Array, channel: int | None) -> Array:
     if channel is None:
         return image
-    kept = np.zeros_like(image)
-    kept[:, :, channel] = image[:, :, channel]
-    return kept
+    return np.asarray(np.where(np.arange(image.shape[2]) == channel, image, 0.0))
 
 
 def _sure_share(terms: Array) -> Array:
@@ -444,14 +383,9 @@ def _sure_share(terms: Array) -> Array:
     A few bright pixels may make up all of a curvature, and be an accident.
     """
     sums, errors = terms.sum(axis=1), np.sqrt(np.square(terms).sum(axis=1))
-    result: Array = np.clip(1 - MARGIN * errors / np.maximum(sums, 1e-300), 0, 1)
-    return result
+    return np.asarray(np.clip(1 - MARGIN * errors / np.maximum(sums, 1e-300), 0, 1))
 
 
 def _changed(slopes: Sequence[Array]) -> int:
     most = max(float(np.abs(slope).max()) for slope in slopes)
     return sum(int(np.sum(np.abs(slope) > SHOWN * most)) for slope in slopes) if most else 0
-
-
-def _rms(values: Array) -> float:
-    return float(np.sqrt(np.mean(np.square(values))))

@@ -3,61 +3,43 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import drjit as dr
 import numpy as np
 
 from reslrb_cli.optimization.identifiability import shown_texels
 from reslrb_cli.optimization.loop import learning_rate_factor
-from reslrb_cli.optimization.sensitivity import rms, sample_gradient, take_gradient
-from reslrb_cli.optimization.uncertainty.curvature import MOST_ENTRIES, Curvature, Direction, plan_changes, row_of
+from reslrb_cli.optimization.problem import Problem
+from reslrb_cli.optimization.sensitivity import sample_gradient, take_gradient
+from reslrb_cli.optimization.uncertainty.curvature import MOST_ENTRIES, Curvature, plan_changes, row_of
 from reslrb_cli.optimization.uncertainty.posterior import Measured
 from reslrb_cli.optimization.uncertainty.verdicts import CertaintyRecord, Gradients, ParameterCertainty, weigh
 from reslrb_cli.records.clock import StepClock
+from reslrb_cli.statistics import Array, rms
 
-if TYPE_CHECKING:
-    from reslrb_cli.optimization.problem import Problem
-
-
-Array = np.ndarray[Any, Any]
-
+_PURPOSE = "certainty"
 
 #: A run of fewer iterations is not judged: what it would cost is no small part of it.
 LEAST_ITERATIONS = 20
-
-
 #: Gradients at the final values: one for so many iterations, within these. They have the samples of a step, so that no
 #: kernel is compiled for them.
 ITERATIONS_A_SAMPLE, LEAST_SAMPLES, MOST_SAMPLES = 40, 3, 16
-
-
 #: Random probes for parameters of many entries; renderings along directions, at most: so many, or one for so many
 #: iterations.
 PROBES, LEAST_CHANGES, ITERATIONS_A_CHANGE = 4, 20, 10
-
-
 #: Share of the samples of a step that each of the two sets of samples has that curvature is measured with, and
 #: samples per pixel that are enough to have all of them.
 PART, FEW = 4, 4
-
-
 #: Directions are differentiated over this share of a parameter's scale.
 STEP = 0.05
-
-
 #: Part of a run whose gradients, the last ones, are asked for their noise.
 RECENT = 0.2
-
-
 #: Where curvature takes longer than this share of the run's time in iterations, and than so many of them, the rest is
 #: left out.
 SHARE, MOST_STEPS = 0.25, 50
-
-
-_PURPOSE = "certainty"
 
 
 class Certainty:
@@ -95,10 +77,8 @@ class Certainty:
             return None
         first, last = (np.array(mean, dtype=np.float64).ravel() for mean, _ in (before, now))
         kept = now[1] ** (iterations - self._seen)
-        slope = self.problem.optimizer.slope(key)
         squares = np.maximum(last - kept * first, 0) / max(1 - kept, 1e-300)
-        result: Array = squares / np.maximum(slope**2, 1e-300)
-        return result
+        return np.asarray(squares / np.maximum(self.problem.optimizer.slope(key) ** 2, 1e-300))
 
     def measure(self, iterations: int, elapsed_s: float, stop: Callable[[], bool]) -> CertaintyRecord | None:
         """Measure after so many iterations, which took `elapsed_s`; None after too few, or where `stop()` says so.
@@ -107,7 +87,7 @@ class Certainty:
         """
         if iterations < LEAST_ITERATIONS:
             return None
-        problem, clock, compiled_ms = self.problem, StepClock(), 0.0
+        problem, config, clock, compiled_ms = self.problem, self.problem.config, StepClock(), 0.0
         try:
             problem.apply()
             rows: dict[str, list[Array]] = {key: [] for key in problem.selection.keys}
@@ -116,26 +96,33 @@ class Certainty:
                 if stop():
                     return None
                 with clock.step() as times:
-                    sample_gradient(problem, problem.integrator, number, _PURPOSE, problem.config.run.spp)
+                    sample_gradient(problem, problem.integrator, number, _PURPOSE, config.run.spp)
                     for key, row in take_gradient(problem).items():
                         rows[key].append(row.astype(np.float64))
                 compiled_ms += times.codegen_ms
             gradients = {key: np.array(samples) for key, samples in rows.items()}
-            budget = _Budget(max(SHARE * elapsed_s, MOST_STEPS * elapsed_s / iterations), stop)
-            most = max(LEAST_CHANGES, iterations // ITERATIONS_A_CHANGE)
+            go_on = _Budget(max(SHARE * elapsed_s, MOST_STEPS * elapsed_s / iterations), stop)
             with clock.step() as times:
-                curvature = self._curvature()
-                found = self._measure_curvature(curvature, gradients, most, budget)
+                unit = problem.samples_per_pass or 1
+                spp = max(max(config.run.spp // PART, min(config.run.spp, FEW)) // unit, 1) * unit
+                curvature = Curvature(problem, spp)
+                scales = {key: self.scale(key) for key in gradients}
+                most = max(LEAST_CHANGES, iterations // ITERATIONS_A_CHANGE)
+                directions, H, B = curvature.along(plan_changes(problem, scales, STEP, most), go_on)
+                # By entry, of parameters that have no directions of their entries.
+                seen = {direction.key for direction in directions if direction.entry is not None}
+                left = [key for key, rows in gradients.items() if np.any(rows) and key not in seen]
+                diagonal = curvature.by_entry(PROBES, go_on) if left else {}
+                of_target = curvature.by_entry_of_target(PROBES, go_on) if diagonal else {}
             compiled_ms += times.codegen_ms
             if stop():
                 return None
-            directions, H, B, diagonal, of_target = found
             measured = self._measured(gradients, iterations)
-            weighed = weigh(measured, directions, H, diagonal, curvature.pixels, B, of_target)
-            parameters = {key: self._with_course(key, about, measured[key]) for key, about in weighed.items()}
+            weighed = weigh(measured, directions, H, _of(left, diagonal), curvature.pixels, B, _of(left, of_target))
             measure_s = max(clock.elapsed_s - compiled_ms / 1e3, 0.0)
+            render = config.target.render
             return CertaintyRecord(
-                parameters=parameters,
+                parameters={key: self._with_course(key, about, measured[key]) for key, about in weighed.items()},
                 gradients=count,
                 changes=curvature.changes,
                 probes=curvature.probes,
@@ -143,33 +130,14 @@ class Certainty:
                 compile_s=compiled_ms / 1e3,
                 share=measure_s / max(elapsed_s, 1e-9),
                 iterations=iterations,
-                scale=problem.config.optimizer.scale,
-                learning_rate=problem.config.optimizer.learning_rate,
+                scale=config.optimizer.scale,
+                learning_rate=config.optimizer.learning_rate,
                 target_noise=self._target_noise(),
-                target_spp=render.spp if (render := problem.config.target.render) is not None else None,
+                target_spp=None if render is None else render.spp,
             )
         finally:
             take_gradient(problem)
             problem.apply()
-
-    def _curvature(self) -> Curvature:
-        unit = self.problem.samples_per_pass or 1
-        spp = self.problem.config.run.spp
-        return Curvature(self.problem, max(max(spp // PART, min(spp, FEW)) // unit, 1) * unit)
-
-    def _measure_curvature(
-        self, curvature: Curvature, gradients: Gradients, most: int, budget: _Budget
-    ) -> tuple[list[Direction], Array, Array, Gradients, Gradients]:
-        """Directions, H and B along them; and, unsmoothed, their diagonals by entry, of parameters that have none of
-        them."""
-        scales = {key: self.scale(key) for key in self.problem.selection.keys}
-        directions, H, B = curvature.along(plan_changes(self.problem, scales, STEP, most), budget)
-        seen = {direction.key for direction in directions if direction.entry is not None}
-        left = [key for key, rows in gradients.items() if np.any(rows) and key not in seen]
-        diagonal = curvature.by_entry(PROBES, budget) if left else {}
-        of_target = curvature.by_entry_of_target(PROBES, budget) if diagonal else {}
-        kept = ({key: found[key] for key in left if key in found} for found in (diagonal, of_target))
-        return directions, H, B, next(kept), next(kept)
 
     def _target_noise(self) -> str:
         """Whether the noise of the targets is in the spreads, as `CertaintyRecord` has it."""
@@ -210,29 +178,28 @@ class Certainty:
         return np.repeat(wide.ravel(), channels)
 
     def _measured(self, gradients: Gradients, iterations: int) -> dict[str, Measured]:
-        config, optimizer = self.problem.config, self.problem.optimizer
-        factors = [
-            learning_rate_factor(
-                config.optimizer.schedule, iteration, config.run.iterations, config.optimizer.final_fraction
-            )
-            for iteration in range(iterations)
-        ]
+        settings, optimizer, selection = self.problem.config.optimizer, self.problem.optimizer, self.problem.selection
+        planned, final = self.problem.config.run.iterations, settings.final_fraction
+        rates = [learning_rate_factor(settings.schedule, each, planned, final) for each in range(iterations)]
         found = {}
         for key, rows in gradients.items():
-            low, high = self.problem.selection.spec(key).bounds or (-np.inf, np.inf)
             value = row_of(self.problem, key)
             found[key] = Measured(
                 value=value,
-                bounds=(low, high),
+                bounds=selection.spec(key).bounds or (-np.inf, np.inf),
                 scale=self.scale(key),
                 gradients=rows,
                 response=np.nan_to_num(optimizer.response(key) * optimizer.rate(key)),
-                rates=factors,
+                rates=rates,
                 is_small=value.size <= MOST_ENTRIES,
                 recent=self._recent(key, iterations),
                 seen=self._seen_entries(key, rows),
             )
         return found
+
+
+def _of(keys: Sequence[str], found: Gradients) -> Gradients:
+    return {key: found[key] for key in keys if key in found}
 
 
 class _Budget:

@@ -1,7 +1,7 @@
 """The distance of final values from the optimum: what the run's steps leave open, less what gradients at the end say.
 
 What was measured of one parameter at the end of a run is a `Measured`; what follows from it is a `Posterior`, of
-entries together (`joint`), or of each as if all others were known, the way and its error (`alone`).
+entries together (`joint`), or of each as if all others were known (`alone`).
 
 Near the optimum the loss is quadratic with curvature H, and the offset d = x - x* of the values x follows the steps
 
@@ -33,36 +33,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 
+from reslrb_cli.statistics import Array
+
 #: A way to go of so many standard errors is no accident; and so are gradients.
 SURE = 2.0
-
-
 #: A value within this share of its scale of a bound is at it, however small the steps are.
 AT_BOUND = 1e-3
-
-
 #: Steps that a value at its bound may have been driven off it by noise.
 STEPS_OFF = 3.0
-
-
-def at_bound(value: Array, low: Array, high: Array, scale: Array, gradient: Array, error: Array, step: Array) -> Array:
-    """Which entries stand at a bound; the arguments are those of `Evidence`.
-
-    The gradient of the loss points upwards: at the lower bound one above 0 holds the value there.
-    """
-    near = np.maximum(AT_BOUND * scale, STEPS_OFF * step)
-    back = SURE * error
-    lower = (value - low <= near) & (gradient >= np.where(value <= low, -back, back))
-    upper = (high - value <= near) & (gradient <= np.where(value >= high, back, -back))
-    result: Array = lower | upper
-    return result
-
-
-Array = np.ndarray[Any, Any]
 
 
 @dataclass(frozen=True)
@@ -70,7 +51,10 @@ class Measured:
     """One parameter of N entries at the end of a run: its values (N,), bounds, scale, and K gradients (K, N).
 
     `response` is how far a step moves an entry per unit of gradient, at the factor 1, and `rates` are the schedule's
-    factors of all iterations. `seen` (N,) says which entries of a texture some view shows; None of what is no texture.
+    factors of all iterations. `recent` is the mean square of the gradients of the last iterations, (N,), where the
+    optimiser kept it. `seen` (N,) says which entries of a texture some view shows; None of what is no texture.
+
+    `mean` and `noise`, both (N,), are the gradients' mean and variance.
     """
 
     value: Array
@@ -80,7 +64,6 @@ class Measured:
     response: Array
     rates: Sequence[float]
     is_small: bool
-    #: The mean square of the gradients of the run's last iterations, (N,), where the optimiser kept it.
     recent: Array | None = None
     seen: Array | None = None
     mean: Array = field(init=False)
@@ -102,41 +85,45 @@ class Measured:
         low, high = self.bounds
         return min(self.scale, (high - low) / np.sqrt(12))
 
+    @property
+    def touched(self) -> Array:
+        """Which entries any gradient sample was not 0 of, (N,)."""
+        return np.any(self.gradients, axis=0)
+
+    @property
+    def at_bound(self) -> Array:
+        """Which entries stand at a bound, (N,): within a step of it, where the gradient does not pull them back.
+
+        The gradient of the loss points upwards: at the lower bound one above 0 holds the value there.
+        """
+        low, high = (np.float32(bound) for bound in self.bounds)
+        step = self.response * self.rates[-1] * np.sqrt(self.noise)  # by which noise moved it in the last iteration
+        near = np.maximum(AT_BOUND * self.scale, STEPS_OFF * step)
+        back = SURE * np.sqrt(self.noise / len(self.gradients))
+        lower = (self.value - low <= near) & (self.mean >= np.where(self.value <= low, -back, back))
+        upper = (high - self.value <= near) & (self.mean <= np.where(self.value >= high, back, -back))
+        return np.asarray(lower | upper)
+
     def within(self, to_go: Array) -> Array:
         """Ways to the optimum, cut off at the bounds: what is far off is not as the curvature here has it."""
         low, high = self.bounds
         return np.clip(to_go, np.minimum(self.value - high, 0), np.maximum(self.value - low, 0)).astype(np.float64)
 
-    @property
-    def error(self) -> Array:
-        """The standard error of the mean gradient, (N,)."""
-        return np.sqrt(self.noise / len(self.gradients))
-
-    @property
-    def step(self) -> Array:
-        """How far noise moved an entry in the last iteration, (N,)."""
-        return self.response * self.rates[-1] * np.sqrt(self.noise)
-
-    @property
-    def at_bound(self) -> Array:
-        """Which entries stand at a bound, (N,)."""
-        (low, high), scale = self.bounds, np.full(self.value.shape, self.scale)
-        return at_bound(self.value, np.float32(low), np.float32(high), scale, self.mean, self.error, self.step)
-
 
 @dataclass(frozen=True)
 class Posterior:
-    """The offset of each of M entries from the optimum, as estimated: its mean (`to_go`, M), and covariance (M, M)."""
+    """The offset of each of M entries from the optimum, as estimated: its mean (`to_go`, M), its `variance` (M,), what
+    of its spread is the target's (`of_target`, M), and where entries were judged together its covariance (M, M)."""
 
     to_go: Array
-    covariance: Array
-    #: What of the spread is the target's, (M,).
+    variance: Array
     of_target: Array
+    covariance: Array | None = None
 
     @property
     def error(self) -> Array:
         """The standard error of `to_go`, (M,)."""
-        return np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
+        return np.sqrt(np.maximum(self.variance, 0.0))
 
     @property
     def spread(self) -> Array:
@@ -155,26 +142,26 @@ def joint(
     of all iterations, `fixed` the B (M, M) of what all gradients share; None: nothing. Each entry is taken in units of
     its scale, so that those of different units have well-conditioned matrices.
     """
-    H = curvature * scale[:, None] * scale[None, :]
-    H = _positive(0.5 * (H + H.T))
-    Sigma = _positive(noise * scale[:, None] * scale[None, :])
-    C, driven = _after(H, response / scale**2, Sigma, rates)
-    B = np.zeros_like(H) if fixed is None else _positive(fixed * scale[:, None] * scale[None, :])
-    E, pulled = C + driven @ B @ driven.T, H @ driven @ B
+    units = np.outer(scale, scale)
+    H, Sigma = _positive(curvature * units), _positive(noise * units)
+    C, D = _after(H, response / scale**2, Sigma, rates)
+    B = np.zeros_like(H) if fixed is None else _positive(fixed * units)
+    driven = D @ B @ D.T
+    E, pulled = C + driven, H @ D @ B
     seen = H @ E @ H - pulled - pulled.T + B + Sigma / samples
     seen = seen + np.eye(len(scale)) * max(1e-9 * float(np.trace(seen)), 1e-30)
-    shared = E @ H - driven @ B
+    shared = E @ H - D @ B
     gain = np.linalg.solve(seen, shared.T).T
-    to_go = gain @ (gradient * scale)
-    of_target = np.sqrt(np.maximum(np.diag(driven @ B @ driven.T), 0.0))
-    return Posterior(to_go * scale, _positive(E - gain @ shared.T) * np.outer(scale, scale), of_target * scale)
+    covariance = _positive(E - gain @ shared.T) * units
+    of_target = np.sqrt(np.maximum(np.diag(driven), 0.0)) * scale
+    return Posterior(gain @ (gradient * scale) * scale, np.diag(covariance), of_target, covariance)
 
 
 def alone(
     curvature: Array, response: Array, scale: Array, noise: Array, gradient: Array, samples: int,
     rates: Sequence[float], fixed: Array | float = 0.0,
-) -> tuple[Array, Array]:  # fmt: skip
-    """`to_go` and its standard error of each entry as if all others were known; everything is (M,), as in `joint`."""
+) -> Posterior:  # fmt: skip
+    """The offset of each entry as if all others were known; everything is (M,), as in `joint`."""
     h = np.maximum(curvature, 0.0)
     C, D = scale**2, np.zeros_like(h)
     for rate in rates:
@@ -185,22 +172,12 @@ def alone(
     seen = h**2 * E - 2 * h * D * fixed + fixed + np.maximum(noise / samples, 1e-300)
     shared = E * h - D * fixed
     gain = shared / seen
-    return gain * gradient, np.sqrt(np.maximum(E - gain * shared, 0.0))
-
-
-def driven_alone(curvature: Array, response: Array, rates: Sequence[float]) -> Array:
-    """D of each entry as if all others were known, (M,)."""
-    h = np.maximum(curvature, 0.0)
-    D = np.zeros_like(h)
-    for rate in rates:
-        D = np.clip(1 - rate * response * h, 0, 1) * D + _driven(rate * response, h)
-    return D
+    return Posterior(gain * gradient, E - gain * shared, D * np.sqrt(fixed))
 
 
 def _driven(step: Array, curvature: Array) -> Array:
     """How far one step goes per unit of a constant gradient: not beyond where curvature makes up for that."""
-    result: Array = np.minimum(step, 1 / np.maximum(curvature, 1e-300))
-    return result
+    return np.asarray(np.minimum(step, 1 / np.maximum(curvature, 1e-300)))
 
 
 def _after(H: Array, response: Array, noise: Array, rates: Sequence[float]) -> tuple[Array, Array]:
@@ -213,9 +190,9 @@ def _after(H: Array, response: Array, noise: Array, rates: Sequence[float]) -> t
         return C, D
     # Steps are symmetric in units of the root of the response.
     q, free = np.sqrt(response[moved]), np.ix_(moved, moved)
-    values, vectors = np.linalg.eigh(H[free] * q[:, None] * q[None, :])
+    values, vectors = np.linalg.eigh(H[free] * np.outer(q, q))
     now = vectors.T @ np.diag(q**-2) @ vectors
-    shaken = vectors.T @ (noise[free] * q[:, None] * q[None, :]) @ vectors
+    shaken = vectors.T @ (noise[free] * np.outer(q, q)) @ vectors
     values, driven = np.maximum(values, 0.0), np.zeros(len(values))
     for rate in rates:
         left = np.clip(1 - rate * values, 0, 1)
@@ -229,5 +206,4 @@ def _after(H: Array, response: Array, noise: Array, rates: Sequence[float]) -> t
 def _positive(matrix: Array) -> Array:
     """The nearest symmetric matrix without negative eigenvalues: what noise made negative is nothing."""
     values, vectors = np.linalg.eigh(0.5 * (matrix + matrix.T))
-    result: Array = (vectors * np.maximum(values, 0.0)) @ vectors.T
-    return result
+    return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T)
