@@ -15,7 +15,6 @@ from reslrb_cli.measure.references import Situation, prb_gradient
 from reslrb_cli.optimization.autotune.race import (
     CONFIDENCE,
     ITERATIONS,
-    Asked,
     Gain,
     Sizes,
     Step,
@@ -54,21 +53,19 @@ def measure_rival(problem: Problem, cache: Cache | None, say: Callable[[str], No
     def measure(allowance: Allowance) -> RivalRecord:
         left = allowance.iterations_left(NEEDS[0])
         spp, run = pilot.spp or _samples(problem, left), problem.config.run
-        entries = sum(problem.selection.array(key).size for key in problem.selection.keys)
-        sizes = Sizes(run.spp, spp, spp, False, entries, 0.0, LONGER, planned=float(run.spp * MOST_ROUNDS))
+        planned = float(run.spp * MOST_ROUNDS)  # as many samples as there are
+        sizes = Sizes(run.spp, spp, spp, False, MOST_ROUNDS, 0.0, LONGER, planned)
         share, most = (min(each, left / ITERATIONS) for each in (SHARE, MOST_SHARE))
         return RivalTurns(RivalTrial(problem), sizes, 1.0, share, most).run()
 
     beside = [pilot.chosen, guided and guided.guided, sequence and sequence.low_discrepancy]
     return Tuner(problem, say, cache).decide(
-        Asked(
-            RivalRecord,
-            of={"rival": RIVAL, "beside": beside},
-            needs=[NEEDS],
-            integrator=problem.integrator,
-            measure=measure,
-            unmeasured=lambda note: RivalRecord(integrator=RIVAL, note=note),
-        )
+        RivalRecord,
+        of={"rival": RIVAL, "beside": beside},
+        needs=[NEEDS],
+        integrator=problem.integrator,
+        measure=measure,
+        unmeasured=lambda note: RivalRecord(integrator=RIVAL, note=note),
     )
 
 
@@ -119,20 +116,12 @@ class RivalTrial:
 class RivalTurns(Turns[RivalRecord]):
     """One decision: whether `prb` is the more efficient. What Python takes beside the kernels is left out."""
 
-    LEAST = LEAST_ROUNDS
-
-    @property
-    def _most_rounds(self) -> int:
-        return MOST_ROUNDS
-
-    def _is_clear(self) -> bool:
-        return False
+    LEAST, LOOKS = LEAST_ROUNDS, 1
 
     def _gain(self, images: bool, confidence: float = CONFIDENCE) -> Gain:
         own, other = self._steps[False], self._steps[True]
         times = [[step.kernel_ms for step in steps] for steps in (own, other)]
-        gradients = [[step.gradients for step in steps] for steps in (own, other)]
-        return compare(gradients[0], times[0], gradients[1], times[1], confidence)
+        return compare([s.gradients for s in own], times[0], [s.gradients for s in other], times[1], confidence)
 
     def _record(self, other: bool, images: bool, gain: Gain, picture: Gain, note: str) -> RivalRecord:
         found: dict[str, Any] = dict(zip(("advantage", "low", "high"), gain, strict=True)) | self._cost()

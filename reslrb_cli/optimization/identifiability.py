@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import dataclasses
 import logging
-from typing import TYPE_CHECKING, Any
+from collections.abc import Sequence
 
 import drjit as dr
 import mitsuba as mi
@@ -28,21 +28,23 @@ from reslrb_cli.integrators.freezing import MOST_PATHS
 from reslrb_cli.integrators.light_tracer import LightTracer
 from reslrb_cli.integrators.step import known_step
 from reslrb_cli.optimization.loading import passes, samples_per_pass
-from reslrb_cli.optimization.sensitivity import see_images
+from reslrb_cli.optimization.problem import Problem
+from reslrb_cli.optimization.sensitivity import see_images, unrecorded
 from reslrb_cli.optimization.views import SHARED
 from reslrb_cli.scene.visibility import visible_texels
 from reslrb_cli.seeds import seed
-
-if TYPE_CHECKING:
-    from reslrb_cli.optimization.problem import Problem
-
-
-Array = np.ndarray[Any, Any]
+from reslrb_cli.statistics import Array
 
 logger = logging.getLogger(__name__)
 
 #: Paths in one pass of the gradient where naive AD keeps every vertex of each of them; light tracing keeps none.
 PATHS_PER_PASS = 2**18
+#: The relative step h.
+STEP = 0.02
+#: Eigenvalues below it are taken for 0: two directions at less than a degree to each other.
+LEAST = 1e-4
+#: A value whose part in the eigenvector is smaller has none in the combination.
+PART = 0.1
 
 
 def find_reached(problem: Problem) -> None:
@@ -61,8 +63,7 @@ def find_reached(problem: Problem) -> None:
         if mask.ndim == 3:
             mask = np.any(mask, axis=2)
             if key in problem.selection.params:  # a heightmap is no texture to be seen
-                sensors = [problem.scene.sensors()[view.sensor] for view in problem.trained]
-                mask = mask & _without_halo(visible_texels(problem.scene, sensors, key), mask.shape[1])
+                mask = mask & _visible(problem, key)
         problem.masks[key] = mask
 
 
@@ -71,19 +72,22 @@ def shown_texels(problem: Problem, key: str) -> Array | None:
     texture to be seen."""
     if key not in problem.selection.params or problem.selection.array(key).ndim != 3:
         return None
+    weights = [view.weights for view in problem.trained]
+    return _visible(problem, key, [None if each is None else np.array(each)[:, :, 0] > 0 for each in weights])
+
+
+def _visible(problem: Problem, key: str, pixels: Sequence[Array | None] = ()) -> Array:
+    """The texels that views that are trained on show, in these pixels, or in any."""
     sensors = [problem.scene.sensors()[view.sensor] for view in problem.trained]
-    pixels = [None if view.weights is None else np.array(view.weights)[:, :, 0] > 0 for view in problem.trained]
-    width = problem.selection.array(key).shape[1]
-    return _without_halo(visible_texels(problem.scene, sensors, key, pixels), width)
+    return _without_halo(visible_texels(problem.scene, sensors, key, pixels), problem.selection.array(key).shape[1])
 
 
 def sensitivity(problem: Problem) -> dict[str, Array]:
     """For each parameter whether the mean image depends on an entry, boolean, of the parameter's shape."""
-    run, optimizer = problem.config.run, problem.optimizer
-    integrator, paths_per_pass = problem.integrator, PATHS_PER_PASS
-    if isinstance(integrator, LightTracer):  # a recording takes as long as some passes, of which there is mostly one
-        integrator = integrator.with_options(samples_per_pass=integrator.samples_per_pass, freeze=False)
-        paths_per_pass = MOST_PATHS
+    run, integrator, multiple = problem.config.run, unrecorded(problem.integrator), samples_per_pass(problem.config)
+    # A recording takes as long as some passes, of which there is mostly one.
+    paths_per_pass = MOST_PATHS if isinstance(integrator, LightTracer) else PATHS_PER_PASS
+    spp = -(-run.reach_spp // multiple) * multiple if multiple else run.reach_spp
     found: dict[str, Array] = {}
     for sensor in [view.sensor for view in problem.trained]:
         film = problem.scene.sensors()[sensor].film()
@@ -91,21 +95,12 @@ def sensitivity(problem: Problem) -> dict[str, Array]:
         # dL/dI of the mean image: known before any path is traced, which some estimators ask for.
         ones = dr.ones(mi.TensorXf, (height, width, int(film.base_channels_count())))
         dr.make_opaque(ones)
-        multiple = samples_per_pass(problem.config)
-        spp = -(-run.reach_spp // multiple) * multiple if multiple else run.reach_spp
         for number, part in enumerate(passes(spp, width * height, multiple, paths_per_pass)):
-            known_step(
-                integrator,
-                problem.scene,
-                sensor,
-                ones,
-                seed=seed(run.seed, 0, sensor, f"reach, pass {number}"),
-                spp=part,
-                params=problem.selection.params,
-            )
+            at = seed(run.seed, 0, sensor, f"reach, pass {number}")
+            known_step(integrator, problem.scene, sensor, ones, seed=at, spp=part, params=problem.selection.params)
             for key, gradient in problem.gradients().items():
                 nonzero = np.array(gradient != 0.0)
-                optimizer.clear_gradient(key)
+                problem.optimizer.clear_gradient(key)
                 found[key] = found[key] | nonzero if key in found else nonzero
     return {key: _like(problem.selection.array(key), value) for key, value in found.items()}
 
@@ -121,14 +116,6 @@ def _without_halo(mask: Array, width: int) -> Array:
     """The middle `width` columns of a mask (H, W, ...)."""
     halo = (mask.shape[1] - width) // 2
     return mask[:, halo : halo + width]
-
-
-#: The relative step h.
-STEP = 0.02
-#: Eigenvalues below it are taken for 0: two directions at less than a degree to each other.
-LEAST = 1e-4
-#: A value whose part in the eigenvector is smaller has none in the combination.
-PART = 0.1
 
 
 @dataclasses.dataclass(frozen=True)
@@ -192,9 +179,7 @@ def _place(problem: Problem, key: str) -> str:
     return "target.exposure"
 
 
-def _row(problem: Problem) -> np.ndarray:
+def _row(problem: Problem) -> Array:
     """The images of all views in a row, each by the root of its share of the loss."""
-    images = see_images(problem)
-    return np.concatenate(
-        [np.sqrt(view.share) * image.ravel() for view, image in zip(problem.trained, images, strict=True)]
-    )
+    pairs = zip(problem.trained, see_images(problem), strict=True)
+    return np.concatenate([np.sqrt(view.share) * image.ravel() for view, image in pairs])

@@ -76,11 +76,21 @@ def unrecorded(integrator: Any) -> Any:
     return integrator.with_options(samples_per_pass=integrator.samples_per_pass, freeze=False)
 
 
+_PURPOSE = "conditioning"
+
 #: The part of the image that a change of h replaces: aimed at, and good enough.
 AIM, LEAST, MOST = 0.03, 0.003, 0.3
 #: Renderings for each parameter, at most, until h is found.
 TRIALS = 8
-_PURPOSE = "conditioning"
+#: Gradient samples that a run takes.
+SAMPLES = 4
+#: What the optimiser moves in place of a parameter x, by transform.
+_MOVED = {
+    "none": "",
+    "log": " in its logarithm",
+    "sigmoid": " in its logit between the bounds",
+    "softplus": " in log(exp(x) - 1)",
+}
 
 
 def measure_sensitivities(problem: Problem, samples: int) -> list[Sensitivity]:
@@ -90,9 +100,8 @@ def measure_sensitivities(problem: Problem, samples: int) -> list[Sensitivity]:
     rows: dict[str, list[Array]] = {key: [] for key in problem.selection.keys}
     total: dict[str, Any] = {}
     for round in range(samples):
-        for key, gradient in sample_gradient(
-            problem, problem.integrator, round, _PURPOSE, problem.config.run.spp
-        ).items():
+        taken = sample_gradient(problem, problem.integrator, round, _PURPOSE, problem.config.run.spp)
+        for key, gradient in taken.items():
             finite = dr.select(dr.isfinite(gradient), gradient, 0)
             total[key] = finite if round == 0 else total[key] + finite
         for key, gradient in take_gradient(problem).items():
@@ -106,7 +115,8 @@ def measure_sensitivities(problem: Problem, samples: int) -> list[Sensitivity]:
         noise = rms(np.std(gradients, axis=0, ddof=1))
         square = rms(np.mean(gradients, axis=0)) ** 2 - noise**2 / samples  # less what the noise adds to it
         row = Sensitivity(key, value.size, rms(value), math.sqrt(max(square, 0.0)), noise)
-        found.append(_probe(problem, row, _downhill(total[key]), base, reference))
+        downhill = dr.select(total[key] == 0, 0, -dr.sign(total[key]))
+        found.append(_probe(problem, row, downhill, base, reference))
     problem.apply()
     return found
 
@@ -115,8 +125,7 @@ def _probe(
     problem: Problem, row: Sensitivity, direction: Any, base: Sequence[Array], reference: Sequence[Array]
 ) -> Sensitivity:
     """`row` with what the image tells, along `direction`, where it does."""
-    key = row.key
-    value = dr.detach(problem.optimizer[key])
+    key, value = row.key, dr.detach(problem.optimizer[row.key])
     low, high = problem.selection.spec(key).bounds or (-math.inf, math.inf)
     # 1 % of the parameter, whatever its unit; of its range where it is 0; a guess where it has none.
     step = 0.01 * (rms(np.array(value)) or (high - low if math.isfinite(high - low) else 1.0))
@@ -156,11 +165,6 @@ def _second_difference(problem: Problem, base: Sequence[Array], difference: Sequ
     return total
 
 
-def _downhill(gradient: Any) -> Any:
-    """-1, 0 or 1 in each entry."""
-    return dr.select(gradient == 0, 0, -dr.sign(gradient))
-
-
 def see_images(problem: Problem) -> list[Array]:
     """Every view that is trained on, exposed, without alpha, 0 where it is left out, always from the same seeds."""
     run, images = problem.config.run, []
@@ -170,19 +174,6 @@ def see_images(problem: Problem) -> list[Array]:
         exposed = view.exposure.applied(first_channels(image, view.target.shape[2]))
         images.append(view.kept(np.array(exposed, dtype=np.float64)))
     return images
-
-
-#: Gradient samples that a run takes.
-SAMPLES = 4
-
-
-#: What the optimiser moves in place of a parameter x, by transform.
-_MOVED = {
-    "none": "",
-    "log": " in its logarithm",
-    "sigmoid": " in its logit between the bounds",
-    "softplus": " in log(exp(x) - 1)",
-}
 
 
 def rescale(problem: Problem) -> list[Scaled]:

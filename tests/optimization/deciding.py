@@ -18,11 +18,18 @@ from reslrb_cli.optimization import loop
 from reslrb_cli.optimization.autotune import sampling
 from reslrb_cli.optimization.autotune.estimators import GUIDING_SHARE
 from reslrb_cli.optimization.autotune.race import Sizes, Step, Turns
-from reslrb_cli.optimization.autotune.sampling import GUIDING_LONGER, GuidingPilot, StepTrial
+from reslrb_cli.optimization.autotune.sampling import (
+    FEW_ENTRIES,
+    GUIDING_LONGER,
+    ROUNDS,
+    ROUNDS_OF_FEW,
+    GuidingPilot,
+    StepTrial,
+)
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.records.clock import StepClock
 
-SIZES = Sizes(step=64, call=16, part=16, alone=False, entries=200, lessons=1 / 7, longer=GUIDING_LONGER)
+SIZES = Sizes(step=64, call=16, part=16, alone=False, rounds=ROUNDS, lessons=1 / 7, longer=GUIDING_LONGER)
 
 
 @dataclass
@@ -71,7 +78,12 @@ class World:
 
     def run(self, sizes: Sizes = SIZES, share: float = 2 * GUIDING_SHARE) -> Any:
         """The record of what is decided."""
-        return self.pilot(self, replace(sizes, entries=self.entries, alone=self.alone), 1.0, share).run()
+        return self.pilot(
+            self,
+            replace(sizes, rounds=ROUNDS_OF_FEW if self.entries < FEW_ENTRIES else ROUNDS, alone=self.alone),
+            1.0,
+            share,
+        ).run()
 
 
 def begin(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Path:

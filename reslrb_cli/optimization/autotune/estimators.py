@@ -32,7 +32,6 @@ from reslrb_cli.integrators.reslrb import Reslrb as Tracer
 from reslrb_cli.optimization.autotune.race import (
     ITERATIONS,
     TIMING_NOISE,
-    Asked,
     Gradients,
     Race,
     Step,
@@ -142,15 +141,13 @@ def settle_estimator(tuner: Tuner, options: Sequence[Option]) -> None:
             return EstimatorRecord(chosen=found.options, label=found.label, note=note)
 
         pilot = tuner.decide(
-            Asked(
-                EstimatorRecord,
-                of={},
-                needs=(ESTIMATOR_NEEDS, *(LATER[option][0] for option in _later(problem.config))),
-                integrator=options[0].integrator,
-                measure=lambda allowance: run_pilot(problem, options, allowance),
-                unmeasured=usual,
-                fits=lambda record: any(option.options == record.chosen for option in options),
-            )
+            EstimatorRecord,
+            of={},
+            needs=(ESTIMATOR_NEEDS, *(LATER[option][0] for option in _later(problem.config))),
+            integrator=options[0].integrator,
+            measure=lambda allowance: run_pilot(problem, options, allowance),
+            unmeasured=usual,
+            fits=lambda record: any(option.options == record.chosen for option in options),
         )
         tuner.take(pilot=pilot)
         chosen = next(option for option in options if option.options == pilot.chosen)
@@ -249,20 +246,19 @@ FREE = 0.25
 
 @dataclass
 class _Entry:
-    """What is known of one candidate."""
+    """What is known of one candidate: steps whose times count, and those whose gradients do."""
 
     candidate: Candidate
-    kernel: list[float] = field(default_factory=list)
-    wall: list[float] = field(default_factory=list)
+    steps: list[Step] = field(default_factory=list)
     gradients: list[Gradients] = field(default_factory=list)
 
     @property
     def time(self) -> float:
-        return statistics.median(self.kernel)
+        return statistics.median(step.kernel_ms for step in self.steps)
 
     @property
-    def overhead(self) -> float:
-        return max(statistics.median(self.wall) - self.time, 0.0)
+    def wall(self) -> float:
+        return statistics.median(step.wall_ms for step in self.steps)
 
 
 class Pilot(Race):
@@ -302,8 +298,8 @@ class Pilot(Race):
         for round in range(MOST_ROUNDS):
             # Each is to be timed once. Where first steps count, the first candidate has been already, and waits for the
             # others.
-            for entry in sorted(alive, key=lambda entry: round == 0 and len(entry.kernel) > 0):
-                if not entry.kernel or self._affords(entry):
+            for entry in sorted(alive, key=lambda entry: round == 0 and len(entry.steps) > 0):
+                if not entry.steps or self._affords(entry):
                     self._measure(entry)
             alive = self._contenders(alive)
             if round == 1:
@@ -329,8 +325,7 @@ class Pilot(Race):
             self._first(measured)
             measured = self._step(entry.candidate, round, self._pilot_spp)
         self._spend(measured)
-        entry.kernel.append(measured.kernel_ms)
-        entry.wall.append(measured.wall_ms)
+        entry.steps.append(measured)
         entry.gradients.append(measured.gradients)
 
     def _choose_size(self, entry: _Entry) -> None:
@@ -354,10 +349,10 @@ class Pilot(Race):
     def _run_ms(self) -> float:
         """Time of a run of ITERATIONS by the fastest candidate so far."""
         scale = self._spp / self._pilot_spp
-        return ITERATIONS * min(entry.overhead + entry.time * scale for entry in self._entries if entry.kernel)
+        return ITERATIONS * min(max(e.wall - e.time, 0.0) + e.time * scale for e in self._entries if e.steps)
 
     def _affords(self, entry: _Entry) -> bool:
-        return self._spent_ms + statistics.median(entry.wall) <= PLANNED * self._share * self._run_ms()
+        return self._spent_ms + entry.wall <= PLANNED * self._share * self._run_ms()
 
     # --- judging ------------------------------------------------------------------------------------------------------
 
@@ -393,7 +388,7 @@ class Pilot(Race):
         best = max(alive, key=self._efficiency)
         kept = []
         for entry in alive:
-            rounds = min(len(entry.kernel), len(best.kernel))
+            rounds = min(len(entry.steps), len(best.steps))
             limit = min((factor for least, factor in DROPPED if rounds >= least), default=math.inf)
             slower = any(
                 other.candidate.exact
@@ -456,7 +451,7 @@ class Pilot(Race):
             entry, row = measured.get(candidate.label), TriedEstimator(name, options, 0)
             if entry is not None:
                 time, variance = entry.time, self._variance(entry)
-                row = TriedEstimator(name, options, len(entry.kernel), time, variance, self._efficiency(entry))
+                row = TriedEstimator(name, options, len(entry.steps), time, variance, self._efficiency(entry))
             rows.append(replace(row, note=self._notes.get(candidate.label, "")))
         return EstimatorRecord(
             chosen=best.candidate.options,

@@ -1,7 +1,7 @@
 """Races of candidates before a run's first iteration: what they may cost, how they compare, what is kept of them.
 
-- `Tuner.decide`: one decision, of which an `Asked` says what it depends on, takes and is without measuring. It is what
-  an earlier run kept, else what is measured now, where the run is long enough for that.
+- `Tuner.decide`: one decision, which is what an earlier run kept, else what is measured now, where the run is long
+  enough for that.
 - `compare`: how much more efficient one way of sampling a gradient is than another, by steps of both, and how sure:
 
       gain = (variance * time of the one) / (variance * time of the other)
@@ -61,23 +61,6 @@ logger = logging.getLogger(__name__)
 # --- one decision -----------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class Asked(Generic[Record]):
-    """A question that `measure` answers, by steps of `integrator` and others.
-
-    `of` is what the answer depends on besides the situation, `needs` what measuring takes at least that says anything
-    (`Allowance.affords`), `unmeasured` the answer without, with a note. What was kept answers it if it `fits`.
-    """
-
-    kind: type[Record]
-    of: dict[str, Any]
-    needs: Sequence[tuple[float, float]]
-    integrator: Tracer
-    measure: Callable[[Allowance], Record]
-    unmeasured: Callable[[str], Record]
-    fits: Callable[[Record], bool] = lambda record: True
-
-
 class Tuner:
     """Decides; `problem` is the one that was given, with what has been decided since.
 
@@ -102,26 +85,39 @@ class Tuner:
             if each not in brief:
                 self.say(each.line(cost=verbose))
 
-    def decide(self, asked: Asked[Record]) -> Record:
-        """What an earlier run measured and kept, else what is measured now, and kept."""
+    def decide(
+        self,
+        kind: type[Record],
+        of: dict[str, Any],
+        needs: Sequence[tuple[float, float]],
+        integrator: Tracer,
+        measure: Callable[[Allowance], Record],
+        unmeasured: Callable[[str], Record],
+        fits: Callable[[Record], bool] = lambda record: True,
+    ) -> Record:
+        """What an earlier run measured and kept, if it `fits`; else what `measure` finds now, which is kept.
+
+        `of` is what that depends on besides the situation, `needs` what measuring by steps of `integrator` and others
+        takes at least that says anything (`Allowance.affords`), `unmeasured` the decision without, with a note.
+        """
         key = ""
         if self._cache is not None:
-            key = key_of({**asked.of, **situation(self.problem)})
+            key = key_of({**of, **situation(self.problem)})
             try:
-                kept = replace(asked.kind.from_json(self._cache.get(key)), cached=True)
-                if asked.fits(kept):
+                kept = replace(kind.from_json(self._cache.get(key)), cached=True)
+                if fits(kept):
                     return kept
             except TypeError:
                 pass  # nothing there, or nothing that this version wrote
-        allowance = self.allowance(asked.integrator)
-        if not allowance.affords(*asked.needs):
-            record = asked.unmeasured(allowance.note())
+        allowance = self.allowance(integrator)
+        if not allowance.affords(*needs):
+            record = unmeasured(allowance.note())
             self._unmeasured.append(record)
             return record
         if not allowance.spent_s:
             self.say("measuring what pays here, before the first iteration")
         with allowance.counted():
-            record = asked.measure(allowance)
+            record = measure(allowance)
         logger.debug(allowance.line())
         if self._cache is not None:
             self._cache.put(key, record.to_json())
@@ -281,8 +277,6 @@ class Race:
 
 # --- two ways in turns ------------------------------------------------------------------------------------------------
 
-#: Rounds that are planned for, of gradients of many entries, and of few, which tell less each.
-ROUNDS, ROUNDS_OF_FEW, FEW_ENTRIES = 8, 16, 64
 #: Fewer rounds than these say nothing.
 LEAST_ROUNDS = 4
 #: Whenever as many rounds have been taken as are planned for it is asked whether it is clear, so often at the most.
@@ -300,23 +294,18 @@ LEARNING_SHARE, LEARNINGS = 0.4, 2
 @dataclass(frozen=True)
 class Sizes:
     """Samples per pixel: of a step of the run (`step`), of each set of its samples that has one dL/dI (`call`), and of
-    a pass of these (`part`). `alone`: images have samples of their own. `entries` are those of all gradients.
-    `lessons` says how often tables of guided emission learn for each such set, in the mean over the run. A step of the
-    other kind may take `longer` times as long as one of this; `planned` are PLANNED, or less."""
+    a pass of these (`part`). `alone`: images have samples of their own. `rounds` are planned for. `lessons` says how
+    often tables of guided emission learn for each such set, in the mean over the run. A step of the other kind may take
+    `longer` times as long as one of this; `planned` are PLANNED, or less."""
 
     step: int
     call: int
     part: int
     alone: bool
-    entries: int
+    rounds: int
     lessons: float
     longer: float
     planned: float = PLANNED
-
-    @property
-    def rounds(self) -> int:
-        """How many rounds are planned for."""
-        return ROUNDS_OF_FEW if self.entries < FEW_ENTRIES else ROUNDS
 
     @property
     def trial(self) -> int:
@@ -350,7 +339,7 @@ class Turns(Race, Generic[Record]):
     """One decision. `views` is how many times the views of an iteration are those of a step here, `share` what of
     ITERATIONS this may cost, and `most` what of them the least number of rounds may, where that is more."""
 
-    LEAST = LEAST_ROUNDS
+    LEAST, LOOKS = LEAST_ROUNDS, LOOKS
 
     def __init__(self, trial: Trial, sizes: Sizes, views: float, share: float, most: float = 0.0) -> None:
         super().__init__()
@@ -370,7 +359,7 @@ class Turns(Race, Generic[Record]):
         if not self._learned(kernels + 2 * plain.beside_ms):
             return self._off(f"to measure it would cost more than {100 * self._most:.2g} % of {ITERATIONS} iterations")
         self._first(self._trial.take(True, 0, spp))
-        for round in range(1, 1 + self._most_rounds):
+        for round in range(1, 1 + self.LOOKS * self._sizes.rounds):
             both = [self._spend(self._trial.take(other, round, spp)) for other in (False, True)]
             for other, step in zip((False, True), both, strict=True):
                 self._steps[other].append(step)
@@ -380,10 +369,6 @@ class Turns(Race, Generic[Record]):
             if round % self._sizes.rounds == 0 and self._is_clear():
                 break
         return self._decided()
-
-    @property
-    def _most_rounds(self) -> int:
-        return LOOKS * self._sizes.rounds
 
     def _learned(self, round_ms: float) -> bool:
         """Have the table learn, if it has not; False where that, and rounds of so long, cannot be afforded."""
@@ -440,18 +425,17 @@ class Turns(Race, Generic[Record]):
             own = [statistics.median(step.image_ms for step in steps) for steps in (plain, other)]
             beside = beside[0] + own[0], beside[1] + own[images]
         times = [[s.kernel_ms + more for s in steps] for steps, more in zip((plain, other), beside, strict=True)]
-        gradients = [[step.gradients for step in steps] for steps in (plain, other)]
-        return compare(gradients[0], times[0], gradients[1], times[1], confidence)
+        return compare([s.gradients for s in plain], times[0], [s.gradients for s in other], times[1], confidence)
 
     def _image_gain(self) -> Gain:
         """Of the image: of samples of its own, where it has them, else of those that serve the gradient too."""
         plain, other = self._steps[False], self._steps[True]
-        images = [[step.images for step in steps] for steps in (plain, other)]
-        times = [[s.image_ms if self._sizes.alone else s.kernel_ms for s in steps] for steps in (plain, other)]
-        if not self._sizes.alone:  # else both count once, with the gradient
+        if self._sizes.alone:  # else what goes on beside kernels counts here, not with the gradient alone
+            times = [[step.image_ms for step in steps] for steps in (plain, other)]
+        else:
             more = self._python_ms, self._python_ms + self._more_ms()
-            times = [[ms + one for ms in row] for row, one in zip(times, more, strict=True)]
-        return compare(images[0], times[0], images[1], times[1])
+            times = [[s.kernel_ms + one for s in steps] for steps, one in zip((plain, other), more, strict=True)]
+        return compare([s.images for s in plain], times[0], [s.images for s in other], times[1])
 
     def _is_clear(self) -> bool:
         """Whether no more steps are needed: it is not on by accident, or off at all events."""

@@ -41,7 +41,6 @@ from reslrb_cli.optimization.autotune.estimators import (
 from reslrb_cli.optimization.autotune.race import (
     ITERATIONS,
     PLANNED,
-    Asked,
     Say,
     Sizes,
     Step,
@@ -60,6 +59,8 @@ from reslrb_cli.records.decisions import GuidedRecord, SequenceRecord
 from reslrb_cli.seeds import seed
 from reslrb_cli.statistics import Array
 
+#: Rounds that are planned for, of gradients of many entries, and of few, which tell less each.
+ROUNDS, ROUNDS_OF_FEW, FEW_ENTRIES = 8, 16, 64
 #: A guided step, or one with low-discrepancy numbers, may take so many times as long as another.
 GUIDING_LONGER, SEQUENCE_LONGER = 3.0, 1.25
 #: What of the share the rounds of the sequence are planned for; the first step takes a part too, and is no round.
@@ -147,7 +148,8 @@ def sizes(problem: Problem, longer: float, planned: float = PLANNED) -> Sizes:
     part = min(problem.samples_per_pass or call, call)
     entries = sum(problem.selection.array(key).size for key in problem.selection.keys)
     sets = run.spp / call * len(problem.drawn(0))
-    return Sizes(run.spp, call, part, adjoint == "independent", entries, lessons(problem) / sets, longer, planned)
+    rounds = ROUNDS_OF_FEW if entries < FEW_ENTRIES else ROUNDS
+    return Sizes(run.spp, call, part, adjoint == "independent", rounds, lessons(problem) / sets, longer, planned)
 
 
 def planned(share: float) -> float:
@@ -205,16 +207,14 @@ def _guided(tuner: Tuner, trials: list[StepTrial]) -> GuidedRecord:
         return GuidingPilot(trials[-1], plan, trials[-1].part_of_views(), share).run()
 
     return tuner.decide(
-        Asked(
-            GuidedRecord,
-            # Learning is a larger part of a short run, where tables learn most often at first.
-            of={"guiding": 4, "of": _chosen(problem), "lessons": plan.lessons},
-            # Where even numbers are likely to do better, to measure guiding alone would mislead.
-            needs=(GUIDING_NEEDS, *([] if why is None else 2 * [SEQUENCE_NEEDS])),
-            integrator=problem.integrator,
-            measure=measure,
-            unmeasured=lambda note: GuidedRecord(guided=False, note=f"{note}; {why or 'it pays in long runs'}"),
-        )
+        GuidedRecord,
+        # Learning is a larger part of a short run, where tables learn most often at first.
+        of={"guiding": 4, "of": _chosen(problem), "lessons": plan.lessons},
+        # Where even numbers are likely to do better, to measure guiding alone would mislead.
+        needs=(GUIDING_NEEDS, *([] if why is None else 2 * [SEQUENCE_NEEDS])),
+        integrator=problem.integrator,
+        measure=measure,
+        unmeasured=lambda note: GuidedRecord(guided=False, note=f"{note}; {why or 'it pays in long runs'}"),
     )
 
 
@@ -263,7 +263,7 @@ def _sequence(tuner: Tuner, trials: list[StepTrial]) -> SequenceRecord:
 
     guided = None if found is None else [found.guided, found.images]
     of = {"sequence": 1, "of": [_chosen(problem), guided]}
-    return tuner.decide(Asked(SequenceRecord, of, [SEQUENCE_NEEDS], plain, measure, unmeasured))
+    return tuner.decide(SequenceRecord, of, [SEQUENCE_NEEDS], plain, measure, unmeasured)
 
 
 # --- steps ------------------------------------------------------------------------------------------------------------
