@@ -12,18 +12,7 @@ from typing import Any
 from reslrb_cli.integrators.step import make_integrator
 from reslrb_cli.measure.gradients import moves_light
 from reslrb_cli.measure.references import Situation, prb_gradient
-from reslrb_cli.optimization.autotune.race import (
-    CONFIDENCE,
-    ITERATIONS,
-    Gain,
-    Sizes,
-    Step,
-    Tuner,
-    Turns,
-    compare,
-    measured_step,
-    sets_of,
-)
+from reslrb_cli.optimization.autotune import race
 from reslrb_cli.optimization.decisions import Allowance, Cache
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.records.clock import StepClock
@@ -54,12 +43,12 @@ def measure_rival(problem: Problem, cache: Cache | None, say: Callable[[str], No
         left = allowance.iterations_left(NEEDS[0])
         spp, run = pilot.spp or _samples(problem, left), problem.config.run
         planned = float(run.spp * MOST_ROUNDS)  # as many samples as there are
-        sizes = Sizes(run.spp, spp, spp, False, MOST_ROUNDS, 0.0, LONGER, planned)
-        share, most = (min(each, left / ITERATIONS) for each in (SHARE, MOST_SHARE))
+        sizes = race.Sizes(run.spp, spp, spp, False, MOST_ROUNDS, 0.0, LONGER, planned)
+        share, most = (min(each, left / race.ITERATIONS) for each in (SHARE, MOST_SHARE))
         return RivalTurns(RivalTrial(problem), sizes, 1.0, share, most).run()
 
     beside = [pilot.chosen, guided and guided.guided, sequence and sequence.low_discrepancy]
-    return Tuner(problem, say, cache).decide(
+    return race.Tuner(problem, say, cache).decide(
         RivalRecord,
         of={"rival": RIVAL, "beside": beside},
         needs=[NEEDS],
@@ -87,7 +76,7 @@ def why_not(problem: Problem) -> str | None:
 
 def _samples(problem: Problem, iterations: float) -> int:
     """Samples per pixel of steps, with which the rounds that there are to be take so many iterations' worth of time."""
-    run, unit = problem.config.run, sets_of(problem.config)
+    run, unit = problem.config.run, race.sets_of(problem.config)
     share = min(iterations / ((1 + LONGER) * MOST_ROUNDS), 1.0)
     return max(int(share * run.spp) // unit, 1) * unit
 
@@ -104,25 +93,23 @@ class RivalTrial:
         own = problem.integrator.to_measure().with_options(samples_per_pass=None, freeze=False)
         self._problem, self._clock, self._integrators = problem, StepClock(), {True: rival, False: own}
 
-    def learn(self, round: int, spp: int) -> Step:
+    def learn(self, round: int, spp: int) -> race.Step:
         """Nothing is learned here."""
         raise NotImplementedError
 
-    def take(self, other: bool, round: int, spp: int) -> Step:
+    def take(self, other: bool, round: int, spp: int) -> race.Step:
         """One step of all views."""
-        return measured_step(self._problem, self._integrators[other], self._clock, round, spp)
+        return race.measured_step(self._problem, self._integrators[other], self._clock, round, spp)
 
 
-class RivalTurns(Turns[RivalRecord]):
+class RivalTurns(race.Turns[RivalRecord]):
     """One decision: whether `prb` is the more efficient. What Python takes beside the kernels is left out."""
 
     LEAST, LOOKS = LEAST_ROUNDS, 1
 
-    def _gain(self, images: bool, confidence: float = CONFIDENCE) -> Gain:
-        own, other = self._steps[False], self._steps[True]
-        times = [[step.kernel_ms for step in steps] for steps in (own, other)]
-        return compare([s.gradients for s in own], times[0], [s.gradients for s in other], times[1], confidence)
+    def _times(self, other: bool, images: bool) -> list[float]:
+        return [step.kernel_ms for step in self._steps[other]]
 
-    def _record(self, other: bool, images: bool, gain: Gain, picture: Gain, note: str) -> RivalRecord:
+    def _record(self, other: bool, images: bool, gain: race.Gain, picture: race.Gain, note: str) -> RivalRecord:
         found: dict[str, Any] = dict(zip(("advantage", "low", "high"), gain, strict=True)) | self._cost()
         return RivalRecord(integrator=RIVAL, rounds=len(self._steps[True]), spp=self._sizes.trial, note=note, **found)

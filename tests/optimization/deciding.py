@@ -15,9 +15,8 @@ from cli import tiny
 
 from reslrb_cli.cli import main
 from reslrb_cli.optimization import loop
-from reslrb_cli.optimization.autotune import sampling
-from reslrb_cli.optimization.autotune.estimators import GUIDING_SHARE
-from reslrb_cli.optimization.autotune.race import Sizes, Step, Turns
+from reslrb_cli.optimization.autotune import race
+from reslrb_cli.optimization.autotune.race import GUIDING_SHARE, Sizes, Step, Turns
 from reslrb_cli.optimization.autotune.sampling import (
     FEW_ENTRIES,
     GUIDING_LONGER,
@@ -97,7 +96,7 @@ def begin(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def fix_times(monkeypatch: pytest.MonkeyPatch, other_ms: Mapping[str, float]) -> None:
     """Have a step take 1 ms, one of the other kind what is given for what is decided, and a walk to learn from 1 ms."""
-    monkeypatch.setattr(sampling, "timed", lambda times: Step(kernel_ms=1.0, wall_ms=1.0))
+    monkeypatch.setattr(race, "timed", lambda times, wall_ms=None: Step(kernel_ms=1.0, wall_ms=1.0))
     take = StepTrial.take
 
     def timed(self: StepTrial, other: bool, round: int, spp: int) -> Step:

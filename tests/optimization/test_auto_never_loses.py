@@ -24,8 +24,8 @@ from reslrb_cli.measure.extreme.suite import ExtremeCase
 from reslrb_cli.measure.gradients import integrator
 from reslrb_cli.measure.scenes.small import load as load_scene
 from reslrb_cli.optimization.assemble import assemble_scene
-from reslrb_cli.optimization.autotune.estimators import SHARE, Option, find_options
-from reslrb_cli.optimization.autotune.race import is_auto
+from reslrb_cli.optimization.autotune.estimators import Option, find_options
+from reslrb_cli.optimization.autotune.race import SHARE, is_auto
 from reslrb_cli.optimization.autotune.sampling import GuidingPilot, SequencePilot, settle
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.targets import make_targets

@@ -11,7 +11,7 @@ from reslrb_cli.config.loader import load
 from reslrb_cli.guiding.tables import Guiding
 from reslrb_cli.optimization import loop
 from reslrb_cli.optimization.assemble import assemble
-from reslrb_cli.optimization.autotune.sampling import lessons, sizes
+from reslrb_cli.optimization.autotune.sampling import FEW_ENTRIES, ROUNDS, ROUNDS_OF_FEW, lessons, sizes
 from reslrb_cli.optimization.forecast import _with_learning
 
 
@@ -36,6 +36,8 @@ def test_a_run_learns_as_often_as_is_said_of_it(
         loop.gradient(problem, iteration, loop.Split())
     assert sum(learned) == pytest.approx(iterations * lessons(problem))
     size = sizes(problem, 1.0)
+    few = sum(problem.selection.array(key).size for key in problem.selection.keys) < FEW_ENTRIES
+    assert size.rounds == (ROUNDS_OF_FEW if few else ROUNDS)
     assert size.lessons * size.step / size.call == pytest.approx(lessons(problem))
 
 

@@ -9,8 +9,15 @@ import numpy as np
 import pytest
 from optimization.deciding import SIZES, World
 
-from reslrb_cli.optimization.autotune.estimators import GUIDING_SHARE
-from reslrb_cli.optimization.autotune.race import ITERATIONS, LEARNINGS, LEAST_ROUNDS, LOOKS, TIMING_NOISE, Sizes
+from reslrb_cli.optimization.autotune.race import (
+    GUIDING_SHARE,
+    ITERATIONS,
+    LEARNINGS,
+    LEAST_ROUNDS,
+    LOOKS,
+    TIMING_NOISE,
+    Sizes,
+)
 from reslrb_cli.optimization.autotune.sampling import GUIDING_LONGER, GuidingPilot
 from reslrb_cli.records.decisions import GuidedRecord
 

@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from reslrb_cli.optimization.autotune.estimators import GUIDING_SHARE, SHARE, Candidate, Pilot
-from reslrb_cli.optimization.autotune.race import ITERATIONS, Step
+from reslrb_cli.optimization.autotune.estimators import Candidate, Pilot
+from reslrb_cli.optimization.autotune.race import GUIDING_SHARE, ITERATIONS, SHARE, Step
 from reslrb_cli.optimization.decisions import Allowance
 from reslrb_cli.records.decisions import EstimatorRecord
 

@@ -10,9 +10,17 @@ import numpy as np
 import pytest
 from optimization.deciding import SIZES, World
 
-from reslrb_cli.optimization.autotune.estimators import GUIDING_SHARE, SEQUENCE_SHARE
-from reslrb_cli.optimization.autotune.estimators import SHARE as PILOT_SHARE
-from reslrb_cli.optimization.autotune.race import ITERATIONS, LEARNINGS, LEAST_ROUNDS, LOOKS, PLANNED, Sizes
+from reslrb_cli.optimization.autotune.race import (
+    GUIDING_SHARE,
+    ITERATIONS,
+    LEARNINGS,
+    LEAST_ROUNDS,
+    LOOKS,
+    PLANNED,
+    SEQUENCE_SHARE,
+    Sizes,
+)
+from reslrb_cli.optimization.autotune.race import SHARE as PILOT_SHARE
 from reslrb_cli.optimization.autotune.sampling import SEQUENCE_LONGER, SequencePilot, planned, share_left
 from reslrb_cli.optimization.decisions import Allowance
 from reslrb_cli.records.decisions import GuidedRecord, SequenceRecord

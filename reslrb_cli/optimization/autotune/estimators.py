@@ -29,17 +29,7 @@ from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.estimators import ESTIMATORS
 from reslrb_cli.integrators.reslrb import Reslrb as Tracer
-from reslrb_cli.optimization.autotune.race import (
-    ITERATIONS,
-    TIMING_NOISE,
-    Gradients,
-    Race,
-    Step,
-    Tuner,
-    is_auto,
-    measured_step,
-    sets_of,
-)
+from reslrb_cli.optimization.autotune import race
 from reslrb_cli.optimization.decisions import Allowance, MemoryPlan
 from reslrb_cli.optimization.loading import pass_spp
 from reslrb_cli.optimization.memory import check_baseline, check_memory, choose_samples, standing
@@ -48,16 +38,6 @@ from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.records.clock import MIB, StepClock
 from reslrb_cli.records.decisions import EstimatorRecord, TriedEstimator
 from reslrb_cli.statistics import Array, sum_of_squares
-
-#: Share of a run of ITERATIONS that all measuring but for that of `prb` may cost, compilation apart; that of whether
-#: guiding pays is planned for (where it is not clear by then, it may take what the pilot has left of its own), and that
-#: of the sequence is left by what is measured before.
-SHARE, GUIDING_SHARE, SEQUENCE_SHARE = 0.05, 0.025, 0.005
-#: What measurements take at least that say anything: kernels to compile, in those of one step, and iterations' worth of
-#: work. Compiling is that of both kinds of steps, and of walks that are learned from.
-ESTIMATOR_NEEDS, GUIDING_NEEDS, SEQUENCE_NEEDS = (4.0, 4.0), (2.5, 3.0), (2.5, 1.0)
-#: What is measured once the estimator is settled.
-LATER = {"guiding": (GUIDING_NEEDS, GUIDING_SHARE), "sequence": (SEQUENCE_NEEDS, SEQUENCE_SHARE)}
 
 
 @dataclass
@@ -108,7 +88,7 @@ def _fitting(problem: Problem, integrator: ReslrbConfig, choices: list[dict[str,
         if budget is None:
             options.append(Option(choice, made, None))
             continue
-        samples = run.spp // sets_of(problem.config)
+        samples = run.spp // race.sets_of(problem.config)
         size, expected = choose_samples(problem, made, samples, budget, fixed)
         if size == 0:
             least.append(expected.total)
@@ -124,7 +104,7 @@ def _fitting(problem: Problem, integrator: ReslrbConfig, choices: list[dict[str,
     return options
 
 
-def settle_estimator(tuner: Tuner, options: Sequence[Option]) -> None:
+def settle_estimator(tuner: race.Tuner, options: Sequence[Option]) -> None:
     """Have the integrator of the tuner's problem be the best of the options; of several a pilot finds it.
 
     What moves light leaves one estimator, which needs no pilot.
@@ -143,7 +123,7 @@ def settle_estimator(tuner: Tuner, options: Sequence[Option]) -> None:
         pilot = tuner.decide(
             EstimatorRecord,
             of={},
-            needs=(ESTIMATOR_NEEDS, *(LATER[option][0] for option in _later(problem.config))),
+            needs=(race.ESTIMATOR_NEEDS, *(race.LATER[option][0] for option in _later(problem.config))),
             integrator=options[0].integrator,
             measure=lambda allowance: run_pilot(problem, options, allowance),
             unmeasured=usual,
@@ -158,7 +138,7 @@ def settle_estimator(tuner: Tuner, options: Sequence[Option]) -> None:
 
 def _later(config: Config) -> list[str]:
     """The options that are measured once the estimator is settled."""
-    return [option for option in LATER if is_auto(config, option)]
+    return [option for option in race.LATER if race.is_auto(config, option)]
 
 
 # --- the pilot --------------------------------------------------------------------------------------------------------
@@ -197,30 +177,30 @@ def _candidate(option: Option) -> Candidate:
 
 def run_pilot(problem: Problem, options: Sequence[Option], allowance: Allowance) -> EstimatorRecord:
     """Measure the options, and say which is the most efficient."""
-    run, sets, clock = problem.config.run, sets_of(problem.config), StepClock()
+    run, sets, clock = problem.config.run, race.sets_of(problem.config), StepClock()
     made = [_candidate(option) for option in options]
     integrators = {c.label: option.integrator.to_measure() for c, option in zip(made, options, strict=True)}
 
-    def step(candidate: Candidate, round: int, spp: int) -> Step:
+    def step(candidate: Candidate, round: int, spp: int) -> race.Step:
         integrator = integrators[candidate.label]
         samples = integrator.samples_per_pass if candidate.passes == 1 else spp // (sets * candidate.passes)
         # Few steps of each sample count: a recording would cost more than it saves.
         integrator = integrator.with_options(samples_per_pass=samples, freeze=False)
-        return measured_step(problem, integrator, clock, round, spp)
+        return race.measured_step(problem, integrator, clock, round, spp)
 
     unit = sets * max(candidate.passes for candidate in made)
     if problem.samples_per_pass is not None:  # the user's own passes
         unit = sets * min(problem.samples_per_pass, run.spp // sets)
     # What is measured later has its part of what it may cost; guiding leaves some of its own for the sequence.
-    later = [LATER[option] for option in _later(problem.config)]
+    later = [race.LATER[option] for option in _later(problem.config)]
     reserved = max((share for _, share in later), default=0.0)
     kernels, began = sum(needs[0] for needs, _ in later), time.perf_counter()
-    share = min(SHARE, allowance.iterations_left(ESTIMATOR_NEEDS[0] + kernels) / ITERATIONS) - reserved
+    share = min(race.SHARE, allowance.iterations_left(race.ESTIMATOR_NEEDS[0] + kernels) / race.ITERATIONS) - reserved
 
     def compiles() -> bool:
         """Whether there is time for the kernels of one more candidate, with those of what is measured later."""
         spent = replace(allowance, spent_s=allowance.spent_s + time.perf_counter() - began)
-        return spent.affords((1 + kernels, reserved * ITERATIONS))
+        return spent.affords((1 + kernels, reserved * race.ITERATIONS))
 
     return Pilot(made, step, run.spp, unit, share, compiles).run()
 
@@ -249,8 +229,8 @@ class _Entry:
     """What is known of one candidate: steps whose times count, and those whose gradients do."""
 
     candidate: Candidate
-    steps: list[Step] = field(default_factory=list)
-    gradients: list[Gradients] = field(default_factory=list)
+    steps: list[race.Step] = field(default_factory=list)
+    gradients: list[race.Gradients] = field(default_factory=list)
 
     @property
     def time(self) -> float:
@@ -261,7 +241,7 @@ class _Entry:
         return statistics.median(step.wall_ms for step in self.steps)
 
 
-class Pilot(Race):
+class Pilot(race.Race):
     """One pilot. `step(candidate, round, spp)` takes a step; equal rounds have equal seeds.
 
     `spp` are those of the run, of which the pilot uses a multiple of `unit`, and `share` is what it may cost of one.
@@ -271,10 +251,10 @@ class Pilot(Race):
     def __init__(
         self,
         candidates: Sequence[Candidate],
-        step: Callable[[Candidate, int, int], Step],
+        step: Callable[[Candidate, int, int], race.Step],
         spp: int,
         unit: int = 1,
-        share: float = SHARE,
+        share: float = race.SHARE,
         compiles: Callable[[], bool] = lambda: True,
     ) -> None:
         super().__init__()
@@ -337,7 +317,7 @@ class Pilot(Race):
         first = self._step(entry.candidate, 0, self._unit)
         self._spent_ms += first.wall_ms
         overhead, slope = first.beside_ms, max(first.kernel_ms, 1e-6) / self._unit
-        budget = PLANNED * self._share * ITERATIONS * (overhead + slope * self._spp) - first.wall_ms
+        budget = PLANNED * self._share * race.ITERATIONS * (overhead + slope * self._spp) - first.wall_ms
         for steps in PLANNED_STEPS:
             fits = int((budget / steps - overhead) / slope) // self._unit * self._unit
             if fits >= self._unit:
@@ -349,14 +329,14 @@ class Pilot(Race):
     def _run_ms(self) -> float:
         """Time of a run of ITERATIONS by the fastest candidate so far."""
         scale = self._spp / self._pilot_spp
-        return ITERATIONS * min(max(e.wall - e.time, 0.0) + e.time * scale for e in self._entries if e.steps)
+        return race.ITERATIONS * min(max(e.wall - e.time, 0.0) + e.time * scale for e in self._entries if e.steps)
 
     def _affords(self, entry: _Entry) -> bool:
         return self._spent_ms + entry.wall <= PLANNED * self._share * self._run_ms()
 
     # --- judging ------------------------------------------------------------------------------------------------------
 
-    def _references(self, passes: int) -> list[Gradients]:
+    def _references(self, passes: int) -> list[race.Gradients]:
         """The exact gradient of each round on the same paths."""
         exact = [e.gradients for e in self._entries if e.candidate.exact and e.candidate.passes == passes]
         return max(exact, key=len, default=[])
@@ -393,7 +373,7 @@ class Pilot(Race):
             slower = any(
                 other.candidate.exact
                 and other.candidate.passes == entry.candidate.passes
-                and other.time * TIMING_NOISE < entry.time
+                and other.time * race.TIMING_NOISE < entry.time
                 for other in alive
             )
             # No estimator has less variance than an exact one of the same paths.
@@ -415,7 +395,7 @@ class Pilot(Race):
                 [relative] = [c for c in self._candidates if c.label == relative.parent]
                 parent = labels.get(relative.label)
             bound = self._bound(candidate, parent)
-            if bound * TIMING_NOISE < best:
+            if bound * race.TIMING_NOISE < best:
                 self._notes[candidate.label] = f"not measured: at most {bound / best:.2f} of the best's efficiency"
             elif not (self._affords(parent) and self._compiles()):
                 self._notes[candidate.label] = (

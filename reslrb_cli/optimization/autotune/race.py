@@ -43,6 +43,15 @@ from reslrb_cli.statistics import Array, jackknife_variance, sum_of_squares
 
 #: Iterations of the run that what measuring costs is a share of.
 ITERATIONS = 200
+#: Share of a run of ITERATIONS that all measuring but for that of `prb` may cost, compilation apart; that of whether
+#: guiding pays is planned for (where it is not clear by then, it may take what the pilot has left of its own), and that
+#: of the sequence is left by what is measured before.
+SHARE, GUIDING_SHARE, SEQUENCE_SHARE = 0.05, 0.025, 0.005
+#: What measurements take at least that say anything: kernels to compile, in those of one step, and iterations' worth of
+#: work. Compiling is that of both kinds of steps, and of walks that are learned from.
+ESTIMATOR_NEEDS, GUIDING_NEEDS, SEQUENCE_NEEDS = (4.0, 4.0), (2.5, 3.0), (2.5, 1.0)
+#: What is measured once the estimator is settled.
+LATER = {"guiding": (GUIDING_NEEDS, GUIDING_SHARE), "sequence": (SEQUENCE_NEEDS, SEQUENCE_SHARE)}
 #: Relative error of a single time that must not decide anything.
 TIMING_NOISE = 1.1
 CONFIDENCE = 0.95
@@ -340,29 +349,32 @@ class Turns(Race, Generic[Record]):
     ITERATIONS this may cost, and `most` what of them the least number of rounds may, where that is more."""
 
     LEAST, LOOKS = LEAST_ROUNDS, LOOKS
+    #: Whether it is decided apart for images that have samples of their own.
+    APART = False
 
     def __init__(self, trial: Trial, sizes: Sizes, views: float, share: float, most: float = 0.0) -> None:
         super().__init__()
         self._trial, self._sizes, self._views, self._share, self._most = trial, sizes, views, share, max(share, most)
+        self._apart = self.APART and sizes.alone
         self._plain: list[Step] = []  # all steps as they are whose times count
         self._steps: dict[bool, list[Step]] = {False: [], True: []}
         self._walk = Step()
 
     def run(self) -> Record:
         """Measure, and decide."""
-        spp = self._sizes.trial
-        self._first(self._trial.take(False, 0, spp))
-        plain = self._spend(self._trial.take(False, 0, spp))
+        spp, take = self._sizes.trial, self._trial.take
+        self._first(take(False, 0, spp))
+        plain = self._spend(take(False, 0, spp))
         self._plain.append(plain)
         # What Python takes is the same for both.
         kernels = (1 + self._sizes.longer) * (plain.kernel_ms + plain.image_ms)
         if not self._learned(kernels + 2 * plain.beside_ms):
             return self._off(f"to measure it would cost more than {100 * self._most:.2g} % of {ITERATIONS} iterations")
-        self._first(self._trial.take(True, 0, spp))
+        self._first(take(True, 0, spp))
         for round in range(1, 1 + self.LOOKS * self._sizes.rounds):
-            both = [self._spend(self._trial.take(other, round, spp)) for other in (False, True)]
-            for other, step in zip((False, True), both, strict=True):
-                self._steps[other].append(step)
+            both = [self._spend(take(other, round, spp)) for other in (False, True)]
+            for other, step in enumerate(both):
+                self._steps[bool(other)].append(step)
             self._plain.append(both[0])
             if not self._affords(sum(step.wall_ms for step in both)):
                 break
@@ -402,13 +414,6 @@ class Turns(Race, Generic[Record]):
         share = self._share if len(self._steps[True]) >= self.LEAST else self._most
         return self._spent_ms + more_ms <= share * ITERATIONS * self._iteration_ms
 
-    # What decisions differ in.
-
-    @property
-    def _apart(self) -> bool:
-        """Whether it is decided apart for images that have samples of their own."""
-        return False
-
     def _more_ms(self) -> float:
         """What a step of the other kind, of `trial` samples, takes in a run beside its own kernels."""
         return 0.0
@@ -417,25 +422,25 @@ class Turns(Race, Generic[Record]):
         """The record of a decision, `found` what all of them hold."""
         raise NotImplementedError
 
-    def _gain(self, images: bool, confidence: float = CONFIDENCE) -> Gain:
-        """Of the gradient, as part of steps whose images, where they have samples of their own, are drawn so or not."""
-        plain, other = self._steps[False], self._steps[True]
-        beside = self._python_ms, self._python_ms + self._more_ms()
+    def _times(self, other: bool, images: bool) -> list[float]:
+        """Of steps of one kind, whose images, where they have samples of their own, are drawn the other way or not."""
+        beside = self._python_ms + (self._more_ms() if other else 0.0)
         if self._sizes.alone:
-            own = [statistics.median(step.image_ms for step in steps) for steps in (plain, other)]
-            beside = beside[0] + own[0], beside[1] + own[images]
-        times = [[s.kernel_ms + more for s in steps] for steps, more in zip((plain, other), beside, strict=True)]
-        return compare([s.gradients for s in plain], times[0], [s.gradients for s in other], times[1], confidence)
+            beside += statistics.median(step.image_ms for step in self._steps[other and images])
+        return [step.kernel_ms + beside for step in self._steps[other]]
+
+    def _gain(self, images: bool, confidence: float = CONFIDENCE) -> Gain:
+        """Of the gradient, as part of steps whose images are drawn the other way or not."""
+        gradients = [[step.gradients for step in self._steps[other]] for other in (False, True)]
+        return compare(gradients[0], self._times(False, images), gradients[1], self._times(True, images), confidence)
 
     def _image_gain(self) -> Gain:
         """Of the image: of samples of its own, where it has them, else of those that serve the gradient too."""
-        plain, other = self._steps[False], self._steps[True]
-        if self._sizes.alone:  # else what goes on beside kernels counts here, not with the gradient alone
-            times = [[step.image_ms for step in steps] for steps in (plain, other)]
-        else:
-            more = self._python_ms, self._python_ms + self._more_ms()
-            times = [[s.kernel_ms + one for s in steps] for steps, one in zip((plain, other), more, strict=True)]
-        return compare([s.images for s in plain], times[0], [s.images for s in other], times[1])
+        images = [[step.images for step in self._steps[other]] for other in (False, True)]
+        times = [self._times(other, False) for other in (False, True)]
+        if self._sizes.alone:  # what goes on beside kernels counts once, with the gradient
+            times = [[step.image_ms for step in self._steps[other]] for other in (False, True)]
+        return compare(images[0], times[0], images[1], times[1])
 
     def _is_clear(self) -> bool:
         """Whether no more steps are needed: it is not on by accident, or off at all events."""
@@ -467,8 +472,10 @@ class Turns(Race, Generic[Record]):
         return self._record(False, False, (None, None, None), (None, None, None), note)
 
     def _record(self, other: bool, images: bool, gain: Gain, picture: Gain, note: str) -> Record:
-        found = dict(zip(("gain", "low", "high"), gain, strict=True))
-        found |= dict(zip(("image_gain", "image_low", "image_high"), picture, strict=True)) | self._cost()
+        found = dict(zip(("gain", "low", "high"), gain, strict=True)) | self._cost()
+        found |= dict(zip(("image_gain", "image_low", "image_high"), picture, strict=True))
         share = self._spent_ms / (ITERATIONS * self._iteration_ms)
-        beside = {"rounds": len(self._steps[True]), "spp": self._sizes.trial, "share": share, "note": note}
-        return self._decide(other, images, {**found, **beside})
+        rounds = len(self._steps[True])
+        return self._decide(
+            other, images, {**found, "rounds": rounds, "spp": self._sizes.trial, "share": share, "note": note}
+        )

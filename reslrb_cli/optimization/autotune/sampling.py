@@ -30,25 +30,8 @@ from reslrb_cli.guiding.tables import Guiding, Purpose, learnings
 from reslrb_cli.integrators.protocol import Job
 from reslrb_cli.integrators.reslrb import Reslrb as Tracer
 from reslrb_cli.integrators.step import render_image
-from reslrb_cli.optimization.autotune.estimators import (
-    GUIDING_NEEDS,
-    SEQUENCE_NEEDS,
-    SEQUENCE_SHARE,
-    SHARE,
-    Option,
-    settle_estimator,
-)
-from reslrb_cli.optimization.autotune.race import (
-    ITERATIONS,
-    PLANNED,
-    Say,
-    Sizes,
-    Step,
-    Tuner,
-    Turns,
-    is_auto,
-    timed,
-)
+from reslrb_cli.optimization.autotune import race
+from reslrb_cli.optimization.autotune.estimators import Option, settle_estimator
 from reslrb_cli.optimization.decisions import Allowance, Cache
 from reslrb_cli.optimization.moving import is_attached
 from reslrb_cli.optimization.problem import Problem
@@ -71,32 +54,32 @@ MOST_VIEWS, MOST_VALUES = 4, 2**15
 IMAGE_SHARE = 0.25
 
 
-def settle(problem: Problem, options: Sequence[Option], say: Say, cache: Cache | None = None) -> Problem:
+def settle(problem: Problem, options: Sequence[Option], say: race.Say, cache: Cache | None = None) -> Problem:
     """`problem` with its integrator settled: the best of the `options` (`find_options`), drawing samples as pays here.
 
     Needs the targets. Fields of the problem say what was measured; `say` is told, and `cache` holds what earlier runs
     measured.
     """
-    tuner = Tuner(problem, say, cache)
+    tuner = race.Tuner(problem, say, cache)
     settle_estimator(tuner, options)
     settle_sampling(tuner)
     tuner.tell(tuner.problem.pilot, tuner.problem.guided, tuner.problem.sequence)
     return tuner.problem
 
 
-def settle_sampling(tuner: Tuner) -> None:
+def settle_sampling(tuner: race.Tuner) -> None:
     """Have the integrator, whose estimator is settled, draw samples as pays here, as far as that is left to
     measurement: guided or not; then from which sequence, in place of being guided, or else as the integrator is then.
     """
     config, plain, memory = tuner.problem.config, tuner.problem.integrator, tuner.problem.memory
     trials: list[StepTrial] = []  # what was measured on so far
-    if is_auto(config, "guiding"):
+    if race.is_auto(config, "guiding"):
         guided = _guided(tuner, trials)
         tuner.take(guided=guided, integrator=as_decided(plain, guided, None))
         if guided.guided and memory is not None:
             expected = replace(memory.expected_bytes, fixed=memory.expected_bytes.fixed + table_bytes(tuner.problem))
             tuner.take(memory=replace(memory, expected_bytes=expected))
-    if is_auto(config, "sequence"):
+    if race.is_auto(config, "sequence"):
         sequence, found = _sequence(tuner, trials), tuner.problem.guided
         if found is not None and sequence.alone and sequence.low_discrepancy:
             note = f"low-discrepancy numbers without it have {sequence.gain:.2g} times that"
@@ -141,7 +124,7 @@ def lessons(problem: Problem) -> float:
     return learnings(max(round(gradients), 1)) * sensors / run.iterations
 
 
-def sizes(problem: Problem, longer: float, planned: float = PLANNED) -> Sizes:
+def sizes(problem: Problem, longer: float, planned: float = race.PLANNED) -> race.Sizes:
     """The samples of the run's steps, and what is planned of those that are taken here."""
     run, adjoint = problem.config.run, problem.config.adjoint
     call = run.spp // run.batches if adjoint == "batched" else run.spp
@@ -149,19 +132,19 @@ def sizes(problem: Problem, longer: float, planned: float = PLANNED) -> Sizes:
     entries = sum(problem.selection.array(key).size for key in problem.selection.keys)
     sets = run.spp / call * len(problem.drawn(0))
     rounds = ROUNDS_OF_FEW if entries < FEW_ENTRIES else ROUNDS
-    return Sizes(run.spp, call, part, adjoint == "independent", rounds, lessons(problem) / sets, longer, planned)
+    return race.Sizes(run.spp, call, part, adjoint == "independent", rounds, lessons(problem) / sets, longer, planned)
 
 
 def planned(share: float) -> float:
     """Steps' worth of time that the sequence's rounds are planned for: the longer, the more of the gain is seen."""
-    return min(ROUNDS_SHARE * share * ITERATIONS, PLANNED)
+    return min(ROUNDS_SHARE * share * race.ITERATIONS, race.PLANNED)
 
 
 def share_left(problem: Problem, allowance: Allowance, reserved: float = 0.0, kernels: float = 0.0) -> float:
     """What earlier measurements left of the share of 200 iterations that all of them may cost, but for what is
     `reserved`, and no more than there is time for in a run as short as this, with `kernels` to compile."""
     spent = sum(each.share for each in (problem.pilot, problem.guided) if each is not None)
-    return max(min(SHARE - spent, allowance.iterations_left(kernels) / ITERATIONS) - reserved, 0.0)
+    return max(min(race.SHARE - spent, allowance.iterations_left(kernels) / race.ITERATIONS) - reserved, 0.0)
 
 
 def _chosen(problem: Problem) -> dict[str, Any] | None:
@@ -171,12 +154,10 @@ def _chosen(problem: Problem) -> dict[str, Any] | None:
 # --- guiding ----------------------------------------------------------------------------------------------------------
 
 
-class GuidingPilot(Turns[GuidedRecord]):
+class GuidingPilot(race.Turns[GuidedRecord]):
     """One decision: guided, or not."""
 
-    @property
-    def _apart(self) -> bool:
-        return self._sizes.alone
+    APART = True
 
     def _more_ms(self) -> float:
         """What learning adds, in the mean over the run."""
@@ -188,7 +169,7 @@ class GuidingPilot(Turns[GuidedRecord]):
         return GuidedRecord(guided=other, images=images, **found)
 
 
-def _guided(tuner: Tuner, trials: list[StepTrial]) -> GuidedRecord:
+def _guided(tuner: race.Tuner, trials: list[StepTrial]) -> GuidedRecord:
     """Whether the problem's integrator, whose estimator is settled, is to be guided."""
     problem = tuner.problem
     if problem.memory is not None:
@@ -196,14 +177,14 @@ def _guided(tuner: Tuner, trials: list[StepTrial]) -> GuidedRecord:
         if needed > free:
             note = f"run.memory_budget has no room for tables of {in_words(needed)}"
             return GuidedRecord(guided=False, note=note)
-    sequence = is_auto(problem.config, "sequence")
+    sequence = race.is_auto(problem.config, "sequence")
     why = suits_even_numbers(problem) if sequence else None
     plan = sizes(problem, GUIDING_LONGER)
 
     def measure(allowance: Allowance) -> GuidedRecord:
         plain, guided = (problem.integrator.afresh(guided=on) for on in (False, True))
         trials.append(StepTrial(problem, "guiding", plain, guided))
-        share = share_left(problem, allowance, SEQUENCE_SHARE if sequence else 0.0, GUIDING_NEEDS[0])
+        share = share_left(problem, allowance, race.SEQUENCE_SHARE if sequence else 0.0, race.GUIDING_NEEDS[0])
         return GuidingPilot(trials[-1], plan, trials[-1].part_of_views(), share).run()
 
     return tuner.decide(
@@ -211,7 +192,7 @@ def _guided(tuner: Tuner, trials: list[StepTrial]) -> GuidedRecord:
         # Learning is a larger part of a short run, where tables learn most often at first.
         of={"guiding": 4, "of": _chosen(problem), "lessons": plan.lessons},
         # Where even numbers are likely to do better, to measure guiding alone would mislead.
-        needs=(GUIDING_NEEDS, *([] if why is None else 2 * [SEQUENCE_NEEDS])),
+        needs=(race.GUIDING_NEEDS, *([] if why is None else 2 * [race.SEQUENCE_NEEDS])),
         integrator=problem.integrator,
         measure=measure,
         unmeasured=lambda note: GuidedRecord(guided=False, note=f"{note}; {why or 'it pays in long runs'}"),
@@ -221,14 +202,14 @@ def _guided(tuner: Tuner, trials: list[StepTrial]) -> GuidedRecord:
 # --- the sequence -----------------------------------------------------------------------------------------------------
 
 
-class SequencePilot(Turns[SequenceRecord]):
+class SequencePilot(race.Turns[SequenceRecord]):
     """One decision: low-discrepancy numbers, or independent ones."""
 
     def _decide(self, other: bool, images: bool, found: dict[str, Any]) -> SequenceRecord:
         return SequenceRecord(low_discrepancy=other, **found)
 
 
-def _sequence(tuner: Tuner, trials: list[StepTrial]) -> SequenceRecord:
+def _sequence(tuner: race.Tuner, trials: list[StepTrial]) -> SequenceRecord:
     """Which sequence the problem's integrator, guided or not, is to have; `trials`: what guiding was measured on."""
     problem, found = tuner.problem, tuner.problem.guided
     plain = problem.integrator
@@ -246,12 +227,12 @@ def _sequence(tuner: Tuner, trials: list[StepTrial]) -> SequenceRecord:
         if found is not None and found.guided:
             # Guided paths start in cells of their own, within which little is left to spread evenly: where numbers
             # that are say nearly all, as under a beam through glass, they do better alone.
-            share = share_left(problem, allowance, kernels=2 * SEQUENCE_NEEDS[0])
+            share = share_left(problem, allowance, kernels=2 * race.SEQUENCE_NEEDS[0])
             alone = replace(pilot("sequence alone", False, share / 2), alone=True)
             if alone.low_discrepancy:
                 return alone
         spent = 0.0 if alone is None else alone.share
-        record = pilot("sequence", None, share_left(problem, allowance, spent, SEQUENCE_NEEDS[0]))
+        record = pilot("sequence", None, share_left(problem, allowance, spent, race.SEQUENCE_NEEDS[0]))
         costs = ("measure_s", "compile_s", "share") if alone is not None else ()
         return replace(record, **{name: getattr(record, name) + getattr(alone, name) for name in costs})
 
@@ -263,7 +244,7 @@ def _sequence(tuner: Tuner, trials: list[StepTrial]) -> SequenceRecord:
 
     guided = None if found is None else [found.guided, found.images]
     of = {"sequence": 1, "of": [_chosen(problem), guided]}
-    return tuner.decide(SequenceRecord, of, [SEQUENCE_NEEDS], plain, measure, unmeasured)
+    return tuner.decide(SequenceRecord, of, [race.SEQUENCE_NEEDS], plain, measure, unmeasured)
 
 
 # --- steps ------------------------------------------------------------------------------------------------------------
@@ -325,7 +306,7 @@ class StepTrial:
         image = render_image(self._tracers[False], self._problem.scene, view.sensor, self._seed(0, view, "image"), spp)
         return to_tensor(np.nan_to_num(slope(view.objective, np.array(image)), nan=0.0, posinf=0.0, neginf=0.0))
 
-    def learn(self, round: int, spp: int) -> Step:
+    def learn(self, round: int, spp: int) -> race.Step:
         """Have the table learn, and be ready to be drawn from, as it is from then on.
 
         The first time all of it is done before as well, and forgotten: what that compiles and records is no part of the
@@ -337,7 +318,7 @@ class StepTrial:
         if self.learns:
             compile_ms = self._teach(self.table, jobs).wall_ms
             self.table.forget()
-        taken = timed(self._teach(self.table, jobs))
+        taken = race.timed(self._teach(self.table, jobs))
         taken.compile_ms += compile_ms
         return taken
 
@@ -349,7 +330,7 @@ class StepTrial:
                     table.table(view.sensor, purpose)
         return times
 
-    def take(self, other: bool, round: int, spp: int) -> Step:
+    def take(self, other: bool, round: int, spp: int) -> race.Step:
         """One step of all views."""
         problem, images = self._problem, {}
         tracer, name = self._tracers[other], "on" if other else "off"
@@ -361,14 +342,14 @@ class StepTrial:
                 gradients = problem.gradients()
                 dr.eval(image, gradients)
                 images[str(view.sensor)] = image
-        taken = timed(times)
+        taken = race.timed(times)
         taken.gradients = take_gradient(problem)
         if self._adjoint == "independent":
             with self._clock.step() as times:
                 for view in self.views:
                     job = self._job(view, self._seed(round, view, f"image, {name}"), spp)
                     images[str(view.sensor)] = tracer.image(job)
-            apart = timed(times)
+            apart = race.timed(times)
             taken.image_ms = apart.kernel_ms
             taken.wall_ms, taken.compile_ms = taken.wall_ms + apart.wall_ms, taken.compile_ms + apart.compile_ms
         taken.images = {name: _few(image) for name, image in images.items()}
