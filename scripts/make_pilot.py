@@ -22,7 +22,7 @@ import reslrb_cli  # noqa: F401  # chooses libLLVM, so it comes before Mitsuba
 from reslrb_cli.backend.variant import set_variant
 from reslrb_cli.config.loader import load
 from reslrb_cli.optimization.assemble import assemble
-from reslrb_cli.optimization.autotune.estimators import Candidate, Option, find_options, run_pilot, sample_variance
+from reslrb_cli.optimization.autotune.estimators import Candidate, find_options, run_pilot, sample_variance
 from reslrb_cli.optimization.autotune.race import ITERATIONS, Gradients, measured_step
 from reslrb_cli.records.clock import StepClock
 from reslrb_cli.statistics import sum_of_squares
@@ -33,7 +33,7 @@ CONFIGS = ("furnace", "caustic_slab", "cornell_floor", "grey_room")
 WARM_UPS = 2
 
 
-def efficiencies(problem: Any, options: list[Option], seeds: int) -> dict[str, float]:
+def efficiencies(problem: Any, options: list[Candidate], seeds: int) -> dict[str, float]:
     """Efficiency of each candidate, by its label, over that of the best."""
     clock, spp = StepClock(), problem.config.run.spp
     times: dict[str, list[float]] = {}
@@ -41,7 +41,7 @@ def efficiencies(problem: Any, options: list[Option], seeds: int) -> dict[str, f
     for round in range(seeds + WARM_UPS):
         for option in options:
             option.integrator.freeze = False
-            label = Candidate(option.options, exact=False).label
+            label = option.label
             step = measured_step(problem, option.integrator, clock, round, spp)
             if round >= WARM_UPS:
                 times.setdefault(label, []).append(step.kernel_ms)

@@ -13,8 +13,9 @@ from reslrb_cli.integrators.step import make_integrator
 from reslrb_cli.measure.gradients import moves_light
 from reslrb_cli.measure.references import Situation, prb_gradient
 from reslrb_cli.optimization.autotune import race
-from reslrb_cli.optimization.decisions import Allowance, Cache
+from reslrb_cli.optimization.decisions import Allowance
 from reslrb_cli.optimization.problem import Problem
+from reslrb_cli.records.cache import PilotCache
 from reslrb_cli.records.clock import StepClock
 from reslrb_cli.records.decisions import RivalRecord
 
@@ -29,7 +30,7 @@ NEEDS = (2.0, 2.0)
 LONGER = 2.0
 
 
-def measure_rival(problem: Problem, cache: Cache | None, say: Callable[[str], None]) -> RivalRecord | None:
+def measure_rival(problem: Problem, cache: PilotCache | None, say: Callable[[str], None]) -> RivalRecord | None:
     """Measure `prb` beside the estimator that a pilot chose; None where no pilot did, or `prb` does not apply.
 
     `say` is told what takes long, `cache` holds what earlier runs measured. Leaves neither gradient nor change behind.
@@ -81,10 +82,8 @@ def _samples(problem: Problem, iterations: float) -> int:
     return max(int(share * run.spp) // unit, 1) * unit
 
 
-class RivalTrial:
+class RivalTrial(race.Trial):
     """Steps of the run, as they are or by `prb`."""
-
-    learns = False
 
     def __init__(self, problem: Problem) -> None:
         options = problem.config.integrator.options()
@@ -92,10 +91,6 @@ class RivalTrial:
         # A recording would cost more than so few steps save.
         own = problem.integrator.to_measure().with_options(samples_per_pass=None, freeze=False)
         self._problem, self._clock, self._integrators = problem, StepClock(), {True: rival, False: own}
-
-    def learn(self, round: int, spp: int) -> race.Step:
-        """Nothing is learned here."""
-        raise NotImplementedError
 
     def take(self, other: bool, round: int, spp: int) -> race.Step:
         """One step of all views."""

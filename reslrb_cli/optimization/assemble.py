@@ -12,7 +12,6 @@ from reslrb_cli.config.schema import Config
 from reslrb_cli.integrators.light_tracer import LightTracer
 from reslrb_cli.optimization.autotune.estimators import find_options
 from reslrb_cli.optimization.autotune.sampling import settle
-from reslrb_cli.optimization.decisions import Cache
 from reslrb_cli.optimization.errors import quantity
 from reslrb_cli.optimization.identifiability import check_exposures, find_reached
 from reslrb_cli.optimization.loading import (
@@ -29,6 +28,7 @@ from reslrb_cli.optimization.problem import Problem, make_optimizer
 from reslrb_cli.optimization.state import Settled
 from reslrb_cli.optimization.targets import make_targets
 from reslrb_cli.optimization.views import expose, make_views
+from reslrb_cli.records.cache import PilotCache
 from reslrb_cli.scene.parameters import Selection, select_parameters
 
 Array = np.ndarray[Any, Any]
@@ -37,7 +37,7 @@ Array = np.ndarray[Any, Any]
 def assemble(
     config: Config,
     say: Callable[[str], None] = lambda line: None,
-    cache: Cache | None = None,
+    cache: PilotCache | None = None,
     to_run: bool = False,
     settled: Settled | None = None,
 ) -> Problem:

@@ -2,11 +2,7 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any, Protocol
 
 from reslrb_cli.records.clock import MIB
 from reslrb_cli.records.decisions import Jsonable
@@ -52,11 +48,10 @@ class MemoryPlan(Jsonable):
 
 @dataclass
 class Allowance:
-    """Seconds that all measuring before the first iteration may take: a share of what the run itself will.
+    """Seconds that all measuring before the first iteration may take: a share of what the run itself will, `run_s`.
 
-    `run_s` is that: kernels compiled (`compile_s`, what those of one step took), and iterations of `iteration_s` each,
-    by two first steps of few samples. `spent_s` grows; these first steps, which the run would take as well, are no
-    part of it.
+    That is kernels compiled (`compile_s`, what those of one step took), and iterations of `iteration_s` each, by two
+    first steps of few samples, which the run would take as well, and which are no part of `spent_s`.
     """
 
     share: float
@@ -79,15 +74,6 @@ class Allowance:
         """The iterations' worth of work that there is time for, once the kernels of so many steps are compiled."""
         return max(self.left_s - kernels * self.compile_s, 0.0) / max(self.iteration_s, 1e-9)
 
-    @contextmanager
-    def counted(self) -> Iterator[None]:
-        """Count the block's time."""
-        start = time.perf_counter()
-        try:
-            yield
-        finally:
-            self.spent_s += time.perf_counter() - start
-
     def note(self) -> str:
         """The words for what there was no time to measure."""
         return f"not measured (over {100 * self.share:.3g} % of this run)"
@@ -96,14 +82,6 @@ class Allowance:
         """The words for what was spent."""
         part = 100 * self.spent_s / max(self.run_s, 1e-9)
         return f"measuring took {self.spent_s:.1f} s, {part:.2g} % of what this run is expected to take"
-
-
-class Cache(Protocol):
-    """Where pilots' outcomes are kept."""
-
-    def get(self, key: str) -> dict[str, Any] | None: ...
-
-    def put(self, key: str, entry: dict[str, Any]) -> None: ...
 
 
 @dataclass(frozen=True)

@@ -24,12 +24,12 @@ from reslrb_cli.integrators.reslrb import Reslrb as Tracer
 from reslrb_cli.optimization.assemble import assemble_scene
 from reslrb_cli.optimization.autotune.estimators import find_options
 from reslrb_cli.optimization.autotune.sampling import lessons, settle
-from reslrb_cli.optimization.decisions import Cache
 from reslrb_cli.optimization.loop import optimize
 from reslrb_cli.optimization.problem import Problem, saved_spp
 from reslrb_cli.optimization.state import guiding_of
 from reslrb_cli.optimization.targets import make_targets
 from reslrb_cli.optimization.uncertainty.measuring import LEAST_ITERATIONS
+from reslrb_cli.records.cache import PilotCache
 from reslrb_cli.records.clock import MIB
 from reslrb_cli.records.metrics import Record
 
@@ -177,7 +177,7 @@ class Forecast:
 def make_forecast(
     config: Config,
     say: Callable[[str], None],
-    cache: Cache | None = None,
+    cache: PilotCache | None = None,
     before: Callable[[Problem], object] = lambda problem: None,
 ) -> Forecast:
     """Measure a few steps of the run that `config` describes; a variant must be set.

@@ -165,12 +165,13 @@ def _second_difference(problem: Problem, base: Sequence[Array], difference: Sequ
     return total
 
 
-def see_images(problem: Problem) -> list[Array]:
-    """Every view that is trained on, exposed, without alpha, 0 where it is left out, always from the same seeds."""
+def see_images(problem: Problem, spp: int | None = None, round: int = 0, purpose: str = _PURPOSE) -> list[Array]:
+    """Every view that is trained on, exposed, without alpha, 0 where it is left out, always from the same seeds; by
+    `spp` samples per pixel, or the run's."""
     run, images = problem.config.run, []
     for view in problem.trained:
-        at = seed(run.seed, 0, view.sensor, _PURPOSE)
-        image = render_image(problem.integrator, problem.scene, view.sensor, at, run.spp)
+        at = seed(run.seed, round, view.sensor, purpose)
+        image = render_image(problem.integrator, problem.scene, view.sensor, at, spp or run.spp)
         exposed = view.exposure.applied(first_channels(image, view.target.shape[2]))
         images.append(view.kept(np.array(exposed, dtype=np.float64)))
     return images

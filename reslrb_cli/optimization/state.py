@@ -29,7 +29,7 @@ from reslrb_cli.backend.memory import own_memory
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.guiding.tables import Guiding
 from reslrb_cli.integrators.reslrb import Reslrb
-from reslrb_cli.optimization.autotune.estimators import Option
+from reslrb_cli.optimization.autotune.estimators import Candidate
 from reslrb_cli.optimization.autotune.race import is_auto
 from reslrb_cli.optimization.autotune.sampling import as_decided
 from reslrb_cli.optimization.decisions import Estimate, MemoryPlan, Scaled, Sensitivity
@@ -364,7 +364,7 @@ class Settled:
             problem.optimizer.set_value(key, values[key])
         problem.apply()
 
-    def settle(self, problem: Problem, options: Sequence[Option]) -> None:
+    def settle(self, problem: Problem, options: Sequence[Candidate]) -> None:
         """Choose what the run had chosen: the pilot's estimator, the samples of a pass, and how samples are drawn."""
         self._estimator(problem, options)
         if is_auto(problem.config, "guiding"):
@@ -381,7 +381,7 @@ class Settled:
         except TypeError:
             raise self.stored.wrong(name, wrong) from None
 
-    def _estimator(self, problem: Problem, options: Sequence[Option]) -> None:
+    def _estimator(self, problem: Problem, options: Sequence[Candidate]) -> None:
         chosen = options[0] if options else None
         problem.pilot = self._found(EstimatorRecord, "pilot", "is not what a pilot finds")
         if problem.pilot is not None:

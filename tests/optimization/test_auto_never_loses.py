@@ -24,7 +24,7 @@ from reslrb_cli.measure.extreme.suite import ExtremeCase
 from reslrb_cli.measure.gradients import integrator
 from reslrb_cli.measure.scenes.small import load as load_scene
 from reslrb_cli.optimization.assemble import assemble_scene
-from reslrb_cli.optimization.autotune.estimators import Option, find_options
+from reslrb_cli.optimization.autotune.estimators import Candidate, find_options
 from reslrb_cli.optimization.autotune.race import SHARE, is_auto
 from reslrb_cli.optimization.autotune.sampling import GuidingPilot, SequencePilot, settle
 from reslrb_cli.optimization.problem import Problem
@@ -52,7 +52,7 @@ PATHS = 2**20
 #: take so many times as long as the mean of all: where steps take milliseconds, that is a part that counts.
 OVERRUN = 2
 #: What decides on the integrator.
-SETTLE: dict[str, Callable[[Problem, Sequence[Option], Callable[[str], None]], Problem]] = {"settle": settle}
+SETTLE: dict[str, Callable[[Problem, Sequence[Candidate], Callable[[str], None]], Problem]] = {"settle": settle}
 
 
 @pytest.fixture(autouse=True)
@@ -141,7 +141,7 @@ def test_losses_are_seen(fault: str, tmp_path: Path, monkeypatch: pytest.MonkeyP
         monkeypatch.setattr(SequencePilot, "_record", lambda self, on, images, *rest: other(self, False, False, *rest))
     else:
 
-        def wrong(problem: Problem, options: Sequence[Option], say: Callable[[str], None]) -> Problem:
+        def wrong(problem: Problem, options: Sequence[Candidate], say: Callable[[str], None]) -> Problem:
             found = settle(problem, options, say)
             on = is_auto(found.config, "guiding")
             return dataclasses.replace(found, integrator=found.integrator.afresh(guided=True)) if on else found

@@ -40,16 +40,34 @@ from reslrb_cli.records.decisions import EstimatorRecord, TriedEstimator
 from reslrb_cli.statistics import Array, sum_of_squares
 
 
-@dataclass
-class Option:
-    """A candidate, ready to run; `memory` where there is a budget."""
+@dataclass(frozen=True)
+class Candidate:
+    """An estimator with its options, and where it is ready to run its `integrator`; `memory` where there is a budget.
+
+    `exact`: it uses every connection. `passes` are those of a step in the pilot; other passes are other paths.
+    `parent`: the label of a candidate than which it is no faster; where it is the same estimator with more slots for
+    connections, `varies_slots`.
+    """
 
     options: dict[str, Any]
-    integrator: Tracer
-    memory: MemoryPlan | None
+    exact: bool
+    passes: int = 1
+    parent: str | None = None
+    varies_slots: bool = False
+    integrator: Any = None
+    memory: MemoryPlan | None = None
+
+    @property
+    def label(self) -> str:
+        """The estimator in words."""
+        return _label(**self.options)
 
 
-def find_options(problem: Problem) -> list[Option]:
+def _label(estimator: str = "", **options: Any) -> str:
+    return ", ".join([estimator, *(f"{key} {value}" for key, value in options.items())])
+
+
+def find_options(problem: Problem) -> list[Candidate]:
     """What the run may use in place of `problem.integrator`, where that is left to measurement; else nothing.
 
     Needs no targets. Raises ConfigError where no estimator keeps the memory budget.
@@ -76,7 +94,7 @@ def candidates(config: Config) -> list[dict[str, Any]]:
     return found
 
 
-def _fitting(problem: Problem, integrator: ReslrbConfig, choices: list[dict[str, Any]]) -> list[Option]:
+def _fitting(problem: Problem, integrator: ReslrbConfig, choices: list[dict[str, Any]]) -> list[Candidate]:
     """The candidates that keep the budget, each with the samples of its passes."""
     run, budget, least, options = problem.config.run, problem.config.run.budget_bytes, [], []
     fixed = 0 if budget is None else standing()
@@ -86,7 +104,7 @@ def _fitting(problem: Problem, integrator: ReslrbConfig, choices: list[dict[str,
         made.expect(pass_spp(problem.config))
         check_memory(problem, made)
         if budget is None:
-            options.append(Option(choice, made, None))
+            options.append(_candidate(choice, made))
             continue
         samples = run.spp // race.sets_of(problem.config)
         size, expected = choose_samples(problem, made, samples, budget, fixed)
@@ -95,7 +113,7 @@ def _fitting(problem: Problem, integrator: ReslrbConfig, choices: list[dict[str,
             continue
         if size < samples:
             made = made.with_options(samples_per_pass=size, freeze=made.freeze)
-        options.append(Option(choice, made, MemoryPlan(budget, size, samples // size, expected)))
+        options.append(_candidate(choice, made, MemoryPlan(budget, size, samples // size, expected)))
     if not options:
         mib = -(-min(least) // MIB)
         reason = f"one sample per pixel takes about {mib:.0f} MiB (scene, targets, images of a step, parameters, paths)"
@@ -104,7 +122,7 @@ def _fitting(problem: Problem, integrator: ReslrbConfig, choices: list[dict[str,
     return options
 
 
-def settle_estimator(tuner: race.Tuner, options: Sequence[Option]) -> None:
+def settle_estimator(tuner: race.Tuner, options: Sequence[Candidate]) -> None:
     """Have the integrator of the tuner's problem be the best of the options; of several a pilot finds it.
 
     What moves light leaves one estimator, which needs no pilot.
@@ -116,9 +134,8 @@ def settle_estimator(tuner: race.Tuner, options: Sequence[Option]) -> None:
 
         def usual(note: str) -> EstimatorRecord:
             """It has been the best, or within a few percent of it, wherever that was measured (docs/benchmarks.md)."""
-            found = _candidate(options[0])
             note += "; every connection, in one traversal"
-            return EstimatorRecord(chosen=found.options, label=found.label, note=note)
+            return EstimatorRecord(chosen=options[0].options, label=options[0].label, note=note)
 
         pilot = tuner.decide(
             EstimatorRecord,
@@ -144,42 +161,22 @@ def _later(config: Config) -> list[str]:
 # --- the pilot --------------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class Candidate:
-    """An estimator and its options. `exact`: it uses every connection. `passes` are those of a step in the pilot; other
-    passes are other paths. `parent`: the label of a candidate than which it is no faster; where it is the same
-    estimator with more slots for connections, `varies_slots`."""
-
-    options: dict[str, Any]
-    exact: bool
-    passes: int = 1
-    parent: str | None = None
-    varies_slots: bool = False
-
-    @property
-    def label(self) -> str:
-        """The estimator in words."""
-        name, *rest = (str(value) if key == "estimator" else f"{key} {value}" for key, value in self.options.items())
-        return ", ".join([name, *rest])
-
-
-def _candidate(option: Option) -> Candidate:
+def _candidate(options: dict[str, Any], integrator: Tracer, memory: MemoryPlan | None = None) -> Candidate:
     """As the pilot sees it: with two passes where the run has more, which take as many traversals."""
-    options = option.options
-    name, slots, parent = options["estimator"], options.get("capacity", 1) > 1, None
+    name, slots, parent = options.get("estimator", ""), options.get("capacity", 1) > 1, None
     if slots or "weight" in options:
-        parent = Candidate({"estimator": name, "capacity": 1}, exact=False).label
+        parent = _label(estimator=name, capacity=1)
     elif name in ("gather", "reservoir"):  # which trace their paths twice, where `event` traces them once
-        parent = Candidate({"estimator": "event", "capacity": 1}, exact=False).label
-    several = option.memory is not None and option.memory.passes > 1
-    return Candidate(options, ESTIMATORS[name].exact, 2 if several else 1, parent, slots and "weight" not in options)
+        parent = _label(estimator="event", capacity=1)
+    exact, several = name in ESTIMATORS and ESTIMATORS[name].exact, memory is not None and memory.passes > 1
+    varies = slots and "weight" not in options
+    return Candidate(options, exact, 2 if several else 1, parent, varies, integrator, memory)
 
 
-def run_pilot(problem: Problem, options: Sequence[Option], allowance: Allowance) -> EstimatorRecord:
+def run_pilot(problem: Problem, options: Sequence[Candidate], allowance: Allowance) -> EstimatorRecord:
     """Measure the options, and say which is the most efficient."""
     run, sets, clock = problem.config.run, race.sets_of(problem.config), StepClock()
-    made = [_candidate(option) for option in options]
-    integrators = {c.label: option.integrator.to_measure() for c, option in zip(made, options, strict=True)}
+    integrators = {option.label: option.integrator.to_measure() for option in options}
 
     def step(candidate: Candidate, round: int, spp: int) -> race.Step:
         integrator = integrators[candidate.label]
@@ -188,7 +185,7 @@ def run_pilot(problem: Problem, options: Sequence[Option], allowance: Allowance)
         integrator = integrator.with_options(samples_per_pass=samples, freeze=False)
         return race.measured_step(problem, integrator, clock, round, spp)
 
-    unit = sets * max(candidate.passes for candidate in made)
+    unit = sets * max(option.passes for option in options)
     if problem.samples_per_pass is not None:  # the user's own passes
         unit = sets * min(problem.samples_per_pass, run.spp // sets)
     # What is measured later has its part of what it may cost; guiding leaves some of its own for the sequence.
@@ -202,7 +199,7 @@ def run_pilot(problem: Problem, options: Sequence[Option], allowance: Allowance)
         spent = replace(allowance, spent_s=allowance.spent_s + time.perf_counter() - began)
         return spent.affords((1 + kernels, reserved * race.ITERATIONS))
 
-    return Pilot(made, step, run.spp, unit, share, compiles).run()
+    return Pilot(options, step, run.spp, unit, share, compiles).run()
 
 
 def sample_variance(values: list[Array]) -> float:

@@ -1,17 +1,15 @@
 """Races of candidates before a run's first iteration: what they may cost, how they compare, what is kept of them.
 
-- `Tuner.decide`: one decision, which is what an earlier run kept, else what is measured now, where the run is long
-  enough for that.
+- `Tuner.decide`: one decision, which is what an earlier run kept, or what is measured now, in a run long enough.
 - `compare`: how much more efficient one way of sampling a gradient is than another, by steps of both, and how sure:
 
       gain = (variance * time of the one) / (variance * time of the other)
 
   Variance is summed over the parameters, each over its gradient's mean square. The interval is that of the logarithm of
   the variances' quotient by the jackknife over the steps, and of times by what a single one may be off.
-- `Turns`: whether another way of taking steps pays, decided from steps of both that take turns. Gradients estimate the
-  same. Times are those of kernels, and, alike for both kinds, what goes on beside them in a run for as many samples: it
-  counts where iterations take milliseconds. Where steps draw from a table that paths before them have made, it is
-  learned first, and held: none of the steps' paths is one that it learned from.
+- `Turns`: whether another way of taking steps pays, by steps of both in turns, whose gradients estimate the same. Times
+  are those of kernels, and, alike for both, what goes on beside them in a run for as many samples, which counts where
+  iterations take milliseconds. A table that steps draw from is learned first, of other paths than theirs, and held.
 """
 
 from __future__ import annotations
@@ -24,7 +22,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Generic, Protocol, TypeVar
+from typing import Any, Generic, TypeVar
 
 import mitsuba as mi
 import numpy as np
@@ -32,10 +30,10 @@ import numpy as np
 from reslrb_cli.backend.doctor import device_name
 from reslrb_cli.config.schema import Config
 from reslrb_cli.integrators.reslrb import Reslrb as Tracer
-from reslrb_cli.optimization.decisions import Allowance, Cache
+from reslrb_cli.optimization.decisions import Allowance
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.sensitivity import sample_gradient, take_gradient
-from reslrb_cli.records.cache import key_of
+from reslrb_cli.records.cache import PilotCache, key_of
 from reslrb_cli.records.clock import StepClock, StepTimes
 from reslrb_cli.records.decisions import LEAST_IMAGE, Finding
 from reslrb_cli.records.manifest import versions
@@ -76,7 +74,7 @@ class Tuner:
     `say` is told what is decided, and once that something is measured; `cache` holds what earlier runs measured.
     """
 
-    def __init__(self, problem: Problem, say: Say, cache: Cache | None = None) -> None:
+    def __init__(self, problem: Problem, say: Say, cache: PilotCache | None = None) -> None:
         self.problem, self.say, self._cache = problem, say, cache
         self._unmeasured: list[Finding] = []
 
@@ -125,8 +123,9 @@ class Tuner:
             return record
         if not allowance.spent_s:
             self.say("measuring what pays here, before the first iteration")
-        with allowance.counted():
-            record = measure(allowance)
+        start = time.perf_counter()
+        record = measure(allowance)
+        allowance.spent_s += time.perf_counter() - start
         logger.debug(allowance.line())
         if self._cache is not None:
             self._cache.put(key, record.to_json())
@@ -327,21 +326,23 @@ class Sizes:
         return max(min(int(LEARNING_SHARE * self.step), self.part), 1)
 
 
-class Trial(Protocol):
-    """What is measured. Equal rounds have equal seeds, others than those of any walk that is learned from."""
+class Trial:
+    """What is measured. Equal rounds have equal seeds, others than those of any walk that is learned from.
+
+    `learns` says whether there is a table that has yet to learn; none has one here.
+    """
 
     @property
     def learns(self) -> bool:
-        """Whether there is a table that has yet to learn."""
-        ...
+        return False
 
     def learn(self, round: int, spp: int) -> Step:
         """Have the table learn, from a walk of `spp` samples per pixel; what is not given is left at 0."""
-        ...
+        raise NotImplementedError
 
     def take(self, other: bool, round: int, spp: int) -> Step:
         """A step as it is, or one the other way; from what the table has learned, which stays as it is."""
-        ...
+        raise NotImplementedError
 
 
 class Turns(Race, Generic[Record]):

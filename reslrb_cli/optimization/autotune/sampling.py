@@ -3,16 +3,14 @@
 Each is settled where it is left to measurement, guiding first. Steps drawn one way take turns with steps drawn the
 other (`race.Turns`), with dL/dI held at one image's (`StepTrial`):
 
-- `GuidingPilot`: whether guided emission pays here. A table is learned, and held; then steps with it take turns with
-  steps without. To a guided step's time is added its part of what a run of that length learns: each time one more walk
-  of one pass, with what Python does for a new table, often at first and then rarely. Short steps make the table less
-  worth than a run's, which has learned from more, and draws more paths from each of its cells. So the gain is rather
-  more than what is found here, and what pays here pays there.
-- `SequencePilot`: whether low-discrepancy numbers pay here. Steps with them take turns with steps without, guided if
-  the run's are; then both draw from one table. What a run goes on learning takes both the same time; it is left out,
-  which makes more of the time that such numbers take. Noise of evenly spread numbers falls faster than with one over
-  the samples, or as fast. So short steps find less of the gain than whole ones have, and what pays here pays there.
-  Where guiding pays, they are tried in place of it first.
+- `GuidingPilot`: guided emission, from a table that is learned first, and held. To a guided step's time is added its
+  part of what a run of that length learns: each time one more walk of one pass, with what Python does for a new table,
+  often at first and then rarely. Short steps make the table less worth than a run's, which has learned from more, and
+  draws more paths from each of its cells: what pays here pays there.
+- `SequencePilot`: low-discrepancy numbers, guided if the run is; then both draw from one table. What a run goes on
+  learning takes both the same time; it is left out, which makes more of the time that such numbers take. Noise of
+  evenly spread numbers falls faster than with one over the samples, or as fast, so that short steps find less of the
+  gain than whole ones have. Where guiding pays, they are tried in place of it first.
 """
 
 from __future__ import annotations
@@ -31,12 +29,13 @@ from reslrb_cli.integrators.protocol import Job
 from reslrb_cli.integrators.reslrb import Reslrb as Tracer
 from reslrb_cli.integrators.step import render_image
 from reslrb_cli.optimization.autotune import race
-from reslrb_cli.optimization.autotune.estimators import Option, settle_estimator
-from reslrb_cli.optimization.decisions import Allowance, Cache
+from reslrb_cli.optimization.autotune.estimators import Candidate, settle_estimator
+from reslrb_cli.optimization.decisions import Allowance
 from reslrb_cli.optimization.moving import is_attached
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.sensitivity import take_gradient
 from reslrb_cli.optimization.views import View, slope, to_tensor
+from reslrb_cli.records.cache import PilotCache
 from reslrb_cli.records.clock import StepClock, StepTimes
 from reslrb_cli.records.decisions import GuidedRecord, SequenceRecord
 from reslrb_cli.seeds import seed
@@ -54,7 +53,7 @@ MOST_VIEWS, MOST_VALUES = 4, 2**15
 IMAGE_SHARE = 0.25
 
 
-def settle(problem: Problem, options: Sequence[Option], say: race.Say, cache: Cache | None = None) -> Problem:
+def settle(problem: Problem, options: Sequence[Candidate], say: race.Say, cache: PilotCache | None = None) -> Problem:
     """`problem` with its integrator settled: the best of the `options` (`find_options`), drawing samples as pays here.
 
     Needs the targets. Fields of the problem say what was measured; `say` is told, and `cache` holds what earlier runs
@@ -250,7 +249,7 @@ def _sequence(tuner: race.Tuner, trials: list[StepTrial]) -> SequenceRecord:
 # --- steps ------------------------------------------------------------------------------------------------------------
 
 
-class StepTrial:
+class StepTrial(race.Trial):
     """Steps of a problem by `plain`, or by `other`; they leave neither gradient nor change behind.
 
     `views` are those that are looked at. Where either is guided, both that are draw from one table: that of `earlier`,
@@ -297,7 +296,6 @@ class StepTrial:
 
     @property
     def learns(self) -> bool:
-        """Whether there is a table that has yet to learn."""
         return self.table is not None and not self.table.learned
 
     def _slope(self, view: View) -> mi.TensorXf:

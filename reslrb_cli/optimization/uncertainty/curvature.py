@@ -35,10 +35,10 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from reslrb_cli.integrators.step import known_step, render_image
+from reslrb_cli.integrators.step import known_step
 from reslrb_cli.optimization.loading import make_configured, render_in_passes
 from reslrb_cli.optimization.problem import Problem
-from reslrb_cli.optimization.sensitivity import take_gradient, unrecorded
+from reslrb_cli.optimization.sensitivity import see_images, take_gradient, unrecorded
 from reslrb_cli.optimization.views import View, slope, to_tensor
 from reslrb_cli.seeds import seed
 from reslrb_cli.statistics import Array, rms
@@ -177,7 +177,7 @@ class Curvature:
         #: By how many values of the images each texture is seen, of those that were changed as a whole.
         self.pixels: dict[str, int] = {}
         self.integrator = unrecorded(problem.integrator)
-        self._base = [self._images(half) for half in (0, 1)]
+        self._base = [see_images(problem, spp, -1 - half, _PURPOSE) for half in (0, 1)]
         self._weights = [self._weight(place, view) for place, view in enumerate(problem.trained)]
         values = sum(weight.size for weight in self._weights)
         random = np.random.default_rng(self._seed(0, 0))
@@ -196,7 +196,7 @@ class Curvature:
             if not go_on():
                 break
             self.problem.selection.set_arrays(change.values)
-            images = [self._images(half) for half in (0, 1)]
+            images = [see_images(self.problem, self.spp, -1 - half, _PURPOSE) for half in (0, 1)]
             self.changes += 1
             self.problem.apply()
             for direction in change.directions:
@@ -328,16 +328,6 @@ class Curvature:
                 spp=self.spp, params=problem.selection.params,
             )  # fmt: skip
         return take_gradient(problem)
-
-    def _images(self, half: int) -> list[Array]:
-        """Every view that is trained on as the scene stands, exposed, without alpha, from the seeds of that set."""
-        images = []
-        for view in self.problem.trained:
-            number = self._seed(view.sensor, -1 - half)
-            image = render_image(self.problem.integrator, self.problem.scene, view.sensor, number, self.spp)
-            colors = np.array(image, dtype=np.float64)[:, :, : view.target.shape[2]]
-            images.append(view.kept(view.exposure.of_array(colors)))
-        return images
 
     def _weight(self, place: int, view: View) -> Array:
         """d2L/dI2 of a view's exposed image, for its pixels (H, W, C): differences of dL/dI over the residual's size.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -109,16 +109,16 @@ class Certainty:
                 scales = {key: self.scale(key) for key in gradients}
                 most = max(LEAST_CHANGES, iterations // ITERATIONS_A_CHANGE)
                 directions, H, B = curvature.along(plan_changes(problem, scales, STEP, most), go_on)
-                # By entry, of parameters that have no directions of their entries.
+                # By entry, where a parameter has no directions of its entries.
                 seen = {direction.key for direction in directions if direction.entry is not None}
-                left = [key for key, rows in gradients.items() if np.any(rows) and key not in seen]
+                left = any(np.any(rows) for key, rows in gradients.items() if key not in seen)
                 diagonal = curvature.by_entry(PROBES, go_on) if left else {}
                 of_target = curvature.by_entry_of_target(PROBES, go_on) if diagonal else {}
             compiled_ms += times.codegen_ms
             if stop():
                 return None
             measured = self._measured(gradients, iterations)
-            weighed = weigh(measured, directions, H, _of(left, diagonal), curvature.pixels, B, _of(left, of_target))
+            weighed = weigh(measured, directions, H, diagonal, curvature.pixels, B, of_target)
             measure_s = max(clock.elapsed_s - compiled_ms / 1e3, 0.0)
             render = config.target.render
             return CertaintyRecord(
@@ -149,7 +149,7 @@ class Certainty:
         optimizer = self.problem.optimizer
         step = optimizer.first_step(key)
         reach = None if step is None else step * float(sum(own.rates))
-        kept = np.any(own.gradients, axis=0) & (True if own.seen is None else own.seen)
+        kept = own.touched & (True if own.seen is None else own.seen)
         moved = rms((own.value - self._initial[key])[kept]) if kept.any() else 0.0
         seen = None if own.seen is None else float(own.seen.mean())
         return replace(about, moved=moved, reach=reach, rate=optimizer.rate(key), seen=seen)
@@ -196,10 +196,6 @@ class Certainty:
                 seen=self._seen_entries(key, rows),
             )
         return found
-
-
-def _of(keys: Sequence[str], found: Gradients) -> Gradients:
-    return {key: found[key] for key in keys if key in found}
 
 
 class _Budget:

@@ -99,11 +99,10 @@ def summarise(found: Mapping[Verdict, float]) -> Verdict:
 class ParameterCertainty:
     """Of one parameter: its verdict, and the share of its entries that each verdict has.
 
-    `spread` is one standard deviation of the final value about the optimum and `to_go` the estimated way there, in the
-    parameter's unit: one number for each entry of a small parameter, else one, the root mean square over the entries
-    that have an effect; None where none was measured, and of entries at their bounds. `partner` is the parameter that
-    makes up for this one, where one does. `of_target` is what of the spread the noise of rendered targets makes, in the
-    same layout.
+    `spread` is one standard deviation of the final value about the optimum, `of_target` what the noise of rendered
+    targets makes of that, and `to_go` the estimated way there, in the parameter's unit: one number for each entry of a
+    small parameter, else one, the root mean square over the entries that have an effect; None where none was measured,
+    and of entries at their bounds. `partner` is the parameter that makes up for this one, where one does.
 
     `moved` is the root mean square of how far the entries went since the start, and `reach` of how far all steps would
     have taken them one way, None where their length depends on the gradient (`sgd`); `rate` is the learning rate.
