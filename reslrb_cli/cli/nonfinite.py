@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -73,13 +73,12 @@ def load_replay(config: Config) -> Replay:
         problem = assemble_scene(config, values=values)
     except ValueError as error:
         raise ConfigError(archive, "", f"does not fit to {config.source}: {error}") from None
+    integrator, size = problem.integrator, problem.samples_per_pass
     if manifest.get("memory"):
-        problem.samples_per_pass = _samples_per_pass(manifest["memory"], written)
-        problem.integrator = problem.integrator.with_options(
-            samples_per_pass=problem.samples_per_pass, freeze=problem.integrator.freeze
-        )
-    problem.guided = guided
-    problem.integrator = as_decided(problem.integrator, guided, None)
+        size = _samples_per_pass(manifest["memory"], written)
+        integrator = integrator.with_options(samples_per_pass=size, freeze=integrator.freeze)
+    integrator = as_decided(integrator, guided, None)
+    problem = replace(problem, guided=guided, integrator=integrator, samples_per_pass=size)
     _teach(problem, saved, archive)
     for view in problem.views:
         suffix = "" if len(problem.views) == 1 else f"-{view.sensor}"

@@ -55,15 +55,13 @@ def assemble(
     line = outlook(config, problem.scene, problem.sensors) if to_run else None
     if line is not None:
         say(line)
-    make_targets(problem, say)
+    problem = make_targets(problem, say)
     if settled is not None:
-        settled.settle(problem, options)
-        settled.reach(problem)
-        return problem
+        return settled.reach(settled.settle(problem, options))
     problem = settle(problem, options, say, cache)
     if to_run:
         check_exposures(problem)
-        find_reached(problem)
+        problem = find_reached(problem)
     return problem
 
 

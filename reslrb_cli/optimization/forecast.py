@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import statistics
 import time
-from collections.abc import Callable, Generator, Sequence
-from contextlib import closing
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from itertools import islice, pairwise
 
@@ -78,20 +78,20 @@ def measure_steps(problem: Problem) -> Steps:
 
 def _peak(problem: Problem, spp: int) -> int:
     """Bytes that two iterations of `spp` samples per pixel take: the second is one that was recorded."""
-    with closing(_iterations(problem, spp)) as iterations:
-        return _highest(problem, list(islice(iterations, 2)))
+    with _trial(problem, spp) as trial:
+        return _highest(problem, list(islice(optimize(trial), 2)))
 
 
-def _iterations(problem: Problem, spp: int) -> Generator[Record, None, None]:
-    """The first iterations of `spp` samples per pixel, by the loop itself; then all is as it was before."""
-    config, values = problem.config, problem.values()
-    enough = {"spp": spp, "iterations": max(config.run.iterations, WARM_UP + MOST)}  # of a run of two, too
-    problem.config = config.model_copy(update={"run": config.run.model_copy(update=enough)})
+@contextmanager
+def _trial(problem: Problem, spp: int) -> Iterator[Problem]:
+    """The problem before its first iteration, of `spp` samples per pixel; then the scene is as it was."""
+    run = problem.config.run
+    enough = {"spp": spp, "iterations": max(run.iterations, WARM_UP + MOST)}  # of a run of two, too
+    config = problem.config.model_copy(update={"run": run.model_copy(update=enough)})
     try:
-        yield from optimize(problem)
+        yield replace(problem.afresh(problem.values()), config=config)
     finally:
-        problem.config = config
-        problem.begin_again(values)
+        problem.apply()
 
 
 def _highest(problem: Problem, records: Sequence[Record]) -> int:
@@ -101,12 +101,12 @@ def _highest(problem: Problem, records: Sequence[Record]) -> int:
 
 def _measure(problem: Problem, spp: int) -> Steps:
     """A few iterations of `spp` samples per pixel."""
-    guiding = guiding_of(problem)
     records: list[Record] = []
     taught: list[int] = []  # how often tables had learned after each
     begin = time.perf_counter()
-    with closing(_iterations(problem, spp)) as iterations:
-        for record in iterations:
+    with _trial(problem, spp) as trial:
+        guiding = guiding_of(trial)
+        for record in optimize(trial):
             records.append(record)
             taught.append(0 if guiding is None else guiding.lessons)
             if len(records) == WARM_UP:
@@ -189,8 +189,7 @@ def make_forecast(
     problem = assemble_scene(_with_short_target(config))
     options = find_options(problem)
     buffers = _buffers(problem)
-    make_targets(problem, say)
-    problem.truth.clear()  # errors are no part of a step
+    problem = replace(make_targets(problem, say), truth={})  # errors are no part of a step
     problem = settle(problem, options, say, cache)
     image_s = _image_seconds(problem)
     before(problem)

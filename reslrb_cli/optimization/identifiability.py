@@ -18,6 +18,7 @@ from __future__ import annotations
 import dataclasses
 import logging
 from collections.abc import Sequence
+from dataclasses import replace
 
 import drjit as dr
 import mitsuba as mi
@@ -47,24 +48,25 @@ LEAST = 1e-4
 PART = 0.1
 
 
-def find_reached(problem: Problem) -> None:
-    """Fill `problem.masks` for the parameters whose true value is known.
+def find_reached(problem: Problem) -> Problem:
+    """The problem with its `masks`, of the parameters whose true value is known.
 
     An entry counts as reached where light reaches it (the gradient of the image's sum with respect to it, over
     `run.reach_spp` samples per pixel, is not 0 in some channel) and, for a texel, where some sensor also sees its
     centre: a texel that only lights others is held by interreflection alone.
     """
     if not problem.truth:
-        return
+        return problem
     logger.debug(f"finding what light and sensor reach: {problem.config.run.reach_spp} spp")
-    sensitive = sensitivity(problem)
+    sensitive, masks = sensitivity(problem), dict[str, Array]()
     for key in problem.truth:
         mask: Array = sensitive[key] | (key in problem.selection.factors)  # every image shows its exposure
         if mask.ndim == 3:
             mask = np.any(mask, axis=2)
             if key in problem.selection.params:  # a heightmap is no texture to be seen
                 mask = mask & _visible(problem, key)
-        problem.masks[key] = mask
+        masks[key] = mask
+    return replace(problem, masks=masks)
 
 
 def shown_texels(problem: Problem, key: str) -> Array | None:

@@ -83,10 +83,9 @@ def optimize(
     state = State(problem) if state is None else state
     clock, policy, clamp, peak_before = state.clock, state.policy, state.clamp, state.peak_mib
     reset_peak()
-    if config.optimizer.scale == "auto" and not state.scaled:
+    if config.optimizer.scale == "auto" and state.sensitivities is None:
         with clock.counted():
-            problem.sensitivities = rescale(problem)
-        state.scaled = True
+            state.sensitivities = rescale(problem)
     meter = problem.error_meter()
     for iteration in range(state.iteration, config.run.iterations):
         errors = meter.errors(problem.selection.array)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -12,7 +12,7 @@ import numpy as np
 from reslrb_cli.config.schema import Config
 from reslrb_cli.integrators.light_tracer import LightTracer
 from reslrb_cli.integrators.step import OnSamples
-from reslrb_cli.optimization.decisions import Allowance, MemoryPlan, Scaled
+from reslrb_cli.optimization.decisions import Allowance, MemoryPlan
 from reslrb_cli.optimization.errors import ErrorMeter
 from reslrb_cli.optimization.loading import BETWEEN_SPP, render_in_passes
 from reslrb_cli.optimization.optimizers import Optimizer, make_transform
@@ -36,9 +36,9 @@ def saved_spp(problem: Problem, between: bool) -> int:
 Array = np.ndarray[Any, Any]
 
 
-@dataclass
+@dataclass(frozen=True)
 class Problem:
-    """What `optimize` works on.
+    """What `optimize` works on, as `assemble` has finished it.
 
     `truth` holds the true value of every parameter for which it is known, textures in the resolution of the scene
     file, and `masks` the entries of those that light and sensor reach (boolean; (H, W) for textures, else of the
@@ -64,22 +64,24 @@ class Problem:
     guided: GuidedRecord | None = None
     sequence: SequenceRecord | None = None
     memory: MemoryPlan | None = None
-    sensitivities: list[Scaled] | None = None
 
     def apply(self, others: Mapping[str, Any] | None = None) -> None:
         """Hand the optimiser's values to the scene, or, of the keys in `others`, those."""
         values = {key: self.optimizer[key] for key in self.selection.keys}
         self.selection.hand_over({**values, **(others or {})})
 
-    def begin_again(self, values: Mapping[str, Array]) -> None:
-        """Be as before the first iteration, with these values, as `values` has them; what was learned is forgotten."""
+    def afresh(self, values: Mapping[str, Array]) -> Problem:
+        """The same as before the first iteration, with these values, as `values` has them; what was learned is
+        forgotten. Both share a scene, which has these values now."""
         self.selection.set_arrays(values)
-        self.optimizer = make_optimizer(self.config, self.selection)
-        if isinstance(self.integrator, LightTracer):
-            self.integrator = self.integrator.afresh()
+        integrator = self.integrator
+        if isinstance(integrator, LightTracer):
+            integrator = integrator.afresh()
             for sensor in self.sensors:  # what it finds out about the scene is no part of the first iteration
-                self.integrator.plan(self.scene, self.scene.sensors()[sensor])
-        self.apply()
+                integrator.plan(self.scene, self.scene.sensors()[sensor])
+        fresh = replace(self, integrator=integrator, optimizer=make_optimizer(self.config, self.selection))
+        fresh.apply()
+        return fresh
 
     def gradients(self) -> dict[str, Any]:
         """The gradient of each parameter that steps have added up since it was last handed over or cleared."""

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -223,13 +223,13 @@ def stored_value(problem: Problem, prefix: str, key: str, value: Any) -> dict[st
 class State:
     """What the iterations of `problem` go on from; a new one is that of a run before its first.
 
-    `iteration` is the number of those done, `scaled` says whether `scale: auto` has been measured, `peak_mib` is the
+    `iteration` is the number of those done, `sensitivities` are what `scale: auto` has measured, `peak_mib` is the
     allocator's high-water mark. The parameters and what moves them are the problem's optimiser's.
     """
 
     problem: Problem
     iteration: int = 0
-    scaled: bool = False
+    sensitivities: list[Scaled] | None = None
     peak_mib: float = 0.0
     clock: StepClock = field(default_factory=StepClock)
     policy: NonFinitePolicy = field(init=False)
@@ -259,14 +259,13 @@ class State:
         guiding = guiding_of(problem)
         gradients, heard = ({}, {}) if guiding is None else guiding.state()
         arrays |= {f"guiding/{name}": value for name, value in heard.items()}
-        measured = problem.sensitivities if self.scaled else None
         values = {
             "elapsed_s": self.clock.elapsed_s,
             "peak_mib": self.peak_mib,
             "standstill": self.policy.standstill,
             "clamp": counts,
             "units": units,
-            "scaling": None if measured is None else [row.to_json() for row in measured],
+            "scaling": None if self.sensitivities is None else [row.to_json() for row in self.sensitivities],
         }
         if guiding is not None:
             values["guiding"] = gradients
@@ -292,8 +291,7 @@ class State:
         if guiding is not None:
             _restore_guiding(problem, guiding, stored)
         rows = stored.scaling(list(values))
-        problem.sensitivities = None if rows is None else [Scaled(**row) for row in rows]
-        self.scaled = rows is not None
+        self.sensitivities = None if rows is None else [Scaled(**row) for row in rows]
         problem.apply()
 
 
@@ -364,15 +362,15 @@ class Settled:
             problem.optimizer.set_value(key, values[key])
         problem.apply()
 
-    def settle(self, problem: Problem, options: Sequence[Candidate]) -> None:
+    def settle(self, problem: Problem, options: Sequence[Candidate]) -> Problem:
         """Choose what the run had chosen: the pilot's estimator, the samples of a pass, and how samples are drawn."""
-        self._estimator(problem, options)
+        problem, guided, sequence = self._estimator(problem, options), None, None
         if is_auto(problem.config, "guiding"):
-            problem.guided = self._found(GuidedRecord, "guided", "is not what measuring whether guiding pays finds")
+            guided = self._found(GuidedRecord, "guided", "is not what measuring whether guiding pays finds")
         if is_auto(problem.config, "sequence"):
-            wrong = "is not what measuring whether the sequence pays finds"
-            problem.sequence = self._found(SequenceRecord, "sequence", wrong)
-        problem.integrator = as_decided(problem.integrator, problem.guided, problem.sequence)
+            sequence = self._found(SequenceRecord, "sequence", "is not what measuring whether the sequence pays finds")
+        integrator = as_decided(problem.integrator, guided, sequence)
+        return replace(problem, guided=guided, sequence=sequence, integrator=integrator)
 
     def _found(self, kind: type[Found], name: str, wrong: str) -> Found | None:
         """What was measured, where it was."""
@@ -381,30 +379,33 @@ class Settled:
         except TypeError:
             raise self.stored.wrong(name, wrong) from None
 
-    def _estimator(self, problem: Problem, options: Sequence[Candidate]) -> None:
+    def _estimator(self, problem: Problem, options: Sequence[Candidate]) -> Problem:
         chosen = options[0] if options else None
-        problem.pilot = self._found(EstimatorRecord, "pilot", "is not what a pilot finds")
-        if problem.pilot is not None:
-            chosen = next((option for option in options if option.options == problem.pilot.chosen), None)
+        pilot = self._found(EstimatorRecord, "pilot", "is not what a pilot finds")
+        if pilot is not None:
+            chosen = next((option for option in options if option.options == pilot.chosen), None)
             if chosen is None:
                 raise self.stored.wrong("pilot.chosen", "is nothing that this run can choose")
         if chosen is None:
-            return
-        problem.integrator, problem.memory = chosen.integrator, chosen.memory
-        if chosen.memory is not None:
-            problem.memory = memory = self._memory(problem, chosen.memory)
-            problem.samples_per_pass = memory.samples_per_pass
-            size = memory.samples_per_pass if memory.passes > 1 else None
-            problem.integrator = chosen.integrator.with_options(samples_per_pass=size, freeze=chosen.integrator.freeze)
+            return replace(problem, pilot=pilot)
+        if chosen.memory is None:
+            return replace(problem, pilot=pilot, integrator=chosen.integrator, memory=None)
+        memory = self._memory(chosen.memory)
+        size = memory.samples_per_pass if memory.passes > 1 else None
+        integrator = chosen.integrator.with_options(samples_per_pass=size, freeze=chosen.integrator.freeze)
+        return replace(
+            problem, pilot=pilot, integrator=integrator, memory=memory, samples_per_pass=memory.samples_per_pass
+        )
 
-    def reach(self, problem: Problem) -> None:
+    def reach(self, problem: Problem) -> Problem:
         """Take up what light and sensor reach, of the parameters whose true value is known."""
+        masks = {}
         for key in problem.truth:
             shape = problem.selection.array(key).shape
-            name = f"mask/{key}"
-            problem.masks[key] = self.stored.archive.array(name, shape[:2] if len(shape) == 3 else shape, "b")
+            masks[key] = self.stored.archive.array(f"mask/{key}", shape[:2] if len(shape) == 3 else shape, "b")
+        return replace(problem, masks=masks)
 
-    def _memory(self, problem: Problem, now: MemoryPlan) -> MemoryPlan:
+    def _memory(self, now: MemoryPlan) -> MemoryPlan:
         """The plan of the run, whose passes decide in what order samples are summed up."""
         size, passes = (self.stored.count("memory", name) for name in ("samples_per_pass", "passes"))
         if size * passes != now.samples_per_pass * now.passes:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import gc
 from collections.abc import Callable
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import mitsuba as mi
@@ -107,8 +108,8 @@ def _lacks_light(config: Config, rendered: bool) -> bool:
 LUMINANCE = np.array([0.212671, 0.715160, 0.072169], dtype=np.float32)
 
 
-def make_targets(problem: Problem, say: Callable[[str], None]) -> None:
-    """Read or render every view's target, and with it what is known of the parameters, `problem.truth`.
+def make_targets(problem: Problem, say: Callable[[str], None]) -> Problem:
+    """Read or render every view's target; returns the problem with what that tells of the parameters, its `truth`.
 
     `say` is told what takes long, and what of the targets is left out. Raises ConfigError.
     """
@@ -122,9 +123,10 @@ def make_targets(problem: Problem, say: Callable[[str], None]) -> None:
                 say(line)
             _see(problem, view, photo.image, photo, say)
     if problem.config.target.render is not None:
-        _render_targets(problem, say)
+        problem = replace(problem, truth=_render_targets(problem, say))
         gc.collect()  # a second scene takes part in all that is traced, until it is gone
     _check_light(problem, say)
+    return problem
 
 
 def _check_light(problem: Problem, say: Callable[[str], None]) -> None:
@@ -159,17 +161,19 @@ def _see(problem: Problem, view: View, image: Array, photo: Photo | None, say: C
     view.see(target, weights)
 
 
-def _render_targets(problem: Problem, say: Callable[[str], None]) -> None:
+def _render_targets(problem: Problem, say: Callable[[str], None]) -> dict[str, Array]:
+    """Give the views without a file their targets; returns the parameters' true values."""
     config, render = problem.config, problem.config.target.render
     assert render is not None, "called for rendered targets only"
     true_scene = load_configured(config, warn=False)
     true_values = set_true_values(config, true_scene)
+    truth: dict[str, Array] = {}
     for key in problem.selection.keys:
         if key in problem.selection.factors:  # the scene's own images are the target
-            problem.truth[key] = np.ones_like(problem.selection.array(key))
+            truth[key] = np.ones_like(problem.selection.array(key))
             continue
-        problem.truth[key] = true_values.array(key)
-        grid = comparison_grid(problem.selection.array(key).shape, problem.truth[key].shape)
+        truth[key] = true_values.array(key)
+        grid = comparison_grid(problem.selection.array(key).shape, truth[key].shape)
         if grid is not None:
             say(f"{key} has another resolution than its true value: compared, resampled, at {grid[1]}x{grid[0]}")
     chosen = render.integrator or config.integrator
@@ -182,6 +186,7 @@ def _render_targets(problem: Problem, say: Callable[[str], None]) -> None:
         say(f"rendering the target of sensor {view.sensor}: {render.spp} spp")
         image = render_in_passes(integrator, true_scene, view.sensor, render.spp, render.seed, 0, "target", multiple)
         _see(problem, view, image, None, say)
+    return truth
 
 
 def set_true_values(config: Config, scene: mi.Scene) -> Selection:

@@ -285,8 +285,8 @@ class Recording:
             return
         with MetricsWriter(self.folder.path) as metrics:
             for record in optimize(self.problem, self._on_nonfinite, self.course.state):
-                if not told and self.problem.sensitivities is not None:
-                    note_scaling(self.manifest, self.problem, self.problem.sensitivities)
+                if not told and self.course.state.sensitivities is not None:
+                    note_scaling(self.manifest, self.problem, self.course.state.sensitivities)
                 told = True
                 self.course.add(record)
                 metrics.write(record)

@@ -77,7 +77,7 @@ class Earlier:
         manifest = self._manifest(manifest_of(problem, variant, self.config.source))
         course = Course(problem, fixed_of(problem, variant))
         course.restore(self.stored, self.records)
-        measured = problem.sensitivities
+        measured = course.state.sensitivities
         manifest.scaling = None if measured is None else [row.to_json() for row in measured]
         return course, manifest
 

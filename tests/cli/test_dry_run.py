@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import re
 import time
-from contextlib import closing
+from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 
@@ -19,6 +19,7 @@ from reslrb_cli.config.loader import load
 from reslrb_cli.optimization import forecast as trial
 from reslrb_cli.optimization.assemble import assemble
 from reslrb_cli.optimization.forecast import make_forecast
+from reslrb_cli.optimization.loop import optimize
 from reslrb_cli.records.clock import MIB, rough_duration
 from reslrb_cli.records.decisions import RivalRecord
 from reslrb_cli.records.manifest import read_manifest
@@ -97,12 +98,12 @@ def test_the_bias_of_correlated_is_counted(experiment: Path, capsys: pytest.Capt
 def test_each_trial_begins_where_the_run_does(experiment: Path) -> None:
     """Else texels that a trial has moved to 0 would have the next one trace, and keep, what the run does not need."""
     problem = assemble(load(experiment / "tiny.yaml", [*SETS, "optimizer.learning_rate=0.4"]))
-    problem.truth.clear()
+    problem = replace(problem, truth={})
     begin = {key: value.copy() for key, value in problem.values().items()}
     losses = []
     for _ in range(2):
-        with closing(trial._iterations(problem, 4)) as iterations:
-            losses.append([record.loss for record in islice(iterations, 3)])
+        with trial._trial(problem, 4) as before:
+            losses.append([record.loss for record in islice(optimize(before), 3)])
             assert all(np.abs(value - begin[key]).max() > 0.3 for key, value in problem.values().items())
         assert all(np.array_equal(value, begin[key]) for key, value in problem.values().items())
     assert losses[0] == losses[1]

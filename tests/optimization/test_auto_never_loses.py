@@ -65,7 +65,7 @@ def decided(config: Config, case: ExtremeCase | None) -> Problem:
     """The problem, in the scene of a case if one is given, with all that is left to measurement decided now."""
     problem = assemble_scene(config, None if case is None else load_scene(case.scene()))
     options = find_options(problem)
-    make_targets(problem, lambda line: None)
+    problem = make_targets(problem, lambda line: None)
     return SETTLE["settle"](problem, options, lambda line: None)
 
 

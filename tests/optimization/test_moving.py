@@ -109,7 +109,7 @@ def norm_of_all_samples(llvm, tmp_path_factory) -> float:
     """The gradient's norm in a step of more samples, in one pass."""
     path = glass.write_experiment(tmp_path_factory.mktemp("all"))
     one = assemble(load(path, ["run.adjoint=independent", "run.iterations=1", "integrator.freeze=false", "run.spp=64"]))
-    find_reached(one)
+    one = find_reached(one)
     [reference] = list(optimize(one))
     return float(reference.grad_norm)
 
@@ -125,7 +125,7 @@ def test_steps_of_several_backward_passes_add_up(tmp_path, options, norm_of_all_
     """Batches and passes propagate more than once through what moves, from one set of values."""
     path = glass.write_experiment(tmp_path)
     problem = assemble(load(path, [options, "run.iterations=1", "integrator.freeze=false"]))
-    find_reached(problem)
+    problem = find_reached(problem)
     [record] = list(optimize(problem))
     assert record.grad_norm > 0
     assert record.grad_norm == pytest.approx(norm_of_all_samples, rel=0.5)
@@ -144,7 +144,7 @@ def test_a_lamp_is_found(tmp_path):
     problem = assemble(config, lines.append)
     assert type(problem.integrator.estimator).__name__ == "Stack"
     assert not any(line.startswith("measuring ") for line in lines)  # there is one
-    find_reached(problem)
+    problem = find_reached(problem)
     records = list(optimize(problem))
     assert records[0].parameter_rmse == pytest.approx(np.sqrt(0.015 / 3), rel=1e-3)
     assert records[-1].parameter_rmse < 0.4 * records[0].parameter_rmse

@@ -24,7 +24,7 @@ def slopes(heights: np.ndarray) -> np.ndarray:
 def test_it_is_recovered_to_a_tenth(name):
     problem = assemble(load(CONFIGS / f"{name}.yaml"))
     start = problem.values()
-    find_reached(problem)
+    problem = find_reached(problem)
     for _ in optimize(problem):
         pass
     for key, value in problem.values().items():

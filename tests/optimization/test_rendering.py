@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +23,7 @@ def test_only_small_images_are_recorded(monkeypatch, most, recorded):
     problem = assemble_scene(load(CONFIG, TINY))
     image = problem.render(0, 8, 0, "saved image")
     assert bool(problem.integrator.preparation.recordings.counts()) == recorded
-    problem.integrator = problem.integrator.with_options(samples_per_pass=None, freeze=False)
+    problem = replace(problem, integrator=problem.integrator.with_options(samples_per_pass=None, freeze=False))
     assert np.array_equal(image, problem.render(0, 8, 0, "saved image"))
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import drjit as dr
@@ -17,6 +18,7 @@ from reslrb_cli.optimization.identifiability import find_reached
 from reslrb_cli.optimization.loop import optimize
 from reslrb_cli.optimization.optimizers import Optimizer, Variable, make_transform
 from reslrb_cli.optimization.sensitivity import measure_sensitivities, own_length, rescale, step_line
+from reslrb_cli.optimization.state import State
 
 CONFIG = Path(__file__).resolve().parents[2] / "configs" / "stiff" / "lamp.yaml"
 TINY = ["scene.options={resx: 12, resy: 12}", "integrator.max_depth=2", "run.spp=32", "run.reach_spp=16",
@@ -82,9 +84,9 @@ def test_measuring_leaves_everything_as_it_was():
 def test_what_has_no_effect_is_not_scaled():
     """At depth 1 nothing but emitters is seen, and a point has no size."""
     problem = assemble(load(CONFIG, [*TINY, "integrator={estimator: gather, max_depth: 1}", "run.iterations=1"]))
-    problem.truth.clear()
-    list(optimize(problem))
-    for row in problem.sensitivities:
+    state = State(replace(problem, truth={}))
+    list(optimize(state.problem, state=state))
+    for row in state.sensitivities:
         assert (row.change, row.length, row.gradient) == (None, None, 0.0)
         assert problem.optimizer.variable(row.key).length == 1.0
 
@@ -125,7 +127,7 @@ def test_a_stiff_problem_is_solved_with_one_learning_rate():
 
     def error(*sets):
         problem = assemble(load(CONFIG, [*TINY, "run.iterations=100", "run.spp=16", "run.adjoint=independent", *sets]))
-        find_reached(problem)
+        problem = find_reached(problem)
         records = list(optimize(problem))
         assert len(records) == 100
         return np.sqrt(np.mean(np.square(relative_errors(problem))))
@@ -156,11 +158,11 @@ def test_the_first_step_is_what_the_line_says(transform):
     """Adam's first step is one learning rate in what it moves."""
     sets = [f"parameters[1].transform={transform}", "parameters[1].bounds=[0, 1e8]", "run.iterations=1"]
     problem = assemble(load(CONFIG, [*TINY, *sets]))
-    problem.truth.clear()
+    state = State(replace(problem, truth={}))
     before = problem.selection.array(LAMP)
-    list(optimize(problem))
+    list(optimize(state.problem, state=state))
     moved = problem.selection.array(LAMP) / before
-    row = next(row for row in problem.sensitivities if row.key == LAMP)
+    row = next(row for row in state.sensitivities if row.key == LAMP)
     rate = problem.config.optimizer.learning_rate
     line = step_line(row, transform, rate)
     assert line.startswith(f"{LAMP} moves in steps of {row.own_length:.3g} times the learning rate")

@@ -12,7 +12,7 @@ from __future__ import annotations
 import enum
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -232,8 +232,8 @@ def survey(
     if objective == "image":
         return facts | {"shapes": {"image": [height, width, int(film.base_channels_count())]}}, {"mask": mask}
     paths = PATHS[objective] if budget_s is None else affordable_paths(problem, pixels, SHARE[objective] * budget_s / 2)
-    shortened = shorten_target(problem, paths // pixels)
-    make_targets(problem, lambda line: None)
+    problem, shortened = shorten_target(problem, paths // pixels)
+    problem = make_targets(problem, lambda line: None)
     count = IMAGES if objective == "loss" else 1
     spp = multiple_of(paths // (count * pixels), problem.samples_per_pass)
     adjoints = []
@@ -309,18 +309,18 @@ def affordable_paths(problem: Problem, pixels: int, seconds: float) -> int:
     return 2 ** int(np.log2(np.clip(paths, TRIAL, MOST_PATHS)))
 
 
-def shorten_target(problem: Problem, most: int) -> str:
-    """Bound the samples per pixel of a target that has to be rendered; returns what to say of it."""
+def shorten_target(problem: Problem, most: int) -> tuple[Problem, str]:
+    """The problem with a bound to the samples per pixel of a target that has to be rendered, and what to say of it."""
     render = problem.config.target.render
     if render is None:
-        return ""
+        return problem, ""
     own = (render.integrator or problem.config.integrator).options().get("samples_per_pass")
     spp = multiple_of(most, own)
     if spp >= render.spp:
-        return ""
+        return problem, ""
     target = problem.config.target.model_copy(update={"render": render.model_copy(update={"spp": spp})})
-    problem.config = problem.config.model_copy(update={"target": target})
-    return f", the target of {spp}, not {render.spp}"
+    shorter = replace(problem, config=problem.config.model_copy(update={"target": target}))
+    return shorter, f", the target of {spp}, not {render.spp}"
 
 
 def multiple_of(spp: int, unit: int | None) -> int:

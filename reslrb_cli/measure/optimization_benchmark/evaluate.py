@@ -124,9 +124,8 @@ def prepare(
     films = [problem.scene.sensors()[sensor].film() for sensor in problem.sensors]
     pixels = sum(int(np.prod(film.crop_size())) for film in films)
     paths = affordable_paths(problem, pixels, TARGET_SHARE * budget_s)
-    shortened = shorten_target(problem, paths // pixels)
-    make_targets(problem, lambda line: None)
-    find_reached(problem)
+    problem, shortened = shorten_target(problem, paths // pixels)
+    problem = find_reached(make_targets(problem, lambda line: None))
     with open(out, "wb") as file:
         np.savez(file, **target_arrays(problem.views))  # type: ignore[arg-type]
     masked = camera and (named or "prb" not in without) and leave_out_border(problem)
@@ -147,11 +146,10 @@ def restore(problem: Problem, targets: str, spp: int, masked: bool) -> tuple[Jud
     The facts: `loss` and `error` of the initial values, and `judge_s`.
     """
     initial = copies(problem)
-    shorten_target(problem, 1)
-    make_targets(problem, lambda line: None)  # for the sake of the true values
+    problem = make_targets(shorten_target(problem, 1)[0], lambda line: None)  # for the sake of the true values
     with np.load(targets) as found:
         set_targets(problem.views, found)
-    find_reached(problem)
+    problem = find_reached(problem)
     if masked:
         leave_out_border(problem)
     return _judge(problem, spp, initial)
