@@ -31,7 +31,6 @@ if TYPE_CHECKING:
 #: Takes addresses in the memory of a running Blender from its parameters.
 _UNSAFE = frozenset({"blender"})
 
-
 #: Names that Mitsuba knows without a library.
 _BUILT_IN = frozenset({"scene", "rgb", "spectrum"})
 
@@ -135,7 +134,6 @@ def python_command(code: str) -> list[str]:
 
 
 MISSING_LIBRARY = "run scripts/setup, or install the package that holds it"
-
 
 #: Of each package the versions that pyproject.toml has, the first of them and the first that is too new, and functions
 #: by which it is told from another package of its name.

@@ -24,10 +24,8 @@ from reslrb_cli.backend.doctor import memory_bytes
 #: What a thread's stack has where the system sets no limit: glibc's own.
 _UNLIMITED_STACK = 2 * 2**20
 
-
 #: What of it is in use where a kernel begins.
 _IN_USE = 2**20
-
 
 #: Lanes of a vector by what the processor knows, the widest first; the backend takes the widest.
 _LANES = (("avx512vl", 16), ("avx", 8))

@@ -36,29 +36,22 @@ if TYPE_CHECKING:
 #: Pixels with which a run takes minutes on two cores, at the samples below.
 PIXELS = 2**14
 
-
 SPP, ITERATIONS, RATE = 16, 200, 0.03
-
 
 #: The same with a parameter that has no upper bound, of which rates are shares: it and what it shines on are told apart
 #: in many steps.
 UNBOUNDED_ITERATIONS, UNBOUNDED_RATE = 300, 0.1
 
-
 #: Commented lines of parameters; a scene can have thousands.
 _MOST_OTHERS = 60
-
 
 #: Variables and sensors that a comment names, and characters of a variable there.
 _MOST_VARIABLES, _MOST_SENSORS, _LONGEST = 8, 6, 40
 
-
 #: Columns of a comment of several lines.
 _COMMENT = 110
 
-
 _NUMBER = re.compile(r"-?\d{1,15}(\.\d{1,15})?")
-
 
 _PLAIN = re.compile(r"(\.\./)*[A-Za-z_][\w.\-]*(/[\w.\-]+)*")
 
@@ -246,7 +239,6 @@ def _text(text: str) -> str:
 
 
 Size = tuple[int, int]
-
 
 #: By how much the ratio of a photograph's sides may differ from the film's.
 _RATIO = 0.01

@@ -118,7 +118,6 @@ def read_recovered(run: Path, overrides: tuple[str, ...]) -> Config:
 
 logger = logging.getLogger(__name__)
 
-
 #: Type of an option that counts something: samples, depths, seeds. As in a configuration, 31 bits.
 COUNT = click.IntRange(min=1, max=2**31 - 1)
 

@@ -93,14 +93,11 @@ def _below_working_directory(value: Any) -> Path:
 
 _PATH_SCHEMA = WithJsonSchema({"type": "string", "format": "path"})
 
-
 #: A path relative to the folder of the config file.
 ConfigPath = Annotated[Path, BeforeValidator(_below_config), _PATH_SCHEMA]
 
-
 #: A path relative to the working directory.
 WorkPath = Annotated[Path, BeforeValidator(_below_working_directory), _PATH_SCHEMA]
-
 
 # --- unions -----------------------------------------------------------------------------------------------------------
 
@@ -151,16 +148,12 @@ def kind_tag(value: Any, word: str | None = None) -> str | None:
 
 Positive = Annotated[float, Field(gt=0)]
 
-
 Count = Annotated[int, Field(ge=1, lt=2**31)]
-
 
 Seed = Annotated[int, Field(ge=0, lt=SEED_END)]
 
-
 #: Names that Windows takes for devices, whatever suffix they have: a folder that is called so cannot be copied there.
 _RESERVED = re.compile(r"(con|prn|aux|nul|(com|lpt)[0-9])(\..*)?", re.IGNORECASE)
-
 
 #: What begins at a root or at a home, or has `.` or `..` for a part. A slash between words is none of that.
 _PATH = re.compile(r"^([/\\~]|[A-Za-z]:[/\\])|(^|[/\\])\.\.?($|[/\\])")
@@ -187,9 +180,7 @@ def check_name(name: str) -> str:
 
 MIB = 2**20
 
-
 _UNITS = {"b": 1, "kb": 10**3, "mb": 10**6, "gb": 10**9, "kib": 2**10, "mib": MIB, "gib": 2**30}
-
 
 _SIZE = re.compile(r"(\d+(?:\.\d*)?|\.\d+)\s*([A-Za-z]+)")
 

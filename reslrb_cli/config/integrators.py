@@ -100,10 +100,8 @@ ESTIMATOR_OPTIONS: dict[str, tuple[str, ...]] = {
     "stack": ("stack_size",),
 }
 
-
 #: Those that `auto` leaves to measurement beside any estimator, with what they are where nothing is measured.
 UNDECIDED: dict[str, str] = {"guiding": "off", "sequence": "independent"}
-
 
 #: Every option that says which estimator, and how.
 _ANY_ESTIMATORS = {"estimator", *(option for options in ESTIMATOR_OPTIONS.values() for option in options)}

@@ -56,7 +56,6 @@ AnyLoss = Annotated[
     by_type("l2"),
 ]
 
-
 _Decay = Annotated[float, Field(ge=0, lt=1)]
 
 

@@ -19,13 +19,10 @@ from reslrb_cli.config.files import KEY_LENGTH, PIXELS
 
 Numbers = Annotated[list[float], Field(min_length=1)]
 
-
 #: What a motion has; it is applied in the opposite order.
 Word = Literal["translation", "rotation", "scale"]
 
-
 WORDS: tuple[Word, ...] = ("translation", "rotation", "scale")
-
 
 #: The name, below its mesh's, of what a heightmap recovers.
 HEIGHTMAP = "heightmap"
@@ -53,12 +50,9 @@ _NumberOrList = Annotated[
     Annotated[float, mark("number")] | Annotated[Numbers, mark("list")], by_kind("a number or a list of numbers")
 ]
 
-
 _Bound = Annotated[float, Field(allow_inf_nan=True)]
 
-
 Bounds = Annotated[tuple[_Bound, _Bound], Field(strict=False)]
-
 
 TransformName = Literal["none", "sigmoid", "log", "softplus"]
 
@@ -110,12 +104,9 @@ def _names(value: list[str]) -> list[str]:
 
 Name = Annotated[str, Field(min_length=1, max_length=KEY_LENGTH)]
 
-
 _NAME = {"type": "string", "minLength": 1, "maxLength": KEY_LENGTH}
 
-
 _NAMES = WithJsonSchema({"anyOf": [_NAME, {"type": "array", "items": _NAME, "minItems": 1}]})
-
 
 #: One name or several.
 Names = Annotated[list[Name], Field(min_length=1), BeforeValidator(_list_of_one), _NAMES]
@@ -174,7 +165,6 @@ class MotionSpec(Section):
 
 ColorSpace = Literal["auto", "linear", "srgb"]
 
-
 COLOR_SPACE = "How values are encoded: `linear`, `srgb`, or `auto` (8-bit files srgb, float files linear)."
 
 
@@ -226,17 +216,13 @@ Initial = Annotated[
     ),
 ]
 
-
 _AnyBounds = Annotated[Annotated[Bounds, mark("list")] | Annotated[MotionBounds, mark(ByWord.TAG)], or_words("list")]
 
-
 _AnyRate = Annotated[Annotated[Positive, mark("number")] | Annotated[MotionRates, mark(ByWord.TAG)], or_words("number")]
-
 
 _AnyTransform = Annotated[
     Annotated[TransformName, mark("text")] | Annotated[MotionTransform, mark(ByWord.TAG)], or_words("text")
 ]
-
 
 #: One key, or several that are tied.
 _Key = Annotated[

@@ -137,7 +137,6 @@ class Rendering(Section):
 
 _PATH = {"type": "string", "format": "path"}
 
-
 _Files = Annotated[
     list[ConfigPath],
     Field(min_length=1),

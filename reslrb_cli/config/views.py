@@ -73,12 +73,10 @@ class _OrText:
 #: `auto`, `none`, an image of weights, or a section that says what is left out.
 AnyMask = Annotated[Mask, BeforeValidator(_mask), _OrText()]
 
-
 MASK = (
     "Pixels that are left out of the loss, and what the others weigh: `auto` (all kinds are left out), `none`, the "
     "path of an image of weights, alone, or a section that switches kinds off and may add weights."
 )
-
 
 MASK_MIXED = (
     "Leave out, with `specular`, the pixels that see a coat, a blend or a thin pane directly, of whose light light "
@@ -119,7 +117,6 @@ Exposures = Annotated[
         }
     ),
 ]
-
 
 EXPOSURE = (
     "What the image is multiplied by before it is compared, target = exposure * image: a number, `auto` (recovered "

@@ -21,10 +21,8 @@ from typing import IO
 
 _PART = re.compile(r"\..+\.\d+\.part")
 
-
 #: How the names of folders that are not finished begin.
 FOLDER_PREFIX = ".reslrb-"
-
 
 #: Files and folders that this process is about to finish.
 unfinished: set[Path] = set()

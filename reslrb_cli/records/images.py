@@ -110,7 +110,6 @@ def load_image(path: Path) -> np.ndarray[Any, Any] | None:
 
 Array = np.ndarray[Any, Any]
 
-
 #: Names of the channels of a layer, by their number. A layer of another number has them counted.
 _CHANNELS = {1: "Y", 3: "RGB", 4: "RGBA"}
 

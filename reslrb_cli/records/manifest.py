@@ -1,15 +1,13 @@
 """The manifest of a run, `manifest.json`: what ran, on what, and how it ended.
 
-On the disk it is written whole, is readable whatever happens, and has room for an end that fits on a full disk. Where
-the process has gone without ending the run (killed, out of memory, the machine switched off), `read_manifest` puts
-right what it left.
+Where the process has gone without ending the run (killed, out of memory, the machine switched off), `read_manifest`
+puts right what it left.
 """
 
 from __future__ import annotations
 
 import contextlib
 import enum
-import errno
 import json
 import os
 import platform
@@ -30,7 +28,6 @@ from reslrb_cli.records.atomic import remove_parts, write_atomically
 from reslrb_cli.records.lock import READER_WAIT_SECONDS, FolderLock, Holder, InUse
 
 PACKAGES = ("mitsuba", "drjit", "numpy")
-
 
 #: Held while a manifest is written; a process that is about to end takes it for good, after so many seconds at most.
 _WRITING, LAST_WAIT_SECONDS = threading.Lock(), 5.0
@@ -103,9 +100,9 @@ class Manifest:
     results: dict[str, Any] = field(default_factory=dict)
 
     def write(self, folder: Path) -> None:
-        """Write `manifest.json` into `folder`, atomically where the disk has room. Raises OSError."""
+        """Write `manifest.json` into `folder`, atomically. Raises OSError."""
         with _WRITING:
-            write_content(folder, self.content())
+            _write(folder, self.content())
 
     def end(self, folder: Path, status: Status, error: str | None = None) -> None:
         """Set the final status and the time, and write the file. Raises OSError."""
@@ -116,7 +113,7 @@ class Manifest:
         """The same in a process that is about to end, by a thread beside the one that works: that writes no more."""
         _WRITING.acquire(timeout=LAST_WAIT_SECONDS)  # and never released
         self.status, self.error, self.ended = status, None, now()
-        write_content(folder, self.content())
+        _write(folder, self.content())
 
     def content(self) -> dict[str, Any]:
         """What the file says once it is written."""
@@ -135,24 +132,10 @@ def read_manifest(folder: Path) -> dict[str, Any] | None:
 
 MANIFEST_FILE = "manifest.json"
 
-
 PROGRAM = "reslrb"
-
 
 #: Bytes of a manifest; the largest part of one is a pilot's table, of some kB.
 MOST_BYTES = 2**24
-
-
-#: Bytes of white space behind a manifest that is not the last one, at least: room for how the run ends.
-ROOM = 1024
-
-
-#: What file systems allocate at once, or a multiple of it.
-_BLOCK = 4096
-
-
-#: What is kept of an error's line where there is no room for more.
-_SHORT = 300
 
 
 def read_content(folder: Path) -> dict[str, Any] | None:
@@ -164,48 +147,9 @@ def read_content(folder: Path) -> dict[str, Any] | None:
     return content if isinstance(content, dict) and content.get("program") == PROGRAM else None
 
 
-def write_content(folder: Path, content: Mapping[str, Any]) -> None:
-    """Write a manifest into `folder`, atomically; on a full disk over the one that is there. Raises OSError."""
-    text = _text(content)
-    if content["status"] == Status.RUNNING or content.get("missing"):
-        text = _padded(text, -(-(len(text) + ROOM) // _BLOCK) * _BLOCK)
-    try:
-        write_atomically(folder / MANIFEST_FILE, lambda file: file.write(text), durable=True)
-    except OSError as error:
-        if error.errno not in (errno.ENOSPC, errno.EDQUOT) or not _overwrite(folder / MANIFEST_FILE, content):
-            raise
-
-
-def _overwrite(path: Path, content: Mapping[str, Any]) -> bool:
-    """Write a manifest into the blocks of the one at `path`; return whether that went well.
-
-    One that is too large for them leaves what is there, and changes how the run ended.
-    """
-    end = {key: content.get(key) for key in ("status", "ended", "missing", "error")}
-    shortest = end | {"missing": {}, "error": (content.get("error") or "")[:_SHORT] or None}
-    try:
-        with path.open("r+b") as file:
-            before = file.read()
-            there = json.loads(before)
-            for changed in (content, there | end, there | shortest):
-                text = _text(changed)
-                if len(text) <= len(before):
-                    file.seek(0)
-                    file.write(_padded(text, len(before)))
-                    file.flush()
-                    os.fsync(file.fileno())
-                    return True
-    except (OSError, ValueError):
-        pass
-    return False
-
-
-def _text(content: Mapping[str, Any]) -> bytes:
-    return json.dumps(content, indent=2, allow_nan=False).encode() + b"\n"
-
-
-def _padded(text: bytes, size: int) -> bytes:
-    return text[:-1].ljust(size - 1) + b"\n"
+def _write(folder: Path, content: Mapping[str, Any]) -> None:
+    text = json.dumps(content, indent=2, allow_nan=False).encode() + b"\n"
+    write_atomically(folder / MANIFEST_FILE, lambda file: file.write(text), durable=True)
 
 
 #: What the manifest of such a run gives as its error.
@@ -234,7 +178,7 @@ def put_right(folder: Path, content: Mapping[str, Any]) -> dict[str, Any]:
         if read_content(folder) == content:  # nobody was faster
             metrics.mend(folder)
             remove_parts(folder)
-            write_content(folder, right)
+            _write(folder, right)
     return right
 
 

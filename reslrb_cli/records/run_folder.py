@@ -32,7 +32,6 @@ from reslrb_cli.records.manifest import Manifest, Status, read_manifest
 
 Array = np.ndarray[Any, Any]
 
-
 #: Keys that an error names.
 _SHOWN = 3
 
@@ -70,9 +69,7 @@ def checkpoint_of(run: Path) -> Path:
 
 SUBFOLDERS = ("images", "parameters", "checkpoint")
 
-
 OWN_ENTRIES = ("config.yaml", manifests.MANIFEST_FILE, metrics.METRICS_FILE, "report.html", *SUBFOLDERS)
-
 
 #: An unfinished folder without a process is removed when it is so old: nobody is just about to lock it.
 LEFT_SECONDS = 60.0

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from cli.calling import read_metrics
 from cli.tiny import write_experiment
 
 from reslrb_cli.cli import main
@@ -22,7 +23,6 @@ from reslrb_cli.optimization.forecast import make_forecast
 from reslrb_cli.records.clock import MIB, rough_duration
 from reslrb_cli.records.decisions import RivalRecord
 from reslrb_cli.records.manifest import read_manifest
-from reslrb_cli.records.metrics import read_metrics
 
 pytestmark = pytest.mark.usefixtures("llvm")
 

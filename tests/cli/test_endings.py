@@ -8,6 +8,7 @@ from unittest import mock
 
 import numpy as np
 import pytest
+from cli.calling import read_metrics
 from cli.failing import RUN, failing_last, full, lines
 from cli.tiny import COMPLETE, KEY, faults, files
 
@@ -39,7 +40,7 @@ def test_a_signal_ends_a_run_after_the_iteration(optimize, during, number):
     code, out, err = optimize()
     assert (code, faults(RUN, code, err)) == (130, [])
     assert COMPLETE <= files(RUN)
-    assert read_content(RUN)["results"]["iterations"] == len(metrics.read_metrics(RUN)) == 2
+    assert read_content(RUN)["results"]["iterations"] == len(read_metrics(RUN)) == 2
     assert out.splitlines()[-1].startswith("interrupted after 2 iterations")
 
 
@@ -112,7 +113,7 @@ def test_a_run_in_progress_is_not_replaced(optimize, during):
     [line] = lines(err)
     assert line.startswith("tiny.yaml: run.name: ")
     assert f"in use by a run (process {os.getpid()} on " in line
-    assert len(metrics.read_metrics(RUN)) == 5
+    assert len(read_metrics(RUN)) == 5
     assert optimize("--force", "--quiet")[0] == 0
     assert sorted(os.listdir("runs")) == ["tiny"]
 

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from cli.calling import read_metrics
 from turns import a_few
 
 from reslrb_cli.cli import main
@@ -96,10 +97,6 @@ def reslrb(capsys, *args):
 
 def read_manifest(folder):
     return json.loads((Path(folder) / "manifest.json").read_text())
-
-
-def read_metrics(folder):
-    return [json.loads(line) for line in (Path(folder) / "metrics.jsonl").read_text().splitlines()]
 
 
 def names(folder):
