@@ -17,7 +17,6 @@ import time
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 import numpy as np
@@ -56,15 +55,22 @@ def read_value(run: Path, key: str) -> Array:
 
 def checkpoint_of(run: Path) -> Path:
     """The file of the newest checkpoint of the run folder `run`. Raises ConfigError where there is none."""
-    if not run.is_dir():
-        what = "is a file, not the folder of a run" if os.path.lexists(run) else "no such folder"
-        raise ConfigError(run, "", what)
-    if read_manifest(run) is None:
-        raise ConfigError(run, "", "is no run's folder: it has no manifest.json that a run wrote")
+    _manifest_of(run)
     path = newest_checkpoint(run / "checkpoint")
     if path is None:
         raise ConfigError(run, "", f"has no checkpoint/{STATE_FILE}: the run ended before it kept anything")
     return path
+
+
+def _manifest_of(run: Path) -> dict[str, Any]:
+    """What the manifest of the run folder `run` says, that of a killed run put right. Raises ConfigError."""
+    if not run.is_dir():
+        what = "is a file, not the folder of a run" if os.path.lexists(run) else "no such folder"
+        raise ConfigError(run, "", what)
+    content = read_manifest(run)
+    if content is None:
+        raise ConfigError(run, "", "is no run's folder: it has no manifest.json that a run wrote")
+    return content
 
 
 SUBFOLDERS = ("images", "parameters", "checkpoint")
@@ -139,11 +145,8 @@ class RunFolder:
 
     def _place(self, wanted: Path) -> RunFolder:
         """Rename the folder to the first free of `wanted`, `wanted-2`, ..."""
-        for number in itertools.count(1):
-            path = wanted if number == 1 else wanted.with_name(f"{wanted.name}-{number}")
-            if self._take_name(path):
-                return replace(self, path=path)
-        raise AssertionError("unreachable: count() does not end")
+        names = itertools.chain([wanted], (wanted.with_name(f"{wanted.name}-{n}") for n in itertools.count(2)))
+        return replace(self, path=next(path for path in names if self._take_name(path)))
 
     def _take_name(self, path: Path) -> bool:
         """Rename the folder to `path`, unless there is something already."""
@@ -182,22 +185,19 @@ class RunFolder:
 
     def _replace_others(self, path: Path, manifest: Manifest) -> None:
         try:
-            self._move_others(path)
+            remove_parts(path)
+            for name in OWN_ENTRIES:
+                entry = path / name
+                if entry.is_dir() and not entry.is_symlink():
+                    shutil.rmtree(entry)
+                elif name != manifests.MANIFEST_FILE:
+                    entry.unlink(missing_ok=True)
+            for name in ("config.yaml", *SUBFOLDERS):
+                os.replace(self.path / name, path / name)
         except OSError as error:
             with contextlib.suppress(OSError):
                 manifest.end(path, Status.FAILED, str(error))
             raise
-
-    def _move_others(self, path: Path) -> None:
-        remove_parts(path)
-        for name in OWN_ENTRIES:
-            entry = path / name
-            if entry.is_dir() and not entry.is_symlink():
-                shutil.rmtree(entry)
-            elif name != manifests.MANIFEST_FILE:
-                entry.unlink(missing_ok=True)
-        for name in ("config.yaml", *SUBFOLDERS):
-            os.replace(self.path / name, path / name)
 
     @property
     def is_there(self) -> bool:
@@ -233,9 +233,7 @@ class RunFolder:
     def __enter__(self) -> RunFolder:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         if self.lock is not None:
             self.lock.release()
 
@@ -301,21 +299,17 @@ def opened(path: Path) -> Iterator[tuple[RunFolder, dict[str, Any]]]:
 
     Raises ConfigError, located in the folder, where it is no run's, or a run is at work in it.
     """
-    if not path.is_dir():
-        what = "is a file, not the folder of a run" if os.path.lexists(path) else "no such folder"
-        raise ConfigError(path, "", what)
-    content = read_manifest(path)  # which puts that of a killed run right
-    if content is None:
-        raise ConfigError(path, "", "is no run's folder: it has no manifest.json that a run wrote")
+    content = _manifest_of(path)
+    in_use = ConfigError(path, "", f"is in use by a run ({_who_works(content)}); end that first")
     try:
         lock = FolderLock(Path(os.path.realpath(path)))
     except InUse:
-        raise _worked_in(path, content) from None
+        raise in_use from None
     except OSError as error:
         raise ConfigError(path, "", f"cannot be opened: {error.strerror}") from None
     with RunFolder(path, lock) as folder:
         if not lock.real and content.get("status") == Status.RUNNING:
-            raise _worked_in(path, content)
+            raise in_use
         yield folder, read_manifest(path) or content
 
 
@@ -393,7 +387,3 @@ def write_beginning(folder: RunFolder, config: str, manifest: Manifest) -> None:
     write_atomically(folder.path / "config.yaml", lambda file: file.write(config.encode()))
     manifest.process = Holder.here(locked=folder.lock is not None and folder.lock.real)
     manifest.write(folder.path)
-
-
-def _worked_in(path: Path, content: dict[str, Any]) -> ConfigError:
-    return ConfigError(path, "", f"is in use by a run ({_who_works(content)}); end that first")
