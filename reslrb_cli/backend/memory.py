@@ -9,9 +9,6 @@ is random: the next array of the same size may lie otherwise, and then all is co
 from __future__ import annotations
 
 import contextlib
-import re
-import shutil
-import subprocess
 import sys
 from pathlib import Path
 from typing import Any
@@ -19,7 +16,7 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from reslrb_cli.backend.doctor import memory_bytes
+from reslrb_cli.backend.doctor import gpu_bytes, memory_bytes, of_system
 
 #: What a thread's stack has where the system sets no limit: glibc's own.
 _UNLIMITED_STACK = 2 * 2**20
@@ -37,11 +34,10 @@ def free_bytes(variant: str) -> int:
     Where nothing tells, the whole of it (`device.memory_bytes`). What this process has already counts as taken.
     """
     if variant.startswith("cuda"):
-        return _free_on_gpu(memory_bytes(variant))
+        return gpu_bytes("memory.free", memory_bytes(variant))
     known = [memory_bytes(variant)]
-    with contextlib.suppress(OSError, ValueError, TypeError):
-        found = re.search(r"^MemAvailable:\s*(\d+) kB$", Path("/proc/meminfo").read_text(), re.MULTILINE)
-        known.append(int(found[1]) * 1024)  # type: ignore[index]  # TypeError where the line is missing
+    if available := of_system("/proc/meminfo", "MemAvailable"):
+        known.append(int(available.removesuffix(" kB")) * 1024)
     with contextlib.suppress(OSError, ValueError):
         group = Path("/sys/fs/cgroup")
         limit, used = ((group / name).read_text() for name in ("memory.max", "memory.current"))
@@ -54,13 +50,6 @@ def free_bytes(variant: str) -> int:
             pages = int(Path("/proc/self/statm").read_text().split()[0])
             known.append(most - pages * resource.getpagesize())
     return max(min(known), 0)
-
-
-def _free_on_gpu(total: int) -> int:
-    command = shutil.which("nvidia-smi")
-    query = [] if command is None else [command, "--query-gpu=memory.free", "--format=csv,noheader,nounits"]
-    output = subprocess.run(query, capture_output=True, text=True, check=False).stdout if query else ""
-    return min([total, *(int(line) * 2**20 for line in output.split() if line.isdigit())])
 
 
 def resident_bytes() -> int | None:
@@ -90,11 +79,7 @@ def local_bytes() -> int:
 
 def _vector_lanes() -> int:
     """Lanes of a vector on this processor, each with a path of its own."""
-    try:
-        found = re.search(r"^flags\s*:\s*(.+)$", Path("/proc/cpuinfo").read_text(), re.MULTILINE)
-    except OSError:
-        found = None
-    flags = found[1].split() if found else []
+    flags = (of_system("/proc/cpuinfo", "flags") or "").split()
     return next((lanes for name, lanes in _LANES if name in flags), 4)
 
 
