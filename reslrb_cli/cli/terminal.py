@@ -211,7 +211,7 @@ def forgiving_output() -> Iterator[None]:
     os.close(number)
     before = sys.stdout, sys.stderr
     forgiving = Forgiving(before[0]), Forgiving(before[1])
-    sys.stdout, sys.stderr = forgiving  # type: ignore[assignment]
+    sys.stdout, sys.stderr = forgiving
     try:
         yield
     finally:
