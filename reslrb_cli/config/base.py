@@ -35,7 +35,9 @@ SEED_END = 2**32
 class Section(BaseModel):
     """A mapping of the file: unknown keys are errors, values are not converted, NaN and infinity are refused."""
 
-    model_config = ConfigDict(strict=True, extra="forbid", frozen=True, allow_inf_nan=False)
+    model_config = ConfigDict(
+        strict=True, extra="forbid", frozen=True, allow_inf_nan=False, use_attribute_docstrings=True
+    )
 
 
 def located(key: str, message: str) -> PydanticCustomError:

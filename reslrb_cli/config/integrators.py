@@ -50,26 +50,21 @@ class Integrator(Choice):
 
     type: str
     max_depth: Annotated[int, AfterValidator(_check_depth)] = Field(
-        default=8,
-        ge=-1,
-        json_schema_extra={"maximum": PATH_LENGTH},
-        description="Longest path in segments, from the emitter to the sensor: 1 shows only directly visible "
-        "emitters, 2 adds direct light; -1: no limit (Russian roulette alone ends a path).",
+        default=8, ge=-1, json_schema_extra={"maximum": PATH_LENGTH}
     )
+    """Longest path in segments, from the emitter to the sensor: 1 shows only directly visible emitters, 2 adds direct
+    light; -1: no limit (Russian roulette alone ends a path)."""
     rr_depth: Count = Field(default=5, description="Path depth at which Russian roulette begins.")
-    hide_emitters: bool = Field(
-        default=False, description="Whether directly visible emitters are left out of the image."
-    )
+    hide_emitters: bool = False
+    """Whether directly visible emitters are left out of the image."""
 
 
 class LightTracerOptions(Integrator):
     """Options of integrators that trace from the emitters; `prb` traces all samples in one pass."""
 
-    samples_per_pass: Count | None = Field(
-        default=None,
-        description="Samples per pixel that one pass traces, to bound its memory; it must divide the samples per "
-        "pixel. null: all in one pass.",
-    )
+    samples_per_pass: Count | None = None
+    """Samples per pixel that one pass traces, to bound its memory; it must divide the samples per pixel. null: all in
+    one pass."""
 
 
 class AttachingTracer(LightTracerOptions):
@@ -78,17 +73,13 @@ class AttachingTracer(LightTracerOptions):
     attached: Annotated[
         Annotated[bool, mark("flag")] | Annotated[Literal["auto"], mark("text")],
         Discriminator(lambda value: MARK + ("flag" if isinstance(value, bool) else "text")),
-    ] = Field(
-        default="auto",
-        description="Whether derivatives follow light where it goes: of rays, hit points and film positions, beside "
-        "those of what light carries. `auto`: where a parameter moves anything that light leaves from or meets; true: "
-        "for roughness and index of refraction too, whose derivatives are detached otherwise.",
-    )
-    filter_normalization: Literal["attached", "detached"] = Field(
-        default="attached",
-        description="Whether the sum of the reconstruction filter's weights has its derivative too, where light moves "
-        "over the film: `attached` is what finite differences find, `detached` what `ptracer` computes.",
-    )
+    ] = "auto"
+    """Whether derivatives follow light where it goes: of rays, hit points and film positions, beside those of what
+    light carries. `auto`: where a parameter moves anything that light leaves from or meets; true: for roughness and
+    index of refraction too, whose derivatives are detached otherwise."""
+    filter_normalization: Literal["attached", "detached"] = "attached"
+    """Whether the sum of the reconstruction filter's weights has its derivative too, where light moves over the film:
+    `attached` is what finite differences find, `detached` what `ptracer` computes."""
 
 
 #: The options of `reslrb` that belong to an estimator, by its name; the others have no use for them.
@@ -110,74 +101,49 @@ _ANY_ESTIMATORS = {"estimator", *(option for options in ESTIMATOR_OPTIONS.values
 class Reslrb(AttachingTracer):
     """Reservoir light replay backpropagation: light tracing whose memory does not depend on path length."""
 
-    type: Literal["reslrb"] = Field(
-        default="reslrb", description="Light tracing, derivatives by a replay of each path."
-    )
-    estimator: Literal["auto", "reservoir", "gather", "event", "stack"] = Field(
-        default="auto",
-        description="How a path's connections enter its gradient. `reservoir`: few of them, kept at random; `gather`: "
-        "all, by a second traversal; `event`: few scattering events, kept at random; `stack`: all, kept in "
-        "thread-local memory; `auto`: the one of these, with its options, that a short pilot measures to be the most "
-        "efficient, 1 / (variance * time).",
-    )
+    type: Literal["reslrb"] = "reslrb"
+    """Light tracing, derivatives by a replay of each path."""
+    estimator: Literal["auto", "reservoir", "gather", "event", "stack"] = "auto"
+    """How a path's connections enter its gradient. `reservoir`: few of them, kept at random; `gather`: all, by a second
+    traversal; `event`: few scattering events, kept at random; `stack`: all, kept in thread-local memory; `auto`: the
+    one of these, with its options, that a short pilot measures to be the most efficient, 1 / (variance * time)."""
     capacity: Annotated[Count, AfterValidator(_check_capacity)] = Field(
-        default=1,
-        json_schema_extra={"maximum": CAPACITY},
-        description="How many connections, or events, are kept of each path. Only with estimators `reservoir` "
-        "and `event`.",
+        default=1, json_schema_extra={"maximum": CAPACITY}
     )
-    weight: Literal["luminance", "adjoint"] = Field(
-        default="luminance",
-        description="What a connection is kept in proportion to: its `luminance`, or its share in the objective "
-        "(`adjoint`: less variance; not with `run.adjoint: correlated`). Only with estimators `reservoir` and "
-        "`event`.",
-    )
-    image: Literal["all", "retained"] = Field(
-        default="all",
-        description="Which connections the image shows: `all`, or the `retained` ones alone, weighted (noisier). "
-        "Only with estimator `reservoir`.",
-    )
-    jacobian_damping: Annotated[float, Field(gt=0, le=1, allow_inf_nan=False)] = Field(
-        default=0.1,
-        description="Where light is followed: by how much the ray behind a surface that is not specular is taken to "
-        "turn with the one before it, to either side at random, so that its Jacobian has an inverse. It makes no bias; "
-        "below 0.01 digits are lost, above 0.5 noise grows. Only with estimator `reservoir`.",
-    )
-    attached_sampling: Literal["auto", "follow", "stay"] = Field(
-        default="auto",
-        description="Where light is followed: what becomes of it behind a surface that is not specular. `follow`: its "
-        "direction turns with the surface, as `ptracer` has it, and sweeps over edges at rest, whose part is then "
-        "missing; `stay`: it goes on to the same place; `auto`: `stay` behind diffuse surfaces, `follow` behind glossy "
-        "ones, where `stay` is noisy.",
-    )
-    stack_size: Count = Field(
-        default=64,
-        description="Vertices of a path that fit into thread-local memory; longer paths are traced a second time. "
-        "Only with estimator `stack`.",
-    )
-    guiding: Literal["auto", "on", "off"] = Field(
-        default="auto",
-        description="Whether light paths start where those of earlier steps had something to say about gradient and "
-        "image, at least a quarter of them anywhere, and end where those had little left to say; in scenes with glossy "
-        "surfaces they are also sent to what the sensor sees. `on`: less noise "
-        "where few paths say anything (a room lit through windows, a caustic), from the second step on; a few of the "
-        "first, and one in sixteen later, trace as many paths again to learn where that is. `auto`: where a few "
-        "steps with and without it, before the first iteration, show that it pays here. Left out it is `auto` with "
-        "estimator `auto`, and `off` with one that is named.",
-    )
-    sequence: Literal["auto", "independent", "low_discrepancy"] = Field(
-        default="auto",
-        description="The random numbers that say where light paths start and how they first scatter. "
-        "`low_discrepancy`: evenly spread over all paths of a step, and independent from one step to the next; less "
-        "noise where little but these numbers says where light goes (a beam through glass), a little less elsewhere. "
-        "`auto`: where a few steps with and without it, before the first iteration, show that it pays here. Left out "
-        "it is `auto` with estimator `auto`, and `independent` with one that is named.",
-    )
-    freeze: bool = Field(
-        default=True,
-        description="Record what a step launches and launch that again, so that its Python runs once, not in every "
-        "iteration. Not with passes, nor with more than 4 million paths, beside which Python does not show.",
-    )
+    """How many connections, or events, are kept of each path. Only with estimators `reservoir` and `event`."""
+    weight: Literal["luminance", "adjoint"] = "luminance"
+    """What a connection is kept in proportion to: its `luminance`, or its share in the objective (`adjoint`: less
+    variance; not with `run.adjoint: correlated`). Only with estimators `reservoir` and `event`."""
+    image: Literal["all", "retained"] = "all"
+    """Which connections the image shows: `all`, or the `retained` ones alone, weighted (noisier). Only with estimator
+    `reservoir`."""
+    jacobian_damping: Annotated[float, Field(gt=0, le=1, allow_inf_nan=False)] = 0.1
+    """Where light is followed: by how much the ray behind a surface that is not specular is taken to turn with the one
+    before it, to either side at random, so that its Jacobian has an inverse. It makes no bias; below 0.01 digits are
+    lost, above 0.5 noise grows. Only with estimator `reservoir`."""
+    attached_sampling: Literal["auto", "follow", "stay"] = "auto"
+    """Where light is followed: what becomes of it behind a surface that is not specular. `follow`: its direction turns
+    with the surface, as `ptracer` has it, and sweeps over edges at rest, whose part is then missing; `stay`: it goes on
+    to the same place; `auto`: `stay` behind diffuse surfaces, `follow` behind glossy ones, where `stay` is noisy."""
+    stack_size: Count = 64
+    """Vertices of a path that fit into thread-local memory; longer paths are traced a second time. Only with estimator
+    `stack`."""
+    guiding: Literal["auto", "on", "off"] = "auto"
+    """Whether light paths start where those of earlier steps had something to say about gradient and image, at least a
+    quarter of them anywhere, and end where those had little left to say; in scenes with glossy surfaces they are also
+    sent to what the sensor sees. `on`: less noise where few paths say anything (a room lit through windows, a caustic),
+    from the second step on; a few of the first, and one in sixteen later, trace as many paths again to learn where that
+    is. `auto`: where a few steps with and without it, before the first iteration, show that it pays here. Left out it
+    is `auto` with estimator `auto`, and `off` with one that is named."""
+    sequence: Literal["auto", "independent", "low_discrepancy"] = "auto"
+    """The random numbers that say where light paths start and how they first scatter. `low_discrepancy`: evenly spread
+    over all paths of a step, and independent from one step to the next; less noise where little but these numbers says
+    where light goes (a beam through glass), a little less elsewhere. `auto`: where a few steps with and without it,
+    before the first iteration, show that it pays here. Left out it is `auto` with estimator `auto`, and `independent`
+    with one that is named."""
+    freeze: bool = True
+    """Record what a step launches and launch that again, so that its Python runs once, not in every iteration. Not with
+    passes, nor with more than 4 million paths, beside which Python does not show."""
 
     @model_validator(mode="after")
     def _leave_off(self) -> Self:
@@ -248,12 +214,9 @@ class Trajectory(LightTracerOptions):
     model_config = NEEDS_TYPE
     type: Literal["trajectory"] = Field(default="trajectory", description="The walk of `reslrb`, reversed by Dr.Jit.")
     max_depth: Annotated[int, AfterValidator(_check_record)] = Field(
-        default=8,
-        ge=0,
-        json_schema_extra={"exclusiveMaximum": LOCAL_ENTRIES},
-        description="Longest path in segments, as above; the record has room for as many vertices, so that there must "
-        "be a limit.",
+        default=8, ge=0, json_schema_extra={"exclusiveMaximum": LOCAL_ENTRIES}
     )
+    """Longest path in segments, as above; the record has room for as many vertices, so that there must be a limit."""
 
 
 AnyIntegrator = Annotated[

@@ -34,10 +34,8 @@ class RelativeL2(Loss):
 
     model_config = NEEDS_TYPE
     type: Literal["relative_l2"] = Field(default="relative_l2", description="Mean of (I - T)² / (T² + epsilon).")
-    epsilon: Positive = Field(
-        default=1e-2,
-        description="Added to the denominator, in squared units of radiance; keeps dark pixels from dominating.",
-    )
+    epsilon: Positive = 1e-2
+    """Added to the denominator, in squared units of radiance; keeps dark pixels from dominating."""
 
 
 class LogL2(Loss):
@@ -63,34 +61,23 @@ class Optimizer(Choice):
     """Options that all optimisers share: the learning rate and its schedule."""
 
     type: str
-    learning_rate: Positive = Field(
-        default=0.02,
-        description="Step size at the first iteration, in the parameter's units; in those of its `transform`, where it "
-        "has one; with `scale: auto`, as a share of the measured length.",
-    )
-    scale: Literal["none", "auto"] = Field(
-        default="none",
-        description="`auto`: before the first iteration, measure for each parameter the length by which it would have "
-        "to change to make up the image where it has an effect, and how large its gradient is, and let the optimizer "
-        "move each in units of its own: one learning rate serves parameters that differ by orders of magnitude, and "
-        "`epsilon` does not matter. Learning rates are then shares of that length: 0.02 is 2 % a step.",
-    )
-    schedule: Literal["constant", "cosine", "exponential"] = Field(
-        default="constant", description="How the learning rate runs from its first value to its last."
-    )
-    final_fraction: float = Field(
-        default=0.01,
-        gt=0,
-        le=1,
-        description="Last learning rate over the first; only with a schedule other than `constant`.",
-    )
+    learning_rate: Positive = 0.02
+    """Step size at the first iteration, in the parameter's units; in those of its `transform`, where it has one; with
+    `scale: auto`, as a share of the measured length."""
+    scale: Literal["none", "auto"] = "none"
+    """`auto`: before the first iteration, measure for each parameter the length by which it would have to change to
+    make up the image where it has an effect, and how large its gradient is, and let the optimizer move each in units of
+    its own: one learning rate serves parameters that differ by orders of magnitude, and `epsilon` does not matter.
+    Learning rates are then shares of that length: 0.02 is 2 % a step."""
+    schedule: Literal["constant", "cosine", "exponential"] = "constant"
+    """How the learning rate runs from its first value to its last."""
+    final_fraction: float = Field(default=0.01, gt=0, le=1)
+    """Last learning rate over the first; only with a schedule other than `constant`."""
 
-    clamp_gradient: Annotated[float, Field(ge=1)] | None = Field(
-        default=None,
-        description="Clamp each entry of a gradient at so many times its usual size: the larger of the running means "
-        "of its own absolute value and of those of all entries of the parameter. Takes the noise of rare bright paths, "
-        "and is biased by what it takes, which the run reports. null: no clamp.",
-    )
+    clamp_gradient: Annotated[float, Field(ge=1)] | None = None
+    """Clamp each entry of a gradient at so many times its usual size: the larger of the running means of its own
+    absolute value and of those of all entries of the parameter. Takes the noise of rare bright paths, and is biased by
+    what it takes, which the run reports. null: no clamp."""
 
     @model_validator(mode="after")
     def _check_schedule(self) -> Self:
@@ -126,12 +113,10 @@ class AdamW(_AdamOptions):
     """Adam with decoupled weight decay (Loshchilov and Hutter 2019)."""
 
     model_config = NEEDS_TYPE
-    type: Literal["adamw"] = Field(
-        default="adamw", description="Adam with decoupled weight decay (Loshchilov, Hutter 2019)."
-    )
-    weight_decay: float = Field(
-        default=0.01, ge=0, description="Share of the value that a step removes, per learning rate."
-    )
+    type: Literal["adamw"] = "adamw"
+    """Adam with decoupled weight decay (Loshchilov, Hutter 2019)."""
+    weight_decay: float = Field(default=0.01, ge=0)
+    """Share of the value that a step removes, per learning rate."""
 
 
 class RMSProp(Optimizer):

@@ -115,13 +115,11 @@ Names = Annotated[list[Name], Field(min_length=1), BeforeValidator(_list_of_one)
 class HeightmapSpec(Section):
     """Displacement of a mesh along its initial normals, in scene units: a texture over its texture coordinates."""
 
-    mesh: Names = Field(
-        description="Id of a mesh with texture coordinates, or a list: one map for all, named by the first."
-    )
-    resolution: Annotated[tuple[Count, Count], Field(strict=False)] = Field(
-        description="[width, height] in texels, at least 2 each, looked up bilinearly; beyond the centres of the "
-        "outermost texels it goes on as they are."
-    )
+    mesh: Names
+    """Id of a mesh with texture coordinates, or a list: one map for all, named by the first."""
+    resolution: Annotated[tuple[Count, Count], Field(strict=False)]
+    """[width, height] in texels, at least 2 each, looked up bilinearly; beyond the centres of the outermost texels it
+    goes on as they are."""
 
     @field_validator("mesh")
     @classmethod
@@ -140,15 +138,11 @@ class MotionSpec(Section):
     """Motion of shapes and emitters together: scaled, then rotated, then translated."""
 
     of: Names = Field(description="Ids of the shapes and emitters that move together; they are named by the first.")
-    pivot: list[float] | None = Field(
-        default=None,
-        description="The point about which they are scaled and rotated; null: the centre of their bounding box.",
-    )
-    free: Annotated[list[Word], Field(min_length=1)] = Field(
-        default=["translation", "rotation"],
-        description="What is recovered. `translation`: three numbers, in scene units; `rotation`: three angles in "
-        "degrees, about the x, then the y, then the z axis of the scene; `scale`: one factor for all axes.",
-    )
+    pivot: list[float] | None = None
+    """The point about which they are scaled and rotated; null: the centre of their bounding box."""
+    free: Annotated[list[Word], Field(min_length=1)] = Field(default=["translation", "rotation"])
+    """What is recovered. `translation`: three numbers, in scene units; `rotation`: three angles in degrees, about the
+    x, then the y, then the z axis of the scene; `scale`: one factor for all axes."""
 
     @field_validator("pivot")
     @classmethod
@@ -180,10 +174,9 @@ class RunValue(Section):
 
     TAG: ClassVar[str] = "run"
 
-    run: ConfigPath = Field(
-        description="Folder of a run, finished or interrupted, that recovered a parameter of the same key; relative to "
-        "the config file."
-    )
+    run: ConfigPath
+    """Folder of a run, finished or interrupted, that recovered a parameter of the same key; relative to the config
+    file."""
 
 
 #: A value for a scene parameter: one number, a list such as [r, g, b], or an image file.
@@ -249,45 +242,31 @@ class Settings:
 class ParameterSpec(Section):
     """What is recovered, by exactly one of `key`, `heightmap` and `motion`."""
 
-    key: _Key | None = Field(
-        default=None,
-        description="Key as `reslrb inspect` lists it: the names of `mi.traverse`, in which an object without an id "
-        "goes by its kind and number in the scene file, such as `Sphere_3`. Or a glob such as `*.reflectance.data`. A "
-        "list of keys ties them to one value, which is recorded by the first.",
-    )
-    heightmap: HeightmapSpec | None = Field(
-        default=None, description="A displacement of a mesh, recorded as `MESH.heightmap`."
-    )
-    motion: MotionSpec | None = Field(
-        default=None,
-        description="A motion of shapes and emitters, recorded as `ID.translation`, `ID.rotation` and `ID.scale`. With "
-        "several `free`, `initial`, `bounds`, `transform` and `learning_rate` are mappings by these words, such as "
-        "`bounds: {rotation: [-10, 10]}`; `transform` and `learning_rate` may also be one for all.",
-    )
-    initial: Initial = Field(
-        default="scene",
-        description="Value to start from: a number (all entries), a list of numbers (one per channel), an "
-        "image file, the value to which a run brought the same key, or `scene` (the scene's own value; a heightmap is "
-        "flat there, and nothing is moved).",
-    )
-    bounds: _AnyBounds | None = Field(
-        default=None,
-        description="[low, high], in the parameter's units; values are clamped to them after each step. "
-        "`-.inf` and `.inf` leave a side open.",
-    )
-    transform: _AnyTransform = Field(
-        default="none",
-        description="What the optimizer moves in place of the value x: `sigmoid`: the logit of x between its `bounds`, "
-        "which it never reaches; `log`: log(x), for positive values known to an order of magnitude at best; "
-        "`softplus`: log(exp(x) - 1), for positive values; as `log` well below 1, as `none` well above. Learning "
-        "rates are in units of that variable.",
-    )
-    learning_rate: _AnyRate | None = Field(
-        default=None, description="Step size of this parameter, in the optimizer's units; null: the optimizer's."
-    )
-    resolution: Annotated[tuple[Count, Count], Field(strict=False)] | None = Field(
-        default=None, description="[width, height] in texels to which a texture is resampled before the start."
-    )
+    key: _Key | None = None
+    """Key as `reslrb inspect` lists it: the names of `mi.traverse`, in which an object without an id goes by its kind
+    and number in the scene file, such as `Sphere_3`. Or a glob such as `*.reflectance.data`. A list of keys ties them
+    to one value, which is recorded by the first."""
+    heightmap: HeightmapSpec | None = None
+    """A displacement of a mesh, recorded as `MESH.heightmap`."""
+    motion: MotionSpec | None = None
+    """A motion of shapes and emitters, recorded as `ID.translation`, `ID.rotation` and `ID.scale`. With several `free`,
+    `initial`, `bounds`, `transform` and `learning_rate` are mappings by these words, such as `bounds: {rotation: [-10,
+    10]}`; `transform` and `learning_rate` may also be one for all."""
+    initial: Initial = "scene"
+    """Value to start from: a number (all entries), a list of numbers (one per channel), an image file, the value to
+    which a run brought the same key, or `scene` (the scene's own value; a heightmap is flat there, and nothing is
+    moved)."""
+    bounds: _AnyBounds | None = None
+    """[low, high], in the parameter's units; values are clamped to them after each step. `-.inf` and `.inf` leave a
+    side open."""
+    transform: _AnyTransform = "none"
+    """What the optimizer moves in place of the value x: `sigmoid`: the logit of x between its `bounds`, which it never
+    reaches; `log`: log(x), for positive values known to an order of magnitude at best; `softplus`: log(exp(x) - 1), for
+    positive values; as `log` well below 1, as `none` well above. Learning rates are in units of that variable."""
+    learning_rate: _AnyRate | None = None
+    """Step size of this parameter, in the optimizer's units; null: the optimizer's."""
+    resolution: Annotated[tuple[Count, Count], Field(strict=False)] | None = None
+    """[width, height] in texels to which a texture is resampled before the start."""
 
     @property
     def names(self) -> list[str]:

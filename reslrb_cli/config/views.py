@@ -22,28 +22,19 @@ class Mask(Section):
     one of the run's integrator and the target's traces from the light and the other does not, also on a rendered one.
     """
 
-    file: ConfigPath | None = Field(
-        default=None,
-        description="Image of weights, of the target's size, relative to the config file: 0 leaves a pixel out. Values "
-        "are taken as they stand in it, of 8 and 16 bits as shares of the greatest; of several channels the mean.",
-    )
-    specular: bool = Field(
-        default=True,
-        description="Leave out pixels that see smooth glass or mirrors directly, which light tracing cannot render.",
-    )
-    border: bool = Field(
-        default=True,
-        description="Leave out pixels within the reconstruction filter's radius of the film's border, where light "
-        "tracing is darker.",
-    )
-    clipped: bool = Field(
-        default=True,
-        description="Leave out pixels of 8 and 16 bit files that are at the greatest value in any channel.",
-    )
+    file: ConfigPath | None = None
+    """Image of weights, of the target's size, relative to the config file: 0 leaves a pixel out. Values are taken as
+    they stand in it, of 8 and 16 bits as shares of the greatest; of several channels the mean."""
+    specular: bool = True
+    """Leave out pixels that see smooth glass or mirrors directly, which light tracing cannot render."""
+    border: bool = True
+    """Leave out pixels within the reconstruction filter's radius of the film's border, where light tracing is
+    darker."""
+    clipped: bool = True
+    """Leave out pixels of 8 and 16 bit files that are at the greatest value in any channel."""
     alpha: bool = Field(default=True, description="Leave out pixels whose alpha is 0.")
-    nonfinite: bool = Field(
-        default=True, description="Leave out pixels that are not finite; false: a file that has any is refused."
-    )
+    nonfinite: bool = True
+    """Leave out pixels that are not finite; false: a file that has any is refused."""
 
     @property
     def is_empty(self) -> bool:
@@ -142,15 +133,13 @@ class ViewSpec(Section):
     """One view: a sensor of the scene, and what it is to see."""
 
     sensor: Annotated[int, Field(ge=0)] = Field(description="Index of the scene's sensor.")
-    target: ConfigPath | None = Field(
-        default=None, description="Target image, relative to the config file; null: rendered, as `target.render` says."
-    )
+    target: ConfigPath | None = None
+    """Target image, relative to the config file; null: rendered, as `target.render` says."""
     mask: AnyMask | None = Field(default=None, description="As `target.mask`, which it stands in place of.")
     mask_mixed: bool | None = Field(default=None, description="As `target.mask_mixed`, which it stands in place of.")
     weight: Positive = Field(default=1.0, description="The view's part of the loss, relative to the other views'.")
-    exposure: Exposure | None = Field(
-        default=None, description="As `target.exposure`, but recovered for this view alone where it is not a number."
-    )
+    exposure: Exposure | None = None
+    """As `target.exposure`, but recovered for this view alone where it is not a number."""
     loss: AnyLoss | None = Field(default=None, description="How this view is compared; null: as `loss` says.")
 
 
