@@ -7,10 +7,12 @@ writes them; and how often a run keeps its state.
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any
 
 from pydantic import (
+    AfterValidator,
     BaseModel,
     BeforeValidator,
     ConfigDict,
@@ -26,14 +28,17 @@ from pydantic import (
 from pydantic_core import PydanticCustomError
 from typing_extensions import Self
 
-from reslrb_cli.config.files import NAME_BYTES, PART_BYTES, PATH_BYTES
+from reslrb_cli.config.files import NAME_BYTES, PART_BYTES, PATH_BYTES, PIXELS
 
 #: Largest seed plus one: Mitsuba's seeds are uint32.
 SEED_END = 2**32
 
 
 class Section(BaseModel):
-    """A mapping of the file: unknown keys are errors, values are not converted, NaN and infinity are refused."""
+    """A mapping of the file: unknown keys are errors, values are not converted, NaN and infinity are refused.
+
+    What a setting means is its `description`, or the docstring below it.
+    """
 
     model_config = ConfigDict(
         strict=True, extra="forbid", frozen=True, allow_inf_nan=False, use_attribute_docstrings=True
@@ -48,6 +53,17 @@ def located(key: str, message: str) -> PydanticCustomError:
 def wrong(message: str) -> PydanticCustomError:
     """An error to raise in a validator of one value: `message` says what the value must be."""
     return PydanticCustomError("wrong", "{message}", {"message": message})
+
+
+def must(hold: Callable[[Any], bool], message: Callable[[Any], str]) -> AfterValidator:
+    """The check of a value that has its type already; `message` says of one that does not hold what it must be."""
+
+    def check(value: Any) -> Any:
+        if not hold(value):
+            raise wrong(message(value))
+        return value
+
+    return AfterValidator(check)
 
 
 # --- sections that are chosen by their `type` -----------------------------------------------------------------------
@@ -146,6 +162,19 @@ def kind_tag(value: Any, word: str | None = None) -> str | None:
     return MARK + "text" if word is not None and value == word else None
 
 
+# --- lists ------------------------------------------------------------------------------------------------------------
+
+
+def list_of_one(value: Any) -> Any:
+    """A name or a path as a list of it; what is none stays."""
+    return [value] if isinstance(value, (str, Path)) else value
+
+
+def each_once(value: list[Any]) -> bool:
+    """Whether nothing stands twice in a list."""
+    return len(set(value)) == len(value)
+
+
 # --- numbers ----------------------------------------------------------------------------------------------------------
 
 Positive = Annotated[float, Field(gt=0)]
@@ -153,6 +182,18 @@ Positive = Annotated[float, Field(gt=0)]
 Count = Annotated[int, Field(ge=1, lt=2**31)]
 
 Seed = Annotated[int, Field(ge=0, lt=SEED_END)]
+
+#: [width, height].
+Size = Annotated[tuple[Count, Count], Field(strict=False)]
+
+
+def few(what: str, reason: str = "") -> AfterValidator:
+    """The check of a size that has a bounded number of pixels, or `what` they are called there."""
+    return must(
+        lambda size: size[0] * size[1] <= PIXELS,
+        lambda size: f"must have at most {PIXELS} {what}, not {size[0] * size[1]}{reason}",
+    )
+
 
 #: Names that Windows takes for devices, whatever suffix they have: a folder that is called so cannot be copied there.
 _RESERVED = re.compile(r"(con|prn|aux|nul|(com|lpt)[0-9])(\..*)?", re.IGNORECASE)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Annotated, Any, Literal
 
 from pydantic import (
-    AfterValidator,
     Discriminator,
     Field,
     SerializerFunctionWrapHandler,
@@ -14,44 +13,39 @@ from pydantic import (
 )
 from typing_extensions import Self
 
-from reslrb_cli.config.base import MARK, NEEDS_TYPE, Choice, Count, by_type, located, mark, wrong
+from reslrb_cli.config.base import MARK, NEEDS_TYPE, Choice, Count, by_type, located, mark, must
 from reslrb_cli.config.files import CAPACITY, LOCAL_ENTRIES, PATH_LENGTH
 
+_DEPTH = must(
+    lambda depth: depth <= PATH_LENGTH,
+    lambda depth: (
+        f"must be at most {PATH_LENGTH} segments, or -1 for no limit, not {depth}: Russian roulette ends a path "
+        "long before, so that this limits nothing"
+    ),
+)
 
-def _check_depth(value: int) -> int:
-    if value > PATH_LENGTH:
-        raise wrong(
-            f"must be at most {PATH_LENGTH} segments, or -1 for no limit, not {value}: Russian roulette ends a path "
-            "long before, so that this limits nothing"
-        )
-    return value
+_RECORD = must(
+    lambda depth: depth < LOCAL_ENTRIES,
+    lambda depth: (
+        f"must be less than {LOCAL_ENTRIES}, not {depth}: the record of a path has room for as many vertices, "
+        "and thread-local memory has no more places; reslrb needs no such record"
+    ),
+)
 
-
-def _check_record(value: int) -> int:
-    if value >= LOCAL_ENTRIES:
-        raise wrong(
-            f"must be less than {LOCAL_ENTRIES}, not {value}: the record of a path has room for as many vertices, and "
-            "thread-local memory has no more places; reslrb needs no such record"
-        )
-    return value
-
-
-def _check_capacity(value: int) -> int:
-    if value > CAPACITY:
-        raise wrong(
-            f"must be at most {CAPACITY}, not {value}: each connection that is kept is code of its own in the kernel, "
-            "which would take hours to compile; estimator gather keeps all of them"
-        )
-    return value
+_CAPACITY = must(
+    lambda capacity: capacity <= CAPACITY,
+    lambda capacity: (
+        f"must be at most {CAPACITY}, not {capacity}: each connection that is kept is code of its own in the "
+        "kernel, which would take hours to compile; estimator gather keeps all of them"
+    ),
+)
 
 
 class Integrator(Choice):
     """Options that all integrators share."""
 
     type: str
-    max_depth: Annotated[int, AfterValidator(_check_depth)] = Field(
-        default=8, ge=-1, json_schema_extra={"maximum": PATH_LENGTH}
-    )
+    max_depth: Annotated[int, _DEPTH] = Field(default=8, ge=-1, json_schema_extra={"maximum": PATH_LENGTH})
     """Longest path in segments, from the emitter to the sensor: 1 shows only directly visible emitters, 2 adds direct
     light; -1: no limit (Russian roulette alone ends a path)."""
     rr_depth: Count = Field(default=5, description="Path depth at which Russian roulette begins.")
@@ -107,9 +101,7 @@ class Reslrb(AttachingTracer):
     """How a path's connections enter its gradient. `reservoir`: few of them, kept at random; `gather`: all, by a second
     traversal; `event`: few scattering events, kept at random; `stack`: all, kept in thread-local memory; `auto`: the
     one of these, with its options, that a short pilot measures to be the most efficient, 1 / (variance * time)."""
-    capacity: Annotated[Count, AfterValidator(_check_capacity)] = Field(
-        default=1, json_schema_extra={"maximum": CAPACITY}
-    )
+    capacity: Annotated[Count, _CAPACITY] = Field(default=1, json_schema_extra={"maximum": CAPACITY})
     """How many connections, or events, are kept of each path. Only with estimators `reservoir` and `event`."""
     weight: Literal["luminance", "adjoint"] = "luminance"
     """What a connection is kept in proportion to: its `luminance`, or its share in the objective (`adjoint`: less
@@ -213,9 +205,7 @@ class Trajectory(LightTracerOptions):
 
     model_config = NEEDS_TYPE
     type: Literal["trajectory"] = Field(default="trajectory", description="The walk of `reslrb`, reversed by Dr.Jit.")
-    max_depth: Annotated[int, AfterValidator(_check_record)] = Field(
-        default=8, ge=0, json_schema_extra={"exclusiveMaximum": LOCAL_ENTRIES}
-    )
+    max_depth: Annotated[int, _RECORD] = Field(default=8, ge=0, json_schema_extra={"exclusiveMaximum": LOCAL_ENTRIES})
     """Longest path in segments, as above; the record has room for as many vertices, so that there must be a limit."""
 
 

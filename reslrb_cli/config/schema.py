@@ -10,12 +10,12 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from pydantic import (
+    AfterValidator,
     BeforeValidator,
     Field,
     PrivateAttr,
     SerializerFunctionWrapHandler,
     WithJsonSchema,
-    field_validator,
     model_serializer,
     model_validator,
 )
@@ -29,16 +29,21 @@ from reslrb_cli.config.base import (
     Positive,
     Section,
     Seed,
+    Size,
     WorkPath,
     by_kind,
     check_name,
+    each_once,
+    few,
     folder_name,
+    list_of_one,
     located,
     mark,
     memory_bytes,
+    must,
     wrong,
 )
-from reslrb_cli.config.files import KEY_LENGTH, PIXELS, largest_pass, passes_obstacle
+from reslrb_cli.config.files import KEY_LENGTH, largest_pass, passes_obstacle
 from reslrb_cli.config.integrators import AnyIntegrator, Integrator
 from reslrb_cli.config.integrators import Reslrb as ReslrbConfig
 from reslrb_cli.config.optimizers import L2, Adam, AnyLoss, AnyOptimizer
@@ -56,14 +61,13 @@ from reslrb_cli.config.views import (
 )
 
 
-def _list_of_one(value: Any) -> Any:
-    return [value] if isinstance(value, (str, Path)) else value
-
-
 def _scalar(value: Any) -> Any:
     if not isinstance(value, (bool, int, float, str)) or (isinstance(value, float) and not math.isfinite(value)):
         raise wrong("must be text, a finite number, true or false")
     return value
+
+
+_SENSORS = must(each_once, lambda _: "must name each sensor once")
 
 
 class SceneConfig(Section):
@@ -75,7 +79,7 @@ class SceneConfig(Section):
     strict: bool = False
     """Refuse a scene file in which anything has to be mended or left out before Mitsuba 3 can load it, in place of
     warning of it."""
-    size: Annotated[tuple[Count, Count], Field(strict=False)] | None = None
+    size: Annotated[Size, few("pixels", ": each image of a step takes 12 bytes or more of every one")] | None = None
     """[width, height] of the film of every sensor in pixels, without crop window; null: as the scene file has it. What
     is seen stays the same where the ratio does."""
     cameras: ConfigPath | None = None
@@ -83,34 +87,23 @@ class SceneConfig(Section):
     `cameras.txt` beside it; relative to the config file. Their images, relative to that file, are the targets of views
     for which no other is named."""
     sensors: Annotated[
-        Annotated[Annotated[list[Annotated[int, Field(ge=0)]], Field(min_length=1)], mark("list")]
+        Annotated[list[Annotated[int, Field(ge=0)]], Field(min_length=1), _SENSORS, mark("list")]
         | Annotated[Literal["all"], mark("text")],
         by_kind("a list of sensor indices, or `all`", "all"),
     ] = Field(default=[0])
     """Indices of the scene's sensors that are used, or `all`."""
 
-    @field_validator("size")
-    @classmethod
-    def _check_size(cls, value: tuple[int, int] | None) -> tuple[int, int] | None:
-        if value is not None and value[0] * value[1] > PIXELS:
-            raise wrong(
-                f"must have at most {PIXELS} pixels, not {value[0] * value[1]}: each image of a step takes 12 bytes or "
-                "more of every one"
-            )
-        return value
-
-    @field_validator("sensors")
-    @classmethod
-    def _check_sensors(cls, value: list[int] | Literal["all"]) -> list[int] | Literal["all"]:
-        if isinstance(value, list) and len(set(value)) < len(value):
-            raise wrong("must name each sensor once")
-        return value
-
 
 class Rendering(Section):
     """A target that is rendered from the scene itself, with other parameter values."""
 
-    parameters: dict[str, Value] = Field(default={})
+    parameters: Annotated[
+        dict[str, Value],
+        must(
+            lambda values: all(0 < len(key) <= KEY_LENGTH for key in values),
+            lambda _: f"must have keys that are not empty, and have at most {KEY_LENGTH} characters",
+        ),
+    ] = Field(default={})
     """True values by key, as in `parameters`: a number, a list of numbers, or an image file. Empty: the scene as it
     stands."""
     spp: Count = Field(default=1024, description="Samples per pixel of the target.")
@@ -118,20 +111,13 @@ class Rendering(Section):
     integrator: AnyIntegrator | None = None
     """Integrator of the target; null: that of the run."""
 
-    @field_validator("parameters")
-    @classmethod
-    def _check_keys(cls, value: dict[str, Any]) -> dict[str, Any]:
-        if not all(0 < len(key) <= KEY_LENGTH for key in value):
-            raise wrong(f"must have keys that are not empty, and have at most {KEY_LENGTH} characters")
-        return value
-
 
 _PATH = {"type": "string", "format": "path"}
 
 _Files = Annotated[
     list[ConfigPath],
     Field(min_length=1),
-    BeforeValidator(_list_of_one),
+    BeforeValidator(list_of_one),
     WithJsonSchema({"anyOf": [_PATH, {"type": "array", "items": _PATH, "minItems": 1}]}),
 ]
 
@@ -182,7 +168,9 @@ def _without_default(schema: dict[str, Any]) -> None:
 class RunConfig(Section):
     """How long, with how many samples, and where to."""
 
-    name: str = Field(default="run", min_length=1, json_schema_extra=_without_default)
+    name: Annotated[str, AfterValidator(check_name)] = Field(
+        default="run", min_length=1, json_schema_extra=_without_default
+    )
     """Name of the run and of its folder, not a path, of at most 200 bytes; left out: the config file's name without its
     suffix."""
     output: WorkPath = Field(default=Path("runs"), validate_default=True)
@@ -237,11 +225,6 @@ class RunConfig(Section):
     """When the state of the run is kept, for `reslrb optimize --resume`: `iterations` or `seconds` between two
     checkpoints. Besides, before the first iteration and at the end, whatever ends it but a kill."""
     reach_spp: Count = Field(default=64, description="Samples for the mask of the texels that light and sensor reach.")
-
-    @field_validator("name")
-    @classmethod
-    def _check_name(cls, value: str) -> str:
-        return check_name(value)
 
     @model_serializer(mode="wrap")
     def _without_unused(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:

@@ -36,11 +36,6 @@ class Mask(Section):
     nonfinite: bool = True
     """Leave out pixels that are not finite; false: a file that has any is refused."""
 
-    @property
-    def is_empty(self) -> bool:
-        """Whether it leaves nothing out, and weighs nothing."""
-        return self.file is None and not any(getattr(self, kind) for kind in _KINDS)
-
 
 def _mask(value: Any) -> Any:
     if value == "auto":
@@ -82,11 +77,13 @@ def _exposure(value: Any) -> Any:
     raise wrong("must be a positive number, `auto` or `per_channel`")
 
 
+_EXPOSURE = [{"type": "number", "exclusiveMinimum": 0}, {"enum": ["auto", "per_channel"]}]
+
 #: One view's exposure: a number, `auto` (recovered, one factor), or `per_channel` (recovered, one factor a channel).
 Exposure = Annotated[
     float | Literal["auto", "per_channel"],
     BeforeValidator(_exposure),
-    WithJsonSchema({"anyOf": [{"type": "number", "exclusiveMinimum": 0}, {"enum": ["auto", "per_channel"]}]}),
+    WithJsonSchema({"anyOf": _EXPOSURE}),
 ]
 
 
@@ -98,15 +95,7 @@ def _exposures(value: Any) -> Any:
 Exposures = Annotated[
     float | Literal["auto", "per_channel"] | list[Exposure],
     BeforeValidator(_exposures),
-    WithJsonSchema(
-        {
-            "anyOf": [
-                {"type": "number", "exclusiveMinimum": 0},
-                {"enum": ["auto", "per_channel"]},
-                {"type": "array", "items": {"anyOf": [{"type": "number"}, {"enum": ["auto", "per_channel"]}]}},
-            ]
-        }
-    ),
+    WithJsonSchema({"anyOf": [*_EXPOSURE, {"type": "array", "items": {"anyOf": [{"type": "number"}, _EXPOSURE[1]]}}]}),
 ]
 
 EXPOSURE = (
