@@ -8,7 +8,6 @@ measured, then has one object a line, and stands on the disk while they go on.
 from __future__ import annotations
 
 import errno
-import logging
 import math
 import os
 from collections.abc import Callable, Sequence
@@ -116,7 +115,6 @@ def read_recovered(run: Path, overrides: tuple[str, ...]) -> Config:
     return config.model_copy(update={"parameters": specs})
 
 
-logger = logging.getLogger(__name__)
 
 #: Type of an option that counts something: samples, depths, seeds. As in a configuration, 31 bits.
 COUNT = click.IntRange(min=1, max=2**31 - 1)

@@ -1,8 +1,7 @@
 """The bounds of what a user hands in, and the one door for files that a user names.
 
 Each bound stands with its reason; beyond one, input is refused at once. A file that is named has to be regular and not
-too large, or there is one located line. How the samples of a step are split into passes, and what is too many of them,
-is known before a scene is loaded.
+too large, or there is one located line.
 """
 
 from __future__ import annotations
@@ -134,35 +133,3 @@ def _check(path: Path, status: os.stat_result, most: int | None) -> None:
         raise ConfigError(path, "", f"is {names.get(kind, 'something else')}, not a regular file")
     if most is not None and status.st_size > most:
         raise ConfigError(path, "", f"has {in_words(status.st_size)}; more than {in_words(most)} are not read")
-
-
-def passes_obstacle(spp: int, per_pass: int | None, pixels: int, splits: bool = True) -> str | None:
-    """Why `spp` samples per pixel of a film of so many `pixels` cannot be traced, and what would be right; or None.
-
-    `per_pass` is the integrator's `samples_per_pass`; it divides `spp`, or is larger. An integrator that does not
-    split its samples by itself (`splits`) has none.
-    """
-    unit = min(per_pass or spp, spp)
-    parts = -(-unit // PASS_SAMPLES) if splits else 1
-    paths = -(-unit // parts) * pixels
-    most = largest_pass(spp, pixels)
-    if paths > PASS_PATHS:
-        advice = f"set integrator.samples_per_pass to {most}, or lower run.spp" if splits and most else "lower run.spp"
-        advice = advice if PASS_PATHS >= pixels else "take a smaller film"
-        return f"makes {paths} light paths in one pass, and no pass has more than {PASS_PATHS}: {advice}"
-    if spp // unit * parts > PASSES:
-        advice = f"set integrator.samples_per_pass to {most}" if most and spp // most <= PASSES else "lower run.spp"
-        return f"makes {spp // unit * parts} passes of a step, and no step has more than {PASSES}: {advice}"
-    return None
-
-
-def largest_pass(spp: int, pixels: int) -> int | None:
-    """The largest `samples_per_pass` that divides `spp` and makes no more paths than a pass can have; None without."""
-    most = min(PASS_PATHS // pixels, PASS_SAMPLES, spp)
-    return max((n for n in divisors(spp) if n <= most), default=None)
-
-
-def divisors(number: int) -> list[int]:
-    """All divisors of a number, the smallest first; of one of 31 bits at once."""
-    small = [n for n in range(1, int(number**0.5) + 1) if number % n == 0]
-    return sorted({*small, *(number // n for n in small)})

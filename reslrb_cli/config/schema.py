@@ -15,7 +15,6 @@ from pydantic import (
     Field,
     PrivateAttr,
     SerializerFunctionWrapHandler,
-    WithJsonSchema,
     model_serializer,
     model_validator,
 )
@@ -26,7 +25,6 @@ from reslrb_cli.config.base import (
     ConfigPath,
     Count,
     Memory,
-    Positive,
     Section,
     Seed,
     Size,
@@ -36,29 +34,17 @@ from reslrb_cli.config.base import (
     each_once,
     few,
     folder_name,
-    list_of_one,
     located,
     mark,
     memory_bytes,
     must,
     wrong,
 )
-from reslrb_cli.config.files import KEY_LENGTH, largest_pass, passes_obstacle
-from reslrb_cli.config.integrators import AnyIntegrator, Integrator
+from reslrb_cli.config.integrators import AnyIntegrator, Integrator, largest_pass, passes_obstacle
 from reslrb_cli.config.integrators import Reslrb as ReslrbConfig
 from reslrb_cli.config.optimizers import L2, Adam, AnyLoss, AnyOptimizer
-from reslrb_cli.config.parameters import COLOR_SPACE, ColorSpace, ParameterSpec, Value
-from reslrb_cli.config.views import (
-    EXPOSURE,
-    MASK,
-    MASK_MIXED,
-    AnyMask,
-    Exposures,
-    Mask,
-    SensorName,
-    ViewSpec,
-    check_views,
-)
+from reslrb_cli.config.parameters import ParameterSpec
+from reslrb_cli.config.views import SensorName, TargetConfig, ViewSpec, check_views
 
 
 def _scalar(value: Any) -> Any:
@@ -92,72 +78,6 @@ class SceneConfig(Section):
         by_kind("a list of sensor indices, or `all`", "all"),
     ] = Field(default=[0])
     """Indices of the scene's sensors that are used, or `all`."""
-
-
-class Rendering(Section):
-    """A target that is rendered from the scene itself, with other parameter values."""
-
-    parameters: Annotated[
-        dict[str, Value],
-        must(
-            lambda values: all(0 < len(key) <= KEY_LENGTH for key in values),
-            lambda _: f"must have keys that are not empty, and have at most {KEY_LENGTH} characters",
-        ),
-    ] = Field(default={})
-    """True values by key, as in `parameters`: a number, a list of numbers, or an image file. Empty: the scene as it
-    stands."""
-    spp: Count = Field(default=1024, description="Samples per pixel of the target.")
-    seed: Seed = Field(default=0, description="Seed of the target's samples.")
-    integrator: AnyIntegrator | None = None
-    """Integrator of the target; null: that of the run."""
-
-
-_PATH = {"type": "string", "format": "path"}
-
-_Files = Annotated[
-    list[ConfigPath],
-    Field(min_length=1),
-    BeforeValidator(list_of_one),
-    WithJsonSchema({"anyOf": [_PATH, {"type": "array", "items": _PATH, "minItems": 1}]}),
-]
-
-
-class TargetConfig(Section):
-    """What the image is compared with: exactly one of `file` and `render`; views with own targets need none."""
-
-    file: _Files | None = None
-    """Target image (EXR, PNG, JPG, HDR), or a list with one for each sensor, in their order; relative to the config
-    file. It is turned as its EXIF orientation says, unless `scene.cameras` is given."""
-    color_space: ColorSpace = Field(default="auto", description=f"{COLOR_SPACE} Only with `file`.")
-    gamma: Positive | None = None
-    """Decode values of 8 and 16 bit files by this power, in place of `color_space`. Only with `file`."""
-    render: Rendering | None = Field(default=None, description="Render the target from the scene.")
-    mask: AnyMask = Field(default=Mask(), description=MASK)
-    mask_mixed: bool = Field(default=False, description=MASK_MIXED)
-    exposure: Exposures = Field(
-        default=1.0,
-        description=f"{EXPOSURE}, all views having the same; or a list of these with one for each view, which are then "
-        "recovered apart.",
-    )
-
-    @model_validator(mode="after")
-    def _check_one(self) -> Self:
-        if self.file is not None and self.render is not None:
-            raise located("", "must have exactly one of `file` and `render`, and has both")
-        if self.render is not None and self.color_space != "auto":
-            raise located("color_space", "has no effect on a rendered target; it goes with `file`")
-        if self.render is not None and self.gamma is not None:
-            raise located("gamma", "has no effect on a rendered target; it goes with `file`")
-        if self.gamma is not None and self.color_space != "auto":
-            raise located("gamma", "decodes the file in place of color_space; give one of the two")
-        return self
-
-    @model_serializer(mode="wrap")
-    def _without_unused(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        values: dict[str, Any] = handler(self)
-        if self.render is not None:
-            values.pop("color_space", None)
-        return values
 
 
 def _without_default(schema: dict[str, Any]) -> None:

@@ -1,4 +1,4 @@
-"""How a target is compared with: the mask that leaves pixels out of it, and its exposure."""
+"""What images are compared with: targets, the masks that leave pixels out of them, their exposures; and views."""
 
 from __future__ import annotations
 
@@ -6,11 +6,23 @@ import math
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BeforeValidator, Field, GetJsonSchemaHandler, WithJsonSchema
+from pydantic import (
+    BeforeValidator,
+    Field,
+    GetJsonSchemaHandler,
+    SerializerFunctionWrapHandler,
+    WithJsonSchema,
+    model_serializer,
+    model_validator,
+)
 from pydantic_core import CoreSchema
+from typing_extensions import Self
 
-from reslrb_cli.config.base import ConfigPath, Positive, Section, located, wrong
+from reslrb_cli.config.base import ConfigPath, Count, Positive, Section, Seed, list_of_one, located, must, wrong
+from reslrb_cli.config.files import KEY_LENGTH
+from reslrb_cli.config.integrators import AnyIntegrator
 from reslrb_cli.config.optimizers import AnyLoss
+from reslrb_cli.config.parameters import COLOR_SPACE, ColorSpace, Value
 
 _KINDS = ("specular", "border", "clipped", "alpha", "nonfinite")
 
@@ -59,16 +71,6 @@ class _OrText:
 #: `auto`, `none`, an image of weights, or a section that says what is left out.
 AnyMask = Annotated[Mask, BeforeValidator(_mask), _OrText()]
 
-MASK = (
-    "Pixels that are left out of the loss, and what the others weigh: `auto` (all kinds are left out), `none`, the "
-    "path of an image of weights, alone, or a section that switches kinds off and may add weights."
-)
-
-MASK_MIXED = (
-    "Leave out, with `specular`, the pixels that see a coat, a blend or a thin pane directly, of whose light light "
-    "tracing lacks a part; else they stay, and are counted."
-)
-
 
 def _exposure(value: Any) -> Any:
     is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
@@ -98,11 +100,6 @@ Exposures = Annotated[
     WithJsonSchema({"anyOf": [*_EXPOSURE, {"type": "array", "items": {"anyOf": [{"type": "number"}, _EXPOSURE[1]]}}]}),
 ]
 
-EXPOSURE = (
-    "What the image is multiplied by before it is compared, target = exposure * image: a number, `auto` (recovered "
-    "with the parameters, one factor), or `per_channel` (recovered, one for each channel, which is white balance)"
-)
-
 
 def _sensor_name(value: Any) -> Any:
     if (isinstance(value, int) and not isinstance(value, bool) and value >= 0) or (isinstance(value, str) and value):
@@ -116,6 +113,75 @@ SensorName = Annotated[
     BeforeValidator(_sensor_name),
     WithJsonSchema({"anyOf": [{"type": "integer", "minimum": 0}, {"type": "string"}]}),
 ]
+
+
+class Rendering(Section):
+    """A target that is rendered from the scene itself, with other parameter values."""
+
+    parameters: Annotated[
+        dict[str, Value],
+        must(
+            lambda values: all(0 < len(key) <= KEY_LENGTH for key in values),
+            lambda _: f"must have keys that are not empty, and have at most {KEY_LENGTH} characters",
+        ),
+    ] = Field(default={})
+    """True values by key, as in `parameters`: a number, a list of numbers, or an image file. Empty: the scene as it
+    stands."""
+    spp: Count = Field(default=1024, description="Samples per pixel of the target.")
+    seed: Seed = Field(default=0, description="Seed of the target's samples.")
+    integrator: AnyIntegrator | None = None
+    """Integrator of the target; null: that of the run."""
+
+
+_PATH = {"type": "string", "format": "path"}
+
+_Files = Annotated[
+    list[ConfigPath],
+    Field(min_length=1),
+    BeforeValidator(list_of_one),
+    WithJsonSchema({"anyOf": [_PATH, {"type": "array", "items": _PATH, "minItems": 1}]}),
+]
+
+
+class TargetConfig(Section):
+    """What the image is compared with: exactly one of `file` and `render`; views with own targets need none."""
+
+    file: _Files | None = None
+    """Target image (EXR, PNG, JPG, HDR), or a list with one for each sensor, in their order; relative to the config
+    file. It is turned as its EXIF orientation says, unless `scene.cameras` is given."""
+    color_space: ColorSpace = Field(default="auto", description=f"{COLOR_SPACE} Only with `file`.")
+    gamma: Positive | None = None
+    """Decode values of 8 and 16 bit files by this power, in place of `color_space`. Only with `file`."""
+    render: Rendering | None = Field(default=None, description="Render the target from the scene.")
+    mask: AnyMask = Mask()
+    """Pixels that are left out of the loss, and what the others weigh: `auto` (all kinds are left out), `none`, the
+    path of an image of weights, alone, or a section that switches kinds off and may add weights."""
+    mask_mixed: bool = False
+    """Leave out, with `specular`, the pixels that see a coat, a blend or a thin pane directly, of whose light light
+    tracing lacks a part; else they stay, and are counted."""
+    exposure: Exposures = 1.0
+    """What the image is multiplied by before it is compared, target = exposure * image: a number, `auto` (recovered
+    with the parameters, one factor), or `per_channel` (recovered, one for each channel, which is white balance), all
+    views having the same; or a list of these with one for each view, which are then recovered apart."""
+
+    @model_validator(mode="after")
+    def _check_one(self) -> Self:
+        if self.file is not None and self.render is not None:
+            raise located("", "must have exactly one of `file` and `render`, and has both")
+        if self.render is not None and self.color_space != "auto":
+            raise located("color_space", "has no effect on a rendered target; it goes with `file`")
+        if self.render is not None and self.gamma is not None:
+            raise located("gamma", "has no effect on a rendered target; it goes with `file`")
+        if self.gamma is not None and self.color_space != "auto":
+            raise located("gamma", "decodes the file in place of color_space; give one of the two")
+        return self
+
+    @model_serializer(mode="wrap")
+    def _without_unused(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        values: dict[str, Any] = handler(self)
+        if self.render is not None:
+            values.pop("color_space", None)
+        return values
 
 
 class ViewSpec(Section):
@@ -132,7 +198,7 @@ class ViewSpec(Section):
     loss: AnyLoss | None = Field(default=None, description="How this view is compared; null: as `loss` says.")
 
 
-def check_views(views: list[ViewSpec], scene: Any, target: Any) -> None:
+def check_views(views: list[ViewSpec], scene: Any, target: TargetConfig) -> None:
     """Raise an error, located, where views and the short forms, `scene.sensors` and `target`, contradict each other."""
     places: dict[int, int] = {}
     for number, view in enumerate(views):

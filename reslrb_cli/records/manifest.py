@@ -16,11 +16,11 @@ import threading
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from datetime import datetime, timezone
-from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 from reslrb_cli import __version__
+from reslrb_cli.backend.variant import package_version
 from reslrb_cli.config.files import read_file
 from reslrb_cli.errors import ConfigError, printable
 from reslrb_cli.records import metrics
@@ -40,13 +40,8 @@ def now() -> str:
 
 def versions() -> dict[str, str]:
     """Versions of Python and of the packages that a result depends on."""
-    found = {"reslrb": __version__, "python": platform.python_version()}
-    for name in PACKAGES:
-        try:
-            found[name] = metadata.version(name)
-        except metadata.PackageNotFoundError:
-            found[name] = "not installed as a package"
-    return found
+    found = {name: package_version(name) or "not installed as a package" for name in PACKAGES}
+    return {"reslrb": __version__, "python": platform.python_version()} | found
 
 
 class Status(str, enum.Enum):

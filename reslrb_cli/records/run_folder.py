@@ -86,8 +86,6 @@ def check_output(source: object, output: Path, name: str, force: bool) -> None:
 
     Tried, not asked: for root, permissions say nothing. Leaves nothing behind. Raises MachineError for a full disk.
     """
-    if not name or name in (".", "..") or "/" in name or "\\" in name or "\0" in name:
-        raise ConfigError(source, "run.name", f"{name!r} cannot name a folder; give a name without slashes")
     ancestor = next(path for path in (output, *output.absolute().parents) if os.path.lexists(path))
     if not ancestor.is_dir():
         raise ConfigError(source, "run.output", f"{ancestor} is not a folder; give a folder that can be written to")
@@ -241,8 +239,6 @@ class RunFolder:
 def _try_name(source: object, folder: Path, name: str) -> None:
     try:
         (folder / f"{name}-2").mkdir()  # as a second run would be called
-    except ValueError:  # characters that no file name can have
-        raise ConfigError(source, "run.name", f"{name!r} cannot name a folder; give another name") from None
     except OSError as error:
         if is_machine_fault(error):
             raise

@@ -15,7 +15,8 @@ from cli.calling import read_metrics
 from cli.tiny import write_experiment
 
 from reslrb_cli.cli import main
-from reslrb_cli.config.files import in_words, largest_pass, passes_obstacle
+from reslrb_cli.config.files import in_words
+from reslrb_cli.config.integrators import largest_pass, passes_obstacle
 from reslrb_cli.config.loader import load
 from reslrb_cli.optimization import forecast as trial
 from reslrb_cli.optimization.assemble import assemble
