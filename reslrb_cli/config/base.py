@@ -1,12 +1,7 @@
-"""The basis of all sections of the configuration: strictness, paths, unions told apart by their `type`, shared values.
-
-The values that several sections share are names of runs, which are names of folders too; amounts of memory as a user
-writes them; and how often a run keeps its state.
-"""
+"""The basis of all sections of the configuration: strictness, paths, unions told apart by their `type`, numbers."""
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any
@@ -18,17 +13,13 @@ from pydantic import (
     ConfigDict,
     Discriminator,
     Field,
-    SerializerFunctionWrapHandler,
     Tag,
     ValidationInfo,
     WithJsonSchema,
-    model_serializer,
-    model_validator,
 )
 from pydantic_core import PydanticCustomError
-from typing_extensions import Self
 
-from reslrb_cli.config.files import NAME_BYTES, PART_BYTES, PATH_BYTES, PIXELS
+from reslrb_cli.config.files import PART_BYTES, PATH_BYTES, PIXELS
 
 #: Largest seed plus one: Mitsuba's seeds are uint32.
 SEED_END = 2**32
@@ -193,93 +184,3 @@ def few(what: str, reason: str = "") -> AfterValidator:
         lambda size: size[0] * size[1] <= PIXELS,
         lambda size: f"must have at most {PIXELS} {what}, not {size[0] * size[1]}{reason}",
     )
-
-
-#: Names that Windows takes for devices, whatever suffix they have: a folder that is called so cannot be copied there.
-_RESERVED = re.compile(r"(con|prn|aux|nul|(com|lpt)[0-9])(\..*)?", re.IGNORECASE)
-
-#: What begins at a root or at a home, or has `.` or `..` for a part. A slash between words is none of that.
-_PATH = re.compile(r"^([/\\~]|[A-Za-z]:[/\\])|(^|[/\\])\.\.?($|[/\\])")
-
-
-def folder_name(name: str) -> str:
-    """A run's name as the name of a folder: what is no letter, digit, `.`, `_`, `+`, `=` becomes `-`."""
-    return re.sub(r"[^\w.+=]+", "-", name).strip("-.")
-
-
-def check_name(name: str) -> str:
-    """`name`, where it can name a run; else raises an error that says what is wrong with it."""
-    folder = folder_name(name)
-    if _PATH.search(name.strip()):
-        raise wrong("must be a name and not a path; run.output says where the run's folder is")
-    if not folder:
-        raise wrong("must hold a letter or a digit")
-    if _RESERVED.fullmatch(folder):
-        raise wrong(f"must be another name: {folder} is a device on Windows, and not a folder's name there")
-    if len(folder.encode()) > NAME_BYTES:
-        raise wrong(f"must have at most {NAME_BYTES} bytes in UTF-8, not {len(folder.encode())}")
-    return name
-
-
-MIB = 2**20
-
-_UNITS = {"b": 1, "kb": 10**3, "mb": 10**6, "gb": 10**9, "kib": 2**10, "mib": MIB, "gib": 2**30}
-
-_SIZE = re.compile(r"(\d+(?:\.\d*)?|\.\d+)\s*([A-Za-z]+)")
-
-
-def memory_bytes(value: int | float | str) -> int:
-    """Bytes of a number of MiB, or of text such as "512 MiB", "2GiB", "500 MB".
-
-    Raises ValueError where it is neither, or less than one byte.
-    """
-    number, unit = float("nan"), "mib"
-    if isinstance(value, str):
-        match = _SIZE.fullmatch(value.strip())
-        if match:
-            number, unit = float(match[1]), match[2].lower()
-    elif not isinstance(value, bool):
-        number = float(value) if abs(value) < 2**63 else float("inf")  # longer integers fit into no float
-    if unit not in _UNITS or not 1 <= number * _UNITS[unit] < 2**63:
-        raise ValueError(f"{value!r} is no amount of memory")
-    return int(number * _UNITS[unit])
-
-
-def _check(value: Any) -> Any:
-    try:
-        if not isinstance(value, (int, float, str)):
-            raise ValueError
-        memory_bytes(value)
-    except ValueError:
-        raise wrong("must be a number of MiB, or text such as 512 MiB or 2GiB, and more than 0") from None
-    return value
-
-
-#: A number of MiB, or text with a unit (B, kB, KiB, MB, MiB, GB, GiB); kept as it was written.
-Memory = Annotated[
-    int | float | str,
-    BeforeValidator(_check),
-    WithJsonSchema({"anyOf": [{"type": "number", "exclusiveMinimum": 0}, {"type": "string"}]}),
-]
-
-
-class CheckpointEvery(Section):
-    """Exactly one of `iterations` and `seconds`."""
-
-    iterations: Count | None = Field(default=None, description="Iterations between two checkpoints.")
-    seconds: Positive | None = Field(default=None, description="Seconds between two checkpoints, at least.")
-
-    @model_validator(mode="after")
-    def _check_one(self) -> Self:
-        if (self.iterations is None) == (self.seconds is None):
-            has = "none" if self.seconds is None else "both"
-            raise located("", f"must have exactly one of `iterations` and `seconds`, and has {has}")
-        return self
-
-    @model_serializer(mode="wrap")
-    def _without_unused(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        return {key: value for key, value in handler(self).items() if value is not None}
-
-    def is_due(self, iterations: int, seconds: float) -> bool:
-        """Whether it is time for one, so many iterations and seconds after the last."""
-        return iterations >= self.iterations if self.iterations is not None else seconds > (self.seconds or 0.0)

@@ -6,6 +6,7 @@ Units, defaults and meanings stand in the fields' descriptions; `scripts/make_re
 from __future__ import annotations
 
 import math
+import re
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -15,31 +16,29 @@ from pydantic import (
     Field,
     PrivateAttr,
     SerializerFunctionWrapHandler,
+    WithJsonSchema,
     model_serializer,
     model_validator,
 )
 from typing_extensions import Self
 
 from reslrb_cli.config.base import (
-    CheckpointEvery,
     ConfigPath,
     Count,
-    Memory,
+    Positive,
     Section,
     Seed,
     Size,
     WorkPath,
     by_kind,
-    check_name,
     each_once,
     few,
-    folder_name,
     located,
     mark,
-    memory_bytes,
     must,
     wrong,
 )
+from reslrb_cli.config.files import NAME_BYTES
 from reslrb_cli.config.integrators import AnyIntegrator, Integrator, largest_pass, passes_obstacle
 from reslrb_cli.config.integrators import Reslrb as ReslrbConfig
 from reslrb_cli.config.optimizers import L2, Adam, AnyLoss, AnyOptimizer
@@ -78,6 +77,96 @@ class SceneConfig(Section):
         by_kind("a list of sensor indices, or `all`", "all"),
     ] = Field(default=[0])
     """Indices of the scene's sensors that are used, or `all`."""
+
+
+# --- runs -------------------------------------------------------------------------------------------------------------
+
+#: Names that Windows takes for devices, whatever suffix they have: a folder that is called so cannot be copied there.
+_RESERVED = re.compile(r"(con|prn|aux|nul|(com|lpt)[0-9])(\..*)?", re.IGNORECASE)
+
+#: What begins at a root or at a home, or has `.` or `..` for a part. A slash between words is none of that.
+_PATH = re.compile(r"^([/\\~]|[A-Za-z]:[/\\])|(^|[/\\])\.\.?($|[/\\])")
+
+
+def folder_name(name: str) -> str:
+    """A run's name as the name of a folder: what is no letter, digit, `.`, `_`, `+`, `=` becomes `-`."""
+    return re.sub(r"[^\w.+=]+", "-", name).strip("-.")
+
+
+def check_name(name: str) -> str:
+    """`name`, where it can name a run; else raises an error that says what is wrong with it."""
+    folder = folder_name(name)
+    if _PATH.search(name.strip()):
+        raise wrong("must be a name and not a path; run.output says where the run's folder is")
+    if not folder:
+        raise wrong("must hold a letter or a digit")
+    if _RESERVED.fullmatch(folder):
+        raise wrong(f"must be another name: {folder} is a device on Windows, and not a folder's name there")
+    if len(folder.encode()) > NAME_BYTES:
+        raise wrong(f"must have at most {NAME_BYTES} bytes in UTF-8, not {len(folder.encode())}")
+    return name
+
+
+MIB = 2**20
+
+_UNITS = {"b": 1, "kb": 10**3, "mb": 10**6, "gb": 10**9, "kib": 2**10, "mib": MIB, "gib": 2**30}
+
+_SIZE = re.compile(r"(\d+(?:\.\d*)?|\.\d+)\s*([A-Za-z]+)")
+
+
+def memory_bytes(value: int | float | str) -> int:
+    """Bytes of a number of MiB, or of text such as "512 MiB", "2GiB", "500 MB".
+
+    Raises ValueError where it is neither, or less than one byte.
+    """
+    number, unit = float("nan"), "mib"
+    if isinstance(value, str):
+        match = _SIZE.fullmatch(value.strip())
+        if match:
+            number, unit = float(match[1]), match[2].lower()
+    elif not isinstance(value, bool):
+        number = float(value) if abs(value) < 2**63 else float("inf")  # longer integers fit into no float
+    if unit not in _UNITS or not 1 <= number * _UNITS[unit] < 2**63:
+        raise ValueError(f"{value!r} is no amount of memory")
+    return int(number * _UNITS[unit])
+
+
+def _check_memory(value: Any) -> Any:
+    try:
+        memory_bytes(value)
+    except (TypeError, ValueError):
+        raise wrong("must be a number of MiB, or text such as 512 MiB or 2GiB, and more than 0") from None
+    return value
+
+
+#: A number of MiB, or text with a unit (B, kB, KiB, MB, MiB, GB, GiB); kept as it was written.
+Memory = Annotated[
+    int | float | str,
+    BeforeValidator(_check_memory),
+    WithJsonSchema({"anyOf": [{"type": "number", "exclusiveMinimum": 0}, {"type": "string"}]}),
+]
+
+
+class CheckpointEvery(Section):
+    """Exactly one of `iterations` and `seconds`."""
+
+    iterations: Count | None = Field(default=None, description="Iterations between two checkpoints.")
+    seconds: Positive | None = Field(default=None, description="Seconds between two checkpoints, at least.")
+
+    @model_validator(mode="after")
+    def _check_one(self) -> Self:
+        if (self.iterations is None) == (self.seconds is None):
+            has = "none" if self.seconds is None else "both"
+            raise located("", f"must have exactly one of `iterations` and `seconds`, and has {has}")
+        return self
+
+    @model_serializer(mode="wrap")
+    def _without_unused(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        return {key: value for key, value in handler(self).items() if value is not None}
+
+    def is_due(self, iterations: int, seconds: float) -> bool:
+        """Whether it is time for one, so many iterations and seconds after the last."""
+        return iterations >= self.iterations if self.iterations is not None else seconds > (self.seconds or 0.0)
 
 
 def _without_default(schema: dict[str, Any]) -> None:

@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 from compilation import search_path
 
-from reslrb_cli.config.base import check_name
 from reslrb_cli.config.files import NAME_BYTES
+from reslrb_cli.config.schema import check_name
 from reslrb_cli.errors import ConfigError, MachineError
 from reslrb_cli.records.lock import FolderLock
 from reslrb_cli.records.manifest import Manifest, Status, read_manifest
