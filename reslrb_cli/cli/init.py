@@ -17,11 +17,11 @@ from typing import TYPE_CHECKING
 import click
 
 from reslrb_cli.cli.inspect import LISTED_SENSORS
-from reslrb_cli.cli.options import check_writable
+from reslrb_cli.cli.options import check_writable, writing
 from reslrb_cli.cli.terminal import echo
 from reslrb_cli.config.loader import loads, parse_override
 from reslrb_cli.config.yaml_text import write
-from reslrb_cli.errors import ConfigError, UnsupportedScene, is_machine_fault, printable
+from reslrb_cli.errors import ConfigError, UnsupportedScene, printable
 from reslrb_cli.records.atomic import write_atomically
 from reslrb_cli.scene.proposal import Proposal
 from reslrb_cli.scene.visibility import Depth
@@ -316,14 +316,10 @@ def command(
     specs = loads(text, path).parameters
     scene = read_as_floats(scene, description, [key for spec in specs for key in spec.keys])
     select_parameters(scene, specs, path)  # what is wrong is to show before anything is written
-    try:
+    with writing("--output", path):
         if copied and photo is not None and image is not None:
             write_smaller(photo, size, image)
         write_atomically(path, lambda file: file.write(text.encode()))
-    except OSError as error:
-        if is_machine_fault(error):
-            raise
-        raise ConfigError("--output", "", f"cannot write {error.filename}: {error.strerror}") from None
     made = f" and {image}" if copied else ""
     count = sum(proposal.first for proposal in proposals)
     echo(f"{path}{made}: {count} of {len(proposals)} parameters, at {size[0]}x{size[1]} pixels")

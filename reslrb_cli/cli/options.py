@@ -10,7 +10,8 @@ from __future__ import annotations
 import errno
 import math
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,7 @@ from reslrb_cli.cli.terminal import echo
 from reslrb_cli.config.loader import load
 from reslrb_cli.config.parameters import RunValue
 from reslrb_cli.config.schema import Config
-from reslrb_cli.errors import ConfigError
+from reslrb_cli.errors import ConfigError, is_machine_fault
 from reslrb_cli.records.atomic import remove_parts_of
 from reslrb_cli.records.measurement_files import (
     Kept,
@@ -115,7 +116,6 @@ def read_recovered(run: Path, overrides: tuple[str, ...]) -> Config:
     return config.model_copy(update={"parameters": specs})
 
 
-
 #: Type of an option that counts something: samples, depths, seeds. As in a configuration, 31 bits.
 COUNT = click.IntRange(min=1, max=2**31 - 1)
 
@@ -149,16 +149,6 @@ class Factors(click.ParamType):
         return tuple(sorted(factors))
 
 
-def experiment_arguments(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Add CONFIG (`config_file`) and `--set` (`overrides`) to a command."""
-    return _arguments(function, required=True)
-
-
-def optional_experiment_arguments(function: Callable[..., Any]) -> Callable[..., Any]:
-    """The same for a command that has a scene of its own: `config_file` is None where CONFIG is left out."""
-    return _arguments(function, required=False)
-
-
 def overrides_option(function: Callable[..., Any]) -> Callable[..., Any]:
     """Add `--set` (`overrides`) to a command."""
     return click.option(
@@ -189,10 +179,16 @@ def allowance(budget_s: float, number: int | None, of: str) -> str:
     return f"budget {budget_s:g} s for the whole, loading and compiling included"
 
 
-def _arguments(function: Callable[..., Any], required: bool) -> Callable[..., Any]:
+def experiment_arguments(function: Callable[..., Any], required: bool = True) -> Callable[..., Any]:
+    """Add CONFIG (`config_file`) and `--set` (`overrides`) to a command."""
     metavar = "CONFIG" if required else "[CONFIG]"
     argument = click.argument("config_file", metavar=metavar, required=required, type=click.Path(path_type=Path))
     return argument(overrides_option(function))
+
+
+def optional_experiment_arguments(function: Callable[..., Any]) -> Callable[..., Any]:
+    """The same for a command that has a scene of its own: `config_file` is None where CONFIG is left out."""
+    return experiment_arguments(function, required=False)
 
 
 def is_given(name: str) -> bool:
@@ -210,6 +206,18 @@ def start_variant(config: Config) -> str:
     from reslrb_cli.backend.variant import set_variant
 
     return set_variant(config.variant)
+
+
+@contextmanager
+def writing(option: str, path: Path) -> Iterator[None]:
+    """Have an error of writing `path` located by the option (ConfigError); one of the machine stays what it is."""
+    try:
+        yield
+    except (OSError, RuntimeError) as error:
+        if is_machine_fault(error):
+            raise
+        place, reason = getattr(error, "filename", None) or path, getattr(error, "strerror", None) or error
+        raise ConfigError(option, "", f"cannot write {place}: {reason}") from None
 
 
 def check_writable(option: str, path: Path | None) -> None:
