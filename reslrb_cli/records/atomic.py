@@ -12,8 +12,8 @@ import contextlib
 import glob
 import os
 import re
+import secrets
 import shutil
-import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -56,9 +56,10 @@ def write_atomically(path: Path, write: Callable[[IO[bytes]], object], durable: 
 @contextmanager
 def unfinished_folder(parent: Path) -> Iterator[Path]:
     """A new folder in `parent`, which the block may rename; else it is removed at its end, with all that is in it."""
-    path = Path(tempfile.mkdtemp(prefix=FOLDER_PREFIX, dir=parent))
+    path = parent / f"{FOLDER_PREFIX}{secrets.token_hex(8)}"
     unfinished.add(path)
     try:
+        path.mkdir()
         yield path
     finally:
         shutil.rmtree(path, ignore_errors=True)

@@ -13,6 +13,7 @@ import errno
 import itertools
 import os
 import shutil
+import tempfile
 import time
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
@@ -24,7 +25,7 @@ import numpy as np
 from reslrb_cli.errors import ConfigError, MachineError, is_machine_fault
 from reslrb_cli.records import manifest as manifests
 from reslrb_cli.records import metrics
-from reslrb_cli.records.atomic import FOLDER_PREFIX, remove_parts, unfinished, unfinished_folder, write_atomically
+from reslrb_cli.records.atomic import FOLDER_PREFIX, remove_parts, unfinished_folder, write_atomically
 from reslrb_cli.records.checkpoint import STATE_FILE, Archive, newest_checkpoint
 from reslrb_cli.records.lock import READER_WAIT_SECONDS, FolderLock, Holder, InUse
 from reslrb_cli.records.manifest import Manifest, Status, read_manifest
@@ -132,7 +133,6 @@ class RunFolder:
                 (part / "config.yaml").write_text(config, encoding="utf-8")
                 manifest.process = Holder.here(locked=lock.real)
                 manifest.write(part)
-                part.chmod(0o777 & ~_umask())
                 own = cls(part, lock)
                 folder = own._replace(source, output / name, manifest) if force else own._place(output / name)
                 if folder.lock is lock:
@@ -283,12 +283,6 @@ def _remove_left(output: Path) -> None:
                         shutil.rmtree(path, ignore_errors=True)
 
 
-def _umask() -> int:
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask
-
-
 @contextlib.contextmanager
 def opened(path: Path) -> Iterator[tuple[RunFolder, dict[str, Any]]]:
     """The run folder `path`, locked while the block works, and what its manifest says.
@@ -320,7 +314,8 @@ def check_writable(folder: RunFolder) -> None:
         for name in SUBFOLDERS:
             (folder.path / name).mkdir(exist_ok=True)
         for place in (folder.path, *(folder.path / name for name in SUBFOLDERS)):
-            _write_and_remove(place / f".resume.{os.getpid()}.part")
+            with tempfile.TemporaryFile(dir=place) as file:
+                file.write(b"is there room?")
         metrics.mend(folder.path)
         remove_parts(folder.path)
     except OSError as error:
@@ -366,16 +361,6 @@ def copy_into(folder: RunFolder, earlier: Path) -> None:
 def _copy(path: Path, target: Path) -> None:
     with path.open("rb") as file:
         write_atomically(target, lambda copy: shutil.copyfileobj(file, copy))
-
-
-def _write_and_remove(path: Path) -> None:
-    unfinished.add(path)
-    try:
-        path.write_bytes(b"is there room?")
-    finally:
-        with contextlib.suppress(OSError):
-            path.unlink(missing_ok=True)
-        unfinished.discard(path)
 
 
 def write_beginning(folder: RunFolder, config: str, manifest: Manifest) -> None:
