@@ -88,12 +88,12 @@ def remove_parts(folder: Path) -> None:
 def remove_parts_of(path: Path) -> None:
     """Remove what processes that are no more began to write in place of the file `path`, and never finished."""
     for part in path.parent.glob(f".{glob.escape(path.name)}.*.part"):
-        if _PART.fullmatch(part.name) and not _is_alive(int(part.name.split(".")[-2])):
+        if _PART.fullmatch(part.name) and not is_alive(int(part.name.split(".")[-2])):
             with contextlib.suppress(OSError):
                 part.unlink()
 
 
-def _is_alive(process: int) -> bool:
+def is_alive(process: int) -> bool:
     """Whether there is a process of this number."""
     try:
         os.kill(process, 0)

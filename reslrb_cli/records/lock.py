@@ -16,6 +16,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from reslrb_cli.records.atomic import is_alive
+
 try:
     import fcntl
 except ImportError:  # Windows
@@ -121,37 +123,19 @@ class Holder:
 
         Where that cannot be known, as of a process on another machine without common locks, it has not.
         """
+        here = Holder.here(locked=False)
+        same_kernel = self.host == here.host or (self.boot is not None and self.boot == here.boot)
         if self.locked:
             try:
                 with FolderLock(folder, READER_WAIT_SECONDS, shared=True) as lock:
                     if lock.real:
-                        return self._shares_locks(folder)
+                        # Not everywhere do machines share locks of network disks, which have no block device.
+                        return same_kernel or os.major(os.stat(folder).st_dev) != 0
             except InUse:
                 return False
             except OSError:
                 pass  # the folder cannot be opened: no lock to ask
-        return self._is_no_process()
-
-    def _shares_locks(self, folder: Path) -> bool:
-        """Whether a lock of the process would be seen here: not everywhere do machines share locks of network disks."""
-        here = Holder.here(locked=True)
-        same_kernel = self.host == here.host or (self.boot is not None and self.boot == here.boot)
-        # Network file systems have no block device.
-        return same_kernel or os.major(os.stat(folder).st_dev) != 0
-
-    def _is_no_process(self) -> bool:
-        here = Holder.here(locked=False)
-        if self.host != here.host:
-            return False
-        if self.boot != here.boot:
-            return True
-        try:
-            os.kill(self.pid, 0)
-        except ProcessLookupError:
-            return True
-        except OSError:  # it is another user's
-            pass
-        return False
+        return self.host == here.host and (self.boot != here.boot or not is_alive(self.pid))
 
     def __str__(self) -> str:
         return f"process {self.pid} on {self.host}"
