@@ -23,12 +23,10 @@ from reslrb_cli.backend import shared_library
 from reslrb_cli.errors import BackendError
 
 VARIABLE = "DRJIT_LIBLLVM_PATH"
-
 MIN_VERSION = 19
 
 # scripts/setup unpacks Debian's packages here where the system lacks a library
 UNPACKED = Path(__file__).resolve().parents[2] / ".cache" / "lib"
-
 _NAME = re.compile(r"libLLVM(?:-(\d+)(?:\.\d+)*)?(?:\.so(?:\.(\d+)(?:\.\d+)*)?|(?:\.(\d+)(?:\.\d+)*)?\.dylib)")
 
 

@@ -34,7 +34,6 @@ if TYPE_CHECKING:
 
 #: Pixels with which a run takes minutes on two cores, at the samples below.
 PIXELS = 2**14
-
 SPP, ITERATIONS, RATE = 16, 200, 0.03
 
 #: The same with a parameter that has no upper bound, of which rates are shares: it and what it shines on are told apart
@@ -49,9 +48,7 @@ _MOST_VARIABLES, _MOST_SENSORS, _LONGEST = 8, 6, 40
 
 #: Columns of a comment of several lines.
 _COMMENT = 110
-
 _NUMBER = re.compile(r"-?\d{1,15}(\.\d{1,15})?")
-
 _PLAIN = re.compile(r"(\.\./)*[A-Za-z_][\w.\-]*(/[\w.\-]+)*")
 
 

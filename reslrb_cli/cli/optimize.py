@@ -115,7 +115,6 @@ def time_lines(forecast: Forecast, before: Sequence[Before]) -> list[str]:
 
 
 NOTICE = "stopping after this iteration; once more, and it ends at once"
-
 logger = logging.getLogger(__name__)
 
 

@@ -26,7 +26,6 @@ from reslrb_cli.errors import ConfigError
 
 #: Formats that hold linear values; the others of `FORMATS` are written in 8-bit sRGB.
 FLOAT_FORMATS = (".exr", ".hdr", ".pfm")
-
 FORMATS = (*FLOAT_FORMATS, ".png", ".jpg", ".jpeg")
 
 

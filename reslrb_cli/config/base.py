@@ -169,9 +169,7 @@ def each_once(value: list[Any]) -> bool:
 # --- numbers ----------------------------------------------------------------------------------------------------------
 
 Positive = Annotated[float, Field(gt=0)]
-
 Count = Annotated[int, Field(ge=1, lt=2**31)]
-
 Seed = Annotated[int, Field(ge=0, lt=SEED_END)]
 
 #: [width, height].

@@ -20,7 +20,6 @@ CONFIG_BYTES = 2**18
 
 #: Number of `--set`, and characters of all of them together.
 OVERRIDES = 1000
-
 OVERRIDES_LENGTH = 2**16
 
 #: Values and keys of a configuration, with every alias and every `<<` spelt out: a few hundred bytes of aliases of

@@ -22,7 +22,6 @@ from reslrb_cli.errors import ConfigError, one_line
 
 #: Mappings whose keys are the user's own and may hold dots: what follows their name is one key.
 FREE_MAPPINGS: tuple[Location, ...] = (("scene", "options"), ("target", "render", "parameters"))
-
 _PART = re.compile(r"\[(\d+)\]|(?:^|\.)([^.\[\]]+)")
 
 

@@ -34,7 +34,6 @@ Numbers = Annotated[list[float], Field(min_length=1)]
 
 #: What a motion has; it is applied in the opposite order.
 Word = Literal["translation", "rotation", "scale"]
-
 WORDS: tuple[Word, ...] = ("translation", "rotation", "scale")
 
 #: The name, below its mesh's, of what a heightmap recovers.
@@ -64,9 +63,7 @@ _NumberOrList = Annotated[
 ]
 
 _Bound = Annotated[float, Field(allow_inf_nan=True)]
-
 Bounds = Annotated[tuple[_Bound, _Bound], Field(strict=False)]
-
 TransformName = Literal["none", "sigmoid", "log", "softplus"]
 
 
@@ -105,11 +102,8 @@ class MotionRates(ByWord):
 # --- what moves -------------------------------------------------------------------------------------------------------
 
 Name = Annotated[str, Field(min_length=1, max_length=KEY_LENGTH)]
-
 _NAME = {"type": "string", "minLength": 1, "maxLength": KEY_LENGTH}
-
 _NAMES = WithJsonSchema({"anyOf": [_NAME, {"type": "array", "items": _NAME, "minItems": 1}]})
-
 _EACH_ONCE = must(each_once, lambda _: "must name each once")
 
 #: One name or several.
@@ -149,7 +143,6 @@ class MotionSpec(Section):
 
 
 ColorSpace = Literal["auto", "linear", "srgb"]
-
 COLOR_SPACE = "How values are encoded: `linear`, `srgb`, or `auto` (8-bit files srgb, float files linear)."
 
 
@@ -201,7 +194,6 @@ Initial = Annotated[
 ]
 
 _AnyBounds = Annotated[Annotated[Bounds, mark("list")] | Annotated[MotionBounds, mark(ByWord.TAG)], or_words("list")]
-
 _AnyRate = Annotated[Annotated[Positive, mark("number")] | Annotated[MotionRates, mark(ByWord.TAG)], or_words("number")]
 
 _AnyTransform = Annotated[

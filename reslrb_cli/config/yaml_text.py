@@ -17,16 +17,12 @@ from reslrb_cli.errors import ConfigError
 
 #: Text, lists, mappings, null: what PyYAML builds of its own that is plain data in YAML 1.2 too.
 _KEPT = ("str", "seq", "map", "null", "bool")
-
 _TAG = "tag:yaml.org,2002:"
 
 #: Tags that a key may have: it is text, or `<<`.
 TEXT_TAGS = (f"{_TAG}str", f"{_TAG}merge")
-
 FLOAT = re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?$|[-+]?\.(inf|Inf|INF)$|\.(nan|NaN|NAN)$")
-
 INTEGER = re.compile(r"[-+]?[0-9]+$|0o[0-7]+$|0x[0-9a-fA-F]+$")
-
 DIGITS = list("-+.0123456789")
 
 
@@ -105,21 +101,13 @@ def _refuse(loader: Loader, node: yaml.Node) -> None:
 
 
 Loader.add_implicit_resolver(f"{_TAG}null", re.compile(r"(~|null|Null|NULL)?$"), ["~", "n", "N", ""])
-
 Loader.add_implicit_resolver(f"{_TAG}bool", re.compile(r"(true|True|TRUE|false|False|FALSE)$"), list("tTfF"))
-
 Loader.add_implicit_resolver(f"{_TAG}int", INTEGER, DIGITS)
-
 Loader.add_implicit_resolver(f"{_TAG}float", FLOAT, DIGITS)
-
 Loader.add_implicit_resolver(f"{_TAG}merge", re.compile(r"<<$"), ["<"])
-
 Loader.add_constructor(f"{_TAG}str", _construct_text)
-
 Loader.add_constructor(f"{_TAG}int", _construct_integer)
-
 Loader.add_constructor(f"{_TAG}float", _construct_float)
-
 Loader.add_constructor(None, _refuse)
 
 Location = tuple["str | int", ...]
@@ -240,9 +228,7 @@ def _represent_list(dumper: _Dumper, data: list[Any]) -> yaml.SequenceNode:
 
 
 _Dumper.add_implicit_resolver("tag:yaml.org,2002:float", FLOAT, DIGITS)
-
 _Dumper.add_implicit_resolver("tag:yaml.org,2002:int", INTEGER, DIGITS)
-
 _Dumper.add_representer(list, _represent_list)
 
 

@@ -27,9 +27,7 @@ except ImportError:  # Windows
 #: Who reads a folder, or puts its manifest right, has the lock for an instant: no run is refused over that, and no
 #: other reader takes it for a run.
 WAIT_SECONDS, READER_WAIT_SECONDS = 1.0, 0.25
-
 _POLL_SECONDS = 0.01
-
 _HELD = {errno.EWOULDBLOCK, errno.EAGAIN, errno.EACCES}
 
 

@@ -126,7 +126,6 @@ def read_manifest(folder: Path) -> dict[str, Any] | None:
 
 
 MANIFEST_FILE = "manifest.json"
-
 PROGRAM = "reslrb"
 
 #: Bytes of a manifest; the largest part of one is a pilot's table, of some kB.

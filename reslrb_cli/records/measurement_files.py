@@ -179,7 +179,6 @@ MOST_SAMPLES_BYTES = 2**28
 
 #: A head, which JSON can hold, and arrays by name.
 Kept = tuple[dict[str, Any], dict[str, np.ndarray]]
-
 _HEAD = "head"
 
 

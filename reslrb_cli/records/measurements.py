@@ -403,7 +403,6 @@ def _percent(share: float) -> str:
 
 
 _READERS: dict[type[Line], TypeAdapter[Any]] = {kind: TypeAdapter(kind) for kind in (GradcheckRecord, MissingRecord)}
-
 R = TypeVar("R", bound=Line)
 
 

@@ -75,7 +75,6 @@ def _manifest_of(run: Path) -> dict[str, Any]:
 
 
 SUBFOLDERS = ("images", "parameters", "checkpoint")
-
 OWN_ENTRIES = ("config.yaml", manifests.MANIFEST_FILE, metrics.METRICS_FILE, "report.html", *SUBFOLDERS)
 
 #: An unfinished folder without a process is removed when it is so old: nobody is just about to lock it.
