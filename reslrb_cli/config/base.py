@@ -75,6 +75,11 @@ class Choice(Section):
 # --- paths ------------------------------------------------------------------------------------------------------------
 
 
+def _folder(info: ValidationInfo) -> Path:
+    """The folder of the config file, where one is known."""
+    return Path((info.context or {}).get("folder", "")).absolute()
+
+
 def _path(folder: Path, value: Any) -> Path:
     """The path `value`, relative to `folder`. Joined, not resolved: `..` after a symbolic link is the system's."""
     if not isinstance(value, (str, Path)) or not str(value).strip() or "\0" in str(value):
@@ -92,21 +97,13 @@ def _path(folder: Path, value: Any) -> Path:
     return path
 
 
-def _below_config(value: Any, info: ValidationInfo) -> Path:
-    return _path(Path((info.context or {}).get("folder", "")).absolute(), value)
-
-
-def _below_working_directory(value: Any) -> Path:
-    return _path(Path.cwd(), value)
-
-
 _PATH_SCHEMA = WithJsonSchema({"type": "string", "format": "path"})
 
 #: A path relative to the folder of the config file.
-ConfigPath = Annotated[Path, BeforeValidator(_below_config), _PATH_SCHEMA]
+ConfigPath = Annotated[Path, BeforeValidator(lambda value, info: _path(_folder(info), value)), _PATH_SCHEMA]
 
 #: A path relative to the working directory.
-WorkPath = Annotated[Path, BeforeValidator(_below_working_directory), _PATH_SCHEMA]
+WorkPath = Annotated[Path, BeforeValidator(lambda value: _path(Path.cwd(), value)), _PATH_SCHEMA]
 
 # --- unions -----------------------------------------------------------------------------------------------------------
 

@@ -74,29 +74,17 @@ def apply(data: dict[str, Any], override: Override) -> dict[str, Any]:
     What is not on the way is shared with `data`. Raises ConfigError where the place cannot be: an index out of range, a
     key below a value that has none.
     """
-    result = dict(data)
-    at: Any = result
-    for i, part in enumerate(override.location):
-        here = override.location[:i]
-        part = _check_part(at, part, here, override)
-        if i == len(override.location) - 1:
-            value = override.value
-        else:
-            value = at[part] if (part in at if isinstance(at, dict) else part < len(at)) else None
-            if value is None:
-                value = [] if isinstance(override.location[i + 1], int) else {}
-            elif isinstance(value, (dict, list)):
-                value = value.copy()
-        if isinstance(at, list) and part == len(at):
-            at.append(value)
-        else:
-            at[part] = value
-        at = value
+    result: dict[str, Any] = _put(data, override, 0)
     return result
 
 
-def _check_part(at: Any, part: str | int, here: Location, override: Override) -> Any:
-    name = format_location(here)
+def _put(at: Any, override: Override, depth: int) -> Any:
+    """The same for what stands at the first `depth` parts of the place."""
+    if depth == len(override.location):
+        return override.value
+    part, name = override.location[depth], format_location(override.location[:depth])
+    if at is None:
+        at = [] if isinstance(part, int) else {}
     if isinstance(at, list):
         if isinstance(part, str) and part.isdecimal():
             part = int(part[:9])
@@ -105,12 +93,12 @@ def _check_part(at: Any, part: str | int, here: Location, override: Override) ->
         if part > len(at):
             has = "1 entry" if len(at) == 1 else f"{len(at)} entries"
             raise ConfigError(override.label, name, f"has {has}; there is no [{part}]")
-        return part
+        return [*at[:part], _put(at[part] if part < len(at) else None, override, depth + 1), *at[part + 1 :]]
     if not isinstance(at, dict):
         raise ConfigError(override.label, name, "is a single value; replace it as a whole")
     if isinstance(part, int):
         raise ConfigError(override.label, name, "is no list; name a key of it, not an index")
-    return part
+    return {**at, part: _put(at.get(part), override, depth + 1)}
 
 
 def load(path: Path | str, overrides: Sequence[str] = ()) -> Config:
