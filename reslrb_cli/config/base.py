@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Union, get_args
 
 from pydantic import (
     AfterValidator,
@@ -13,11 +13,12 @@ from pydantic import (
     ConfigDict,
     Discriminator,
     Field,
+    GetCoreSchemaHandler,
     Tag,
     ValidationInfo,
     WithJsonSchema,
 )
-from pydantic_core import PydanticCustomError
+from pydantic_core import CoreSchema, PydanticCustomError
 
 from reslrb_cli.config.files import PART_BYTES, PATH_BYTES, PIXELS
 
@@ -61,7 +62,7 @@ def must(hold: Callable[[Any], bool], message: Callable[[Any], str]) -> AfterVal
 
 
 #: For JSON Schema: `type` may be left out only for the first member of a union.
-NEEDS_TYPE = ConfigDict(json_schema_extra={"required": ["type"]})
+NEEDS_TYPE: dict[str, Any] = {"required": ["type"]}
 
 
 class Choice(Section):
@@ -118,15 +119,20 @@ def mark(name: str) -> Tag:
     return Tag(MARK + name)
 
 
-def by_type(default: str) -> Discriminator:
+class ByType(Discriminator):
     """Tells the members of a union apart by their key `type`, `default` where it is left out."""
 
-    def tag(value: Any) -> str | None:
-        if isinstance(value, Section):
-            return f"{MARK}{getattr(value, 'type', '')}"
-        return f"{MARK}{value.get('type', default)}" if isinstance(value, dict) else None
+    def __init__(self, default: str) -> None:
+        def tag(value: Any) -> str | None:
+            if isinstance(value, Section):
+                return f"{MARK}{getattr(value, 'type', '')}"
+            return f"{MARK}{value.get('type', default)}" if isinstance(value, dict) else None
 
-    return Discriminator(tag)
+        super().__init__(tag)
+
+    def __get_pydantic_core_schema__(self, source_type: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+        tagged = [Annotated[kind, mark(kind.model_fields["type"].default)] for kind in get_args(source_type)]
+        return super().__get_pydantic_core_schema__(Union[tuple(tagged)], handler)  # noqa: UP007 (made of a list)
 
 
 def by_kind(expected: str, word: str | None = None) -> Discriminator:

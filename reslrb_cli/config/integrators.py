@@ -16,7 +16,7 @@ from pydantic import (
 )
 from typing_extensions import Self
 
-from reslrb_cli.config.base import MARK, NEEDS_TYPE, Choice, Count, by_type, located, mark, must
+from reslrb_cli.config.base import MARK, NEEDS_TYPE, ByType, Choice, Count, located, mark, must
 from reslrb_cli.config.files import CAPACITY, LOCAL_ENTRIES, PASS_PATHS, PASS_SAMPLES, PASSES, PATH_LENGTH
 
 _DEPTH = must(
@@ -182,44 +182,33 @@ class Reslrb(AttachingTracer):
         return _ANY_ESTIMATORS - {"estimator", *ESTIMATOR_OPTIONS[self.estimator]}
 
 
-class Ptracer(LightTracerOptions):
+class Ptracer(LightTracerOptions, json_schema_extra=NEEDS_TYPE):
     """Mitsuba's own light tracer under naive reverse-mode differentiation: memory grows with depth."""
 
-    model_config = NEEDS_TYPE
     type: Literal["ptracer"] = Field(default="ptracer", description="Mitsuba's light tracer, naively differentiated.")
 
 
-class Prb(Integrator):
+class Prb(Integrator, json_schema_extra=NEEDS_TYPE):
     """Mitsuba's path replay backpropagation: paths from the sensor; it cannot see caustics of small lights."""
 
-    model_config = NEEDS_TYPE
     type: Literal["prb"] = Field(default="prb", description="Mitsuba's path replay backpropagation, from the sensor.")
 
 
-class WalkAd(AttachingTracer):
+class WalkAd(AttachingTracer, json_schema_extra=NEEDS_TYPE):
     """The light-path walk of `reslrb` under naive reverse-mode differentiation, for comparisons at equal seeds."""
 
-    model_config = NEEDS_TYPE
     type: Literal["walk_ad"] = Field(default="walk_ad", description="The walk of `reslrb`, naively differentiated.")
 
 
-class Trajectory(LightTracerOptions):
+class Trajectory(LightTracerOptions, json_schema_extra=NEEDS_TYPE):
     """The same walk, reversed by Dr.Jit itself: it records each path's loop state in thread-local memory."""
 
-    model_config = NEEDS_TYPE
     type: Literal["trajectory"] = Field(default="trajectory", description="The walk of `reslrb`, reversed by Dr.Jit.")
     max_depth: Annotated[int, _RECORD] = Field(default=8, ge=0, json_schema_extra={"exclusiveMaximum": LOCAL_ENTRIES})
     """Longest path in segments, as above; the record has room for as many vertices, so that there must be a limit."""
 
 
-AnyIntegrator = Annotated[
-    Annotated[Reslrb, mark("reslrb")]
-    | Annotated[Ptracer, mark("ptracer")]
-    | Annotated[Prb, mark("prb")]
-    | Annotated[WalkAd, mark("walk_ad")]
-    | Annotated[Trajectory, mark("trajectory")],
-    by_type("reslrb"),
-]
+AnyIntegrator = Annotated[Reslrb | Ptracer | Prb | WalkAd | Trajectory, ByType("reslrb")]
 
 
 def passes_obstacle(spp: int, per_pass: int | None, pixels: int, splits: bool = True) -> str | None:

@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
 from typing_extensions import Self
 
-from reslrb_cli.config.base import NEEDS_TYPE, Choice, Positive, by_type, located, mark
+from reslrb_cli.config.base import NEEDS_TYPE, ByType, Choice, Positive, located
 
 
 class Loss(Choice):
@@ -22,37 +22,28 @@ class L2(Loss):
     type: Literal["l2"] = Field(default="l2", description="Mean of (I - T)².")
 
 
-class L1(Loss):
+class L1(Loss, json_schema_extra=NEEDS_TYPE):
     """Mean of |I - T|."""
 
-    model_config = NEEDS_TYPE
     type: Literal["l1"] = Field(default="l1", description="Mean of |I - T|.")
 
 
-class RelativeL2(Loss):
+class RelativeL2(Loss, json_schema_extra=NEEDS_TYPE):
     """Mean of (I - T)² / (T² + epsilon)."""
 
-    model_config = NEEDS_TYPE
     type: Literal["relative_l2"] = Field(default="relative_l2", description="Mean of (I - T)² / (T² + epsilon).")
     epsilon: Positive = 1e-2
     """Added to the denominator, in squared units of radiance; keeps dark pixels from dominating."""
 
 
-class LogL2(Loss):
+class LogL2(Loss, json_schema_extra=NEEDS_TYPE):
     """Mean of (log(I + epsilon) - log(T + epsilon))², negative values as 0."""
 
-    model_config = NEEDS_TYPE
     type: Literal["log_l2"] = Field(default="log_l2", description="Mean of (log(I + epsilon) - log(T + epsilon))².")
     epsilon: Positive = Field(default=1e-2, description="Added inside both logarithms, in units of radiance.")
 
 
-AnyLoss = Annotated[
-    Annotated[L2, mark("l2")]
-    | Annotated[L1, mark("l1")]
-    | Annotated[RelativeL2, mark("relative_l2")]
-    | Annotated[LogL2, mark("log_l2")],
-    by_type("l2"),
-]
+AnyLoss = Annotated[L2 | L1 | RelativeL2 | LogL2, ByType("l2")]
 
 _Decay = Annotated[float, Field(ge=0, lt=1)]
 
@@ -109,37 +100,28 @@ class Adam(_AdamOptions):
     type: Literal["adam"] = Field(default="adam", description="Adam (Kingma and Ba 2015).")
 
 
-class AdamW(_AdamOptions):
+class AdamW(_AdamOptions, json_schema_extra=NEEDS_TYPE):
     """Adam with decoupled weight decay (Loshchilov and Hutter 2019)."""
 
-    model_config = NEEDS_TYPE
     type: Literal["adamw"] = "adamw"
     """Adam with decoupled weight decay (Loshchilov, Hutter 2019)."""
     weight_decay: float = Field(default=0.01, ge=0)
     """Share of the value that a step removes, per learning rate."""
 
 
-class RMSProp(Optimizer):
+class RMSProp(Optimizer, json_schema_extra=NEEDS_TYPE):
     """RMSProp (Hinton 2012)."""
 
-    model_config = NEEDS_TYPE
     type: Literal["rmsprop"] = Field(default="rmsprop", description="RMSProp (Hinton 2012).")
     decay: _Decay = Field(default=0.99, description="Decay of the running mean of the squared gradient.")
     epsilon: Positive = Field(default=1e-8, description="Added to the root of the mean squared gradient.")
 
 
-class SGD(Optimizer):
+class SGD(Optimizer, json_schema_extra=NEEDS_TYPE):
     """Gradient descent with momentum."""
 
-    model_config = NEEDS_TYPE
     type: Literal["sgd"] = Field(default="sgd", description="Gradient descent, with momentum if that is above 0.")
     momentum: _Decay = Field(default=0.0, description="Decay of the running sum of gradients; 0: none.")
 
 
-AnyOptimizer = Annotated[
-    Annotated[Adam, mark("adam")]
-    | Annotated[AdamW, mark("adamw")]
-    | Annotated[RMSProp, mark("rmsprop")]
-    | Annotated[SGD, mark("sgd")],
-    by_type("adam"),
-]
+AnyOptimizer = Annotated[Adam | AdamW | RMSProp | SGD, ByType("adam")]
