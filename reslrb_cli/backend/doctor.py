@@ -84,7 +84,7 @@ def resident_paths() -> int:
     import ctypes
 
     try:
-        driver, count = ctypes.CDLL("nvcuda.dll" if os.name == "nt" else "libcuda.so.1"), []
+        driver, count = ctypes.CDLL("libcuda.so.1"), []
         for attribute in (16, 39):  # multiprocessors, and the most threads on each
             value = ctypes.c_int()
             if driver.cuDeviceGetAttribute(ctypes.byref(value), attribute, 0):

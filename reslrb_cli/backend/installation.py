@@ -45,7 +45,7 @@ def package_folder() -> Path:
 @functools.cache
 def shipped_plugins() -> frozenset[str]:
     """Names of the plugins that came with Mitsuba and that a scene file may say."""
-    libraries = (path for path in (package_folder() / "plugins").iterdir() if path.suffix in (".so", ".dylib", ".dll"))
+    libraries = (path for path in (package_folder() / "plugins").iterdir() if path.suffix in (".so", ".dylib"))
     return frozenset(path.stem for path in libraries) - _UNSAFE | _BUILT_IN
 
 

@@ -9,6 +9,7 @@ is random: the next array of the same size may lie otherwise, and then all is co
 from __future__ import annotations
 
 import contextlib
+import resource
 import sys
 from pathlib import Path
 from typing import Any
@@ -42,22 +43,15 @@ def free_bytes(variant: str) -> int:
         group = Path("/sys/fs/cgroup")
         limit, used = ((group / name).read_text() for name in ("memory.max", "memory.current"))
         known.append(int(limit) - int(used))
-    with contextlib.suppress(ImportError, OSError, ValueError):
-        import resource
-
-        most, _ = resource.getrlimit(resource.RLIMIT_AS)
-        if most != resource.RLIM_INFINITY:
-            pages = int(Path("/proc/self/statm").read_text().split()[0])
-            known.append(most - pages * resource.getpagesize())
+    most, _ = resource.getrlimit(resource.RLIMIT_AS)
+    if most != resource.RLIM_INFINITY:
+        with contextlib.suppress(OSError, ValueError):
+            known.append(most - int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize())
     return max(min(known), 0)
 
 
-def resident_bytes() -> int | None:
-    """Bytes of memory that this process has had at the most, all that is in it counted; None where nothing tells."""
-    try:
-        import resource
-    except ImportError:
-        return None
+def resident_bytes() -> int:
+    """Bytes of memory that this process has had at the most, all that is in it counted."""
     most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return most if sys.platform == "darwin" else most * 1024
 
@@ -67,13 +61,8 @@ def local_bytes() -> int:
 
     A kernel that wants more writes over what lies behind the stack, or ends the process.
     """
-    try:
-        import resource
-
-        stack, _ = resource.getrlimit(resource.RLIMIT_STACK)
-        stack = _UNLIMITED_STACK if stack == resource.RLIM_INFINITY else stack
-    except ImportError:
-        stack = _UNLIMITED_STACK
+    stack, _ = resource.getrlimit(resource.RLIMIT_STACK)
+    stack = _UNLIMITED_STACK if stack == resource.RLIM_INFINITY else stack
     return max(stack - _IN_USE, 0) // _vector_lanes()
 
 

@@ -226,7 +226,7 @@ def check_writable(option: str, path: Path | None) -> None:
         return
     existed = os.path.lexists(path)
     try:  # without waiting: a pipe that nobody reads from would make wait for ever
-        os.close(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND | getattr(os, "O_NONBLOCK", 0), 0o666))
+        os.close(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_NONBLOCK, 0o666))
     except (OSError, ValueError) as error:
         reason = "nobody reads from that pipe" if getattr(error, "errno", None) == errno.ENXIO else None
         raise ConfigError(

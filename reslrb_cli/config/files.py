@@ -78,9 +78,6 @@ PIXELS = 2**27
 #: Bytes of an image's file: that many pixels of four floats, not compressed, and something for the file's head.
 IMAGE_BYTES = 16 * PIXELS + 2**20
 
-#: As far as the system has them: never wait, hand down to no child, change no line ends.
-_FLAGS = ("O_NONBLOCK", "O_CLOEXEC", "O_BINARY")
-
 
 def open_file(path: Path, most: int | None = None) -> BinaryIO:
     """Open the file `path` to read it. Raises ConfigError, located in it, where it cannot be.
@@ -90,7 +87,7 @@ def open_file(path: Path, most: int | None = None) -> BinaryIO:
     """
     try:
         _check(path, os.stat(path), most)  # before it is opened: to open some devices does something already
-        descriptor = os.open(path, os.O_RDONLY | sum(getattr(os, flag, 0) for flag in _FLAGS))
+        descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
         try:
             _check(path, os.fstat(descriptor), most)  # it may have been replaced in between
         except BaseException:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import fcntl
 import os
 import platform
 import time
@@ -17,12 +18,6 @@ from pathlib import Path
 from typing import Any
 
 from reslrb_cli.records.atomic import is_alive
-
-try:
-    import fcntl
-except ImportError:  # Windows
-    fcntl = None  # type: ignore[assignment]
-
 
 #: Who reads a folder, or puts its manifest right, has the lock for an instant: no run is refused over that, and no
 #: other reader takes it for a run.
@@ -44,21 +39,18 @@ class FolderLock:
     """
 
     def __init__(self, folder: Path, wait_s: float = WAIT_SECONDS, shared: bool = False) -> None:
-        flags = os.O_RDONLY | getattr(os, "O_DIRECTORY", 0) | getattr(os, "O_NOFOLLOW", 0)
-        self._descriptor: int | None = os.open(folder, flags) if fcntl is not None else None
+        self._descriptor: int | None = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
         try:
-            self.real = self._take(wait_s, shared)
+            self.real = self._take(self._descriptor, wait_s, shared)
         except BaseException:
             self.release()
             raise
 
-    def _take(self, wait_s: float, shared: bool) -> bool:
-        if self._descriptor is None:
-            return False
+    def _take(self, descriptor: int, wait_s: float, shared: bool) -> bool:
         kind, end = fcntl.LOCK_SH if shared else fcntl.LOCK_EX, time.monotonic() + wait_s
         while True:
             try:
-                fcntl.flock(self._descriptor, kind | fcntl.LOCK_NB)
+                fcntl.flock(descriptor, kind | fcntl.LOCK_NB)
             except OSError as error:
                 if error.errno not in _HELD:
                     return False
@@ -70,10 +62,8 @@ class FolderLock:
 
     def is_of(self, folder: Path) -> bool:
         """Whether the folder at that path is the one that is locked, which may have been moved or removed since."""
-        if self._descriptor is None:
-            return folder.is_dir()
         try:
-            return os.path.samestat(os.fstat(self._descriptor), os.lstat(folder))
+            return self._descriptor is not None and os.path.samestat(os.fstat(self._descriptor), os.lstat(folder))
         except OSError:
             return False
 
