@@ -33,7 +33,6 @@ def test_a_run_that_ends_well_is_complete(optimize):
 # --- signals ----------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.skipif(os.name != "posix", reason="sends signals")
 @pytest.mark.parametrize("number", SIGNALS)
 def test_a_signal_ends_a_run_after_the_iteration(optimize, during, number):
     during(lambda record: os.kill(os.getpid(), number) if record.iteration == 1 else None)
@@ -44,7 +43,6 @@ def test_a_signal_ends_a_run_after_the_iteration(optimize, during, number):
     assert out.splitlines()[-1].startswith("interrupted after 2 iterations")
 
 
-@pytest.mark.skipif(os.name != "posix", reason="sends signals")
 @pytest.mark.parametrize(("name", "call"), [("write_image", 0), ("write_parameters", 2), ("write_image", 2)])
 def test_a_signal_while_files_are_written_leaves_none_of_them_out(optimize, monkeypatch, name, call):
     real, calls = getattr(recording, name), []
@@ -96,7 +94,6 @@ def test_there_is_a_checkpoint_before_the_first_iteration(optimize, monkeypatch)
     assert seen == [(0, 0.5)]
 
 
-@pytest.mark.skipif(os.name != "posix", reason="no locks")
 def test_a_run_in_progress_is_not_replaced(optimize, during):
     seen = []
 

@@ -322,7 +322,6 @@ def test_inspect_tells_what_can_be_recovered(experiment, capsys):
     assert parameters[KEY]["shape"] == [4, 4, 3]
 
 
-@pytest.mark.skipif(os.name != "posix", reason="sends SIGINT")
 def test_ctrl_c_leaves_a_complete_run_folder(experiment):
     command = [sys.executable, "-c", "from reslrb_cli.cli import main; main()", "optimize", "box.yaml"]
     package = str(Path(__file__).resolve().parents[2])

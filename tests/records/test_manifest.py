@@ -5,7 +5,6 @@ from __future__ import annotations
 import errno
 import json
 import os
-import sys
 import threading
 from pathlib import Path
 
@@ -31,7 +30,6 @@ def stored(folder: Path):
     return json.loads((folder / MANIFEST_FILE).read_text())
 
 
-@pytest.mark.skipif(sys.platform == "win32", reason="no locks")
 def test_a_run_that_was_killed_is_interrupted(tmp_path):
     abandoned(tmp_path)
     (tmp_path / "metrics.jsonl").write_text('{"iteration": 0}\n{"itera')
@@ -47,7 +45,6 @@ def test_a_run_that_was_killed_is_interrupted(tmp_path):
     assert sorted(os.listdir(tmp_path)) == [MANIFEST_FILE, "metrics.jsonl"]
 
 
-@pytest.mark.skipif(sys.platform == "win32", reason="no locks")
 def test_a_run_that_goes_on_is_running(tmp_path):
     abandoned(tmp_path)
     with FolderLock(tmp_path):
@@ -55,7 +52,6 @@ def test_a_run_that_goes_on_is_running(tmp_path):
     assert stored(tmp_path)["status"] == "running"
 
 
-@pytest.mark.skipif(sys.platform == "win32", reason="no locks")
 def test_a_reader_who_may_not_write_is_told_the_same(tmp_path, monkeypatch):
     abandoned(tmp_path)
 
