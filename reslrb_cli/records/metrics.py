@@ -170,12 +170,8 @@ def read_records(folder: Path, count: int, last: Mapping[str, Any] | None) -> tu
     """
     path = folder / METRICS_FILE
     content = read_file(path, MOST_BYTES) if count and os.path.lexists(path) else b""
-    records: list[Record] = []
-    size = 0
-    for number, line in enumerate(content.splitlines(keepends=True)[:count]):
-        if line.endswith(b"\n"):
-            records.append(_record(line, number, path))
-            size += len(line)
+    whole = [line for line in content.splitlines(keepends=True)[:count] if line.endswith(b"\n")]
+    records = [_record(line, number, path) for number, line in enumerate(whole)]
     if len(records) == count - 1 and last is not None:
         records.append(_record(json.dumps(last).encode(), count - 1, path))
     if len(records) < count:
@@ -185,7 +181,7 @@ def read_records(folder: Path, count: int, last: Mapping[str, Any] | None) -> tu
             f"holds {len(records)} of the {count} iterations of the checkpoint; put it back, or begin anew from "
             "`initial: {run: ...}`",
         )
-    return records, size
+    return records, sum(map(len, whole))
 
 
 def cut_back(folder: Path, records: list[Record], size: int) -> None:
@@ -194,17 +190,10 @@ def cut_back(folder: Path, records: list[Record], size: int) -> None:
     if not records:
         path.unlink(missing_ok=True)
         return
-    if size == 0:  # of a run of one iteration, whose line was lost: it is never seen empty
-        write_atomically(path, lambda file: file.write(records[-1].to_json().encode() + b"\n"), durable=True)
-        return
-    with path.open("r+b") as file:
-        file.truncate(size)
-        file.seek(0)
-        written = sum(1 for _ in file)
-        if written < len(records):
-            file.write(records[-1].to_json().encode() + b"\n")
-        file.flush()
-        os.fsync(file.fileno())
+    content = read_file(path, MOST_BYTES)[:size] if size else b""
+    if content.count(b"\n") < len(records):
+        content += records[-1].to_json().encode() + b"\n"
+    write_atomically(path, lambda file: file.write(content), durable=True)
 
 
 _RECORD: TypeAdapter[Record] = TypeAdapter(Record)
