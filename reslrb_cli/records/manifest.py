@@ -115,16 +115,6 @@ class Manifest:
         return {"program": PROGRAM, **asdict(self), "status": self.status.value}
 
 
-def read_manifest(folder: Path) -> dict[str, Any] | None:
-    """Return the manifest in `folder`, or None where there is none that `reslrb` wrote.
-
-    One that was left saying `running` by a process that has gone says `interrupted`, on the disk too from then on, if
-    that can be written to.
-    """
-    content = read_content(folder)
-    return put_right(folder, content) if content is not None and is_abandoned(folder, content) else content
-
-
 MANIFEST_FILE = "manifest.json"
 PROGRAM = "reslrb"
 
@@ -146,28 +136,24 @@ def _write(folder: Path, content: Mapping[str, Any]) -> None:
     write_atomically(folder / MANIFEST_FILE, lambda file: file.write(text), durable=True)
 
 
-#: What the manifest of such a run gives as its error.
+#: What the manifest of a run gives as its error whose process has gone.
 REASON = "its process ended before the run did"
 
 
-def is_abandoned(folder: Path, content: Mapping[str, Any]) -> bool:
-    """Whether the manifest in `folder`, `content`, says `running` and the process that wrote it has surely gone."""
-    if content.get("status") != Status.RUNNING:
-        return False
-    holder = Holder.from_json(content.get("process"))
-    return holder is None or holder.is_gone(folder)
+def read_manifest(folder: Path) -> dict[str, Any] | None:
+    """Return the manifest in `folder`, or None where there is none that `reslrb` wrote.
 
-
-def put_right(folder: Path, content: Mapping[str, Any]) -> dict[str, Any]:
-    """What the manifest of an abandoned run should say; written into `folder` too, if that can be.
-
-    What the run never finished is removed then.
+    One that was left saying `running` by a process that has surely gone says `interrupted`, on the disk too from then
+    on, if that can be written to; what the run never finished is removed then.
     """
-    right = dict(content) | {
-        "status": Status.INTERRUPTED.value,
-        "ended": _last_sign(folder) or content.get("ended"),
-        "error": REASON,
-    }
+    content = read_content(folder)
+    if content is None or content.get("status") != Status.RUNNING:
+        return content
+    holder = Holder.from_json(content.get("process"))
+    if holder is not None and not holder.is_gone(folder):
+        return content
+    ended = _last_sign(folder) or content.get("ended")
+    right = content | {"status": Status.INTERRUPTED.value, "ended": ended, "error": REASON}
     with contextlib.suppress(InUse, OSError), FolderLock(folder, READER_WAIT_SECONDS):
         if read_content(folder) == content:  # nobody was faster
             metrics.mend(folder)
