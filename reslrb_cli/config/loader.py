@@ -122,7 +122,7 @@ def loads(text: str, path: Path | str, overrides: Sequence[str] = ()) -> Config:
         raise ConfigError(source, "", "is empty; it needs at least scene, target and parameters")
     if not isinstance(data, dict) and data is not None:
         raise ConfigError(source, "", "must hold sections (scene: ...) at its top level, not a list or a single value")
-    if sum(count_values(value, NODES + 1) for value in (data, *(override.value for override in parsed))) > NODES:
+    if sum(count_values(value) for value in (data, *(override.value for override in parsed))) > NODES:
         raise ConfigError(source, "", f"holds more than {NODES} values, together with what --set puts in")
     stages: list[dict[str, Any]] = [data or {}]
     for override in parsed:
@@ -158,7 +158,7 @@ def with_integrator(config: Config, values: dict[str, Any], blame: str, adjoint:
     `adjoint` holds `adjoint` and what goes with it, or nothing, and all stays as it is. Raises ConfigError that names
     `blame`.
     """
-    data = _plain(config.model_dump(exclude_none=True)) | {"integrator": values}
+    data = config.model_dump(mode="json", exclude_none=True) | {"integrator": values}
     if "adjoint" in adjoint:
         data["run"] = {key: value for key, value in data["run"].items() if key not in ("batches", "first_batch")}
     data["run"] |= adjoint
@@ -170,15 +170,7 @@ def with_integrator(config: Config, values: dict[str, Any], blame: str, adjoint:
 
 def dump(config: Config) -> str:
     """The configuration as YAML, with every default and absolute paths; `load` reads it back as an equal one."""
-    return write(_plain(config.model_dump(exclude_none=True)))
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _plain(item) for key, item in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_plain(item) for item in value]
-    return str(value) if isinstance(value, Path) else value
+    return write(config.model_dump(mode="json", exclude_none=True))
 
 
 def read_text(path: Path, source: str) -> str:

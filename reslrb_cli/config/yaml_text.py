@@ -176,18 +176,11 @@ def _problem(error: yaml.MarkedYAMLError, text: str, example: Callable[[str], st
     return f"not valid YAML: {problem}{hint}"
 
 
-def count_values(data: Any, most: int) -> int:
-    """How many values and keys plain `data` holds, where the same list stands twice counted twice; at most `most`."""
-    count, waiting = 0, [data]
-    while waiting and count < most:
-        value = waiting.pop()
-        count += 1
-        if isinstance(value, dict):
-            count += len(value)
-            waiting += value.values()
-        elif isinstance(value, list):
-            waiting += value
-    return min(count, most)
+def count_values(data: Any) -> int:
+    """How many values and keys plain `data`, as `parse` bounds it, holds: the same list stands twice, counted twice."""
+    if isinstance(data, dict):
+        return 1 + len(data) + sum(map(count_values, data.values()))
+    return 1 + sum(map(count_values, data)) if isinstance(data, list) else 1
 
 
 def _check_keys(node: yaml.Node, at: Callable[[int], str], location: Location, seen: set[int]) -> None:
