@@ -64,7 +64,7 @@ class Keeper:
             self._samples = samples_file(json_file)
             remove_parts_of(self._samples)
         self._origin, self._final, self._provisional, self._kept = origin, final, provisional, kept
-        self._live = LivePage(self._save, "the file of --json")
+        self._live = LivePage(lambda: self._write(self._final(), self._provisional()), "the file of --json")
 
     def refresh(self) -> None:
         """Write, if it is time to: every few seconds, and no more than a small share of the time. Between steps."""
@@ -78,16 +78,13 @@ class Keeper:
     def finish(self, lines: Sequence[Line]) -> None:
         """Write all `lines`, none of which changes any more. Raises OSError."""
         if self._file is not None:
-            if not self._write(self._file, lines):
+            if not self._write(lines):
                 echo("what was sampled is too large to be kept: --resume cannot go on from it")
             self._file.close()
 
-    def _save(self) -> None:
-        assert self._file is not None
-        self._write(self._file, self._final(), self._provisional())
-
-    def _write(self, file: LineFile, final: Sequence[Line], provisional: Sequence[Line] = ()) -> bool:
+    def _write(self, final: Sequence[Line], provisional: Sequence[Line] = ()) -> bool:
         """Write both files; whether what there is to be kept is."""
+        assert self._file is not None
         kept = None if self._samples is None else self._kept()
         fits = kept is None or are_kept(kept[1])
         if self._samples is not None:
@@ -95,7 +92,7 @@ class Keeper:
                 write_samples(self._samples, *kept)
             else:  # what may lie there is not of these lines
                 self._samples.unlink(missing_ok=True)
-        file.write([self._origin, *final], provisional)
+        self._file.write([self._origin, *final], provisional)
         return fits
 
 
