@@ -8,11 +8,7 @@ import errno
 #: Characters of a message, and of the file or key that it names: a few lines of a terminal. What a message quotes may
 #: be as long as a file; of longer text the two ends are shown.
 MESSAGE_LENGTH = 600
-
-
 PLACE_LENGTH = 300
-
-
 LINE_LENGTH = MESSAGE_LENGTH + 2 * PLACE_LENGTH
 
 
@@ -143,7 +139,6 @@ _MACHINE_ERRNOS = {
     )
     if (number := getattr(errno, name, None)) is not None
 }  # fmt: skip
-
 
 #: How Dr.Jit's messages about a driver or a compiler begin, and what CUDA and OptiX call their errors.
 _DRIVER_WORDS = (

@@ -72,15 +72,21 @@ Below `scene.options` and `target.render.parameters` the rest of KEY is one name
 
 def json_schema() -> dict[str, Any]:
     """The JSON Schema of a configuration file."""
-    schema = _without_titles(Config.model_json_schema())
+    schema = _tidied(Config.model_json_schema())
     return {"$schema": "https://json-schema.org/draft/2020-12/schema", "title": "reslrb configuration", **schema}
 
 
-def _without_titles(node: Any) -> Any:
-    if isinstance(node, dict):
-        # a property may be called `title`; its value is then a mapping, not text
-        return {k: _without_titles(v) for k, v in node.items() if not (k == "title" and isinstance(v, str))}
-    return [_without_titles(item) for item in node] if isinstance(node, list) else node
+def _tidied(node: Any) -> Any:
+    """Without titles, and with descriptions of keys, which are docstrings, on one line."""
+    if isinstance(node, list):
+        return [_tidied(item) for item in node]
+    if not isinstance(node, dict):
+        return node
+    # a property may be called `title`; its value is then a mapping, not text
+    tidied = {k: _tidied(v) for k, v in node.items() if not (k == "title" and isinstance(v, str))}
+    for value in tidied.get("properties", {}).values():
+        value["description"] = " ".join(value["description"].split())
+    return tidied
 
 
 def markdown() -> str:

@@ -86,10 +86,10 @@ def test_the_newest_that_loads_is_chosen(machine: Machine) -> None:
             "libLLVM.so.23.1": "abort",
         }
     )
-    choice = llvm.choose()
-    assert choice.library is not None
-    assert (choice.library.path.name, choice.library.version) == ("libLLVM.so.20.1", "20.1.2")
-    reasons = {rejected.path.name: rejected.reason for rejected in choice.rejected}
+    library, passed_over = llvm.choose()
+    assert library is not None
+    assert (library.path.name, library.version) == ("libLLVM.so.20.1", "20.1.2")
+    reasons = {other.path.name: other.fault for other in passed_over}
     assert reasons["libLLVM.so.22.1"] == "it needs libz3.so.4, which is missing"
     assert "ended a process" in reasons["libLLVM.so.23.1"]
 

@@ -32,39 +32,46 @@ def device_name(variant: str) -> str:
 
 def gpu_name() -> str:
     """The NVIDIA GPU and its driver's version, as far as `nvidia-smi` tells."""
+    return "; ".join(ask_gpu("name,driver_version")) or "NVIDIA GPU"
+
+
+def ask_gpu(query: str) -> list[str]:
+    """What `nvidia-smi` says of each GPU, numbers without their units; nothing where there is no such program."""
     command = shutil.which("nvidia-smi")
     if command is None:
-        return "NVIDIA GPU"
-    query = [command, "--query-gpu=name,driver_version", "--format=csv,noheader"]
-    return subprocess.run(query, capture_output=True, text=True, check=False).stdout.strip().replace("\n", "; ")
+        return []
+    words = [command, f"--query-gpu={query}", "--format=csv,noheader,nounits"]
+    return subprocess.run(words, capture_output=True, text=True, check=False).stdout.strip().splitlines()
+
+
+def gpu_bytes(kind: str, most: int) -> int:
+    """The least `memory.total`, `memory.free` of the GPUs; `most` where that is less, or nothing tells."""
+    return min([most, *(int(line) * 2**20 for line in ask_gpu(kind) if line.isdigit())])
 
 
 def cpu_name() -> str:
     """The processor's model, or at least its architecture."""
+    return of_system("/proc/cpuinfo", "model name") or platform.machine()
+
+
+def of_system(file: str, name: str) -> str | None:
+    """What a file of the kernel's says of `name`, the first time; None where it does not, or there is no such file."""
     try:
-        found = re.search(r"^model name\s*:\s*(.+)$", Path("/proc/cpuinfo").read_text(), re.MULTILINE)
+        found = re.search(rf"^{name}\s*:\s*(.+)$", Path(file).read_text(), re.MULTILINE)
     except OSError:
-        found = None
-    return found[1] if found else platform.machine()
+        return None
+    return found and found[1]
 
 
 def memory_bytes(variant: str) -> int:
     """The memory that `variant` can use: the GPU's, or the machine's as far as this process may have it."""
     if variant.startswith("cuda"):
-        return _gpu_memory()
+        return gpu_bytes("memory.total", 2**40)  # unknown: more than any has, so that it never counts as scarce
     total = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     try:
         return min(total, int(Path("/sys/fs/cgroup/memory.max").read_text()))
     except (OSError, ValueError):  # no control groups, or `max`: no limit
         return total
-
-
-def _gpu_memory() -> int:
-    command = shutil.which("nvidia-smi")
-    query = [] if command is None else [command, "--query-gpu=memory.total", "--format=csv,noheader,nounits"]
-    output = subprocess.run(query, capture_output=True, text=True, check=False).stdout if query else ""
-    sizes = [int(line) for line in output.split() if line.isdigit()]
-    return min(sizes, default=2**20) * 2**20  # unknown: more than any has, so that it never counts as scarce
 
 
 def resident_paths() -> int:
@@ -77,7 +84,7 @@ def resident_paths() -> int:
     import ctypes
 
     try:
-        driver, count = ctypes.CDLL("nvcuda.dll" if os.name == "nt" else "libcuda.so.1"), []
+        driver, count = ctypes.CDLL("libcuda.so.1"), []
         for attribute in (16, 39):  # multiprocessors, and the most threads on each
             value = ctypes.c_int()
             if driver.cuDeviceGetAttribute(ctypes.byref(value), attribute, 0):

@@ -31,7 +31,6 @@ if TYPE_CHECKING:
 #: Takes addresses in the memory of a running Blender from its parameters.
 _UNSAFE = frozenset({"blender"})
 
-
 #: Names that Mitsuba knows without a library.
 _BUILT_IN = frozenset({"scene", "rgb", "spectrum"})
 
@@ -46,7 +45,7 @@ def package_folder() -> Path:
 @functools.cache
 def shipped_plugins() -> frozenset[str]:
     """Names of the plugins that came with Mitsuba and that a scene file may say."""
-    libraries = (path for path in (package_folder() / "plugins").iterdir() if path.suffix in (".so", ".dylib", ".dll"))
+    libraries = (path for path in (package_folder() / "plugins").iterdir() if path.suffix in (".so", ".dylib"))
     return frozenset(path.stem for path in libraries) - _UNSAFE | _BUILT_IN
 
 
@@ -135,7 +134,6 @@ def python_command(code: str) -> list[str]:
 
 
 MISSING_LIBRARY = "run scripts/setup, or install the package that holds it"
-
 
 #: Of each package the versions that pyproject.toml has, the first of them and the first that is too new, and functions
 #: by which it is told from another package of its name.

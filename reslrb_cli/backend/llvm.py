@@ -23,47 +23,27 @@ from reslrb_cli.backend import shared_library
 from reslrb_cli.errors import BackendError
 
 VARIABLE = "DRJIT_LIBLLVM_PATH"
-
-
 MIN_VERSION = 19
-
 
 # scripts/setup unpacks Debian's packages here where the system lacks a library
 UNPACKED = Path(__file__).resolve().parents[2] / ".cache" / "lib"
-
-
 _NAME = re.compile(r"libLLVM(?:-(\d+)(?:\.\d+)*)?(?:\.so(?:\.(\d+)(?:\.\d+)*)?|(?:\.(\d+)(?:\.\d+)*)?\.dylib)")
 
 
 @dataclass(frozen=True)
 class Library:
-    """A libLLVM that was loaded once: its file, and its version (`19.1.7`)."""
+    """A libLLVM that was found: its file and its version (`19.1.7`), or the `fault` for which it is not used."""
 
     path: Path
-    version: str
-
-
-@dataclass(frozen=True)
-class Rejected:
-    """A libLLVM that was found and is not used, and why."""
-
-    path: Path
-    reason: str
-
-
-@dataclass(frozen=True)
-class Choice:
-    """What a search came to: the library to use (None: there is none), and those that it passed over."""
-
-    library: Library | None
-    rejected: tuple[Rejected, ...]
+    version: str = ""
+    fault: str = ""
 
 
 def prepare() -> None:
     """Chooses libLLVM, unless the user did or Dr.Jit is loaded already, and loads what Dr.Jit needs and the system
     lacks. Never raises: `require` tells of what failed, to those who need LLVM."""
     if not os.environ.get(VARIABLE) and "drjit" not in sys.modules:
-        library = choose().library
+        library, _ = choose()
         if library is not None:
             os.environ[VARIABLE] = str(library.path)
     unpacked = sorted(UNPACKED.glob("libatomic.so*"))  # Dr.Jit's wheels need it; a minimal Debian has none
@@ -77,35 +57,34 @@ def require() -> Library:
     """The libLLVM that Dr.Jit loads. Raises BackendError where it is missing, broken, or would end the process."""
     named = os.environ.get(VARIABLE)
     if named:
-        examined = _examine(Path(named))
-        if isinstance(examined, Rejected):
-            raise BackendError(f"{VARIABLE}={named}: {examined.reason}; {_what_to_install()}, or unset {VARIABLE}")
-        return examined
-    choice = choose()
-    if choice.library is None:
-        found = "; ".join(f"{r.path}: {r.reason}" for r in choice.rejected) or "none found"
+        library = _examine(Path(named))
+        if library.fault:
+            raise BackendError(f"{VARIABLE}={named}: {library.fault}; {_what_to_install()}, or unset {VARIABLE}")
+        return library
+    best, passed_over = choose()
+    if best is None:
+        found = "; ".join(f"{library.path}: {library.fault}" for library in passed_over) or "none found"
         raise BackendError(
             f"no usable libLLVM ({MIN_VERSION} or newer) on this machine ({found}); {_what_to_install()}"
         )
-    return choice.library
+    return best
 
 
 @functools.cache
-def choose() -> Choice:
-    """Searches the machine for the newest libLLVM that loads, among those of MIN_VERSION and above."""
-    rejected: list[Rejected] = []
-    newest_first = sorted(candidates(), key=lambda path: -(version_from_name(path) or MIN_VERSION))
+def choose() -> tuple[Library | None, list[Library]]:
+    """The newest libLLVM on this machine that works (None: there is none), and those that were passed over."""
+    passed_over: list[Library] = []
     best: Library | None = None
-    for path in newest_first:
+    for path in sorted(candidates(), key=lambda path: -(version_from_name(path) or MIN_VERSION)):
         named = version_from_name(path)
         if best is not None and named is not None and named <= _major(best.version):
             break
-        examined = _examine(path)
-        if isinstance(examined, Rejected):
-            rejected.append(examined)
-        elif best is None or _major(examined.version) > _major(best.version):
-            best = examined
-    return Choice(best, tuple(rejected))
+        library = _examine(path)
+        if library.fault:
+            passed_over.append(library)
+        elif best is None or _major(library.version) > _major(best.version):
+            best = library
+    return best, passed_over
 
 
 def candidates() -> list[Path]:
@@ -125,26 +104,28 @@ def version_from_name(path: Path) -> int | None:
 
 
 @functools.cache
-def _examine(path: Path) -> Library | Rejected:
+def _examine(path: Path) -> Library:
     """Loads `path` in a process of its own, unless its name already rules it out."""
     named = version_from_name(path.resolve())
     if named is not None and named < MIN_VERSION:
-        return Rejected(path, _too_old(str(named)))
+        return Library(path, fault=_too_old(str(named)))
     if not path.is_file():
-        return Rejected(path, "no such file")
+        return Library(path, fault="no such file")
     try:
         command = [sys.executable, "-I", "-S", shared_library.__file__, str(path)]
         probe = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
     except (OSError, subprocess.TimeoutExpired) as error:
-        return Rejected(path, f"could not be tried ({error})")
+        return Library(path, fault=f"could not be tried ({error})")
     if probe.returncode != 0:
         message = " ".join(probe.stderr.split()) or f"loading it ended a process with code {probe.returncode}"
         missing = shared_library.missing_library(message)
-        return Rejected(path, f"it needs {missing}, which is missing" if missing else message)
+        return Library(path, fault=f"it needs {missing}, which is missing" if missing else message)
     version = probe.stdout.strip()
     if version == "unknown":
-        return Rejected(path, _too_old("before 16" if named is None else str(named)))
-    return Rejected(path, _too_old(version)) if _major(version) < MIN_VERSION else Library(path, version)
+        version = "before 16" if named is None else str(named)
+    elif _major(version) >= MIN_VERSION:
+        return Library(path, version)
+    return Library(path, fault=_too_old(version))
 
 
 def _too_old(version: str) -> str:
@@ -160,20 +141,11 @@ def _folders() -> Iterator[Path]:
     yield UNPACKED
     roots = [sys.prefix, os.environ.get("CONDA_PREFIX"), sys.base_prefix]
     yield from (Path(root) / "lib" for root in dict.fromkeys(roots) if root)
-    patterns = [
-        f"usr/lib/{platform.machine()}-linux-gnu*",
-        "usr/lib64",
-        "usr/lib64/llvm*/lib*",
-        "usr/lib/llvm-*/lib*",
-        "usr/lib/llvm*/lib*",
-        "usr/lib",
-        "usr/local/lib",
-        "usr/local/lib64",
-        "opt/homebrew/opt/llvm*/lib",
-        "usr/local/opt/llvm*/lib",
+    for pattern in (
+        f"usr/lib/{platform.machine()}-linux-gnu*", "usr/lib64", "usr/lib64/llvm*/lib*", "usr/lib/llvm*/lib*",
+        "usr/lib", "usr/local/lib", "usr/local/lib64", "opt/homebrew/opt/llvm*/lib", "usr/local/opt/llvm*/lib",
         "home/linuxbrew/.linuxbrew/opt/llvm*/lib",
-    ]
-    for pattern in patterns:
+    ):  # fmt: skip
         yield from sorted(Path("/").glob(pattern))
 
 

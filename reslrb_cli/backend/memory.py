@@ -9,9 +9,7 @@ is random: the next array of the same size may lie otherwise, and then all is co
 from __future__ import annotations
 
 import contextlib
-import re
-import shutil
-import subprocess
+import resource
 import sys
 from pathlib import Path
 from typing import Any
@@ -19,15 +17,13 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from reslrb_cli.backend.doctor import memory_bytes
+from reslrb_cli.backend.doctor import gpu_bytes, memory_bytes, of_system
 
 #: What a thread's stack has where the system sets no limit: glibc's own.
 _UNLIMITED_STACK = 2 * 2**20
 
-
 #: What of it is in use where a kernel begins.
 _IN_USE = 2**20
-
 
 #: Lanes of a vector by what the processor knows, the widest first; the backend takes the widest.
 _LANES = (("avx512vl", 16), ("avx", 8))
@@ -39,38 +35,23 @@ def free_bytes(variant: str) -> int:
     Where nothing tells, the whole of it (`device.memory_bytes`). What this process has already counts as taken.
     """
     if variant.startswith("cuda"):
-        return _free_on_gpu(memory_bytes(variant))
+        return gpu_bytes("memory.free", memory_bytes(variant))
     known = [memory_bytes(variant)]
-    with contextlib.suppress(OSError, ValueError, TypeError):
-        found = re.search(r"^MemAvailable:\s*(\d+) kB$", Path("/proc/meminfo").read_text(), re.MULTILINE)
-        known.append(int(found[1]) * 1024)  # type: ignore[index]  # TypeError where the line is missing
+    if available := of_system("/proc/meminfo", "MemAvailable"):
+        known.append(int(available.removesuffix(" kB")) * 1024)
     with contextlib.suppress(OSError, ValueError):
         group = Path("/sys/fs/cgroup")
         limit, used = ((group / name).read_text() for name in ("memory.max", "memory.current"))
         known.append(int(limit) - int(used))
-    with contextlib.suppress(ImportError, OSError, ValueError):
-        import resource
-
-        most, _ = resource.getrlimit(resource.RLIMIT_AS)
-        if most != resource.RLIM_INFINITY:
-            pages = int(Path("/proc/self/statm").read_text().split()[0])
-            known.append(most - pages * resource.getpagesize())
+    most, _ = resource.getrlimit(resource.RLIMIT_AS)
+    if most != resource.RLIM_INFINITY:
+        with contextlib.suppress(OSError, ValueError):
+            known.append(most - int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize())
     return max(min(known), 0)
 
 
-def _free_on_gpu(total: int) -> int:
-    command = shutil.which("nvidia-smi")
-    query = [] if command is None else [command, "--query-gpu=memory.free", "--format=csv,noheader,nounits"]
-    output = subprocess.run(query, capture_output=True, text=True, check=False).stdout if query else ""
-    return min([total, *(int(line) * 2**20 for line in output.split() if line.isdigit())])
-
-
-def resident_bytes() -> int | None:
-    """Bytes of memory that this process has had at the most, all that is in it counted; None where nothing tells."""
-    try:
-        import resource
-    except ImportError:
-        return None
+def resident_bytes() -> int:
+    """Bytes of memory that this process has had at the most, all that is in it counted."""
     most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return most if sys.platform == "darwin" else most * 1024
 
@@ -80,23 +61,14 @@ def local_bytes() -> int:
 
     A kernel that wants more writes over what lies behind the stack, or ends the process.
     """
-    try:
-        import resource
-
-        stack, _ = resource.getrlimit(resource.RLIMIT_STACK)
-        stack = _UNLIMITED_STACK if stack == resource.RLIM_INFINITY else stack
-    except ImportError:
-        stack = _UNLIMITED_STACK
+    stack, _ = resource.getrlimit(resource.RLIMIT_STACK)
+    stack = _UNLIMITED_STACK if stack == resource.RLIM_INFINITY else stack
     return max(stack - _IN_USE, 0) // _vector_lanes()
 
 
 def _vector_lanes() -> int:
     """Lanes of a vector on this processor, each with a path of its own."""
-    try:
-        found = re.search(r"^flags\s*:\s*(.+)$", Path("/proc/cpuinfo").read_text(), re.MULTILINE)
-    except OSError:
-        found = None
-    flags = found[1].split() if found else []
+    flags = (of_system("/proc/cpuinfo", "flags") or "").split()
     return next((lanes for name, lanes in _LANES if name in flags), 4)
 
 

@@ -47,7 +47,6 @@ assert abs(t[0] - 2) < 1e-4, f"a ray met the unit sphere at {t[0]} instead of 2"
 print(json.dumps({"compile_ms": compile_ms, "run_ms": run_ms, "ray_ms": ray_ms}))
 """
 
-
 #: What stands before the line of an error of ours in a traceback.
 _OURS = "reslrb_cli.errors.BackendError: "
 

@@ -6,6 +6,7 @@ import ctypes
 import logging
 import os
 from importlib import metadata
+from types import ModuleType
 
 from reslrb_cli.backend import llvm
 from reslrb_cli.backend.installation import load_packages, prefer_own_plugins
@@ -22,7 +23,10 @@ def set_variant(name: str = "auto") -> str:
     """
     chosen, why = choose(name)
     if chosen.startswith("cuda") and name != "auto":
-        require_cuda(chosen)
+        missing = missing_cuda(chosen)
+        if missing:
+            advice = "install NVIDIA's driver (535 or newer, with OptiX), or take `variant: llvm_ad_rgb`"
+            raise BackendError(f"variant {chosen}: {missing}; {advice}")
     library = llvm.require() if chosen.startswith("llvm") else None
     dr, mi = load_packages()
     if chosen not in mi.variants():
@@ -65,16 +69,6 @@ def check_variant() -> None:
         raise BackendError(f"{is_set}; call mitsuba.set_variant(...) with one of {works}")
 
 
-def require_cuda(variant: str = "cuda_ad_rgb") -> None:
-    """Raises BackendError where Mitsuba cannot trace rays with `variant`."""
-    missing = missing_cuda(variant)
-    if missing:
-        raise BackendError(
-            f"variant {variant}: {missing}; install NVIDIA's driver (535 or newer, with OptiX), "
-            "or take `variant: llvm_ad_rgb`"
-        )
-
-
 def missing_cuda(variant: str = "cuda_ad_rgb") -> str:
     """Why Mitsuba cannot trace rays with the CUDA variant; empty where it can.
 
@@ -96,26 +90,23 @@ def package_version(name: str) -> str | None:
         return None
 
 
-def _have_two_threads(dr: object) -> None:
+def _have_two_threads(dr: ModuleType) -> None:
     """Gives Dr.Jit two threads where the process has one core.
 
     It would have one, and with one Mitsuba 3.9 never comes to the end of reading or writing an EXR file.
     """
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    if cores == 1 and dr.thread_count() == 1:  # type: ignore[attr-defined]
-        dr.set_thread_count(2)  # type: ignore[attr-defined]
+    if cores == 1 and dr.thread_count() == 1:
+        dr.set_thread_count(2)
 
 
-def _check_loaded_llvm(dr: object) -> None:
+def _check_loaded_llvm(dr: ModuleType) -> None:
     """Refuses a libLLVM that a Dr.Jit imported before this package chose for itself."""
-    if not dr.has_backend(dr.JitBackend.LLVM):  # type: ignore[attr-defined]
-        raise BackendError(
-            f"Dr.Jit was imported before reslrb_cli and found no usable libLLVM; import reslrb_cli first, or set "
-            f"{llvm.VARIABLE}"
-        )
-    major = dr.detail.llvm_version()[0]  # type: ignore[attr-defined]
-    if major < llvm.MIN_VERSION:
-        raise BackendError(
-            f"Dr.Jit was imported before reslrb_cli and took libLLVM {major}, which would end the process; import "
-            f"reslrb_cli first, or set {llvm.VARIABLE}"
-        )
+    fault = ""
+    if not dr.has_backend(dr.JitBackend.LLVM):
+        fault = "found no usable libLLVM"
+    elif (major := dr.detail.llvm_version()[0]) < llvm.MIN_VERSION:
+        fault = f"took libLLVM {major}, which would end the process"
+    if fault:
+        advice = f"import reslrb_cli first, or set {llvm.VARIABLE}"
+        raise BackendError(f"Dr.Jit was imported before reslrb_cli and {fault}; {advice}")

@@ -12,7 +12,6 @@ import os
 import sys
 import traceback
 from collections.abc import Sequence
-from pkgutil import iter_modules
 from typing import Any
 
 import click
@@ -42,18 +41,17 @@ class _Main(click.Group):
     debug = False
 
     def list_commands(self, ctx: click.Context) -> list[str]:
-        present = {module.name for module in iter_modules(__path__)}
-        return [name for name in _SUMMARIES if name in present]
+        return list(_SUMMARIES)
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
-        if cmd_name not in self.list_commands(ctx):
+        if cmd_name not in _SUMMARIES:
             return None
         command: click.Command = importlib.import_module(f"{__name__}.{cmd_name}").command
         return command
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         with formatter.section("Commands"):
-            formatter.write_dl([(name, _SUMMARIES[name]) for name in self.list_commands(ctx)])
+            formatter.write_dl(list(_SUMMARIES.items()))
 
     def main(
         self,

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 
 import click
 
-from reslrb_cli.cli.options import overrides_option, read_recovered, start_variant
+from reslrb_cli.cli.options import overrides_option, read_recovered, start_variant, writing
 from reslrb_cli.cli.terminal import echo
-from reslrb_cli.errors import ConfigError, is_machine_fault
+from reslrb_cli.errors import ConfigError
 
 if TYPE_CHECKING:
     import mitsuba as mi
@@ -46,12 +46,8 @@ def command(run: Path, overrides: tuple[str, ...], output: Path) -> None:
     check_integrator(config, config.integrator, scene, choose_sensors(config, scene))
     selection = select_parameters(scene, config.parameters, config.source)
     integrator, why = choose_integrator(config, scene, selection.params)
-    try:
+    with writing("--output", output):
         export_scene(description, selection.params, selection.scene_keys, integrator, output, run)
-    except OSError as error:
-        if is_machine_fault(error):
-            raise
-        raise ConfigError("--output", "", f"{error.filename or output}: {error.strerror}") from None
     echo(f"{output / 'scene.xml'}: {', '.join(selection.keys)}; rendered by {integrator['type']}{why}")
 
 

@@ -17,13 +17,12 @@ from typing import TYPE_CHECKING
 import click
 
 from reslrb_cli.cli.inspect import LISTED_SENSORS
-from reslrb_cli.cli.options import check_writable
+from reslrb_cli.cli.options import check_writable, writing
 from reslrb_cli.cli.terminal import echo
 from reslrb_cli.config.loader import loads, parse_override
 from reslrb_cli.config.yaml_text import write
-from reslrb_cli.errors import ConfigError, UnsupportedScene, is_machine_fault, printable
+from reslrb_cli.errors import ConfigError, UnsupportedScene, printable
 from reslrb_cli.records.atomic import write_atomically
-from reslrb_cli.scene.catalog import Value
 from reslrb_cli.scene.proposal import Proposal
 from reslrb_cli.scene.visibility import Depth
 
@@ -35,31 +34,21 @@ if TYPE_CHECKING:
 
 #: Pixels with which a run takes minutes on two cores, at the samples below.
 PIXELS = 2**14
-
-
 SPP, ITERATIONS, RATE = 16, 200, 0.03
-
 
 #: The same with a parameter that has no upper bound, of which rates are shares: it and what it shines on are told apart
 #: in many steps.
 UNBOUNDED_ITERATIONS, UNBOUNDED_RATE = 300, 0.1
 
-
 #: Commented lines of parameters; a scene can have thousands.
 _MOST_OTHERS = 60
-
 
 #: Variables and sensors that a comment names, and characters of a variable there.
 _MOST_VARIABLES, _MOST_SENSORS, _LONGEST = 8, 6, 40
 
-
 #: Columns of a comment of several lines.
 _COMMENT = 110
-
-
 _NUMBER = re.compile(r"-?\d{1,15}(\.\d{1,15})?")
-
-
 _PLAIN = re.compile(r"(\.\./)*[A-Za-z_][\w.\-]*(/[\w.\-]+)*")
 
 
@@ -89,63 +78,56 @@ class FirstConfig:
 
     def text(self, path: Path) -> str:
         """The YAML of the configuration in the file `path`."""
-        folder = path.absolute().parent
+        folder, (width, height), missing = path.absolute().parent, self.film, self.depth.missing
+        longer = (
+            "light bounces on and on" if missing is None else f"longer paths have {missing:.1%} of the light in view"
+        )
         lines = [
             "# Every setting and its default: docs/config.md. Begin with",
             f"#     reslrb optimize {path.name}",
             "scene:",
             f"  file: {_path(self.scene, folder)}",
             *self._option_lines(),
-            *self._size_lines(),
-            *self._sensor_lines(),
-            "target:",
-            *self._target_lines(folder),
-            "parameters:  # by their share of the picture; bounds are the usual ones",
-            *self._parameter_lines(),
-            "integrator:",
-            *self._reason_lines(),
+        ]
+        if self.size != self.film:
+            lines += [f"  size: {list(self.size)}  # runs in minutes; the scene's own film has {width}x{height}"]
+        if len(self.sensors) > 1:
+            listed = [f"{number} is {_word(name)}" for number, name in enumerate(self.sensors[:_MOST_SENSORS])]
+            named = ", ".join(listed) + (" ..." if len(self.sensors) > _MOST_SENSORS else "")
+            lines += [f"  sensors: [{self.sensor}]  # {named}; `views` take several, each with its photograph"]
+        lines += ["target:", *self._target_lines(folder)]
+        lines += ["parameters:  # by their share of the picture; bounds are the usual ones", *self._parameter_lines()]
+        lines += ["integrator:"]
+        if self.reason is not None:
+            words = f"by paths from the sensor, since light paths cannot render this: {printable(self.reason)}"
+            lines += wrap(words, _COMMENT, initial_indent="  # ", subsequent_indent="  # ", break_long_words=False)
+        lines += [
             f"  type: {self.integrator}",
-            f"  max_depth: {self.depth.segments}  # {self._depth_words()}; depth costs time alone, no memory",
-            *(["  hide_emitters: true  # as the scene's own integrator has it"] if self.hides_emitters else []),
+            f"  max_depth: {self.depth.segments}  # {longer}; depth costs time alone, no memory",
+            *["  hide_emitters: true  # as the scene's own integrator has it"] * self.hides_emitters,
             "loss:",
             "  type: relative_l2  # by l2 the noise of the brightest parts would drown what the others say",
             "optimizer:",
-            *self._step_lines(),
+        ]
+        iterations, rate, unit = ITERATIONS, RATE, ""
+        if self._is_scaled:  # between bounds the size of steps is known beforehand, of a lamp it has to be measured
+            iterations, rate, unit = UNBOUNDED_ITERATIONS, UNBOUNDED_RATE, "of its unit "
+            lines += [
+                "  scale: auto  # a lamp may be of any brightness: in what units each parameter moves is measured first"
+            ]
+        lines += [
+            f"  learning_rate: {rate}  # by so much {unit}a value moves in an iteration, at first",
             "  schedule: cosine  # to next to nothing, so that the noise of the last iterations counts little",
             "run:",
-            f"  iterations: {UNBOUNDED_ITERATIONS if self._is_scaled else ITERATIONS}",
+            f"  iterations: {iterations}",
             f"  spp: {SPP}",
         ]
         return "\n".join(lines) + "\n"
-
-    def _reason_lines(self) -> list[str]:
-        if self.reason is None:
-            return []
-        words = f"by paths from the sensor, since light paths cannot render this: {printable(self.reason)}"
-        return wrap(words, _COMMENT, initial_indent="  # ", subsequent_indent="  # ", break_long_words=False)
-
-    def _step_lines(self) -> list[str]:
-        """The size of steps: between bounds it is known beforehand, of a lamp it has to be measured."""
-        if not self._is_scaled:
-            return [f"  learning_rate: {RATE}  # by so much a value moves in an iteration, at first"]
-        return [
-            "  scale: auto  # a lamp may be of any brightness: in what units each parameter moves is measured first",
-            f"  learning_rate: {UNBOUNDED_RATE}  # by so much of its unit a value moves in an iteration, at first",
-        ]
 
     @property
     def _is_scaled(self) -> bool:
         """Whether steps have to be measured: something that may be of any size is to begin with."""
         return any(item.first and not item.is_bounded for item in self.proposals)
-
-    @property
-    def _has_exposure(self) -> bool:
-        """Whether one is recovered; beside a lamp, which it could not be told from, it is not."""
-        return self.is_integer and not any(item.first and item.info.kind == "emitter" for item in self.proposals)
-
-    def _depth_words(self) -> str:
-        missing = self.depth.missing
-        return "light bounces on and on" if missing is None else f"longer paths have {missing:.1%} of the light in view"
 
     def _option_lines(self) -> list[str]:
         given = ", ".join(f"{_word(name)}: {json.dumps(value)}" for name, value in self.options.items())
@@ -158,39 +140,19 @@ class FirstConfig:
             return [f"  options: {{{given}}}" + (f"  # the scene file also has {rest}" if rest else "")]
         return [f"  # options: {{{rest}}}  # variables of the scene file, and what they are there"] if rest else []
 
-    def _sensor_lines(self) -> list[str]:
-        if len(self.sensors) == 1:
-            return []
-        listed = [f"{number} is {_word(name)}" for number, name in enumerate(self.sensors[:_MOST_SENSORS])]
-        more = " ..." if len(self.sensors) > _MOST_SENSORS else ""
-        return [
-            f"  sensors: [{self.sensor}]  # {', '.join(listed)}{more}; `views` take several, each with its photograph"
-        ]
-
-    def _size_lines(self) -> list[str]:
-        if self.size == self.film:
-            return []
-        width, height = self.film
-        note = f"runs in minutes; the scene's own film has {width}x{height}"
-        return [f"  size: {list(self.size)}  # {note}"]
-
     def _target_lines(self, folder: Path) -> list[str]:
+        """A photograph of 8 or 16 bits has an exposure that is not known. `mask: auto` is the default."""
         if self.target is not None:
-            return [f"  file: {_path(self.target, folder)}", *self._exposure_lines()]
+            exposure = "  exposure: auto  # one factor for the whole image, recovered beside the parameters"
+            if any(item.first and item.info.kind == "emitter" for item in self.proposals):  # not told from one
+                exposure = "  # exposure: auto  # one factor for the whole image; the lamps below make up for it"
+            return [f"  file: {_path(self.target, folder)}", *[exposure] * self.is_integer]
         width, height = self.size
         return [
             f"  file: photo.png  # put your photograph there, of {width}x{height} pixels, or have it made by",
             "  # reslrb init --target PHOTO from one of any size in that ratio. To try without, in place of `file`:",
             "  # render: {spp: 1024, parameters: {KEY: VALUE}}  # the scene itself with other values",
         ]
-
-    def _exposure_lines(self) -> list[str]:
-        """For a photograph: of 8 or 16 bits its exposure is not known. `mask: auto` is the default."""
-        if self._has_exposure:
-            return ["  exposure: auto  # one factor for the whole image, recovered beside the parameters"]
-        return [
-            "  # exposure: auto  # one factor for the whole image; the lamps below make up for it"
-        ] * self.is_integer
 
     def _parameter_lines(self) -> list[str]:
         first = [proposal for proposal in self.proposals if proposal.first]
@@ -216,18 +178,13 @@ def _entry(proposal: Proposal, is_scaled: bool) -> str:
 
 
 def _note(proposal: Proposal) -> str:
-    info = proposal.info
-    seen = f"{100 * proposal.share:.0f} % of the picture" if proposal.share >= 0.005 else "not seen itself"
-    size = f", {info.shape[1]}x{info.shape[0]} texels" if len(info.shape) == 3 else ""
-    return f"{seen}{size}{_value(info.value)}" + (f", {info.remark}" if info.remark is not None else "")
-
-
-def _value(value: Value | None) -> str:
-    if value is None:
-        return ""
-    if value.numbers is not None:
-        return f", {'now ' + ' '.join(f'{number:.3g}' for number in value.numbers)}"
-    return f", {value.low:.3g} to {value.high:.3g}"
+    info, value = proposal.info, proposal.info.value
+    parts = [f"{100 * proposal.share:.0f} % of the picture" if proposal.share >= 0.005 else "not seen itself"]
+    parts += [f"{info.shape[1]}x{info.shape[0]} texels"] if len(info.shape) == 3 else []
+    if value is not None:
+        numbers = None if value.numbers is None else " ".join(f"{number:.3g}" for number in value.numbers)
+        parts.append(f"{value.low:.3g} to {value.high:.3g}" if numbers is None else f"now {numbers}")
+    return ", ".join(parts if info.remark is None else [*parts, info.remark])
 
 
 def _path(path: Path, folder: Path) -> str:
@@ -246,7 +203,6 @@ def _text(text: str) -> str:
 
 
 Size = tuple[int, int]
-
 
 #: By how much the ratio of a photograph's sides may differ from the film's.
 _RATIO = 0.01
@@ -321,8 +277,7 @@ def command(
     from reslrb_cli.scene.visibility import find_depth
 
     photo = None if target is None else open_photograph(target)
-    turned = None if target is None else turned_line(target)
-    if turned is not None:
+    if target is not None and (turned := turned_line(target)) is not None:
         echo(turned)
     scene, description = load_described(scene_file, options)
     sensors = [str(sensor.id()) for sensor in scene.sensors()]
@@ -334,10 +289,9 @@ def command(
     integrator, reason = _integrator(scene, sensor, description.hides_emitters, scene_file)
     is_integer = photo is not None and photo.is_integer
     proposals = _propose(scene_file, scene, index, wanted, lamps=not is_integer and not description.hides_emitters)
-    image, copied = target, False
-    if photo is not None and target is not None and photo.size != size:
-        image = path.with_name(f"{target.stem}-{size[0]}x{size[1]}{'.png' if photo.is_integer else '.exr'}")
-        copied = True
+    image, copied = target, photo is not None and photo.size != size
+    if photo is not None and copied:
+        image = path.with_name(f"{photo.path.stem}-{size[0]}x{size[1]}{'.png' if photo.is_integer else '.exr'}")
         _check_free(image, force)
     first = FirstConfig(
         scene=scene_file,
@@ -359,14 +313,10 @@ def command(
     specs = loads(text, path).parameters
     scene = read_as_floats(scene, description, [key for spec in specs for key in spec.keys])
     select_parameters(scene, specs, path)  # what is wrong is to show before anything is written
-    try:
+    with writing("--output", path):
         if copied and photo is not None and image is not None:
             write_smaller(photo, size, image)
         write_atomically(path, lambda file: file.write(text.encode()))
-    except OSError as error:
-        if is_machine_fault(error):
-            raise
-        raise ConfigError("--output", "", f"cannot write {error.filename}: {error.strerror}") from None
     made = f" and {image}" if copied else ""
     count = sum(proposal.first for proposal in proposals)
     echo(f"{path}{made}: {count} of {len(proposals)} parameters, at {size[0]}x{size[1]} pixels")
@@ -381,7 +331,6 @@ def choose_size(film: Size, photo: Photograph | None, fixed: bool = False) -> Si
     A `fixed` one, which is a window of a larger film, stays as it is. Raises ConfigError for a photograph whose ratio
     is not that of the film.
     """
-
     width, height = film if photo is None else photo.size
     if photo is not None and abs(width / height * film[1] / film[0] - 1) > _RATIO:
         fits = (width, round(width * film[1] / film[0]))

@@ -89,13 +89,11 @@ def memory_lines(forecast: Forecast, budget: int | None) -> list[str]:
         f"memory of the iterations: {in_words(forecast.peak)} at the most; {in_words(forecast.free)} are free{allowed}"
     ]
     lines += [f"  {in_words(size):>10}  {part}" for part, size in forecast.parts.items()]
-    lines.append(f"  {in_words(forecast.scratch):>10}  thread-local memory of paths (stack), beside it")
-    resident = resident_bytes()
-    if resident:
-        lines.append(
-            f"  {in_words(resident):>10}  this process as a whole: Python, libraries, kernels' code, and all above"
-        )
-    return lines
+    return [
+        *lines,
+        f"  {in_words(forecast.scratch):>10}  thread-local memory of paths (stack), beside it",
+        f"  {in_words(resident_bytes()):>10}  this process as a whole: Python, libraries, kernels' code, and all above",
+    ]
 
 
 def time_lines(forecast: Forecast, before: Sequence[Before]) -> list[str]:
@@ -115,8 +113,6 @@ def time_lines(forecast: Forecast, before: Sequence[Before]) -> list[str]:
 
 
 NOTICE = "stopping after this iteration; once more, and it ends at once"
-
-
 logger = logging.getLogger(__name__)
 
 

@@ -8,10 +8,10 @@ measured, then has one object a line, and stands on the disk while they go on.
 from __future__ import annotations
 
 import errno
-import logging
 import math
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +22,7 @@ from reslrb_cli.cli.terminal import echo
 from reslrb_cli.config.loader import load
 from reslrb_cli.config.parameters import RunValue
 from reslrb_cli.config.schema import Config
-from reslrb_cli.errors import ConfigError
+from reslrb_cli.errors import ConfigError, is_machine_fault
 from reslrb_cli.records.atomic import remove_parts_of
 from reslrb_cli.records.measurement_files import (
     Kept,
@@ -64,7 +64,7 @@ class Keeper:
             self._samples = samples_file(json_file)
             remove_parts_of(self._samples)
         self._origin, self._final, self._provisional, self._kept = origin, final, provisional, kept
-        self._live = LivePage(self._save, "the file of --json")
+        self._live = LivePage(lambda: self._write(self._final(), self._provisional()), "the file of --json")
 
     def refresh(self) -> None:
         """Write, if it is time to: every few seconds, and no more than a small share of the time. Between steps."""
@@ -78,16 +78,13 @@ class Keeper:
     def finish(self, lines: Sequence[Line]) -> None:
         """Write all `lines`, none of which changes any more. Raises OSError."""
         if self._file is not None:
-            if not self._write(self._file, lines):
+            if not self._write(lines):
                 echo("what was sampled is too large to be kept: --resume cannot go on from it")
             self._file.close()
 
-    def _save(self) -> None:
-        assert self._file is not None
-        self._write(self._file, self._final(), self._provisional())
-
-    def _write(self, file: LineFile, final: Sequence[Line], provisional: Sequence[Line] = ()) -> bool:
+    def _write(self, final: Sequence[Line], provisional: Sequence[Line] = ()) -> bool:
         """Write both files; whether what there is to be kept is."""
+        assert self._file is not None
         kept = None if self._samples is None else self._kept()
         fits = kept is None or are_kept(kept[1])
         if self._samples is not None:
@@ -95,7 +92,7 @@ class Keeper:
                 write_samples(self._samples, *kept)
             else:  # what may lie there is not of these lines
                 self._samples.unlink(missing_ok=True)
-        file.write([self._origin, *final], provisional)
+        self._file.write([self._origin, *final], provisional)
         return fits
 
 
@@ -114,9 +111,6 @@ def read_recovered(run: Path, overrides: tuple[str, ...]) -> Config:
     start = RunValue(run=run.absolute())
     specs = [spec.model_copy(update={"initial": start}) for spec in config.parameters]
     return config.model_copy(update={"parameters": specs})
-
-
-logger = logging.getLogger(__name__)
 
 
 #: Type of an option that counts something: samples, depths, seeds. As in a configuration, 31 bits.
@@ -152,16 +146,6 @@ class Factors(click.ParamType):
         return tuple(sorted(factors))
 
 
-def experiment_arguments(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Add CONFIG (`config_file`) and `--set` (`overrides`) to a command."""
-    return _arguments(function, required=True)
-
-
-def optional_experiment_arguments(function: Callable[..., Any]) -> Callable[..., Any]:
-    """The same for a command that has a scene of its own: `config_file` is None where CONFIG is left out."""
-    return _arguments(function, required=False)
-
-
 def overrides_option(function: Callable[..., Any]) -> Callable[..., Any]:
     """Add `--set` (`overrides`) to a command."""
     return click.option(
@@ -192,10 +176,16 @@ def allowance(budget_s: float, number: int | None, of: str) -> str:
     return f"budget {budget_s:g} s for the whole, loading and compiling included"
 
 
-def _arguments(function: Callable[..., Any], required: bool) -> Callable[..., Any]:
+def experiment_arguments(function: Callable[..., Any], required: bool = True) -> Callable[..., Any]:
+    """Add CONFIG (`config_file`) and `--set` (`overrides`) to a command."""
     metavar = "CONFIG" if required else "[CONFIG]"
     argument = click.argument("config_file", metavar=metavar, required=required, type=click.Path(path_type=Path))
     return argument(overrides_option(function))
+
+
+def optional_experiment_arguments(function: Callable[..., Any]) -> Callable[..., Any]:
+    """The same for a command that has a scene of its own: `config_file` is None where CONFIG is left out."""
+    return experiment_arguments(function, required=False)
 
 
 def is_given(name: str) -> bool:
@@ -215,13 +205,25 @@ def start_variant(config: Config) -> str:
     return set_variant(config.variant)
 
 
+@contextmanager
+def writing(option: str, path: Path) -> Iterator[None]:
+    """Have an error of writing `path` located by the option (ConfigError); one of the machine stays what it is."""
+    try:
+        yield
+    except (OSError, RuntimeError) as error:
+        if is_machine_fault(error):
+            raise
+        place, reason = getattr(error, "filename", None) or path, getattr(error, "strerror", None) or error
+        raise ConfigError(option, "", f"cannot write {place}: {reason}") from None
+
+
 def check_writable(option: str, path: Path | None) -> None:
     """Raise ConfigError, located by the option, where the file `path` cannot be written; it is left as it was."""
     if path is None:
         return
     existed = os.path.lexists(path)
     try:  # without waiting: a pipe that nobody reads from would make wait for ever
-        os.close(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND | getattr(os, "O_NONBLOCK", 0), 0o666))
+        os.close(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_NONBLOCK, 0o666))
     except (OSError, ValueError) as error:
         reason = "nobody reads from that pipe" if getattr(error, "errno", None) == errno.ENXIO else None
         raise ConfigError(

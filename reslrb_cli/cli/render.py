@@ -18,15 +18,14 @@ from reslrb_cli.cli.options import (
     read_config,
     read_recovered,
     start_variant,
+    writing,
 )
 from reslrb_cli.cli.terminal import echo
 from reslrb_cli.config.schema import Config
-from reslrb_cli.errors import ConfigError, is_machine_fault
+from reslrb_cli.errors import ConfigError
 
 #: Formats that hold linear values; the others of `FORMATS` are written in 8-bit sRGB.
 FLOAT_FORMATS = (".exr", ".hdr", ".pfm")
-
-
 FORMATS = (*FLOAT_FORMATS, ".png", ".jpg", ".jpeg")
 
 
@@ -114,12 +113,8 @@ def command(
     image = render_in_passes(integrator, scene, sensors[0], samples, config.run.seed, 0, "render", multiple)
     suits = 1.0 if linear else _suiting(image, scene, scene.sensors()[sensors[0]])
     factor = suits if exposure is None else exposure
-    try:
+    with writing("--output", output):
         write_file(output.resolve(), image * factor, linear)
-    except (OSError, RuntimeError) as error:
-        if is_machine_fault(error):
-            raise
-        raise ConfigError("--output", "", f"cannot write {output}: {getattr(error, 'strerror', error)}") from None
     words = [f"{image.shape[1]}x{image.shape[0]}", f"{samples} spp", *filter(None, [exposure_words(factor)])]
     hint = "" if suits == 1 or is_given("exposure") else f"; --exposure auto: {exposure_words(suits)}"
     echo(f"{output}: {', '.join(words)}{hint}")
@@ -167,8 +162,6 @@ def check_image_path(path: Path) -> None:
     if os.path.lexists(path) and not path.is_file():
         raise ConfigError("--output", "", f"{path} is not a regular file")
     check_writable("--output", path)
-    try:  # for the file that takes the place of that one when it is complete
-        with tempfile.TemporaryFile(dir=path.resolve().parent):
-            pass
-    except OSError as error:
-        raise ConfigError("--output", "", f"cannot write {path}: {error.strerror}") from None
+    # for the file that takes the place of that one when it is complete
+    with writing("--output", path), tempfile.TemporaryFile(dir=path.resolve().parent):
+        pass

@@ -24,7 +24,6 @@ descriptor that Python's C code writes to. It can do its work while a kernel run
 from __future__ import annotations
 
 import contextlib
-import errno
 import io
 import logging
 import os
@@ -158,90 +157,58 @@ class LineFormatter(logging.Formatter):
         return printable(record.getMessage())
 
 
-#: Errors of a stream after which nothing will ever be written to it again.
-_GONE = {errno.EPIPE, errno.EIO, errno.EBADF, errno.ENXIO, errno.ENODEV}
+class Forgiving:
+    """Passes text on to `stream`, and goes on where that fails; else it is that stream. None shows nothing.
 
-
-class Forgiving(io.TextIOBase):
-    """Passes text on to `stream`, and goes on where that fails; None takes everything and shows nothing.
-
-    It has no `buffer`, so that nobody writes past it.
+    It has no `buffer`, so that nobody writes past it. Characters that the stream's encoding lacks become `\\u...`.
     """
 
     def __init__(self, stream: TextIO | None) -> None:
-        self._stream = stream
+        self._stream = stream if stream is not None else open(os.devnull, "w")  # noqa: SIM115 (until the end)
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
 
     def write(self, text: str) -> int:
-        """Write what can be written; characters that the stream's encoding lacks become `\\u...`."""
-        if self._stream is not None:
-            try:
-                try:
-                    self._stream.write(text)
-                except UnicodeEncodeError:
-                    encoding = self._stream.encoding or "ascii"
-                    self._stream.write(text.encode(encoding, "backslashreplace").decode(encoding))
-            except (OSError, ValueError) as error:
-                self._failed(error)
+        """Write what can be written."""
+        with contextlib.suppress(OSError, ValueError):
+            self._stream.write(text)
         return len(text)
 
     def flush(self) -> None:
         """Pass on what is held back, if it can be."""
-        if self._stream is not None:
-            try:
-                self._stream.flush()
-            except (OSError, ValueError) as error:
-                self._failed(error)
-
-    def settle(self) -> None:
-        """Flush for the last time: what still cannot be written is dropped, so that Python does not try it again."""
-        if self._stream is not None:
-            try:
-                self._stream.flush()
-            except (OSError, ValueError):
-                self._drop()
-
-    def _failed(self, error: OSError | ValueError) -> None:
-        if isinstance(error, OSError) and error.errno in _GONE:
-            self._drop()
-
-    def _drop(self) -> None:
-        """Lead the stream to nowhere, with all that it holds back."""
-        stream, self._stream = self._stream, None
-        # ValueError: it is closed, or has no descriptor at all.
-        with contextlib.suppress(OSError, ValueError, AttributeError):
-            nowhere = os.open(os.devnull, os.O_WRONLY)
-            os.dup2(nowhere, stream.fileno())  # type: ignore[union-attr]
-            os.close(nowhere)
-
-    # What others ask a stream for.
+        with contextlib.suppress(OSError, ValueError):
+            self._stream.flush()
 
     def isatty(self) -> bool:
+        """Whether it is a terminal; a stream that is closed is none."""
+        with contextlib.suppress(ValueError):
+            return self._stream.isatty()
+        return False
+
+    def __getattr__(self, name: str) -> Any:
+        if name == "buffer":
+            raise AttributeError(name)
+        return getattr(self._stream, name)
+
+    def settle(self) -> None:
+        """Flush for the last time: what still cannot be written leads nowhere, so that Python does not try it again."""
         try:
-            return self._stream is not None and self._stream.isatty()
-        except ValueError:  # closed
-            return False
-
-    def fileno(self) -> int:
-        if self._stream is None:
-            raise io.UnsupportedOperation("fileno")
-        return self._stream.fileno()
-
-    def writable(self) -> bool:
-        return True
-
-    @property
-    def encoding(self) -> str:  # type: ignore[override]
-        return getattr(self._stream, "encoding", None) or "utf-8"
-
-    @property
-    def errors(self) -> str | None:  # type: ignore[override]
-        return getattr(self._stream, "errors", None)
+            self._stream.flush()
+        except (OSError, ValueError):
+            with contextlib.suppress(OSError, ValueError):  # ValueError: it is closed, or has no descriptor at all
+                nowhere = os.open(os.devnull, os.O_WRONLY)
+                os.dup2(nowhere, self._stream.fileno())
+                os.close(nowhere)
 
 
 @contextmanager
 def forgiving_output() -> Iterator[None]:
     """Have `sys.stdout` and `sys.stderr` forgive everything, until the end of the block."""
-    _occupy_closed()
+    # Of standard descriptors that the program was started without, the next files to be opened would take the numbers,
+    # and what libraries print would end up in these.
+    while (number := os.open(os.devnull, os.O_RDWR)) <= 2:
+        pass
+    os.close(number)
     before = sys.stdout, sys.stderr
     forgiving = Forgiving(before[0]), Forgiving(before[1])
     sys.stdout, sys.stderr = forgiving
@@ -251,19 +218,6 @@ def forgiving_output() -> Iterator[None]:
         for stream in forgiving:
             stream.settle()
         sys.stdout, sys.stderr = before
-
-
-def _occupy_closed() -> None:
-    """Open standard descriptors that the program was started without.
-
-    The next file to be opened would take their numbers, and what libraries print would end up in it.
-    """
-    for descriptor in (0, 1, 2):
-        try:
-            os.fstat(descriptor)
-        except OSError:
-            with contextlib.suppress(OSError):
-                os.open(os.devnull, os.O_RDWR)  # the lowest number that is free: this one
 
 
 class LogLines(logging.Handler):

@@ -33,7 +33,6 @@ _EXPECTED = {
     "less_than_equal": "at most {le}",
     "string_too_short": "nonempty text",
     "string_too_long": "text of at most {max_length} characters",
-    "literal_error": "{expected}",
 }
 
 
@@ -62,17 +61,25 @@ def problems(error: ValidationError, data: Any) -> list[Problem]:
 def _problem(detail: ErrorDetails, data: Any) -> Problem:
     kind, value, context = detail["type"], detail["input"], detail.get("ctx", {})
     location = _location(detail["loc"], data)
-    if kind == "extra_forbidden":
-        return Problem(format_location(location), "unknown key", unknown=detail["loc"])
-    if kind == "located":
-        return Problem(_join(format_location(location), context["key"]), context["message"])
-    if kind.startswith("union_tag"):
-        return _wrong_type(location, value, detail["loc"])
-    if kind == "missing" and isinstance(location[-1], str):
-        return Problem(format_location(location), "missing; it has no default")
-    if kind in ("missing", "too_short", "too_long"):  # `missing`: an entry of a pair
-        return Problem(*_wrong_length(location, kind, context))
     key = format_location(location)
+    if kind == "extra_forbidden":
+        return Problem(key, "unknown key", unknown=detail["loc"])
+    if kind == "located":
+        return Problem(_join(key, context["key"]), context["message"])
+    if kind.startswith("union_tag"):
+        if not isinstance(value, dict):
+            return Problem(key, _but_is("must be a mapping such as {type: NAME}", value))
+        given, known = value.get("type"), [str(_type_name(section)) for section in _candidates(detail["loc"])[0]]
+        return Problem(_join(key, "type"), _but_is("must be " + _one_of(known, given), given))
+    if kind == "missing" and isinstance(location[-1], str):
+        return Problem(key, "missing; it has no default")
+    if kind == "missing":  # an entry of a pair
+        return Problem(format_location(location[:-1]), "must be a list of two: it has too few entries")
+    if kind == "too_long":
+        most = {1: "one", 2: "two"}.get(context["max_length"], str(context["max_length"]))
+        return Problem(key, f"must be a list of {most}: it has too many entries")
+    if kind == "too_short":
+        return Problem(key, "must have at least one entry")
     if kind == "wrong":
         return Problem(key, _but_is(context.get("message") or detail["msg"], value))
     if kind == "literal_error":
@@ -167,26 +174,6 @@ def _below(section: type[Section], name: str, key: str) -> list[str]:
 
 
 # --- values -----------------------------------------------------------------------------------------------------------
-
-
-def _wrong_type(location: Location, value: Any, loc: tuple[int | str, ...]) -> Problem:
-    if not isinstance(value, dict):
-        return Problem(format_location(location), _but_is("must be a mapping such as {type: NAME}", value))
-    given = value.get("type")
-    known = [str(_type_name(section)) for section in _candidates(loc)[0]]
-    return Problem(format_location((*location, "type")), _but_is("must be " + _one_of(known, given), given))
-
-
-def _wrong_length(location: Location, kind: str, context: dict[str, Any]) -> tuple[str, str]:
-    if kind == "missing":
-        return format_location(location[:-1]), "must be a list of two: it has too few entries"
-    if kind == "too_long":
-        return format_location(location), f"must be a list of {_words(context['max_length'])}: it has too many entries"
-    return format_location(location), "must have at least one entry"
-
-
-def _words(number: int) -> str:
-    return {1: "one", 2: "two"}.get(number, str(number))
 
 
 def _one_of(known: list[str], value: Any) -> str:

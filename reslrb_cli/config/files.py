@@ -1,8 +1,7 @@
 """The bounds of what a user hands in, and the one door for files that a user names.
 
 Each bound stands with its reason; beyond one, input is refused at once. A file that is named has to be regular and not
-too large, or there is one located line. How the samples of a step are split into passes, and what is too many of them,
-is known before a scene is loaded.
+too large, or there is one located line.
 """
 
 from __future__ import annotations
@@ -19,45 +18,34 @@ from reslrb_cli.errors import ConfigError
 #: Bytes of a configuration's file. One with every default written out takes 2 kB.
 CONFIG_BYTES = 2**18
 
-
 #: Number of `--set`, and characters of all of them together.
 OVERRIDES = 1000
-
-
 OVERRIDES_LENGTH = 2**16
-
 
 #: Values and keys of a configuration, with every alias and every `<<` spelt out: a few hundred bytes of aliases of
 #: aliases can stand for billions. A parameter with every default written out has some 20.
 NODES = 20_000
 
-
 #: Sections within sections. The deepest setting, `target.render.parameters.KEY.file`, is five deep.
 DEPTH = 20
-
 
 #: Characters of a parameter's key or glob. To make a pattern of one takes time that grows with the square of it.
 KEY_LENGTH = 1000
 
-
 #: Integers are below this, and above its negative: nothing that a file counts has more than 64 bits.
 INTEGER_END = 2**64
-
 
 # --- names and paths --------------------------------------------------------------------------------------------------
 
 #: Bytes of a part of a path: no file system in use takes more.
 PART_BYTES = 255
 
-
 #: Bytes of a whole path. Linux takes 4095; the rest is for what a run adds to it below its folder.
 PATH_BYTES = 3000
-
 
 #: Bytes of a run's folder: PART_BYTES, less what is put before and behind it: `-2` and so on, and the mark of a
 #: folder that is not whole yet.
 NAME_BYTES = 200
-
 
 # --- paths of light ---------------------------------------------------------------------------------------------------
 
@@ -65,41 +53,30 @@ NAME_BYTES = 200
 #: at each vertex: of 10^20 paths not one is a thousand vertices longer than `rr_depth`.
 PATH_LENGTH = 2**16 - 1
 
-
 #: Entries of an array in a kernel's thread-local memory: Dr.Jit's bound.
 LOCAL_ENTRIES = 2**16
-
 
 #: Connections, or events, that are kept of a path. Each is code of its own in the kernel, and the time to compile it
 #: grows faster than their number: on two cores 64 took seconds, 256 most of a minute.
 CAPACITY = 1024
 
-
 #: Light paths of one pass: their numbers have 32 bits.
 PASS_PATHS = 2**32 - 1
-
 
 #: Samples per pixel of one pass. In single precision a sum loses terms below a 2^24th of it, and thousands of such
 #: passes can be added to one another.
 PASS_SAMPLES = 2**18
 
-
 #: Passes of a step, each of which is launched by itself and has a seed that is made before the first of them.
 PASSES = 2**16
-
 
 # --- files that a configuration names ---------------------------------------------------------------------------------
 
 #: Pixels of an image: 16384 x 8192, the largest environment map in use. Decoded they take 1.5 GiB.
 PIXELS = 2**27
 
-
 #: Bytes of an image's file: that many pixels of four floats, not compressed, and something for the file's head.
 IMAGE_BYTES = 16 * PIXELS + 2**20
-
-
-#: As far as the system has them: never wait, hand down to no child, change no line ends.
-_FLAGS = ("O_NONBLOCK", "O_CLOEXEC", "O_BINARY")
 
 
 def open_file(path: Path, most: int | None = None) -> BinaryIO:
@@ -110,7 +87,7 @@ def open_file(path: Path, most: int | None = None) -> BinaryIO:
     """
     try:
         _check(path, os.stat(path), most)  # before it is opened: to open some devices does something already
-        descriptor = os.open(path, os.O_RDONLY | sum(getattr(os, flag, 0) for flag in _FLAGS))
+        descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
         try:
             _check(path, os.fstat(descriptor), most)  # it may have been replaced in between
         except BaseException:
@@ -152,35 +129,3 @@ def _check(path: Path, status: os.stat_result, most: int | None) -> None:
         raise ConfigError(path, "", f"is {names.get(kind, 'something else')}, not a regular file")
     if most is not None and status.st_size > most:
         raise ConfigError(path, "", f"has {in_words(status.st_size)}; more than {in_words(most)} are not read")
-
-
-def passes_obstacle(spp: int, per_pass: int | None, pixels: int, splits: bool = True) -> str | None:
-    """Why `spp` samples per pixel of a film of so many `pixels` cannot be traced, and what would be right; or None.
-
-    `per_pass` is the integrator's `samples_per_pass`; it divides `spp`, or is larger. An integrator that does not
-    split its samples by itself (`splits`) has none.
-    """
-    unit = min(per_pass or spp, spp)
-    parts = -(-unit // PASS_SAMPLES) if splits else 1
-    paths = -(-unit // parts) * pixels
-    most = largest_pass(spp, pixels)
-    if paths > PASS_PATHS:
-        advice = f"set integrator.samples_per_pass to {most}, or lower run.spp" if splits and most else "lower run.spp"
-        advice = advice if PASS_PATHS >= pixels else "take a smaller film"
-        return f"makes {paths} light paths in one pass, and no pass has more than {PASS_PATHS}: {advice}"
-    if spp // unit * parts > PASSES:
-        advice = f"set integrator.samples_per_pass to {most}" if most and spp // most <= PASSES else "lower run.spp"
-        return f"makes {spp // unit * parts} passes of a step, and no step has more than {PASSES}: {advice}"
-    return None
-
-
-def largest_pass(spp: int, pixels: int) -> int | None:
-    """The largest `samples_per_pass` that divides `spp` and makes no more paths than a pass can have; None without."""
-    most = min(PASS_PATHS // pixels, PASS_SAMPLES, spp)
-    return max((n for n in divisors(spp) if n <= most), default=None)
-
-
-def divisors(number: int) -> list[int]:
-    """All divisors of a number, the smallest first; of one of 31 bits at once."""
-    small = [n for n in range(1, int(number**0.5) + 1) if number % n == 0]
-    return sorted({*small, *(number // n for n in small)})

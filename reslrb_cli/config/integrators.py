@@ -1,11 +1,13 @@
-"""The integrators, each with the options that it knows."""
+"""The integrators, each with the options that it knows.
+
+How the samples of a step are split into passes, and what is too many of them, is known before a scene is loaded.
+"""
 
 from __future__ import annotations
 
 from typing import Annotated, Any, Literal
 
 from pydantic import (
-    AfterValidator,
     Discriminator,
     Field,
     SerializerFunctionWrapHandler,
@@ -14,62 +16,52 @@ from pydantic import (
 )
 from typing_extensions import Self
 
-from reslrb_cli.config.base import MARK, NEEDS_TYPE, Choice, Count, by_type, located, mark, wrong
-from reslrb_cli.config.files import CAPACITY, LOCAL_ENTRIES, PATH_LENGTH
+from reslrb_cli.config.base import MARK, NEEDS_TYPE, ByType, Choice, Count, located, mark, must
+from reslrb_cli.config.files import CAPACITY, LOCAL_ENTRIES, PASS_PATHS, PASS_SAMPLES, PASSES, PATH_LENGTH
 
+_DEPTH = must(
+    lambda depth: depth <= PATH_LENGTH,
+    lambda depth: (
+        f"must be at most {PATH_LENGTH} segments, or -1 for no limit, not {depth}: Russian roulette ends a path "
+        "long before, so that this limits nothing"
+    ),
+)
 
-def _check_depth(value: int) -> int:
-    if value > PATH_LENGTH:
-        raise wrong(
-            f"must be at most {PATH_LENGTH} segments, or -1 for no limit, not {value}: Russian roulette ends a path "
-            "long before, so that this limits nothing"
-        )
-    return value
+_RECORD = must(
+    lambda depth: depth < LOCAL_ENTRIES,
+    lambda depth: (
+        f"must be less than {LOCAL_ENTRIES}, not {depth}: the record of a path has room for as many vertices, "
+        "and thread-local memory has no more places; reslrb needs no such record"
+    ),
+)
 
-
-def _check_record(value: int) -> int:
-    if value >= LOCAL_ENTRIES:
-        raise wrong(
-            f"must be less than {LOCAL_ENTRIES}, not {value}: the record of a path has room for as many vertices, and "
-            "thread-local memory has no more places; reslrb needs no such record"
-        )
-    return value
-
-
-def _check_capacity(value: int) -> int:
-    if value > CAPACITY:
-        raise wrong(
-            f"must be at most {CAPACITY}, not {value}: each connection that is kept is code of its own in the kernel, "
-            "which would take hours to compile; estimator gather keeps all of them"
-        )
-    return value
+_CAPACITY = must(
+    lambda capacity: capacity <= CAPACITY,
+    lambda capacity: (
+        f"must be at most {CAPACITY}, not {capacity}: each connection that is kept is code of its own in the "
+        "kernel, which would take hours to compile; estimator gather keeps all of them"
+    ),
+)
 
 
 class Integrator(Choice):
     """Options that all integrators share."""
 
     type: str
-    max_depth: Annotated[int, AfterValidator(_check_depth)] = Field(
-        default=8,
-        ge=-1,
-        json_schema_extra={"maximum": PATH_LENGTH},
-        description="Longest path in segments, from the emitter to the sensor: 1 shows only directly visible "
-        "emitters, 2 adds direct light; -1: no limit (Russian roulette alone ends a path).",
-    )
+    max_depth: Annotated[int, _DEPTH] = Field(default=8, ge=-1, json_schema_extra={"maximum": PATH_LENGTH})
+    """Longest path in segments, from the emitter to the sensor: 1 shows only directly visible emitters, 2 adds direct
+    light; -1: no limit (Russian roulette alone ends a path)."""
     rr_depth: Count = Field(default=5, description="Path depth at which Russian roulette begins.")
-    hide_emitters: bool = Field(
-        default=False, description="Whether directly visible emitters are left out of the image."
-    )
+    hide_emitters: bool = False
+    """Whether directly visible emitters are left out of the image."""
 
 
 class LightTracerOptions(Integrator):
     """Options of integrators that trace from the emitters; `prb` traces all samples in one pass."""
 
-    samples_per_pass: Count | None = Field(
-        default=None,
-        description="Samples per pixel that one pass traces, to bound its memory; it must divide the samples per "
-        "pixel. null: all in one pass.",
-    )
+    samples_per_pass: Count | None = None
+    """Samples per pixel that one pass traces, to bound its memory; it must divide the samples per pixel. null: all in
+    one pass."""
 
 
 class AttachingTracer(LightTracerOptions):
@@ -78,17 +70,13 @@ class AttachingTracer(LightTracerOptions):
     attached: Annotated[
         Annotated[bool, mark("flag")] | Annotated[Literal["auto"], mark("text")],
         Discriminator(lambda value: MARK + ("flag" if isinstance(value, bool) else "text")),
-    ] = Field(
-        default="auto",
-        description="Whether derivatives follow light where it goes: of rays, hit points and film positions, beside "
-        "those of what light carries. `auto`: where a parameter moves anything that light leaves from or meets; true: "
-        "for roughness and index of refraction too, whose derivatives are detached otherwise.",
-    )
-    filter_normalization: Literal["attached", "detached"] = Field(
-        default="attached",
-        description="Whether the sum of the reconstruction filter's weights has its derivative too, where light moves "
-        "over the film: `attached` is what finite differences find, `detached` what `ptracer` computes.",
-    )
+    ] = "auto"
+    """Whether derivatives follow light where it goes: of rays, hit points and film positions, beside those of what
+    light carries. `auto`: where a parameter moves anything that light leaves from or meets; true: for roughness and
+    index of refraction too, whose derivatives are detached otherwise."""
+    filter_normalization: Literal["attached", "detached"] = "attached"
+    """Whether the sum of the reconstruction filter's weights has its derivative too, where light moves over the film:
+    `attached` is what finite differences find, `detached` what `ptracer` computes."""
 
 
 #: The options of `reslrb` that belong to an estimator, by its name; the others have no use for them.
@@ -100,10 +88,8 @@ ESTIMATOR_OPTIONS: dict[str, tuple[str, ...]] = {
     "stack": ("stack_size",),
 }
 
-
 #: Those that `auto` leaves to measurement beside any estimator, with what they are where nothing is measured.
 UNDECIDED: dict[str, str] = {"guiding": "off", "sequence": "independent"}
-
 
 #: Every option that says which estimator, and how.
 _ANY_ESTIMATORS = {"estimator", *(option for options in ESTIMATOR_OPTIONS.values() for option in options)}
@@ -112,74 +98,47 @@ _ANY_ESTIMATORS = {"estimator", *(option for options in ESTIMATOR_OPTIONS.values
 class Reslrb(AttachingTracer):
     """Reservoir light replay backpropagation: light tracing whose memory does not depend on path length."""
 
-    type: Literal["reslrb"] = Field(
-        default="reslrb", description="Light tracing, derivatives by a replay of each path."
-    )
-    estimator: Literal["auto", "reservoir", "gather", "event", "stack"] = Field(
-        default="auto",
-        description="How a path's connections enter its gradient. `reservoir`: few of them, kept at random; `gather`: "
-        "all, by a second traversal; `event`: few scattering events, kept at random; `stack`: all, kept in "
-        "thread-local memory; `auto`: the one of these, with its options, that a short pilot measures to be the most "
-        "efficient, 1 / (variance * time).",
-    )
-    capacity: Annotated[Count, AfterValidator(_check_capacity)] = Field(
-        default=1,
-        json_schema_extra={"maximum": CAPACITY},
-        description="How many connections, or events, are kept of each path. Only with estimators `reservoir` "
-        "and `event`.",
-    )
-    weight: Literal["luminance", "adjoint"] = Field(
-        default="luminance",
-        description="What a connection is kept in proportion to: its `luminance`, or its share in the objective "
-        "(`adjoint`: less variance; not with `run.adjoint: correlated`). Only with estimators `reservoir` and "
-        "`event`.",
-    )
-    image: Literal["all", "retained"] = Field(
-        default="all",
-        description="Which connections the image shows: `all`, or the `retained` ones alone, weighted (noisier). "
-        "Only with estimator `reservoir`.",
-    )
-    jacobian_damping: Annotated[float, Field(gt=0, le=1, allow_inf_nan=False)] = Field(
-        default=0.1,
-        description="Where light is followed: by how much the ray behind a surface that is not specular is taken to "
-        "turn with the one before it, to either side at random, so that its Jacobian has an inverse. It makes no bias; "
-        "below 0.01 digits are lost, above 0.5 noise grows. Only with estimator `reservoir`.",
-    )
-    attached_sampling: Literal["auto", "follow", "stay"] = Field(
-        default="auto",
-        description="Where light is followed: what becomes of it behind a surface that is not specular. `follow`: its "
-        "direction turns with the surface, as `ptracer` has it, and sweeps over edges at rest, whose part is then "
-        "missing; `stay`: it goes on to the same place; `auto`: `stay` behind diffuse surfaces, `follow` behind glossy "
-        "ones, where `stay` is noisy.",
-    )
-    stack_size: Count = Field(
-        default=64,
-        description="Vertices of a path that fit into thread-local memory; longer paths are traced a second time. "
-        "Only with estimator `stack`.",
-    )
-    guiding: Literal["auto", "on", "off"] = Field(
-        default="auto",
-        description="Whether light paths start where those of earlier steps had something to say about gradient and "
-        "image, at least a quarter of them anywhere, and end where those had little left to say; in scenes with glossy "
-        "surfaces they are also sent to what the sensor sees. `on`: less noise "
-        "where few paths say anything (a room lit through windows, a caustic), from the second step on; a few of the "
-        "first, and one in sixteen later, trace as many paths again to learn where that is. `auto`: where a few "
-        "steps with and without it, before the first iteration, show that it pays here. Left out it is `auto` with "
-        "estimator `auto`, and `off` with one that is named.",
-    )
-    sequence: Literal["auto", "independent", "low_discrepancy"] = Field(
-        default="auto",
-        description="The random numbers that say where light paths start and how they first scatter. "
-        "`low_discrepancy`: evenly spread over all paths of a step, and independent from one step to the next; less "
-        "noise where little but these numbers says where light goes (a beam through glass), a little less elsewhere. "
-        "`auto`: where a few steps with and without it, before the first iteration, show that it pays here. Left out "
-        "it is `auto` with estimator `auto`, and `independent` with one that is named.",
-    )
-    freeze: bool = Field(
-        default=True,
-        description="Record what a step launches and launch that again, so that its Python runs once, not in every "
-        "iteration. Not with passes, nor with more than 4 million paths, beside which Python does not show.",
-    )
+    type: Literal["reslrb"] = "reslrb"
+    """Light tracing, derivatives by a replay of each path."""
+    estimator: Literal["auto", "reservoir", "gather", "event", "stack"] = "auto"
+    """How a path's connections enter its gradient. `reservoir`: few of them, kept at random; `gather`: all, by a second
+    traversal; `event`: few scattering events, kept at random; `stack`: all, kept in thread-local memory; `auto`: the
+    one of these, with its options, that a short pilot measures to be the most efficient, 1 / (variance * time)."""
+    capacity: Annotated[Count, _CAPACITY] = Field(default=1, json_schema_extra={"maximum": CAPACITY})
+    """How many connections, or events, are kept of each path. Only with estimators `reservoir` and `event`."""
+    weight: Literal["luminance", "adjoint"] = "luminance"
+    """What a connection is kept in proportion to: its `luminance`, or its share in the objective (`adjoint`: less
+    variance; not with `run.adjoint: correlated`). Only with estimators `reservoir` and `event`."""
+    image: Literal["all", "retained"] = "all"
+    """Which connections the image shows: `all`, or the `retained` ones alone, weighted (noisier). Only with estimator
+    `reservoir`."""
+    jacobian_damping: Annotated[float, Field(gt=0, le=1, allow_inf_nan=False)] = 0.1
+    """Where light is followed: by how much the ray behind a surface that is not specular is taken to turn with the one
+    before it, to either side at random, so that its Jacobian has an inverse. It makes no bias; below 0.01 digits are
+    lost, above 0.5 noise grows. Only with estimator `reservoir`."""
+    attached_sampling: Literal["auto", "follow", "stay"] = "auto"
+    """Where light is followed: what becomes of it behind a surface that is not specular. `follow`: its direction turns
+    with the surface, as `ptracer` has it, and sweeps over edges at rest, whose part is then missing; `stay`: it goes on
+    to the same place; `auto`: `stay` behind diffuse surfaces, `follow` behind glossy ones, where `stay` is noisy."""
+    stack_size: Count = 64
+    """Vertices of a path that fit into thread-local memory; longer paths are traced a second time. Only with estimator
+    `stack`."""
+    guiding: Literal["auto", "on", "off"] = "auto"
+    """Whether light paths start where those of earlier steps had something to say about gradient and image, at least a
+    quarter of them anywhere, and end where those had little left to say; in scenes with glossy surfaces they are also
+    sent to what the sensor sees. `on`: less noise where few paths say anything (a room lit through windows, a caustic),
+    from the second step on; a few of the first, and one in sixteen later, trace as many paths again to learn where that
+    is. `auto`: where a few steps with and without it, before the first iteration, show that it pays here. Left out it
+    is `auto` with estimator `auto`, and `off` with one that is named."""
+    sequence: Literal["auto", "independent", "low_discrepancy"] = "auto"
+    """The random numbers that say where light paths start and how they first scatter. `low_discrepancy`: evenly spread
+    over all paths of a step, and independent from one step to the next; less noise where little but these numbers says
+    where light goes (a beam through glass), a little less elsewhere. `auto`: where a few steps with and without it,
+    before the first iteration, show that it pays here. Left out it is `auto` with estimator `auto`, and `independent`
+    with one that is named."""
+    freeze: bool = True
+    """Record what a step launches and launch that again, so that its Python runs once, not in every iteration. Not with
+    passes, nor with more than 4 million paths, beside which Python does not show."""
 
     @model_validator(mode="after")
     def _leave_off(self) -> Self:
@@ -223,46 +182,62 @@ class Reslrb(AttachingTracer):
         return _ANY_ESTIMATORS - {"estimator", *ESTIMATOR_OPTIONS[self.estimator]}
 
 
-class Ptracer(LightTracerOptions):
+class Ptracer(LightTracerOptions, json_schema_extra=NEEDS_TYPE):
     """Mitsuba's own light tracer under naive reverse-mode differentiation: memory grows with depth."""
 
-    model_config = NEEDS_TYPE
     type: Literal["ptracer"] = Field(default="ptracer", description="Mitsuba's light tracer, naively differentiated.")
 
 
-class Prb(Integrator):
+class Prb(Integrator, json_schema_extra=NEEDS_TYPE):
     """Mitsuba's path replay backpropagation: paths from the sensor; it cannot see caustics of small lights."""
 
-    model_config = NEEDS_TYPE
     type: Literal["prb"] = Field(default="prb", description="Mitsuba's path replay backpropagation, from the sensor.")
 
 
-class WalkAd(AttachingTracer):
+class WalkAd(AttachingTracer, json_schema_extra=NEEDS_TYPE):
     """The light-path walk of `reslrb` under naive reverse-mode differentiation, for comparisons at equal seeds."""
 
-    model_config = NEEDS_TYPE
     type: Literal["walk_ad"] = Field(default="walk_ad", description="The walk of `reslrb`, naively differentiated.")
 
 
-class Trajectory(LightTracerOptions):
+class Trajectory(LightTracerOptions, json_schema_extra=NEEDS_TYPE):
     """The same walk, reversed by Dr.Jit itself: it records each path's loop state in thread-local memory."""
 
-    model_config = NEEDS_TYPE
     type: Literal["trajectory"] = Field(default="trajectory", description="The walk of `reslrb`, reversed by Dr.Jit.")
-    max_depth: Annotated[int, AfterValidator(_check_record)] = Field(
-        default=8,
-        ge=0,
-        json_schema_extra={"exclusiveMaximum": LOCAL_ENTRIES},
-        description="Longest path in segments, as above; the record has room for as many vertices, so that there must "
-        "be a limit.",
-    )
+    max_depth: Annotated[int, _RECORD] = Field(default=8, ge=0, json_schema_extra={"exclusiveMaximum": LOCAL_ENTRIES})
+    """Longest path in segments, as above; the record has room for as many vertices, so that there must be a limit."""
 
 
-AnyIntegrator = Annotated[
-    Annotated[Reslrb, mark("reslrb")]
-    | Annotated[Ptracer, mark("ptracer")]
-    | Annotated[Prb, mark("prb")]
-    | Annotated[WalkAd, mark("walk_ad")]
-    | Annotated[Trajectory, mark("trajectory")],
-    by_type("reslrb"),
-]
+AnyIntegrator = Annotated[Reslrb | Ptracer | Prb | WalkAd | Trajectory, ByType("reslrb")]
+
+
+def passes_obstacle(spp: int, per_pass: int | None, pixels: int, splits: bool = True) -> str | None:
+    """Why `spp` samples per pixel of a film of so many `pixels` cannot be traced, and what would be right; or None.
+
+    `per_pass` is the integrator's `samples_per_pass`; it divides `spp`, or is larger. An integrator that does not
+    split its samples by itself (`splits`) has none.
+    """
+    unit = min(per_pass or spp, spp)
+    parts = -(-unit // PASS_SAMPLES) if splits else 1
+    paths = -(-unit // parts) * pixels
+    most = largest_pass(spp, pixels)
+    if paths > PASS_PATHS:
+        advice = f"set integrator.samples_per_pass to {most}, or lower run.spp" if splits and most else "lower run.spp"
+        advice = advice if PASS_PATHS >= pixels else "take a smaller film"
+        return f"makes {paths} light paths in one pass, and no pass has more than {PASS_PATHS}: {advice}"
+    if spp // unit * parts > PASSES:
+        advice = f"set integrator.samples_per_pass to {most}" if most and spp // most <= PASSES else "lower run.spp"
+        return f"makes {spp // unit * parts} passes of a step, and no step has more than {PASSES}: {advice}"
+    return None
+
+
+def largest_pass(spp: int, pixels: int) -> int | None:
+    """The largest `samples_per_pass` that divides `spp` and makes no more paths than a pass can have; None without."""
+    most = min(PASS_PATHS // pixels, PASS_SAMPLES, spp)
+    return max((n for n in divisors(spp) if n <= most), default=None)
+
+
+def divisors(number: int) -> list[int]:
+    """All divisors of a number, the smallest first; of one of 31 bits at once."""
+    small = [n for n in range(1, int(number**0.5) + 1) if number % n == 0]
+    return sorted({*small, *(number // n for n in small)})

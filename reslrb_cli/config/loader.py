@@ -22,8 +22,6 @@ from reslrb_cli.errors import ConfigError, one_line
 
 #: Mappings whose keys are the user's own and may hold dots: what follows their name is one key.
 FREE_MAPPINGS: tuple[Location, ...] = (("scene", "options"), ("target", "render", "parameters"))
-
-
 _PART = re.compile(r"\[(\d+)\]|(?:^|\.)([^.\[\]]+)")
 
 
@@ -76,29 +74,17 @@ def apply(data: dict[str, Any], override: Override) -> dict[str, Any]:
     What is not on the way is shared with `data`. Raises ConfigError where the place cannot be: an index out of range, a
     key below a value that has none.
     """
-    result = dict(data)
-    at: Any = result
-    for i, part in enumerate(override.location):
-        here = override.location[:i]
-        part = _check_part(at, part, here, override)
-        if i == len(override.location) - 1:
-            value = override.value
-        else:
-            value = at[part] if (part in at if isinstance(at, dict) else part < len(at)) else None
-            if value is None:
-                value = [] if isinstance(override.location[i + 1], int) else {}
-            elif isinstance(value, (dict, list)):
-                value = value.copy()
-        if isinstance(at, list) and part == len(at):
-            at.append(value)
-        else:
-            at[part] = value
-        at = value
+    result: dict[str, Any] = _put(data, override, 0)
     return result
 
 
-def _check_part(at: Any, part: str | int, here: Location, override: Override) -> Any:
-    name = format_location(here)
+def _put(at: Any, override: Override, depth: int) -> Any:
+    """The same for what stands at the first `depth` parts of the place."""
+    if depth == len(override.location):
+        return override.value
+    part, name = override.location[depth], format_location(override.location[:depth])
+    if at is None:
+        at = [] if isinstance(part, int) else {}
     if isinstance(at, list):
         if isinstance(part, str) and part.isdecimal():
             part = int(part[:9])
@@ -107,12 +93,12 @@ def _check_part(at: Any, part: str | int, here: Location, override: Override) ->
         if part > len(at):
             has = "1 entry" if len(at) == 1 else f"{len(at)} entries"
             raise ConfigError(override.label, name, f"has {has}; there is no [{part}]")
-        return part
+        return [*at[:part], _put(at[part] if part < len(at) else None, override, depth + 1), *at[part + 1 :]]
     if not isinstance(at, dict):
         raise ConfigError(override.label, name, "is a single value; replace it as a whole")
     if isinstance(part, int):
         raise ConfigError(override.label, name, "is no list; name a key of it, not an index")
-    return part
+    return {**at, part: _put(at.get(part), override, depth + 1)}
 
 
 def load(path: Path | str, overrides: Sequence[str] = ()) -> Config:
@@ -136,7 +122,7 @@ def loads(text: str, path: Path | str, overrides: Sequence[str] = ()) -> Config:
         raise ConfigError(source, "", "is empty; it needs at least scene, target and parameters")
     if not isinstance(data, dict) and data is not None:
         raise ConfigError(source, "", "must hold sections (scene: ...) at its top level, not a list or a single value")
-    if sum(count_values(value, NODES + 1) for value in (data, *(override.value for override in parsed))) > NODES:
+    if sum(count_values(value) for value in (data, *(override.value for override in parsed))) > NODES:
         raise ConfigError(source, "", f"holds more than {NODES} values, together with what --set puts in")
     stages: list[dict[str, Any]] = [data or {}]
     for override in parsed:
@@ -172,7 +158,7 @@ def with_integrator(config: Config, values: dict[str, Any], blame: str, adjoint:
     `adjoint` holds `adjoint` and what goes with it, or nothing, and all stays as it is. Raises ConfigError that names
     `blame`.
     """
-    data = _plain(config.model_dump(exclude_none=True)) | {"integrator": values}
+    data = config.model_dump(mode="json", exclude_none=True) | {"integrator": values}
     if "adjoint" in adjoint:
         data["run"] = {key: value for key, value in data["run"].items() if key not in ("batches", "first_batch")}
     data["run"] |= adjoint
@@ -184,15 +170,7 @@ def with_integrator(config: Config, values: dict[str, Any], blame: str, adjoint:
 
 def dump(config: Config) -> str:
     """The configuration as YAML, with every default and absolute paths; `load` reads it back as an equal one."""
-    return write(_plain(config.model_dump(exclude_none=True)))
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _plain(item) for key, item in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_plain(item) for item in value]
-    return str(value) if isinstance(value, Path) else value
+    return write(config.model_dump(mode="json", exclude_none=True))
 
 
 def read_text(path: Path, source: str) -> str:

@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
 from typing_extensions import Self
 
-from reslrb_cli.config.base import NEEDS_TYPE, Choice, Positive, by_type, located, mark
+from reslrb_cli.config.base import NEEDS_TYPE, ByType, Choice, Positive, located
 
 
 class Loss(Choice):
@@ -22,40 +22,28 @@ class L2(Loss):
     type: Literal["l2"] = Field(default="l2", description="Mean of (I - T)².")
 
 
-class L1(Loss):
+class L1(Loss, json_schema_extra=NEEDS_TYPE):
     """Mean of |I - T|."""
 
-    model_config = NEEDS_TYPE
     type: Literal["l1"] = Field(default="l1", description="Mean of |I - T|.")
 
 
-class RelativeL2(Loss):
+class RelativeL2(Loss, json_schema_extra=NEEDS_TYPE):
     """Mean of (I - T)² / (T² + epsilon)."""
 
-    model_config = NEEDS_TYPE
     type: Literal["relative_l2"] = Field(default="relative_l2", description="Mean of (I - T)² / (T² + epsilon).")
-    epsilon: Positive = Field(
-        default=1e-2,
-        description="Added to the denominator, in squared units of radiance; keeps dark pixels from dominating.",
-    )
+    epsilon: Positive = 1e-2
+    """Added to the denominator, in squared units of radiance; keeps dark pixels from dominating."""
 
 
-class LogL2(Loss):
+class LogL2(Loss, json_schema_extra=NEEDS_TYPE):
     """Mean of (log(I + epsilon) - log(T + epsilon))², negative values as 0."""
 
-    model_config = NEEDS_TYPE
     type: Literal["log_l2"] = Field(default="log_l2", description="Mean of (log(I + epsilon) - log(T + epsilon))².")
     epsilon: Positive = Field(default=1e-2, description="Added inside both logarithms, in units of radiance.")
 
 
-AnyLoss = Annotated[
-    Annotated[L2, mark("l2")]
-    | Annotated[L1, mark("l1")]
-    | Annotated[RelativeL2, mark("relative_l2")]
-    | Annotated[LogL2, mark("log_l2")],
-    by_type("l2"),
-]
-
+AnyLoss = Annotated[L2 | L1 | RelativeL2 | LogL2, ByType("l2")]
 
 _Decay = Annotated[float, Field(ge=0, lt=1)]
 
@@ -64,34 +52,23 @@ class Optimizer(Choice):
     """Options that all optimisers share: the learning rate and its schedule."""
 
     type: str
-    learning_rate: Positive = Field(
-        default=0.02,
-        description="Step size at the first iteration, in the parameter's units; in those of its `transform`, where it "
-        "has one; with `scale: auto`, as a share of the measured length.",
-    )
-    scale: Literal["none", "auto"] = Field(
-        default="none",
-        description="`auto`: before the first iteration, measure for each parameter the length by which it would have "
-        "to change to make up the image where it has an effect, and how large its gradient is, and let the optimizer "
-        "move each in units of its own: one learning rate serves parameters that differ by orders of magnitude, and "
-        "`epsilon` does not matter. Learning rates are then shares of that length: 0.02 is 2 % a step.",
-    )
-    schedule: Literal["constant", "cosine", "exponential"] = Field(
-        default="constant", description="How the learning rate runs from its first value to its last."
-    )
-    final_fraction: float = Field(
-        default=0.01,
-        gt=0,
-        le=1,
-        description="Last learning rate over the first; only with a schedule other than `constant`.",
-    )
+    learning_rate: Positive = 0.02
+    """Step size at the first iteration, in the parameter's units; in those of its `transform`, where it has one; with
+    `scale: auto`, as a share of the measured length."""
+    scale: Literal["none", "auto"] = "none"
+    """`auto`: before the first iteration, measure for each parameter the length by which it would have to change to
+    make up the image where it has an effect, and how large its gradient is, and let the optimizer move each in units of
+    its own: one learning rate serves parameters that differ by orders of magnitude, and `epsilon` does not matter.
+    Learning rates are then shares of that length: 0.02 is 2 % a step."""
+    schedule: Literal["constant", "cosine", "exponential"] = "constant"
+    """How the learning rate runs from its first value to its last."""
+    final_fraction: float = Field(default=0.01, gt=0, le=1)
+    """Last learning rate over the first; only with a schedule other than `constant`."""
 
-    clamp_gradient: Annotated[float, Field(ge=1)] | None = Field(
-        default=None,
-        description="Clamp each entry of a gradient at so many times its usual size: the larger of the running means "
-        "of its own absolute value and of those of all entries of the parameter. Takes the noise of rare bright paths, "
-        "and is biased by what it takes, which the run reports. null: no clamp.",
-    )
+    clamp_gradient: Annotated[float, Field(ge=1)] | None = None
+    """Clamp each entry of a gradient at so many times its usual size: the larger of the running means of its own
+    absolute value and of those of all entries of the parameter. Takes the noise of rare bright paths, and is biased by
+    what it takes, which the run reports. null: no clamp."""
 
     @model_validator(mode="after")
     def _check_schedule(self) -> Self:
@@ -123,39 +100,28 @@ class Adam(_AdamOptions):
     type: Literal["adam"] = Field(default="adam", description="Adam (Kingma and Ba 2015).")
 
 
-class AdamW(_AdamOptions):
+class AdamW(_AdamOptions, json_schema_extra=NEEDS_TYPE):
     """Adam with decoupled weight decay (Loshchilov and Hutter 2019)."""
 
-    model_config = NEEDS_TYPE
-    type: Literal["adamw"] = Field(
-        default="adamw", description="Adam with decoupled weight decay (Loshchilov, Hutter 2019)."
-    )
-    weight_decay: float = Field(
-        default=0.01, ge=0, description="Share of the value that a step removes, per learning rate."
-    )
+    type: Literal["adamw"] = "adamw"
+    """Adam with decoupled weight decay (Loshchilov, Hutter 2019)."""
+    weight_decay: float = Field(default=0.01, ge=0)
+    """Share of the value that a step removes, per learning rate."""
 
 
-class RMSProp(Optimizer):
+class RMSProp(Optimizer, json_schema_extra=NEEDS_TYPE):
     """RMSProp (Hinton 2012)."""
 
-    model_config = NEEDS_TYPE
     type: Literal["rmsprop"] = Field(default="rmsprop", description="RMSProp (Hinton 2012).")
     decay: _Decay = Field(default=0.99, description="Decay of the running mean of the squared gradient.")
     epsilon: Positive = Field(default=1e-8, description="Added to the root of the mean squared gradient.")
 
 
-class SGD(Optimizer):
+class SGD(Optimizer, json_schema_extra=NEEDS_TYPE):
     """Gradient descent with momentum."""
 
-    model_config = NEEDS_TYPE
     type: Literal["sgd"] = Field(default="sgd", description="Gradient descent, with momentum if that is above 0.")
     momentum: _Decay = Field(default=0.0, description="Decay of the running sum of gradients; 0: none.")
 
 
-AnyOptimizer = Annotated[
-    Annotated[Adam, mark("adam")]
-    | Annotated[AdamW, mark("adamw")]
-    | Annotated[RMSProp, mark("rmsprop")]
-    | Annotated[SGD, mark("sgd")],
-    by_type("adam"),
-]
+AnyOptimizer = Annotated[Adam | AdamW | RMSProp | SGD, ByType("adam")]

@@ -7,25 +7,34 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar, Literal
 
-from pydantic import BeforeValidator, Discriminator, Field, WithJsonSchema, field_validator, model_validator
+from pydantic import BeforeValidator, Discriminator, Field, WithJsonSchema, model_validator
 from typing_extensions import Self
 
-from reslrb_cli.config.base import MARK, ConfigPath, Count, Positive, Section, by_kind, kind_tag, located, mark, wrong
+from reslrb_cli.config.base import (
+    MARK,
+    ConfigPath,
+    Positive,
+    Section,
+    Size,
+    by_kind,
+    each_once,
+    few,
+    kind_tag,
+    list_of_one,
+    located,
+    mark,
+    must,
+)
 from reslrb_cli.config.files import KEY_LENGTH, PIXELS
 
 Numbers = Annotated[list[float], Field(min_length=1)]
 
-
 #: What a motion has; it is applied in the opposite order.
 Word = Literal["translation", "rotation", "scale"]
-
-
 WORDS: tuple[Word, ...] = ("translation", "rotation", "scale")
-
 
 #: The name, below its mesh's, of what a heightmap recovers.
 HEIGHTMAP = "heightmap"
@@ -53,13 +62,8 @@ _NumberOrList = Annotated[
     Annotated[float, mark("number")] | Annotated[Numbers, mark("list")], by_kind("a number or a list of numbers")
 ]
 
-
 _Bound = Annotated[float, Field(allow_inf_nan=True)]
-
-
 Bounds = Annotated[tuple[_Bound, _Bound], Field(strict=False)]
-
-
 TransformName = Literal["none", "sigmoid", "log", "softplus"]
 
 
@@ -97,84 +101,48 @@ class MotionRates(ByWord):
 
 # --- what moves -------------------------------------------------------------------------------------------------------
 
-
-def _list_of_one(value: Any) -> Any:
-    return [value] if isinstance(value, str) else value
-
-
-def _names(value: list[str]) -> list[str]:
-    if len(set(value)) < len(value):
-        raise wrong("must name each once")
-    return value
-
-
 Name = Annotated[str, Field(min_length=1, max_length=KEY_LENGTH)]
-
-
 _NAME = {"type": "string", "minLength": 1, "maxLength": KEY_LENGTH}
-
-
 _NAMES = WithJsonSchema({"anyOf": [_NAME, {"type": "array", "items": _NAME, "minItems": 1}]})
-
+_EACH_ONCE = must(each_once, lambda _: "must name each once")
 
 #: One name or several.
-Names = Annotated[list[Name], Field(min_length=1), BeforeValidator(_list_of_one), _NAMES]
+Names = Annotated[list[Name], Field(min_length=1), BeforeValidator(list_of_one), _EACH_ONCE, _NAMES]
+
+
+_TEXELS = must(
+    lambda size: min(size) >= 2 and size[0] * size[1] <= PIXELS,
+    lambda size: f"must be at least [2, 2], and have at most {PIXELS} texels, not {list(size)}",
+)
 
 
 class HeightmapSpec(Section):
     """Displacement of a mesh along its initial normals, in scene units: a texture over its texture coordinates."""
 
-    mesh: Names = Field(
-        description="Id of a mesh with texture coordinates, or a list: one map for all, named by the first."
-    )
-    resolution: Annotated[tuple[Count, Count], Field(strict=False)] = Field(
-        description="[width, height] in texels, at least 2 each, looked up bilinearly; beyond the centres of the "
-        "outermost texels it goes on as they are."
-    )
+    mesh: Names
+    """Id of a mesh with texture coordinates, or a list: one map for all, named by the first."""
+    resolution: Annotated[Size, _TEXELS]
+    """[width, height] in texels, at least 2 each, looked up bilinearly; beyond the centres of the outermost texels it
+    goes on as they are."""
 
-    @field_validator("mesh")
-    @classmethod
-    def _check_mesh(cls, value: list[str]) -> list[str]:
-        return _names(value)
 
-    @field_validator("resolution")
-    @classmethod
-    def _check_resolution(cls, value: tuple[int, int]) -> tuple[int, int]:
-        if min(value) < 2 or value[0] * value[1] > PIXELS:
-            raise wrong(f"must be at least [2, 2], and have at most {PIXELS} texels, not {list(value)}")
-        return value
+_POINT = must(
+    lambda point: len(point) == 3, lambda point: f"must be a point, [x, y, z], not a list of length {len(point)}"
+)
 
 
 class MotionSpec(Section):
     """Motion of shapes and emitters together: scaled, then rotated, then translated."""
 
     of: Names = Field(description="Ids of the shapes and emitters that move together; they are named by the first.")
-    pivot: list[float] | None = Field(
-        default=None,
-        description="The point about which they are scaled and rotated; null: the centre of their bounding box.",
-    )
-    free: Annotated[list[Word], Field(min_length=1)] = Field(
-        default=["translation", "rotation"],
-        description="What is recovered. `translation`: three numbers, in scene units; `rotation`: three angles in "
-        "degrees, about the x, then the y, then the z axis of the scene; `scale`: one factor for all axes.",
-    )
-
-    @field_validator("pivot")
-    @classmethod
-    def _check_pivot(cls, value: list[float] | None) -> list[float] | None:
-        if value is not None and len(value) != 3:
-            raise wrong(f"must be a point, [x, y, z], not a list of length {len(value)}")
-        return value
-
-    @field_validator("of", "free")
-    @classmethod
-    def _check_names(cls, value: list[str]) -> list[str]:
-        return _names(value)
+    pivot: Annotated[list[float], _POINT] | None = None
+    """The point about which they are scaled and rotated; null: the centre of their bounding box."""
+    free: Annotated[list[Word], Field(min_length=1), _EACH_ONCE] = Field(default=["translation", "rotation"])
+    """What is recovered. `translation`: three numbers, in scene units; `rotation`: three angles in degrees, about the
+    x, then the y, then the z axis of the scene; `scale`: one factor for all axes."""
 
 
 ColorSpace = Literal["auto", "linear", "srgb"]
-
-
 COLOR_SPACE = "How values are encoded: `linear`, `srgb`, or `auto` (8-bit files srgb, float files linear)."
 
 
@@ -190,10 +158,9 @@ class RunValue(Section):
 
     TAG: ClassVar[str] = "run"
 
-    run: ConfigPath = Field(
-        description="Folder of a run, finished or interrupted, that recovered a parameter of the same key; relative to "
-        "the config file."
-    )
+    run: ConfigPath
+    """Folder of a run, finished or interrupted, that recovered a parameter of the same key; relative to the config
+    file."""
 
 
 #: A value for a scene parameter: one number, a list such as [r, g, b], or an image file.
@@ -226,17 +193,12 @@ Initial = Annotated[
     ),
 ]
 
-
 _AnyBounds = Annotated[Annotated[Bounds, mark("list")] | Annotated[MotionBounds, mark(ByWord.TAG)], or_words("list")]
-
-
 _AnyRate = Annotated[Annotated[Positive, mark("number")] | Annotated[MotionRates, mark(ByWord.TAG)], or_words("number")]
-
 
 _AnyTransform = Annotated[
     Annotated[TransformName, mark("text")] | Annotated[MotionTransform, mark(ByWord.TAG)], or_words("text")
 ]
-
 
 #: One key, or several that are tied.
 _Key = Annotated[
@@ -263,45 +225,31 @@ class Settings:
 class ParameterSpec(Section):
     """What is recovered, by exactly one of `key`, `heightmap` and `motion`."""
 
-    key: _Key | None = Field(
-        default=None,
-        description="Key as `reslrb inspect` lists it: the names of `mi.traverse`, in which an object without an id "
-        "goes by its kind and number in the scene file, such as `Sphere_3`. Or a glob such as `*.reflectance.data`. A "
-        "list of keys ties them to one value, which is recorded by the first.",
-    )
-    heightmap: HeightmapSpec | None = Field(
-        default=None, description="A displacement of a mesh, recorded as `MESH.heightmap`."
-    )
-    motion: MotionSpec | None = Field(
-        default=None,
-        description="A motion of shapes and emitters, recorded as `ID.translation`, `ID.rotation` and `ID.scale`. With "
-        "several `free`, `initial`, `bounds`, `transform` and `learning_rate` are mappings by these words, such as "
-        "`bounds: {rotation: [-10, 10]}`; `transform` and `learning_rate` may also be one for all.",
-    )
-    initial: Initial = Field(
-        default="scene",
-        description="Value to start from: a number (all entries), a list of numbers (one per channel), an "
-        "image file, the value to which a run brought the same key, or `scene` (the scene's own value; a heightmap is "
-        "flat there, and nothing is moved).",
-    )
-    bounds: _AnyBounds | None = Field(
-        default=None,
-        description="[low, high], in the parameter's units; values are clamped to them after each step. "
-        "`-.inf` and `.inf` leave a side open.",
-    )
-    transform: _AnyTransform = Field(
-        default="none",
-        description="What the optimizer moves in place of the value x: `sigmoid`: the logit of x between its `bounds`, "
-        "which it never reaches; `log`: log(x), for positive values known to an order of magnitude at best; "
-        "`softplus`: log(exp(x) - 1), for positive values; as `log` well below 1, as `none` well above. Learning "
-        "rates are in units of that variable.",
-    )
-    learning_rate: _AnyRate | None = Field(
-        default=None, description="Step size of this parameter, in the optimizer's units; null: the optimizer's."
-    )
-    resolution: Annotated[tuple[Count, Count], Field(strict=False)] | None = Field(
-        default=None, description="[width, height] in texels to which a texture is resampled before the start."
-    )
+    key: _Key | None = None
+    """Key as `reslrb inspect` lists it: the names of `mi.traverse`, in which an object without an id goes by its kind
+    and number in the scene file, such as `Sphere_3`. Or a glob such as `*.reflectance.data`. A list of keys ties them
+    to one value, which is recorded by the first."""
+    heightmap: HeightmapSpec | None = None
+    """A displacement of a mesh, recorded as `MESH.heightmap`."""
+    motion: MotionSpec | None = None
+    """A motion of shapes and emitters, recorded as `ID.translation`, `ID.rotation` and `ID.scale`. With several `free`,
+    `initial`, `bounds`, `transform` and `learning_rate` are mappings by these words, such as `bounds: {rotation: [-10,
+    10]}`; `transform` and `learning_rate` may also be one for all."""
+    initial: Initial = "scene"
+    """Value to start from: a number (all entries), a list of numbers (one per channel), an image file, the value to
+    which a run brought the same key, or `scene` (the scene's own value; a heightmap is flat there, and nothing is
+    moved)."""
+    bounds: _AnyBounds | None = None
+    """[low, high], in the parameter's units; values are clamped to them after each step. `-.inf` and `.inf` leave a
+    side open."""
+    transform: _AnyTransform = "none"
+    """What the optimizer moves in place of the value x: `sigmoid`: the logit of x between its `bounds`, which it never
+    reaches; `log`: log(x), for positive values known to an order of magnitude at best; `softplus`: log(exp(x) - 1), for
+    positive values; as `log` well below 1, as `none` well above. Learning rates are in units of that variable."""
+    learning_rate: _AnyRate | None = None
+    """Step size of this parameter, in the optimizer's units; null: the optimizer's."""
+    resolution: Annotated[Size, few("texels")] | None = None
+    """[width, height] in texels to which a texture is resampled before the start."""
 
     @property
     def names(self) -> list[str]:
@@ -346,13 +294,6 @@ class ParameterSpec(Section):
             of("initial", "scene"), of("bounds"), of("transform", "none"), of("learning_rate"), resolution, word
         )
 
-    @field_validator("resolution")
-    @classmethod
-    def _check_resolution(cls, value: tuple[int, int] | None) -> tuple[int, int] | None:
-        if value is not None and value[0] * value[1] > PIXELS:
-            raise wrong(f"must have at most {PIXELS} texels, not {value[0] * value[1]}")
-        return value
-
     @model_validator(mode="after")
     def _check_kind(self) -> Self:
         has = [option for option in ("key", "heightmap", "motion") if getattr(self, option) is not None]
@@ -384,7 +325,9 @@ class ParameterSpec(Section):
                         raise located(f"{option}.{word}", f"has no effect: `motion.free` has {', '.join(free)} alone")
             elif isinstance(value, ImageFile) and self.motion is not None:
                 raise located(option, "is an image file, and a motion is no texture; give numbers")
-            elif len(free) > 1 and option in ("initial", "bounds") and not _fits_all_words(value):
+            elif value in (None, "scene") or isinstance(value, RunValue):
+                continue
+            elif len(free) > 1 and option in ("initial", "bounds"):
                 words = ", ".join(f"{word}: ..." for word in free)
                 raise located(option, f"must be a mapping by what is free, {{{words}}}: they have different units")
         return self
@@ -392,39 +335,18 @@ class ParameterSpec(Section):
     @model_validator(mode="after")
     def _check_values(self) -> Self:
         for word in self.motion.free if self.motion is not None else ("",):
-            settings = self.settings(word)
-
-            at = functools.partial(self.at, word=word)
-            _check_bounds(settings, at)
-            _check_transform(settings, at)
-            _check_initial(settings, at)
+            said, at = self.settings(word), functools.partial(self.at, word=word)
+            low, high = said.bounds or (-math.inf, math.inf)
+            if not low < high:
+                raise located(at("bounds"), f"must be [low, high] with low < high, not [{low:g}, {high:g}]")
+            if said.transform == "sigmoid" and not (math.isfinite(low) and math.isfinite(high)):
+                has = "has none" if said.bounds is None else f"has [{low:g}, {high:g}]"
+                raise located(at("transform"), f"sigmoid maps to finite `bounds`, [low, high]; this parameter {has}")
+            if said.transform in ("log", "softplus") and high <= 0:
+                reason = f"leave no positive value, and transform: {said.transform} yields nothing else"
+                raise located(at("bounds"), reason)
+            numbers = [said.initial] if isinstance(said.initial, float) else said.initial
+            for number in numbers if isinstance(numbers, list) else ():
+                if not low <= number <= high:
+                    raise located(at("initial"), f"{number:g} is outside of the bounds [{low:g}, {high:g}]")
         return self
-
-
-def _fits_all_words(value: Any) -> bool:
-    """Whether an `initial` or `bounds` says of each word of a motion what it is to be."""
-    return value is None or value == "scene" or isinstance(value, RunValue)
-
-
-def _check_bounds(settings: Settings, at: Callable[[str], str]) -> None:
-    value = settings.bounds
-    if value is not None and not value[0] < value[1]:
-        raise located(at("bounds"), f"must be [low, high] with low < high, not [{value[0]:g}, {value[1]:g}]")
-
-
-def _check_transform(settings: Settings, at: Callable[[str], str]) -> None:
-    low, high = settings.bounds or (-math.inf, math.inf)
-    if settings.transform == "sigmoid" and not (math.isfinite(low) and math.isfinite(high)):
-        has = "has none" if settings.bounds is None else f"has [{low:g}, {high:g}]"
-        raise located(at("transform"), f"sigmoid maps to finite `bounds`, [low, high]; this parameter {has}")
-    if settings.transform in ("log", "softplus") and high <= 0:
-        raise located(at("bounds"), f"leave no positive value, and transform: {settings.transform} yields nothing else")
-
-
-def _check_initial(settings: Settings, at: Callable[[str], str]) -> None:
-    if settings.bounds is None or not isinstance(settings.initial, (float, list)):
-        return
-    low, high = settings.bounds
-    for number in settings.initial if isinstance(settings.initial, list) else [settings.initial]:
-        if not low <= number <= high:
-            raise located(at("initial"), f"{number:g} is outside of the bounds [{low:g}, {high:g}]")

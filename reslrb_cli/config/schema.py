@@ -6,58 +6,44 @@ Units, defaults and meanings stand in the fields' descriptions; `scripts/make_re
 from __future__ import annotations
 
 import math
+import re
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from pydantic import (
+    AfterValidator,
     BeforeValidator,
     Field,
     PrivateAttr,
     SerializerFunctionWrapHandler,
     WithJsonSchema,
-    field_validator,
     model_serializer,
     model_validator,
 )
 from typing_extensions import Self
 
 from reslrb_cli.config.base import (
-    CheckpointEvery,
     ConfigPath,
     Count,
-    Memory,
     Positive,
     Section,
     Seed,
+    Size,
     WorkPath,
     by_kind,
-    check_name,
-    folder_name,
+    each_once,
+    few,
     located,
     mark,
-    memory_bytes,
+    must,
     wrong,
 )
-from reslrb_cli.config.files import KEY_LENGTH, PIXELS, largest_pass, passes_obstacle
-from reslrb_cli.config.integrators import AnyIntegrator, Integrator
+from reslrb_cli.config.files import NAME_BYTES
+from reslrb_cli.config.integrators import AnyIntegrator, Integrator, largest_pass, passes_obstacle
 from reslrb_cli.config.integrators import Reslrb as ReslrbConfig
 from reslrb_cli.config.optimizers import L2, Adam, AnyLoss, AnyOptimizer
-from reslrb_cli.config.parameters import COLOR_SPACE, ColorSpace, ParameterSpec, Value
-from reslrb_cli.config.views import (
-    EXPOSURE,
-    MASK,
-    MASK_MIXED,
-    AnyMask,
-    Exposures,
-    Mask,
-    SensorName,
-    ViewSpec,
-    check_views,
-)
-
-
-def _list_of_one(value: Any) -> Any:
-    return [value] if isinstance(value, (str, Path)) else value
+from reslrb_cli.config.parameters import ParameterSpec
+from reslrb_cli.config.views import SensorName, TargetConfig, ViewSpec, check_views
 
 
 def _scalar(value: Any) -> Any:
@@ -66,126 +52,119 @@ def _scalar(value: Any) -> Any:
     return value
 
 
+_SENSORS = must(each_once, lambda _: "must name each sensor once")
+
+
 class SceneConfig(Section):
     """The scene and what it is seen through."""
 
     file: ConfigPath = Field(description="Mitsuba scene (XML, versions 0.5 to 3), relative to the config file.")
-    options: dict[str, Annotated[bool | int | float | str, BeforeValidator(_scalar)]] = Field(
-        default={}, description="Values of the scene file's `$name` variables."
-    )
-    strict: bool = Field(
-        default=False,
-        description="Refuse a scene file in which anything has to be mended or left out before Mitsuba 3 can load it, "
-        "in place of warning of it.",
-    )
-    size: Annotated[tuple[Count, Count], Field(strict=False)] | None = Field(
-        default=None,
-        description="[width, height] of the film of every sensor in pixels, without crop window; null: as the scene "
-        "file has it. What is seen stays the same where the ratio does.",
-    )
-    cameras: ConfigPath | None = Field(
-        default=None,
-        description="Cameras in place of the scene's own sensors: NeRF's `transforms.json`, or COLMAP's `images.txt` "
-        "with `cameras.txt` beside it; relative to the config file. Their images, relative to that file, are the "
-        "targets of views for which no other is named.",
-    )
+    options: dict[str, Annotated[bool | int | float | str, BeforeValidator(_scalar)]] = Field(default={})
+    """Values of the scene file's `$name` variables."""
+    strict: bool = False
+    """Refuse a scene file in which anything has to be mended or left out before Mitsuba 3 can load it, in place of
+    warning of it."""
+    size: Annotated[Size, few("pixels", ": each image of a step takes 12 bytes or more of every one")] | None = None
+    """[width, height] of the film of every sensor in pixels, without crop window; null: as the scene file has it. What
+    is seen stays the same where the ratio does."""
+    cameras: ConfigPath | None = None
+    """Cameras in place of the scene's own sensors: NeRF's `transforms.json`, or COLMAP's `images.txt` with
+    `cameras.txt` beside it; relative to the config file. Their images, relative to that file, are the targets of views
+    for which no other is named."""
     sensors: Annotated[
-        Annotated[Annotated[list[Annotated[int, Field(ge=0)]], Field(min_length=1)], mark("list")]
+        Annotated[list[Annotated[int, Field(ge=0)]], Field(min_length=1), _SENSORS, mark("list")]
         | Annotated[Literal["all"], mark("text")],
         by_kind("a list of sensor indices, or `all`", "all"),
-    ] = Field(default=[0], description="Indices of the scene's sensors that are used, or `all`.")
-
-    @field_validator("size")
-    @classmethod
-    def _check_size(cls, value: tuple[int, int] | None) -> tuple[int, int] | None:
-        if value is not None and value[0] * value[1] > PIXELS:
-            raise wrong(
-                f"must have at most {PIXELS} pixels, not {value[0] * value[1]}: each image of a step takes 12 bytes or "
-                "more of every one"
-            )
-        return value
-
-    @field_validator("sensors")
-    @classmethod
-    def _check_sensors(cls, value: list[int] | Literal["all"]) -> list[int] | Literal["all"]:
-        if isinstance(value, list) and len(set(value)) < len(value):
-            raise wrong("must name each sensor once")
-        return value
+    ] = Field(default=[0])
+    """Indices of the scene's sensors that are used, or `all`."""
 
 
-class Rendering(Section):
-    """A target that is rendered from the scene itself, with other parameter values."""
+# --- runs -------------------------------------------------------------------------------------------------------------
 
-    parameters: dict[str, Value] = Field(
-        default={},
-        description="True values by key, as in `parameters`: a number, a list of numbers, or an image "
-        "file. Empty: the scene as it stands.",
-    )
-    spp: Count = Field(default=1024, description="Samples per pixel of the target.")
-    seed: Seed = Field(default=0, description="Seed of the target's samples.")
-    integrator: AnyIntegrator | None = Field(
-        default=None, description="Integrator of the target; null: that of the run."
-    )
+#: Names that Windows takes for devices, whatever suffix they have: a folder that is called so cannot be copied there.
+_RESERVED = re.compile(r"(con|prn|aux|nul|(com|lpt)[0-9])(\..*)?", re.IGNORECASE)
 
-    @field_validator("parameters")
-    @classmethod
-    def _check_keys(cls, value: dict[str, Any]) -> dict[str, Any]:
-        if not all(0 < len(key) <= KEY_LENGTH for key in value):
-            raise wrong(f"must have keys that are not empty, and have at most {KEY_LENGTH} characters")
-        return value
+#: What begins at a root or at a home, or has `.` or `..` for a part. A slash between words is none of that.
+_PATH = re.compile(r"^([/\\~]|[A-Za-z]:[/\\])|(^|[/\\])\.\.?($|[/\\])")
 
 
-_PATH = {"type": "string", "format": "path"}
+def folder_name(name: str) -> str:
+    """A run's name as the name of a folder: what is no letter, digit, `.`, `_`, `+`, `=` becomes `-`."""
+    return re.sub(r"[^\w.+=]+", "-", name).strip("-.")
 
 
-_Files = Annotated[
-    list[ConfigPath],
-    Field(min_length=1),
-    BeforeValidator(_list_of_one),
-    WithJsonSchema({"anyOf": [_PATH, {"type": "array", "items": _PATH, "minItems": 1}]}),
+def check_name(name: str) -> str:
+    """`name`, where it can name a run; else raises an error that says what is wrong with it."""
+    folder = folder_name(name)
+    if _PATH.search(name.strip()):
+        raise wrong("must be a name and not a path; run.output says where the run's folder is")
+    if not folder:
+        raise wrong("must hold a letter or a digit")
+    if _RESERVED.fullmatch(folder):
+        raise wrong(f"must be another name: {folder} is a device on Windows, and not a folder's name there")
+    if len(folder.encode()) > NAME_BYTES:
+        raise wrong(f"must have at most {NAME_BYTES} bytes in UTF-8, not {len(folder.encode())}")
+    return name
+
+
+MIB = 2**20
+_UNITS = {"b": 1, "kb": 10**3, "mb": 10**6, "gb": 10**9, "kib": 2**10, "mib": MIB, "gib": 2**30}
+_SIZE = re.compile(r"(\d+(?:\.\d*)?|\.\d+)\s*([A-Za-z]+)")
+
+
+def memory_bytes(value: int | float | str) -> int:
+    """Bytes of a number of MiB, or of text such as "512 MiB", "2GiB", "500 MB".
+
+    Raises ValueError where it is neither, or less than one byte.
+    """
+    number, unit = float("nan"), "mib"
+    if isinstance(value, str):
+        match = _SIZE.fullmatch(value.strip())
+        if match:
+            number, unit = float(match[1]), match[2].lower()
+    elif not isinstance(value, bool):
+        number = float(value) if abs(value) < 2**63 else float("inf")  # longer integers fit into no float
+    if unit not in _UNITS or not 1 <= number * _UNITS[unit] < 2**63:
+        raise ValueError(f"{value!r} is no amount of memory")
+    return int(number * _UNITS[unit])
+
+
+def _check_memory(value: Any) -> Any:
+    try:
+        memory_bytes(value)
+    except (TypeError, ValueError):
+        raise wrong("must be a number of MiB, or text such as 512 MiB or 2GiB, and more than 0") from None
+    return value
+
+
+#: A number of MiB, or text with a unit (B, kB, KiB, MB, MiB, GB, GiB); kept as it was written.
+Memory = Annotated[
+    int | float | str,
+    BeforeValidator(_check_memory),
+    WithJsonSchema({"anyOf": [{"type": "number", "exclusiveMinimum": 0}, {"type": "string"}]}),
 ]
 
 
-class TargetConfig(Section):
-    """What the image is compared with: exactly one of `file` and `render`; views with own targets need none."""
+class CheckpointEvery(Section):
+    """Exactly one of `iterations` and `seconds`."""
 
-    file: _Files | None = Field(
-        default=None,
-        description="Target image (EXR, PNG, JPG, HDR), or a list with one for each sensor, in their order; "
-        "relative to the config file. It is turned as its EXIF orientation says, unless `scene.cameras` is given.",
-    )
-    color_space: ColorSpace = Field(default="auto", description=f"{COLOR_SPACE} Only with `file`.")
-    gamma: Positive | None = Field(
-        default=None,
-        description="Decode values of 8 and 16 bit files by this power, in place of `color_space`. Only with `file`.",
-    )
-    render: Rendering | None = Field(default=None, description="Render the target from the scene.")
-    mask: AnyMask = Field(default=Mask(), description=MASK)
-    mask_mixed: bool = Field(default=False, description=MASK_MIXED)
-    exposure: Exposures = Field(
-        default=1.0,
-        description=f"{EXPOSURE}, all views having the same; or a list of these with one for each view, which are then "
-        "recovered apart.",
-    )
+    iterations: Count | None = Field(default=None, description="Iterations between two checkpoints.")
+    seconds: Positive | None = Field(default=None, description="Seconds between two checkpoints, at least.")
 
     @model_validator(mode="after")
     def _check_one(self) -> Self:
-        if self.file is not None and self.render is not None:
-            raise located("", "must have exactly one of `file` and `render`, and has both")
-        if self.render is not None and self.color_space != "auto":
-            raise located("color_space", "has no effect on a rendered target; it goes with `file`")
-        if self.render is not None and self.gamma is not None:
-            raise located("gamma", "has no effect on a rendered target; it goes with `file`")
-        if self.gamma is not None and self.color_space != "auto":
-            raise located("gamma", "decodes the file in place of color_space; give one of the two")
+        if (self.iterations is None) == (self.seconds is None):
+            has = "none" if self.seconds is None else "both"
+            raise located("", f"must have exactly one of `iterations` and `seconds`, and has {has}")
         return self
 
     @model_serializer(mode="wrap")
     def _without_unused(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        values: dict[str, Any] = handler(self)
-        if self.render is not None:
-            values.pop("color_space", None)
-        return values
+        return {key: value for key, value in handler(self).items() if value is not None}
+
+    def is_due(self, iterations: int, seconds: float) -> bool:
+        """Whether it is time for one, so many iterations and seconds after the last."""
+        return iterations >= self.iterations if self.iterations is not None else seconds > (self.seconds or 0.0)
 
 
 def _without_default(schema: dict[str, Any]) -> None:
@@ -196,100 +175,63 @@ def _without_default(schema: dict[str, Any]) -> None:
 class RunConfig(Section):
     """How long, with how many samples, and where to."""
 
-    name: str = Field(
-        default="run",
-        min_length=1,
-        description="Name of the run and of its folder, not a path, of at most 200 bytes; left out: the config file's "
-        "name without its suffix.",
-        json_schema_extra=_without_default,
+    name: Annotated[str, AfterValidator(check_name)] = Field(
+        default="run", min_length=1, json_schema_extra=_without_default
     )
-    output: WorkPath = Field(
-        default=Path("runs"),
-        validate_default=True,
-        description="Folder of the run folders, relative to the working directory.",
-    )
+    """Name of the run and of its folder, not a path, of at most 200 bytes; left out: the config file's name without its
+    suffix."""
+    output: WorkPath = Field(default=Path("runs"), validate_default=True)
+    """Folder of the run folders, relative to the working directory."""
     iterations: Count = Field(default=200, description="Optimisation steps.")
     spp: Count = Field(default=16, description="Samples per pixel and step.")
     seed: Seed = Field(default=0, description="Seed of the run; every other seed is made from it.")
-    adjoint: Literal["auto", "correlated", "independent", "batched"] = Field(
-        default="auto",
-        description="Samples that the adjoint image dL/dI comes from: the batches before the one that is "
-        "differentiated (`batched`), a second set (`independent`, twice the paths), or those of the gradient "
-        "(`correlated`). Gradients of `l2` and `relative_l2` are unbiased with the first two; with `correlated` the "
-        "noise that both share pulls parameters, mostly towards darker: a run says by how much, where a measurement "
-        "before its first iteration can see it. `l1` and `log_l2` are biased with any of them, since noise in the "
-        "image does not average out of their derivatives; more samples help. `auto`: `batched` "
-        "where `batches` divides `spp`, else `independent`.",
-    )
-    batches: Annotated[int, Field(ge=2)] = Field(
-        default=4,
-        description="Batches of a step's samples; with `adjoint: batched` it must divide `spp`. Not with `correlated` "
-        "and `independent`.",
-    )
-    first_batch: Literal["image", "again"] = Field(
-        default="image",
-        description="What the first batch is for: an `image` alone, or to be traced `again` for its gradient, with the "
-        "adjoint image of all others. Not with `correlated` and `independent`.",
-    )
-    memory_budget: Memory | None = Field(
-        default=None,
-        description="Memory that the iterations may take, with what stands before them: a number of MiB, or text such "
-        "as 512 MiB or 2GiB. The samples of a step are split into passes that fit. It covers what the backend's "
-        "allocator gives out (the scene's textures and buffers, targets, images of a step, parameters and what the "
-        "optimiser keeps of them, what is kept of paths; `peak_mib` in `metrics.jsonl` is that) and thread-local "
-        "memory; not Python, libraries, the code of kernels, the structure that rays are traced in, nor what targets "
-        "and saved images take while they are rendered. null: no limit but what is free. Only with integrator "
-        "`reslrb`.",
-    )
-    on_nonfinite: Literal["stop", "skip", "zero"] = Field(
-        default="skip",
-        description="What to do where a loss, its derivative, or a gradient is not finite. `stop`: end the run (exit "
-        "code 5); `skip`: leave the parameter as it is in this iteration, or all of them; `zero`: take such entries of "
-        "a gradient or of the loss's derivative for 0, and go on. No such value ever reaches a parameter; a run that "
-        "comes to a standstill for 10 iterations ends.",
-    )
-    images_every: Annotated[int, Field(ge=0)] = Field(
-        default=0, description="Iterations between two saved images; 0: only the initial and the final one."
-    )
-    final_spp: Count = Field(
-        default=256,
-        description="Samples per pixel of the saved initial and final image, rounded up to whole passes of "
-        "`samples_per_pass`.",
-    )
-    views_per_iteration: Count | None = Field(
-        default=None,
-        description="Views that an iteration renders, drawn anew each time by the run's seed; their loss is scaled so "
-        "that its mean is that of all. null: all of them.",
-    )
-    held_out: list[SensorName] = Field(
-        default=[],
-        description="Sensors whose views are not trained on, by index or id, which for those of `scene.cameras` is the "
-        "image's name without its suffix; their loss is recorded every 10 iterations (`held_out`), and of the first "
-        "and the last image.",
-    )
-    measuring: Annotated[float, Field(ge=0, allow_inf_nan=False)] = Field(
-        default=0.1,
-        description="What is `auto` in the integrator is measured before the first iteration. This is what all of that "
-        "may take, kernels that are compiled for it included, as a share of what the run itself is expected to take. "
-        "What there is no time for is decided by the scene's features; 0: all of it, and nothing is measured.",
-    )
-    certainty: bool = Field(
-        default=True,
-        description="After the last iteration, measure how certain the values are: their spread, and a verdict on each "
-        "parameter. Takes as long as some iterations, ten or so where parameters are few; runs of fewer than 20 "
-        "iterations, and interrupted ones, go without.",
-    )
-    checkpoint_every: CheckpointEvery = Field(
-        default=CheckpointEvery(seconds=30.0),
-        description="When the state of the run is kept, for `reslrb optimize --resume`: `iterations` or `seconds` "
-        "between two checkpoints. Besides, before the first iteration and at the end, whatever ends it but a kill.",
-    )
+    adjoint: Literal["auto", "correlated", "independent", "batched"] = "auto"
+    """Samples that the adjoint image dL/dI comes from: the batches before the one that is differentiated (`batched`), a
+    second set (`independent`, twice the paths), or those of the gradient (`correlated`). Gradients of `l2` and
+    `relative_l2` are unbiased with the first two; with `correlated` the noise that both share pulls parameters, mostly
+    towards darker: a run says by how much, where a measurement before its first iteration can see it. `l1` and `log_l2`
+    are biased with any of them, since noise in the image does not average out of their derivatives; more samples help.
+    `auto`: `batched` where `batches` divides `spp`, else `independent`."""
+    batches: Annotated[int, Field(ge=2)] = 4
+    """Batches of a step's samples; with `adjoint: batched` it must divide `spp`. Not with `correlated` and
+    `independent`."""
+    first_batch: Literal["image", "again"] = "image"
+    """What the first batch is for: an `image` alone, or to be traced `again` for its gradient, with the adjoint image
+    of all others. Not with `correlated` and `independent`."""
+    memory_budget: Memory | None = None
+    """Memory that the iterations may take, with what stands before them: a number of MiB, or text such as 512 MiB or
+    2GiB. The samples of a step are split into passes that fit. It covers what the backend's allocator gives out (the
+    scene's textures and buffers, targets, images of a step, parameters and what the optimiser keeps of them, what is
+    kept of paths; `peak_mib` in `metrics.jsonl` is that) and thread-local memory; not Python, libraries, the code of
+    kernels, the structure that rays are traced in, nor what targets and saved images take while they are rendered.
+    null: no limit but what is free. Only with integrator `reslrb`."""
+    on_nonfinite: Literal["stop", "skip", "zero"] = "skip"
+    """What to do where a loss, its derivative, or a gradient is not finite. `stop`: end the run (exit code 5); `skip`:
+    leave the parameter as it is in this iteration, or all of them; `zero`: take such entries of a gradient or of the
+    loss's derivative for 0, and go on. No such value ever reaches a parameter; a run that comes to a standstill for 10
+    iterations ends."""
+    images_every: Annotated[int, Field(ge=0)] = 0
+    """Iterations between two saved images; 0: only the initial and the final one."""
+    final_spp: Count = 256
+    """Samples per pixel of the saved initial and final image, rounded up to whole passes of `samples_per_pass`."""
+    views_per_iteration: Count | None = None
+    """Views that an iteration renders, drawn anew each time by the run's seed; their loss is scaled so that its mean is
+    that of all. null: all of them."""
+    held_out: list[SensorName] = Field(default=[])
+    """Sensors whose views are not trained on, by index or id, which for those of `scene.cameras` is the image's name
+    without its suffix; their loss is recorded every 10 iterations (`held_out`), and of the first and the last image."""
+    measuring: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 0.1
+    """What is `auto` in the integrator is measured before the first iteration. This is what all of that may take,
+    kernels that are compiled for it included, as a share of what the run itself is expected to take. What there is no
+    time for is decided by the scene's features; 0: all of it, and nothing is measured."""
+    certainty: bool = True
+    """After the last iteration, measure how certain the values are: their spread, and a verdict on each parameter.
+    Takes as long as some iterations, ten or so where parameters are few; runs of fewer than 20 iterations, and
+    interrupted ones, go without."""
+    checkpoint_every: CheckpointEvery = CheckpointEvery(seconds=30.0)
+    """When the state of the run is kept, for `reslrb optimize --resume`: `iterations` or `seconds` between two
+    checkpoints. Besides, before the first iteration and at the end, whatever ends it but a kill."""
     reach_spp: Count = Field(default=64, description="Samples for the mask of the texels that light and sensor reach.")
-
-    @field_validator("name")
-    @classmethod
-    def _check_name(cls, value: str) -> str:
-        return check_name(value)
 
     @model_serializer(mode="wrap")
     def _without_unused(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
@@ -312,17 +254,13 @@ class RunConfig(Section):
 class Config(Section):
     """One experiment, checked; its paths are absolute."""
 
-    variant: Literal["auto", "llvm_ad_rgb", "cuda_ad_rgb", "llvm_ad_mono", "cuda_ad_mono"] = Field(
-        default="auto",
-        description="Mitsuba variant; `auto`: cuda_ad_rgb where Mitsuba can trace rays on it, else llvm_ad_rgb.",
-    )
+    variant: Literal["auto", "llvm_ad_rgb", "cuda_ad_rgb", "llvm_ad_mono", "cuda_ad_mono"] = "auto"
+    """Mitsuba variant; `auto`: cuda_ad_rgb where Mitsuba can trace rays on it, else llvm_ad_rgb."""
     scene: SceneConfig = Field(description="The scene and its sensors.")
     target: TargetConfig = Field(description="What the image is compared with.")
-    views: Annotated[list[ViewSpec], Field(min_length=1)] | None = Field(
-        default=None,
-        description="Sensors, each with its target, in place of `scene.sensors` and `target.file`; what a view does "
-        "not say is as `target` and `loss` have it.",
-    )
+    views: Annotated[list[ViewSpec], Field(min_length=1)] | None = None
+    """Sensors, each with its target, in place of `scene.sensors` and `target.file`; what a view does not say is as
+    `target` and `loss` have it."""
     parameters: Annotated[list[ParameterSpec], Field(min_length=1)] = Field(description="What is recovered.")
     integrator: AnyIntegrator = Field(default=ReslrbConfig(), description="How image and gradient are computed.")
     loss: AnyLoss = Field(default=L2(), description="How image and target are compared.")

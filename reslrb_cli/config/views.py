@@ -1,4 +1,4 @@
-"""How a target is compared with: the mask that leaves pixels out of it, and its exposure."""
+"""What images are compared with: targets, the masks that leave pixels out of them, their exposures; and views."""
 
 from __future__ import annotations
 
@@ -6,11 +6,23 @@ import math
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BeforeValidator, Field, GetJsonSchemaHandler, WithJsonSchema
+from pydantic import (
+    BeforeValidator,
+    Field,
+    GetJsonSchemaHandler,
+    SerializerFunctionWrapHandler,
+    WithJsonSchema,
+    model_serializer,
+    model_validator,
+)
 from pydantic_core import CoreSchema
+from typing_extensions import Self
 
-from reslrb_cli.config.base import ConfigPath, Positive, Section, located, wrong
+from reslrb_cli.config.base import ConfigPath, Count, Positive, Section, Seed, list_of_one, located, must, wrong
+from reslrb_cli.config.files import KEY_LENGTH
+from reslrb_cli.config.integrators import AnyIntegrator
 from reslrb_cli.config.optimizers import AnyLoss
+from reslrb_cli.config.parameters import COLOR_SPACE, ColorSpace, Value
 
 _KINDS = ("specular", "border", "clipped", "alpha", "nonfinite")
 
@@ -22,33 +34,19 @@ class Mask(Section):
     one of the run's integrator and the target's traces from the light and the other does not, also on a rendered one.
     """
 
-    file: ConfigPath | None = Field(
-        default=None,
-        description="Image of weights, of the target's size, relative to the config file: 0 leaves a pixel out. Values "
-        "are taken as they stand in it, of 8 and 16 bits as shares of the greatest; of several channels the mean.",
-    )
-    specular: bool = Field(
-        default=True,
-        description="Leave out pixels that see smooth glass or mirrors directly, which light tracing cannot render.",
-    )
-    border: bool = Field(
-        default=True,
-        description="Leave out pixels within the reconstruction filter's radius of the film's border, where light "
-        "tracing is darker.",
-    )
-    clipped: bool = Field(
-        default=True,
-        description="Leave out pixels of 8 and 16 bit files that are at the greatest value in any channel.",
-    )
+    file: ConfigPath | None = None
+    """Image of weights, of the target's size, relative to the config file: 0 leaves a pixel out. Values are taken as
+    they stand in it, of 8 and 16 bits as shares of the greatest; of several channels the mean."""
+    specular: bool = True
+    """Leave out pixels that see smooth glass or mirrors directly, which light tracing cannot render."""
+    border: bool = True
+    """Leave out pixels within the reconstruction filter's radius of the film's border, where light tracing is
+    darker."""
+    clipped: bool = True
+    """Leave out pixels of 8 and 16 bit files that are at the greatest value in any channel."""
     alpha: bool = Field(default=True, description="Leave out pixels whose alpha is 0.")
-    nonfinite: bool = Field(
-        default=True, description="Leave out pixels that are not finite; false: a file that has any is refused."
-    )
-
-    @property
-    def is_empty(self) -> bool:
-        """Whether it leaves nothing out, and weighs nothing."""
-        return self.file is None and not any(getattr(self, kind) for kind in _KINDS)
+    nonfinite: bool = True
+    """Leave out pixels that are not finite; false: a file that has any is refused."""
 
 
 def _mask(value: Any) -> Any:
@@ -74,18 +72,6 @@ class _OrText:
 AnyMask = Annotated[Mask, BeforeValidator(_mask), _OrText()]
 
 
-MASK = (
-    "Pixels that are left out of the loss, and what the others weigh: `auto` (all kinds are left out), `none`, the "
-    "path of an image of weights, alone, or a section that switches kinds off and may add weights."
-)
-
-
-MASK_MIXED = (
-    "Leave out, with `specular`, the pixels that see a coat, a blend or a thin pane directly, of whose light light "
-    "tracing lacks a part; else they stay, and are counted."
-)
-
-
 def _exposure(value: Any) -> Any:
     is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
     if (is_number and math.isfinite(value) and value > 0) or value in ("auto", "per_channel"):
@@ -93,11 +79,13 @@ def _exposure(value: Any) -> Any:
     raise wrong("must be a positive number, `auto` or `per_channel`")
 
 
+_EXPOSURE = [{"type": "number", "exclusiveMinimum": 0}, {"enum": ["auto", "per_channel"]}]
+
 #: One view's exposure: a number, `auto` (recovered, one factor), or `per_channel` (recovered, one factor a channel).
 Exposure = Annotated[
     float | Literal["auto", "per_channel"],
     BeforeValidator(_exposure),
-    WithJsonSchema({"anyOf": [{"type": "number", "exclusiveMinimum": 0}, {"enum": ["auto", "per_channel"]}]}),
+    WithJsonSchema({"anyOf": _EXPOSURE}),
 ]
 
 
@@ -109,22 +97,8 @@ def _exposures(value: Any) -> Any:
 Exposures = Annotated[
     float | Literal["auto", "per_channel"] | list[Exposure],
     BeforeValidator(_exposures),
-    WithJsonSchema(
-        {
-            "anyOf": [
-                {"type": "number", "exclusiveMinimum": 0},
-                {"enum": ["auto", "per_channel"]},
-                {"type": "array", "items": {"anyOf": [{"type": "number"}, {"enum": ["auto", "per_channel"]}]}},
-            ]
-        }
-    ),
+    WithJsonSchema({"anyOf": [*_EXPOSURE, {"type": "array", "items": {"anyOf": [{"type": "number"}, _EXPOSURE[1]]}}]}),
 ]
-
-
-EXPOSURE = (
-    "What the image is multiplied by before it is compared, target = exposure * image: a number, `auto` (recovered "
-    "with the parameters, one factor), or `per_channel` (recovered, one for each channel, which is white balance)"
-)
 
 
 def _sensor_name(value: Any) -> Any:
@@ -141,23 +115,90 @@ SensorName = Annotated[
 ]
 
 
+class Rendering(Section):
+    """A target that is rendered from the scene itself, with other parameter values."""
+
+    parameters: Annotated[
+        dict[str, Value],
+        must(
+            lambda values: all(0 < len(key) <= KEY_LENGTH for key in values),
+            lambda _: f"must have keys that are not empty, and have at most {KEY_LENGTH} characters",
+        ),
+    ] = Field(default={})
+    """True values by key, as in `parameters`: a number, a list of numbers, or an image file. Empty: the scene as it
+    stands."""
+    spp: Count = Field(default=1024, description="Samples per pixel of the target.")
+    seed: Seed = Field(default=0, description="Seed of the target's samples.")
+    integrator: AnyIntegrator | None = None
+    """Integrator of the target; null: that of the run."""
+
+
+_PATH = {"type": "string", "format": "path"}
+
+_Files = Annotated[
+    list[ConfigPath],
+    Field(min_length=1),
+    BeforeValidator(list_of_one),
+    WithJsonSchema({"anyOf": [_PATH, {"type": "array", "items": _PATH, "minItems": 1}]}),
+]
+
+
+class TargetConfig(Section):
+    """What the image is compared with: exactly one of `file` and `render`; views with own targets need none."""
+
+    file: _Files | None = None
+    """Target image (EXR, PNG, JPG, HDR), or a list with one for each sensor, in their order; relative to the config
+    file. It is turned as its EXIF orientation says, unless `scene.cameras` is given."""
+    color_space: ColorSpace = Field(default="auto", description=f"{COLOR_SPACE} Only with `file`.")
+    gamma: Positive | None = None
+    """Decode values of 8 and 16 bit files by this power, in place of `color_space`. Only with `file`."""
+    render: Rendering | None = Field(default=None, description="Render the target from the scene.")
+    mask: AnyMask = Mask()
+    """Pixels that are left out of the loss, and what the others weigh: `auto` (all kinds are left out), `none`, the
+    path of an image of weights, alone, or a section that switches kinds off and may add weights."""
+    mask_mixed: bool = False
+    """Leave out, with `specular`, the pixels that see a coat, a blend or a thin pane directly, of whose light light
+    tracing lacks a part; else they stay, and are counted."""
+    exposure: Exposures = 1.0
+    """What the image is multiplied by before it is compared, target = exposure * image: a number, `auto` (recovered
+    with the parameters, one factor), or `per_channel` (recovered, one for each channel, which is white balance), all
+    views having the same; or a list of these with one for each view, which are then recovered apart."""
+
+    @model_validator(mode="after")
+    def _check_one(self) -> Self:
+        if self.file is not None and self.render is not None:
+            raise located("", "must have exactly one of `file` and `render`, and has both")
+        if self.render is not None and self.color_space != "auto":
+            raise located("color_space", "has no effect on a rendered target; it goes with `file`")
+        if self.render is not None and self.gamma is not None:
+            raise located("gamma", "has no effect on a rendered target; it goes with `file`")
+        if self.gamma is not None and self.color_space != "auto":
+            raise located("gamma", "decodes the file in place of color_space; give one of the two")
+        return self
+
+    @model_serializer(mode="wrap")
+    def _without_unused(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        values: dict[str, Any] = handler(self)
+        if self.render is not None:
+            values.pop("color_space", None)
+        return values
+
+
 class ViewSpec(Section):
     """One view: a sensor of the scene, and what it is to see."""
 
     sensor: Annotated[int, Field(ge=0)] = Field(description="Index of the scene's sensor.")
-    target: ConfigPath | None = Field(
-        default=None, description="Target image, relative to the config file; null: rendered, as `target.render` says."
-    )
+    target: ConfigPath | None = None
+    """Target image, relative to the config file; null: rendered, as `target.render` says."""
     mask: AnyMask | None = Field(default=None, description="As `target.mask`, which it stands in place of.")
     mask_mixed: bool | None = Field(default=None, description="As `target.mask_mixed`, which it stands in place of.")
     weight: Positive = Field(default=1.0, description="The view's part of the loss, relative to the other views'.")
-    exposure: Exposure | None = Field(
-        default=None, description="As `target.exposure`, but recovered for this view alone where it is not a number."
-    )
+    exposure: Exposure | None = None
+    """As `target.exposure`, but recovered for this view alone where it is not a number."""
     loss: AnyLoss | None = Field(default=None, description="How this view is compared; null: as `loss` says.")
 
 
-def check_views(views: list[ViewSpec], scene: Any, target: Any) -> None:
+def check_views(views: list[ViewSpec], scene: Any, target: TargetConfig) -> None:
     """Raise an error, located, where views and the short forms, `scene.sensors` and `target`, contradict each other."""
     places: dict[int, int] = {}
     for number, view in enumerate(views):

@@ -17,21 +17,12 @@ from reslrb_cli.errors import ConfigError
 
 #: Text, lists, mappings, null: what PyYAML builds of its own that is plain data in YAML 1.2 too.
 _KEPT = ("str", "seq", "map", "null", "bool")
-
-
 _TAG = "tag:yaml.org,2002:"
-
 
 #: Tags that a key may have: it is text, or `<<`.
 TEXT_TAGS = (f"{_TAG}str", f"{_TAG}merge")
-
-
 FLOAT = re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?$|[-+]?\.(inf|Inf|INF)$|\.(nan|NaN|NAN)$")
-
-
 INTEGER = re.compile(r"[-+]?[0-9]+$|0o[0-7]+$|0x[0-9a-fA-F]+$")
-
-
 DIGITS = list("-+.0123456789")
 
 
@@ -110,38 +101,19 @@ def _refuse(loader: Loader, node: yaml.Node) -> None:
 
 
 Loader.add_implicit_resolver(f"{_TAG}null", re.compile(r"(~|null|Null|NULL)?$"), ["~", "n", "N", ""])
-
-
 Loader.add_implicit_resolver(f"{_TAG}bool", re.compile(r"(true|True|TRUE|false|False|FALSE)$"), list("tTfF"))
-
-
 Loader.add_implicit_resolver(f"{_TAG}int", INTEGER, DIGITS)
-
-
 Loader.add_implicit_resolver(f"{_TAG}float", FLOAT, DIGITS)
-
-
 Loader.add_implicit_resolver(f"{_TAG}merge", re.compile(r"<<$"), ["<"])
-
-
 Loader.add_constructor(f"{_TAG}str", _construct_text)
-
-
 Loader.add_constructor(f"{_TAG}int", _construct_integer)
-
-
 Loader.add_constructor(f"{_TAG}float", _construct_float)
-
-
 Loader.add_constructor(None, _refuse)
-
 
 Location = tuple["str | int", ...]
 
-
 #: What no key holds: control characters, and halves of surrogate pairs.
 UNFIT = re.compile(r"[\x00-\x1f\x7f-\x9f\ud800-\udfff]")
-
 
 #: What an alias begins with, up to where YAML or a reader would take it to end.
 _ALIAS = re.compile(r"\*[^\s,\]}]*")
@@ -204,18 +176,11 @@ def _problem(error: yaml.MarkedYAMLError, text: str, example: Callable[[str], st
     return f"not valid YAML: {problem}{hint}"
 
 
-def count_values(data: Any, most: int) -> int:
-    """How many values and keys plain `data` holds, where the same list stands twice counted twice; at most `most`."""
-    count, waiting = 0, [data]
-    while waiting and count < most:
-        value = waiting.pop()
-        count += 1
-        if isinstance(value, dict):
-            count += len(value)
-            waiting += value.values()
-        elif isinstance(value, list):
-            waiting += value
-    return min(count, most)
+def count_values(data: Any) -> int:
+    """How many values and keys plain `data`, as `parse` bounds it, holds: the same list stands twice, counted twice."""
+    if isinstance(data, dict):
+        return 1 + len(data) + sum(map(count_values, data.values()))
+    return 1 + sum(map(count_values, data)) if isinstance(data, list) else 1
 
 
 def _check_keys(node: yaml.Node, at: Callable[[int], str], location: Location, seen: set[int]) -> None:
@@ -256,11 +221,7 @@ def _represent_list(dumper: _Dumper, data: list[Any]) -> yaml.SequenceNode:
 
 
 _Dumper.add_implicit_resolver("tag:yaml.org,2002:float", FLOAT, DIGITS)
-
-
 _Dumper.add_implicit_resolver("tag:yaml.org,2002:int", INTEGER, DIGITS)
-
-
 _Dumper.add_representer(list, _represent_list)
 
 

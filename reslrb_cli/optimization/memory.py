@@ -20,8 +20,9 @@ import mitsuba as mi
 
 from reslrb_cli.backend.doctor import resident_paths
 from reslrb_cli.backend.memory import free_bytes, local_bytes
-from reslrb_cli.config.files import divisors, in_words, passes_obstacle
+from reslrb_cli.config.files import in_words
 from reslrb_cli.config.integrators import Reslrb as ReslrbConfig
+from reslrb_cli.config.integrators import divisors, passes_obstacle
 from reslrb_cli.config.parameters import ParameterSpec
 from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ConfigError

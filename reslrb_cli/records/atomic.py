@@ -12,8 +12,8 @@ import contextlib
 import glob
 import os
 import re
+import secrets
 import shutil
-import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -21,10 +21,8 @@ from typing import IO
 
 _PART = re.compile(r"\..+\.\d+\.part")
 
-
 #: How the names of folders that are not finished begin.
 FOLDER_PREFIX = ".reslrb-"
-
 
 #: Files and folders that this process is about to finish.
 unfinished: set[Path] = set()
@@ -58,9 +56,10 @@ def write_atomically(path: Path, write: Callable[[IO[bytes]], object], durable: 
 @contextmanager
 def unfinished_folder(parent: Path) -> Iterator[Path]:
     """A new folder in `parent`, which the block may rename; else it is removed at its end, with all that is in it."""
-    path = Path(tempfile.mkdtemp(prefix=FOLDER_PREFIX, dir=parent))
+    path = parent / f"{FOLDER_PREFIX}{secrets.token_hex(8)}"
     unfinished.add(path)
     try:
+        path.mkdir()
         yield path
     finally:
         shutil.rmtree(path, ignore_errors=True)
@@ -89,12 +88,12 @@ def remove_parts(folder: Path) -> None:
 def remove_parts_of(path: Path) -> None:
     """Remove what processes that are no more began to write in place of the file `path`, and never finished."""
     for part in path.parent.glob(f".{glob.escape(path.name)}.*.part"):
-        if _PART.fullmatch(part.name) and not _is_alive(int(part.name.split(".")[-2])):
+        if _PART.fullmatch(part.name) and not is_alive(int(part.name.split(".")[-2])):
             with contextlib.suppress(OSError):
                 part.unlink()
 
 
-def _is_alive(process: int) -> bool:
+def is_alive(process: int) -> bool:
     """Whether there is a process of this number."""
     try:
         os.kill(process, 0)

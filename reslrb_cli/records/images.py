@@ -22,6 +22,8 @@ import numpy as np
 from reslrb_cli.config.parameters import HEIGHTMAP
 from reslrb_cli.records.atomic import write_atomically
 
+Array = np.ndarray[Any, Any]
+
 #: Bytes of such a name. File systems take 255, of which some are for suffixes and for files that are being written.
 MOST_BYTES = 180
 
@@ -50,7 +52,7 @@ def _numbered(stem: str, whole: str) -> str:
 FORMATS = {".exr": "OpenEXR", ".hdr": "RGBE", ".pfm": "PFM", ".png": "PNG", ".jpg": "JPEG", ".jpeg": "JPEG"}
 
 
-def write_image(stem: Path, image: np.ndarray[Any, Any], shown: np.ndarray[Any, Any] | None = None) -> None:
+def write_image(stem: Path, image: Array, shown: Array | None = None) -> None:
     """Write an (H, W, C) image of linear values as `<stem>.exr`, and it or what is `shown` of it as `<stem>.png`.
 
     `stem` is appended to rather than given a new suffix: keys of parameters have dots of their own.
@@ -59,7 +61,7 @@ def write_image(stem: Path, image: np.ndarray[Any, Any], shown: np.ndarray[Any, 
     write_file(Path(f"{stem}.png"), image if shown is None else shown, linear=False)
 
 
-def finite_range(arrays: Iterable[np.ndarray[Any, Any]]) -> tuple[float, float]:
+def finite_range(arrays: Iterable[Array]) -> tuple[float, float]:
     """The least and the greatest finite value in any of the arrays; 0 and 0 where there is none."""
     known = [values for array in arrays if (values := array[np.isfinite(array)]).size]
     if not known:
@@ -67,7 +69,7 @@ def finite_range(arrays: Iterable[np.ndarray[Any, Any]]) -> tuple[float, float]:
     return min(float(values.min()) for values in known), max(float(values.max()) for values in known)
 
 
-def write_file(path: Path, image: np.ndarray[Any, Any], linear: bool) -> None:
+def write_file(path: Path, image: Array, linear: bool) -> None:
     """Write an (H, W, C) image of linear values in the format that the suffix of `path` names, atomically.
 
     `linear` writes it as it is; else it becomes 8-bit sRGB, clipped to [0, 1], and of four channels or more, and of
@@ -92,23 +94,15 @@ def write_bitmap(path: Path, bitmap: mi.Bitmap) -> None:
     write_atomically(path, lambda file: file.write(stream.raw_buffer()))
 
 
-def read_exr(path: Path) -> np.ndarray[Any, Any]:
-    """Read an image of linear values that `write_image` wrote; (H, W, C) float32. Raises OSError or RuntimeError."""
-    with path.open("rb"):  # else the exception is Mitsuba's
-        pass
-    array = np.array(mi.Bitmap(str(path)), dtype=np.float32)
-    return array if array.ndim == 3 else array[:, :, None]
-
-
-def load_image(path: Path) -> np.ndarray[Any, Any] | None:
-    """The same; None where there is no image, or what is there is damaged."""
+def load_image(path: Path) -> Array | None:
+    """An image of linear values that `write_image` wrote, (H, W, C) float32; None where none is, or it is damaged."""
+    if not path.is_file():
+        return None
     try:
-        return read_exr(path)
+        array = np.array(mi.Bitmap(str(path)), dtype=np.float32)
     except (OSError, RuntimeError, ValueError):
         return None
-
-
-Array = np.ndarray[Any, Any]
+    return array if array.ndim == 3 else array[:, :, None]
 
 
 #: Names of the channels of a layer, by their number. A layer of another number has them counted.

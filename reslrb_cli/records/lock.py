@@ -8,29 +8,21 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import fcntl
 import os
 import platform
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
-try:
-    import fcntl
-except ImportError:  # Windows
-    fcntl = None  # type: ignore[assignment]
-
+from reslrb_cli.records.atomic import is_alive
 
 #: Who reads a folder, or puts its manifest right, has the lock for an instant: no run is refused over that, and no
 #: other reader takes it for a run.
 WAIT_SECONDS, READER_WAIT_SECONDS = 1.0, 0.25
-
-
 _POLL_SECONDS = 0.01
-
-
 _HELD = {errno.EWOULDBLOCK, errno.EAGAIN, errno.EACCES}
 
 
@@ -47,21 +39,18 @@ class FolderLock:
     """
 
     def __init__(self, folder: Path, wait_s: float = WAIT_SECONDS, shared: bool = False) -> None:
-        flags = os.O_RDONLY | getattr(os, "O_DIRECTORY", 0) | getattr(os, "O_NOFOLLOW", 0)
-        self._descriptor: int | None = os.open(folder, flags) if fcntl is not None else None
+        self._descriptor: int | None = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
         try:
-            self.real = self._take(wait_s, shared)
+            self.real = self._take(self._descriptor, wait_s, shared)
         except BaseException:
             self.release()
             raise
 
-    def _take(self, wait_s: float, shared: bool) -> bool:
-        if self._descriptor is None:
-            return False
+    def _take(self, descriptor: int, wait_s: float, shared: bool) -> bool:
         kind, end = fcntl.LOCK_SH if shared else fcntl.LOCK_EX, time.monotonic() + wait_s
         while True:
             try:
-                fcntl.flock(self._descriptor, kind | fcntl.LOCK_NB)
+                fcntl.flock(descriptor, kind | fcntl.LOCK_NB)
             except OSError as error:
                 if error.errno not in _HELD:
                     return False
@@ -73,10 +62,8 @@ class FolderLock:
 
     def is_of(self, folder: Path) -> bool:
         """Whether the folder at that path is the one that is locked, which may have been moved or removed since."""
-        if self._descriptor is None:
-            return folder.is_dir()
         try:
-            return os.path.samestat(os.fstat(self._descriptor), os.lstat(folder))
+            return self._descriptor is not None and os.path.samestat(os.fstat(self._descriptor), os.lstat(folder))
         except OSError:
             return False
 
@@ -89,9 +76,7 @@ class FolderLock:
     def __enter__(self) -> FolderLock:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.release()
 
 
@@ -126,37 +111,19 @@ class Holder:
 
         Where that cannot be known, as of a process on another machine without common locks, it has not.
         """
+        here = Holder.here(locked=False)
+        same_kernel = self.host == here.host or (self.boot is not None and self.boot == here.boot)
         if self.locked:
             try:
                 with FolderLock(folder, READER_WAIT_SECONDS, shared=True) as lock:
                     if lock.real:
-                        return self._shares_locks(folder)
+                        # Not everywhere do machines share locks of network disks, which have no block device.
+                        return same_kernel or os.major(os.stat(folder).st_dev) != 0
             except InUse:
                 return False
             except OSError:
                 pass  # the folder cannot be opened: no lock to ask
-        return self._is_no_process()
-
-    def _shares_locks(self, folder: Path) -> bool:
-        """Whether a lock of the process would be seen here: not everywhere do machines share locks of network disks."""
-        here = Holder.here(locked=True)
-        same_kernel = self.host == here.host or (self.boot is not None and self.boot == here.boot)
-        # Network file systems have no block device.
-        return same_kernel or os.major(os.stat(folder).st_dev) != 0
-
-    def _is_no_process(self) -> bool:
-        here = Holder.here(locked=False)
-        if self.host != here.host:
-            return False
-        if self.boot != here.boot:
-            return True
-        try:
-            os.kill(self.pid, 0)
-        except ProcessLookupError:
-            return True
-        except OSError:  # it is another user's
-            pass
-        return False
+        return self.host == here.host and (self.boot != here.boot or not is_alive(self.pid))
 
     def __str__(self) -> str:
         return f"process {self.pid} on {self.host}"

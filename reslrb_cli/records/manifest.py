@@ -1,15 +1,13 @@
 """The manifest of a run, `manifest.json`: what ran, on what, and how it ended.
 
-On the disk it is written whole, is readable whatever happens, and has room for an end that fits on a full disk. Where
-the process has gone without ending the run (killed, out of memory, the machine switched off), `read_manifest` puts
-right what it left.
+Where the process has gone without ending the run (killed, out of memory, the machine switched off), `read_manifest`
+puts right what it left.
 """
 
 from __future__ import annotations
 
 import contextlib
 import enum
-import errno
 import json
 import os
 import platform
@@ -18,11 +16,11 @@ import threading
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from datetime import datetime, timezone
-from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 from reslrb_cli import __version__
+from reslrb_cli.backend.variant import package_version
 from reslrb_cli.config.files import read_file
 from reslrb_cli.errors import ConfigError, printable
 from reslrb_cli.records import metrics
@@ -30,7 +28,6 @@ from reslrb_cli.records.atomic import remove_parts, write_atomically
 from reslrb_cli.records.lock import READER_WAIT_SECONDS, FolderLock, Holder, InUse
 
 PACKAGES = ("mitsuba", "drjit", "numpy")
-
 
 #: Held while a manifest is written; a process that is about to end takes it for good, after so many seconds at most.
 _WRITING, LAST_WAIT_SECONDS = threading.Lock(), 5.0
@@ -43,13 +40,8 @@ def now() -> str:
 
 def versions() -> dict[str, str]:
     """Versions of Python and of the packages that a result depends on."""
-    found = {"reslrb": __version__, "python": platform.python_version()}
-    for name in PACKAGES:
-        try:
-            found[name] = metadata.version(name)
-        except metadata.PackageNotFoundError:
-            found[name] = "not installed as a package"
-    return found
+    found = {name: package_version(name) or "not installed as a package" for name in PACKAGES}
+    return {"reslrb": __version__, "python": platform.python_version()} | found
 
 
 class Status(str, enum.Enum):
@@ -103,9 +95,9 @@ class Manifest:
     results: dict[str, Any] = field(default_factory=dict)
 
     def write(self, folder: Path) -> None:
-        """Write `manifest.json` into `folder`, atomically where the disk has room. Raises OSError."""
+        """Write `manifest.json` into `folder`, atomically. Raises OSError."""
         with _WRITING:
-            write_content(folder, self.content())
+            _write(folder, self.content())
 
     def end(self, folder: Path, status: Status, error: str | None = None) -> None:
         """Set the final status and the time, and write the file. Raises OSError."""
@@ -116,43 +108,18 @@ class Manifest:
         """The same in a process that is about to end, by a thread beside the one that works: that writes no more."""
         _WRITING.acquire(timeout=LAST_WAIT_SECONDS)  # and never released
         self.status, self.error, self.ended = status, None, now()
-        write_content(folder, self.content())
+        _write(folder, self.content())
 
     def content(self) -> dict[str, Any]:
         """What the file says once it is written."""
         return {"program": PROGRAM, **asdict(self), "status": self.status.value}
 
 
-def read_manifest(folder: Path) -> dict[str, Any] | None:
-    """Return the manifest in `folder`, or None where there is none that `reslrb` wrote.
-
-    One that was left saying `running` by a process that has gone says `interrupted`, on the disk too from then on, if
-    that can be written to.
-    """
-    content = read_content(folder)
-    return put_right(folder, content) if content is not None and is_abandoned(folder, content) else content
-
-
 MANIFEST_FILE = "manifest.json"
-
-
 PROGRAM = "reslrb"
-
 
 #: Bytes of a manifest; the largest part of one is a pilot's table, of some kB.
 MOST_BYTES = 2**24
-
-
-#: Bytes of white space behind a manifest that is not the last one, at least: room for how the run ends.
-ROOM = 1024
-
-
-#: What file systems allocate at once, or a multiple of it.
-_BLOCK = 4096
-
-
-#: What is kept of an error's line where there is no room for more.
-_SHORT = 300
 
 
 def read_content(folder: Path) -> dict[str, Any] | None:
@@ -164,77 +131,34 @@ def read_content(folder: Path) -> dict[str, Any] | None:
     return content if isinstance(content, dict) and content.get("program") == PROGRAM else None
 
 
-def write_content(folder: Path, content: Mapping[str, Any]) -> None:
-    """Write a manifest into `folder`, atomically; on a full disk over the one that is there. Raises OSError."""
-    text = _text(content)
-    if content["status"] == Status.RUNNING or content.get("missing"):
-        text = _padded(text, -(-(len(text) + ROOM) // _BLOCK) * _BLOCK)
-    try:
-        write_atomically(folder / MANIFEST_FILE, lambda file: file.write(text), durable=True)
-    except OSError as error:
-        if error.errno not in (errno.ENOSPC, errno.EDQUOT) or not _overwrite(folder / MANIFEST_FILE, content):
-            raise
+def _write(folder: Path, content: Mapping[str, Any]) -> None:
+    text = json.dumps(content, indent=2, allow_nan=False).encode() + b"\n"
+    write_atomically(folder / MANIFEST_FILE, lambda file: file.write(text), durable=True)
 
 
-def _overwrite(path: Path, content: Mapping[str, Any]) -> bool:
-    """Write a manifest into the blocks of the one at `path`; return whether that went well.
-
-    One that is too large for them leaves what is there, and changes how the run ended.
-    """
-    end = {key: content.get(key) for key in ("status", "ended", "missing", "error")}
-    shortest = end | {"missing": {}, "error": (content.get("error") or "")[:_SHORT] or None}
-    try:
-        with path.open("r+b") as file:
-            before = file.read()
-            there = json.loads(before)
-            for changed in (content, there | end, there | shortest):
-                text = _text(changed)
-                if len(text) <= len(before):
-                    file.seek(0)
-                    file.write(_padded(text, len(before)))
-                    file.flush()
-                    os.fsync(file.fileno())
-                    return True
-    except (OSError, ValueError):
-        pass
-    return False
-
-
-def _text(content: Mapping[str, Any]) -> bytes:
-    return json.dumps(content, indent=2, allow_nan=False).encode() + b"\n"
-
-
-def _padded(text: bytes, size: int) -> bytes:
-    return text[:-1].ljust(size - 1) + b"\n"
-
-
-#: What the manifest of such a run gives as its error.
+#: What the manifest of a run gives as its error whose process has gone.
 REASON = "its process ended before the run did"
 
 
-def is_abandoned(folder: Path, content: Mapping[str, Any]) -> bool:
-    """Whether the manifest in `folder`, `content`, says `running` and the process that wrote it has surely gone."""
-    if content.get("status") != Status.RUNNING:
-        return False
-    holder = Holder.from_json(content.get("process"))
-    return holder is None or holder.is_gone(folder)
+def read_manifest(folder: Path) -> dict[str, Any] | None:
+    """Return the manifest in `folder`, or None where there is none that `reslrb` wrote.
 
-
-def put_right(folder: Path, content: Mapping[str, Any]) -> dict[str, Any]:
-    """What the manifest of an abandoned run should say; written into `folder` too, if that can be.
-
-    What the run never finished is removed then.
+    One that was left saying `running` by a process that has surely gone says `interrupted`, on the disk too from then
+    on, if that can be written to; what the run never finished is removed then.
     """
-    right = dict(content) | {
-        "status": Status.INTERRUPTED.value,
-        "ended": _last_sign(folder) or content.get("ended"),
-        "error": REASON,
-    }
+    content = read_content(folder)
+    if content is None or content.get("status") != Status.RUNNING:
+        return content
+    holder = Holder.from_json(content.get("process"))
+    if holder is not None and not holder.is_gone(folder):
+        return content
+    ended = _last_sign(folder) or content.get("ended")
+    right = content | {"status": Status.INTERRUPTED.value, "ended": ended, "error": REASON}
     with contextlib.suppress(InUse, OSError), FolderLock(folder, READER_WAIT_SECONDS):
         if read_content(folder) == content:  # nobody was faster
             metrics.mend(folder)
             remove_parts(folder)
-            write_content(folder, right)
+            _write(folder, right)
     return right
 
 

@@ -18,9 +18,9 @@ import time
 import zipfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import IO, Any, Protocol
+from typing import IO, Any, ClassVar
 
 import numpy as np
 
@@ -28,20 +28,12 @@ from reslrb_cli.config.files import in_words, open_file
 from reslrb_cli.errors import ConfigError, printable
 from reslrb_cli.records.atomic import remove_parts_of, write_atomically
 from reslrb_cli.records.manifest import now, versions
-from reslrb_cli.records.metrics import MOST_BYTES
+from reslrb_cli.records.metrics import MOST_BYTES, Line
 
 logger = logging.getLogger(__name__)
 
-
-class Line(Protocol):
-    """What is a line of JSON."""
-
-    def to_json(self) -> str: ...
-
-
 #: Lines after which it is told how far reading has come.
 _LINES = 4096
-
 
 #: What is told of a file that is being read: it, the bytes that are done, and those that it has.
 Tell = Callable[[Path, int, int], None]
@@ -146,21 +138,20 @@ class LineFile:
             self._stream.close()
 
 
-KIND = "origin"
-
-
 def _command() -> list[str]:
     """The command line of this process, as it can be typed anywhere: the program without its folder."""
     return ["reslrb", *(printable(word) for word in sys.argv[1:])]
 
 
 @dataclass(frozen=True)
-class Origin:
+class Origin(Line):
     """What measured, on what, and the command that does it again.
 
     `command` are its words, `versions` those of `manifest.json`; `written` is when the file was begun. What a damaged
     or foreign line does not tell is empty.
     """
+
+    KIND: ClassVar[str] = "origin"
 
     device: str
     variant: str
@@ -169,14 +160,10 @@ class Origin:
     platform: str = field(default_factory=platform.platform)
     written: str = field(default_factory=now)
 
-    def to_json(self) -> str:
-        """The record as one line of JSON."""
-        return json.dumps({"kind": KIND, **asdict(self)}, allow_nan=False)
-
 
 def read_origin(entry: Mapping[str, Any]) -> Origin | None:
     """The record that a line holds; None where it holds another one. Members of other types than theirs are empty."""
-    if entry.get("kind") != KIND:
+    if entry.get("kind") != Origin.KIND:
         return None
     words, named = entry.get("command"), entry.get("versions")
     texts = {name: entry.get(name) for name in ("device", "variant", "platform", "written")}
@@ -190,11 +177,8 @@ def read_origin(entry: Mapping[str, Any]) -> Origin | None:
 #: Bytes of samples that are kept; more are not.
 MOST_SAMPLES_BYTES = 2**28
 
-
 #: A head, which JSON can hold, and arrays by name.
 Kept = tuple[dict[str, Any], dict[str, np.ndarray]]
-
-
 _HEAD = "head"
 
 

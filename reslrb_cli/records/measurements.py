@@ -13,13 +13,14 @@ from __future__ import annotations
 
 import enum
 import json
-import math
 import statistics
 from collections.abc import Mapping, Sequence
-from dataclasses import MISSING, asdict, dataclass, field, fields
-from typing import Any
+from dataclasses import asdict, dataclass, field
+from typing import Any, ClassVar, Literal, TypeVar
 
-from reslrb_cli.records.metrics import finite
+from pydantic import TypeAdapter, ValidationError
+
+from reslrb_cli.records.metrics import Line, finite
 
 
 class BenchStatus(str, enum.Enum):
@@ -45,7 +46,7 @@ class Spread:
 
 
 @dataclass(frozen=True)
-class BenchRecord:
+class BenchRecord(Line):
     """Cost of a step of one integrator at one depth, number of samples, size of film, and size of textures.
 
     `estimator` is None where the integrator has none; what makes it another than by default, but for `capacity`, stands
@@ -76,10 +77,6 @@ class BenchRecord:
     scratch_bytes: int | None
     repeats: int
     texels: int | None = None
-
-    def to_json(self) -> str:
-        """The record as one line of JSON."""
-        return json.dumps(asdict(self), allow_nan=False)
 
 
 #: Relative errors whose time is told.
@@ -113,13 +110,15 @@ class Method:
 
 
 @dataclass(frozen=True)
-class PointRecord:
+class PointRecord(Line):
     """The error of the average of `steps` steps, which take `elapsed_s` seconds.
 
     `parameter` is a parameter's key, `all` (of them together) or `image`. Errors are relative to the size of what is
     estimated, in L2 over all its entries. `relative_rmse` has the reference's own error, `reference_rmse`, subtracted,
     and is the root of the mean square over `repeats` such averages; None where it drowns in the reference's.
     """
+
+    KIND: ClassVar[str] = "point"
 
     method: Method
     parameter: str
@@ -129,13 +128,9 @@ class PointRecord:
     reference_rmse: float | None
     repeats: int
 
-    def to_json(self) -> str:
-        """The record as one line of JSON."""
-        return _convergence_line("point", self)
-
 
 @dataclass(frozen=True)
-class MethodRecord:
+class MethodRecord(Line):
     """What the points of one method and parameter come to; `repeats` is the number of steps.
 
     `relative_rmse` is that of one step, from their variance, which takes `step_s` seconds; `cold_s` is the first step
@@ -147,6 +142,8 @@ class MethodRecord:
     (`0.1`, `0.03`, `0.01`) the time until averages are as good, None where a bias keeps them from it; those in
     `extrapolated` lie beyond the steps that were taken, or below the reference's error. What was not measured is None.
     """
+
+    KIND: ClassVar[str] = "method"
 
     method: Method
     parameter: str
@@ -168,18 +165,16 @@ class MethodRecord:
     extrapolated: list[str] = field(default_factory=list)
     message: str = ""
 
-    def to_json(self) -> str:
-        """The record as one line of JSON."""
-        return _convergence_line("method", self)
-
 
 @dataclass(frozen=True)
-class ReferenceRecord:
+class ReferenceRecord(Line):
     """What errors are taken from: the mean of `repeats` steps, with the relative standard error `reference_rmse`.
 
     `bias_z` is its own largest deviation from an independent reference, as of a `MethodRecord`; None where there is
     none.
     """
+
+    KIND: ClassVar[str] = "reference"
 
     method: Method
     parameter: str
@@ -191,27 +186,14 @@ class ReferenceRecord:
     biased: bool | None = None
     message: str = ""
 
-    def to_json(self) -> str:
-        """The record as one line of JSON."""
-        return _convergence_line("reference", self)
-
 
 @dataclass(frozen=True)
-class SummaryRecord:
+class SummaryRecord(Line):
     """Which method is the best, in words."""
 
+    KIND: ClassVar[str] = "summary"
+
     line: str
-
-    def to_json(self) -> str:
-        """The record as one line of JSON."""
-        return json.dumps({"kind": "summary", "line": self.line})
-
-
-def _convergence_line(kind: str, record: PointRecord | MethodRecord | ReferenceRecord) -> str:
-    """One line: the method's fields beside the others; figures that are not finite become null."""
-    values = asdict(record)
-    method = values.pop("method")
-    return json.dumps({"kind": kind} | method | finite(values), allow_nan=False)
 
 
 class Reference(str, enum.Enum):
@@ -256,7 +238,7 @@ class Verdict(str, enum.Enum):
 
 
 @dataclass(frozen=True)
-class GradcheckRecord:
+class GradcheckRecord(Line):
     """One comparison: the gradient of a parameter by an integrator, against a reference.
 
     `case` names the scene: the configuration, or a case of a suite. `parameter` is None where all are compared
@@ -294,18 +276,13 @@ class GradcheckRecord:
 
     @classmethod
     def of(cls, values: Mapping[str, Any]) -> GradcheckRecord:
-        """The record of these values, by name. Raises TypeError and ValueError where they are none of a record."""
-        names = {"reference": Reference, "kind": Kind, "verdict": Verdict}
-        return cls(**{key: names[key](value) if key in names else value for key, value in values.items()})
+        """The record of these values, by name. Raises ValueError where they are none of a record."""
+        found: GradcheckRecord = _READERS[cls].validate_python(values)
+        return found
 
     def to_json(self) -> str:
         """The record as one line of JSON; figures that are not finite become null."""
-        values = {key: _finite(value) for key, value in asdict(self).items()}
-        return json.dumps(values | {"holds": self.holds}, allow_nan=False)
-
-
-def _finite(value: Any) -> Any:
-    return None if isinstance(value, float) and not math.isfinite(value) else value
+        return json.dumps(finite(asdict(self)) | {"holds": self.holds}, allow_nan=False)
 
 
 @dataclass(frozen=True)
@@ -323,13 +300,15 @@ class Band:
 
 
 @dataclass(frozen=True)
-class RunPointRecord:
+class RunPointRecord(Line):
     """Where one run stands after `elapsed_s` seconds, all its costs counted: `iteration` of them are done by then.
 
     `loss` is that of an image which all methods share the samples of. `parameter_error` is the root mean square error
     over all parameters whose true value is known, or, where these have no common unit, the root mean square of their
     relative errors; None where no true value is known. What is not finite becomes null in JSON.
     """
+
+    KIND: ClassVar[str] = "run_point"
 
     method: Method
     seed: int
@@ -338,19 +317,17 @@ class RunPointRecord:
     loss: float
     parameter_error: float | None
 
-    def to_json(self) -> str:
-        """The record as one line of JSON."""
-        return _runs_line("run_point", self)
-
 
 @dataclass(frozen=True)
-class RunMethodRecord:
+class RunMethodRecord(Line):
     """What the runs of one method came to after `elapsed_s` seconds each.
 
     `runs` is the number of those that came so far, which the bands are over; `status` is not ok where one of them ended
     before, as `message` says. `first_s` are the seconds until the first iteration was done: loading, pilot, compiling.
     What was not measured is None.
     """
+
+    KIND: ClassVar[str] = "run_method"
 
     method: Method
     status: BenchStatus
@@ -362,13 +339,9 @@ class RunMethodRecord:
     parameter_error: Band | None = None
     message: str = ""
 
-    def to_json(self) -> str:
-        """The record as one line of JSON."""
-        return _runs_line("run_method", self)
-
 
 @dataclass(frozen=True)
-class RunBestRecord:
+class RunBestRecord(Line):
     """A method at the best of its learning rates, and over the method that was named first.
 
     `of` is what is compared at the end of the runs, `loss` or `parameter_error`; `value` is that of the best rate,
@@ -376,6 +349,8 @@ class RunBestRecord:
     beyond. `ratio` is the median over that of the method `to` at its own best; None where that is not known. `line`
     is the record in words.
     """
+
+    KIND: ClassVar[str] = "run_best"
 
     label: str
     of: str
@@ -387,28 +362,16 @@ class RunBestRecord:
     to: str | None
     line: str = ""
 
-    def to_json(self) -> str:
-        """The record as one line of JSON."""
-        return json.dumps({"kind": "run_best"} | finite(asdict(self)), allow_nan=False)
-
-
-def _runs_line(kind: str, record: RunPointRecord | RunMethodRecord) -> str:
-    """One line: the method's fields beside the others; figures that are not finite become null."""
-    values = asdict(record)
-    method = values.pop("method")
-    return json.dumps({"kind": kind} | method | finite(values), allow_nan=False)
-
 
 #: Standard errors within which a share counts as none.
 NOTHING = 3
-
 
 #: A share that single precision may have made.
 LEAST = 1e-4
 
 
 @dataclass(frozen=True)
-class MissingRecord:
+class MissingRecord(Line):
     """The share of a parameter's derivative that is not in the attached gradient, relative to finite differences.
 
     `share` and `standard_error` are None where the derivative itself is lost in its noise.
@@ -420,12 +383,7 @@ class MissingRecord:
     standard_error: float | None
     directions: int
     seeds: int
-    kind: str = "missing"
-
-    def to_json(self) -> str:
-        """The record as one line of JSON."""
-        values = asdict(self)
-        return json.dumps({k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in values.items()})
+    kind: Literal["missing"] = "missing"
 
     def line(self) -> str:
         """What it says, in one line."""
@@ -444,37 +402,14 @@ def _percent(share: float) -> str:
     return f"{share:.1%}" if share < 0.0995 else f"{share:.0%}"
 
 
-def gradcheck_record(entry: Mapping[str, Any]) -> GradcheckRecord | None:
-    """The record that a line holds; None where it holds none."""
-    kinds: dict[str, tuple[type, ...]] = {"int": (int,), "str": (str,)}
-    found: dict[str, Any] = {}
+_READERS: dict[type[Line], TypeAdapter[Any]] = {kind: TypeAdapter(kind) for kind in (GradcheckRecord, MissingRecord)}
+R = TypeVar("R", bound=Line)
+
+
+def record_of(kind: type[R], entry: Mapping[str, Any]) -> R | None:
+    """The record of that class which a line, read back, holds; None where it holds none."""
     try:
-        for field in fields(GradcheckRecord):
-            if field.name not in entry and field.default is not MISSING:
-                continue
-            value = entry[field.name]
-            enums: dict[str, Any] = {"reference": Reference, "kind": Kind, "verdict": Verdict}
-            optional = "None" in str(field.type)
-            if field.name in enums:
-                value = enums[field.name](value)
-            elif not (optional and value is None):
-                name = str(field.type).partition(" ")[0]
-                if not isinstance(value, kinds.get(name, (int, float))):
-                    return None
-            found[field.name] = value
-    except (KeyError, ValueError):
+        found: R = _READERS[kind].validate_python(entry)
+    except ValidationError:
         return None
-    return GradcheckRecord(**found)
-
-
-def missing_record(entry: Mapping[str, Any]) -> MissingRecord | None:
-    """The record that a line holds; None where it holds none."""
-    if entry.get("kind") != "missing":
-        return None
-    texts = [entry.get(name) for name in ("case", "parameter")]
-    figures = [entry.get(name) for name in ("share", "standard_error")]
-    counts = [entry.get(name) for name in ("directions", "seeds")]
-    whole = all(isinstance(text, str) for text in texts) and all(isinstance(count, int) for count in counts)
-    if not whole or any(not isinstance(figure, int | float | None) for figure in figures):
-        return None
-    return MissingRecord(*texts, *figures, *counts)  # type: ignore[arg-type]
+    return found

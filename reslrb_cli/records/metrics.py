@@ -13,16 +13,52 @@ import math
 import os
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import MISSING, asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from types import TracebackType
-from typing import Any
+from typing import Annotated, Any, ClassVar
+
+from pydantic import ConfigDict, TypeAdapter, ValidationError, ValidatorFunctionWrapHandler, WrapValidator
 
 from reslrb_cli.config.files import read_file
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.records.atomic import write_atomically
 
 METRICS_FILE = "metrics.jsonl"
+
+#: Bytes of such a file. A million iterations of a run with ten parameters take as much.
+MOST_BYTES = 2**30
+
+
+class Line:
+    """A line of JSON: a dataclass's fields in their order, behind `kind` where the class has a `KIND`.
+
+    Those of a `method` stand beside the others, in front. Figures that are not finite become null: JSON has none.
+    """
+
+    KIND: ClassVar[str] = ""
+
+    def to_json(self) -> str:
+        """The record as one line of JSON."""
+        values = asdict(self)  # type: ignore[call-overload]  # of a dataclass derived from this
+        head = {"kind": self.KIND} if self.KIND else {}
+        return json.dumps(head | values.pop("method", {}) | finite(values), allow_nan=False)
+
+
+def finite(value: Any) -> Any:
+    """The same of mappings, lists and numbers, with None for numbers that are not finite: JSON has none."""
+    if isinstance(value, dict):
+        return {key: finite(entry) for key, entry in value.items()}
+    if isinstance(value, list):
+        return [finite(entry) for entry in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _nan_for_null(value: object, handler: ValidatorFunctionWrapHandler) -> float:
+    return math.nan if value is None else handler(value)
+
+
+#: A number that may be not finite, which JSON does not have.
+_Figure = Annotated[float, WrapValidator(_nan_for_null)]
 
 
 @dataclass(frozen=True)
@@ -32,12 +68,12 @@ class Clamped:
     that it took of their sum."""
 
     entries: int
-    share: dict[str, float]
-    bias: dict[str, float]
+    share: dict[str, _Figure]
+    bias: dict[str, _Figure]
 
 
 @dataclass(frozen=True)
-class Record:
+class Record(Line):
     """What one iteration was: its step, and the parameters before its update.
 
     `step_ms` is the wall time of the step (image, loss and gradient of every sensor, evaluated; the optimiser's update
@@ -53,8 +89,10 @@ class Record:
     None where they have no common unit, or no true value is known.
     """
 
+    __pydantic_config__ = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False)
+
     iteration: int
-    loss: float
+    loss: _Figure
     step_ms: float
     primal_ms: float | None
     adjoint_ms: float | None
@@ -63,26 +101,13 @@ class Record:
     peak_mib: float
     spp: int
     lr: float
-    grad_norm: float
+    grad_norm: _Figure
     nonfinite: int
     parameter_rmse: float | None
-    parameter_errors: dict[str, float] = field(default_factory=dict)
+    parameter_errors: dict[str, _Figure] = field(default_factory=dict)
     nonfinite_by_parameter: dict[str, int] = field(default_factory=dict)
     clamped: Clamped | None = None
     held_out: float | None = None
-
-    def to_json(self) -> str:
-        """The record as one line of JSON, non-finite numbers as null (JSON has none)."""
-        return json.dumps(finite(asdict(self)), allow_nan=False)
-
-
-def finite(value: Any) -> Any:
-    """The same of mappings, lists and numbers, with None for numbers that are not finite: JSON has none."""
-    if isinstance(value, dict):
-        return {key: finite(entry) for key, entry in value.items()}
-    if isinstance(value, list):
-        return [finite(entry) for entry in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 class MetricsWriter:
@@ -120,9 +145,7 @@ class MetricsWriter:
     def __enter__(self) -> MetricsWriter:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         if self._descriptor is not None:
             os.close(self._descriptor)
 
@@ -139,28 +162,6 @@ def mend(folder: Path) -> None:
         pass
 
 
-def read_metrics(folder: Path) -> list[dict[str, Any]]:
-    """Return the records in `folder`, oldest first; a last line that a crash cut short is left out."""
-    try:
-        lines = (folder / METRICS_FILE).read_text(encoding="utf-8").splitlines()
-    except FileNotFoundError:
-        return []
-    records = []
-    for number, line in enumerate(lines):
-        try:
-            records.append(json.loads(line))
-        except ValueError:
-            if number + 1 < len(lines):
-                raise
-    return records
-
-
-_NULL_IS_NAN = {"loss", "grad_norm"}  # numbers that may be not finite, which JSON does not have
-
-
-_NAMES = {field.name: field for field in fields(Record)}
-
-
 def read_records(folder: Path, count: int, last: Mapping[str, Any] | None) -> tuple[list[Record], int]:
     """The first `count` records in `folder`, and the bytes that they take; the rest was not kept by a checkpoint.
 
@@ -169,12 +170,8 @@ def read_records(folder: Path, count: int, last: Mapping[str, Any] | None) -> tu
     """
     path = folder / METRICS_FILE
     content = read_file(path, MOST_BYTES) if count and os.path.lexists(path) else b""
-    records: list[Record] = []
-    size = 0
-    for number, line in enumerate(content.splitlines(keepends=True)[:count]):
-        if line.endswith(b"\n"):
-            records.append(_record(line, number, path))
-            size += len(line)
+    whole = [line for line in content.splitlines(keepends=True)[:count] if line.endswith(b"\n")]
+    records = [_record(line, number, path) for number, line in enumerate(whole)]
     if len(records) == count - 1 and last is not None:
         records.append(_record(json.dumps(last).encode(), count - 1, path))
     if len(records) < count:
@@ -184,7 +181,7 @@ def read_records(folder: Path, count: int, last: Mapping[str, Any] | None) -> tu
             f"holds {len(records)} of the {count} iterations of the checkpoint; put it back, or begin anew from "
             "`initial: {run: ...}`",
         )
-    return records, size
+    return records, sum(map(len, whole))
 
 
 def cut_back(folder: Path, records: list[Record], size: int) -> None:
@@ -193,56 +190,26 @@ def cut_back(folder: Path, records: list[Record], size: int) -> None:
     if not records:
         path.unlink(missing_ok=True)
         return
-    if size == 0:  # of a run of one iteration, whose line was lost: it is never seen empty
-        write_atomically(path, lambda file: file.write(records[-1].to_json().encode() + b"\n"), durable=True)
-        return
-    with path.open("r+b") as file:
-        file.truncate(size)
-        file.seek(0)
-        written = sum(1 for _ in file)
-        if written < len(records):
-            file.write(records[-1].to_json().encode() + b"\n")
-        file.flush()
-        os.fsync(file.fileno())
+    content = read_file(path, MOST_BYTES)[:size] if size else b""
+    if content.count(b"\n") < len(records):
+        content += records[-1].to_json().encode() + b"\n"
+    write_atomically(path, lambda file: file.write(content), durable=True)
+
+
+_RECORD: TypeAdapter[Record] = TypeAdapter(Record)
 
 
 def _record(line: bytes, number: int, path: Path) -> Record:
     """The record of iteration `number`. Raises ConfigError."""
     try:
-        found = json.loads(line)
-        if not isinstance(found, dict) or found.get("iteration") != number:
-            raise ValueError("another iteration, or none")
-        absent = {name for name, field in _NAMES.items() if name not in found and field.default is MISSING}
-        if absent - {"parameter_errors", "nonfinite_by_parameter"} or set(found) - set(_NAMES):
-            raise ValueError("other names")
-        values: dict[str, Any] = {name: _value(name, value) for name, value in found.items()}
-        return Record(**values)
-    except (ValueError, TypeError, RecursionError) as error:
-        reason = f"is not what a run writes ({error or type(error).__name__})"
-        raise ConfigError(path, f"line {number + 1}", reason) from None
-
-
-def _value(name: str, value: Any) -> Any:
-    if name == "clamped" and value is not None:
-        shares = {each: _numbers(value[each]) for each in ("share", "bias")}
-        return Clamped(int(_number(value["entries"])), **shares)
-    if name in ("parameter_errors", "nonfinite_by_parameter"):
-        return _numbers(value, int if name.startswith("nonfinite") else float)
-    if value is None:
-        return math.nan if name in _NULL_IS_NAN else None
-    return _number(value)
-
-
-def _numbers(value: Any, kind: type = float) -> dict[str, Any]:
-    if not isinstance(value, dict):
-        raise ValueError("a mapping is missing")
-    return {str(key): math.nan if each is None else kind(_number(each)) for key, each in value.items()}
-
-
-def _number(value: Any) -> float | int:
-    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < 1e308:
-        raise ValueError("a number is missing")
-    return value
+        record = _RECORD.validate_json(line)
+        if record.iteration == number:
+            return record
+        reason = "another iteration"
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        reason = ": ".join([*map(str, first["loc"]), first["msg"]])
+    raise ConfigError(path, f"line {number + 1}", f"is not what a run writes ({reason})")
 
 
 @dataclass
@@ -289,8 +256,8 @@ class ClampTally:
 
     def to_json(self) -> dict[str, Any]:
         """For the manifest."""
-        bias = {key: value if math.isfinite(value) else None for key, value in self.bias.items()}
-        return {"iterations": self.iterations, "entries": self.entries, "bias": bias}
+        found: dict[str, Any] = finite(asdict(self))
+        return found
 
     def __str__(self) -> str:
         """For the last line of a run; empty where nothing was clamped."""
@@ -298,7 +265,3 @@ class ClampTally:
             return ""
         shares = ", ".join(f"{100 * value:.2g} % of that of {key}" for key, value in self.bias.items())
         return f"{self.entries} entries of gradients clamped in {self.iterations} iterations: a bias of {shares}"
-
-
-#: Bytes of such a file. A million iterations of a run with ten parameters take as much.
-MOST_BYTES = 2**30

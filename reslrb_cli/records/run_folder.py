@@ -13,11 +13,11 @@ import errno
 import itertools
 import os
 import shutil
+import tempfile
 import time
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 import numpy as np
@@ -25,13 +25,12 @@ import numpy as np
 from reslrb_cli.errors import ConfigError, MachineError, is_machine_fault
 from reslrb_cli.records import manifest as manifests
 from reslrb_cli.records import metrics
-from reslrb_cli.records.atomic import FOLDER_PREFIX, remove_parts, unfinished, unfinished_folder, write_atomically
+from reslrb_cli.records.atomic import FOLDER_PREFIX, remove_parts, unfinished_folder, write_atomically
 from reslrb_cli.records.checkpoint import STATE_FILE, Archive, newest_checkpoint
 from reslrb_cli.records.lock import READER_WAIT_SECONDS, FolderLock, Holder, InUse
 from reslrb_cli.records.manifest import Manifest, Status, read_manifest
 
 Array = np.ndarray[Any, Any]
-
 
 #: Keys that an error names.
 _SHOWN = 3
@@ -57,22 +56,26 @@ def read_value(run: Path, key: str) -> Array:
 
 def checkpoint_of(run: Path) -> Path:
     """The file of the newest checkpoint of the run folder `run`. Raises ConfigError where there is none."""
-    if not run.is_dir():
-        what = "is a file, not the folder of a run" if os.path.lexists(run) else "no such folder"
-        raise ConfigError(run, "", what)
-    if read_manifest(run) is None:
-        raise ConfigError(run, "", "is no run's folder: it has no manifest.json that a run wrote")
+    _manifest_of(run)
     path = newest_checkpoint(run / "checkpoint")
     if path is None:
         raise ConfigError(run, "", f"has no checkpoint/{STATE_FILE}: the run ended before it kept anything")
     return path
 
 
+def _manifest_of(run: Path) -> dict[str, Any]:
+    """What the manifest of the run folder `run` says, that of a killed run put right. Raises ConfigError."""
+    if not run.is_dir():
+        what = "is a file, not the folder of a run" if os.path.lexists(run) else "no such folder"
+        raise ConfigError(run, "", what)
+    content = read_manifest(run)
+    if content is None:
+        raise ConfigError(run, "", "is no run's folder: it has no manifest.json that a run wrote")
+    return content
+
+
 SUBFOLDERS = ("images", "parameters", "checkpoint")
-
-
 OWN_ENTRIES = ("config.yaml", manifests.MANIFEST_FILE, metrics.METRICS_FILE, "report.html", *SUBFOLDERS)
-
 
 #: An unfinished folder without a process is removed when it is so old: nobody is just about to lock it.
 LEFT_SECONDS = 60.0
@@ -83,8 +86,6 @@ def check_output(source: object, output: Path, name: str, force: bool) -> None:
 
     Tried, not asked: for root, permissions say nothing. Leaves nothing behind. Raises MachineError for a full disk.
     """
-    if not name or name in (".", "..") or "/" in name or "\\" in name or "\0" in name:
-        raise ConfigError(source, "run.name", f"{name!r} cannot name a folder; give a name without slashes")
     ancestor = next(path for path in (output, *output.absolute().parents) if os.path.lexists(path))
     if not ancestor.is_dir():
         raise ConfigError(source, "run.output", f"{ancestor} is not a folder; give a folder that can be written to")
@@ -131,7 +132,6 @@ class RunFolder:
                 (part / "config.yaml").write_text(config, encoding="utf-8")
                 manifest.process = Holder.here(locked=lock.real)
                 manifest.write(part)
-                part.chmod(0o777 & ~_umask())
                 own = cls(part, lock)
                 folder = own._replace(source, output / name, manifest) if force else own._place(output / name)
                 if folder.lock is lock:
@@ -142,11 +142,8 @@ class RunFolder:
 
     def _place(self, wanted: Path) -> RunFolder:
         """Rename the folder to the first free of `wanted`, `wanted-2`, ..."""
-        for number in itertools.count(1):
-            path = wanted if number == 1 else wanted.with_name(f"{wanted.name}-{number}")
-            if self._take_name(path):
-                return replace(self, path=path)
-        raise AssertionError("unreachable: count() does not end")
+        names = itertools.chain([wanted], (wanted.with_name(f"{wanted.name}-{n}") for n in itertools.count(2)))
+        return replace(self, path=next(path for path in names if self._take_name(path)))
 
     def _take_name(self, path: Path) -> bool:
         """Rename the folder to `path`, unless there is something already."""
@@ -185,22 +182,19 @@ class RunFolder:
 
     def _replace_others(self, path: Path, manifest: Manifest) -> None:
         try:
-            self._move_others(path)
+            remove_parts(path)
+            for name in OWN_ENTRIES:
+                entry = path / name
+                if entry.is_dir() and not entry.is_symlink():
+                    shutil.rmtree(entry)
+                elif name != manifests.MANIFEST_FILE:
+                    entry.unlink(missing_ok=True)
+            for name in ("config.yaml", *SUBFOLDERS):
+                os.replace(self.path / name, path / name)
         except OSError as error:
             with contextlib.suppress(OSError):
                 manifest.end(path, Status.FAILED, str(error))
             raise
-
-    def _move_others(self, path: Path) -> None:
-        remove_parts(path)
-        for name in OWN_ENTRIES:
-            entry = path / name
-            if entry.is_dir() and not entry.is_symlink():
-                shutil.rmtree(entry)
-            elif name != manifests.MANIFEST_FILE:
-                entry.unlink(missing_ok=True)
-        for name in ("config.yaml", *SUBFOLDERS):
-            os.replace(self.path / name, path / name)
 
     @property
     def is_there(self) -> bool:
@@ -236,9 +230,7 @@ class RunFolder:
     def __enter__(self) -> RunFolder:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         if self.lock is not None:
             self.lock.release()
 
@@ -246,8 +238,6 @@ class RunFolder:
 def _try_name(source: object, folder: Path, name: str) -> None:
     try:
         (folder / f"{name}-2").mkdir()  # as a second run would be called
-    except ValueError:  # characters that no file name can have
-        raise ConfigError(source, "run.name", f"{name!r} cannot name a folder; give another name") from None
     except OSError as error:
         if is_machine_fault(error):
             raise
@@ -292,33 +282,23 @@ def _remove_left(output: Path) -> None:
                         shutil.rmtree(path, ignore_errors=True)
 
 
-def _umask() -> int:
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask
-
-
 @contextlib.contextmanager
 def opened(path: Path) -> Iterator[tuple[RunFolder, dict[str, Any]]]:
     """The run folder `path`, locked while the block works, and what its manifest says.
 
     Raises ConfigError, located in the folder, where it is no run's, or a run is at work in it.
     """
-    if not path.is_dir():
-        what = "is a file, not the folder of a run" if os.path.lexists(path) else "no such folder"
-        raise ConfigError(path, "", what)
-    content = read_manifest(path)  # which puts that of a killed run right
-    if content is None:
-        raise ConfigError(path, "", "is no run's folder: it has no manifest.json that a run wrote")
+    content = _manifest_of(path)
+    in_use = ConfigError(path, "", f"is in use by a run ({_who_works(content)}); end that first")
     try:
         lock = FolderLock(Path(os.path.realpath(path)))
     except InUse:
-        raise _worked_in(path, content) from None
+        raise in_use from None
     except OSError as error:
         raise ConfigError(path, "", f"cannot be opened: {error.strerror}") from None
     with RunFolder(path, lock) as folder:
         if not lock.real and content.get("status") == Status.RUNNING:
-            raise _worked_in(path, content)
+            raise in_use
         yield folder, read_manifest(path) or content
 
 
@@ -333,7 +313,8 @@ def check_writable(folder: RunFolder) -> None:
         for name in SUBFOLDERS:
             (folder.path / name).mkdir(exist_ok=True)
         for place in (folder.path, *(folder.path / name for name in SUBFOLDERS)):
-            _write_and_remove(place / f".resume.{os.getpid()}.part")
+            with tempfile.TemporaryFile(dir=place) as file:
+                file.write(b"is there room?")
         metrics.mend(folder.path)
         remove_parts(folder.path)
     except OSError as error:
@@ -381,22 +362,8 @@ def _copy(path: Path, target: Path) -> None:
         write_atomically(target, lambda copy: shutil.copyfileobj(file, copy))
 
 
-def _write_and_remove(path: Path) -> None:
-    unfinished.add(path)
-    try:
-        path.write_bytes(b"is there room?")
-    finally:
-        with contextlib.suppress(OSError):
-            path.unlink(missing_ok=True)
-        unfinished.discard(path)
-
-
 def write_beginning(folder: RunFolder, config: str, manifest: Manifest) -> None:
     """Write configuration and manifest of a run that goes on in `folder`. Raises OSError."""
     write_atomically(folder.path / "config.yaml", lambda file: file.write(config.encode()))
     manifest.process = Holder.here(locked=folder.lock is not None and folder.lock.real)
     manifest.write(folder.path)
-
-
-def _worked_in(path: Path, content: dict[str, Any]) -> ConfigError:
-    return ConfigError(path, "", f"is in use by a run ({_who_works(content)}); end that first")

@@ -345,11 +345,9 @@ def export_scene(
     folder = folder.absolute()
     folder.parent.mkdir(parents=True, exist_ok=True)
     with unfinished_folder(folder.parent) as part:
-        inner = part / "scene"  # since the folder of an unfinished one is the user's alone
-        inner.mkdir()
-        parts.write(inner)
-        _check(inner, params, source)
-        os.replace(inner, folder)
+        parts.write(part)
+        _check(part, params, source)
+        os.replace(part, folder)
 
 
 def _put_integrator(description: Description, integrator: Mapping[str, object]) -> None:

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import json
+from pathlib import Path
+from typing import Any
+
 from click.testing import CliRunner, Result
 
 from reslrb_cli.cli import main
@@ -22,3 +26,8 @@ def done(*arguments: object) -> Result:
 def settings(*given: str) -> list[str]:
     """`--set` for each of them."""
     return [word for setting in given for word in ("--set", setting)]
+
+
+def read_metrics(folder: Path | str) -> list[dict[str, Any]]:
+    """The lines of a run's metrics, oldest first."""
+    return [json.loads(line) for line in (Path(folder) / "metrics.jsonl").read_text().splitlines()]

@@ -7,12 +7,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from cli.calling import read_metrics
 from cli.test_optimize import CONFIG, KEY, SCENE
 from turns import a_few, taking_turns
 
 from reslrb_cli.cli import main
 from reslrb_cli.records.manifest import read_manifest
-from reslrb_cli.records.metrics import read_metrics
 
 OWN = "{max_depth: 4, guiding: off, sequence: independent}"
 AUTO = CONFIG.replace("{type: ptracer, max_depth: 3}", OWN).replace("iterations: 25", "iterations: 2, measuring: 1000")

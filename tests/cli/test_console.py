@@ -123,7 +123,6 @@ def test_a_reader_that_has_gone_ends_nothing() -> None:
     assert (run.returncode, err) == (0, b"error\n")
 
 
-@pytest.mark.skipif(os.name != "posix", reason="closes descriptors")
 def test_no_file_takes_the_place_of_a_closed_stream(tmp_path: Path) -> None:
     script = "from reslrb_cli.cli.terminal import forgiving_output\n"
     script += f"with forgiving_output(): print(open({str(tmp_path / 'file')!r}, 'w').fileno() > 2)"

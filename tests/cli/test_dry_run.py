@@ -11,10 +11,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from cli.calling import read_metrics
 from cli.tiny import write_experiment
 
 from reslrb_cli.cli import main
-from reslrb_cli.config.files import in_words, largest_pass, passes_obstacle
+from reslrb_cli.config.files import in_words
+from reslrb_cli.config.integrators import largest_pass, passes_obstacle
 from reslrb_cli.config.loader import load
 from reslrb_cli.optimization import forecast as trial
 from reslrb_cli.optimization.assemble import assemble
@@ -23,7 +25,6 @@ from reslrb_cli.optimization.loop import optimize
 from reslrb_cli.records.clock import MIB, rough_duration
 from reslrb_cli.records.decisions import RivalRecord
 from reslrb_cli.records.manifest import read_manifest
-from reslrb_cli.records.metrics import read_metrics
 
 pytestmark = pytest.mark.usefixtures("llvm")
 

@@ -8,6 +8,7 @@ from unittest import mock
 
 import numpy as np
 import pytest
+from cli.calling import read_metrics
 from cli.failing import RUN, failing_last, full, lines
 from cli.tiny import COMPLETE, KEY, faults, files
 
@@ -32,18 +33,16 @@ def test_a_run_that_ends_well_is_complete(optimize):
 # --- signals ----------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.skipif(os.name != "posix", reason="sends signals")
 @pytest.mark.parametrize("number", SIGNALS)
 def test_a_signal_ends_a_run_after_the_iteration(optimize, during, number):
     during(lambda record: os.kill(os.getpid(), number) if record.iteration == 1 else None)
     code, out, err = optimize()
     assert (code, faults(RUN, code, err)) == (130, [])
     assert COMPLETE <= files(RUN)
-    assert read_content(RUN)["results"]["iterations"] == len(metrics.read_metrics(RUN)) == 2
+    assert read_content(RUN)["results"]["iterations"] == len(read_metrics(RUN)) == 2
     assert out.splitlines()[-1].startswith("interrupted after 2 iterations")
 
 
-@pytest.mark.skipif(os.name != "posix", reason="sends signals")
 @pytest.mark.parametrize(("name", "call"), [("write_image", 0), ("write_parameters", 2), ("write_image", 2)])
 def test_a_signal_while_files_are_written_leaves_none_of_them_out(optimize, monkeypatch, name, call):
     real, calls = getattr(recording, name), []
@@ -95,7 +94,6 @@ def test_there_is_a_checkpoint_before_the_first_iteration(optimize, monkeypatch)
     assert seen == [(0, 0.5)]
 
 
-@pytest.mark.skipif(os.name != "posix", reason="no locks")
 def test_a_run_in_progress_is_not_replaced(optimize, during):
     seen = []
 
@@ -112,7 +110,7 @@ def test_a_run_in_progress_is_not_replaced(optimize, during):
     [line] = lines(err)
     assert line.startswith("tiny.yaml: run.name: ")
     assert f"in use by a run (process {os.getpid()} on " in line
-    assert len(metrics.read_metrics(RUN)) == 5
+    assert len(read_metrics(RUN)) == 5
     assert optimize("--force", "--quiet")[0] == 0
     assert sorted(os.listdir("runs")) == ["tiny"]
 

@@ -19,7 +19,7 @@ from reslrb_cli.errors import ConfigError
 from reslrb_cli.measure.comparison import compare
 from reslrb_cli.optimization.assemble import assemble_scene
 from reslrb_cli.records.checkpoint import STATE_FILE, save_checkpoint
-from reslrb_cli.records.images import read_exr, read_parameters
+from reslrb_cli.records.images import load_image, read_parameters
 from reslrb_cli.records.run_folder import read_value
 from reslrb_cli.scene.load import load_scene
 from reslrb_cli.scene.parameters import select_parameters
@@ -106,10 +106,10 @@ def test_rendering_a_run_is_rendering_what_it_recovered(folder: Path) -> None:
     assert expected.exit_code == 0, expected.output
     assert reslrb("render", "--run", folder / "runs/tiny", *common, folder / "b.exr").exit_code == 0
     # Of equal samples, whose sum a CPU takes in any order.
-    assert np.allclose(read_exr(folder / "a.exr"), read_exr(folder / "b.exr"), rtol=1e-5)
+    assert np.allclose(load_image(folder / "a.exr"), load_image(folder / "b.exr"), rtol=1e-5)
     initial = reslrb("render", folder / "runs/tiny/config.yaml", *common, folder / "c.exr")
     assert initial.exit_code == 0
-    assert not np.allclose(read_exr(folder / "a.exr"), read_exr(folder / "c.exr"), rtol=1e-2)
+    assert not np.allclose(load_image(folder / "a.exr"), load_image(folder / "c.exr"), rtol=1e-2)
 
 
 def test_mitsuba_renders_what_was_exported_as_the_run_does(folder: Path) -> None:

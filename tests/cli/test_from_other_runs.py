@@ -15,7 +15,7 @@ from reslrb_cli.cli.options import read_recovered
 from reslrb_cli.config.loader import load
 from reslrb_cli.measure.comparison import compare
 from reslrb_cli.optimization.assemble import assemble_scene
-from reslrb_cli.records.images import read_exr
+from reslrb_cli.records.images import load_image
 from reslrb_cli.records.run_folder import read_value
 
 pytestmark = pytest.mark.usefixtures("llvm")
@@ -102,7 +102,7 @@ def test_each_camera_is_rendered_with_the_relief(run: Path, tmp_path: Path, sens
     file = tmp_path / "image.exr"
     done = reslrb("render", "--run", run, "--sensor", sensor, "--spp", 256, "--set", "run.seed=3", "-o", file)
     assert done.exit_code == 0, done.output
-    image = read_exr(file)
+    image = load_image(file)
     assert image.shape == (SIZE, SIZE, 3)
     recovered, begun = (assemble_scene(config) for config in (read_recovered(run, ()), load(run / "config.yaml")))
     own, first = (np.stack([one.render(sensor, 16, k, "test").mean() for k in range(16)]) for one in (recovered, begun))

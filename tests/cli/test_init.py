@@ -15,7 +15,8 @@ from turns import a_few
 
 from reslrb_cli.cli.init import PIXELS
 from reslrb_cli.config.loader import load
-from reslrb_cli.config.schema import Config, TargetConfig
+from reslrb_cli.config.schema import Config
+from reslrb_cli.config.views import TargetConfig
 from reslrb_cli.optimization.assemble import assemble_scene
 from reslrb_cli.records.manifest import read_manifest
 from reslrb_cli.scene.images import decode_srgb

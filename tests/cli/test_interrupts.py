@@ -15,7 +15,6 @@ from compilation import search_path
 
 from reslrb_cli.cli.terminal import SIGNALS, Interrupts
 
-pytestmark = pytest.mark.skipif(os.name != "posix", reason="sends signals")
 ROOT = Path(__file__).resolve().parents[2]
 
 

@@ -110,7 +110,6 @@ def test_samples_that_are_too_large_are_not_kept_and_that_is_said(
     assert not measurement_files.samples_file(tmp_path / "c.jsonl").exists()
 
 
-@pytest.mark.skipif(os.name != "posix", reason="makes a pipe")
 def test_a_pipe_has_each_line_once_as_it_comes(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe")
     reader = os.open(tmp_path / "pipe", os.O_RDONLY | os.O_NONBLOCK)

@@ -8,13 +8,13 @@ from itertools import pairwise
 from pathlib import Path
 
 import pytest
+from cli.calling import read_metrics
 from cli.tiny import KEY, write_experiment
 
 from reslrb_cli.cli import main
 from reslrb_cli.records import measurement_files
 from reslrb_cli.records.manifest import read_content
 from reslrb_cli.records.measurement_files import LivePage
-from reslrb_cli.records.metrics import read_metrics
 from reslrb_cli.runs import recorder
 from reslrb_cli.runs import recorder as recording
 

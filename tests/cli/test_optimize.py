@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from cli.calling import read_metrics
 from turns import a_few
 
 from reslrb_cli.cli import main
@@ -96,10 +97,6 @@ def reslrb(capsys, *args):
 
 def read_manifest(folder):
     return json.loads((Path(folder) / "manifest.json").read_text())
-
-
-def read_metrics(folder):
-    return [json.loads(line) for line in (Path(folder) / "metrics.jsonl").read_text().splitlines()]
 
 
 def names(folder):
@@ -325,7 +322,6 @@ def test_inspect_tells_what_can_be_recovered(experiment, capsys):
     assert parameters[KEY]["shape"] == [4, 4, 3]
 
 
-@pytest.mark.skipif(os.name != "posix", reason="sends SIGINT")
 def test_ctrl_c_leaves_a_complete_run_folder(experiment):
     command = [sys.executable, "-c", "from reslrb_cli.cli import main; main()", "optimize", "box.yaml"]
     package = str(Path(__file__).resolve().parents[2])

@@ -7,7 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from cli.test_optimize import CONFIG, KEY, SCENE, read_manifest, read_metrics, reslrb
+from cli.calling import read_metrics
+from cli.test_optimize import CONFIG, KEY, SCENE, read_manifest, reslrb
 
 from reslrb_cli.records.images import read_layers
 

@@ -24,10 +24,7 @@ from compilation import search_path
 from reslrb_cli.cli.terminal import SIGNALS
 from reslrb_cli.records.manifest import read_content, read_manifest
 
-pytestmark = [
-    pytest.mark.skipif(os.name != "posix", reason="sends signals"),
-    pytest.mark.usefixtures("llvm"),
-]
+pytestmark = pytest.mark.usefixtures("llvm")
 #: Moments of a run: it has printed this, or its folder holds that file.
 MOMENTS = {"loading": "variant ", "the target": "rendering ", "the mask": "finding ", "iterations": "metrics.jsonl"}
 LONG = ["--set", "run.iterations=20000"]

@@ -6,12 +6,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from cli.calling import read_metrics
 from cli.photographs import WALLS, cornell_box
 from cli.tiny import write_experiment
 
 from reslrb_cli.cli import main
 from reslrb_cli.records.manifest import read_manifest
-from reslrb_cli.records.metrics import read_metrics
 
 #: Where eight cameras stand before the Cornell box.
 EYES = tuple(f"{x:.2f}, {y:.2f}, 3.6" for x, y in ((-0.8, 0), (0.8, 0), (0, 0.6), (0, -0.6), (-0.6, 0.5), (0.6, 0.5),

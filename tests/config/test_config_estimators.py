@@ -6,8 +6,8 @@ from typing import Any, get_args
 
 import pytest
 
-from reslrb_cli.config.base import memory_bytes
 from reslrb_cli.config.integrators import ESTIMATOR_OPTIONS, Reslrb
+from reslrb_cli.config.schema import memory_bytes
 from reslrb_cli.estimators import ESTIMATORS
 
 

@@ -171,7 +171,7 @@ def test_a_record_is_a_line_and_comes_back() -> None:
     assert json.loads(record(relative_l2=float("inf")).to_json())["relative_l2"] is None
     assert json.loads(record().to_json())["holds"] is False
     assert GradcheckRecord.of(json.loads(json.dumps(asdict(found)))) == found
-    with pytest.raises(TypeError):
+    with pytest.raises(ValueError, match="validation error"):
         GradcheckRecord.of({"case": "a", "colour": 3})
 
 

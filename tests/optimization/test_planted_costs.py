@@ -13,13 +13,13 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from cli.calling import read_metrics
 from cli.tiny import write_experiment
 from optimization.toy import make_problem
 
 from reslrb_cli.cli import main
 from reslrb_cli.optimization import loop
 from reslrb_cli.records.clock import MIB, StepClock, peak_mib, reset_peak
-from reslrb_cli.records.metrics import read_metrics
 from reslrb_cli.runs import prepare
 from reslrb_cli.runs import recorder as recording
 

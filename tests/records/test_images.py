@@ -60,11 +60,11 @@ def test_parameters_and_masks_are_written_like_that(tmp_path, file_size_limit):
 def test_a_heightmap_is_seen_from_its_lowest_point_to_its_highest(tmp_path):
     from matplotlib.image import imread
 
-    from reslrb_cli.records.images import read_exr, write_parameters
+    from reslrb_cli.records.images import load_image, write_parameters
 
     heights = np.linspace(-1e-3, 2e-3, 12, dtype=np.float32).reshape(3, 4, 1)
     write_parameters(tmp_path, {"face.heightmap": heights, "wall.data": np.abs(heights)})
-    assert np.array_equal(read_exr(tmp_path / "face.heightmap.exr"), heights)
+    assert np.array_equal(load_image(tmp_path / "face.heightmap.exr"), heights)
     seen = imread(tmp_path / "face.heightmap.png")
     assert (seen.min(), seen.max()) == (0, 1)
     assert np.all(np.diff(seen.ravel()[: heights.size]) >= 0)

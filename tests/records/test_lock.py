@@ -91,14 +91,6 @@ def test_a_file_system_without_locks_locks_nothing(tmp_path: Path, monkeypatch: 
         assert (first.real, second.real) == (False, False)
 
 
-def test_a_system_without_locks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(locks, "fcntl", None)
-    with FolderLock(tmp_path) as lock:
-        assert not lock.real
-        assert lock.is_of(tmp_path)
-    assert not Holder.here(locked=False).is_gone(tmp_path)
-
-
 def ended_pid() -> int:
     process = subprocess.Popen([sys.executable, "-c", ""])
     process.wait()

@@ -1,20 +1,18 @@
-"""Manifests: what they say once their process has gone, and their end on a full disk."""
+"""Manifests: what they say once their process has gone."""
 
 from __future__ import annotations
 
 import errno
 import json
 import os
-import sys
 import threading
 from pathlib import Path
 
 import pytest
 
-from reslrb_cli.records import manifest as manifest_file
 from reslrb_cli.records import manifest as manifests
 from reslrb_cli.records.lock import FolderLock, Holder
-from reslrb_cli.records.manifest import MANIFEST_FILE, Manifest, Status, read_content, read_manifest
+from reslrb_cli.records.manifest import MANIFEST_FILE, Manifest, Status, read_manifest
 
 
 def make_manifest(**changes):
@@ -32,7 +30,6 @@ def stored(folder: Path):
     return json.loads((folder / MANIFEST_FILE).read_text())
 
 
-@pytest.mark.skipif(sys.platform == "win32", reason="no locks")
 def test_a_run_that_was_killed_is_interrupted(tmp_path):
     abandoned(tmp_path)
     (tmp_path / "metrics.jsonl").write_text('{"iteration": 0}\n{"itera')
@@ -48,7 +45,6 @@ def test_a_run_that_was_killed_is_interrupted(tmp_path):
     assert sorted(os.listdir(tmp_path)) == [MANIFEST_FILE, "metrics.jsonl"]
 
 
-@pytest.mark.skipif(sys.platform == "win32", reason="no locks")
 def test_a_run_that_goes_on_is_running(tmp_path):
     abandoned(tmp_path)
     with FolderLock(tmp_path):
@@ -56,14 +52,13 @@ def test_a_run_that_goes_on_is_running(tmp_path):
     assert stored(tmp_path)["status"] == "running"
 
 
-@pytest.mark.skipif(sys.platform == "win32", reason="no locks")
 def test_a_reader_who_may_not_write_is_told_the_same(tmp_path, monkeypatch):
     abandoned(tmp_path)
 
     def fail(*args, **options):
         raise OSError(errno.EROFS, "Read-only file system")
 
-    monkeypatch.setattr(manifest_file, "write_atomically", fail)
+    monkeypatch.setattr(manifests, "write_atomically", fail)
     assert read_manifest(tmp_path)["status"] == "interrupted"
     assert stored(tmp_path)["status"] == "running"
 
@@ -96,65 +91,3 @@ def test_the_last_word_of_a_process_that_ends_at_once_stays(tmp_path, monkeypatc
         thread.join(timeout=0.5)
     assert thread.is_alive()
     assert stored(tmp_path)["status"] == "interrupted"
-
-
-# --- full disks -------------------------------------------------------------------------------------------------------
-
-
-@pytest.fixture
-def full_disk(monkeypatch):
-    """From its call on there is room for no new file."""
-
-    def fail(path, write, durable=False):
-        raise OSError(errno.ENOSPC, "No space left on device", str(path))
-
-    return lambda: monkeypatch.setattr(manifest_file, "write_atomically", fail)
-
-
-def test_the_end_fits_on_a_full_disk(tmp_path, full_disk):
-    manifest = make_manifest()
-    manifest.write(tmp_path)
-    size = (tmp_path / MANIFEST_FILE).stat().st_size
-    assert size % 4096 == 0
-    full_disk()
-    manifest.results = {"iterations": 12}
-    manifest.missing = {"page": "no room"}
-    manifest.end(tmp_path, Status.FAILED, "the disk is full")
-    content = read_manifest(tmp_path)
-    assert (content["status"], content["error"]) == ("failed", "the disk is full")
-    assert (content["results"], content["missing"]) == ({"iterations": 12}, {"page": "no room"})
-    assert (tmp_path / MANIFEST_FILE).stat().st_size == size
-    assert stored(tmp_path)["ended"]
-
-
-def test_what_does_not_fit_leaves_the_truth(tmp_path, full_disk):
-    manifest = make_manifest(pilot={"rows": ["x" * 100] * 30})
-    manifest.write(tmp_path)
-    full_disk()
-    manifest.results = {"much": ["x" * 100] * 100}
-    manifest.missing = {"parameters": "no room"}
-    manifest.end(tmp_path, Status.FAILED, "the disk is full")
-    content = read_manifest(tmp_path)
-    assert (content["status"], content["error"], content["results"]) == ("failed", "the disk is full", {})
-    assert content["missing"] == {"parameters": "no room"}
-    assert content["pilot"] == manifest.pilot
-    # nor does this
-    manifest.missing = {"parameters": "x" * 9000}
-    manifest.end(tmp_path, Status.FAILED, "the disk is full, " + "x" * 9000)
-    content = read_content(tmp_path)
-    assert (content["status"], content["missing"], len(content["error"])) == ("failed", {}, 300)
-    assert content["pilot"] == manifest.pilot
-
-
-def test_a_disk_without_room_and_without_a_manifest_is_an_error(tmp_path, full_disk):
-    full_disk()
-    with pytest.raises(OSError, match="No space left"):
-        make_manifest().end(tmp_path, Status.FAILED, "x")
-
-
-def test_the_last_manifest_has_no_padding(tmp_path):
-    manifest = make_manifest()
-    for missing, padded in (({"page": "not written yet"}, True), ({}, False)):
-        manifest.missing = missing
-        manifest.end(tmp_path, Status.FINISHED)
-        assert (tmp_path / MANIFEST_FILE).read_bytes().endswith(b" \n") is padded

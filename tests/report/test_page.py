@@ -160,12 +160,12 @@ def test_the_colours_of_an_error_map_end_where_it_says(tmp_path):
 
 
 def test_dark_scenes_are_shown_brighter_and_say_so(tmp_path):
-    from reslrb_cli.records.images import read_exr, write_image
+    from reslrb_cli.records.images import load_image, write_image
 
     folder = make_run(tmp_path / "lamp")
     before = {alt: pixels(uri) for alt, uri in page_of(folder).pictures}
     for name in ("initial", "final", "target"):
-        write_image(folder / "images" / name, read_exr(folder / "images" / f"{name}.exr") * np.float32(1e-6))
+        write_image(folder / "images" / name, load_image(folder / "images" / f"{name}.exr") * np.float32(1e-6))
     page = page_of(folder)
     assert re.search(r"shown \S+ times brighter", page.sections["Images"])
     after = {alt: pixels(uri) for alt, uri in page.pictures}

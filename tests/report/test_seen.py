@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from report.run_folder import FLOOR, LAMP, make_run, texture
 
-from reslrb_cli.records.images import read_exr
+from reslrb_cli.records.images import load_image
 from reslrb_cli.report import perceptual
 from reslrb_cli.report.perceptual import (
     WHITE,
@@ -196,7 +196,7 @@ def test_what_is_found_in_a_run_folder(tmp_path):
     about = {FLOOR: {"quantity": ""}, LAMP: {"quantity": "intensity"}, "gone": {}}
     found = seen_errors(folder, {"parameters": about})
     assert list(found["images"]) == ["-0", "-1"]
-    target, final = (read_exr(folder / "images" / f"{name}-1.exr") for name in ("target", "final"))
+    target, final = (load_image(folder / "images" / f"{name}-1.exr") for name in ("target", "final"))
     again = image_errors(final, target, 1.0)
     assert {key: found["images"]["-1"]["final"][key] for key in again} == again
     assert {key: colors["measure"] for key, colors in found["colors"].items()} == {FLOOR: "ciede2000", LAMP: "itp"}

@@ -15,7 +15,7 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any
 
-from reslrb_cli.records.measurements import Verdict, gradcheck_record, missing_record
+from reslrb_cli.records.measurements import GradcheckRecord, MissingRecord, Verdict, record_of
 from reslrb_cli.report.format import count, duration, number
 from reslrb_cli.report.page.images import gradient_maps, image_rows, seen_tables
 from reslrb_cli.report.page.markup import (
@@ -437,8 +437,8 @@ def measured(source: Measurements | Maps) -> str:
 
 def gradcheck(objects: Sequence[Mapping[str, Any]]) -> tuple[str, int]:
     """The comparisons as a table, what fails first, and what is missing; and how many lines are neither."""
-    records = [record for entry in objects if (record := gradcheck_record(entry)) is not None]
-    missing = [found for entry in objects if (found := missing_record(entry)) is not None]
+    records = [record for entry in objects if (record := record_of(GradcheckRecord, entry)) is not None]
+    missing = [found for entry in objects if (found := record_of(MissingRecord, entry)) is not None]
     several = len({record.case for record in records}) > 1
     head = ["case"] * several + list(HEAD)
     rows = []
