@@ -23,11 +23,8 @@ from reslrb_cli.scene.xml.read import Description, Element
 
 #: Bytes of such a file, at most.
 MOST_BYTES = 2**26
-
-
 #: By how much the focal lengths of rows and columns may differ, relative to them.
 SQUARE = 1e-3
-
 
 #: COLMAP's models without a fisheye, and the names of their parameters; `f` is both focal lengths.
 MODELS = {
@@ -39,10 +36,7 @@ MODELS = {
     "FULL_OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
 }
 
-
 _DISTORTION = re.compile(r"[kp]\d")
-
-
 #: From a camera's axes to the sensor's: of NeRF (x right, y up, looking along -z) and of COLMAP (y down, along +z).
 _NERF, _COLMAP = np.diag([-1.0, 1.0, -1.0, 1.0]), np.diag([-1.0, -1.0, 1.0, 1.0])
 

@@ -40,15 +40,10 @@ _BEAM_SHAPES = {
     "sun_direction": "moves the light",
 }
 
-
 #: Spectra by wavelength, which RGB variants cannot evaluate: their numbers describe what stands in the scene file.
 _SPECTRA = ("RegularSpectrum", "IrregularSpectrum", "BlackBodySpectrum")
-
-
 #: What a mesh has besides attributes such as `vertex_color`.
 _MESH_GEOMETRY = ("vertex_positions", "vertex_normals", "vertex_texcoords", "vertex_count", "face_count", "faces")
-
-
 #: Numbers that are written out one by one; of more, their mean and range.
 _FEW = 4
 

@@ -33,21 +33,13 @@ from reslrb_cli.config.parameters import HEIGHTMAP
 
 #: Analytic shapes whose `to_world` moves their surface interactions and their samples.
 MOVING_SHAPES = ("Rectangle", "Disk", "Sphere", "Cylinder")
-
-
 #: What of a mesh moves light.
 MOVING_MESH = ("vertex_positions", "vertex_normals")
-
-
 #: Emitters without a surface that can move, and what moves them.
 MOVING_EMITTERS = {"PointLight": "position", "SpotLight": "to_world", "Projector": "to_world",
                    "DirectionalEmitter": "to_world"}  # fmt: skip
-
-
 #: Parameters that say where an emitter is.
 PLACES = ("position", "to_world")
-
-
 #: Parameters of emitters that are flagged as differentiable, and change where light goes as well.
 BEAMS = ("cutoff_angle", "beam_width", "sun_direction", "sun_aperture")
 
@@ -172,8 +164,6 @@ def where_moved(params: mi.SceneParameters, keys: list[str]) -> list[Movable]:
 
 #: By how much a sphere that has become too small is larger than need be: kernels are compiled for each one.
 MARGIN = 1.25
-
-
 #: A sphere this many times as large as need be wastes light paths.
 TOO_LARGE = 2.0
 

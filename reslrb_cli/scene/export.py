@@ -102,8 +102,6 @@ def put_mesh(owner: Element, mesh: mi.Mesh, parts: Parts, key: str) -> None:
 
 #: The exported scene, in its folder.
 SCENE = "scene.xml"
-
-
 #: Folders beside it: of recovered values, and of files from elsewhere than the scene's own folder.
 RECOVERED, ELSEWHERE = "recovered", "assets"
 
@@ -192,17 +190,14 @@ _OTHER_PLACES = {
     "emitter": ("direction", "position"),
 }
 
-
 #: BSDFs whose `eta` is that of the inside over that of the outside.
 _RELATIVE_INDEX = ("dielectric", "roughdielectric", "thindielectric", "plastic", "roughplastic")
-
 
 #: What Mitsuba leaves out of a `principled` BSDF for good where it begins at 0.
 LOBES = (
     *("anisotropic", "clearcoat", "diff_trans", "flatness", "metallic"),
     *("sheen", "sheen_tint", "spec_tint", "spec_trans"),
 )
-
 
 _CONDUCTORS = ("conductor", "roughconductor")
 
@@ -314,8 +309,6 @@ def _numbers(value: Any) -> Any:
 
 #: What of a scene is no part of what it looks like.
 _ASIDE = ("silhouette_sampling_weight", "sampling_weight")
-
-
 #: How Mitsuba names what has lost its id, as bitmaps do that nothing uses: by where it lies in memory.
 _ADDRESS = re.compile(r"object_\d+\.")
 

@@ -24,16 +24,10 @@ from reslrb_cli.scene.xml.read import quoted
 #: The largest ray offset, as a fraction of the scene's size, with which no loss of light is to be seen: that of a room
 #: of size 3 that stands about 150 from the origin, or measures a fiftieth across.
 LARGEST_OFFSET = 5e-3
-
-
 #: Rays from each sensor, and from the lights, that look for faces at the same place, along each side of a grid.
 _RAYS = 128
-
-
 #: Sensors that do.
 _SENSORS = 8
-
-
 #: Pairs of shapes that are named.
 _NAMED = 2
 
@@ -252,16 +246,10 @@ def _met(scene: Any, shapes: Sequence[Any]) -> set[tuple[int, int]]:
 
 #: Rays start so many offsets before the next surface, at least, where nothing is said.
 LEAST_OFFSETS = 10
-
-
 #: Of the crossings that light meets, the share that may be nearer: at edges, and where it grazes a ball.
 SHARE = 0.01
-
-
 #: What rounding may put between the places where two rays meet one surface: in offsets, and of the longer ray's length.
 ROUNDING, FAR = 0.1, 1e-5
-
-
 #: Paths that are followed, and surfaces along each.
 _PATHS, _SURFACES = 4096, 8
 

@@ -164,12 +164,8 @@ def _can_be_sampled(emitter: mi.Emitter) -> bool:
 
 #: What a lamp's diameter on the film is below, in pixels.
 SMALL = 1.0
-
-
 #: Lamps, at the most: of those, light is told from all other by comparing each in turn.
 MOST = 64
-
-
 #: Points of a lamp along each side of a grid, by which it is found to be in view.
 POINTS = 16
 

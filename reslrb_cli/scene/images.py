@@ -26,28 +26,15 @@ from reslrb_cli.config.files import IMAGE_BYTES, PIXELS, open_file
 from reslrb_cli.errors import ConfigError, is_out_of_memory
 
 logger = logging.getLogger(__name__)
-
-
 FORMATS = "EXR, PNG, JPG, HDR, PFM, PPM or BMP"
-
-
 #: Bytes in which a file says how large its image is; a preview may stand before it.
 _HEAD = 2**20
-
-
 #: Parts that a PNG or a JPEG has at most, so that one of nothing but empty parts takes no time.
 _MOST_PARTS = 2**20
-
-
 #: Bytes of what EXIF says: a segment of a JPEG has no more, and the orientation stands at its beginning.
 _EXIF_BYTES = 2**16
-
-
 _DAMAGED = "is damaged or cut off; copy or save it again"
-
-
 Size = tuple[int, int]
-
 
 #: What is done to the pixels of a file to see them upright, by EXIF's number of the orientation; 1 is upright.
 TURNS = {
@@ -200,12 +187,8 @@ def _examine(file: BinaryIO) -> _Says | None:
 # --- formats ----------------------------------------------------------------------------------------------------------
 
 _PNG, _JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff"
-
-
 #: How a JPEG's segment of EXIF begins, and the entry in it that says how the camera was held: a number of 16 bits.
 _EXIF, _ORIENTATION, _SHORT = b"Exif\0\0", 0x0112, 3
-
-
 #: The next marker after compressed data, in which 0xFF stands before 0, or before the number of a restart.
 _MARKER = re.compile(rb"\xff+[\x01-\xcf\xd8-\xfe]")
 

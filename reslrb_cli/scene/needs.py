@@ -17,18 +17,14 @@ from reslrb_cli.scene.graph import Lamp, SceneGraph, emitted_rays, find_lamps, s
 
 #: Sensors to which a light path can connect: `sample_direction` is there, and its density is that of `sample_ray`.
 SENSORS = ("PerspectiveCamera", "ThinLensCamera")
-
-
 #: Shapes whose shading normal is their geometric one.
 _PLAIN_SHAPES = ("Rectangle", "Disk", "Sphere", "Cylinder")
-
 
 #: BSDFs that read nothing of a surface but its texture coordinates and local directions.
 _PLAIN_BSDFS = (
     *("SmoothDiffuse", "SmoothConductor", "RoughConductor", "SmoothDielectric", "RoughDielectric", "ThinDielectric"),
     *("SmoothPlastic", "RoughPlastic", "Principled", "PrincipledThin", "BlendBSDF", "MaskBSDF", "TwoSidedBRDF", "Null"),
 )
-
 
 #: BSDFs whose samples have the derivative of what they are samples of (`transport.scattering.following`), and those
 #: that only wrap others.
@@ -37,27 +33,16 @@ _FOLLOWED_BSDFS = (
     *("TwoSidedBRDF", "BumpMap", "NormalMap", "Null"),
 )
 
-
 #: What rounding may make of a depth between the clip planes, of 0 to 1.
 _DEPTH_ROUNDING = 1e-5
-
-
 #: BSDFs that are not the same with light and view exchanged, by class: camera paths alone meet them as they are meant.
 _ONE_WAY = {"Hair": "hair", "Measured": "measured", "MeasuredPolarized": "measured_polarized"}
-
-
 #: Shapes on which Mitsuba draws no points: light cannot start there, but paths from the sensor find it.
 _NO_POINTS = {"SDFGrid": "sdfgrid", "Ellipsoids": "ellipsoids", "EllipsoidsMesh": "ellipsoidsmesh"}
-
-
 #: Shapes that Mitsuba cannot have emit at all.
 _NO_LAMPS = {"BSplineCurve": "bsplinecurve", "LinearCurve": "linearcurve"}
-
-
 #: How many see-through surfaces a primary ray is followed through.
 CROSSINGS = 32
-
-
 #: Primary rays that look at a scene, along each side of a grid.
 LOOK = 128
 

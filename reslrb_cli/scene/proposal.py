@@ -97,16 +97,11 @@ def _box_weights(old: int, new: int) -> Image:
 
 #: Colours of materials, by which a photograph mostly differs from a scene.
 _COLOUR = re.compile(r"(reflectance|base_color|color\d|vertex_color)(\.(value|data))?$")
-
-
 #: What is seen foremost of a rough surface without a diffuse lobe: its colour is its material's, and a factor of 1 on
 #: that is no colour that anybody chose.
 _ROUGHNESS, _FACTOR = re.compile(r"\balpha(_u|_v)?\.value$"), re.compile(r"\bspecular_\w+\.value$")
-
-
 #: What a lamp in view shows of itself.
 _RADIANCE = re.compile(r"\bradiance\.value$")
-
 
 #: Bounds by the end of a key, and what it is; the first that fits.
 _BOUNDS: tuple[tuple[str, str], ...] = (
@@ -121,16 +116,11 @@ _BOUNDS: tuple[tuple[str, str], ...] = (
     (r"\.value$|\.data$|\.specular$", "[0, 1]"),
 )
 
-
 #: Rays along each axis of the film, by which shares are taken.
 _RAYS = 64
-
-
 #: What takes less of the picture is left for later, and so are more parameters than these. A lamp is known by a few
 #: pixels.
 LEAST_SHARE, LEAST_LAMP, MOST_FIRST = 0.02, 0.002, 8
-
-
 #: Texels along an axis with which a texture begins to be recovered.
 TEXELS = 64
 

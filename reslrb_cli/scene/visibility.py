@@ -26,8 +26,6 @@ from reslrb_cli.scene.needs import CROSSINGS, LOOK, what_is_seen
 
 #: Primary rays are spread over a pixel in so many rows and columns of cells.
 CELLS = 4
-
-
 #: Points of the aperture, in [0, 1]^2, from which a lens looks for lamps.
 _APERTURE = ((0.5, 0.5), (0.05, 0.5), (0.95, 0.5), (0.5, 0.05), (0.5, 0.95))
 
@@ -131,8 +129,6 @@ def _first_surfaces(scene: mi.Scene, ray: mi.Ray3f, count: int) -> tuple[mi.Bool
 
 #: Primary rays for each pixel and for each texel, and in one pass.
 _RAYS_PER_CELL, _MAX_RAYS, _RAYS_PER_PASS = 64, 2**25, 2**20
-
-
 _CROSSINGS = 8
 
 
@@ -212,12 +208,8 @@ def _modulo(value: Any, size: int) -> Any:
 
 #: Depths that are tried; the last one stands for all light.
 DEPTHS = (8, 16, 32, 64)
-
-
 #: What may be missing of a pixel's light, on average.
 LOST = 0.01
-
-
 #: Rays along each axis of the film, and paths for each of them.
 _RAYS, _PATHS = 48, 32
 

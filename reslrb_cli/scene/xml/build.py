@@ -22,16 +22,10 @@ from reslrb_cli.scene.xml.read import Description, Element, quoted, tag_lines
 
 #: Plugins that name what they hold by its place among the others, in every load alike.
 _GROUPS = ("shapegroup", "batch")
-
-
 #: How the ids begin that Mitsuba gives to objects without one when it writes a scene; it takes them for none.
 _UNNAMED = "_unnamed_"
-
-
 #: Characters of an id that is kept: keys become names of files.
 _LONGEST = 120
-
-
 #: Elements, by what Mitsuba makes of them.
 _KINDS = {"bsdf": "BSDF", "emitter": "Emitter", "shape": "Shape", "texture": "Texture"}
 
@@ -159,19 +153,11 @@ class Owners:
 
 #: "[parser.cpp:482] " and "[PluginManager] ": where in Mitsuba's sources a message comes from.
 _ORIGIN = re.compile(r"\[[\w.]+(:\d+)?\]\s*")
-
-
 #: "At string (line 3, col 7): " and the like, before the message proper.
 _PREAMBLE = re.compile(r"^(At|Error while loading|While loading) .*?\(line \d+, col \d+\):? ?")
-
-
 _PLACE = re.compile(r"\(line (\d+), col \d+\)")
-
-
 #: What Mitsuba says of a mesh without faces.
 _NO_FACES = re.compile(r"Storing new normals in a Mesh that didn't have normals.*")
-
-
 #: Parameters of one object for which names that are like theirs are looked for.
 _HINTS = 30
 

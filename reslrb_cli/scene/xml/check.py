@@ -25,18 +25,10 @@ from reslrb_cli.scene.xml.read import MAX_DEPTH, Description, Element, quoted
 
 #: Parameters without which a plugin reads memory that is not its own.
 _NEEDED = {"bitmap": "filename", "normalmap": "normalmap"}
-
-
 _VECTORS = ("point", "vector", "translate", "scale", "rotate")
-
-
 _NUMBERS = ("float", "rgb", "spectrum", "matrix", "lookat", *_VECTORS)
-
-
 #: Mitsuba reads these as numbers.
 _NOT_FINITE = re.compile(r"(?i)(?<![\w.])[-+]?(nan|inf|infinity)(?!\w)")
-
-
 #: Lines, or objects, that one message names.
 _SHOWN = 5
 
@@ -158,12 +150,8 @@ def _check_chains(root: Element) -> None:
 #: Bytes of memory that a pixel of an image takes as a texture at the least: Mitsuba keeps three half floats of it, or
 #: floats where the scene says so.
 _TEXEL_BYTES, _FLOAT_BYTES = 6, 12
-
-
 #: Bytes in which a mesh says what it consists of.
 _HEAD = 2**16
-
-
 #: What Git's extension for large files writes in place of one.
 _LFS = b"version https://git-lfs.github.com/"
 

@@ -83,7 +83,6 @@ def refuse(notes: Sequence[Note]) -> None:
 #: Spellings of elements.
 ELEMENTS = {"lookAt": "lookat", "srgb": "rgb"}
 
-
 #: Elements of Mitsuba 0.x that mean what Mitsuba 3 cannot be told, and what to do.
 LOST_ELEMENTS = {
     "camera": "an element of Mitsuba before 0.4, whose axes pointed elsewhere; save the scene with Mitsuba 0.6",
@@ -92,7 +91,6 @@ LOST_ELEMENTS = {
     "blackbody": "an element of Mitsuba 0.6 that Mitsuba 3 does not have; write its colour as <rgb>",
     "animation": "an element of Mitsuba 0.6; nothing moves in Mitsuba 3: write one of its transforms",
 }
-
 
 #: Attributes of elements other than objects.
 ATTRIBUTES = {
@@ -108,9 +106,7 @@ ATTRIBUTES = {
     "matrix": ("value",),
 }
 
-
 OBJECT_ATTRIBUTES = ("type", "id", "name")
-
 
 #: Plugins by other names, for elements of one kind.
 PLUGINS = {
@@ -122,13 +118,11 @@ PLUGINS = {
     ("film", "mfilm"): "hdrfilm",
 }
 
-
 #: Objects without which the same light reaches the same film, and what takes their place.
 REPLACEABLE = {
     "sampler": "an `independent` one takes its place",
     "rfilter": "the film's default takes its place",
 }
-
 
 #: Plugins of Mitsuba 0.6 that Mitsuba 3 does not have, and what comes near them.
 LOST_PLUGINS = {
@@ -152,14 +146,12 @@ LOST_PLUGINS = {
     ("texture", "vertexcolors"): "`mesh_attribute` says the same",
 }
 
-
 #: Plugins that Mitsuba 3 has, and that no scene file can use here.
 REFUSED_PLUGINS = {
     ("shape", "hair"): "is a plugin of Mitsuba 0.6 that Mitsuba 3 does not have; `bsplinecurve` draws strands",
     ("shape", "blender"): "reads the memory of a running Blender; export the mesh as `ply` or `obj`",
     ("sensor", "flat_sensor"): "belongs to Mitsuba's own RayDataLoader; take a `perspective` one",
 }
-
 
 #: Values of text parameters, by plugin and parameter.
 VALUES = {
@@ -171,7 +163,6 @@ VALUES = {
         "xyzAlpha": "xyza",
     },
 }
-
 
 #: Formats of files that `hdrfilm` knows; nothing here is written by the film, so that another can be left out.
 FORMATS = {
@@ -187,12 +178,8 @@ def snake_case(name: str) -> str:
 
 #: Spectra by wavelength, by plugin.
 SPECTRA = ("regular", "irregular", "blackbody")
-
-
 #: Wavelengths, in nm, of what Mitsuba takes for visible, and how far apart a black body's are taken.
 _VISIBLE, _STEP = (360.0, 830.0), 5.0
-
-
 #: Planck's constant times the speed of light squared, twice (W m^2), and times it over Boltzmann's (m K), as Mitsuba's.
 _FIRST, _SECOND = 2 * 6.62607004e-34 * 2.99792458e8**2, 6.62607004e-34 * 2.99792458e8 / 1.38064852e-23
 

@@ -30,11 +30,8 @@ OBJECTS = frozenset(
     )
 )
 
-
 #: Elements that are values of parameters; a <spectrum> without a type is one, too.
 VALUES = frozenset(("float", "integer", "boolean", "string", "point", "vector", "rgb", "transform"))
-
-
 #: Characters of a quotation.
 _QUOTED = 60
 
@@ -116,19 +113,11 @@ class Element:
 
 #: XML of all files of a scene together, each counted as often as it is included.
 MAX_BYTES = 64 * 2**20
-
-
 #: Elements within one another. Mitsuba's parser calls itself for each level, until the stack is full.
 MAX_DEPTH = 100
-
-
 _COMMENT = re.compile(r"<!--.*?-->", re.DOTALL)
-
-
 #: An ampersand that begins none of XML's own references: Mitsuba's parser takes it for itself.
 _BARE_AMPERSAND = re.compile(r"&(?!(?:amp|lt|gt|quot|apos|#\d+|#x[0-9a-fA-F]+);)")
-
-
 _DECLARED_ENCODING = re.compile(rb"""^\s*<\?xml[^>]*\bencoding\s*=\s*["']([\w.-]+)["']""")
 
 
@@ -202,8 +191,6 @@ def _version(text: str | None) -> tuple[int, ...] | None:
 
 #: Characters of one attribute, after its variables are put in: variables of variables can grow at each step.
 MAX_LENGTH = 2**20
-
-
 #: Characters of a variable's name; longer ones are never found.
 _LONGEST_NAME = 256
 
@@ -265,8 +252,6 @@ class Variables:
 
 
 MAX_INCLUDES = 1000
-
-
 #: Includes within one another; that of Mitsuba's parser.
 MAX_INCLUDE_DEPTH = 15
 
