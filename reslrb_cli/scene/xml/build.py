@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import bisect
 import difflib
+import itertools
 import re
 from collections import Counter
 from typing import Any
@@ -44,21 +45,26 @@ def name_objects(root: Element) -> list[Note]:
     taken = {element.attributes[key] for element in root.walk() for key in ("id", "as") if key in element.attributes}
     owners: dict[str, Element] = {}
     renamed: dict[str, str] = {}
-    doubled: dict[str, list[Element]] = {}
+    differing: dict[str, Element] = {}
     notes: list[Note] = []
     numbers: Counter[str] = Counter()
     for element in objects:
         kind = element.type[:1].upper() + element.type[1:]
         numbers[kind] += 1
-        own = element.attributes.get("id", "")
+        own = element.id
         if own in owners:
-            doubled.setdefault(own, []).append(element)
-        elif _is_usable(own):
+            if not _same(owners[own], element):
+                differing[own] = element
+        elif own.strip() and own.isprintable() and len(own) <= _LONGEST and not own.startswith(_UNNAMED):
             owners[own] = element
             continue
         elif element in grouped and not own:
             continue
-        name = _free(f"{kind}_{numbers[kind]}", taken)
+        name = first = f"{kind}_{numbers[kind]}"
+        for number in itertools.count(2):
+            if name not in taken:
+                break
+            name = f"{first}_{number}"
         taken.add(name)
         element.attributes["id"] = name
         if own in owners:
@@ -67,36 +73,21 @@ def name_objects(root: Element) -> list[Note]:
             renamed[own] = name
             if not own.startswith(_UNNAMED):
                 notes.append(Note(element, f"id {quoted(own)} cannot stand in a key", f"named {name}"))
-    differing = {own: other for own, others in doubled.items() for other in others if not _same(owners[own], other)}
-    for element in root.walk():
-        own = element.attributes.get("id", "")
-        if element.tag in ("ref", "alias"):
-            if own in differing:
-                places = f"{owners[own].place} and {differing[own].place}"
-                raise element.fail("", f"refers to {quoted(own)}, the id of two objects ({places}); rename one of them")
-            if own in renamed:
-                element.attributes["id"] = renamed[own]
+    for element in root.walk("ref", "alias"):
+        own = element.id
+        if own in differing:
+            places = f"{owners[own].place} and {differing[own].place}"
+            raise element.fail("", f"refers to {quoted(own)}, the id of two objects ({places}); rename one of them")
+        if own in renamed:
+            element.attributes["id"] = renamed[own]
     return notes
-
-
-def _is_usable(own: str) -> bool:
-    return own.strip() != "" and own.isprintable() and len(own) <= _LONGEST and not own.startswith(_UNNAMED)
-
-
-def _free(name: str, taken: set[str]) -> str:
-    """`name`, or the first of name_2, name_3 ... that no object has for its id."""
-    number, free = 1, name
-    while free in taken:
-        number += 1
-        free = f"{name}_{number}"
-    return free
 
 
 def _same(a: Element, b: Element) -> bool:
     """Whether two elements, their ids aside, say the same."""
-    own = [{key: value for key, value in element.attributes.items() if key != "id"} for element in (a, b)]
+    one, other = ({**element.attributes, "id": ""} for element in (a, b))
     return (
-        (a.tag, own[0], len(a.children)) == (b.tag, own[1], len(b.children))
+        (a.tag, one, len(a.children)) == (b.tag, other, len(b.children))
         and all(_same(x, y) for x, y in zip(a.children, b.children, strict=True))
     )  # fmt: skip
 
@@ -105,9 +96,7 @@ class Owners:
     """The elements of a description by the ids of their objects, for the way back from a parameter to its element."""
 
     def __init__(self, root: Element) -> None:
-        self._elements = {
-            item.attributes["id"]: item for item in root.walk() if item.is_object and "id" in item.attributes
-        }
+        self._elements = {item.id: item for item in root.objects() if item.id}
 
     def place(self, params: mi.SceneParameters, key: str) -> tuple[Element, list[str]] | None:
         """The element of the nearest object above the parameter `key` that has one, and the names that lead on.
@@ -137,18 +126,17 @@ class Owners:
         Some objects lose their ids, as bitmaps do; those in a group have none.
         """
         tag = next((tag for tag, kind in _KINDS.items() if isinstance(node, getattr(mi, kind))), None)
-        named: list[Element] = []
         unnamed: list[Element] = []
         for item in owner.children:
-            meant = self._elements.get(item.attributes["id"], item) if item.tag == "ref" else item
-            has_own_id = owner.type == "shapegroup" and "id" in meant.attributes  # by which it is found
+            meant = self._elements.get(item.id, item) if item.tag == "ref" else item
+            has_own_id = owner.type == "shapegroup" and meant.id  # by which it is found
             if meant.tag == tag and item.name in (name, "") and not has_own_id:
-                (named if item.name else unnamed).append(meant)
-        if named or not unnamed:
-            return named[0] if named else None
-        number = re.fullmatch(r".*?(?:_(\d+))?", name)
-        place = int(number[1] or 0) if number else 0
-        return unnamed[0] if len(unnamed) == 1 else unnamed[place] if place < len(unnamed) else None
+                if item.name:
+                    return meant
+                unnamed.append(meant)
+        number = re.search(r"_(\d+)$", name)
+        place = int(number[1]) if number and len(unnamed) > 1 else 0
+        return unnamed[place] if place < len(unnamed) else None
 
 
 #: "[parser.cpp:482] " and "[PluginManager] ": where in Mitsuba's sources a message comes from.
@@ -213,19 +201,17 @@ class _Text:
 def _unused(props: mi.Properties, element: Element) -> list[Note]:
     """Notes on what `element` gives its plugin, and the plugin did not ask for."""
     notes = []
-    children = {child.name: child for child in element.children if child.name}
     unnamed = [child for child in element.children if not child.name and (child.is_object or child.tag == "ref")]
     for name in props.unqueried():
         number = re.match(r"_arg_(\d+)", name)
         if number and int(number[1]) < len(unnamed):
             child = unnamed[int(number[1])]
             wrong = f"{element.type} has no use for a <{child.tag}> in Mitsuba 3"
-            notes.append(Note(child, wrong, "left out", element))
         else:
             likely = likely_parameters(element.type) if len(notes) < _HINTS else []
             near = difflib.get_close_matches(name, likely, n=1, cutoff=0.75)
             hint = f" (did you mean `{near[0]}`?)" if near else ""
-            child = children.get(name, element)
+            child = element.find(name) or element
             wrong = f"{element.type} has no parameter {quoted(child.written or name)} in Mitsuba 3{hint}"
-            notes.append(Note(child, wrong, "left out", None if child is element else element))
+        notes.append(Note(child, wrong, "left out", None if child is element else element))
     return notes

@@ -13,17 +13,16 @@ it is what an emitter emits, elsewhere that of a surface under D65.
 
 from __future__ import annotations
 
-import itertools
 import math
-import os
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
 from reslrb_cli.backend.installation import is_known
-from reslrb_cli.errors import ConfigError
-from reslrb_cli.scene.xml.read import Description, Element, quoted
+from reslrb_cli.scene.xml.read import Description, Element, find_file, quoted
 
 #: Lines that one warning names, and warnings of one scene.
 _LINES, _WARNINGS = 5, 30
@@ -44,11 +43,12 @@ class Note:
 
 def in_order(notes: Iterable[Note], root: Element) -> list[Note]:
     """The notes in the order of lines, those on the file of `root` first."""
-    return sorted(notes, key=lambda note: (note.element.source != root.source, *_place(note)))
 
+    def place(note: Note) -> tuple[bool, str, int]:
+        source = note.element.source
+        return source != root.source, str(source.file), note.element.line
 
-def _place(note: Note) -> tuple[str, int]:
-    return str(note.element.source.file), note.element.line
+    return sorted(notes, key=place)
 
 
 def warnings(notes: Sequence[Note]) -> list[str]:
@@ -58,35 +58,30 @@ def warnings(notes: Sequence[Note]) -> list[str]:
         kinds.setdefault((note.wrong, note.done, note.element.source.file), []).append(note.element)
     lines = []
     for (wrong, done, _), elements in kinds.items():
-        others = list(dict.fromkeys(element.line for element in elements[1:]))
-        more = ", ".join(map(str, others[:_LINES])) + (f" and {len(others) - _LINES} more" * (len(others) > _LINES))
-        lines.append(f"{elements[0].place}: {wrong}: {done}" + (f" (also in line {more})" if others else ""))
+        others = list(dict.fromkeys(str(element.line) for element in elements[1:]))
+        more = ", ".join(others[:_LINES]) + f" and {len(others) - _LINES} more" * (len(others) > _LINES)
+        lines.append(f"{elements[0].place}: {wrong}: {done}" + f" (also in line {more})" * bool(others))
     if len(lines) > _WARNINGS:
-        rest = len(lines) - _WARNINGS
-        lines = [
-            *lines[:_WARNINGS],
-            f"{notes[0].element.source.file}: {rest} more kinds of things were mended or left out",
-        ]
+        rest = f"{len(lines) - _WARNINGS} more kinds of things were mended or left out"
+        lines[_WARNINGS:] = [f"{notes[0].element.source.file}: {rest}"]
     return lines
 
 
 def refuse(notes: Sequence[Note]) -> None:
     """Raise ConfigError for the first of `notes`, if there is any."""
     if notes:
-        first = notes[0]
         more = f" (and {len(notes) - 1} more)" if len(notes) > 1 else ""
-        raise ConfigError(
-            first.element.place, "", f"{first.wrong}; with scene.strict: false it would be {first.done}{more}"
-        )
+        first = notes[0]
+        raise first.element.fail("", f"{first.wrong}; with scene.strict: false it would be {first.done}{more}")
 
 
 #: Spellings of elements.
 ELEMENTS = {"lookAt": "lookat", "srgb": "rgb"}
 
+_BEFORE_04 = "an element of Mitsuba before 0.4, whose axes pointed elsewhere; save the scene with Mitsuba 0.6"
 #: Elements of Mitsuba 0.x that mean what Mitsuba 3 cannot be told, and what to do.
 LOST_ELEMENTS = {
-    "camera": "an element of Mitsuba before 0.4, whose axes pointed elsewhere; save the scene with Mitsuba 0.6",
-    "luminaire": "an element of Mitsuba before 0.4, whose axes pointed elsewhere; save the scene with Mitsuba 0.6",
+    **dict.fromkeys(("camera", "luminaire"), _BEFORE_04),
     "subsurface": "an element of Mitsuba 0.6 that Mitsuba 3 does not have; remove it, or take a medium",
     "blackbody": "an element of Mitsuba 0.6 that Mitsuba 3 does not have; write its colour as <rgb>",
     "animation": "an element of Mitsuba 0.6; nothing moves in Mitsuba 3: write one of its transforms",
@@ -111,11 +106,7 @@ OBJECT_ATTRIBUTES = ("type", "id", "name")
 #: Plugins by other names, for elements of one kind.
 PLUGINS = {
     ("bsdf", "bump"): "bumpmap",
-    ("film", "exrfilm"): "hdrfilm",
-    ("film", "pngfilm"): "hdrfilm",
-    ("film", "ldrfilm"): "hdrfilm",
-    ("film", "tiledhdrfilm"): "hdrfilm",
-    ("film", "mfilm"): "hdrfilm",
+    **{("film", name): "hdrfilm" for name in ("exrfilm", "pngfilm", "ldrfilm", "tiledhdrfilm", "mfilm")},
 }
 
 #: Objects without which the same light reaches the same film, and what takes their place.
@@ -126,8 +117,7 @@ REPLACEABLE = {
 
 #: Plugins of Mitsuba 0.6 that Mitsuba 3 does not have, and what comes near them.
 LOST_PLUGINS = {
-    ("bsdf", "coating"): "`principled` with a clearcoat comes near",
-    ("bsdf", "roughcoating"): "`principled` with a clearcoat comes near",
+    **dict.fromkeys((("bsdf", "coating"), ("bsdf", "roughcoating")), "`principled` with a clearcoat comes near"),
     ("bsdf", "mixturebsdf"): "nested `blendbsdf` say the same",
     ("bsdf", "phong"): "`roughplastic` comes near",
     ("bsdf", "ward"): "`roughconductor` or `roughplastic` comes near",
@@ -135,8 +125,9 @@ LOST_PLUGINS = {
     ("bsdf", "difftrans"): "`principledthin` comes near",
     ("bsdf", "hk"): "a medium comes near",
     ("bsdf", "irawan"): "a texture comes near",
-    ("emitter", "sky"): "`sunsky` comes near, with z for its up axis in place of y",
-    ("emitter", "sun"): "`sunsky` comes near, with z for its up axis in place of y",
+    **dict.fromkeys(
+        (("emitter", "sky"), ("emitter", "sun")), "`sunsky` comes near, with z for its up axis in place of y"
+    ),
     ("emitter", "collimated"): "`directionalarea` comes near",
     ("shape", "heightfield"): "write it as a mesh",
     ("texture", "scale"): "multiply the texture itself",
@@ -178,15 +169,23 @@ def snake_case(name: str) -> str:
 
 #: Spectra by wavelength, by plugin.
 SPECTRA = ("regular", "irregular", "blackbody")
-#: Wavelengths, in nm, of what Mitsuba takes for visible, and how far apart a black body's are taken.
-_VISIBLE, _STEP = (360.0, 830.0), 5.0
+#: Wavelengths, in nm, of what Mitsuba takes for visible, how far apart a black body's are taken, and how many at most.
+_VISIBLE, _STEP, _MOST = (360.0, 830.0), 5.0, 2**14
 #: Planck's constant times the speed of light squared, twice (W m^2), and times it over Boltzmann's (m K), as Mitsuba's.
 _FIRST, _SECOND = 2 * 6.62607004e-34 * 2.99792458e8**2, 6.62607004e-34 * 2.99792458e8 / 1.38064852e-23
 
 
+def _floats(text: str) -> list[float]:
+    """The numbers of a list of them; none where one is no number."""
+    try:
+        return [float(word) for word in text.replace(",", " ").split()]
+    except ValueError:
+        return []
+
+
 def hexadecimal(element: Element) -> str:
     """The three numbers of `#rrggbb`, each a fraction of 255. Raises ConfigError where it is none."""
-    text = element.attributes.get("value", "").strip()
+    text = element.value.strip()
     if re.fullmatch(r"#[0-9a-fA-F]{6}", text) is None:
         raise element.fail(element.name, f"must be a colour such as #80ff00, not {quoted(text)}")
     return " ".join(f"{int(text[i : i + 2], 16) / 255:.9g}" for i in (1, 3, 5))
@@ -194,12 +193,8 @@ def hexadecimal(element: Element) -> str:
 
 def linear(element: Element) -> str:
     """The value of an <srgb> element, one or three numbers or `#rrggbb`, as linear Rec. 709. Raises ConfigError."""
-    text = element.attributes.get("value", "")
-    words = (hexadecimal(element) if text.strip().startswith("#") else text).replace(",", " ").split()
-    try:
-        encoded = [float(word) for word in words]
-    except ValueError:
-        encoded = []
+    text = element.value
+    encoded = _floats(hexadecimal(element) if text.strip().startswith("#") else text)
     if len(encoded) not in (1, 3):
         raise element.fail(element.name, f"must be one or three numbers or #rrggbb, not {quoted(text)}")
     # IEC 61966-2-1
@@ -211,90 +206,74 @@ def by_wavelength(spectrum: Element, owner: Element) -> dict[str, str]:
 
     Raises ConfigError where it is no spectrum, or a black body that is not what an emitter emits.
     """
-    inner = next((child for child in spectrum.children if child.tag == "spectrum" and child.name == "value"), None)
-    if inner is not None and spectrum.type != "blackbody":
-        return {key: value for key, value in inner.attributes.items() if key in ("value", "filename")}
+    inner = spectrum.find("value")
     if spectrum.type == "blackbody":
         if owner.tag != "emitter":
             raise spectrum.fail("", f"a blackbody is what an emitter emits; a {owner.tag} can have <rgb>")
-        pairs = _black_body(spectrum)
+        wavelengths, values = _black_body(spectrum)
+    elif inner is not None and inner.tag == "spectrum":
+        return {key: value for key, value in inner.attributes.items() if key in ("value", "filename")}
     elif spectrum.type == "regular":
-        values, (first, last) = _numbers(spectrum, "values"), _range(spectrum, required=True)
-        step = (last - first) / max(len(values) - 1, 1)
-        pairs = [(first + step * place, value) for place, value in enumerate(values)]
+        values = _numbers(spectrum, "values")
+        wavelengths = np.linspace(*_range(spectrum, ()), len(values))
     else:
         wavelengths, values = _numbers(spectrum, "wavelengths"), _numbers(spectrum, "values")
         if len(wavelengths) != len(values):
             raise spectrum.fail("", f"irregular has {len(wavelengths)} wavelengths and {len(values)} values")
-        pairs = list(zip(wavelengths, values, strict=True))
-    if len(pairs) < 2 or any(left >= right for (left, _), (right, _) in itertools.pairwise(pairs)):
+    if len(wavelengths) < 2 or (np.diff(wavelengths) <= 0).any():
         raise spectrum.fail("", f"{spectrum.type} needs two wavelengths or more, in ascending order")
+    pairs = zip(wavelengths, values, strict=True)
     return {"value": ", ".join(f"{wavelength:.9g}:{value:.9g}" for wavelength, value in pairs)}
 
 
-def _black_body(spectrum: Element) -> list[tuple[float, float]]:
+def _black_body(spectrum: Element) -> tuple[np.ndarray, np.ndarray]:
     """Wavelengths in nm, and the radiance of a black body in W/(m^2 sr nm)."""
-    [temperature, *more] = _numbers(spectrum, "temperature")
-    if more or temperature <= 0:
+    temperature = _numbers(spectrum, "temperature")
+    if len(temperature) > 1 or temperature[0] <= 0:
         raise spectrum.fail("temperature", "must be a number of kelvin above 0")
-    first, last = _range(spectrum, required=False)
-    count = max(math.ceil((last - first) / _STEP), 1)
-    pairs = []
-    for place in range(count + 1):
-        metres = 1e-9 * (first + (last - first) * place / count)
-        exponent = min(_SECOND / (metres * temperature), 700.0)  # beyond it is 0 to a float, and the other overflows
-        pairs.append((1e9 * metres, 1e-9 * _FIRST / (metres**5 * math.expm1(exponent))))
-    return pairs
+    first, last = _range(spectrum, _VISIBLE)
+    nm = np.linspace(first, last, min(math.ceil((last - first) / _STEP), _MOST) + 1)
+    exponent = _SECOND / (1e-9 * nm * temperature[0])
+    # Beyond 700 it is 0 to a float, and the other overflows.
+    return nm, 1e-9 * _FIRST / ((1e-9 * nm) ** 5 * np.expm1(np.minimum(exponent, 700)))
 
 
-def _range(spectrum: Element, required: bool) -> tuple[float, float]:
+def _range(spectrum: Element, default: Sequence[float]) -> tuple[float, float]:
+    """The ends of the wavelengths, in nm: those of `default` where they are not given, and there is one."""
     names = ("wavelength_min", "wavelength_max")
-    given = {child.name for child in spectrum.children}
-    ends = [
-        _numbers(spectrum, name)[0] if required or name in given else default
-        for name, default in zip(names, _VISIBLE, strict=True)
-    ]
-    if not 0 < ends[0] < ends[1]:
+    low, high = (
+        default[place] if default and spectrum.find(name) is None else _numbers(spectrum, name)[0]
+        for place, name in enumerate(names)
+    )
+    if not 0 < low < high:
         raise spectrum.fail("", f"{spectrum.type}: wavelength_max must be above wavelength_min, and both above 0")
-    return ends[0], ends[1]
+    return low, high
 
 
-def _numbers(spectrum: Element, name: str) -> Sequence[float]:
+def _numbers(spectrum: Element, name: str) -> np.ndarray:
     """The numbers of a parameter, one or more, none of them negative or not finite."""
-    text = next((child.attributes.get("value", "") for child in spectrum.children if child.name == name), None)
-    if text is None:
+    parameter = spectrum.find(name)
+    if parameter is None:
         raise spectrum.fail("", f"{spectrum.type} needs a parameter `{name}`")
-    try:
-        numbers = [float(word) for word in text.replace(",", " ").split()]
-    except ValueError:
-        numbers = []
-    if not numbers or not all(math.isfinite(number) and number >= 0 for number in numbers):
-        raise spectrum.fail(name, f"must be numbers from 0 on, not {quoted(text)}")
+    numbers = np.array(_floats(parameter.value))
+    if not numbers.size or not (np.isfinite(numbers) & (numbers >= 0)).all():
+        raise spectrum.fail(name, f"must be numbers from 0 on, not {quoted(parameter.value)}")
     return numbers
-
-
-#: The steps of a transform, in their order, and the parameters that give them along u and v.
-_STEPS = {"translate": ("uoffset", "voffset"), "scale": ("uscale", "vscale")}
 
 
 def transform_coordinates(texture: Element) -> Element | None:
     """Write what a texture says of `uscale` and its like as the transform that they mean; return the first of them."""
-    names = [name for pair in _STEPS.values() for name in pair]
+    names = ("uoffset", "voffset", "uscale", "vscale")
     given = {child.name: child for child in texture.children if child.tag == "float" and child.name in names}
     if not given:
         return None
     first = next(iter(given.values()))
     steps = []
-    for tag, pair in _STEPS.items():
-        values = {
-            axis: given[name].attributes.get("value", "")
-            for axis, name in zip("xy", pair, strict=True)
-            if name in given
-        }
-        if values:
-            steps.append(Element(tag, values, first.source, first.line))
-    texture.children[:] = [child for child in texture.children if child not in given.values()]
-    texture.children.append(Element("transform", {"name": "to_uv"}, first.source, first.line, steps))
+    for tag, word in (("translate", "offset"), ("scale", "scale")):  # in their order
+        axes = {axis: given[u + word].value for axis, u in (("x", "u"), ("y", "v")) if u + word in given}
+        steps += [first.new(tag, **axes)] if axes else []
+    texture.drop(*given)
+    texture.children.append(first.new("transform", *steps, name="to_uv"))
     return first
 
 
@@ -304,15 +283,15 @@ def place_textures(root: Element) -> None:
     Mitsuba lists the parameters of what stands right below the scene as the scene's own, by the id of a texture, which
     some lose: nothing would say that they are properties of a material or a light.
     """
-    textures = {child.attributes.get("id", ""): child for child in root.children if child.tag == "texture"}
-    textures.pop("", None)
-    aliased = {element.attributes.get("id") for element in root.walk() if element.tag == "alias"}
+    textures = {child.id: child for child in root.children if child.tag == "texture" and child.id}
+    for alias in root.walk("alias"):
+        textures.pop(alias.id, None)
     for element in list(root.walk()):
-        for index, child in enumerate(element.children):
-            texture = textures.get(child.attributes.get("id", "")) if child.tag == "ref" else None
-            if texture is None or element is root or element is texture or texture.attributes["id"] in aliased:
+        for index, child in enumerate(element.children if element is not root else ()):
+            texture = textures.get(child.id) if child.tag == "ref" else None
+            if texture is None or texture is element:
                 continue
-            del textures[texture.attributes["id"]]
+            del textures[texture.id]
             root.children.remove(texture)
             texture.attributes.pop("name", None)
             if child.name:
@@ -332,8 +311,8 @@ def mend(description: Description) -> list[Note]:
     """
     mender = _Mender(description.folders)
     root = description.root
+    given = root.attributes.pop("version", None)
     if root.source.version is None:
-        given = root.attributes.get("version")
         wrong = "the version is missing" if given is None else f"version {quoted(given)} is not three numbers"
         mender.note(root, wrong, f"taken for {CURRENT_VERSION}")
     mender.mend_root(root)
@@ -352,7 +331,6 @@ class _Mender:
 
     def mend_root(self, root: Element) -> None:
         """Mend the whole scene."""
-        root.attributes.pop("version", None)
         if root.is_object:
             self._element(root)
         self.mend(root)
@@ -360,7 +338,7 @@ class _Mender:
         # What refers to something that was left out goes with it.
         for element in root.walk() if self.gone else ():
             element.children[:] = [
-                child for child in element.children if child.tag != "ref" or child.attributes.get("id") not in self.gone
+                child for child in element.children if child.tag != "ref" or child.id not in self.gone
             ]
 
     def mend(self, element: Element) -> None:
@@ -368,25 +346,20 @@ class _Mender:
         kept = []
         names = {child.name for child in element.children}
         for child in element.children:
-            if self._is_kept(child):
-                if element.is_object:
-                    self._parameter(child, element, names)
-                if not self._is_needless_format(child, element):
-                    kept.append(child)
-            else:
-                self.gone.update(other.attributes.get("id", "") for other in child.walk() if other.is_object)
+            # In place of a scene's integrator there is the experiment's own.
+            if child.tag == "integrator" or not self._element(child) or (child.is_object and not self._plugin(child)):
+                self.gone.update(other.id for other in child.objects())
+            elif not element.is_object or self._parameter(child, element, names):
+                kept.append(child)
         element.children[:] = kept
         if element.is_object:
             self._repetitions(element)
-            self._texture_coordinates(element)
+        if element.tag == "texture":
+            replaced = transform_coordinates(element)
+            if replaced is not None and not element.source.is_old:
+                self.note(replaced, f"`{replaced.name}` is unknown to Mitsuba 3", "read as `to_uv`")
         for child in element.children:
             self.mend(child)
-
-    def _is_kept(self, element: Element) -> bool:
-        """Mend an element and its plugin; False where it is to be left out."""
-        if element.tag == "integrator":  # the experiment's own takes its place
-            return False
-        return self._element(element) and (not element.is_object or self._plugin(element))
 
     # --- elements and plugins -----------------------------------------------------------------------------------------
 
@@ -398,9 +371,7 @@ class _Mender:
         if tag in ELEMENTS:
             element.tag = ELEMENTS[tag]
             self.note(element, f"{quoted(f'<{tag}>')} is unknown to Mitsuba 3", f"read as <{element.tag}>")
-        known = ATTRIBUTES.get(element.tag)
-        if element.is_object:
-            known = OBJECT_ATTRIBUTES
+        known = OBJECT_ATTRIBUTES if element.is_object else ATTRIBUTES.get(element.tag)
         if known is None:
             if tag in LOST_ELEMENTS:
                 raise element.fail("", f"<{tag}> is {LOST_ELEMENTS[tag]}")
@@ -414,41 +385,39 @@ class _Mender:
     def _plugin(self, element: Element) -> bool:
         """Mend the name of an object's plugin; False where the object is to be left out."""
         type = element.type
+        wrong = f"there is no {element.tag} {quoted(type)} in Mitsuba 3"
+        other = PLUGINS.get((element.tag, type), type.lower())
         if is_known(type):
             if element.tag == "sampler" and type != "independent":
                 # Others round the number of samples, which is the experiment's, and fail where it is split otherwise.
                 element.attributes["type"] = "independent"
                 element.children[:] = [child for child in element.children if child.name == "sample_count"]
-            return True
-        other = PLUGINS.get((element.tag, type), type.lower())
-        if is_known(other):
-            self.note(element, f"there is no {element.tag} {quoted(type)} in Mitsuba 3", f"read as `{other}`")
+        elif is_known(other):
+            self.note(element, wrong, f"read as `{other}`")
             element.attributes["type"] = other
-            return True
-        replacement = REPLACEABLE.get(element.tag)
-        if replacement is None:
-            return True
-        self.note(element, f"there is no {element.tag} {quoted(type)} in Mitsuba 3", f"left out ({replacement})")
-        return False
+        elif element.tag in REPLACEABLE:
+            self.note(element, wrong, f"left out ({REPLACEABLE[element.tag]})")
+            return False
+        return True
 
     # --- parameters ---------------------------------------------------------------------------------------------------
 
-    def _parameter(self, element: Element, owner: Element, names: set[str]) -> None:
-        """Mend the name and the value of a parameter of `owner`, whose parameters have these `names`."""
+    def _parameter(self, element: Element, owner: Element, names: set[str]) -> bool:
+        """Mend the name and the value of a parameter of `owner`, whose parameters have these `names`; False where it is
+        to be left out."""
         if owner.tag == "scene" and element.is_object:
             # A name says nothing here, but of two objects with the same one Mitsuba drops the first.
             element.attributes.pop("name", None)
-            return
+            return True
         self._name(element, owner, names)
-        value = element.attributes.get("value", "")
+        value = element.value
         if element.tag == "spectrum" and "type" not in element.attributes and _is_colour(value):
             self.note(element, "a <spectrum> of three numbers is unknown to Mitsuba 3", "read as <rgb>")
             element.tag = "rgb"
         elif element.tag == "rgb" and value.startswith("#"):
             element.attributes["value"] = hexadecimal(element)
             self.note(element, f"a colour cannot be written as {quoted(value)} in Mitsuba 3", "read as three numbers")
-        elif element.tag == "string":
-            self._text(element, owner, value)
+        return element.tag != "string" or self._text(element, owner, value)
 
     def _name(self, element: Element, owner: Element, names: set[str]) -> None:
         old, name = element.name, snake_case(element.name)
@@ -462,28 +431,21 @@ class _Mender:
         if not element.source.is_old:
             self.note(element, f"{quoted(old)} is spelled as before Mitsuba 2", f"read as {quoted(name)}")
 
-    def _text(self, element: Element, owner: Element, value: str) -> None:
+    def _text(self, element: Element, owner: Element, value: str) -> bool:
+        wrong = f"{owner.type} has no {element.name} {quoted(value)} in Mitsuba 3"
+        if owner.type == "hdrfilm" and value.lower() not in FORMATS.get(element.name, (value.lower(),)):
+            self.note(element, wrong, "left out")  # images are written without it
+            return False
         other = VALUES.get((owner.type, element.name), {}).get(value)
         if (owner.type, element.name) == ("hdrfilm", "pixel_format") and "," in value:
             other = value.partition(",")[0].strip()  # one for each of several images
-        wrong = f"{owner.type} has no {element.name} {quoted(value)} in Mitsuba 3"
-        slashed = value.replace("\\", "/")
-        if element.name == "filename" and slashed != value and not self._exists(value) and self._exists(slashed):
-            other, wrong = slashed, f"there is no file {quoted(value)}"
+        if element.name == "filename" and "\\" in value and find_file(value, self.folders) is None:
+            slashed = value.replace("\\", "/")
+            if find_file(slashed, self.folders) is not None:
+                other, wrong = slashed, f"there is no file {quoted(value)}"
         if other is not None:
             element.attributes["value"] = other
             self.note(element, wrong, f"read as {quoted(other)}")
-
-    def _exists(self, file: str) -> bool:
-        return any(os.path.exists(folder / file) for folder in self.folders)
-
-    def _is_needless_format(self, element: Element, owner: Element) -> bool:
-        """Whether `element` asks `hdrfilm` for a format that it does not know: images are written without it."""
-        known = FORMATS.get(element.name)
-        value = element.attributes.get("value", "")
-        if owner.type != "hdrfilm" or known is None or element.tag != "string" or value.lower() in known:
-            return False
-        self.note(element, f"hdrfilm has no {element.name} {quoted(value)} in Mitsuba 3", "left out")
         return True
 
     def _repetitions(self, owner: Element) -> None:
@@ -501,32 +463,26 @@ class _Mender:
     def _spectra(self, root: Element) -> None:
         """Write spectra by wavelength as parameters of what has them, since RGB variants have no such plugins."""
         named = {
-            element.attributes["id"]: element
-            for element in root.walk()
-            if element.tag in ("spectrum", "texture") and element.type in SPECTRA and "id" in element.attributes
+            item.id: item
+            for item in root.walk("spectrum", "texture")
+            if item.type in SPECTRA and "id" in item.attributes
         }
-        for alias in [element for element in root.walk() if element.tag == "alias"]:
-            if alias.attributes.get("id") in named:
-                named[alias.attributes.get("as", "")] = named[alias.attributes["id"]]
-        for owner in [element for element in root.walk() if element.is_object and element.type != "specfilm"]:
+        for alias in root.walk("alias"):
+            if alias.id in named:
+                named[alias.attributes.get("as", "")] = named[alias.id]
+        for owner in [element for element in root.objects() if element.type != "specfilm"]:
             kept = []
             for child in owner.children:
-                meant = named.get(child.attributes.get("id", ""))
+                meant = named.get(child.id)
                 if meant is None:
                     kept.append(child)
                 elif owner is not root:
                     name = child.name or meant.name
                     if not name:
                         raise child.fail("", f"<{meant.tag}> `{meant.type}` needs a name: that of what it is for")
-                    attributes = {"name": name, **by_wavelength(meant, owner)}
-                    kept.append(Element("spectrum", attributes, child.source, child.line))
+                    kept.append(child.new("spectrum", name=name, **by_wavelength(meant, owner)))
                     self.note(meant, f"RGB variants have no spectrum `{meant.type}`", "read as the colour of it")
             owner.children[:] = kept
-
-    def _texture_coordinates(self, owner: Element) -> None:
-        replaced = transform_coordinates(owner) if owner.tag == "texture" else None
-        if replaced is not None and not owner.source.is_old:
-            self.note(replaced, f"`{replaced.name}` is unknown to Mitsuba 3", "read as `to_uv`")
 
 
 def _is_colour(value: str) -> bool:
