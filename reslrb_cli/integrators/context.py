@@ -22,8 +22,8 @@ from reslrb_cli.guiding.tables import Guiding
 from reslrb_cli.integrators.freezing import Recordings
 from reslrb_cli.scene.catalog import parameter_kind
 from reslrb_cli.scene.deformation import BEAMS, PLACES, Surroundings, moving_emitter_obstacle, moving_shape_obstacle
-from reslrb_cli.scene.graph import SceneGraph, emitted_rays, find_lamps
-from reslrb_cli.scene.needs import check_supported, interpolates_normals, scene_needs
+from reslrb_cli.scene.graph import SceneGraph, emitted_rays, find_lamps, interpolates_normals
+from reslrb_cli.scene.needs import check_supported, scene_needs
 from reslrb_cli.transport.aim import worthwhile
 from reslrb_cli.transport.bsdf import Scattering, stays_behind
 from reslrb_cli.transport.connection import Connection

@@ -135,11 +135,8 @@ def value_shape(value: Any, halo: int = 0) -> tuple[int, ...]:
 def current_value(params: Any, key: str) -> Value | None:
     """The value of one entry of a `mi.traverse` result; None for what is no number."""
     value = _value(params, key)
-    try:
-        array = np.asarray(value.matrix if "AffineTransform" in type(value).__name__ else value)
-    except (RuntimeError, TypeError):
-        return None
-    if array.dtype.kind not in "buif" or array.size == 0:
+    array = as_numbers(value)
+    if array is None or array.size == 0:
         return None
     if array.dtype == np.uint8 and coarse_bits(params, key) is not None:
         return _encoded_value(array, params.properties[key][2])
@@ -147,6 +144,15 @@ def current_value(params: Any, key: str) -> Value | None:
     array = array[:, columns : array.shape[1] - columns] if columns else array
     numbers = [float(number) for number in array.ravel()] if array.size <= _FEW else None
     return Value(numbers, float(array.mean(dtype=np.float64)), float(array.min()), float(array.max()))
+
+
+def as_numbers(value: Any) -> np.ndarray | None:
+    """A parameter's value as an array, a transform by its matrix; None of what is no number."""
+    try:
+        array = np.asarray(value.matrix if "AffineTransform" in type(value).__name__ else value)
+    except (RuntimeError, TypeError):
+        return None
+    return array if array.dtype.kind in "buif" else None
 
 
 def _encoded_value(array: np.ndarray, texture: mi.Texture) -> Value:

@@ -4,6 +4,7 @@
 - `Lamp`: a shape that emits light, and what its emitter does.
 - `emitted_rays`: rays as the emitters of a scene send them out, where Mitsuba can sample them.
 - `small_lamps`: lamps in view that are smaller than a pixel, which rays through the pixels hardly ever hit.
+- `triangles`, `normal_cosines`: meshes as arrays, and how far their shading normals turn from those of their faces.
 """
 
 from __future__ import annotations
@@ -63,30 +64,29 @@ class SceneGraph:
         """All shapes that rays can hit, also those inside of groups that are instanced."""
         return [shape for shape in self.of_type(mi.Shape) if shape.class_name() not in ("Instance", "ShapeGroupPlugin")]
 
+    def has_instances(self) -> bool:
+        """Whether there is an instance of a group of shapes."""
+        return any(item.class_name() == "Instance" for item in self.objects)
+
     def is_shown(self, shape: Any) -> bool:
         """Whether rays may meet a shape: it does not stand in a group alone, where nothing is instanced."""
-        grouped = all(parent.class_name() == "ShapeGroupPlugin" for parent in self.parents[shape])
-        return not grouped or any(item.class_name() == "Instance" for item in self.objects)
+        return self.has_instances() or any(item.class_name() != "ShapeGroupPlugin" for item in self.parents[shape])
 
     def surface_bsdfs(self) -> list[Any]:
         """The BSDFs that shapes have (not those nested in others), each once."""
-        found: dict[Any, None] = {}
-        for shape in self.shapes():
-            if shape.bsdf() is not None:
-                found[shape.bsdf()] = None
-        return list(found)
+        return list(dict.fromkeys(shape.bsdf() for shape in self.shapes() if shape.bsdf() is not None))
 
     def owning_bsdfs(self, item: Any) -> list[Any]:
         """The outermost BSDFs that use `item` (a texture, or a nested BSDF) at any depth."""
-        owners: dict[Any, None] = {}
-        waiting = [item]
+        owners, waiting = [], [item]
         while waiting:
             current = waiting.pop()
-            above = [p for p in self.parents.get(current, []) if isinstance(p, (mi.BSDF, mi.Texture))]
-            if isinstance(current, mi.BSDF) and len(above) < len(self.parents.get(current, [])):
-                owners[current] = None
+            parents = self.parents.get(current, [])
+            above = [parent for parent in parents if isinstance(parent, (mi.BSDF, mi.Texture))]
+            if isinstance(current, mi.BSDF) and len(above) < len(parents):
+                owners.append(current)
             waiting += above
-        return list(owners)
+        return list(dict.fromkeys(owners))
 
 
 @dataclass(frozen=True)
@@ -121,16 +121,21 @@ class Lamp:
 
 def find_lamps(scene: mi.Scene, graph: SceneGraph) -> tuple[Lamp, ...]:
     """All shapes of `scene` that emit, in the order of `scene.emitters()`."""
+    textures = graph.of_type(mi.Texture)
     found = []
     for index, emitter in enumerate(scene.emitters()):
-        shape = emitter.get_shape()
-        if shape is None:
-            continue
-        parallel = emitter.class_name() == "DirectionalArea"
-        textures = [item for item in graph.of_type(mi.Texture) if emitter in graph.parents[item]]
-        varying = [texture for texture in textures if texture.is_spatially_varying()]
-        found.append(Lamp(shape, emitter, index, parallel, varying[0] if varying and not parallel else None))
+        shape, parallel = emitter.get_shape(), emitter.class_name() == "DirectionalArea"
+        if shape is not None:
+            own = [texture for texture in textures if emitter in graph.parents[texture]]
+            varying = [texture for texture in own if texture.is_spatially_varying()]
+            found.append(Lamp(shape, emitter, index, parallel, varying[0] if varying and not parallel else None))
     return tuple(found)
+
+
+def grid(side: int) -> mi.Point2f:
+    """The centres of side^2 cells of the unit square, row by row."""
+    lane = dr.arange(mi.UInt32, side**2)
+    return (mi.Point2f(lane % side, lane // side) + 0.5) / side
 
 
 def emitted_rays(
@@ -195,10 +200,34 @@ def _pixels(sensor: mi.Sensor, shape: mi.Shape) -> float:
 
 def _is_in_view(scene: mi.Scene, sensor: mi.Sensor, shape: mi.Shape) -> bool:
     """Whether any of a grid of points on the shape is before the lens, with nothing in between."""
-    lane = dr.arange(mi.UInt32, POINTS**2)
-    sample = (mi.Point2f(lane % POINTS, lane // POINTS) + 0.5) / POINTS
     with dr.suspend_grad():
-        si = mi.SurfaceInteraction3f(shape.sample_position(sensor.shutter_open(), sample), mi.Color0f())
+        si = mi.SurfaceInteraction3f(shape.sample_position(sensor.shutter_open(), grid(POINTS)), mi.Color0f())
         ds, _ = sensor.sample_direction(si, mi.Point2f(0.5), True)
         seen = ds.pdf > 0
         return bool(dr.any(seen & ~scene.ray_test(si.spawn_ray_to(ds.p), seen)))
+
+
+def interpolates_normals(shape: mi.Shape) -> bool:
+    """Whether the shape is a mesh whose shading normals, as soon as it bends, differ from its geometric ones."""
+    return shape.is_mesh() and shape.has_vertex_normals() and not shape.has_face_normals()
+
+
+def triangles(mesh: mi.Mesh) -> np.ndarray:
+    """The corners of a mesh's faces, (F, 3, 3) float64."""
+    return _at_corners(mesh, mesh.vertex_positions_buffer())
+
+
+def face_normals(corners: np.ndarray) -> np.ndarray:
+    """Normals of triangles (F, 3, 3), (F, 3), of twice the length of their areas."""
+    return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+
+
+def normal_cosines(mesh: mi.Mesh) -> np.ndarray:
+    """Cosines between the normals of a mesh's vertices and that of the face, (F, 3); 0 for a face without area."""
+    flat, shading = face_normals(triangles(mesh))[:, None], _at_corners(mesh, mesh.vertex_normals_buffer())
+    lengths = np.linalg.norm(flat, axis=2) * np.linalg.norm(shading, axis=2)
+    return np.asarray((flat * shading).sum(2) / np.maximum(lengths, 1e-30))
+
+
+def _at_corners(mesh: mi.Mesh, buffer: mi.Float) -> np.ndarray:
+    return np.array(buffer, np.float64).reshape(-1, 3)[np.array(mesh.faces_buffer()).reshape(-1, 3)]

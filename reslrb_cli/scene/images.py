@@ -27,13 +27,13 @@ from reslrb_cli.errors import ConfigError, is_out_of_memory
 
 logger = logging.getLogger(__name__)
 FORMATS = "EXR, PNG, JPG, HDR, PFM, PPM or BMP"
+_NO_IMAGE = f"is not an image that can be read ({FORMATS})"
 #: Bytes in which a file says how large its image is; a preview may stand before it.
 _HEAD = 2**20
 #: Parts that a PNG or a JPEG has at most, so that one of nothing but empty parts takes no time.
 _MOST_PARTS = 2**20
 #: Bytes of what EXIF says: a segment of a JPEG has no more, and the orientation stands at its beginning.
 _EXIF_BYTES = 2**16
-_DAMAGED = "is damaged or cut off; copy or save it again"
 Size = tuple[int, int]
 
 #: What is done to the pixels of a file to see them upright, by EXIF's number of the orientation; 1 is upright.
@@ -68,10 +68,6 @@ class _Says:
     orientation: int = 1
     is_jpeg: bool = False
 
-    def seen(self, upright: bool) -> Size:
-        """The (width, height) of the image, as it lies or `upright`."""
-        return self.size[::-1] if upright and self.orientation >= 5 else self.size
-
 
 def read_bitmap(path: Path, size: Size | None = None) -> mi.Bitmap:
     """Decode the image file `path`; `size` is the (width, height) that it must have, None for any.
@@ -91,8 +87,7 @@ def read_upright(path: Path, size: Size | None = None) -> mi.Bitmap:
     bitmap, orientation = _read(path, size, upright=True)
     if orientation == 1:
         return bitmap
-    pixels = np.array(bitmap)
-    turned = mi.Bitmap(np.ascontiguousarray(turn(pixels, orientation)), bitmap.pixel_format())
+    turned = mi.Bitmap(np.ascontiguousarray(turn(np.array(bitmap), orientation)), bitmap.pixel_format())
     turned.set_srgb_gamma(bitmap.srgb_gamma())
     turned.set_premultiplied_alpha(bitmap.premultiplied_alpha())
     return turned
@@ -110,27 +105,24 @@ def turn(pixels: np.ndarray, orientation: int) -> np.ndarray:
 
 
 def orientation_of(path: Path) -> int:
-    """EXIF's orientation of an image file, 1 to 8: 1 of one that has none. Raises ConfigError where it is no file."""
-    with open_file(path, IMAGE_BYTES) as file, suppress(_CutOff, _Damaged, OSError):
-        says = _examine(file)
-        return 1 if says is None else says.orientation
-    return 1
+    """EXIF's orientation of an image file, 1 to 8: 1 of one that has none. Raises ConfigError where it is no image."""
+    return _examine(path).orientation
+
+
+def image_size(path: Path) -> Size:
+    """The (width, height) of an image as it lies in its file. Raises ConfigError, located in it, where it is none."""
+    width, height = _examine(path).size
+    if min(width, height) < 1:
+        raise DamagedImage(path, "", f"says that it is {width}x{height} pixels; save it again")
+    return width, height
 
 
 def _read(path: Path, size: Size | None, upright: bool) -> tuple[mi.Bitmap, int]:
     """The image as it lies in the file, and its orientation; `size` is that of the image as it lies, or `upright`."""
-    with open_file(path, IMAGE_BYTES) as file:
-        try:
-            says = _examine(file)
-        except _CutOff:
-            raise ConfigError(path, "", "is cut off: the file ends before its image; copy or save it again") from None
-        except _Damaged:
-            raise DamagedImage(path, "", _DAMAGED) from None
-        except OSError as error:
-            raise ConfigError(path, "", f"cannot be read: {error.strerror}") from None
-    if says is None or min(says.size) < 1:
-        raise ConfigError(path, "", f"is not an image that can be read ({FORMATS})")
-    width, height = says.seen(upright)
+    says = _examine(path)
+    width, height = says.size[::-1] if upright and says.orientation >= 5 else says.size
+    if min(width, height) < 1:
+        raise ConfigError(path, "", _NO_IMAGE)
     if size is not None and (width, height) != size:
         turned = f", {TURNS[says.orientation]} as its EXIF orientation says" if upright and says.orientation > 1 else ""
         raise ConfigError(path, "", f"is {width}x{height} pixels{turned}; it must be {size[0]}x{size[1]}")
@@ -153,35 +145,25 @@ def _read(path: Path, size: Size | None, upright: bool) -> tuple[mi.Bitmap, int]
     return bitmap, says.orientation
 
 
-def image_size(path: Path) -> Size:
-    """The (width, height) of an image as it lies in its file. Raises ConfigError, located in it, where it is none."""
+def _examine(path: Path) -> _Says:
+    """What a file says of its image. Raises ConfigError, located in it, where it is none, or a PNG or JPEG without its
+    end, which readers of the other formats tell themselves."""
+    says: _Says | None = None
     with open_file(path, IMAGE_BYTES) as file:
         try:
-            says = _examine(file)
-        except _CutOff:
-            says = None
-        except _Damaged:
-            raise DamagedImage(path, "", _DAMAGED) from None
-    if says is not None and min(says.size) < 1:
-        raise DamagedImage(path, "", f"says that it is {says.size[0]}x{says.size[1]} pixels; save it again")
-    if says is None:
-        raise ConfigError(path, "", f"is not an image that can be read ({FORMATS})")
-    return says.size
-
-
-def _examine(file: BinaryIO) -> _Says | None:
-    """What a file says of its image, None where it is none.
-
-    Raises _CutOff where a PNG or JPEG has no end; the readers of the other formats tell that themselves.
-    """
-    head = file.read(_HEAD) or b""
-    for magic, reader in _READERS.items():
-        if head.startswith(magic):
+            head = file.read(_HEAD) or b""
+            reader = next((reader for magic, reader in _READERS.items() if head.startswith(magic)), None)
             with suppress(struct.error, ValueError):  # a head that is cut off is none
-                says = reader(head, file)
-                return _Says(says) if isinstance(says, tuple) else says
-            return None
-    return None
+                says = None if reader is None else reader(head, file)
+        except _CutOff:
+            raise ConfigError(path, "", "is cut off: the file ends before its image; copy or save it again") from None
+        except _Damaged:
+            raise DamagedImage(path, "", "is damaged or cut off; copy or save it again") from None
+        except OSError as error:
+            raise ConfigError(path, "", f"cannot be read: {error.strerror}") from None
+    if says is None:
+        raise ConfigError(path, "", _NO_IMAGE)
+    return says
 
 
 # --- formats ----------------------------------------------------------------------------------------------------------
@@ -253,7 +235,7 @@ def _orientation(exif: bytes) -> int:
     return 1
 
 
-def _exr_size(head: bytes, file: BinaryIO) -> Size | None:
+def _exr(head: bytes, file: BinaryIO) -> _Says | None:
     position = 8
     while True:  # attributes: a name and a type, each ended by a zero, the number of bytes, and these
         name, _, rest = head[position : position + 600].partition(b"\0")
@@ -264,11 +246,11 @@ def _exr_size(head: bytes, file: BinaryIO) -> Size | None:
             return None
         if name == b"dataWindow":
             left, top, right, bottom = struct.unpack_from("<4i", head, position + 4)
-            return right - left + 1, bottom - top + 1
+            return _Says((right - left + 1, bottom - top + 1))
         position += 4 + length
 
 
-def _hdr_size(head: bytes, file: BinaryIO) -> Size | None:
+def _hdr(head: bytes, file: BinaryIO) -> _Says | None:
     found = re.search(rb"\n-Y (\d{1,9}) \+X (\d{1,9})\n", head)
     if found is None:
         return None
@@ -276,7 +258,7 @@ def _hdr_size(head: bytes, file: BinaryIO) -> Size | None:
     if width * height <= PIXELS:  # else it is refused for that
         file.seek(found.end())
         _check_runs(file.read(), width, height)
-    return width, height
+    return _Says((width, height))
 
 
 def _check_runs(data: bytes, width: int, height: int) -> None:
@@ -296,33 +278,31 @@ def _check_runs(data: bytes, width: int, height: int) -> None:
             left = width
             while left > 0 and position < end:
                 code = data[position]
-                if code > 128:
-                    left, position = left - code + 128, position + 2
-                elif code:
-                    left, position = left - code, position + code + 1
-                else:
+                if code == 0:
                     raise _Damaged
+                length = code - 128 if code > 128 else code
+                left, position = left - length, position + (2 if code > 128 else length + 1)
             if left or position > end:
                 raise _Damaged
 
 
-def _netpbm_size(head: bytes, file: BinaryIO) -> Size | None:
+def _netpbm(head: bytes, file: BinaryIO) -> _Says | None:
     found = re.match(rb"..(?:\s|#[^\n]*\n)+(\d{1,9})(?:\s|#[^\n]*\n)+(\d{1,9})\s", head)
-    return (int(found[1]), int(found[2])) if found else None
+    return _Says((int(found[1]), int(found[2]))) if found else None
 
 
-def _bmp_size(head: bytes, file: BinaryIO) -> Size | None:
+def _bmp(head: bytes, file: BinaryIO) -> _Says | None:
     width, height = struct.unpack_from("<ii", head, 18)
-    return width, abs(height)
+    return _Says((width, abs(height)))
 
 
-_READERS: dict[bytes, Callable[[bytes, BinaryIO], Size | _Says | None]] = {
-    b"\x76\x2f\x31\x01": _exr_size,
+_READERS: dict[bytes, Callable[[bytes, BinaryIO], _Says | None]] = {
+    b"\x76\x2f\x31\x01": _exr,
     _PNG: _png,
     _JPEG: _jpeg,
-    b"#?": _hdr_size,
-    **dict.fromkeys((b"PF", b"Pf", b"P5", b"P6"), _netpbm_size),
-    b"BM": _bmp_size,
+    b"#?": _hdr,
+    **dict.fromkeys((b"PF", b"Pf", b"P5", b"P6"), _netpbm),
+    b"BM": _bmp,
 }
 
 
@@ -374,17 +354,13 @@ class Photo:
 
 def turned_line(path: Path, upright: bool = True) -> str | None:
     """What the user is told of an image with an EXIF orientation, which is read `upright` or not; None of others."""
-    orientation = orientation_of(path)
-    if orientation == 1:
-        return None
-    if upright:
-        return f"{path}: {TURNS[orientation]}, as its EXIF orientation says"
-    return f"{path}: not {TURNS[orientation]} as its EXIF orientation says: cameras of files see pixels as they lie"
+    turned = TURNS.get(orientation_of(path))
+    if turned is None or upright:
+        return None if turned is None else f"{path}: {turned}, as its EXIF orientation says"
+    return f"{path}: not {turned} as its EXIF orientation says: cameras of files see pixels as they lie"
 
 
-def read_image(
-    path: Path, color_space: str = "auto", size: tuple[int, int] | None = None, signed: bool = False
-) -> Image:
+def read_image(path: Path, color_space: str = "auto", size: Size | None = None, signed: bool = False) -> Image:
     """Read an EXR, PNG, JPG, HDR, PFM, PPM or BMP file as linear Rec. 709: (H, W, 3) float32.
 
     `color_space` says how the file's values are encoded: `linear`, `srgb`, or `auto` (integers srgb, floats linear).
@@ -394,8 +370,8 @@ def read_image(
     or holds a value that is not finite or, unless `signed`, negative.
     """
     photo = read_photo(path, color_space, size, upright=False)
-    _check_values(Path(path), photo.image, signed)
-    orientation = orientation_of(Path(path))
+    _check_values(path, photo.image, signed)
+    orientation = orientation_of(path)
     if orientation > 1:
         logger.warning("%s: is read as it lies in the file, not %s as its EXIF says", path, TURNS[orientation])
     return photo.image
@@ -404,7 +380,7 @@ def read_image(
 def read_photo(
     path: Path,
     color_space: str = "auto",
-    size: tuple[int, int] | None = None,
+    size: Size | None = None,
     gamma: float | None = None,
     upright: bool = True,
 ) -> Photo:
@@ -414,7 +390,6 @@ def read_photo(
     to how a person sees it; `size` is that of the image then. Raises ConfigError, located in the file, also where
     `gamma` is given for a file of floats.
     """
-    path = Path(path)
     bitmap = read_upright(path, size) if upright else read_bitmap(path, size)
     if bitmap.pixel_format() == mi.Bitmap.PixelFormat.MultiChannel:
         raise ConfigError(path, "", f"has {bitmap.channel_count()} channels; give one with R, G, B or Y only")
@@ -443,7 +418,7 @@ def read_photo(
 
 def check_photo(path: Path, photo: Photo, allow_nonfinite: bool) -> None:
     """Raise ConfigError, located in the file, where a photo holds negative values, or such that are not finite."""
-    _check_values(path, np.nan_to_num(photo.image, posinf=0, neginf=0) if allow_nonfinite else photo.image, False)
+    _check_values(path, np.nan_to_num(photo.image, posinf=0, neginf=0) if allow_nonfinite else photo.image)
 
 
 def read_weights(path: Path, size: tuple[int, int], upright: bool = True) -> Image:
@@ -453,7 +428,7 @@ def read_weights(path: Path, size: tuple[int, int], upright: bool = True) -> Ima
     like the photograph that it belongs to by that one's. Raises ConfigError, located in the file, like `read_image`.
     """
     photo = read_photo(path, "linear", size, upright=upright)
-    _check_values(Path(path), photo.image, False)
+    _check_values(path, photo.image)
     return photo.image.mean(axis=2)
 
 
@@ -464,12 +439,10 @@ def decode_srgb(image: Image) -> Image:
     return np.asarray(eotf_sRGB(image), dtype=np.float32)
 
 
-def _check_values(path: Path, image: Image, signed: bool) -> None:
-    for bad, what in ((~np.isfinite(image), "not finite"), (image < 0, "negative")):
-        if bad.any() and not (signed and what == "negative"):
+def _check_values(path: Path, image: Image, signed: bool = False) -> None:
+    for bad, what in ((~np.isfinite(image), "not finite"), ((image < 0) & (not signed), "negative")):
+        if bad.any():
             y, x, channel = (int(n) for n in np.argwhere(bad)[0])
-            value = f"{image[y, x, channel]:g}"
-            count = int(bad.any(axis=2).sum())
-            raise ConfigError(
-                path, "", f"pixel ({x}, {y}), channel {'RGB'[channel]}, is {value}: {what} ({count} pixels in all)"
-            )
+            value, count = f"{image[y, x, channel]:g}", int(bad.any(axis=2).sum())
+            where = f"pixel ({x}, {y}), channel {'RGB'[channel]}"
+            raise ConfigError(path, "", f"{where}, is {value}: {what} ({count} pixels in all)")

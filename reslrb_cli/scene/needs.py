@@ -13,7 +13,16 @@ import numpy as np
 
 from reslrb_cli.errors import UnsupportedScene, is_machine_fault
 from reslrb_cli.scene.extent import clipped
-from reslrb_cli.scene.graph import Lamp, SceneGraph, emitted_rays, find_lamps, small_lamps
+from reslrb_cli.scene.graph import (
+    Lamp,
+    SceneGraph,
+    emitted_rays,
+    find_lamps,
+    grid,
+    interpolates_normals,
+    normal_cosines,
+    small_lamps,
+)
 
 #: Sensors to which a light path can connect: `sample_direction` is there, and its density is that of `sample_ray`.
 SENSORS = ("PerspectiveCamera", "ThinLensCamera")
@@ -41,6 +50,10 @@ _ONE_WAY = {"Hair": "hair", "Measured": "measured", "MeasuredPolarized": "measur
 _NO_POINTS = {"SDFGrid": "sdfgrid", "Ellipsoids": "ellipsoids", "EllipsoidsMesh": "ellipsoidsmesh"}
 #: Shapes that Mitsuba cannot have emit at all.
 _NO_LAMPS = {"BSplineCurve": "bsplinecurve", "LinearCurve": "linearcurve"}
+_MEDIUM = (
+    " a participating medium; no integrator here knows media (nor do Mitsuba's prb, path and ptracer): remove it from "
+    "the scene file"
+)
 #: How many see-through surfaces a primary ray is followed through.
 CROSSINGS = 32
 #: Primary rays that look at a scene, along each side of a grid.
@@ -104,24 +117,26 @@ def scene_needs(scene: Any, sensor: Any) -> SceneNeeds:
     is_projective = sensor.class_name() in SENSORS
     near, far = clipped(scene, sensor) if is_projective else (False, False)
     thin_lens = bool(sensor.needs_aperture_sample())
-    pointlike = int(mi.EmitterFlags.Delta)
+    params = mi.traverse(sensor)
     return SceneNeeds(
         emitters=tuple(emitter.class_name() for emitter in emitters),
         environment=None if environment is None else emitters.index(environment),
-        has_visible_emitters=any(int(emitter.flags()) & pointlike == 0 for emitter in emitters),
+        has_visible_emitters=any(not int(emitter.flags()) & int(mi.EmitterFlags.Delta) for emitter in emitters),
         has_smooth=flags & int(mi.BSDFFlags.Smooth) != 0,
         has_glossy=flags & int(mi.BSDFFlags.Glossy) != 0,
         has_delta_lobes=flags & delta != 0,
         has_null=flags & int(mi.BSDFFlags.Null) != 0,
-        has_instances=any(shape.class_name() == "Instance" for shape in graph.of_type(mi.Shape)),
+        has_instances=graph.has_instances(),
         has_shading_normals=any(_has_shading_normals(shape) for shape in graph.shapes()),
         has_perturbed_normals=any(bsdf.class_name() in ("BumpMap", "NormalMap") for bsdf in graph.of_type(mi.BSDF)),
         bsdfs_read_geometry=_read_geometry(graph),
         moving_shutter=float(sensor.shutter_open_time()) > 0,
         thin_lens=thin_lens,
-        principal_point=_has_principal_point(sensor),
+        principal_point=any(
+            key.startswith("principal_point_offset") and np.any(np.array(value) != 0) for key, value in params
+        ),
         near_clip=near,
-        lens_clip=thin_lens and (near or far or (is_projective and _focuses_outside(sensor))),
+        lens_clip=thin_lens and (near or far or (is_projective and _focuses_outside(params))),
         unfollowed=tuple(bsdf for bsdf in graph.surface_bsdfs() if not _is_followed(graph, bsdf)),
         lamps=lamps,
         small_lamps=small_lamps(scene, sensor, lamps) if is_projective else (),
@@ -181,20 +196,19 @@ def stock_clip(needs: SceneNeeds) -> str | None:
 
 def camera_obstacle(scene: Any, sensor: Any) -> str | None:
     """The reason why paths from `sensor` cannot render `scene`, without tracing a ray; None where they can."""
-    obstacle = _unknown_part(scene, sensor)
+    graph = SceneGraph.of(scene)
+    obstacle = _unknown_part(scene, sensor, graph)
     if obstacle is not None:
         return obstacle
     for emitter in scene.emitters():
         if emitter.class_name() == "DirectionalArea":
-            return (
-                f"emitter {emitter.id()} is a `directionalarea`, which camera paths cannot find and `prb` cannot "
-                "evaluate"
-            )
+            what = "which camera paths cannot find and `prb` cannot evaluate"
+            return f"emitter {emitter.id()} is a `directionalarea`, {what}"
     half = mi.Point2f(0.5)
     reason = _failure(partial(sensor.sample_ray_differential, 0, 0.5, half, half))
     if reason is not None:
         return f"Mitsuba cannot send rays from sensor {sensor.id()}: {reason}"
-    for emitter in _one_of_a_kind(SceneGraph.of(scene), scene.emitters()):
+    for emitter in _one_of_a_kind(graph, scene.emitters()):
         reason = _failure(partial(emitter.sample_direction, _somewhere(), half))
         if reason is not None:
             return f"Mitsuba cannot find emitter {emitter.id()} from a surface: {reason}"
@@ -203,54 +217,43 @@ def camera_obstacle(scene: Any, sensor: Any) -> str | None:
 
 def unsupported_part(scene: Any, sensor: Any) -> str | None:
     """What in the scene no light path can deal with, found without tracing a ray; None where there is nothing."""
-    obstacle, name = _unknown_part(scene, sensor), sensor.id()
+    graph, name = SceneGraph.of(scene), sensor.id()
+    obstacle = _unknown_part(scene, sensor, graph)
     if obstacle is not None:
         return obstacle
     if sensor.class_name() not in SENSORS:
         return f"sensor {name} is a {sensor.class_name()}; light paths connect to `perspective` and `thinlens` sensors"
     if sensor.film().class_name() != "HDRFilm":
         return f"sensor {name} has a {sensor.film().class_name()}; light paths are splatted on an `hdrfilm`"
-    for bsdf in SceneGraph.of(scene).of_type(mi.BSDF):
+    for bsdf in graph.of_type(mi.BSDF):
         plugin = _ONE_WAY.get(bsdf.class_name())
         if plugin is not None:
-            return (
-                f"bsdf {bsdf.id()} is `{plugin}`, which is not the same with light and view exchanged: light paths "
-                "would render another material"
-            )
-    lamp = _lamp_on(SceneGraph.of(scene), _NO_POINTS)
+            why = "which is not the same with light and view exchanged: light paths would render another material"
+            return f"bsdf {bsdf.id()} is `{plugin}`, {why}"
+    lamp = _lamp_on(graph, _NO_POINTS)
     if lamp is not None:
         return f"{lamp}, where Mitsuba draws no points for light to start from; give the lamp as a mesh"
     return None
 
 
-def _unknown_part(scene: Any, sensor: Any) -> str | None:
+def _unknown_part(scene: Any, sensor: Any, graph: SceneGraph) -> str | None:
     """What in the scene no integrator here knows, found without tracing a ray; None where there is nothing."""
-    graph = SceneGraph.of(scene)
     for shape in graph.shapes():
         if shape.is_medium_transition() and graph.is_shown(shape):
-            return _of_medium(f"shape {shape.id() or 'of a group'} bounds")
+            return f"shape {shape.id() or 'of a group'} bounds{_MEDIUM}"
     for held in (sensor, *(child for child in graph.of_type(mi.Sensor) if sensor in graph.parents[child])):
         if held.get_medium() is not None:
-            return _of_medium(f"sensor {held.id()} stands in")
+            return f"sensor {held.id()} stands in{_MEDIUM}"
     for emitter in scene.emitters():
         if emitter.get_medium() is not None:
-            return _of_medium(f"emitter {emitter.id()} stands in")
+            return f"emitter {emitter.id()} stands in{_MEDIUM}"
         if emitter.class_name() == "TimedSunskyEmitter":
-            return (
-                f"emitter {emitter.id()} is a `timed_sunsky`, which evaluates arrays while it is traced: Mitsuba 3.9 "
-                "cannot render it in a kernel; take a `sunsky`"
-            )
+            why = "which evaluates arrays while it is traced: Mitsuba 3.9 cannot render it in a kernel; take a `sunsky`"
+            return f"emitter {emitter.id()} is a `timed_sunsky`, {why}"
     lamp = _lamp_on(graph, _NO_LAMPS)
     if lamp is not None:
         return f"{lamp}, which Mitsuba cannot have emit; give the lamp as a `cylinder` or a mesh"
     return _failing_part(scene, graph)
-
-
-def _of_medium(subject: str) -> str:
-    return (
-        f"{subject} a participating medium; no integrator here knows media (nor do Mitsuba's prb, path and ptracer): "
-        "remove it from the scene file"
-    )
 
 
 def _lamp_on(graph: SceneGraph, plugins: dict[str, str]) -> str | None:
@@ -263,20 +266,22 @@ def _lamp_on(graph: SceneGraph, plugins: dict[str, str]) -> str | None:
 
 def _failing_part(scene: Any, graph: SceneGraph) -> str | None:
     """The first surface or emitter that Mitsuba cannot evaluate, such as one whose texture has too many channels."""
-    si, half = _somewhere(), mi.Point2f(0.5)
-    for bsdf in _one_of_a_kind(graph, graph.surface_bsdfs()):
-
-        def scattered(bsdf: Any = bsdf) -> None:
-            bsdf.sample(mi.BSDFContext(), si, 0.5, half)
-            bsdf.eval(mi.BSDFContext(), si, mi.Vector3f(0, 0, 1))
-
-        reason = _failure(scattered)
+    si, half, context = _somewhere(), mi.Point2f(0.5), mi.BSDFContext()
+    calls = [
+        *(
+            (f"bsdf {bsdf.id()}", call)
+            for bsdf in _one_of_a_kind(graph, graph.surface_bsdfs())
+            for call in (partial(bsdf.sample, context, si, 0.5, half), partial(bsdf.eval, context, si, si.wi))
+        ),
+        *(
+            (f"emitter {emitter.id()}", partial(emitter.eval, si))
+            for emitter in _one_of_a_kind(graph, scene.emitters())
+        ),
+    ]
+    for part, call in calls:
+        reason = _failure(call)
         if reason is not None:
-            return f"Mitsuba cannot evaluate bsdf {bsdf.id()}: {reason}"
-    for emitter in _one_of_a_kind(graph, scene.emitters()):
-        reason = _failure(partial(emitter.eval, si))
-        if reason is not None:
-            return f"Mitsuba cannot evaluate emitter {emitter.id()}: {reason}"
+            return f"Mitsuba cannot evaluate {part}: {reason}"
     return None
 
 
@@ -305,7 +310,6 @@ def _one_of_a_kind(graph: SceneGraph, items: Sequence[Any]) -> list[Any]:
     for child, parents in graph.parents.items():
         for parent in parents:
             below.setdefault(parent, []).append(child)
-
     found: dict[tuple[Any, ...], Any] = {}
     for item in items:
         found.setdefault(_kind(item, below), item)
@@ -324,24 +328,17 @@ def _kind(item: Any, below: dict[Any, list[Any]]) -> tuple[Any, ...]:
 def look(scene: Any, sensor: Any) -> View:
     """Cast primary rays through the centres of a grid of LOOK^2 cells of the film's crop window."""
     smooth, specular, emission = what_is_seen(scene, sensor)
-    count = LOOK * LOOK
-
-    def fraction(mask: Any) -> float:
-        return float(dr.count(mask)[0]) / count
-
-    return View(fraction(smooth), fraction(specular), fraction(~(smooth | specular)), fraction(emission))
+    masks = (smooth, specular, ~(smooth | specular), emission)
+    return View(*(float(dr.count(mask)[0]) / LOOK**2 for mask in masks))
 
 
 def what_is_seen(scene: Any, sensor: Any, aperture: tuple[float, float] | None = None) -> tuple[Any, Any, Any]:
     """Of the rays through a grid of LOOK^2 cells, row by row, as `View` has them: which meet surfaces that are smooth,
     those that are specular alone, and emission. They start at a point of the `aperture`, by default its middle."""
-    count = LOOK * LOOK
-    lane = dr.arange(mi.UInt32, count)
-    position = mi.Point2f(lane % LOOK + 0.5, lane // LOOK + 0.5) / LOOK
     lens = mi.Point2f(0.5) if aperture is None else mi.Point2f(*(dr.opaque(mi.Float, place) for place in aperture))
-    ray, _ = sensor.sample_ray(sensor.shutter_open(), 0.5, position, lens, True)
-    active = dr.full(mi.Mask, True, count)
-    smooth, specular, emission = (dr.zeros(mi.Mask, count) for _ in range(3))
+    ray, _ = sensor.sample_ray(sensor.shutter_open(), 0.5, grid(LOOK), lens, True)
+    active = dr.full(mi.Mask, True, LOOK**2)
+    smooth, specular, emission = (dr.zeros(mi.Mask, LOOK**2) for _ in range(3))
     for _ in range(CROSSINGS):
         si = scene.ray_intersect(ray, active)
         emission |= active & dr.any(si.emitter(scene, active).eval(si, active) > 0)
@@ -375,37 +372,17 @@ def _is_followed(graph: SceneGraph, bsdf: mi.BSDF) -> bool:
     return all(item.class_name() in _FOLLOWED_BSDFS for item in nested)
 
 
-def _has_principal_point(sensor: Any) -> bool:
-    """Whether the principal point of `sensor` is not the film's centre."""
-    params = mi.traverse(sensor)
-    keys = [f"principal_point_offset_{axis}" for axis in "xy"]
-    return any(np.any(np.array(params[key]) != 0) for key in keys if key in params)
-
-
-def _focuses_outside(sensor: Any) -> bool:
-    """Whether a thin lens focuses so far out that Mitsuba's `sample_direction`, in single precision, may take it to lie
-    outside of the clip planes, and so to see nothing. By default it focuses on the far one."""
-    params = mi.traverse(sensor)
+def _focuses_outside(params: mi.SceneParameters) -> bool:
+    """Whether a thin lens with these `params` focuses so far out that Mitsuba's `sample_direction`, in single
+    precision, may take it to lie outside of the clip planes, and so to see nothing. By default it focuses on the far
+    one."""
     near, far, focus = (float(np.ravel(params[key])[0]) for key in ("near_clip", "far_clip", "focus_distance"))
     depth = (1 - near / focus) * far / (far - near) if focus > 0 else -np.inf  # as projected: 0 at near, 1 at far
     return not _DEPTH_ROUNDING < depth < 1 - _DEPTH_ROUNDING
-
-
-def interpolates_normals(shape: mi.Shape) -> bool:
-    """Whether the shape is a mesh whose shading normals, as soon as it bends, differ from its geometric ones."""
-    return shape.is_mesh() and shape.has_vertex_normals() and not shape.has_face_normals()
 
 
 def _has_shading_normals(shape: mi.Shape) -> bool:
     """Whether the shape's shading normals differ from its geometric ones anywhere."""
     if not shape.is_mesh():
         return shape.class_name() not in _PLAIN_SHAPES
-    if not interpolates_normals(shape):
-        return False
-    positions = np.array(shape.vertex_positions_buffer()).reshape(-1, 3)
-    normals = np.array(shape.vertex_normals_buffer()).reshape(-1, 3)
-    faces = np.array(shape.faces_buffer()).reshape(-1, 3)
-    a, b, c = (positions[faces[:, k]] for k in range(3))
-    flat = np.cross(b - a, c - a)
-    flat /= np.maximum(np.linalg.norm(flat, axis=1, keepdims=True), 1e-30)
-    return bool(any((np.sum(flat * normals[faces[:, k]], axis=1) < 1 - 1e-5).any() for k in range(3)))
+    return interpolates_normals(shape) and bool((normal_cosines(shape) < 1 - 1e-5).any())

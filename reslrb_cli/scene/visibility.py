@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import zip_longest
 from typing import Any
 
 import drjit as dr
@@ -30,13 +31,18 @@ CELLS = 4
 _APERTURE = ((0.5, 0.5), (0.05, 0.5), (0.95, 0.5), (0.5, 0.05), (0.5, 0.95))
 
 
+def _margin(sensor: mi.Sensor) -> int:
+    """How many pixels away a sample is at most that lies within the filter's radius of a pixel's centre."""
+    return int(np.ceil(float(sensor.film().rfilter().radius()) - 0.5))
+
+
 def interior(shape: tuple[int, ...], sensor: mi.Sensor) -> np.ndarray:
     """Where light tracing loses nothing by the film's border: boolean (H, W), for a sensor whose film is so large.
 
     Samples just outside of the film are lost, so that pixels within the filter's radius of its border lack what they
     would have added; paths from the sensor lose none.
     """
-    margin = int(np.ceil(float(sensor.film().rfilter().radius()) - 0.5))
+    margin = _margin(sensor)
     inside = np.zeros(shape[:2], dtype=bool)
     inside[margin : shape[0] - margin, margin : shape[1] - margin] = True
     return inside
@@ -59,8 +65,7 @@ def sees_specular(scene: mi.Scene, sensor: mi.Sensor) -> SeenSpecular:
 
     What is smaller than a cell may be missed. The rays are the same at every call.
     """
-    film = sensor.film()
-    width, height = (int(n) for n in film.crop_size())
+    width, height = (int(n) for n in sensor.film().crop_size())
     count = width * height
     lane = dr.arange(mi.UInt32, count)
     corner = mi.Point2f(lane % width, lane // width)
@@ -78,13 +83,8 @@ def sees_specular(scene: mi.Scene, sensor: mi.Sensor) -> SeenSpecular:
         dr.eval(alone, mixed, random)
     from scipy.ndimage import maximum_filter  # here: a run that is refused does not wait for it
 
-    # A sample that lies within the radius of a pixel's centre is at most so many pixels away.
-    size = 2 * int(np.ceil(float(film.rfilter().radius()) - 0.5)) + 1
-
-    def reached(mask: mi.Bool) -> np.ndarray:
-        return np.asarray(maximum_filter(np.array(mask, dtype=bool).reshape(height, width), size))
-
-    return SeenSpecular(reached(alone), reached(mixed))
+    masks = (np.array(mask, dtype=bool).reshape(height, width) for mask in (alone, mixed))
+    return SeenSpecular(*(np.asarray(maximum_filter(mask, 2 * _margin(sensor) + 1)) for mask in masks))
 
 
 def sees_lamps(scene: mi.Scene, sensor: mi.Sensor) -> np.ndarray:
@@ -92,8 +92,7 @@ def sees_lamps(scene: mi.Scene, sensor: mi.Sensor) -> np.ndarray:
 
     A lamp smaller than the cells of a grid of LOOK^2 may be missed.
     """
-    film = sensor.film()
-    width, height = (int(n) for n in film.crop_size())
+    width, height = (int(n) for n in sensor.film().crop_size())
     cells = np.zeros((LOOK, LOOK), dtype=bool)
     for point in _APERTURE if sensor.needs_aperture_sample() else (None,):
         cells |= np.array(what_is_seen(scene, sensor, point)[2]).reshape(LOOK, LOOK)
@@ -105,7 +104,7 @@ def sees_lamps(scene: mi.Scene, sensor: mi.Sensor) -> np.ndarray:
     for axis, size in enumerate((height, width)):
         first = np.arange(size) * LOOK // size
         cells = np.maximum.reduceat(cells, first, axis=axis) if size < LOOK else np.take(cells, first, axis=axis)
-    return np.asarray(maximum_filter(cells, 2 * int(np.ceil(float(film.rfilter().radius()) - 0.5)) + 1))
+    return np.asarray(maximum_filter(cells, 2 * _margin(sensor) + 1))
 
 
 def _first_surfaces(scene: mi.Scene, ray: mi.Ray3f, count: int) -> tuple[mi.Bool, mi.Bool]:
@@ -154,23 +153,22 @@ def visible_texels(
     transform = np.array(params[to_uv].matrix, dtype=np.float64)
 
     seen = dr.zeros(mi.UInt32, height * width)
-    for place, sensor in enumerate(sensors):
+    for sensor, kept in zip_longest(sensors, pixels[: len(sensors)]):
         count = int(np.prod(sensor.film().crop_size()))
-        kept = pixels[place] if place < len(pixels) else None
         rays = min(_RAYS_PER_CELL * max(count, height * width), _MAX_RAYS)
         for number in range(-(-rays // _RAYS_PER_PASS)):
             random = mi.PCG32(size=min(rays, _RAYS_PER_PASS), initstate=dr.opaque(mi.UInt64, number))
-            _mark_seen(scene, sensor, owners, transform, random, seen, width, height, kept)
+            _mark_seen(scene, sensor, owners, transform, random, seen, (width, height), kept)
             dr.eval(seen)
     return np.array(seen).reshape(height, width) > 0
 
 
 def _mark_seen(
-    scene: Any, sensor: Any, owners: Sequence[Any], transform: Any, random: Any, seen: Any, width: int, height: int,
+    scene: Any, sensor: Any, owners: Sequence[Any], transform: Any, random: Any, seen: Any, size: tuple[int, int],
     kept: np.ndarray[Any, Any] | None,
 ) -> None:  # fmt: skip
-    """Cast one primary ray per lane, through pixels (H, W) that are `kept`, and mark in `seen` the texels whose inner
-    quarter it hits."""
+    """Cast one primary ray per lane, through pixels (H, W) that are `kept`, and mark in `seen` the texels, of `size`
+    (width, height), whose inner quarter it hits."""
     time = sensor.shutter_open() + random.next_float32() * sensor.shutter_open_time()
     film = mi.Point2f(random.next_float32(), random.next_float32())
     aperture = mi.Point2f(random.next_float32(), random.next_float32())
@@ -188,12 +186,11 @@ def _mark_seen(
         for owner in owners:
             is_owner |= bsdf == mi.BSDFPtr(owner)
         u, v = (row[0] * si.uv.x + row[1] * si.uv.y + row[2] for row in transform.tolist()[:2])
-        cell = mi.Point2f(u * width, v * height)
+        cell = mi.Point2f(u, v) * mi.Vector2f(size)
         inside = mi.Vector2f(cell - dr.floor(cell))
         inner = (dr.abs(inside.x - 0.5) < 0.25) & (dr.abs(inside.y - 0.5) < 0.25)
-        x, y = (mi.Int32(dr.floor(c)) for c in (cell.x, cell.y))
-        index = _modulo(y, height) * width + _modulo(x, width)
-        dr.scatter(seen, mi.UInt32(1), mi.UInt32(index), active & is_owner & inner)
+        x, y = (_modulo(mi.Int32(dr.floor(c)), n) for c, n in zip((cell.x, cell.y), size, strict=True))
+        dr.scatter(seen, mi.UInt32(1), mi.UInt32(y * size[0] + x), active & is_owner & inner)
         active &= mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null)
         ray = si.spawn_ray(ray.d)
         dr.eval(seen, active, ray)
@@ -229,17 +226,14 @@ def find_depth(scene: mi.Scene, sensor: int) -> Depth:
     By camera paths of equal random numbers without roulette, so that those of one depth begin those of the next.
     """
     whole = _pixels(scene, sensor, DEPTHS[-1])
+    lit = np.isfinite(whole) & (whole > 0)
     for segments in DEPTHS[:-1]:
-        missing = _missing(_pixels(scene, sensor, segments), whole)
+        # The mean over lit pixels of what they lack: no few bright ones decide.
+        lacking = 1 - _pixels(scene, sensor, segments)[lit] / whole[lit]
+        missing = float(lacking.mean()) if lit.any() else 0.0
         if missing <= LOST:
             return Depth(segments, missing)
     return Depth(DEPTHS[-1], None)
-
-
-def _missing(pixels: np.ndarray, whole: np.ndarray) -> float:
-    """The mean over lit pixels of what they lack: no few bright ones decide."""
-    lit = np.isfinite(whole) & (whole > 0)
-    return float(np.mean(1 - pixels[lit] / whole[lit])) if lit.any() else 0.0
 
 
 def _pixels(scene: mi.Scene, index: int, segments: int) -> np.ndarray:
