@@ -16,7 +16,8 @@ import mitsuba as mi
 import numpy as np
 
 from reslrb_cli.scene.deformation import (
-    Movable,
+    BEAMS,
+    PLACES,
     heightmap_obstacle,
     list_movable,
     moving_emitter_obstacle,
@@ -32,13 +33,6 @@ from reslrb_cli.scene.needs import (
     scene_needs,
     unsupported_part,
 )
-
-#: Emitter parameters that Mitsuba flags as differentiable, but that change where light goes and not how much it is.
-_BEAM_SHAPES = {
-    "cutoff_angle": "shapes the beam",
-    "beam_width": "shapes the beam",
-    "sun_direction": "moves the light",
-}
 
 #: Spectra by wavelength, which RGB variants cannot evaluate: their numbers describe what stands in the scene file.
 _SPECTRA = ("RegularSpectrum", "IrregularSpectrum", "BlackBodySpectrum")
@@ -88,7 +82,7 @@ class ParameterInfo:
 def list_parameters(params: Any, values: bool = False) -> list[ParameterInfo]:
     """Describe every entry of a `mi.traverse` result, in its order; their `values` too, if they are asked for."""
     infos = [describe(params, key) for key in params.properties]
-    return [replace(info, value=current_value(params, info.key)) for info in infos] if values else infos
+    return [replace(info, value=_current_value(params, info.key)) for info in infos] if values else infos
 
 
 def describe(params: Any, key: str) -> ParameterInfo:
@@ -132,7 +126,7 @@ def value_shape(value: Any, halo: int = 0) -> tuple[int, ...]:
     return shape if dr.is_tensor_v(value) or shape[-1:] != (1,) else shape[:-1]
 
 
-def current_value(params: Any, key: str) -> Value | None:
+def _current_value(params: Any, key: str) -> Value | None:
     """The value of one entry of a `mi.traverse` result; None for what is no number."""
     value = _value(params, key)
     array = as_numbers(value)
@@ -176,36 +170,26 @@ def _value(params: Any, key: str) -> Any:
 
 def parameter_kind(params: Any, key: str) -> str:
     """What an entry of a `mi.traverse` result belongs to (`ParameterInfo.kind`)."""
-    node = params.properties[key][2]
-    kinds = {
-        "bsdf": mi.BSDF,
-        "emitter": mi.Emitter,
-        "shape": mi.Shape,
-        "sensor": mi.Sensor,
-        "film": mi.Film,
-        "medium": mi.Medium,
-        "integrator": mi.Integrator,
-    }
-    name = key.rpartition(".")[2]
+    node, name = params.properties[key][2], key.rpartition(".")[2]
+    is_attribute = name.startswith(("vertex_", "face_")) and name not in _MESH_GEOMETRY
     while node is not None:
-        for kind, type_ in kinds.items():
-            if isinstance(node, type_):
-                if kind == "shape" and isinstance(node, mi.Mesh) and _is_attribute(name):
-                    return "attribute"
-                return kind
+        for kind in ("BSDF", "Emitter", "Shape", "Sensor", "Film", "Medium", "Integrator"):
+            if isinstance(node, getattr(mi, kind)):
+                return "attribute" if is_attribute and isinstance(node, mi.Mesh) else kind.lower()
         node = params.hierarchy[node][0]
     return "scene"
-
-
-def _is_attribute(name: str) -> bool:
-    return name.startswith(("vertex_", "face_")) and name not in _MESH_GEOMETRY
 
 
 def _obstacle(kind: str, key: str, value: Any, differentiable: bool, node: Any, coarse: int | None) -> str | None:
     only = "only materials, emission, shapes and lights have derivatives"
     id, _, name = key.rpartition(".")
-    if kind == "shape" or (kind == "emitter" and name in ("to_world", "position")):
-        return _moving_obstacle(kind, id, name, node)
+    if kind == "shape" or (kind == "emitter" and name in PLACES):
+        if kind == "shape" and name not in ("to_world", "vertex_positions"):
+            return "belongs to a shape, of which vertices and motions are recovered"
+        reason = moving_shape_obstacle(node, name) if kind == "shape" else moving_emitter_obstacle(node)
+        if reason is not None:
+            return f"cannot be moved ({reason})"
+        return f"is recovered as a motion (`motion: {{of: {id}}}`)" if name == "to_world" else None
     if kind in ("sensor", "film"):
         return f"belongs to the {kind}; {only}"
     if node.class_name() in _SPECTRA:
@@ -214,8 +198,8 @@ def _obstacle(kind: str, key: str, value: Any, differentiable: bool, node: Any, 
         return "is not given in the scene file"
     if kind not in ("bsdf", "emitter", "attribute"):
         return f"is no property of a material or a light; {only}"
-    if kind == "emitter" and name in _BEAM_SHAPES:
-        return f"{_BEAM_SHAPES[name]}; of an emitter, only what it emits has derivatives"
+    if kind == "emitter" and name in BEAMS:
+        return f"{BEAMS[name]}; of an emitter, only what it emits has derivatives"
     if coarse is not None:  # not differentiable for that reason alone
         return None
     bits = _storage_bits(value)
@@ -223,31 +207,14 @@ def _obstacle(kind: str, key: str, value: Any, differentiable: bool, node: Any, 
         return f"is stored with {bits} bits a channel, too few to follow a gradient"
     if not differentiable:
         return f"is not differentiable ({node.class_name()})"
-    if bits is None:
-        return f"is no number with derivatives ({type(value).__name__})"
-    return None
-
-
-def _moving_obstacle(kind: str, id: str, name: str, node: Any) -> str | None:
-    """Why the place of a shape or an emitter is not recovered by this name; None where it is."""
-    if kind == "shape" and name not in ("to_world", "vertex_positions"):
-        return "belongs to a shape, of which vertices and motions are recovered"
-    reason = moving_shape_obstacle(node, name) if kind == "shape" else moving_emitter_obstacle(node)
-    if reason is not None:
-        return f"cannot be moved ({reason})"
-    if name == "to_world":
-        return f"is recovered as a motion (`motion: {{of: {id}}}`)"
-    return None
+    return f"is no number with derivatives ({type(value).__name__})" if bits is None else None
 
 
 def _storage_bits(value: Any) -> int | None:
     """Bits of one entry of a numeric JIT array that a parameter could be; None for anything else."""
-    if not dr.is_jit_v(value):
-        return None
     bits = {dr.VarType.UInt8: 8, dr.VarType.Float16: 16, dr.VarType.Float32: 32, dr.VarType.Float64: 64}
-    if dr.is_matrix_v(value) or not dr.is_arithmetic_v(value):
-        return None
-    return bits.get(dr.type_v(value))
+    is_number = dr.is_jit_v(value) and dr.is_arithmetic_v(value) and not dr.is_matrix_v(value)
+    return bits.get(dr.type_v(value)) if is_number else None
 
 
 @dataclass(frozen=True)
@@ -255,8 +222,7 @@ class SensorSummary:
     """One sensor: its film in pixels (`crop` is offset and size), what it sees, and what light tracing needs for it.
 
     `obstacle` is the reason why light tracing cannot render for it, or None, and `camera_obstacle` the same of paths
-    from the sensor (`prb`). `view` is None where the reason lies
-    in the scene's parts and not in what the sensor sees.
+    from the sensor (`prb`). `view` is None where the reason lies in the scene's parts and not in what the sensor sees.
     """
 
     index: int
@@ -296,23 +262,23 @@ class SceneSummary:
 
 def summarise(scene: Any, hide_emitters: bool = False, sensors: Sequence[int] | None = None) -> SceneSummary:
     """Look `scene` over; `sensors` are the indices of those to describe, None for all."""
-    graph = SceneGraph.of(scene)
+    graph, params = SceneGraph.of(scene), mi.traverse(scene)
     shapes = graph.shapes()
-    indices = range(len(scene.sensors())) if sensors is None else sensors
-    params = mi.traverse(scene)
     return SceneSummary(
         emitters=_count(scene.emitters()),
         bsdfs=_count(graph.of_type(mi.BSDF)),
         shapes=_count(shapes),
         triangles=sum(int(shape.face_count()) for shape in shapes if shape.is_mesh()),
-        sensors=[_sensor(scene, index, hide_emitters) for index in indices],
+        sensors=[
+            _sensor(scene, index, hide_emitters)
+            for index in (range(len(scene.sensors())) if sensors is None else sensors)
+        ],
         parameters=list_parameters(params, values=True),
-        movable=[MovableSummary(item.id, _moved_by(item)) for item in list_movable(params)],
+        movable=[
+            MovableSummary(item.id, ["motion"] if heightmap_obstacle(item) else ["motion", "heightmap"])
+            for item in list_movable(params)
+        ],
     )
-
-
-def _moved_by(item: Movable) -> list[str]:
-    return ["motion"] if heightmap_obstacle(item) else ["motion", "heightmap"]
 
 
 def _count(objects: Sequence[Any]) -> dict[str, int]:

@@ -30,6 +30,7 @@ import mitsuba as mi
 import numpy as np
 
 from reslrb_cli.config.parameters import HEIGHTMAP
+from reslrb_cli.scene.graph import bounds, face_normals, triangles
 
 #: Analytic shapes whose `to_world` moves their surface interactions and their samples.
 MOVING_SHAPES = ("Rectangle", "Disk", "Sphere", "Cylinder")
@@ -41,7 +42,12 @@ MOVING_EMITTERS = {"PointLight": "position", "SpotLight": "to_world", "Projector
 #: Parameters that say where an emitter is.
 PLACES = ("position", "to_world")
 #: Parameters of emitters that are flagged as differentiable, and change where light goes as well.
-BEAMS = ("cutoff_angle", "beam_width", "sun_direction", "sun_aperture")
+BEAMS = {
+    **dict.fromkeys(("cutoff_angle", "beam_width", "sun_aperture"), "shapes the beam"),
+    "sun_direction": "moves the light",
+}
+#: Parameters that say where an object is: a rectangle has its vertices besides.
+_PLACED = ("to_world", "vertex_positions", "position")
 
 
 def moving_shape_obstacle(shape: mi.Shape, key: str) -> str | None:
@@ -100,7 +106,7 @@ class Movable:
 
 def find_movable(params: mi.SceneParameters, id: str) -> Movable | str:
     """The object with this id, or the reason why it cannot be moved."""
-    for name in ("to_world", "vertex_positions", "position"):  # a rectangle has its vertices besides
+    for name in _PLACED:
         key = f"{id}.{name}"
         if key not in params.properties:
             continue
@@ -122,14 +128,9 @@ def find_movable(params: mi.SceneParameters, id: str) -> Movable | str:
 
 def list_movable(params: mi.SceneParameters) -> list[Movable]:
     """All that can be moved, in the scene's order."""
-    found: dict[str, Movable] = {}
-    for key in params.properties:
-        id, _, name = key.rpartition(".")
-        if id and id not in found and name in ("to_world", "vertex_positions", "position"):
-            item = find_movable(params, id)
-            if isinstance(item, Movable):
-                found[id] = item
-    return list(found.values())
+    split = (key.rpartition(".") for key in params.properties)
+    ids = dict.fromkeys(id for id, _, name in split if id and name in _PLACED)
+    return [item for item in (find_movable(params, id) for id in ids) if isinstance(item, Movable)]
 
 
 def heightmap_obstacle(item: Movable) -> str | None:
@@ -152,12 +153,12 @@ def casts_edges(scene: mi.Scene, item: Movable) -> bool:
 
 def where_moved(params: mi.SceneParameters, keys: list[str]) -> list[Movable]:
     """The objects that the scene parameters `keys` move."""
-    kinds = (*MOVING_SHAPES, *MOVING_EMITTERS)
     found = []
     for key in keys:
         id, _, name = key.rpartition(".")
         node = params.properties[key][2]
-        if name == "vertex_positions" or (name in ("to_world", "position") and node.class_name() in kinds):
+        is_placed = name in PLACES and node.class_name() in (*MOVING_SHAPES, *MOVING_EMITTERS)
+        if is_placed or name == "vertex_positions":
             found.append(Movable(id, key, node))
     return found
 
@@ -193,34 +194,21 @@ class Surroundings:
 
         It stays as it is while that is so.
         """
-        around, before = bounds(scene), self._horizon if self._scene == scene.ptr else None
-        if before is not None and before.holds(scene.bbox()) and before.radius < TOO_LARGE * around.radius:
+        sphere, before = scene.bbox().bounding_sphere(), self._horizon if self._scene == scene.ptr else None
+        if before is not None and before.holds(scene.bbox()) and before.radius < TOO_LARGE * sphere.radius:
             return before
-        if before is None:
-            self._horizon = around
-            tell(scene, scene)
-        else:
-            self._horizon = Horizon(around.center, MARGIN * around.radius)
+        x, y, z, radius = (float(value) for value in (*sphere.center, sphere.radius))
+        bounded = scene
+        if before is not None:
+            radius *= MARGIN
             # An emitter asks a scene for its bounds, and nothing else; this one has those that it is to know.
-            half = [self._horizon.radius / 3**0.5] * 3
-            corner = mi.ScalarTransform4f().translate(list(self._horizon.center)) @ mi.ScalarTransform4f().scale(half)
-            tell(scene, mi.load_dict({"type": "scene", "box": {"type": "cube", "to_world": corner}}))
-        self._scene = scene.ptr
+            corner = mi.ScalarTransform4f().translate([x, y, z]).scale(radius / 3**0.5)
+            bounded = mi.load_dict({"type": "scene", "box": {"type": "cube", "to_world": corner}})
+        self._scene, self._horizon = scene.ptr, Horizon((x, y, z), radius)
+        for emitter in scene.emitters():
+            if mi.has_flag(emitter.flags(), mi.EmitterFlags.Infinite):
+                emitter.set_scene(bounded)
         return self._horizon
-
-
-def bounds(scene: mi.Scene) -> Horizon:
-    """The smallest sphere around the box around all shapes."""
-    sphere = scene.bbox().bounding_sphere()
-    x, y, z = (float(value) for value in sphere.center)
-    return Horizon((x, y, z), float(sphere.radius))
-
-
-def tell(scene: mi.Scene, bounded: mi.Scene) -> None:
-    """Have the emitters of `scene` that are infinitely far away light what `bounded` has bounds around."""
-    for emitter in scene.emitters():
-        if mi.has_flag(emitter.flags(), mi.EmitterFlags.Infinite):
-            emitter.set_scene(bounded)
 
 
 @dataclass(frozen=True)
@@ -235,9 +223,8 @@ class Motion:
         """M, or, not `scaled`, its rotation alone."""
         transform = mi.AffineTransform4f
         pivot = mi.Vector3f(self.pivot)
-        result = transform().translate(pivot) if scaled else transform()
-        if scaled and "translation" in self.names:
-            result = transform().translate(pivot + values[self.names["translation"]])
+        moved = values[self.names["translation"]] if "translation" in self.names else 0
+        result = transform().translate(pivot + moved) if scaled else transform()
         if "rotation" in self.names:
             angles = values[self.names["rotation"]]
             for axis in (2, 1, 0):
@@ -349,7 +336,7 @@ class Deformation:
 
     def collect(self) -> None:
         """Add the gradient that steps left at the scene's parameters to that of the values, and clear it there."""
-        tracked = [moved for moved in self._moved.values() if moved.leaf is not None and dr.grad_enabled(moved.leaf)]
+        tracked = self._tracked()
         for moved in tracked:
             dr.set_grad(moved.tracked, dr.grad(moved.leaf))
             dr.clear_grad(moved.leaf)
@@ -360,20 +347,21 @@ class Deformation:
 
     def push(self) -> None:
         """Give the scene's parameters, and what follows from them, the tangents that have reached what they are."""
-        tracked = [moved for moved in self._moved.values() if moved.leaf is not None and dr.grad_enabled(moved.leaf)]
+        tracked = self._tracked()
         for moved in tracked:
             dr.set_grad(moved.leaf, dr.grad(moved.tracked))
             dr.enqueue(dr.ADMode.Forward, moved.leaf)
         if tracked:
             dr.traverse(dr.ADMode.Forward, dr.ADFlag.ClearEdges)
 
+    def _tracked(self) -> list[_Moved]:
+        return [moved for moved in self._moved.values() if moved.leaf is not None and dr.grad_enabled(moved.leaf)]
+
     def _place(self, item: Movable) -> _Moved:
         if item.key not in self._moved:
             value = dr.detach(self.params[item.key])
-            kind: Any = type(value)
-            if item.by_vertices:
-                value, kind = dr.unravel(mi.Point3f, value), mi.Point3f
-            self._moved[item.key] = _Moved(item, _opaque(kind(value)))
+            value = dr.unravel(mi.Point3f, value) if item.by_vertices else type(value)(value)
+            self._moved[item.key] = _Moved(item, _opaque(value))
         return self._moved[item.key]
 
     def _function(self, moved: _Moved) -> Any:
@@ -387,9 +375,8 @@ class Deformation:
         if item.is_point or item.is_shape:
             return motion.matrix(self.values) @ base
         # An emitter's frame has no scale: its place moves, and its directions turn.
-        to, turned = mi.AffineTransform4f, motion.matrix(self.values, scaled=False)
-        place = base @ mi.Point3f(0)
-        there = motion.matrix(self.values) @ place
+        to, place = mi.AffineTransform4f, base @ mi.Point3f(0)
+        there, turned = motion.matrix(self.values) @ place, motion.matrix(self.values, scaled=False)
         return to().translate(there) @ turned @ to().translate(-place) @ base
 
     def _heights(self, moved: _Moved) -> mi.Float:
@@ -434,11 +421,8 @@ def _vertex_normals(mesh: mi.Mesh) -> mi.Normal3f:
     """The normals of a mesh's vertices: its own, or, of one without, those of the faces about each, by area."""
     if mesh.has_vertex_normals():
         return dr.normalize(dr.unravel(mi.Normal3f, mesh.vertex_normals_buffer()))
-    positions = np.array(mesh.vertex_positions_buffer(), dtype=np.float64).reshape(-1, 3)
     faces = np.array(mesh.faces_buffer()).reshape(-1, 3)
-    a, b, c = (positions[faces[:, k]] for k in range(3))
-    areas = np.cross(b - a, c - a)
-    total = np.zeros_like(positions)
+    areas, total = face_normals(triangles(mesh)), np.zeros((mesh.vertex_count(), 3))
     for k in range(3):
         np.add.at(total, faces[:, k], areas)
     total /= np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-30)
@@ -447,15 +431,13 @@ def _vertex_normals(mesh: mi.Mesh) -> mi.Normal3f:
 
 def _centre(params: mi.SceneParameters, items: tuple[Movable, ...]) -> tuple[float, float, float]:
     """The centre of the bounding box of `items`; emitters without a surface are points."""
-    corners = []
+    corners: list[np.ndarray] = []
     for item in items:
         if item.is_shape:
-            box = item.node.bbox()
-            corners += [np.array(box.min, float), np.array(box.max, float)]
+            corners += bounds(item.node)
         elif item.node.class_name() != "DirectionalEmitter":  # which is nowhere
             value = params[item.key]
-            point = value if item.is_point else value @ mi.Point3f(0)
-            corners.append(np.array(point, float).reshape(3))
+            corners.append(np.ravel(value if item.is_point else value @ mi.Point3f(0)).astype(np.float64))
     if not corners:
         return 0.0, 0.0, 0.0
     x, y, z = (np.min(corners, axis=0) + np.max(corners, axis=0)) / 2

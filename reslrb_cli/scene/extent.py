@@ -20,6 +20,7 @@ import numpy as np
 from reslrb_cli.errors import UnsupportedScene
 from reslrb_cli.scene.graph import (
     SceneGraph,
+    bounds,
     emitted_rays,
     face_normals,
     grid,
@@ -40,18 +41,13 @@ _SENSORS = 8
 _NAMED = 2
 
 
-def _ends(box: Any) -> tuple[np.ndarray, np.ndarray]:
-    """The least and the greatest corner of a bounding box, (3,) float64 each."""
-    return np.ravel(box.min).astype(np.float64), np.ravel(box.max).astype(np.float64)
-
-
 def lost_light(scene: Any) -> str | None:
     """What is wrong with a scene that is far from the origin, or tiny, and what to do; None where nothing is.
 
     Mitsuba starts rays off their surface by RayEpsilon (1 + max |p|), in the scene's units, so that they jump over what
     is nearer: light is lost in corners, in all integrators.
     """
-    low, high = _ends(scene.bbox())
+    low, high = bounds(scene)
     size = float(np.linalg.norm(high - low))
     reach = float(np.maximum(np.abs(low), np.abs(high)).max())
     offset = mi.math.RayEpsilon * (1 + reach)
@@ -78,7 +74,7 @@ def clipped(scene: Any, sensor: Any) -> tuple[bool, bool]:
     )
     to_world = np.array(sensor.world_transform().matrix, np.float64).reshape(4, 4)
     axes, eye = to_world[:3, :3], to_world[:3, 3]
-    corners = np.array(list(product(*zip(*_ends(scene.bbox()), strict=True))))
+    corners = np.array(list(product(*zip(*bounds(scene), strict=True))))
     beyond = bool(((corners - eye) @ axes[:, 2]).max() > far)
 
     # The box, in the sensor's coordinates, around all that may be between the aperture and the near plane.
@@ -93,7 +89,7 @@ def clipped(scene: Any, sensor: Any) -> tuple[bool, bool]:
 def _touches(shape: Any, axes: np.ndarray, eye: np.ndarray, middle: np.ndarray, half: np.ndarray) -> bool:
     """Whether a shape may touch a box, given by its middle and half sizes in the coordinates of `axes` (columns) and
     `eye`."""
-    low, high = _ends(shape.bbox())
+    low, high = bounds(shape)
     centre, extent = (low + high) / 2, (high - low) / 2
     apart = centre - (eye + axes @ middle)
     beside = (np.abs(apart) > extent + np.abs(axes) @ half) | (np.abs(apart @ axes) > half + extent @ np.abs(axes))
@@ -182,7 +178,7 @@ def _twin_shapes(shapes: Sequence[Any]) -> _Twins:
     for index, shape in enumerate(shapes):
         if shape.class_name() not in ("Disk", "Sphere"):
             continue
-        size = np.float32(_ends(shape.bbox())).tobytes()
+        size = np.array(bounds(shape), np.float32).tobytes()
         others = before.setdefault((shape.class_name(), size), [])
         for other in others:
             turned = shape.has_flipped_normals() != shapes[other].has_flipped_normals()

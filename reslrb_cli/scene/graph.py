@@ -188,10 +188,10 @@ def small_lamps(scene: mi.Scene, sensor: mi.Sensor, lamps: Iterable[Lamp]) -> tu
 
 def _pixels(sensor: mi.Sensor, shape: mi.Shape) -> float:
     """The diameter on the film, in pixels, of the sphere around the shape's bounding box, wherever the sensor looks."""
-    box = shape.bbox()
-    radius = float(np.linalg.norm(np.ravel(box.max) - np.ravel(box.min))) / 2
+    low, high = bounds(shape)
+    radius = float(np.linalg.norm(high - low)) / 2
     eye = np.ravel(sensor.world_transform().translation())
-    distance = float(np.linalg.norm((np.ravel(box.max) + np.ravel(box.min)) / 2 - eye))
+    distance = float(np.linalg.norm((high + low) / 2 - eye))
     if not distance > radius:
         return np.inf
     half = np.tan(np.deg2rad(float(mi.traverse(sensor)["x_fov"][0])) / 2)
@@ -205,6 +205,12 @@ def _is_in_view(scene: mi.Scene, sensor: mi.Sensor, shape: mi.Shape) -> bool:
         ds, _ = sensor.sample_direction(si, mi.Point2f(0.5), True)
         seen = ds.pdf > 0
         return bool(dr.any(seen & ~scene.ray_test(si.spawn_ray_to(ds.p), seen)))
+
+
+def bounds(item: Any) -> tuple[np.ndarray, np.ndarray]:
+    """The least and the greatest corner of the bounding box of a shape or a scene, (3,) float64 each."""
+    box = item.bbox()
+    return np.ravel(box.min).astype(np.float64), np.ravel(box.max).astype(np.float64)
 
 
 def interpolates_normals(shape: mi.Shape) -> bool:

@@ -200,7 +200,7 @@ class _Text:
 
 def _unused(props: mi.Properties, element: Element) -> list[Note]:
     """Notes on what `element` gives its plugin, and the plugin did not ask for."""
-    notes = []
+    notes: list[Note] = []
     unnamed = [child for child in element.children if not child.name and (child.is_object or child.tag == "ref")]
     for name in props.unqueried():
         number = re.match(r"_arg_(\d+)", name)
