@@ -50,7 +50,7 @@ class Selection:
     @property
     def scene_keys(self) -> list[str]:
         """The entries of `params` that what is recovered determines."""
-        own = [key for key in self.keys if key not in self.deformation.values and key not in self.factors]
+        own = [key for key in self.keys if self._holder(key) is self.params]
         return [*own, *(other for key in own for other in self.tied.get(key, ())), *self.deformation.keys]
 
     def spec(self, key: str) -> Settings:
@@ -77,15 +77,15 @@ class Selection:
 
         All is evaluated, so that a step's kernels are the same from the first one on.
         """
+        own: list[str] = []
         for key, value in values.items():
-            if key in self.deformation.values or key in self.factors:
-                self._holder(key)[key] = value
-            else:
-                for each in (key, *self.tied.get(key, ())):
-                    self.params[each] = value
+            holder = self._holder(key)
+            keys = [key, *self.tied.get(key, ())] if holder is self.params else [key]
+            for each in keys:
+                holder[each] = value
+            own += keys if holder is self.params else []
         moved = self.deformation.place()
         self.params.update()
-        own = [each for key in values for each in (key, *self.tied.get(key, ())) if self._holder(key) is self.params]
         settled = settle(self.params, (*own, *self.deformation.keys))
         dr.eval([self.params[key] for key in own], moved, settled, self.factors)
 
@@ -157,11 +157,12 @@ def set_values(
     What is given no value stays as the scene has it. Values are checked like initial ones are; an error is located at
     `option` and the key. A heightmap may have the resolution of its image file.
     """
-    selection, _ = _choose(mi.traverse(scene), specs, source)
-    params, names = selection.params, selection.deformation.values
+    params = mi.traverse(scene)
+    selection, _ = _choose(params, specs, source)
+    names = selection.deformation.values
     given: dict[str, str] = {}
     for pattern, value in values.items():
-        place = Place(source, f"{option}.{pattern}", _itself)
+        place = Place(source, f"{option}.{pattern}", lambda _: "")  # a value has no options
         for key in [pattern] if pattern in names else _matching(params, pattern, place, [*names]):
             if key in given:
                 raise place.fail("", f"`{key}` is matched by `{given[key]}` already")
@@ -169,19 +170,13 @@ def set_values(
                 raise place.fail("", f"`{key}` follows from {' and '.join(f'`{name}`' for name in names)} here")
             given[key] = pattern
             slot = selection.slot(key)
-            array = initial_array(slot, value, None, place, any_size=key in names)
-            slot.set(array)
+            slot.set(initial_array(slot, value, None, place, any_size=key in names))
     # What is tied has the value of the first, unless it is given one of its own.
-    tied = {key: [other for other in others if other not in given] for key, others in selection.tied.items()}
-    tied = {key: others for key, others in tied.items() if key in given}
+    followed = ((key, others) for key, others in selection.tied.items() if key in given)
+    tied = {key: [other for other in others if other not in given] for key, others in followed}
     chosen = Selection(params, selection.specs, tied, selection.deformation)
     chosen.update()
     return chosen
-
-
-def _itself(option: str) -> str:
-    """Where an error of a value is that has no options: at itself."""
-    return ""
 
 
 def _choose(params: mi.SceneParameters, specs: Sequence[ParameterSpec], source: object
@@ -238,20 +233,23 @@ def _movables(params: mi.SceneParameters, spec: ParameterSpec, place: Place, ori
 
 def _check_effect(items: list[Movable], word: str, pivot: bool, place: Place) -> None:
     """Raise ConfigError where what is free moves nothing."""
-    nowhere = all(item.node.class_name() == "DirectionalEmitter" for item in items)
-    if nowhere and word != "rotation":
-        raise place.fail("motion.free", f"{word} does not move `{items[0].id}`, which is a direction; free: [rotation]")
-    if len(items) == 1 and items[0].is_point and not pivot and word != "translation":
-        raise place.fail("motion.free", f"{word} about itself does not move `{items[0].id}`, which is a point")
-    if len(items) == 1 and not items[0].is_shape and word == "scale" and not pivot:
-        raise place.fail("motion.free", f"scale about itself does not move `{items[0].id}`, which has no size")
+    id, alone = f"`{items[0].id}`", len(items) == 1 and not pivot
+    obstacle = None
+    if word != "rotation" and all(item.node.class_name() == "DirectionalEmitter" for item in items):
+        obstacle = f"{word} does not move {id}, which is a direction; free: [rotation]"
+    elif alone and items[0].is_point and word != "translation":
+        obstacle = f"{word} about itself does not move {id}, which is a point"
+    elif alone and not items[0].is_shape and word == "scale":
+        obstacle = f"scale about itself does not move {id}, which has no size"
+    if obstacle is not None:
+        raise place.fail("motion.free", obstacle)
 
 
 def _tied_keys(params: mi.SceneParameters, keys: list[str], place: Place) -> list[str]:
     """Keys that share one value; each names one parameter, and all have one shape."""
     found: list[str] = []
     for number, key in enumerate(keys):
-        at = Place(place.source, f"{place.key}.key[{number}]", _itself)
+        at = Place(place.source, f"{place.key}.key[{number}]", lambda _: "")
         if key not in params.properties and any(fnmatchcase(name, key) for name in params.properties):
             raise at.fail("", f"`{key}` is a glob; name each key that is tied")
         [name] = _matching(params, key, at)
@@ -273,7 +271,9 @@ def _matching(params: mi.SceneParameters, pattern: str, place: Place, names: Seq
     matches = [key for key in params.properties if fnmatchcase(key, pattern)]
     if not matches:
         near = difflib.get_close_matches(pattern, [*names, *params.properties], n=3, cutoff=0.5)
-        near = near or difflib.get_close_matches(pattern, _recoverable(params), n=3, cutoff=0)
+        if not near:
+            recoverable = [info.key for info in list_parameters(params) if _obstacle(info) is None]
+            near = difflib.get_close_matches(pattern, recoverable, n=3, cutoff=0)
         hint = " or ".join(f"`{key}`" for key in near)
         id, _, word = pattern.rpartition(".")
         if word in (*WORDS, HEIGHTMAP) and isinstance(find_movable(params, id), Movable):
@@ -283,11 +283,9 @@ def _matching(params: mi.SceneParameters, pattern: str, place: Place, names: Seq
     infos = [describe(params, key) for key in matches]
     usable = [info.key for info in infos if _obstacle(info) is None]
     if not usable:
+        first = f"`{infos[0].key}` {_obstacle(infos[0])}"
         more = f", nor can the other {len(infos) - 1}" if len(infos) > 1 else ""
-        raise place.fail(
-            "key",
-            f"`{pattern}` matches nothing that can be recovered: `{infos[0].key}` {_obstacle(infos[0])}{more}",
-        )
+        raise place.fail("key", f"`{pattern}` matches nothing that can be recovered: {first}{more}")
     return usable
 
 
@@ -299,7 +297,3 @@ def _obstacle(info: ParameterInfo) -> str | None:
         f"is stored with {info.bits} bits a channel, too few to follow a gradient; give the texture in the scene file "
         '<string name="format" value="variant"/>'
     )
-
-
-def _recoverable(params: mi.SceneParameters) -> list[str]:
-    return [info.key for info in list_parameters(params) if _obstacle(info) is None]
