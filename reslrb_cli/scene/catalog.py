@@ -154,11 +154,10 @@ def _encoded_value(array: np.ndarray, texture: mi.Texture) -> Value:
     table = np.arange(256, dtype=np.float32) / 255
     if not re.search(r"^ *raw = 1,$", str(texture), re.MULTILINE):
         table = np.array(dr.srgb_to_linear(mi.Float(table)))
-    levels = array.ravel()
-    parts = (levels[start : start + 2**20] for start in range(0, levels.size, 2**20))  # each as integers of 8 bytes
-    counts = sum((np.bincount(part, minlength=256) for part in parts), start=np.zeros(256, dtype=np.int64))
+    # By rows, since it is counted as integers of 8 bytes.
+    counts = np.sum([np.bincount(row.ravel(), minlength=256) for row in array], axis=0)
     there = table[counts > 0]
-    numbers = [float(table[level]) for level in levels] if array.size <= _FEW else None
+    numbers = [float(table[level]) for level in array.ravel()] if array.size <= _FEW else None
     return Value(numbers, float(table.astype(np.float64) @ counts / array.size), float(there.min()), float(there.max()))
 
 

@@ -213,9 +213,8 @@ class Surroundings:
 
 @dataclass(frozen=True)
 class Motion:
-    """A motion of `items` about the point `pivot`; `names` are those of its values, by word."""
+    """A motion about the point `pivot`; `names` are those of its values, by word."""
 
-    items: tuple[Movable, ...]
     pivot: Sequence[float]
     names: Mapping[str, str]
 
@@ -234,33 +233,17 @@ class Motion:
         return result @ transform().translate(-pivot) if scaled else result
 
 
-@dataclass(frozen=True)
-class Heightmap:
-    """A displacement of meshes, `items`, by the texture `name`, (height, width, 1)."""
-
-    items: tuple[Movable, ...]
-    name: str
-
-
-def identity(word: str, resolution: tuple[int, int] | None = None) -> Any:
-    """The value of a motion's word, or of a heightmap of (width, height) texels, that moves nothing."""
-    if word == HEIGHTMAP:
-        assert resolution is not None, "a heightmap has one"
-        value = dr.zeros(mi.TensorXf, (resolution[1], resolution[0], 1))
-    else:
-        value = mi.Float(1) if word == "scale" else mi.Vector3f(0)
-    dr.make_opaque(value)
-    return value
-
-
 @dataclass
 class _Moved:
-    """One scene parameter that is a function: where it began, what moves it, and its value with and without graph."""
+    """One scene parameter that is a function: where it began, what moves it, and its value with and without graph.
+
+    `heightmap` is the name of the texture, (height, width, 1), that displaces a mesh along its own `normals`.
+    """
 
     item: Movable
     base: Any
     motion: Motion | None = None
-    heightmap: Heightmap | None = None
+    heightmap: str | None = None
     normals: Any = None
     texcoords: Any = None
     tracked: Any = None
@@ -301,28 +284,24 @@ class Deformation:
                    ) -> None:  # fmt: skip
         """Move `items`, none of which has a motion yet, about `pivot`; None: the centre of their bounding box."""
         names = {word: f"{items[0].id}.{word}" for word in words}
-        motion = Motion(items, pivot or _centre(self.params, items), names)
+        motion = Motion(pivot or _centre(self.params, items), names)
         for item in items:
             self._place(item).motion = motion
         for word, name in names.items():
-            self.values[name] = identity(word)
+            self.values[name] = _opaque(mi.Float(1) if word == "scale" else mi.Vector3f(0))
             self.quantities[name] = {"translation": "length", "rotation": "degrees"}.get(word, word)
 
     def add_heightmap(self, items: tuple[Movable, ...], resolution: tuple[int, int]) -> None:
         """Displace the meshes `items`, none of which has a heightmap yet."""
-        heightmap = Heightmap(items, f"{items[0].id}.{HEIGHTMAP}")
+        name = f"{items[0].id}.{HEIGHTMAP}"
         for item in items:
             moved, mesh = self._place(item), item.node
-            moved.heightmap = heightmap
+            moved.heightmap = name
             sign = -1.0 if mesh.has_flipped_normals() else 1.0
             moved.normals = _opaque(sign * _vertex_normals(mesh))
             moved.texcoords = _opaque(dr.unravel(mi.Point2f, mesh.vertex_texcoords_buffer()))
-        self.values[heightmap.name] = identity(HEIGHTMAP, resolution)
-        self.quantities[heightmap.name] = "length"
-
-    def moves(self, key: str) -> bool:
-        """Whether the scene parameter `key` is a function already."""
-        return key in self._moved
+        self.values[name] = _opaque(dr.zeros(mi.TensorXf, (*resolution[::-1], 1)))
+        self.quantities[name] = "length"
 
     def place(self) -> list[Any]:
         """Give the scene what follows from the values; `params.update()` has to follow. Returns what to evaluate."""
@@ -367,7 +346,7 @@ class Deformation:
     def _function(self, moved: _Moved) -> Any:
         item, motion, base = moved.item, moved.motion, moved.base
         if moved.heightmap is not None:
-            base = base + moved.normals * self._heights(moved)
+            base = base + moved.normals * self._heights(moved, self.values[moved.heightmap])
         if motion is None:
             return dr.ravel(base)
         if item.by_vertices:
@@ -379,10 +358,8 @@ class Deformation:
         there, turned = motion.matrix(self.values) @ place, motion.matrix(self.values, scaled=False)
         return to().translate(there) @ turned @ to().translate(-place) @ base
 
-    def _heights(self, moved: _Moved) -> mi.Float:
+    def _heights(self, moved: _Moved, values: mi.TensorXf) -> mi.Float:
         """h at each vertex, bilinear between the centres of the texels."""
-        assert moved.heightmap is not None
-        values = self.values[moved.heightmap.name]
         height, width = values.shape[:2]
         place = (moved.item.key, width, height)
         if place not in self._corners:

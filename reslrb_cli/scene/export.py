@@ -1,9 +1,8 @@
 """The export of a scene, with the values that its parameters have, into a new folder.
 
 - Values as elements of a scene description.
-- A mesh as it stands in a loaded scene, as a PLY file in place of what its element names.
-- `Parts`, the files beside the exported scene: those that it refers to, copied, and those that hold recovered values.
-- `Replacing` puts the values that a scene's parameters have into the description that the scene was built from.
+- `Replacing` puts the values that a scene's parameters have into the description that the scene was built from, meshes
+  and images in files beside it, and has copied what files it names besides.
 - `export_scene` does all of it, and checks that Mitsuba reads the same values back.
 """
 
@@ -14,7 +13,6 @@ import os
 import re
 import shutil
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 
 import mitsuba as mi
@@ -64,84 +62,12 @@ def triple(owner: Element, tag: str, name: str, value: Array) -> Element:
     return owner.new(tag, name=name, x=x, y=y, z=z)
 
 
-#: Parameters of a mesh that a PLY file does not hold.
-_KEPT = ("face_normals", "flip_normals")
-
-
-def put_mesh(owner: Element, mesh: mi.Mesh, parts: Parts, key: str) -> None:
-    """Have the element of `mesh`, which has the parameter `key`, name a file that holds the mesh.
-
-    That has vertices as they stand in the world, faces and attributes.
-    """
-    owner.children[:] = [item for item in owner.children if not item.is_value or item.name in _KEPT]
-    owner.attributes["type"] = "ply"
-    parts.add(owner, file_stem(key.rpartition(".")[0]), ".ply", lambda path: mesh.write_ply(str(path)))
-
-
 #: The exported scene, in its folder.
 SCENE = "scene.xml"
 #: Folders beside it: of recovered values, and of files from elsewhere than the scene's own folder.
 RECOVERED, ELSEWHERE = "recovered", "assets"
-
-
-@dataclass
-class Parts:
-    """Files by their path in the exported folder, with `/`, and who writes each into a path that is new."""
-
-    writers: dict[str, Callable[[Path], object]] = field(default_factory=dict)
-    _made: set[Element] = field(default_factory=set)
-
-    def add(self, owner: Element, stem: str, suffix: str, write: Callable[[Path], object]) -> None:
-        """Have `owner` name a file of recovered values in place of the one that it names."""
-        name = f"{RECOVERED}/{stem}{suffix}"
-        self.writers[name] = write
-        element = owner.new("string", name="filename", value=name)
-        self._made.add(element)
-        replace(owner, element)
-
-    def copy_assets(self, description: Description) -> None:
-        """Have every file that elements name copied, and named by where its copy is.
-
-        A file in the folder of the scene keeps its path relative to that, any other goes to a folder of its own.
-        """
-        own = {name.casefold() for name in (SCENE, *self.writers)}
-        home = description.root.source.file.absolute().parent.resolve()
-        copies: dict[Path, str] = {}
-        for element in description.root.walk("string", "spectrum"):
-            attribute = "filename" if element.tag == "spectrum" else "value"
-            name = element.attributes.get(attribute)
-            if not name or element in self._made or (element.tag == "string" and element.name != "filename"):
-                continue
-            path = find_file(name, description.folders)
-            if path is not None and path.is_file():
-                source = path.resolve()
-                if source not in copies:
-                    copies[source] = _free(source, home, own)
-                    own.add(copies[source].casefold())
-                element.attributes[attribute] = copies[source]
-        for source, name in copies.items():
-            self.writers[name] = functools.partial(shutil.copyfile, source)
-
-    def write(self, folder: Path) -> None:
-        """Write all files into `folder`, which has none of them. Raises OSError."""
-        for name, write in self.writers.items():
-            path = folder / name
-            path.parent.mkdir(parents=True, exist_ok=True)
-            write(path)
-
-
-def _free(source: Path, home: Path, taken: set[str]) -> str:
-    """The path of a copy of `source` in the exported folder, as it is below `home`, or in a folder for those that are
-    not; with a number before its suffix where that is taken, by whatever case it is written in."""
-    inside = source.is_relative_to(home)
-    path = PurePosixPath(*source.relative_to(home).parts) if inside else PurePosixPath(ELSEWHERE, source.name)
-    name, number = str(path), 1
-    while name.casefold() in taken:
-        number += 1
-        name = str(path.with_name(f"{path.stem}-{number}{path.suffix}"))
-    return name
-
-
+#: Parameters of a mesh that a PLY file does not hold.
+_KEPT = ("face_normals", "flip_normals")
 #: What gives a place in another way than `to_world`, by tag.
 _OTHER_PLACES = {"shape": ("center", "radius", "p0", "p1"), "emitter": ("direction", "position")}
 
@@ -158,11 +84,17 @@ _CONDUCTORS = ("conductor", "roughconductor")
 
 
 class Replacing:
-    """The description of a scene, whose `params` have the values that it is to get; `parts` are the files beside it."""
+    """The `description` of a scene, whose `params` have the values that it is to get.
 
-    def __init__(self, root: Element, params: mi.SceneParameters, parts: Parts, source: object) -> None:
-        self.params, self.parts, self.source = params, parts, source
-        self._owners = Owners(root)
+    `writers` are the files beside it by their path in the exported folder, with `/`: who writes each into a path that
+    is new. `source` is named in errors.
+    """
+
+    def __init__(self, description: Description, params: mi.SceneParameters, source: object) -> None:
+        self.description, self.params, self.source = description, params, source
+        self.writers: dict[str, Callable[[Path], object]] = {}
+        self._made: set[Element] = set()
+        self._owners = Owners(description.root)
 
     def put(self, key: str) -> None:
         """Put the value of the scene parameter `key` in. Raises ConfigError where the description cannot say it."""
@@ -174,7 +106,10 @@ class Replacing:
         if below:
             self._put_nested(owner, below, name, key)
         elif isinstance(node, mi.Mesh) and name != "to_world":
-            put_mesh(owner, node, self.parts, key)
+            # The file has vertices as they stand in the world, faces and attributes.
+            owner.children[:] = [item for item in owner.children if not item.is_value or item.name in _KEPT]
+            owner.attributes["type"] = "ply"
+            self._add_file(owner, file_stem(key.rpartition(".")[0]), ".ply", lambda path: node.write_ply(str(path)))
         elif name == "to_world":
             matrix = owner.new("matrix", value=numbers(np.array(self.params[key].matrix, dtype=np.float32)))
             replace(owner, owner.new("transform", matrix, name=name), *_OTHER_PLACES.get(owner.tag, ()))
@@ -227,7 +162,7 @@ class Replacing:
 
     def _put_image(self, owner: Element, key: str) -> None:
         image = self._array(key)
-        self.parts.add(owner, file_stem(key), ".exr", lambda path: write_file(path, image, linear=True))
+        self._add_file(owner, file_stem(key), ".exr", lambda path: write_file(path, image, linear=True))
         if owner.tag == "texture":
             # Its values are linear as they stand, in a file of floats, and not to be rounded to fewer bits.
             replace(owner, owner.new("string", name="format", value="variant"), "color_space", "gamma")
@@ -237,6 +172,49 @@ class Replacing:
 
     def _fail(self, key: str, why: str) -> ConfigError:
         return ConfigError(self.source, key, f"cannot be exported: {why}")
+
+    def _add_file(self, owner: Element, stem: str, suffix: str, write: Callable[[Path], object]) -> None:
+        """Have `owner` name a file of recovered values in place of the one that it names."""
+        name = f"{RECOVERED}/{stem}{suffix}"
+        self.writers[name] = write
+        element = owner.new("string", name="filename", value=name)
+        self._made.add(element)
+        replace(owner, element)
+
+    def copy_assets(self) -> None:
+        """Have every file that elements name copied, and named by where its copy is.
+
+        A file in the folder of the scene keeps its path relative to that, any other goes to a folder of its own.
+        """
+        own = {name.casefold() for name in (SCENE, *self.writers)}
+        home = self.description.root.source.file.absolute().parent.resolve()
+        copies: dict[Path, str] = {}
+        for element in self.description.root.walk("string", "spectrum"):
+            attribute = "filename" if element.tag == "spectrum" else "value"
+            name = element.attributes.get(attribute)
+            if not name or element in self._made or (element.tag == "string" and element.name != "filename"):
+                continue
+            path = find_file(name, self.description.folders)
+            if path is not None and path.is_file():
+                source = path.resolve()
+                if source not in copies:
+                    copies[source] = _free(source, home, own)
+                    own.add(copies[source].casefold())
+                element.attributes[attribute] = copies[source]
+        for source, name in copies.items():
+            self.writers[name] = functools.partial(shutil.copyfile, source)
+
+
+def _free(source: Path, home: Path, taken: set[str]) -> str:
+    """The path of a copy of `source` in the exported folder, as it is below `home`, or in a folder for those that are
+    not; with a number before its suffix where that is taken, by whatever case it is written in."""
+    inside = source.is_relative_to(home)
+    path = PurePosixPath(*source.relative_to(home).parts) if inside else PurePosixPath(ELSEWHERE, source.name)
+    name, number = str(path), 1
+    while name.casefold() in taken:
+        number += 1
+        name = str(path.with_name(f"{path.stem}-{number}{path.suffix}"))
+    return name
 
 
 def same_values(a: object, b: object) -> bool:
@@ -270,12 +248,10 @@ def export_scene(
     options. The folder appears once it is whole, and Mitsuba has read the same values back from it. Raises ConfigError,
     located in `source` and the key, where a value cannot be said, and OSError.
     """
-    parts = Parts()
-    replacing = Replacing(description.root, params, parts, source)
+    replacing, root = Replacing(description, params, source), description.root
     for key in keys:
         replacing.put(key)
-    parts.copy_assets(description)
-    root = description.root
+    replacing.copy_assets()
     options = [
         root.new({bool: "boolean", int: "integer"}.get(type(value), "float"), name=name, value=str(value).lower())
         for name, value in integrator.items()
@@ -283,13 +259,16 @@ def export_scene(
     ]
     root.children.insert(0, root.new("integrator", *options, type=str(integrator["type"])))
     lines = ["<!-- Written by `reslrb export`. -->", *(line for line, _ in tag_lines(root)), ""]
-    parts.writers[SCENE] = lambda path: path.write_text("\n".join(lines), encoding="utf-8")
+    replacing.writers[SCENE] = lambda path: path.write_text("\n".join(lines), encoding="utf-8")
     folder = folder.absolute()
     folder.parent.mkdir(parents=True, exist_ok=True)
     with unfinished_folder(folder.parent) as part:
         inner = part / "scene"  # since the folder of an unfinished one is the user's alone
         inner.mkdir()
-        parts.write(inner)
+        for name, write in replacing.writers.items():
+            path = inner / name
+            path.parent.mkdir(parents=True, exist_ok=True)
+            write(path)
         _check(inner, params, source)
         os.replace(inner, folder)
 

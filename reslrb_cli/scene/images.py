@@ -69,28 +69,43 @@ class _Says:
     is_jpeg: bool = False
 
 
-def read_bitmap(path: Path, size: Size | None = None) -> mi.Bitmap:
+def read_bitmap(path: Path, size: Size | None = None, upright: bool = False) -> mi.Bitmap:
     """Decode the image file `path`; `size` is the (width, height) that it must have, None for any.
 
-    Its pixels are as they lie in the file, whatever EXIF says. Raises ConfigError, located in the file, where it cannot
-    be read, is no image, too large, of another size, damaged or cut off. What is checked first is what the file says of
-    itself.
+    Its pixels are as they lie in the file, or `upright`: as a person sees them, turned as EXIF says (`TURNS`), and so
+    is the size. Raises ConfigError, located in the file, where it cannot be read, is no image, too large, of another
+    size, damaged or cut off. What is checked first is what the file says of itself.
     """
-    return _read(path, size, upright=False)[0]
-
-
-def read_upright(path: Path, size: Size | None = None) -> mi.Bitmap:
-    """The image of a file as a person sees it: turned as its EXIF orientation says (`TURNS`).
-
-    `size` is the (width, height) after that; it raises as `read_bitmap`.
-    """
-    bitmap, orientation = _read(path, size, upright=True)
+    says = _examine(path)
+    orientation = says.orientation if upright else 1
+    width, height = says.size[::-1] if orientation >= 5 else says.size
+    if min(width, height) < 1:
+        raise ConfigError(path, "", _NO_IMAGE)
+    if size is not None and (width, height) != size:
+        turned = f", {TURNS[orientation]} as its EXIF orientation says" if orientation > 1 else ""
+        raise ConfigError(path, "", f"is {width}x{height} pixels{turned}; it must be {size[0]}x{size[1]}")
+    if width * height > PIXELS:
+        raise ConfigError(path, "", f"is {width}x{height} pixels; more than {PIXELS} are not read")
+    complaints: list[str] = []
+    try:
+        with _heard(complaints) if says.is_jpeg else nullcontext():
+            bitmap = mi.Bitmap(str(path))
+    except Exception as error:
+        if is_out_of_memory(error):
+            raise
+        raise ConfigError(path, "", "is damaged or cut off, or of a kind that Mitsuba does not decode") from None
+    for line in complaints:
+        if line.startswith(("Corrupt JPEG data", "Premature end")):
+            raise ConfigError(path, "", f"is damaged or cut off ({line}); copy or save it again")
+        logger.warning("%s: %s", path, line)
+    if (int(bitmap.width()), int(bitmap.height())) != says.size:
+        raise ConfigError(path, "", f"says that it is {says.size[0]}x{says.size[1]} pixels, and is not")
     if orientation == 1:
         return bitmap
-    turned = mi.Bitmap(np.ascontiguousarray(turn(np.array(bitmap), orientation)), bitmap.pixel_format())
-    turned.set_srgb_gamma(bitmap.srgb_gamma())
-    turned.set_premultiplied_alpha(bitmap.premultiplied_alpha())
-    return turned
+    turned_bitmap = mi.Bitmap(np.ascontiguousarray(turn(np.array(bitmap), orientation)), bitmap.pixel_format())
+    turned_bitmap.set_srgb_gamma(bitmap.srgb_gamma())
+    turned_bitmap.set_premultiplied_alpha(bitmap.premultiplied_alpha())
+    return turned_bitmap
 
 
 def turn(pixels: np.ndarray, orientation: int) -> np.ndarray:
@@ -115,34 +130,6 @@ def image_size(path: Path) -> Size:
     if min(width, height) < 1:
         raise DamagedImage(path, "", f"says that it is {width}x{height} pixels; save it again")
     return width, height
-
-
-def _read(path: Path, size: Size | None, upright: bool) -> tuple[mi.Bitmap, int]:
-    """The image as it lies in the file, and its orientation; `size` is that of the image as it lies, or `upright`."""
-    says = _examine(path)
-    width, height = says.size[::-1] if upright and says.orientation >= 5 else says.size
-    if min(width, height) < 1:
-        raise ConfigError(path, "", _NO_IMAGE)
-    if size is not None and (width, height) != size:
-        turned = f", {TURNS[says.orientation]} as its EXIF orientation says" if upright and says.orientation > 1 else ""
-        raise ConfigError(path, "", f"is {width}x{height} pixels{turned}; it must be {size[0]}x{size[1]}")
-    if width * height > PIXELS:
-        raise ConfigError(path, "", f"is {width}x{height} pixels; more than {PIXELS} are not read")
-    complaints: list[str] = []
-    try:
-        with _heard(complaints) if says.is_jpeg else nullcontext():
-            bitmap = mi.Bitmap(str(path))
-    except Exception as error:
-        if is_out_of_memory(error):
-            raise
-        raise ConfigError(path, "", "is damaged or cut off, or of a kind that Mitsuba does not decode") from None
-    for line in complaints:
-        if line.startswith(("Corrupt JPEG data", "Premature end")):
-            raise ConfigError(path, "", f"is damaged or cut off ({line}); copy or save it again")
-        logger.warning("%s: %s", path, line)
-    if (int(bitmap.width()), int(bitmap.height())) != says.size:
-        raise ConfigError(path, "", f"says that it is {says.size[0]}x{says.size[1]} pixels, and is not")
-    return bitmap, says.orientation
 
 
 def _examine(path: Path) -> _Says:
@@ -390,7 +377,7 @@ def read_photo(
     to how a person sees it; `size` is that of the image then. Raises ConfigError, located in the file, also where
     `gamma` is given for a file of floats.
     """
-    bitmap = read_upright(path, size) if upright else read_bitmap(path, size)
+    bitmap = read_bitmap(path, size, upright)
     if bitmap.pixel_format() == mi.Bitmap.PixelFormat.MultiChannel:
         raise ConfigError(path, "", f"has {bitmap.channel_count()} channels; give one with R, G, B or Y only")
     width, height = (int(n) for n in bitmap.size())

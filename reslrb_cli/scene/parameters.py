@@ -166,7 +166,7 @@ def set_values(
         for key in [pattern] if pattern in names else _matching(params, pattern, place, [*names]):
             if key in given:
                 raise place.fail("", f"`{key}` is matched by `{given[key]}` already")
-            if selection.deformation.moves(key):
+            if key in selection.deformation.keys:
                 raise place.fail("", f"`{key}` follows from {' and '.join(f'`{name}`' for name in names)} here")
             given[key] = pattern
             slot = selection.slot(key)
@@ -202,7 +202,7 @@ def _choose(params: mi.SceneParameters, specs: Sequence[ParameterSpec], source: 
             at = f"key[{number}]" if len(spec.keys) > 1 else "key"
             if key in origin:
                 raise place.fail(at, f"`{key}` is matched by parameters[{origin[key]}] already")
-            if deformation.moves(key):
+            if key in deformation.keys:
                 raise place.fail(at, f"`{key}` follows from a motion or a heightmap; remove one of the two")
             origin[key] = index
         if len(spec.keys) > 1:
