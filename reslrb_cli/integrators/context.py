@@ -21,7 +21,7 @@ from reslrb_cli.errors import UnsupportedScene
 from reslrb_cli.guiding.tables import Guiding
 from reslrb_cli.integrators.freezing import Recordings
 from reslrb_cli.scene.catalog import parameter_kind
-from reslrb_cli.scene.deformation import BEAMS, PLACES, Surroundings, moving_emitter_obstacle, moving_shape_obstacle
+from reslrb_cli.scene.deformation import BEAMS, PLACES, Surroundings, moving_obstacle
 from reslrb_cli.scene.graph import SceneGraph, emitted_rays, find_lamps, interpolates_normals
 from reslrb_cli.scene.needs import check_supported, scene_needs
 from reslrb_cli.transport.aim import worthwhile
@@ -88,12 +88,12 @@ def differentiated(params: mi.SceneParameters) -> Differentiated:
         if kind in ("bsdf", "attribute"):
             nodes[node] = None
         elif kind == "shape":
-            _refuse(key, moving_shape_obstacle(node, key))
+            _refuse(key, moving_obstacle(node, key))
             shapes[node] = None
             if node.is_emitter():
                 emitters[node.emitter()] = None
         elif kind == "emitter" and key.rpartition(".")[2] in (*PLACES, *BEAMS):
-            _refuse(key, moving_emitter_obstacle(node, key))
+            _refuse(key, moving_obstacle(node, key))
             emitters[node] = None
             continue  # no factor of a path
         elif kind == "emitter":

@@ -15,14 +15,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from reslrb_cli.scene.deformation import (
-    BEAMS,
-    PLACES,
-    heightmap_obstacle,
-    list_movable,
-    moving_emitter_obstacle,
-    moving_shape_obstacle,
-)
+from reslrb_cli.scene.deformation import BEAMS, PLACES, heightmap_obstacle, list_movable, moving_obstacle
 from reslrb_cli.scene.graph import SceneGraph
 from reslrb_cli.scene.needs import (
     SceneNeeds,
@@ -185,7 +178,7 @@ def _obstacle(kind: str, key: str, value: Any, differentiable: bool, node: Any, 
     if kind == "shape" or (kind == "emitter" and name in PLACES):
         if kind == "shape" and name not in ("to_world", "vertex_positions"):
             return "belongs to a shape, of which vertices and motions are recovered"
-        reason = moving_shape_obstacle(node, name) if kind == "shape" else moving_emitter_obstacle(node)
+        reason = moving_obstacle(node, name)
         if reason is not None:
             return f"cannot be moved ({reason})"
         return f"is recovered as a motion (`motion: {{of: {id}}}`)" if name == "to_world" else None

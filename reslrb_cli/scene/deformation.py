@@ -37,8 +37,10 @@ MOVING_SHAPES = ("Rectangle", "Disk", "Sphere", "Cylinder")
 #: What of a mesh moves light.
 MOVING_MESH = ("vertex_positions", "vertex_normals")
 #: Emitters without a surface that can move, and what moves them.
-MOVING_EMITTERS = {"PointLight": "position", "SpotLight": "to_world", "Projector": "to_world",
-                   "DirectionalEmitter": "to_world"}  # fmt: skip
+MOVING_EMITTERS = {
+    "PointLight": "position",
+    **dict.fromkeys(("SpotLight", "Projector", "DirectionalEmitter"), "to_world"),
+}
 #: Parameters that say where an emitter is.
 PLACES = ("position", "to_world")
 #: Parameters of emitters that are flagged as differentiable, and change where light goes as well.
@@ -50,31 +52,25 @@ BEAMS = {
 _PLACED = ("to_world", "vertex_positions", "position")
 
 
-def moving_shape_obstacle(shape: mi.Shape, key: str) -> str | None:
-    """Why there is no derivative of the parameter `key` of a shape; None where there is one."""
-    name = key.rpartition(".")[2]
-    if shape.is_mesh() and shape.class_name() not in MOVING_SHAPES:  # Mitsuba takes a rectangle for a mesh, too
-        if name not in MOVING_MESH:
-            return f"of a mesh, {' and '.join(MOVING_MESH)} have derivatives, not {name}"
+def moving_obstacle(node: mi.Shape | mi.Emitter, key: str) -> str | None:
+    """Why there is no derivative of the parameter `key` of a shape or of an emitter without a surface, which says where
+    it is or where its light goes; None where there is one."""
+    kind, name = node.class_name(), key.rpartition(".")[2]
+    if not isinstance(node, mi.Shape):
+        if name == MOVING_EMITTERS.get(kind):
+            return None
+        if name in BEAMS:
+            return f"{name} changes where the light of a {kind} goes, which has no derivative here"
+        if kind in ("EnvironmentMapEmitter", "SunskyEmitter"):
+            return f"a {kind} that turns has no derivative here: its directions are drawn from what it shows in each"
+        return f"a {kind} that moves has no derivative here"
+    if node.is_mesh() and kind not in MOVING_SHAPES:  # Mitsuba takes a rectangle for a mesh, too
+        moving = " and ".join(MOVING_MESH)
+        return None if name in MOVING_MESH else f"of a mesh, {moving} have derivatives, not {name}"
+    if kind in MOVING_SHAPES and name == "to_world":
         return None
-    if shape.class_name() not in MOVING_SHAPES or name != "to_world":
-        kinds = ", ".join(kind.lower() for kind in MOVING_SHAPES)
-        return f"meshes (by their vertices) and {kinds} (by `to_world`) have derivatives, not a {shape.class_name()}"
-    return None
-
-
-def moving_emitter_obstacle(emitter: mi.Emitter, key: str | None = None) -> str | None:
-    """Why there is no derivative of the parameter `key` of an emitter without a surface, which says where it is or
-    where its light goes (None: of whatever moves it); None where there is one."""
-    kind = emitter.class_name()
-    name = MOVING_EMITTERS.get(kind, "") if key is None else key.rpartition(".")[2]
-    if name and name == MOVING_EMITTERS.get(kind):
-        return None
-    if name in BEAMS:
-        return f"{name} changes where the light of a {kind} goes, which has no derivative here"
-    if kind in ("EnvironmentMapEmitter", "SunskyEmitter"):
-        return f"a {kind} that turns has no derivative here: its directions are drawn from what it shows in each"
-    return f"a {kind} that moves has no derivative here"
+    kinds = ", ".join(shape.lower() for shape in MOVING_SHAPES)
+    return f"meshes (by their vertices) and {kinds} (by `to_world`) have derivatives, not a {kind}"
 
 
 @dataclass(frozen=True)
@@ -111,12 +107,9 @@ def find_movable(params: mi.SceneParameters, id: str) -> Movable | str:
         if key not in params.properties:
             continue
         node = params.properties[key][2]
-        if isinstance(node, mi.Emitter):
-            reason = moving_emitter_obstacle(node)
-        elif isinstance(node, mi.Shape):
-            reason = moving_shape_obstacle(node, key)
-        else:
+        if not isinstance(node, (mi.Emitter, mi.Shape)):
             return f"`{id}` is a {node.class_name()}; shapes and emitters can be moved"
+        reason = moving_obstacle(node, key)
         return Movable(id, key, node) if reason is None else f"`{id}` cannot be moved: {reason}"
     if any(key.startswith(f"{id}.") for key in params.properties):
         return f"`{id}` has neither vertices nor a place in the scene that can be moved"
@@ -144,11 +137,8 @@ def heightmap_obstacle(item: Movable) -> str | None:
 
 def casts_edges(scene: mi.Scene, item: Movable) -> bool:
     """Whether what moves can have a silhouette or throw a shadow: a shape that does not enclose all others."""
-    if not item.is_shape:
-        return False
-    own = item.node.bbox()
     others = [shape.bbox() for shape in scene.shapes() if shape.ptr != item.node.ptr]
-    return not all(own.contains(box, strict=True) for box in others)
+    return item.is_shape and not all(item.node.bbox().contains(box, strict=True) for box in others)
 
 
 def where_moved(params: mi.SceneParameters, keys: list[str]) -> list[Movable]:

@@ -9,15 +9,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from reslrb_cli.errors import UnsupportedScene
+from reslrb_cli.errors import UnsupportedScene, is_machine_fault
 
 
 @dataclass
@@ -151,20 +152,25 @@ def emitted_rays(
     except RuntimeError as error:
         if "not implemented" not in str(error):
             raise
-        names = ", ".join(emitter.id() for emitter in scene.emitters() if not _can_be_sampled(emitter))
+        half = mi.Point2f(0.5)
+        calls = {emitter.id(): partial(emitter.sample_ray, 0, 0.5, half, half, True) for emitter in scene.emitters()}
+        names = ", ".join(id for id, call in calls.items() if failure(call) is not None)
         reason = " ".join(str(error).split())
-        raise UnsupportedScene(
-            f"Mitsuba cannot sample the rays of emitter {names}: {reason}; give it a `bitmap`"
-        ) from None
+        problem = f"Mitsuba cannot sample the rays of emitter {names}: {reason}; give it a `bitmap`"
+        raise UnsupportedScene(problem) from None
     return ray, weight
 
 
-def _can_be_sampled(emitter: mi.Emitter) -> bool:
+def failure(call: Callable[[], object]) -> str | None:
+    """Mitsuba's reason, in one line, why it cannot do what `call` asks for; None where it can."""
     try:
-        emitter.sample_ray(0, 0.5, mi.Point2f(0.5), mi.Point2f(0.5), True)
-    except RuntimeError:
-        return False
-    return True
+        with dr.suspend_grad():
+            call()
+    except RuntimeError as error:
+        if is_machine_fault(error):
+            raise
+        return " ".join(str(error).split())
+    return None
 
 
 #: What a lamp's diameter on the film is below, in pixels.

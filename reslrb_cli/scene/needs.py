@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -11,12 +11,13 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from reslrb_cli.errors import UnsupportedScene, is_machine_fault
+from reslrb_cli.errors import UnsupportedScene
 from reslrb_cli.scene.extent import clipped
 from reslrb_cli.scene.graph import (
     Lamp,
     SceneGraph,
     emitted_rays,
+    failure,
     find_lamps,
     grid,
     interpolates_normals,
@@ -118,6 +119,8 @@ def scene_needs(scene: Any, sensor: Any) -> SceneNeeds:
     near, far = clipped(scene, sensor) if is_projective else (False, False)
     thin_lens = bool(sensor.needs_aperture_sample())
     params = mi.traverse(sensor)
+    others = [bsdf for bsdf in graph.of_type(mi.BSDF) if bsdf.class_name() not in _FOLLOWED_BSDFS]
+    unfollowed = {owner for bsdf in others for owner in graph.owning_bsdfs(bsdf)}
     return SceneNeeds(
         emitters=tuple(emitter.class_name() for emitter in emitters),
         environment=None if environment is None else emitters.index(environment),
@@ -137,7 +140,7 @@ def scene_needs(scene: Any, sensor: Any) -> SceneNeeds:
         ),
         near_clip=near,
         lens_clip=thin_lens and (near or far or (is_projective and _focuses_outside(params))),
-        unfollowed=tuple(bsdf for bsdf in graph.surface_bsdfs() if not _is_followed(graph, bsdf)),
+        unfollowed=tuple(bsdf for bsdf in graph.surface_bsdfs() if bsdf in unfollowed),
         lamps=lamps,
         small_lamps=small_lamps(scene, sensor, lamps) if is_projective else (),
     )
@@ -197,29 +200,23 @@ def stock_clip(needs: SceneNeeds) -> str | None:
 def camera_obstacle(scene: Any, sensor: Any) -> str | None:
     """The reason why paths from `sensor` cannot render `scene`, without tracing a ray; None where they can."""
     graph = SceneGraph.of(scene)
-    obstacle = _unknown_part(scene, sensor, graph)
-    if obstacle is not None:
+    if (obstacle := _unknown_part(scene, sensor, graph)) is not None:
         return obstacle
     for emitter in scene.emitters():
         if emitter.class_name() == "DirectionalArea":
             what = "which camera paths cannot find and `prb` cannot evaluate"
             return f"emitter {emitter.id()} is a `directionalarea`, {what}"
-    half = mi.Point2f(0.5)
-    reason = _failure(partial(sensor.sample_ray_differential, 0, 0.5, half, half))
-    if reason is not None:
-        return f"Mitsuba cannot send rays from sensor {sensor.id()}: {reason}"
+    half, si = mi.Point2f(0.5), _somewhere()
+    calls = [(f"send rays from sensor {sensor.id()}", partial(sensor.sample_ray_differential, 0, 0.5, half, half))]
     for emitter in _one_of_a_kind(graph, scene.emitters()):
-        reason = _failure(partial(emitter.sample_direction, _somewhere(), half))
-        if reason is not None:
-            return f"Mitsuba cannot find emitter {emitter.id()} from a surface: {reason}"
-    return None
+        calls.append((f"find emitter {emitter.id()} from a surface", partial(emitter.sample_direction, si, half)))
+    return _first_failure(calls)
 
 
 def unsupported_part(scene: Any, sensor: Any) -> str | None:
     """What in the scene no light path can deal with, found without tracing a ray; None where there is nothing."""
     graph, name = SceneGraph.of(scene), sensor.id()
-    obstacle = _unknown_part(scene, sensor, graph)
-    if obstacle is not None:
+    if (obstacle := _unknown_part(scene, sensor, graph)) is not None:
         return obstacle
     if sensor.class_name() not in SENSORS:
         return f"sensor {name} is a {sensor.class_name()}; light paths connect to `perspective` and `thinlens` sensors"
@@ -253,7 +250,21 @@ def _unknown_part(scene: Any, sensor: Any, graph: SceneGraph) -> str | None:
     lamp = _lamp_on(graph, _NO_LAMPS)
     if lamp is not None:
         return f"{lamp}, which Mitsuba cannot have emit; give the lamp as a `cylinder` or a mesh"
-    return _failing_part(scene, graph)
+    # Such as one whose texture has too many channels.
+    si, half, context = _somewhere(), mi.Point2f(0.5), mi.BSDFContext()
+    calls = []
+    for bsdf in _one_of_a_kind(graph, graph.surface_bsdfs()):
+        calls.append((f"evaluate bsdf {bsdf.id()}", partial(bsdf.sample, context, si, 0.5, half)))
+        calls.append((f"evaluate bsdf {bsdf.id()}", partial(bsdf.eval, context, si, si.wi)))
+    for emitter in _one_of_a_kind(graph, scene.emitters()):
+        calls.append((f"evaluate emitter {emitter.id()}", partial(emitter.eval, si)))
+    return _first_failure(calls)
+
+
+def _first_failure(calls: Iterable[tuple[str, Callable[[], object]]]) -> str | None:
+    """The first of `calls` that Mitsuba cannot do, by what it is to do, and its reason."""
+    found = ((what, failure(call)) for what, call in calls)
+    return next((f"Mitsuba cannot {what}: {reason}" for what, reason in found if reason is not None), None)
 
 
 def _lamp_on(graph: SceneGraph, plugins: dict[str, str]) -> str | None:
@@ -264,44 +275,11 @@ def _lamp_on(graph: SceneGraph, plugins: dict[str, str]) -> str | None:
     return None
 
 
-def _failing_part(scene: Any, graph: SceneGraph) -> str | None:
-    """The first surface or emitter that Mitsuba cannot evaluate, such as one whose texture has too many channels."""
-    si, half, context = _somewhere(), mi.Point2f(0.5), mi.BSDFContext()
-    calls = [
-        *(
-            (f"bsdf {bsdf.id()}", call)
-            for bsdf in _one_of_a_kind(graph, graph.surface_bsdfs())
-            for call in (partial(bsdf.sample, context, si, 0.5, half), partial(bsdf.eval, context, si, si.wi))
-        ),
-        *(
-            (f"emitter {emitter.id()}", partial(emitter.eval, si))
-            for emitter in _one_of_a_kind(graph, scene.emitters())
-        ),
-    ]
-    for part, call in calls:
-        reason = _failure(call)
-        if reason is not None:
-            return f"Mitsuba cannot evaluate {part}: {reason}"
-    return None
-
-
 def _somewhere() -> Any:
     """A point on a surface, of one entry, looked at from straight above."""
     si = dr.zeros(mi.SurfaceInteraction3f)
     si.wi, si.n, si.sh_frame = mi.Vector3f(0, 0, 1), mi.Normal3f(0, 0, 1), mi.Frame3f(mi.Vector3f(0, 0, 1))
     return si
-
-
-def _failure(call: Callable[[], object]) -> str | None:
-    """Mitsuba's reason, in one line, why it cannot do what `call` asks for; None where it can."""
-    try:
-        with dr.suspend_grad():
-            call()
-    except RuntimeError as error:
-        if is_machine_fault(error):
-            raise
-        return " ".join(str(error).split())
-    return None
 
 
 def _one_of_a_kind(graph: SceneGraph, items: Sequence[Any]) -> list[Any]:
@@ -365,11 +343,6 @@ def _read_geometry(graph: SceneGraph) -> bool:
     textures = [texture for texture in graph.of_type(mi.Texture) if graph.owning_bsdfs(texture)]
     bsdfs = graph.of_type(mi.BSDF)
     return not all(map(plain, textures)) or any(bsdf.class_name() not in _PLAIN_BSDFS for bsdf in bsdfs)
-
-
-def _is_followed(graph: SceneGraph, bsdf: mi.BSDF) -> bool:
-    nested = (item for item in graph.of_type(mi.BSDF) if bsdf in graph.owning_bsdfs(item))
-    return all(item.class_name() in _FOLLOWED_BSDFS for item in nested)
 
 
 def _focuses_outside(params: mi.SceneParameters) -> bool:

@@ -189,18 +189,14 @@ def _mark_seen(
         cell = mi.Point2f(u, v) * mi.Vector2f(size)
         inside = mi.Vector2f(cell - dr.floor(cell))
         inner = (dr.abs(inside.x - 0.5) < 0.25) & (dr.abs(inside.y - 0.5) < 0.25)
-        x, y = (_modulo(mi.Int32(dr.floor(c)), n) for c, n in zip((cell.x, cell.y), size, strict=True))
+        # Twice, since the remainder of what is below 0 is not above it.
+        x, y = ((mi.Int32(dr.floor(c)) % n + n) % n for c, n in zip((cell.x, cell.y), size, strict=True))
         dr.scatter(seen, mi.UInt32(1), mi.UInt32(y * size[0] + x), active & is_owner & inner)
         active &= mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null)
         ray = si.spawn_ray(ray.d)
         dr.eval(seen, active, ray)
         if dr.none(active):
             break
-
-
-def _modulo(value: Any, size: int) -> Any:
-    remainder = value % size
-    return dr.select(remainder < 0, remainder + size, remainder)
 
 
 #: Depths that are tried; the last one stands for all light.

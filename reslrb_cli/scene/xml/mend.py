@@ -411,7 +411,7 @@ class _Mender:
             return True
         self._name(element, owner, names)
         value = element.value
-        if element.tag == "spectrum" and "type" not in element.attributes and _is_colour(value):
+        if element.tag == "spectrum" and "type" not in element.attributes and len(_floats(value)) == 3:
             self.note(element, "a <spectrum> of three numbers is unknown to Mitsuba 3", "read as <rgb>")
             element.tag = "rgb"
         elif element.tag == "rgb" and value.startswith("#"):
@@ -483,7 +483,3 @@ class _Mender:
                     kept.append(child.new("spectrum", name=name, **by_wavelength(meant, owner)))
                     self.note(meant, f"RGB variants have no spectrum `{meant.type}`", "read as the colour of it")
             owner.children[:] = kept
-
-
-def _is_colour(value: str) -> bool:
-    return ":" not in value and len(value.replace(",", " ").split()) == 3
