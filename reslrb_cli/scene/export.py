@@ -1,9 +1,7 @@
 """The export of a scene, with the values that its parameters have, into a new folder.
 
-- Values as elements of a scene description.
-- `Replacing` puts the values that a scene's parameters have into the description that the scene was built from, meshes
-  and images in files beside it, and has copied what files it names besides.
-- `export_scene` does all of it, and checks that Mitsuba reads the same values back.
+The values that a scene's parameters have are put into the description that the scene was built from, meshes and images
+in files beside it; what other files it names are copied. In the end Mitsuba has to read the same values back.
 """
 
 from __future__ import annotations

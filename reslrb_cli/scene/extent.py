@@ -1,10 +1,4 @@
-"""The place and size of a scene and its parts, where single precision or a sensor's clip planes lose light by them.
-
-- `lost_light`: a scene far from the origin, or tiny.
-- `clipped`: parts before a sensor's near clip plane or beyond its far one.
-- `coincident`: different faces at the same place.
-- `thin_glass`: glass so thin that rays, which start off the surface that they leave, jump over its other side.
-"""
+"""The place and size of a scene and its parts, where single precision or a sensor's clip planes lose light by them."""
 
 from __future__ import annotations
 

@@ -1,11 +1,4 @@
-"""The graph of a scene's objects, and its lamps: what there is, what uses what, and what emits.
-
-- `SceneGraph`: the objects and all parents of each.
-- `Lamp`: a shape that emits light, and what its emitter does.
-- `emitted_rays`: rays as the emitters of a scene send them out, where Mitsuba can sample them.
-- `small_lamps`: lamps in view that are smaller than a pixel, which rays through the pixels hardly ever hit.
-- `triangles`, `normal_cosines`: meshes as arrays, and how far their shading normals turn from those of their faces.
-"""
+"""The graph of a scene's objects: what there is, what uses what, which lamps emit, and meshes as arrays."""
 
 from __future__ import annotations
 
@@ -30,6 +23,7 @@ class SceneGraph:
 
     objects: list[Any] = field(default_factory=list)
     parents: dict[Any, list[Any]] = field(default_factory=dict)
+    children: dict[Any, list[Any]] = field(default_factory=dict)
 
     @classmethod
     def of(cls, scene: Any) -> SceneGraph:
@@ -49,6 +43,7 @@ class SceneGraph:
             parent = waiting.pop()
             callback = Children()
             parent.traverse(callback)
+            graph.children[parent] = callback.found
             for child in callback.found:
                 if child not in graph.parents:
                     graph.objects.append(child)

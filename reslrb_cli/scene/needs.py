@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -30,19 +31,25 @@ SENSORS = ("PerspectiveCamera", "ThinLensCamera")
 #: Shapes whose shading normal is their geometric one.
 _PLAIN_SHAPES = ("Rectangle", "Disk", "Sphere", "Cylinder")
 
+_SIMPLE_BSDFS = (
+    *("SmoothDiffuse", "SmoothConductor", "RoughConductor", "SmoothDielectric", "RoughDielectric", "ThinDielectric"),
+    *("TwoSidedBRDF", "Null"),
+)
 #: BSDFs that read nothing of a surface but its texture coordinates and local directions.
 _PLAIN_BSDFS = (
-    *("SmoothDiffuse", "SmoothConductor", "RoughConductor", "SmoothDielectric", "RoughDielectric", "ThinDielectric"),
-    *("SmoothPlastic", "RoughPlastic", "Principled", "PrincipledThin", "BlendBSDF", "MaskBSDF", "TwoSidedBRDF", "Null"),
+    *_SIMPLE_BSDFS,
+    "SmoothPlastic",
+    "RoughPlastic",
+    "Principled",
+    "PrincipledThin",
+    "BlendBSDF",
+    "MaskBSDF",
 )
-
 #: BSDFs whose samples have the derivative of what they are samples of (`transport.scattering.following`), and those
 #: that only wrap others.
-_FOLLOWED_BSDFS = (
-    *("SmoothDiffuse", "SmoothConductor", "RoughConductor", "SmoothDielectric", "RoughDielectric", "ThinDielectric"),
-    *("TwoSidedBRDF", "BumpMap", "NormalMap", "Null"),
-)
-
+_FOLLOWED_BSDFS = (*_SIMPLE_BSDFS, "BumpMap", "NormalMap")
+#: Textures that do not, either, by their classes.
+_PLAIN_TEXTURES = re.compile(r"BitmapTexture.*|.*Spectrum|Checkerboard")
 #: What rounding may make of a depth between the clip planes, of 0 to 1.
 _DEPTH_ROUNDING = 1e-5
 #: BSDFs that are not the same with light and view exchanged, by class: camera paths alone meet them as they are meant.
@@ -284,23 +291,19 @@ def _somewhere() -> Any:
 
 def _one_of_a_kind(graph: SceneGraph, items: Sequence[Any]) -> list[Any]:
     """Of objects that consist of the same kinds of objects the first: thousands may differ in numbers alone."""
-    below: dict[Any, list[Any]] = {}
-    for child, parents in graph.parents.items():
-        for parent in parents:
-            below.setdefault(parent, []).append(child)
     found: dict[tuple[Any, ...], Any] = {}
     for item in items:
-        found.setdefault(_kind(item, below), item)
+        found.setdefault(_kind(item, graph), item)
     return list(found.values())
 
 
-def _kind(item: Any, below: dict[Any, list[Any]]) -> tuple[Any, ...]:
+def _kind(item: Any, graph: SceneGraph) -> tuple[Any, ...]:
     """What an object consists of. No closure, which would call itself and so keep the scene alive."""
     name = item.class_name()
     # The one texture that has one channel or three by what it was given.
     size = np.size(mi.traverse(item)["value"]) if name == "RawConstantTexture" else 0
-    used = (child for child in below.get(item, []) if isinstance(child, (mi.BSDF, mi.Texture, mi.Volume)))
-    return (name, size, *(_kind(child, below) for child in used))
+    used = (child for child in graph.children.get(item, ()) if isinstance(child, (mi.BSDF, mi.Texture, mi.Volume)))
+    return (name, size, *(_kind(child, graph) for child in used))
 
 
 def look(scene: Any, sensor: Any) -> View:
@@ -335,14 +338,9 @@ def what_is_seen(scene: Any, sensor: Any, aperture: tuple[float, float] | None =
 
 def _read_geometry(graph: SceneGraph) -> bool:
     """Whether any BSDF, or texture of one, may read more of a surface than texture coordinates and local directions."""
-
-    def plain(texture: Any) -> bool:
-        name = texture.class_name()
-        return name.startswith("BitmapTexture") or name.endswith("Spectrum") or name == "Checkerboard"
-
-    textures = [texture for texture in graph.of_type(mi.Texture) if graph.owning_bsdfs(texture)]
-    bsdfs = graph.of_type(mi.BSDF)
-    return not all(map(plain, textures)) or any(bsdf.class_name() not in _PLAIN_BSDFS for bsdf in bsdfs)
+    textures = [texture.class_name() for texture in graph.of_type(mi.Texture) if graph.owning_bsdfs(texture)]
+    is_plain = all(bsdf.class_name() in _PLAIN_BSDFS for bsdf in graph.of_type(mi.BSDF))
+    return not is_plain or not all(map(_PLAIN_TEXTURES.fullmatch, textures))
 
 
 def _focuses_outside(params: mi.SceneParameters) -> bool:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import difflib
 import functools
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from fnmatch import fnmatchcase
 from typing import Any
 
@@ -157,13 +157,12 @@ def set_values(
     What is given no value stays as the scene has it. Values are checked like initial ones are; an error is located at
     `option` and the key. A heightmap may have the resolution of its image file.
     """
-    params = mi.traverse(scene)
-    selection, _ = _choose(params, specs, source)
+    selection, _ = _choose(mi.traverse(scene), specs, source)
     names = selection.deformation.values
     given: dict[str, str] = {}
     for pattern, value in values.items():
         place = Place(source, f"{option}.{pattern}", lambda _: "")  # a value has no options
-        for key in [pattern] if pattern in names else _matching(params, pattern, place, [*names]):
+        for key in [pattern] if pattern in names else _matching(selection.params, pattern, place, [*names]):
             if key in given:
                 raise place.fail("", f"`{key}` is matched by `{given[key]}` already")
             if key in selection.deformation.keys:
@@ -174,9 +173,9 @@ def set_values(
     # What is tied has the value of the first, unless it is given one of its own.
     followed = ((key, others) for key, others in selection.tied.items() if key in given)
     tied = {key: [other for other in others if other not in given] for key, others in followed}
-    chosen = Selection(params, selection.specs, tied, selection.deformation)
-    chosen.update()
-    return chosen
+    selection = replace(selection, tied=tied)
+    selection.update()
+    return selection
 
 
 def _choose(params: mi.SceneParameters, specs: Sequence[ParameterSpec], source: object
@@ -263,12 +262,8 @@ def _tied_keys(params: mi.SceneParameters, keys: list[str], place: Place) -> lis
 
 def _matching(params: mi.SceneParameters, pattern: str, place: Place, names: Sequence[str] = ()) -> list[str]:
     """The keys that `pattern` names, all of which can be recovered; `names` are others that could be meant."""
-    if pattern in params.properties:
-        info = describe(params, pattern)
-        if (obstacle := _obstacle(info)) is not None:
-            raise place.fail("key", f"`{pattern}` {obstacle}")
-        return [pattern]
-    matches = [key for key in params.properties if fnmatchcase(key, pattern)]
+    is_key = pattern in params.properties
+    matches = [pattern] if is_key else [key for key in params.properties if fnmatchcase(key, pattern)]
     if not matches:
         near = difflib.get_close_matches(pattern, [*names, *params.properties], n=3, cutoff=0.5)
         if not near:
@@ -284,6 +279,8 @@ def _matching(params: mi.SceneParameters, pattern: str, place: Place, names: Seq
     usable = [info.key for info in infos if _obstacle(info) is None]
     if not usable:
         first = f"`{infos[0].key}` {_obstacle(infos[0])}"
+        if is_key:
+            raise place.fail("key", first)
         more = f", nor can the other {len(infos) - 1}" if len(infos) > 1 else ""
         raise place.fail("key", f"`{pattern}` matches nothing that can be recovered: {first}{more}")
     return usable

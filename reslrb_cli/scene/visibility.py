@@ -1,14 +1,9 @@
 """The view that sensors have of a scene: pixels and texels of use to light tracing, and how long its paths have to be.
 
-Pixels: light tracing lacks something at the film's border (`interior`), and where the sensor sees glass, mirrors, coats
-(`sees_specular`), from the smooth lobes of which light paths cannot connect to the sensor. `sees_lamps` has the pixels
-that see lamps.
-
-Texels: those that the sensors see (`visible_texels`).
-
-Depth: how long light's paths have to be that a picture of a scene lacks next to nothing of what a camera would see
-(`find_depth`). A photograph has light of any number of bounces. An image of paths of at most d segments is darker,
-which an exposure or a colour would make up for.
+Light tracing lacks something at the film's border (`interior`), and where the sensor sees glass, mirrors, coats
+(`sees_specular`), from the smooth lobes of which light paths cannot connect to the sensor. A photograph has light of
+any number of bounces; an image of paths of at most d segments is darker, which an exposure or a colour would make up
+for (`find_depth`).
 """
 
 from __future__ import annotations

@@ -1,7 +1,6 @@
 """The refusals of what a scene's files must not say, before Mitsuba sees any of it.
 
-`check` refuses plugins that are not Mitsuba's, endless files, chains without end, and, before Mitsuba allocates any,
-sizes for which no machine has room. `resize_films` gives films another size than their files say.
+These are plugins that are not Mitsuba's, endless files, chains without end, and sizes for which no machine has room.
 """
 
 from __future__ import annotations

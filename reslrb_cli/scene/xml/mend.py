@@ -1,14 +1,10 @@
 """The mending of what other versions of Mitsuba and exporters for them wrote, where Mitsuba 3 can say it.
 
-In the order of the code: notes of what was mended, or left out, so that a scene could be loaded; tables of how those
-versions and exporters say what Mitsuba 3 says in another way; colours and spectra; texture coordinates as Mitsuba 0.6
-let them be scaled and shifted; textures that stand by themselves, put where they are used, so that their parameters
-belong to what uses them; and `mend`, which goes through the elements.
-
-Colours as Mitsuba 0.6 let them be written, and spectra that RGB variants lack, get a form that has a colour there. The
-plugins `regular`, `irregular` and `blackbody` can be evaluated by wavelength alone. Of the same spectrum written as
-`<spectrum value="400:0.1, 700:0.9"/>` Mitsuba computes the colour, by the CIE's matching functions: that of light where
-it is what an emitter emits, elsewhere that of a surface under D65.
+Notes say what was mended, or left out, so that a scene could be loaded; tables, how those versions and exporters say
+what Mitsuba 3 says in another way. The plugins `regular`, `irregular` and `blackbody` can be evaluated by wavelength
+alone, which RGB variants lack. Of the same spectrum written as `<spectrum value="400:0.1, 700:0.9"/>` Mitsuba computes
+the colour, by the CIE's matching functions: that of light where it is what an emitter emits, elsewhere that of a
+surface under D65.
 """
 
 from __future__ import annotations
@@ -77,7 +73,6 @@ def refuse(notes: Sequence[Note]) -> None:
 
 #: Spellings of elements.
 ELEMENTS = {"lookAt": "lookat", "srgb": "rgb"}
-
 _BEFORE_04 = "an element of Mitsuba before 0.4, whose axes pointed elsewhere; save the scene with Mitsuba 0.6"
 #: Elements of Mitsuba 0.x that mean what Mitsuba 3 cannot be told, and what to do.
 LOST_ELEMENTS = {
@@ -315,7 +310,13 @@ def mend(description: Description) -> list[Note]:
     if root.source.version is None:
         wrong = "the version is missing" if given is None else f"version {quoted(given)} is not three numbers"
         mender.note(root, wrong, f"taken for {CURRENT_VERSION}")
-    mender.mend_root(root)
+    if root.is_object:
+        mender.mend_element(root)
+    mender.mend_below(root)
+    mender.mend_spectra(root)
+    # What refers to something that was left out goes with it.
+    for element in root.walk() if mender.gone else ():
+        element.children[:] = [child for child in element.children if child.tag != "ref" or child.id not in mender.gone]
     root.attributes["version"] = CURRENT_VERSION
     return mender.notes
 
@@ -329,25 +330,17 @@ class _Mender:
     def note(self, element: Element, wrong: str, done: str) -> None:
         self.notes.append(Note(element, wrong, done))
 
-    def mend_root(self, root: Element) -> None:
-        """Mend the whole scene."""
-        if root.is_object:
-            self._element(root)
-        self.mend(root)
-        self._spectra(root)
-        # What refers to something that was left out goes with it.
-        for element in root.walk() if self.gone else ():
-            element.children[:] = [
-                child for child in element.children if child.tag != "ref" or child.id not in self.gone
-            ]
-
-    def mend(self, element: Element) -> None:
+    def mend_below(self, element: Element) -> None:
         """Mend all below `element`, which is mended itself."""
         kept = []
         names = {child.name for child in element.children}
         for child in element.children:
             # In place of a scene's integrator there is the experiment's own.
-            if child.tag == "integrator" or not self._element(child) or (child.is_object and not self._plugin(child)):
+            if (
+                child.tag == "integrator"
+                or not self.mend_element(child)
+                or (child.is_object and not self._plugin(child))
+            ):
                 self.gone.update(other.id for other in child.objects())
             elif not element.is_object or self._parameter(child, element, names):
                 kept.append(child)
@@ -359,11 +352,11 @@ class _Mender:
             if replaced is not None and not element.source.is_old:
                 self.note(replaced, f"`{replaced.name}` is unknown to Mitsuba 3", "read as `to_uv`")
         for child in element.children:
-            self.mend(child)
+            self.mend_below(child)
 
     # --- elements and plugins -----------------------------------------------------------------------------------------
 
-    def _element(self, element: Element) -> bool:
+    def mend_element(self, element: Element) -> bool:
         """Mend tag and attributes; False where the element is to be left out."""
         tag = element.tag
         if tag == "srgb":
@@ -460,7 +453,7 @@ class _Mender:
             last[child.name] = child
         owner.children[:] = [child for child in owner.children if child not in dropped]
 
-    def _spectra(self, root: Element) -> None:
+    def mend_spectra(self, root: Element) -> None:
         """Write spectra by wavelength as parameters of what has them, since RGB variants have no such plugins."""
         named = {
             item.id: item

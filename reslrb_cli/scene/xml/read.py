@@ -1,11 +1,6 @@
 """Scene files as elements: read, included files and variables put in, and written for Mitsuba's parser.
 
-- `Element` knows the file and the line that it comes from.
-- `read_document` reads one XML file, and refuses what would take the parser down or never end.
-- `Variables` puts in the `$name` variables of a scene file as Mitsuba's parser does.
-- `read_description` brings a scene together from its files: includes are followed, variables put in, folders to look in
-  collected.
-- `tag_lines` writes the elements as the XML that Mitsuba's own parser reads.
+Each element knows the file and the line that it comes from. What would take the parser down or never end is refused.
 """
 
 from __future__ import annotations
@@ -206,52 +201,6 @@ def _version(text: str) -> tuple[int, ...] | None:
 MAX_LENGTH = 2**20
 #: A `$` that stands for no other sign, and what may be the name of a variable behind it: longer ones are never found.
 _VARIABLE = re.compile(r"(?<!\\)\$([^$]{0,256})")
-
-
-class Variables:
-    """The `values` of variables by name: those that the user gives, and the file's defaults as they are met."""
-
-    def __init__(self, options: Mapping[str, str]) -> None:
-        self.values = dict(options)
-        self._unused = set(options)
-
-    def put_into(self, element: Element) -> None:
-        """Replace the variables in the attributes of `element`. Raises ConfigError for one without a value."""
-        for key, text in element.attributes.items():
-            if "$" in text:
-                element.attributes[key] = self._replace(text, element)
-
-    def _replace(self, text: str, element: Element) -> str:
-        length = len(text)
-
-        def value_of(found: re.Match[str]) -> str:
-            """The value of the longest name: one may be the beginning of another."""
-            nonlocal length
-            behind = found[1]
-            name = next((behind[:n] for n in range(len(behind), 0, -1) if behind[:n] in self.values), None)
-            if name is None:
-                raise self._fail(behind, element)
-            self._unused.discard(name)
-            length += len(self.values[name])
-            if length > MAX_LENGTH:
-                raise element.fail(f"${name}", f"makes a text of more than {MAX_LENGTH} characters")
-            return self.values[name] + behind[len(name) :]
-
-        return _VARIABLE.sub(value_of, text).replace("\\$", "$")
-
-    def _fail(self, behind: str, element: Element) -> ConfigError:
-        name = quoted(re.match(r"\w*", behind, re.ASCII)[0], "")  # type: ignore[index]  # an empty text matches
-        how = f"set scene.options.{name} (--set scene.options.{name}=VALUE)"
-        message = f"has no value and no default; {how}" if name else "is no variable; write \\$"
-        return element.fail(f"${name}", message)
-
-    def check_used(self, source: object) -> None:
-        """Raise ConfigError, located in `source`, where a value that the user gives was never put in."""
-        if self._unused:
-            names = ", ".join(f"${name}" for name in self.values if name in self._unused)
-            raise ConfigError(source, quoted(names, ""), "is set in scene.options, but the scene file does not use it")
-
-
 MAX_INCLUDES = 1000
 #: Includes within one another; that of Mitsuba's parser.
 MAX_INCLUDE_DEPTH = 15
@@ -278,21 +227,25 @@ def read_description(file: Path, options: Mapping[str, str]) -> Description:
     Raises ConfigError, located by file and line, for what cannot be read, for variables without a value, and for
     options without a variable.
     """
-    reader = _Reader(Variables(options))
+    reader = _Reader(dict(options), set(options))
     folders = [file.absolute().parent]
     root = reader.read(file, folders, None)
-    reader.variables.check_used(file)
+    if reader.unused:
+        names = quoted(", ".join(f"${name}" for name in options if name in reader.unused), "")
+        raise ConfigError(file, names, "is set in scene.options, but the scene file does not use it")
     said = [value for child in root.children if child.tag == "integrator" for value in child.walk()]
     # In the spelling of any version.
     hides = any(each.name in ("hide_emitters", "hideEmitters") and each.value.strip() == "true" for each in said)
-    return Description(root, folders, reader.variables.values, hides)
+    return Description(root, folders, reader.values, hides)
 
 
 @dataclass
 class _Reader:
-    """What the files of one scene share."""
+    """What the files of one scene share: the `values` of variables by name, those that the user gives, and the files'
+    defaults as they are met."""
 
-    variables: Variables
+    values: dict[str, str]
+    unused: set[str]
     bytes_left: int = field(default_factory=lambda: MAX_BYTES)
     includes: int = 0
     including: int = 0
@@ -313,7 +266,7 @@ class _Reader:
             raise include.fail("", f"includes {file}, which {error.message}") from None
         self.bytes_left -= size
         self.including += 1
-        self.variables.put_into(root)
+        self._put_variables(root)
         self._complete(root, root, folders, depth)
         self.including -= 1
         return root
@@ -328,9 +281,9 @@ class _Reader:
             element.attributes["filename"] = str(find_file(name, folders) or name)
         children: list[Element] = []
         for child in element.children:
-            self.variables.put_into(child)
+            self._put_variables(child)
             if child.tag == "default":
-                self.variables.values.setdefault(_required(child, "name"), _required(child, "value"))
+                self.values.setdefault(_required(child, "name"), _required(child, "value"))
             elif child.tag == "path":
                 if element is not root:
                     raise child.fail("", "<path> can only stand directly below the root")
@@ -341,6 +294,36 @@ class _Reader:
                 self._complete(child, root, folders, depth + 1)
                 children.append(child)
         element.children[:] = children
+
+    def _put_variables(self, element: Element) -> None:
+        """Replace the variables in the attributes of `element`. Raises ConfigError for one without a value."""
+        for key, text in element.attributes.items():
+            if "$" in text:
+                element.attributes[key] = self._replace(text, element)
+
+    def _replace(self, text: str, element: Element) -> str:
+        length = len(text)
+
+        def value_of(found: re.Match[str]) -> str:
+            """The value of the longest name: one may be the beginning of another."""
+            nonlocal length
+            behind = found[1]
+            name = next((behind[:n] for n in range(len(behind), 0, -1) if behind[:n] in self.values), None)
+            if name is None:
+                raise self._fail(behind, element)
+            self.unused.discard(name)
+            length += len(self.values[name])
+            if length > MAX_LENGTH:
+                raise element.fail(f"${name}", f"makes a text of more than {MAX_LENGTH} characters")
+            return self.values[name] + behind[len(name) :]
+
+        return _VARIABLE.sub(value_of, text).replace("\\$", "$")
+
+    def _fail(self, behind: str, element: Element) -> ConfigError:
+        name = quoted(re.match(r"\w*", behind, re.ASCII)[0], "")  # type: ignore[index]  # an empty text matches
+        how = f"set scene.options.{name} (--set scene.options.{name}=VALUE)"
+        message = f"has no value and no default; {how}" if name else "is no variable; write \\$"
+        return element.fail(f"${name}", message)
 
     def _include(self, include: Element, folders: list[Path], depth: int) -> list[Element]:
         """What stands in the place of `include`: the objects of a scene, or the one object that a file holds."""
