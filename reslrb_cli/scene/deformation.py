@@ -363,14 +363,13 @@ class _Lookup(dr.CustomOp):
 
     def eval(self, buffer: mi.Float, indices: list[mi.UInt32], weights: list[mi.Float]) -> mi.Float:
         self.indices, self.weights, self.size = indices, weights, dr.width(buffer)
-        return sum(
-            (w * dr.gather(mi.Float, buffer, i) for i, w in zip(indices, weights, strict=True)), start=mi.Float(0)
-        )
+        return self._sum(buffer)
+
+    def _sum(self, buffer: mi.Float) -> mi.Float:
+        return sum(w * dr.gather(mi.Float, buffer, i) for i, w in zip(self.indices, self.weights, strict=True))
 
     def forward(self) -> None:
-        tangent = self.grad_in("buffer")
-        total = sum(w * dr.gather(mi.Float, tangent, i) for i, w in zip(self.indices, self.weights, strict=True))
-        self.set_grad_out(total)
+        self.set_grad_out(self._sum(self.grad_in("buffer")))
 
     def backward(self) -> None:
         gradient, total = self.grad_out(), dr.zeros(mi.Float, self.size)

@@ -28,6 +28,7 @@ from reslrb_cli.errors import ConfigError, is_out_of_memory
 logger = logging.getLogger(__name__)
 FORMATS = "EXR, PNG, JPG, HDR, PFM, PPM or BMP"
 _NO_IMAGE = f"is not an image that can be read ({FORMATS})"
+_CUT_OFF = "is cut off: the file ends before its image; copy or save it again"
 #: Bytes in which a file says how large its image is; a preview may stand before it.
 _HEAD = 2**20
 #: Parts that a PNG or a JPEG has at most, so that one of nothing but empty parts takes no time.
@@ -46,14 +47,6 @@ TURNS = {
     7: "turned by 90 degrees counterclockwise and mirrored left to right",
     8: "turned by 90 degrees counterclockwise",
 }
-
-
-class _CutOff(Exception):
-    """The file ends before its image does."""
-
-
-class _Damaged(Exception):
-    """Mitsuba's reader would write past its own memory."""
 
 
 class DamagedImage(ConfigError):
@@ -141,11 +134,7 @@ def _examine(path: Path) -> _Says:
             head = file.read(_HEAD) or b""
             reader = next((reader for magic, reader in _READERS.items() if head.startswith(magic)), None)
             with suppress(struct.error, ValueError):  # a head that is cut off is none
-                says = None if reader is None else reader(head, file)
-        except _CutOff:
-            raise ConfigError(path, "", "is cut off: the file ends before its image; copy or save it again") from None
-        except _Damaged:
-            raise DamagedImage(path, "", "is damaged or cut off; copy or save it again") from None
+                says = None if reader is None else reader(path, head, file)
         except OSError as error:
             raise ConfigError(path, "", f"cannot be read: {error.strerror}") from None
     if says is None:
@@ -162,7 +151,7 @@ _EXIF, _ORIENTATION, _SHORT = b"Exif\0\0", 0x0112, 3
 _MARKER = re.compile(rb"\xff+[\x01-\xcf\xd8-\xfe]")
 
 
-def _png(head: bytes, file: BinaryIO) -> _Says | None:
+def _png(path: Path, head: bytes, file: BinaryIO) -> _Says | None:
     if head[12:16] != b"IHDR":
         return None
     width, height = struct.unpack(">II", head[16:24])
@@ -172,7 +161,7 @@ def _png(head: bytes, file: BinaryIO) -> _Says | None:
         length, kind = struct.unpack(">I4s", file.read(8).ljust(8, b"\0"))
         position += 12 + length  # with its check sum
         if position > end:
-            raise _CutOff
+            raise ConfigError(path, "", _CUT_OFF)
         if kind == b"eXIf" and not exif:
             exif = file.read(min(length, _EXIF_BYTES))
         if kind == b"IEND":
@@ -180,20 +169,20 @@ def _png(head: bytes, file: BinaryIO) -> _Says | None:
     return None
 
 
-def _jpeg(head: bytes, file: BinaryIO) -> _Says | None:
+def _jpeg(path: Path, head: bytes, file: BinaryIO) -> _Says | None:
     file.seek(0)
     data, position, size, exif = file.read(), 2, None, b""
     for _ in range(_MOST_PARTS):
         found = _MARKER.search(data, position)
         if found is None:
-            raise _CutOff
+            raise ConfigError(path, "", _CUT_OFF)
         kind, position = data[found.end() - 1], found.end()
         if kind == 0xD9:  # the end of the image
             return None if size is None else _Says(size, _orientation(exif), is_jpeg=True)
         if kind == 0x01 or kind == 0xD8:
             continue
         if position + 2 > len(data):
-            raise _CutOff
+            raise ConfigError(path, "", _CUT_OFF)
         [length] = struct.unpack_from(">H", data, position)
         if 0xC0 <= kind <= 0xCF and kind not in (0xC4, 0xC8, 0xCC) and position + 7 <= len(data):
             height, width = struct.unpack_from(">HH", data, position + 3)
@@ -222,7 +211,7 @@ def _orientation(exif: bytes) -> int:
     return 1
 
 
-def _exr(head: bytes, file: BinaryIO) -> _Says | None:
+def _exr(path: Path, head: bytes, file: BinaryIO) -> _Says | None:
     position = 8
     while True:  # attributes: a name and a type, each ended by a zero, the number of bytes, and these
         name, _, rest = head[position : position + 600].partition(b"\0")
@@ -237,53 +226,51 @@ def _exr(head: bytes, file: BinaryIO) -> _Says | None:
         position += 4 + length
 
 
-def _hdr(head: bytes, file: BinaryIO) -> _Says | None:
+def _hdr(path: Path, head: bytes, file: BinaryIO) -> _Says | None:
     found = re.search(rb"\n-Y (\d{1,9}) \+X (\d{1,9})\n", head)
     if found is None:
         return None
     width, height = int(found[2]), int(found[1])
     if width * height <= PIXELS:  # else it is refused for that
         file.seek(found.end())
-        _check_runs(file.read(), width, height)
+        if not _are_whole(file.read(), width, height):
+            raise DamagedImage(path, "", "is damaged or cut off; copy or save it again")
     return _Says((width, height))
 
 
-def _check_runs(data: bytes, width: int, height: int) -> None:
-    """Raise _Damaged where the lines of a Radiance image are not what its head says: runs that fill each of the four
-    parts of a line to its end, in all lines or in none. Mitsuba's reader believes what the lines say."""
+def _are_whole(data: bytes, width: int, height: int) -> bool:
+    """Whether the lines of a Radiance image are what its head says: runs that fill each of the four parts of a line to
+    its end, in all lines or in none. Mitsuba's reader believes what the lines say, and would write past its memory."""
     start = bytes((2, 2, width >> 8, width & 255)) if 8 <= width <= 0x7FFF else b""
     if not start or data[:2] != start[:2] or data[2:3] >= b"\x80":
-        if len(data) < 4 * width * height:
-            raise _Damaged
-        return
+        return len(data) >= 4 * width * height
     position, end = 0, len(data)
     for _ in range(height):
         if data[position : position + 4] != start:
-            raise _Damaged
+            return False
         position += 4
         for _ in range(4):
             left = width
-            while left > 0 and position < end:
+            while left > 0 and position < end and data[position]:
                 code = data[position]
-                if code == 0:
-                    raise _Damaged
                 length = code - 128 if code > 128 else code
                 left, position = left - length, position + (2 if code > 128 else length + 1)
             if left or position > end:
-                raise _Damaged
+                return False
+    return True
 
 
-def _netpbm(head: bytes, file: BinaryIO) -> _Says | None:
+def _netpbm(path: Path, head: bytes, file: BinaryIO) -> _Says | None:
     found = re.match(rb"..(?:\s|#[^\n]*\n)+(\d{1,9})(?:\s|#[^\n]*\n)+(\d{1,9})\s", head)
     return _Says((int(found[1]), int(found[2]))) if found else None
 
 
-def _bmp(head: bytes, file: BinaryIO) -> _Says | None:
+def _bmp(path: Path, head: bytes, file: BinaryIO) -> _Says | None:
     width, height = struct.unpack_from("<ii", head, 18)
     return _Says((width, abs(height)))
 
 
-_READERS: dict[bytes, Callable[[bytes, BinaryIO], _Says | None]] = {
+_READERS: dict[bytes, Callable[[Path, bytes, BinaryIO], _Says | None]] = {
     b"\x76\x2f\x31\x01": _exr,
     _PNG: _png,
     _JPEG: _jpeg,
