@@ -96,7 +96,7 @@ class Owners:
     """The elements of a description by the ids of their objects, for the way back from a parameter to its element."""
 
     def __init__(self, root: Element) -> None:
-        self._elements = {item.id: item for item in root.objects() if item.id}
+        self._elements = root.by_id()
 
     def place(self, params: mi.SceneParameters, key: str) -> tuple[Element, list[str]] | None:
         """The element of the nearest object above the parameter `key` that has one, and the names that lead on.

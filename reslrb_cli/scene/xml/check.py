@@ -104,15 +104,11 @@ def _object_type(tag: str) -> mi.ObjectType:
 
 def _check_chains(root: Element) -> None:
     """Refuse objects that use themselves, or others in chains so long that Mitsuba's stack would not hold them."""
-    objects = root.objects()
-    owners = {element.id: element for element in objects if element.id}
-    for alias in root.walk("alias"):
-        if alias.id in owners:
-            owners.setdefault(alias.attributes.get("as", ""), owners[alias.id])
+    owners = root.by_id()
     uses = {
         element: [child for child in element.children if child.is_object]
         + [owners[child.id] for child in element.children if child.tag == "ref" and child.id in owners]
-        for element in objects
+        for element in root.objects()
     }
     try:
         order = list(TopologicalSorter(uses).static_order())

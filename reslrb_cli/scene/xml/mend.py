@@ -336,11 +336,8 @@ class _Mender:
         names = {child.name for child in element.children}
         for child in element.children:
             # In place of a scene's integrator there is the experiment's own.
-            if (
-                child.tag == "integrator"
-                or not self.mend_element(child)
-                or (child.is_object and not self._plugin(child))
-            ):
+            is_kept = child.tag != "integrator" and self.mend_element(child)
+            if not is_kept or (child.is_object and not self._plugin(child)):
                 self.gone.update(other.id for other in child.objects())
             elif not element.is_object or self._parameter(child, element, names):
                 kept.append(child)
@@ -455,14 +452,7 @@ class _Mender:
 
     def mend_spectra(self, root: Element) -> None:
         """Write spectra by wavelength as parameters of what has them, since RGB variants have no such plugins."""
-        named = {
-            item.id: item
-            for item in root.walk("spectrum", "texture")
-            if item.type in SPECTRA and "id" in item.attributes
-        }
-        for alias in root.walk("alias"):
-            if alias.id in named:
-                named[alias.attributes.get("as", "")] = named[alias.id]
+        named = {id: item for id, item in root.by_id().items() if item.type in SPECTRA}
         for owner in [element for element in root.objects() if element.type != "specfilm"]:
             kept = []
             for child in owner.children:

@@ -117,6 +117,14 @@ class Element:
         """The objects among them: the nodes that Mitsuba's parser makes, in its order."""
         return [element for element in self.walk() if element.is_object]
 
+    def by_id(self) -> dict[str, Element]:
+        """The objects among them by their ids, and by the aliases of these."""
+        found = {element.id: element for element in self.objects() if element.id}
+        for alias in self.walk("alias"):
+            if alias.id in found:
+                found.setdefault(alias.attributes.get("as", ""), found[alias.id])
+        return found
+
     def find(self, name: str) -> Element | None:
         """The first parameter of this name."""
         return next((child for child in self.children if child.name == name), None)
