@@ -39,7 +39,7 @@ from reslrb_cli.records.clock import StepClock
 from reslrb_cli.records.decisions import RivalRecord, key_of
 from reslrb_cli.scene.catalog import parameter_kind
 from reslrb_cli.scene.graph import SceneGraph
-from reslrb_cli.scene.needs import SceneNeeds, View, look, scene_needs, stock_clip
+from reslrb_cli.scene.needs import PrimaryHits, SceneNeeds, look, scene_needs, stock_clip
 from reslrb_cli.scene.visibility import interior
 
 RIVAL = "prb"
@@ -235,7 +235,7 @@ class Situation:
     params: Any
     graph: SceneGraph
     needs: SceneNeeds
-    view: View
+    view: PrimaryHits
     max_depth: int
     hide_emitters: bool
     attached: bool = False

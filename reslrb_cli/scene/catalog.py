@@ -18,8 +18,8 @@ import numpy as np
 from reslrb_cli.scene.deformation import BEAMS, PLACES, heightmap_obstacle, list_movable, moving_obstacle
 from reslrb_cli.scene.graph import SceneGraph
 from reslrb_cli.scene.needs import (
+    PrimaryHits,
     SceneNeeds,
-    View,
     camera_obstacle,
     light_obstacle,
     look,
@@ -226,7 +226,7 @@ class SensorSummary:
     filter: str
     channels: int
     needs: SceneNeeds
-    view: View | None
+    view: PrimaryHits | None
     obstacle: str | None
     camera_obstacle: str | None
 

@@ -21,7 +21,7 @@ from reslrb_cli.errors import ConfigError
 from reslrb_cli.records.atomic import unfinished_folder
 from reslrb_cli.records.images import file_stem, write_file
 from reslrb_cli.scene.catalog import as_numbers, parameter_kind
-from reslrb_cli.scene.values import Slot
+from reslrb_cli.scene.values import ParameterValue
 from reslrb_cli.scene.xml.build import Owners
 from reslrb_cli.scene.xml.read import Description, Element, find_file, tag_lines
 
@@ -166,7 +166,7 @@ class Replacing:
             replace(owner, owner.new("string", name="format", value="variant"), "color_space", "gamma")
 
     def _array(self, key: str) -> Array:
-        return Slot(self.params, key).get()
+        return ParameterValue(self.params, key).get()
 
     def _fail(self, key: str, why: str) -> ConfigError:
         return ConfigError(self.source, key, f"cannot be exported: {why}")

@@ -54,7 +54,7 @@ class DamagedImage(ConfigError):
 
 
 @dataclass(frozen=True)
-class _Says:
+class _Header:
     """What a file says of its image: (width, height) of the pixels as they lie in it, and EXIF's orientation."""
 
     size: Size
@@ -69,9 +69,9 @@ def read_bitmap(path: Path, size: Size | None = None, upright: bool = False) -> 
     is the size. Raises ConfigError, located in the file, where it cannot be read, is no image, too large, of another
     size, damaged or cut off. What is checked first is what the file says of itself.
     """
-    says = _examine(path)
-    orientation = says.orientation if upright else 1
-    width, height = says.size[::-1] if orientation >= 5 else says.size
+    header = _examine(path)
+    orientation = header.orientation if upright else 1
+    width, height = header.size[::-1] if orientation >= 5 else header.size
     if min(width, height) < 1:
         raise ConfigError(path, "", _NO_IMAGE)
     if size is not None and (width, height) != size:
@@ -81,7 +81,7 @@ def read_bitmap(path: Path, size: Size | None = None, upright: bool = False) -> 
         raise ConfigError(path, "", f"is {width}x{height} pixels; more than {PIXELS} are not read")
     complaints: list[str] = []
     try:
-        with _heard(complaints) if says.is_jpeg else nullcontext():
+        with _heard(complaints) if header.is_jpeg else nullcontext():
             bitmap = mi.Bitmap(str(path))
     except Exception as error:
         if is_out_of_memory(error):
@@ -91,8 +91,8 @@ def read_bitmap(path: Path, size: Size | None = None, upright: bool = False) -> 
         if line.startswith(("Corrupt JPEG data", "Premature end")):
             raise ConfigError(path, "", f"is damaged or cut off ({line}); copy or save it again")
         logger.warning("%s: %s", path, line)
-    if (int(bitmap.width()), int(bitmap.height())) != says.size:
-        raise ConfigError(path, "", f"says that it is {says.size[0]}x{says.size[1]} pixels, and is not")
+    if (int(bitmap.width()), int(bitmap.height())) != header.size:
+        raise ConfigError(path, "", f"says that it is {header.size[0]}x{header.size[1]} pixels, and is not")
     if orientation == 1:
         return bitmap
     turned_bitmap = mi.Bitmap(np.ascontiguousarray(turn(np.array(bitmap), orientation)), bitmap.pixel_format())
@@ -125,21 +125,21 @@ def image_size(path: Path) -> Size:
     return width, height
 
 
-def _examine(path: Path) -> _Says:
+def _examine(path: Path) -> _Header:
     """What a file says of its image. Raises ConfigError, located in it, where it is none, or a PNG or JPEG without its
     end, which readers of the other formats tell themselves."""
-    says: _Says | None = None
+    header: _Header | None = None
     with open_file(path, IMAGE_BYTES) as file:
         try:
             head = file.read(_HEAD) or b""
             reader = next((reader for magic, reader in _READERS.items() if head.startswith(magic)), None)
             with suppress(struct.error, ValueError):  # a head that is cut off is none
-                says = None if reader is None else reader(path, head, file)
+                header = None if reader is None else reader(path, head, file)
         except OSError as error:
             raise ConfigError(path, "", f"cannot be read: {error.strerror}") from None
-    if says is None:
+    if header is None:
         raise ConfigError(path, "", _NO_IMAGE)
-    return says
+    return header
 
 
 # --- formats ----------------------------------------------------------------------------------------------------------
@@ -151,7 +151,7 @@ _EXIF, _ORIENTATION, _SHORT = b"Exif\0\0", 0x0112, 3
 _MARKER = re.compile(rb"\xff+[\x01-\xcf\xd8-\xfe]")
 
 
-def _png(path: Path, head: bytes, file: BinaryIO) -> _Says | None:
+def _png(path: Path, head: bytes, file: BinaryIO) -> _Header | None:
     if head[12:16] != b"IHDR":
         return None
     width, height = struct.unpack(">II", head[16:24])
@@ -165,11 +165,11 @@ def _png(path: Path, head: bytes, file: BinaryIO) -> _Says | None:
         if kind == b"eXIf" and not exif:
             exif = file.read(min(length, _EXIF_BYTES))
         if kind == b"IEND":
-            return _Says((width, height), _orientation(exif))
+            return _Header((width, height), _orientation(exif))
     return None
 
 
-def _jpeg(path: Path, head: bytes, file: BinaryIO) -> _Says | None:
+def _jpeg(path: Path, head: bytes, file: BinaryIO) -> _Header | None:
     file.seek(0)
     data, position, size, exif = file.read(), 2, None, b""
     for _ in range(_MOST_PARTS):
@@ -178,7 +178,7 @@ def _jpeg(path: Path, head: bytes, file: BinaryIO) -> _Says | None:
             raise ConfigError(path, "", _CUT_OFF)
         kind, position = data[found.end() - 1], found.end()
         if kind == 0xD9:  # the end of the image
-            return None if size is None else _Says(size, _orientation(exif), is_jpeg=True)
+            return None if size is None else _Header(size, _orientation(exif), is_jpeg=True)
         if kind == 0x01 or kind == 0xD8:
             continue
         if position + 2 > len(data):
@@ -211,7 +211,7 @@ def _orientation(exif: bytes) -> int:
     return 1
 
 
-def _exr(path: Path, head: bytes, file: BinaryIO) -> _Says | None:
+def _exr(path: Path, head: bytes, file: BinaryIO) -> _Header | None:
     position = 8
     while True:  # attributes: a name and a type, each ended by a zero, the number of bytes, and these
         name, _, rest = head[position : position + 600].partition(b"\0")
@@ -222,11 +222,11 @@ def _exr(path: Path, head: bytes, file: BinaryIO) -> _Says | None:
             return None
         if name == b"dataWindow":
             left, top, right, bottom = struct.unpack_from("<4i", head, position + 4)
-            return _Says((right - left + 1, bottom - top + 1))
+            return _Header((right - left + 1, bottom - top + 1))
         position += 4 + length
 
 
-def _hdr(path: Path, head: bytes, file: BinaryIO) -> _Says | None:
+def _hdr(path: Path, head: bytes, file: BinaryIO) -> _Header | None:
     found = re.search(rb"\n-Y (\d{1,9}) \+X (\d{1,9})\n", head)
     if found is None:
         return None
@@ -235,7 +235,7 @@ def _hdr(path: Path, head: bytes, file: BinaryIO) -> _Says | None:
         file.seek(found.end())
         if not _are_whole(file.read(), width, height):
             raise DamagedImage(path, "", "is damaged or cut off; copy or save it again")
-    return _Says((width, height))
+    return _Header((width, height))
 
 
 def _are_whole(data: bytes, width: int, height: int) -> bool:
@@ -260,17 +260,17 @@ def _are_whole(data: bytes, width: int, height: int) -> bool:
     return True
 
 
-def _netpbm(path: Path, head: bytes, file: BinaryIO) -> _Says | None:
+def _netpbm(path: Path, head: bytes, file: BinaryIO) -> _Header | None:
     found = re.match(rb"..(?:\s|#[^\n]*\n)+(\d{1,9})(?:\s|#[^\n]*\n)+(\d{1,9})\s", head)
-    return _Says((int(found[1]), int(found[2]))) if found else None
+    return _Header((int(found[1]), int(found[2]))) if found else None
 
 
-def _bmp(path: Path, head: bytes, file: BinaryIO) -> _Says | None:
+def _bmp(path: Path, head: bytes, file: BinaryIO) -> _Header | None:
     width, height = struct.unpack_from("<ii", head, 18)
-    return _Says((width, abs(height)))
+    return _Header((width, abs(height)))
 
 
-_READERS: dict[bytes, Callable[[Path, bytes, BinaryIO], _Says | None]] = {
+_READERS: dict[bytes, Callable[[Path, bytes, BinaryIO], _Header | None]] = {
     b"\x76\x2f\x31\x01": _exr,
     _PNG: _png,
     _JPEG: _jpeg,

@@ -138,7 +138,7 @@ def _mark_floats(scene: mi.Scene, description: Description, keys: Iterable[str])
             continue
         owner, names = owners.place(params, key) or (description.root, [])
         if owner.type == "bitmap" and names == ["data"]:  # else nothing is done, and to select it says why
-            _tell(f"{owner.place}: `{key}` is read as floating point")
+            warn_once(f"{owner.place}: `{key}` is read as floating point", logging.INFO)
             owner.drop("format")
             owner.children.append(owner.new("string", name="format", value="variant"))
             changed = True
@@ -158,12 +158,6 @@ def _check_meshes(file: Path, scene: mi.Scene) -> None:
 
 
 @functools.cache
-def warn_once(line: str) -> None:
+def warn_once(line: str, level: int = logging.WARNING) -> None:
     """Say it in the log, once: one experiment may load its scene several times."""
-    logger.warning("%s", line)
-
-
-@functools.cache
-def _tell(line: str) -> None:
-    """The same of what is nothing to worry about."""
-    logger.info("%s", line)
+    logger.log(level, "%s", line)

@@ -99,7 +99,7 @@ class SceneNeeds:
 
 
 @dataclass(frozen=True)
-class View:
+class PrimaryHits:
     """What primary rays meet, after see-through surfaces: fractions of the film, which sum to 1.
 
     `smooth`: surfaces that light paths can connect to the sensor from; `specular`: only smooth specular ones (glass,
@@ -306,16 +306,16 @@ def _kind(item: Any, graph: SceneGraph) -> tuple[Any, ...]:
     return (name, size, *(_kind(child, graph) for child in used))
 
 
-def look(scene: Any, sensor: Any) -> View:
+def look(scene: Any, sensor: Any) -> PrimaryHits:
     """Cast primary rays through the centres of a grid of LOOK^2 cells of the film's crop window."""
     smooth, specular, emission = what_is_seen(scene, sensor)
     masks = (smooth, specular, ~(smooth | specular), emission)
-    return View(*(float(dr.count(mask)[0]) / LOOK**2 for mask in masks))
+    return PrimaryHits(*(float(dr.count(mask)[0]) / LOOK**2 for mask in masks))
 
 
 def what_is_seen(scene: Any, sensor: Any, aperture: tuple[float, float] | None = None) -> tuple[Any, Any, Any]:
-    """Of the rays through a grid of LOOK^2 cells, row by row, as `View` has them: which meet surfaces that are smooth,
-    those that are specular alone, and emission. They start at a point of the `aperture`, by default its middle."""
+    """Of the rays through a grid of LOOK^2 cells, row by row, which meet surfaces that are smooth, those that are
+    specular alone, and emission (`PrimaryHits`). They start at a point of the `aperture`, by default its middle."""
     lens = mi.Point2f(0.5) if aperture is None else mi.Point2f(*(dr.opaque(mi.Float, place) for place in aperture))
     ray, _ = sensor.sample_ray(sensor.shutter_open(), 0.5, grid(LOOK), lens, True)
     active = dr.full(mi.Mask, True, LOOK**2)

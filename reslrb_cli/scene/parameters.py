@@ -19,7 +19,7 @@ import numpy as np
 from reslrb_cli.config.parameters import HEIGHTMAP, WORDS, ParameterSpec, Settings
 from reslrb_cli.scene.catalog import ParameterInfo, describe, list_parameters
 from reslrb_cli.scene.deformation import Deformation, Movable, find_movable, heightmap_obstacle
-from reslrb_cli.scene.values import Place, Slot, check_bounds, check_transform, initial_array, settle
+from reslrb_cli.scene.values import ParameterValue, Place, check_bounds, check_transform, initial_array, settle
 
 
 @dataclass(frozen=True)
@@ -115,9 +115,9 @@ class Selection:
         self.deformation.place()
         self.params.update()
 
-    def slot(self, key: str) -> Slot:
+    def slot(self, key: str) -> ParameterValue:
         """The value of `key`, to be read and set; `update` has to follow."""
-        return Slot(self._holder(key), key)
+        return ParameterValue(self._holder(key), key)
 
     def _holder(self, key: str) -> Any:
         """What has the value of `key` under that name."""

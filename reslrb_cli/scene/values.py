@@ -34,7 +34,7 @@ class Place:
         return ConfigError(self.source, f"{self.key}.{option}" if option else self.key, message)
 
 
-class Slot:
+class ParameterValue:
     """One value of `holder` as a NumPy array: a texture (H, W, C), a colour (C,), a buffer (N,), a number ().
 
     `holder` is a scene's `mi.traverse`, or maps names to values that are none of the scene's own. An environment map
@@ -79,7 +79,7 @@ class Slot:
 
 
 def initial_array(
-    slot: Slot, initial: Any, resolution: tuple[int, int] | None, place: Place, any_size: bool = False
+    slot: ParameterValue, initial: Any, resolution: tuple[int, int] | None, place: Place, any_size: bool = False
 ) -> Array:
     """The value that `initial` ("scene", a number, a list, an image file or a run) gives the parameter in `slot`.
 
@@ -110,14 +110,14 @@ def initial_array(
     return array
 
 
-def check_bounds(slot: Slot, array: Array, bounds: tuple[float, float], place: Place) -> None:
+def check_bounds(slot: ParameterValue, array: Array, bounds: tuple[float, float], place: Place) -> None:
     """Raise ConfigError at `place` where an entry of `array` lies outside of `bounds`."""
     low, high = np.float32(bounds[0]), np.float32(bounds[1])
     if (outside := _first(array, (array < low) | (array > high))) is not None:
         raise place.fail("bounds", f"exclude the initial value of `{slot.key}`, {outside}")
 
 
-def check_transform(slot: Slot, array: Array, spec: Settings, place: Place) -> None:
+def check_transform(slot: ParameterValue, array: Array, spec: Settings, place: Place) -> None:
     """Raise ConfigError at `place` where an entry of `array` is not among the values that the transform yields."""
     if spec.transform == "none":
         return
@@ -153,14 +153,14 @@ def _channels(node: Any, key: str, value: Any, is_tensor: bool) -> int:
     return int(shape[0])
 
 
-def _fill(slot: Slot, current: Array, numbers: list[float], place: Place) -> Array:
+def _fill(slot: ParameterValue, current: Array, numbers: list[float], place: Place) -> Array:
     if len(numbers) != slot.channels:
         has = "1 number" if slot.channels == 1 else f"{slot.channels} numbers"
         raise place.fail("initial", f"has {len(numbers)} numbers; `{slot.key}` takes {has}")
     return np.tile(np.array(numbers, dtype=np.float32), current.size // len(numbers)).reshape(current.shape)
 
 
-def _from_file(slot: Slot, current: Array, image_file: Any, any_size: bool, place: Place) -> Array:
+def _from_file(slot: ParameterValue, current: Array, image_file: Any, any_size: bool, place: Place) -> Array:
     if not slot.is_texture:
         raise place.fail("initial", f"`{slot.key}` is no texture; give a number or a list of numbers")
     path: Path = image_file.file
@@ -180,7 +180,7 @@ def _from_file(slot: Slot, current: Array, image_file: Any, any_size: bool, plac
     return image
 
 
-def _from_run(slot: Slot, current: Array, run: Path, any_size: bool, place: Place) -> Array:
+def _from_run(slot: ParameterValue, current: Array, run: Path, any_size: bool, place: Place) -> Array:
     try:
         array = read_value(run, slot.key)
     except ConfigError as error:
