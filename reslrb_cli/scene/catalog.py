@@ -178,8 +178,7 @@ def _obstacle(kind: str, key: str, value: Any, differentiable: bool, node: Any, 
     if kind == "shape" or (kind == "emitter" and name in PLACES):
         if kind == "shape" and name not in ("to_world", "vertex_positions"):
             return "belongs to a shape, of which vertices and motions are recovered"
-        reason = moving_obstacle(node, name)
-        if reason is not None:
+        if (reason := moving_obstacle(node, name)) is not None:
             return f"cannot be moved ({reason})"
         return f"is recovered as a motion (`motion: {{of: {id}}}`)" if name == "to_world" else None
     if kind in ("sensor", "film"):

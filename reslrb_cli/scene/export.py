@@ -97,8 +97,7 @@ class Replacing:
     def put(self, key: str) -> None:
         """Put the value of the scene parameter `key` in. Raises ConfigError where the description cannot say it."""
         node = self.params.properties[key][2]
-        place = self._owners.place(self.params, key)
-        if place is None:
+        if (place := self._owners.place(self.params, key)) is None:
             raise self._fail(key, "what it belongs to does not stand in the scene's files")
         owner, (*below, name) = place
         if below:

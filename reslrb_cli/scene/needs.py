@@ -45,7 +45,7 @@ _PLAIN_BSDFS = (
     "BlendBSDF",
     "MaskBSDF",
 )
-#: BSDFs whose samples have the derivative of what they are samples of (`transport.scattering.following`), and those
+#: BSDFs whose samples have the derivative of what they are samples of (`transport.bsdf.following`), and those
 #: that only wrap others.
 _FOLLOWED_BSDFS = (*_SIMPLE_BSDFS, "BumpMap", "NormalMap")
 #: Textures that do not, either, by their classes.
@@ -155,16 +155,14 @@ def scene_needs(scene: Any, sensor: Any) -> SceneNeeds:
 
 def check_supported(scene: Any, sensor: Any, hide_emitters: bool = False) -> None:
     """Raise UnsupportedScene, with the reason and the way out, where light tracing cannot render `scene`."""
-    obstacle = light_obstacle(scene, sensor, hide_emitters)
-    if obstacle is not None:
+    if (obstacle := light_obstacle(scene, sensor, hide_emitters)) is not None:
         other = camera_obstacle(scene, sensor)
         raise UnsupportedScene(_advised(obstacle, other, "take integrator.type: prb"))
 
 
 def check_camera_paths(scene: Any, sensor: Any) -> None:
     """The same for paths from the sensor: `prb`, and `path`, which has its images."""
-    obstacle = camera_obstacle(scene, sensor)
-    if obstacle is not None:
+    if (obstacle := camera_obstacle(scene, sensor)) is not None:
         other = light_obstacle(scene, sensor)
         raise UnsupportedScene(_advised(obstacle, other, "take integrator.type: reslrb or ptracer"))
 
@@ -179,8 +177,7 @@ def _advised(obstacle: str, other: str | None, way: str) -> str:
 
 def light_obstacle(scene: Any, sensor: Any, hide_emitters: bool = False) -> str | None:
     """The reason why light tracing cannot render `scene` for `sensor`; None where it can."""
-    obstacle = unsupported_part(scene, sensor)
-    if obstacle is not None:
+    if (obstacle := unsupported_part(scene, sensor)) is not None:
         return obstacle
     try:
         emitted_rays(scene, mi.Float(0.5), mi.Point2f(0.5), mi.Point2f(0.5))
@@ -230,12 +227,10 @@ def unsupported_part(scene: Any, sensor: Any) -> str | None:
     if sensor.film().class_name() != "HDRFilm":
         return f"sensor {name} has a {sensor.film().class_name()}; light paths are splatted on an `hdrfilm`"
     for bsdf in graph.of_type(mi.BSDF):
-        plugin = _ONE_WAY.get(bsdf.class_name())
-        if plugin is not None:
+        if (plugin := _ONE_WAY.get(bsdf.class_name())) is not None:
             why = "which is not the same with light and view exchanged: light paths would render another material"
             return f"bsdf {bsdf.id()} is `{plugin}`, {why}"
-    lamp = _lamp_on(graph, _NO_POINTS)
-    if lamp is not None:
+    if (lamp := _lamp_on(graph, _NO_POINTS)) is not None:
         return f"{lamp}, where Mitsuba draws no points for light to start from; give the lamp as a mesh"
     return None
 
@@ -254,8 +249,7 @@ def _unknown_part(scene: Any, sensor: Any, graph: SceneGraph) -> str | None:
         if emitter.class_name() == "TimedSunskyEmitter":
             why = "which evaluates arrays while it is traced: Mitsuba 3.9 cannot render it in a kernel; take a `sunsky`"
             return f"emitter {emitter.id()} is a `timed_sunsky`, {why}"
-    lamp = _lamp_on(graph, _NO_LAMPS)
-    if lamp is not None:
+    if (lamp := _lamp_on(graph, _NO_LAMPS)) is not None:
         return f"{lamp}, which Mitsuba cannot have emit; give the lamp as a `cylinder` or a mesh"
     # Such as one whose texture has too many channels.
     si, half, context = _somewhere(), mi.Point2f(0.5), mi.BSDFContext()

@@ -113,8 +113,7 @@ class Owners:
         owner, names = self._elements[chain.pop().id()], key.split(".")
         names = names[-len(chain) - 1 :]
         while chain:
-            nested = self._nested(owner, names[0], chain[-1])
-            if nested is None:
+            if (nested := self._nested(owner, names[0], chain[-1])) is None:
                 break
             owner, names = nested, names[1:]
             chain.pop()

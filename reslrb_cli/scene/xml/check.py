@@ -19,8 +19,36 @@ from reslrb_cli.backend.memory import free_bytes
 from reslrb_cli.config.files import PIXELS, in_words
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.scene.images import DamagedImage, image_size
-from reslrb_cli.scene.xml import mend
 from reslrb_cli.scene.xml.read import MAX_DEPTH, Description, Element, find_file, quoted
+
+#: Plugins of Mitsuba 0.6 that Mitsuba 3 does not have, and what comes near them.
+LOST_PLUGINS = {
+    **dict.fromkeys((("bsdf", "coating"), ("bsdf", "roughcoating")), "`principled` with a clearcoat comes near"),
+    ("bsdf", "mixturebsdf"): "nested `blendbsdf` say the same",
+    ("bsdf", "phong"): "`roughplastic` comes near",
+    ("bsdf", "ward"): "`roughconductor` or `roughplastic` comes near",
+    ("bsdf", "roughdiffuse"): "`diffuse` comes near",
+    ("bsdf", "difftrans"): "`principledthin` comes near",
+    ("bsdf", "hk"): "a medium comes near",
+    ("bsdf", "irawan"): "a texture comes near",
+    **dict.fromkeys(
+        (("emitter", "sky"), ("emitter", "sun")), "`sunsky` comes near, with z for its up axis in place of y"
+    ),
+    ("emitter", "collimated"): "`directionalarea` comes near",
+    ("shape", "heightfield"): "write it as a mesh",
+    ("texture", "scale"): "multiply the texture itself",
+    ("texture", "gridtexture"): "`bitmap` or `checkerboard` comes near",
+    ("texture", "wireframe"): "`bitmap` comes near",
+    ("texture", "curvature"): "`mesh_attribute` comes near",
+    ("texture", "vertexcolors"): "`mesh_attribute` says the same",
+}
+
+#: Plugins that Mitsuba 3 has, and that no scene file can use here.
+REFUSED_PLUGINS = {
+    ("shape", "hair"): "is a plugin of Mitsuba 0.6 that Mitsuba 3 does not have; `bsplinecurve` draws strands",
+    ("shape", "blender"): "reads the memory of a running Blender; export the mesh as `ply` or `obj`",
+    ("sensor", "flat_sensor"): "belongs to Mitsuba's own RayDataLoader; take a `perspective` one",
+}
 
 #: Parameters without which a plugin reads memory that is not its own.
 _NEEDED = {"bitmap": "filename", "normalmap": "normalmap"}
@@ -51,8 +79,7 @@ def _check_plugin(root: Element, element: Element) -> None:
     """Refuse an object of another plugin than Mitsuba's, or without what Mitsuba takes to be there, and reads memory
     that is not its own."""
     tag, type = element.tag, element.type
-    refused = mend.REFUSED_PLUGINS.get((tag, type))
-    if refused is not None:
+    if (refused := REFUSED_PLUGINS.get((tag, type))) is not None:
         raise element.fail("", f"{tag} `{type}` {refused}")
     if not is_known(type):
         raise _unknown_plugin(root, element)
@@ -88,8 +115,7 @@ def _unknown_plugin(root: Element, element: Element) -> ConfigError:
         return element.fail("", f"<{tag}> has no type")
     lines = [str(other.line) for other in root.walk(tag) if other.type == type and other is not element]
     more = f" (also in line {', '.join(lines[:_SHOWN])}{' and more' * (len(lines) > _SHOWN)})" if lines else ""
-    lost = mend.LOST_PLUGINS.get((tag, type))
-    if lost is not None:
+    if (lost := LOST_PLUGINS.get((tag, type))) is not None:
         return element.fail("", f"{tag} `{type}` is a plugin of Mitsuba 0.6 that Mitsuba 3 does not have; {lost}{more}")
     near = nearest_plugin(type, _object_type(tag))
     hint = f"; did you mean `{near}`?" if near else "; only Mitsuba's own plugins are loaded"
@@ -196,8 +222,7 @@ def _wrong_file(name: str, folders: list[Path], free: int, texel: int) -> str | 
     size = os.path.getsize(path)
     if size > free:
         return f"{path} has {in_words(size)}, and {in_words(free)} of memory are free"
-    wrong = _wrong_head(path, size)
-    if wrong is not None:
+    if (wrong := _wrong_head(path, size)) is not None:
         return wrong
     try:
         width, height = image_size(path)

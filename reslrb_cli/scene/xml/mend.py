@@ -110,35 +110,6 @@ REPLACEABLE = {
     "rfilter": "the film's default takes its place",
 }
 
-#: Plugins of Mitsuba 0.6 that Mitsuba 3 does not have, and what comes near them.
-LOST_PLUGINS = {
-    **dict.fromkeys((("bsdf", "coating"), ("bsdf", "roughcoating")), "`principled` with a clearcoat comes near"),
-    ("bsdf", "mixturebsdf"): "nested `blendbsdf` say the same",
-    ("bsdf", "phong"): "`roughplastic` comes near",
-    ("bsdf", "ward"): "`roughconductor` or `roughplastic` comes near",
-    ("bsdf", "roughdiffuse"): "`diffuse` comes near",
-    ("bsdf", "difftrans"): "`principledthin` comes near",
-    ("bsdf", "hk"): "a medium comes near",
-    ("bsdf", "irawan"): "a texture comes near",
-    **dict.fromkeys(
-        (("emitter", "sky"), ("emitter", "sun")), "`sunsky` comes near, with z for its up axis in place of y"
-    ),
-    ("emitter", "collimated"): "`directionalarea` comes near",
-    ("shape", "heightfield"): "write it as a mesh",
-    ("texture", "scale"): "multiply the texture itself",
-    ("texture", "gridtexture"): "`bitmap` or `checkerboard` comes near",
-    ("texture", "wireframe"): "`bitmap` comes near",
-    ("texture", "curvature"): "`mesh_attribute` comes near",
-    ("texture", "vertexcolors"): "`mesh_attribute` says the same",
-}
-
-#: Plugins that Mitsuba 3 has, and that no scene file can use here.
-REFUSED_PLUGINS = {
-    ("shape", "hair"): "is a plugin of Mitsuba 0.6 that Mitsuba 3 does not have; `bsplinecurve` draws strands",
-    ("shape", "blender"): "reads the memory of a running Blender; export the mesh as `ply` or `obj`",
-    ("sensor", "flat_sensor"): "belongs to Mitsuba's own RayDataLoader; take a `perspective` one",
-}
-
 #: Values of text parameters, by plugin and parameter.
 VALUES = {
     ("bitmap", "filter_type"): {"trilinear": "bilinear", "ewa": "bilinear"},
@@ -247,8 +218,7 @@ def _range(spectrum: Element, default: Sequence[float]) -> tuple[float, float]:
 
 def _numbers(spectrum: Element, name: str) -> np.ndarray:
     """The numbers of a parameter, one or more, none of them negative or not finite."""
-    parameter = spectrum.find(name)
-    if parameter is None:
+    if (parameter := spectrum.find(name)) is None:
         raise spectrum.fail("", f"{spectrum.type} needs a parameter `{name}`")
     numbers = np.array(_floats(parameter.value))
     if not numbers.size or not (np.isfinite(numbers) & (numbers >= 0)).all():

@@ -336,8 +336,7 @@ class _Reader:
     def _include(self, include: Element, folders: list[Path], depth: int) -> list[Element]:
         """What stands in the place of `include`: the objects of a scene, or the one object that a file holds."""
         here = [include.source.file.absolute().parent, *folders]
-        file = find_file(_required(include, "filename"), here)
-        if file is None:
+        if (file := find_file(_required(include, "filename"), here)) is None:
             raise include.fail("", f"included file {quoted(include.attributes['filename'])} not found")
         root = self.read(file, here, include, depth)
         if root.type == "scene":
