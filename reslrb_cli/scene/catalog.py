@@ -8,7 +8,7 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
@@ -74,12 +74,11 @@ class ParameterInfo:
 
 def list_parameters(params: Any, values: bool = False) -> list[ParameterInfo]:
     """Describe every entry of a `mi.traverse` result, in its order; their `values` too, if they are asked for."""
-    infos = [describe(params, key) for key in params.properties]
-    return [replace(info, value=_current_value(params, info.key)) for info in infos] if values else infos
+    return [describe(params, key, values) for key in params.properties]
 
 
-def describe(params: Any, key: str) -> ParameterInfo:
-    """Describe one entry of a `mi.traverse` result."""
+def describe(params: Any, key: str, values: bool = False) -> ParameterInfo:
+    """Describe one entry of a `mi.traverse` result, with its value where `values` are asked for."""
     value, node, flags = _value(params, key), params.properties[key][2], int(params.flags(key))
     differentiable = flags & (int(mi.ParamFlags.NonDifferentiable) | int(mi.ParamFlags.ReadOnly)) == 0
     kind, bits = parameter_kind(params, key), coarse_bits(params, key)
@@ -91,6 +90,7 @@ def describe(params: Any, key: str) -> ParameterInfo:
         differentiable=differentiable,
         discontinuous=flags & int(mi.ParamFlags.Discontinuous) != 0,
         obstacle=_obstacle(kind, key, value, differentiable, node, bits),
+        value=_current_value(params, key) if values else None,
         bits=bits,
     )
 

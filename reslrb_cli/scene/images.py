@@ -343,12 +343,11 @@ def read_image(path: Path, color_space: str = "auto", size: Size | None = None, 
     ConfigError, located in the file, where it is missing or no image, damaged, cut off, too large or of another size,
     or holds a value that is not finite or, unless `signed`, negative.
     """
-    photo = read_photo(path, color_space, size, upright=False)
-    _check_values(path, photo.image, signed)
+    image = read_photo(path, color_space, size, upright=False, signed=signed).image
     orientation = orientation_of(path)
     if orientation > 1:
         logger.warning("%s: is read as it lies in the file, not %s as its EXIF says", path, TURNS[orientation])
-    return photo.image
+    return image
 
 
 def read_photo(
@@ -357,12 +356,14 @@ def read_photo(
     size: Size | None = None,
     gamma: float | None = None,
     upright: bool = True,
+    signed: bool = False,
+    nonfinite: bool = False,
 ) -> Photo:
-    """Read an image file like `read_image`, and mark pixels that are not to be trusted; values are not checked.
+    """Read an image file like `read_image`, and mark pixels that are not to be trusted.
 
     `gamma`, if any, decodes integers in place of `color_space`. `upright` turns the image as its EXIF orientation says,
-    to how a person sees it; `size` is that of the image then. Raises ConfigError, located in the file, also where
-    `gamma` is given for a file of floats.
+    to how a person sees it; `size` is that of the image then. Values may be negative where it is `signed`, and not
+    finite with `nonfinite`. Raises ConfigError, located in the file, also where `gamma` is given for a file of floats.
     """
     bitmap = read_bitmap(path, size, upright)
     if bitmap.pixel_format() == mi.Bitmap.PixelFormat.MultiChannel:
@@ -381,29 +382,28 @@ def read_photo(
         image = image**gamma
     elif color_space == "srgb" or (color_space == "auto" and is_integer):
         image = decode_srgb(image)
-    nothing = np.zeros((height, width), dtype=bool)
+    finite, nothing = np.isfinite(image), np.zeros((height, width), dtype=bool)
+    for bad, what in ((~finite & (not nonfinite), "not finite"), (finite & (image < 0) & (not signed), "negative")):
+        if bad.any():
+            y, x, channel = (int(n) for n in np.argwhere(bad)[0])
+            value, count = f"{image[y, x, channel]:g}", int(bad.any(axis=2).sum())
+            where = f"pixel ({x}, {y}), channel {'RGB'[channel]}"
+            raise ConfigError(path, "", f"{where}, is {value}: {what} ({count} pixels in all)")
     return Photo(
         image,
         clipped=(colors == np.iinfo(raw.dtype).max).any(axis=2) if is_integer else nothing,
         transparent=nothing if alpha is None else alpha == 0,
-        nonfinite=np.logical_not(np.isfinite(image).all(axis=2)),
+        nonfinite=np.logical_not(finite.all(axis=2)),
     )
 
 
-def check_photo(path: Path, photo: Photo, allow_nonfinite: bool) -> None:
-    """Raise ConfigError, located in the file, where a photo holds negative values, or such that are not finite."""
-    _check_values(path, np.nan_to_num(photo.image, posinf=0, neginf=0) if allow_nonfinite else photo.image)
-
-
-def read_weights(path: Path, size: tuple[int, int], upright: bool = True) -> Image:
+def read_weights(path: Path, size: Size, upright: bool = True) -> Image:
     """Read an image of weights, float32 (H, W): values as they stand in the file, the mean of several channels.
 
     Those of 8 and 16 bits are shares of the greatest; alpha is dropped. `upright` turns it by its own EXIF orientation,
     like the photograph that it belongs to by that one's. Raises ConfigError, located in the file, like `read_image`.
     """
-    photo = read_photo(path, "linear", size, upright=upright)
-    _check_values(path, photo.image)
-    return photo.image.mean(axis=2)
+    return read_photo(path, "linear", size, upright=upright).image.mean(axis=2)
 
 
 def decode_srgb(image: Image) -> Image:
@@ -411,12 +411,3 @@ def decode_srgb(image: Image) -> Image:
     from colour.models import eotf_sRGB  # late: the import takes a second
 
     return np.asarray(eotf_sRGB(image), dtype=np.float32)
-
-
-def _check_values(path: Path, image: Image, signed: bool = False) -> None:
-    for bad, what in ((~np.isfinite(image), "not finite"), ((image < 0) & (not signed), "negative")):
-        if bad.any():
-            y, x, channel = (int(n) for n in np.argwhere(bad)[0])
-            value, count = f"{image[y, x, channel]:g}", int(bad.any(axis=2).sum())
-            where = f"pixel ({x}, {y}), channel {'RGB'[channel]}"
-            raise ConfigError(path, "", f"{where}, is {value}: {what} ({count} pixels in all)")

@@ -18,10 +18,9 @@ from reslrb_cli.errors import ConfigError
 from reslrb_cli.scene.cameras import read_cameras, replace_sensors
 from reslrb_cli.scene.catalog import coarse_bits
 from reslrb_cli.scene.extent import coincident, lost_light, thin_glass
-from reslrb_cli.scene.xml import mend as notes
 from reslrb_cli.scene.xml.build import Owners, build, name_objects
 from reslrb_cli.scene.xml.check import check, check_files, resize_films
-from reslrb_cli.scene.xml.mend import mend, place_textures
+from reslrb_cli.scene.xml.mend import mend, place_textures, refuse, warnings
 from reslrb_cli.scene.xml.read import Description, quoted, read_description
 
 logger = logging.getLogger(__name__)
@@ -61,9 +60,9 @@ def load_scene(
     root = description.root
     if cameras is not None:
         replace_sensors(description, read_cameras(cameras))
-    found = notes.in_order([*name_objects(root), *mend(description)], root)
+    found = [*name_objects(root), *mend(description)]
     if strict:
-        notes.refuse(found)
+        refuse(found, root)
     if size is not None:
         resize_films(root, size)
     check(description)
@@ -72,7 +71,7 @@ def load_scene(
         look(description)
     scene, unused = build(description)
     if strict:
-        notes.refuse(unused)
+        refuse(unused, root)
     if not isinstance(scene, mi.Scene):
         raise ConfigError(file, "", "its root is a single object, not a <scene>")
     for objects, wrong in (
@@ -84,8 +83,7 @@ def load_scene(
             raise ConfigError(file, "", wrong)
     _check_meshes(file, scene)
     lost = {note.element for note in unused}  # what else was done to them says nothing
-    found = [note for note in found if note.element not in lost]
-    for line in notes.warnings(notes.in_order([*found, *unused], root)):
+    for line in warnings([*(note for note in found if note.element not in lost), *unused], root):
         warn_once(line)
     for loss in (lost_light(scene), thin_glass(scene), coincident(scene)) if warn else ():
         if loss is not None:

@@ -37,7 +37,7 @@ class Note:
     owner: Element | None = None
 
 
-def in_order(notes: Iterable[Note], root: Element) -> list[Note]:
+def _in_order(notes: Iterable[Note], root: Element) -> list[Note]:
     """The notes in the order of lines, those on the file of `root` first."""
 
     def place(note: Note) -> tuple[bool, str, int]:
@@ -47,10 +47,10 @@ def in_order(notes: Iterable[Note], root: Element) -> list[Note]:
     return sorted(notes, key=place)
 
 
-def warnings(notes: Sequence[Note]) -> list[str]:
+def warnings(notes: Sequence[Note], root: Element) -> list[str]:
     """A line for each kind of thing, located where it is first met."""
     kinds: dict[tuple[str, str, object], list[Element]] = {}
-    for note in notes:
+    for note in _in_order(notes, root):
         kinds.setdefault((note.wrong, note.done, note.element.source.file), []).append(note.element)
     lines = []
     for (wrong, done, _), elements in kinds.items():
@@ -59,15 +59,15 @@ def warnings(notes: Sequence[Note]) -> list[str]:
         lines.append(f"{elements[0].place}: {wrong}: {done}" + f" (also in line {more})" * bool(others))
     if len(lines) > _WARNINGS:
         rest = f"{len(lines) - _WARNINGS} more kinds of things were mended or left out"
-        lines[_WARNINGS:] = [f"{notes[0].element.source.file}: {rest}"]
+        lines[_WARNINGS:] = [f"{root.source.file}: {rest}"]
     return lines
 
 
-def refuse(notes: Sequence[Note]) -> None:
+def refuse(notes: Sequence[Note], root: Element) -> None:
     """Raise ConfigError for the first of `notes`, if there is any."""
     if notes:
         more = f" (and {len(notes) - 1} more)" if len(notes) > 1 else ""
-        first = notes[0]
+        first = _in_order(notes, root)[0]
         raise first.element.fail("", f"{first.wrong}; with scene.strict: false it would be {first.done}{more}")
 
 
