@@ -345,24 +345,8 @@ def _bsdfs(at: Situation, key: str) -> list[Any]:
     """The BSDFs that a parameter belongs to, nested ones and those around them."""
     node = at.params.properties[key][2]
     if isinstance(node, mi.Shape):  # an attribute, which some texture of its BSDF reads
-        return _below(at.graph, node.bsdf())
-    found: dict[Any, None] = {}
-    waiting = [node]
-    while waiting:
-        current = waiting.pop()
-        if isinstance(current, mi.BSDF):
-            found[current] = None
-        waiting += [p for p in at.graph.parents.get(current, []) if isinstance(p, (mi.BSDF, mi.Texture))]
-    return list(found)
-
-
-def _below(graph: SceneGraph, bsdf: Any) -> list[Any]:
-    """A BSDF and those nested in it."""
-    found = [bsdf]
-    for item in graph.of_type(mi.BSDF):
-        if any(parent in found for parent in graph.parents[item]) and item not in found:
-            found.append(item)
-    return found
+        return at.graph.nested_bsdfs(node.bsdf())
+    return at.graph.bsdfs_above(node)
 
 
 def _is_turned(emitter: Any) -> bool:

@@ -72,17 +72,30 @@ class SceneGraph:
         """The BSDFs that shapes have (not those nested in others), each once."""
         return list(dict.fromkeys(shape.bsdf() for shape in self.shapes() if shape.bsdf() is not None))
 
-    def owning_bsdfs(self, item: Any) -> list[Any]:
-        """The outermost BSDFs that use `item` (a texture, or a nested BSDF) at any depth."""
-        owners, waiting = [], [item]
+    def bsdfs_above(self, item: Any) -> list[Any]:
+        """The BSDFs that use `item` (a texture, or a BSDF, which is one of them) at any depth."""
+        found: dict[Any, None] = {}
+        waiting = [item]
         while waiting:
             current = waiting.pop()
-            parents = self.parents.get(current, [])
-            above = [parent for parent in parents if isinstance(parent, (mi.BSDF, mi.Texture))]
-            if isinstance(current, mi.BSDF) and len(above) < len(parents):
-                owners.append(current)
-            waiting += above
-        return list(dict.fromkeys(owners))
+            if isinstance(current, mi.BSDF):
+                found[current] = None
+            waiting += [parent for parent in self.parents.get(current, []) if isinstance(parent, (mi.BSDF, mi.Texture))]
+        return list(found)
+
+    def owning_bsdfs(self, item: Any) -> list[Any]:
+        """The outermost of them: those that something else than a BSDF or a texture has."""
+        inner = (mi.BSDF, mi.Texture)
+        return [
+            bsdf for bsdf in self.bsdfs_above(item) if not all(isinstance(p, inner) for p in self.parents.get(bsdf, []))
+        ]
+
+    def nested_bsdfs(self, bsdf: Any) -> list[Any]:
+        """A BSDF and those nested in it."""
+        found = [bsdf]
+        for item in found:  # which grows meanwhile
+            found += [child for child in self.children[item] if isinstance(child, mi.BSDF) and child not in found]
+        return found
 
 
 @dataclass(frozen=True)
