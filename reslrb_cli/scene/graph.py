@@ -85,10 +85,8 @@ class SceneGraph:
 
     def owning_bsdfs(self, item: Any) -> list[Any]:
         """The outermost of them: those that something else than a BSDF or a texture has."""
-        inner = (mi.BSDF, mi.Texture)
-        return [
-            bsdf for bsdf in self.bsdfs_above(item) if not all(isinstance(p, inner) for p in self.parents.get(bsdf, []))
-        ]
+        found = ((bsdf, self.parents.get(bsdf, [])) for bsdf in self.bsdfs_above(item))
+        return [bsdf for bsdf, parents in found if not all(isinstance(p, (mi.BSDF, mi.Texture)) for p in parents)]
 
     def nested_bsdfs(self, bsdf: Any) -> list[Any]:
         """A BSDF and those nested in it."""

@@ -66,9 +66,7 @@ def check(description: Description) -> None:
         if element.is_object:
             _check_plugin(description.root, element)
         elif element.tag in _NUMBERS:
-            _check_finite(element)
-            if element.tag in _VECTORS:
-                _check_vector(element)
+            _check_numbers(element)
         if element.tag == "film":
             _check_film(element)
     _check_chains(description.root)
@@ -92,20 +90,17 @@ def _check_plugin(root: Element, element: Element) -> None:
         raise element.fail("", "blendbsdf needs two BSDFs")
 
 
-def _check_finite(element: Element) -> None:
-    """Refuse what is no number, and a colour or a place that is infinite: all that comes of it is not finite."""
+def _check_numbers(element: Element) -> None:
+    """Refuse what is no number, a colour or a place that is infinite, of which nothing comes that is finite, and a
+    vector that is given in two ways, or by a number of numbers; Mitsuba would not say where."""
     for name, text in element.attributes.items():
         bad = _NOT_FINITE.search(text) if name not in ("id", "name", "filename", "type") else None
         if bad is not None and (element.tag != "float" or bad[1].lower() == "nan"):
             raise element.fail(element.name or element.tag, f"{quoted(text)}: {bad[0]} is not finite")
-
-
-def _check_vector(element: Element) -> None:
-    """Refuse a vector that is given in two ways, or by a number of numbers; Mitsuba would not say where."""
-    if "value" in element.attributes:
+    if element.tag in _VECTORS and "value" in element.attributes:
         if any(axis in element.attributes for axis in "xyz"):
             raise element.fail("", f"<{element.tag}> can have `value` or x, y and z, not both")
-        if len(element.attributes["value"].replace(",", " ").split()) not in (1, 3):
+        if len(element.value.replace(",", " ").split()) not in (1, 3):
             raise element.fail("", f"<{element.tag}> needs one or three numbers in `value`")
 
 
@@ -173,11 +168,8 @@ def _check_film(film: Element) -> None:
     """Refuse a film of more pixels than an image may have; what is no number, Mitsuba refuses."""
     size = _size_of(film)
     if size.width * size.height > PIXELS:
-        raise film.fail(
-            "",
-            f"a film of {size.width}x{size.height} pixels; it must have at most {PIXELS}, since each image of a step "
-            "takes 12 bytes or more of every one",
-        )
+        why = f"it must have at most {PIXELS}, since each image of a step takes 12 bytes or more of every one"
+        raise film.fail("", f"a film of {size.width}x{size.height} pixels; {why}")
 
 
 def film_sizes(description: Description) -> list[FilmSize]:
