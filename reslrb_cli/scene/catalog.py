@@ -15,7 +15,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from reslrb_cli.scene.deformation import BEAMS, PLACES, heightmap_obstacle, list_movable, moving_obstacle
+from reslrb_cli.scene.deformation import BEAMS, PLACES, list_movable, moving_obstacle
 from reslrb_cli.scene.graph import SceneGraph
 from reslrb_cli.scene.needs import (
     PrimaryHits,
@@ -266,7 +266,7 @@ def summarise(scene: Any, hide_emitters: bool = False, sensors: Sequence[int] | 
         ],
         parameters=list_parameters(params, values=True),
         movable=[
-            MovableSummary(item.id, ["motion"] if heightmap_obstacle(item) else ["motion", "heightmap"])
+            MovableSummary(item.id, ["motion"] if item.heightmap_obstacle() else ["motion", "heightmap"])
             for item in list_movable(params)
         ],
     )

@@ -99,6 +99,19 @@ class Movable:
         """Whether it has a surface."""
         return isinstance(self.node, mi.Shape)
 
+    def heightmap_obstacle(self) -> str | None:
+        """Why no heightmap can displace it; None where one can."""
+        if not self.by_vertices:
+            return f"`{self.id}` is a {self.node.class_name()}; a heightmap displaces the vertices of a mesh"
+        if not self.node.has_vertex_texcoords():
+            return f"`{self.id}` has no texture coordinates, over which a heightmap is laid; give the mesh some"
+        return None
+
+    def casts_edges(self, scene: mi.Scene) -> bool:
+        """Whether it can have a silhouette or throw a shadow: a shape that does not enclose all others."""
+        others = [shape.bbox() for shape in scene.shapes() if shape.ptr != self.node.ptr]
+        return self.is_shape and not all(self.node.bbox().contains(box, strict=True) for box in others)
+
 
 def find_movable(params: mi.SceneParameters, id: str) -> Movable | str:
     """The object with this id, or the reason why it cannot be moved."""
@@ -124,21 +137,6 @@ def list_movable(params: mi.SceneParameters) -> list[Movable]:
     split = (key.rpartition(".") for key in params.properties)
     ids = dict.fromkeys(id for id, _, name in split if id and name in _PLACED)
     return [item for item in (find_movable(params, id) for id in ids) if isinstance(item, Movable)]
-
-
-def heightmap_obstacle(item: Movable) -> str | None:
-    """Why no heightmap can displace an object; None where one can."""
-    if not item.by_vertices:
-        return f"`{item.id}` is a {item.node.class_name()}; a heightmap displaces the vertices of a mesh"
-    if not item.node.has_vertex_texcoords():
-        return f"`{item.id}` has no texture coordinates, over which a heightmap is laid; give the mesh some"
-    return None
-
-
-def casts_edges(scene: mi.Scene, item: Movable) -> bool:
-    """Whether what moves can have a silhouette or throw a shadow: a shape that does not enclose all others."""
-    others = [shape.bbox() for shape in scene.shapes() if shape.ptr != item.node.ptr]
-    return item.is_shape and not all(item.node.bbox().contains(box, strict=True) for box in others)
 
 
 def where_moved(params: mi.SceneParameters, keys: list[str]) -> list[Movable]:

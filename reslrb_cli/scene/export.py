@@ -23,7 +23,7 @@ from reslrb_cli.records.images import file_stem, write_file
 from reslrb_cli.scene.catalog import as_numbers, parameter_kind
 from reslrb_cli.scene.values import ParameterValue
 from reslrb_cli.scene.xml.build import Owners
-from reslrb_cli.scene.xml.read import Description, Element, find_file, tag_lines
+from reslrb_cli.scene.xml.read import Description, Element, tag_lines
 
 Array = np.ndarray[tuple[int, ...], np.dtype[np.float32]]
 
@@ -191,7 +191,7 @@ class Replacing:
             name = element.attributes.get(attribute)
             if not name or element in self._made or (element.tag == "string" and element.name != "filename"):
                 continue
-            path = find_file(name, self.description.folders)
+            path = self.description.find_file(name)
             if path is not None and path.is_file():
                 source = path.resolve()
                 if source not in copies:

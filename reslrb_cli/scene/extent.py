@@ -12,16 +12,7 @@ import mitsuba as mi
 import numpy as np
 
 from reslrb_cli.errors import UnsupportedScene
-from reslrb_cli.scene.graph import (
-    SceneGraph,
-    bounds,
-    emitted_rays,
-    face_normals,
-    grid,
-    interpolates_normals,
-    normal_cosines,
-    triangles,
-)
+from reslrb_cli.scene.graph import SceneGraph, bent_faces, bounds, emitted_rays, face_normals, grid, triangles
 from reslrb_cli.scene.xml.read import quoted
 
 #: The largest ray offset, as a fraction of the scene's size, with which no loss of light is to be seen: that of a room
@@ -35,7 +26,12 @@ _SENSORS = 8
 _NAMED = 2
 
 
-def lost_light(scene: Any) -> str | None:
+def doubts(scene: Any) -> list[str]:
+    """What is wrong with the place or the size of a scene or its parts, in words."""
+    return [loss for loss in (_lost_light(scene), _thin_glass(scene), _coincident(scene)) if loss is not None]
+
+
+def _lost_light(scene: Any) -> str | None:
     """What is wrong with a scene that is far from the origin, or tiny, and what to do; None where nothing is.
 
     Mitsuba starts rays off their surface by RayEpsilon (1 + max |p|), in the scene's units, so that they jump over what
@@ -99,7 +95,7 @@ def _touches(shape: Any, axes: np.ndarray, eye: np.ndarray, middle: np.ndarray, 
     return bool((np.abs((normals * corners[:, 0]).sum(1)) <= np.abs(normals) @ half).any())
 
 
-def coincident(scene: Any) -> str | None:
+def _coincident(scene: Any) -> str | None:
     """What is wrong with a scene in which a sensor or a light meets two faces at the same place; None where nothing is.
 
     Which of them a ray meets is decided by rounding. That makes no difference where both face the same way, or both
@@ -152,8 +148,7 @@ def _twin_faces(shapes: Sequence[Any]) -> _Twins:
     turned = (facing[same] < 0) ^ (flipped[owner[first]] != flipped[owner[second]])
     bends = np.zeros(len(number), bool)  # shading normals differ from the geometric one
     for index in np.union1d(owner[first], owner[second]).tolist():
-        if interpolates_normals(shapes[index]):
-            bends[owner == index] = ~(normal_cosines(shapes[index]) > 0.999).all(1)
+        bends[owner == index] = bent_faces(shapes[index], 0.999)
     kinds = np.stack([owner[first], owner[second], turned, bends[first] | bends[second]], 1)
     found: _Twins = {}
     for kind in np.unique(kinds, axis=0):
@@ -228,7 +223,7 @@ ROUNDING, FAR = 0.1, 1e-5
 _PATHS, _SURFACES = 4096, 8
 
 
-def thin_glass(scene: mi.Scene) -> str | None:
+def _thin_glass(scene: mi.Scene) -> str | None:
     """What is wrong with a scene in which light passes through two surfaces that nearly touch; None where nothing is.
 
     Rays from the lights go straight on through what lets light pass; what lies between two surfaces is measured from

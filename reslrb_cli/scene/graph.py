@@ -68,6 +68,18 @@ class SceneGraph:
         """Whether rays may meet a shape: it does not stand in a group alone, where nothing is instanced."""
         return self.has_instances() or any(item.class_name() != "ShapeGroupPlugin" for item in self.parents[shape])
 
+    def find_lamps(self, scene: mi.Scene) -> tuple[Lamp, ...]:
+        """All shapes of `scene` that emit, in the order of `scene.emitters()`."""
+        textures = self.of_type(mi.Texture)
+        found = []
+        for index, emitter in enumerate(scene.emitters()):
+            shape, parallel = emitter.get_shape(), emitter.class_name() == "DirectionalArea"
+            if shape is not None:
+                own = [texture for texture in textures if emitter in self.parents[texture]]
+                varying = [texture for texture in own if texture.is_spatially_varying()]
+                found.append(Lamp(shape, emitter, index, parallel, varying[0] if varying and not parallel else None))
+        return tuple(found)
+
     def surface_bsdfs(self) -> list[Any]:
         """The BSDFs that shapes have (not those nested in others), each once."""
         return list(dict.fromkeys(shape.bsdf() for shape in self.shapes() if shape.bsdf() is not None))
@@ -124,19 +136,6 @@ class Lamp:
     def has_faces(self) -> bool:
         """Whether the shape is a mesh of which each vertex can move."""
         return self.shape.is_mesh() and self.shape.class_name() != "Rectangle"
-
-
-def find_lamps(scene: mi.Scene, graph: SceneGraph) -> tuple[Lamp, ...]:
-    """All shapes of `scene` that emit, in the order of `scene.emitters()`."""
-    textures = graph.of_type(mi.Texture)
-    found = []
-    for index, emitter in enumerate(scene.emitters()):
-        shape, parallel = emitter.get_shape(), emitter.class_name() == "DirectionalArea"
-        if shape is not None:
-            own = [texture for texture in textures if emitter in graph.parents[texture]]
-            varying = [texture for texture in own if texture.is_spatially_varying()]
-            found.append(Lamp(shape, emitter, index, parallel, varying[0] if varying and not parallel else None))
-    return tuple(found)
 
 
 def grid(side: int) -> mi.Point2f:
@@ -240,11 +239,13 @@ def face_normals(corners: np.ndarray) -> np.ndarray:
     return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
 
 
-def normal_cosines(mesh: mi.Mesh) -> np.ndarray:
-    """Cosines between the normals of a mesh's vertices and that of the face, (F, 3); 0 for a face without area."""
+def bent_faces(mesh: mi.Mesh, cosine: float) -> np.ndarray:
+    """Of a mesh's faces, (F,), whether the normal of a vertex turns from that of the face, by less than this cosine."""
+    if not interpolates_normals(mesh):
+        return np.zeros(mesh.face_count(), bool)
     flat, shading = face_normals(triangles(mesh))[:, None], _at_corners(mesh, mesh.vertex_normals_buffer())
     lengths = np.linalg.norm(flat, axis=2) * np.linalg.norm(shading, axis=2)
-    return np.asarray((flat * shading).sum(2) / np.maximum(lengths, 1e-30))
+    return np.asarray(~((flat * shading).sum(2) > cosine * np.maximum(lengths, 1e-30)).all(1))
 
 
 def _at_corners(mesh: mi.Mesh, buffer: mi.Float) -> np.ndarray:

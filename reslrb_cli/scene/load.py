@@ -17,7 +17,7 @@ from reslrb_cli.backend.variant import check_variant
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.scene.cameras import read_cameras, replace_sensors
 from reslrb_cli.scene.catalog import coarse_bits
-from reslrb_cli.scene.extent import coincident, lost_light, thin_glass
+from reslrb_cli.scene.extent import doubts
 from reslrb_cli.scene.xml.build import Owners, build, name_objects
 from reslrb_cli.scene.xml.check import check, check_files, resize_films
 from reslrb_cli.scene.xml.mend import mend, place_textures, refuse, warnings
@@ -85,9 +85,8 @@ def load_scene(
     lost = {note.element for note in unused}  # what else was done to them says nothing
     for line in warnings([*(note for note in found if note.element not in lost), *unused], root):
         warn_once(line)
-    for loss in (lost_light(scene), thin_glass(scene), coincident(scene)) if warn else ():
-        if loss is not None:
-            warn_once(f"{file}: {loss}")
+    for doubt in doubts(scene) if warn else ():
+        warn_once(f"{file}: {doubt}")
     for note in unused:
         if note.owner is not None:
             note.owner.children.remove(note.element)

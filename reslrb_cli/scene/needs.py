@@ -14,17 +14,7 @@ import numpy as np
 
 from reslrb_cli.errors import UnsupportedScene
 from reslrb_cli.scene.extent import clipped
-from reslrb_cli.scene.graph import (
-    Lamp,
-    SceneGraph,
-    emitted_rays,
-    failure,
-    find_lamps,
-    grid,
-    interpolates_normals,
-    normal_cosines,
-    small_lamps,
-)
+from reslrb_cli.scene.graph import Lamp, SceneGraph, bent_faces, emitted_rays, failure, grid, small_lamps
 
 #: Sensors to which a light path can connect: `sample_direction` is there, and its density is that of `sample_ray`.
 SENSORS = ("PerspectiveCamera", "ThinLensCamera")
@@ -121,7 +111,7 @@ def scene_needs(scene: Any, sensor: Any) -> SceneNeeds:
         flags |= int(bsdf.flags())
     emitters, environment = list(scene.emitters()), scene.environment()
     delta = int(mi.BSDFFlags.Delta) & ~int(mi.BSDFFlags.Null)  # `Delta` holds it too
-    lamps = find_lamps(scene, graph)
+    lamps = graph.find_lamps(scene)
     is_projective = sensor.class_name() in SENSORS
     near, far = clipped(scene, sensor) if is_projective else (False, False)
     thin_lens = bool(sensor.needs_aperture_sample())
@@ -137,7 +127,10 @@ def scene_needs(scene: Any, sensor: Any) -> SceneNeeds:
         has_delta_lobes=flags & delta != 0,
         has_null=flags & int(mi.BSDFFlags.Null) != 0,
         has_instances=graph.has_instances(),
-        has_shading_normals=any(_has_shading_normals(shape) for shape in graph.shapes()),
+        has_shading_normals=any(
+            bool(bent_faces(shape, 1 - 1e-5).any()) if shape.is_mesh() else shape.class_name() not in _PLAIN_SHAPES
+            for shape in graph.shapes()
+        ),
         has_perturbed_normals=any(bsdf.class_name() in ("BumpMap", "NormalMap") for bsdf in graph.of_type(mi.BSDF)),
         bsdfs_read_geometry=_read_geometry(graph),
         moving_shutter=float(sensor.shutter_open_time()) > 0,
@@ -344,10 +337,3 @@ def _focuses_outside(params: mi.SceneParameters) -> bool:
     near, far, focus = (float(np.ravel(params[key])[0]) for key in ("near_clip", "far_clip", "focus_distance"))
     depth = (1 - near / focus) * far / (far - near) if focus > 0 else -np.inf  # as projected: 0 at near, 1 at far
     return not _DEPTH_ROUNDING < depth < 1 - _DEPTH_ROUNDING
-
-
-def _has_shading_normals(shape: mi.Shape) -> bool:
-    """Whether the shape's shading normals differ from its geometric ones anywhere."""
-    if not shape.is_mesh():
-        return shape.class_name() not in _PLAIN_SHAPES
-    return interpolates_normals(shape) and bool((normal_cosines(shape) < 1 - 1e-5).any())

@@ -18,7 +18,7 @@ import numpy as np
 
 from reslrb_cli.config.parameters import HEIGHTMAP, WORDS, ParameterSpec, Settings
 from reslrb_cli.scene.catalog import ParameterInfo, describe, list_parameters
-from reslrb_cli.scene.deformation import Deformation, Movable, find_movable, heightmap_obstacle
+from reslrb_cli.scene.deformation import Deformation, Movable, find_movable
 from reslrb_cli.scene.values import ParameterValue, Place, check_bounds, check_transform, initial_array, settle
 
 
@@ -218,7 +218,7 @@ def _movables(params: mi.SceneParameters, spec: ParameterSpec, place: Place, ori
         at = option if len(named) == 1 else f"{option}[{number}]"
         item = find_movable(params, name)
         if isinstance(item, Movable) and spec.heightmap is not None:
-            item = heightmap_obstacle(item) or item
+            item = item.heightmap_obstacle() or item
         if isinstance(item, str):
             raise place.fail(at, item)
         if item.key in origin:

@@ -19,7 +19,7 @@ from reslrb_cli.backend.memory import free_bytes
 from reslrb_cli.config.files import PIXELS, in_words
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.scene.images import DamagedImage, image_size
-from reslrb_cli.scene.xml.read import MAX_DEPTH, Description, Element, find_file, quoted
+from reslrb_cli.scene.xml.read import MAX_DEPTH, Description, Element, quoted
 
 #: Plugins of Mitsuba 0.6 that Mitsuba 3 does not have, and what comes near them.
 LOST_PLUGINS = {
@@ -197,17 +197,17 @@ def check_files(description: Description) -> None:
     free = free_bytes(mi.variant()) if named else 0
     for element, owner in named:
         as_floats = any(child.name == "format" and child.value == "variant" for child in owner.children)
-        wrong = _wrong_file(element.value, description.folders, free, _FLOAT_BYTES if as_floats else _TEXEL_BYTES)
+        wrong = _wrong_file(element.value, description, free, _FLOAT_BYTES if as_floats else _TEXEL_BYTES)
         if wrong is not None:
             raise element.fail("filename", wrong)
 
 
-def _wrong_file(name: str, folders: list[Path], free: int, texel: int) -> str | None:
+def _wrong_file(name: str, description: Description, free: int, texel: int) -> str | None:
     """What is wrong with a file: it is not there, a pipe or a device, which might never end, or takes more memory than
     is free, by its size or by what an image says of itself. `texel` are the bytes that a pixel of it takes."""
-    path = find_file(name, folders)
+    path = description.find_file(name)
     if path is None:
-        looked = "" if os.path.isabs(name) else f"; looked for in {', '.join(str(folder) for folder in folders)}"
+        looked = "" if os.path.isabs(name) else f"; looked for in {', '.join(map(str, description.folders))}"
         return f"{quoted(name)}: no such file{looked}"
     if not stat.S_ISREG(path.stat().st_mode):
         return f"{path} is no regular file"

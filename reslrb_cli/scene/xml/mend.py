@@ -13,12 +13,11 @@ import math
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
 from reslrb_cli.backend.installation import is_known
-from reslrb_cli.scene.xml.read import Description, Element, find_file, quoted
+from reslrb_cli.scene.xml.read import Description, Element, quoted
 
 #: Lines that one warning names, and warnings of one scene.
 _LINES, _WARNINGS = 5, 30
@@ -274,7 +273,7 @@ def mend(description: Description) -> list[Note]:
     shapes keep their meaning: those that Mitsuba 3 does not have stay as they are, to be refused. Parameters that no
     plugin asks for show only when the scene is built.
     """
-    mender = _Mender(description.folders)
+    mender = _Mender(description)
     root = description.root
     given = root.attributes.pop("version", None)
     if root.source.version is None:
@@ -292,8 +291,8 @@ def mend(description: Description) -> list[Note]:
 
 
 class _Mender:
-    def __init__(self, folders: list[Path]) -> None:
-        self.folders = folders
+    def __init__(self, description: Description) -> None:
+        self.find_file = description.find_file
         self.notes: list[Note] = []
         self.gone: set[str] = set()
 
@@ -399,9 +398,9 @@ class _Mender:
         other = VALUES.get((owner.type, element.name), {}).get(value)
         if (owner.type, element.name) == ("hdrfilm", "pixel_format") and "," in value:
             other = value.partition(",")[0].strip()  # one for each of several images
-        if element.name == "filename" and "\\" in value and find_file(value, self.folders) is None:
+        if element.name == "filename" and "\\" in value and self.find_file(value) is None:
             slashed = value.replace("\\", "/")
-            if find_file(slashed, self.folders) is not None:
+            if self.find_file(slashed) is not None:
                 other, wrong = slashed, f"there is no file {quoted(value)}"
         if other is not None:
             element.attributes["value"] = other

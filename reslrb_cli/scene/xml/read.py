@@ -228,6 +228,10 @@ class Description:
     variables: dict[str, str]
     hides_emitters: bool
 
+    def find_file(self, name: str) -> Path | None:
+        """The file or folder that Mitsuba opens by this name: the first in `folders`, or what it says by itself."""
+        return _find(name, self.folders)
+
 
 def read_description(file: Path, options: Mapping[str, str]) -> Description:
     """Read the scene in `file` and all that it includes; `options` are the values of its `$name` variables.
@@ -286,7 +290,7 @@ class _Reader:
         if element.tag == "spectrum" and "filename" in element.attributes:
             # Mitsuba opens it while it parses, from the folder of the file that is being parsed.
             name = element.attributes["filename"]
-            element.attributes["filename"] = str(find_file(name, folders) or name)
+            element.attributes["filename"] = str(_find(name, folders) or name)
         children: list[Element] = []
         for child in element.children:
             self._put_variables(child)
@@ -336,7 +340,7 @@ class _Reader:
     def _include(self, include: Element, folders: list[Path], depth: int) -> list[Element]:
         """What stands in the place of `include`: the objects of a scene, or the one object that a file holds."""
         here = [include.source.file.absolute().parent, *folders]
-        if (file := find_file(_required(include, "filename"), here)) is None:
+        if (file := _find(_required(include, "filename"), here)) is None:
             raise include.fail("", f"included file {quoted(include.attributes['filename'])} not found")
         root = self.read(file, here, include, depth)
         if root.type == "scene":
@@ -355,15 +359,14 @@ def _required(element: Element, attribute: str) -> str:
     return element.attributes[attribute]
 
 
-def find_file(name: str, folders: Sequence[Path]) -> Path | None:
-    """The file or folder that Mitsuba opens by this name: the first in `folders`, or what the name says by itself."""
+def _find(name: str, folders: Sequence[Path]) -> Path | None:
     places = [*(folder / name for folder in folders), Path(name)]
     return next((path for path in places if os.path.exists(path)), None)  # False of a name that is too long, too
 
 
 def _folder(element: Element, folders: list[Path]) -> Path:
     name = _required(element, "value")
-    folder = find_file(name, [element.source.file.absolute().parent, *folders])
+    folder = _find(name, [element.source.file.absolute().parent, *folders])
     if folder is None or not folder.is_dir():
         raise element.fail("", f"<path>: folder {quoted(name)} not found")
     return folder.absolute()
