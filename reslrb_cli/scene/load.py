@@ -18,9 +18,9 @@ from reslrb_cli.errors import ConfigError
 from reslrb_cli.scene.cameras import read_cameras, replace_sensors
 from reslrb_cli.scene.catalog import coarse_bits
 from reslrb_cli.scene.extent import doubts
-from reslrb_cli.scene.xml.build import Owners, build, name_objects
+from reslrb_cli.scene.xml.build import Owners, build
 from reslrb_cli.scene.xml.check import check, check_files, resize_films
-from reslrb_cli.scene.xml.mend import mend, place_textures, refuse, warnings
+from reslrb_cli.scene.xml.mend import mend, refuse, warnings
 from reslrb_cli.scene.xml.read import Description, quoted, read_description
 
 logger = logging.getLogger(__name__)
@@ -60,13 +60,12 @@ def load_scene(
     root = description.root
     if cameras is not None:
         replace_sensors(description, read_cameras(cameras))
-    found = [*name_objects(root), *mend(description)]
+    found = mend(description)
     if strict:
         refuse(found, root)
     if size is not None:
         resize_films(root, size)
     check(description)
-    place_textures(root)
     if look is not None:
         look(description)
     scene, unused = build(description)

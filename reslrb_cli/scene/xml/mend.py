@@ -1,4 +1,7 @@
-"""The mending of what other versions of Mitsuba and exporters for them wrote, where Mitsuba 3 can say it.
+"""The mending of what other versions of Mitsuba and exporters for them wrote, where Mitsuba 3 can say it, and of ids.
+
+Mitsuba names an object without an id by its address in memory, which differs each time that the scene is loaded. Its
+lasting name is its kind, and its number among all of that kind.
 
 Notes say what was mended, or left out, so that a scene could be loaded; tables, how those versions and exporters say
 what Mitsuba 3 says in another way. The plugins `regular`, `irregular` and `blackbody` can be evaluated by wavelength
@@ -9,8 +12,10 @@ surface under D65.
 
 from __future__ import annotations
 
+import itertools
 import math
 import re
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
@@ -241,26 +246,73 @@ def transform_coordinates(texture: Element) -> Element | None:
     return first
 
 
-def place_textures(root: Element) -> None:
-    """Move each texture right below `root` into the place of the first reference to it; other references stay.
+#: Plugins that name what they hold by its place among the others, in every load alike.
+_GROUPS = ("shapegroup", "batch")
+#: How the ids begin that Mitsuba gives to objects without one when it writes a scene; it takes them for none.
+_UNNAMED = "_unnamed_"
+#: Characters of an id that is kept: keys become names of files.
+_LONGEST = 120
 
-    Mitsuba lists the parameters of what stands right below the scene as the scene's own, by the id of a texture, which
-    some lose: nothing would say that they are properties of a material or a light.
+
+def _name_objects(root: Element) -> list[Note]:
+    """Give every object below `root` an id that is there in every load of the same files; say whose ids were changed.
+
+    The third `sphere` of the files becomes `Sphere_3`, whether or not the first two have ids. An id that Mitsuba could
+    not use in a key is replaced: one that is empty, starts with `_unnamed_`, is very long or holds what cannot be
+    printed, or is that of an earlier object. References follow. Raises ConfigError where a reference is to an id of two
+    objects that differ.
     """
-    textures = {child.id: child for child in root.children if child.tag == "texture" and child.id}
-    for alias in root.walk("alias"):
-        textures.pop(alias.id, None)
-    for element in list(root.walk()):
-        for index, child in enumerate(element.children if element is not root else ()):
-            texture = textures.get(child.id) if child.tag == "ref" else None
-            if texture is None or texture is element:
-                continue
-            del textures[texture.id]
-            root.children.remove(texture)
-            texture.attributes.pop("name", None)
-            if child.name:
-                texture.attributes["name"] = child.name
-            element.children[index] = texture
+    root.attributes.pop("id", None)
+    objects = root.objects()[1:]
+    grouped = {child for element in objects if element.type in _GROUPS for child in element.children}
+    taken = {element.attributes[key] for element in root.walk() for key in ("id", "as") if key in element.attributes}
+    owners: dict[str, Element] = {}
+    renamed: dict[str, str] = {}
+    differing: dict[str, Element] = {}
+    notes: list[Note] = []
+    numbers: Counter[str] = Counter()
+    for element in objects:
+        kind = element.type[:1].upper() + element.type[1:]
+        numbers[kind] += 1
+        own = element.id
+        if own in owners:
+            if not _same(owners[own], element):
+                differing[own] = element
+        elif own.strip() and own.isprintable() and len(own) <= _LONGEST and not own.startswith(_UNNAMED):
+            owners[own] = element
+            continue
+        elif element in grouped and not own:
+            continue
+        name = first = f"{kind}_{numbers[kind]}"
+        for number in itertools.count(2):
+            if name not in taken:
+                break
+            name = f"{first}_{number}"
+        taken.add(name)
+        element.attributes["id"] = name
+        if own in owners:
+            notes.append(Note(element, f"id {quoted(own)} is that of {owners[own].place}, too", f"named {name}"))
+        elif own.strip() and own not in renamed:
+            renamed[own] = name
+            if not own.startswith(_UNNAMED):
+                notes.append(Note(element, f"id {quoted(own)} cannot stand in a key", f"named {name}"))
+    for element in root.walk("ref", "alias"):
+        own = element.id
+        if own in differing:
+            places = f"{owners[own].place} and {differing[own].place}"
+            raise element.fail("", f"refers to {quoted(own)}, the id of two objects ({places}); rename one of them")
+        if own in renamed:
+            element.attributes["id"] = renamed[own]
+    return notes
+
+
+def _same(a: Element, b: Element) -> bool:
+    """Whether two elements, their ids aside, say the same."""
+    one, other = ({**element.attributes, "id": ""} for element in (a, b))
+    return (
+        (a.tag, one, len(a.children)) == (b.tag, other, len(b.children))
+        and all(_same(x, y) for x, y in zip(a.children, b.children, strict=True))
+    )  # fmt: skip
 
 
 CURRENT_VERSION = "3.0.0"
@@ -273,8 +325,8 @@ def mend(description: Description) -> list[Note]:
     shapes keep their meaning: those that Mitsuba 3 does not have stay as they are, to be refused. Parameters that no
     plugin asks for show only when the scene is built.
     """
-    mender = _Mender(description)
-    root = description.root
+    mender, root = _Mender(description), description.root
+    mender.notes += _name_objects(root)
     given = root.attributes.pop("version", None)
     if root.source.version is None:
         wrong = "the version is missing" if given is None else f"version {quoted(given)} is not three numbers"
