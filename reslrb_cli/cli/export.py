@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     import mitsuba as mi
 
     from reslrb_cli.config.schema import Config
+    from reslrb_cli.scene.xml.read import Description
 
 
 @click.command("export")
@@ -35,19 +36,17 @@ def command(run: Path, overrides: tuple[str, ...], output: Path) -> None:
     check_folder(output)
     start_variant(config)
 
-    from reslrb_cli.optimization.loading import check_integrator, choose_sensors
+    from reslrb_cli.optimization.loading import check_integrator, choose_sensors, load_configured
     from reslrb_cli.scene.export import export_scene
-    from reslrb_cli.scene.load import load_described
     from reslrb_cli.scene.parameters import select_parameters
 
-    at = config.scene
-    keys = [key for spec in config.parameters for key in spec.keys]
-    scene, description = load_described(at.file, at.options, at.strict, at.size, at.cameras, keys=keys)
+    described: list[Description] = []
+    scene = load_configured(config, described.append)
     check_integrator(config, config.integrator, scene, choose_sensors(config, scene))
     selection = select_parameters(scene, config.parameters, config.source)
     integrator, why = choose_integrator(config, scene, selection.params)
     with writing("--output", output):
-        export_scene(description, selection.params, selection.scene_keys, integrator, output, run)
+        export_scene(described[0], selection.params, selection.scene_keys, integrator, output, run)
     echo(f"{output / 'scene.xml'}: {', '.join(selection.keys)}; rendered by {integrator['type']}{why}")
 
 

@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     import mitsuba as mi
 
     from reslrb_cli.scene.proposal import Photograph
+    from reslrb_cli.scene.xml.read import Description
 
 
 #: Pixels with which a run takes minutes on two cores, at the samples below.
@@ -271,7 +272,7 @@ def command(
     set_variant("auto")
 
     from reslrb_cli.scene.images import turned_line
-    from reslrb_cli.scene.load import load_described, read_as_floats
+    from reslrb_cli.scene.load import load_scene, read_as_floats
     from reslrb_cli.scene.parameters import select_parameters
     from reslrb_cli.scene.proposal import open_photograph, write_smaller
     from reslrb_cli.scene.visibility import find_depth
@@ -279,7 +280,9 @@ def command(
     photo = None if target is None else open_photograph(target)
     if target is not None and (turned := turned_line(target)) is not None:
         echo(turned)
-    scene, description = load_described(scene_file, options)
+    described: list[Description] = []
+    scene = load_scene(scene_file, options, look=described.append)
+    [description] = described
     sensors = [str(sensor.id()) for sensor in scene.sensors()]
     _tell_sensor(index, sensors)
     sensor = scene.sensors()[index]

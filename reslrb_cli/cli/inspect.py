@@ -403,10 +403,10 @@ def select(config: Config, scene: Any) -> Selection | str:
 
 def edges_of(scene: Any, selection: Selection) -> list[str]:
     """The shapes that the configuration moves whose edges move, too."""
-    from reslrb_cli.scene.deformation import casts_edges, where_moved
+    from reslrb_cli.scene.deformation import where_moved
 
     moved = where_moved(selection.params, selection.scene_keys)
-    return [item.id for item in moved if casts_edges(scene, item)]
+    return [item.id for item in moved if item.casts_edges(scene)]
 
 
 def make_plan_report(subject: Subject, scene: Any, selection: Selection | str, counts: bool) -> PlanReport | str:

@@ -21,9 +21,9 @@ from reslrb_cli.errors import UnsupportedScene
 from reslrb_cli.guiding.tables import Guiding
 from reslrb_cli.integrators.freezing import Recordings
 from reslrb_cli.scene.catalog import parameter_kind
-from reslrb_cli.scene.deformation import BEAMS, PLACES, Surroundings, moving_emitter_obstacle, moving_shape_obstacle
-from reslrb_cli.scene.graph import SceneGraph, emitted_rays, find_lamps
-from reslrb_cli.scene.needs import check_supported, interpolates_normals, scene_needs
+from reslrb_cli.scene.deformation import BEAMS, PLACES, Surroundings, moving_obstacle
+from reslrb_cli.scene.graph import SceneGraph, emitted_rays, interpolates_normals
+from reslrb_cli.scene.needs import check_supported, scene_needs
 from reslrb_cli.transport.aim import worthwhile
 from reslrb_cli.transport.bsdf import Scattering, stays_behind
 from reslrb_cli.transport.connection import Connection
@@ -88,12 +88,12 @@ def differentiated(params: mi.SceneParameters) -> Differentiated:
         if kind in ("bsdf", "attribute"):
             nodes[node] = None
         elif kind == "shape":
-            _refuse(key, moving_shape_obstacle(node, key))
+            _refuse(key, moving_obstacle(node, key))
             shapes[node] = None
             if node.is_emitter():
                 emitters[node.emitter()] = None
         elif kind == "emitter" and key.rpartition(".")[2] in (*PLACES, *BEAMS):
-            _refuse(key, moving_emitter_obstacle(node, key))
+            _refuse(key, moving_obstacle(node, key))
             emitters[node] = None
             continue  # no factor of a path
         elif kind == "emitter":
@@ -175,7 +175,7 @@ class Renewal:
         graph = SceneGraph.of(scene)
         self._surroundings = Surroundings()
         self._infinite = any(mi.has_flag(e.flags(), mi.EmitterFlags.Infinite) for e in scene.emitters())
-        self._lamps = [lamp.shape for lamp in find_lamps(scene, graph) if lamp.faces_by_area]
+        self._lamps = [lamp.shape for lamp in graph.find_lamps(scene) if lamp.faces_by_area]
         # Vertices as they were when it was decided that interpolated normals need no correction, because meshes are
         # flat. They are held, so that other arrays do not get their place.
         smooth = [shape for shape in graph.shapes() if interpolates_normals(shape)]

@@ -21,7 +21,7 @@ from reslrb_cli.measure.scenes.analytic import furnace
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.scene.catalog import parameter_kind
 from reslrb_cli.scene.graph import SceneGraph
-from reslrb_cli.scene.needs import SceneNeeds, View, look, scene_needs, stock_clip
+from reslrb_cli.scene.needs import PrimaryHits, SceneNeeds, look, scene_needs, stock_clip
 from reslrb_cli.scene.visibility import interior
 
 
@@ -95,7 +95,7 @@ class Situation:
     params: Any
     graph: SceneGraph
     needs: SceneNeeds
-    view: View
+    view: PrimaryHits
     max_depth: int
     hide_emitters: bool
     attached: bool = False
@@ -205,24 +205,8 @@ def _bsdfs(at: Situation, key: str) -> list[Any]:
     """The BSDFs that a parameter belongs to, nested ones and those around them."""
     node = at.params.properties[key][2]
     if isinstance(node, mi.Shape):  # an attribute, which some texture of its BSDF reads
-        return _below(at.graph, node.bsdf())
-    found: dict[Any, None] = {}
-    waiting = [node]
-    while waiting:
-        current = waiting.pop()
-        if isinstance(current, mi.BSDF):
-            found[current] = None
-        waiting += [p for p in at.graph.parents.get(current, []) if isinstance(p, (mi.BSDF, mi.Texture))]
-    return list(found)
-
-
-def _below(graph: SceneGraph, bsdf: Any) -> list[Any]:
-    """A BSDF and those nested in it."""
-    found = [bsdf]
-    for item in graph.of_type(mi.BSDF):
-        if any(parent in found for parent in graph.parents[item]) and item not in found:
-            found.append(item)
-    return found
+        return at.graph.nested_bsdfs(node.bsdf())
+    return at.graph.bsdfs_above(node)
 
 
 def _is_turned(emitter: Any) -> bool:

@@ -27,7 +27,7 @@ from reslrb_cli.optimization.loading import (
     render_in_passes,
 )
 from reslrb_cli.optimization.views import Masked, View, color_channels
-from reslrb_cli.scene.images import Photo, check_photo, read_photo, read_weights, turned_line
+from reslrb_cli.scene.images import Photo, read_photo, read_weights, turned_line
 from reslrb_cli.scene.parameters import Selection, set_values
 from reslrb_cli.scene.visibility import interior, sees_specular
 
@@ -214,13 +214,12 @@ def _read_photo(problem: Problem, view: View) -> Photo:
     config, wanted = problem.config, view.wanted
     assert wanted.file is not None, "called for target files only"
     width, height = (int(n) for n in problem.scene.sensors()[view.sensor].film().crop_size())
-    upright = are_upright(config)
+    upright, nonfinite, size = are_upright(config), wanted.mask.nonfinite, (width, height)
+    space, gamma = config.target.color_space, config.target.gamma
     try:
-        photo = read_photo(wanted.file, config.target.color_space, (width, height), config.target.gamma, upright)
-        check_photo(wanted.file, photo, allow_nonfinite=wanted.mask.nonfinite)
+        return read_photo(wanted.file, space, size, gamma, upright, nonfinite=nonfinite)
     except ConfigError as error:
         raise ConfigError(config.source, wanted.file_key, error.message) from None
-    return photo
 
 
 def _fit(problem: Problem, image: Array, sensor: int) -> Array:

@@ -23,11 +23,8 @@ from reslrb_cli.scene.xml.read import Description, Element
 
 #: Bytes of such a file, at most.
 MOST_BYTES = 2**26
-
-
 #: By how much the focal lengths of rows and columns may differ, relative to them.
 SQUARE = 1e-3
-
 
 #: COLMAP's models without a fisheye, and the names of their parameters; `f` is both focal lengths.
 MODELS = {
@@ -39,10 +36,7 @@ MODELS = {
     "FULL_OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
 }
 
-
 _DISTORTION = re.compile(r"[kp]\d")
-
-
 #: From a camera's axes to the sensor's: of NeRF (x right, y up, looking along -z) and of COLMAP (y down, along +z).
 _NERF, _COLMAP = np.diag([-1.0, 1.0, -1.0, 1.0]), np.diag([-1.0, -1.0, 1.0, 1.0])
 
@@ -72,52 +66,46 @@ def replace_sensors(description: Description, cameras: list[Camera]) -> None:
     root = description.root
     own = [child for child in root.children if child.tag == "sensor"]
     root.children = [child for child in root.children if child.tag != "sensor"]
-    taken: set[str] = {element.attributes.get("id", "") for element in root.walk()}
+    taken = {element.id for element in root.walk()}
     for camera in cameras:
         name = re.sub(r"\W+", "_", camera.name) or "camera"
         while name in taken:
             name += "_"
         taken.add(name)
-        root.children.append(_sensor(root, own[0] if own else None, camera, name))
+        root.children.append(_sensor(own[0] if own else root.new("sensor"), camera, name))
 
 
-def _sensor(root: Element, like: Element | None, camera: Camera, name: str) -> Element:
-    def element(tag: str, children: list[Element] | None = None, **attributes: str) -> Element:
-        return Element(tag, attributes, root.source, like.line if like is not None else root.line, children or [])
-
-    film = next((child for child in (like.children if like is not None else []) if child.tag == "film"), None)
-    kept = [_copy(child) for child in (film.children if film is not None else []) if not _is_size(child)]
-    width, height = camera.size
-    sizes = [element("integer", name=key, value=str(n)) for key, n in (("width", width), ("height", height))]
-    fov = math.degrees(2 * math.atan(width / (2 * camera.focal)))
+def _sensor(like: Element, camera: Camera, name: str) -> Element:
+    film = next((child for child in like.children if child.tag == "film"), like.new("film"))
+    sizes = [
+        like.new("integer", name=key, value=str(n)) for key, n in zip(("width", "height"), camera.size, strict=True)
+    ]
+    kept = [_copy(child) for child in film.children if not child.name.startswith(("width", "height", "crop"))]
+    fov = math.degrees(2 * math.atan(camera.size[0] / (2 * camera.focal)))
     offsets = [
-        element("float", name=f"principal_point_offset_{axis}", value=repr(offset))
+        like.new("float", name=f"principal_point_offset_{axis}", value=repr(offset))
         for axis, center, n in zip("xy", camera.center, camera.size, strict=True)
         if abs(offset := 0.5 - center / n) > 1e-6
     ]
-    matrix = element("matrix", value=" ".join(repr(float(entry)) for entry in camera.to_world.ravel()))
-    children = [
-        element("string", name="fov_axis", value="x"),
-        element("float", name="fov", value=repr(fov)),
-        *offsets,
-        element("transform", [matrix], name="to_world"),
-        element("film", [*sizes, *kept], type="hdrfilm"),
-    ]
+    matrix = like.new("matrix", value=" ".join(repr(float(entry)) for entry in camera.to_world.ravel()))
     clips = ("near_clip", "far_clip", "nearClip", "farClip")
-    for child in like.children if like is not None else []:
-        if child.tag == "sampler" or child.name in clips:
-            children.append(_copy(child))
-    return element("sensor", children, type="perspective", id=name)
+    return like.new(
+        "sensor",
+        like.new("string", name="fov_axis", value="x"),
+        like.new("float", name="fov", value=repr(fov)),
+        *offsets,
+        like.new("transform", matrix, name="to_world"),
+        like.new("film", *sizes, *kept, type="hdrfilm"),
+        *(_copy(child) for child in like.children if child.tag == "sampler" or child.name in clips),
+        type="perspective",
+        id=name,
+    )
 
 
 def _copy(element: Element) -> Element:
     """The element for another sensor: what lies in it has ids of its own."""
     attributes = {key: value for key, value in element.attributes.items() if key != "id"}
-    return Element(element.tag, attributes, element.source, element.line, [_copy(child) for child in element.children])
-
-
-def _is_size(child: Element) -> bool:
-    return child.name in ("width", "height") or child.name.startswith(("crop_", "crop"))
+    return element.new(element.tag, *map(_copy, element.children), **attributes)
 
 
 # --- transforms.json --------------------------------------------------------------------------------------------------
@@ -137,7 +125,7 @@ def _frame(file: Path, key: str, frame: Mapping[str, Any]) -> Camera:
         raise ConfigError(file, f"{key}.file_path", "must name the camera's image")
     if "FISHEYE" in str(frame.get("camera_model", "")).upper() or frame.get("is_fisheye"):
         raise ConfigError(file, f"{key}.camera_model", "is a fisheye, which Mitsuba lacks; undistort the images")
-    _check_distortion(file, key, {name: frame[name] for name in frame if _DISTORTION.fullmatch(name)})
+    _check_distortion(file, key, frame)
     try:
         matrix = np.array(frame["transform_matrix"], dtype=np.float64)
     except (KeyError, ValueError, TypeError):
@@ -146,17 +134,14 @@ def _frame(file: Path, key: str, frame: Mapping[str, Any]) -> Camera:
         raise ConfigError(file, f"{key}.transform_matrix", "must be four rows of four numbers, from camera to world")
     to_world = np.vstack([matrix[:3], [0, 0, 0, 1]]) @ _NERF
     image = _image(file.parent / frame["file_path"])
-    numbers = {name: _number(file, f"{key}.{name}", frame.get(name)) for name in ("w", "h", "fl_x", "fl_y", "cx", "cy")}
-    width, height = (int(n) for n in (numbers["w"], numbers["h"]) if n) if numbers["w"] and numbers["h"] else (0, 0)
-    if not width:
-        width, height = image_size(image)
-    angle = _number(file, f"{key}.camera_angle_x", frame.get("camera_angle_x"))
-    focal = numbers["fl_x"] or (width / (2 * math.tan(angle / 2)) if angle else None)
+    names = ("w", "h", "fl_x", "fl_y", "cx", "cy", "camera_angle_x")
+    w, h, fx, fy, cx, cy, angle = (_number(file, f"{key}.{name}", frame.get(name)) for name in names)
+    width, height = (int(w), int(h)) if w and h else image_size(image)
+    focal = fx or (width / (2 * math.tan(angle / 2)) if angle else None)
     if focal is None:
         raise ConfigError(file, f"{key}.fl_x", "missing, and no `camera_angle_x` either")
-    _check_square(file, key, focal, numbers["fl_y"] or focal)
-    cx, cy = (numbers[axis] if numbers[axis] is not None else n / 2 for axis, n in (("cx", width), ("cy", height)))
-    return Camera(image.stem, image, (width, height), focal, (float(cx), float(cy)), to_world)  # type: ignore[arg-type]
+    _check_square(file, key, focal, fy or focal)
+    return Camera(image.stem, image, (width, height), focal, (cx or width / 2, cy or height / 2), to_world)
 
 
 def _image(path: Path) -> Path:
@@ -175,83 +160,71 @@ def _number(file: Path, key: str, value: Any) -> float | None:
     return float(value)
 
 
-def _check_distortion(file: Path, key: str, coefficients: Mapping[str, Any]) -> None:
-    for name, value in coefficients.items():
-        if value != 0:
-            raise ConfigError(
-                file, key, f"has distortion ({name} = {value}), which Mitsuba's sensors lack; undistort the images"
-            )
+def _check_distortion(source: object, key: str, parameters: Mapping[str, Any]) -> None:
+    for name, value in parameters.items():
+        if _DISTORTION.fullmatch(name) and value != 0:
+            what = f"has distortion ({name} = {value}), which Mitsuba's sensors lack"
+            raise ConfigError(source, key, f"{what}; undistort the images")
 
 
-def _check_square(file: Path, key: str, fx: float, fy: float) -> None:
+def _check_square(source: object, key: str, fx: float, fy: float) -> None:
     if abs(fx - fy) > SQUARE * fx:
-        raise ConfigError(
-            file,
-            key,
-            f"has focal lengths {fx:g} and {fy:g}, but Mitsuba's pixels are squares; undistort to one of them",
-        )
+        what = f"has focal lengths {fx:g} and {fy:g}, but Mitsuba's pixels are squares"
+        raise ConfigError(source, key, f"{what}; undistort to one of them")
 
 
 # --- COLMAP -----------------------------------------------------------------------------------------------------------
 
 
 def _colmap(file: Path) -> list[Camera]:
+    from scipy.spatial.transform import Rotation  # late: few scenes have such a file
+
     models = dict(_models(file.with_name("cameras.txt")))
     cameras = []
     lines = _lines(file)
-    for number, words in lines:
+    for place, words in lines:
         if not words:
             continue
         next(lines, None)  # the image's points
-        place = f"{file}:{number}"
         try:
-            pose = np.array([float(word) for word in words[1:8]])
+            w, *pose = (float(word) for word in words[1:8])
             camera, name = int(words[8]), " ".join(words[9:])
-            w, x, y, z = pose[:4] / np.linalg.norm(pose[:4])
+            rotation = Rotation.from_quat([*pose[:3], w]).as_matrix()
         except (ValueError, IndexError):
             raise ConfigError(place, "", "is no image: IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME") from None
-        if camera not in models or pose.size != 7 or not name or not np.isfinite(pose).all():
+        if camera not in models or not name or not np.isfinite([w, *pose]).all():
             raise ConfigError(place, "", f"has camera {camera}, which cameras.txt does not have, or no name")
-        rotation = np.array(
-            [
-                [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-                [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-                [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-            ]
-        )
         to_world = np.eye(4)
-        to_world[:3, :3], to_world[:3, 3] = rotation.T, -rotation.T @ pose[4:]
-        size, focal, center = models[camera]
-        cameras.append(Camera(Path(name).stem, file.parent / name, size, focal, center, to_world @ _COLMAP))
+        to_world[:3, :3], to_world[:3, 3] = rotation.T, -rotation.T @ pose[3:]
+        cameras.append(Camera(Path(name).stem, file.parent / name, *models[camera], to_world @ _COLMAP))
     return cameras
 
 
 def _models(file: Path) -> Iterator[tuple[int, tuple[tuple[int, int], float, tuple[float, float]]]]:
-    for number, words in _lines(file):
-        place = Path(f"{file}:{number}")
+    """The size, focal length and centre of each camera, by its number."""
+    for place, words in _lines(file):
         if not words:
             continue
         model = words[1] if len(words) > 1 else ""
         if model not in MODELS:
-            raise ConfigError(
-                place, "", f"has model {model or 'none'}, which Mitsuba lacks; undistort the images to PINHOLE"
-            )
+            what = f"has model {model or 'none'}, which Mitsuba lacks"
+            raise ConfigError(place, "", f"{what}; undistort the images to PINHOLE")
         try:
-            width, height = int(words[2]), int(words[3])
+            number, width, height = int(words[0]), int(words[2]), int(words[3])
             found = dict(zip(MODELS[model], map(float, words[4:]), strict=True))
         except (ValueError, IndexError):
             raise ConfigError(place, "", f"is no camera: CAMERA_ID, {model}, WIDTH, HEIGHT, parameters") from None
-        _check_distortion(place, "", {name: value for name, value in found.items() if _DISTORTION.fullmatch(name)})
+        _check_distortion(place, "", found)
         focal = found.get("f", found.get("fx", 0.0))
         _check_square(place, "", focal, found.get("fy", focal))
         if not (focal > 0 and math.isfinite(focal) and width > 0 and height > 0):
             raise ConfigError(place, "", "must have a positive focal length and size")
-        yield int(words[0]), ((width, height), focal, (found["cx"], found["cy"]))
+        yield number, ((width, height), focal, (found["cx"], found["cy"]))
 
 
-def _lines(file: Path) -> Iterator[tuple[int, list[str]]]:
-    """Number and words of each line that is no comment; a line of points may be empty."""
+def _lines(file: Path) -> Iterator[tuple[str, list[str]]]:
+    """File and number, and words of each line that is no comment; a line of points may be empty."""
     text = read_file(file, MOST_BYTES).decode("utf-8", errors="replace")
     for number, line in enumerate(text.splitlines(), 1):
         if not line.startswith("#"):
-            yield number, line.split()
+            yield f"{file}:{number}", line.split()

@@ -8,24 +8,18 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from reslrb_cli.scene.deformation import (
-    Movable,
-    heightmap_obstacle,
-    list_movable,
-    moving_emitter_obstacle,
-    moving_shape_obstacle,
-)
+from reslrb_cli.scene.deformation import BEAMS, PLACES, list_movable, moving_obstacle
 from reslrb_cli.scene.graph import SceneGraph
 from reslrb_cli.scene.needs import (
+    PrimaryHits,
     SceneNeeds,
-    View,
     camera_obstacle,
     light_obstacle,
     look,
@@ -33,22 +27,10 @@ from reslrb_cli.scene.needs import (
     unsupported_part,
 )
 
-#: Emitter parameters that Mitsuba flags as differentiable, but that change where light goes and not how much it is.
-_BEAM_SHAPES = {
-    "cutoff_angle": "shapes the beam",
-    "beam_width": "shapes the beam",
-    "sun_direction": "moves the light",
-}
-
-
 #: Spectra by wavelength, which RGB variants cannot evaluate: their numbers describe what stands in the scene file.
 _SPECTRA = ("RegularSpectrum", "IrregularSpectrum", "BlackBodySpectrum")
-
-
 #: What a mesh has besides attributes such as `vertex_color`.
 _MESH_GEOMETRY = ("vertex_positions", "vertex_normals", "vertex_texcoords", "vertex_count", "face_count", "faces")
-
-
 #: Numbers that are written out one by one; of more, their mean and range.
 _FEW = 4
 
@@ -92,12 +74,11 @@ class ParameterInfo:
 
 def list_parameters(params: Any, values: bool = False) -> list[ParameterInfo]:
     """Describe every entry of a `mi.traverse` result, in its order; their `values` too, if they are asked for."""
-    infos = [describe(params, key) for key in params.properties]
-    return [replace(info, value=current_value(params, info.key)) for info in infos] if values else infos
+    return [describe(params, key, values) for key in params.properties]
 
 
-def describe(params: Any, key: str) -> ParameterInfo:
-    """Describe one entry of a `mi.traverse` result."""
+def describe(params: Any, key: str, values: bool = False) -> ParameterInfo:
+    """Describe one entry of a `mi.traverse` result, with its value where `values` are asked for."""
     value, node, flags = _value(params, key), params.properties[key][2], int(params.flags(key))
     differentiable = flags & (int(mi.ParamFlags.NonDifferentiable) | int(mi.ParamFlags.ReadOnly)) == 0
     kind, bits = parameter_kind(params, key), coarse_bits(params, key)
@@ -109,6 +90,7 @@ def describe(params: Any, key: str) -> ParameterInfo:
         differentiable=differentiable,
         discontinuous=flags & int(mi.ParamFlags.Discontinuous) != 0,
         obstacle=_obstacle(kind, key, value, differentiable, node, bits),
+        value=_current_value(params, key) if values else None,
         bits=bits,
     )
 
@@ -137,14 +119,11 @@ def value_shape(value: Any, halo: int = 0) -> tuple[int, ...]:
     return shape if dr.is_tensor_v(value) or shape[-1:] != (1,) else shape[:-1]
 
 
-def current_value(params: Any, key: str) -> Value | None:
+def _current_value(params: Any, key: str) -> Value | None:
     """The value of one entry of a `mi.traverse` result; None for what is no number."""
     value = _value(params, key)
-    try:
-        array = np.asarray(value.matrix if "AffineTransform" in type(value).__name__ else value)
-    except (RuntimeError, TypeError):
-        return None
-    if array.dtype.kind not in "buif" or array.size == 0:
+    array = as_numbers(value)
+    if array is None or array.size == 0:
         return None
     if array.dtype == np.uint8 and coarse_bits(params, key) is not None:
         return _encoded_value(array, params.properties[key][2])
@@ -154,16 +133,24 @@ def current_value(params: Any, key: str) -> Value | None:
     return Value(numbers, float(array.mean(dtype=np.float64)), float(array.min()), float(array.max()))
 
 
+def as_numbers(value: Any) -> np.ndarray | None:
+    """A parameter's value as an array, a transform by its matrix; None of what is no number."""
+    try:
+        array = np.asarray(value.matrix if "AffineTransform" in type(value).__name__ else value)
+    except (RuntimeError, TypeError):
+        return None
+    return array if array.dtype.kind in "buif" else None
+
+
 def _encoded_value(array: np.ndarray, texture: mi.Texture) -> Value:
     """The value of a texture of 8 bits as it is looked up: a share of 255, decoded from sRGB unless it is raw."""
     table = np.arange(256, dtype=np.float32) / 255
     if not re.search(r"^ *raw = 1,$", str(texture), re.MULTILINE):
         table = np.array(dr.srgb_to_linear(mi.Float(table)))
-    levels = array.ravel()
-    parts = (levels[start : start + 2**20] for start in range(0, levels.size, 2**20))  # each as integers of 8 bytes
-    counts = sum((np.bincount(part, minlength=256) for part in parts), start=np.zeros(256, dtype=np.int64))
+    # By rows, since it is counted as integers of 8 bytes.
+    counts = np.sum([np.bincount(row.ravel(), minlength=256) for row in array], axis=0)
     there = table[counts > 0]
-    numbers = [float(table[level]) for level in levels] if array.size <= _FEW else None
+    numbers = [float(table[level]) for level in array.ravel()] if array.size <= _FEW else None
     return Value(numbers, float(table.astype(np.float64) @ counts / array.size), float(there.min()), float(there.max()))
 
 
@@ -175,36 +162,25 @@ def _value(params: Any, key: str) -> Any:
 
 def parameter_kind(params: Any, key: str) -> str:
     """What an entry of a `mi.traverse` result belongs to (`ParameterInfo.kind`)."""
-    node = params.properties[key][2]
-    kinds = {
-        "bsdf": mi.BSDF,
-        "emitter": mi.Emitter,
-        "shape": mi.Shape,
-        "sensor": mi.Sensor,
-        "film": mi.Film,
-        "medium": mi.Medium,
-        "integrator": mi.Integrator,
-    }
-    name = key.rpartition(".")[2]
+    node, name = params.properties[key][2], key.rpartition(".")[2]
+    is_attribute = name.startswith(("vertex_", "face_")) and name not in _MESH_GEOMETRY
     while node is not None:
-        for kind, type_ in kinds.items():
-            if isinstance(node, type_):
-                if kind == "shape" and isinstance(node, mi.Mesh) and _is_attribute(name):
-                    return "attribute"
-                return kind
+        for kind in ("BSDF", "Emitter", "Shape", "Sensor", "Film", "Medium", "Integrator"):
+            if isinstance(node, getattr(mi, kind)):
+                return "attribute" if is_attribute and isinstance(node, mi.Mesh) else kind.lower()
         node = params.hierarchy[node][0]
     return "scene"
-
-
-def _is_attribute(name: str) -> bool:
-    return name.startswith(("vertex_", "face_")) and name not in _MESH_GEOMETRY
 
 
 def _obstacle(kind: str, key: str, value: Any, differentiable: bool, node: Any, coarse: int | None) -> str | None:
     only = "only materials, emission, shapes and lights have derivatives"
     id, _, name = key.rpartition(".")
-    if kind == "shape" or (kind == "emitter" and name in ("to_world", "position")):
-        return _moving_obstacle(kind, id, name, node)
+    if kind == "shape" or (kind == "emitter" and name in PLACES):
+        if kind == "shape" and name not in ("to_world", "vertex_positions"):
+            return "belongs to a shape, of which vertices and motions are recovered"
+        if (reason := moving_obstacle(node, name)) is not None:
+            return f"cannot be moved ({reason})"
+        return f"is recovered as a motion (`motion: {{of: {id}}}`)" if name == "to_world" else None
     if kind in ("sensor", "film"):
         return f"belongs to the {kind}; {only}"
     if node.class_name() in _SPECTRA:
@@ -213,8 +189,8 @@ def _obstacle(kind: str, key: str, value: Any, differentiable: bool, node: Any, 
         return "is not given in the scene file"
     if kind not in ("bsdf", "emitter", "attribute"):
         return f"is no property of a material or a light; {only}"
-    if kind == "emitter" and name in _BEAM_SHAPES:
-        return f"{_BEAM_SHAPES[name]}; of an emitter, only what it emits has derivatives"
+    if kind == "emitter" and name in BEAMS:
+        return f"{BEAMS[name]}; of an emitter, only what it emits has derivatives"
     if coarse is not None:  # not differentiable for that reason alone
         return None
     bits = _storage_bits(value)
@@ -222,31 +198,14 @@ def _obstacle(kind: str, key: str, value: Any, differentiable: bool, node: Any, 
         return f"is stored with {bits} bits a channel, too few to follow a gradient"
     if not differentiable:
         return f"is not differentiable ({node.class_name()})"
-    if bits is None:
-        return f"is no number with derivatives ({type(value).__name__})"
-    return None
-
-
-def _moving_obstacle(kind: str, id: str, name: str, node: Any) -> str | None:
-    """Why the place of a shape or an emitter is not recovered by this name; None where it is."""
-    if kind == "shape" and name not in ("to_world", "vertex_positions"):
-        return "belongs to a shape, of which vertices and motions are recovered"
-    reason = moving_shape_obstacle(node, name) if kind == "shape" else moving_emitter_obstacle(node)
-    if reason is not None:
-        return f"cannot be moved ({reason})"
-    if name == "to_world":
-        return f"is recovered as a motion (`motion: {{of: {id}}}`)"
-    return None
+    return f"is no number with derivatives ({type(value).__name__})" if bits is None else None
 
 
 def _storage_bits(value: Any) -> int | None:
     """Bits of one entry of a numeric JIT array that a parameter could be; None for anything else."""
-    if not dr.is_jit_v(value):
-        return None
     bits = {dr.VarType.UInt8: 8, dr.VarType.Float16: 16, dr.VarType.Float32: 32, dr.VarType.Float64: 64}
-    if dr.is_matrix_v(value) or not dr.is_arithmetic_v(value):
-        return None
-    return bits.get(dr.type_v(value))
+    is_number = dr.is_jit_v(value) and dr.is_arithmetic_v(value) and not dr.is_matrix_v(value)
+    return bits.get(dr.type_v(value)) if is_number else None
 
 
 @dataclass(frozen=True)
@@ -254,8 +213,7 @@ class SensorSummary:
     """One sensor: its film in pixels (`crop` is offset and size), what it sees, and what light tracing needs for it.
 
     `obstacle` is the reason why light tracing cannot render for it, or None, and `camera_obstacle` the same of paths
-    from the sensor (`prb`). `view` is None where the reason lies
-    in the scene's parts and not in what the sensor sees.
+    from the sensor (`prb`). `view` is None where the reason lies in the scene's parts and not in what the sensor sees.
     """
 
     index: int
@@ -267,7 +225,7 @@ class SensorSummary:
     filter: str
     channels: int
     needs: SceneNeeds
-    view: View | None
+    view: PrimaryHits | None
     obstacle: str | None
     camera_obstacle: str | None
 
@@ -295,23 +253,23 @@ class SceneSummary:
 
 def summarise(scene: Any, hide_emitters: bool = False, sensors: Sequence[int] | None = None) -> SceneSummary:
     """Look `scene` over; `sensors` are the indices of those to describe, None for all."""
-    graph = SceneGraph.of(scene)
+    graph, params = SceneGraph.of(scene), mi.traverse(scene)
     shapes = graph.shapes()
-    indices = range(len(scene.sensors())) if sensors is None else sensors
-    params = mi.traverse(scene)
     return SceneSummary(
         emitters=_count(scene.emitters()),
         bsdfs=_count(graph.of_type(mi.BSDF)),
         shapes=_count(shapes),
         triangles=sum(int(shape.face_count()) for shape in shapes if shape.is_mesh()),
-        sensors=[_sensor(scene, index, hide_emitters) for index in indices],
+        sensors=[
+            _sensor(scene, index, hide_emitters)
+            for index in (range(len(scene.sensors())) if sensors is None else sensors)
+        ],
         parameters=list_parameters(params, values=True),
-        movable=[MovableSummary(item.id, _moved_by(item)) for item in list_movable(params)],
+        movable=[
+            MovableSummary(item.id, ["motion"] if item.heightmap_obstacle() else ["motion", "heightmap"])
+            for item in list_movable(params)
+        ],
     )
-
-
-def _moved_by(item: Movable) -> list[str]:
-    return ["motion"] if heightmap_obstacle(item) else ["motion", "heightmap"]
 
 
 def _count(objects: Sequence[Any]) -> dict[str, int]:

@@ -30,53 +30,47 @@ import mitsuba as mi
 import numpy as np
 
 from reslrb_cli.config.parameters import HEIGHTMAP
+from reslrb_cli.scene.graph import bounds, face_normals, triangles
 
 #: Analytic shapes whose `to_world` moves their surface interactions and their samples.
 MOVING_SHAPES = ("Rectangle", "Disk", "Sphere", "Cylinder")
-
-
 #: What of a mesh moves light.
 MOVING_MESH = ("vertex_positions", "vertex_normals")
-
-
 #: Emitters without a surface that can move, and what moves them.
-MOVING_EMITTERS = {"PointLight": "position", "SpotLight": "to_world", "Projector": "to_world",
-                   "DirectionalEmitter": "to_world"}  # fmt: skip
-
-
+MOVING_EMITTERS = {
+    "PointLight": "position",
+    **dict.fromkeys(("SpotLight", "Projector", "DirectionalEmitter"), "to_world"),
+}
 #: Parameters that say where an emitter is.
 PLACES = ("position", "to_world")
-
-
 #: Parameters of emitters that are flagged as differentiable, and change where light goes as well.
-BEAMS = ("cutoff_angle", "beam_width", "sun_direction", "sun_aperture")
+BEAMS = {
+    **dict.fromkeys(("cutoff_angle", "beam_width", "sun_aperture"), "shapes the beam"),
+    "sun_direction": "moves the light",
+}
+#: Parameters that say where an object is: a rectangle has its vertices besides.
+_PLACED = ("to_world", "vertex_positions", "position")
 
 
-def moving_shape_obstacle(shape: mi.Shape, key: str) -> str | None:
-    """Why there is no derivative of the parameter `key` of a shape; None where there is one."""
-    name = key.rpartition(".")[2]
-    if shape.is_mesh() and shape.class_name() not in MOVING_SHAPES:  # Mitsuba takes a rectangle for a mesh, too
-        if name not in MOVING_MESH:
-            return f"of a mesh, {' and '.join(MOVING_MESH)} have derivatives, not {name}"
+def moving_obstacle(node: mi.Shape | mi.Emitter, key: str) -> str | None:
+    """Why there is no derivative of the parameter `key` of a shape or of an emitter without a surface, which says where
+    it is or where its light goes; None where there is one."""
+    kind, name = node.class_name(), key.rpartition(".")[2]
+    if not isinstance(node, mi.Shape):
+        if name == MOVING_EMITTERS.get(kind):
+            return None
+        if name in BEAMS:
+            return f"{name} changes where the light of a {kind} goes, which has no derivative here"
+        if kind in ("EnvironmentMapEmitter", "SunskyEmitter"):
+            return f"a {kind} that turns has no derivative here: its directions are drawn from what it shows in each"
+        return f"a {kind} that moves has no derivative here"
+    if node.is_mesh() and kind not in MOVING_SHAPES:  # Mitsuba takes a rectangle for a mesh, too
+        moving = " and ".join(MOVING_MESH)
+        return None if name in MOVING_MESH else f"of a mesh, {moving} have derivatives, not {name}"
+    if kind in MOVING_SHAPES and name == "to_world":
         return None
-    if shape.class_name() not in MOVING_SHAPES or name != "to_world":
-        kinds = ", ".join(kind.lower() for kind in MOVING_SHAPES)
-        return f"meshes (by their vertices) and {kinds} (by `to_world`) have derivatives, not a {shape.class_name()}"
-    return None
-
-
-def moving_emitter_obstacle(emitter: mi.Emitter, key: str | None = None) -> str | None:
-    """Why there is no derivative of the parameter `key` of an emitter without a surface, which says where it is or
-    where its light goes (None: of whatever moves it); None where there is one."""
-    kind = emitter.class_name()
-    name = MOVING_EMITTERS.get(kind, "") if key is None else key.rpartition(".")[2]
-    if name and name == MOVING_EMITTERS.get(kind):
-        return None
-    if name in BEAMS:
-        return f"{name} changes where the light of a {kind} goes, which has no derivative here"
-    if kind in ("EnvironmentMapEmitter", "SunskyEmitter"):
-        return f"a {kind} that turns has no derivative here: its directions are drawn from what it shows in each"
-    return f"a {kind} that moves has no derivative here"
+    kinds = ", ".join(shape.lower() for shape in MOVING_SHAPES)
+    return f"meshes (by their vertices) and {kinds} (by `to_world`) have derivatives, not a {kind}"
 
 
 @dataclass(frozen=True)
@@ -105,20 +99,30 @@ class Movable:
         """Whether it has a surface."""
         return isinstance(self.node, mi.Shape)
 
+    def heightmap_obstacle(self) -> str | None:
+        """Why no heightmap can displace it; None where one can."""
+        if not self.by_vertices:
+            return f"`{self.id}` is a {self.node.class_name()}; a heightmap displaces the vertices of a mesh"
+        if not self.node.has_vertex_texcoords():
+            return f"`{self.id}` has no texture coordinates, over which a heightmap is laid; give the mesh some"
+        return None
+
+    def casts_edges(self, scene: mi.Scene) -> bool:
+        """Whether it can have a silhouette or throw a shadow: a shape that does not enclose all others."""
+        others = [shape.bbox() for shape in scene.shapes() if shape.ptr != self.node.ptr]
+        return self.is_shape and not all(self.node.bbox().contains(box, strict=True) for box in others)
+
 
 def find_movable(params: mi.SceneParameters, id: str) -> Movable | str:
     """The object with this id, or the reason why it cannot be moved."""
-    for name in ("to_world", "vertex_positions", "position"):  # a rectangle has its vertices besides
+    for name in _PLACED:
         key = f"{id}.{name}"
         if key not in params.properties:
             continue
         node = params.properties[key][2]
-        if isinstance(node, mi.Emitter):
-            reason = moving_emitter_obstacle(node)
-        elif isinstance(node, mi.Shape):
-            reason = moving_shape_obstacle(node, key)
-        else:
+        if not isinstance(node, (mi.Emitter, mi.Shape)):
             return f"`{id}` is a {node.class_name()}; shapes and emitters can be moved"
+        reason = moving_obstacle(node, key)
         return Movable(id, key, node) if reason is None else f"`{id}` cannot be moved: {reason}"
     if any(key.startswith(f"{id}.") for key in params.properties):
         return f"`{id}` has neither vertices nor a place in the scene that can be moved"
@@ -130,50 +134,25 @@ def find_movable(params: mi.SceneParameters, id: str) -> Movable | str:
 
 def list_movable(params: mi.SceneParameters) -> list[Movable]:
     """All that can be moved, in the scene's order."""
-    found: dict[str, Movable] = {}
-    for key in params.properties:
-        id, _, name = key.rpartition(".")
-        if id and id not in found and name in ("to_world", "vertex_positions", "position"):
-            item = find_movable(params, id)
-            if isinstance(item, Movable):
-                found[id] = item
-    return list(found.values())
-
-
-def heightmap_obstacle(item: Movable) -> str | None:
-    """Why no heightmap can displace an object; None where one can."""
-    if not item.by_vertices:
-        return f"`{item.id}` is a {item.node.class_name()}; a heightmap displaces the vertices of a mesh"
-    if not item.node.has_vertex_texcoords():
-        return f"`{item.id}` has no texture coordinates, over which a heightmap is laid; give the mesh some"
-    return None
-
-
-def casts_edges(scene: mi.Scene, item: Movable) -> bool:
-    """Whether what moves can have a silhouette or throw a shadow: a shape that does not enclose all others."""
-    if not item.is_shape:
-        return False
-    own = item.node.bbox()
-    others = [shape.bbox() for shape in scene.shapes() if shape.ptr != item.node.ptr]
-    return not all(own.contains(box, strict=True) for box in others)
+    split = (key.rpartition(".") for key in params.properties)
+    ids = dict.fromkeys(id for id, _, name in split if id and name in _PLACED)
+    return [item for item in (find_movable(params, id) for id in ids) if isinstance(item, Movable)]
 
 
 def where_moved(params: mi.SceneParameters, keys: list[str]) -> list[Movable]:
     """The objects that the scene parameters `keys` move."""
-    kinds = (*MOVING_SHAPES, *MOVING_EMITTERS)
     found = []
     for key in keys:
         id, _, name = key.rpartition(".")
         node = params.properties[key][2]
-        if name == "vertex_positions" or (name in ("to_world", "position") and node.class_name() in kinds):
+        is_placed = name in PLACES and node.class_name() in (*MOVING_SHAPES, *MOVING_EMITTERS)
+        if is_placed or name == "vertex_positions":
             found.append(Movable(id, key, node))
     return found
 
 
 #: By how much a sphere that has become too small is larger than need be: kernels are compiled for each one.
 MARGIN = 1.25
-
-
 #: A sphere this many times as large as need be wastes light paths.
 TOO_LARGE = 2.0
 
@@ -203,41 +182,27 @@ class Surroundings:
 
         It stays as it is while that is so.
         """
-        around, before = bounds(scene), self._horizon if self._scene == scene.ptr else None
-        if before is not None and before.holds(scene.bbox()) and before.radius < TOO_LARGE * around.radius:
+        sphere, before = scene.bbox().bounding_sphere(), self._horizon if self._scene == scene.ptr else None
+        if before is not None and before.holds(scene.bbox()) and before.radius < TOO_LARGE * sphere.radius:
             return before
-        if before is None:
-            self._horizon = around
-            tell(scene, scene)
-        else:
-            self._horizon = Horizon(around.center, MARGIN * around.radius)
+        x, y, z, radius = (float(value) for value in (*sphere.center, sphere.radius))
+        bounded = scene
+        if before is not None:
+            radius *= MARGIN
             # An emitter asks a scene for its bounds, and nothing else; this one has those that it is to know.
-            half = [self._horizon.radius / 3**0.5] * 3
-            corner = mi.ScalarTransform4f().translate(list(self._horizon.center)) @ mi.ScalarTransform4f().scale(half)
-            tell(scene, mi.load_dict({"type": "scene", "box": {"type": "cube", "to_world": corner}}))
-        self._scene = scene.ptr
+            corner = mi.ScalarTransform4f().translate([x, y, z]).scale(radius / 3**0.5)
+            bounded = mi.load_dict({"type": "scene", "box": {"type": "cube", "to_world": corner}})
+        self._scene, self._horizon = scene.ptr, Horizon((x, y, z), radius)
+        for emitter in scene.emitters():
+            if mi.has_flag(emitter.flags(), mi.EmitterFlags.Infinite):
+                emitter.set_scene(bounded)
         return self._horizon
-
-
-def bounds(scene: mi.Scene) -> Horizon:
-    """The smallest sphere around the box around all shapes."""
-    sphere = scene.bbox().bounding_sphere()
-    x, y, z = (float(value) for value in sphere.center)
-    return Horizon((x, y, z), float(sphere.radius))
-
-
-def tell(scene: mi.Scene, bounded: mi.Scene) -> None:
-    """Have the emitters of `scene` that are infinitely far away light what `bounded` has bounds around."""
-    for emitter in scene.emitters():
-        if mi.has_flag(emitter.flags(), mi.EmitterFlags.Infinite):
-            emitter.set_scene(bounded)
 
 
 @dataclass(frozen=True)
 class Motion:
-    """A motion of `items` about the point `pivot`; `names` are those of its values, by word."""
+    """A motion about the point `pivot`; `names` are those of its values, by word."""
 
-    items: tuple[Movable, ...]
     pivot: Sequence[float]
     names: Mapping[str, str]
 
@@ -245,9 +210,8 @@ class Motion:
         """M, or, not `scaled`, its rotation alone."""
         transform = mi.AffineTransform4f
         pivot = mi.Vector3f(self.pivot)
-        result = transform().translate(pivot) if scaled else transform()
-        if scaled and "translation" in self.names:
-            result = transform().translate(pivot + values[self.names["translation"]])
+        moved = values[self.names["translation"]] if "translation" in self.names else 0
+        result = transform().translate(pivot + moved) if scaled else transform()
         if "rotation" in self.names:
             angles = values[self.names["rotation"]]
             for axis in (2, 1, 0):
@@ -257,33 +221,17 @@ class Motion:
         return result @ transform().translate(-pivot) if scaled else result
 
 
-@dataclass(frozen=True)
-class Heightmap:
-    """A displacement of meshes, `items`, by the texture `name`, (height, width, 1)."""
-
-    items: tuple[Movable, ...]
-    name: str
-
-
-def identity(word: str, resolution: tuple[int, int] | None = None) -> Any:
-    """The value of a motion's word, or of a heightmap of (width, height) texels, that moves nothing."""
-    if word == HEIGHTMAP:
-        assert resolution is not None, "a heightmap has one"
-        value = dr.zeros(mi.TensorXf, (resolution[1], resolution[0], 1))
-    else:
-        value = mi.Float(1) if word == "scale" else mi.Vector3f(0)
-    dr.make_opaque(value)
-    return value
-
-
 @dataclass
 class _Moved:
-    """One scene parameter that is a function: where it began, what moves it, and its value with and without graph."""
+    """One scene parameter that is a function: where it began, what moves it, and its value with and without graph.
+
+    `heightmap` is the name of the texture, (height, width, 1), that displaces a mesh along its own `normals`.
+    """
 
     item: Movable
     base: Any
     motion: Motion | None = None
-    heightmap: Heightmap | None = None
+    heightmap: str | None = None
     normals: Any = None
     texcoords: Any = None
     tracked: Any = None
@@ -324,28 +272,24 @@ class Deformation:
                    ) -> None:  # fmt: skip
         """Move `items`, none of which has a motion yet, about `pivot`; None: the centre of their bounding box."""
         names = {word: f"{items[0].id}.{word}" for word in words}
-        motion = Motion(items, pivot or _centre(self.params, items), names)
+        motion = Motion(pivot or _centre(self.params, items), names)
         for item in items:
             self._place(item).motion = motion
         for word, name in names.items():
-            self.values[name] = identity(word)
+            self.values[name] = _opaque(mi.Float(1) if word == "scale" else mi.Vector3f(0))
             self.quantities[name] = {"translation": "length", "rotation": "degrees"}.get(word, word)
 
     def add_heightmap(self, items: tuple[Movable, ...], resolution: tuple[int, int]) -> None:
         """Displace the meshes `items`, none of which has a heightmap yet."""
-        heightmap = Heightmap(items, f"{items[0].id}.{HEIGHTMAP}")
+        name = f"{items[0].id}.{HEIGHTMAP}"
         for item in items:
             moved, mesh = self._place(item), item.node
-            moved.heightmap = heightmap
+            moved.heightmap = name
             sign = -1.0 if mesh.has_flipped_normals() else 1.0
             moved.normals = _opaque(sign * _vertex_normals(mesh))
             moved.texcoords = _opaque(dr.unravel(mi.Point2f, mesh.vertex_texcoords_buffer()))
-        self.values[heightmap.name] = identity(HEIGHTMAP, resolution)
-        self.quantities[heightmap.name] = "length"
-
-    def moves(self, key: str) -> bool:
-        """Whether the scene parameter `key` is a function already."""
-        return key in self._moved
+        self.values[name] = _opaque(dr.zeros(mi.TensorXf, (*resolution[::-1], 1)))
+        self.quantities[name] = "length"
 
     def place(self) -> list[Any]:
         """Give the scene what follows from the values; `params.update()` has to follow. Returns what to evaluate."""
@@ -359,7 +303,7 @@ class Deformation:
 
     def collect(self) -> None:
         """Add the gradient that steps left at the scene's parameters to that of the values, and clear it there."""
-        tracked = [moved for moved in self._moved.values() if moved.leaf is not None and dr.grad_enabled(moved.leaf)]
+        tracked = self._tracked()
         for moved in tracked:
             dr.set_grad(moved.tracked, dr.grad(moved.leaf))
             dr.clear_grad(moved.leaf)
@@ -370,26 +314,27 @@ class Deformation:
 
     def push(self) -> None:
         """Give the scene's parameters, and what follows from them, the tangents that have reached what they are."""
-        tracked = [moved for moved in self._moved.values() if moved.leaf is not None and dr.grad_enabled(moved.leaf)]
+        tracked = self._tracked()
         for moved in tracked:
             dr.set_grad(moved.leaf, dr.grad(moved.tracked))
             dr.enqueue(dr.ADMode.Forward, moved.leaf)
         if tracked:
             dr.traverse(dr.ADMode.Forward, dr.ADFlag.ClearEdges)
 
+    def _tracked(self) -> list[_Moved]:
+        return [moved for moved in self._moved.values() if moved.leaf is not None and dr.grad_enabled(moved.leaf)]
+
     def _place(self, item: Movable) -> _Moved:
         if item.key not in self._moved:
             value = dr.detach(self.params[item.key])
-            kind: Any = type(value)
-            if item.by_vertices:
-                value, kind = dr.unravel(mi.Point3f, value), mi.Point3f
-            self._moved[item.key] = _Moved(item, _opaque(kind(value)))
+            value = dr.unravel(mi.Point3f, value) if item.by_vertices else type(value)(value)
+            self._moved[item.key] = _Moved(item, _opaque(value))
         return self._moved[item.key]
 
     def _function(self, moved: _Moved) -> Any:
         item, motion, base = moved.item, moved.motion, moved.base
         if moved.heightmap is not None:
-            base = base + moved.normals * self._heights(moved)
+            base = base + moved.normals * self._heights(moved, self.values[moved.heightmap])
         if motion is None:
             return dr.ravel(base)
         if item.by_vertices:
@@ -397,15 +342,12 @@ class Deformation:
         if item.is_point or item.is_shape:
             return motion.matrix(self.values) @ base
         # An emitter's frame has no scale: its place moves, and its directions turn.
-        to, turned = mi.AffineTransform4f, motion.matrix(self.values, scaled=False)
-        place = base @ mi.Point3f(0)
-        there = motion.matrix(self.values) @ place
+        to, place = mi.AffineTransform4f, base @ mi.Point3f(0)
+        there, turned = motion.matrix(self.values) @ place, motion.matrix(self.values, scaled=False)
         return to().translate(there) @ turned @ to().translate(-place) @ base
 
-    def _heights(self, moved: _Moved) -> mi.Float:
+    def _heights(self, moved: _Moved, values: mi.TensorXf) -> mi.Float:
         """h at each vertex, bilinear between the centres of the texels."""
-        assert moved.heightmap is not None
-        values = self.values[moved.heightmap.name]
         height, width = values.shape[:2]
         place = (moved.item.key, width, height)
         if place not in self._corners:
@@ -419,14 +361,13 @@ class _Lookup(dr.CustomOp):
 
     def eval(self, buffer: mi.Float, indices: list[mi.UInt32], weights: list[mi.Float]) -> mi.Float:
         self.indices, self.weights, self.size = indices, weights, dr.width(buffer)
-        return sum(
-            (w * dr.gather(mi.Float, buffer, i) for i, w in zip(indices, weights, strict=True)), start=mi.Float(0)
-        )
+        return self._sum(buffer)
+
+    def _sum(self, buffer: mi.Float) -> mi.Float:
+        return sum(w * dr.gather(mi.Float, buffer, i) for i, w in zip(self.indices, self.weights, strict=True))
 
     def forward(self) -> None:
-        tangent = self.grad_in("buffer")
-        total = sum(w * dr.gather(mi.Float, tangent, i) for i, w in zip(self.indices, self.weights, strict=True))
-        self.set_grad_out(total)
+        self.set_grad_out(self._sum(self.grad_in("buffer")))
 
     def backward(self) -> None:
         gradient, total = self.grad_out(), dr.zeros(mi.Float, self.size)
@@ -444,11 +385,8 @@ def _vertex_normals(mesh: mi.Mesh) -> mi.Normal3f:
     """The normals of a mesh's vertices: its own, or, of one without, those of the faces about each, by area."""
     if mesh.has_vertex_normals():
         return dr.normalize(dr.unravel(mi.Normal3f, mesh.vertex_normals_buffer()))
-    positions = np.array(mesh.vertex_positions_buffer(), dtype=np.float64).reshape(-1, 3)
     faces = np.array(mesh.faces_buffer()).reshape(-1, 3)
-    a, b, c = (positions[faces[:, k]] for k in range(3))
-    areas = np.cross(b - a, c - a)
-    total = np.zeros_like(positions)
+    areas, total = face_normals(triangles(mesh)), np.zeros((mesh.vertex_count(), 3))
     for k in range(3):
         np.add.at(total, faces[:, k], areas)
     total /= np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-30)
@@ -457,15 +395,13 @@ def _vertex_normals(mesh: mi.Mesh) -> mi.Normal3f:
 
 def _centre(params: mi.SceneParameters, items: tuple[Movable, ...]) -> tuple[float, float, float]:
     """The centre of the bounding box of `items`; emitters without a surface are points."""
-    corners = []
+    corners: list[np.ndarray] = []
     for item in items:
         if item.is_shape:
-            box = item.node.bbox()
-            corners += [np.array(box.min, float), np.array(box.max, float)]
+            corners += bounds(item.node)
         elif item.node.class_name() != "DirectionalEmitter":  # which is nowhere
             value = params[item.key]
-            point = value if item.is_point else value @ mi.Point3f(0)
-            corners.append(np.array(point, float).reshape(3))
+            corners.append(np.ravel(value if item.is_point else value @ mi.Point3f(0)).astype(np.float64))
     if not corners:
         return 0.0, 0.0, 0.0
     x, y, z = (np.min(corners, axis=0) + np.max(corners, axis=0)) / 2

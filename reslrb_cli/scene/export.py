@@ -1,21 +1,17 @@
 """The export of a scene, with the values that its parameters have, into a new folder.
 
-- Values as elements of a scene description.
-- A mesh as it stands in a loaded scene, as a PLY file in place of what its element names.
-- `Parts`, the files beside the exported scene: those that it refers to, copied, and those that hold recovered values.
-- `Replacing` puts the values that a scene's parameters have into the description that the scene was built from.
-- `export_scene` does all of it, and checks that Mitsuba reads the same values back.
+The values that a scene's parameters have are put into the description that the scene was built from, meshes and images
+in files beside it; what other files it names are copied. In the end Mitsuba has to read the same values back.
 """
 
 from __future__ import annotations
 
+import functools
 import os
 import re
 import shutil
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
-from typing import Any
 
 import mitsuba as mi
 import numpy as np
@@ -24,29 +20,18 @@ from reslrb_cli.backend.installation import looking_in
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.records.atomic import unfinished_folder
 from reslrb_cli.records.images import file_stem, write_file
-from reslrb_cli.scene.catalog import parameter_kind
-from reslrb_cli.scene.values import Slot
+from reslrb_cli.scene.catalog import as_numbers, parameter_kind
+from reslrb_cli.scene.values import ParameterValue
 from reslrb_cli.scene.xml.build import Owners
 from reslrb_cli.scene.xml.read import Description, Element, tag_lines
 
 Array = np.ndarray[tuple[int, ...], np.dtype[np.float32]]
 
 
-def child(owner: Element, tag: str, **attributes: str) -> Element:
-    """A new element with these attributes, `type_` for `type`, which is not among the children of `owner` yet."""
-    return Element(tag, {key.rstrip("_"): value for key, value in attributes.items()}, owner.source, owner.line)
-
-
 def replace(owner: Element, new: Element, *instead_of: str) -> None:
     """Put `new` among the children of `owner`, in place of those of its name and of the names in `instead_of`."""
-    gone = {new.name, *instead_of}
-    owner.children[:] = [other for other in owner.children if other.name not in gone]
+    owner.drop(new.name, *instead_of)
     owner.children.insert(0, new)
-
-
-def remove(owner: Element, names: set[str]) -> None:
-    """Remove the parameters of these names."""
-    owner.children[:] = [other for other in owner.children if other.name not in names]
 
 
 def numbers(values: Array) -> str:
@@ -56,146 +41,36 @@ def numbers(values: Array) -> str:
 
 def number(owner: Element, name: str, value: float) -> Element:
     """A number, or a spectrum that is the same at all wavelengths."""
-    return child(owner, "float", name=name, value=numbers(np.array(value, dtype=np.float32)))
+    return owner.new("float", name=name, value=numbers(np.array(value, dtype=np.float32)))
 
 
 def colour(owner: Element, name: str, value: Array, bounded: bool) -> Element:
     """A colour (3,), or a grey of one number; where it is `bounded`, Mitsuba's <rgb> has values from 0 to 1 only."""
     if value.size == 1:
         return number(owner, name, float(value.ravel()[0]))
-    rgb = child(owner, "rgb", name=name, value=numbers(value))
     if not bounded or bool(((value >= 0) & (value <= 1)).all()):
-        return rgb
-    rgb.attributes["name"] = "color"
-    whole = child(owner, "texture", type_="srgb", name=name)
-    whole.children += [rgb, child(owner, "boolean", name="unbounded", value="true")]
-    return whole
-
-
-def transform(owner: Element, name: str, value: mi.AffineTransform4f) -> Element:
-    """A transform by its 4x4 matrix."""
-    whole = child(owner, "transform", name=name)
-    matrix = np.array(value.matrix, dtype=np.float32).reshape(4, 4)
-    whole.children.append(child(owner, "matrix", value=numbers(matrix)))
-    return whole
+        return owner.new("rgb", name=name, value=numbers(value))
+    rgb = owner.new("rgb", name="color", value=numbers(value))
+    return owner.new("texture", rgb, owner.new("boolean", name="unbounded", value="true"), type="srgb", name=name)
 
 
 def triple(owner: Element, tag: str, name: str, value: Array) -> Element:
     """Three numbers: a <point> or a <vector>, by `tag`."""
-    x, y, z = (numbers(value.reshape(3)[k : k + 1]) for k in range(3))
-    return child(owner, tag, name=name, x=x, y=y, z=z)
-
-
-#: Parameters of a mesh that a PLY file does not hold.
-_KEPT = ("face_normals", "flip_normals")
-
-
-def put_mesh(owner: Element, mesh: mi.Mesh, parts: Parts, key: str) -> None:
-    """Have the element of `mesh`, which has the parameter `key`, name a file that holds the mesh.
-
-    That has vertices as they stand in the world, faces and attributes.
-    """
-    owner.children[:] = [item for item in owner.children if not item.is_value or item.name in _KEPT]
-    owner.attributes["type"] = "ply"
-    parts.add(owner, file_stem(key.rpartition(".")[0]), ".ply", lambda path: mesh.write_ply(str(path)))
+    x, y, z = numbers(value).split()
+    return owner.new(tag, name=name, x=x, y=y, z=z)
 
 
 #: The exported scene, in its folder.
 SCENE = "scene.xml"
-
-
 #: Folders beside it: of recovered values, and of files from elsewhere than the scene's own folder.
 RECOVERED, ELSEWHERE = "recovered", "assets"
-
-
-@dataclass
-class Parts:
-    """Files by their path in the exported folder, with `/`, and who writes each into a path that is new."""
-
-    writers: dict[str, Callable[[Path], object]] = field(default_factory=dict)
-    _copies: dict[Path, str] = field(default_factory=dict)
-    _made: set[Element] = field(default_factory=set)
-
-    def add(self, owner: Element, stem: str, suffix: str, write: Callable[[Path], object]) -> None:
-        """Have `owner` name a file of recovered values in place of the one that it names."""
-        name = f"{RECOVERED}/{stem}{suffix}"
-        self.writers[name] = write
-        element = child(owner, "string", name="filename", value=name)
-        self._made.add(element)
-        replace(owner, element)
-
-    def copy_assets(self, description: Description) -> None:
-        """Have every file that elements name copied, and named by where its copy is.
-
-        A file in the folder of the scene keeps its path relative to that, any other goes to a folder of its own.
-        """
-        own = {name.casefold() for name in (SCENE, *self.writers)}
-        home = description.root.source.file.absolute().parent
-        for element in description.root.walk():
-            attribute = _file_attribute(element)
-            if attribute is None or element in self._made:
-                continue
-            source = _found(element.attributes[attribute], description.folders)
-            if source is not None:
-                if source not in self._copies:
-                    self._copies[source] = _free(_wanted(source, home), own)
-                    own.add(self._copies[source].casefold())
-                element.attributes[attribute] = self._copies[source]
-        for source, name in self._copies.items():
-            self.writers[name] = _copier(source)
-
-    def write(self, folder: Path) -> None:
-        """Write all files into `folder`, which has none of them. Raises OSError."""
-        for name, write in self.writers.items():
-            path = folder / name
-            path.parent.mkdir(parents=True, exist_ok=True)
-            write(path)
-
-
-def _copier(source: Path) -> Callable[[Path], object]:
-    return lambda path: shutil.copyfile(source, path)
-
-
-def _file_attribute(element: Element) -> str | None:
-    """The attribute of an element that names a file; None of one that names none."""
-    if element.tag == "spectrum" and "filename" in element.attributes:
-        return "filename"
-    return (
-        "value" if element.tag == "string" and element.name == "filename" and element.attributes.get("value") else None
-    )
-
-
-def _found(name: str, folders: list[Path]) -> Path | None:
-    """The file that Mitsuba opens by this name; None where there is none."""
-    candidates = [folder / name for folder in folders] + [Path(name).absolute()]
-    return next((path.resolve() for path in candidates if path.is_file()), None)
-
-
-def _wanted(source: Path, home: Path) -> str:
-    if source.is_relative_to(home.resolve()):
-        return str(PurePosixPath(*source.relative_to(home.resolve()).parts))
-    return f"{ELSEWHERE}/{source.name}"
-
-
-def _free(wanted: str, taken: set[str]) -> str:
-    """`wanted`, or with a number before its suffix where that is taken, by whatever case it is written in."""
-    path, name, number = PurePosixPath(wanted), wanted, 1
-    while name.casefold() in taken:
-        number += 1
-        name = str(path.with_name(f"{path.stem}-{number}{path.suffix}"))
-    return name
-
-
+#: Parameters of a mesh that a PLY file does not hold.
+_KEPT = ("face_normals", "flip_normals")
 #: What gives a place in another way than `to_world`, by tag.
-_OTHER_PLACES = {
-    "shape": ("center", "radius", "p0", "p1"),
-    "emitter": ("direction", "position"),
-}
-
+_OTHER_PLACES = {"shape": ("center", "radius", "p0", "p1"), "emitter": ("direction", "position")}
 
 #: BSDFs whose `eta` is that of the inside over that of the outside.
 _RELATIVE_INDEX = ("dielectric", "roughdielectric", "thindielectric", "plastic", "roughplastic")
-
 
 #: What Mitsuba leaves out of a `principled` BSDF for good where it begins at 0.
 LOBES = (
@@ -203,30 +78,38 @@ LOBES = (
     *("sheen", "sheen_tint", "spec_tint", "spec_trans"),
 )
 
-
 _CONDUCTORS = ("conductor", "roughconductor")
 
 
 class Replacing:
-    """The description of a scene, whose `params` have the values that it is to get; `parts` are the files beside it."""
+    """The `description` of a scene, whose `params` have the values that it is to get.
 
-    def __init__(self, root: Element, params: mi.SceneParameters, parts: Parts, source: object) -> None:
-        self.params, self.parts, self.source = params, parts, source
-        self._owners = Owners(root)
+    `writers` are the files beside it by their path in the exported folder, with `/`: who writes each into a path that
+    is new. `source` is named in errors.
+    """
+
+    def __init__(self, description: Description, params: mi.SceneParameters, source: object) -> None:
+        self.description, self.params, self.source = description, params, source
+        self.writers: dict[str, Callable[[Path], object]] = {}
+        self._made: set[Element] = set()
+        self._owners = Owners(description.root)
 
     def put(self, key: str) -> None:
         """Put the value of the scene parameter `key` in. Raises ConfigError where the description cannot say it."""
         node = self.params.properties[key][2]
-        place = self._owners.place(self.params, key)
-        if place is None:
+        if (place := self._owners.place(self.params, key)) is None:
             raise self._fail(key, "what it belongs to does not stand in the scene's files")
         owner, (*below, name) = place
         if below:
             self._put_nested(owner, below, name, key)
         elif isinstance(node, mi.Mesh) and name != "to_world":
-            put_mesh(owner, node, self.parts, key)
+            # The file has vertices as they stand in the world, faces and attributes.
+            owner.children[:] = [item for item in owner.children if not item.is_value or item.name in _KEPT]
+            owner.attributes["type"] = "ply"
+            self._add_file(owner, file_stem(key.rpartition(".")[0]), ".ply", lambda path: node.write_ply(str(path)))
         elif name == "to_world":
-            replace(owner, transform(owner, name, self.params[key]), *_OTHER_PLACES.get(owner.tag, ()))
+            matrix = owner.new("matrix", value=numbers(np.array(self.params[key].matrix, dtype=np.float32)))
+            replace(owner, owner.new("transform", matrix, name=name), *_OTHER_PLACES.get(owner.tag, ()))
         elif name == "position":
             replace(owner, triple(owner, "point", name, self._array(key)), "to_world")
         elif name == "data":
@@ -243,22 +126,20 @@ class Replacing:
         if name == "value" and len(below) == 1:
             self._put_spectrum(owner, below[0], key)
         elif name == "value" and below[0] == "bsdf" and len(below) == 2 and owner.tag == "shape":
-            bsdf = child(owner, "bsdf", type_="diffuse")  # Mitsuba's own, where a shape has none
-            bsdf.children.append(colour(bsdf, below[1], self._array(key), bounded=True))
-            owner.children.append(bsdf)
+            # Mitsuba's own, where a shape has none.
+            reflectance = colour(owner, below[1], self._array(key), bounded=True)
+            owner.children.append(owner.new("bsdf", reflectance, type="diffuse"))
         else:
             raise self._fail(key, "what it belongs to does not stand in the scene's files")
 
-    def _put_number(self, owner: Element, name: str, value: Any, key: str) -> None:
+    def _put_number(self, owner: Element, name: str, value: Array, key: str) -> None:
         if value.size != 1:
             raise self._fail(key, f"{owner.type} has no way to be given {value.size} numbers as its {name}")
         if name == "eta" and owner.type in _RELATIVE_INDEX:
             replace(owner, number(owner, "ext_ior", 1.0))
-            replace(owner, number(owner, "int_ior", float(value)))
-        elif owner.type == "principled" and name in ("eta", "specular"):
-            replace(owner, number(owner, name, float(value)), "eta", "specular")
-        else:
-            replace(owner, number(owner, name, float(value)))
+            name = "int_ior"
+        is_either = owner.type == "principled" and name in ("eta", "specular")
+        replace(owner, number(owner, name, float(value)), *(("eta", "specular") if is_either else ()))
 
     def _put_spectrum(self, owner: Element, name: str, key: str) -> None:
         if owner.type == "spot" and name == "texture":
@@ -270,31 +151,72 @@ class Replacing:
                 replace(owner, colour(owner, each, self._array(f"{stem}.{each}.value"), bounded=False), "material")
             return
         if owner.type in ("principled", "principledthin") and name in LOBES and self._array(key).any():
-            given = next((item for item in owner.children if item.name == name), None)
-            if given is None or (given.tag == "float" and float(given.attributes["value"]) == 0):
+            given = owner.find(name)
+            if given is None or (given.tag == "float" and float(given.value) == 0):
                 why = f"a {owner.type} has no such lobe where its file has no {name}, or 0, and so it had no effect"
                 raise self._fail(key, why)
-        bounded = parameter_kind(self.params, key) == "bsdf"
-        replace(owner, colour(owner, name, self._array(key), bounded))
+        replace(owner, colour(owner, name, self._array(key), bounded=parameter_kind(self.params, key) == "bsdf"))
 
     def _put_image(self, owner: Element, key: str) -> None:
         image = self._array(key)
-        self.parts.add(owner, file_stem(key), ".exr", lambda path: write_file(path, image, linear=True))
+        self._add_file(owner, file_stem(key), ".exr", lambda path: write_file(path, image, linear=True))
         if owner.tag == "texture":
             # Its values are linear as they stand, in a file of floats, and not to be rounded to fewer bits.
-            replace(owner, child(owner, "string", name="format", value="variant"))
-            remove(owner, {"color_space", "gamma"})
+            replace(owner, owner.new("string", name="format", value="variant"), "color_space", "gamma")
 
-    def _array(self, key: str) -> Any:
-        return Slot(self.params, key).get()
+    def _array(self, key: str) -> Array:
+        return ParameterValue(self.params, key).get()
 
     def _fail(self, key: str, why: str) -> ConfigError:
         return ConfigError(self.source, key, f"cannot be exported: {why}")
 
+    def _add_file(self, owner: Element, stem: str, suffix: str, write: Callable[[Path], object]) -> None:
+        """Have `owner` name a file of recovered values in place of the one that it names."""
+        name = f"{RECOVERED}/{stem}{suffix}"
+        self.writers[name] = write
+        element = owner.new("string", name="filename", value=name)
+        self._made.add(element)
+        replace(owner, element)
 
-def same_values(a: Any, b: Any) -> bool:
+    def copy_assets(self) -> None:
+        """Have every file that elements name copied, and named by where its copy is.
+
+        A file in the folder of the scene keeps its path relative to that, any other goes to a folder of its own.
+        """
+        own = {name.casefold() for name in (SCENE, *self.writers)}
+        home = self.description.root.source.file.absolute().parent.resolve()
+        copies: dict[Path, str] = {}
+        for element in self.description.root.walk("string", "spectrum"):
+            attribute = "filename" if element.tag == "spectrum" else "value"
+            name = element.attributes.get(attribute)
+            if not name or element in self._made or (element.tag == "string" and element.name != "filename"):
+                continue
+            path = self.description.find_file(name)
+            if path is not None and path.is_file():
+                source = path.resolve()
+                if source not in copies:
+                    copies[source] = _free(source, home, own)
+                    own.add(copies[source].casefold())
+                element.attributes[attribute] = copies[source]
+        for source, name in copies.items():
+            self.writers[name] = functools.partial(shutil.copyfile, source)
+
+
+def _free(source: Path, home: Path, taken: set[str]) -> str:
+    """The path of a copy of `source` in the exported folder, as it is below `home`, or in a folder for those that are
+    not; with a number before its suffix where that is taken, by whatever case it is written in."""
+    inside = source.is_relative_to(home)
+    path = PurePosixPath(*source.relative_to(home).parts) if inside else PurePosixPath(ELSEWHERE, source.name)
+    name, number = str(path), 1
+    while name.casefold() in taken:
+        number += 1
+        name = str(path.with_name(f"{path.stem}-{number}{path.suffix}"))
+    return name
+
+
+def same_values(a: object, b: object) -> bool:
     """Whether two values of a parameter agree but for rounding; a grey agrees with the same number in each channel."""
-    x, y = _numbers(a), _numbers(b)
+    x, y = as_numbers(a), as_numbers(b)
     if x is None or y is None:
         return x is y
     if x.shape != y.shape and 1 not in (x.size, y.size):
@@ -303,19 +225,8 @@ def same_values(a: Any, b: Any) -> bool:
     return bool(np.allclose(x, y, rtol=1e-5, atol=1e-6 * scale))
 
 
-def _numbers(value: Any) -> Any:
-    """A parameter's value as an array; None of what is no number."""
-    try:
-        array = np.array(value.matrix if "AffineTransform" in type(value).__name__ else value)
-    except (RuntimeError, TypeError):
-        return None
-    return array.astype(np.float64) if array.dtype.kind in "buif" else None
-
-
 #: What of a scene is no part of what it looks like.
 _ASIDE = ("silhouette_sampling_weight", "sampling_weight")
-
-
 #: How Mitsuba names what has lost its id, as bitmaps do that nothing uses: by where it lies in memory.
 _ADDRESS = re.compile(r"object_\d+\.")
 
@@ -334,30 +245,27 @@ def export_scene(
     options. The folder appears once it is whole, and Mitsuba has read the same values back from it. Raises ConfigError,
     located in `source` and the key, where a value cannot be said, and OSError.
     """
-    parts = Parts()
-    replacing = Replacing(description.root, params, parts, source)
+    replacing, root = Replacing(description, params, source), description.root
     for key in keys:
         replacing.put(key)
-    parts.copy_assets(description)
-    _put_integrator(description, integrator)
-    lines = ["<!-- Written by `reslrb export`. -->", *(line for line, _ in tag_lines(description.root)), ""]
-    parts.writers[SCENE] = lambda path: path.write_text("\n".join(lines), encoding="utf-8")
+    replacing.copy_assets()
+    options = [
+        root.new({bool: "boolean", int: "integer"}.get(type(value), "float"), name=name, value=str(value).lower())
+        for name, value in integrator.items()
+        if name != "type"
+    ]
+    root.children.insert(0, root.new("integrator", *options, type=str(integrator["type"])))
+    lines = ["<!-- Written by `reslrb export`. -->", *(line for line, _ in tag_lines(root)), ""]
+    replacing.writers[SCENE] = lambda path: path.write_text("\n".join(lines), encoding="utf-8")
     folder = folder.absolute()
     folder.parent.mkdir(parents=True, exist_ok=True)
     with unfinished_folder(folder.parent) as part:
-        parts.write(part)
+        for name, write in replacing.writers.items():
+            path = part / name
+            path.parent.mkdir(parents=True, exist_ok=True)
+            write(path)
         _check(part, params, source)
         os.replace(part, folder)
-
-
-def _put_integrator(description: Description, integrator: Mapping[str, object]) -> None:
-    root = description.root
-    element = child(root, "integrator", type_=str(integrator["type"]))
-    for name, value in integrator.items():
-        if name != "type":
-            tag = {bool: "boolean", int: "integer"}.get(type(value), "float")
-            element.children.append(child(root, tag, name=name, value=str(value).lower()))
-    root.children.insert(0, element)
 
 
 def _check(folder: Path, params: mi.SceneParameters, source: object) -> None:
@@ -368,9 +276,8 @@ def _check(folder: Path, params: mi.SceneParameters, source: object) -> None:
         except Exception as error:
             raise ConfigError(source, "", f"cannot be exported: Mitsuba does not read it back ({error})") from None
     for key in params.properties:
-        if key.rpartition(".")[2] in _ASIDE or key.startswith("integrator."):
-            continue
-        if params.properties[key][0] is None:  # what the files do not give, and Mitsuba does not hand out
+        is_given = params.properties[key][0] is not None  # by the files; Mitsuba does not hand out what is not
+        if not is_given or key.rpartition(".")[2] in _ASIDE or key.startswith("integrator."):
             continue
         if key not in found.properties and not _ADDRESS.match(key):
             raise ConfigError(source, key, "cannot be exported: Mitsuba does not find it in what was written")

@@ -1,10 +1,4 @@
-"""The place and size of a scene and its parts, where single precision or a sensor's clip planes lose light by them.
-
-- `lost_light`: a scene far from the origin, or tiny.
-- `clipped`: parts before a sensor's near clip plane or beyond its far one.
-- `coincident`: different faces at the same place.
-- `thin_glass`: glass so thin that rays, which start off the surface that they leave, jump over its other side.
-"""
+"""The place and size of a scene and its parts, where single precision or a sensor's clip planes lose light by them."""
 
 from __future__ import annotations
 
@@ -18,34 +12,32 @@ import mitsuba as mi
 import numpy as np
 
 from reslrb_cli.errors import UnsupportedScene
-from reslrb_cli.scene.graph import SceneGraph, emitted_rays
+from reslrb_cli.scene.graph import SceneGraph, bent_faces, bounds, emitted_rays, face_normals, grid, triangles
 from reslrb_cli.scene.xml.read import quoted
 
 #: The largest ray offset, as a fraction of the scene's size, with which no loss of light is to be seen: that of a room
 #: of size 3 that stands about 150 from the origin, or measures a fiftieth across.
 LARGEST_OFFSET = 5e-3
-
-
 #: Rays from each sensor, and from the lights, that look for faces at the same place, along each side of a grid.
 _RAYS = 128
-
-
 #: Sensors that do.
 _SENSORS = 8
-
-
 #: Pairs of shapes that are named.
 _NAMED = 2
 
 
-def lost_light(scene: Any) -> str | None:
+def doubts(scene: Any) -> list[str]:
+    """What is wrong with the place or the size of a scene or its parts, in words."""
+    return [loss for loss in (_lost_light(scene), _thin_glass(scene), _coincident(scene)) if loss is not None]
+
+
+def _lost_light(scene: Any) -> str | None:
     """What is wrong with a scene that is far from the origin, or tiny, and what to do; None where nothing is.
 
     Mitsuba starts rays off their surface by RayEpsilon (1 + max |p|), in the scene's units, so that they jump over what
     is nearer: light is lost in corners, in all integrators.
     """
-    box = scene.bbox()
-    low, high = np.array(box.min, float), np.array(box.max, float)
+    low, high = bounds(scene)
     size = float(np.linalg.norm(high - low))
     reach = float(np.maximum(np.abs(low), np.abs(high)).max())
     offset = mi.math.RayEpsilon * (1 + reach)
@@ -72,8 +64,7 @@ def clipped(scene: Any, sensor: Any) -> tuple[bool, bool]:
     )
     to_world = np.array(sensor.world_transform().matrix, np.float64).reshape(4, 4)
     axes, eye = to_world[:3, :3], to_world[:3, 3]
-    box = scene.bbox()
-    corners = np.array(list(product(*zip(np.ravel(box.min), np.ravel(box.max), strict=True))), np.float64)
+    corners = np.array(list(product(*zip(*bounds(scene), strict=True))))
     beyond = bool(((corners - eye) @ axes[:, 2]).max() > far)
 
     # The box, in the sensor's coordinates, around all that may be between the aperture and the near plane.
@@ -88,26 +79,23 @@ def clipped(scene: Any, sensor: Any) -> tuple[bool, bool]:
 def _touches(shape: Any, axes: np.ndarray, eye: np.ndarray, middle: np.ndarray, half: np.ndarray) -> bool:
     """Whether a shape may touch a box, given by its middle and half sizes in the coordinates of `axes` (columns) and
     `eye`."""
-    box = shape.bbox()
-    low, high = np.ravel(box.min).astype(np.float64), np.ravel(box.max).astype(np.float64)
+    low, high = bounds(shape)
     centre, extent = (low + high) / 2, (high - low) / 2
     apart = centre - (eye + axes @ middle)
-    if (np.abs(apart) > extent + np.abs(axes) @ half).any() or (
-        np.abs(apart @ axes) > half + extent @ np.abs(axes)
-    ).any():
+    beside = (np.abs(apart) > extent + np.abs(axes) @ half) | (np.abs(apart @ axes) > half + extent @ np.abs(axes))
+    if beside.any():
         return False
     if shape.class_name() == "Sphere":  # which a sensor may stand in
         return bool(np.linalg.norm(apart) + np.linalg.norm(half) > extent.min() * 0.999)
     if not shape.is_mesh():
         return True
-    positions = np.array(shape.vertex_positions_buffer(), np.float64).reshape(-1, 3)
-    corners = ((positions - eye) @ axes - middle)[np.array(shape.faces_buffer()).reshape(-1, 3)]
+    corners = (triangles(shape) - eye) @ axes - middle
     corners = corners[((corners.min(1) <= half) & (corners.max(1) >= -half)).all(1)]
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals = face_normals(corners)
     return bool((np.abs((normals * corners[:, 0]).sum(1)) <= np.abs(normals) @ half).any())
 
 
-def coincident(scene: Any) -> str | None:
+def _coincident(scene: Any) -> str | None:
     """What is wrong with a scene in which a sensor or a light meets two faces at the same place; None where nothing is.
 
     Which of them a ray meets is decided by rounding. That makes no difference where both face the same way, or both
@@ -137,57 +125,39 @@ _Twins = dict[tuple[int, int], tuple[int, int]]
 
 def _twin_faces(shapes: Sequence[Any]) -> _Twins:
     """The triangles of meshes that are where others are, and differ."""
-    meshes = [(index, shape) for index, shape in enumerate(shapes) if shape.is_mesh() and shape.face_count()]
+    meshes = [index for index, shape in enumerate(shapes) if shape.is_mesh() and shape.face_count()]
     if not meshes:
         return {}
-    corners = [
-        np.array(shape.vertex_positions_buffer(), np.float32).reshape(-1, 3)[
-            np.array(shape.faces_buffer()).reshape(-1, 3)
-        ]
-        for _, shape in meshes
-    ]
-    owner = np.concatenate([np.full(len(part), index) for (index, _), part in zip(meshes, corners, strict=True)])
+    corners = [triangles(shapes[index]).astype(np.float32) for index in meshes]
+    owner = np.repeat(meshes, [len(part) for part in corners])
     number = np.concatenate([np.arange(len(part)) for part in corners])
-    triangles = np.concatenate(corners) + np.float32(0)  # -0 is 0
+    faces = np.concatenate(corners) + np.float32(0)  # -0 is 0
     # Hashes of corners, summed over them: equal in any order.
     factors = np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], np.uint64)
-    hashes = (triangles.view(np.uint32) * factors).sum(2, dtype=np.uint64)
+    hashes = (faces.view(np.uint32) * factors).sum(2, dtype=np.uint64)
     hashes = (hashes ^ (hashes >> np.uint64(29))) * np.uint64(0xBF58476D1CE4E5B9)
     keys = (hashes ^ (hashes >> np.uint64(32))).sum(1, dtype=np.uint64)
     order = np.argsort(keys)
     same = np.flatnonzero(keys[order[1:]] == keys[order[:-1]])
     first, second = order[same], order[same + 1]
-    a, b = triangles[first].astype(np.float64), triangles[second].astype(np.float64)
-    facing = (_normals(a) * _normals(b)).sum(1)
+    a, b = faces[first].astype(np.float64), faces[second].astype(np.float64)
+    facing = (face_normals(a) * face_normals(b)).sum(1)
     flipped = np.array([shape.has_flipped_normals() for shape in shapes])
     same = np.flatnonzero((np.sort(a, 1) == np.sort(b, 1)).all((1, 2)) & (facing != 0))
     first, second = first[same], second[same]
     turned = (facing[same] < 0) ^ (flipped[owner[first]] != flipped[owner[second]])
-    concerned = np.union1d(owner[first], owner[second]).tolist()
-    bends = np.zeros(len(number), bool)
-    for index in concerned:
-        bends[owner == index] = _bent(shapes[index])
+    bends = np.zeros(len(number), bool)  # shading normals differ from the geometric one
+    for index in np.union1d(owner[first], owner[second]).tolist():
+        bends[owner == index] = bent_faces(shapes[index], 0.999)
     kinds = np.stack([owner[first], owner[second], turned, bends[first] | bends[second]], 1)
     found: _Twins = {}
     for kind in np.unique(kinds, axis=0):
         one, other = sorted(kind[:2].tolist())
         if _differ(shapes[one], shapes[other], bool(kind[2]), bool(kind[3])):
             these = (kinds == kind).all(1)
-            for faces in (first[these], second[these]):
-                keys_of = zip(owner[faces].tolist(), number[faces].tolist(), strict=True)
-                found |= dict.fromkeys(keys_of, (one, other))
+            both = np.concatenate([first[these], second[these]])
+            found |= dict.fromkeys(zip(owner[both].tolist(), number[both].tolist(), strict=True), (one, other))
     return found
-
-
-def _bent(mesh: Any) -> np.ndarray:
-    """Of each face, whether its shading normals differ from its geometric one."""
-    if mesh.has_face_normals() or not mesh.has_vertex_normals():
-        return np.zeros(mesh.face_count(), bool)
-    faces = np.array(mesh.faces_buffer()).reshape(-1, 3)
-    flat = _normals(np.array(mesh.vertex_positions_buffer(), np.float64).reshape(-1, 3)[faces])
-    shading = np.array(mesh.vertex_normals_buffer(), np.float64).reshape(-1, 3)[faces]
-    lengths = np.linalg.norm(flat, axis=1)[:, None] * np.linalg.norm(shading, axis=2)
-    return np.asarray(~((flat[:, None] * shading).sum(2) > 0.999 * lengths).all(1))
 
 
 def _twin_shapes(shapes: Sequence[Any]) -> _Twins:
@@ -197,9 +167,8 @@ def _twin_shapes(shapes: Sequence[Any]) -> _Twins:
     for index, shape in enumerate(shapes):
         if shape.class_name() not in ("Disk", "Sphere"):
             continue
-        box = shape.bbox()
-        size = np.array([*np.ravel(box.min), *np.ravel(box.max)], np.float32)
-        others = before.setdefault((shape.class_name(), size.tobytes()), [])
+        size = np.array(bounds(shape), np.float32).tobytes()
+        others = before.setdefault((shape.class_name(), size), [])
         for other in others:
             turned = shape.has_flipped_normals() != shapes[other].has_flipped_normals()
             if shape.class_name() == "Disk":
@@ -211,10 +180,6 @@ def _twin_shapes(shapes: Sequence[Any]) -> _Twins:
                 found |= {(index, 0): (other, index), (other, 0): (other, index)}
         others.append(index)
     return found
-
-
-def _normals(triangles: np.ndarray) -> np.ndarray:
-    return np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
 
 
 def _differ(one: Any, other: Any, turned: bool, bent: bool) -> bool:
@@ -229,8 +194,7 @@ def _differ(one: Any, other: Any, turned: bool, bent: bool) -> bool:
 
 def _met(scene: Any, shapes: Sequence[Any]) -> set[tuple[int, int]]:
     """The shapes and faces that rays meet first which leave sensors and lights."""
-    lane = dr.arange(mi.UInt32, _RAYS * _RAYS)
-    place = (mi.Point2f(lane % _RAYS, lane // _RAYS) + 0.5) / _RAYS
+    place, lane = grid(_RAYS), dr.arange(mi.UInt32, _RAYS**2)
     numbers = [mi.Float(mi.sample_tea_float32(lane, mi.UInt32(k))) for k in range(3)]
     rays = [
         sensor.sample_ray(sensor.shutter_open(), 0.5, place, mi.Point2f(*numbers[:2]))[0]
@@ -243,8 +207,7 @@ def _met(scene: Any, shapes: Sequence[Any]) -> set[tuple[int, int]]:
     for ray in rays:
         hit = scene.ray_intersect_preliminary(ray)
         shape = np.array(dr.select(hit.is_valid(), dr.reinterpret_array(mi.UInt32, hit.shape), 0))
-        pairs = np.unique(np.stack([shape, np.array(hit.prim_index)]), axis=1).T.tolist()
-        for number, face in pairs:
+        for number, face in np.unique(np.stack([shape, np.array(hit.prim_index)]), axis=1).T.tolist():
             if number in index:
                 met.add((index[number], face if shapes[index[number]].is_mesh() else 0))
     return met
@@ -252,21 +215,15 @@ def _met(scene: Any, shapes: Sequence[Any]) -> set[tuple[int, int]]:
 
 #: Rays start so many offsets before the next surface, at least, where nothing is said.
 LEAST_OFFSETS = 10
-
-
 #: Of the crossings that light meets, the share that may be nearer: at edges, and where it grazes a ball.
 SHARE = 0.01
-
-
 #: What rounding may put between the places where two rays meet one surface: in offsets, and of the longer ray's length.
 ROUNDING, FAR = 0.1, 1e-5
-
-
 #: Paths that are followed, and surfaces along each.
 _PATHS, _SURFACES = 4096, 8
 
 
-def thin_glass(scene: mi.Scene) -> str | None:
+def _thin_glass(scene: mi.Scene) -> str | None:
     """What is wrong with a scene in which light passes through two surfaces that nearly touch; None where nothing is.
 
     Rays from the lights go straight on through what lets light pass; what lies between two surfaces is measured from

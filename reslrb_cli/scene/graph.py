@@ -1,22 +1,17 @@
-"""The graph of a scene's objects, and its lamps: what there is, what uses what, and what emits.
-
-- `SceneGraph`: the objects and all parents of each.
-- `Lamp`: a shape that emits light, and what its emitter does.
-- `emitted_rays`: rays as the emitters of a scene send them out, where Mitsuba can sample them.
-- `small_lamps`: lamps in view that are smaller than a pixel, which rays through the pixels hardly ever hit.
-"""
+"""The graph of a scene's objects: what there is, what uses what, which lamps emit, and meshes as arrays."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from reslrb_cli.errors import UnsupportedScene
+from reslrb_cli.errors import UnsupportedScene, is_machine_fault
 
 
 @dataclass
@@ -28,6 +23,7 @@ class SceneGraph:
 
     objects: list[Any] = field(default_factory=list)
     parents: dict[Any, list[Any]] = field(default_factory=dict)
+    children: dict[Any, list[Any]] = field(default_factory=dict)
 
     @classmethod
     def of(cls, scene: Any) -> SceneGraph:
@@ -47,6 +43,7 @@ class SceneGraph:
             parent = waiting.pop()
             callback = Children()
             parent.traverse(callback)
+            graph.children[parent] = callback.found
             for child in callback.found:
                 if child not in graph.parents:
                     graph.objects.append(child)
@@ -63,30 +60,52 @@ class SceneGraph:
         """All shapes that rays can hit, also those inside of groups that are instanced."""
         return [shape for shape in self.of_type(mi.Shape) if shape.class_name() not in ("Instance", "ShapeGroupPlugin")]
 
+    def has_instances(self) -> bool:
+        """Whether there is an instance of a group of shapes."""
+        return any(item.class_name() == "Instance" for item in self.objects)
+
     def is_shown(self, shape: Any) -> bool:
         """Whether rays may meet a shape: it does not stand in a group alone, where nothing is instanced."""
-        grouped = all(parent.class_name() == "ShapeGroupPlugin" for parent in self.parents[shape])
-        return not grouped or any(item.class_name() == "Instance" for item in self.objects)
+        return self.has_instances() or any(item.class_name() != "ShapeGroupPlugin" for item in self.parents[shape])
+
+    def find_lamps(self, scene: mi.Scene) -> tuple[Lamp, ...]:
+        """All shapes of `scene` that emit, in the order of `scene.emitters()`."""
+        textures = self.of_type(mi.Texture)
+        found = []
+        for index, emitter in enumerate(scene.emitters()):
+            shape, parallel = emitter.get_shape(), emitter.class_name() == "DirectionalArea"
+            if shape is not None:
+                own = [texture for texture in textures if emitter in self.parents[texture]]
+                varying = [texture for texture in own if texture.is_spatially_varying()]
+                found.append(Lamp(shape, emitter, index, parallel, varying[0] if varying and not parallel else None))
+        return tuple(found)
 
     def surface_bsdfs(self) -> list[Any]:
         """The BSDFs that shapes have (not those nested in others), each once."""
-        found: dict[Any, None] = {}
-        for shape in self.shapes():
-            if shape.bsdf() is not None:
-                found[shape.bsdf()] = None
-        return list(found)
+        return list(dict.fromkeys(shape.bsdf() for shape in self.shapes() if shape.bsdf() is not None))
 
-    def owning_bsdfs(self, item: Any) -> list[Any]:
-        """The outermost BSDFs that use `item` (a texture, or a nested BSDF) at any depth."""
-        owners: dict[Any, None] = {}
+    def bsdfs_above(self, item: Any) -> list[Any]:
+        """The BSDFs that use `item` (a texture, or a BSDF, which is one of them) at any depth."""
+        found: dict[Any, None] = {}
         waiting = [item]
         while waiting:
             current = waiting.pop()
-            above = [p for p in self.parents.get(current, []) if isinstance(p, (mi.BSDF, mi.Texture))]
-            if isinstance(current, mi.BSDF) and len(above) < len(self.parents.get(current, [])):
-                owners[current] = None
-            waiting += above
-        return list(owners)
+            if isinstance(current, mi.BSDF):
+                found[current] = None
+            waiting += [parent for parent in self.parents.get(current, []) if isinstance(parent, (mi.BSDF, mi.Texture))]
+        return list(found)
+
+    def owning_bsdfs(self, item: Any) -> list[Any]:
+        """The outermost of them: those that something else than a BSDF or a texture has."""
+        found = ((bsdf, self.parents.get(bsdf, [])) for bsdf in self.bsdfs_above(item))
+        return [bsdf for bsdf, parents in found if not all(isinstance(p, (mi.BSDF, mi.Texture)) for p in parents)]
+
+    def nested_bsdfs(self, bsdf: Any) -> list[Any]:
+        """A BSDF and those nested in it."""
+        found = [bsdf]
+        for item in found:  # which grows meanwhile
+            found += [child for child in self.children[item] if isinstance(child, mi.BSDF) and child not in found]
+        return found
 
 
 @dataclass(frozen=True)
@@ -119,18 +138,10 @@ class Lamp:
         return self.shape.is_mesh() and self.shape.class_name() != "Rectangle"
 
 
-def find_lamps(scene: mi.Scene, graph: SceneGraph) -> tuple[Lamp, ...]:
-    """All shapes of `scene` that emit, in the order of `scene.emitters()`."""
-    found = []
-    for index, emitter in enumerate(scene.emitters()):
-        shape = emitter.get_shape()
-        if shape is None:
-            continue
-        parallel = emitter.class_name() == "DirectionalArea"
-        textures = [item for item in graph.of_type(mi.Texture) if emitter in graph.parents[item]]
-        varying = [texture for texture in textures if texture.is_spatially_varying()]
-        found.append(Lamp(shape, emitter, index, parallel, varying[0] if varying and not parallel else None))
-    return tuple(found)
+def grid(side: int) -> mi.Point2f:
+    """The centres of side^2 cells of the unit square, row by row."""
+    lane = dr.arange(mi.UInt32, side**2)
+    return (mi.Point2f(lane % side, lane // side) + 0.5) / side
 
 
 def emitted_rays(
@@ -146,30 +157,31 @@ def emitted_rays(
     except RuntimeError as error:
         if "not implemented" not in str(error):
             raise
-        names = ", ".join(emitter.id() for emitter in scene.emitters() if not _can_be_sampled(emitter))
+        half = mi.Point2f(0.5)
+        calls = {emitter.id(): partial(emitter.sample_ray, 0, 0.5, half, half, True) for emitter in scene.emitters()}
+        names = ", ".join(id for id, call in calls.items() if failure(call) is not None)
         reason = " ".join(str(error).split())
-        raise UnsupportedScene(
-            f"Mitsuba cannot sample the rays of emitter {names}: {reason}; give it a `bitmap`"
-        ) from None
+        problem = f"Mitsuba cannot sample the rays of emitter {names}: {reason}; give it a `bitmap`"
+        raise UnsupportedScene(problem) from None
     return ray, weight
 
 
-def _can_be_sampled(emitter: mi.Emitter) -> bool:
+def failure(call: Callable[[], object]) -> str | None:
+    """Mitsuba's reason, in one line, why it cannot do what `call` asks for; None where it can."""
     try:
-        emitter.sample_ray(0, 0.5, mi.Point2f(0.5), mi.Point2f(0.5), True)
-    except RuntimeError:
-        return False
-    return True
+        with dr.suspend_grad():
+            call()
+    except RuntimeError as error:
+        if is_machine_fault(error):
+            raise
+        return " ".join(str(error).split())
+    return None
 
 
 #: What a lamp's diameter on the film is below, in pixels.
 SMALL = 1.0
-
-
 #: Lamps, at the most: of those, light is told from all other by comparing each in turn.
 MOST = 64
-
-
 #: Points of a lamp along each side of a grid, by which it is found to be in view.
 POINTS = 16
 
@@ -187,10 +199,10 @@ def small_lamps(scene: mi.Scene, sensor: mi.Sensor, lamps: Iterable[Lamp]) -> tu
 
 def _pixels(sensor: mi.Sensor, shape: mi.Shape) -> float:
     """The diameter on the film, in pixels, of the sphere around the shape's bounding box, wherever the sensor looks."""
-    box = shape.bbox()
-    radius = float(np.linalg.norm(np.ravel(box.max) - np.ravel(box.min))) / 2
+    low, high = bounds(shape)
+    radius = float(np.linalg.norm(high - low)) / 2
     eye = np.ravel(sensor.world_transform().translation())
-    distance = float(np.linalg.norm((np.ravel(box.max) + np.ravel(box.min)) / 2 - eye))
+    distance = float(np.linalg.norm((high + low) / 2 - eye))
     if not distance > radius:
         return np.inf
     half = np.tan(np.deg2rad(float(mi.traverse(sensor)["x_fov"][0])) / 2)
@@ -199,10 +211,42 @@ def _pixels(sensor: mi.Sensor, shape: mi.Shape) -> float:
 
 def _is_in_view(scene: mi.Scene, sensor: mi.Sensor, shape: mi.Shape) -> bool:
     """Whether any of a grid of points on the shape is before the lens, with nothing in between."""
-    lane = dr.arange(mi.UInt32, POINTS**2)
-    sample = (mi.Point2f(lane % POINTS, lane // POINTS) + 0.5) / POINTS
     with dr.suspend_grad():
-        si = mi.SurfaceInteraction3f(shape.sample_position(sensor.shutter_open(), sample), mi.Color0f())
+        si = mi.SurfaceInteraction3f(shape.sample_position(sensor.shutter_open(), grid(POINTS)), mi.Color0f())
         ds, _ = sensor.sample_direction(si, mi.Point2f(0.5), True)
         seen = ds.pdf > 0
         return bool(dr.any(seen & ~scene.ray_test(si.spawn_ray_to(ds.p), seen)))
+
+
+def bounds(item: Any) -> tuple[np.ndarray, np.ndarray]:
+    """The least and the greatest corner of the bounding box of a shape or a scene, (3,) float64 each."""
+    box = item.bbox()
+    return np.ravel(box.min).astype(np.float64), np.ravel(box.max).astype(np.float64)
+
+
+def interpolates_normals(shape: mi.Shape) -> bool:
+    """Whether the shape is a mesh whose shading normals, as soon as it bends, differ from its geometric ones."""
+    return shape.is_mesh() and shape.has_vertex_normals() and not shape.has_face_normals()
+
+
+def triangles(mesh: mi.Mesh) -> np.ndarray:
+    """The corners of a mesh's faces, (F, 3, 3) float64."""
+    return _at_corners(mesh, mesh.vertex_positions_buffer())
+
+
+def face_normals(corners: np.ndarray) -> np.ndarray:
+    """Normals of triangles (F, 3, 3), (F, 3), of twice the length of their areas."""
+    return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+
+
+def bent_faces(mesh: mi.Mesh, cosine: float) -> np.ndarray:
+    """Of a mesh's faces, (F,), whether the normal of a vertex turns from that of the face, by less than this cosine."""
+    if not interpolates_normals(mesh):
+        return np.zeros(mesh.face_count(), bool)
+    flat, shading = face_normals(triangles(mesh))[:, None], _at_corners(mesh, mesh.vertex_normals_buffer())
+    lengths = np.linalg.norm(flat, axis=2) * np.linalg.norm(shading, axis=2)
+    return np.asarray(~((flat * shading).sum(2) > cosine * np.maximum(lengths, 1e-30)).all(1))
+
+
+def _at_corners(mesh: mi.Mesh, buffer: mi.Float) -> np.ndarray:
+    return np.array(buffer, np.float64).reshape(-1, 3)[np.array(mesh.faces_buffer()).reshape(-1, 3)]

@@ -26,28 +26,16 @@ from reslrb_cli.config.files import IMAGE_BYTES, PIXELS, open_file
 from reslrb_cli.errors import ConfigError, is_out_of_memory
 
 logger = logging.getLogger(__name__)
-
-
 FORMATS = "EXR, PNG, JPG, HDR, PFM, PPM or BMP"
-
-
+_NO_IMAGE = f"is not an image that can be read ({FORMATS})"
+_CUT_OFF = "is cut off: the file ends before its image; copy or save it again"
 #: Bytes in which a file says how large its image is; a preview may stand before it.
 _HEAD = 2**20
-
-
 #: Parts that a PNG or a JPEG has at most, so that one of nothing but empty parts takes no time.
 _MOST_PARTS = 2**20
-
-
 #: Bytes of what EXIF says: a segment of a JPEG has no more, and the orientation stands at its beginning.
 _EXIF_BYTES = 2**16
-
-
-_DAMAGED = "is damaged or cut off; copy or save it again"
-
-
 Size = tuple[int, int]
-
 
 #: What is done to the pixels of a file to see them upright, by EXIF's number of the orientation; 1 is upright.
 TURNS = {
@@ -61,54 +49,56 @@ TURNS = {
 }
 
 
-class _CutOff(Exception):
-    """The file ends before its image does."""
-
-
-class _Damaged(Exception):
-    """Mitsuba's reader would write past its own memory."""
-
-
 class DamagedImage(ConfigError):
     """An image by which Mitsuba's reader, or what uses the image, would leave its own memory."""
 
 
 @dataclass(frozen=True)
-class _Says:
+class _Header:
     """What a file says of its image: (width, height) of the pixels as they lie in it, and EXIF's orientation."""
 
     size: Size
     orientation: int = 1
     is_jpeg: bool = False
 
-    def seen(self, upright: bool) -> Size:
-        """The (width, height) of the image, as it lies or `upright`."""
-        return self.size[::-1] if upright and self.orientation >= 5 else self.size
 
-
-def read_bitmap(path: Path, size: Size | None = None) -> mi.Bitmap:
+def read_bitmap(path: Path, size: Size | None = None, upright: bool = False) -> mi.Bitmap:
     """Decode the image file `path`; `size` is the (width, height) that it must have, None for any.
 
-    Its pixels are as they lie in the file, whatever EXIF says. Raises ConfigError, located in the file, where it cannot
-    be read, is no image, too large, of another size, damaged or cut off. What is checked first is what the file says of
-    itself.
+    Its pixels are as they lie in the file, or `upright`: as a person sees them, turned as EXIF says (`TURNS`), and so
+    is the size. Raises ConfigError, located in the file, where it cannot be read, is no image, too large, of another
+    size, damaged or cut off. What is checked first is what the file says of itself.
     """
-    return _read(path, size, upright=False)[0]
-
-
-def read_upright(path: Path, size: Size | None = None) -> mi.Bitmap:
-    """The image of a file as a person sees it: turned as its EXIF orientation says (`TURNS`).
-
-    `size` is the (width, height) after that; it raises as `read_bitmap`.
-    """
-    bitmap, orientation = _read(path, size, upright=True)
+    header = _examine(path)
+    orientation = header.orientation if upright else 1
+    width, height = header.size[::-1] if orientation >= 5 else header.size
+    if min(width, height) < 1:
+        raise ConfigError(path, "", _NO_IMAGE)
+    if size is not None and (width, height) != size:
+        turned = f", {TURNS[orientation]} as its EXIF orientation says" if orientation > 1 else ""
+        raise ConfigError(path, "", f"is {width}x{height} pixels{turned}; it must be {size[0]}x{size[1]}")
+    if width * height > PIXELS:
+        raise ConfigError(path, "", f"is {width}x{height} pixels; more than {PIXELS} are not read")
+    complaints: list[str] = []
+    try:
+        with _heard(complaints) if header.is_jpeg else nullcontext():
+            bitmap = mi.Bitmap(str(path))
+    except Exception as error:
+        if is_out_of_memory(error):
+            raise
+        raise ConfigError(path, "", "is damaged or cut off, or of a kind that Mitsuba does not decode") from None
+    for line in complaints:
+        if line.startswith(("Corrupt JPEG data", "Premature end")):
+            raise ConfigError(path, "", f"is damaged or cut off ({line}); copy or save it again")
+        logger.warning("%s: %s", path, line)
+    if (int(bitmap.width()), int(bitmap.height())) != header.size:
+        raise ConfigError(path, "", f"says that it is {header.size[0]}x{header.size[1]} pixels, and is not")
     if orientation == 1:
         return bitmap
-    pixels = np.array(bitmap)
-    turned = mi.Bitmap(np.ascontiguousarray(turn(pixels, orientation)), bitmap.pixel_format())
-    turned.set_srgb_gamma(bitmap.srgb_gamma())
-    turned.set_premultiplied_alpha(bitmap.premultiplied_alpha())
-    return turned
+    turned_bitmap = mi.Bitmap(np.ascontiguousarray(turn(np.array(bitmap), orientation)), bitmap.pixel_format())
+    turned_bitmap.set_srgb_gamma(bitmap.srgb_gamma())
+    turned_bitmap.set_premultiplied_alpha(bitmap.premultiplied_alpha())
+    return turned_bitmap
 
 
 def turn(pixels: np.ndarray, orientation: int) -> np.ndarray:
@@ -123,94 +113,45 @@ def turn(pixels: np.ndarray, orientation: int) -> np.ndarray:
 
 
 def orientation_of(path: Path) -> int:
-    """EXIF's orientation of an image file, 1 to 8: 1 of one that has none. Raises ConfigError where it is no file."""
-    with open_file(path, IMAGE_BYTES) as file, suppress(_CutOff, _Damaged, OSError):
-        says = _examine(file)
-        return 1 if says is None else says.orientation
-    return 1
-
-
-def _read(path: Path, size: Size | None, upright: bool) -> tuple[mi.Bitmap, int]:
-    """The image as it lies in the file, and its orientation; `size` is that of the image as it lies, or `upright`."""
-    with open_file(path, IMAGE_BYTES) as file:
-        try:
-            says = _examine(file)
-        except _CutOff:
-            raise ConfigError(path, "", "is cut off: the file ends before its image; copy or save it again") from None
-        except _Damaged:
-            raise DamagedImage(path, "", _DAMAGED) from None
-        except OSError as error:
-            raise ConfigError(path, "", f"cannot be read: {error.strerror}") from None
-    if says is None or min(says.size) < 1:
-        raise ConfigError(path, "", f"is not an image that can be read ({FORMATS})")
-    width, height = says.seen(upright)
-    if size is not None and (width, height) != size:
-        turned = f", {TURNS[says.orientation]} as its EXIF orientation says" if upright and says.orientation > 1 else ""
-        raise ConfigError(path, "", f"is {width}x{height} pixels{turned}; it must be {size[0]}x{size[1]}")
-    if width * height > PIXELS:
-        raise ConfigError(path, "", f"is {width}x{height} pixels; more than {PIXELS} are not read")
-    complaints: list[str] = []
-    try:
-        with _heard(complaints) if says.is_jpeg else nullcontext():
-            bitmap = mi.Bitmap(str(path))
-    except Exception as error:
-        if is_out_of_memory(error):
-            raise
-        raise ConfigError(path, "", "is damaged or cut off, or of a kind that Mitsuba does not decode") from None
-    for line in complaints:
-        if line.startswith(("Corrupt JPEG data", "Premature end")):
-            raise ConfigError(path, "", f"is damaged or cut off ({line}); copy or save it again")
-        logger.warning("%s: %s", path, line)
-    if (int(bitmap.width()), int(bitmap.height())) != says.size:
-        raise ConfigError(path, "", f"says that it is {says.size[0]}x{says.size[1]} pixels, and is not")
-    return bitmap, says.orientation
+    """EXIF's orientation of an image file, 1 to 8: 1 of one that has none. Raises ConfigError where it is no image."""
+    return _examine(path).orientation
 
 
 def image_size(path: Path) -> Size:
     """The (width, height) of an image as it lies in its file. Raises ConfigError, located in it, where it is none."""
+    width, height = _examine(path).size
+    if min(width, height) < 1:
+        raise DamagedImage(path, "", f"says that it is {width}x{height} pixels; save it again")
+    return width, height
+
+
+def _examine(path: Path) -> _Header:
+    """What a file says of its image. Raises ConfigError, located in it, where it is none, or a PNG or JPEG without its
+    end, which readers of the other formats tell themselves."""
+    header: _Header | None = None
     with open_file(path, IMAGE_BYTES) as file:
         try:
-            says = _examine(file)
-        except _CutOff:
-            says = None
-        except _Damaged:
-            raise DamagedImage(path, "", _DAMAGED) from None
-    if says is not None and min(says.size) < 1:
-        raise DamagedImage(path, "", f"says that it is {says.size[0]}x{says.size[1]} pixels; save it again")
-    if says is None:
-        raise ConfigError(path, "", f"is not an image that can be read ({FORMATS})")
-    return says.size
-
-
-def _examine(file: BinaryIO) -> _Says | None:
-    """What a file says of its image, None where it is none.
-
-    Raises _CutOff where a PNG or JPEG has no end; the readers of the other formats tell that themselves.
-    """
-    head = file.read(_HEAD) or b""
-    for magic, reader in _READERS.items():
-        if head.startswith(magic):
+            head = file.read(_HEAD) or b""
+            reader = next((reader for magic, reader in _READERS.items() if head.startswith(magic)), None)
             with suppress(struct.error, ValueError):  # a head that is cut off is none
-                says = reader(head, file)
-                return _Says(says) if isinstance(says, tuple) else says
-            return None
-    return None
+                header = None if reader is None else reader(path, head, file)
+        except OSError as error:
+            raise ConfigError(path, "", f"cannot be read: {error.strerror}") from None
+    if header is None:
+        raise ConfigError(path, "", _NO_IMAGE)
+    return header
 
 
 # --- formats ----------------------------------------------------------------------------------------------------------
 
 _PNG, _JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff"
-
-
 #: How a JPEG's segment of EXIF begins, and the entry in it that says how the camera was held: a number of 16 bits.
 _EXIF, _ORIENTATION, _SHORT = b"Exif\0\0", 0x0112, 3
-
-
 #: The next marker after compressed data, in which 0xFF stands before 0, or before the number of a restart.
 _MARKER = re.compile(rb"\xff+[\x01-\xcf\xd8-\xfe]")
 
 
-def _png(head: bytes, file: BinaryIO) -> _Says | None:
+def _png(path: Path, head: bytes, file: BinaryIO) -> _Header | None:
     if head[12:16] != b"IHDR":
         return None
     width, height = struct.unpack(">II", head[16:24])
@@ -220,28 +161,28 @@ def _png(head: bytes, file: BinaryIO) -> _Says | None:
         length, kind = struct.unpack(">I4s", file.read(8).ljust(8, b"\0"))
         position += 12 + length  # with its check sum
         if position > end:
-            raise _CutOff
+            raise ConfigError(path, "", _CUT_OFF)
         if kind == b"eXIf" and not exif:
             exif = file.read(min(length, _EXIF_BYTES))
         if kind == b"IEND":
-            return _Says((width, height), _orientation(exif))
+            return _Header((width, height), _orientation(exif))
     return None
 
 
-def _jpeg(head: bytes, file: BinaryIO) -> _Says | None:
+def _jpeg(path: Path, head: bytes, file: BinaryIO) -> _Header | None:
     file.seek(0)
     data, position, size, exif = file.read(), 2, None, b""
     for _ in range(_MOST_PARTS):
         found = _MARKER.search(data, position)
         if found is None:
-            raise _CutOff
+            raise ConfigError(path, "", _CUT_OFF)
         kind, position = data[found.end() - 1], found.end()
         if kind == 0xD9:  # the end of the image
-            return None if size is None else _Says(size, _orientation(exif), is_jpeg=True)
+            return None if size is None else _Header(size, _orientation(exif), is_jpeg=True)
         if kind == 0x01 or kind == 0xD8:
             continue
         if position + 2 > len(data):
-            raise _CutOff
+            raise ConfigError(path, "", _CUT_OFF)
         [length] = struct.unpack_from(">H", data, position)
         if 0xC0 <= kind <= 0xCF and kind not in (0xC4, 0xC8, 0xCC) and position + 7 <= len(data):
             height, width = struct.unpack_from(">HH", data, position + 3)
@@ -270,7 +211,7 @@ def _orientation(exif: bytes) -> int:
     return 1
 
 
-def _exr_size(head: bytes, file: BinaryIO) -> Size | None:
+def _exr(path: Path, head: bytes, file: BinaryIO) -> _Header | None:
     position = 8
     while True:  # attributes: a name and a type, each ended by a zero, the number of bytes, and these
         name, _, rest = head[position : position + 600].partition(b"\0")
@@ -281,65 +222,61 @@ def _exr_size(head: bytes, file: BinaryIO) -> Size | None:
             return None
         if name == b"dataWindow":
             left, top, right, bottom = struct.unpack_from("<4i", head, position + 4)
-            return right - left + 1, bottom - top + 1
+            return _Header((right - left + 1, bottom - top + 1))
         position += 4 + length
 
 
-def _hdr_size(head: bytes, file: BinaryIO) -> Size | None:
+def _hdr(path: Path, head: bytes, file: BinaryIO) -> _Header | None:
     found = re.search(rb"\n-Y (\d{1,9}) \+X (\d{1,9})\n", head)
     if found is None:
         return None
     width, height = int(found[2]), int(found[1])
     if width * height <= PIXELS:  # else it is refused for that
         file.seek(found.end())
-        _check_runs(file.read(), width, height)
-    return width, height
+        if not _are_whole(file.read(), width, height):
+            raise DamagedImage(path, "", "is damaged or cut off; copy or save it again")
+    return _Header((width, height))
 
 
-def _check_runs(data: bytes, width: int, height: int) -> None:
-    """Raise _Damaged where the lines of a Radiance image are not what its head says: runs that fill each of the four
-    parts of a line to its end, in all lines or in none. Mitsuba's reader believes what the lines say."""
+def _are_whole(data: bytes, width: int, height: int) -> bool:
+    """Whether the lines of a Radiance image are what its head says: runs that fill each of the four parts of a line to
+    its end, in all lines or in none. Mitsuba's reader believes what the lines say, and would write past its memory."""
     start = bytes((2, 2, width >> 8, width & 255)) if 8 <= width <= 0x7FFF else b""
     if not start or data[:2] != start[:2] or data[2:3] >= b"\x80":
-        if len(data) < 4 * width * height:
-            raise _Damaged
-        return
+        return len(data) >= 4 * width * height
     position, end = 0, len(data)
     for _ in range(height):
         if data[position : position + 4] != start:
-            raise _Damaged
+            return False
         position += 4
         for _ in range(4):
             left = width
-            while left > 0 and position < end:
+            while left > 0 and position < end and data[position]:
                 code = data[position]
-                if code > 128:
-                    left, position = left - code + 128, position + 2
-                elif code:
-                    left, position = left - code, position + code + 1
-                else:
-                    raise _Damaged
+                length = code - 128 if code > 128 else code
+                left, position = left - length, position + (2 if code > 128 else length + 1)
             if left or position > end:
-                raise _Damaged
+                return False
+    return True
 
 
-def _netpbm_size(head: bytes, file: BinaryIO) -> Size | None:
+def _netpbm(path: Path, head: bytes, file: BinaryIO) -> _Header | None:
     found = re.match(rb"..(?:\s|#[^\n]*\n)+(\d{1,9})(?:\s|#[^\n]*\n)+(\d{1,9})\s", head)
-    return (int(found[1]), int(found[2])) if found else None
+    return _Header((int(found[1]), int(found[2]))) if found else None
 
 
-def _bmp_size(head: bytes, file: BinaryIO) -> Size | None:
+def _bmp(path: Path, head: bytes, file: BinaryIO) -> _Header | None:
     width, height = struct.unpack_from("<ii", head, 18)
-    return width, abs(height)
+    return _Header((width, abs(height)))
 
 
-_READERS: dict[bytes, Callable[[bytes, BinaryIO], Size | _Says | None]] = {
-    b"\x76\x2f\x31\x01": _exr_size,
+_READERS: dict[bytes, Callable[[Path, bytes, BinaryIO], _Header | None]] = {
+    b"\x76\x2f\x31\x01": _exr,
     _PNG: _png,
     _JPEG: _jpeg,
-    b"#?": _hdr_size,
-    **dict.fromkeys((b"PF", b"Pf", b"P5", b"P6"), _netpbm_size),
-    b"BM": _bmp_size,
+    b"#?": _hdr,
+    **dict.fromkeys((b"PF", b"Pf", b"P5", b"P6"), _netpbm),
+    b"BM": _bmp,
 }
 
 
@@ -391,17 +328,13 @@ class Photo:
 
 def turned_line(path: Path, upright: bool = True) -> str | None:
     """What the user is told of an image with an EXIF orientation, which is read `upright` or not; None of others."""
-    orientation = orientation_of(path)
-    if orientation == 1:
-        return None
-    if upright:
-        return f"{path}: {TURNS[orientation]}, as its EXIF orientation says"
-    return f"{path}: not {TURNS[orientation]} as its EXIF orientation says: cameras of files see pixels as they lie"
+    turned = TURNS.get(orientation_of(path))
+    if turned is None or upright:
+        return None if turned is None else f"{path}: {turned}, as its EXIF orientation says"
+    return f"{path}: not {turned} as its EXIF orientation says: cameras of files see pixels as they lie"
 
 
-def read_image(
-    path: Path, color_space: str = "auto", size: tuple[int, int] | None = None, signed: bool = False
-) -> Image:
+def read_image(path: Path, color_space: str = "auto", size: Size | None = None, signed: bool = False) -> Image:
     """Read an EXR, PNG, JPG, HDR, PFM, PPM or BMP file as linear Rec. 709: (H, W, 3) float32.
 
     `color_space` says how the file's values are encoded: `linear`, `srgb`, or `auto` (integers srgb, floats linear).
@@ -410,29 +343,29 @@ def read_image(
     ConfigError, located in the file, where it is missing or no image, damaged, cut off, too large or of another size,
     or holds a value that is not finite or, unless `signed`, negative.
     """
-    photo = read_photo(path, color_space, size, upright=False)
-    _check_values(Path(path), photo.image, signed)
-    orientation = orientation_of(Path(path))
+    image = read_photo(path, color_space, size, upright=False, signed=signed).image
+    orientation = orientation_of(path)
     if orientation > 1:
         logger.warning("%s: is read as it lies in the file, not %s as its EXIF says", path, TURNS[orientation])
-    return photo.image
+    return image
 
 
 def read_photo(
     path: Path,
     color_space: str = "auto",
-    size: tuple[int, int] | None = None,
+    size: Size | None = None,
     gamma: float | None = None,
     upright: bool = True,
+    signed: bool = False,
+    nonfinite: bool = False,
 ) -> Photo:
-    """Read an image file like `read_image`, and mark pixels that are not to be trusted; values are not checked.
+    """Read an image file like `read_image`, and mark pixels that are not to be trusted.
 
     `gamma`, if any, decodes integers in place of `color_space`. `upright` turns the image as its EXIF orientation says,
-    to how a person sees it; `size` is that of the image then. Raises ConfigError, located in the file, also where
-    `gamma` is given for a file of floats.
+    to how a person sees it; `size` is that of the image then. Values may be negative where it is `signed`, and not
+    finite with `nonfinite`. Raises ConfigError, located in the file, also where `gamma` is given for a file of floats.
     """
-    path = Path(path)
-    bitmap = read_upright(path, size) if upright else read_bitmap(path, size)
+    bitmap = read_bitmap(path, size, upright)
     if bitmap.pixel_format() == mi.Bitmap.PixelFormat.MultiChannel:
         raise ConfigError(path, "", f"has {bitmap.channel_count()} channels; give one with R, G, B or Y only")
     width, height = (int(n) for n in bitmap.size())
@@ -449,29 +382,28 @@ def read_photo(
         image = image**gamma
     elif color_space == "srgb" or (color_space == "auto" and is_integer):
         image = decode_srgb(image)
-    nothing = np.zeros((height, width), dtype=bool)
+    finite, nothing = np.isfinite(image), np.zeros((height, width), dtype=bool)
+    for bad, what in ((~finite & (not nonfinite), "not finite"), (finite & (image < 0) & (not signed), "negative")):
+        if bad.any():
+            y, x, channel = (int(n) for n in np.argwhere(bad)[0])
+            value, count = f"{image[y, x, channel]:g}", int(bad.any(axis=2).sum())
+            where = f"pixel ({x}, {y}), channel {'RGB'[channel]}"
+            raise ConfigError(path, "", f"{where}, is {value}: {what} ({count} pixels in all)")
     return Photo(
         image,
         clipped=(colors == np.iinfo(raw.dtype).max).any(axis=2) if is_integer else nothing,
         transparent=nothing if alpha is None else alpha == 0,
-        nonfinite=np.logical_not(np.isfinite(image).all(axis=2)),
+        nonfinite=np.logical_not(finite.all(axis=2)),
     )
 
 
-def check_photo(path: Path, photo: Photo, allow_nonfinite: bool) -> None:
-    """Raise ConfigError, located in the file, where a photo holds negative values, or such that are not finite."""
-    _check_values(path, np.nan_to_num(photo.image, posinf=0, neginf=0) if allow_nonfinite else photo.image, False)
-
-
-def read_weights(path: Path, size: tuple[int, int], upright: bool = True) -> Image:
+def read_weights(path: Path, size: Size, upright: bool = True) -> Image:
     """Read an image of weights, float32 (H, W): values as they stand in the file, the mean of several channels.
 
     Those of 8 and 16 bits are shares of the greatest; alpha is dropped. `upright` turns it by its own EXIF orientation,
     like the photograph that it belongs to by that one's. Raises ConfigError, located in the file, like `read_image`.
     """
-    photo = read_photo(path, "linear", size, upright=upright)
-    _check_values(Path(path), photo.image, False)
-    return photo.image.mean(axis=2)
+    return read_photo(path, "linear", size, upright=upright).image.mean(axis=2)
 
 
 def decode_srgb(image: Image) -> Image:
@@ -479,14 +411,3 @@ def decode_srgb(image: Image) -> Image:
     from colour.models import eotf_sRGB  # late: the import takes a second
 
     return np.asarray(eotf_sRGB(image), dtype=np.float32)
-
-
-def _check_values(path: Path, image: Image, signed: bool) -> None:
-    for bad, what in ((~np.isfinite(image), "not finite"), (image < 0, "negative")):
-        if bad.any() and not (signed and what == "negative"):
-            y, x, channel = (int(n) for n in np.argwhere(bad)[0])
-            value = f"{image[y, x, channel]:g}"
-            count = int(bad.any(axis=2).sum())
-            raise ConfigError(
-                path, "", f"pixel ({x}, {y}), channel {'RGB'[channel]}, is {value}: {what} ({count} pixels in all)"
-            )

@@ -17,12 +17,11 @@ from reslrb_cli.backend.variant import check_variant
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.scene.cameras import read_cameras, replace_sensors
 from reslrb_cli.scene.catalog import coarse_bits
-from reslrb_cli.scene.extent import coincident, lost_light, thin_glass
-from reslrb_cli.scene.xml import mend as notes
-from reslrb_cli.scene.xml.build import Owners, build, name_objects
-from reslrb_cli.scene.xml.check import check, check_sizes, resize_films
-from reslrb_cli.scene.xml.mend import mend, place_textures
-from reslrb_cli.scene.xml.read import Description, Element, quoted, read_description
+from reslrb_cli.scene.extent import doubts
+from reslrb_cli.scene.xml.build import Owners, build
+from reslrb_cli.scene.xml.check import check, check_files, resize_films
+from reslrb_cli.scene.xml.mend import mend, refuse, warnings
+from reslrb_cli.scene.xml.read import Description, quoted, read_description
 
 logger = logging.getLogger(__name__)
 
@@ -44,15 +43,56 @@ def load_scene(
     `Sphere_3`. What Mitsuba's parser would refuse because another version or an exporter wrote it is mended or left
     out, with a warning in the log; `strict` has it refused. Those of `cameras`, a file, stand in place of the scene's
     sensors. The scene's integrator is not loaded: an experiment has its own. Plugins are loaded from Mitsuba's own
-    folder alone. `size` is the (width, height) of all films in pixels, in place of what the files say. `look` sees what
-    is to be built before anything of it is, and may raise. `keys`, which may be globs, are of parameters that are to
-    have derivatives: bitmaps among them that Mitsuba would keep with 8 or 16 bits are read as floating point.
+    folder alone. `size` is the (width, height) of all films in pixels, in place of what the files say. `look` sees the
+    description that the scene is built from before anything of it is, and may raise; in the end Mitsuba has a use for
+    every element of that. `keys`, which may be globs, are of parameters that are to have derivatives: bitmaps among
+    them that Mitsuba would keep with 8 or 16 bits are read as floating point.
 
     Raises ConfigError, located in the scene file, where it is missing or wrong, has nothing in it, or no light. Warns,
     too, of a scene that is too far from the origin, or too small, of glass that is too thin, and of faces at the same
     place; without `warn`, as for a scene that was looked at before, none of this is looked for.
     """
-    return load_described(file, options, strict, size, cameras, look, keys, warn)[0]
+    file = Path(file)
+    texts = {
+        name: str(value).lower() if isinstance(value, bool) else str(value) for name, value in (options or {}).items()
+    }
+    description = read_description(file, texts)
+    root = description.root
+    if cameras is not None:
+        replace_sensors(description, read_cameras(cameras))
+    found = mend(description)
+    if strict:
+        refuse(found, root)
+    if size is not None:
+        resize_films(root, size)
+    check(description)
+    if look is not None:
+        look(description)
+    scene, unused = build(description)
+    if strict:
+        refuse(unused, root)
+    if not isinstance(scene, mi.Scene):
+        raise ConfigError(file, "", "its root is a single object, not a <scene>")
+    for objects, wrong in (
+        (scene.shapes(), "the scene is empty: it has no shapes"),
+        (scene.emitters(), "the scene has no emitters: no light path can start"),
+        (scene.sensors(), "the scene has no sensor"),
+    ):
+        if len(objects) == 0:
+            raise ConfigError(file, "", wrong)
+    _check_meshes(file, scene)
+    lost = {note.element for note in unused}  # what else was done to them says nothing
+    for line in warnings([*(note for note in found if note.element not in lost), *unused], root):
+        warn_once(line)
+    for doubt in doubts(scene) if warn else ():
+        warn_once(f"{file}: {doubt}")
+    for note in unused:
+        if note.owner is not None:
+            note.owner.children.remove(note.element)
+    if _mark_floats(scene, description, keys):
+        scene = None  # before the other takes its memory
+        scene = build(description)[0]
+    return scene
 
 
 def load_for_script(file: str | os.PathLike[str], keys: Iterable[str] = (), /, **options: Any) -> mi.Scene:
@@ -69,60 +109,6 @@ def load_for_script(file: str | os.PathLike[str], keys: Iterable[str] = (), /, *
     """
     check_variant()
     return load_scene(Path(file), options, keys=[keys] if isinstance(keys, str) else keys)
-
-
-def load_described(
-    file: Path,
-    options: Mapping[str, Any] | None = None,
-    strict: bool = False,
-    size: tuple[int, int] | None = None,
-    cameras: Path | None = None,
-    look: Callable[[Description], object] | None = None,
-    keys: Iterable[str] = (),
-    warn: bool = True,
-) -> tuple[mi.Scene, Description]:
-    """The same, and the description that the scene was built from, of which Mitsuba has a use for every element."""
-    file = Path(file)
-    description = read_description(file, {name: _as_text(value) for name, value in (options or {}).items()})
-    root = description.root
-    if cameras is not None:
-        replace_sensors(description, read_cameras(cameras))
-    found = notes.in_order([*name_objects(root), *mend(description)], root)
-    if strict:
-        notes.refuse(found)
-    check(description)
-    place_textures(root)
-    if size is not None:
-        resize_films(root, size)
-    check_sizes(description)
-    if look is not None:
-        look(description)
-    scene, unused = build(description)
-    if strict:
-        notes.refuse(unused)
-    if not isinstance(scene, mi.Scene):
-        raise ConfigError(file, "", "its root is a single object, not a <scene>")
-    if len(scene.shapes()) == 0:
-        raise ConfigError(file, "", "the scene is empty: it has no shapes")
-    if len(scene.emitters()) == 0:
-        raise ConfigError(file, "", "the scene has no emitters: no light path can start")
-    if len(scene.sensors()) == 0:
-        raise ConfigError(file, "", "the scene has no sensor")
-    _check_meshes(file, scene)
-    lost = {note.element for note in unused}  # what else was done to them says nothing
-    found = [note for note in found if note.element not in lost]
-    for line in notes.warnings(notes.in_order([*found, *unused], root)):
-        warn_once(line)
-    for loss in (lost_light(scene), thin_glass(scene), coincident(scene)) if warn else ():
-        if loss is not None:
-            warn_once(f"{file}: {loss}")
-    for note in unused:
-        if note.owner is not None:
-            note.owner.children.remove(note.element)
-    if _mark_floats(scene, description, keys):
-        scene = None  # before the other takes its memory
-        scene = build(description)[0]
-    return scene, description
 
 
 def read_as_floats(scene: mi.Scene, description: Description, keys: Iterable[str]) -> mi.Scene:
@@ -148,12 +134,12 @@ def _mark_floats(scene: mi.Scene, description: Description, keys: Iterable[str])
             continue
         owner, names = owners.place(params, key) or (description.root, [])
         if owner.type == "bitmap" and names == ["data"]:  # else nothing is done, and to select it says why
-            _tell(f"{owner.place}: `{key}` is read as floating point")
-            owner.children[:] = [child for child in owner.children if child.name != "format"]
-            owner.children.append(Element("string", {"name": "format", "value": "variant"}, owner.source, owner.line))
+            warn_once(f"{owner.place}: `{key}` is read as floating point", logging.INFO)
+            owner.drop("format")
+            owner.children.append(owner.new("string", name="format", value="variant"))
             changed = True
     if changed:
-        check_sizes(description)
+        check_files(description)
     return changed
 
 
@@ -168,16 +154,6 @@ def _check_meshes(file: Path, scene: mi.Scene) -> None:
 
 
 @functools.cache
-def warn_once(line: str) -> None:
+def warn_once(line: str, level: int = logging.WARNING) -> None:
     """Say it in the log, once: one experiment may load its scene several times."""
-    logger.warning("%s", line)
-
-
-@functools.cache
-def _tell(line: str) -> None:
-    """The same of what is nothing to worry about."""
-    logger.info("%s", line)
-
-
-def _as_text(value: Any) -> str:
-    return str(value).lower() if isinstance(value, bool) else str(value)
+    logger.log(level, "%s", line)

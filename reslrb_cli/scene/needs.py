@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import re
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -11,53 +12,48 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from reslrb_cli.errors import UnsupportedScene, is_machine_fault
+from reslrb_cli.errors import UnsupportedScene
 from reslrb_cli.scene.extent import clipped
-from reslrb_cli.scene.graph import Lamp, SceneGraph, emitted_rays, find_lamps, small_lamps
+from reslrb_cli.scene.graph import Lamp, SceneGraph, bent_faces, emitted_rays, failure, grid, small_lamps
 
 #: Sensors to which a light path can connect: `sample_direction` is there, and its density is that of `sample_ray`.
 SENSORS = ("PerspectiveCamera", "ThinLensCamera")
-
-
 #: Shapes whose shading normal is their geometric one.
 _PLAIN_SHAPES = ("Rectangle", "Disk", "Sphere", "Cylinder")
 
-
+_SIMPLE_BSDFS = (
+    *("SmoothDiffuse", "SmoothConductor", "RoughConductor", "SmoothDielectric", "RoughDielectric", "ThinDielectric"),
+    *("TwoSidedBRDF", "Null"),
+)
 #: BSDFs that read nothing of a surface but its texture coordinates and local directions.
 _PLAIN_BSDFS = (
-    *("SmoothDiffuse", "SmoothConductor", "RoughConductor", "SmoothDielectric", "RoughDielectric", "ThinDielectric"),
-    *("SmoothPlastic", "RoughPlastic", "Principled", "PrincipledThin", "BlendBSDF", "MaskBSDF", "TwoSidedBRDF", "Null"),
+    *_SIMPLE_BSDFS,
+    "SmoothPlastic",
+    "RoughPlastic",
+    "Principled",
+    "PrincipledThin",
+    "BlendBSDF",
+    "MaskBSDF",
 )
-
-
-#: BSDFs whose samples have the derivative of what they are samples of (`transport.scattering.following`), and those
+#: BSDFs whose samples have the derivative of what they are samples of (`transport.bsdf.following`), and those
 #: that only wrap others.
-_FOLLOWED_BSDFS = (
-    *("SmoothDiffuse", "SmoothConductor", "RoughConductor", "SmoothDielectric", "RoughDielectric", "ThinDielectric"),
-    *("TwoSidedBRDF", "BumpMap", "NormalMap", "Null"),
-)
-
-
+_FOLLOWED_BSDFS = (*_SIMPLE_BSDFS, "BumpMap", "NormalMap")
+#: Textures that do not, either, by their classes.
+_PLAIN_TEXTURES = re.compile(r"BitmapTexture.*|.*Spectrum|Checkerboard")
 #: What rounding may make of a depth between the clip planes, of 0 to 1.
 _DEPTH_ROUNDING = 1e-5
-
-
 #: BSDFs that are not the same with light and view exchanged, by class: camera paths alone meet them as they are meant.
 _ONE_WAY = {"Hair": "hair", "Measured": "measured", "MeasuredPolarized": "measured_polarized"}
-
-
 #: Shapes on which Mitsuba draws no points: light cannot start there, but paths from the sensor find it.
 _NO_POINTS = {"SDFGrid": "sdfgrid", "Ellipsoids": "ellipsoids", "EllipsoidsMesh": "ellipsoidsmesh"}
-
-
 #: Shapes that Mitsuba cannot have emit at all.
 _NO_LAMPS = {"BSplineCurve": "bsplinecurve", "LinearCurve": "linearcurve"}
-
-
+_MEDIUM = (
+    " a participating medium; no integrator here knows media (nor do Mitsuba's prb, path and ptracer): remove it from "
+    "the scene file"
+)
 #: How many see-through surfaces a primary ray is followed through.
 CROSSINGS = 32
-
-
 #: Primary rays that look at a scene, along each side of a grid.
 LOOK = 128
 
@@ -93,7 +89,7 @@ class SceneNeeds:
 
 
 @dataclass(frozen=True)
-class View:
+class PrimaryHits:
     """What primary rays meet, after see-through surfaces: fractions of the film, which sum to 1.
 
     `smooth`: surfaces that light paths can connect to the sensor from; `specular`: only smooth specular ones (glass,
@@ -115,29 +111,36 @@ def scene_needs(scene: Any, sensor: Any) -> SceneNeeds:
         flags |= int(bsdf.flags())
     emitters, environment = list(scene.emitters()), scene.environment()
     delta = int(mi.BSDFFlags.Delta) & ~int(mi.BSDFFlags.Null)  # `Delta` holds it too
-    lamps = find_lamps(scene, graph)
+    lamps = graph.find_lamps(scene)
     is_projective = sensor.class_name() in SENSORS
     near, far = clipped(scene, sensor) if is_projective else (False, False)
     thin_lens = bool(sensor.needs_aperture_sample())
-    pointlike = int(mi.EmitterFlags.Delta)
+    params = mi.traverse(sensor)
+    others = [bsdf for bsdf in graph.of_type(mi.BSDF) if bsdf.class_name() not in _FOLLOWED_BSDFS]
+    unfollowed = {owner for bsdf in others for owner in graph.owning_bsdfs(bsdf)}
     return SceneNeeds(
         emitters=tuple(emitter.class_name() for emitter in emitters),
         environment=None if environment is None else emitters.index(environment),
-        has_visible_emitters=any(int(emitter.flags()) & pointlike == 0 for emitter in emitters),
+        has_visible_emitters=any(not int(emitter.flags()) & int(mi.EmitterFlags.Delta) for emitter in emitters),
         has_smooth=flags & int(mi.BSDFFlags.Smooth) != 0,
         has_glossy=flags & int(mi.BSDFFlags.Glossy) != 0,
         has_delta_lobes=flags & delta != 0,
         has_null=flags & int(mi.BSDFFlags.Null) != 0,
-        has_instances=any(shape.class_name() == "Instance" for shape in graph.of_type(mi.Shape)),
-        has_shading_normals=any(_has_shading_normals(shape) for shape in graph.shapes()),
+        has_instances=graph.has_instances(),
+        has_shading_normals=any(
+            bool(bent_faces(shape, 1 - 1e-5).any()) if shape.is_mesh() else shape.class_name() not in _PLAIN_SHAPES
+            for shape in graph.shapes()
+        ),
         has_perturbed_normals=any(bsdf.class_name() in ("BumpMap", "NormalMap") for bsdf in graph.of_type(mi.BSDF)),
         bsdfs_read_geometry=_read_geometry(graph),
         moving_shutter=float(sensor.shutter_open_time()) > 0,
         thin_lens=thin_lens,
-        principal_point=_has_principal_point(sensor),
+        principal_point=any(
+            key.startswith("principal_point_offset") and np.any(np.array(value) != 0) for key, value in params
+        ),
         near_clip=near,
-        lens_clip=thin_lens and (near or far or (is_projective and _focuses_outside(sensor))),
-        unfollowed=tuple(bsdf for bsdf in graph.surface_bsdfs() if not _is_followed(graph, bsdf)),
+        lens_clip=thin_lens and (near or far or (is_projective and _focuses_outside(params))),
+        unfollowed=tuple(bsdf for bsdf in graph.surface_bsdfs() if bsdf in unfollowed),
         lamps=lamps,
         small_lamps=small_lamps(scene, sensor, lamps) if is_projective else (),
     )
@@ -145,16 +148,14 @@ def scene_needs(scene: Any, sensor: Any) -> SceneNeeds:
 
 def check_supported(scene: Any, sensor: Any, hide_emitters: bool = False) -> None:
     """Raise UnsupportedScene, with the reason and the way out, where light tracing cannot render `scene`."""
-    obstacle = light_obstacle(scene, sensor, hide_emitters)
-    if obstacle is not None:
+    if (obstacle := light_obstacle(scene, sensor, hide_emitters)) is not None:
         other = camera_obstacle(scene, sensor)
         raise UnsupportedScene(_advised(obstacle, other, "take integrator.type: prb"))
 
 
 def check_camera_paths(scene: Any, sensor: Any) -> None:
     """The same for paths from the sensor: `prb`, and `path`, which has its images."""
-    obstacle = camera_obstacle(scene, sensor)
-    if obstacle is not None:
+    if (obstacle := camera_obstacle(scene, sensor)) is not None:
         other = light_obstacle(scene, sensor)
         raise UnsupportedScene(_advised(obstacle, other, "take integrator.type: reslrb or ptracer"))
 
@@ -169,8 +170,7 @@ def _advised(obstacle: str, other: str | None, way: str) -> str:
 
 def light_obstacle(scene: Any, sensor: Any, hide_emitters: bool = False) -> str | None:
     """The reason why light tracing cannot render `scene` for `sensor`; None where it can."""
-    obstacle = unsupported_part(scene, sensor)
-    if obstacle is not None:
+    if (obstacle := unsupported_part(scene, sensor)) is not None:
         return obstacle
     try:
         emitted_rays(scene, mi.Float(0.5), mi.Point2f(0.5), mi.Point2f(0.5))
@@ -196,76 +196,69 @@ def stock_clip(needs: SceneNeeds) -> str | None:
 
 def camera_obstacle(scene: Any, sensor: Any) -> str | None:
     """The reason why paths from `sensor` cannot render `scene`, without tracing a ray; None where they can."""
-    obstacle = _unknown_part(scene, sensor)
-    if obstacle is not None:
+    graph = SceneGraph.of(scene)
+    if (obstacle := _unknown_part(scene, sensor, graph)) is not None:
         return obstacle
     for emitter in scene.emitters():
         if emitter.class_name() == "DirectionalArea":
-            return (
-                f"emitter {emitter.id()} is a `directionalarea`, which camera paths cannot find and `prb` cannot "
-                "evaluate"
-            )
-    half = mi.Point2f(0.5)
-    reason = _failure(partial(sensor.sample_ray_differential, 0, 0.5, half, half))
-    if reason is not None:
-        return f"Mitsuba cannot send rays from sensor {sensor.id()}: {reason}"
-    for emitter in _one_of_a_kind(SceneGraph.of(scene), scene.emitters()):
-        reason = _failure(partial(emitter.sample_direction, _somewhere(), half))
-        if reason is not None:
-            return f"Mitsuba cannot find emitter {emitter.id()} from a surface: {reason}"
-    return None
+            what = "which camera paths cannot find and `prb` cannot evaluate"
+            return f"emitter {emitter.id()} is a `directionalarea`, {what}"
+    half, si = mi.Point2f(0.5), _somewhere()
+    calls = [(f"send rays from sensor {sensor.id()}", partial(sensor.sample_ray_differential, 0, 0.5, half, half))]
+    for emitter in _one_of_a_kind(graph, scene.emitters()):
+        calls.append((f"find emitter {emitter.id()} from a surface", partial(emitter.sample_direction, si, half)))
+    return _first_failure(calls)
 
 
 def unsupported_part(scene: Any, sensor: Any) -> str | None:
     """What in the scene no light path can deal with, found without tracing a ray; None where there is nothing."""
-    obstacle, name = _unknown_part(scene, sensor), sensor.id()
-    if obstacle is not None:
+    graph, name = SceneGraph.of(scene), sensor.id()
+    if (obstacle := _unknown_part(scene, sensor, graph)) is not None:
         return obstacle
     if sensor.class_name() not in SENSORS:
         return f"sensor {name} is a {sensor.class_name()}; light paths connect to `perspective` and `thinlens` sensors"
     if sensor.film().class_name() != "HDRFilm":
         return f"sensor {name} has a {sensor.film().class_name()}; light paths are splatted on an `hdrfilm`"
-    for bsdf in SceneGraph.of(scene).of_type(mi.BSDF):
-        plugin = _ONE_WAY.get(bsdf.class_name())
-        if plugin is not None:
-            return (
-                f"bsdf {bsdf.id()} is `{plugin}`, which is not the same with light and view exchanged: light paths "
-                "would render another material"
-            )
-    lamp = _lamp_on(SceneGraph.of(scene), _NO_POINTS)
-    if lamp is not None:
+    for bsdf in graph.of_type(mi.BSDF):
+        if (plugin := _ONE_WAY.get(bsdf.class_name())) is not None:
+            why = "which is not the same with light and view exchanged: light paths would render another material"
+            return f"bsdf {bsdf.id()} is `{plugin}`, {why}"
+    if (lamp := _lamp_on(graph, _NO_POINTS)) is not None:
         return f"{lamp}, where Mitsuba draws no points for light to start from; give the lamp as a mesh"
     return None
 
 
-def _unknown_part(scene: Any, sensor: Any) -> str | None:
+def _unknown_part(scene: Any, sensor: Any, graph: SceneGraph) -> str | None:
     """What in the scene no integrator here knows, found without tracing a ray; None where there is nothing."""
-    graph = SceneGraph.of(scene)
     for shape in graph.shapes():
         if shape.is_medium_transition() and graph.is_shown(shape):
-            return _of_medium(f"shape {shape.id() or 'of a group'} bounds")
+            return f"shape {shape.id() or 'of a group'} bounds{_MEDIUM}"
     for held in (sensor, *(child for child in graph.of_type(mi.Sensor) if sensor in graph.parents[child])):
         if held.get_medium() is not None:
-            return _of_medium(f"sensor {held.id()} stands in")
+            return f"sensor {held.id()} stands in{_MEDIUM}"
     for emitter in scene.emitters():
         if emitter.get_medium() is not None:
-            return _of_medium(f"emitter {emitter.id()} stands in")
+            return f"emitter {emitter.id()} stands in{_MEDIUM}"
         if emitter.class_name() == "TimedSunskyEmitter":
-            return (
-                f"emitter {emitter.id()} is a `timed_sunsky`, which evaluates arrays while it is traced: Mitsuba 3.9 "
-                "cannot render it in a kernel; take a `sunsky`"
-            )
-    lamp = _lamp_on(graph, _NO_LAMPS)
-    if lamp is not None:
+            why = "which evaluates arrays while it is traced: Mitsuba 3.9 cannot render it in a kernel; take a `sunsky`"
+            return f"emitter {emitter.id()} is a `timed_sunsky`, {why}"
+    if (lamp := _lamp_on(graph, _NO_LAMPS)) is not None:
         return f"{lamp}, which Mitsuba cannot have emit; give the lamp as a `cylinder` or a mesh"
-    return _failing_part(scene, graph)
+    # Such as one whose texture has too many channels.
+    si, half, context = _somewhere(), mi.Point2f(0.5), mi.BSDFContext()
+    calls = []
+    for bsdf in _one_of_a_kind(graph, graph.surface_bsdfs()):
+        calls.append((f"evaluate bsdf {bsdf.id()}", partial(bsdf.sample, context, si, 0.5, half)))
+        calls.append((f"evaluate bsdf {bsdf.id()}", partial(bsdf.eval, context, si, si.wi)))
+    for emitter in _one_of_a_kind(graph, scene.emitters()):
+        calls.append((f"evaluate emitter {emitter.id()}", partial(emitter.eval, si)))
+    return _first_failure(calls)
 
 
-def _of_medium(subject: str) -> str:
-    return (
-        f"{subject} a participating medium; no integrator here knows media (nor do Mitsuba's prb, path and ptracer): "
-        "remove it from the scene file"
-    )
+def _first_failure(calls: Iterable[tuple[str, Callable[[], object]]]) -> str | None:
+    """The first of `calls` that Mitsuba cannot do, by what it is to do, and its reason."""
+    found = ((what, failure(call)) for what, call in calls)
+    return next((f"Mitsuba cannot {what}: {reason}" for what, reason in found if reason is not None), None)
 
 
 def _lamp_on(graph: SceneGraph, plugins: dict[str, str]) -> str | None:
@@ -276,25 +269,6 @@ def _lamp_on(graph: SceneGraph, plugins: dict[str, str]) -> str | None:
     return None
 
 
-def _failing_part(scene: Any, graph: SceneGraph) -> str | None:
-    """The first surface or emitter that Mitsuba cannot evaluate, such as one whose texture has too many channels."""
-    si, half = _somewhere(), mi.Point2f(0.5)
-    for bsdf in _one_of_a_kind(graph, graph.surface_bsdfs()):
-
-        def scattered(bsdf: Any = bsdf) -> None:
-            bsdf.sample(mi.BSDFContext(), si, 0.5, half)
-            bsdf.eval(mi.BSDFContext(), si, mi.Vector3f(0, 0, 1))
-
-        reason = _failure(scattered)
-        if reason is not None:
-            return f"Mitsuba cannot evaluate bsdf {bsdf.id()}: {reason}"
-    for emitter in _one_of_a_kind(graph, scene.emitters()):
-        reason = _failure(partial(emitter.eval, si))
-        if reason is not None:
-            return f"Mitsuba cannot evaluate emitter {emitter.id()}: {reason}"
-    return None
-
-
 def _somewhere() -> Any:
     """A point on a surface, of one entry, looked at from straight above."""
     si = dr.zeros(mi.SurfaceInteraction3f)
@@ -302,61 +276,37 @@ def _somewhere() -> Any:
     return si
 
 
-def _failure(call: Callable[[], object]) -> str | None:
-    """Mitsuba's reason, in one line, why it cannot do what `call` asks for; None where it can."""
-    try:
-        with dr.suspend_grad():
-            call()
-    except RuntimeError as error:
-        if is_machine_fault(error):
-            raise
-        return " ".join(str(error).split())
-    return None
-
-
 def _one_of_a_kind(graph: SceneGraph, items: Sequence[Any]) -> list[Any]:
     """Of objects that consist of the same kinds of objects the first: thousands may differ in numbers alone."""
-    below: dict[Any, list[Any]] = {}
-    for child, parents in graph.parents.items():
-        for parent in parents:
-            below.setdefault(parent, []).append(child)
-
     found: dict[tuple[Any, ...], Any] = {}
     for item in items:
-        found.setdefault(_kind(item, below), item)
+        found.setdefault(_kind(item, graph), item)
     return list(found.values())
 
 
-def _kind(item: Any, below: dict[Any, list[Any]]) -> tuple[Any, ...]:
+def _kind(item: Any, graph: SceneGraph) -> tuple[Any, ...]:
     """What an object consists of. No closure, which would call itself and so keep the scene alive."""
     name = item.class_name()
     # The one texture that has one channel or three by what it was given.
     size = np.size(mi.traverse(item)["value"]) if name == "RawConstantTexture" else 0
-    used = (child for child in below.get(item, []) if isinstance(child, (mi.BSDF, mi.Texture, mi.Volume)))
-    return (name, size, *(_kind(child, below) for child in used))
+    used = (child for child in graph.children.get(item, ()) if isinstance(child, (mi.BSDF, mi.Texture, mi.Volume)))
+    return (name, size, *(_kind(child, graph) for child in used))
 
 
-def look(scene: Any, sensor: Any) -> View:
+def look(scene: Any, sensor: Any) -> PrimaryHits:
     """Cast primary rays through the centres of a grid of LOOK^2 cells of the film's crop window."""
     smooth, specular, emission = what_is_seen(scene, sensor)
-    count = LOOK * LOOK
-
-    def fraction(mask: Any) -> float:
-        return float(dr.count(mask)[0]) / count
-
-    return View(fraction(smooth), fraction(specular), fraction(~(smooth | specular)), fraction(emission))
+    masks = (smooth, specular, ~(smooth | specular), emission)
+    return PrimaryHits(*(float(dr.count(mask)[0]) / LOOK**2 for mask in masks))
 
 
 def what_is_seen(scene: Any, sensor: Any, aperture: tuple[float, float] | None = None) -> tuple[Any, Any, Any]:
-    """Of the rays through a grid of LOOK^2 cells, row by row, as `View` has them: which meet surfaces that are smooth,
-    those that are specular alone, and emission. They start at a point of the `aperture`, by default its middle."""
-    count = LOOK * LOOK
-    lane = dr.arange(mi.UInt32, count)
-    position = mi.Point2f(lane % LOOK + 0.5, lane // LOOK + 0.5) / LOOK
+    """Of the rays through a grid of LOOK^2 cells, row by row, which meet surfaces that are smooth, those that are
+    specular alone, and emission (`PrimaryHits`). They start at a point of the `aperture`, by default its middle."""
     lens = mi.Point2f(0.5) if aperture is None else mi.Point2f(*(dr.opaque(mi.Float, place) for place in aperture))
-    ray, _ = sensor.sample_ray(sensor.shutter_open(), 0.5, position, lens, True)
-    active = dr.full(mi.Mask, True, count)
-    smooth, specular, emission = (dr.zeros(mi.Mask, count) for _ in range(3))
+    ray, _ = sensor.sample_ray(sensor.shutter_open(), 0.5, grid(LOOK), lens, True)
+    active = dr.full(mi.Mask, True, LOOK**2)
+    smooth, specular, emission = (dr.zeros(mi.Mask, LOOK**2) for _ in range(3))
     for _ in range(CROSSINGS):
         si = scene.ray_intersect(ray, active)
         emission |= active & dr.any(si.emitter(scene, active).eval(si, active) > 0)
@@ -375,52 +325,15 @@ def what_is_seen(scene: Any, sensor: Any, aperture: tuple[float, float] | None =
 
 def _read_geometry(graph: SceneGraph) -> bool:
     """Whether any BSDF, or texture of one, may read more of a surface than texture coordinates and local directions."""
-
-    def plain(texture: Any) -> bool:
-        name = texture.class_name()
-        return name.startswith("BitmapTexture") or name.endswith("Spectrum") or name == "Checkerboard"
-
-    textures = [texture for texture in graph.of_type(mi.Texture) if graph.owning_bsdfs(texture)]
-    bsdfs = graph.of_type(mi.BSDF)
-    return not all(map(plain, textures)) or any(bsdf.class_name() not in _PLAIN_BSDFS for bsdf in bsdfs)
+    textures = [texture.class_name() for texture in graph.of_type(mi.Texture) if graph.owning_bsdfs(texture)]
+    is_plain = all(bsdf.class_name() in _PLAIN_BSDFS for bsdf in graph.of_type(mi.BSDF))
+    return not is_plain or not all(map(_PLAIN_TEXTURES.fullmatch, textures))
 
 
-def _is_followed(graph: SceneGraph, bsdf: mi.BSDF) -> bool:
-    nested = (item for item in graph.of_type(mi.BSDF) if bsdf in graph.owning_bsdfs(item))
-    return all(item.class_name() in _FOLLOWED_BSDFS for item in nested)
-
-
-def _has_principal_point(sensor: Any) -> bool:
-    """Whether the principal point of `sensor` is not the film's centre."""
-    params = mi.traverse(sensor)
-    keys = [f"principal_point_offset_{axis}" for axis in "xy"]
-    return any(np.any(np.array(params[key]) != 0) for key in keys if key in params)
-
-
-def _focuses_outside(sensor: Any) -> bool:
-    """Whether a thin lens focuses so far out that Mitsuba's `sample_direction`, in single precision, may take it to lie
-    outside of the clip planes, and so to see nothing. By default it focuses on the far one."""
-    params = mi.traverse(sensor)
+def _focuses_outside(params: mi.SceneParameters) -> bool:
+    """Whether a thin lens with these `params` focuses so far out that Mitsuba's `sample_direction`, in single
+    precision, may take it to lie outside of the clip planes, and so to see nothing. By default it focuses on the far
+    one."""
     near, far, focus = (float(np.ravel(params[key])[0]) for key in ("near_clip", "far_clip", "focus_distance"))
     depth = (1 - near / focus) * far / (far - near) if focus > 0 else -np.inf  # as projected: 0 at near, 1 at far
     return not _DEPTH_ROUNDING < depth < 1 - _DEPTH_ROUNDING
-
-
-def interpolates_normals(shape: mi.Shape) -> bool:
-    """Whether the shape is a mesh whose shading normals, as soon as it bends, differ from its geometric ones."""
-    return shape.is_mesh() and shape.has_vertex_normals() and not shape.has_face_normals()
-
-
-def _has_shading_normals(shape: mi.Shape) -> bool:
-    """Whether the shape's shading normals differ from its geometric ones anywhere."""
-    if not shape.is_mesh():
-        return shape.class_name() not in _PLAIN_SHAPES
-    if not interpolates_normals(shape):
-        return False
-    positions = np.array(shape.vertex_positions_buffer()).reshape(-1, 3)
-    normals = np.array(shape.vertex_normals_buffer()).reshape(-1, 3)
-    faces = np.array(shape.faces_buffer()).reshape(-1, 3)
-    a, b, c = (positions[faces[:, k]] for k in range(3))
-    flat = np.cross(b - a, c - a)
-    flat /= np.maximum(np.linalg.norm(flat, axis=1, keepdims=True), 1e-30)
-    return bool(any((np.sum(flat * normals[faces[:, k]], axis=1) < 1 - 1e-5).any() for k in range(3)))

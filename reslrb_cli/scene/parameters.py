@@ -8,7 +8,7 @@ from __future__ import annotations
 import difflib
 import functools
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from fnmatch import fnmatchcase
 from typing import Any
 
@@ -18,8 +18,8 @@ import numpy as np
 
 from reslrb_cli.config.parameters import HEIGHTMAP, WORDS, ParameterSpec, Settings
 from reslrb_cli.scene.catalog import ParameterInfo, describe, list_parameters
-from reslrb_cli.scene.deformation import Deformation, Movable, find_movable, heightmap_obstacle
-from reslrb_cli.scene.values import Place, Slot, check_bounds, check_transform, initial_array, settle
+from reslrb_cli.scene.deformation import Deformation, Movable, find_movable
+from reslrb_cli.scene.values import ParameterValue, Place, check_bounds, check_transform, initial_array, settle
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ class Selection:
     @property
     def scene_keys(self) -> list[str]:
         """The entries of `params` that what is recovered determines."""
-        own = [key for key in self.keys if key not in self.deformation.values and key not in self.factors]
+        own = [key for key in self.keys if self._holder(key) is self.params]
         return [*own, *(other for key in own for other in self.tied.get(key, ())), *self.deformation.keys]
 
     def spec(self, key: str) -> Settings:
@@ -77,15 +77,15 @@ class Selection:
 
         All is evaluated, so that a step's kernels are the same from the first one on.
         """
+        own: list[str] = []
         for key, value in values.items():
-            if key in self.deformation.values or key in self.factors:
-                self._holder(key)[key] = value
-            else:
-                for each in (key, *self.tied.get(key, ())):
-                    self.params[each] = value
+            holder = self._holder(key)
+            keys = [key, *self.tied.get(key, ())] if holder is self.params else [key]
+            for each in keys:
+                holder[each] = value
+            own += keys if holder is self.params else []
         moved = self.deformation.place()
         self.params.update()
-        own = [each for key in values for each in (key, *self.tied.get(key, ())) if self._holder(key) is self.params]
         settled = settle(self.params, (*own, *self.deformation.keys))
         dr.eval([self.params[key] for key in own], moved, settled, self.factors)
 
@@ -115,9 +115,9 @@ class Selection:
         self.deformation.place()
         self.params.update()
 
-    def slot(self, key: str) -> Slot:
+    def slot(self, key: str) -> ParameterValue:
         """The value of `key`, to be read and set; `update` has to follow."""
-        return Slot(self._holder(key), key)
+        return ParameterValue(self._holder(key), key)
 
     def _holder(self, key: str) -> Any:
         """What has the value of `key` under that name."""
@@ -158,30 +158,24 @@ def set_values(
     `option` and the key. A heightmap may have the resolution of its image file.
     """
     selection, _ = _choose(mi.traverse(scene), specs, source)
-    params, names = selection.params, selection.deformation.values
+    names = selection.deformation.values
     given: dict[str, str] = {}
     for pattern, value in values.items():
-        place = Place(source, f"{option}.{pattern}", _itself)
-        for key in [pattern] if pattern in names else _matching(params, pattern, place, [*names]):
+        place = Place(source, f"{option}.{pattern}", lambda _: "")  # a value has no options
+        for key in [pattern] if pattern in names else _matching(selection.params, pattern, place, [*names]):
             if key in given:
                 raise place.fail("", f"`{key}` is matched by `{given[key]}` already")
-            if selection.deformation.moves(key):
+            if key in selection.deformation.keys:
                 raise place.fail("", f"`{key}` follows from {' and '.join(f'`{name}`' for name in names)} here")
             given[key] = pattern
             slot = selection.slot(key)
-            array = initial_array(slot, value, None, place, any_size=key in names)
-            slot.set(array)
+            slot.set(initial_array(slot, value, None, place, any_size=key in names))
     # What is tied has the value of the first, unless it is given one of its own.
-    tied = {key: [other for other in others if other not in given] for key, others in selection.tied.items()}
-    tied = {key: others for key, others in tied.items() if key in given}
-    chosen = Selection(params, selection.specs, tied, selection.deformation)
-    chosen.update()
-    return chosen
-
-
-def _itself(option: str) -> str:
-    """Where an error of a value is that has no options: at itself."""
-    return ""
+    followed = ((key, others) for key, others in selection.tied.items() if key in given)
+    tied = {key: [other for other in others if other not in given] for key, others in followed}
+    selection = replace(selection, tied=tied)
+    selection.update()
+    return selection
 
 
 def _choose(params: mi.SceneParameters, specs: Sequence[ParameterSpec], source: object
@@ -207,7 +201,7 @@ def _choose(params: mi.SceneParameters, specs: Sequence[ParameterSpec], source: 
             at = f"key[{number}]" if len(spec.keys) > 1 else "key"
             if key in origin:
                 raise place.fail(at, f"`{key}` is matched by parameters[{origin[key]}] already")
-            if deformation.moves(key):
+            if key in deformation.keys:
                 raise place.fail(at, f"`{key}` follows from a motion or a heightmap; remove one of the two")
             origin[key] = index
         if len(spec.keys) > 1:
@@ -224,7 +218,7 @@ def _movables(params: mi.SceneParameters, spec: ParameterSpec, place: Place, ori
         at = option if len(named) == 1 else f"{option}[{number}]"
         item = find_movable(params, name)
         if isinstance(item, Movable) and spec.heightmap is not None:
-            item = heightmap_obstacle(item) or item
+            item = item.heightmap_obstacle() or item
         if isinstance(item, str):
             raise place.fail(at, item)
         if item.key in origin:
@@ -238,20 +232,23 @@ def _movables(params: mi.SceneParameters, spec: ParameterSpec, place: Place, ori
 
 def _check_effect(items: list[Movable], word: str, pivot: bool, place: Place) -> None:
     """Raise ConfigError where what is free moves nothing."""
-    nowhere = all(item.node.class_name() == "DirectionalEmitter" for item in items)
-    if nowhere and word != "rotation":
-        raise place.fail("motion.free", f"{word} does not move `{items[0].id}`, which is a direction; free: [rotation]")
-    if len(items) == 1 and items[0].is_point and not pivot and word != "translation":
-        raise place.fail("motion.free", f"{word} about itself does not move `{items[0].id}`, which is a point")
-    if len(items) == 1 and not items[0].is_shape and word == "scale" and not pivot:
-        raise place.fail("motion.free", f"scale about itself does not move `{items[0].id}`, which has no size")
+    id, alone = f"`{items[0].id}`", len(items) == 1 and not pivot
+    obstacle = None
+    if word != "rotation" and all(item.node.class_name() == "DirectionalEmitter" for item in items):
+        obstacle = f"{word} does not move {id}, which is a direction; free: [rotation]"
+    elif alone and items[0].is_point and word != "translation":
+        obstacle = f"{word} about itself does not move {id}, which is a point"
+    elif alone and not items[0].is_shape and word == "scale":
+        obstacle = f"scale about itself does not move {id}, which has no size"
+    if obstacle is not None:
+        raise place.fail("motion.free", obstacle)
 
 
 def _tied_keys(params: mi.SceneParameters, keys: list[str], place: Place) -> list[str]:
     """Keys that share one value; each names one parameter, and all have one shape."""
     found: list[str] = []
     for number, key in enumerate(keys):
-        at = Place(place.source, f"{place.key}.key[{number}]", _itself)
+        at = Place(place.source, f"{place.key}.key[{number}]", lambda _: "")
         if key not in params.properties and any(fnmatchcase(name, key) for name in params.properties):
             raise at.fail("", f"`{key}` is a glob; name each key that is tied")
         [name] = _matching(params, key, at)
@@ -265,15 +262,13 @@ def _tied_keys(params: mi.SceneParameters, keys: list[str], place: Place) -> lis
 
 def _matching(params: mi.SceneParameters, pattern: str, place: Place, names: Sequence[str] = ()) -> list[str]:
     """The keys that `pattern` names, all of which can be recovered; `names` are others that could be meant."""
-    if pattern in params.properties:
-        info = describe(params, pattern)
-        if (obstacle := _obstacle(info)) is not None:
-            raise place.fail("key", f"`{pattern}` {obstacle}")
-        return [pattern]
-    matches = [key for key in params.properties if fnmatchcase(key, pattern)]
+    is_key = pattern in params.properties
+    matches = [pattern] if is_key else [key for key in params.properties if fnmatchcase(key, pattern)]
     if not matches:
         near = difflib.get_close_matches(pattern, [*names, *params.properties], n=3, cutoff=0.5)
-        near = near or difflib.get_close_matches(pattern, _recoverable(params), n=3, cutoff=0)
+        if not near:
+            recoverable = [info.key for info in list_parameters(params) if _obstacle(info) is None]
+            near = difflib.get_close_matches(pattern, recoverable, n=3, cutoff=0)
         hint = " or ".join(f"`{key}`" for key in near)
         id, _, word = pattern.rpartition(".")
         if word in (*WORDS, HEIGHTMAP) and isinstance(find_movable(params, id), Movable):
@@ -283,11 +278,11 @@ def _matching(params: mi.SceneParameters, pattern: str, place: Place, names: Seq
     infos = [describe(params, key) for key in matches]
     usable = [info.key for info in infos if _obstacle(info) is None]
     if not usable:
+        first = f"`{infos[0].key}` {_obstacle(infos[0])}"
+        if is_key:
+            raise place.fail("key", first)
         more = f", nor can the other {len(infos) - 1}" if len(infos) > 1 else ""
-        raise place.fail(
-            "key",
-            f"`{pattern}` matches nothing that can be recovered: `{infos[0].key}` {_obstacle(infos[0])}{more}",
-        )
+        raise place.fail("key", f"`{pattern}` matches nothing that can be recovered: {first}{more}")
     return usable
 
 
@@ -299,7 +294,3 @@ def _obstacle(info: ParameterInfo) -> str | None:
         f"is stored with {info.bits} bits a channel, too few to follow a gradient; give the texture in the scene file "
         '<string name="format" value="variant"/>'
     )
-
-
-def _recoverable(params: mi.SceneParameters) -> list[str]:
-    return [info.key for info in list_parameters(params) if _obstacle(info) is None]

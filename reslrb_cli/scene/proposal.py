@@ -19,8 +19,8 @@ import numpy as np
 from reslrb_cli.records.images import write_bitmap
 from reslrb_cli.scene.catalog import ParameterInfo, list_parameters
 from reslrb_cli.scene.export import LOBES
-from reslrb_cli.scene.graph import SceneGraph
-from reslrb_cli.scene.images import decode_srgb, read_upright
+from reslrb_cli.scene.graph import SceneGraph, grid
+from reslrb_cli.scene.images import decode_srgb, read_bitmap
 
 Image = np.ndarray[Any, Any]
 
@@ -40,7 +40,7 @@ class Photograph:
 
 def open_photograph(path: Path) -> Photograph:
     """Read an image file. Raises ConfigError, located in it, where it is none."""
-    bitmap = read_upright(path)
+    bitmap = read_bitmap(path, upright=True)
     width, height = (int(n) for n in bitmap.size())
     return Photograph(path, (width, height), np.array(bitmap).dtype.kind in "ui", bitmap)
 
@@ -97,19 +97,14 @@ def _box_weights(old: int, new: int) -> Image:
 
 #: Colours of materials, by which a photograph mostly differs from a scene.
 _COLOUR = re.compile(r"(reflectance|base_color|color\d|vertex_color)(\.(value|data))?$")
-
-
 #: What is seen foremost of a rough surface without a diffuse lobe: its colour is its material's, and a factor of 1 on
 #: that is no colour that anybody chose.
 _ROUGHNESS, _FACTOR = re.compile(r"\balpha(_u|_v)?\.value$"), re.compile(r"\bspecular_\w+\.value$")
-
-
 #: What a lamp in view shows of itself.
 _RADIANCE = re.compile(r"\bradiance\.value$")
 
-
 #: Bounds by the end of a key, and what it is; the first that fits.
-_BOUNDS: tuple[tuple[str, str], ...] = (
+_BOUNDS = (
     (r"(reflectance|transmittance|base_color|color\d)\.(value|data)$", "[0, 1]"),
     (r"\b(vertex|face)_\w*$", "[0, 1]"),
     (r"\b(alpha\w*|roughness)(\.(value|data))?$", "[0.02, 1]"),
@@ -121,16 +116,11 @@ _BOUNDS: tuple[tuple[str, str], ...] = (
     (r"\.value$|\.data$|\.specular$", "[0, 1]"),
 )
 
-
 #: Rays along each axis of the film, by which shares are taken.
 _RAYS = 64
-
-
 #: What takes less of the picture is left for later, and so are more parameters than these. A lamp is known by a few
 #: pixels.
 LEAST_SHARE, LEAST_LAMP, MOST_FIRST = 0.02, 0.002, 8
-
-
 #: Texels along an axis with which a texture begins to be recovered.
 TEXELS = 64
 
@@ -166,33 +156,29 @@ def propose(scene: mi.Scene, sensor: int, lamps: bool = False, wanted: Sequence[
     shares = _shares(scene, sensor)
     found, smooth = [], set[str]()
     for info in list_parameters(params, values=True):
-        wanted_kind = info.kind in ("bsdf", "emitter", "attribute")
-        if info.obstacle is None and wanted_kind and not _is_left_out(params, info):
+        is_kind = info.kind in ("bsdf", "emitter", "attribute")
+        if info.obstacle is None and is_kind and not _is_left_out(params, info):
             chain = _above(params, info.key)
-            share = max((shares.get(item, 0.0) for item in chain), default=0.0)
-            found.append((info, share))
+            found.append((info, max((shares.get(item, 0.0) for item in chain), default=0.0)))
             bsdfs = [item for item in chain if isinstance(item, mi.BSDF)]
-            if bsdfs and all(_is_delta(bsdf) for bsdf in bsdfs):
+            if bsdfs and not any(int(bsdf.flags()) & int(mi.BSDFFlags.Smooth) for bsdf in bsdfs):
                 smooth.add(info.key)
     found.sort(key=lambda pair: -pair[1])
+    keys = [info.key for info, _ in found]
+    for glob in wanted:
+        if not fnmatch.filter(keys, glob):
+            raise LookupError(glob)
     if wanted:
-        first = _matching([info.key for info, _ in found], wanted)
+        first = [key for key in keys if any(fnmatch.fnmatchcase(key, glob) for glob in wanted)]
     else:
         # A mask leaves out the pixels that see mirrors and smooth glass: only what these light shows their colours.
         shown = [info for info, share in found if share >= LEAST_SHARE and info.key not in smooth]
         seen = {info.key for info in shown if _is_foremost(params, info)}
         if lamps:
             seen |= {info.key for info, share in found if share >= LEAST_LAMP and _RADIANCE.search(info.key)}
-        first = [info.key for info, _ in found if info.key in seen][:MOST_FIRST]
-        first = first or [info.key for info, _ in found if info.kind == "emitter"][:1] or [i.key for i, _ in found][:1]
+        emitters = [info.key for info, _ in found if info.kind == "emitter"]
+        first = [key for key in keys if key in seen][:MOST_FIRST] or emitters[:1] or keys[:1]
     return [Proposal(info, share, _bounds(info), _resolution(info), info.key in first) for info, share in found]
-
-
-def _matching(keys: Sequence[str], globs: Sequence[str]) -> list[str]:
-    for glob in globs:
-        if not fnmatch.filter(keys, glob):
-            raise LookupError(glob)
-    return [key for key in keys if any(fnmatch.fnmatchcase(key, glob) for glob in globs)]
 
 
 def _is_foremost(params: mi.SceneParameters, info: ParameterInfo) -> bool:
@@ -214,17 +200,13 @@ def _is_left_out(params: mi.SceneParameters, info: ParameterInfo) -> bool:
     return is_principled and name in LOBES and info.value is not None and info.value.high == 0
 
 
-def _is_delta(bsdf: mi.BSDF) -> bool:
-    return int(bsdf.flags()) & int(mi.BSDFFlags.Smooth) == 0
-
-
 def _above(params: mi.SceneParameters, key: str) -> list[Any]:
     """The object that has a parameter, and those above it, without the scene."""
     node: Any = params.properties[key][2]
     chain: list[Any] = []
+    kinds = (mi.BSDF, mi.Emitter)
     while node is not None and not isinstance(node, mi.Scene):
         # A material belongs to all shapes that have it, and has a share of its own; a lamp may have a back.
-        kinds = (mi.BSDF, mi.Emitter)
         if isinstance(node, kinds) or not any(isinstance(item, kinds) for item in chain):
             chain.append(node)
         node = params.hierarchy[node][0]
@@ -233,33 +215,27 @@ def _above(params: mi.SceneParameters, key: str) -> list[Any]:
 
 def _shares(scene: mi.Scene, index: int) -> dict[Any, float]:
     """The share of the picture that each BSDF, shape and emitter has, as the rays from the sensor meet it first."""
-    sensor, lane = scene.sensors()[index], dr.arange(mi.UInt32, _RAYS**2)
-    position = mi.Point2f(lane % _RAYS + 0.5, lane // _RAYS + 0.5) / _RAYS
+    sensor = scene.sensors()[index]
     # One for each ray: an irradiance meter makes a single direction of a single one, which Dr.Jit fails to compile.
     aperture = dr.opaque(mi.Point2f, 0.5, shape=_RAYS**2)
-    ray, _ = sensor.sample_ray_differential(sensor.shutter_open(), 0.5, position, aperture, True)
+    ray, _ = sensor.sample_ray_differential(sensor.shutter_open(), 0.5, grid(_RAYS), aperture, True)
     si = scene.ray_intersect(ray)
+    emitter = si.emitter(scene)  # an area light has a back
+    shining = dr.select(dr.any(emitter.eval(si) > 0), emitter, dr.zeros(mi.EmitterPtr))
     graph = SceneGraph.of(scene)
     shares: dict[Any, float] = {}
     for pointers, kind, items in (
         (si.bsdf(), mi.BSDFPtr, graph.surface_bsdfs()),
         (si.shape, mi.ShapePtr, graph.shapes()),
-        (_shining(scene, si), mi.EmitterPtr, scene.emitters()),
+        (shining, mi.EmitterPtr, scene.emitters()),
     ):
         numbers = np.bincount(np.array(dr.reinterpret_array(mi.UInt32, pointers)))
         for item in items:
             own = int(np.array(dr.reinterpret_array(mi.UInt32, kind(item)))[0])
             shares[item] = float(numbers[own]) / _RAYS**2 if own < len(numbers) else 0.0
     for bsdf in graph.of_type(mi.BSDF):  # what is nested is seen with what it is nested in
-        owners = graph.owning_bsdfs(bsdf)
-        shares[bsdf] = max([shares.get(owner, 0.0) for owner in owners], default=0.0)
+        shares[bsdf] = max((shares.get(owner, 0.0) for owner in graph.owning_bsdfs(bsdf)), default=0.0)
     return shares
-
-
-def _shining(scene: mi.Scene, si: mi.SurfaceInteraction3f) -> mi.EmitterPtr:
-    """The emitters that shine at where they are met: an area light has a back."""
-    emitter = si.emitter(scene)
-    return dr.select(dr.any(emitter.eval(si) > 0), emitter, dr.zeros(mi.EmitterPtr))
 
 
 def _bounds(info: ParameterInfo) -> str | None:

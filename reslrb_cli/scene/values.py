@@ -34,7 +34,7 @@ class Place:
         return ConfigError(self.source, f"{self.key}.{option}" if option else self.key, message)
 
 
-class Slot:
+class ParameterValue:
     """One value of `holder` as a NumPy array: a texture (H, W, C), a colour (C,), a buffer (N,), a number ().
 
     `holder` is a scene's `mi.traverse`, or maps names to values that are none of the scene's own. An environment map
@@ -60,8 +60,7 @@ class Slot:
 
     def shown(self, value: Any) -> Array:
         """Another value for the same place, as Dr.Jit has it, in the shape of `get`."""
-        value = dr.detach(value)
-        array = np.array(value, dtype=np.float32)
+        array = np.array(dr.detach(value), dtype=np.float32)
         if not self.is_tensor and array.ndim and array.shape[-1] == 1:
             array = array[..., 0]
         return array[:, self.halo : array.shape[1] - self.halo] if self.halo else array
@@ -80,20 +79,20 @@ class Slot:
 
 
 def initial_array(
-    slot: Slot, initial: Any, resolution: tuple[int, int] | None, place: Place, any_size: bool = False
+    slot: ParameterValue, initial: Any, resolution: tuple[int, int] | None, place: Place, any_size: bool = False
 ) -> Array:
     """The value that `initial` ("scene", a number, a list, an image file or a run) gives the parameter in `slot`.
 
     `resolution` is the (width, height) to which a texture is resampled, or None; with `any_size` it may be that of the
     file. Raises ConfigError at `place`.
     """
-    current = slot.get()
+    current, resizable = slot.get(), any_size or resolution is not None
     if resolution is not None:
         if not slot.is_texture:
             raise place.fail("resolution", f"`{slot.key}` is no texture and cannot be resampled")
-        least = (2, 3) if slot.halo else (2, 2)
+        least = [2, 3] if slot.halo else [2, 2]
         if resolution[0] < least[0] or resolution[1] < least[1]:
-            raise place.fail("resolution", f"must be at least {list(least)}; Mitsuba has no smaller textures")
+            raise place.fail("resolution", f"must be at least {least}; Mitsuba has no smaller textures")
     if isinstance(initial, str):
         array = current
     elif isinstance(initial, (int, float)):
@@ -101,43 +100,38 @@ def initial_array(
     elif isinstance(initial, (list, tuple)):
         array = _fill(slot, current, list(initial), place)
     elif isinstance(initial, RunValue):
-        array = _from_run(slot, current, initial.run, any_size or resolution is not None, place)
+        array = _from_run(slot, current, initial.run, resizable, place)
     else:
-        array = _from_file(slot, current, initial, any_size or resolution is not None, place)
+        array = _from_file(slot, current, initial, resizable, place)
     if resolution is not None and array.shape[:2] != resolution[::-1]:
         array = resample(array, resolution)
-    _check_finite(slot, array, place)
+    if (bad := _first(array, ~np.isfinite(array))) is not None:
+        raise place.fail("initial", f"`{slot.key}` holds {bad}; all values must be finite")
     return array
 
 
-def check_bounds(slot: Slot, array: Array, bounds: tuple[float, float], place: Place) -> None:
+def check_bounds(slot: ParameterValue, array: Array, bounds: tuple[float, float], place: Place) -> None:
     """Raise ConfigError at `place` where an entry of `array` lies outside of `bounds`."""
     low, high = np.float32(bounds[0]), np.float32(bounds[1])
-    outside = (array < low) | (array > high)
-    if outside.any():
-        value = float(array[outside].flat[0])
-        where = _entry(array, outside)
-        raise place.fail("bounds", f"exclude the initial value of `{slot.key}`, {value:g}{where}")
+    if (outside := _first(array, (array < low) | (array > high))) is not None:
+        raise place.fail("bounds", f"exclude the initial value of `{slot.key}`, {outside}")
 
 
-def check_transform(slot: Slot, array: Array, spec: Settings, place: Place) -> None:
+def check_transform(slot: ParameterValue, array: Array, spec: Settings, place: Place) -> None:
     """Raise ConfigError at `place` where an entry of `array` is not among the values that the transform yields."""
     if spec.transform == "none":
         return
-    low, high = (0.0, np.inf) if spec.transform != "sigmoid" else spec.bounds or (-np.inf, np.inf)
+    bounded = spec.transform == "sigmoid"
+    low, high = (spec.bounds or (-np.inf, np.inf)) if bounded else (0.0, np.inf)
     outside = (array <= np.float32(low)) | (array >= np.float32(high))
-    if isinstance(spec.initial, RunValue) and spec.transform == "sigmoid":
+    if isinstance(spec.initial, RunValue) and bounded:
         # Between bounds that lie close beside each other rounding may have brought a run onto one; the optimiser
         # begins at the nearest value that the transform yields.
         outside = (array < np.float32(low)) | (array > np.float32(high))
-    if outside.any():
-        yields = (
-            f"values between its bounds, {low:g} and {high:g}" if spec.transform == "sigmoid" else "positive values"
-        )
-        value = f"{float(array[outside].flat[0]):g}{_entry(array, outside)}"
-        raise place.fail(
-            "initial", f"`{slot.key}` begins at {value}; transform: {spec.transform} yields {yields} alone"
-        )
+    if (value := _first(array, outside)) is not None:
+        yields = f"values between its bounds, {low:g} and {high:g}" if bounded else "positive values"
+        problem = f"`{slot.key}` begins at {value}; transform: {spec.transform} yields {yields} alone"
+        raise place.fail("initial", problem)
 
 
 def resample(array: Array, resolution: tuple[int, int]) -> Array:
@@ -153,23 +147,20 @@ def resample(array: Array, resolution: tuple[int, int]) -> Array:
 def _channels(node: Any, key: str, value: Any, is_tensor: bool) -> int:
     if is_tensor:
         return int(value.shape[-1])
-    shape = dr.shape(value)
-    if len(shape) > 1:
-        return int(shape[0])
-    name = key.rpartition(".")[2]
-    if name.startswith(("vertex_", "face_")) and hasattr(node, "vertex_count"):
-        return int(shape[0]) // int(node.vertex_count() if name.startswith("vertex_") else node.face_count())
+    shape, kind = dr.shape(value), key.rpartition(".")[2].partition("_")[0]
+    if len(shape) == 1 and kind in ("vertex", "face") and hasattr(node, "vertex_count"):
+        return int(shape[0]) // int(node.vertex_count() if kind == "vertex" else node.face_count())
     return int(shape[0])
 
 
-def _fill(slot: Slot, current: Array, numbers: list[float], place: Place) -> Array:
+def _fill(slot: ParameterValue, current: Array, numbers: list[float], place: Place) -> Array:
     if len(numbers) != slot.channels:
         has = "1 number" if slot.channels == 1 else f"{slot.channels} numbers"
         raise place.fail("initial", f"has {len(numbers)} numbers; `{slot.key}` takes {has}")
     return np.tile(np.array(numbers, dtype=np.float32), current.size // len(numbers)).reshape(current.shape)
 
 
-def _from_file(slot: Slot, current: Array, image_file: Any, any_size: bool, place: Place) -> Array:
+def _from_file(slot: ParameterValue, current: Array, image_file: Any, any_size: bool, place: Place) -> Array:
     if not slot.is_texture:
         raise place.fail("initial", f"`{slot.key}` is no texture; give a number or a list of numbers")
     path: Path = image_file.file
@@ -177,13 +168,9 @@ def _from_file(slot: Slot, current: Array, image_file: Any, any_size: bool, plac
         image = read_image(path, image_file.color_space, signed=slot.is_signed)
     except ConfigError as error:
         raise place.fail("initial.file", f"{path}: {error.message}") from None
-    height, width = current.shape[:2]
-    if not any_size and image.shape[:2] != (height, width):
-        size = f"{image.shape[1]}x{image.shape[0]}"
-        raise place.fail(
-            "initial.file",
-            f"{path} is {size}, the texture {width}x{height}; give `resolution: [width, height]` to resample",
-        )
+    if not any_size and image.shape[:2] != current.shape[:2]:
+        message = f"{path} is {_size(image)}, the texture {_size(current)}; {_RESAMPLE}"
+        raise place.fail("initial.file", message)
     if slot.channels == 1:
         if (image != image[..., :1]).any():
             raise place.fail("initial.file", f"{path} is coloured, but `{slot.key}` has one channel; give a grey image")
@@ -193,40 +180,37 @@ def _from_file(slot: Slot, current: Array, image_file: Any, any_size: bool, plac
     return image
 
 
-def _from_run(slot: Slot, current: Array, run: Path, any_size: bool, place: Place) -> Array:
+def _from_run(slot: ParameterValue, current: Array, run: Path, any_size: bool, place: Place) -> Array:
     try:
         array = read_value(run, slot.key)
     except ConfigError as error:
         raise place.fail("initial.run", str(error)) from None
-    if slot.is_texture and array.ndim == 3 and array.shape[2] == current.shape[2]:
-        if any_size or array.shape == current.shape:
-            return np.asarray(array, dtype=np.float32)
-        sizes = [f"{value.shape[1]}x{value.shape[0]}" for value in (array, current)]
-        raise place.fail(
-            "initial.run",
-            f"{run} has `{slot.key}` with {sizes[0]} texels, the texture has {sizes[1]}; give `resolution: [width, "
-            "height]` to resample",
-        )
-    if array.shape != current.shape:
+    is_like = slot.is_texture and array.ndim == 3 and array.shape[2] == current.shape[2]
+    if array.shape == current.shape or (is_like and any_size):
+        return np.asarray(array, dtype=np.float32)
+    if is_like:
+        has = f"with {_size(array)} texels, the texture has {_size(current)}; {_RESAMPLE}"
+    else:
         shapes = ["x".join(map(str, value.shape)) or "one number" for value in (array, current)]
-        raise place.fail("initial.run", f"{run} has `{slot.key}` of shape {shapes[0]}, the scene of shape {shapes[1]}")
-    return np.asarray(array, dtype=np.float32)
+        has = f"of shape {shapes[0]}, the scene of shape {shapes[1]}"
+    raise place.fail("initial.run", f"{run} has `{slot.key}` {has}")
 
 
-def _check_finite(slot: Slot, array: Array, place: Place) -> None:
-    bad = ~np.isfinite(array)
-    if bad.any():
-        value = float(array[bad].flat[0])
-        raise place.fail("initial", f"`{slot.key}` holds {value:g}{_entry(array, bad)}; all values must be finite")
+_RESAMPLE = "give `resolution: [width, height]` to resample"
 
 
-def _entry(array: Array, mask: Array) -> str:
-    if array.ndim == 0:
-        return ""
-    index = [int(n) for n in np.argwhere(mask)[0]]
+def _size(image: Array) -> str:
+    return f"{image.shape[1]}x{image.shape[0]}"
+
+
+def _first(array: Array, mask: Array) -> str | None:
+    """The first entry of `array` that `mask` marks, and where it is, in words; None where there is none."""
+    if not mask.any():
+        return None
+    value, index = f"{float(array[mask].flat[0]):g}", [int(n) for n in np.argwhere(mask)[0]]
     if array.ndim == 3:
-        return f" at texel ({index[1]}, {index[0]}), channel {index[2]}"
-    return f" at entry {index[0] if len(index) == 1 else index}"
+        return f"{value} at texel ({index[1]}, {index[0]}), channel {index[2]}"
+    return value if array.ndim == 0 else f"{value} at entry {index[0] if len(index) == 1 else index}"
 
 
 def settle(params: mi.SceneParameters, keys: Iterable[str]) -> list[Any]:

@@ -1,20 +1,16 @@
 """The view that sensors have of a scene: pixels and texels of use to light tracing, and how long its paths have to be.
 
-Pixels: light tracing lacks something at the film's border (`interior`), and where the sensor sees glass, mirrors, coats
-(`sees_specular`), from the smooth lobes of which light paths cannot connect to the sensor. `sees_lamps` has the pixels
-that see lamps.
-
-Texels: those that the sensors see (`visible_texels`).
-
-Depth: how long light's paths have to be that a picture of a scene lacks next to nothing of what a camera would see
-(`find_depth`). A photograph has light of any number of bounces. An image of paths of at most d segments is darker,
-which an exposure or a colour would make up for.
+Light tracing lacks something at the film's border (`interior`), and where the sensor sees glass, mirrors, coats
+(`sees_specular`), from the smooth lobes of which light paths cannot connect to the sensor. A photograph has light of
+any number of bounces; an image of paths of at most d segments is darker, which an exposure or a colour would make up
+for (`find_depth`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import zip_longest
 from typing import Any
 
 import drjit as dr
@@ -26,10 +22,13 @@ from reslrb_cli.scene.needs import CROSSINGS, LOOK, what_is_seen
 
 #: Primary rays are spread over a pixel in so many rows and columns of cells.
 CELLS = 4
-
-
 #: Points of the aperture, in [0, 1]^2, from which a lens looks for lamps.
 _APERTURE = ((0.5, 0.5), (0.05, 0.5), (0.95, 0.5), (0.5, 0.05), (0.5, 0.95))
+
+
+def _margin(sensor: mi.Sensor) -> int:
+    """How many pixels away a sample is at most that lies within the filter's radius of a pixel's centre."""
+    return int(np.ceil(float(sensor.film().rfilter().radius()) - 0.5))
 
 
 def interior(shape: tuple[int, ...], sensor: mi.Sensor) -> np.ndarray:
@@ -38,7 +37,7 @@ def interior(shape: tuple[int, ...], sensor: mi.Sensor) -> np.ndarray:
     Samples just outside of the film are lost, so that pixels within the filter's radius of its border lack what they
     would have added; paths from the sensor lose none.
     """
-    margin = int(np.ceil(float(sensor.film().rfilter().radius()) - 0.5))
+    margin = _margin(sensor)
     inside = np.zeros(shape[:2], dtype=bool)
     inside[margin : shape[0] - margin, margin : shape[1] - margin] = True
     return inside
@@ -61,8 +60,7 @@ def sees_specular(scene: mi.Scene, sensor: mi.Sensor) -> SeenSpecular:
 
     What is smaller than a cell may be missed. The rays are the same at every call.
     """
-    film = sensor.film()
-    width, height = (int(n) for n in film.crop_size())
+    width, height = (int(n) for n in sensor.film().crop_size())
     count = width * height
     lane = dr.arange(mi.UInt32, count)
     corner = mi.Point2f(lane % width, lane // width)
@@ -80,13 +78,8 @@ def sees_specular(scene: mi.Scene, sensor: mi.Sensor) -> SeenSpecular:
         dr.eval(alone, mixed, random)
     from scipy.ndimage import maximum_filter  # here: a run that is refused does not wait for it
 
-    # A sample that lies within the radius of a pixel's centre is at most so many pixels away.
-    size = 2 * int(np.ceil(float(film.rfilter().radius()) - 0.5)) + 1
-
-    def reached(mask: mi.Bool) -> np.ndarray:
-        return np.asarray(maximum_filter(np.array(mask, dtype=bool).reshape(height, width), size))
-
-    return SeenSpecular(reached(alone), reached(mixed))
+    masks = (np.array(mask, dtype=bool).reshape(height, width) for mask in (alone, mixed))
+    return SeenSpecular(*(np.asarray(maximum_filter(mask, 2 * _margin(sensor) + 1)) for mask in masks))
 
 
 def sees_lamps(scene: mi.Scene, sensor: mi.Sensor) -> np.ndarray:
@@ -94,8 +87,7 @@ def sees_lamps(scene: mi.Scene, sensor: mi.Sensor) -> np.ndarray:
 
     A lamp smaller than the cells of a grid of LOOK^2 may be missed.
     """
-    film = sensor.film()
-    width, height = (int(n) for n in film.crop_size())
+    width, height = (int(n) for n in sensor.film().crop_size())
     cells = np.zeros((LOOK, LOOK), dtype=bool)
     for point in _APERTURE if sensor.needs_aperture_sample() else (None,):
         cells |= np.array(what_is_seen(scene, sensor, point)[2]).reshape(LOOK, LOOK)
@@ -107,7 +99,7 @@ def sees_lamps(scene: mi.Scene, sensor: mi.Sensor) -> np.ndarray:
     for axis, size in enumerate((height, width)):
         first = np.arange(size) * LOOK // size
         cells = np.maximum.reduceat(cells, first, axis=axis) if size < LOOK else np.take(cells, first, axis=axis)
-    return np.asarray(maximum_filter(cells, 2 * int(np.ceil(float(film.rfilter().radius()) - 0.5)) + 1))
+    return np.asarray(maximum_filter(cells, 2 * _margin(sensor) + 1))
 
 
 def _first_surfaces(scene: mi.Scene, ray: mi.Ray3f, count: int) -> tuple[mi.Bool, mi.Bool]:
@@ -131,8 +123,6 @@ def _first_surfaces(scene: mi.Scene, ray: mi.Ray3f, count: int) -> tuple[mi.Bool
 
 #: Primary rays for each pixel and for each texel, and in one pass.
 _RAYS_PER_CELL, _MAX_RAYS, _RAYS_PER_PASS = 64, 2**25, 2**20
-
-
 _CROSSINGS = 8
 
 
@@ -158,23 +148,22 @@ def visible_texels(
     transform = np.array(params[to_uv].matrix, dtype=np.float64)
 
     seen = dr.zeros(mi.UInt32, height * width)
-    for place, sensor in enumerate(sensors):
+    for sensor, kept in zip_longest(sensors, pixels[: len(sensors)]):
         count = int(np.prod(sensor.film().crop_size()))
-        kept = pixels[place] if place < len(pixels) else None
         rays = min(_RAYS_PER_CELL * max(count, height * width), _MAX_RAYS)
         for number in range(-(-rays // _RAYS_PER_PASS)):
             random = mi.PCG32(size=min(rays, _RAYS_PER_PASS), initstate=dr.opaque(mi.UInt64, number))
-            _mark_seen(scene, sensor, owners, transform, random, seen, width, height, kept)
+            _mark_seen(scene, sensor, owners, transform, random, seen, (width, height), kept)
             dr.eval(seen)
     return np.array(seen).reshape(height, width) > 0
 
 
 def _mark_seen(
-    scene: Any, sensor: Any, owners: Sequence[Any], transform: Any, random: Any, seen: Any, width: int, height: int,
+    scene: Any, sensor: Any, owners: Sequence[Any], transform: Any, random: Any, seen: Any, size: tuple[int, int],
     kept: np.ndarray[Any, Any] | None,
 ) -> None:  # fmt: skip
-    """Cast one primary ray per lane, through pixels (H, W) that are `kept`, and mark in `seen` the texels whose inner
-    quarter it hits."""
+    """Cast one primary ray per lane, through pixels (H, W) that are `kept`, and mark in `seen` the texels, of `size`
+    (width, height), whose inner quarter it hits."""
     time = sensor.shutter_open() + random.next_float32() * sensor.shutter_open_time()
     film = mi.Point2f(random.next_float32(), random.next_float32())
     aperture = mi.Point2f(random.next_float32(), random.next_float32())
@@ -192,12 +181,12 @@ def _mark_seen(
         for owner in owners:
             is_owner |= bsdf == mi.BSDFPtr(owner)
         u, v = (row[0] * si.uv.x + row[1] * si.uv.y + row[2] for row in transform.tolist()[:2])
-        cell = mi.Point2f(u * width, v * height)
+        cell = mi.Point2f(u, v) * mi.Vector2f(size)
         inside = mi.Vector2f(cell - dr.floor(cell))
         inner = (dr.abs(inside.x - 0.5) < 0.25) & (dr.abs(inside.y - 0.5) < 0.25)
-        x, y = (mi.Int32(dr.floor(c)) for c in (cell.x, cell.y))
-        index = _modulo(y, height) * width + _modulo(x, width)
-        dr.scatter(seen, mi.UInt32(1), mi.UInt32(index), active & is_owner & inner)
+        # Twice, since the remainder of what is below 0 is not above it.
+        x, y = ((mi.Int32(dr.floor(c)) % n + n) % n for c, n in zip((cell.x, cell.y), size, strict=True))
+        dr.scatter(seen, mi.UInt32(1), mi.UInt32(y * size[0] + x), active & is_owner & inner)
         active &= mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null)
         ray = si.spawn_ray(ray.d)
         dr.eval(seen, active, ray)
@@ -205,19 +194,10 @@ def _mark_seen(
             break
 
 
-def _modulo(value: Any, size: int) -> Any:
-    remainder = value % size
-    return dr.select(remainder < 0, remainder + size, remainder)
-
-
 #: Depths that are tried; the last one stands for all light.
 DEPTHS = (8, 16, 32, 64)
-
-
 #: What may be missing of a pixel's light, on average.
 LOST = 0.01
-
-
 #: Rays along each axis of the film, and paths for each of them.
 _RAYS, _PATHS = 48, 32
 
@@ -237,17 +217,14 @@ def find_depth(scene: mi.Scene, sensor: int) -> Depth:
     By camera paths of equal random numbers without roulette, so that those of one depth begin those of the next.
     """
     whole = _pixels(scene, sensor, DEPTHS[-1])
+    lit = np.isfinite(whole) & (whole > 0)
     for segments in DEPTHS[:-1]:
-        missing = _missing(_pixels(scene, sensor, segments), whole)
+        # The mean over lit pixels of what they lack: no few bright ones decide.
+        lacking = 1 - _pixels(scene, sensor, segments)[lit] / whole[lit]
+        missing = float(lacking.mean()) if lit.any() else 0.0
         if missing <= LOST:
             return Depth(segments, missing)
     return Depth(DEPTHS[-1], None)
-
-
-def _missing(pixels: np.ndarray, whole: np.ndarray) -> float:
-    """The mean over lit pixels of what they lack: no few bright ones decide."""
-    lit = np.isfinite(whole) & (whole > 0)
-    return float(np.mean(1 - pixels[lit] / whole[lit])) if lit.any() else 0.0
 
 
 def _pixels(scene: mi.Scene, index: int, segments: int) -> np.ndarray:

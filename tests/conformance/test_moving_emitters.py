@@ -273,12 +273,12 @@ def test_fault(name: str, monkeypatch: pytest.MonkeyPatch):
 
 
 def test_faces_of_a_mesh_are_those_that_mitsuba_draws():
-    from reslrb_cli.scene.graph import SceneGraph, find_lamps
+    from reslrb_cli.scene.graph import SceneGraph
     from reslrb_cli.transport.emission import drawn_face
     from reslrb_cli.transport.samples import sums_of_areas
 
     scene = load(over_floor(mesh()))
-    [lamp] = find_lamps(scene, SceneGraph.of(scene))
+    [lamp] = SceneGraph.of(scene).find_lamps(scene)
     [areas] = sums_of_areas([lamp])
     samples = mi.Float(np.random.default_rng(1).random(1000).astype(np.float32))
     ps = lamp.shape.sample_position(0, mi.Point2f(0.3, samples))

@@ -63,7 +63,7 @@ def growing() -> str:
         ),
         (entities(), 2, "declares an XML entity"),
         ('<!DOCTYPE s [<!ENTITY e SYSTEM "file:///etc/passwd">]>\n<scene/>', 1, "declares an XML entity"),
-        (growing(), 6, "$v3: makes a text of more than 1048576 characters"),
+        (growing(), 7, "$v4: makes a text of more than 1048576 characters"),
         (HEAD + '\n<include filename="scene.xml"/></scene>', 3, "files are included more than 15 levels deep"),
         (HEAD + TEXTURE.format("pipe") + "</scene>", 3, "pipe is no regular file"),
         (HEAD + TEXTURE.format("/dev/zero") + "</scene>", 3, "/dev/zero is no regular file"),

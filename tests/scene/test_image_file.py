@@ -15,7 +15,7 @@ import pytest
 
 from reslrb_cli.errors import ConfigError, OutOfMemory
 from reslrb_cli.scene import images
-from reslrb_cli.scene.images import orientation_of, read_bitmap, read_image, read_upright
+from reslrb_cli.scene.images import orientation_of, read_bitmap, read_image
 
 pytestmark = pytest.mark.usefixtures("llvm")
 
@@ -249,17 +249,17 @@ def test_what_is_seen_upright_is_what_pillow_makes_of_it(name, channels, orienta
     from PIL import Image, ImageOps
 
     path = with_orientation(tmp_path / name, orientation, channels)
-    raw, seen = read_bitmap(path), read_upright(path)
+    raw, seen = read_bitmap(path), read_bitmap(path, upright=True)
     expected = np.array(ImageOps.exif_transpose(Image.open(path))).reshape(*seen.size()[::-1], channels)
     assert orientation_of(path) == orientation
     assert np.array_equal(np.array(seen).reshape(expected.shape), expected)
     assert list(raw.size()) == [7, 5]
     assert (seen.pixel_format(), seen.srgb_gamma()) == (raw.pixel_format(), raw.srgb_gamma())
     size = (5, 7) if orientation >= 5 else (7, 5)
-    assert list(read_upright(path, size).size()) == list(size)
+    assert list(read_bitmap(path, size, upright=True).size()) == list(size)
     if orientation >= 5:
         with pytest.raises(ConfigError, match=r"is 5x7 pixels, turned by 90 degrees .* it must be 7x5"):
-            read_upright(path, (7, 5))
+            read_bitmap(path, (7, 5), upright=True)
 
 
 def exif(entries, order=">", place=8, count=None):
@@ -289,7 +289,7 @@ def test_entries_before_the_orientation_and_other_segments_are_passed_over(order
     data = b"Exif\0\0" + exif(entries, order)
     path = jpeg_with(tmp_path / "a.jpg", b"http://ns.adobe.com/xap/1.0/\0<x/>", data, b"Exif\0\0" + exif([]))
     assert orientation_of(path) == 6
-    assert list(read_upright(path).size()) == [5, 7]
+    assert list(read_bitmap(path, upright=True).size()) == [5, 7]
 
 
 @pytest.mark.parametrize(
@@ -317,7 +317,7 @@ def test_exif_that_says_nothing_turns_nothing(data, tmp_path):
         png_with(tmp_path / "a.png", data),
     ):
         assert orientation_of(path) == 1
-        assert list(read_upright(path).size()) == [7, 5]
+        assert list(read_bitmap(path, upright=True).size()) == [7, 5]
     assert time.monotonic() - start < 5
 
 

@@ -1,16 +1,10 @@
-"""The way from a scene's elements to Mitsuba's objects, under names that last, and back.
-
-Mitsuba names an object without an id by its address in memory, which differs each time that the scene is loaded. Its
-lasting name is its kind, and its number among all of that kind; `Owners` leads from names back to elements. Objects are
-made by way of Mitsuba's own parser.
-"""
+"""The way from a scene's elements to Mitsuba's objects, by its own parser, and from their parameters back."""
 
 from __future__ import annotations
 
 import bisect
 import difflib
 import re
-from collections import Counter
 from typing import Any
 
 import mitsuba as mi
@@ -20,100 +14,15 @@ from reslrb_cli.errors import ConfigError
 from reslrb_cli.scene.xml.mend import Note
 from reslrb_cli.scene.xml.read import Description, Element, quoted, tag_lines
 
-#: Plugins that name what they hold by its place among the others, in every load alike.
-_GROUPS = ("shapegroup", "batch")
-
-
-#: How the ids begin that Mitsuba gives to objects without one when it writes a scene; it takes them for none.
-_UNNAMED = "_unnamed_"
-
-
-#: Characters of an id that is kept: keys become names of files.
-_LONGEST = 120
-
-
 #: Elements, by what Mitsuba makes of them.
 _KINDS = {"bsdf": "BSDF", "emitter": "Emitter", "shape": "Shape", "texture": "Texture"}
-
-
-def name_objects(root: Element) -> list[Note]:
-    """Give every object below `root` an id that is there in every load of the same files; say whose ids were changed.
-
-    The third `sphere` of the files becomes `Sphere_3`, whether or not the first two have ids. An id that Mitsuba could
-    not use in a key is replaced: one that is empty, starts with `_unnamed_`, is very long or holds what cannot be
-    printed, or is that of an earlier object. References follow. Raises ConfigError where a reference is to an id of two
-    objects that differ.
-    """
-    root.attributes.pop("id", None)
-    objects = root.objects()[1:]
-    grouped = {child for element in objects if element.type in _GROUPS for child in element.children}
-    taken = {element.attributes[key] for element in root.walk() for key in ("id", "as") if key in element.attributes}
-    owners: dict[str, Element] = {}
-    renamed: dict[str, str] = {}
-    doubled: dict[str, list[Element]] = {}
-    notes: list[Note] = []
-    numbers: Counter[str] = Counter()
-    for element in objects:
-        kind = element.type[:1].upper() + element.type[1:]
-        numbers[kind] += 1
-        own = element.attributes.get("id", "")
-        if own in owners:
-            doubled.setdefault(own, []).append(element)
-        elif _is_usable(own):
-            owners[own] = element
-            continue
-        elif element in grouped and not own:
-            continue
-        name = _free(f"{kind}_{numbers[kind]}", taken)
-        taken.add(name)
-        element.attributes["id"] = name
-        if own in owners:
-            notes.append(Note(element, f"id {quoted(own)} is that of {owners[own].place}, too", f"named {name}"))
-        elif own.strip() and own not in renamed:
-            renamed[own] = name
-            if not own.startswith(_UNNAMED):
-                notes.append(Note(element, f"id {quoted(own)} cannot stand in a key", f"named {name}"))
-    differing = {own: other for own, others in doubled.items() for other in others if not _same(owners[own], other)}
-    for element in root.walk():
-        own = element.attributes.get("id", "")
-        if element.tag in ("ref", "alias"):
-            if own in differing:
-                places = f"{owners[own].place} and {differing[own].place}"
-                raise element.fail("", f"refers to {quoted(own)}, the id of two objects ({places}); rename one of them")
-            if own in renamed:
-                element.attributes["id"] = renamed[own]
-    return notes
-
-
-def _is_usable(own: str) -> bool:
-    return own.strip() != "" and own.isprintable() and len(own) <= _LONGEST and not own.startswith(_UNNAMED)
-
-
-def _free(name: str, taken: set[str]) -> str:
-    """`name`, or the first of name_2, name_3 ... that no object has for its id."""
-    number, free = 1, name
-    while free in taken:
-        number += 1
-        free = f"{name}_{number}"
-    return free
-
-
-def _same(a: Element, b: Element) -> bool:
-    """Whether two elements, their ids aside, say the same."""
-    own = [{key: value for key, value in element.attributes.items() if key != "id"} for element in (a, b)]
-    return (
-        (a.tag, own[0], len(a.children)) == (b.tag, own[1], len(b.children))
-        and all(_same(x, y) for x, y in zip(a.children, b.children, strict=True))
-    )  # fmt: skip
 
 
 class Owners:
     """The elements of a description by the ids of their objects, for the way back from a parameter to its element."""
 
     def __init__(self, root: Element) -> None:
-        self._elements = {
-            item.attributes["id"]: item for item in root.walk() if item.is_object and "id" in item.attributes
-        }
+        self._elements = root.by_id()
 
     def place(self, params: mi.SceneParameters, key: str) -> tuple[Element, list[str]] | None:
         """The element of the nearest object above the parameter `key` that has one, and the names that lead on.
@@ -130,8 +39,7 @@ class Owners:
         owner, names = self._elements[chain.pop().id()], key.split(".")
         names = names[-len(chain) - 1 :]
         while chain:
-            nested = self._nested(owner, names[0], chain[-1])
-            if nested is None:
+            if (nested := self._nested(owner, names[0], chain[-1])) is None:
                 break
             owner, names = nested, names[1:]
             chain.pop()
@@ -143,37 +51,50 @@ class Owners:
         Some objects lose their ids, as bitmaps do; those in a group have none.
         """
         tag = next((tag for tag, kind in _KINDS.items() if isinstance(node, getattr(mi, kind))), None)
-        named: list[Element] = []
         unnamed: list[Element] = []
         for item in owner.children:
-            meant = self._elements.get(item.attributes["id"], item) if item.tag == "ref" else item
-            has_own_id = owner.type == "shapegroup" and "id" in meant.attributes  # by which it is found
+            meant = self._elements.get(item.id, item) if item.tag == "ref" else item
+            has_own_id = owner.type == "shapegroup" and meant.id  # by which it is found
             if meant.tag == tag and item.name in (name, "") and not has_own_id:
-                (named if item.name else unnamed).append(meant)
-        if named or not unnamed:
-            return named[0] if named else None
-        number = re.fullmatch(r".*?(?:_(\d+))?", name)
-        place = int(number[1] or 0) if number else 0
-        return unnamed[0] if len(unnamed) == 1 else unnamed[place] if place < len(unnamed) else None
+                if item.name:
+                    return meant
+                unnamed.append(meant)
+        number = re.search(r"_(\d+)$", name)
+        place = int(number[1]) if number and len(unnamed) > 1 else 0
+        return unnamed[place] if place < len(unnamed) else None
 
 
 #: "[parser.cpp:482] " and "[PluginManager] ": where in Mitsuba's sources a message comes from.
 _ORIGIN = re.compile(r"\[[\w.]+(:\d+)?\]\s*")
-
-
 #: "At string (line 3, col 7): " and the like, before the message proper.
 _PREAMBLE = re.compile(r"^(At|Error while loading|While loading) .*?\(line \d+, col \d+\):? ?")
-
-
 _PLACE = re.compile(r"\(line (\d+), col \d+\)")
-
-
 #: What Mitsuba says of a mesh without faces.
 _NO_FACES = re.compile(r"Storing new normals in a Mesh that didn't have normals.*")
-
-
 #: Parameters of one object for which names that are like theirs are looked for.
 _HINTS = 30
+
+
+def _place_textures(root: Element) -> None:
+    """Move each texture right below `root` into the place of the first reference to it; other references stay.
+
+    Mitsuba lists the parameters of what stands right below the scene as the scene's own, by the id of a texture, which
+    some lose: nothing would say that they are properties of a material or a light.
+    """
+    textures = {child.id: child for child in root.children if child.tag == "texture" and child.id}
+    for alias in root.walk("alias"):
+        textures.pop(alias.id, None)
+    for element in list(root.walk()):
+        for index, child in enumerate(element.children if element is not root else ()):
+            texture = textures.get(child.id) if child.tag == "ref" else None
+            if texture is None or texture is element:
+                continue
+            del textures[texture.id]
+            root.children.remove(texture)
+            texture.attributes.pop("name", None)
+            if child.name:
+                texture.attributes["name"] = child.name
+            element.children[index] = texture
 
 
 def build(description: Description) -> tuple[Any, list[Note]]:
@@ -181,6 +102,7 @@ def build(description: Description) -> tuple[Any, list[Note]]:
 
     Nothing is merged: all parameters keep their names. Raises ConfigError, located, for what Mitsuba refuses.
     """
+    _place_textures(description.root)
     text = _Text(description.root)
     config = mi.parser.ParserConfig(mi.variant())
     config.merge_equivalent = config.merge_meshes = False
@@ -226,20 +148,18 @@ class _Text:
 
 def _unused(props: mi.Properties, element: Element) -> list[Note]:
     """Notes on what `element` gives its plugin, and the plugin did not ask for."""
-    notes = []
-    children = {child.name: child for child in element.children if child.name}
+    notes: list[Note] = []
     unnamed = [child for child in element.children if not child.name and (child.is_object or child.tag == "ref")]
     for name in props.unqueried():
         number = re.match(r"_arg_(\d+)", name)
         if number and int(number[1]) < len(unnamed):
             child = unnamed[int(number[1])]
             wrong = f"{element.type} has no use for a <{child.tag}> in Mitsuba 3"
-            notes.append(Note(child, wrong, "left out", element))
         else:
             likely = likely_parameters(element.type) if len(notes) < _HINTS else []
             near = difflib.get_close_matches(name, likely, n=1, cutoff=0.75)
             hint = f" (did you mean `{near[0]}`?)" if near else ""
-            child = children.get(name, element)
+            child = element.find(name) or element
             wrong = f"{element.type} has no parameter {quoted(child.written or name)} in Mitsuba 3{hint}"
-            notes.append(Note(child, wrong, "left out", None if child is element else element))
+        notes.append(Note(child, wrong, "left out", None if child is element else element))
     return notes

@@ -1,28 +1,27 @@
-"""The mending of what other versions of Mitsuba and exporters for them wrote, where Mitsuba 3 can say it.
+"""The mending of what other versions of Mitsuba and exporters for them wrote, where Mitsuba 3 can say it, and of ids.
 
-In the order of the code: notes of what was mended, or left out, so that a scene could be loaded; tables of how those
-versions and exporters say what Mitsuba 3 says in another way; colours and spectra; texture coordinates as Mitsuba 0.6
-let them be scaled and shifted; textures that stand by themselves, put where they are used, so that their parameters
-belong to what uses them; and `mend`, which goes through the elements.
+Mitsuba names an object without an id by its address in memory, which differs each time that the scene is loaded. Its
+lasting name is its kind, and its number among all of that kind.
 
-Colours as Mitsuba 0.6 let them be written, and spectra that RGB variants lack, get a form that has a colour there. The
-plugins `regular`, `irregular` and `blackbody` can be evaluated by wavelength alone. Of the same spectrum written as
-`<spectrum value="400:0.1, 700:0.9"/>` Mitsuba computes the colour, by the CIE's matching functions: that of light where
-it is what an emitter emits, elsewhere that of a surface under D65.
+Notes say what was mended, or left out, so that a scene could be loaded; tables, how those versions and exporters say
+what Mitsuba 3 says in another way. The plugins `regular`, `irregular` and `blackbody` can be evaluated by wavelength
+alone, which RGB variants lack. Of the same spectrum written as `<spectrum value="400:0.1, 700:0.9"/>` Mitsuba computes
+the colour, by the CIE's matching functions: that of light where it is what an emitter emits, elsewhere that of a
+surface under D65.
 """
 
 from __future__ import annotations
 
 import itertools
 import math
-import os
 import re
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
+
+import numpy as np
 
 from reslrb_cli.backend.installation import is_known
-from reslrb_cli.errors import ConfigError
 from reslrb_cli.scene.xml.read import Description, Element, quoted
 
 #: Lines that one warning names, and warnings of one scene.
@@ -42,57 +41,50 @@ class Note:
     owner: Element | None = None
 
 
-def in_order(notes: Iterable[Note], root: Element) -> list[Note]:
+def _in_order(notes: Iterable[Note], root: Element) -> list[Note]:
     """The notes in the order of lines, those on the file of `root` first."""
-    return sorted(notes, key=lambda note: (note.element.source != root.source, *_place(note)))
+
+    def place(note: Note) -> tuple[bool, str, int]:
+        source = note.element.source
+        return source != root.source, str(source.file), note.element.line
+
+    return sorted(notes, key=place)
 
 
-def _place(note: Note) -> tuple[str, int]:
-    return str(note.element.source.file), note.element.line
-
-
-def warnings(notes: Sequence[Note]) -> list[str]:
+def warnings(notes: Sequence[Note], root: Element) -> list[str]:
     """A line for each kind of thing, located where it is first met."""
     kinds: dict[tuple[str, str, object], list[Element]] = {}
-    for note in notes:
+    for note in _in_order(notes, root):
         kinds.setdefault((note.wrong, note.done, note.element.source.file), []).append(note.element)
     lines = []
     for (wrong, done, _), elements in kinds.items():
-        others = list(dict.fromkeys(element.line for element in elements[1:]))
-        more = ", ".join(map(str, others[:_LINES])) + (f" and {len(others) - _LINES} more" * (len(others) > _LINES))
-        lines.append(f"{elements[0].place}: {wrong}: {done}" + (f" (also in line {more})" if others else ""))
+        others = list(dict.fromkeys(str(element.line) for element in elements[1:]))
+        more = ", ".join(others[:_LINES]) + f" and {len(others) - _LINES} more" * (len(others) > _LINES)
+        lines.append(f"{elements[0].place}: {wrong}: {done}" + f" (also in line {more})" * bool(others))
     if len(lines) > _WARNINGS:
-        rest = len(lines) - _WARNINGS
-        lines = [
-            *lines[:_WARNINGS],
-            f"{notes[0].element.source.file}: {rest} more kinds of things were mended or left out",
-        ]
+        rest = f"{len(lines) - _WARNINGS} more kinds of things were mended or left out"
+        lines[_WARNINGS:] = [f"{root.source.file}: {rest}"]
     return lines
 
 
-def refuse(notes: Sequence[Note]) -> None:
+def refuse(notes: Sequence[Note], root: Element) -> None:
     """Raise ConfigError for the first of `notes`, if there is any."""
     if notes:
-        first = notes[0]
         more = f" (and {len(notes) - 1} more)" if len(notes) > 1 else ""
-        raise ConfigError(
-            first.element.place, "", f"{first.wrong}; with scene.strict: false it would be {first.done}{more}"
-        )
+        first = _in_order(notes, root)[0]
+        raise first.element.fail("", f"{first.wrong}; with scene.strict: false it would be {first.done}{more}")
 
 
 #: Spellings of elements.
 ELEMENTS = {"lookAt": "lookat", "srgb": "rgb"}
-
-
+_BEFORE_04 = "an element of Mitsuba before 0.4, whose axes pointed elsewhere; save the scene with Mitsuba 0.6"
 #: Elements of Mitsuba 0.x that mean what Mitsuba 3 cannot be told, and what to do.
 LOST_ELEMENTS = {
-    "camera": "an element of Mitsuba before 0.4, whose axes pointed elsewhere; save the scene with Mitsuba 0.6",
-    "luminaire": "an element of Mitsuba before 0.4, whose axes pointed elsewhere; save the scene with Mitsuba 0.6",
+    **dict.fromkeys(("camera", "luminaire"), _BEFORE_04),
     "subsurface": "an element of Mitsuba 0.6 that Mitsuba 3 does not have; remove it, or take a medium",
     "blackbody": "an element of Mitsuba 0.6 that Mitsuba 3 does not have; write its colour as <rgb>",
     "animation": "an element of Mitsuba 0.6; nothing moves in Mitsuba 3: write one of its transforms",
 }
-
 
 #: Attributes of elements other than objects.
 ATTRIBUTES = {
@@ -108,58 +100,19 @@ ATTRIBUTES = {
     "matrix": ("value",),
 }
 
-
 OBJECT_ATTRIBUTES = ("type", "id", "name")
-
 
 #: Plugins by other names, for elements of one kind.
 PLUGINS = {
     ("bsdf", "bump"): "bumpmap",
-    ("film", "exrfilm"): "hdrfilm",
-    ("film", "pngfilm"): "hdrfilm",
-    ("film", "ldrfilm"): "hdrfilm",
-    ("film", "tiledhdrfilm"): "hdrfilm",
-    ("film", "mfilm"): "hdrfilm",
+    **{("film", name): "hdrfilm" for name in ("exrfilm", "pngfilm", "ldrfilm", "tiledhdrfilm", "mfilm")},
 }
-
 
 #: Objects without which the same light reaches the same film, and what takes their place.
 REPLACEABLE = {
     "sampler": "an `independent` one takes its place",
     "rfilter": "the film's default takes its place",
 }
-
-
-#: Plugins of Mitsuba 0.6 that Mitsuba 3 does not have, and what comes near them.
-LOST_PLUGINS = {
-    ("bsdf", "coating"): "`principled` with a clearcoat comes near",
-    ("bsdf", "roughcoating"): "`principled` with a clearcoat comes near",
-    ("bsdf", "mixturebsdf"): "nested `blendbsdf` say the same",
-    ("bsdf", "phong"): "`roughplastic` comes near",
-    ("bsdf", "ward"): "`roughconductor` or `roughplastic` comes near",
-    ("bsdf", "roughdiffuse"): "`diffuse` comes near",
-    ("bsdf", "difftrans"): "`principledthin` comes near",
-    ("bsdf", "hk"): "a medium comes near",
-    ("bsdf", "irawan"): "a texture comes near",
-    ("emitter", "sky"): "`sunsky` comes near, with z for its up axis in place of y",
-    ("emitter", "sun"): "`sunsky` comes near, with z for its up axis in place of y",
-    ("emitter", "collimated"): "`directionalarea` comes near",
-    ("shape", "heightfield"): "write it as a mesh",
-    ("texture", "scale"): "multiply the texture itself",
-    ("texture", "gridtexture"): "`bitmap` or `checkerboard` comes near",
-    ("texture", "wireframe"): "`bitmap` comes near",
-    ("texture", "curvature"): "`mesh_attribute` comes near",
-    ("texture", "vertexcolors"): "`mesh_attribute` says the same",
-}
-
-
-#: Plugins that Mitsuba 3 has, and that no scene file can use here.
-REFUSED_PLUGINS = {
-    ("shape", "hair"): "is a plugin of Mitsuba 0.6 that Mitsuba 3 does not have; `bsplinecurve` draws strands",
-    ("shape", "blender"): "reads the memory of a running Blender; export the mesh as `ply` or `obj`",
-    ("sensor", "flat_sensor"): "belongs to Mitsuba's own RayDataLoader; take a `perspective` one",
-}
-
 
 #: Values of text parameters, by plugin and parameter.
 VALUES = {
@@ -171,7 +124,6 @@ VALUES = {
         "xyzAlpha": "xyza",
     },
 }
-
 
 #: Formats of files that `hdrfilm` knows; nothing here is written by the film, so that another can be left out.
 FORMATS = {
@@ -187,19 +139,23 @@ def snake_case(name: str) -> str:
 
 #: Spectra by wavelength, by plugin.
 SPECTRA = ("regular", "irregular", "blackbody")
-
-
-#: Wavelengths, in nm, of what Mitsuba takes for visible, and how far apart a black body's are taken.
-_VISIBLE, _STEP = (360.0, 830.0), 5.0
-
-
+#: Wavelengths, in nm, of what Mitsuba takes for visible, how far apart a black body's are taken, and how many at most.
+_VISIBLE, _STEP, _MOST = (360.0, 830.0), 5.0, 2**14
 #: Planck's constant times the speed of light squared, twice (W m^2), and times it over Boltzmann's (m K), as Mitsuba's.
 _FIRST, _SECOND = 2 * 6.62607004e-34 * 2.99792458e8**2, 6.62607004e-34 * 2.99792458e8 / 1.38064852e-23
 
 
+def _floats(text: str) -> list[float]:
+    """The numbers of a list of them; none where one is no number."""
+    try:
+        return [float(word) for word in text.replace(",", " ").split()]
+    except ValueError:
+        return []
+
+
 def hexadecimal(element: Element) -> str:
     """The three numbers of `#rrggbb`, each a fraction of 255. Raises ConfigError where it is none."""
-    text = element.attributes.get("value", "").strip()
+    text = element.value.strip()
     if re.fullmatch(r"#[0-9a-fA-F]{6}", text) is None:
         raise element.fail(element.name, f"must be a colour such as #80ff00, not {quoted(text)}")
     return " ".join(f"{int(text[i : i + 2], 16) / 255:.9g}" for i in (1, 3, 5))
@@ -207,12 +163,8 @@ def hexadecimal(element: Element) -> str:
 
 def linear(element: Element) -> str:
     """The value of an <srgb> element, one or three numbers or `#rrggbb`, as linear Rec. 709. Raises ConfigError."""
-    text = element.attributes.get("value", "")
-    words = (hexadecimal(element) if text.strip().startswith("#") else text).replace(",", " ").split()
-    try:
-        encoded = [float(word) for word in words]
-    except ValueError:
-        encoded = []
+    text = element.value
+    encoded = _floats(hexadecimal(element) if text.strip().startswith("#") else text)
     if len(encoded) not in (1, 3):
         raise element.fail(element.name, f"must be one or three numbers or #rrggbb, not {quoted(text)}")
     # IEC 61966-2-1
@@ -224,113 +176,143 @@ def by_wavelength(spectrum: Element, owner: Element) -> dict[str, str]:
 
     Raises ConfigError where it is no spectrum, or a black body that is not what an emitter emits.
     """
-    inner = next((child for child in spectrum.children if child.tag == "spectrum" and child.name == "value"), None)
-    if inner is not None and spectrum.type != "blackbody":
-        return {key: value for key, value in inner.attributes.items() if key in ("value", "filename")}
+    inner = spectrum.find("value")
     if spectrum.type == "blackbody":
         if owner.tag != "emitter":
             raise spectrum.fail("", f"a blackbody is what an emitter emits; a {owner.tag} can have <rgb>")
-        pairs = _black_body(spectrum)
+        wavelengths, values = _black_body(spectrum)
+    elif inner is not None and inner.tag == "spectrum":
+        return {key: value for key, value in inner.attributes.items() if key in ("value", "filename")}
     elif spectrum.type == "regular":
-        values, (first, last) = _numbers(spectrum, "values"), _range(spectrum, required=True)
-        step = (last - first) / max(len(values) - 1, 1)
-        pairs = [(first + step * place, value) for place, value in enumerate(values)]
+        values = _numbers(spectrum, "values")
+        wavelengths = np.linspace(*_range(spectrum, ()), len(values))
     else:
         wavelengths, values = _numbers(spectrum, "wavelengths"), _numbers(spectrum, "values")
         if len(wavelengths) != len(values):
             raise spectrum.fail("", f"irregular has {len(wavelengths)} wavelengths and {len(values)} values")
-        pairs = list(zip(wavelengths, values, strict=True))
-    if len(pairs) < 2 or any(left >= right for (left, _), (right, _) in itertools.pairwise(pairs)):
+    if len(wavelengths) < 2 or (np.diff(wavelengths) <= 0).any():
         raise spectrum.fail("", f"{spectrum.type} needs two wavelengths or more, in ascending order")
+    pairs = zip(wavelengths, values, strict=True)
     return {"value": ", ".join(f"{wavelength:.9g}:{value:.9g}" for wavelength, value in pairs)}
 
 
-def _black_body(spectrum: Element) -> list[tuple[float, float]]:
+def _black_body(spectrum: Element) -> tuple[np.ndarray, np.ndarray]:
     """Wavelengths in nm, and the radiance of a black body in W/(m^2 sr nm)."""
-    [temperature, *more] = _numbers(spectrum, "temperature")
-    if more or temperature <= 0:
+    temperature = _numbers(spectrum, "temperature")
+    if len(temperature) > 1 or temperature[0] <= 0:
         raise spectrum.fail("temperature", "must be a number of kelvin above 0")
-    first, last = _range(spectrum, required=False)
-    count = max(math.ceil((last - first) / _STEP), 1)
-    pairs = []
-    for place in range(count + 1):
-        metres = 1e-9 * (first + (last - first) * place / count)
-        exponent = min(_SECOND / (metres * temperature), 700.0)  # beyond it is 0 to a float, and the other overflows
-        pairs.append((1e9 * metres, 1e-9 * _FIRST / (metres**5 * math.expm1(exponent))))
-    return pairs
+    first, last = _range(spectrum, _VISIBLE)
+    nm = np.linspace(first, last, min(math.ceil((last - first) / _STEP), _MOST) + 1)
+    exponent = _SECOND / (1e-9 * nm * temperature[0])
+    # Beyond 700 it is 0 to a float, and the other overflows.
+    return nm, 1e-9 * _FIRST / ((1e-9 * nm) ** 5 * np.expm1(np.minimum(exponent, 700)))
 
 
-def _range(spectrum: Element, required: bool) -> tuple[float, float]:
+def _range(spectrum: Element, default: Sequence[float]) -> tuple[float, float]:
+    """The ends of the wavelengths, in nm: those of `default` where they are not given, and there is one."""
     names = ("wavelength_min", "wavelength_max")
-    given = {child.name for child in spectrum.children}
-    ends = [
-        _numbers(spectrum, name)[0] if required or name in given else default
-        for name, default in zip(names, _VISIBLE, strict=True)
-    ]
-    if not 0 < ends[0] < ends[1]:
+    low, high = (
+        default[place] if default and spectrum.find(name) is None else _numbers(spectrum, name)[0]
+        for place, name in enumerate(names)
+    )
+    if not 0 < low < high:
         raise spectrum.fail("", f"{spectrum.type}: wavelength_max must be above wavelength_min, and both above 0")
-    return ends[0], ends[1]
+    return low, high
 
 
-def _numbers(spectrum: Element, name: str) -> Sequence[float]:
+def _numbers(spectrum: Element, name: str) -> np.ndarray:
     """The numbers of a parameter, one or more, none of them negative or not finite."""
-    text = next((child.attributes.get("value", "") for child in spectrum.children if child.name == name), None)
-    if text is None:
+    if (parameter := spectrum.find(name)) is None:
         raise spectrum.fail("", f"{spectrum.type} needs a parameter `{name}`")
-    try:
-        numbers = [float(word) for word in text.replace(",", " ").split()]
-    except ValueError:
-        numbers = []
-    if not numbers or not all(math.isfinite(number) and number >= 0 for number in numbers):
-        raise spectrum.fail(name, f"must be numbers from 0 on, not {quoted(text)}")
+    numbers = np.array(_floats(parameter.value))
+    if not numbers.size or not (np.isfinite(numbers) & (numbers >= 0)).all():
+        raise spectrum.fail(name, f"must be numbers from 0 on, not {quoted(parameter.value)}")
     return numbers
-
-
-#: The steps of a transform, in their order, and the parameters that give them along u and v.
-_STEPS = {"translate": ("uoffset", "voffset"), "scale": ("uscale", "vscale")}
 
 
 def transform_coordinates(texture: Element) -> Element | None:
     """Write what a texture says of `uscale` and its like as the transform that they mean; return the first of them."""
-    names = [name for pair in _STEPS.values() for name in pair]
+    names = ("uoffset", "voffset", "uscale", "vscale")
     given = {child.name: child for child in texture.children if child.tag == "float" and child.name in names}
     if not given:
         return None
     first = next(iter(given.values()))
     steps = []
-    for tag, pair in _STEPS.items():
-        values = {
-            axis: given[name].attributes.get("value", "")
-            for axis, name in zip("xy", pair, strict=True)
-            if name in given
-        }
-        if values:
-            steps.append(Element(tag, values, first.source, first.line))
-    texture.children[:] = [child for child in texture.children if child not in given.values()]
-    texture.children.append(Element("transform", {"name": "to_uv"}, first.source, first.line, steps))
+    for tag, word in (("translate", "offset"), ("scale", "scale")):  # in their order
+        axes = {axis: given[u + word].value for axis, u in (("x", "u"), ("y", "v")) if u + word in given}
+        steps += [first.new(tag, **axes)] if axes else []
+    texture.drop(*given)
+    texture.children.append(first.new("transform", *steps, name="to_uv"))
     return first
 
 
-def place_textures(root: Element) -> None:
-    """Move each texture right below `root` into the place of the first reference to it; other references stay.
+#: Plugins that name what they hold by its place among the others, in every load alike.
+_GROUPS = ("shapegroup", "batch")
+#: How the ids begin that Mitsuba gives to objects without one when it writes a scene; it takes them for none.
+_UNNAMED = "_unnamed_"
+#: Characters of an id that is kept: keys become names of files.
+_LONGEST = 120
 
-    Mitsuba lists the parameters of what stands right below the scene as the scene's own, by the id of a texture, which
-    some lose: nothing would say that they are properties of a material or a light.
+
+def _name_objects(root: Element) -> list[Note]:
+    """Give every object below `root` an id that is there in every load of the same files; say whose ids were changed.
+
+    The third `sphere` of the files becomes `Sphere_3`, whether or not the first two have ids. An id that Mitsuba could
+    not use in a key is replaced: one that is empty, starts with `_unnamed_`, is very long or holds what cannot be
+    printed, or is that of an earlier object. References follow. Raises ConfigError where a reference is to an id of two
+    objects that differ.
     """
-    textures = {child.attributes.get("id", ""): child for child in root.children if child.tag == "texture"}
-    textures.pop("", None)
-    aliased = {element.attributes.get("id") for element in root.walk() if element.tag == "alias"}
-    for element in list(root.walk()):
-        for index, child in enumerate(element.children):
-            texture = textures.get(child.attributes.get("id", "")) if child.tag == "ref" else None
-            if texture is None or element is root or element is texture or texture.attributes["id"] in aliased:
-                continue
-            del textures[texture.attributes["id"]]
-            root.children.remove(texture)
-            texture.attributes.pop("name", None)
-            if child.name:
-                texture.attributes["name"] = child.name
-            element.children[index] = texture
+    root.attributes.pop("id", None)
+    objects = root.objects()[1:]
+    grouped = {child for element in objects if element.type in _GROUPS for child in element.children}
+    taken = {element.attributes[key] for element in root.walk() for key in ("id", "as") if key in element.attributes}
+    owners: dict[str, Element] = {}
+    renamed: dict[str, str] = {}
+    differing: dict[str, Element] = {}
+    notes: list[Note] = []
+    numbers: Counter[str] = Counter()
+    for element in objects:
+        kind = element.type[:1].upper() + element.type[1:]
+        numbers[kind] += 1
+        own = element.id
+        if own in owners:
+            if not _same(owners[own], element):
+                differing[own] = element
+        elif own.strip() and own.isprintable() and len(own) <= _LONGEST and not own.startswith(_UNNAMED):
+            owners[own] = element
+            continue
+        elif element in grouped and not own:
+            continue
+        name = first = f"{kind}_{numbers[kind]}"
+        for number in itertools.count(2):
+            if name not in taken:
+                break
+            name = f"{first}_{number}"
+        taken.add(name)
+        element.attributes["id"] = name
+        if own in owners:
+            notes.append(Note(element, f"id {quoted(own)} is that of {owners[own].place}, too", f"named {name}"))
+        elif own.strip() and own not in renamed:
+            renamed[own] = name
+            if not own.startswith(_UNNAMED):
+                notes.append(Note(element, f"id {quoted(own)} cannot stand in a key", f"named {name}"))
+    for element in root.walk("ref", "alias"):
+        own = element.id
+        if own in differing:
+            places = f"{owners[own].place} and {differing[own].place}"
+            raise element.fail("", f"refers to {quoted(own)}, the id of two objects ({places}); rename one of them")
+        if own in renamed:
+            element.attributes["id"] = renamed[own]
+    return notes
+
+
+def _same(a: Element, b: Element) -> bool:
+    """Whether two elements, their ids aside, say the same."""
+    one, other = ({**element.attributes, "id": ""} for element in (a, b))
+    return (
+        (a.tag, one, len(a.children)) == (b.tag, other, len(b.children))
+        and all(_same(x, y) for x, y in zip(a.children, b.children, strict=True))
+    )  # fmt: skip
 
 
 CURRENT_VERSION = "3.0.0"
@@ -343,67 +325,56 @@ def mend(description: Description) -> list[Note]:
     shapes keep their meaning: those that Mitsuba 3 does not have stay as they are, to be refused. Parameters that no
     plugin asks for show only when the scene is built.
     """
-    mender = _Mender(description.folders)
-    root = description.root
+    mender, root = _Mender(description), description.root
+    mender.notes += _name_objects(root)
+    given = root.attributes.pop("version", None)
     if root.source.version is None:
-        given = root.attributes.get("version")
         wrong = "the version is missing" if given is None else f"version {quoted(given)} is not three numbers"
         mender.note(root, wrong, f"taken for {CURRENT_VERSION}")
-    mender.mend_root(root)
+    if root.is_object:
+        mender.mend_element(root)
+    mender.mend_below(root)
+    mender.mend_spectra(root)
+    # What refers to something that was left out goes with it.
+    for element in root.walk() if mender.gone else ():
+        element.children[:] = [child for child in element.children if child.tag != "ref" or child.id not in mender.gone]
     root.attributes["version"] = CURRENT_VERSION
     return mender.notes
 
 
 class _Mender:
-    def __init__(self, folders: list[Path]) -> None:
-        self.folders = folders
+    def __init__(self, description: Description) -> None:
+        self.find_file = description.find_file
         self.notes: list[Note] = []
         self.gone: set[str] = set()
 
     def note(self, element: Element, wrong: str, done: str) -> None:
         self.notes.append(Note(element, wrong, done))
 
-    def mend_root(self, root: Element) -> None:
-        """Mend the whole scene."""
-        root.attributes.pop("version", None)
-        if root.is_object:
-            self._element(root)
-        self.mend(root)
-        self._spectra(root)
-        # What refers to something that was left out goes with it.
-        for element in root.walk() if self.gone else ():
-            element.children[:] = [
-                child for child in element.children if child.tag != "ref" or child.attributes.get("id") not in self.gone
-            ]
-
-    def mend(self, element: Element) -> None:
+    def mend_below(self, element: Element) -> None:
         """Mend all below `element`, which is mended itself."""
         kept = []
         names = {child.name for child in element.children}
         for child in element.children:
-            if self._is_kept(child):
-                if element.is_object:
-                    self._parameter(child, element, names)
-                if not self._is_needless_format(child, element):
-                    kept.append(child)
-            else:
-                self.gone.update(other.attributes.get("id", "") for other in child.walk() if other.is_object)
+            # In place of a scene's integrator there is the experiment's own.
+            is_kept = child.tag != "integrator" and self.mend_element(child)
+            if not is_kept or (child.is_object and not self._plugin(child)):
+                self.gone.update(other.id for other in child.objects())
+            elif not element.is_object or self._parameter(child, element, names):
+                kept.append(child)
         element.children[:] = kept
         if element.is_object:
             self._repetitions(element)
-            self._texture_coordinates(element)
+        if element.tag == "texture":
+            replaced = transform_coordinates(element)
+            if replaced is not None and not element.source.is_old:
+                self.note(replaced, f"`{replaced.name}` is unknown to Mitsuba 3", "read as `to_uv`")
         for child in element.children:
-            self.mend(child)
-
-    def _is_kept(self, element: Element) -> bool:
-        """Mend an element and its plugin; False where it is to be left out."""
-        if element.tag == "integrator":  # the experiment's own takes its place
-            return False
-        return self._element(element) and (not element.is_object or self._plugin(element))
+            self.mend_below(child)
 
     # --- elements and plugins -----------------------------------------------------------------------------------------
 
-    def _element(self, element: Element) -> bool:
+    def mend_element(self, element: Element) -> bool:
         """Mend tag and attributes; False where the element is to be left out."""
         tag = element.tag
         if tag == "srgb":
@@ -411,9 +382,7 @@ class _Mender:
         if tag in ELEMENTS:
             element.tag = ELEMENTS[tag]
             self.note(element, f"{quoted(f'<{tag}>')} is unknown to Mitsuba 3", f"read as <{element.tag}>")
-        known = ATTRIBUTES.get(element.tag)
-        if element.is_object:
-            known = OBJECT_ATTRIBUTES
+        known = OBJECT_ATTRIBUTES if element.is_object else ATTRIBUTES.get(element.tag)
         if known is None:
             if tag in LOST_ELEMENTS:
                 raise element.fail("", f"<{tag}> is {LOST_ELEMENTS[tag]}")
@@ -427,41 +396,39 @@ class _Mender:
     def _plugin(self, element: Element) -> bool:
         """Mend the name of an object's plugin; False where the object is to be left out."""
         type = element.type
+        wrong = f"there is no {element.tag} {quoted(type)} in Mitsuba 3"
+        other = PLUGINS.get((element.tag, type), type.lower())
         if is_known(type):
             if element.tag == "sampler" and type != "independent":
                 # Others round the number of samples, which is the experiment's, and fail where it is split otherwise.
                 element.attributes["type"] = "independent"
                 element.children[:] = [child for child in element.children if child.name == "sample_count"]
-            return True
-        other = PLUGINS.get((element.tag, type), type.lower())
-        if is_known(other):
-            self.note(element, f"there is no {element.tag} {quoted(type)} in Mitsuba 3", f"read as `{other}`")
+        elif is_known(other):
+            self.note(element, wrong, f"read as `{other}`")
             element.attributes["type"] = other
-            return True
-        replacement = REPLACEABLE.get(element.tag)
-        if replacement is None:
-            return True
-        self.note(element, f"there is no {element.tag} {quoted(type)} in Mitsuba 3", f"left out ({replacement})")
-        return False
+        elif element.tag in REPLACEABLE:
+            self.note(element, wrong, f"left out ({REPLACEABLE[element.tag]})")
+            return False
+        return True
 
     # --- parameters ---------------------------------------------------------------------------------------------------
 
-    def _parameter(self, element: Element, owner: Element, names: set[str]) -> None:
-        """Mend the name and the value of a parameter of `owner`, whose parameters have these `names`."""
+    def _parameter(self, element: Element, owner: Element, names: set[str]) -> bool:
+        """Mend the name and the value of a parameter of `owner`, whose parameters have these `names`; False where it is
+        to be left out."""
         if owner.tag == "scene" and element.is_object:
             # A name says nothing here, but of two objects with the same one Mitsuba drops the first.
             element.attributes.pop("name", None)
-            return
+            return True
         self._name(element, owner, names)
-        value = element.attributes.get("value", "")
-        if element.tag == "spectrum" and "type" not in element.attributes and _is_colour(value):
+        value = element.value
+        if element.tag == "spectrum" and "type" not in element.attributes and len(_floats(value)) == 3:
             self.note(element, "a <spectrum> of three numbers is unknown to Mitsuba 3", "read as <rgb>")
             element.tag = "rgb"
         elif element.tag == "rgb" and value.startswith("#"):
             element.attributes["value"] = hexadecimal(element)
             self.note(element, f"a colour cannot be written as {quoted(value)} in Mitsuba 3", "read as three numbers")
-        elif element.tag == "string":
-            self._text(element, owner, value)
+        return element.tag != "string" or self._text(element, owner, value)
 
     def _name(self, element: Element, owner: Element, names: set[str]) -> None:
         old, name = element.name, snake_case(element.name)
@@ -475,28 +442,21 @@ class _Mender:
         if not element.source.is_old:
             self.note(element, f"{quoted(old)} is spelled as before Mitsuba 2", f"read as {quoted(name)}")
 
-    def _text(self, element: Element, owner: Element, value: str) -> None:
+    def _text(self, element: Element, owner: Element, value: str) -> bool:
+        wrong = f"{owner.type} has no {element.name} {quoted(value)} in Mitsuba 3"
+        if owner.type == "hdrfilm" and value.lower() not in FORMATS.get(element.name, (value.lower(),)):
+            self.note(element, wrong, "left out")  # images are written without it
+            return False
         other = VALUES.get((owner.type, element.name), {}).get(value)
         if (owner.type, element.name) == ("hdrfilm", "pixel_format") and "," in value:
             other = value.partition(",")[0].strip()  # one for each of several images
-        wrong = f"{owner.type} has no {element.name} {quoted(value)} in Mitsuba 3"
-        slashed = value.replace("\\", "/")
-        if element.name == "filename" and slashed != value and not self._exists(value) and self._exists(slashed):
-            other, wrong = slashed, f"there is no file {quoted(value)}"
+        if element.name == "filename" and "\\" in value and self.find_file(value) is None:
+            slashed = value.replace("\\", "/")
+            if self.find_file(slashed) is not None:
+                other, wrong = slashed, f"there is no file {quoted(value)}"
         if other is not None:
             element.attributes["value"] = other
             self.note(element, wrong, f"read as {quoted(other)}")
-
-    def _exists(self, file: str) -> bool:
-        return any(os.path.exists(folder / file) for folder in self.folders)
-
-    def _is_needless_format(self, element: Element, owner: Element) -> bool:
-        """Whether `element` asks `hdrfilm` for a format that it does not know: images are written without it."""
-        known = FORMATS.get(element.name)
-        value = element.attributes.get("value", "")
-        if owner.type != "hdrfilm" or known is None or element.tag != "string" or value.lower() in known:
-            return False
-        self.note(element, f"hdrfilm has no {element.name} {quoted(value)} in Mitsuba 3", "left out")
         return True
 
     def _repetitions(self, owner: Element) -> None:
@@ -511,36 +471,19 @@ class _Mender:
             last[child.name] = child
         owner.children[:] = [child for child in owner.children if child not in dropped]
 
-    def _spectra(self, root: Element) -> None:
+    def mend_spectra(self, root: Element) -> None:
         """Write spectra by wavelength as parameters of what has them, since RGB variants have no such plugins."""
-        named = {
-            element.attributes["id"]: element
-            for element in root.walk()
-            if element.tag in ("spectrum", "texture") and element.type in SPECTRA and "id" in element.attributes
-        }
-        for alias in [element for element in root.walk() if element.tag == "alias"]:
-            if alias.attributes.get("id") in named:
-                named[alias.attributes.get("as", "")] = named[alias.attributes["id"]]
-        for owner in [element for element in root.walk() if element.is_object and element.type != "specfilm"]:
+        named = {id: item for id, item in root.by_id().items() if item.type in SPECTRA}
+        for owner in [element for element in root.objects() if element.type != "specfilm"]:
             kept = []
             for child in owner.children:
-                meant = named.get(child.attributes.get("id", ""))
+                meant = named.get(child.id)
                 if meant is None:
                     kept.append(child)
                 elif owner is not root:
                     name = child.name or meant.name
                     if not name:
                         raise child.fail("", f"<{meant.tag}> `{meant.type}` needs a name: that of what it is for")
-                    attributes = {"name": name, **by_wavelength(meant, owner)}
-                    kept.append(Element("spectrum", attributes, child.source, child.line))
+                    kept.append(child.new("spectrum", name=name, **by_wavelength(meant, owner)))
                     self.note(meant, f"RGB variants have no spectrum `{meant.type}`", "read as the colour of it")
             owner.children[:] = kept
-
-    def _texture_coordinates(self, owner: Element) -> None:
-        replaced = transform_coordinates(owner) if owner.tag == "texture" else None
-        if replaced is not None and not owner.source.is_old:
-            self.note(replaced, f"`{replaced.name}` is unknown to Mitsuba 3", "read as `to_uv`")
-
-
-def _is_colour(value: str) -> bool:
-    return ":" not in value and len(value.replace(",", " ").split()) == 3

@@ -1,18 +1,14 @@
 """Scene files as elements: read, included files and variables put in, and written for Mitsuba's parser.
 
-- `Element` knows the file and the line that it comes from.
-- `read_document` reads one XML file, and refuses what would take the parser down or never end.
-- `Variables` puts in the `$name` variables of a scene file as Mitsuba's parser does.
-- `read_description` brings a scene together from its files: includes are followed, variables put in, folders to look in
-  collected.
-- `tag_lines` writes the elements as the XML that Mitsuba's own parser reads.
+Each element knows the file and the line that it comes from. What would take the parser down or never end is refused.
 """
 
 from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -30,11 +26,8 @@ OBJECTS = frozenset(
     )
 )
 
-
 #: Elements that are values of parameters; a <spectrum> without a type is one, too.
 VALUES = frozenset(("float", "integer", "boolean", "string", "point", "vector", "rgb", "transform"))
-
-
 #: Characters of a quotation.
 _QUOTED = 60
 
@@ -93,6 +86,16 @@ class Element:
         return self.attributes.get("name", "")
 
     @property
+    def value(self) -> str:
+        """What it says that it is, or empty."""
+        return self.attributes.get("value", "")
+
+    @property
+    def id(self) -> str:
+        """Its own id, or the one that it refers to; empty where it has none."""
+        return self.attributes.get("id", "")
+
+    @property
     def type(self) -> str:
         """The name of its plugin; empty where it has none."""
         return self.attributes.get("type", "scene" if self.tag == "scene" else "")
@@ -101,34 +104,47 @@ class Element:
         """The error for this element."""
         return ConfigError(self.place, key, message)
 
-    def walk(self) -> Iterator[Element]:
-        """This element and all below it, in the order of the file."""
+    def walk(self, *tags: str) -> Iterator[Element]:
+        """This element and all below it, in the order of the file; those with one of `tags`, where any are given."""
         waiting = [self]
         while waiting:
             element = waiting.pop()
-            yield element
+            if not tags or element.tag in tags:
+                yield element
             waiting += reversed(element.children)
 
     def objects(self) -> list[Element]:
         """The objects among them: the nodes that Mitsuba's parser makes, in its order."""
         return [element for element in self.walk() if element.is_object]
 
+    def by_id(self) -> dict[str, Element]:
+        """The objects among them by their ids, and by the aliases of these."""
+        found = {element.id: element for element in self.objects() if element.id}
+        for alias in self.walk("alias"):
+            if alias.id in found:
+                found.setdefault(alias.attributes.get("as", ""), found[alias.id])
+        return found
+
+    def find(self, name: str) -> Element | None:
+        """The first parameter of this name."""
+        return next((child for child in self.children if child.name == name), None)
+
+    def drop(self, *names: str) -> None:
+        """Remove the parameters of these names."""
+        self.children[:] = [child for child in self.children if child.name not in names]
+
+    def new(self, tag: str, /, *children: Element, **attributes: str) -> Element:
+        """An element that stands where this one does, and is not among its children."""
+        return Element(tag, attributes, self.source, self.line, list(children))
+
 
 #: XML of all files of a scene together, each counted as often as it is included.
 MAX_BYTES = 64 * 2**20
-
-
 #: Elements within one another. Mitsuba's parser calls itself for each level, until the stack is full.
 MAX_DEPTH = 100
-
-
 _COMMENT = re.compile(r"<!--.*?-->", re.DOTALL)
-
-
 #: An ampersand that begins none of XML's own references: Mitsuba's parser takes it for itself.
 _BARE_AMPERSAND = re.compile(r"&(?!(?:amp|lt|gt|quot|apos|#\d+|#x[0-9a-fA-F]+);)")
-
-
 _DECLARED_ENCODING = re.compile(rb"""^\s*<\?xml[^>]*\bencoding\s*=\s*["']([\w.-]+)["']""")
 
 
@@ -150,15 +166,10 @@ def read_document(file: Path, max_bytes: int) -> tuple[Element, int]:
 def _decode(data: bytes) -> str:
     """The text of a file; Mitsuba's parser takes bytes that are not of their encoding as they come."""
     declared = _DECLARED_ENCODING.match(data)
-    if data.startswith((b"\xff\xfe", b"\xfe\xff")):
-        encodings = ["utf-16"]
-    else:
-        encodings = ["utf-8-sig", *([declared[1].decode("ascii")] if declared else []), "latin-1"]
-    for encoding in encodings:
-        try:
+    encodings = ["utf-8-sig", *([declared[1].decode("ascii")] if declared else [])]
+    for encoding in ["utf-16"] if data.startswith((b"\xff\xfe", b"\xfe\xff")) else encodings:
+        with suppress(LookupError, UnicodeError):
             return data.decode(encoding)
-        except (LookupError, UnicodeError):
-            continue
     return data.decode("latin-1")
 
 
@@ -168,25 +179,19 @@ def _parse(file: Path, text: str) -> Element:
     roots: list[Element] = []
 
     def start(tag: str, attributes: dict[str, str]) -> None:
-        line = parser.CurrentLineNumber
-        source = stack[0].source if stack else Source(file, _version(attributes.get("version")))
-        element = Element(tag, attributes, source, line)
+        source = stack[0].source if stack else Source(file, _version(attributes.get("version", "")))
+        element = Element(tag, attributes, source, parser.CurrentLineNumber)
         if len(stack) == MAX_DEPTH:
             raise element.fail("", f"elements are nested more than {MAX_DEPTH} levels deep")
         (stack[-1].children if stack else roots).append(element)
         stack.append(element)
 
-    def end(tag: str) -> None:
-        stack.pop()
-
     def declare_entity(*_: Any) -> None:
-        place = f"{file}:{parser.CurrentLineNumber}"
-        raise ConfigError(
-            place, "", "declares an XML entity, which no Mitsuba scene needs; write out what it stands for"
-        )
+        said = "declares an XML entity, which no Mitsuba scene needs; write out what it stands for"
+        raise ConfigError(f"{file}:{parser.CurrentLineNumber}", "", said)
 
     parser.StartElementHandler = start
-    parser.EndElementHandler = end
+    parser.EndElementHandler = lambda tag: stack.pop()
     parser.EntityDeclHandler = declare_entity
     try:
         parser.Parse(text.encode("utf-8"), True)
@@ -195,78 +200,16 @@ def _parse(file: Path, text: str) -> Element:
     return roots[0]
 
 
-def _version(text: str | None) -> tuple[int, ...] | None:
+def _version(text: str) -> tuple[int, ...] | None:
     """A version as numbers; None where there is none, or it is not three numbers, which Mitsuba asks for."""
-    return tuple(map(int, text.split("."))) if text is not None and re.fullmatch(r"\d+\.\d+\.\d+", text) else None
+    return tuple(map(int, text.split("."))) if re.fullmatch(r"\d+\.\d+\.\d+", text) else None
 
 
 #: Characters of one attribute, after its variables are put in: variables of variables can grow at each step.
 MAX_LENGTH = 2**20
-
-
-#: Characters of a variable's name; longer ones are never found.
-_LONGEST_NAME = 256
-
-
-class Variables:
-    """Values by name: those that the user gives, and the file's defaults as they are met."""
-
-    def __init__(self, options: Mapping[str, str]) -> None:
-        self._values = dict(options)
-        self._unused = set(options)
-
-    def add_default(self, name: str, value: str) -> None:
-        """Set the value of `name` where it has none yet."""
-        self._values.setdefault(name, value)
-
-    def values(self) -> dict[str, str]:
-        """All values so far, those of the user first."""
-        return dict(self._values)
-
-    def put_into(self, element: Element) -> None:
-        """Replace the variables in the attributes of `element`. Raises ConfigError for one without a value."""
-        for key, text in element.attributes.items():
-            if "$" in text:
-                element.attributes[key] = self._replace(text, element)
-
-    def _replace(self, text: str, element: Element) -> str:
-        # The longest name first, since a name may be the beginning of another; and each once.
-        done: set[str] = set()
-        longest = _LONGEST_NAME
-        while names := [name for name in self._named(text, longest) if name not in done]:
-            name = max(names, key=len)
-            done.add(name)
-            longest = len(name)
-            value, parts = self._values[name], re.split(r"(?<!\\)" + re.escape(f"${name}"), text)
-            if len(parts) > 1:
-                self._unused.discard(name)
-            if len(text) + len(parts) * len(value) > MAX_LENGTH:
-                raise element.fail(f"${name}", f"makes a text of more than {MAX_LENGTH} characters")
-            text = value.join(parts)
-        missing = re.search(r"(?<!\\)\$(\w*)", text, re.ASCII)
-        if missing:
-            name = quoted(missing[1], "")
-            how = f"set scene.options.{name} (--set scene.options.{name}=VALUE)"
-            message = f"has no value and no default; {how}" if name else "is no variable; write \\$"
-            raise element.fail(f"${name}", message)
-        return text.replace("\\$", "$")
-
-    def _named(self, text: str, longest: int) -> set[str]:
-        """The names of at most so many characters that stand behind a `$` in `text`."""
-        longest = min(longest, max(map(len, self._values), default=0))
-        behind = (text[place.end() : place.end() + longest] for place in re.finditer(r"\$", text))
-        return {run[:n] for run in behind for n in range(1, len(run) + 1) if run[:n] in self._values}
-
-    def check_used(self, source: object) -> None:
-        """Raise ConfigError, located in `source`, where a value that the user gives was never put in."""
-        if self._unused:
-            names = ", ".join(f"${name}" for name in self._values if name in self._unused)
-            raise ConfigError(source, quoted(names, ""), "is set in scene.options, but the scene file does not use it")
-
-
+#: A `$` that stands for no other sign, and what may be the name of a variable behind it: longer ones are never found.
+_VARIABLE = re.compile(r"(?<!\\)\$([^$]{0,256})")
 MAX_INCLUDES = 1000
-
-
 #: Includes within one another; that of Mitsuba's parser.
 MAX_INCLUDE_DEPTH = 15
 
@@ -285,6 +228,10 @@ class Description:
     variables: dict[str, str]
     hides_emitters: bool
 
+    def find_file(self, name: str) -> Path | None:
+        """The file or folder that Mitsuba opens by this name: the first in `folders`, or what it says by itself."""
+        return _find(name, self.folders)
+
 
 def read_description(file: Path, options: Mapping[str, str]) -> Description:
     """Read the scene in `file` and all that it includes; `options` are the values of its `$name` variables.
@@ -292,38 +239,36 @@ def read_description(file: Path, options: Mapping[str, str]) -> Description:
     Raises ConfigError, located by file and line, for what cannot be read, for variables without a value, and for
     options without a variable.
     """
-    reader = _Reader(Variables(options))
+    reader = _Reader(dict(options), set(options))
     folders = [file.absolute().parent]
     root = reader.read(file, folders, None)
-    reader.variables.check_used(file)
-    return Description(root, folders, reader.variables.values(), _hides_emitters(root))
-
-
-def _hides_emitters(root: Element) -> bool:
-    """Whether an integrator of the scene says so, in the spelling of any version."""
-    found = [value for child in root.children if child.tag == "integrator" for value in child.walk()]
-    return any(
-        value.name in ("hide_emitters", "hideEmitters") and value.attributes.get("value", "").strip() == "true"
-        for value in found
-    )
+    if reader.unused:
+        names = quoted(", ".join(f"${name}" for name in options if name in reader.unused), "")
+        raise ConfigError(file, names, "is set in scene.options, but the scene file does not use it")
+    said = [value for child in root.children if child.tag == "integrator" for value in child.walk()]
+    # In the spelling of any version.
+    hides = any(each.name in ("hide_emitters", "hideEmitters") and each.value.strip() == "true" for each in said)
+    return Description(root, folders, reader.values, hides)
 
 
 @dataclass
 class _Reader:
-    """What the files of one scene share."""
+    """What the files of one scene share: the `values` of variables by name, those that the user gives, and the files'
+    defaults as they are met."""
 
-    variables: Variables
+    values: dict[str, str]
+    unused: set[str]
     bytes_left: int = field(default_factory=lambda: MAX_BYTES)
-    includes: list[Path] = field(default_factory=list)
-    including: list[Path] = field(default_factory=list)
+    includes: int = 0
+    including: int = 0
 
     def read(self, file: Path, folders: list[Path], include: Element | None, depth: int = 0) -> Element:
         """The root of `file`, complete. `folders` grows by what its <path> elements name."""
         if include is not None:
-            self.includes.append(file)
-            if len(self.including) + 1 >= MAX_INCLUDE_DEPTH:
+            self.includes += 1
+            if self.including + 1 >= MAX_INCLUDE_DEPTH:
                 raise include.fail("", f"files are included more than {MAX_INCLUDE_DEPTH} levels deep")
-            if len(self.includes) > MAX_INCLUDES:
+            if self.includes > MAX_INCLUDES:
                 raise include.fail("", f"more than {MAX_INCLUDES} files are included")
         try:
             root, size = read_document(file, self.bytes_left)
@@ -332,42 +277,70 @@ class _Reader:
                 raise
             raise include.fail("", f"includes {file}, which {error.message}") from None
         self.bytes_left -= size
-        self.including.append(file)
+        self.including += 1
+        self._put_variables(root)
         self._complete(root, root, folders, depth)
-        self.including.pop()
+        self.including -= 1
         return root
 
     def _complete(self, element: Element, root: Element, folders: list[Path], depth: int) -> None:
         """Put variables into `element` and all below it, and what is included in the place of its includes."""
         if depth >= MAX_DEPTH:
             raise element.fail("", f"elements are nested more than {MAX_DEPTH} levels deep")
-        self.variables.put_into(element)
         if element.tag == "spectrum" and "filename" in element.attributes:
             # Mitsuba opens it while it parses, from the folder of the file that is being parsed.
-            element.attributes["filename"] = str(_find(element.attributes["filename"], folders))
+            name = element.attributes["filename"]
+            element.attributes["filename"] = str(_find(name, folders) or name)
         children: list[Element] = []
         for child in element.children:
+            self._put_variables(child)
             if child.tag == "default":
-                self.variables.put_into(child)
-                self.variables.add_default(_required(child, "name"), _required(child, "value"))
+                self.values.setdefault(_required(child, "name"), _required(child, "value"))
             elif child.tag == "path":
-                self.variables.put_into(child)
                 if element is not root:
                     raise child.fail("", "<path> can only stand directly below the root")
                 folders.insert(0, _folder(child, folders))
             elif child.tag == "include":
-                self.variables.put_into(child)
-                children += self._include(child, element, folders, depth)
+                children += self._include(child, folders, depth)
             else:
                 self._complete(child, root, folders, depth + 1)
                 children.append(child)
         element.children[:] = children
 
-    def _include(self, include: Element, parent: Element, folders: list[Path], depth: int) -> list[Element]:
+    def _put_variables(self, element: Element) -> None:
+        """Replace the variables in the attributes of `element`. Raises ConfigError for one without a value."""
+        for key, text in element.attributes.items():
+            if "$" in text:
+                element.attributes[key] = self._replace(text, element)
+
+    def _replace(self, text: str, element: Element) -> str:
+        length = len(text)
+
+        def value_of(found: re.Match[str]) -> str:
+            """The value of the longest name: one may be the beginning of another."""
+            nonlocal length
+            behind = found[1]
+            name = next((behind[:n] for n in range(len(behind), 0, -1) if behind[:n] in self.values), None)
+            if name is None:
+                raise self._fail(behind, element)
+            self.unused.discard(name)
+            length += len(self.values[name])
+            if length > MAX_LENGTH:
+                raise element.fail(f"${name}", f"makes a text of more than {MAX_LENGTH} characters")
+            return self.values[name] + behind[len(name) :]
+
+        return _VARIABLE.sub(value_of, text).replace("\\$", "$")
+
+    def _fail(self, behind: str, element: Element) -> ConfigError:
+        name = quoted(re.match(r"\w*", behind, re.ASCII)[0], "")  # type: ignore[index]  # an empty text matches
+        how = f"set scene.options.{name} (--set scene.options.{name}=VALUE)"
+        message = f"has no value and no default; {how}" if name else "is no variable; write \\$"
+        return element.fail(f"${name}", message)
+
+    def _include(self, include: Element, folders: list[Path], depth: int) -> list[Element]:
         """What stands in the place of `include`: the objects of a scene, or the one object that a file holds."""
         here = [include.source.file.absolute().parent, *folders]
-        file = _find(_required(include, "filename"), here)
-        if not os.path.exists(file):
+        if (file := _find(_required(include, "filename"), here)) is None:
             raise include.fail("", f"included file {quoted(include.attributes['filename'])} not found")
         root = self.read(file, here, include, depth)
         if root.type == "scene":
@@ -386,15 +359,15 @@ def _required(element: Element, attribute: str) -> str:
     return element.attributes[attribute]
 
 
-def _find(name: str, folders: list[Path]) -> Path:
-    """The first file of that name in `folders`, or what the name says by itself."""
-    return next((folder / name for folder in folders if os.path.exists(folder / name)), Path(name))
+def _find(name: str, folders: Sequence[Path]) -> Path | None:
+    places = [*(folder / name for folder in folders), Path(name)]
+    return next((path for path in places if os.path.exists(path)), None)  # False of a name that is too long, too
 
 
 def _folder(element: Element, folders: list[Path]) -> Path:
     name = _required(element, "value")
     folder = _find(name, [element.source.file.absolute().parent, *folders])
-    if not folder.is_dir():
+    if folder is None or not folder.is_dir():
         raise element.fail("", f"<path>: folder {quoted(name)} not found")
     return folder.absolute()
 
