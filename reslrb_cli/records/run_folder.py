@@ -77,6 +77,9 @@ def _manifest_of(run: Path) -> dict[str, Any]:
 SUBFOLDERS = ("images", "parameters", "checkpoint")
 OWN_ENTRIES = ("config.yaml", manifests.MANIFEST_FILE, metrics.METRICS_FILE, "report.html", *SUBFOLDERS)
 
+#: 56 KiB, which are tried to be written first: for a configuration, a manifest, and what it is to say of the run's end.
+_ROOM = "is there room?" * 4096
+
 #: An unfinished folder without a process is removed when it is so old: nobody is just about to lock it.
 LEFT_SECONDS = 60.0
 
@@ -91,7 +94,7 @@ def check_output(source: object, output: Path, name: str, force: bool) -> None:
         raise ConfigError(source, "run.output", f"{ancestor} is not a folder; give a folder that can be written to")
     try:
         with unfinished_folder(ancestor) as folder:
-            (folder / "file").write_text("is there room?")
+            (folder / "file").write_text(_ROOM)
             _try_name(source, folder, name)
     except OSError as error:
         raise _output_error(source, ancestor, error) from None
@@ -314,7 +317,7 @@ def check_writable(folder: RunFolder) -> None:
             (folder.path / name).mkdir(exist_ok=True)
         for place in (folder.path, *(folder.path / name for name in SUBFOLDERS)):
             with tempfile.TemporaryFile(dir=place) as file:
-                file.write(b"is there room?")
+                file.write(_ROOM.encode())
         metrics.mend(folder.path)
         remove_parts(folder.path)
     except OSError as error:
