@@ -174,7 +174,7 @@ class MissingCheck:
         [listed] = parse_estimators(ESTIMATOR)
         problem = assemble(listed.at(config, depth, True).with_exposures_fixed())
         self.source, sensor = str(config.source), problem.sensors[0]
-        self.case = Case.of(problem.scene, problem.selection.keys, sensor, problem.selection)
+        self.case = Case(problem.scene, problem.selection.keys, sensor, problem.selection)
         height, width, _ = self.case.weights.shape
         self.spp = spp or max(PATHS // (height * width), 1)
         self._weigh(problem, sensor, max(IMAGE_PATHS // (height * width), 1))

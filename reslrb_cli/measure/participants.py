@@ -125,7 +125,7 @@ class Participants:
         problem = assemble_scene(first, small.build(config.scene.options) if built_in else None)
         scene, sensor = problem.scene, problem.sensors[0]
         shrink(scene, sensor, PATHS)
-        self.case = Case.of(scene, problem.selection.keys, sensor, problem.selection)
+        self.case = Case(scene, problem.selection.keys, sensor, problem.selection)
         self.sensor = scene.sensors()[sensor]
         self.film: tuple[int, int] = (self.case.weights.shape[1], self.case.weights.shape[0])
         self.spp = settings.spp or _samples(self.film, config.run.spp, problem.samples_per_pass)

@@ -19,8 +19,18 @@ import numpy as np
 from reslrb_cli.measure.extreme.suite import Differences, Exact, Extrapolated, ExtremeCase, Stock, Twin
 from reslrb_cli.measure.scenes.analytic import camera, refraction_scene, slab_scene
 from reslrb_cli.measure.scenes.analytic import camera as pinhole
-from reslrb_cli.measure.scenes.moving import FILTER, Displacement, Move, Number, Pose, grid, mesh, smooth_fields, waves
-from reslrb_cli.measure.scenes.moving_light import TOP, vertices
+from reslrb_cli.measure.scenes.moving import (
+    FILTER,
+    Displacement,
+    Move,
+    Number,
+    Pose,
+    grid,
+    mesh,
+    smooth_fields,
+    vertices,
+    waves,
+)
 from reslrb_cli.measure.scenes.small import bitmap, diffuse, rgb, room, transform
 
 FLOOR = "floor.brdf_0.reflectance.value"
@@ -135,6 +145,9 @@ GLASS_CASES = [
 
 
 SIZE = 24
+
+
+TOP = "top.vertex_positions"
 
 
 #: Ten ray offsets where a thin slab is: 8.9e-5 (1 + max |p|) each.

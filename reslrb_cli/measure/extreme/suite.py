@@ -23,12 +23,11 @@ from reslrb_cli.integrators.reslrb import Reslrb
 from reslrb_cli.integrators.step import gradient_step, render_image
 from reslrb_cli.measure import resume_store
 from reslrb_cli.measure.comparison import Comparison, Family, compare_equal_seeds, compare_expectations, renders
-from reslrb_cli.measure.gradients import Case, integrator, seeds, smooth_weights
+from reslrb_cli.measure.gradients import Case, integrator
 from reslrb_cli.measure.gradients import seeds as seeds_of
 from reslrb_cli.measure.resume_store import Earlier
 from reslrb_cli.measure.scenes.analytic import KnownScene
-from reslrb_cli.measure.scenes.moving import AMPLITUDES, Displaced, Move
-from reslrb_cli.measure.scenes.small import load
+from reslrb_cli.measure.scenes.moving import Move, moving_case
 from reslrb_cli.records.manifest import versions
 from reslrb_cli.records.measurement_files import Kept
 from reslrb_cli.records.measurements import GradcheckRecord, Kind, Reference, Verdict
@@ -63,7 +62,7 @@ class Stock:
 
     def samples(self, case: ExtremeCase, setup: Case) -> Samples:
         tracer = integrator(self.name, **without_roulette(case))
-        return Samples(setup.gradients(tracer, seeds(case.seeds, 1), self.spp or case.spp))
+        return Samples(setup.gradients(tracer, seeds_of(case.seeds, 1), self.spp or case.spp))
 
 
 @dataclass(frozen=True)
@@ -86,7 +85,7 @@ class Twin:
         keys = self.keys or case.keys
         other = Case(self.scene(), keys)
         other.weights = setup.weights
-        values = other.gradients(integrator(self.name, **without_roulette(case)), seeds(case.seeds, 1), case.spp)
+        values = other.gradients(integrator(self.name, **without_roulette(case)), seeds_of(case.seeds, 1), case.spp)
         scale = [np.full(len(other.initial[key]), self.factors.get(key, 1.0)) for key in keys]
         return Samples(values * np.concatenate(scale))
 
@@ -109,11 +108,9 @@ class Differences:
         along = directions if self.sides == "both" else np.abs(directions)
         tracer = integrator("reslrb", **without_roulette(case))
         paired = "rr_depth" not in case.options
-        values = [
-            [setup.difference(tracer, direction, seed, case.spp, self.step, self.sides) for direction in along]
-            for seed in seeds(case.seeds, 0 if paired else 1)
-        ]
-        return Samples(np.array(values), paired=paired, along=along)
+        chosen = seeds_of(case.seeds, 0 if paired else 1)
+        values = setup.differences(tracer, along, chosen, case.spp, self.step, self.sides)
+        return Samples(values, paired=paired, along=along)
 
 
 @dataclass(frozen=True)
@@ -131,10 +128,8 @@ class Extrapolated:
     def samples(self, case: ExtremeCase, setup: Case) -> Samples:
         along = np.eye(sum(len(value) for value in setup.initial.values()))
         tracer = integrator("reslrb", **without_roulette(case))
-        near, far = (
-            np.array([[setup.difference(tracer, d, seed, case.spp, step) for d in along] for seed in seeds(case.seeds)])
-            for step in (self.step, 2 * self.step)
-        )
+        chosen, steps = seeds_of(case.seeds), (self.step, 2 * self.step)
+        near, far = (setup.differences(tracer, along, chosen, case.spp, step) for step in steps)
         correction = (near - far) / 3
         values = near + correction
         size = float(np.sqrt(np.mean(np.square(values.mean(0)))))
@@ -224,10 +219,7 @@ class ExtremeCase:
         """The scene, loaded, with its parameters."""
         if self.moves is None:
             return Case(self.scene(), self.keys)
-        scene = load(self.scene())
-        case = Case.of(scene, [AMPLITUDES], values=Displaced(scene, self.moves(scene)))
-        case.weigh(smooth_weights(*case.weights.shape))
-        return case
+        return moving_case(self.scene(), self.moves)
 
     def naive_options(self) -> dict[str, Any]:
         """The options of `walk_ad`."""

@@ -14,12 +14,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from measure.differenced import SIZE, AttachedScene
+from measure.moving_light import point, setting, square_lamp
 from numpy.typing import NDArray
 
 from reslrb_cli.measure.gradients import smooth_weights
 from reslrb_cli.measure.scenes.analytic import fresnel
-from reslrb_cli.measure.scenes.moving import FILTER, SIZE, AttachedScene, Pose
-from reslrb_cli.measure.scenes.moving_light import point, setting, square_lamp
+from reslrb_cli.measure.scenes.moving import FILTER, Pose
 from reslrb_cli.measure.scenes.small import rgb, transform
 
 Array = NDArray[np.float64]

@@ -13,31 +13,31 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from measure.differenced import SIZE, AttachedScene
+from numpy.typing import NDArray
 
 from reslrb_cli.measure.scenes.analytic import camera
 from reslrb_cli.measure.scenes.moving import (
     FILTER,
-    SIZE,
-    AttachedScene,
     Displacement,
     Move,
     Number,
     Pose,
-    ball,
     grid,
     mesh,
     smooth_fields,
+    vertices,
     waves,
 )
 from reslrb_cli.measure.scenes.small import bitmap, diffuse, rgb, transform
+
+Array = NDArray[np.float64]
+
 
 GLASS = {"type": "dielectric", "int_ior": 1.5, "ext_ior": 1.0}
 
 
 ROUGH = {"type": "roughdielectric", "int_ior": 1.5, "ext_ior": 1.0, "alpha": 0.1}
-
-
-TOP = "top.vertex_positions"
 
 
 def setting(size: int = SIZE, **objects: Any) -> dict:
@@ -89,13 +89,6 @@ def rough_surface() -> dict:
     return scene
 
 
-def vertices(scene: Any, name: str) -> np.ndarray:
-    """Positions (V, 3) of a mesh."""
-    import mitsuba as mi
-
-    return np.array(mi.traverse(scene)[f"{name}.vertex_positions"], float).reshape(-1, 3)
-
-
 def waving(scene: Any, name: str = "top", height: float = 1.8, count: int = 10) -> list[Move]:
     """The waves of a sheet by their size, and smooth displacements."""
     positions = vertices(scene, name)
@@ -127,6 +120,36 @@ def sphere_lens(radius: float = 0.8, y: float = 1.95, cutoff: float = 18, bsdf: 
     """A ball of glass in a cone of light that it contains."""
     return setting(lamp=spot(cutoff=cutoff, origin=(0.1, 3.6, -0.08), target=(0.05, y, 0)),
                    lens={"type": "sphere", "center": [0, y, 0], "radius": radius, "bsdf": bsdf})  # fmt: skip
+
+
+def ball(radius: float, center: tuple[float, float, float], levels: int = 4, inward: bool = False
+         ) -> tuple[Array, Array]:  # fmt: skip
+    """A sphere of 20 * 4^levels triangles that faces outward, or `inward`: vertices and triangles."""
+    golden = (1 + 5**0.5) / 2
+    corners = [(-1, golden, 0), (1, golden, 0), (-1, -golden, 0), (1, -golden, 0)]
+    points = np.array([np.roll(corner, turn) for turn in range(3) for corner in corners], float)
+    points /= np.linalg.norm(points[0])
+    near = np.linalg.norm(points[:, None] - points[None], axis=-1) < 1.1
+    faces = np.array([(a, b, c) for a in range(12) for b in range(a) for c in range(b)
+                      if near[a, b] and near[b, c] and near[a, c]])  # fmt: skip
+    for _ in range(levels):
+        points, faces = _divided(points, faces)
+    p, q, r = (points[faces[:, k]] for k in range(3))
+    outward = np.sum(np.cross(q - p, r - p) * p, 1) > 0
+    faces = np.where((outward != inward)[:, None], faces, faces[:, ::-1])
+    return points * radius + np.array(center), faces
+
+
+def _divided(points: Array, faces: Array) -> tuple[Array, Array]:
+    """Each triangle divided into four, all vertices on the unit sphere."""
+    edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), 1)
+    unique, number = np.unique(edges, axis=0, return_inverse=True)
+    middles = points[unique].sum(1)
+    middles /= np.linalg.norm(middles, axis=1, keepdims=True)
+    ab, bc, ca = np.split(number.ravel() + len(points), 3)
+    a, b, c = faces.T
+    divided = [np.stack(corners, 1) for corners in ((a, ab, ca), (b, bc, ab), (c, ca, bc), (ab, bc, ca))]
+    return np.concatenate([points, middles]), np.concatenate(divided)
 
 
 def mesh_lens(radius: float = 0.8, y: float = 1.95) -> dict:
