@@ -22,7 +22,6 @@ from reslrb_cli.config.schema import Config
 from reslrb_cli.estimators import ESTIMATORS
 from reslrb_cli.measure.comparison import (
     ROUNDING,
-    Comparison,
     Family,
     compare_equal_seeds,
     compare_expectations,
@@ -34,7 +33,7 @@ from reslrb_cli.measure.processes import NO_TIME
 from reslrb_cli.measure.resume_store import Earlier
 from reslrb_cli.measure.sampling import NAIVE, Name, Sampling
 from reslrb_cli.records.measurement_files import Kept
-from reslrb_cli.records.measurements import GradcheckRecord, Kind, Reference, Verdict
+from reslrb_cli.records.measurements import Comparison, GradcheckRecord, Kind, Reference, Verdict
 
 #: What a stock integrator on the same paths differs by from this one, relative to the entries: whether a point is
 #: visible is another matter of rounding to each.
@@ -112,7 +111,7 @@ class Gradcheck:
 
     def expected(self) -> list[GradcheckRecord]:
         """A record of every line of the table to come, without figures."""
-        return [self._record(row, Comparison(Verdict.NOT_MEASURED, None), 0) for row in self.rows] + [
+        return [self._record(row, Comparison(Verdict.NOT_MEASURED), 0) for row in self.rows] + [
             result.record for result in self._without_reference()
         ]
 
@@ -137,7 +136,7 @@ class Gradcheck:
                 yield self._result(row, family)
             elif not stop():
                 late = True
-                yield Result(self._record(row, Comparison(Verdict.NOT_MEASURED, None, message=NO_TIME), 0))
+                yield Result(self._record(row, Comparison(Verdict.NOT_MEASURED, message=NO_TIME), 0))
         if compared or not stop():
             yield from self._without_reference()
         if late and not stop():
@@ -224,7 +223,7 @@ class Gradcheck:
             reference=row.reference,
             kind=row.kind,
             seeds=seeds,
-            **figures.figures,
+            **vars(figures),
         )
 
     def _without_reference(self) -> Iterator[Result]:
@@ -238,7 +237,7 @@ class Gradcheck:
         if parts.image is None:
             missing.append((Row(None, "reslrb", Reference.PATH, Kind.IMAGE), parts.why_no_image))
         for row, why in missing:
-            yield Result(self._record(row, Comparison(Verdict.NO_REFERENCE, None, message=why), 0))
+            yield Result(self._record(row, Comparison(Verdict.NO_REFERENCE, message=why), 0))
 
 
 def _draws_plainly(config: Config) -> bool:

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from agreement import compare, renders
 from turns import taking_turns
 
 from reslrb_cli.integrators.step import render_image
-from reslrb_cli.measure.comparison import compare, renders
 from reslrb_cli.measure.gradients import Case, integrator, seeds
 from reslrb_cli.measure.scenes.analytic import (
     KnownScene,

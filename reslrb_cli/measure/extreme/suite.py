@@ -20,9 +20,9 @@ from reslrb_cli.estimators.base import Pass
 from reslrb_cli.estimators.gather import Gathering, Taking
 from reslrb_cli.integrators.protocol import Job
 from reslrb_cli.integrators.reslrb import Reslrb
-from reslrb_cli.integrators.step import gradient_step, render_image
+from reslrb_cli.integrators.step import gradient_step
 from reslrb_cli.measure import resume_store
-from reslrb_cli.measure.comparison import Comparison, Family, compare_equal_seeds, compare_expectations, renders
+from reslrb_cli.measure.comparison import Family, compare_equal_seeds, compare_expectations
 from reslrb_cli.measure.gradients import Case, integrator
 from reslrb_cli.measure.gradients import seeds as seeds_of
 from reslrb_cli.measure.resume_store import Earlier
@@ -30,7 +30,7 @@ from reslrb_cli.measure.scenes.analytic import KnownScene
 from reslrb_cli.measure.scenes.moving import Move, moving_case
 from reslrb_cli.records.manifest import versions
 from reslrb_cli.records.measurement_files import Kept
-from reslrb_cli.records.measurements import GradcheckRecord, Kind, Reference, Verdict
+from reslrb_cli.records.measurements import Comparison, GradcheckRecord, Kind, Reference, Verdict
 
 Scene = Callable[[], dict]
 
@@ -178,7 +178,7 @@ def residual(case: ExtremeCase, setup: Case, seed: int = 1) -> Comparison:
     setup.release(leaves)
     found = float(sizes[0] / sizes[1])
     verdict = Verdict.HOLDS if found < LIMIT else Verdict.FAILS
-    return Comparison(verdict, None, relative_l2=found, relative_l2_limit=LIMIT, message="residual of the replay")
+    return Comparison(verdict, relative_l2=found, relative_l2_limit=LIMIT, message="residual of the replay")
 
 
 @dataclass(frozen=True)
@@ -303,7 +303,7 @@ def _run(case: ExtremeCase, estimators: tuple[str, ...]) -> Iterator[GradcheckRe
         if case.residual and name == "gather":
             rows.append((None, Reference.ANALYTIC, Kind.EQUAL_SEEDS, residual(case, setup)))
         for parameter, other, kind, comparison in rows:
-            yield GradcheckRecord(case.name, parameter, "reslrb", name, other, kind, case.seeds, **comparison.figures)
+            yield GradcheckRecord(case.name, parameter, "reslrb", name, other, kind, case.seeds, **vars(comparison))
 
 
 @dataclass(frozen=True)
@@ -335,12 +335,12 @@ def _refusals(weights: np.ndarray, refused: list[int]) -> Comparison:
     expected = int(np.count_nonzero(~np.isfinite(weights)))
     holds = set(refused) == {expected}
     message = f"refused {', '.join(map(str, sorted(set(refused))))} entries of dL/dI, of {expected} not finite"
-    return Comparison(Verdict.HOLDS if holds else Verdict.FAILS, None, message=message)
+    return Comparison(Verdict.HOLDS if holds else Verdict.FAILS, message=message)
 
 
 def _stock_images(case: ExtremeCase, setup: Case) -> np.ndarray:
     tracer = integrator(case.image, **without_roulette(case))
-    return renders(lambda seed: render_image(tracer, setup.scene, 0, seed, case.spp), seeds_of(case.seeds, 2))[..., :3]
+    return np.stack([setup.image(tracer, seed, case.spp) for seed in seeds_of(case.seeds, 2)])
 
 
 def _comparisons(
