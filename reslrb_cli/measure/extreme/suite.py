@@ -226,6 +226,16 @@ class ExtremeCase:
         return {**self.options, **self.ours} | ({} if self.moves is None else {"attached": True})
 
 
+def exact(
+    name: str, about: str, known: Callable[[], KnownScene], keys: Mapping[str, str], max_depth: int,
+    rr_depth: int | None = None, **more: Any,
+) -> ExtremeCase:  # fmt: skip
+    """A case whose image is known in closed form; `keys` are those of its parameters, `more` fields of the case."""
+    options = {"max_depth": max_depth} | ({} if rr_depth is None else {"rr_depth": rr_depth})
+    shared: dict[str, Any] = {"options": options, **more}
+    return ExtremeCase(name, about, lambda: known().scene(), tuple(keys.values()), Exact(known), **shared)
+
+
 def without_roulette(case: ExtremeCase) -> dict[str, Any]:
     """The options of a case, for integrators whose gradient roulette biases."""
     return {key: value for key, value in case.options.items() if key != "rr_depth"}
