@@ -4,7 +4,7 @@
 - `residual`: what `gather`'s replay leaves of its sum: nothing but rounding, once every contribution has been taken off
   again.
 - `restore`, `kept`: going on with a suite, whose cases are whole or not there.
-- `run_cases`: every estimator of a case against naive AD of the same paths, and against the case's reference.
+- `run_case`: every estimator of a case against naive AD of the same paths, and against the case's reference.
 """
 
 from __future__ import annotations
@@ -54,7 +54,6 @@ class Stock:
     """A stock integrator in the same scene. Where roulette is on, the reference goes without it: see docs/method.md."""
 
     name: str
-    spp: int | None = None
 
     @property
     def reference(self) -> Reference:
@@ -62,31 +61,25 @@ class Stock:
 
     def samples(self, case: ExtremeCase, setup: Case) -> Samples:
         tracer = integrator(self.name, **without_roulette(case))
-        return Samples(setup.gradients(tracer, seeds_of(case.seeds, 1), self.spp or case.spp))
+        return Samples(setup.gradients(tracer, seeds_of(case.seeds, 1), case.spp))
 
 
 @dataclass(frozen=True)
 class Twin:
-    """A stock integrator in another scene, whose gradients are known multiples of this one's.
+    """`ptracer` in another scene, whose gradients are known multiples of this one's.
 
-    `factors` are by parameter; those that are not named are 1. `keys` are the parameters there, in our order.
+    `factors` are by parameter; those that are not named are 1.
     """
 
     scene: Scene
     factors: Mapping[str, float] = field(default_factory=dict)
-    keys: tuple[str, ...] = ()
-    name: str = "ptracer"
-
-    @property
-    def reference(self) -> Reference:
-        return Reference(self.name)
+    reference = Reference.PTRACER
 
     def samples(self, case: ExtremeCase, setup: Case) -> Samples:
-        keys = self.keys or case.keys
-        other = Case(self.scene(), keys)
+        other = Case(self.scene(), case.keys)
         other.weights = setup.weights
-        values = other.gradients(integrator(self.name, **without_roulette(case)), seeds_of(case.seeds, 1), case.spp)
-        scale = [np.full(len(other.initial[key]), self.factors.get(key, 1.0)) for key in keys]
+        values = other.gradients(integrator("ptracer", **without_roulette(case)), seeds_of(case.seeds, 1), case.spp)
+        scale = [np.full(len(other.initial[key]), self.factors.get(key, 1.0)) for key in case.keys]
         return Samples(values * np.concatenate(scale))
 
 
@@ -100,11 +93,10 @@ class Differences:
 
     step: float
     sides: str = "both"
-    along: int = 2
     reference = Reference.FINITE_DIFFERENCE
 
     def samples(self, case: ExtremeCase, setup: Case) -> Samples:
-        directions = setup.directions(self.along)
+        directions = setup.directions(2)
         along = directions if self.sides == "both" else np.abs(directions)
         tracer = integrator("reslrb", **without_roulette(case))
         paired = "rr_depth" not in case.options
@@ -284,16 +276,11 @@ FAMILY = Family(rows=1500, entries=30000)
 BELOW_ZERO = 1e-5
 
 
-def run_cases(
-    cases: Iterable[ExtremeCase], estimators: Iterable[str] | None = None, seeds: int | None = None
+def run_case(
+    case: ExtremeCase, estimators: Iterable[str] | None = None, seeds: int | None = None
 ) -> Iterator[GradcheckRecord]:
-    """Run `cases` with these estimators (all of them by default); `seeds` replaces each case's own number."""
-    names = tuple(estimators) if estimators is not None else tuple(ESTIMATORS)
-    for case in cases:
-        yield from _run(case if seeds is None else replace(case, seeds=seeds), names)
-
-
-def _run(case: ExtremeCase, estimators: tuple[str, ...]) -> Iterator[GradcheckRecord]:
+    """Run a case with these estimators (all of them by default); `seeds` replaces its own number."""
+    case = case if seeds is None else replace(case, seeds=seeds)
     setup = case.setup()
     weights = np.array(setup.weights) if case.weights is None else case.weights(np.array(setup.weights))
     # What is refused of dL/dI counts as zero; references are never shown it.
@@ -303,29 +290,23 @@ def _run(case: ExtremeCase, estimators: tuple[str, ...]) -> Iterator[GradcheckRe
     naive = setup.gradients(walk_ad, seeds_of(case.seeds), case.spp) if case.naive else None
     stock = _stock_images(case, setup) if case.image else None
     setup.weights = type(setup.weights)(weights)
-    for name in estimators if case.moves is None else [name for name in estimators if ESTIMATORS[name].attaches]:
-        taken = _steps(case, setup, name)
-        rows = list(_comparisons(case, setup, name, taken.gradients, naive, reference))
+    for name in ESTIMATORS if estimators is None else estimators:
+        if case.moves is not None and not ESTIMATORS[name].attaches:
+            continue
+        gradients, images, refused = _steps(case, setup, name)
+        rows = list(_comparisons(case, setup, name, gradients, naive, reference))
         if stock is not None:
-            rows.append((None, Reference(case.image), Kind.IMAGE, _images(taken.images, stock)))
+            rows.append((None, Reference(case.image), Kind.IMAGE, _images(images, stock)))
         if not np.isfinite(weights).all():
-            rows.append((None, Reference.ANALYTIC, Kind.EQUAL_SEEDS, _refusals(weights, taken.refused)))
+            rows.append((None, Reference.ANALYTIC, Kind.EQUAL_SEEDS, _refusals(weights, refused)))
         if case.residual and name == "gather":
             rows.append((None, Reference.ANALYTIC, Kind.EQUAL_SEEDS, residual(case, setup)))
         for parameter, other, kind, comparison in rows:
             yield GradcheckRecord(case.name, parameter, "reslrb", name, other, kind, case.seeds, **vars(comparison))
 
 
-@dataclass(frozen=True)
-class _Taken:
+def _steps(case: ExtremeCase, setup: Case, name: str) -> tuple[np.ndarray, np.ndarray, list[int]]:
     """Of an estimator's steps: gradients (N, P), images (N, H, W, 3), entries of dL/dI that were refused (N,)."""
-
-    gradients: np.ndarray
-    images: np.ndarray
-    refused: list[int]
-
-
-def _steps(case: ExtremeCase, setup: Case, name: str) -> _Taken:
     images, refused = [], []
 
     def step(*arguments: Any, **options: Any) -> None:
@@ -337,7 +318,7 @@ def _steps(case: ExtremeCase, setup: Case, name: str) -> _Taken:
     ours = {"attached_sampling": "follow"} | dict(case.ours)
     tracer = integrator("reslrb", **case.options, **ours, estimator=name)
     gradients = setup.gradients(tracer, seeds_of(case.seeds), case.spp, step=step)
-    return _Taken(gradients, np.stack(images), refused)
+    return gradients, np.stack(images), refused
 
 
 def _refusals(weights: np.ndarray, refused: list[int]) -> Comparison:
