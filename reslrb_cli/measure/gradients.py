@@ -33,9 +33,10 @@ import numpy as np
 
 from reslrb_cli.backend.memory import own_memory
 from reslrb_cli.integrators.protocol import Job, first_channels
-from reslrb_cli.integrators.step import gradient_step, make_integrator, render_image
+from reslrb_cli.integrators.step import gradient_step, known_step, make_integrator, render_image
 from reslrb_cli.measure.scenes.small import load
 from reslrb_cli.scene.catalog import parameter_kind
+from reslrb_cli.scene.parameters import Selection
 from reslrb_cli.scene.values import settle
 
 #: How far the largest step of finite differences moves things, relative to their size, in units of the step.
@@ -206,10 +207,20 @@ def directions(case: Case, key: str, bounds: tuple[float, float], count: int, se
     return found
 
 
-def moving_directions(case: Case, key: str, extent: float, count: int) -> list[Direction]:
-    """Directions along which a parameter that moves light changes smoothly (`moving.smooth_rows`)."""
-    rows = smooth_rows(key, case.values.value(key), extent, count)
-    return [Direction(_embed(case, key, row), "both") for row in rows]
+def all_directions(case: Case, selection: Selection, moving: int, others: int) -> dict[str, list[Direction]]:
+    """By parameter, so many of each that moves light, along which it changes smoothly, and of each of the others."""
+    box, found = case.scene.bbox(), {}
+    extent = float(np.linalg.norm(np.array(box.max - box.min)))
+    for key in case.keys:
+        if moves_light(case.params, key):
+            rows = smooth_rows(key, case.values.value(key), extent, moving)
+            found[key] = [Direction(_embed(case, key, row), "both") for row in rows]
+            continue
+        bounds = selection.spec(key).bounds
+        if bounds is None or not np.all(np.isfinite(bounds)):
+            bounds = natural_bounds(parameter_kind(case.params, key), case.initial[key])
+        found[key] = directions(case, key, bounds, others)
+    return found
 
 
 def choose_step(case: Case, integrator: Any, direction: Direction, seeds: Sequence[int], spp: int) -> Direction:
@@ -306,6 +317,10 @@ class Case:
         result = [np.array(dr.grad(leaf), dtype=np.float64).ravel() for leaf in leaves.values()]
         self.release(leaves)
         return np.concatenate(result)
+
+    def known_step(self, integrator: Any, scene: Any, sensor: Any, _objective: Any, **options: Any) -> Any:
+        """A step for `gradient` that knows dL/dI before the image."""
+        return known_step(integrator, scene, sensor, self.adjoint, **options)
 
     def leaves(self) -> dict[str, Any]:
         """The parameters with derivatives enabled, handed over to the scene.
