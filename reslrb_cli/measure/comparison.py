@@ -129,13 +129,21 @@ def divisions(shape: tuple[int, ...]) -> list[int]:
     size = int(np.prod(shape, dtype=int))
     if size <= 4:
         return [0]
-    coarser = [tiles for tiles in TILES if _parts(np.zeros((1, size)), shape, tiles).shape[1] < size]
+    coarser = [tiles for tiles in TILES if parts(np.zeros((1, size)), shape, tiles).shape[1] < size]
     return [0, *coarser] if size <= FEW else coarser
 
 
 def parts(samples: np.ndarray, shape: tuple[int, ...], tiles: int) -> np.ndarray:
     """Sums over the parts of one division: (N, E) of the (N, P) gradients of a parameter of this shape."""
-    return samples if tiles == 0 else _parts(samples, shape, tiles)
+    if tiles == 0:
+        return samples
+    height, width, channels = shape if len(shape) == 3 else (1, samples.shape[1], 1)
+    down = min(tiles, height)
+    across = min(tiles if len(shape) == 3 else tiles * tiles, width)
+    grid = samples.reshape(len(samples), height, width, channels)
+    rows, columns = (np.arange(n) * size // n for n, size in ((down, height), (across, width)))
+    sums = np.add.reduceat(np.add.reduceat(grid, rows, axis=1), columns, axis=2)
+    return sums.reshape(len(samples), -1)
 
 
 def overall(samples: np.ndarray) -> np.ndarray:
@@ -156,16 +164,6 @@ def entry_count(shape: tuple[int, ...]) -> int:
     """The most entries in which a parameter of this shape is compared."""
     none = np.zeros((1, int(np.prod(shape, dtype=int))))
     return parts(none, shape, divisions(shape)[0]).shape[1] + overall(none).shape[1]
-
-
-def _parts(samples: np.ndarray, shape: tuple[int, ...], tiles: int) -> np.ndarray:
-    height, width, channels = shape if len(shape) == 3 else (1, samples.shape[1], 1)
-    down = min(tiles, height)
-    across = min(tiles if len(shape) == 3 else tiles * tiles, width)
-    grid = samples.reshape(len(samples), height, width, channels)
-    rows, columns = (np.arange(n) * size // n for n, size in ((down, height), (across, width)))
-    sums = np.add.reduceat(np.add.reduceat(grid, rows, axis=1), columns, axis=2)
-    return sums.reshape(len(samples), -1)
 
 
 #: Probability with which a deviation of the size `detectable` is seen.
@@ -217,26 +215,10 @@ class Family:
         return z_rms_limit(independent, float(-np.expm1(np.log1p(-self.alpha) / self.rows)))
 
 
-def cosine(a: np.ndarray, b: np.ndarray) -> float | None:
-    """Cosine of the angle between two vectors; None where one is zero or has one entry."""
-    return _ratio(float(a @ b), float(np.linalg.norm(a) * np.linalg.norm(b))) if a.size > 1 else None
-
-
-def variance_ratio(ours: np.ndarray, reference: np.ndarray) -> float | None:
-    """Summed variance of (N, P) samples over that of the reference's; None where that has none."""
-    return _ratio(ours.var(0, ddof=1).sum(), reference.var(0, ddof=1).sum())
-
-
 def compare_expectations(
-    ours: np.ndarray,
-    reference: np.ndarray,
-    family: Family,
-    *,
-    shape: tuple[int, ...] | None = None,
-    paired: bool = True,
-    bias: Any = 0.0,
-    rounding: float = ROUNDING,
-) -> Comparison:
+    ours: np.ndarray, reference: np.ndarray, family: Family, *, shape: tuple[int, ...] | None = None,
+    paired: bool = True, bias: Any = 0.0, rounding: float = ROUNDING,
+) -> Comparison:  # fmt: skip
     """Compare the means of (N, P) samples with those of a reference.
 
     `reference` is (N, P) at the same seeds if `paired`, else (M, P) at others, or (P,): exact values. `shape` is that
@@ -267,6 +249,8 @@ def compare_expectations(
     counts = noise > np.maximum(NOISY * floor, (bias if joined else 0.0) / NOISY) ** 2
     heavy = any(tail_weight(side[:, counts]) > TAIL for side in sides)
     our_mean, its_mean = ours.mean(0), np.atleast_2d(reference).mean(0)
+    far = _ratio(np.linalg.norm(our_mean - its_mean), np.linalg.norm(its_mean))
+    cosine, variances = _alikeness(ours, reference)
     verdict, message = Verdict.HOLDS, ""
     if heavy:
         verdict, message = Verdict.HEAVY_TAILED, "single seeds carry the variance: more samples per pixel, or seeds"
@@ -275,17 +259,9 @@ def compare_expectations(
     elif detectable > RESOLUTION:
         verdict, message = Verdict.UNRESOLVED, f"a deviation by {detectable:.0%} could hide in the noise: more seeds"
     return Comparison(
-        verdict,
-        relative_l2=_ratio(np.linalg.norm(our_mean - its_mean), np.linalg.norm(its_mean)),
-        z_rms=z_rms,
-        z_rms_limit=rms_limit,
-        z_max=z_max,
-        z_max_limit=family.z_max_limit,
-        cosine=cosine(our_mean, its_mean),
-        variance_ratio=None if exact else variance_ratio(ours, reference),
-        detectable=detectable,
-        message=message,
-    )
+        verdict, relative_l2=far, z_rms=z_rms, z_rms_limit=rms_limit, z_max=z_max, z_max_limit=family.z_max_limit,
+        cosine=cosine, variance_ratio=variances, detectable=detectable, message=message,
+    )  # fmt: skip
 
 
 def compare_equal_seeds(ours: np.ndarray, reference: np.ndarray, limit: float = ROUNDING) -> Comparison:
@@ -294,14 +270,19 @@ def compare_equal_seeds(ours: np.ndarray, reference: np.ndarray, limit: float = 
     if problem is not None:
         return problem
     distance = float(np.linalg.norm(ours - reference) / np.linalg.norm(reference)) if reference.any() else np.inf
+    verdict, (cosine, variances) = Verdict.HOLDS if distance < limit else Verdict.FAILS, _alikeness(ours, reference)
     return Comparison(
-        Verdict.HOLDS if distance < limit else Verdict.FAILS,
-        relative_l2=distance,
-        relative_l2_limit=limit,
-        cosine=cosine(ours.mean(0), reference.mean(0)),
-        variance_ratio=variance_ratio(ours, reference) if len(ours) > 1 else None,
-        detectable=limit,
+        verdict, distance, relative_l2_limit=limit, cosine=cosine, variance_ratio=variances, detectable=limit
     )
+
+
+def _alikeness(ours: np.ndarray, reference: np.ndarray) -> tuple[float | None, float | None]:
+    """The cosine of the angle between the means, and the summed variance over the reference's; None for 0 / 0."""
+    a, b = ours.mean(0), np.atleast_2d(reference).mean(0)
+    cosine = _ratio(a @ b, np.linalg.norm(a) * np.linalg.norm(b)) if a.size > 1 else None
+    if reference.ndim == 1 or len(ours) < 2:
+        return cosine, None
+    return cosine, _ratio(ours.var(0, ddof=1).sum(), reference.var(0, ddof=1).sum())
 
 
 def tail_weight(samples: np.ndarray) -> float:
