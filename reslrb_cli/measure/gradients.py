@@ -36,8 +36,8 @@ from reslrb_cli.integrators.protocol import Job, first_channels
 from reslrb_cli.integrators.step import gradient_step, known_step, make_integrator, render_image
 from reslrb_cli.measure.scenes.small import load
 from reslrb_cli.scene.catalog import parameter_kind
+from reslrb_cli.scene.deformation import Deformation
 from reslrb_cli.scene.parameters import Selection
-from reslrb_cli.scene.values import settle
 
 #: How far the largest step of finite differences moves things, relative to their size, in units of the step.
 REACH = 0.1
@@ -134,30 +134,6 @@ class Values(Protocol):
     def push(self) -> None:
         """Bring tangents of the values that were handed over, once propagated, on to what is in the scene."""
         ...
-
-
-class SceneValues:
-    """A scene's own parameters."""
-
-    def __init__(self, scene: mi.Scene) -> None:
-        self.params = mi.traverse(scene)
-
-    def value(self, key: str) -> Any:
-        """The parameter `key`."""
-        return self.params[key]
-
-    def hand_over(self, values: Mapping[str, Any]) -> None:
-        """Set parameters. Textures pad their storage, and the normals of meshes follow, ahead of the next step."""
-        for key, value in values.items():
-            self.params[key] = value
-        self.params.update()
-        dr.eval([self.params[key] for key in values], settle(self.params, values))
-
-    def collect(self) -> None:
-        """They are in the scene: nothing is to be done."""
-
-    def push(self) -> None:
-        """They are in the scene: nothing is to be done."""
 
 
 #: Steps that are tried, in units of the direction.
@@ -264,8 +240,10 @@ class Case:
     def __init__(self, scene: Any, keys: Iterable[str], sensor: int = 0, values: Values | None = None) -> None:
         self.scene = load(scene) if isinstance(scene, dict) else scene
         self.sensor = sensor
-        self.values: Values = SceneValues(self.scene) if values is None else values
-        self.params = self.values.params
+        if values is None:
+            params = mi.traverse(self.scene)
+            values = Selection(params, {}, {}, Deformation(params))
+        self.values, self.params = values, values.params
         self.keys = list(keys)
         self.initial = {key: self.flat(key) for key in self.keys}
         film = self.scene.sensors()[sensor].film()
