@@ -68,20 +68,15 @@ def itp(first: Array, second: Array) -> Array:
     """
     colour = _colour()
     to_bt2020 = colour.matrix_RGB_to_RGB("sRGB", "ITU-R BT.2020")
-    encoded = []
-    for values in (first, second):
-        light = np.clip(WHITE * (values.astype(np.float64) @ to_bt2020.T), 0.0, 1e4)
-        encoded.append(colour.RGB_to_ICtCp(light))
-    return np.asarray(colour.delta_E(*encoded, method="ITP"))
+    light = [np.clip(WHITE * (values.astype(np.float64) @ to_bt2020.T), 0.0, 1e4) for values in (first, second)]
+    return np.asarray(colour.delta_E(*map(colour.RGB_to_ICtCp, light), method="ITP"))
 
 
 def told(values: Array) -> dict[str, float]:
     """`mean`, the percentiles as `p50` and so on, and `max` of differences, of at least one."""
-    found = {"mean": float(np.mean(values))}
-    found |= {
-        f"p{share}": float(value) for share, value in zip(PERCENTILES, np.percentile(values, PERCENTILES), strict=True)
-    }
-    return found | {"max": float(np.max(values))}
+    shares = zip(PERCENTILES, np.percentile(values, PERCENTILES), strict=True)
+    between = {f"p{share}": float(value) for share, value in shares}
+    return {"mean": float(np.mean(values)), **between, "max": float(np.max(values))}
 
 
 def _colour() -> Any:
@@ -183,9 +178,7 @@ def flip_map(image: Array, target: Array) -> Array | None:
         return None
     low, high = exposures
     options = {"startExposure": low, "stopExposure": high, "numExposures": max(2, math.ceil(high - low))}
-    pair = [
-        np.ascontiguousarray(np.clip(np.nan_to_num(array), 0.0, 1e30), dtype=np.float32) for array in (target, image)
-    ]
+    pair = [np.ascontiguousarray(np.clip(np.nan_to_num(a), 0.0, 1e30), dtype=np.float32) for a in (target, image)]
     error, _, _ = flip_evaluator.evaluate(*pair, "HDR", applyMagma=False, computeMeanError=False, parameters=options)
     return np.asarray(error)[:, :, 0]
 

@@ -213,10 +213,6 @@ class ExtremeCase:
             return Case(self.scene(), self.keys)
         return moving_case(self.scene(), self.moves)
 
-    def naive_options(self) -> dict[str, Any]:
-        """The options of `walk_ad`."""
-        return {**self.options, **self.ours} | ({} if self.moves is None else {"attached": True})
-
 
 def exact(
     name: str, about: str, known: Callable[[], KnownScene], keys: Mapping[str, str], max_depth: int,
@@ -286,7 +282,8 @@ def run_case(
     # What is refused of dL/dI counts as zero; references are never shown it.
     setup.weights = type(setup.weights)(np.where(np.isfinite(weights), weights, 0))
     reference = case.source.samples(case, setup)
-    walk_ad = integrator("walk_ad", **case.naive_options())
+    attached = {} if case.moves is None else {"attached": True}
+    walk_ad = integrator("walk_ad", **{**case.options, **case.ours, **attached})
     naive = setup.gradients(walk_ad, seeds_of(case.seeds), case.spp) if case.naive else None
     stock = _stock_images(case, setup) if case.image else None
     setup.weights = type(setup.weights)(weights)
@@ -323,10 +320,9 @@ def _steps(case: ExtremeCase, setup: Case, name: str) -> tuple[np.ndarray, np.nd
 
 def _refusals(weights: np.ndarray, refused: list[int]) -> Comparison:
     """Whether every step counted just the entries of dL/dI that are not finite."""
-    expected = int(np.count_nonzero(~np.isfinite(weights)))
-    holds = set(refused) == {expected}
-    message = f"refused {', '.join(map(str, sorted(set(refused))))} entries of dL/dI, of {expected} not finite"
-    return Comparison(Verdict.HOLDS if holds else Verdict.FAILS, message=message)
+    expected, counts = int(np.count_nonzero(~np.isfinite(weights))), sorted(set(refused))
+    message = f"refused {', '.join(map(str, counts))} entries of dL/dI, of {expected} not finite"
+    return Comparison(Verdict.HOLDS if counts == [expected] else Verdict.FAILS, message=message)
 
 
 def _stock_images(case: ExtremeCase, setup: Case) -> np.ndarray:
@@ -371,16 +367,20 @@ def _parameters(setup: Case) -> Iterator[tuple[str, slice, tuple[int, ...]]]:
 
 def _settled(case: ExtremeCase, parameter: str | None, found: Comparison, ours: np.ndarray) -> Comparison:
     """The comparison with what else has to hold; in a suite nothing is left open without a reason."""
-    if found.verdict is Verdict.UNREACHED and isinstance(case.source, Zero):
-        return replace(found, verdict=Verdict.HOLDS, message="exactly zero")
-    if found.verdict is Verdict.UNREACHED and parameter in case.open_ended:
-        return replace(found, verdict=Verdict.HOLDS, message="exactly zero, as the reference")
+    if found.verdict is Verdict.UNREACHED and (isinstance(case.source, Zero) or parameter in case.open_ended):
+        message = "exactly zero" if isinstance(case.source, Zero) else "exactly zero, as the reference"
+        return replace(found, verdict=Verdict.HOLDS, message=message)
     if found.verdict in (Verdict.UNREACHED, Verdict.HEAVY_TAILED, Verdict.UNRESOLVED):
         reason = case.open_ended.get(parameter or "")
         if reason is None:
             return replace(found, verdict=Verdict.FAILS, message=f"{found.verdict.value}: {found.message}")
         return replace(found, message=reason)
-    if found.verdict is Verdict.HOLDS and not case.signed and ours.min() < -BELOW_ZERO * np.abs(ours).max():
+    return found if case.signed else _not_negative(found, ours, BELOW_ZERO)
+
+
+def _not_negative(found: Comparison, ours: np.ndarray, share: float) -> Comparison:
+    """The comparison; it fails where an entry is below zero by more than this `share` of the largest."""
+    if found.verdict is Verdict.HOLDS and ours.min() < -share * np.abs(ours).max():
         return replace(found, verdict=Verdict.FAILS, message=f"negative: {ours.min():.3g}")
     return found
 
@@ -389,8 +389,6 @@ def _images(ours: np.ndarray, stock: np.ndarray) -> Comparison:
     shape = ours.shape[1:]
     flat, other = ours.reshape(len(ours), -1), stock.reshape(len(stock), -1)
     found = compare_expectations(flat, other, FAMILY, shape=shape, paired=False)
-    if found.verdict is Verdict.HOLDS and ours.min() < 0:
-        return replace(found, verdict=Verdict.FAILS, message=f"negative: {ours.min():.3g}")
     if found.verdict is Verdict.UNREACHED:
         return replace(found, verdict=Verdict.HOLDS, message="black")
-    return found
+    return _not_negative(found, ours, 0)
