@@ -48,7 +48,6 @@ if TYPE_CHECKING:
 COMPARING = {"suite": "--suite", "cases": "--case", "estimators": "--estimators", "markdown_file": "--markdown",
              "folder": "--images"}  # fmt: skip
 
-
 #: Options that mean nothing without a configuration, as of a suite.
 CONFIGURED = {"config_file": "CONFIG", "overrides": "--set", "budget": "--budget", "spp": "--spp", "folder": "--images"}
 

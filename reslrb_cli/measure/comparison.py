@@ -115,10 +115,8 @@ def effective_entries(samples: np.ndarray) -> float:
 #: Tiles of a texture along each side, the finest division first.
 TILES = (8, 4, 2, 1)
 
-
 #: Parameters with no more entries than these may be compared entry by entry.
 FEW = 48
-
 
 #: Projections of a parameter that has more.
 PROJECTIONS = 16
@@ -169,29 +167,23 @@ def entry_count(shape: tuple[int, ...]) -> int:
 #: Probability with which a deviation of the size `detectable` is seen.
 POWER = 0.9
 
-
 #: Relative error that single precision alone may cause in a sum over many samples, added to the standard error.
 ROUNDING = 1e-4
-
 
 #: Where not even a deviation by this fraction of the gradient would have been seen, as of one that is missing, nothing
 #: is said.
 RESOLUTION = 1.0
 
-
 #: Tails are too heavy for z scores where the mean kurtosis of the entries' samples lies above this fraction of the way
 #: from that of normal deviates to the greatest that N samples can have, which is that of one outlier.
 TAIL = 0.5
 
-
 #: A parameter is divided no finer than its tiles have tails lighter than this: z of skewed samples is too large.
 TILE_TAIL = 0.12
-
 
 #: Tails of noise below so many times what rounding may cause do not matter, nor those of noise so many times below what
 #: the reference may be wrong by: no z score is large for them.
 NOISY = 10
-
 
 #: Fewer seeds than these say nothing of tails.
 TAIL_SEEDS = 8

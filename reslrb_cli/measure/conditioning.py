@@ -34,8 +34,6 @@ from reslrb_cli.transport.walk import Hooks, Vertex
 
 #: Light paths that are looked at.
 PATHS = 2**16
-
-
 _PURPOSE = "conditions"
 
 

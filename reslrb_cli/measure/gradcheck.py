@@ -39,7 +39,6 @@ from reslrb_cli.records.measurements import Comparison, GradcheckRecord, Kind, R
 #: visible is another matter of rounding to each.
 STOCK_ROUNDING = 1e-3
 
-
 #: References that know the gradient along a few directions alone.
 ALONG_DIRECTIONS = (Reference.FINITE_DIFFERENCE, Reference.FORWARD_MODE)
 

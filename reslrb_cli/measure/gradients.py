@@ -42,14 +42,11 @@ from reslrb_cli.scene.parameters import Selection
 #: How far the largest step of finite differences moves things, relative to their size, in units of the step.
 REACH = 0.1
 
-
 #: The same of a heightmap, relative to the scene's size.
 RELIEF = 0.02
 
-
 #: The same of what makes up a motion: a turn is in degrees; None stands for `REACH` of the scene's size.
 UNITS = {"translation": None, "rotation": 10.0, "scale": REACH}
-
 
 #: Waves that have room in what is displaced, at most.
 WAVES = 1.5
@@ -138,7 +135,6 @@ class Values(Protocol):
 
 #: Steps that are tried, in units of the direction.
 STEPS = (0.1, 0.01, 0.001)
-
 
 #: How many seeds the comparison may have, by which the noise of a single one is judged.
 PLANNED_SEEDS = 16

@@ -43,7 +43,6 @@ from reslrb_cli.records.measurements import NOTHING, MissingRecord
 #: Seeds that steps are chosen with, and the fewest that a share is made of.
 PILOT_SEEDS, FEWEST = 4, 4
 
-
 #: How often the largest step is halved.
 HALVINGS = 8
 
@@ -134,10 +133,8 @@ def _mean(samples: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 #: Light paths of the image that dL/dI is taken at.
 IMAGE_PATHS = 2**22
 
-
 #: What is kept says that it is of this.
 KIND = "gradcheck --missing"
-
 
 #: The estimator whose gradient is looked at: exact, and attached where anything moves.
 ESTIMATOR = "stack"

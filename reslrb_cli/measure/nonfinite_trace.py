@@ -93,7 +93,6 @@ QUANTITIES = (
     "contribution C = E s_1 ... s_{i-1} c_i",
 )
 
-
 _E, _DE, _S, _DS, _PRODUCT, _C, _DC, _CONTRIBUTION = range(1, len(QUANTITIES))
 
 

@@ -22,7 +22,6 @@ from reslrb_cli.records.measurement_files import Kept
 #: What is kept says that it is of this.
 KIND = "gradcheck"
 
-
 #: What samples are of: `gradient` or `image` and an integrator's label, `differences` or `tangents` and a parameter.
 Name = tuple[str, str]
 
@@ -36,18 +35,14 @@ def settings(checked: Settings, variant: str, device: str) -> dict[str, Any]:
 #: Seeds, where no number is given: so many of everything, more of what is cheap, as the budget allows.
 LEAST_SEEDS, MOST_SEEDS = 8, 64
 
-
 #: Fewer seeds have no standard error worth the name, and are not judged.
 FEWEST = 3
-
 
 #: Shares of the budget: what more than LEAST_SEEDS are taken of has the larger one.
 LARGE_SHARE, SMALL_SHARE = 3, 1
 
-
 #: Whose gradients are naive AD, and compile for much longer than any other.
 NAIVE = ("walk_ad", "ptracer")
-
 
 #: Bytes that samples may take.
 MEMORY = 2**30

@@ -31,10 +31,8 @@ from reslrb_cli.report.tonemap import encode, exposure_for, shown_exposures
 
 Array = np.ndarray[Any, Any]
 
-
 #: Luminance of a linear value of 1 in cd/m², for what needs absolute units: the reference white of ITU-R BT.2408.
 WHITE = 203.0
-
 
 #: Percentiles that are told.
 PERCENTILES = (50, 95, 99)
@@ -90,7 +88,6 @@ def _colour() -> Any:
 #: Parameters of three numbers that are no colours to look at.
 NO_COLORS = ("eta", "k")
 
-
 #: What is no light and no colour, but where something is.
 PLACES = ("length", "degrees", "scale")
 
@@ -142,14 +139,11 @@ def _entries(value: Array, true: Array, mask: Array | None) -> tuple[Array, Arra
 
 MISSING = "HDR-FLIP was not measured: its package is not installed (`pip install reslrb[flip]`)"
 
-
 #: Exposures at most. FLIP takes one a stop between what shows the brightest pixel and what shows the median one.
 MOST_EXPOSURES = 8
 
-
 #: Luminance of linear sRGB, as FLIP has it.
 _LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
-
 
 #: The ACES curve (a x² + b x + c) / (d x² + e x + f) that FLIP takes for its tone mapper, and the output that counts as
 #: bright.
@@ -247,8 +241,6 @@ def ssim(first: Array, second: Array) -> float | None:
 
 
 _TARGET = re.compile(r"target(-\d+)?\.exr")
-
-
 MOMENTS = ("initial", "final")
 
 

@@ -20,7 +20,6 @@ LISTED = (
     *light.UNFOUND_CASES,
 )
 
-
 #: By name, of which no two cases have the same.
 CASES = {case.name: case for case in LISTED}
 

@@ -45,17 +45,9 @@ from reslrb_cli.measure.scenes.small import (
 )
 
 FLOOR = "floor.brdf_0.reflectance.value"
-
-
 WALL = "wall.brdf_0.reflectance.value"
-
-
 LAMP = "lamp.emitter.radiance.value"
-
-
 VEIL = "veil.bsdf.nested_bsdf.brdf_0.reflectance.value"
-
-
 OPACITY = "veil.bsdf.opacity.value"
 
 
@@ -104,7 +96,6 @@ def _parallel(start: list[float], end: list[float], half: float, radiance: dict)
 #: What paths from the sensor hardly find is compared with an image of paths from the light.
 TRACED: dict[str, Any] = {"image": "ptracer", "spp": 512}
 
-
 GLASS_CASES = [
     ExtremeCase("opacity_0", "a mask that is not there", lambda: veiled(0.0), (FLOOR, LAMP), Stock("prb"), spp=128),
     ExtremeCase("opacity_1", "a mask that hides all", lambda: veiled(1.0), (FLOOR, LAMP, VEIL), Stock("prb"), spp=128),
@@ -133,17 +124,11 @@ GLASS_CASES = [
           lambda: slab_scene(3.0, 85, 10), SLAB, 10, **TRACED),
 ]  # fmt: skip
 
-
 SIZE = 24
-
-
 TOP = "top.vertex_positions"
-
 
 #: Ten ray offsets where a thin slab is: 8.9e-5 (1 + max |p|) each.
 THIN = 10 * 8.9e-5 * (1 + 2.5)
-
-
 Moves = Callable[[Any], Sequence[Move]]
 
 
@@ -232,7 +217,6 @@ def moved(name: str, about: str, scene: Callable[[], dict], step: float = 0.01, 
 
 ROUGH: dict[str, Any] = {"type": "roughdielectric", "alpha": 0.1}
 
-
 MOTION_CASES = [
     moved("slope_0", "a flat surface of glass that begins to bend", surface(slope=0)),
     moved("slope_1e-6", "slopes of a millionth", surface(slope=1e-5)),
@@ -251,7 +235,6 @@ MOTION_CASES = [
     moved("shrunk_to_0.03", "a slab three hundredths of its size", moving_slab(scale=0.03), depth=4,
           moves=bending(1, 0.03), left=5e-3),
 ]  # fmt: skip
-
 
 AWAY = [60.0, 60.0, 52.9]  # 100 from the origin
 
@@ -333,7 +316,6 @@ PLACES_CASES = [
                 ("floor.nested_bsdf.reflectance.value", WALL), Stock("prb"), spp=512),
 ]  # fmt: skip
 
-
 RECEIVER = "floor.bsdf.reflectance.value"
 
 
@@ -382,11 +364,8 @@ def plate(kind: str, roughness: str) -> dict:
 
 ROUGHNESS = ("1", "0.1", "1e-2", "1e-4")
 
-
 #: Roughnesses whose derivative is decided where light follows them. `principled` chooses a lobe: it has none such.
 FOLLOWED = [(kind, roughness) for kind in ("roughconductor", "roughdielectric") for roughness in ("0.1", "1e-2")]
-
-
 NOISE = "the noise of a roughness's derivative grows as 1 / roughness: equal seeds decide"
 
 
@@ -431,6 +410,4 @@ def _followed(kind: str, roughness: str) -> ExtremeCase:
 
 
 ROUGHNESS_CASES = [_case(kind, roughness) for kind in KINDS for roughness in ROUGHNESS]
-
-
 ROUGHNESS_CASES += [_followed(kind, roughness) for kind, roughness in FOLLOWED]

@@ -41,11 +41,7 @@ from reslrb_cli.measure.scenes.small import (
 )
 
 FLOOR = "floor.brdf_0.reflectance.data"
-
-
 WALL = "wall.brdf_0.reflectance.value"
-
-
 LAMP = "lamp.emitter.radiance.value"
 
 
@@ -72,7 +68,6 @@ def bright(value: float) -> dict:
 
 #: It plays from the second vertex on.
 ROULETTE = {"max_depth": 5, "rr_depth": 2}
-
 
 COLOURS_CASES = [
     ExtremeCase(
@@ -244,7 +239,6 @@ LIGHTS_CASES = [
           lambda: furnace_scene((0, 0, 0), (1, 2, 0.5), 8, 8), FURNACE, 8),
 ]  # fmt: skip
 
-
 LIT_FLOOR = "floor.brdf_0.reflectance.value"
 
 
@@ -284,11 +278,8 @@ LOSSES_CASES = [
     _sums("sums_1e8", 10**8),
 ]  # fmt: skip
 
-
 #: The parameters of `texels_over_plane`.
 PLANE = "plane.bsdf.reflectance.value"
-
-
 TEXELS = {"albedo": PLANE, "texels": f"{RADIANCE}.data"}
 
 

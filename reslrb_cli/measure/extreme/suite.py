@@ -232,7 +232,6 @@ def without_roulette(case: ExtremeCase) -> dict[str, Any]:
 #: Of the root mean square of the sums.
 LIMIT = 1e-5
 
-
 #: What is kept says that it is of this.
 KIND = "gradcheck --suite"
 
@@ -266,7 +265,6 @@ def kept(settings: Mapping[str, Any], cases: Mapping[str, Sequence[GradcheckReco
 
 #: All z scores of the suite are corrected for together; a little more than it has.
 FAMILY = Family(rows=1500, entries=30000)
-
 
 #: What rounding may leave below zero, of the largest entry.
 BELOW_ZERO = 1e-5

@@ -58,14 +58,11 @@ class KnownScene:
 
 #: The parameters of these scenes, by the names of their derivatives.
 FURNACE = {"albedo": "walls.bsdf.reflectance.value", "emission": "walls.emitter.radiance.value"}
-
-
 POOL = {
     "albedo": "plane.bsdf.reflectance.value",
     "intensity": "light.intensity.value",
     "transmittance": "surface.bsdf.specular_transmittance.value",
 }
-
 
 SLAB = {
     "albedo": "plane.bsdf.reflectance.value",
@@ -74,11 +71,8 @@ SLAB = {
     "reflectance": "top.bsdf.specular_reflectance.value",
 }
 
-
 #: The albedo of all planes here.
 ALBEDO = (0.7, 0.5, 0.3)
-
-
 DOWN, UP = ([1, 0, 0], 90), ([1, 0, 0], -90)
 
 
@@ -136,10 +130,7 @@ def slab_scene(ior: float = 1.5, degrees: float = 40, max_depth: int = 6) -> Kno
 
 
 FOV = 50
-
-
 RADIANCE = "lamp.emitter.radiance"
-
 
 #: Where the lamp over the plane is, beside what the camera sees: middle and half of its side.
 MIDDLE, HALF = (1.0, 0.8, -0.2), 0.3

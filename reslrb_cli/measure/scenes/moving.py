@@ -23,7 +23,6 @@ from reslrb_cli.scene.graph import SceneGraph
 
 Array = NDArray[np.float64]
 
-
 #: Waves of a surface: wave vectors, phases, and amplitudes for a mean slope of about 0.1.
 WAVES = (((5.1, 2.3), 0.4, 0.0135), ((-3.7, 5.9), 1.9, 0.012), ((7.9, -4.6), 4.1, 0.0062), ((2.2, -8.8), 2.7, 0.0055))
 
@@ -110,7 +109,6 @@ class Move(Protocol):
 
 #: The name of the amplitudes among the parameters.
 AMPLITUDES = "amplitudes"
-
 
 #: Degrees that an amplitude of 1 turns by.
 DEGREES = 57.29577951308232

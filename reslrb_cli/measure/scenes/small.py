@@ -18,10 +18,8 @@ from reslrb_cli.errors import ConfigError
 #: What errors name in place of a file.
 CORNELL_BOX_SOURCE = "the built-in Cornell box"
 
-
 #: What stands for the scene in `scene.file`.
 FILE = Path("/cornell-box")
-
 
 #: No roulette, no directly visible emitters; `size` is the film's, `texture` the texture's, both squares.
 CORNELL_BOX = f"""\
