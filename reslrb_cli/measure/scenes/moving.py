@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -89,24 +89,6 @@ def vertices(scene: Any, name: str) -> np.ndarray:
 FILTER = {"type": "gaussian", "stddev": 0.7}
 
 
-class Move(Protocol):
-    """Something in a scene that amplitudes move; all zero, it stands as the scene has it."""
-
-    @property
-    def key(self) -> str:
-        """What it moves, as `mi.traverse` names it."""
-        ...
-
-    @property
-    def size(self) -> int:
-        """How many amplitudes there are."""
-        ...
-
-    def value(self, initial: Any, amplitudes: list[mi.Float]) -> Any:
-        """The value of `key`, with its derivative by the amplitudes, of which each has width 1."""
-        ...
-
-
 #: The name of the amplitudes among the parameters.
 AMPLITUDES = "amplitudes"
 
@@ -177,6 +159,11 @@ class Number:
         return type(initial)(initial + amplitudes[0])
 
 
+#: Something in a scene (`key`, as `mi.traverse` names it) that `size` amplitudes move; all zero, it stands as the scene
+#: has it. `value` is that of `key`, with its derivative by the amplitudes, of which each has width 1.
+Move = Displacement | Pose | Number
+
+
 @dataclass
 class Displaced:
     """The `measure.values.Values` of a scene that `moves` move: AMPLITUDES, all of theirs in a row."""
@@ -209,10 +196,9 @@ class Displaced:
         dr.eval(moved, [mesh.vertex_normals_buffer() for mesh in self._meshes])
 
     def collect(self) -> None:
-        """Gradients of one step find their way back by themselves."""
+        """Gradients of one step find their way back by themselves, and so do tangents."""
 
-    def push(self) -> None:
-        """So do tangents."""
+    push = collect
 
 
 def moving_case(description: dict, moves: Callable[[Any], Sequence[Move]]) -> Case:
