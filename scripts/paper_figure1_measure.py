@@ -16,8 +16,8 @@ from paper_noise import Fall, fall, relative_noise
 
 from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ConfigError
-from reslrb_cli.measure.comparison import Comparison, Family, compare_expectations, entry_count
-from reslrb_cli.records.measurements import BenchStatus, Verdict
+from reslrb_cli.measure.comparison import Family, compare_expectations, entry_count
+from reslrb_cli.records.measurements import BenchStatus, Comparison, Verdict
 
 
 @dataclass(frozen=True)

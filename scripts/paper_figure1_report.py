@@ -81,7 +81,7 @@ def to_json(result: Result) -> dict[str, Any]:
         "gradients": [_kind_json(result, kind) for kind in result.kinds],
         "naive_at_many_spp_mib": result.asked_mib,
         "comparisons": [
-            {"gradient": one, "reference": other, **finite(figures.figures)}
+            {"gradient": one, "reference": other, **finite(vars(figures))}
             for (one, other), figures in result.comparisons.items()
         ],
         "noise": None if result.fall is None else finite(dataclasses.asdict(result.fall)),

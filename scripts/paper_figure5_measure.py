@@ -18,14 +18,13 @@ from paper_kinds import OWN, Kind, check_config, sample, take_pictures
 
 from reslrb_cli.config.schema import Config
 from reslrb_cli.measure.comparison import (
-    Comparison,
     Family,
     compare_equal_seeds,
     compare_expectations,
     entry_count,
     z_scores,
 )
-from reslrb_cli.records.measurements import Verdict
+from reslrb_cli.records.measurements import Comparison, Verdict
 
 #: Estimators that equal naive AD of the same paths but for rounding; and how far they may be from it, in relative L2.
 EXACT, CLOSE = ("stack", "gather"), 1e-4

@@ -75,7 +75,7 @@ def to_json(result: Result) -> dict[str, Any]:
             for kind in result.kinds
         ],
         "comparisons": [
-            {"gradient": one, "reference": other, **finite(figures.figures)}
+            {"gradient": one, "reference": other, **finite(vars(figures))}
             for (one, other), figures in result.comparisons.items()
         ],
         "holds": result.holds,

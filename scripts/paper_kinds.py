@@ -1,7 +1,7 @@
 """Kinds of gradients that have one dL/dI, each sampled in a process of its own: what figures of the paper compare.
 
-The processes load `fixed_adjoint.py`, which holds dL/dI at a reference image's; this module knows no Mitsuba. Seeds
-differ between kinds, but for those that are asked to share them.
+The processes load `paper_fixed_adjoint.py`, which holds dL/dI at a reference image's; this module knows no Mitsuba.
+Seeds differ between kinds, but for those that are asked to share them.
 """
 
 from __future__ import annotations
@@ -12,12 +12,12 @@ from typing import Any
 
 import numpy as np
 
+from reslrb_cli.backend.installation import python_command
 from reslrb_cli.config.integrators import Reslrb as ReslrbConfig
 from reslrb_cli.config.loader import dump
 from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.measure.processes import Ended, Process
-from reslrb_cli.measure.tasks import start_process
 from reslrb_cli.seeds import seed
 
 MIB = 2**20
@@ -38,8 +38,8 @@ _ADJOINT = "adjoint.npy"
 class Kind:
     """One kind of gradient: `samples` (N, H, W, C), the peak of Dr.Jit's arrays, and of the process's address space.
 
-    `by` is who takes them, as `held.comparable` has it. `end` is how a process ended that did not come to its first
-    gradient.
+    `by` is who takes them, as `comparable` has it. `end` is how a process ended that did not come to its
+    first gradient.
     """
 
     name: str
@@ -75,7 +75,7 @@ def check_config(config: Config) -> str:
 
 
 def take_pictures(config: Config, spp: int, folder: Path, masked: bool = False) -> dict[str, np.ndarray]:
-    """Target, initial image and dL/dI of `held.pictures`; what `sample` does in this folder has that dL/dI."""
+    """Target, initial image and dL/dI of `pictures`; what `sample` does in this folder has that dL/dI."""
     process = _start(config, None, OWN, None)
     try:
         process.answer(_never)
@@ -121,7 +121,8 @@ def _start(config: Config, limit: int | None, by: str, adjoint: Path | None) -> 
         "by": by,
         "adjoint": None if adjoint is None else str(adjoint),
     }
-    return start_process(first, "held_gradients")
+    imports = "from paper_fixed_adjoint import begin_holding\nfrom reslrb_cli.measure.workers import run"
+    return Process(first, python_command(f"{imports}\nrun(lambda: begin_holding)"))
 
 
 def _never() -> bool:

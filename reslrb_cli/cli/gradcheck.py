@@ -10,69 +10,77 @@ import difflib
 import logging
 import os
 import time
-from collections.abc import Iterator
-from itertools import groupby
+from collections.abc import Iterable, Mapping
+from itertools import takewhile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from reslrb_cli.cli.options import COUNT, allowance, check_writable, optional_experiment_arguments, resume_option
-from reslrb_cli.cli.terminal import echo
+from reslrb_cli.backend.doctor import device_name
+from reslrb_cli.backend.installation import load_packages
+from reslrb_cli.backend.variant import set_variant
+from reslrb_cli.cli.options import (
+    COUNT,
+    Keeper,
+    allowance,
+    check_writable,
+    is_given,
+    optional_experiment_arguments,
+    origin_of,
+    read_earlier,
+    resume_option,
+)
+from reslrb_cli.cli.terminal import Interrupts, echo
+from reslrb_cli.config.integrators import ESTIMATOR_OPTIONS
+from reslrb_cli.config.loader import load, loads
 from reslrb_cli.errors import ConfigError, ExitCode
+from reslrb_cli.measure.methods import all_estimators, parse_estimators
+from reslrb_cli.measure.resume_store import Earlier, settings
+from reslrb_cli.records.measurements import GradcheckRecord, MissingRecord, Verdict
 
 if TYPE_CHECKING:
     from reslrb_cli.config.schema import Config
     from reslrb_cli.measure.gradcheck import Gradcheck, Result
-    from reslrb_cli.records.measurements import GradcheckRecord, MissingRecord
 
 
-#: Options that say something about comparisons, of which there is none.
-FOREIGN = {"suite": "--suite", "cases": "--case", "estimators": "--estimators", "markdown_file": "--markdown",
-           "folder": "--images"}  # fmt: skip
+#: Options that say something about comparisons, of which `--missing` makes none.
+COMPARING = {"suite": "--suite", "cases": "--case", "estimators": "--estimators", "markdown_file": "--markdown",
+             "folder": "--images"}  # fmt: skip
+
+#: Options that mean nothing without a configuration, as of a suite.
+CONFIGURED = {"config_file": "CONFIG", "overrides": "--set", "budget": "--budget", "spp": "--spp", "folder": "--images"}
 
 
-def refuse_comparisons(context: click.Context) -> None:
-    """Raise ConfigError where an option of the command has no part in this."""
-    for name, option in FOREIGN.items():
-        if context.get_parameter_source(name) is click.core.ParameterSource.COMMANDLINE:
-            raise ConfigError(option, "", "does not go with --missing, which compares no estimators; leave out one")
-    if context.params["config_file"] is None:
-        raise ConfigError("--missing", "", "needs a CONFIG, whose parameters and loss it looks at")
+def _given(options: Mapping[str, str]) -> str | None:
+    """The first of `options`, written by their parameters' names, that the user gave."""
+    return next((option for name, option in options.items() if is_given(name)), None)
+
+
+def _earlier(kind: str, resumed: Path | None, now: Mapping[str, Any]) -> Earlier | None:
+    """The session that left the file `resumed`. Raises ConfigError where its settings are not those of `now`."""
+    if resumed is None:
+        return None
+    earlier = Earlier(kind, resumed, *read_earlier(resumed))
+    earlier.check(now)
+    return earlier
 
 
 def run_missing(
-    config: Config,
-    variant: str,
-    budget: float,
-    seeds: int | None,
-    spp: int | None,
-    along: int | None,
-    json_file: Path | None,
-    resumed: Path | None,
-) -> int:
+    config: Config, variant: str, budget: float, seeds: int | None, spp: int | None, along: int | None,
+    json_file: Path | None, resumed: Path | None,
+) -> int:  # fmt: skip
     """Measure, print and write; returns the exit code. `variant` must be set."""
-    from reslrb_cli.backend.doctor import device_name
-    from reslrb_cli.cli.options import Keeper, origin_of, read_earlier
-    from reslrb_cli.cli.terminal import Interrupts
     from reslrb_cli.measure.missing import KIND, MissingCheck
-    from reslrb_cli.measure.resume_store import Earlier, settings
 
     to_keep = settings(config, variant, device_name(variant), spp=spp, directions=along)
-    earlier = None
-    if resumed is not None:
-        earlier = Earlier(KIND, resumed, *read_earlier(resumed))
-        earlier.check(to_keep)
-    check = MissingCheck(config, budget, seeds, spp, along, earlier)
+    check = MissingCheck(config, budget, seeds, spp, along, _earlier(KIND, resumed, to_keep))
     echo(check.conditions())
     records: list[MissingRecord] = []
     keeper = Keeper(
-        json_file,
-        origin_of(variant),
-        lambda: records,
-        lambda: check.known()[len(records) :],
+        json_file, origin_of(variant), lambda: records, lambda: check.known()[len(records) :],
         lambda: check.kept(to_keep),
-    )
+    )  # fmt: skip
     with Interrupts() as interrupts:
         for record in check.run(lambda: interrupts.requested, keeper.refresh):
             records.append(record)
@@ -81,103 +89,57 @@ def run_missing(
         return ExitCode.INTERRUPTED if interrupts.requested else ExitCode.DONE
 
 
-#: Options of `gradcheck` that mean nothing without a configuration, by their parameters' names.
-_FOREIGN = {
-    "config_file": "CONFIG",
-    "overrides": "--set",
-    "budget": "--budget",
-    "spp": "--spp",
-    "folder": "--images",
-}
-
-
-def refuse_foreign(context: click.Context) -> None:
-    """Raise ConfigError where an option is given that a suite has no use for."""
-    for name, option in _FOREIGN.items():
-        if context.get_parameter_source(name) is click.core.ParameterSource.COMMANDLINE:
-            raise ConfigError(
-                "--suite", "", f"{option} has no effect on a suite, whose cases have their own; remove it"
-            )
-
-
 def run_suite_command(
-    names: tuple[str, ...],
-    estimators: str | None,
-    seeds: int | None,
-    json_file: Path | None,
-    markdown_file: Path | None,
-    resumed: Path | None,
-) -> int:
+    names: tuple[str, ...], estimators: str | None, seeds: int | None, json_file: Path | None,
+    markdown_file: Path | None, resumed: Path | None,
+) -> int:  # fmt: skip
     """Run the cases of these names, all where there is none; print a line for each, write the files.
 
     Cases that the file `resumed` has are not run again.
     """
-    from reslrb_cli.backend.doctor import device_name
-    from reslrb_cli.backend.variant import set_variant
-    from reslrb_cli.cli.options import Keeper, origin_of, read_earlier
-    from reslrb_cli.cli.terminal import Interrupts
-    from reslrb_cli.report.tables import summary_lines
-
     chosen = _estimators(estimators)
     variant = set_variant("auto")
 
     from reslrb_cli.measure.extreme import CASES, run_suite, suite
-    from reslrb_cli.measure.resume_store import Earlier
 
     for name in names:
         if name not in CASES:
             near = difflib.get_close_matches(name, list(CASES), n=1, cutoff=0)
             raise ConfigError("--case", "", f"there is no case `{name}`; did you mean {near[0]}?")
-    settings = suite.settings(chosen, seeds, variant, device_name(variant))
-    done: dict[str, list[GradcheckRecord]] = {}
-    to_do = list(names or CASES)
-    if resumed is not None:
-        earlier = Earlier(suite.KIND, resumed, *read_earlier(resumed))
-        earlier.check(settings)
-        done = suite.restore(earlier)
-        to_do = [name for name in to_do if name not in done]
-        if not to_do:
-            raise earlier.complete("all these cases", "others with --case")
-    echo(f"{device_name(variant)}, {variant}")
+    machine = f"{device_name(variant)}, {variant}"
+    to_keep = suite.settings(chosen, seeds, variant, device_name(variant))
+    earlier = _earlier(suite.KIND, resumed, to_keep)
+    done = {} if earlier is None else suite.restore(earlier)
+    to_do = [name for name in names or CASES if name not in done]
+    if earlier is not None and not to_do:
+        raise earlier.complete("all these cases", "others with --case")
+    echo(machine)
     for case, rows in done.items():
         echo(_case_line(case, rows))
 
     def lines() -> list[GradcheckRecord]:
         return [record for rows in done.values() for record in rows]
 
-    keeper = Keeper(json_file, origin_of(variant), lines, lambda: [], lambda: suite.kept(settings, done))
+    keeper = Keeper(json_file, origin_of(variant), lines, lambda: [], lambda: suite.kept(to_keep, done))
     with Interrupts() as interrupts:
-
-        def until_interrupted(found: Iterator[GradcheckRecord]) -> Iterator[GradcheckRecord]:
-            for record in found:
-                if interrupts.requested:
-                    return
-                yield record
-
-        for case, group in groupby(until_interrupted(run_suite(to_do, chosen, seeds)), lambda r: r.case):
-            rows = list(group)
+        for name in to_do:
+            rows = list(takewhile(lambda _: not interrupts.requested, run_suite([name], chosen, seeds)))
             if interrupts.requested:  # there may be more of this one
                 break
-            done[case] = rows
+            done[name] = rows
             keeper.refresh()
-            echo(_case_line(case, rows))
-        records, interrupted = lines(), interrupts.requested
-        keeper.finish(records)
-    for line in summary_lines(records):
-        echo(line)
+            echo(_case_line(name, rows))
+        interrupted = interrupts.requested
+        keeper.finish(lines())
+    _say(lines())
     if markdown_file is not None:
         about = {name: case.about for name, case in CASES.items()}
-        markdown_file.write_text(_document(records, about, f"{device_name(variant)}, {variant}"), encoding="utf-8")
-    if interrupted:
-        return ExitCode.INTERRUPTED
-    return ExitCode.CHECK_FAILED if any(record.holds is False for record in records) else ExitCode.DONE
+        markdown_file.write_text(_document(lines(), about, machine), encoding="utf-8")
+    return ExitCode.INTERRUPTED if interrupted else _exit_code(lines())
 
 
 def _estimators(text: str | None) -> list[str] | None:
     """Names of estimators, without options: the cases have their own."""
-    from reslrb_cli.config.integrators import ESTIMATOR_OPTIONS
-    from reslrb_cli.measure.methods import parse_estimators
-
     if text is None:
         return None
     names = []
@@ -249,9 +211,7 @@ logger = logging.getLogger(__name__)
 @click.option("--images", "folder", type=click.Path(path_type=Path, file_okay=False),
               help="Write maps of the gradients of textures, their references and z into this folder, as PNG and as "
                    "layers of EXR files.")  # fmt: skip
-@click.pass_context
 def command(
-    context: click.Context,
     config_file: Path | None,
     overrides: tuple[str, ...],
     suite: str | None,
@@ -275,31 +235,26 @@ def command(
     1 where a comparison fails; the last lines say which, and by how much. docs/gradcheck.md explains the columns.
     """
     began = time.monotonic()
-    from reslrb_cli.backend.doctor import device_name
-    from reslrb_cli.backend.installation import load_packages
-    from reslrb_cli.backend.variant import set_variant
-    from reslrb_cli.cli.options import read_earlier
-    from reslrb_cli.config.loader import load, loads
-
     load_packages()  # before what follows asks for them
     from reslrb_cli.measure.gradcheck import Gradcheck
-    from reslrb_cli.measure.methods import all_estimators, parse_estimators
     from reslrb_cli.measure.participants import Settings
-    from reslrb_cli.measure.resume_store import Earlier
     from reslrb_cli.measure.sampling import KIND
     from reslrb_cli.measure.sampling import settings as settings_to_keep
     from reslrb_cli.measure.scenes import small
-    from reslrb_cli.records.measurements import Verdict
 
-    if missing:
-        refuse_comparisons(context)
-    elif directions is not None:
+    if missing and (option := _given(COMPARING)):
+        raise ConfigError(option, "", "does not go with --missing, which compares no estimators; leave out one")
+    if missing and config_file is None:
+        raise ConfigError("--missing", "", "needs a CONFIG, whose parameters and loss it looks at")
+    if directions is not None and not missing:
         raise ConfigError("--directions", "", "goes with --missing alone")
     json_file = json_file or resumed
     check_writable("--json", json_file)
     check_writable("--markdown", markdown_file)
     if suite is not None:
-        refuse_foreign(context)
+        if option := _given(CONFIGURED):
+            reason = f"{option} has no effect on a suite, whose cases have their own; remove it"
+            raise ConfigError("--suite", "", reason)
         return run_suite_command(cases, estimators, seeds, json_file, markdown_file, resumed)
     if cases:
         raise ConfigError("--case", "", "names a case of a suite; take --suite extreme with it")
@@ -313,32 +268,44 @@ def command(
         return run_missing(config, variant, budget, seeds, spp, directions, json_file, resumed)
     listed = all_estimators(config) if estimators is None else parse_estimators(estimators)
     _check_folder(folder)
-    settings = Settings(config, listed, budget, seeds, spp, estimators is not None, time.monotonic() - began)
-    settings.configs()  # before anything is loaded
+    checked = Settings(config, listed, budget, seeds, spp, estimators is not None, time.monotonic() - began)
+    checked.configs()  # before anything is loaded
     variant = set_variant(config.variant)
-    to_keep = settings_to_keep(settings, variant, device_name(variant))
-    earlier = None if resumed is None else Earlier(KIND, resumed, *read_earlier(resumed))
-    if earlier is not None:
-        earlier.check(to_keep)
-    check = Gradcheck(settings, earlier=earlier)
+    to_keep = settings_to_keep(checked, variant, device_name(variant))
+    check = Gradcheck(checked, earlier=_earlier(KIND, resumed, to_keep))
     echo(f"{device_name(variant)}, {variant}; {allowance(budget, seeds, 'seed')}")
     echo(check.conditions())
     records, interrupted = _run(check, variant, to_keep, json_file, folder)
-    _finish(records, markdown_file)
+    if records:
+        _say(records)
+    else:
+        echo("interrupted before there were enough seeds to compare")
+    if markdown_file is not None:
+        from reslrb_cli.report.tables import markdown_table
+
+        markdown_file.write_text(markdown_table(records), encoding="utf-8")
+    nothing = all(record.verdict in (Verdict.NOT_MEASURED, Verdict.NO_REFERENCE) for record in records)
     if interrupted:
         return ExitCode.INTERRUPTED
-    nothing = all(record.verdict in (Verdict.NOT_MEASURED, Verdict.NO_REFERENCE) for record in records)
-    failed = nothing or any(record.holds is False for record in records)
-    return ExitCode.CHECK_FAILED if failed else ExitCode.DONE
+    return ExitCode.CHECK_FAILED if nothing else _exit_code(records)
+
+
+def _exit_code(records: Iterable[GradcheckRecord]) -> int:
+    return ExitCode.CHECK_FAILED if any(record.holds is False for record in records) else ExitCode.DONE
+
+
+def _say(records: list[GradcheckRecord]) -> None:
+    """Print what the records come to."""
+    from reslrb_cli.report.tables import summary_lines
+
+    for line in summary_lines(records):
+        echo(line)
 
 
 def _run(
     check: Gradcheck, variant: str, to_keep: dict[str, Any], json_file: Path | None, folder: Path | None
 ) -> tuple[list[GradcheckRecord], bool]:
     """Measure, print and write; returns all records, and whether the user interrupted."""
-    from reslrb_cli.cli.options import Keeper, origin_of
-    from reslrb_cli.cli.terminal import Interrupts
-    from reslrb_cli.records.measurements import Verdict
     from reslrb_cli.report.tables import Table
 
     records: list[GradcheckRecord] = []
@@ -367,16 +334,6 @@ def _draw(result: Result, folder: Path | None) -> None:
 
     folder.mkdir(parents=True, exist_ok=True)
     plot_maps(result.record, result.maps.gradient, result.maps.reference, result.maps.z, folder)
-
-
-def _finish(records: list[GradcheckRecord], markdown_file: Path | None) -> None:
-    """Print what it comes to, and write the Markdown table."""
-    from reslrb_cli.report.tables import markdown_table, summary_lines
-
-    for line in summary_lines(records) if records else ["interrupted before there were enough seeds to compare"]:
-        echo(line)
-    if markdown_file is not None:
-        markdown_file.write_text(markdown_table(records), encoding="utf-8")
 
 
 def _check_folder(folder: Path | None) -> None:

@@ -9,6 +9,8 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -68,7 +70,7 @@ def load_replay(config: Config) -> Replay:
     guided = _guided(config, manifest, written)
     if not 0 <= iteration < config.run.iterations:
         raise ConfigError(archive, "iteration", f"is {iteration}; the run has {config.run.iterations} iterations")
-    config = _chosen(_with_sequence(config, manifest, written), manifest, written)
+    config = _settled(config, manifest, written)
     try:
         problem = assemble_scene(config, values=values)
     except ValueError as error:
@@ -88,37 +90,35 @@ def load_replay(config: Config) -> Replay:
     return Replay(problem, iteration)
 
 
-def _chosen(config: Config, manifest: dict[str, Any], path: Path) -> Config:
-    """The configuration with the estimator that the run's pilot chose, by the manifest at `path`."""
-    if not manifest.get("pilot") or not isinstance(config.integrator, ReslrbConfig):
-        return config
+@contextmanager
+def _as_written(path: Path, place: str, what: str) -> Iterator[None]:
+    """Raise ConfigError where the entry at `place` of the manifest at `path` is not what a run writes."""
     try:
-        options = config.integrator.chosen(**manifest["pilot"]["chosen"]).options()
-    except (TypeError, KeyError, ValueError):  # pydantic's error is a ValueError
-        raise ConfigError(path, "pilot.chosen", "is not an estimator with its options, as a run writes it") from None
-    return with_integrator(config, {"type": config.integrator.type} | options, str(path), {})
+        yield
+    except (AttributeError, KeyError, TypeError, ValueError):  # pydantic's error is a ValueError
+        raise ConfigError(path, place, f"is not {what}, as a run writes it") from None
 
 
-def _with_sequence(config: Config, manifest: dict[str, Any], path: Path) -> Config:
-    """The configuration with the sequence that the run measured to pay, by the manifest at `path`."""
+def _settled(config: Config, manifest: dict[str, Any], path: Path) -> Config:
+    """The configuration with the sequence that was measured to pay, and the estimator that the run's pilot chose."""
     options = config.integrator.options()
-    if options.get("sequence") != "auto":
-        return config
-    try:
-        options["sequence"] = SequenceRecord.from_json(manifest["sequence"]).setting
-    except (TypeError, KeyError, AttributeError):
-        raise ConfigError(path, "sequence", "is not whether a sequence paid, as a run writes it") from None
-    return with_integrator(config, {"type": config.integrator.type} | options, str(path), {})
+    if options.get("sequence") == "auto":
+        with _as_written(path, "sequence", "whether a sequence paid"):
+            options["sequence"] = SequenceRecord.from_json(manifest["sequence"]).setting
+        config = with_integrator(config, {"type": config.integrator.type} | options, str(path), {})
+    if manifest.get("pilot") and isinstance(config.integrator, ReslrbConfig):
+        with _as_written(path, "pilot.chosen", "an estimator with its options"):
+            options = config.integrator.chosen(**manifest["pilot"]["chosen"]).options()
+        config = with_integrator(config, {"type": config.integrator.type} | options, str(path), {})
+    return config
 
 
 def _guided(config: Config, manifest: dict[str, Any], path: Path) -> GuidedRecord | None:
     """Whether guided emission was measured to pay, by the manifest at `path`; None where that was not measured."""
     if config.integrator.options().get("guiding") != "auto" or manifest.get("guided") is None:
         return None
-    try:
+    with _as_written(path, "guided", "whether guiding paid"):
         return GuidedRecord.from_json(manifest["guided"])
-    except (TypeError, AttributeError):
-        raise ConfigError(path, "guided", "is not whether guiding paid, as a run writes it") from None
 
 
 def _teach(problem: Problem, saved: NonFiniteStep, archive: Path) -> None:

@@ -1,14 +1,11 @@
-"""Comparisons of Monte Carlo estimates: two sets of images with each other, and gradients with a reference.
+"""Comparisons of Monte Carlo estimates of gradients, and of images, with a reference.
 
-Whether two estimators agree (`compare`): Welch's test for each block of pixels, corrected for how many there are.
+Whether two means agree, over N and M independent samples, is told by Welch's test of each entry:
 
-    t = (mean_a - mean_b) / sqrt(s_a^2 / N + s_b^2 / M)        per block and channel, over N and M independent renders
+    t = (mean_a - mean_b) / sqrt(s_a^2 / N + s_b^2 / M)
 
 t is turned into the standard normal z of the same probability (Welch-Satterthwaite degrees of freedom), so that few
-renders do not look like a bias. Beside the blocks, the mean of the whole image is tested: a bias that is everywhere
-small shows there. Two sides must hold: max |z| under Sidak's threshold for all blocks and channels, and the root mean
-square of z under that of as many normal deviates as there are blocks (channels may be fully correlated), or, entry by
-entry, as the correlated entries are worth.
+samples do not look like a bias.
 
 The entries in which a gradient is compared are those of a small parameter, tiles and projections of a large one. A
 texel that few paths meet has a gradient whose noise is far from normal, and z scores of thousands of them raise false
@@ -24,7 +21,7 @@ share:
 
     t_k = mean_k(a - b) / sqrt(var_k(a - b) / N + floor_k^2)         to z, the normal deviate of the same probability
 
-Two criteria must hold, as in `compare`. The largest |z| stays under Sidak's threshold for all entries of all rows of a
+Two criteria must hold. The largest |z| stays under Sidak's threshold for all entries of all rows of a
 table, and the root mean square of a row's z under that of nu normal deviates, nu the row's effective number of
 independent entries (Satterthwaite, with the mean squared correlation r^2 of its entries' samples, chance taken off):
 
@@ -33,62 +30,17 @@ independent entries (Satterthwaite, with the mean squared correlation r^2 of its
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from scipy import stats
 
-from reslrb_cli.records.measurements import Verdict
+from reslrb_cli.records.measurements import Comparison, Verdict
 
 #: Probability that a comparison of two equal expectations fails, for each of its two criteria. Seeds are fixed, so that
 #: a test that passes once passes always.
 ALPHA = 1e-4
-
-
-@dataclass(frozen=True)
-class Agreement:
-    """Result of a comparison; `z` is (blocks, C), the whole image's last; `difference` is mean_a / mean_b - 1."""
-
-    z: np.ndarray
-    threshold: float
-    z_rms: float
-    z_rms_threshold: float
-    difference: float
-    relative_error: float
-    worst: str
-
-    @property
-    def holds(self) -> bool:
-        """Whether both criteria hold; NaN does not."""
-        return bool(np.abs(self.z).max() < self.threshold and self.z_rms < self.z_rms_threshold)
-
-    def __bool__(self) -> bool:
-        return self.holds
-
-    def __str__(self) -> str:
-        verdict = "agree" if self.holds else "DISAGREE"
-        return (
-            f"{verdict}: max |z| {np.abs(self.z).max():.2f} (limit {self.threshold:.2f}), z rms {self.z_rms:.2f} "
-            f"(limit {self.z_rms_threshold:.2f}), {len(self.z) - 1} blocks, "
-            f"mean differs by {self.difference:+.3%}, "
-            f"standard error of the mean {self.relative_error:.2%}; worst: {self.worst}"
-        )
-
-    __repr__ = __str__
-
-
-def renders(render: Callable[[int], Any], seeds: Iterable[int]) -> np.ndarray:
-    """Stack `render(seed)` of all seeds, as float64: (N, ...)."""
-    return np.stack([np.array(render(seed), dtype=np.float64) for seed in seeds])
-
-
-def blocks(samples: np.ndarray, size: int) -> np.ndarray:
-    """Means over blocks of `size` x `size` pixels of (N, H, W, C) samples: (N, blocks, C). Remainders count too."""
-    _, height, width, _ = samples.shape
-    rows, columns = range(0, height, size), range(0, width, size)
-    return np.stack([samples[:, y : y + size, x : x + size].mean((1, 2)) for y in rows for x in columns], axis=1)
 
 
 def z_scores(a: np.ndarray, b: np.ndarray, rounding: float = 1e-5) -> np.ndarray:
@@ -130,39 +82,6 @@ def _normal_scores(t: np.ndarray, freedom: np.ndarray) -> np.ndarray:
     return np.where(np.isfinite(z), z, t)
 
 
-def compare(a: np.ndarray, b: np.ndarray, block: int | None = 8, alpha: float = ALPHA) -> Agreement:
-    """Compare (N, H, W, C) with (M, H, W, C) renders block by block; `block=None`: (N, ...) entry by entry.
-
-    Assert on the result: `assert agreement, agreement` (or `assert compare(...)`, whose failure prints it).
-    """
-    if a.shape[1:] != b.shape[1:]:
-        raise ValueError(f"renders of different shapes: {a.shape[1:]} and {b.shape[1:]}")
-    if block is None:
-        parts_a, parts_b = (x.reshape(len(x), -1, 1) for x in (a, b))
-    else:
-        parts_a, parts_b = blocks(a, block), blocks(b, block)
-    all_a, all_b = (np.concatenate([x, x.mean(1, keepdims=True)], 1) for x in (parts_a, parts_b))
-    z = z_scores(all_a, all_b)
-
-    index, channel = np.unravel_index(np.argmax(np.where(np.isfinite(z), np.abs(z), np.inf)), z.shape)
-    in_a, in_b = all_a[:, index, channel].mean(), all_b[:, index, channel].mean()
-    where = "whole" if index == len(z) - 1 else f"block {index}"
-    total_a, total_b = parts_a.mean((1, 2)), parts_b.mean((1, 2))
-    scale = abs(total_b.mean()) or 1.0
-    count: float = len(z) - 1
-    if block is None:
-        count = min(effective_entries(x.reshape(len(x), -1)) for x in (a, b))
-    return Agreement(
-        z=z,
-        threshold=sidak(z.size, alpha),
-        z_rms=combined_z_rms(z[:-1]),
-        z_rms_threshold=z_rms_limit(count, alpha),
-        difference=float((total_a.mean() - total_b.mean()) / scale),
-        relative_error=float(np.hypot(stats.sem(total_a), stats.sem(total_b)) / scale),
-        worst=f"{where}, channel {channel}: {in_a:.5g} against {in_b:.5g}",
-    )
-
-
 def sidak(count: int, alpha: float = ALPHA) -> float:
     """The |z| that the largest of `count` independent normal deviates exceeds with probability `alpha`."""
     return float(stats.norm.isf(-np.expm1(np.log1p(-alpha) / count) / 2))
@@ -196,10 +115,8 @@ def effective_entries(samples: np.ndarray) -> float:
 #: Tiles of a texture along each side, the finest division first.
 TILES = (8, 4, 2, 1)
 
-
 #: Parameters with no more entries than these may be compared entry by entry.
 FEW = 48
-
 
 #: Projections of a parameter that has more.
 PROJECTIONS = 16
@@ -210,13 +127,21 @@ def divisions(shape: tuple[int, ...]) -> list[int]:
     size = int(np.prod(shape, dtype=int))
     if size <= 4:
         return [0]
-    coarser = [tiles for tiles in TILES if _parts(np.zeros((1, size)), shape, tiles).shape[1] < size]
+    coarser = [tiles for tiles in TILES if parts(np.zeros((1, size)), shape, tiles).shape[1] < size]
     return [0, *coarser] if size <= FEW else coarser
 
 
 def parts(samples: np.ndarray, shape: tuple[int, ...], tiles: int) -> np.ndarray:
     """Sums over the parts of one division: (N, E) of the (N, P) gradients of a parameter of this shape."""
-    return samples if tiles == 0 else _parts(samples, shape, tiles)
+    if tiles == 0:
+        return samples
+    height, width, channels = shape if len(shape) == 3 else (1, samples.shape[1], 1)
+    down = min(tiles, height)
+    across = min(tiles if len(shape) == 3 else tiles * tiles, width)
+    grid = samples.reshape(len(samples), height, width, channels)
+    rows, columns = (np.arange(n) * size // n for n, size in ((down, height), (across, width)))
+    sums = np.add.reduceat(np.add.reduceat(grid, rows, axis=1), columns, axis=2)
+    return sums.reshape(len(samples), -1)
 
 
 def overall(samples: np.ndarray) -> np.ndarray:
@@ -239,42 +164,26 @@ def entry_count(shape: tuple[int, ...]) -> int:
     return parts(none, shape, divisions(shape)[0]).shape[1] + overall(none).shape[1]
 
 
-def _parts(samples: np.ndarray, shape: tuple[int, ...], tiles: int) -> np.ndarray:
-    height, width, channels = shape if len(shape) == 3 else (1, samples.shape[1], 1)
-    down = min(tiles, height)
-    across = min(tiles if len(shape) == 3 else tiles * tiles, width)
-    grid = samples.reshape(len(samples), height, width, channels)
-    rows, columns = (np.arange(n) * size // n for n, size in ((down, height), (across, width)))
-    sums = np.add.reduceat(np.add.reduceat(grid, rows, axis=1), columns, axis=2)
-    return sums.reshape(len(samples), -1)
-
-
 #: Probability with which a deviation of the size `detectable` is seen.
 POWER = 0.9
 
-
 #: Relative error that single precision alone may cause in a sum over many samples, added to the standard error.
 ROUNDING = 1e-4
-
 
 #: Where not even a deviation by this fraction of the gradient would have been seen, as of one that is missing, nothing
 #: is said.
 RESOLUTION = 1.0
 
-
 #: Tails are too heavy for z scores where the mean kurtosis of the entries' samples lies above this fraction of the way
 #: from that of normal deviates to the greatest that N samples can have, which is that of one outlier.
 TAIL = 0.5
 
-
 #: A parameter is divided no finer than its tiles have tails lighter than this: z of skewed samples is too large.
 TILE_TAIL = 0.12
-
 
 #: Tails of noise below so many times what rounding may cause do not matter, nor those of noise so many times below what
 #: the reference may be wrong by: no z score is large for them.
 NOISY = 10
-
 
 #: Fewer seeds than these say nothing of tails.
 TAIL_SEEDS = 8
@@ -298,49 +207,10 @@ class Family:
         return z_rms_limit(independent, float(-np.expm1(np.log1p(-self.alpha) / self.rows)))
 
 
-def cosine(a: np.ndarray, b: np.ndarray) -> float | None:
-    """Cosine of the angle between two vectors; None where one is zero or has one entry."""
-    return _ratio(float(a @ b), float(np.linalg.norm(a) * np.linalg.norm(b))) if a.size > 1 else None
-
-
-def variance_ratio(ours: np.ndarray, reference: np.ndarray) -> float | None:
-    """Summed variance of (N, P) samples over that of the reference's; None where that has none."""
-    return _ratio(ours.var(0, ddof=1).sum(), reference.var(0, ddof=1).sum())
-
-
-@dataclass(frozen=True)
-class Comparison:
-    """The figures of a `GradcheckRecord`, under its names, and `z` of each entry (E,)."""
-
-    verdict: Verdict
-    z: np.ndarray | None
-    relative_l2: float | None = None
-    relative_l2_limit: float | None = None
-    z_rms: float | None = None
-    z_rms_limit: float | None = None
-    z_max: float | None = None
-    z_max_limit: float | None = None
-    cosine: float | None = None
-    variance_ratio: float | None = None
-    detectable: float | None = None
-    message: str = ""
-
-    @property
-    def figures(self) -> dict[str, Any]:
-        """What a record takes over."""
-        return {name: value for name, value in vars(self).items() if name != "z"}
-
-
 def compare_expectations(
-    ours: np.ndarray,
-    reference: np.ndarray,
-    family: Family,
-    *,
-    shape: tuple[int, ...] | None = None,
-    paired: bool = True,
-    bias: Any = 0.0,
-    rounding: float = ROUNDING,
-) -> Comparison:
+    ours: np.ndarray, reference: np.ndarray, family: Family, *, shape: tuple[int, ...] | None = None,
+    paired: bool = True, bias: Any = 0.0, rounding: float = ROUNDING,
+) -> Comparison:  # fmt: skip
     """Compare the means of (N, P) samples with those of a reference.
 
     `reference` is (N, P) at the same seeds if `paired`, else (M, P) at others, or (P,): exact values. `shape` is that
@@ -371,6 +241,8 @@ def compare_expectations(
     counts = noise > np.maximum(NOISY * floor, (bias if joined else 0.0) / NOISY) ** 2
     heavy = any(tail_weight(side[:, counts]) > TAIL for side in sides)
     our_mean, its_mean = ours.mean(0), np.atleast_2d(reference).mean(0)
+    far = _ratio(np.linalg.norm(our_mean - its_mean), np.linalg.norm(its_mean))
+    cosine, variances = _alikeness(ours, reference)
     verdict, message = Verdict.HOLDS, ""
     if heavy:
         verdict, message = Verdict.HEAVY_TAILED, "single seeds carry the variance: more samples per pixel, or seeds"
@@ -379,18 +251,9 @@ def compare_expectations(
     elif detectable > RESOLUTION:
         verdict, message = Verdict.UNRESOLVED, f"a deviation by {detectable:.0%} could hide in the noise: more seeds"
     return Comparison(
-        verdict,
-        z,
-        relative_l2=_ratio(np.linalg.norm(our_mean - its_mean), np.linalg.norm(its_mean)),
-        z_rms=z_rms,
-        z_rms_limit=rms_limit,
-        z_max=z_max,
-        z_max_limit=family.z_max_limit,
-        cosine=cosine(our_mean, its_mean),
-        variance_ratio=None if exact else variance_ratio(ours, reference),
-        detectable=detectable,
-        message=message,
-    )
+        verdict, relative_l2=far, z_rms=z_rms, z_rms_limit=rms_limit, z_max=z_max, z_max_limit=family.z_max_limit,
+        cosine=cosine, variance_ratio=variances, detectable=detectable, message=message,
+    )  # fmt: skip
 
 
 def compare_equal_seeds(ours: np.ndarray, reference: np.ndarray, limit: float = ROUNDING) -> Comparison:
@@ -399,15 +262,19 @@ def compare_equal_seeds(ours: np.ndarray, reference: np.ndarray, limit: float = 
     if problem is not None:
         return problem
     distance = float(np.linalg.norm(ours - reference) / np.linalg.norm(reference)) if reference.any() else np.inf
+    verdict, (cosine, variances) = Verdict.HOLDS if distance < limit else Verdict.FAILS, _alikeness(ours, reference)
     return Comparison(
-        Verdict.HOLDS if distance < limit else Verdict.FAILS,
-        None,
-        relative_l2=distance,
-        relative_l2_limit=limit,
-        cosine=cosine(ours.mean(0), reference.mean(0)),
-        variance_ratio=variance_ratio(ours, reference) if len(ours) > 1 else None,
-        detectable=limit,
+        verdict, distance, relative_l2_limit=limit, cosine=cosine, variance_ratio=variances, detectable=limit
     )
+
+
+def _alikeness(ours: np.ndarray, reference: np.ndarray) -> tuple[float | None, float | None]:
+    """The cosine of the angle between the means, and the summed variance over the reference's; None for 0 / 0."""
+    a, b = ours.mean(0), np.atleast_2d(reference).mean(0)
+    cosine = _ratio(a @ b, np.linalg.norm(a) * np.linalg.norm(b)) if a.size > 1 else None
+    if reference.ndim == 1 or len(ours) < 2:
+        return cosine, None
+    return cosine, _ratio(ours.var(0, ddof=1).sum(), reference.var(0, ddof=1).sum())
 
 
 def tail_weight(samples: np.ndarray) -> float:
@@ -453,9 +320,9 @@ def _problem(ours: np.ndarray, reference: np.ndarray) -> Comparison | None:
     for name, samples in (("gradient", ours), ("reference", reference)):
         bad = int(np.count_nonzero(~np.isfinite(samples)))
         if bad:
-            return Comparison(Verdict.FAILS, None, message=f"the {name} has {bad} entries that are not finite")
+            return Comparison(Verdict.FAILS, message=f"the {name} has {bad} entries that are not finite")
     if not ours.any() and not reference.any():
-        return Comparison(Verdict.UNREACHED, None, message="gradient and reference are zero: no light path sees it")
+        return Comparison(Verdict.UNREACHED, message="gradient and reference are zero: no light path sees it")
     return None
 
 

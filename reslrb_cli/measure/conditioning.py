@@ -10,7 +10,7 @@ How far apart the sensitivities of the parameters lie (`measure_conditioning`).
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import drjit as dr
@@ -34,8 +34,6 @@ from reslrb_cli.transport.walk import Hooks, Vertex
 
 #: Light paths that are looked at.
 PATHS = 2**16
-
-
 _PURPOSE = "conditions"
 
 
@@ -48,10 +46,6 @@ class ChainConditions:
     median: float
     percentile_99: float
     largest: float
-
-    def to_json(self) -> dict[str, Any]:
-        """As a mapping for JSON."""
-        return asdict(self)
 
 
 @dataclass
@@ -77,14 +71,12 @@ class Watched(Hooks):
     def connection(
         self, state: WatchedState, vertex: Vertex, connection: Connection, numbers: list[mi.Float]
     ) -> WatchedState:
-        chain = self.selection.connection(state.chain, vertex, connection, numbers)
-        return WatchedState(chain, state.J, state.kept, state.vertices)
+        return replace(state, chain=self.selection.connection(state.chain, vertex, connection, numbers))
 
     def scattering(
         self, state: WatchedState, vertex: Vertex, connection: Connection, scattering: Scattering
     ) -> WatchedState:
-        before = state.chain
-        chain = self.selection.scattering(before, vertex, connection, scattering)
+        before, chain = state.chain, self.selection.scattering(state.chain, vertex, connection, scattering)
         taken = connection.active & (chain.slots[0].number == vertex.depth)
         J = dr.select(taken, before.J[0], state.J)
         kept = dr.select(taken, state.vertices, state.kept)
@@ -164,14 +156,9 @@ class Conditioning:
 
     def to_json(self) -> dict[str, Any]:
         """As a mapping for JSON."""
-        return {
-            "samples": self.samples,
-            "spp": self.spp,
-            "seed": self.seed,
-            "parameters": [row.to_json() for row in self.rows],
-            "spread": {quantity: self.spread(quantity) for quantity in QUANTITIES},
-            "chains": [chain.to_json() for chain in self.chains],
-        }
+        values = asdict(self)
+        rows, chains, spread = values.pop("rows"), values.pop("chains"), map(self.spread, QUANTITIES)
+        return values | {"parameters": rows, "spread": dict(zip(QUANTITIES, spread, strict=True)), "chains": chains}
 
 
 def measure_conditioning(problem: Problem, samples: int) -> Conditioning:

@@ -22,7 +22,6 @@ from reslrb_cli.config.schema import Config
 from reslrb_cli.estimators import ESTIMATORS
 from reslrb_cli.measure.comparison import (
     ROUNDING,
-    Comparison,
     Family,
     compare_equal_seeds,
     compare_expectations,
@@ -34,12 +33,11 @@ from reslrb_cli.measure.processes import NO_TIME
 from reslrb_cli.measure.resume_store import Earlier
 from reslrb_cli.measure.sampling import NAIVE, Name, Sampling
 from reslrb_cli.records.measurement_files import Kept
-from reslrb_cli.records.measurements import GradcheckRecord, Kind, Reference, Verdict
+from reslrb_cli.records.measurements import Comparison, GradcheckRecord, Kind, Reference, Verdict
 
 #: What a stock integrator on the same paths differs by from this one, relative to the entries: whether a point is
 #: visible is another matter of rounding to each.
 STOCK_ROUNDING = 1e-3
-
 
 #: References that know the gradient along a few directions alone.
 ALONG_DIRECTIONS = (Reference.FINITE_DIFFERENCE, Reference.FORWARD_MODE)
@@ -112,7 +110,7 @@ class Gradcheck:
 
     def expected(self) -> list[GradcheckRecord]:
         """A record of every line of the table to come, without figures."""
-        return [self._record(row, Comparison(Verdict.NOT_MEASURED, None), 0) for row in self.rows] + [
+        return [self._record(row, Comparison(Verdict.NOT_MEASURED), 0) for row in self.rows] + [
             result.record for result in self._without_reference()
         ]
 
@@ -137,7 +135,7 @@ class Gradcheck:
                 yield self._result(row, family)
             elif not stop():
                 late = True
-                yield Result(self._record(row, Comparison(Verdict.NOT_MEASURED, None, message=NO_TIME), 0))
+                yield Result(self._record(row, Comparison(Verdict.NOT_MEASURED, message=NO_TIME), 0))
         if compared or not stop():
             yield from self._without_reference()
         if late and not stop():
@@ -146,20 +144,16 @@ class Gradcheck:
             say(f"the fewest seeds of everything take {enough}; allow that with --budget")
 
     def _needs(self, row: Row) -> list[Name]:
-        """The samples that a comparison is made of."""
+        """The samples that a comparison is made of: of ours, and of the reference where that is not exact."""
         if row.key is None:
             return [("image", "walk_ad"), ("image", row.reference.value)]
-        ours = self._ours(row)
-        if row.reference is Reference.ANALYTIC:
-            return [ours]
-        if row.reference is Reference.FINITE_DIFFERENCE:
-            return [ours, ("differences", row.key)]
-        if row.reference is Reference.FORWARD_MODE:
-            return [ours, ("tangents", row.key)]
-        return [ours, ("gradient", row.reference.value)]
-
-    def _ours(self, row: Row) -> Name:
-        return "gradient", self.participants.sampled(row.label, row.reference)
+        ours = "gradient", self.participants.sampled(row.label, row.reference)
+        its = {
+            Reference.ANALYTIC: [],
+            Reference.FINITE_DIFFERENCE: [("differences", row.key)],
+            Reference.FORWARD_MODE: [("tangents", row.key)],
+        }
+        return [ours, *its.get(row.reference, [("gradient", row.reference.value)])]
 
     # --- comparing ----------------------------------------------------------------------------------------------------
 
@@ -178,67 +172,47 @@ class Gradcheck:
         return entry_count(parts.shape(row.key))
 
     def _result(self, row: Row, family: Family) -> Result:
-        parts = self.participants
+        parts, (mine, *its) = self.participants, self._needs(row)
+        ours, shape, bias = self._sampling.of(mine), None, np.zeros(1)
+        reference = self._sampling.of(its[0]) if its else parts.exact[str(row.key)]
         if row.key is None:
-            ours, reference = (self._sampling.of(name) for name in self._needs(row))
-            shape, least = tuple(parts.case.weights.shape), min(len(ours), len(reference))
+            shape = tuple(parts.case.weights.shape)
+        else:
+            place, chosen = parts.slices()[row.key], parts.directions[row.key]
+            ours = ours[:, place]
+            if row.reference in ALONG_DIRECTIONS:
+                ours = ours @ np.array([direction.vector[place] for direction in chosen]).T
+            elif its:
+                reference, shape = reference[:, place], parts.shape(row.key)
+            if row.reference is Reference.FINITE_DIFFERENCE:
+                bias = np.array([direction.truncation for direction in chosen])
+        if its:
+            least = min(len(ours), len(reference))
             ours, reference = ours[:least], reference[:least]
-            figures = compare_expectations(ours, reference, family, shape=shape, rounding=STOCK_ROUNDING)
-            return Result(self._record(row, figures, len(ours)))
-        ours = self._sampling.of(self._ours(row))[:, parts.slices()[row.key]]
-        if row.reference in ALONG_DIRECTIONS:
-            return self._along(row, ours, family)
-        shape = parts.shape(row.key)
-        if row.reference is Reference.ANALYTIC:
-            return Result(self._record(row, compare_expectations(ours, parts.exact[row.key], family), len(ours)))
-        reference = self._sampling.of(("gradient", row.reference.value))[:, parts.slices()[row.key]]
-        least = min(len(ours), len(reference))
-        ours, reference = ours[:least], reference[:least]
         if row.kind is Kind.EQUAL_SEEDS:
             figures = compare_equal_seeds(ours, reference)
         else:
-            rounding = ROUNDING if row.reference is Reference.WALK_AD else STOCK_ROUNDING
-            figures = compare_expectations(ours, reference, family, shape=shape, rounding=rounding)
-        return Result(self._record(row, figures, len(ours)), _maps(ours, reference, shape))
-
-    def _along(self, row: Row, ours: np.ndarray, family: Family) -> Result:
-        """Against derivatives along a few directions."""
-        assert row.key is not None
-        chosen, place = self.participants.directions[row.key], self.participants.slices()[row.key]
-        projected = ours @ np.array([direction.vector[place] for direction in chosen]).T
-        if row.reference is Reference.FINITE_DIFFERENCE:
-            reference, bias = self._sampling.of(("differences", row.key)), np.array([d.truncation for d in chosen])
-        else:
-            reference, bias = self._sampling.of(("tangents", row.key)), np.zeros(len(chosen))
-        least = min(len(projected), len(reference))
-        figures = compare_expectations(projected[:least], reference[:least], family, bias=bias)
-        return Result(self._record(row, figures, least))
+            rounding = ROUNDING if shape is None or row.reference is Reference.WALK_AD else STOCK_ROUNDING
+            figures = compare_expectations(ours, reference, family, shape=shape, bias=bias, rounding=rounding)
+        maps = _maps(ours, reference, shape) if row.key is not None and shape is not None else None
+        return Result(self._record(row, figures, len(ours)), maps)
 
     def _record(self, row: Row, figures: Comparison, seeds: int) -> GradcheckRecord:
         kind, _, estimator = row.label.partition(":")
         return GradcheckRecord(
-            case=str(self.settings.config.source),
-            parameter=row.key,
-            integrator=kind,
-            estimator=estimator or None,
-            reference=row.reference,
-            kind=row.kind,
-            seeds=seeds,
-            **figures.figures,
-        )
+            str(self.settings.config.source), row.key, kind, estimator or None, row.reference, row.kind, seeds,
+            **vars(figures),
+        )  # fmt: skip
 
     def _without_reference(self) -> Iterator[Result]:
         """Say so where no stock integrator counts."""
         parts = self.participants
-        missing = [
-            (Row(key, "reslrb", Reference.PTRACER, Kind.EXPECTATION), parts.why[key])
-            for key in parts.case.keys
-            if parts.stock[key] is None
-        ]
+        missing = {key: parts.why[key] for key in parts.case.keys if parts.stock[key] is None}
+        rows = [(Row(key, "reslrb", Reference.PTRACER, Kind.EXPECTATION), why) for key, why in missing.items()]
         if parts.image is None:
-            missing.append((Row(None, "reslrb", Reference.PATH, Kind.IMAGE), parts.why_no_image))
-        for row, why in missing:
-            yield Result(self._record(row, Comparison(Verdict.NO_REFERENCE, None, message=why), 0))
+            rows.append((Row(None, "reslrb", Reference.PATH, Kind.IMAGE), parts.why_no_image))
+        for row, why in rows:
+            yield Result(self._record(row, Comparison(Verdict.NO_REFERENCE, message=why), 0))
 
 
 def _draws_plainly(config: Config) -> bool:

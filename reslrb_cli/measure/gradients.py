@@ -31,23 +31,22 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from reslrb_cli.backend.memory import own_memory
 from reslrb_cli.integrators.protocol import Job, first_channels
-from reslrb_cli.integrators.step import gradient_step, make_integrator, render_image
+from reslrb_cli.integrators.step import gradient_step, known_step, make_integrator, render_image
 from reslrb_cli.measure.scenes.small import load
 from reslrb_cli.scene.catalog import parameter_kind
-from reslrb_cli.scene.values import settle
+from reslrb_cli.scene.deformation import Deformation
+from reslrb_cli.scene.parameters import Selection
 
 #: How far the largest step of finite differences moves things, relative to their size, in units of the step.
 REACH = 0.1
 
-
 #: The same of a heightmap, relative to the scene's size.
 RELIEF = 0.02
 
-
 #: The same of what makes up a motion: a turn is in degrees; None stands for `REACH` of the scene's size.
 UNITS = {"translation": None, "rotation": 10.0, "scale": REACH}
-
 
 #: Waves that have room in what is displaced, at most.
 WAVES = 1.5
@@ -134,33 +133,8 @@ class Values(Protocol):
         ...
 
 
-class SceneValues:
-    """A scene's own parameters."""
-
-    def __init__(self, scene: mi.Scene) -> None:
-        self.params = mi.traverse(scene)
-
-    def value(self, key: str) -> Any:
-        """The parameter `key`."""
-        return self.params[key]
-
-    def hand_over(self, values: Mapping[str, Any]) -> None:
-        """Set parameters. Textures pad their storage, and the normals of meshes follow, ahead of the next step."""
-        for key, value in values.items():
-            self.params[key] = value
-        self.params.update()
-        dr.eval([self.params[key] for key in values], settle(self.params, values))
-
-    def collect(self) -> None:
-        """They are in the scene: nothing is to be done."""
-
-    def push(self) -> None:
-        """They are in the scene: nothing is to be done."""
-
-
 #: Steps that are tried, in units of the direction.
 STEPS = (0.1, 0.01, 0.001)
-
 
 #: How many seeds the comparison may have, by which the noise of a single one is judged.
 PLANNED_SEEDS = 16
@@ -205,10 +179,20 @@ def directions(case: Case, key: str, bounds: tuple[float, float], count: int, se
     return found
 
 
-def moving_directions(case: Case, key: str, extent: float, count: int) -> list[Direction]:
-    """Directions along which a parameter that moves light changes smoothly (`moving.smooth_rows`)."""
-    rows = smooth_rows(key, case.values.value(key), extent, count)
-    return [Direction(_embed(case, key, row), "both") for row in rows]
+def all_directions(case: Case, selection: Selection, moving: int, others: int) -> dict[str, list[Direction]]:
+    """By parameter, so many of each that moves light, along which it changes smoothly, and of each of the others."""
+    box, found = case.scene.bbox(), {}
+    extent = float(np.linalg.norm(np.array(box.max - box.min)))
+    for key in case.keys:
+        if moves_light(case.params, key):
+            rows = smooth_rows(key, case.values.value(key), extent, moving)
+            found[key] = [Direction(_embed(case, key, row), "both") for row in rows]
+            continue
+        bounds = selection.spec(key).bounds
+        if bounds is None or not np.all(np.isfinite(bounds)):
+            bounds = natural_bounds(parameter_kind(case.params, key), case.initial[key])
+        found[key] = directions(case, key, bounds, others)
+    return found
 
 
 def choose_step(case: Case, integrator: Any, direction: Direction, seeds: Sequence[int], spp: int) -> Direction:
@@ -244,23 +228,18 @@ def _embed(case: Case, key: str, row: np.ndarray) -> np.ndarray:
 
 
 class Case:
-    """A scene, its parameters, and a linear objective."""
+    """A scene, or what it is loaded from, seen through one of its sensors; its parameters, and a linear objective.
 
-    @classmethod
-    def of(cls, loaded: Any, keys: Iterable[str], sensor: int = 0, values: Values | None = None) -> Case:
-        """A case of a scene that is loaded already, seen through one of its sensors.
+    `keys` are of `values`, where these are given, and of the scene otherwise.
+    """
 
-        `keys` are of `values`, where these are given, and of the scene otherwise.
-        """
-        return cls(loaded, keys, sensor=sensor, values=values)
-
-    def __init__(
-        self, scene: Any, keys: Iterable[str], seed: int = 7, sensor: int = 0, values: Values | None = None
-    ) -> None:
+    def __init__(self, scene: Any, keys: Iterable[str], sensor: int = 0, values: Values | None = None) -> None:
         self.scene = load(scene) if isinstance(scene, dict) else scene
         self.sensor = sensor
-        self.values: Values = SceneValues(self.scene) if values is None else values
-        self.params = self.values.params
+        if values is None:
+            params = mi.traverse(self.scene)
+            values = Selection(params, {}, {}, Deformation(params))
+        self.values, self.params = values, values.params
         self.keys = list(keys)
         self.initial = {key: self.flat(key) for key in self.keys}
         film = self.scene.sensors()[sensor].film()
@@ -268,19 +247,15 @@ class Case:
         self.channels = int(film.base_channels_count())
         shape = (int(height), int(width), 1 if self.channels <= 2 else 3)
         # Mean 1, so that entries do not cancel; random, so that a wrong film position shows.
-        self.weigh(np.random.default_rng(seed).uniform(0.2, 1.8, shape))
+        self.weigh(np.random.default_rng(7).uniform(0.2, 1.8, shape))
 
     def weigh(self, weights: np.ndarray) -> None:
         """Set the weights of the objective, (H, W, C) without alpha: dL/dI."""
-        import mitsuba as mi
-
         self.weights = mi.TensorXf(np.ascontiguousarray(weights, np.float32))
 
     @property
     def adjoint(self) -> Any:
         """dL/dI, (H, W, C) with as many channels as the film has: none of its alpha counts."""
-        import mitsuba as mi
-
         weights = np.array(self.weights)
         return mi.TensorXf(np.pad(weights, ((0, 0), (0, 0), (0, self.channels - weights.shape[2]))))
 
@@ -290,10 +265,6 @@ class Case:
 
     def shaped(self, key: str, row: np.ndarray) -> Any:
         """A row of values as the parameter's type."""
-        import drjit as dr
-
-        from reslrb_cli.backend.memory import own_memory
-
         now, array = self.values.value(key), np.asarray(row, np.float32)
         kind = type(now)
         if dr.is_tensor_v(kind):
@@ -302,23 +273,17 @@ class Case:
 
     def set(self, values: dict[str, np.ndarray]) -> None:
         """Set parameters from rows of values."""
-        import drjit as dr
-
         shaped = {key: self.shaped(key, value) for key, value in values.items()}
         dr.make_opaque(shaped)
         self.values.hand_over(shaped)
 
     def objective(self, image: Any) -> Any:
         """sum(image * weights) over the colour channels."""
-        import drjit as dr
-
         return dr.sum(first_channels(image, self.weights.shape[2]) * self.weights, axis=None)
 
     def gradient(self, integrator: Any, seed: int, spp: int, objective: Callable | None = None,
                  step: Callable = gradient_step, **options: Any) -> np.ndarray:  # fmt: skip
         """The gradient of all parameters in a row, by one step; `options` are the step's."""
-        import drjit as dr
-
         leaves = self.leaves()
         objective = objective or self.objective
         step(integrator, self.scene, self.sensor, objective, seed=seed, spp=spp, params=self.params, **options)
@@ -327,14 +292,16 @@ class Case:
         self.release(leaves)
         return np.concatenate(result)
 
+    def known_step(self, integrator: Any, scene: Any, sensor: Any, _objective: Any, **options: Any) -> Any:
+        """A step for `gradient` that knows dL/dI before the image."""
+        return known_step(integrator, scene, sensor, self.adjoint, **options)
+
     def leaves(self) -> dict[str, Any]:
         """The parameters with derivatives enabled, handed over to the scene.
 
         They are leaves of our own: the scene may put something derived in their place (an environment map pads its
         columns).
         """
-        import drjit as dr
-
         leaves = {}
         for key in self.keys:
             value = self.values.value(key)
@@ -345,8 +312,6 @@ class Case:
 
     def release(self, leaves: dict[str, Any]) -> None:
         """Have the scene forget the derivatives that `leaves` gave it."""
-        import drjit as dr
-
         self.values.hand_over({key: dr.detach(leaf) for key, leaf in leaves.items()})
 
     def gradients(self, integrator: Any, seeds: Iterable[int], spp: int, **step: Any) -> np.ndarray:
@@ -371,8 +336,6 @@ class Case:
 
         For forward mode: `tangent` is to render the derivative of the image along that direction.
         """
-        import drjit as dr
-
         leaves, at = self.leaves(), 0
         for key, leaf in leaves.items():
             size = len(self.initial[key])
@@ -387,9 +350,6 @@ class Case:
 
     def tangent(self, integrator: Any, direction: np.ndarray, seed: int, spp: int) -> float:
         """The objective's derivative along `direction` (P,) in forward mode."""
-        import drjit as dr
-        import mitsuba as mi
-
         sensor, opaque = self.scene.sensors()[self.sensor], dr.opaque(mi.UInt32, seed)
         return self.weighted(
             self.along(direction, lambda: integrator.tangent(Job(self.scene, sensor, opaque, spp, self.params)))
@@ -419,6 +379,13 @@ class Case:
             total += coefficient * self.value(integrator, seed, spp)
         self.set(self.initial)
         return total / step
+
+    def differences(
+        self, integrator: Any, directions: np.ndarray, seeds: Iterable[int], spp: int, step: float, sides: str = "both"
+    ) -> np.ndarray:
+        """Finite differences along each of K directions at each of N seeds: (N, K)."""
+        fixed = spp, step, sides
+        return np.array([[self.difference(integrator, d, seed, *fixed) for d in directions] for seed in seeds])
 
 
 def seeds(count: int, block: int = 0) -> range:

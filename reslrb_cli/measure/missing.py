@@ -29,17 +29,8 @@ import numpy as np
 
 from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ConfigError
-from reslrb_cli.integrators.step import known_step, make_integrator
-from reslrb_cli.measure.gradients import (
-    STEPS,
-    Case,
-    Direction,
-    directions,
-    moves_light,
-    moving_directions,
-    natural_bounds,
-    seeds,
-)
+from reslrb_cli.integrators.step import make_integrator
+from reslrb_cli.measure.gradients import STEPS, Case, Direction, all_directions, seeds
 from reslrb_cli.measure.methods import parse_estimators
 from reslrb_cli.measure.participants import MOVING_DIRECTIONS, NEVER, PATHS
 from reslrb_cli.measure.references import ends
@@ -48,12 +39,10 @@ from reslrb_cli.optimization.assemble import assemble
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.records.measurement_files import Kept
 from reslrb_cli.records.measurements import NOTHING, MissingRecord
-from reslrb_cli.scene.catalog import parameter_kind
 from reslrb_cli.statistics import jackknife_variance
 
 #: Seeds that steps are chosen with, and the fewest that a share is made of.
 PILOT_SEEDS, FEWEST = 4, 4
-
 
 #: How often the largest step is halved.
 HALVINGS = 8
@@ -78,12 +67,10 @@ class Missing:
     def take(self, case: Case, tracer: Any, differenced: Any, seed: int, spp: int, step: Callable) -> None:
         """One more seed; `step` is the gradient step that knows dL/dI."""
         gradient = case.gradient(tracer, seed, spp, step=step)
-        self.ours.append(np.array([gradient @ one.vector for one in self.directions]))
-        found = [
-            [_difference(case, differenced, one, factor * one.step, seed, spp) for one in self.directions]
-            for factor in (1, 2, 4)
-        ]
-        self.differences.append(np.array(found))
+        along = self.directions
+        self.ours.append(np.array([gradient @ one.vector for one in along]))
+        found = [_differences(case, differenced, one, [one.step * k for k in (1, 2, 4)], seed, spp) for one in along]
+        self.differences.append(np.transpose(found))
 
     @property
     def count(self) -> int:
@@ -121,7 +108,7 @@ def _ratio(missing: np.ndarray, whole: np.ndarray) -> float:
 def _with_step(case: Case, differenced: Any, direction: Direction, spp: int) -> Direction:
     steps = [STEPS[0] / 2**number for number in range(HALVINGS)]
     pilot = seeds(PILOT_SEEDS, 9)
-    found = np.array([[_difference(case, differenced, direction, step, seed, spp) for seed in pilot] for step in steps])
+    found = np.transpose([_differences(case, differenced, direction, steps, seed, spp) for seed in pilot])
     extrapolated = _extrapolate(found[1:], found[:-1])
     change, noise = _mean(np.diff(extrapolated, axis=0).T)
     # From step to step; one that agrees with both its neighbours is no coincidence.
@@ -129,8 +116,10 @@ def _with_step(case: Case, differenced: Any, direction: Direction, spp: int) -> 
     return replace(direction, step=steps[2 + int(np.argmin(changed[:-1] + changed[1:]))])
 
 
-def _difference(case: Case, differenced: Any, direction: Direction, step: float, seed: int, spp: int) -> float:
-    return case.difference(differenced, direction.vector, seed, spp, step, direction.sides)
+def _differences(
+    case: Case, differenced: Any, direction: Direction, steps: Sequence[float], seed: int, spp: int
+) -> list[float]:
+    return [case.difference(differenced, direction.vector, seed, spp, step, direction.sides) for step in steps]
 
 
 def _extrapolate(near: np.ndarray, far: np.ndarray) -> np.ndarray:
@@ -145,10 +134,8 @@ def _mean(samples: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 #: Light paths of the image that dL/dI is taken at.
 IMAGE_PATHS = 2**22
 
-
 #: What is kept says that it is of this.
 KIND = "gradcheck --missing"
-
 
 #: The estimator whose gradient is looked at: exact, and attached where anything moves.
 ESTIMATOR = "stack"
@@ -162,20 +149,15 @@ class MissingCheck:
     """
 
     def __init__(
-        self,
-        config: Config,
-        budget_s: float,
-        count: int | None,
-        spp: int | None,
-        along: int | None,
+        self, config: Config, budget_s: float, count: int | None, spp: int | None, along: int | None,
         earlier: Earlier | None = None,
-    ) -> None:
+    ) -> None:  # fmt: skip
         self._budget, self._count, self._start = budget_s, count, time.perf_counter()
         depth = config.integrator.max_depth
         [listed] = parse_estimators(ESTIMATOR)
         problem = assemble(listed.at(config, depth, True).with_exposures_fixed())
         self.source, sensor = str(config.source), problem.sensors[0]
-        self.case = Case.of(problem.scene, problem.selection.keys, sensor, problem.selection)
+        self.case = Case(problem.scene, problem.selection.keys, sensor, problem.selection)
         height, width, _ = self.case.weights.shape
         self.spp = spp or max(PATHS // (height * width), 1)
         self._weigh(problem, sensor, max(IMAGE_PATHS // (height * width), 1))
@@ -183,7 +165,8 @@ class MissingCheck:
         shared = {name: options[name] for name in ("max_depth", "hide_emitters")}
         self._tracer = make_integrator("reslrb", **options)
         self._differenced = make_integrator("walk_ad", **shared, rr_depth=NEVER if ends(depth) else options["rr_depth"])
-        self._directions = {key: self._along(problem, key, along or MOVING_DIRECTIONS) for key in self.case.keys}
+        count_of_each = along or MOVING_DIRECTIONS
+        self._directions = all_directions(self.case, problem.selection, count_of_each, count_of_each)
         #: By parameter, as far as they have been looked at, in the order of `case.keys`.
         self._found: dict[str, Missing] = {} if earlier is None else self._restore(earlier)
         if earlier is not None and count is not None and len(self._found) == len(self.case.keys):
@@ -201,8 +184,8 @@ class MissingCheck:
         for place, key in enumerate(self.case.keys):
             if stop():
                 return
-            left = self._budget - (time.perf_counter() - self._start)
-            end = time.perf_counter() + left / (len(self.case.keys) - place)
+            now = time.perf_counter()
+            end = now + (self._budget - (now - self._start)) / (len(self.case.keys) - place)
             self._measure(key, end, stop, between)
             yield self._record(key)
 
@@ -243,16 +226,13 @@ class MissingCheck:
             enough = found.count >= FEWEST and (stop() or (self._count is None and time.perf_counter() > end))
             if enough:
                 break
-            found.take(self.case, self._tracer, self._differenced, seed, self.spp, self._step)
+            found.take(self.case, self._tracer, self._differenced, seed, self.spp, self.case.known_step)
             between()
 
     def _record(self, key: str) -> MissingRecord:
         found = self._found[key]
         share, error = found.share() or (None, None)
         return MissingRecord(self.source, key, share, error, len(found.directions), found.count)
-
-    def _step(self, integrator: Any, scene: Any, sensor: Any, _objective: Any, **options: Any) -> Any:
-        return known_step(integrator, scene, sensor, self.case.adjoint, **options)
 
     def _weigh(self, problem: Problem, sensor: int, spp: int) -> None:
         view = problem.views[0]
@@ -264,13 +244,3 @@ class MissingCheck:
             )
         # Its size has no part in a share, and tiny numbers would vanish beside the rounding of a sum.
         self.case.weigh(weights / np.abs(weights).mean())
-
-    def _along(self, problem: Problem, key: str, count: int) -> list[Direction]:
-        selection = problem.selection
-        if moves_light(self.case.params, key):
-            box = problem.scene.bbox()
-            return moving_directions(self.case, key, float(np.linalg.norm(np.array(box.max - box.min))), count)
-        bounds = selection.spec(key).bounds
-        if bounds is None or not np.all(np.isfinite(bounds)):
-            bounds = natural_bounds(parameter_kind(self.case.params, key), self.case.initial[key])
-        return directions(self.case, key, bounds, count)

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import drjit as dr
@@ -125,7 +126,6 @@ QUANTITIES = (
     "derivative of the connection factor, dc",
     "contribution C = E s_1 ... s_{i-1} c_i",
 )
-
 
 _E, _DE, _S, _DS, _PRODUCT, _C, _DC, _CONTRIBUTION = range(1, len(QUANTITIES))
 
@@ -243,46 +243,36 @@ class Found:
 
 def search_paths(samples: Samples, sensor: int, label: str, pixel: tuple[int, int] | None) -> Found:
     """Look at every path of these samples; those that reach `pixel` come first. Parameters have their tangents set."""
-    plan = samples.plan
+    plan, describe = samples.plan, partial(_describe, samples, sensor, label)
     with dr.suspend_grad():
         with dr.resume_grad():
             E = sample_emission(samples, samples.sampler())
             [dE] = forward_derivatives(E.weight) if plan.differentiate_emission else [mi.Spectrum(0)]
         state = walk(samples, SearchHooks(samples, Emission(E.ray, dr.detach(E.weight), E.emitter), dE, pixel))
         dr.eval(state)
-    describe = Describe(samples, sensor, label)
     size = np.array(dr.max(dr.abs(state.largest.value)))
     brightest = int(np.argmax(np.where(np.isfinite(size), size, 0)))
     largest = describe(state.largest, state.largest_u, brightest) if size[brightest] > 0 else None
     lane, there = _first(np.array(state.found.kind) != 0, np.array(state.there))
     if lane is not None:
         return Found(describe(state.found, state.u, lane), there, largest)
-    return _search_visible_emission(samples, describe, pixel, largest)
-
-
-def _search_visible_emission(
-    samples: Samples, describe: Describe, pixel: tuple[int, int] | None, largest: Offender | None
-) -> Found:
-    if not samples.plan.visible_emission:
-        return Found(None, False, largest)
     with dr.suspend_grad():
-        for seen in (_through_pixels, _on_small_lamps) if samples.plan.small_lamps else (_through_pixels,):
-            suspect, tangent, u, active = seen(samples)
-            there = np.array(reaches(samples.film, u, pixel))
-            for name, value in (
-                ("emission E towards the sensor", suspect.value),
-                ("derivative of emission, dE", tangent),
-            ):
+        for suspect, tangent, u, active in _seen_emission(samples) if plan.visible_emission else ():
+            at_pixel = np.array(reaches(samples.film, u, pixel))
+            for quantity, value in (("emission E towards the sensor", suspect.value), (QUANTITIES[_DE], tangent)):
                 bad = np.broadcast_to(np.array(active & is_bad(value)), samples.width)
-                lane, at_pixel = _first(bad, there)
+                lane, there = _first(bad, at_pixel)
                 if lane is not None:
-                    offender = describe(replace(suspect, value=mi.Spectrum(value)), u, lane, name)
-                    return Found(offender, at_pixel, largest)
+                    offender = describe(replace(suspect, value=mi.Spectrum(value)), u, lane, quantity)
+                    return Found(offender, there, largest)
     return Found(None, False, largest)
 
 
-def _through_pixels(samples: Samples) -> tuple[Suspect, mi.Spectrum, mi.Point2f, mi.Bool]:
-    """What primary rays see: radiance (C,), its tangent, film positions, and the active lanes."""
+def _seen_emission(samples: Samples) -> Iterator[tuple[Suspect, mi.Spectrum, mi.Point2f, mi.Bool]]:
+    """What the sensor sees of lamps, by primary rays, then of points on lamps that are smaller than a pixel.
+
+    Radiance (C,), its tangent, film positions, and the active lanes.
+    """
     plan, tangent = samples.plan, mi.Spectrum(0)
     primary = primary_ray(samples)
     radiance = visible_radiance(plan, samples.scene, primary)
@@ -290,20 +280,17 @@ def _through_pixels(samples: Samples) -> tuple[Suspect, mi.Spectrum, mi.Point2f,
         tangent = visible_tangent(plan, samples.scene, primary)
     si = samples.scene.ray_intersect(primary.ray, primary.active)
     p, shape = dr.select(si.is_valid(), si.p, primary.ray.o), dr.reinterpret_array(mi.UInt32, si.shape)
-    return Suspect(mi.UInt32(0), mi.UInt32(0), p, shape, radiance), tangent, primary.u, primary.active
-
-
-def _on_small_lamps(samples: Samples) -> tuple[Suspect, mi.Spectrum, mi.Point2f, mi.Bool]:
-    """The same of points on lamps that are smaller than a pixel."""
-    tangent = mi.Spectrum(0)
-    point = small_points(samples)
+    yield Suspect(mi.UInt32(0), mi.UInt32(0), p, shape, radiance), tangent, primary.u, primary.active
+    if not plan.small_lamps:
+        return
+    tangent, point = mi.Spectrum(0), small_points(samples)
     with dr.resume_grad():
         radiance = point.radiance()
-        if samples.plan.differentiate_emission:
+        if plan.differentiate_emission:
             [tangent] = forward_derivatives(radiance)
     shape = dr.reinterpret_array(mi.UInt32, point.emitter.get_shape())
     suspect = Suspect(mi.UInt32(0), mi.UInt32(0), point.si.p, shape, dr.detach(radiance))
-    return suspect, tangent, point.u, point.active
+    yield suspect, tangent, point.u, point.active
 
 
 def _first(bad: Array, there: Array) -> tuple[int | None, bool]:
@@ -315,30 +302,26 @@ def _first(bad: Array, there: Array) -> tuple[int | None, bool]:
     return (int(lanes[0]) if lanes.size else None), False
 
 
-@dataclass
-class Describe:
-    """Makes a record of one lane's suspect."""
+def _describe(
+    samples: Samples, sensor: int, label: str, suspect: Suspect, u: Any, lane: int, quantity: str | None = None
+) -> Offender:
+    """The record of one lane's suspect."""
 
-    samples: Samples
-    sensor: int
-    label: str
+    def number(value: Any) -> Any:
+        return np.array(value).ravel()[lane % dr.width(value)]
 
-    def __call__(self, suspect: Suspect, u: Any, lane: int, quantity: str | None = None) -> Offender:
-        def number(value: Any) -> Any:
-            return np.array(value).ravel()[lane % dr.width(value)]
-
-        where = PathVertex(
-            samples=self.label,
-            seed=int(self.samples.seed[0]),
-            path=lane,
-            paths=self.samples.width,
-            vertex=int(number(suspect.vertex)),
-            position=(float(number(suspect.p.x)), float(number(suspect.p.y)), float(number(suspect.p.z))),
-            surface=_shape_name(self.samples.scene, int(number(suspect.shape))),
-        )
-        pixel = (int(np.floor(number(u.x))), int(np.floor(number(u.y))))
-        value = [float(number(channel)) for channel in suspect.value]
-        return Offender(self.sensor, pixel, quantity or QUANTITIES[int(number(suspect.kind))], value, where)
+    where = PathVertex(
+        samples=label,
+        seed=int(samples.seed[0]),
+        path=lane,
+        paths=samples.width,
+        vertex=int(number(suspect.vertex)),
+        position=(float(number(suspect.p.x)), float(number(suspect.p.y)), float(number(suspect.p.z))),
+        surface=_shape_name(samples.scene, int(number(suspect.shape))),
+    )
+    pixel = (int(np.floor(number(u.x))), int(np.floor(number(u.y))))
+    value = [float(number(channel)) for channel in suspect.value]
+    return Offender(sensor, pixel, quantity or QUANTITIES[int(number(suspect.kind))], value, where)
 
 
 def _shape_name(scene: Any, index: int) -> str | None:
@@ -346,18 +329,6 @@ def _shape_name(scene: Any, index: int) -> str | None:
         if int(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))[0]) == index:
             return str(shape.id())
     return None
-
-
-SUM = "sum of contributions, each of which is finite; the largest"
-
-
-LOSS = "derivative of the loss, dL/dI"
-
-
-IMAGE = "image (of this integrator no paths are looked at)"
-
-
-GRADIENT = "gradient (of this integrator no paths are looked at) of"
 
 
 def find_offenders(problem: Problem, iteration: int) -> list[Offender]:
@@ -380,17 +351,18 @@ def _of_view(problem: Problem, iteration: int, view: View) -> Offender | None:
         problem.integrator.preparation.draw_from(witness, problem.scene)
     step = _take_step(problem, view, step_seed)
     if problem.config.integrator.type not in LIGHT_TRACERS:
-        return _of_step(step, view.sensor, view.target, None)
+        return _of_step(step, view, None)
     if not is_attached(problem):
         _set_tangents(problem)
-    found = [search_paths(*part, step.pixel) for part in _parts(problem, view, step_seed, witness)]
+    pixel = None if step.refused is None else step.refused[:2]
+    found = [search_paths(*part, pixel) for part in _parts(problem, view, step_seed, witness)]
     problem.apply()
-    offenders = sorted((part for part in found if part.offender is not None), key=lambda part: not part.there)
+    offenders = [part.offender for part in sorted(found, key=lambda part: not part.there) if part.offender is not None]
     if offenders:
-        return offenders[0].offender
+        return offenders[0]
     largest = [part.largest for part in found if part.largest is not None]
     most = max(largest, key=lambda entry: max(map(abs, entry.value)), default=None)
-    return _of_step(step, view.sensor, view.target, most)
+    return _of_step(step, view, most)
 
 
 def _parts(
@@ -444,11 +416,6 @@ class Step:
     gradients: dict[str, Array]
     refused: tuple[int, int, int] | None
 
-    @property
-    def pixel(self) -> tuple[int, int] | None:
-        """The pixel of that entry."""
-        return None if self.refused is None else self.refused[:2]
-
 
 def _take_step(problem: Problem, view: View, step_seed: int) -> Step:
     """The view's step, as the run took it; leaves no gradient behind."""
@@ -464,25 +431,23 @@ def _take_step(problem: Problem, view: View, step_seed: int) -> Step:
     return Step(np.array(step.image), gradients, step.refused.entry())
 
 
-def _of_step(step: Step, sensor: int, target: Any, largest: Offender | None) -> Offender | None:
-    """What is left where no path has anything: sums that overflow, and the loss."""
-    image = step.image
+def _of_step(step: Step, view: View, largest: Offender | None) -> Offender | None:
+    """What is left where no path has anything: the loss, sums that overflow, or paths that were not looked at."""
+    image, target = step.image, np.array(view.target)
     if step.refused is not None:
         x, y, channel = step.refused
         if np.isfinite(image[y, x]).all():
-            here, wanted = (np.array(array)[y, x].tolist() for array in (image, target))
-            return Offender(sensor, (x, y), f"{LOSS}, channel {channel}", [], None, here, wanted)
-    if all(np.isfinite(array).all() for array in [image, *step.gradients.values()]):
+            what = f"derivative of the loss, dL/dI, channel {channel}"
+            return Offender(view.sensor, (x, y), what, [], None, image[y, x].tolist(), target[y, x].tolist())
+    bad = [key for key, gradient in step.gradients.items() if not np.isfinite(gradient).all()]
+    if np.isfinite(image).all() and not bad:
         return None
     if largest is not None:
-        return Offender(sensor, largest.pixel, SUM, largest.value, largest.where)
-    return _without_paths(sensor, image, np.array(target), step.gradients)
-
-
-def _without_paths(sensor: int, image: Array, target: Array, gradients: dict[str, Array]) -> Offender:
-    """What there is to say where paths were not looked at: the pixel, or else the parameter."""
-    if not np.isfinite(image).all():
-        y, x, _ = (int(index) for index in np.argwhere(~np.isfinite(image))[0])
-        return Offender(sensor, (x, y), IMAGE, image[y, x].tolist(), None, image[y, x].tolist(), target[y, x].tolist())
-    [key, *_] = [key for key, gradient in gradients.items() if not np.isfinite(gradient).all()]
-    return Offender(sensor, None, f"{GRADIENT} {key}", [], None)
+        what = "sum of contributions, each of which is finite; the largest"
+        return replace(largest, sensor=view.sensor, quantity=what)
+    unseen = "(of this integrator no paths are looked at)"
+    if bad and np.isfinite(image).all():
+        return Offender(view.sensor, None, f"gradient {unseen} of {bad[0]}", [], None)
+    y, x, _ = (int(index) for index in np.argwhere(~np.isfinite(image))[0])
+    value = image[y, x].tolist()
+    return Offender(view.sensor, (x, y), f"image {unseen}", value, None, value, target[y, x].tolist())

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import mitsuba as mi
 import numpy as np
@@ -13,15 +12,12 @@ from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.estimators import ESTIMATORS
 from reslrb_cli.integrators.protocol import StepIntegrator
-from reslrb_cli.integrators.step import known_step, make_integrator
+from reslrb_cli.integrators.step import make_integrator
 from reslrb_cli.measure.gradients import (
     Case,
-    Direction,
+    all_directions,
     choose_step,
-    directions,
     moves_light,
-    moving_directions,
-    natural_bounds,
     seeds,
     smooth_weights,
 )
@@ -40,7 +36,7 @@ from reslrb_cli.measure.scenes import small
 from reslrb_cli.measure.stepper import shrink
 from reslrb_cli.optimization.assemble import assemble_scene
 from reslrb_cli.records.measurements import Reference
-from reslrb_cli.scene.catalog import parameter_kind, value_shape
+from reslrb_cli.scene.catalog import value_shape
 from reslrb_cli.scene.visibility import interior
 
 #: Light paths of one gradient, as near as whole samples per pixel come.
@@ -125,7 +121,7 @@ class Participants:
         problem = assemble_scene(first, small.build(config.scene.options) if built_in else None)
         scene, sensor = problem.scene, problem.sensors[0]
         shrink(scene, sensor, PATHS)
-        self.case = Case.of(scene, problem.selection.keys, sensor, problem.selection)
+        self.case = Case(scene, problem.selection.keys, sensor, problem.selection)
         self.sensor = scene.sensors()[sensor]
         self.film: tuple[int, int] = (self.case.weights.shape[1], self.case.weights.shape[0])
         self.spp = settings.spp or _samples(self.film, config.run.spp, problem.samples_per_pass)
@@ -153,7 +149,7 @@ class Participants:
         self._situation = Situation.of(scene, self.sensor, self.case.params, depth, hidden, self.attached, moved)
         self._choose_references()
         self._weigh()
-        self.directions = self._directions(problem.selection)
+        self.directions = all_directions(self.case, problem.selection, MOVING_DIRECTIONS, DIRECTIONS)
         weights = np.array(self.case.weights, np.float64)
         known = {key: known_gradient(self._situation, self.sensor, key, weights) for key in self.case.keys}
         self.exact = {key: value for key, value in known.items() if value is not None}
@@ -217,20 +213,6 @@ class Participants:
             weights *= interior(shape, self.sensor)[:, :, None]
         self.case.weigh(weights)
 
-    def _directions(self, selection: Any) -> dict[str, list[Direction]]:
-        found = {}
-        box = self._situation.scene.bbox()
-        extent = float(np.linalg.norm(np.array(box.max - box.min)))
-        for key in self.case.keys:
-            if moves_light(self.case.params, key):
-                found[key] = moving_directions(self.case, key, extent, MOVING_DIRECTIONS)
-                continue
-            bounds = selection.spec(key).bounds
-            if bounds is None or not np.all(np.isfinite(bounds)):
-                bounds = natural_bounds(parameter_kind(self.case.params, key), self.case.initial[key])
-            found[key] = directions(self.case, key, bounds, DIRECTIONS)
-        return found
-
     def shape(self, key: str) -> tuple[int, ...]:
         """Shape of a parameter."""
         return value_shape(self.case.values.value(key))
@@ -259,12 +241,7 @@ class Participants:
         integrator = self.integrators[label]
         if not self.known:
             return self.case.gradient(integrator, seed, self.spp)
-        adjoint = self.case.adjoint
-
-        def step(integrator: Any, scene: Any, sensor: Any, _objective: Any, **options: Any) -> Any:
-            return known_step(integrator, scene, sensor, adjoint, **options)
-
-        return self.case.gradient(integrator, seed, self.spp, step=step)
+        return self.case.gradient(integrator, seed, self.spp, step=self.case.known_step)
 
     def differences(self, key: str, seed: int) -> list[float]:
         """Finite differences of the image's objective along the directions of a parameter."""

@@ -1,13 +1,13 @@
 """Samples of what takes part in a gradcheck, taken when they are first needed, until they are enough or time is up.
 
-A session may go on from the samples that an earlier one has taken, with the seeds after theirs (`restore`, `kept`).
+A session may go on from the samples that an earlier one has taken, with the seeds after theirs.
 """
 
 from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from typing import Any
 
@@ -22,7 +22,6 @@ from reslrb_cli.records.measurement_files import Kept
 #: What is kept says that it is of this.
 KIND = "gradcheck"
 
-
 #: What samples are of: `gradient` or `image` and an integrator's label, `differences` or `tangents` and a parameter.
 Name = tuple[str, str]
 
@@ -33,51 +32,17 @@ def settings(checked: Settings, variant: str, device: str) -> dict[str, Any]:
     return resume_store.settings(checked.config, variant, device, estimators=labels, spp=checked.spp)
 
 
-def restore(before: Earlier) -> dict[Name, list[np.ndarray]]:
-    """The samples of an earlier session, by what they are of."""
-    return {
-        (kind, of): list(before.arrays[f"samples/{number}"]) for number, (kind, of) in enumerate(before.head["samples"])
-    }
-
-
-def restore_steps(before: Earlier, directions: Mapping[str, Sequence[Direction]]) -> dict[str, list[Direction]]:
-    """The directions whose steps were chosen then, by parameter: differences go on with the same ones."""
-    return {
-        key: [
-            replace(direction, step=step, truncation=truncation)
-            for direction, (step, truncation) in zip(directions[key], steps, strict=True)
-        ]
-        for key, steps in before.head["steps"].items()
-    }
-
-
-def kept(
-    settings: Mapping[str, Any], samples: Mapping[Name, Sequence[np.ndarray]], chosen: Mapping[str, Sequence[Direction]]
-) -> Kept | None:
-    """What a later session needs to go on; None where nothing has been sampled."""
-    found = {name: np.stack(rows) for name, rows in samples.items() if rows}
-    if not found:
-        return None
-    steps = {key: [[d.step, d.truncation] for d in directions] for key, directions in chosen.items()}
-    arrays = {f"samples/{number}": rows for number, rows in enumerate(found.values())}
-    return resume_store.head(KIND, settings, samples=list(found), steps=steps), arrays
-
-
 #: Seeds, where no number is given: so many of everything, more of what is cheap, as the budget allows.
 LEAST_SEEDS, MOST_SEEDS = 8, 64
-
 
 #: Fewer seeds have no standard error worth the name, and are not judged.
 FEWEST = 3
 
-
 #: Shares of the budget: what more than LEAST_SEEDS are taken of has the larger one.
 LARGE_SHARE, SMALL_SHARE = 3, 1
 
-
 #: Whose gradients are naive AD, and compile for much longer than any other.
 NAIVE = ("walk_ad", "ptracer")
-
 
 #: Bytes that samples may take.
 MEMORY = 2**30
@@ -100,12 +65,17 @@ class Sampling:
         self._start = now() - settings.spent_s
         self._end = self._start + settings.budget_s
         self.participants = Participants(settings)
-        self._samples: dict[Name, list[np.ndarray]] = {} if earlier is None else restore(earlier)
-        self._before = {name: len(samples) for name, samples in self._samples.items()}
+        self._samples: dict[Name, list[np.ndarray]] = {}
+        #: Directions whose steps have been chosen, by parameter: differences go on with the same ones.
         self._chosen: dict[str, list[Direction]] = {}
         if earlier is not None:
-            self._chosen = restore_steps(earlier, self.participants.directions)
+            names = enumerate(earlier.head["samples"])
+            self._samples = {(kind, of): list(earlier.arrays[f"samples/{k}"]) for k, (kind, of) in names}
+            for key, steps in earlier.head["steps"].items():
+                along = zip(self.participants.directions[key], steps, strict=True)
+                self._chosen[key] = [replace(one, step=step, truncation=error) for one, (step, error) in along]
             self.participants.directions.update(self._chosen)
+        self._before = {name: len(samples) for name, samples in self._samples.items()}
         #: Called after each sample.
         self.between: Callable[[], None] = lambda: None
         self._taken: set[Name] = set()
@@ -126,7 +96,12 @@ class Sampling:
 
     def kept(self, settings: dict[str, Any]) -> Kept | None:
         """What a later session, of the same `settings`, needs to go on; None where nothing has been sampled."""
-        return kept(settings, self._samples, self._chosen)
+        found = {name: np.stack(rows) for name, rows in self._samples.items() if rows}
+        if not found:
+            return None
+        steps = {key: [[d.step, d.truncation] for d in directions] for key, directions in self._chosen.items()}
+        arrays = {f"samples/{number}": rows for number, rows in enumerate(found.values())}
+        return resume_store.head(KIND, settings, samples=list(found), steps=steps), arrays
 
     def take(self, name: Name, stop: Callable[[], bool], say: Callable[[str], None]) -> bool:
         """Take the samples of `name`, where that was not done yet; whether there are enough to compare.
@@ -217,10 +192,8 @@ class Sampling:
         most = max(LEAST_SEEDS, min(MOST_SEEDS, self._seeds_in_memory()))
         if name[0] == "gradient" and not self.participants.exact:
             # More than the stock reference has are compared with nothing.
-            labels = [label for label in self.participants.stock_labels() if ("gradient", label) in self._taken]
-            stock = [
-                len(self._samples["gradient", label]) - self._before.get(("gradient", label), 0) for label in labels
-            ]
+            names = [("gradient", label) for label in self.participants.stock_labels()]
+            stock = [len(self._samples[name]) - self._before.get(name, 0) for name in names if name in self._taken]
             most = min(most, max(LEAST_SEEDS, *stock)) if any(stock) else most
         return most
 
@@ -234,10 +207,9 @@ class Sampling:
             return parts.gradient(of, seed)
         if kind == "image":
             return parts.picture(of, seed)
-        if kind == "differences":
-            return np.asarray(parts.differences(of, seed))
         # Forward mode is the same for all estimators.
-        return np.asarray(parts.tangents(self.participants.listed[0].label, of, seed))
+        first = parts.listed[0].label
+        return np.asarray(parts.differences(of, seed) if kind == "differences" else parts.tangents(first, of, seed))
 
 
 def _kind(name: Name) -> tuple[str, bool]:

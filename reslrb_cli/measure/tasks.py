@@ -32,13 +32,6 @@ def measured_steps() -> Begin:
     return begin
 
 
-def held_gradients() -> Begin:
-    """Gradients with dL/dI held, and what they are taken at."""
-    from reslrb_cli.measure.fixed_adjoint import begin_holding
-
-    return begin_holding
-
-
 def surveyed() -> Begin:
     """What `convergence` asks before it measures."""
     from reslrb_cli.measure.convergence.setup import begin_survey

@@ -238,16 +238,11 @@ class Verdict(str, enum.Enum):
 
 
 @dataclass(frozen=True)
-class GradcheckRecord(Line):
-    """One comparison: the gradient of a parameter by an integrator, against a reference.
+class Compared:
+    """The two sides of a comparison: the gradient of a parameter by an integrator, and a reference.
 
     `case` names the scene: the configuration, or a case of a suite. `parameter` is None where all are compared
     together, or the image; `estimator` where the integrator has none. `seeds` is how many gradients each side has.
-    `relative_l2` is the distance from the reference over its norm: at equal seeds of the samples, else of the
-    means. `z_rms` and `z_max` are in standard errors; each has its limit, corrected for the number of comparisons.
-    `cosine` is that of the angle between the means, `variance_ratio` the variance over that of the reference.
-    `detectable` is the least deviation, as a fraction of the reference, that would have been seen. `message` says what
-    the figures do not. What does not apply is None.
     """
 
     case: str
@@ -257,6 +252,19 @@ class GradcheckRecord(Line):
     reference: Reference
     kind: Kind
     seeds: int
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """The outcome of a comparison of estimates with a reference.
+
+    `relative_l2` is the distance from the reference over its norm: at equal seeds of the samples, else of the
+    means. `z_rms` and `z_max` are in standard errors; each has its limit, corrected for the number of comparisons.
+    `cosine` is that of the angle between the means, `variance_ratio` the variance over that of the reference.
+    `detectable` is the least deviation, as a fraction of the reference, that would have been seen. `message` says what
+    the figures do not. What does not apply is None.
+    """
+
     verdict: Verdict
     relative_l2: float | None = None
     relative_l2_limit: float | None = None
@@ -273,6 +281,11 @@ class GradcheckRecord(Line):
     def holds(self) -> bool | None:
         """True or False where the comparison decides; None where it does not."""
         return {Verdict.HOLDS: True, Verdict.FAILS: False}.get(self.verdict)
+
+
+@dataclass(frozen=True)
+class GradcheckRecord(Comparison, Compared, Line):
+    """One comparison: what was compared, and what was found."""
 
     @classmethod
     def of(cls, values: Mapping[str, Any]) -> GradcheckRecord:

@@ -31,10 +31,8 @@ from reslrb_cli.report.tonemap import encode, exposure_for, shown_exposures
 
 Array = np.ndarray[Any, Any]
 
-
 #: Luminance of a linear value of 1 in cd/m², for what needs absolute units: the reference white of ITU-R BT.2408.
 WHITE = 203.0
-
 
 #: Percentiles that are told.
 PERCENTILES = (50, 95, 99)
@@ -68,20 +66,15 @@ def itp(first: Array, second: Array) -> Array:
     """
     colour = _colour()
     to_bt2020 = colour.matrix_RGB_to_RGB("sRGB", "ITU-R BT.2020")
-    encoded = []
-    for values in (first, second):
-        light = np.clip(WHITE * (values.astype(np.float64) @ to_bt2020.T), 0.0, 1e4)
-        encoded.append(colour.RGB_to_ICtCp(light))
-    return np.asarray(colour.delta_E(*encoded, method="ITP"))
+    light = [np.clip(WHITE * (values.astype(np.float64) @ to_bt2020.T), 0.0, 1e4) for values in (first, second)]
+    return np.asarray(colour.delta_E(*map(colour.RGB_to_ICtCp, light), method="ITP"))
 
 
 def told(values: Array) -> dict[str, float]:
     """`mean`, the percentiles as `p50` and so on, and `max` of differences, of at least one."""
-    found = {"mean": float(np.mean(values))}
-    found |= {
-        f"p{share}": float(value) for share, value in zip(PERCENTILES, np.percentile(values, PERCENTILES), strict=True)
-    }
-    return found | {"max": float(np.max(values))}
+    shares = zip(PERCENTILES, np.percentile(values, PERCENTILES), strict=True)
+    between = {f"p{share}": float(value) for share, value in shares}
+    return {"mean": float(np.mean(values)), **between, "max": float(np.max(values))}
 
 
 def _colour() -> Any:
@@ -94,7 +87,6 @@ def _colour() -> Any:
 
 #: Parameters of three numbers that are no colours to look at.
 NO_COLORS = ("eta", "k")
-
 
 #: What is no light and no colour, but where something is.
 PLACES = ("length", "degrees", "scale")
@@ -147,14 +139,11 @@ def _entries(value: Array, true: Array, mask: Array | None) -> tuple[Array, Arra
 
 MISSING = "HDR-FLIP was not measured: its package is not installed (`pip install reslrb[flip]`)"
 
-
 #: Exposures at most. FLIP takes one a stop between what shows the brightest pixel and what shows the median one.
 MOST_EXPOSURES = 8
 
-
 #: Luminance of linear sRGB, as FLIP has it.
 _LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
-
 
 #: The ACES curve (a x² + b x + c) / (d x² + e x + f) that FLIP takes for its tone mapper, and the output that counts as
 #: bright.
@@ -183,9 +172,7 @@ def flip_map(image: Array, target: Array) -> Array | None:
         return None
     low, high = exposures
     options = {"startExposure": low, "stopExposure": high, "numExposures": max(2, math.ceil(high - low))}
-    pair = [
-        np.ascontiguousarray(np.clip(np.nan_to_num(array), 0.0, 1e30), dtype=np.float32) for array in (target, image)
-    ]
+    pair = [np.ascontiguousarray(np.clip(np.nan_to_num(a), 0.0, 1e30), dtype=np.float32) for a in (target, image)]
     error, _, _ = flip_evaluator.evaluate(*pair, "HDR", applyMagma=False, computeMeanError=False, parameters=options)
     return np.asarray(error)[:, :, 0]
 
@@ -254,8 +241,6 @@ def ssim(first: Array, second: Array) -> float | None:
 
 
 _TARGET = re.compile(r"target(-\d+)?\.exr")
-
-
 MOMENTS = ("initial", "final")
 
 

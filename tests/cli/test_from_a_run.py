@@ -7,6 +7,7 @@ from pathlib import Path
 import mitsuba as mi
 import numpy as np
 import pytest
+from agreement import compare
 from cli import tiny
 from click.testing import CliRunner, Result
 
@@ -16,7 +17,6 @@ from reslrb_cli.cli.options import read_recovered
 from reslrb_cli.config.loader import load
 from reslrb_cli.config.parameters import ParameterSpec, RunValue
 from reslrb_cli.errors import ConfigError
-from reslrb_cli.measure.comparison import compare
 from reslrb_cli.optimization.assemble import assemble_scene
 from reslrb_cli.records.checkpoint import STATE_FILE, save_checkpoint
 from reslrb_cli.records.images import load_image, read_parameters

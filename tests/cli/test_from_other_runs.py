@@ -8,12 +8,12 @@ from pathlib import Path
 import mitsuba as mi
 import numpy as np
 import pytest
+from agreement import compare
 from click.testing import CliRunner, Result
 
 from reslrb_cli.cli import main
 from reslrb_cli.cli.options import read_recovered
 from reslrb_cli.config.loader import load
-from reslrb_cli.measure.comparison import compare
 from reslrb_cli.optimization.assemble import assemble_scene
 from reslrb_cli.records.images import load_image
 from reslrb_cli.records.run_folder import read_value

@@ -10,10 +10,10 @@ from typing import Any
 
 import mitsuba as mi
 import numpy as np
+from agreement import Agreement, compare
 
 import reslrb_cli
 from reslrb_cli.integrators.step import make_integrator, render_image
-from reslrb_cli.measure.comparison import Agreement, compare
 
 #: Largest relative difference between images of the same random numbers.
 SAME = 3e-4

@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from agreement import Agreement, compare
 from conformance.gradient_cases import FLOOR, floor
 from turns import a_few
 
 from reslrb_cli.integrators.step import gradient_step, known_step, render_image, sample_sets
-from reslrb_cli.measure.comparison import Agreement, compare
 from reslrb_cli.measure.gradients import Case, integrator, seeds
 from reslrb_cli.measure.scenes.small import texture
 

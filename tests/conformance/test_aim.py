@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from agreement import compare
 from conformance.test_guiding import SPP, guided, sample, samples, seeds
 from conformance.test_survival import replayed_from, replays_agree
 from turns import a_few
@@ -15,7 +16,6 @@ from reslrb_cli.estimators import ESTIMATORS
 from reslrb_cli.guiding import tables as guiding
 from reslrb_cli.guiding.tables import NOW, Learned, Purpose
 from reslrb_cli.integrators import context
-from reslrb_cli.measure.comparison import compare
 from reslrb_cli.measure.gradients import Case, relative
 from reslrb_cli.transport import aim
 from reslrb_cli.transport.aim import Pending

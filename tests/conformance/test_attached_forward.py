@@ -10,13 +10,13 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from conformance.moving import rippled, under_glass
+from measure.moving_light import SCENES
 from measure.test_mutations import plant
 from turns import taking_turns
 
 from reslrb_cli import register
 from reslrb_cli.errors import UnsupportedScene
 from reslrb_cli.measure.gradients import integrator, relative
-from reslrb_cli.measure.scenes.moving_light import SCENES
 
 pytestmark = pytest.mark.usefixtures("llvm")
 

@@ -14,13 +14,14 @@ import numpy as np
 import pytest
 from conformance.attached_cases import CASES
 from conformance.moving_lamps import CASES as LAMPS
+from measure.differenced import AttachedScene
+from measure.moving_light import moved, room, shelf, wall
 from measure.test_mutations import plant
 
 from reslrb_cli.estimators import chain, jacobian
 from reslrb_cli.integrators.step import gradient_step
 from reslrb_cli.measure.gradients import integrator, relative, seeds
-from reslrb_cli.measure.scenes.moving import AttachedScene, Pose
-from reslrb_cli.measure.scenes.moving_light import moved, room, shelf, wall
+from reslrb_cli.measure.scenes.moving import Pose
 from reslrb_cli.measure.scenes.small import diffuse
 
 pytestmark = pytest.mark.usefixtures("llvm")

@@ -11,12 +11,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from measure.differenced import AttachedScene, compare_with_differences
+from measure.moving_light import SCENES, moved, point, room, smooth_texture, wall
 
 from reslrb_cli.integrators.context import stays
 from reslrb_cli.measure.comparison import Family, compare_expectations
 from reslrb_cli.measure.gradients import integrator, seeds
-from reslrb_cli.measure.scenes.moving import AttachedScene, Move, Pose, compare_with_differences
-from reslrb_cli.measure.scenes.moving_light import SCENES, moved, point, room, smooth_texture, wall
+from reslrb_cli.measure.scenes.moving import Move, Pose
 from reslrb_cli.measure.scenes.small import diffuse
 
 pytestmark = pytest.mark.usefixtures("llvm")

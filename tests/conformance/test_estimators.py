@@ -8,10 +8,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from agreement import compare
 from conformance.gradient_cases import AT_EQUAL_SEEDS, CASES, GradientCase
 from turns import a_few, taking_turns
 
-from reslrb_cli.measure.comparison import compare
 from reslrb_cli.measure.gradients import Case, integrator, relative, seeds
 
 pytestmark = pytest.mark.usefixtures("llvm")

@@ -6,11 +6,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from agreement import compare
 from conformance.gradient_cases import CASES
 from conformance.scenes import plugin
 from turns import a_few
 
-from reslrb_cli.measure.comparison import compare
 from reslrb_cli.measure.gradients import Case, integrator, relative, seeds
 
 pytestmark = pytest.mark.usefixtures("llvm")

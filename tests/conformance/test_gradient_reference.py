@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from agreement import Agreement, compare
 from conformance.gradient_cases import CASES, IN_EXPECTATION, GradientCase
 from turns import a_few
 
-from reslrb_cli.measure.comparison import Agreement, compare
 from reslrb_cli.measure.gradients import Case, integrator, seeds
 
 pytestmark = pytest.mark.usefixtures("llvm")

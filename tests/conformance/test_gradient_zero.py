@@ -11,9 +11,9 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
+from agreement import compare
 from conformance.gradient_cases import _IN_VIEW, FLOOR, _mask, floor
 
-from reslrb_cli.measure.comparison import compare
 from reslrb_cli.measure.gradients import Case, integrator, relative, seeds
 from reslrb_cli.measure.scenes.small import bitmap, diffuse, lamp, rgb, room
 

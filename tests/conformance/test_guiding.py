@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from agreement import compare
 from conformance.gradient_cases import CASES
 from conformance.guiding_faults import FAULTS, learned_in_its_midst, same_numbers
 from turns import a_few
@@ -16,7 +17,6 @@ from turns import a_few
 import reslrb_cli
 from reslrb_cli.estimators import ESTIMATORS
 from reslrb_cli.integrators.step import known_step, render_image
-from reslrb_cli.measure.comparison import compare
 from reslrb_cli.measure.gradients import Case, integrator, relative, seeds
 
 pytestmark = pytest.mark.usefixtures("llvm")

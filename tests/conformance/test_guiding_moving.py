@@ -6,12 +6,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from agreement import compare
 from conformance import attached_cases, moving_lamps
 from conformance.test_survival import by_harsh_table
 from turns import a_few
 
 from reslrb_cli.integrators.step import make_integrator
-from reslrb_cli.measure.comparison import compare
 from reslrb_cli.measure.gradients import seeds
 
 pytestmark = pytest.mark.usefixtures("llvm")

@@ -6,6 +6,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from agreement import compare, renders
 from conformance.scenes import (
     RED,
     SAME,
@@ -25,7 +26,6 @@ from conformance.scenes import (
 from turns import a_few, taking_turns
 
 from reslrb_cli.integrators.step import gradient_step, make_integrator
-from reslrb_cli.measure.comparison import compare, renders
 
 pytestmark = pytest.mark.usefixtures("samples")
 

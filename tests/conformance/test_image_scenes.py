@@ -6,11 +6,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from agreement import compare
 from conformance.scenes import SAME, agreement, difference_from_ptracer, images
 from rooms import real_room
 from turns import a_few
 
-from reslrb_cli.measure.comparison import compare
 from reslrb_cli.measure.references import Situation, ptracer_image
 from reslrb_cli.scene.load import load_scene
 from reslrb_cli.scene.visibility import interior, sees_specular

@@ -124,7 +124,7 @@ def test_second_step_compiles_nothing_on_shipped_scenes(name: str, adjoint: str)
     found = list(mi.traverse(loaded).keys())
     keys = SHIPPED[name] or [key for key in found if "reflectance" in key or "radiance" in key][:2]
     assert set(keys) <= set(found), found
-    scene = Case.of(loaded, keys)
+    scene = Case(loaded, keys)
     ours = integrator("reslrb", 6, 3)
 
     def step(seed: int) -> None:

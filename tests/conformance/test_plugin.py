@@ -11,13 +11,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from agreement import compare
 from conformance.gradient_cases import FLOOR, _mask, _textured
 from conformance.scenes import plugin
 
 from reslrb_cli import step
 from reslrb_cli.errors import UnsupportedScene
 from reslrb_cli.integrators.step import render_image
-from reslrb_cli.measure.comparison import compare
 from reslrb_cli.measure.gradients import Case, integrator, relative, seeds
 from reslrb_cli.measure.scenes.small import camera, lamp, rgb, room
 

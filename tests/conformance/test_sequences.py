@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from agreement import compare
 from conformance import attached_cases, moving_lamps, sequence_faults
 from conformance.gradient_cases import CASES
 from conformance.test_guiding import guided, sample, samples
@@ -19,7 +20,6 @@ import reslrb_cli
 from reslrb_cli.estimators import ESTIMATORS
 from reslrb_cli.integrators.plan_report import SEQUENCE
 from reslrb_cli.integrators.step import make_integrator
-from reslrb_cli.measure.comparison import compare
 from reslrb_cli.measure.gradients import Case, integrator, relative, seeds
 
 pytestmark = pytest.mark.usefixtures("llvm")

@@ -15,7 +15,7 @@ from measure.faults import Fault
 from measure.test_mutations import plant
 
 from reslrb_cli.integrators.plan_report import FEATURES, count
-from reslrb_cli.measure.extreme.suite import Exact, ExtremeCase, Stock, run_cases
+from reslrb_cli.measure.extreme.suite import Exact, ExtremeCase, Stock, run_case
 from reslrb_cli.measure.gradients import Case, integrator, relative
 from reslrb_cli.measure.scenes.analytic import RADIANCE, speck_in_view
 from reslrb_cli.measure.scenes.small import camera, diffuse, load, rgb, room, transform
@@ -68,7 +68,7 @@ CASES = {
 
 def failures(name: str) -> set[str]:
     """References that do not hold, of `stack`."""
-    records = list(run_cases([CASES[name]], ["stack"]))
+    records = list(run_case(CASES[name], ["stack"]))
     for record in records:
         print(record.to_json())
     assert len(records) >= 3

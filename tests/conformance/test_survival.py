@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from agreement import compare
 from conformance.test_guiding import SPP, guided, sample, samples, seeds
 from turns import a_few
 
 from reslrb_cli.estimators import ESTIMATORS
 from reslrb_cli.guiding.tables import Guiding, Purpose
-from reslrb_cli.measure.comparison import compare
 from reslrb_cli.measure.gradients import Case, relative
 from reslrb_cli.transport.guide import CELLS, Survival, Table
 

@@ -8,13 +8,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from agreement import compare
 from conformance.test_guiding import SPP, guided, seeds
 from conformance.test_survival import BOX, harsh
 
 from reslrb_cli.guiding.collect import FLOOR, LEAN, SURE, Onward, Walked
 from reslrb_cli.guiding.tables import Purpose, learning_seed
 from reslrb_cli.integrators.protocol import Job
-from reslrb_cli.measure.comparison import compare
 from reslrb_cli.measure.gradients import Case
 from reslrb_cli.transport.guide import BITS, CELLS, LEAST, SHAPE, Survival
 

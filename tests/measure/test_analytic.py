@@ -4,23 +4,54 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from agreement import compare, renders
 from turns import taking_turns
 
 from reslrb_cli.integrators.step import render_image
-from reslrb_cli.measure.comparison import compare, renders
 from reslrb_cli.measure.gradients import Case, integrator, seeds
 from reslrb_cli.measure.scenes.analytic import (
+    ALBEDO,
+    UP,
+    Known,
     KnownScene,
     beam_through_slab,
     fresnel,
     furnace,
     furnace_scene,
     plane_points,
-    plane_scene,
     point_through_surface,
     refraction_scene,
     slab_scene,
 )
+from reslrb_cli.measure.scenes.small import SIZE, diffuse, pinhole, rectangle, rgb
+
+LIGHT = (0.4, 0.8, -0.3)
+
+
+def irradiance(light: tuple[float, float, float], height: float, fov: float, size: int) -> np.ndarray:
+    """Mean over each pixel, (H, W, 1), of what a point light of unit power gives to the plane y = 0; J. H. Lambert."""
+    points, weights = plane_points(height, fov, size)
+    to_light = np.array(light) - points
+    return (to_light[..., 1] / np.linalg.norm(to_light, axis=-1) ** 3 @ weights)[..., None]
+
+
+def plane_scene() -> KnownScene:
+    """A point light over a plane, off the camera's axis."""
+    intensity = (2, 3, 4)
+
+    def scene() -> dict:
+        return {
+            "type": "scene",
+            "camera": pinhole([0, 1.5, 0], [0, 0, 0], [0, 0, -1], 50),
+            "light": {"type": "point", "position": list(LIGHT), "intensity": rgb(*intensity)},
+            "plane": rectangle(diffuse(*ALBEDO), rotate=UP, scale=2),
+        }
+
+    by_albedo = irradiance(LIGHT, 1.5, 50, SIZE) / np.pi * intensity
+    known = Known(by_albedo * ALBEDO, {"albedo": by_albedo, "intensity": by_albedo * ALBEDO / intensity})
+    keys = {"albedo": "plane.bsdf.reflectance.value", "intensity": "light.intensity.value"}
+    return KnownScene(scene, known, keys, 2)
+
 
 SCENES = {
     "furnace": (lambda: furnace_scene((0.5, 0.8, 0.9), (1, 2, 0.5), 16, 8), 64, "path"),
@@ -72,10 +103,8 @@ def test_fresnel():
 
 def test_a_medium_of_index_one_is_not_there():
     through = point_through_surface(0.5, 2.0, 1.0, 1.0, (0.3, 1.6, -0.2), 1.0, 0.9, 60, 4)
-    points, weights = plane_points(0.9, 60, 4)
-    to_light = np.array([0.3, 1.6, -0.2]) - points
-    irradiance = (2.0 * to_light[..., 1] / np.linalg.norm(to_light, axis=-1) ** 3) @ weights
-    assert through.image[..., 0] == pytest.approx(irradiance * 0.5 / np.pi, rel=1e-9)
+    alone = 2.0 * irradiance((0.3, 1.6, -0.2), 0.9, 60, 4)
+    assert through.image[..., :1] == pytest.approx(alone * 0.5 / np.pi, rel=1e-9)
 
 
 @pytest.mark.parametrize("name", ["albedo", "radiance", "transmittance", "reflectance"])

@@ -7,10 +7,10 @@ from collections.abc import Callable
 import drjit as dr
 import numpy as np
 import pytest
+from measure.analytic_motion import KnownMotion, ball_lens, lamp_over_plane, tilted_surface
 
 from reslrb_cli.measure.comparison import Family, compare_expectations
 from reslrb_cli.measure.gradients import integrator, seeds
-from reslrb_cli.measure.scenes.analytic_motion import KnownMotion, ball_lens, lamp_over_plane, tilted_surface
 from reslrb_cli.records.measurements import Verdict
 from reslrb_cli.transport.walk import Segment
 

@@ -8,10 +8,11 @@ from typing import Any
 import drjit as dr
 import numpy as np
 import pytest
+from measure.differenced import Differenced, compare_with_differences
+from measure.moving_light import ROOMS_SCENES as ROOMS
+from measure.moving_light import SCENES
 
-from reslrb_cli.measure.scenes.moving import Differenced, Displacement, Move, compare_with_differences, smooth_fields
-from reslrb_cli.measure.scenes.moving_light import ROOMS_SCENES as ROOMS
-from reslrb_cli.measure.scenes.moving_light import SCENES, TOP, vertices
+from reslrb_cli.measure.scenes.moving import Displacement, Move, smooth_fields, vertices
 from reslrb_cli.transport import bsdf, connection
 from reslrb_cli.transport.walk import Segment
 
@@ -47,7 +48,7 @@ def beam(only: tuple[float, float, float], seeds: int = 2) -> Differenced:
     """A slab in parallel light, of which some coordinates move, by a few directions."""
 
     def moves(scene: Any) -> list[Move]:
-        return [Displacement(TOP, smooth_fields(vertices(scene, "top"), 3, 1.0) * np.array(only))]
+        return [Displacement("top.vertex_positions", smooth_fields(vertices(scene, "top"), 3, 1.0) * np.array(only))]
 
     return compare_with_differences(replace(SCENES["slab_beam"], moves=moves), count=seeds)
 

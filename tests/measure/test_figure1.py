@@ -118,7 +118,7 @@ def test_what_is_written(config: Config, tmp_path: Path) -> None:
 @pytest.mark.long
 def test_what_is_compared_has_one_expectation(config: Config) -> None:
     """Whatever of ours naive AD does not have is left out."""
-    from reslrb_cli.measure.fixed_adjoint import Held, comparable
+    from paper_fixed_adjoint import Held, comparable
 
     y, x = np.mgrid[0:16, 0:16] / 16
     adjoint = np.repeat((np.sin(5 * x) * np.cos(4 * y) + 1.5)[:, :, None], 3, 2).astype(np.float32)

@@ -9,7 +9,10 @@ from pathlib import Path
 import drjit as dr
 import numpy as np
 import pytest
+from measure.analytic_motion import centre_of_gravity, parallel
+from measure.differenced import AttachedScene
 from measure.faults import room
+from measure.moving_light import setting
 
 from reslrb_cli.cli import main
 from reslrb_cli.errors import ConfigError
@@ -18,9 +21,7 @@ from reslrb_cli.measure import missing as missing_check
 from reslrb_cli.measure.gradients import Case, Direction, integrator, seeds
 from reslrb_cli.measure.missing import Missing, MissingCheck
 from reslrb_cli.measure.scenes.analytic import fresnel
-from reslrb_cli.measure.scenes.analytic_motion import centre_of_gravity, parallel
-from reslrb_cli.measure.scenes.moving import AttachedScene, Pose
-from reslrb_cli.measure.scenes.moving_light import setting
+from reslrb_cli.measure.scenes.moving import Pose
 from reslrb_cli.measure.scenes.small import transform
 from reslrb_cli.optimization import targets
 from reslrb_cli.records.measurements import LEAST, NOTHING, MissingRecord

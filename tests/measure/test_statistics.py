@@ -4,16 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from agreement import blocks, compare
 
-from reslrb_cli.measure.comparison import (
-    blocks,
-    combined_z_rms,
-    compare,
-    effective_entries,
-    sidak,
-    z_rms_limit,
-    z_scores,
-)
+from reslrb_cli.measure.comparison import combined_z_rms, effective_entries, sidak, z_rms_limit, z_scores
 
 
 def noise(seed: int, shape=(12, 32, 32, 3), mean: float = 1.0) -> np.ndarray:

@@ -6,11 +6,11 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from agreement import compare
 from cli.tiny import KEY, write_experiment
 
 from reslrb_cli.config.loader import load
 from reslrb_cli.errors import ConfigError
-from reslrb_cli.measure.comparison import compare
 from reslrb_cli.optimization.assemble import assemble
 from reslrb_cli.optimization.identifiability import check_exposures, find_ambiguous
 from reslrb_cli.optimization.loop import optimize

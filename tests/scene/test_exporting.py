@@ -10,10 +10,10 @@ from pathlib import Path
 import mitsuba as mi
 import numpy as np
 import pytest
+from agreement import compare
 
 from reslrb_cli.config.parameters import ParameterSpec
 from reslrb_cli.errors import ConfigError
-from reslrb_cli.measure.comparison import compare
 from reslrb_cli.scene import load
 from reslrb_cli.scene.export import export_scene
 from reslrb_cli.scene.load import load_scene

@@ -9,7 +9,6 @@ import numpy as np
 from reslrb_cli.measure.comparison import (
     ROUNDING,
     TAIL,
-    Comparison,
     Family,
     compare_expectations,
     entry_count,
@@ -22,6 +21,7 @@ from reslrb_cli.measure.methods import ALL, IMAGES
 from reslrb_cli.records.measurements import (
     TARGETS,
     BenchStatus,
+    Comparison,
     MethodRecord,
     PointRecord,
     Range,

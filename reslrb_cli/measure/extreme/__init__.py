@@ -5,33 +5,23 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 
 from reslrb_cli.measure.extreme import geometry, light
-from reslrb_cli.measure.extreme.suite import ExtremeCase, run_cases
+from reslrb_cli.measure.extreme.suite import run_case
 from reslrb_cli.records.measurements import GradcheckRecord
 
-
-def registry(cases: Iterable[ExtremeCase]) -> dict[str, ExtremeCase]:
-    """Cases by name. Raises ValueError where two have the same."""
-    found: dict[str, ExtremeCase] = {}
-    for case in cases:
-        if case.name in found:
-            raise ValueError(f"two cases are named {case.name}")
-        found[case.name] = case
-    return found
-
-
-CASES = registry(
-    [
-        *light.COLOURS_CASES,
-        *light.LIGHTS_CASES,
-        *geometry.PLACES_CASES,
-        *geometry.ROUGHNESS_CASES,
-        *light.FILMS_CASES,
-        *geometry.GLASS_CASES,
-        *light.LOSSES_CASES,
-        *geometry.MOTION_CASES,
-        *light.UNFOUND_CASES,
-    ]
+LISTED = (
+    *light.COLOURS_CASES,
+    *light.LIGHTS_CASES,
+    *geometry.PLACES_CASES,
+    *geometry.ROUGHNESS_CASES,
+    *light.FILMS_CASES,
+    *geometry.GLASS_CASES,
+    *light.LOSSES_CASES,
+    *geometry.MOTION_CASES,
+    *light.UNFOUND_CASES,
 )
+
+#: By name, of which no two cases have the same.
+CASES = {case.name: case for case in LISTED}
 
 
 def run_suite(
@@ -41,5 +31,5 @@ def run_suite(
 
     Raises KeyError where there is no such case.
     """
-    chosen = list(CASES.values()) if names is None else [CASES[name] for name in names]
-    return run_cases(chosen, estimators, seeds)
+    for name in CASES if names is None else names:
+        yield from run_case(CASES[name], estimators, seeds)

@@ -14,27 +14,40 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any
 
+import mitsuba as mi
 import numpy as np
 
-from reslrb_cli.measure.extreme.suite import Differences, Exact, Extrapolated, ExtremeCase, Stock, Twin
-from reslrb_cli.measure.scenes.analytic import camera, refraction_scene, slab_scene
-from reslrb_cli.measure.scenes.analytic import camera as pinhole
-from reslrb_cli.measure.scenes.moving import FILTER, Displacement, Move, Number, Pose, grid, mesh, smooth_fields, waves
-from reslrb_cli.measure.scenes.moving_light import TOP, vertices
-from reslrb_cli.measure.scenes.small import bitmap, diffuse, rgb, room, transform
+from reslrb_cli.measure.extreme.suite import Differences, Extrapolated, ExtremeCase, Stock, Twin, exact
+from reslrb_cli.measure.scenes.analytic import DOWN, POOL, SLAB, UP, refraction_scene, slab_scene
+from reslrb_cli.measure.scenes.moving import (
+    FILTER,
+    Displacement,
+    Move,
+    Number,
+    Pose,
+    grid,
+    mesh,
+    smooth_fields,
+    vertices,
+    waves,
+)
+from reslrb_cli.measure.scenes.small import (
+    bitmap,
+    diffuse,
+    glass,
+    lit_square,
+    look_at,
+    pinhole,
+    rectangle,
+    rgb,
+    room,
+    transform,
+)
 
 FLOOR = "floor.brdf_0.reflectance.value"
-
-
 WALL = "wall.brdf_0.reflectance.value"
-
-
 LAMP = "lamp.emitter.radiance.value"
-
-
 VEIL = "veil.bsdf.nested_bsdf.brdf_0.reflectance.value"
-
-
 OPACITY = "veil.bsdf.opacity.value"
 
 
@@ -42,68 +55,46 @@ def veiled(opacity: Any, **changes: Any) -> dict:
     """A sheet between lamp and floor, and between camera and wall."""
     bsdf = {"type": "mask", "opacity": opacity, "id": "veil_bsdf",
             "bsdf": {"type": "twosided", "bsdf": diffuse(0.7, 0.6, 0.3)}}  # fmt: skip
-    place = transform(translate=[0.1, 0.2, 0.2], rotate=([1, 0, 0], -80), scale=0.5)
-    return room(veil={"type": "rectangle", "to_world": place, "bsdf": bsdf}, **changes)
+    veil = rectangle(bsdf, translate=[0.1, 0.2, 0.2], rotate=([1, 0, 0], -80), scale=0.5)
+    return room(veil=veil, **changes)
 
 
 def nested() -> dict:
     """A ball of glass in a ball of water, out of the camera's view of the floor below."""
-    water = {"type": "dielectric", "int_ior": 1.33, "ext_ior": 1.0, "specular_transmittance": rgb(0.9, 0.8, 0.7)}
-    glass = {"type": "dielectric", "int_ior": 1.5, "ext_ior": 1.33, "specular_transmittance": rgb(0.7, 0.8, 0.9),
-             "specular_reflectance": rgb(0.9, 0.6, 0.8)}  # fmt: skip
+    water = glass(1.33, specular_transmittance=rgb(0.9, 0.8, 0.7))
+    inner = glass(1.5, 1.33, specular_transmittance=rgb(0.7, 0.8, 0.9), specular_reflectance=rgb(0.9, 0.6, 0.8))
     return {
         "type": "scene",
         "camera": pinhole([0, 0.3, 0], [0, 0, 0], [0, 0, -1], 80),
-        "floor": {"type": "rectangle", "bsdf": diffuse(0.7, 0.5, 0.6),
-                  "to_world": transform(rotate=([1, 0, 0], -90), scale=2)},
+        "floor": rectangle(diffuse(0.7, 0.5, 0.6), rotate=UP, scale=2),
         "water": {"type": "sphere", "center": [0, 1, 0], "radius": 0.6, "bsdf": water},
-        "glass": {"type": "sphere", "center": [0.1, 1, 0], "radius": 0.35, "bsdf": glass},
-        "lamp": {"type": "rectangle", "bsdf": diffuse(0, 0, 0), "emitter": {"type": "area", "radiance": rgb(9, 8, 7)},
-                 "to_world": transform(translate=[0, 2.2, 0], rotate=([1, 0, 0], 90), scale=0.5)},
-    }  # fmt: skip
+        "glass": {"type": "sphere", "center": [0.1, 1, 0], "radius": 0.35, "bsdf": inner},
+        "lamp": lit_square(rgb(9, 8, 7), translate=[0, 2.2, 0], rotate=DOWN, scale=0.5),
+    }
 
 
 def critical() -> dict:
     """A beam in a medium of index 1.5 that meets its flat surface, y = 0, at the critical angle, and the bottom that
     total reflection lights."""
-    import mitsuba as mi
-
     theta = float(np.arcsin(1 / 1.5))
     start = [-float(np.sin(theta)), -float(np.cos(theta)), 0.0]
-    aim = mi.ScalarTransform4f().look_at(origin=start, target=[0, 0, 0], up=[0, 0, 1])
     below = [4 * float(np.tan(theta)), -4.0, 0.0]
-    surface = {"type": "dielectric", "int_ior": 1.5, "ext_ior": 1.0, "specular_reflectance": rgb(0.9, 0.7, 0.5)}
     return {
         "type": "scene",
         "camera": pinhole([below[0], -3, 2], below, [0, 1, 0], 20),
-        "surface": {"type": "rectangle", "bsdf": surface,
-                    "to_world": transform(rotate=([1, 0, 0], -90), scale=3)},
-        "floor": {"type": "rectangle", "bsdf": diffuse(0.7, 0.5, 0.6),
-                  "to_world": transform(translate=below, rotate=([1, 0, 0], -90), scale=2)},
-        "lamp": {"type": "rectangle", "bsdf": diffuse(0, 0, 0), "to_world": aim @ mi.ScalarTransform4f().scale(0.5),
-                 "emitter": {"type": "directionalarea", "radiance": rgb(3, 2, 4)}},
-    }  # fmt: skip
+        "surface": rectangle(glass(specular_reflectance=rgb(0.9, 0.7, 0.5)), rotate=UP, scale=3),
+        "floor": rectangle(diffuse(0.7, 0.5, 0.6), translate=below, rotate=UP, scale=2),
+        "lamp": _parallel(start, [0, 0, 0], 0.5, rgb(3, 2, 4)),
+    }
 
 
-def refraction(ior: float) -> Any:
-    return refraction_scene(ior=ior)
+def _parallel(start: list[float], end: list[float], half: float, radiance: dict) -> dict:
+    """Parallel light from a square at `start` towards `end`."""
+    return lit_square(radiance, look_at(start, end) @ transform(scale=half), "directionalarea")
 
 
-def slab(ior: float, degrees: float, max_depth: int) -> Any:
-    return slab_scene(ior=ior, degrees=degrees, max_depth=max_depth)
-
-
-SURFACE = ("plane.bsdf.reflectance.value", "light.intensity.value", "surface.bsdf.specular_transmittance.value")
-
-
-SLAB = ("plane.bsdf.reflectance.value", "lamp.emitter.radiance.value", "top.bsdf.specular_transmittance.value",
-        "top.bsdf.specular_reflectance.value")  # fmt: skip
-
-
-def _exact(name: str, about: str, known: Any, keys: tuple[str, ...], max_depth: int, **more: Any) -> ExtremeCase:
-    return ExtremeCase(name, about, lambda: known().scene(), keys, Exact(known), image="ptracer", spp=512,
-                       options={"max_depth": max_depth}, **more)  # fmt: skip
-
+#: What paths from the sensor hardly find is compared with an image of paths from the light.
+TRACED: dict[str, Any] = {"image": "ptracer", "spp": 512}
 
 GLASS_CASES = [
     ExtremeCase("opacity_0", "a mask that is not there", lambda: veiled(0.0), (FLOOR, LAMP), Stock("prb"), spp=128),
@@ -124,44 +115,27 @@ GLASS_CASES = [
     ExtremeCase("critical_angle", "a beam that is totally reflected at the critical angle", critical,
                 ("surface.bsdf.specular_reflectance.value", "floor.bsdf.reflectance.value"), Stock("ptracer"),
                 image="ptracer", spp=512),
-    _exact("refraction", "a point light over a pool", lambda: refraction(1.5), SURFACE, 3),
-    _exact("index_1", "the same without a change of index", lambda: refraction(1.0), SURFACE, 3),
-    _exact("index_3", "the same with index 3", lambda: refraction(3.0), SURFACE, 3),
-    _exact("slab", "a beam through a glass slab, reflected inside it up to six times", lambda: slab(1.5, 40, 10), SLAB,
-           10, seeds=24),
-    _exact("slab_index_3_grazing", "index 3 at 85 degrees: most of the light is reflected",
-           lambda: slab(3.0, 85, 10), SLAB, 10),
+    exact("refraction", "a point light over a pool", refraction_scene, POOL, 3, **TRACED),
+    exact("index_1", "the same without a change of index", lambda: refraction_scene(1.0), POOL, 3, **TRACED),
+    exact("index_3", "the same with index 3", lambda: refraction_scene(3.0), POOL, 3, **TRACED),
+    exact("slab", "a beam through a glass slab, reflected inside it up to six times",
+          lambda: slab_scene(1.5, 40, 10), SLAB, 10, seeds=24, **TRACED),
+    exact("slab_index_3_grazing", "index 3 at 85 degrees: most of the light is reflected",
+          lambda: slab_scene(3.0, 85, 10), SLAB, 10, **TRACED),
 ]  # fmt: skip
 
-
 SIZE = 24
-
+TOP = "top.vertex_positions"
 
 #: Ten ray offsets where a thin slab is: 8.9e-5 (1 + max |p|) each.
 THIN = 10 * 8.9e-5 * (1 + 2.5)
-
-
 Moves = Callable[[Any], Sequence[Move]]
-
-
-def glass(ior: float = 1.5, alpha: float = 0) -> dict:
-    """Smooth glass, or rough."""
-    index = {"int_ior": ior, "ext_ior": 1.0}
-    return {"type": "roughdielectric", "alpha": alpha} | index if alpha else {"type": "dielectric"} | index
 
 
 def beam(origin: tuple[float, float], target: tuple[float, float], half: float, scale: float = 1) -> dict:
     """Parallel light in the plane z = 0, from (x, y) to (x, y), with a square cross-section."""
-    import mitsuba as mi
-
     start, end = ([scale * x, scale * y, 0.0] for x, y in (origin, target))
-    aim = mi.ScalarTransform4f().look_at(origin=start, target=end, up=[0, 0, 1])
-    return {
-        "type": "rectangle",
-        "to_world": aim @ mi.ScalarTransform4f().scale(scale * half),
-        "bsdf": diffuse(0, 0, 0),
-        "emitter": {"type": "directionalarea", "radiance": rgb(9, 8, 7)},
-    }
+    return _parallel(start, end, scale * half, rgb(9, 8, 7))
 
 
 def steep(scale: float = 1) -> dict:
@@ -170,34 +144,26 @@ def steep(scale: float = 1) -> dict:
 
 
 def pool(
-    bsdf: dict,
-    light: dict,
-    slope: float = 1,
-    height: float = 1.8,
-    thickness: float = 0,
-    scale: float = 1,
+    bsdf: dict, light: dict, slope: float = 1, height: float = 1.8, thickness: float = 0, scale: float = 1,
     cells: int = 128,
-) -> dict:
+) -> dict:  # fmt: skip
     """A receiver in glass, whose surface has waves; with a `thickness` it is a slab, and the receiver below it.
 
     `slope` is that of the waves, as a multiple of one tenth. Everything is `scale` times as large. The faces of its
     `cells` leave an error of their own, which falls with the square of their number (docs/method.md).
     """
-    seen = camera([0, scale, 0], [0, 0, 0], [0, 0, -1], 90, SIZE)
-    seen["film"]["rfilter"] = FILTER
-    seen |= {"near_clip": 1e-2 * scale, "far_clip": 1e3 * scale}
+    seen = pinhole([0, scale, 0], [0, 0, 0], [0, 0, -1], 90, SIZE, rfilter=FILTER)
     positions, faces, uv = grid(cells, lambda x, z: height + slope * waves(x, z), 2.5)
-    floor = transform(rotate=([1, 0, 0], -90), scale=20 * scale)
     scene = {
         "type": "scene",
-        "camera": seen,
-        "floor": {"type": "rectangle", "bsdf": diffuse(0.8, 0.7, 0.6), "to_world": floor},
+        "camera": seen | {"near_clip": 1e-2 * scale, "far_clip": 1e3 * scale},
+        "floor": rectangle(diffuse(0.8, 0.7, 0.6), rotate=UP, scale=20 * scale),
         "lamp": light,
         "top": mesh(scale * positions, faces, bsdf, uv),
     }
     if thickness:
-        place = transform(translate=[0, scale * (height - thickness), 0], rotate=([1, 0, 0], 90), scale=3 * scale)
-        scene["bottom"] = {"type": "rectangle", "bsdf": bsdf, "to_world": place}
+        below = [0, scale * (height - thickness), 0]
+        scene["bottom"] = rectangle(bsdf, translate=below, rotate=DOWN, scale=3 * scale)
     return scene
 
 
@@ -225,8 +191,9 @@ def moving_slab(slope: float = 1, thickness: float = 0.2, scale: float = 1) -> C
     return lambda: pool(glass(), steep(scale), slope, thickness=thickness, scale=scale)
 
 
-def surface(ior: float = 1.5, alpha: float = 0, slope: float = 1) -> Callable[[], dict]:
-    return lambda: pool(glass(ior, alpha), steep(), slope)
+def surface(ior: float = 1.5, slope: float = 1, **rough: Any) -> Callable[[], dict]:
+    """A receiver in smooth glass, or in rough."""
+    return lambda: pool(glass(ior) | rough, steep(), slope)
 
 
 def totally_reflected() -> dict:
@@ -248,6 +215,8 @@ def moved(name: str, about: str, scene: Callable[[], dict], step: float = 0.01, 
                        options={"max_depth": depth}, moves=moves or bending(), **more)  # fmt: skip
 
 
+ROUGH: dict[str, Any] = {"type": "roughdielectric", "alpha": 0.1}
+
 MOTION_CASES = [
     moved("slope_0", "a flat surface of glass that begins to bend", surface(slope=0)),
     moved("slope_1e-6", "slopes of a millionth", surface(slope=1e-5)),
@@ -256,27 +225,22 @@ MOTION_CASES = [
     moved("total_reflection", "a surface with waves, beyond the critical angle", totally_reflected, 0.0015),
     moved("grazing_85", "light at 85 degrees on glass", lambda: grazing(85), 0.005, moves=bending(0.1)),
     moved("parallel_faces", "a slab with flat faces that begins to bend", moving_slab(0), depth=4),
-    moved(
-        "thin_slab", "a slab of ten ray offsets", moving_slab(0, THIN), depth=4, moves=bending(THIN), step=0.1, spp=256
-    ),
+    moved("thin_slab", "a slab of ten ray offsets", moving_slab(0, THIN), 0.1, depth=4, moves=bending(THIN), spp=256),
     moved("moved_index_1", "glass of index 1, and the lamp over it", surface(1.0), moves=with_lamp),
     moved("moved_index_3", "glass of index 3", surface(3.0)),
-    moved("moved_rough_1.001", "rough glass of index 1.001, and the lamp over it", surface(1.001, 0.1),
+    moved("moved_rough_1.001", "rough glass of index 1.001, and the lamp over it", surface(1.001, **ROUGH),
           moves=with_lamp, equal=1e-3),
-    moved("moved_rough_3", "rough glass of index 3", surface(3.0, 0.1), equal=1e-3),
+    moved("moved_rough_3", "rough glass of index 3", surface(3.0, **ROUGH), equal=1e-3),
     moved("millimetres", "a slab a thousand times its size", moving_slab(scale=1e3), depth=4, moves=bending(1, 1e3)),
     moved("shrunk_to_0.03", "a slab three hundredths of its size", moving_slab(scale=0.03), depth=4,
           moves=bending(1, 0.03), left=5e-3),
 ]  # fmt: skip
-
 
 AWAY = [60.0, 60.0, 52.9]  # 100 from the origin
 
 
 def placed(scale: float = 1, offset: Any = (0, 0, 0)) -> dict:
     """The room, scaled about the origin and then moved; radiance makes its image the same."""
-    import mitsuba as mi
-
     scene = room()
     move = transform(translate=list(offset), scale=scale)
     for name, item in scene.items():
@@ -297,16 +261,13 @@ def turned_panes() -> dict:
     """Two sheets that scatter on one side: one turns its back on the camera, the other on the lamp."""
 
     def pane(tilt: float, **place: Any) -> dict:
-        return {"type": "rectangle", "bsdf": diffuse(0.8, 0.6, 0.7),
-                "to_world": transform(**place, rotate=([1, 0, 0], tilt), scale=0.35)}  # fmt: skip
+        return rectangle(diffuse(0.8, 0.6, 0.7), **place, rotate=([1, 0, 0], tilt), scale=0.35)
 
     return room(first=pane(160, translate=[0.4, -0.2, 0.6]), second=pane(40, translate=[-0.4, -0.3, 0.5]))
 
 
 def octahedron(*reflectance: float) -> dict:
     """A solid of eight flat faces that is shaded as a sphere."""
-    import mitsuba as mi
-
     properties = mi.Properties()
     properties["mesh_bsdf"] = mi.load_dict(diffuse(*reflectance))
     mesh = mi.Mesh("solid", 6, 8, has_vertex_normals=True, props=properties)
@@ -329,13 +290,8 @@ def normal_map() -> dict:
 
 def vertical_light() -> dict:
     """A lamp that stands on the floor's edge: nearly all its light on the floor arrives at grazing angles."""
-    side = {
-        "type": "rectangle",
-        "bsdf": diffuse(0, 0, 0),
-        "emitter": {"type": "area", "radiance": rgb(9, 8, 7)},
-        "to_world": transform(translate=[0, -0.99, 0.999], rotate=([0, 1, 0], 180), scale=[1, 0.01, 1]),
-    }
-    return room(lamp=side)
+    place = transform(translate=[0, -0.99, 0.999], rotate=([0, 1, 0], 180), scale=[1, 0.01, 1])
+    return room(lamp=lit_square(rgb(9, 8, 7), place))
 
 
 PLACES_CASES = [
@@ -360,78 +316,56 @@ PLACES_CASES = [
                 ("floor.nested_bsdf.reflectance.value", WALL), Stock("prb"), spp=512),
 ]  # fmt: skip
 
-
 RECEIVER = "floor.bsdf.reflectance.value"
-
-
-def _horizontal(y: float, half: float, turn: float = -90) -> Any:
-    return transform(translate=[0, y, 0], rotate=([1, 0, 0], turn), scale=half)
 
 
 def reflected(bsdf: dict) -> dict:
     """A lamp shines on an upright plate, which reflects it on the floor."""
     return {
         "type": "scene",
-        "camera": camera([0, 0.9, 0], [0, 0, 0], [0, 0, -1], 60),
-        "floor": {"type": "rectangle", "bsdf": diffuse(0.7, 0.5, 0.6), "to_world": _horizontal(0, 2)},
-        "plate": {"type": "rectangle", "bsdf": bsdf,
-                  "to_world": transform(translate=[-1, 1, 0], rotate=([0, 1, 0], 90))},
-        "lamp": {"type": "rectangle", "bsdf": diffuse(0, 0, 0), "emitter": {"type": "area", "radiance": rgb(5, 6, 4)},
-                 "to_world": transform(translate=[0.8, 1.3, 0], rotate=([0, 1, 0], -90), scale=0.4)},
-    }  # fmt: skip
+        "camera": pinhole([0, 0.9, 0], [0, 0, 0], [0, 0, -1], 60),
+        "floor": rectangle(diffuse(0.7, 0.5, 0.6), translate=[0, 0, 0], rotate=UP, scale=2),
+        "plate": rectangle(bsdf, translate=[-1, 1, 0], rotate=([0, 1, 0], 90)),
+        "lamp": lit_square(rgb(5, 6, 4), translate=[0.8, 1.3, 0], rotate=([0, 1, 0], -90), scale=0.4),
+    }
 
 
 def transmitted(bsdf: dict) -> dict:
     """A lamp shines through a horizontal plate on the floor; the camera stands between the two."""
     return reflected(bsdf) | {
-        "plate": {"type": "rectangle", "bsdf": bsdf, "to_world": _horizontal(1, 2)},
-        "lamp": {"type": "rectangle", "bsdf": diffuse(0, 0, 0), "emitter": {"type": "area", "radiance": rgb(5, 6, 4)},
-                 "to_world": _horizontal(1.8, 0.5, 90)},
-    }  # fmt: skip
+        "plate": rectangle(bsdf, translate=[0, 1, 0], rotate=UP, scale=2),
+        "lamp": lit_square(rgb(5, 6, 4), translate=[0, 1.8, 0], rotate=DOWN, scale=0.5),
+    }
 
 
 def close() -> dict:
     """A narrow beam that falls on the floor, and a camera that looks at nothing else."""
     return {
-        "camera": camera([0, 0.9, 0], [0, 0, 0], [0, 0, -1], 4),
-        "lamp": {"type": "rectangle", "bsdf": diffuse(0, 0, 0), "to_world": _horizontal(1.8, 0.01, 90),
-                 "emitter": {"type": "directionalarea", "radiance": rgb(5, 6, 4)}},
-    }  # fmt: skip
+        "camera": pinhole([0, 0.9, 0], [0, 0, 0], [0, 0, -1], 4),
+        "lamp": lit_square(rgb(5, 6, 4), None, "directionalarea", translate=[0, 1.8, 0], rotate=DOWN, scale=0.01),
+    }
 
 
-def conductor(alpha: float) -> dict:
-    return reflected({"type": "roughconductor", "alpha": alpha, "specular_reflectance": rgb(0.9, 0.7, 0.5)})
-
-
-def dielectric(alpha: float) -> dict:
-    return transmitted({"type": "roughdielectric", "alpha": alpha, "specular_transmittance": rgb(0.9, 0.7, 0.5)})
-
-
-def plastic(alpha: float) -> dict:
-    return reflected({"type": "roughplastic", "alpha": alpha, "diffuse_reflectance": rgb(0.1, 0.2, 0.3),
-                      "specular_reflectance": rgb(0.9, 0.7, 0.5)})  # fmt: skip
-
-
-def principled(roughness: float) -> dict:
-    return reflected({"type": "principled", "roughness": roughness, "metallic": 0.9, "base_color": rgb(0.9, 0.7, 0.5)})
-
-
-#: Maker, colour of the lobe, and roughness, where that is a parameter.
-KINDS = {
-    "roughconductor": (conductor, "specular_reflectance", "alpha"),
-    "roughdielectric": (dielectric, "specular_transmittance", "alpha"),
-    "roughplastic": (plastic, "specular_reflectance", None),
-    "principled": (principled, "base_color", "roughness"),
+#: Of each kind of BSDF what stands around it, its options, the colour of its lobe and its roughness by their names, and
+#: whether the roughness is a parameter.
+KINDS: dict[str, tuple[Callable[[dict], dict], dict, str, str, bool]] = {
+    "roughconductor": (reflected, {}, "specular_reflectance", "alpha", True),
+    "roughdielectric": (transmitted, {}, "specular_transmittance", "alpha", True),
+    "roughplastic": (reflected, {"diffuse_reflectance": rgb(0.1, 0.2, 0.3)}, "specular_reflectance", "alpha", False),
+    "principled": (reflected, {"metallic": 0.9}, "base_color", "roughness", True),
 }
+
+
+def plate(kind: str, roughness: str) -> dict:
+    """Light by way of a plate with a BSDF of this kind."""
+    around, options, colour, own, _ = KINDS[kind]
+    return around({"type": kind, own: float(roughness), colour: rgb(0.9, 0.7, 0.5), **options})
 
 
 ROUGHNESS = ("1", "0.1", "1e-2", "1e-4")
 
-
 #: Roughnesses whose derivative is decided where light follows them. `principled` chooses a lobe: it has none such.
 FOLLOWED = [(kind, roughness) for kind in ("roughconductor", "roughdielectric") for roughness in ("0.1", "1e-2")]
-
-
 NOISE = "the noise of a roughness's derivative grows as 1 / roughness: equal seeds decide"
 
 
@@ -441,26 +375,16 @@ def followed(kind: str, roughness: str) -> str:
 
 
 def _case(kind: str, roughness: str) -> ExtremeCase:
-    make, colour, own = KINDS[kind]
-    colour, keys = f"plate.bsdf.{colour}.value", [RECEIVER]
-    open_ended, elsewhere = {}, {}
-    if own is not None:
-        keys.append(f"plate.bsdf.{own}.value")
-        if (kind, roughness) in FOLLOWED:
-            elsewhere[keys[-1]] = followed(kind, roughness)
-        elif float(roughness) <= 0.1:
-            open_ended[keys[-1]] = NOISE
+    _, _, colour, own, is_parameter = KINDS[kind]
+    key = f"plate.bsdf.{own}.value"
+    is_followed = is_parameter and (kind, roughness) in FOLLOWED
+    is_noisy = is_parameter and not is_followed and float(roughness) <= 0.1
     return ExtremeCase(
-        f"{kind}_{roughness}",
-        f"light by way of a {kind} of roughness {roughness}",
-        lambda: make(float(roughness)),
-        (colour, *keys),
-        Stock("prb"),
-        spp=256,
-        signed=own is not None,
-        open_ended=open_ended,
-        elsewhere=elsewhere,
-    )
+        f"{kind}_{roughness}", f"light by way of a {kind} of roughness {roughness}", lambda: plate(kind, roughness),
+        (f"plate.bsdf.{colour}.value", RECEIVER, *([key] if is_parameter else [])), Stock("prb"), spp=256,
+        signed=is_parameter, open_ended={key: NOISE} if is_noisy else {},
+        elsewhere={key: followed(kind, roughness)} if is_followed else {},
+    )  # fmt: skip
 
 
 def _followed(kind: str, roughness: str) -> ExtremeCase:
@@ -469,32 +393,21 @@ def _followed(kind: str, roughness: str) -> ExtremeCase:
     What nearly smooth glass blurs is less than a pixel of the camera above, and next to nothing of its derivative is
     left: a closer one looks at a narrow beam.
     """
-    make, _, own = KINDS[kind]
 
     def scene() -> dict:
-        made = make(float(roughness))
+        made = plate(kind, roughness)
         if (kind, roughness) == ("roughdielectric", "1e-2"):
             made |= close()
         made["camera"]["film"]["rfilter"] = FILTER  # a box filter has no derivative by where light lands
         return made
 
     return ExtremeCase(
-        followed(kind, roughness),
-        f"how light follows the roughness {roughness} of a {kind}",
-        scene,
-        (),
-        Extrapolated(0.05 * float(roughness), 2e-3),
-        image="",
-        spp=256,
-        signed=True,
+        followed(kind, roughness), f"how light follows the roughness {roughness} of a {kind}", scene, (),
+        Extrapolated(0.05 * float(roughness), 2e-3), image="", spp=256, signed=True,
         options={"max_depth": 3},  # from the plate to the floor, and no farther: beyond it are edges at rest
-        ours={"attached": True},
-        equal=5e-4,
-        moves=lambda scene: [Number(f"plate.bsdf.{own}.value")],
-    )
+        ours={"attached": True}, equal=5e-4, moves=lambda scene: [Number("plate.bsdf.alpha.value")],
+    )  # fmt: skip
 
 
 ROUGHNESS_CASES = [_case(kind, roughness) for kind in KINDS for roughness in ROUGHNESS]
-
-
 ROUGHNESS_CASES += [_followed(kind, roughness) for kind, roughness in FOLLOWED]

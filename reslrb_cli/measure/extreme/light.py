@@ -12,19 +12,36 @@ from __future__ import annotations
 
 from typing import Any
 
+import mitsuba as mi
 import numpy as np
 
-from reslrb_cli.measure.extreme.suite import Differences, Exact, ExtremeCase, Stock, Twin, Zero
-from reslrb_cli.measure.scenes.analytic import RADIANCE, KnownScene, furnace_scene, speck_in_view, texels_over_plane
-from reslrb_cli.measure.scenes.analytic import camera as pinhole
-from reslrb_cli.measure.scenes.small import bitmap, camera, diffuse, lamp, rgb, room, texture, transform
+from reslrb_cli.measure.extreme.suite import Differences, ExtremeCase, Stock, Twin, Zero, exact
+from reslrb_cli.measure.scenes.analytic import (
+    DOWN,
+    FURNACE,
+    RADIANCE,
+    KnownScene,
+    furnace_scene,
+    speck_in_view,
+    texels_over_plane,
+)
+from reslrb_cli.measure.scenes.small import (
+    bitmap,
+    camera,
+    diffuse,
+    lamp,
+    lit_square,
+    look_at,
+    pinhole,
+    rectangle,
+    rgb,
+    room,
+    texture,
+    transform,
+)
 
 FLOOR = "floor.brdf_0.reflectance.data"
-
-
 WALL = "wall.brdf_0.reflectance.value"
-
-
 LAMP = "lamp.emitter.radiance.value"
 
 
@@ -39,32 +56,39 @@ def matte(reflectance: Any) -> dict:
     return {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": reflectance}}
 
 
+def dark(value: float) -> dict:
+    """The room, with a floor of which one texel is black, or nearly."""
+    return room(floor=matte(columns((value, value, value), (0.6, 0.3, 0.5))))
+
+
+def bright(value: float) -> dict:
+    """The room, with a floor and a wall that are white, or nearly."""
+    return room(floor=matte(columns((value, value, value), (value, 0.3, value))), wall=matte(rgb(value, value, value)))
+
+
+#: It plays from the second vertex on.
+ROULETTE = {"max_depth": 5, "rr_depth": 2}
+
 COLOURS_CASES = [
     ExtremeCase(
         "albedo_0_in_one_channel", "texels that are exactly 0 in one channel: ds/s is 0/0 there",
         lambda: room(floor=matte(columns((0.5, 0.0, 0.4), (0.6, 0.3, 0.0)))), (FLOOR, WALL), Differences(0.05, "up")),
     ExtremeCase(
         "albedo_0", "texels that are exactly 0 in all channels: throughput ends there, its derivative does not",
-        lambda: room(floor=matte(columns((0, 0, 0), (0.6, 0.3, 0.5)))), (FLOOR, WALL), Differences(0.05, "up")),
+        lambda: dark(0), (FLOOR, WALL), Differences(0.05, "up")),
     ExtremeCase(
         "albedo_0_roulette", "the same with Russian roulette, which knows throughput alone",
-        lambda: room(floor=matte(columns((0, 0, 0), (0.6, 0.3, 0.5)))), (FLOOR, WALL), Differences(0.05, "up"),
-        spp=256, options={"max_depth": 5, "rr_depth": 2}),
+        lambda: dark(0), (FLOOR, WALL), Differences(0.05, "up"), spp=256, options=ROULETTE),
     ExtremeCase(
         "albedo_1e-6", "texels a millionth above 0: what lies behind weighs a millionth, its derivative does not",
-        lambda: room(floor=matte(columns((1e-6, 1e-6, 1e-6), (0.6, 0.3, 0.5)))), (FLOOR, WALL), Stock("ptracer")),
+        lambda: dark(1e-6), (FLOOR, WALL), Stock("ptracer")),
     ExtremeCase(
-        "albedo_1e-6_roulette", "the same with Russian roulette",
-        lambda: room(floor=matte(columns((1e-6, 1e-6, 1e-6), (0.6, 0.3, 0.5)))), (FLOOR, WALL), Stock("ptracer"),
-        spp=256, options={"max_depth": 5, "rr_depth": 2}),
+        "albedo_1e-6_roulette", "the same with Russian roulette", lambda: dark(1e-6), (FLOOR, WALL), Stock("ptracer"),
+        spp=256, options=ROULETTE),
     ExtremeCase(
-        "albedo_1", "a floor and a wall that are exactly white",
-        lambda: room(floor=matte(columns((1, 1, 1), (1, 0.3, 1))), wall=matte(rgb(1, 1, 1))), (FLOOR, WALL),
-        Stock("ptracer")),
+        "albedo_1", "a floor and a wall that are exactly white", lambda: bright(1), (FLOOR, WALL), Stock("ptracer")),
     ExtremeCase(
-        "albedo_1-1e-6", "the same a millionth below 1",
-        lambda: room(floor=matte(columns((1 - 1e-6, 1 - 1e-6, 1 - 1e-6), (1 - 1e-6, 0.3, 1 - 1e-6))),
-                     wall=matte(rgb(1 - 1e-6, 1 - 1e-6, 1 - 1e-6))), (FLOOR, WALL), Stock("ptracer")),
+        "albedo_1-1e-6", "the same a millionth below 1", lambda: bright(1 - 1e-6), (FLOOR, WALL), Stock("ptracer")),
     ExtremeCase(
         "pure_colours", "red light on a green floor and a blue wall: the image is black, the derivative is not",
         lambda: room(floor=matte(columns((0, 0.8, 0), (0, 0.5, 0))), wall=matte(rgb(0, 0, 0.7)),
@@ -74,7 +98,7 @@ COLOURS_CASES = [
         "pure_colours_roulette", "each product is zero in a channel of its own, and roulette goes by the others",
         lambda: room(floor=matte(columns((0.9, 0, 0), (0, 0.9, 0))), wall=matte(rgb(0, 0.8, 0.8)),
                      side=matte(rgb(0.8, 0, 0.8)), lamp=lamp(radiance=rgb(5, 5, 0))), (FLOOR, WALL, LAMP),
-        Differences(0.05, "up"), spp=256, options={"max_depth": 5, "rr_depth": 2}),
+        Differences(0.05, "up"), spp=256, options=ROULETTE),
     ExtremeCase(
         "lamp_0", "a lamp of radiance 0: a black image, whose derivative is that of a white lamp",
         lambda: room(lamp=lamp(radiance=rgb(0, 0, 0))), (LAMP,), Differences(0.5, "up")),
@@ -83,12 +107,7 @@ COLOURS_CASES = [
 
 def seen(camera: dict, **change: Any) -> dict:
     """The room with a texture on its floor, of 2 x 2 texels, the least that Mitsuba takes."""
-    return room(camera=camera, floor={"type": "twosided", "bsdf": {
-        "type": "diffuse", "reflectance": texture(2, 2) | change}})  # fmt: skip
-
-
-def one_texel() -> dict:
-    return seen(camera(), to_uv=transform(scale=0.4))
+    return room(camera=camera, floor=matte(texture(2, 2) | change))
 
 
 def strip() -> dict:
@@ -97,27 +116,21 @@ def strip() -> dict:
     return seen(camera() | {"film": film, "fov": 0.2})
 
 
-def cropped(**film: Any) -> dict:
-    return seen(camera("tent", **film))
-
-
 FILMS_CASES = [
     ExtremeCase("one_pixel", "a film of one pixel", lambda: seen(camera(size=1)), (FLOOR, LAMP), Stock("ptracer"),
                 spp=8192),
     ExtremeCase("one_sample", "one light path for each of 256 pixels", lambda: seen(camera()), (FLOOR, LAMP),
                 Stock("ptracer"), spp=1, seeds=160),
-    ExtremeCase("one_texel", "one texel that covers all of the floor", one_texel, (FLOOR, LAMP), Stock("ptracer")),
+    ExtremeCase("one_texel", "one texel that covers all of the floor",
+                lambda: seen(camera(), to_uv=transform(scale=0.4)), (FLOOR, LAMP), Stock("ptracer")),
     ExtremeCase("film_1x4096", "a film of one column of 4096 pixels", strip, (FLOOR, LAMP), Stock("ptracer"),
                 spp=64),
     ExtremeCase("film_border", "a filter that reaches over the film's border, where samples are lost",
                 lambda: seen(camera("gaussian", size=4)), (FLOOR, LAMP), Stock("ptracer"), image="ptracer", spp=1024),
     ExtremeCase("film_crop", "a crop window of 3 x 2 pixels, and a filter that reaches over its border",
-                lambda: cropped(crop_offset_x=6, crop_offset_y=12, crop_width=3, crop_height=2), (FLOOR, LAMP),
-                Stock("ptracer"), image="ptracer", spp=512),
+                lambda: seen(camera("tent", crop_offset_x=6, crop_offset_y=12, crop_width=3, crop_height=2)),
+                (FLOOR, LAMP), Stock("ptracer"), image="ptracer", spp=512),
 ]  # fmt: skip
-
-
-ROULETTE = {"max_depth": 5, "rr_depth": 2}
 
 
 def lit(scale: float) -> dict:
@@ -139,8 +152,6 @@ def small_lamp(radiance: float) -> dict:
 
 def sun() -> dict:
     """A sky of 8 x 16 texels, one of which is a million times brighter than the others."""
-    import mitsuba as mi
-
     sky = np.random.default_rng(2).uniform(0.5, 1.5, (8, 16, 3)).astype(np.float32)
     sky[2, 5] = 1e6
     return room(lamp=None, sky={"type": "envmap", "bitmap": mi.Bitmap(sky)})
@@ -155,58 +166,43 @@ def skimming() -> dict:
 
 def speck() -> dict:
     """A hall lit by a beam on a speck that stands before the lens, at a ten thousandth of the walls' distance."""
-    import mitsuba as mi
 
     def facing(origin: list, target: list, half: float) -> Any:
-        aim = mi.ScalarTransform4f().look_at(origin=origin, target=target, up=[0, 1, 0])
-        return aim @ mi.ScalarTransform4f().scale(half)
+        return look_at(origin, target, [0, 1, 0]) @ transform(scale=half)
 
     at = [0.01, 0.0, -0.05]
     return {
         "type": "scene",
-        "camera": pinhole([0, 0, 0], [0, 0, -1], [0, 1, 0], 50) | {"near_clip": 1e-3},
+        "camera": pinhole([0, 0, 0], [0, 0, -1], [0, 1, 0], 50),
         "box": {"type": "cube", "flip_normals": True, "to_world": transform(translate=[0, 0, -100], scale=500),
                 "bsdf": diffuse(0.6, 0.7, 0.5)},
-        "speck": {"type": "rectangle", "bsdf": diffuse(0.5, 0.6, 0.8), "to_world": facing(at, [0.01, 0, 1], 2e-3)},
-        "lamp": {"type": "rectangle", "bsdf": diffuse(0, 0, 0), "to_world": facing([20, 8, 15], at, 5e-4),
-                 "emitter": {"type": "directionalarea", "radiance": rgb(3, 2, 4)}},
+        "speck": rectangle(diffuse(0.5, 0.6, 0.8), facing(at, [0.01, 0, 1], 2e-3)),
+        "lamp": lit_square(rgb(3, 2, 4), facing([20, 8, 15], at, 5e-4), "directionalarea"),
     }  # fmt: skip
 
 
 def away() -> dict:
     """The camera looks into the void."""
-    import mitsuba as mi
-
-    back = mi.ScalarTransform4f().look_at(origin=[1.2, 0.6, 4], target=[2.5, 1.4, 8], up=[0, 1, 0])
-    return room(camera=camera() | {"to_world": back})
+    return room(camera=camera() | {"to_world": look_at([1.2, 0.6, 4], [2.5, 1.4, 8], [0, 1, 0])})
 
 
-def white(max_depth: int) -> Any:
-    return furnace_scene((1, 1, 1), (0.5, 1, 2), max_depth, 4)
-
-
-def grey(max_depth: int) -> Any:
-    return furnace_scene((0.5, 0.8, 0.9), (1, 2, 0.5), max_depth, 8)
+def grey(max_depth: int, size: int = 8) -> KnownScene:
+    """A furnace whose light has a limit."""
+    return furnace_scene((0.5, 0.8, 0.9), (1, 2, 0.5), max_depth, size)
 
 
 def white_box() -> dict:
     """A closed white box that holds a white cube, behind which the camera does not see."""
-    import mitsuba as mi
-
-    view = mi.ScalarTransform4f().look_at(origin=[0.8, 0.7, 0.8], target=[-0.2, -0.2, -0.2], up=[0, 1, 0])
+    view = look_at([0.8, 0.7, 0.8], [-0.2, -0.2, -0.2], [0, 1, 0])
     return {
         "type": "scene",
         "camera": camera(size=8) | {"to_world": view, "fov": 80},
         "box": {"type": "cube", "flip_normals": True, "bsdf": diffuse(1, 0.99, 1)},
         "cube": {"type": "cube", "bsdf": diffuse(1, 1, 0.98),
                  "to_world": transform(rotate=([1, 2, 3], 40), scale=0.35)},
-        "lamp": lamp(radiance=rgb(3, 4, 5)) | {
-            "to_world": transform(translate=[0.2, 0.99, 0.2], rotate=([1, 0, 0], 90), scale=0.3),
-            "bsdf": diffuse(0.9, 0.9, 0.9)},
+        "lamp": lit_square(rgb(3, 4, 5), translate=[0.2, 0.99, 0.2], rotate=DOWN, scale=0.3)
+        | {"bsdf": diffuse(0.9, 0.9, 0.9)},
     }  # fmt: skip
-
-
-FURNACE = ("walls.bsdf.reflectance.value", "walls.emitter.radiance.value")
 
 
 LIGHTS_CASES = [
@@ -230,27 +226,20 @@ LIGHTS_CASES = [
                 ("speck.bsdf.reflectance.value", "box.bsdf.reflectance.value", LAMP), Stock("ptracer"),
                 image="ptracer", spp=256, options={"max_depth": 5}, residual=True),
     ExtremeCase("no_connection", "no light path connects to a sensor that looks away", away, (WALL, LAMP), Zero()),
-    ExtremeCase("furnace", "a closed furnace, 16 bounces", lambda: grey(16).scene(), FURNACE,
-                Exact(lambda: grey(16)), options={"max_depth": 16}, residual=True),
-    ExtremeCase("furnace_roulette", "a closed furnace without a depth limit: roulette alone ends its paths",
-                lambda: grey(-1).scene(), FURNACE, Exact(lambda: grey(-1)), spp=64, seeds=12,
-                options={"max_depth": -1, "rr_depth": 5}, residual=True),
-    ExtremeCase("furnace_1024", "a furnace of albedo 1, 1024 bounces", lambda: white(1024).scene(), FURNACE,
-                Exact(lambda: white(1024)), spp=256, image="", options={"max_depth": 1024}, naive=False, residual=True),
+    exact("furnace", "a closed furnace, 16 bounces", lambda: grey(16), FURNACE, 16, residual=True),
+    exact("furnace_roulette", "a closed furnace without a depth limit: roulette alone ends its paths",
+          lambda: grey(-1), FURNACE, -1, rr_depth=5, seeds=12, residual=True),
+    exact("furnace_1024", "a furnace of albedo 1, 1024 bounces",
+          lambda: furnace_scene((1, 1, 1), (0.5, 1, 2), 1024, 4), FURNACE, 1024, spp=256, image="", naive=False,
+          residual=True),
     ExtremeCase("white_box_100", "a white box with an obstacle, 100 bounces: more than have a bit for visibility",
                 white_box, ("box.bsdf.reflectance.value", "cube.bsdf.reflectance.value"), Stock("ptracer"),
                 image="ptracer", options={"max_depth": 100, "hide_emitters": True}, residual=True),
-    ExtremeCase("furnace_black", "a furnace of albedo 0, whose derivative is its first bounce",
-                lambda: furnace_scene((0, 0, 0), (1, 2, 0.5), 8, 8).scene(), FURNACE,
-                Exact(lambda: furnace_scene((0, 0, 0), (1, 2, 0.5), 8, 8)), options={"max_depth": 8}),
+    exact("furnace_black", "a furnace of albedo 0, whose derivative is its first bounce",
+          lambda: furnace_scene((0, 0, 0), (1, 2, 0.5), 8, 8), FURNACE, 8),
 ]  # fmt: skip
 
-
 LIT_FLOOR = "floor.brdf_0.reflectance.value"
-
-
-def negative(weights: np.ndarray) -> np.ndarray:
-    return -weights
 
 
 def mixed(weights: np.ndarray) -> np.ndarray:
@@ -270,20 +259,15 @@ def spoilt(value: float) -> Any:
     return spoil
 
 
-def one_pixel() -> Any:
-    """A furnace seen by a film of one pixel, so that all samples go into the same few sums."""
-    return furnace_scene((0.5, 0.8, 0.9), (1, 2, 0.5), 2, 1)
-
-
 def _sums(name: str, spp: int) -> ExtremeCase:
-    return ExtremeCase(name, f"{spp:.0e} samples in one pixel, in single precision", lambda: one_pixel().scene(),
-                       FURNACE, Exact(one_pixel), image="", spp=spp, seeds=1, options={"max_depth": 2}, naive=False,
-                       equal=5e-3)  # fmt: skip
+    """A furnace seen by a film of one pixel, so that all samples go into the same few sums."""
+    return exact(name, f"{spp:.0e} samples in one pixel, in single precision", lambda: grey(2, 1), FURNACE, 2, image="",
+                 spp=spp, seeds=1, naive=False, equal=5e-3)  # fmt: skip
 
 
 LOSSES_CASES = [
     ExtremeCase("negative_loss", "a loss with negative derivatives", room, (LIT_FLOOR, LAMP), Stock("ptracer"),
-                weights=negative, signed=True),
+                weights=np.negative, signed=True),
     ExtremeCase("mixed_loss", "a loss with derivatives of either sign, by channel and pixel", room, (LIT_FLOOR, LAMP),
                 Stock("ptracer"), weights=mixed, signed=True, spp=256),
     ExtremeCase("nan_loss", "NaN in the loss's derivative: refused and counted", room, (LIT_FLOOR, LAMP),
@@ -294,8 +278,9 @@ LOSSES_CASES = [
     _sums("sums_1e8", 10**8),
 ]  # fmt: skip
 
-
+#: The parameters of `texels_over_plane`.
 PLANE = "plane.bsdf.reflectance.value"
+TEXELS = {"albedo": PLANE, "texels": f"{RADIANCE}.data"}
 
 
 def unfound_speck() -> KnownScene:
@@ -310,18 +295,12 @@ def spots() -> KnownScene:
     return texels_over_plane(texels)
 
 
-def black() -> KnownScene:
-    """No texel that is not black."""
-    return texels_over_plane(np.zeros((2, 2, 3)))
-
-
 UNFOUND_CASES = [
-    ExtremeCase("lamp_of_a_thousandth_of_a_pixel", "a lamp in view that one primary ray in a thousand hits",
-                lambda: unfound_speck().scene(), (f"{RADIANCE}.value",), Exact(unfound_speck), image="ptracer",
-                options={"max_depth": 1}),
-    ExtremeCase("black_texels", "a lamp with texels that are black, and drawn in proportion to their radiance: never",
-                lambda: spots().scene(), (PLANE, f"{RADIANCE}.data"), Exact(spots), spp=256, options={"max_depth": 2}),
-    ExtremeCase("black_lamp", "a lamp with nothing but black texels: there is no density in proportion to them",
-                lambda: black().scene(), (PLANE, f"{RADIANCE}.data"), Exact(black), spp=256, options={"max_depth": 2},
-                open_ended={PLANE: "there is no light that it could reflect"}),
+    exact("lamp_of_a_thousandth_of_a_pixel", "a lamp in view that one primary ray in a thousand hits", unfound_speck,
+          {"radiance": LAMP}, 1, image="ptracer"),
+    exact("black_texels", "a lamp with texels that are black, and drawn in proportion to their radiance: never", spots,
+          TEXELS, 2, spp=256),
+    exact("black_lamp", "a lamp with nothing but black texels: there is no density in proportion to them",
+          lambda: texels_over_plane(np.zeros((2, 2, 3))), TEXELS, 2, spp=256,
+          open_ended={PLANE: "there is no light that it could reflect"}),
 ]  # fmt: skip

@@ -4,7 +4,7 @@
 - `residual`: what `gather`'s replay leaves of its sum: nothing but rounding, once every contribution has been taken off
   again.
 - `restore`, `kept`: going on with a suite, whose cases are whole or not there.
-- `run_cases`: every estimator of a case against naive AD of the same paths, and against the case's reference.
+- `run_case`: every estimator of a case against naive AD of the same paths, and against the case's reference.
 """
 
 from __future__ import annotations
@@ -20,18 +20,17 @@ from reslrb_cli.estimators.base import Pass
 from reslrb_cli.estimators.gather import Gathering, Taking
 from reslrb_cli.integrators.protocol import Job
 from reslrb_cli.integrators.reslrb import Reslrb
-from reslrb_cli.integrators.step import gradient_step, render_image
+from reslrb_cli.integrators.step import gradient_step
 from reslrb_cli.measure import resume_store
-from reslrb_cli.measure.comparison import Comparison, Family, compare_equal_seeds, compare_expectations, renders
-from reslrb_cli.measure.gradients import Case, integrator, seeds, smooth_weights
+from reslrb_cli.measure.comparison import Family, compare_equal_seeds, compare_expectations
+from reslrb_cli.measure.gradients import Case, integrator
 from reslrb_cli.measure.gradients import seeds as seeds_of
 from reslrb_cli.measure.resume_store import Earlier
 from reslrb_cli.measure.scenes.analytic import KnownScene
-from reslrb_cli.measure.scenes.moving import AMPLITUDES, Displaced, Move
-from reslrb_cli.measure.scenes.small import load
+from reslrb_cli.measure.scenes.moving import Move, moving_case
 from reslrb_cli.records.manifest import versions
 from reslrb_cli.records.measurement_files import Kept
-from reslrb_cli.records.measurements import GradcheckRecord, Kind, Reference, Verdict
+from reslrb_cli.records.measurements import Comparison, GradcheckRecord, Kind, Reference, Verdict
 
 Scene = Callable[[], dict]
 
@@ -55,7 +54,6 @@ class Stock:
     """A stock integrator in the same scene. Where roulette is on, the reference goes without it: see docs/method.md."""
 
     name: str
-    spp: int | None = None
 
     @property
     def reference(self) -> Reference:
@@ -63,31 +61,25 @@ class Stock:
 
     def samples(self, case: ExtremeCase, setup: Case) -> Samples:
         tracer = integrator(self.name, **without_roulette(case))
-        return Samples(setup.gradients(tracer, seeds(case.seeds, 1), self.spp or case.spp))
+        return Samples(setup.gradients(tracer, seeds_of(case.seeds, 1), case.spp))
 
 
 @dataclass(frozen=True)
 class Twin:
-    """A stock integrator in another scene, whose gradients are known multiples of this one's.
+    """`ptracer` in another scene, whose gradients are known multiples of this one's.
 
-    `factors` are by parameter; those that are not named are 1. `keys` are the parameters there, in our order.
+    `factors` are by parameter; those that are not named are 1.
     """
 
     scene: Scene
     factors: Mapping[str, float] = field(default_factory=dict)
-    keys: tuple[str, ...] = ()
-    name: str = "ptracer"
-
-    @property
-    def reference(self) -> Reference:
-        return Reference(self.name)
+    reference = Reference.PTRACER
 
     def samples(self, case: ExtremeCase, setup: Case) -> Samples:
-        keys = self.keys or case.keys
-        other = Case(self.scene(), keys)
+        other = Case(self.scene(), case.keys)
         other.weights = setup.weights
-        values = other.gradients(integrator(self.name, **without_roulette(case)), seeds(case.seeds, 1), case.spp)
-        scale = [np.full(len(other.initial[key]), self.factors.get(key, 1.0)) for key in keys]
+        values = other.gradients(integrator("ptracer", **without_roulette(case)), seeds_of(case.seeds, 1), case.spp)
+        scale = [np.full(len(other.initial[key]), self.factors.get(key, 1.0)) for key in case.keys]
         return Samples(values * np.concatenate(scale))
 
 
@@ -101,19 +93,16 @@ class Differences:
 
     step: float
     sides: str = "both"
-    along: int = 2
     reference = Reference.FINITE_DIFFERENCE
 
     def samples(self, case: ExtremeCase, setup: Case) -> Samples:
-        directions = setup.directions(self.along)
+        directions = setup.directions(2)
         along = directions if self.sides == "both" else np.abs(directions)
         tracer = integrator("reslrb", **without_roulette(case))
         paired = "rr_depth" not in case.options
-        values = [
-            [setup.difference(tracer, direction, seed, case.spp, self.step, self.sides) for direction in along]
-            for seed in seeds(case.seeds, 0 if paired else 1)
-        ]
-        return Samples(np.array(values), paired=paired, along=along)
+        chosen = seeds_of(case.seeds, 0 if paired else 1)
+        values = setup.differences(tracer, along, chosen, case.spp, self.step, self.sides)
+        return Samples(values, paired=paired, along=along)
 
 
 @dataclass(frozen=True)
@@ -131,10 +120,8 @@ class Extrapolated:
     def samples(self, case: ExtremeCase, setup: Case) -> Samples:
         along = np.eye(sum(len(value) for value in setup.initial.values()))
         tracer = integrator("reslrb", **without_roulette(case))
-        near, far = (
-            np.array([[setup.difference(tracer, d, seed, case.spp, step) for d in along] for seed in seeds(case.seeds)])
-            for step in (self.step, 2 * self.step)
-        )
+        chosen, steps = seeds_of(case.seeds), (self.step, 2 * self.step)
+        near, far = (setup.differences(tracer, along, chosen, case.spp, step) for step in steps)
         correction = (near - far) / 3
         values = near + correction
         size = float(np.sqrt(np.mean(np.square(values.mean(0)))))
@@ -183,7 +170,7 @@ def residual(case: ExtremeCase, setup: Case, seed: int = 1) -> Comparison:
     setup.release(leaves)
     found = float(sizes[0] / sizes[1])
     verdict = Verdict.HOLDS if found < LIMIT else Verdict.FAILS
-    return Comparison(verdict, None, relative_l2=found, relative_l2_limit=LIMIT, message="residual of the replay")
+    return Comparison(verdict, relative_l2=found, relative_l2_limit=LIMIT, message="residual of the replay")
 
 
 @dataclass(frozen=True)
@@ -224,14 +211,17 @@ class ExtremeCase:
         """The scene, loaded, with its parameters."""
         if self.moves is None:
             return Case(self.scene(), self.keys)
-        scene = load(self.scene())
-        case = Case.of(scene, [AMPLITUDES], values=Displaced(scene, self.moves(scene)))
-        case.weigh(smooth_weights(*case.weights.shape))
-        return case
+        return moving_case(self.scene(), self.moves)
 
-    def naive_options(self) -> dict[str, Any]:
-        """The options of `walk_ad`."""
-        return {**self.options, **self.ours} | ({} if self.moves is None else {"attached": True})
+
+def exact(
+    name: str, about: str, known: Callable[[], KnownScene], keys: Mapping[str, str], max_depth: int,
+    rr_depth: int | None = None, **more: Any,
+) -> ExtremeCase:  # fmt: skip
+    """A case whose image is known in closed form; `keys` are those of its parameters, `more` fields of the case."""
+    options = {"max_depth": max_depth} | ({} if rr_depth is None else {"rr_depth": rr_depth})
+    shared: dict[str, Any] = {"options": options, **more}
+    return ExtremeCase(name, about, lambda: known().scene(), tuple(keys.values()), Exact(known), **shared)
 
 
 def without_roulette(case: ExtremeCase) -> dict[str, Any]:
@@ -241,7 +231,6 @@ def without_roulette(case: ExtremeCase) -> dict[str, Any]:
 
 #: Of the root mean square of the sums.
 LIMIT = 1e-5
-
 
 #: What is kept says that it is of this.
 KIND = "gradcheck --suite"
@@ -277,53 +266,42 @@ def kept(settings: Mapping[str, Any], cases: Mapping[str, Sequence[GradcheckReco
 #: All z scores of the suite are corrected for together; a little more than it has.
 FAMILY = Family(rows=1500, entries=30000)
 
-
 #: What rounding may leave below zero, of the largest entry.
 BELOW_ZERO = 1e-5
 
 
-def run_cases(
-    cases: Iterable[ExtremeCase], estimators: Iterable[str] | None = None, seeds: int | None = None
+def run_case(
+    case: ExtremeCase, estimators: Iterable[str] | None = None, seeds: int | None = None
 ) -> Iterator[GradcheckRecord]:
-    """Run `cases` with these estimators (all of them by default); `seeds` replaces each case's own number."""
-    names = tuple(estimators) if estimators is not None else tuple(ESTIMATORS)
-    for case in cases:
-        yield from _run(case if seeds is None else replace(case, seeds=seeds), names)
-
-
-def _run(case: ExtremeCase, estimators: tuple[str, ...]) -> Iterator[GradcheckRecord]:
+    """Run a case with these estimators (all of them by default); `seeds` replaces its own number."""
+    case = case if seeds is None else replace(case, seeds=seeds)
     setup = case.setup()
     weights = np.array(setup.weights) if case.weights is None else case.weights(np.array(setup.weights))
     # What is refused of dL/dI counts as zero; references are never shown it.
     setup.weights = type(setup.weights)(np.where(np.isfinite(weights), weights, 0))
     reference = case.source.samples(case, setup)
-    walk_ad = integrator("walk_ad", **case.naive_options())
+    attached = {} if case.moves is None else {"attached": True}
+    walk_ad = integrator("walk_ad", **{**case.options, **case.ours, **attached})
     naive = setup.gradients(walk_ad, seeds_of(case.seeds), case.spp) if case.naive else None
     stock = _stock_images(case, setup) if case.image else None
     setup.weights = type(setup.weights)(weights)
-    for name in estimators if case.moves is None else [name for name in estimators if ESTIMATORS[name].attaches]:
-        taken = _steps(case, setup, name)
-        rows = list(_comparisons(case, setup, name, taken.gradients, naive, reference))
+    for name in ESTIMATORS if estimators is None else estimators:
+        if case.moves is not None and not ESTIMATORS[name].attaches:
+            continue
+        gradients, images, refused = _steps(case, setup, name)
+        rows = list(_comparisons(case, setup, name, gradients, naive, reference))
         if stock is not None:
-            rows.append((None, Reference(case.image), Kind.IMAGE, _images(taken.images, stock)))
+            rows.append((None, Reference(case.image), Kind.IMAGE, _images(images, stock)))
         if not np.isfinite(weights).all():
-            rows.append((None, Reference.ANALYTIC, Kind.EQUAL_SEEDS, _refusals(weights, taken.refused)))
+            rows.append((None, Reference.ANALYTIC, Kind.EQUAL_SEEDS, _refusals(weights, refused)))
         if case.residual and name == "gather":
             rows.append((None, Reference.ANALYTIC, Kind.EQUAL_SEEDS, residual(case, setup)))
         for parameter, other, kind, comparison in rows:
-            yield GradcheckRecord(case.name, parameter, "reslrb", name, other, kind, case.seeds, **comparison.figures)
+            yield GradcheckRecord(case.name, parameter, "reslrb", name, other, kind, case.seeds, **vars(comparison))
 
 
-@dataclass(frozen=True)
-class _Taken:
+def _steps(case: ExtremeCase, setup: Case, name: str) -> tuple[np.ndarray, np.ndarray, list[int]]:
     """Of an estimator's steps: gradients (N, P), images (N, H, W, 3), entries of dL/dI that were refused (N,)."""
-
-    gradients: np.ndarray
-    images: np.ndarray
-    refused: list[int]
-
-
-def _steps(case: ExtremeCase, setup: Case, name: str) -> _Taken:
     images, refused = [], []
 
     def step(*arguments: Any, **options: Any) -> None:
@@ -335,20 +313,19 @@ def _steps(case: ExtremeCase, setup: Case, name: str) -> _Taken:
     ours = {"attached_sampling": "follow"} | dict(case.ours)
     tracer = integrator("reslrb", **case.options, **ours, estimator=name)
     gradients = setup.gradients(tracer, seeds_of(case.seeds), case.spp, step=step)
-    return _Taken(gradients, np.stack(images), refused)
+    return gradients, np.stack(images), refused
 
 
 def _refusals(weights: np.ndarray, refused: list[int]) -> Comparison:
     """Whether every step counted just the entries of dL/dI that are not finite."""
-    expected = int(np.count_nonzero(~np.isfinite(weights)))
-    holds = set(refused) == {expected}
-    message = f"refused {', '.join(map(str, sorted(set(refused))))} entries of dL/dI, of {expected} not finite"
-    return Comparison(Verdict.HOLDS if holds else Verdict.FAILS, None, message=message)
+    expected, counts = int(np.count_nonzero(~np.isfinite(weights))), sorted(set(refused))
+    message = f"refused {', '.join(map(str, counts))} entries of dL/dI, of {expected} not finite"
+    return Comparison(Verdict.HOLDS if counts == [expected] else Verdict.FAILS, message=message)
 
 
 def _stock_images(case: ExtremeCase, setup: Case) -> np.ndarray:
     tracer = integrator(case.image, **without_roulette(case))
-    return renders(lambda seed: render_image(tracer, setup.scene, 0, seed, case.spp), seeds_of(case.seeds, 2))[..., :3]
+    return np.stack([setup.image(tracer, seed, case.spp) for seed in seeds_of(case.seeds, 2)])
 
 
 def _comparisons(
@@ -388,16 +365,20 @@ def _parameters(setup: Case) -> Iterator[tuple[str, slice, tuple[int, ...]]]:
 
 def _settled(case: ExtremeCase, parameter: str | None, found: Comparison, ours: np.ndarray) -> Comparison:
     """The comparison with what else has to hold; in a suite nothing is left open without a reason."""
-    if found.verdict is Verdict.UNREACHED and isinstance(case.source, Zero):
-        return replace(found, verdict=Verdict.HOLDS, message="exactly zero")
-    if found.verdict is Verdict.UNREACHED and parameter in case.open_ended:
-        return replace(found, verdict=Verdict.HOLDS, message="exactly zero, as the reference")
+    if found.verdict is Verdict.UNREACHED and (isinstance(case.source, Zero) or parameter in case.open_ended):
+        message = "exactly zero" if isinstance(case.source, Zero) else "exactly zero, as the reference"
+        return replace(found, verdict=Verdict.HOLDS, message=message)
     if found.verdict in (Verdict.UNREACHED, Verdict.HEAVY_TAILED, Verdict.UNRESOLVED):
         reason = case.open_ended.get(parameter or "")
         if reason is None:
             return replace(found, verdict=Verdict.FAILS, message=f"{found.verdict.value}: {found.message}")
         return replace(found, message=reason)
-    if found.verdict is Verdict.HOLDS and not case.signed and ours.min() < -BELOW_ZERO * np.abs(ours).max():
+    return found if case.signed else _not_negative(found, ours, BELOW_ZERO)
+
+
+def _not_negative(found: Comparison, ours: np.ndarray, share: float) -> Comparison:
+    """The comparison; it fails where an entry is below zero by more than this `share` of the largest."""
+    if found.verdict is Verdict.HOLDS and ours.min() < -share * np.abs(ours).max():
         return replace(found, verdict=Verdict.FAILS, message=f"negative: {ours.min():.3g}")
     return found
 
@@ -406,8 +387,6 @@ def _images(ours: np.ndarray, stock: np.ndarray) -> Comparison:
     shape = ours.shape[1:]
     flat, other = ours.reshape(len(ours), -1), stock.reshape(len(stock), -1)
     found = compare_expectations(flat, other, FAMILY, shape=shape, paired=False)
-    if found.verdict is Verdict.HOLDS and ours.min() < 0:
-        return replace(found, verdict=Verdict.FAILS, message=f"negative: {ours.min():.3g}")
     if found.verdict is Verdict.UNREACHED:
         return replace(found, verdict=Verdict.HOLDS, message="black")
-    return found
+    return _not_negative(found, ours, 0)

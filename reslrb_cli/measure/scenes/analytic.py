@@ -6,7 +6,7 @@ channel of the image depends on the same channel of a parameter alone.
 - `KnownScene`: a scene, as `mi.load_dict` takes it, beside its reference: `furnace_scene` and those after it.
 - `speck_in_view`, `texels_over_plane`: lamps that samples hardly find, or not at all, and whose images are known:
   specks, and those with black texels.
-- `furnace`, `point_over_plane`, `point_through_surface`, `beam_through_slab`: the images, in closed form.
+- `furnace`, `point_through_surface`, `beam_through_slab`: the images, in closed form.
 """
 
 from __future__ import annotations
@@ -15,10 +15,20 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+import mitsuba as mi
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from reslrb_cli.measure.scenes.small import SIZE, diffuse, rgb, transform
+from reslrb_cli.measure.scenes.small import (
+    SIZE,
+    diffuse,
+    glass,
+    lit_square,
+    look_at,
+    pinhole,
+    rectangle,
+    rgb,
+)
 
 Array = NDArray[np.float64]
 
@@ -29,10 +39,6 @@ class Known:
 
     image: Array
     derivatives: dict[str, Array]
-
-    def gradient(self, weights: ArrayLike) -> dict[str, Array]:
-        """Gradient (3,) of sum(image * weights) for each parameter; `weights` are (H, W, 3)."""
-        return {name: np.sum(np.asarray(weights, np.float64) * d, (0, 1)) for name, d in self.derivatives.items()}
 
 
 @dataclass(frozen=True)
@@ -45,29 +51,29 @@ class KnownScene:
     max_depth: int
 
     def gradient(self, weights: Any) -> np.ndarray:
-        """Gradient of sum(image * weights) in a row, parameters in the order of `keys`."""
-        gradients = self.known.gradient(weights)
-        return np.concatenate([gradients[name] for name in self.keys])
+        """Gradient of sum(image * weights) in a row, parameters in the order of `keys`; `weights` are (H, W, 3)."""
+        G = np.asarray(weights, np.float64)
+        return np.concatenate([np.sum(G * self.known.derivatives[name], (0, 1)) for name in self.keys])
 
 
-def camera(origin: list, target: list, up: list, fov: float, size: int = SIZE) -> dict:
-    """A pinhole camera whose image is a box filter's."""
-    import mitsuba as mi
+#: The parameters of these scenes, by the names of their derivatives.
+FURNACE = {"albedo": "walls.bsdf.reflectance.value", "emission": "walls.emitter.radiance.value"}
+POOL = {
+    "albedo": "plane.bsdf.reflectance.value",
+    "intensity": "light.intensity.value",
+    "transmittance": "surface.bsdf.specular_transmittance.value",
+}
 
-    return {
-        "type": "perspective",
-        "fov": fov,
-        "near_clip": 1e-3,
-        "to_world": mi.ScalarTransform4f().look_at(origin=origin, target=target, up=up),
-        "film": {"type": "hdrfilm", "width": size, "height": size, "pixel_format": "rgb", "rfilter": {"type": "box"}},
-        "sampler": {"type": "independent"},
-    }
+SLAB = {
+    "albedo": "plane.bsdf.reflectance.value",
+    "radiance": "lamp.emitter.radiance.value",
+    "transmittance": "top.bsdf.specular_transmittance.value",
+    "reflectance": "top.bsdf.specular_reflectance.value",
+}
 
-
-def _plane(bsdf: dict, y: float = 0) -> dict:
-    """A horizontal square of side 4 that faces up."""
-    return {"type": "rectangle", "bsdf": bsdf, "to_world": transform(translate=[0, y, 0], rotate=([1, 0, 0], -90),
-                                                                     scale=2)}  # fmt: skip
+#: The albedo of all planes here.
+ALBEDO = (0.7, 0.5, 0.3)
+DOWN, UP = ([1, 0, 0], 90), ([1, 0, 0], -90)
 
 
 def furnace_scene(albedo: tuple, emission: tuple, max_depth: int, size: int = SIZE) -> KnownScene:
@@ -76,106 +82,58 @@ def furnace_scene(albedo: tuple, emission: tuple, max_depth: int, size: int = SI
     def scene() -> dict:
         walls = {"type": "cube", "flip_normals": True, "bsdf": diffuse(*albedo),
                  "emitter": {"type": "area", "radiance": rgb(*emission)}}  # fmt: skip
-        return {"type": "scene", "camera": camera([0, 0.1, 0.4], [0.2, 0, -1], [0, 1, 0], 60, size), "walls": walls}
+        return {"type": "scene", "camera": pinhole([0, 0.1, 0.4], [0.2, 0, -1], [0, 1, 0], 60, size), "walls": walls}
 
-    keys = {"albedo": "walls.bsdf.reflectance.value", "emission": "walls.emitter.radiance.value"}
-    return KnownScene(scene, furnace(albedo, emission, max_depth, size), keys, max_depth)
-
-
-def plane_scene(albedo: tuple = (0.7, 0.5, 0.3), intensity: tuple = (2, 3, 4), size: int = SIZE) -> KnownScene:
-    """A point light over a plane, off the camera's axis."""
-    light = (0.4, 0.8, -0.3)
-
-    def scene() -> dict:
-        return {
-            "type": "scene",
-            "camera": camera([0, 1.5, 0], [0, 0, 0], [0, 0, -1], 50, size),
-            "light": {"type": "point", "position": list(light), "intensity": rgb(*intensity)},
-            "plane": _plane(diffuse(*albedo)),
-        }
-
-    keys = {"albedo": "plane.bsdf.reflectance.value", "intensity": "light.intensity.value"}
-    return KnownScene(scene, point_over_plane(albedo, intensity, light, 1.5, 50, size), keys, 2)
+    return KnownScene(scene, furnace(albedo, emission, max_depth, size), FURNACE, max_depth)
 
 
-def refraction_scene(
-    albedo: tuple = (0.7, 0.5, 0.3), intensity: tuple = (9, 6, 5), tau: tuple = (0.9, 0.8, 0.6), ior: float = 1.5,
-    light: tuple = (0.3, 1.6, -0.2), size: int = SIZE,
-) -> KnownScene:  # fmt: skip
+def refraction_scene(ior: float = 1.5) -> KnownScene:
     """A point light over a pool, whose bottom a camera sees from inside of it."""
+    intensity, tau, light = (9, 6, 5), (0.9, 0.8, 0.6), (0.3, 1.6, -0.2)
 
     def scene() -> dict:
-        glass = {"type": "dielectric", "int_ior": ior, "ext_ior": 1.0, "specular_transmittance": rgb(*tau)}
         return {
             "type": "scene",
-            "camera": camera([0, 0.9, 0], [0, 0, 0], [0, 0, -1], 60, size),
+            "camera": pinhole([0, 0.9, 0], [0, 0, 0], [0, 0, -1], 60),
             "light": {"type": "point", "position": list(light), "intensity": rgb(*intensity)},
-            "plane": _plane(diffuse(*albedo)),
-            "surface": _plane(glass, 1.0),
+            "plane": rectangle(diffuse(*ALBEDO), translate=[0, 0, 0], rotate=UP, scale=2),
+            "surface": rectangle(glass(ior, specular_transmittance=rgb(*tau)), translate=[0, 1, 0], rotate=UP, scale=2),
         }
 
-    keys = {
-        "albedo": "plane.bsdf.reflectance.value",
-        "intensity": "light.intensity.value",
-        "transmittance": "surface.bsdf.specular_transmittance.value",
-    }
-    known = point_through_surface(albedo, intensity, tau, ior, light, 1.0, 0.9, 60, size)
-    return KnownScene(scene, known, keys, 3)
+    known = point_through_surface(ALBEDO, intensity, tau, ior, light, 1.0, 0.9, 60, SIZE)
+    return KnownScene(scene, known, POOL, 3)
 
 
-def slab_scene(
-    albedo: tuple = (0.7, 0.5, 0.3), radiance: tuple = (2, 3, 4), tau: tuple = (0.9, 0.8, 0.7),
-    reflectance: tuple = (0.9, 0.6, 0.8), ior: float = 1.5, degrees: float = 40, max_depth: int = 6, size: int = SIZE,
-) -> KnownScene:  # fmt: skip
+def slab_scene(ior: float = 1.5, degrees: float = 40, max_depth: int = 6) -> KnownScene:
     """A parallel beam through a slab on a plane far below it, seen from the side."""
+    radiance, tau, reflectance = (2, 3, 4), (0.9, 0.8, 0.7), (0.9, 0.6, 0.8)
     distance, angle = 40.0, np.deg2rad(degrees)
     direction = np.array([np.sin(angle), -np.cos(angle), 0])
     start = -3 * direction
 
     def scene() -> dict:
-        import mitsuba as mi
-
-        glass = {"type": "dielectric", "int_ior": ior, "ext_ior": 1.0, "specular_transmittance": rgb(*tau),
-                 "specular_reflectance": rgb(*reflectance)}  # fmt: skip
-        toward = mi.ScalarTransform4f().look_at(origin=start.tolist(), target=[0, 0, 0], up=[0, 0, 1])
+        bsdf = glass(ior, specular_transmittance=rgb(*tau), specular_reflectance=rgb(*reflectance), id="glass")
         below = [distance * np.tan(angle), -distance, 0.0]
         beside = [below[0] - 1.5, -distance + 3, 2.0]
         return {
             "type": "scene",
-            "camera": camera(beside, below, [0, 1, 0], 12, size),
-            "lamp": {"type": "rectangle", "to_world": toward, "bsdf": diffuse(0, 0, 0),
-                     "emitter": {"type": "directionalarea", "radiance": rgb(*radiance)}},
+            "camera": pinhole(beside, below, [0, 1, 0], 12),
+            "lamp": lit_square(rgb(*radiance), look_at(start.tolist(), [0, 0, 0]), "directionalarea"),
             # The lower surface faces down: the glass is between them.
-            "top": {"type": "rectangle", "bsdf": glass | {"id": "glass"},
-                    "to_world": transform(translate=[0, 0.025, 0], rotate=([1, 0, 0], -90), scale=3)},
-            "bottom": {"type": "rectangle", "bsdf": {"type": "ref", "id": "glass"},
-                       "to_world": transform(translate=[0, -0.025, 0], rotate=([1, 0, 0], 90), scale=3)},
-            "plane": {"type": "rectangle", "bsdf": diffuse(*albedo),
-                      "to_world": transform(translate=below, rotate=([1, 0, 0], -90), scale=6)},
-        }  # fmt: skip
+            "top": rectangle(bsdf, translate=[0, 0.025, 0], rotate=UP, scale=3),
+            "bottom": rectangle({"type": "ref", "id": "glass"}, translate=[0, -0.025, 0], rotate=DOWN, scale=3),
+            "plane": rectangle(diffuse(*ALBEDO), translate=below, rotate=UP, scale=6),
+        }
 
-    keys = {
-        "albedo": "plane.bsdf.reflectance.value",
-        "radiance": "lamp.emitter.radiance.value",
-        "transmittance": "top.bsdf.specular_transmittance.value",
-        "reflectance": "top.bsdf.specular_reflectance.value",
-    }
-    known = beam_through_slab(albedo, radiance, tau, reflectance, ior, float(angle), max_depth, size)
-    return KnownScene(scene, known, keys, max_depth)
+    known = beam_through_slab(ALBEDO, radiance, tau, reflectance, ior, float(angle), max_depth, SIZE)
+    return KnownScene(scene, known, SLAB, max_depth)
 
 
 FOV = 50
-
-
 RADIANCE = "lamp.emitter.radiance"
-
 
 #: Where the lamp over the plane is, beside what the camera sees: middle and half of its side.
 MIDDLE, HALF = (1.0, 0.8, -0.2), 0.3
-
-
-#: The plane's albedo.
-ALBEDO = (0.7, 0.5, 0.3)
 
 
 def covered(center: tuple[float, float], side: float, distance: float, size: int) -> Array:
@@ -193,27 +151,27 @@ def covered(center: tuple[float, float], side: float, distance: float, size: int
     return np.outer(shares(-center[1]), shares(center[0]))[..., None]
 
 
-def speck_in_view(side: float, radiance: tuple = (3, 2, 4), size: int = SIZE) -> KnownScene:
+def speck_in_view(side: float, radiance: tuple = (3, 2, 4)) -> KnownScene:
     """A square lamp across the border of two pixels, before a wall that it does not light."""
     distance = 2.0
-    pixel = 2 * distance * np.tan(np.deg2rad(FOV) / 2) / size
+    pixel = 2 * distance * np.tan(np.deg2rad(FOV) / 2) / SIZE
     center = (pixel + 0.2 * side, 0.6 * pixel)  # 0.7 of it to the right of a border
-    share = covered(center, side, distance, size)
+    share = covered(center, side, distance, SIZE)
 
     def scene() -> dict[str, Any]:
-        # The camera looks along -z: x goes to the right, and the lamp faces it.
-        lamp = {"type": "rectangle", "to_world": transform(translate=[*center, -distance], scale=side / 2),
-                "bsdf": diffuse(0, 0, 0), "emitter": {"type": "area", "radiance": rgb(*radiance)}}  # fmt: skip
-        wall = {"type": "rectangle", "bsdf": diffuse(0.5, 0.5, 0.5), "to_world": transform(translate=[0, 0, -4],
-                                                                                           scale=6)}  # fmt: skip
-        return {"type": "scene", "camera": camera([0, 0, 0], [0, 0, -1], [0, 1, 0], FOV, size), "lamp": lamp,
-                "wall": wall}  # fmt: skip
+        return {
+            "type": "scene",
+            # The camera looks along -z: x goes to the right, and the lamp faces it.
+            "camera": pinhole([0, 0, 0], [0, 0, -1], [0, 1, 0], FOV),
+            "lamp": lit_square(rgb(*radiance), translate=[*center, -distance], scale=side / 2),
+            "wall": rectangle(diffuse(0.5, 0.5, 0.5), translate=[0, 0, -4], scale=6),
+        }
 
     known = Known(share * np.array(radiance), {"radiance": np.repeat(share, 3, axis=-1)})
     return KnownScene(scene, known, {"radiance": f"{RADIANCE}.value"}, 4)
 
 
-def texels_over_plane(texels: ArrayLike, size: int = SIZE) -> KnownScene:
+def texels_over_plane(texels: ArrayLike) -> KnownScene:
     """A square lamp with these texels, (N, N, 3), over a diffuse plane that a camera sees without the lamp.
 
         L(x) = rho / pi * sum_t Le_t int_t h^2 / d^4 dA
@@ -222,11 +180,11 @@ def texels_over_plane(texels: ArrayLike, size: int = SIZE) -> KnownScene:
     """
     radiance = np.asarray(texels, np.float64)
     count = len(radiance)
-    points, weights = plane_points(1.5, FOV, size, order=4)
+    points, weights = plane_points(1.5, FOV, SIZE, order=4)
     nodes, own = np.polynomial.legendre.leggauss(4)
     at = HALF * (2 * (np.arange(count)[:, None] + (nodes + 1) / 2) / count - 1)  # along a side, (N, 4)
     area = np.outer(own, own) / 4 * (2 * HALF / count) ** 2
-    factors = np.zeros((count, count, size, size, 1))
+    factors = np.zeros((count, count, SIZE, SIZE, 1))
     for row in range(count):
         for column in range(count):
             x, z = MIDDLE[0] + at[column][None, :], MIDDLE[2] + at[row][:, None]
@@ -235,22 +193,16 @@ def texels_over_plane(texels: ArrayLike, size: int = SIZE) -> KnownScene:
             factors[row, column] = np.sum(received * weights, -1)[..., None] / np.pi
 
     def scene() -> dict[str, Any]:
-        import mitsuba as mi
-
         texture = {"type": "bitmap", "bitmap": mi.Bitmap(radiance.astype(np.float32)), "raw": True,
                    "format": "variant", "filter_type": "nearest"}  # fmt: skip
-        down = transform(translate=list(MIDDLE), rotate=([1, 0, 0], 90), scale=HALF)
-        plane = {"type": "rectangle", "bsdf": diffuse(*ALBEDO), "to_world": transform(rotate=([1, 0, 0], -90),
-                                                                                      scale=4)}  # fmt: skip
         return {
             "type": "scene",
-            "camera": camera([0, 1.5, 0], [0, 0, 0], [0, 0, -1], FOV, size),
-            "lamp": {"type": "rectangle", "to_world": down, "bsdf": diffuse(0, 0, 0),
-                     "emitter": {"type": "area", "radiance": texture}},
-            "plane": plane,
-        }  # fmt: skip
+            "camera": pinhole([0, 1.5, 0], [0, 0, 0], [0, 0, -1], FOV),
+            "lamp": lit_square(texture, translate=list(MIDDLE), rotate=DOWN, scale=HALF),
+            "plane": rectangle(diffuse(*ALBEDO), rotate=UP, scale=4),
+        }
 
-    flat = factors.reshape(-1, size, size, 1)
+    flat = factors.reshape(-1, SIZE, SIZE, 1)
     by_albedo = np.tensordot(radiance.reshape(-1, 3), flat[..., 0], (0, 0)).transpose(1, 2, 0)
     derivatives = {"albedo": by_albedo} | {f"texel {k}": factor * np.array(ALBEDO) for k, factor in enumerate(flat)}
     keys = {"albedo": "plane.bsdf.reflectance.value"} | {f"texel {k}": f"{RADIANCE}.data" for k in range(len(flat))}
@@ -280,22 +232,6 @@ def furnace(albedo: ArrayLike, emission: ArrayLike, max_depth: int, size: int) -
     return Known(image * (Le * series), {"albedo": image * (Le * derivative), "emission": image * series})
 
 
-def point_over_plane(
-    albedo: ArrayLike, intensity: ArrayLike, light: ArrayLike, camera_height: float, fov: float, size: int
-) -> Known:
-    """A point light at `light` (3,) over the diffuse plane y = 0, seen from straight above the origin.
-
-        L(x) = rho / pi * I cos(theta) / d^2
-
-    Inverse square and cosine law, J. H. Lambert, Photometria, 1760. The camera is that of `plane_points`.
-    """
-    points, weights = plane_points(camera_height, fov, size)
-    to_light = np.asarray(light, np.float64) - points
-    distance = np.linalg.norm(to_light, axis=-1)
-    irradiance = _pixels(to_light[..., 1] / distance**3, weights)
-    return _lit_plane(albedo, intensity, irradiance, "intensity")
-
-
 def point_through_surface(
     albedo: ArrayLike, intensity: ArrayLike, transmittance: ArrayLike, ior: float, light: ArrayLike, depth: float,
     camera_height: float, fov: float, size: int,
@@ -322,10 +258,11 @@ def point_through_surface(
     # sin(theta_1) / x, which is finite below the light
     ratio = 1 / (height / cos_1 + depth / (ior * cos_2))
     passed = 1 - fresnel(theta, ior)
-    known = _lit_plane(albedo, intensity, _pixels(passed * ratio / slope, weights), "intensity")
-    tau = np.broadcast_to(np.asarray(transmittance, np.float64), 3)
-    derivatives = {name: d * tau for name, d in known.derivatives.items()} | {"transmittance": known.image}
-    return Known(known.image * tau, derivatives)
+    per_pi = np.sum(passed * ratio / slope * weights, -1)[..., None] / np.pi
+    rho, power, tau = (np.broadcast_to(np.asarray(v, np.float64), 3) for v in (albedo, intensity, transmittance))
+    image = per_pi * (rho * power)
+    derivatives = {"albedo": per_pi * power * tau, "intensity": per_pi * rho * tau, "transmittance": image}
+    return Known(image * tau, derivatives)
 
 
 def beam_through_slab(
@@ -351,15 +288,8 @@ def beam_through_slab(
     series, d_series = np.sum(q**powers, 0), np.sum(powers * q ** np.maximum(powers - 1, 0), 0) * 2 * r * R**2
     L = rho / np.pi * E * np.cos(angle) * (tau * (1 - R)) ** 2 * series
     pixel = np.ones((size, size, 1))
-    return Known(
-        pixel * L,
-        {
-            "albedo": pixel * (L / rho),
-            "radiance": pixel * (L / E),
-            "transmittance": pixel * (2 * L / tau),
-            "reflectance": pixel * (L * d_series / series),
-        },
-    )
+    slopes = {"albedo": L / rho, "radiance": L / E, "transmittance": 2 * L / tau, "reflectance": L * d_series / series}
+    return Known(pixel * L, {name: pixel * slope for name, slope in slopes.items()})
 
 
 def fresnel(theta: Array, ior: float) -> Array:
@@ -395,15 +325,3 @@ def _refracted_angle(offset: Array, height: float, depth: float, ior: float) -> 
         beyond = height * np.tan(middle) + depth * sin_2 / np.sqrt(1 - sin_2**2) > offset
         low, high = np.where(beyond, low, middle), np.where(beyond, middle, high)
     return (low + high) / 2
-
-
-def _pixels(values: Array, weights: Array) -> Array:
-    """Means over pixels of (H, W, nodes) values: (H, W, 1)."""
-    return np.sum(values * weights, -1)[..., None]
-
-
-def _lit_plane(albedo: ArrayLike, power: ArrayLike, irradiance: Array, name: str) -> Known:
-    """Radiance of a diffuse plane that light of unit power gives `irradiance` (H, W, 1)."""
-    rho, power = (np.broadcast_to(np.asarray(value, np.float64), 3) for value in (albedo, power))
-    per_pi = irradiance / np.pi
-    return Known(per_pi * (rho * power), {"albedo": per_pi * power, name: per_pi * rho})

@@ -1,16 +1,15 @@
-"""Test scenes in which parameters move light, what they are made of, and what finite differences find there.
+"""Test scenes in which parameters move light, and what they are made of.
 
 - Smooth meshes, and fields that displace their vertices smoothly: `mesh`, `smooth_fields`.
-- What such a scene is, and the derivatives that finite differences give of it: `AttachedScene`, `Differenced`.
 - Motions along a few directions: amplitudes as parameters, of which what moves is a function: `Displacement`, `Pose`,
-  `Number`, `Displaced`.
+  `Number`, `moving_case`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -18,12 +17,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reslrb_cli.backend.memory import own_memory
-from reslrb_cli.measure.gradients import Case, integrator, seeds, smooth_weights
+from reslrb_cli.measure.gradients import Case, smooth_weights
 from reslrb_cli.measure.scenes.small import load
 from reslrb_cli.scene.graph import SceneGraph
 
 Array = NDArray[np.float64]
-
 
 #: Waves of a surface: wave vectors, phases, and amplitudes for a mean slope of about 0.1.
 WAVES = (((5.1, 2.3), 0.4, 0.0135), ((-3.7, 5.9), 1.9, 0.012), ((7.9, -4.6), 4.1, 0.0062), ((2.2, -8.8), 2.7, 0.0055))
@@ -36,8 +34,6 @@ def waves(x: Array, z: Array) -> Array:
 
 def mesh(positions: Array, faces: Array, bsdf: dict, texcoords: Array | None = None) -> Any:
     """A mesh with interpolated normals, of vertices (V, 3) and triangles (F, 3)."""
-    import mitsuba as mi
-
     properties = mi.Properties()
     properties["mesh_bsdf"] = mi.load_dict(bsdf)
     shape = mi.Mesh("mesh", len(positions), len(faces), has_vertex_normals=True,
@@ -68,36 +64,6 @@ def grid(cells: int, height: Callable[[Array, Array], Array], half: float = 1.0,
     return np.stack([x, height(x, z), z], -1).reshape(-1, 3), faces, np.stack([u, v], -1).reshape(-1, 2)
 
 
-def ball(radius: float, center: tuple[float, float, float], levels: int = 4, inward: bool = False
-         ) -> tuple[Array, Array]:  # fmt: skip
-    """A sphere of 20 * 4^levels triangles that faces outward, or `inward`: vertices and triangles."""
-    golden = (1 + 5**0.5) / 2
-    corners = [(-1, golden, 0), (1, golden, 0), (-1, -golden, 0), (1, -golden, 0)]
-    points = np.array([np.roll(corner, turn) for turn in range(3) for corner in corners], float)
-    points /= np.linalg.norm(points[0])
-    near = np.linalg.norm(points[:, None] - points[None], axis=-1) < 1.1
-    faces = np.array([(a, b, c) for a in range(12) for b in range(a) for c in range(b)
-                      if near[a, b] and near[b, c] and near[a, c]])  # fmt: skip
-    for _ in range(levels):
-        points, faces = _divided(points, faces)
-    p, q, r = (points[faces[:, k]] for k in range(3))
-    outward = np.sum(np.cross(q - p, r - p) * p, 1) > 0
-    faces = np.where((outward != inward)[:, None], faces, faces[:, ::-1])
-    return points * radius + np.array(center), faces
-
-
-def _divided(points: Array, faces: Array) -> tuple[Array, Array]:
-    """Each triangle divided into four, all vertices on the unit sphere."""
-    edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), 1)
-    unique, number = np.unique(edges, axis=0, return_inverse=True)
-    middles = points[unique].sum(1)
-    middles /= np.linalg.norm(middles, axis=1, keepdims=True)
-    ab, bc, ca = np.split(number.ravel() + len(points), 3)
-    a, b, c = faces.T
-    divided = [np.stack(corners, 1) for corners in ((a, ab, ca), (b, bc, ab), (c, ca, bc), (ab, bc, ca))]
-    return np.concatenate([points, middles]), np.concatenate(divided)
-
-
 def smooth_fields(positions: Array, count: int, span: float, seed: int = 5) -> Array:
     """Random smooth displacements of unit size in all three directions: (count, V, 3).
 
@@ -113,8 +79,9 @@ def smooth_fields(positions: Array, count: int, span: float, seed: int = 5) -> A
     return np.stack(found)
 
 
-#: Pixels of a film, each way.
-SIZE = 32
+def vertices(scene: Any, name: str) -> np.ndarray:
+    """Positions (V, 3) of a mesh."""
+    return np.array(mi.traverse(scene)[f"{name}.vertex_positions"], float).reshape(-1, 3)
 
 
 #: A filter so wide that what lands between two pixels counts as much as on one. That of the default width (0.5) changes
@@ -122,130 +89,8 @@ SIZE = 32
 FILTER = {"type": "gaussian", "stddev": 0.7}
 
 
-#: At how many seeds truncation is measured, by differences of twice the step: one in so many, and at least that many.
-ONE_IN, EXTRAPOLATED = 4, 3
-
-
-class Move(Protocol):
-    """Something in a scene that amplitudes move; all zero, it stands as the scene has it."""
-
-    @property
-    def key(self) -> str:
-        """What it moves, as `mi.traverse` names it."""
-        ...
-
-    @property
-    def size(self) -> int:
-        """How many amplitudes there are."""
-        ...
-
-    def value(self, initial: Any, amplitudes: list[mi.Float]) -> Any:
-        """The value of `key`, with its derivative by the amplitudes, of which each has width 1."""
-        ...
-
-
-@dataclass(frozen=True)
-class AttachedScene:
-    """One scene. `scene` and `moves` are functions, since they need Mitsuba; the first of the amplitudes says most.
-
-    Finite differences hold: no silhouette, no edge of a shadow and no edge at rest that moved paths sweep over;
-    dL/dI is smooth and vanishes at the film's border. `step` is that of the amplitudes, `options` the integrators'.
-    Less noise comes by `seeds`, not by `spp`: from a thousand on, what sums of an image lose in single precision shows
-    in its differences.
-    """
-
-    name: str
-    about: str
-    scene: Callable[[], dict]
-    moves: Callable[[Any], Sequence[Move]]
-    step: float = 0.01
-    spp: int = 64
-    seeds: int = 8
-    options: Mapping[str, Any] = field(default_factory=lambda: {"max_depth": 4})
-
-    def case(self) -> Case:
-        """The scene, loaded, with its amplitudes as the one parameter."""
-        scene = load(self.scene())
-        case = Case.of(scene, [AMPLITUDES], values=Displaced(scene, self.moves(scene)))
-        case.weigh(smooth_weights(*case.weights.shape))
-        return case
-
-
-@dataclass(frozen=True)
-class Differenced:
-    """Derivatives of the objective along K amplitudes, ours and by finite differences: (N, K) at N seeds.
-
-    `differences` are central ones, `correction` (M, K) what Richardson's extrapolation to a step of 0 adds to them, at
-    the first seeds. The rest is relative to the root mean square of the reference: `error` the largest deviation of the
-    means, `standard_error` the largest one of these deviations, `truncation` the largest correction.
-    """
-
-    ours: np.ndarray
-    differences: np.ndarray
-    correction: np.ndarray
-
-    @property
-    def reference(self) -> np.ndarray:
-        """The means of the differences, extrapolated: (K,)."""
-        mean: np.ndarray = self.differences.mean(0) + self.correction.mean(0)
-        return mean
-
-    @property
-    def scale(self) -> float:
-        return float(np.sqrt(np.mean(np.square(self.reference))))
-
-    @property
-    def errors(self) -> np.ndarray:
-        """Of each amplitude, signed: (K,)."""
-        errors: np.ndarray = (self.ours.mean(0) - self.reference) / self.scale
-        return errors
-
-    @property
-    def error(self) -> float:
-        return float(np.abs(self.errors).max())
-
-    @property
-    def standard_errors(self) -> np.ndarray:
-        """Of each amplitude: (K,)."""
-        sides = self.ours - self.differences, self.correction
-        variance = sum(side.var(0, ddof=1) / len(side) for side in sides)
-        errors: np.ndarray = np.sqrt(variance) / self.scale
-        return errors
-
-    @property
-    def standard_error(self) -> float:
-        return float(self.standard_errors.max())
-
-    @property
-    def truncation(self) -> float:
-        return float(np.abs(self.correction.mean(0)).max() / self.scale)
-
-    def __str__(self) -> str:
-        return (
-            f"largest deviation {self.error:.2%} of the root mean square, standard error {self.standard_error:.2%}, "
-            f"truncation {self.truncation:.2%}"
-        )
-
-
-def compare_with_differences(scene: AttachedScene, estimator: str = "stack", count: int | None = None) -> Differenced:
-    """Differentiate a scene by an estimator, and by finite differences of its image at the same random numbers."""
-    case = scene.case()
-    tracer = integrator("reslrb", **scene.options, estimator=estimator)
-    chosen = seeds(count or scene.seeds)
-    ours = case.gradients(tracer, chosen, scene.spp)
-    directions = np.eye(len(case.initial[AMPLITUDES]))
-
-    def differences(step: float, some: Sequence[int]) -> np.ndarray:
-        return np.array([[case.difference(tracer, d, seed, scene.spp, step) for d in directions] for seed in some])
-
-    near = differences(scene.step, chosen)
-    few = chosen[: max(len(chosen) // ONE_IN, EXTRAPOLATED)]
-    return Differenced(ours, near, (near[: len(few)] - differences(2 * scene.step, few)) / 3)
-
-
 #: The name of the amplitudes among the parameters.
 AMPLITUDES = "amplitudes"
-
 
 #: Degrees that an amplitude of 1 turns by.
 DEGREES = 57.29577951308232
@@ -314,6 +159,11 @@ class Number:
         return type(initial)(initial + amplitudes[0])
 
 
+#: Something in a scene (`key`, as `mi.traverse` names it) that `size` amplitudes move; all zero, it stands as the scene
+#: has it. `value` is that of `key`, with its derivative by the amplitudes, of which each has width 1.
+Move = Displacement | Pose | Number
+
+
 @dataclass
 class Displaced:
     """The `measure.values.Values` of a scene that `moves` move: AMPLITUDES, all of theirs in a row."""
@@ -346,10 +196,17 @@ class Displaced:
         dr.eval(moved, [mesh.vertex_normals_buffer() for mesh in self._meshes])
 
     def collect(self) -> None:
-        """Gradients of one step find their way back by themselves."""
+        """Gradients of one step find their way back by themselves, and so do tangents."""
 
-    def push(self) -> None:
-        """So do tangents."""
+    push = collect
+
+
+def moving_case(description: dict, moves: Callable[[Any], Sequence[Move]]) -> Case:
+    """A scene, loaded, with the amplitudes of its `moves` as the one parameter; dL/dI is smooth."""
+    scene = load(description)
+    case = Case(scene, [AMPLITUDES], values=Displaced(scene, moves(scene)))
+    case.weigh(smooth_weights(*case.weights.shape))
+    return case
 
 
 def _copy(value: Any) -> Any:

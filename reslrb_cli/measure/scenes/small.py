@@ -6,6 +6,7 @@ of a room, and what to put into it, as `mi.load_dict` takes them, are to check g
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,10 +18,8 @@ from reslrb_cli.errors import ConfigError
 #: What errors name in place of a file.
 CORNELL_BOX_SOURCE = "the built-in Cornell box"
 
-
 #: What stands for the scene in `scene.file`.
 FILE = Path("/cornell-box")
-
 
 #: No roulette, no directly visible emitters; `size` is the film's, `texture` the texture's, both squares.
 CORNELL_BOX = f"""\
@@ -43,22 +42,14 @@ def build(options: dict[str, Any]) -> Any:
     values = {"size": 128, "texture": 16} | options
     for name, value in values.items():
         if name not in ("size", "texture") or type(value) is not int or value < 1:
-            raise ConfigError(
-                CORNELL_BOX_SOURCE, f"scene.options.{name}", "the options are size and texture, both at least 1"
-            )
+            reason = "the options are size and texture, both at least 1"
+            raise ConfigError(CORNELL_BOX_SOURCE, f"scene.options.{name}", reason)
     size, texture = values["size"], values["texture"]
     scene = mi.cornell_box()
     texels = np.random.default_rng(0).uniform(0.2, 0.9, (texture, texture, 3))
-    scene["white"] = {
-        "type": "diffuse",
-        "reflectance": {
-            "type": "bitmap",
-            "bitmap": mi.Bitmap(texels.astype(np.float32)),
-            "raw": True,
-            "filter_type": "bilinear",
-            "format": "variant",
-        },
-    }
+    scene["white"] = {"type": "diffuse", "reflectance": {
+        "type": "bitmap", "bitmap": mi.Bitmap(texels.astype(np.float32)), "raw": True, "filter_type": "bilinear",
+        "format": "variant"}}  # fmt: skip
     scene["sensor"]["film"] |= {"width": size, "height": size, "rfilter": {"type": "box"}}
     return mi.load_dict(scene, optimize=False)
 
@@ -74,8 +65,6 @@ def texture(height: int, width: int, low: float = 0.2, high: float = 0.8, seed: 
 
 def bitmap(data: np.ndarray, filter_type: str = "nearest") -> dict:
     """A bitmap texture that holds `data` (H, W, C) as it is."""
-    import mitsuba as mi
-
     return {"type": "bitmap", "data": mi.TensorXf(np.ascontiguousarray(data, np.float32)), "raw": True,
             "filter_type": filter_type, "wrap_mode": "clamp"}  # fmt: skip
 
@@ -90,10 +79,13 @@ def diffuse(*value: float) -> dict:
     return {"type": "diffuse", "reflectance": rgb(*value)}
 
 
+def glass(ior: float = 1.5, outside: float = 1.0, **options: Any) -> dict:
+    """A smooth dielectric of this index."""
+    return {"type": "dielectric", "int_ior": ior, "ext_ior": outside, **options}
+
+
 def transform(**steps: Any) -> Any:
     """A transform of `translate`, `rotate` (axis, angle) and `scale`, applied in reverse order of naming."""
-    import mitsuba as mi
-
     result = mi.ScalarTransform4f()
     for name, value in steps.items():
         if name == "rotate":
@@ -104,20 +96,37 @@ def transform(**steps: Any) -> Any:
     return result
 
 
+def look_at(origin: Sequence[float], target: Sequence[float], up: Sequence[float] = (0, 0, 1)) -> Any:
+    """A transform that takes the z axis from `origin` towards `target`."""
+    return mi.ScalarTransform4f().look_at(origin=list(origin), target=list(target), up=list(up))
+
+
+def rectangle(bsdf: dict, to_world: Any = None, **place: Any) -> dict:
+    """A square of side 2 that faces along z, taken to its place by `to_world` or the steps of a `transform`."""
+    return {"type": "rectangle", "bsdf": bsdf, "to_world": transform(**place) if to_world is None else to_world}
+
+
+def lit_square(radiance: dict, to_world: Any = None, kind: str = "area", **place: Any) -> dict:
+    """A black `rectangle` that is an emitter: an `area` light, or a `directionalarea` one."""
+    return rectangle(diffuse(0, 0, 0), to_world, **place) | {"emitter": {"type": kind, "radiance": radiance}}
+
+
+def pinhole(origin: Sequence[float], target: Sequence[float], up: Sequence[float], fov: float, size: int = SIZE,
+            **film: Any) -> dict:  # fmt: skip
+    """A camera that sees from close by, whose image is a box filter's where `film` has no other `rfilter`."""
+    return _camera("perspective", fov, look_at(origin, target, up), size, film) | {"near_clip": 1e-3}
+
+
 def camera(rfilter: str = "box", size: int = SIZE, sensor: str = "perspective", **film: Any) -> dict:
     """A camera that looks at the corner of the room."""
-    import mitsuba as mi
-
     lens = {"aperture_radius": 0.1, "focus_distance": 4.0} if sensor == "thinlens" else {}
-    return {
-        "type": sensor,
-        "fov": 45,
-        **lens,
-        "to_world": mi.ScalarTransform4f().look_at(origin=[1.2, 0.6, 4], target=[-0.1, -0.2, 0], up=[0, 1, 0]),
-        "film": {"type": "hdrfilm", "width": size, "height": size, "pixel_format": "rgb",
-                 "rfilter": {"type": rfilter}, **film},
-        "sampler": {"type": "independent"},
-    }  # fmt: skip
+    view = look_at([1.2, 0.6, 4], [-0.1, -0.2, 0], [0, 1, 0])
+    return _camera(sensor, 45, view, size, {"rfilter": {"type": rfilter}} | film) | lens
+
+
+def _camera(sensor: str, fov: float, to_world: Any, size: int, film: dict) -> dict:
+    shape = {"type": "hdrfilm", "width": size, "height": size, "pixel_format": "rgb", "rfilter": {"type": "box"}}
+    return {"type": sensor, "fov": fov, "to_world": to_world, "film": shape | film, "sampler": {"type": "independent"}}
 
 
 def room(**changes: Any) -> dict:
@@ -131,30 +140,21 @@ def room(**changes: Any) -> dict:
         "floor": {"type": "twosided", "bsdf": diffuse(0.7, 0.5, 0.6)},
         "wall": {"type": "twosided", "bsdf": diffuse(0.5, 0.7, 0.4)},
         "side": {"type": "twosided", "bsdf": diffuse(0.6, 0.4, 0.7)},
-        "floor_shape": {"type": "rectangle", "to_world": transform(translate=[0, -1, 0], rotate=([1, 0, 0], -90)),
-                        "bsdf": {"type": "ref", "id": "floor"}},
-        "wall_shape": {"type": "rectangle", "to_world": transform(translate=[0, 0, -1]),
-                       "bsdf": {"type": "ref", "id": "wall"}},
-        "side_shape": {"type": "rectangle", "to_world": transform(translate=[-1, 0, 0], rotate=([0, 1, 0], 90)),
-                       "bsdf": {"type": "ref", "id": "side"}},
+        "floor_shape": rectangle({"type": "ref", "id": "floor"}, translate=[0, -1, 0], rotate=([1, 0, 0], -90)),
+        "wall_shape": rectangle({"type": "ref", "id": "wall"}, translate=[0, 0, -1]),
+        "side_shape": rectangle({"type": "ref", "id": "side"}, translate=[-1, 0, 0], rotate=([0, 1, 0], 90)),
         "lamp": lamp(radiance=rgb(3.0, 4.0, 5.0)),
-    }  # fmt: skip
+    }
     scene.update(changes)
     return {key: value for key, value in scene.items() if value is not None}
 
 
 def lamp(**emitter: Any) -> dict:
     """A square area light above the room that shines down into it; `emitter` are options of its `area` emitter."""
-    return {
-        "type": "rectangle",
-        "to_world": transform(translate=[0.2, 1.6, 0.2], rotate=([1, 0, 0], 90), scale=0.6),
-        "bsdf": diffuse(0.0, 0.0, 0.0),
-        "emitter": {"type": "area", **emitter},
-    }
+    place = transform(translate=[0.2, 1.6, 0.2], rotate=([1, 0, 0], 90), scale=0.6)
+    return rectangle(diffuse(0.0, 0.0, 0.0), place) | {"emitter": {"type": "area", **emitter}}
 
 
 def load(scene: dict) -> Any:
     """The scene, its objects as they stand."""
-    import mitsuba as mi
-
     return mi.load_dict(scene, optimize=False)

@@ -13,61 +13,59 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from measure.differenced import SIZE, AttachedScene
+from numpy.typing import NDArray
 
-from reslrb_cli.measure.scenes.analytic import camera
 from reslrb_cli.measure.scenes.moving import (
     FILTER,
-    SIZE,
-    AttachedScene,
     Displacement,
     Move,
     Number,
     Pose,
-    ball,
     grid,
     mesh,
     smooth_fields,
+    vertices,
     waves,
 )
-from reslrb_cli.measure.scenes.small import bitmap, diffuse, rgb, transform
+from reslrb_cli.measure.scenes.small import (
+    bitmap,
+    diffuse,
+    glass,
+    lit_square,
+    look_at,
+    pinhole,
+    rectangle,
+    rgb,
+    transform,
+)
 
-GLASS = {"type": "dielectric", "int_ior": 1.5, "ext_ior": 1.0}
+Array = NDArray[np.float64]
+
+
+GLASS = glass()
 
 
 ROUGH = {"type": "roughdielectric", "int_ior": 1.5, "ext_ior": 1.0, "alpha": 0.1}
 
 
-TOP = "top.vertex_positions"
-
-
 def setting(size: int = SIZE, **objects: Any) -> dict:
     """A receiver at y = 0, and a camera at y = 1 that sees the part within 1 of the axis; the rest are `objects`."""
-    seen = camera([0, 1, 0], [0, 0, 0], [0, 0, -1], 90, size)
-    seen["film"]["rfilter"] = FILTER
-    floor = {"type": "rectangle", "to_world": transform(rotate=([1, 0, 0], -90), scale=50),
-             "bsdf": diffuse(0.8, 0.7, 0.6)}  # fmt: skip
+    seen = pinhole([0, 1, 0], [0, 0, 0], [0, 0, -1], 90, size, rfilter=FILTER)
+    floor = rectangle(diffuse(0.8, 0.7, 0.6), rotate=([1, 0, 0], -90), scale=50)
     return {"type": "scene", "camera": seen, "floor": floor} | objects
 
 
 def spot(origin: tuple = (0.05, 3.2, -0.04), target: tuple = (0, 0, 0), cutoff: float = 14) -> dict:
     """A lamp whose light ends smoothly."""
-    import mitsuba as mi
-
-    aim = mi.ScalarTransform4f().look_at(origin=list(origin), target=list(target), up=[0, 0, 1])
-    return {
-        "type": "spot",
-        "intensity": rgb(9, 8, 7),
-        "cutoff_angle": cutoff,
-        "beam_width": cutoff / 3,
-        "to_world": aim,
-    }
+    return {"type": "spot", "intensity": rgb(9, 8, 7), "cutoff_angle": cutoff, "beam_width": cutoff / 3,
+            "to_world": look_at(origin, target)}  # fmt: skip
 
 
 def sheet(y: float, up: bool, bsdf: dict, tilt: float = 0, scale: float = 3) -> dict:
     """A flat surface; light that comes through it from the side that it faces enters the glass."""
     turn = (-90 if up else 90) + tilt
-    return {"type": "rectangle", "bsdf": bsdf,
-            "to_world": transform(translate=[0, y, 0], rotate=([1, 0, 0], turn), scale=scale)}  # fmt: skip
+    return rectangle(bsdf, translate=[0, y, 0], rotate=([1, 0, 0], turn), scale=scale)
 
 
 def slab(bsdf: dict = GLASS, cells: int = 64, half: float = 1.0, wide: float = 0, lamp: Any = None, y: float = 1.8,
@@ -89,13 +87,6 @@ def rough_surface() -> dict:
     return scene
 
 
-def vertices(scene: Any, name: str) -> np.ndarray:
-    """Positions (V, 3) of a mesh."""
-    import mitsuba as mi
-
-    return np.array(mi.traverse(scene)[f"{name}.vertex_positions"], float).reshape(-1, 3)
-
-
 def waving(scene: Any, name: str = "top", height: float = 1.8, count: int = 10) -> list[Move]:
     """The waves of a sheet by their size, and smooth displacements."""
     positions = vertices(scene, name)
@@ -110,23 +101,49 @@ def moving_sphere(name: str, pivot: tuple[float, float, float]) -> list[Move]:
 
 def beam(half: float = 0.3) -> dict:
     """Parallel light from a square, at thirty degrees."""
-    import mitsuba as mi
-
-    aim = mi.ScalarTransform4f().look_at(origin=[0.9, 3.2, -0.04], target=[0.05, 1.8, 0], up=[0, 0, 1])
-    light = {"type": "directionalarea", "radiance": rgb(9, 8, 7)}
-    return square_lamp() | {"to_world": aim @ mi.ScalarTransform4f().scale(half), "emitter": light}
+    aim = look_at([0.9, 3.2, -0.04], [0.05, 1.8, 0])
+    return lit_square(rgb(9, 8, 7), aim @ transform(scale=half), "directionalarea")
 
 
 def square_lamp(half: float = 0.25, y: float = 3.2) -> dict:
     """An area light that shines down."""
-    return {"type": "rectangle", "bsdf": diffuse(0, 0, 0), "emitter": {"type": "area", "radiance": rgb(9, 8, 7)},
-            "to_world": transform(translate=[0.05, y, -0.04], rotate=([1, 0, 0], 90), scale=half)}  # fmt: skip
+    return lit_square(rgb(9, 8, 7), translate=[0.05, y, -0.04], rotate=([1, 0, 0], 90), scale=half)
 
 
 def sphere_lens(radius: float = 0.8, y: float = 1.95, cutoff: float = 18, bsdf: dict = GLASS) -> dict:
     """A ball of glass in a cone of light that it contains."""
     return setting(lamp=spot(cutoff=cutoff, origin=(0.1, 3.6, -0.08), target=(0.05, y, 0)),
                    lens={"type": "sphere", "center": [0, y, 0], "radius": radius, "bsdf": bsdf})  # fmt: skip
+
+
+def ball(radius: float, center: tuple[float, float, float], levels: int = 4, inward: bool = False
+         ) -> tuple[Array, Array]:  # fmt: skip
+    """A sphere of 20 * 4^levels triangles that faces outward, or `inward`: vertices and triangles."""
+    golden = (1 + 5**0.5) / 2
+    corners = [(-1, golden, 0), (1, golden, 0), (-1, -golden, 0), (1, -golden, 0)]
+    points = np.array([np.roll(corner, turn) for turn in range(3) for corner in corners], float)
+    points /= np.linalg.norm(points[0])
+    near = np.linalg.norm(points[:, None] - points[None], axis=-1) < 1.1
+    faces = np.array([(a, b, c) for a in range(12) for b in range(a) for c in range(b)
+                      if near[a, b] and near[b, c] and near[a, c]])  # fmt: skip
+    for _ in range(levels):
+        points, faces = _divided(points, faces)
+    p, q, r = (points[faces[:, k]] for k in range(3))
+    outward = np.sum(np.cross(q - p, r - p) * p, 1) > 0
+    faces = np.where((outward != inward)[:, None], faces, faces[:, ::-1])
+    return points * radius + np.array(center), faces
+
+
+def _divided(points: Array, faces: Array) -> tuple[Array, Array]:
+    """Each triangle divided into four, all vertices on the unit sphere."""
+    edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), 1)
+    unique, number = np.unique(edges, axis=0, return_inverse=True)
+    middles = points[unique].sum(1)
+    middles /= np.linalg.norm(middles, axis=1, keepdims=True)
+    ab, bc, ca = np.split(number.ravel() + len(points), 3)
+    a, b, c = faces.T
+    divided = [np.stack(corners, 1) for corners in ((a, ab, ca), (b, bc, ab), (c, ca, bc), (ab, bc, ca))]
+    return np.concatenate([points, middles]), np.concatenate(divided)
 
 
 def mesh_lens(radius: float = 0.8, y: float = 1.95) -> dict:
@@ -276,8 +293,7 @@ PLACES_SCENES = [
 
 def wall(bsdf: dict[str, Any], turn: float = -90, x: float = 1.0) -> dict[str, Any]:
     """A wall at `x`, which faces back to the axis; `turn` is its angle about the vertical."""
-    return {"type": "rectangle", "bsdf": bsdf,
-            "to_world": transform(translate=[x, 1, 0], rotate=([0, 1, 0], turn), scale=3)}  # fmt: skip
+    return rectangle(bsdf, translate=[x, 1, 0], rotate=([0, 1, 0], turn), scale=3)
 
 
 def room(**changes: Any) -> dict[str, Any]:
@@ -285,8 +301,7 @@ def room(**changes: Any) -> dict[str, Any]:
 
     `changes` are objects beside these, or in place of them.
     """
-    seen = camera([-0.6, 0.8, 0], [1, 0.8, 0], [0, 1, 0], 40, SIZE)
-    seen["film"]["rfilter"] = FILTER
+    seen = pinhole([-0.6, 0.8, 0], [1, 0.8, 0], [0, 1, 0], 40, SIZE, rfilter=FILTER)
     return slab(lamp=spot(cutoff=8), camera=seen) | changes
 
 
@@ -306,10 +321,8 @@ def shelf() -> dict[str, Any]:
 
     It hangs above the floor: light passes below it to the wall, and comes back. Its shadow's edge is missing.
     """
-    seen = camera([0.95, 0.8, 0], [0, 0.8, 0], [0, 1, 0], 50, SIZE)
-    seen["film"]["rfilter"] = FILTER
-    panel = {"type": "rectangle", "bsdf": diffuse(0.7, 0.8, 0.9),
-             "to_world": transform(translate=[0.45, 0.8, 0], rotate=([0, 1, 0], 90), scale=0.3)}  # fmt: skip
+    seen = pinhole([0.95, 0.8, 0], [0, 0.8, 0], [0, 1, 0], 50, SIZE, rfilter=FILTER)
+    panel = rectangle(diffuse(0.7, 0.8, 0.9), translate=[0.45, 0.8, 0], rotate=([0, 1, 0], 90), scale=0.3)
     return slab(lamp=spot(cutoff=8), camera=seen, wall=wall(diffuse(0.8, 0.7, 0.6)), panel=panel)
 
 

@@ -14,13 +14,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from measure.differenced import SIZE, AttachedScene
+from measure.moving_light import point, setting
 from numpy.typing import NDArray
 
 from reslrb_cli.measure.gradients import smooth_weights
 from reslrb_cli.measure.scenes.analytic import fresnel
-from reslrb_cli.measure.scenes.moving import FILTER, SIZE, AttachedScene, Pose
-from reslrb_cli.measure.scenes.moving_light import point, setting, square_lamp
-from reslrb_cli.measure.scenes.small import rgb, transform
+from reslrb_cli.measure.scenes.moving import FILTER, Pose
+from reslrb_cli.measure.scenes.small import glass, lit_square, rectangle, rgb, transform
 
 Array = NDArray[np.float64]
 
@@ -55,8 +56,7 @@ def centre_of_gravity() -> Array:
 def parallel(half: float, x: float, y: float, radiance: float) -> dict:
     """Light straight down from a square around (x, 0), whose flux is `radiance` * (2 half)^2."""
     place = transform(translate=[x, y, 0], rotate=([1, 0, 0], 90), scale=half)
-    light = {"type": "directionalarea", "radiance": rgb(radiance, radiance, radiance)}
-    return square_lamp() | {"to_world": place, "emitter": light}
+    return lit_square(rgb(radiance, radiance, radiance), place, "directionalarea")
 
 
 def tilted_surface(tilt: float = 0.3, ior: float = 1.5, height: float = 1.4, half: float = 0.2) -> KnownMotion:
@@ -74,9 +74,8 @@ def tilted_surface(tilt: float = 0.3, ior: float = 1.5, height: float = 1.4, hal
 
     flux, h = 50.0 * (2 * half) ** 2, 1e-5
     slope = (objective(tilt + h) - objective(tilt - h)) / (2 * h)
-    glass = {"type": "dielectric", "int_ior": ior, "ext_ior": 1.0}
     place = transform(translate=[0, height, 0]) @ transform(rotate=([0, 0, 1], float(np.rad2deg(tilt))))
-    surface = {"type": "rectangle", "bsdf": glass, "to_world": place @ transform(rotate=([1, 0, 0], -90), scale=2)}
+    surface = rectangle(glass(ior), place @ transform(rotate=([1, 0, 0], -90), scale=2))
     scene = AttachedScene(
         "tilted_surface", "parallel light on a tilted surface of glass",
         lambda: setting(lamp=parallel(half, 0, 3, 50.0), top=surface),
@@ -102,7 +101,7 @@ def ball_lens(radius: float = 2.4, ior: float = 1.5, offset: float = 0.04, half:
         "ball_lens", "a thin beam through a ball of glass with its focus on the receiver",
         lambda: setting(lamp=parallel(half, offset, f + radius + 1, 5e4),
                         lens={"type": "sphere", "center": [0, f, 0], "radius": radius,
-                              "bsdf": {"type": "dielectric", "int_ior": ior, "ext_ior": 1.0}}),
+                              "bsdf": glass(ior)}),
         lambda scene: [Pose("lens.to_world", ("tx", "ty", "s"), (0, f, 0))],
     )  # fmt: skip
     return KnownMotion(scene, centre_of_gravity(), RHO.sum() / np.pi * flux * passed * slopes, 2e-3)
