@@ -60,10 +60,8 @@ def known_gradient(at: Situation, sensor: mi.Sensor, key: str, weights: np.ndarr
     rho, Le = (np.array(value).ravel() for value in (bsdf["reflectance.value"], emitter["radiance.value"]))
     if at.max_depth == -1 and np.any(rho >= 1):
         return None
-    names = {"bsdf": "albedo", "emitter": "emission"}
-    name = (
-        names.get(parameter_kind(at.params, key)) if key.endswith((".reflectance.value", ".radiance.value")) else None
-    )
+    names = {".reflectance.value": "albedo", ".radiance.value": "emission"}
+    name = next((name for end, name in names.items() if key.endswith(end)), None)
     if name is None:
         return None
     gradient = furnace(rho, Le, at.max_depth, 1).derivatives[name][0, 0] * weights.sum((0, 1))

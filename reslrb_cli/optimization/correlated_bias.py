@@ -158,13 +158,11 @@ def find_bias(
 
 def _with_error(products: Array, function: Callable[[Array], float]) -> tuple[float, float]:
     """`function` of the means over r != s of (K, R, R) inner products (K,), and its standard error."""
-    rounds = products.shape[1]
-    parts = [np.delete(np.delete(products, r, axis=1), r, axis=2) for r in range(rounds)]
-    found, *without = (float(function(_off_diagonal_mean(each))) for each in (products, *parts))
-    return found, float(np.sqrt(jackknife_variance(np.array(without))))
 
+    def at(left: Array) -> float:
+        """Of (K, S, S) products."""
+        off_diagonal = left.sum(axis=(1, 2)) - np.trace(left, axis1=1, axis2=2)
+        return float(function(off_diagonal / (left.shape[1] * (left.shape[1] - 1))))
 
-def _off_diagonal_mean(products: Array) -> Array:
-    rounds = products.shape[1]
-    total = products.sum(axis=(1, 2)) - np.trace(products, axis1=1, axis2=2)
-    return np.asarray(total / (rounds * (rounds - 1)))
+    without = [at(np.delete(np.delete(products, r, axis=1), r, axis=2)) for r in range(products.shape[1])]
+    return at(products), float(np.sqrt(jackknife_variance(np.array(without))))

@@ -195,16 +195,12 @@ def rescale(problem: Problem) -> list[Scaled]:
         unit.gain = 1 / rms(slope)
         optimizer.set_variable(row.key, unit)
         rate = problem.selection.spec(row.key).learning_rate or problem.config.optimizer.learning_rate
-        measured[place] = replace(row, own_length=length, first_step=_first_step(unit, value, rate))
+        # By a learning rate upwards or downwards, whichever is farther.
+        at = unit.from_scene(value)
+        up, down = (dr.abs(unit.to_scene(at + side * rate) - value) for side in (1, -1))
+        measured[place] = replace(row, own_length=length, first_step=rms(np.array(dr.maximum(up, down))))
     problem.apply()
     return measured
-
-
-def _first_step(unit: Variable, value: Any, rate: float) -> float:
-    """How far a step of `rate` moves the scene's `value`, upwards or downwards, whichever is farther."""
-    v = unit.from_scene(value)
-    up, down = (dr.abs(unit.to_scene(v + side * rate) - value) for side in (1, -1))
-    return rms(np.array(dr.maximum(up, down)))
 
 
 def own_length(transform: Transform | None, bounds: Bounds, value: Any, length: float) -> float:

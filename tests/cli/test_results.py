@@ -46,7 +46,7 @@ def test_correlated_samples_tell_of_their_bias(capsys, monkeypatch):
     from reslrb_cli.runs import prepare
 
     bias = CorrelatedBias(8, 4, [Bias(KEY, -0.38, 0.06, along=True, exceeds=False)])
-    monkeypatch.setattr(prepare, "measure_correlated_bias", lambda problem, say: bias)
+    monkeypatch.setattr(prepare, "measure_correlated_bias", lambda problem: bias)
     code, _, err = reslrb(capsys, "optimize", "box.yaml", "--quiet", "--set", "run.iterations=2")
     assert code == 0
     assert err.strip() == bias.line()

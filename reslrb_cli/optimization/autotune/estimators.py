@@ -221,7 +221,7 @@ MOST_ROUNDS = 12
 FREE = 0.25
 
 
-@dataclass
+@dataclass(eq=False)
 class _Entry:
     """What is known of one candidate: steps whose times count, and those whose gradients do."""
 
@@ -333,10 +333,9 @@ class Pilot(race.Race):
 
     # --- judging ------------------------------------------------------------------------------------------------------
 
-    def _references(self, passes: int) -> list[race.Gradients]:
-        """The exact gradient of each round on the same paths."""
-        exact = [e.gradients for e in self._entries if e.candidate.exact and e.candidate.passes == passes]
-        return max(exact, key=len, default=[])
+    def _exact(self, passes: int) -> list[_Entry]:
+        """Those that are exact on the same paths."""
+        return [e for e in self._entries if e.candidate.exact and e.candidate.passes == passes]
 
     def _scales(self) -> dict[str, float]:
         """Mean square norm of each parameter's gradient."""
@@ -346,7 +345,10 @@ class Pilot(race.Race):
 
     def _variance(self, entry: _Entry) -> float:
         scales = {key: scale for key, scale in self._scales().items() if scale > 0}
-        references = self._references(entry.candidate.passes)
+        # The exact gradient of each round on the same paths.
+        references: list[race.Gradients] = max(
+            (each.gradients for each in self._exact(entry.candidate.passes)), key=len, default=[]
+        )
         total = 0.0
         for key, scale in scales.items():
             own = [g[key] for g in entry.gradients]
@@ -367,12 +369,8 @@ class Pilot(race.Race):
         for entry in alive:
             rounds = min(len(entry.steps), len(best.steps))
             limit = min((factor for least, factor in DROPPED if rounds >= least), default=math.inf)
-            slower = any(
-                other.candidate.exact
-                and other.candidate.passes == entry.candidate.passes
-                and other.time * race.TIMING_NOISE < entry.time
-                for other in alive
-            )
+            exact = [other for other in self._exact(entry.candidate.passes) if other in alive]
+            slower = any(other.time * race.TIMING_NOISE < entry.time for other in exact)
             # No estimator has less variance than an exact one of the same paths.
             if entry is best or not (slower or self._efficiency(entry) * limit < self._efficiency(best)):
                 kept.append(entry)
@@ -410,10 +408,10 @@ class Pilot(race.Race):
     def _bound(self, candidate: Candidate, relative: _Entry) -> float:
         """The greatest efficiency that a candidate can have: it is no faster than its relative, and its variance is no
         less than an exact one's. Of more slots of one estimator the variance is known."""
-        if not self._references(candidate.passes) or candidate.passes != relative.candidate.passes:
+        exact = self._exact(candidate.passes)
+        if not any(entry.gradients for entry in exact) or candidate.passes != relative.candidate.passes:
             return math.inf
-        exact = next(e for e in self._entries if e.candidate.exact and e.candidate.passes == candidate.passes)
-        least = self._variance(exact)
+        least = self._variance(exact[0])
         if candidate.parent == relative.candidate.label and candidate.varies_slots:
             least += (self._variance(relative) - least) / candidate.options["capacity"]
         return 1 / (least * max(relative.time, 1e-6))

@@ -146,10 +146,6 @@ def share_left(problem: Problem, allowance: Allowance, reserved: float = 0.0, ke
     return max(min(race.SHARE - spent, allowance.iterations_left(kernels) / race.ITERATIONS) - reserved, 0.0)
 
 
-def _chosen(problem: Problem) -> dict[str, Any] | None:
-    return None if problem.pilot is None else problem.pilot.chosen
-
-
 # --- guiding ----------------------------------------------------------------------------------------------------------
 
 
@@ -189,7 +185,7 @@ def _guided(tuner: race.Tuner, trials: list[StepTrial]) -> GuidedRecord:
     return tuner.decide(
         GuidedRecord,
         # Learning is a larger part of a short run, where tables learn most often at first.
-        of={"guiding": 4, "of": _chosen(problem), "lessons": plan.lessons},
+        of={"guiding": 4, "of": problem.pilot and problem.pilot.chosen, "lessons": plan.lessons},
         # Where even numbers are likely to do better, to measure guiding alone would mislead.
         needs=(race.GUIDING_NEEDS, *([] if why is None else 2 * [race.SEQUENCE_NEEDS])),
         integrator=problem.integrator,
@@ -242,7 +238,7 @@ def _sequence(tuner: race.Tuner, trials: list[StepTrial]) -> SequenceRecord:
         return SequenceRecord(low_discrepancy=not is_guided, note=note)
 
     guided = None if found is None else [found.guided, found.images]
-    of = {"sequence": 1, "of": [_chosen(problem), guided]}
+    of = {"sequence": 1, "of": [problem.pilot and problem.pilot.chosen, guided]}
     return tuner.decide(SequenceRecord, of, [race.SEQUENCE_NEEDS], plain, measure, unmeasured)
 
 

@@ -233,7 +233,6 @@ class Curvature:
                 break
             roots = [np.sqrt(weight) * random.choice([-1.0, 1.0], size=weight.shape) for weight in self._weights]
             self._add_probe(total, roots, 2 * probe)
-            self.probes += 1
         return {key: value / self.probes for key, value in total.items()}
 
     def by_entry_of_target(self, first: int, go_on: Callable[[], bool]) -> dict[str, Array]:
@@ -247,10 +246,8 @@ class Curvature:
             if not go_on():
                 return {}
             self._add_probe(odd, [noise.signed(random) for noise in noises], 2 * (first + number))
-            self.probes += 1
         if odd:
             self._add_probe(even, [noise.even for noise in views[0]], 2 * (first + PROBED))
-            self.probes += 1
         return {key: value / len(views) + even[key] for key, value in odd.items()}
 
     def _add_probe(self, total: dict[str, Array], gradients: Sequence[Array], number: int) -> None:
@@ -258,6 +255,7 @@ class Curvature:
         a, b = (self._probe(gradients, number + half) for half in (0, 1))
         for key in a:
             total[key] = total.get(key, 0.0) + a[key].astype(np.float64) * b[key]
+        self.probes += 1
 
     def _target_noises(self) -> list[list[TargetNoise]]:
         config, trained = self.problem.config, self.problem.trained
