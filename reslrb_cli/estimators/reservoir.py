@@ -42,8 +42,6 @@ from reslrb_cli.transport.plan import Plan
 from reslrb_cli.transport.walk import Vertex
 
 JACOBIAN_DAMPING = 0.1  # of attached derivatives: `estimators.jacobian`
-
-
 SHARE = 0.01  # the least share of a candidate in the weights up to it
 
 

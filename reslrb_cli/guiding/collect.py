@@ -50,8 +50,6 @@ from reslrb_cli.transport.samples import Samples
 from reslrb_cli.transport.walk import Hooks, Vertex, walk
 
 Array = np.ndarray[Any, Any]
-
-
 PLACES = 32  # vertices
 
 
@@ -159,20 +157,10 @@ def walk_back(trail: Trail) -> Onwards:
 
 
 NAMES = ("onward", "frame")  # of its arrays
-
-
 KEEP = 0.75  # what of the past counts beside the newest walk
-
-
 SURE = 16.0
-
-
 LEAN = 100.0
-
-
 FLOOR = 0.1
-
-
 RAY = 0.2  # what a ray costs that meets nothing, in vertices
 
 
@@ -277,8 +265,6 @@ def _cubes(values: Array, level: int) -> Array:
 
 
 MOST_BSDFS = 6  # that are heard apart; the others are heard together
-
-
 BINS = 1024  # of sums over all paths, so that none loses small numbers
 
 

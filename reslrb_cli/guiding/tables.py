@@ -31,13 +31,10 @@ from reslrb_cli.transport.samples import Samples
 
 Array = np.ndarray[Any, Any]
 
-
 #: Of neighbouring cells, along each number. A quarter in place of the twentieth leaves a cell a sixteenth of what was
 #: heard of it, and rooms 1.3 to 1.4 times the squares; with none, cells that few paths have met count for what these
 #: few said.
 BLUR = (0.05, 0.9, 0.05)
-
-
 FINE = 2.0  # cells, at most, for each path that has been heard
 
 
@@ -156,22 +153,11 @@ def _blurred(grid: Grid, values: Array) -> Array:
 
 
 EVERY = 16  # gradients of a sensor from one time that its table learns to the next; at first after 1, 2, 4 and 8
-
-
 WRONG = 1.5  # `Learned.worse` of a table that does harm; one that is worth nothing, and right, has 1
-
-
 LEAST_BITS = 16  # cells, log2, however many sensors there are
-
-
 MOST_BYTES = 2**26  # of all tables together; sensors for which there is no room share
-
-
 NOW = 0.2  # of the paths aimed for a gradient: by its own dL/dI, where that is known; the others by what was said
-
-
 LEARNING_STREAM = 0x1EA2  # seeds of the samples that tables learn from
-
 
 #: Names of the arrays of each sensor in what has been learned.
 KNOWN = ("sums", "draws", "film", *NAMES)

@@ -38,7 +38,6 @@ from reslrb_cli.transport.walk import Hooks, Vertex, walk
 #: Where a parameter of a BSDF is this small, paths are followed and chosen in spite of it.
 NEARLY_ZERO = 1e-2
 
-
 #: What is a factor of a BSDF's value, where a roughness, say, is none.
 FACTORS = ("reflectance", "transmittance", "base_color", "opacity", "weight")
 
@@ -122,7 +121,6 @@ def _has_singular(key: str, value: dr.ArrayBase, least: float) -> bool:
 
 #: Light paths that are looked at: of what they do not meet, the part in a derivative is small.
 PATHS = 2**16
-
 
 #: What is found is to be the same for all runs of a scene.
 SEED = 0xB0A2CE

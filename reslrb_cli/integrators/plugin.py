@@ -16,8 +16,6 @@ from reslrb_cli.integrators.reslrb import Reslrb
 
 #: Our integrators by the names of their plugins.
 TRACERS = ("reslrb", "walk_ad", "trajectory")
-
-
 _registered_with_callback = False
 
 

@@ -22,18 +22,11 @@ from reslrb_cli.integrators.plugin import TRACERS, interface_of, make_tracer, re
 from reslrb_cli.integrators.protocol import Job, Refused, StepIntegrator
 
 Adjoint = Literal["correlated", "independent", "batched"]
-
-
 FirstBatch = Literal["image", "again"]
-
-
 Objective = Callable[[Any], Any]
-
 
 #: Told of an image and of the dL/dI that its samples were differentiated with.
 OnSamples: TypeAlias = "Callable[[mi.TensorXf, mi.TensorXf], None]"
-
-
 BATCH_STREAM = 0xBA7C4E5  # keeps the batches' seeds apart from those of passes and of the second samples
 
 

@@ -40,8 +40,6 @@ if TYPE_CHECKING:
 
 
 SHARE = 0.25  # of the paths that scatter
-
-
 REACHED = 1 - 1e-3  # of the distance to a point, where nothing stands in the way: as far as shadow rays look
 
 

@@ -41,20 +41,10 @@ from reslrb_cli.transport.film import Blocks
 from reslrb_cli.transport.plan import Grid, least_slots
 
 Array = np.ndarray[Any, Any]
-
-
 BITS = 4  # cubes along each axis of the box, log2
-
-
 OCTANTS = 8
-
-
 CELLS = OCTANTS << (3 * BITS)
-
-
 SHAPE = (1 << BITS, 1 << BITS, 1 << BITS, OCTANTS)  # of an array of all cells
-
-
 LEAST = 0.5  # the smallest probability of going on
 
 
@@ -109,8 +99,6 @@ def box_of(scene: mi.Scene) -> Array:
 
 
 CELL_BITS = 19  # cells of all emitters together, log2
-
-
 MOST_EMITTERS = 1024  # that have cells of their own; of more, neighbours share theirs
 
 
@@ -251,6 +239,4 @@ class Guide:
 
 
 AIM_UNIFORM = 0.2  # of these, how many are sent to places drawn evenly on the film, at least
-
-
 AIM_SLOTS = 1 << 17

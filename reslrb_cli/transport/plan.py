@@ -15,14 +15,8 @@ from reslrb_cli.scene.needs import SceneNeeds
 from reslrb_cli.transport.random import Coordinates
 
 Array = np.ndarray[Any, Any]
-
-
 GUIDE_UNIFORM = 0.25  # share of paths that start evenly, at least
-
-
 SLOTS_PER_CELL = 4  # one of them is the even share
-
-
 SLOTS_OF_SEVERAL = 8  # where emitters have unequal shares, which are rounded up to whole slots
 
 

@@ -59,7 +59,6 @@ class Early:
 
 DIGITS = 32
 
-
 #: Of each coordinate behind the first: the inner coefficients of its polynomial, one bit each, and its first numbers m.
 JOE_KUO: tuple[tuple[int, tuple[int, ...]], ...] = (
     (0, (1,)),
@@ -72,7 +71,6 @@ JOE_KUO: tuple[tuple[int, tuple[int, ...]], ...] = (
     (4, (1, 1, 5, 5, 5)),
     (7, (1, 1, 7, 11, 19)),
 )
-
 
 #: Scattering events whose numbers are coordinates: through a pane of glass, or around a corner.
 BOUNCES = 2

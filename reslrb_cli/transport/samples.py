@@ -83,23 +83,11 @@ def finish_pass(*results: object) -> None:
 
 #: Names of the random streams beside the sampler's own, mixed into the seed.
 SELECTION_STREAM = 0x5E1EC7  # what hooks draw to select
-
-
 VISIBLE_STREAM = 0xD1EC7  # primary rays
-
-
 LAMP_STREAM = 0x1A3B5 << 12  # points of lamps; the lamp's number is added
-
-
 PASS_STREAM = 0x9A55E5  # seeds of the second pass and those after it
-
-
 SMALL_LAMP_STREAM = 0x57A25  # points of lamps that are smaller than a pixel
-
-
 GUIDE_STREAM = 0x6D1DE  # cells of emission
-
-
 NET_STREAM = 0x5EC0E  # scrambles of numbers of low discrepancy
 
 

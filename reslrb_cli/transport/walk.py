@@ -187,8 +187,6 @@ def segment(
 
 
 ROULETTE_LIMIT = 0.95  # the largest probability of going on, as in `ptracer`
-
-
 DIMMEST = 1e-30  # the least emission that roulette knows, well above what single precision rounds to zero
 
 
