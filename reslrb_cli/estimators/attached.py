@@ -24,13 +24,13 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from reslrb_cli.estimators.base import Pass, VertexHooks, entry_bytes
+from reslrb_cli.estimators.base import Pass, VertexHooks, entry_bytes, places, vertices
 from reslrb_cli.estimators.kept import Before, SurfacePoint, reach
 from reslrb_cli.transport.bsdf import Scattering
 from reslrb_cli.transport.connection import Connection
 from reslrb_cli.transport.factors import Product
 from reslrb_cli.transport.plan import Plan
-from reslrb_cli.transport.random import Numbers
+from reslrb_cli.transport.samples import Numbers
 from reslrb_cli.transport.walk import Vertex, segment
 
 
@@ -180,7 +180,7 @@ def sweep(p: Pass, stack_size: int) -> Adjoint:
 
     dL/dI is known.
     """
-    size, longest = places(p.plan, stack_size), max(p.plan.max_depth - 1, 0)
+    size, longest = places(p.plan, stack_size), vertices(p.plan)
     pushed: Pushed = p.walk(Pushing(p, size))
     bottom = dr.select(pushed.count > size, pushed.count - size, 0)  # the first vertex that the ring still holds
     adjoint = walk_back(p, size, pushed, pushed.needed, bottom, Adjoint.zero())
@@ -259,11 +259,6 @@ def differentiate_start(p: Pass, adjoint: Adjoint) -> None:
         if plan.moving_emission:
             objective += dr.dot(adjoint.origin, emission.ray.o) + dr.dot(adjoint.direction, emission.ray.d)
         dr.backward_from(objective, flags=dr.ADFlag.Default | dr.ADFlag.AllowNoGrad)
-
-
-def places(plan: Plan, stack_size: int) -> int:
-    """How many vertices a stack has room for: no more than a path can have, and one at least."""
-    return min(stack_size, max(plan.max_depth - 1, 1))
 
 
 def scratch_bytes(plan: Plan, stack_size: int) -> int:

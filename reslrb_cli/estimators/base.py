@@ -195,6 +195,16 @@ class VertexHooks(Hooks):
         return self.concerned(state) | plan.concerns(vertex.bsdf)
 
 
+def vertices(plan: Plan) -> int:
+    """The most vertices that a path can have."""
+    return max(plan.max_depth - 1, 0)
+
+
+def places(plan: Plan, stack_size: int) -> int:
+    """How many vertices a stack has room for: no more than a path can have, and one at least."""
+    return min(stack_size, max(vertices(plan), 1))
+
+
 def one_of(name: str, value: str, allowed: tuple[str, ...]) -> None:
     """Raise ValueError where an option has none of the values it may have."""
     if value not in allowed:

@@ -45,7 +45,7 @@ from reslrb_cli.transport.bsdf import Scattering
 from reslrb_cli.transport.connection import Connection
 from reslrb_cli.transport.factors import Product
 from reslrb_cli.transport.plan import Plan
-from reslrb_cli.transport.random import Numbers
+from reslrb_cli.transport.samples import Numbers
 from reslrb_cli.transport.walk import Vertex, segment
 
 #: Vertices that are not specular in one block of a chain.

@@ -24,6 +24,7 @@ from reslrb_cli.estimators.base import (
     contribution,
     differentiate_emission,
     differentiate_passage,
+    vertices,
 )
 from reslrb_cli.estimators.kept import AdjointSum
 from reslrb_cli.transport.bsdf import Scattering, tracked_factors
@@ -84,7 +85,7 @@ class Gathering(VertexHooks):
         p = self.p
         # The sum is all that derivatives of emission need.
         traced_again = p.adjoint is None or p.plan.differentiate_bsdfs
-        visibility = Visibility.none(vertices(p) if traced_again else 0)
+        visibility = Visibility.none(vertices(p.plan) if traced_again else 0)
         if p.adjoint is None:
             return GatherState(visibility, [], [])
         return GatherState(visibility, [AdjointSum.zero(p.plan.track_zeros)], [mi.UInt32(0)])
@@ -122,7 +123,7 @@ class Summing(VertexHooks):
         return Summed(AdjointSum.zero(self.p.plan.track_zeros), mi.UInt32(0), mi.UInt32(0))
 
     def seen(self, vertex: Vertex) -> Seen:
-        return self.visibility.seen(vertex.depth, vertices(self.p))
+        return self.visibility.seen(vertex.depth, vertices(self.p.plan))
 
     def goes_on(self, state: Summed, vertex: Vertex) -> mi.Bool:
         return vertex.depth < self.visibility.last
@@ -148,7 +149,7 @@ class Taking(VertexHooks):
         return self.S
 
     def seen(self, vertex: Vertex) -> Seen:
-        return self.visibility.seen(vertex.depth, vertices(self.p))
+        return self.visibility.seen(vertex.depth, vertices(self.p.plan))
 
     def goes_on(self, state: AdjointSum, vertex: Vertex) -> mi.Bool:
         return vertex.depth < self.visibility.last
@@ -193,11 +194,6 @@ def needed(latest: mi.UInt32, depth: mi.UInt32) -> mi.UInt32:
     return dr.select(latest > 0, dr.minimum(latest + 1, depth), 0)
 
 
-def vertices(p: Pass) -> int:
-    """The most vertices that a path of this pass can have."""
-    return max(p.plan.max_depth - 1, 0)
-
-
 def plus(p: Pass, S: AdjointSum, vertex: Vertex, connection: Connection, C: Product) -> AdjointSum:
     """S + delta C."""
     return S.plus(p.delta(connection.u, connection.active), C, vertex.depth, connection.active)
@@ -225,5 +221,5 @@ class Gather(Estimator):
             p.walk(Taking(p, visibility, S), visibility.last > 0)
 
     def kept(self, plan: Plan) -> GatherState:
-        visibility = Visibility.none(max(plan.max_depth - 1, 0))
+        visibility = Visibility.none(vertices(plan))
         return GatherState(visibility, [AdjointSum.zero(plan.track_zeros)], [mi.UInt32(0)])

@@ -21,7 +21,7 @@ import mitsuba as mi
 
 from reslrb_cli.estimators.kept import Before, is_staying, reach
 from reslrb_cli.transport.plan import Plan
-from reslrb_cli.transport.random import Numbers
+from reslrb_cli.transport.samples import Numbers
 from reslrb_cli.transport.walk import Vertex, segment
 
 AXES = 4

@@ -31,8 +31,10 @@ from reslrb_cli.estimators.base import (
     differentiate_emission,
     differentiate_passage,
     entry_bytes,
+    places,
+    vertices,
 )
-from reslrb_cli.estimators.gather import Gather, GatherState, Taking, Visibility, vertices
+from reslrb_cli.estimators.gather import Gather, GatherState, Taking, Visibility
 from reslrb_cli.estimators.kept import AdjointSum, PlainSum, SurfacePoint, blank_lobe, event, lobe
 from reslrb_cli.transport.bsdf import Scattering, tracked_factors
 from reslrb_cli.transport.connection import Connection, Seen, stand_in
@@ -105,11 +107,6 @@ class StackState:
     last: mi.UInt32
 
 
-def places(plan: Plan, stack_size: int) -> int:
-    """How many vertices a stack has room for: no more than a path can have, and one at least."""
-    return min(stack_size, max(plan.max_depth - 1, 1))
-
-
 class Pushing(VertexHooks):
     """The way out: splat, and push vertices.
 
@@ -120,7 +117,7 @@ class Pushing(VertexHooks):
     def __init__(self, p: Pass, visibility: Visibility | None, stack_size: int) -> None:
         super().__init__(p)
         self.visibility, self.size = visibility, places(p.plan, stack_size)
-        self.bounded = vertices(p) > self.size
+        self.bounded = vertices(p.plan) > self.size
 
     def start(self, product: Product) -> Pushed:
         plan = self.p.plan
@@ -133,7 +130,7 @@ class Pushing(VertexHooks):
         return state.height > 0
 
     def seen(self, vertex: Vertex) -> Seen | None:
-        return None if self.visibility is None else self.visibility.seen(vertex.depth, vertices(self.p))
+        return None if self.visibility is None else self.visibility.seen(vertex.depth, vertices(self.p.plan))
 
     def goes_on(self, state: Pushed, vertex: Vertex) -> mi.Bool:
         return mi.Bool(True) if self.visibility is None else vertex.depth < self.visibility.last
@@ -245,7 +242,7 @@ class Stack(Estimator):
             state = self._sweep(p, state.visibility)
             dr.eval(state)
         differentiate_emission(p, state.S.adjoint_of_emission)
-        if vertices(p) > self.stack_size:
+        if vertices(p.plan) > self.stack_size:
             beyond = Visibility([], state.last)
             p.walk(Taking(p, beyond, state.tail, state.first), (state.first > 0) & (state.first <= state.last))
 
@@ -254,7 +251,7 @@ class Stack(Estimator):
             return []
         # Visibility is there from an image pass that did not know delta; the sweep's own state comes beside it.
         S = AdjointSum.zero(plan.track_zeros)
-        return [Visibility.none(max(plan.max_depth - 1, 0)), StackState(S, S, mi.UInt32(0), mi.UInt32(0))]
+        return [Visibility.none(vertices(plan)), StackState(S, S, mi.UInt32(0), mi.UInt32(0))]
 
     def scratch_bytes(self, plan: Plan) -> int:
         if plan.attached:

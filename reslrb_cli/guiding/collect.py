@@ -5,10 +5,10 @@ They lie in thread-local memory, the first PLACES of them; what later ones say i
 over all later vertices is at hand when a vertex is reached, as in `estimators/stack.py`.
 
 Onward: what light paths go on to say from where they are, and whether they are worth following by that. Of every cell
-of place and direction (`transport/guide.py`) two means are learned over the rays that leave a vertex there: the square
-of what the path still says behind it if its throughput is 1 (m), and how many vertices still follow (c). A ray that
-leaves with throughput w goes on with probability q = min(1, max(LEAST, w s)). Of all q those make variance times work
-least for which
+of place and direction (`transport/roulette.py`) two means are learned over the rays that leave a vertex there: the
+square of what the path still says behind it if its throughput is 1 (m), and how many vertices still follow (c). A ray
+that leaves with throughput w goes on with probability q = min(1, max(LEAST, w s)). Of all q those make variance times
+work least for which
 
     s = sqrt(m W / (c V))        V: the mean square of what a whole path says; W: the mean number of its vertices
 
@@ -44,8 +44,8 @@ from reslrb_cli.transport.connection import Connection
 from reslrb_cli.transport.emission import sample_time
 from reslrb_cli.transport.factors import Product
 from reslrb_cli.transport.film import AdjointImage, film_blocks
-from reslrb_cli.transport.guide import BITS, CELLS, SHAPE
 from reslrb_cli.transport.plan import Plan
+from reslrb_cli.transport.roulette import BITS, CELLS, SHAPE
 from reslrb_cli.transport.samples import Samples
 from reslrb_cli.transport.walk import Hooks, Vertex, walk
 
@@ -108,7 +108,7 @@ class Trail:
 
 @dataclass
 class Onwards:
-    """Sums over all paths, by the cell that a ray leaves a vertex by (`transport/guide.py`): the squares of what
+    """Sums over all paths, by the cell that a ray leaves a vertex by (`transport/roulette.py`): the squares of what
     paths still said at a throughput of 1 (voices * CELLS), voice by voice, the image last; the vertices that followed
     (CELLS); the rays that left (CELLS)."""
 

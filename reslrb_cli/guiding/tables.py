@@ -23,10 +23,12 @@ import mitsuba as mi
 import numpy as np
 
 from reslrb_cli.guiding.collect import KEEP, NAMES, Onward, Said
+from reslrb_cli.transport.aim import AIM_SLOTS, Aim
 from reslrb_cli.transport.emission import used_numbers
 from reslrb_cli.transport.film import BLOCKS, Blocks
-from reslrb_cli.transport.guide import AIM_SLOTS, CELL_BITS, CELLS, Aim, Survival, Table, apportion, box_of, make_grid
+from reslrb_cli.transport.guide import CELL_BITS, Table, apportion, make_grid
 from reslrb_cli.transport.plan import Grid
+from reslrb_cli.transport.roulette import CELLS, Survival, box_of
 from reslrb_cli.transport.samples import Samples
 
 Array = np.ndarray[Any, Any]

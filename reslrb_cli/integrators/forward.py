@@ -17,11 +17,19 @@ import mitsuba as mi
 from reslrb_cli.estimators.kept import Before, reach
 from reslrb_cli.transport.bsdf import Scattering, evaluate, tracked_factor
 from reslrb_cli.transport.connection import Connection, forward_derivatives, passage, transmittance
+from reslrb_cli.transport.emission import sample_emission
 from reslrb_cli.transport.factors import Product
 from reslrb_cli.transport.film import AdjointImage
-from reslrb_cli.transport.random import Numbers
-from reslrb_cli.transport.samples import Samples
-from reslrb_cli.transport.walk import Hooks, Splat, Vertex, segment
+from reslrb_cli.transport.samples import Numbers, Samples
+from reslrb_cli.transport.visible import (
+    differentiate_visible_emission,
+    moving_splats,
+    primary_ray,
+    small_splat,
+    splat_visible_emission,
+    visible_tangent,
+)
+from reslrb_cli.transport.walk import Hooks, Splat, Vertex, segment, walk
 
 
 class TrackedSplat(Splat):
@@ -163,3 +171,40 @@ class AttachedTangentSplat(Hooks):
 
     def survived(self, state: AttachedTangent, weight: mi.Float) -> AttachedTangent:
         return AttachedTangent(state.d_product * weight, state.d_origin, state.d_direction, state.before)
+
+
+def reverse_recorded(samples: Samples, adjoint: AdjointImage) -> None:
+    """Add the same derivatives by Dr.Jit's own reversal of the walk, which records the loop's state on the way."""
+    differentiate_visible_emission(samples, adjoint)
+    with dr.resume_grad():
+        S = walk(samples, RecordedObjective(samples, adjoint))
+        dr.backward_from(S, flags=dr.ADFlag.Default | dr.ADFlag.AllowNoGrad)
+
+
+def splat_tangents(samples: Samples, block: mi.ImageBlock) -> None:
+    """Add the forward-mode derivative of the samples' contributions to the block, exactly and in one traversal."""
+    plan, dE = samples.plan, mi.Spectrum(0)
+    with dr.resume_grad():
+        if plan.differentiate_emission:
+            E = sample_emission(samples, samples.sampler()).weight
+            [dE] = forward_derivatives(E)
+        if plan.visible_emission and (plan.differentiate_emission or plan.differentiate_null):
+            primary = primary_ray(samples)
+            tangent = visible_tangent(plan, samples.scene, primary)
+            samples.film.put(block, primary.u, tangent * primary.weight * samples.fraction, primary.active)
+        if plan.small_lamps and plan.differentiate_emission:
+            u, C, active = small_splat(samples)
+            [tangent] = forward_derivatives(C)
+            samples.film.put(block, u, tangent, active)
+    hooks = AttachedTangentSplat if plan.attached else TangentSplat
+    walk(samples, hooks(samples, block, dE))
+
+
+def splat_tracked(samples: Samples, block: mi.ImageBlock) -> None:
+    """Add the contributions with derivatives tracked to the block: naive AD, its memory proportional to depth."""
+    with dr.resume_grad():
+        splat_visible_emission(samples, block, "evaluated")
+        for u, C, active in moving_splats(samples):  # twice, so that the image stays as it is
+            samples.film.put(block, u, C, active, samples.plan.attached_normalization)
+            samples.film.put(block, dr.detach(u), -dr.detach(C), active)
+        walk(samples, TrackedSplat(samples, block, samples.plan.attached))

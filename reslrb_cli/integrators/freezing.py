@@ -18,8 +18,8 @@ import mitsuba as mi
 from reslrb_cli.errors import UnsupportedScene, is_machine_fault, is_out_of_memory
 from reslrb_cli.transport.film import Film
 from reslrb_cli.transport.guide import Guide
-from reslrb_cli.transport.random import Net
 from reslrb_cli.transport.samples import Samples
+from reslrb_cli.transport.sobol import Net
 
 logger = logging.getLogger(__name__)
 

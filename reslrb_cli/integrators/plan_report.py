@@ -16,14 +16,14 @@ import drjit as dr
 import mitsuba as mi
 
 from reslrb_cli.guiding.tables import grid_for, sensor_bytes
-from reslrb_cli.integrators import light_tracer as lt
+from reslrb_cli.integrators import reslrb as lt
 from reslrb_cli.integrators.reslrb import Reslrb
 from reslrb_cli.scene.catalog import list_parameters
 from reslrb_cli.transport.film import film_blocks
 from reslrb_cli.transport.guide import even_table
 from reslrb_cli.transport.plan import UNBOUNDED, Plan
-from reslrb_cli.transport.random import make_coordinates
 from reslrb_cli.transport.samples import passes
+from reslrb_cli.transport.sobol import make_coordinates
 
 #: The feature that guiding is.
 GUIDED = "guided emission"

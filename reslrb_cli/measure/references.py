@@ -27,7 +27,7 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
-from reslrb_cli.integrators.light_tracer import LightTracer
+from reslrb_cli.integrators.reslrb import LightTracer
 from reslrb_cli.integrators.step import make_integrator
 from reslrb_cli.measure.gradients import moves_light
 from reslrb_cli.measure.scenes.analytic import furnace

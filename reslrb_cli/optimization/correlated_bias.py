@@ -29,7 +29,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from reslrb_cli.integrators.light_tracer import LightTracer
+from reslrb_cli.integrators.reslrb import LightTracer
 from reslrb_cli.integrators.step import cross_step
 from reslrb_cli.optimization.sensitivity import take_gradient
 from reslrb_cli.optimization.views import QUADRATIC

@@ -12,7 +12,7 @@ import numpy as np
 from reslrb_cli.scene.deformation import Horizon
 from reslrb_cli.scene.graph import Lamp
 from reslrb_cli.scene.needs import SceneNeeds
-from reslrb_cli.transport.random import Coordinates
+from reslrb_cli.transport.sobol import Coordinates
 
 Array = np.ndarray[Any, Any]
 GUIDE_UNIFORM = 0.25  # share of paths that start evenly, at least

@@ -7,7 +7,7 @@ another.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import drjit as dr
@@ -17,8 +17,9 @@ from reslrb_cli.config.files import PASS_PATHS, PASS_SAMPLES, PASSES
 from reslrb_cli.scene.graph import Lamp
 from reslrb_cli.transport.film import Film
 from reslrb_cli.transport.guide import Drawn, Guide, Table
+from reslrb_cli.transport.lamps import sums_of_areas
 from reslrb_cli.transport.plan import Plan
-from reslrb_cli.transport.random import Early, Net, Numbered, Points
+from reslrb_cli.transport.sobol import Net, Points
 
 
 def in_passes(
@@ -92,6 +93,35 @@ NET_STREAM = 0x5EC0E  # scrambles of numbers of low discrepancy
 
 
 @dataclass
+class Numbers:
+    """What one segment draws: a point on the sensor's aperture, then two numbers and one for the BSDF."""
+
+    aperture: mi.Point2f
+    bsdf_2d: mi.Point2f
+    bsdf_1d: mi.Float
+
+    @staticmethod
+    def draw(sampler: mi.Sampler, active: mi.Bool) -> Numbers:
+        """The numbers of the next segment. Roulette's follows them, and is drawn by the walk."""
+        return Numbers(sampler.next_2d(active), sampler.next_2d(active), sampler.next_1d(active))
+
+    def of_early(self, early: list[Early], depth: mi.UInt32) -> Numbers:
+        """The same, but those for the BSDF as `early` has them for the first vertices; the first is of depth 1."""
+        bsdf = Early(self.bsdf_2d, self.bsdf_1d)
+        for bounce, own in enumerate(early):
+            bsdf = dr.select(depth == bounce + 1, own, bsdf)
+        return replace(self, bsdf_2d=bsdf.bsdf_2d, bsdf_1d=bsdf.bsdf_1d)
+
+
+@dataclass
+class Early:
+    """What the BSDF of one of the first vertices has, known before the path is traced."""
+
+    bsdf_2d: mi.Point2f
+    bsdf_1d: mi.Float
+
+
+@dataclass
 class Samples:
     """The samples of one pass. `seed` is an opaque UInt32; `width` is the number of light paths.
 
@@ -114,7 +144,8 @@ class Samples:
 
     def __post_init__(self) -> None:
         # Now: in the midst of tracing they would cut a kernel in two.
-        self._areas = sums_of_areas(self.plan.reshaped_lamps)
+        lamps = self.plan.reshaped_lamps
+        self._areas = sums_of_areas(lamps) if lamps else []
 
     def areas(self, lamp: Lamp) -> mi.Float | None:
         """Sums of the areas of a lamp's faces, where these move; else None."""
@@ -179,20 +210,20 @@ class Samples:
         stream = self.stream(GUIDE_STREAM)
         return self.guide.draw(self.plan.grid, self.width, stream, choice, position, direction)
 
-    def visible_numbers(self) -> Numbered:
+    def visible_numbers(self) -> NumberStream:
         """Random numbers for primary rays: the light paths are those of `ptracer` with or without them."""
-        return _NumberStream(self.stream(VISIBLE_STREAM))
+        return NumberStream(self.stream(VISIBLE_STREAM))
 
-    def small_lamp_numbers(self) -> Numbered:
+    def small_lamp_numbers(self) -> NumberStream:
         """Random numbers for points of lamps that are smaller than a pixel."""
-        return _NumberStream(self.stream(SMALL_LAMP_STREAM))
+        return NumberStream(self.stream(SMALL_LAMP_STREAM))
 
-    def lamp_numbers(self, lamp: Lamp) -> Numbered:
+    def lamp_numbers(self, lamp: Lamp) -> NumberStream:
         """Random numbers for points of a lamp that moves and is seen directly."""
-        return _NumberStream(self.stream(LAMP_STREAM + lamp.index))
+        return NumberStream(self.stream(LAMP_STREAM + lamp.index))
 
 
-class _NumberStream:
+class NumberStream:
     """The two methods of a Mitsuba sampler that emission asks for, over a bare generator."""
 
     def __init__(self, generator: mi.PCG32) -> None:
@@ -257,17 +288,3 @@ def _parts(spp: int) -> list[int]:
     """The fewest parts of at most PASS_SAMPLES samples, of sizes that differ by 1 at most."""
     count = -(-spp // PASS_SAMPLES)
     return [spp // count + (part < spp % count) for part in range(count)]
-
-
-def sums_of_areas(lamps: Sequence[Lamp]) -> list[mi.Float]:
-    """Of each lamp, a mesh, the areas of its first faces, summed: (F,), evaluated and detached."""
-    with dr.suspend_grad():
-        found = [dr.cumsum(face_area(lamp.shape, dr.arange(mi.UInt32, lamp.shape.face_count()))) for lamp in lamps]
-        dr.eval(found)
-        return found
-
-
-def face_area(mesh: mi.Mesh, face: mi.UInt32) -> mi.Float:
-    """The area of a face of a mesh."""
-    a, b, c = (mesh.vertex_position(vertex) for vertex in mesh.face_indices(face))
-    return 0.5 * dr.norm(dr.cross(b - a, c - a))

@@ -25,10 +25,11 @@ import mitsuba as mi
 
 from reslrb_cli.scene.graph import Lamp
 from reslrb_cli.transport.connection import connect, forward_derivatives, passage
-from reslrb_cli.transport.emission import lamp_point, sample_time
+from reslrb_cli.transport.emission import sample_time
+from reslrb_cli.transport.film import AdjointImage
+from reslrb_cli.transport.lamps import lamp_point
 from reslrb_cli.transport.plan import Plan
-from reslrb_cli.transport.random import Numbered
-from reslrb_cli.transport.samples import Samples
+from reslrb_cli.transport.samples import NumberStream, Samples
 
 
 def moving_splats(samples: Samples) -> Iterator[tuple[mi.Point2f, mi.Spectrum, mi.Bool]]:
@@ -84,7 +85,7 @@ def _splat(samples: Samples, lamp: Lamp) -> tuple[mi.Point2f, mi.Spectrum, mi.Bo
     return point.u, dr.select(point.active, radiance * point.weight, 0), point.active
 
 
-def _points(samples: Samples, lamps: Sequence[Lamp], index: mi.UInt32, numbers: Numbered, attached: bool) -> Points:
+def _points(samples: Samples, lamps: Sequence[Lamp], index: mi.UInt32, numbers: NumberStream, attached: bool) -> Points:
     """A point of each lane's lamp, the one of that index in `scene.emitters()`."""
     plan, sensor = samples.plan, samples.sensor
     time = sample_time(plan, sensor, numbers)
@@ -232,3 +233,31 @@ def _look(
     state = _Look(mi.Bool(primary.active), primary.ray, mi.Spectrum(1), mi.Spectrum(0), mi.UInt32(0), d_state)
     (state,) = dr.while_loop((state,), lambda state: state.active, look, label="primary ray", mode=mode)
     return state
+
+
+def splat_visible_emission(samples: Samples, block: mi.ImageBlock, loop_mode: str = "symbolic") -> None:
+    """Add C_0 to the block."""
+    if samples.plan.visible_emission:
+        primary = primary_ray(samples)
+        radiance = visible_radiance(samples.plan, samples.scene, primary, loop_mode)
+        samples.film.put(block, primary.u, radiance * primary.weight * samples.fraction, primary.active)
+    if samples.plan.small_lamps:
+        samples.film.put(block, *small_splat(samples))
+
+
+def differentiate_visible_emission(samples: Samples, adjoint: AdjointImage) -> None:
+    """Add the derivatives of C_0."""
+    plan = samples.plan
+    if plan.visible_emission and (plan.differentiate_emission or plan.differentiate_null):
+        primary = primary_ray(samples)
+        delta = adjoint.lookup(primary.u, primary.active) * primary.weight * samples.fraction
+        differentiate_visible_radiance(plan, samples.scene, primary, delta)
+    if plan.small_lamps and plan.differentiate_emission:
+        with dr.resume_grad():
+            u, C, active = small_splat(samples)
+            objective = dr.dot(adjoint.lookup(u, active), C)
+            dr.backward_from(objective, flags=dr.ADFlag.Default | dr.ADFlag.AllowNoGrad)
+    if plan.visible_moving_lamps:
+        with dr.resume_grad():
+            for u, C, active in moving_splats(samples):
+                dr.backward_from(dr.dot(adjoint.lookup(u, active, plan.attached_normalization), C))

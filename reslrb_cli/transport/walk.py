@@ -25,8 +25,8 @@ from reslrb_cli.transport.connection import Connection, Seen, connect, passage
 from reslrb_cli.transport.emission import sample_emission
 from reslrb_cli.transport.factors import Product
 from reslrb_cli.transport.plan import Plan
-from reslrb_cli.transport.random import Early, Numbers
-from reslrb_cli.transport.samples import SELECTION_STREAM, Samples
+from reslrb_cli.transport.roulette import first_eta, play
+from reslrb_cli.transport.samples import SELECTION_STREAM, Early, Numbers, Samples
 
 
 @dataclass
@@ -186,10 +186,6 @@ def segment(
     return Segment(si, connection, scattering)
 
 
-ROULETTE_LIMIT = 0.95  # the largest probability of going on, as in `ptracer`
-DIMMEST = 1e-30  # the least emission that roulette knows, well above what single precision rounds to zero
-
-
 @dataclass
 class Path:
     """Loop state of one light path."""
@@ -220,13 +216,7 @@ def walk(samples: Samples, hooks: Hooks, active: mi.Bool | bool = True) -> Any:
         product = product.times(emission.weight, mi.Int32(0))
         active &= product.alive()
         if plan.roulette:
-            # Relative to emission where that is dim: else light of small lamps, or in large units, would end at once.
-            light = dr.max(product.weight())
-            if emission.guided is None:
-                eta = dr.rsqrt(dr.clip(light, DIMMEST, 1))
-            else:
-                # As without the guide: paths that it has found would end for being many.
-                eta = dr.rsqrt(dr.clip(light / emission.guided, DIMMEST, 1)) * dr.rsqrt(emission.guided)
+            eta = first_eta(dr.max(product.weight()), emission.guided)
     state = hooks.start(product)
     active &= plan.max_depth > 1
     pi, active = intersect(plan, scene, emission.ray, active)
@@ -257,7 +247,8 @@ def walk(samples: Samples, hooks: Hooks, active: mi.Bool | bool = True) -> Any:
         aimed = None
         if aim is not None:
             able = active & aims_from(bsdf)
-            aimed, numbers = choose(scene, sensor, aim, path.ray.time, numbers, slot, able)
+            aimed, bsdf_1d = choose(scene, sensor, aim, path.ray.time, numbers.bsdf_1d, numbers.bsdf_2d, slot, able)
+            numbers = replace(numbers, bsdf_1d=bsdf_1d)
         this = segment(
             plan, sensor, path.ray, si, bsdf, numbers, connected, active, hooks.connects, hooks.tracked,
             hooks.attached, aimed,
@@ -289,16 +280,10 @@ def walk(samples: Samples, hooks: Hooks, active: mi.Bool | bool = True) -> Any:
         # ---- Russian roulette ----
         number = sampler.next_1d(active)
         if plan.roulette or survival is not None:
-            throughput, q, playing = dr.max(dr.abs(product.weight())), mi.Float(1), mi.Bool(False)
-            if plan.roulette:
-                q = dr.minimum(throughput * dr.square(eta), ROULETTE_LIMIT)
-                playing = path.depth + 1 > plan.rr_depth
-            if survival is not None:
-                learned = survival.probability(si.p, scattering.d, throughput)
-                q, playing = dr.minimum(dr.select(playing, q, 1), learned), mi.Bool(True)
-            active &= ~playing | (number < q)
-            roulette_weight = dr.select(playing, dr.rcp(q), 1)
-            product, state = product.scaled(roulette_weight), hooks.survived(state, roulette_weight)
+            throughput = dr.max(dr.abs(product.weight()))
+            survives, weight = play(plan, survival, path.depth, throughput, eta, si.p, scattering.d, number)
+            active &= survives
+            product, state = product.scaled(weight), hooks.survived(state, weight)
 
         pending = []
         if aimed is not None:

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from reslrb_cli.integrators.context import stays
+from reslrb_cli.integrators.differentiated import stays
 from reslrb_cli.measure.comparison import Family, compare_expectations
 from reslrb_cli.measure.gradients import integrator, seeds
 from reslrb_cli.measure.scenes.moving import AttachedScene, Move, Pose, compare_with_differences

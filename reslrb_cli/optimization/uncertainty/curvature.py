@@ -35,7 +35,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from reslrb_cli.integrators.light_tracer import LightTracer
+from reslrb_cli.integrators.reslrb import LightTracer
 from reslrb_cli.integrators.step import known_step, render_image
 from reslrb_cli.optimization.loading import make_configured, render_in_passes
 from reslrb_cli.optimization.sensitivity import take_gradient
