@@ -20,16 +20,15 @@ from reslrb_cli.estimators.base import (
     Pass,
     PathAdjoint,
     VertexHooks,
-    adjoint_of_factor,
+    adjoint_of_connection,
     contribution,
     differentiate_emission,
-    differentiate_passage,
     vertices,
 )
 from reslrb_cli.estimators.kept import AdjointSum
 from reslrb_cli.transport.bsdf import Scattering, tracked_factors
-from reslrb_cli.transport.connection import Connection, Seen, stand_in
-from reslrb_cli.transport.factors import NO_ZERO, Product
+from reslrb_cli.transport.connection import Connection, Seen
+from reslrb_cli.transport.factors import Product
 from reslrb_cli.transport.plan import Plan
 from reslrb_cli.transport.walk import Vertex
 
@@ -167,14 +166,7 @@ class Taking(VertexHooks):
         delta = p.delta(connection.u, connected)
         S = state.minus(delta, C, vertex.depth, connected)
         own = PathAdjoint(delta * C.nonzero, C)
-        rest_c = mi.Spectrum(dr.rcp(stand_in(connection)[0]))
-        if plan.needs.has_null:
-
-            def adjoint_of(transmission: mi.Spectrum) -> mi.Spectrum:
-                return adjoint_of_factor(own, mi.Int32(NO_ZERO), transmission, 0)
-
-            rest_c *= differentiate_passage(p, vertex.si, vertex.depth, connection, connected, adjoint_of)
-        weight_c = adjoint_of_factor(own, vertex.depth, connection.f, rest_c)
+        weight_c = adjoint_of_connection(p, vertex, connection, connected, own)
         weight_s = S.adjoint_of_factor(scattering.f, vertex.product, scattering.correction / scattering.pdf)
         connected, scattered = connected & useful, scattering.active & useful
         with dr.resume_grad():

@@ -33,11 +33,12 @@ import drjit as dr
 import mitsuba as mi
 
 from reslrb_cli.estimators.base import Pass, PathAdjoint, adjoint_of_factor, differentiate_passage
-from reslrb_cli.transport.bsdf import Scattering, evaluate, stays_behind, tracked_factor
+from reslrb_cli.transport.bsdf import Hit, Scattering, evaluate, stays_behind, tracked_factor
 from reslrb_cli.transport.connection import Connection, connect, stand_in
 from reslrb_cli.transport.factors import NO_ZERO, Product, showing
 from reslrb_cli.transport.plan import Plan
-from reslrb_cli.transport.walk import Vertex, find_following_vertex, find_vertex
+from reslrb_cli.transport.samples import Numbers, Samples
+from reslrb_cli.transport.walk import Segment, Vertex, find_following_vertex, find_vertex, segment
 
 
 @dataclass
@@ -208,14 +209,6 @@ class Before:
         stays = stays_behind(plan, vertex.bsdf, scattering.is_delta)
         return [Before(SurfacePoint.of(plan, vertex), dr.select(stays, mi.UInt32(1), 0))]
 
-    def members(self) -> list[dr.ArrayBase]:
-        """All arrays, in the order of `like`."""
-        return [*self.point.numbers, self.stays]
-
-    def like(self, members: list[dr.ArrayBase]) -> Before:
-        """One of the same form that has these members."""
-        return Before(SurfacePoint(members[:-1]), members[-1])
-
 
 def is_staying(before: list[Before]) -> mi.Bool:
     """Lanes in which the vertex behind `before` stays where it is."""
@@ -223,23 +216,19 @@ def is_staying(before: list[Before]) -> mi.Bool:
 
 
 def reach(
-    plan: Plan,
-    before: list[Before],
-    ray: mi.Ray3f,
-    pi: mi.PreliminaryIntersection3f,
-    active: mi.Bool,
+    plan: Plan, before: list[Before], ray: mi.Ray3f, pi: mi.PreliminaryIntersection3f, active: mi.Bool,
     parameters: bool = True,
-) -> tuple[mi.SurfaceInteraction3f, mi.BSDFPtr, mi.Ray3f, mi.Spectrum]:
-    """The vertex where `ray` hits what `pi` says, its BSDF, the ray that reaches it, and a factor (C,) of value 1 that
-    carries the derivatives of s_{i-1} which belong to it.
+) -> tuple[Hit, mi.Spectrum]:  # fmt: skip
+    """The vertex where `ray` hits what `pi` says, and a factor (C,) of value 1 that carries the derivatives of s_{i-1}
+    which belong to it.
 
     Call under `dr.resume_grad()`, the ray being differentiable; without `parameters`, where it is resumed for the ray
     alone.
     """
     if not before:
-        return *find_vertex(ray, pi, active), ray, mi.Spectrum(1)
+        return find_vertex(ray, pi, active), mi.Spectrum(1)
     stays = active & is_staying(before)
-    slid, _ = find_vertex(ray, pi, active & ~stays)
+    slid = find_vertex(ray, pi, active & ~stays).si
     stayed, reaching, factor = find_following_vertex(ray, pi, stays)
     with dr.suspend_grad():
         other, other_bsdf = before[0].point.interaction(plan, stays)
@@ -251,7 +240,16 @@ def reach(
     si = dr.select(stays, stayed, slid)
     there = mi.Ray3f(ray)
     there.d = dr.select(stays, reaching.d, ray.d)
-    return si, si.bsdf(), there, dr.select(stays, changed, 1)
+    return Hit(si, si.bsdf(), there), dr.select(stays, changed, 1)
+
+
+def segment_again(
+    samples: Samples, before: list[Before], ray: mi.Ray3f, pi: mi.PreliminaryIntersection3f, numbers: Numbers,
+    connected: mi.Bool, scattered: mi.Bool, evaluates: bool = True, parameters: bool = True,
+) -> tuple[Segment, mi.Spectrum]:  # fmt: skip
+    """The segment from there, with attached derivatives, and that factor."""
+    hit, factor = reach(samples.plan, before, ray, pi, connected | scattered, parameters)
+    return segment(samples, hit, numbers, connected, scattered, evaluates, attached=True), factor
 
 
 @dataclass
@@ -315,11 +313,7 @@ def differentiate_event(p: Pass, kept: Event, adjoint: PathAdjoint, active: mi.B
     if plan.passage_in_gradient:
         own, sample = kept.own
         connection = connect(plan, p.samples.sensor, si, kept.point.ray(), sample, active & own)
-
-        def adjoint_of(transmission: mi.Spectrum) -> mi.Spectrum:
-            return adjoint_of_factor(adjoint, mi.Int32(NO_ZERO), transmission, 0)
-
-        passed = differentiate_passage(p, si, kept.index, connection, active & own, adjoint_of)
+        passed = differentiate_passage(p, si, kept.index, connection, active & own, adjoint)
         rest = dr.select(own, rest * passed, rest)
     weight = adjoint_of_factor(adjoint, kept.index, kept.f, rest)
     active &= plan.differentiates(bsdf)

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from reslrb_cli.estimators.kept import Before, reach
+from reslrb_cli.estimators.kept import Before, segment_again
 from reslrb_cli.transport.bsdf import Scattering, evaluate, tracked_factor
 from reslrb_cli.transport.connection import Connection, forward_derivatives, passage, transmittance
 from reslrb_cli.transport.emission import sample_emission
@@ -29,7 +29,7 @@ from reslrb_cli.transport.visible import (
     splat_visible_emission,
     visible_tangent,
 )
-from reslrb_cli.transport.walk import Hooks, Splat, Vertex, segment, walk
+from reslrb_cli.transport.walk import Hooks, Splat, Vertex, walk
 
 
 class TrackedSplat(Splat):
@@ -152,8 +152,7 @@ class AttachedTangentSplat(Hooks):
             dr.enable_grad(ray.o, ray.d)
             dr.set_grad(ray.o, mi.Point3f(state.d_origin))
             dr.set_grad(ray.d, state.d_direction)
-            si, bsdf, reaching, reached = reach(plan, state.before, ray, vertex.pi, seen | scattered)
-            this = segment(plan, s.sensor, reaching, si, bsdf, numbers, seen, scattered, attached=True)
+            this, reached = segment_again(s, state.before, ray, vertex.pi, numbers, seen, scattered)
             following, taps = this.next_ray(attached=True), s.film.taps(this.connection.u, plan.attached_normalization)
             # Selected: no other of these hangs on what that makes, which would be cleared on the way.
             connection, scattering = this.connection, this.scattering

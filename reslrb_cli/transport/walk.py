@@ -20,7 +20,7 @@ import drjit as dr
 import mitsuba as mi
 
 from reslrb_cli.transport.aim import Pending, aims_from, choose
-from reslrb_cli.transport.bsdf import Aimed, Scattering, evaluate, scatter, tracked_factor
+from reslrb_cli.transport.bsdf import Aimed, Hit, Scattering, evaluate, scatter, tracked_factor
 from reslrb_cli.transport.connection import Connection, Seen, connect, passage
 from reslrb_cli.transport.emission import sample_emission
 from reslrb_cli.transport.factors import Product
@@ -30,13 +30,10 @@ from reslrb_cli.transport.samples import SELECTION_STREAM, Early, Numbers, Sampl
 
 
 @dataclass
-class Vertex:
+class Vertex(Hit):
     """The current vertex as hooks see it; `product` does not include the vertex's own scattering."""
 
     pi: mi.PreliminaryIntersection3f
-    si: mi.SurfaceInteraction3f
-    bsdf: mi.BSDFPtr
-    ray: mi.Ray3f
     depth: mi.UInt32
     product: Product
     active: mi.Bool
@@ -77,11 +74,8 @@ class Hooks:
         return state
 
     def goes_on(self, state: Any, vertex: Vertex) -> mi.Bool:
-        """Lanes that scatter on from this vertex, as far as the hooks care."""
-        return mi.Bool(True)
-
-    def is_followed(self, state: Any, vertex: Vertex) -> mi.Bool:
-        """In a replay: lanes that `goes_on` let scatter, and whose next vertex is wanted as well."""
+        """Lanes that scatter on from this vertex, as far as the hooks care. A replay asks also of the next one, of
+        which it knows the depth alone, before it goes there."""
         return mi.Bool(True)
 
     def scattering(self, state: Any, vertex: Vertex, connection: Connection, scattering: Scattering) -> Any:
@@ -126,12 +120,10 @@ class Segment:
         return ray if attached else dr.detach(ray)
 
 
-def find_vertex(
-    ray: mi.Ray3f, pi: mi.PreliminaryIntersection3f, active: mi.Bool
-) -> tuple[mi.SurfaceInteraction3f, mi.BSDFPtr]:
-    """The surface interaction where `ray` hits what `pi` says, and its BSDF."""
+def find_vertex(ray: mi.Ray3f, pi: mi.PreliminaryIntersection3f, active: mi.Bool) -> Hit:
+    """The vertex where `ray` hits what `pi` says."""
     si = pi.compute_surface_interaction(ray, mi.RayFlags.All, active)
-    return si, si.bsdf()
+    return Hit(si, si.bsdf(), ray)
 
 
 def find_following_vertex(
@@ -155,33 +147,24 @@ def find_following_vertex(
 
 
 def segment(
-    plan: Plan,
-    sensor: mi.Sensor,
-    ray: mi.Ray3f,
-    si: mi.SurfaceInteraction3f,
-    bsdf: mi.BSDFPtr,
-    numbers: Numbers,
-    connected: mi.Bool,
-    scattered: mi.Bool,
-    evaluates: bool = True,
-    tracked: bool = False,
-    attached: bool = False,
-    aimed: Aimed | None = None,
-) -> Segment:
-    """The segment from the vertex `si`, which `ray` reaches: connected in some lanes, scattered in some.
+    samples: Samples, hit: Hit, numbers: Numbers, connected: mi.Bool, scattered: mi.Bool, evaluates: bool = True,
+    tracked: bool = False, attached: bool = False, aimed: Aimed | None = None,
+) -> Segment:  # fmt: skip
+    """The segment from a vertex: connected in some lanes, scattered in some.
 
     Without `evaluates` the BSDF is not evaluated towards the sensor. With `tracked` the scattering weight carries the
     derivatives of the scene's parameters, where gradients are enabled, and the connection is left to be evaluated where
     it turns out to be visible; directions, densities and film positions have no derivatives then. With `attached` they
     have, and so has everything else. Lanes that are `aimed` scatter to their points.
     """
-    connection = connect(plan, sensor, si, ray, numbers.aperture, connected, attached)
+    plan, si = samples.plan, hit.si
+    connection = connect(plan, samples.sensor, si, hit.ray, numbers.aperture, connected, attached)
     wanted = connection.active if evaluates and not tracked else None
     scattering, connection.f = scatter(
-        plan, si, bsdf, ray, numbers.bsdf_1d, numbers.bsdf_2d, scattered, connection.wo, wanted, attached, aimed
+        plan, hit, numbers.bsdf_1d, numbers.bsdf_2d, scattered, connection.wo, wanted, attached, aimed
     )
     if tracked and not attached:
-        f = tracked_factor(plan, si, bsdf, scattering, scattering.active)
+        f = tracked_factor(plan, si, hit.bsdf, scattering, scattering.active)
         scattering.weight = dr.replace_grad(scattering.weight, f * (scattering.correction / scattering.pdf))
     return Segment(si, connection, scattering)
 
@@ -227,7 +210,8 @@ def walk(samples: Samples, hooks: Hooks, active: mi.Bool | bool = True) -> Any:
     def body(
         path: Path, state: Any, sampler: mi.Sampler, selection: mi.PCG32 | None
     ) -> tuple[Path, Any, mi.Sampler, mi.PCG32 | None]:
-        si, bsdf = find_vertex(path.ray, path.pi, path.active)
+        hit = find_vertex(path.ray, path.pi, path.active)
+        si, bsdf = hit.si, hit.bsdf
         numbers = Numbers.draw(sampler, path.active).of_early(path.early, path.depth)
         slot = None if aim is None else sampler.next_1d(path.active)
         seen = None
@@ -239,7 +223,7 @@ def walk(samples: Samples, hooks: Hooks, active: mi.Bool | bool = True) -> Any:
             r = before.factor(aim, sensor, si, path.ray, here, visible)
             path = replace(path, active=path.active & (r != 0), product=path.product.scaled(r))  # NaN goes on
             state = hooks.aimed(state, r)
-        vertex = Vertex(path.pi, si, bsdf, path.ray, path.depth, path.product, path.active)
+        vertex = Vertex(si, bsdf, path.ray, path.pi, path.depth, path.product, path.active)
 
         # ---- Connect to the sensor, and scatter ----
         connected = path.active & hooks.wants(state, vertex)
@@ -250,9 +234,8 @@ def walk(samples: Samples, hooks: Hooks, active: mi.Bool | bool = True) -> Any:
             aimed, bsdf_1d = choose(scene, sensor, aim, path.ray.time, numbers.bsdf_1d, numbers.bsdf_2d, slot, able)
             numbers = replace(numbers, bsdf_1d=bsdf_1d)
         this = segment(
-            plan, sensor, path.ray, si, bsdf, numbers, connected, active, hooks.connects, hooks.tracked,
-            hooks.attached, aimed,
-        )  # fmt: skip
+            samples, vertex, numbers, connected, active, hooks.connects, hooks.tracked, hooks.attached, aimed
+        )
         connection, scattering = this.connection, this.scattering
         if hooks.connects:
             if not (hooks.tracked or plan.track_zeros):
@@ -271,7 +254,7 @@ def walk(samples: Samples, hooks: Hooks, active: mi.Bool | bool = True) -> Any:
         state = hooks.scattering(state, vertex, connection, scattering)
         if hooks.replaying:
             sampler.next_1d(active)  # roulette's
-            active &= hooks.is_followed(state, vertex)
+            active &= hooks.goes_on(state, replace(vertex, depth=path.depth + 1))
             return _next(path, active, this.next_ray(hooks.attached)), state, sampler, selection
         product = path.product.times(scattering.weight, path.depth)
         eta = path.eta * dr.detach(scattering.eta)
