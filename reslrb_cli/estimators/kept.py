@@ -175,18 +175,17 @@ def _index(pointer: mi.BSDFPtr | mi.ShapePtr) -> mi.UInt32:
     return dr.reinterpret_array(mi.UInt32, pointer)
 
 
-def lobe(plan: Plan, scattering: Scattering) -> list[mi.UInt32 | mi.Float | mi.Point2f]:
-    """Which lobe was sampled (1: delta, 2: null), with which numbers; nothing where just smooth ones matter."""
+def lobe(plan: Plan, scattering: Scattering | None) -> list[mi.UInt32 | mi.Float | mi.Point2f]:
+    """Which lobe was sampled (1: delta, 2: null), with which numbers; nothing where just smooth ones matter.
+
+    Of no event (None) zeros of the same form.
+    """
     if not (plan.differentiate_delta or plan.differentiate_null):
         return []
+    if scattering is None:
+        return [mi.UInt32(0), mi.Float(0), mi.Point2f(0)]
     kind = dr.select(scattering.is_delta, mi.UInt32(1), 0) + dr.select(scattering.is_null, mi.UInt32(2), 0)
     return [kind, scattering.sample_1, scattering.sample_2]
-
-
-def blank_lobe(plan: Plan) -> list[mi.UInt32 | mi.Float | mi.Point2f]:
-    """Zeros of the same form."""
-    singular = plan.differentiate_delta or plan.differentiate_null
-    return [mi.UInt32(0), mi.Float(0), mi.Point2f(0)] if singular else []
 
 
 @dataclass
@@ -272,37 +271,30 @@ class Event:
     @staticmethod
     def emission(plan: Plan) -> Event:
         """The event before the first vertex."""
-        own = [mi.Bool(False), mi.Point2f(0)] if plan.passage_in_gradient else []
-        point = SurfacePoint.blank(plan)
-        rest = [mi.Float(0)] if plan.track_zeros else []
-        return Event(mi.UInt32(0), point, mi.Vector3f(0), mi.Spectrum(0), rest, blank_lobe(plan), own)
+        rest, wo, f = [mi.Float(0)] if plan.track_zeros else [], mi.Vector3f(0), mi.Spectrum(0)
+        return Event(mi.UInt32(0), SurfacePoint.blank(plan), wo, f, rest, lobe(plan, None), _own(plan, None))
 
     @staticmethod
     def of_connection(plan: Plan, vertex: Vertex, connection: Connection) -> Event:
         """The BSDF of the vertex towards the sensor; index 0 where there is nothing to differentiate."""
         useful = mi.Bool(True) if plan.passage_in_gradient else plan.differentiates(vertex.bsdf)
-        return Event(
-            index=dr.select(useful, mi.UInt32(vertex.depth), 0),
-            point=SurfacePoint.of(plan, vertex),
-            wo=connection.wo,
-            f=connection.f,
-            rest=[dr.rcp(stand_in(connection)[0])] if plan.track_zeros else [],
-            lobe=blank_lobe(plan),
-            own=[mi.Bool(True), connection.sample] if plan.passage_in_gradient else [],
-        )
+        index, point = dr.select(useful, mi.UInt32(vertex.depth), 0), SurfacePoint.of(plan, vertex)
+        rest = [dr.rcp(stand_in(connection)[0])] if plan.track_zeros else []
+        return Event(index, point, connection.wo, connection.f, rest, lobe(plan, None), _own(plan, connection))
 
     @staticmethod
     def of_scattering(plan: Plan, vertex: Vertex, scattering: Scattering) -> Event:
         """The BSDF of the vertex along the path."""
-        return Event(
-            index=mi.UInt32(vertex.depth),
-            point=SurfacePoint.of(plan, vertex),
-            wo=scattering.wo,
-            f=scattering.f,
-            rest=[scattering.correction / scattering.pdf] if plan.track_zeros else [],
-            lobe=lobe(plan, scattering),
-            own=[mi.Bool(False), mi.Point2f(0)] if plan.passage_in_gradient else [],
-        )
+        rest = [scattering.correction / scattering.pdf] if plan.track_zeros else []
+        index, point, wo = mi.UInt32(vertex.depth), SurfacePoint.of(plan, vertex), scattering.wo
+        return Event(index, point, wo, scattering.f, rest, lobe(plan, scattering), _own(plan, None))
+
+
+def _own(plan: Plan, connection: Connection | None) -> list[mi.Bool | mi.Point2f]:
+    """`Event.own` of an event that is a connection's, or of another."""
+    if not plan.passage_in_gradient:
+        return []
+    return [mi.Bool(False), mi.Point2f(0)] if connection is None else [mi.Bool(True), connection.sample]
 
 
 def differentiate_event(p: Pass, kept: Event, adjoint: PathAdjoint, active: mi.Bool) -> None:

@@ -89,3 +89,6 @@ class SlotReplay(VertexHooks):
 
     def goes_on(self, state: Any, vertex: Vertex) -> mi.Bool:
         return vertex.depth <= self.last
+
+    def is_followed(self, state: Any, vertex: Vertex) -> mi.Bool:
+        return vertex.depth < self.last

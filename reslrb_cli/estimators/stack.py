@@ -37,7 +37,8 @@ from reslrb_cli.estimators.base import (
     write,
 )
 from reslrb_cli.estimators.gather import Gather, GatherState, Taking, Visibility
-from reslrb_cli.estimators.kept import AdjointSum, PlainSum, SurfacePoint, blank_lobe, event, lobe
+from reslrb_cli.estimators.kept import AdjointSum, PlainSum, SurfacePoint, event
+from reslrb_cli.estimators.kept import lobe as kept_lobe
 from reslrb_cli.transport.bsdf import Scattering, tracked_factors
 from reslrb_cli.transport.connection import Connection, Seen
 from reslrb_cli.transport.factors import Product
@@ -70,7 +71,7 @@ class Frame:
         """A frame of zeros with the members that the plan needs."""
         zeros = [mi.Float(0), mi.Spectrum(0)] if plan.track_zeros else []
         wo = mi.Vector3f(0)
-        point, lobe = SurfacePoint.blank(plan), blank_lobe(plan)
+        point, lobe = SurfacePoint.blank(plan), kept_lobe(plan, None)
         return Frame(point, wo, wo, mi.Spectrum(0), mi.Spectrum(0), mi.Spectrum(0), zeros, lobe)
 
 
@@ -146,7 +147,7 @@ class Pushing(VertexHooks):
             f_s=dr.select(scattering.active, scattering.f, 0),
             own=since.value,
             zeros=zeros,
-            lobe=lobe(plan, scattering),
+            lobe=kept_lobe(plan, scattering),
         )
         write(state.stack, frame, dr.select(fits, state.height, self.size), fits)
         height = state.height + dr.select(fits, mi.UInt32(1), 0)

@@ -63,7 +63,9 @@ def _plugin_class() -> type[mi.CppADIntegrator]:
         """One of our light tracers, under `mi.render`."""
 
         def __init__(self, type: str, props: mi.Properties) -> None:
-            options = _take_options(type, props)
+            # Of all that stays unread Mitsuba says that there is no such option; what is asked for counts as read.
+            names = _option_names(type, props.get("estimator", None) if type == "reslrb" else None)
+            options = {name: props.get(name) for name in names if name in props}
             # Before the base class sees it, which has another idea of a pass and warns.
             if "samples_per_pass" in props:
                 del props["samples_per_pass"]
@@ -94,12 +96,6 @@ def _plugin_class() -> type[mi.CppADIntegrator]:
             return f"{self.type}[max_depth = {self.max_depth}, rr_depth = {self.rr_depth}]"
 
     return LightTracerPlugin
-
-
-def _take_options(type: str, props: mi.Properties) -> dict[str, Any]:
-    """The options that an integrator of this type has. What stays unread Mitsuba reports as an error."""
-    estimator = props.get("estimator", None) if type == "reslrb" else None  # what is asked for counts as read
-    return {name: props.get(name) for name in _option_names(type, estimator) if name in props}
 
 
 def _option_names(type: str, estimator: str | None) -> list[str]:

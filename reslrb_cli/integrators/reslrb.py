@@ -225,15 +225,15 @@ class Reslrb(LightTracer):
         own = {name: options.pop(name) for name in kind.OPTIONS if name in options}
         obstacle = None if kind.attaches else _no_attached(estimator)
         motion = Motion(attached, filter_normalization, obstacle, attached_sampling)
-        if guiding == "auto":
-            raise ValueError('"guiding" auto needs an experiment to measure on (`reslrb optimize`); say on or off')
-        one_of("guiding", guiding, ("on", "off"))
-        if sequence == "auto":
-            raise ValueError(
-                '"sequence" auto needs an experiment to measure on (`reslrb optimize`); say independent or '
-                "low_discrepancy"
-            )
-        one_of("sequence", sequence, ("independent", "low_discrepancy"))
+        for name, value, values in (
+            ("guiding", guiding, ("on", "off")),
+            ("sequence", sequence, ("independent", "low_discrepancy")),
+        ):
+            if value == "auto":
+                raise ValueError(
+                    f'"{name}" auto needs an experiment to measure on (`reslrb optimize`); say {" or ".join(values)}'
+                )
+            one_of(name, value, values)
         low_discrepancy = sequence == "low_discrepancy"
         return cls(kind(**own), motion=motion, guided=guiding == "on", low_discrepancy=low_discrepancy, **options)
 

@@ -94,14 +94,9 @@ def emission_of(
 
 
 def _emitter_ray(
-    samples: Samples,
-    emitter: mi.EmitterPtr,
-    time: mi.Float,
-    number: mi.Float,
-    position: mi.Point2f,
-    direction: mi.Point2f,
-    active: mi.Bool,
-) -> tuple[mi.Ray3f, mi.Spectrum]:
+    samples: Samples, emitter: mi.EmitterPtr, time: mi.Float, number: mi.Float, position: mi.Point2f, direction:
+    mi.Point2f, active: mi.Bool,
+) -> tuple[mi.Ray3f, mi.Spectrum]:  # fmt: skip
     """A ray that leaves each lane's emitter: from lamps that we place as `lamp_ray` has it, else as Mitsuba has it."""
     placed = samples.plan.placed_lamps
     lamps = {lamp.emitter: (lamp, samples.areas(lamp), lamp in samples.plan.evened_lamps) for lamp in placed}

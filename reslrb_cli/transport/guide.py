@@ -117,14 +117,8 @@ class Guide:
         return Guide(table, dr.opaque(mi.UInt64, width))
 
     def draw(
-        self,
-        grid: Grid,
-        width: int,
-        stream: mi.PCG32,
-        choice: mi.Float,
-        position: mi.Point2f,
-        direction: mi.Point2f,
-    ) -> Drawn:
+        self, grid: Grid, width: int, stream: mi.PCG32, choice: mi.Float, position: mi.Point2f, direction: mi.Point2f,
+    ) -> Drawn:  # fmt: skip
         """Where each of `width` lanes starts; `choice`, `position` and `direction` say where within its cell."""
         lane, jitter = mi.UInt64(dr.arange(mi.UInt32, width)), mi.UInt64(stream.next_uint32())
         slot = ((lane << 32) | jitter) // self.lanes >> (32 - (grid.slots.bit_length() - 1))

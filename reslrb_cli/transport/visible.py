@@ -38,7 +38,9 @@ def moving_splats(samples: Samples) -> Iterator[tuple[mi.Point2f, mi.Spectrum, m
     u and C_0 have their derivatives where gradients are enabled; what they sum up to is already in the image.
     """
     for lamp in samples.plan.visible_moving_lamps:
-        yield _splat(samples, lamp)
+        point = _points(samples, (lamp,), mi.UInt32(lamp.index), samples.lamp_numbers(lamp), attached=True)
+        # Points stay where they are on the lamp, so that nothing that moves has a part in their radiance.
+        yield point.u, dr.select(point.active, dr.detach(point.radiance()) * point.weight, 0), point.active
 
 
 def small_splat(samples: Samples) -> tuple[mi.Point2f, mi.Spectrum, mi.Bool]:
@@ -76,13 +78,6 @@ class Points:
     def radiance(self) -> mi.Spectrum:
         """What leaves them towards the sensor (C,), with its derivative by their radiance where there is any."""
         return self.emitter.eval(self.si, self.active)
-
-
-def _splat(samples: Samples, lamp: Lamp) -> tuple[mi.Point2f, mi.Spectrum, mi.Bool]:
-    point = _points(samples, (lamp,), mi.UInt32(lamp.index), samples.lamp_numbers(lamp), attached=True)
-    # Points stay where they are on the lamp, so that nothing that moves has a part in their radiance.
-    radiance = dr.detach(point.radiance())
-    return point.u, dr.select(point.active, radiance * point.weight, 0), point.active
 
 
 def _points(samples: Samples, lamps: Sequence[Lamp], index: mi.UInt32, numbers: NumberStream, attached: bool) -> Points:
@@ -200,13 +195,9 @@ def _radiance(plan: Plan, scene: mi.Scene, si: mi.SurfaceInteraction3f, active: 
 
 
 def _look(
-    plan: Plan,
-    scene: mi.Scene,
-    primary: PrimaryRay,
-    on_surface: Callable[[_Look, mi.Spectrum, mi.Spectrum, mi.Spectrum], None] | None,
-    mode: str,
-    tangents: bool = False,
-) -> _Look:
+    plan: Plan, scene: mi.Scene, primary: PrimaryRay, on_surface: Callable[[_Look, mi.Spectrum, mi.Spectrum,
+    mi.Spectrum], None] | None, mode: str, tangents: bool = False,
+) -> _Look:  # fmt: skip
     def look(state: _Look) -> tuple[_Look]:
         with dr.suspend_grad():  # where shapes move, `visible.py` has the derivative
             si = scene.ray_intersect(state.ray, state.active)

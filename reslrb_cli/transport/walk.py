@@ -74,8 +74,11 @@ class Hooks:
         return state
 
     def goes_on(self, state: Any, vertex: Vertex) -> mi.Bool:
-        """Lanes that scatter on from this vertex, as far as the hooks care. A replay asks also of the next one, of
-        which it knows the depth alone, before it goes there."""
+        """Lanes that scatter on from this vertex, as far as the hooks care."""
+        return mi.Bool(True)
+
+    def is_followed(self, state: Any, vertex: Vertex) -> mi.Bool:
+        """In a replay: lanes that `goes_on` let scatter, and whose next vertex is wanted as well."""
         return mi.Bool(True)
 
     def scattering(self, state: Any, vertex: Vertex, connection: Connection, scattering: Scattering) -> Any:
@@ -254,7 +257,7 @@ def walk(samples: Samples, hooks: Hooks, active: mi.Bool | bool = True) -> Any:
         state = hooks.scattering(state, vertex, connection, scattering)
         if hooks.replaying:
             sampler.next_1d(active)  # roulette's
-            active &= hooks.goes_on(state, replace(vertex, depth=path.depth + 1))
+            active &= hooks.is_followed(state, vertex)
             return _next(path, active, this.next_ray(hooks.attached)), state, sampler, selection
         product = path.product.times(scattering.weight, path.depth)
         eta = path.eta * dr.detach(scattering.eta)
