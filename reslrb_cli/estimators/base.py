@@ -180,8 +180,8 @@ def adjoint_of_factor(
 
 
 def differentiate_passage(
-    p: Pass, si: mi.SurfaceInteraction3f, depth: mi.UInt32, connection: Connection, active: mi.Bool, adjoint:
-    PathAdjoint,
+    p: Pass, si: mi.SurfaceInteraction3f, depth: mi.UInt32, connection: Connection, active: mi.Bool,
+    adjoint: PathAdjoint,
 ) -> mi.Spectrum:  # fmt: skip
     """Transmittance (C,) of the masks between a vertex and the sensor; adds its derivative, by that of the connection.
 

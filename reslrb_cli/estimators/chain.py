@@ -152,8 +152,8 @@ class ChainSelection(VertexHooks):
     """Image pass: splat, chain Jacobians, and keep connections as `choose` says."""
 
     def __init__(
-        self, p: Pass, capacity: int, damping: float, splat: bool, weigh: Callable[[Connection, Product, mi.Float],
-        mi.Float],
+        self, p: Pass, capacity: int, damping: float, splat: bool,
+        weigh: Callable[[Connection, Product, mi.Float], mi.Float],
     ) -> None:  # fmt: skip
         """`weigh(connection, C, W)` is the selection weight w of a connection, W the sum before it."""
         super().__init__(p)

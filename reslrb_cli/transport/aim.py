@@ -91,8 +91,8 @@ class Pending:
         return Pending(aimed.share, dr.select(discrete, dr.inf, dr.detach(pdf)), dr.detach(distance))
 
     def factor(
-        self, aim: Aim, sensor: mi.Sensor, si: mi.SurfaceInteraction3f, ray: mi.Ray3f, connection: Connection, visible:
-        mi.Bool,
+        self, aim: Aim, sensor: mi.Sensor, si: mi.SurfaceInteraction3f, ray: mi.Ray3f, connection: Connection,
+        visible: mi.Bool,
     ) -> mi.Float:  # fmt: skip
         """r at the vertex `si`, which `ray` reaches, and from which the sensor is `visible`; 0 where its path ends.
 
@@ -122,8 +122,8 @@ def aims_from(bsdf: mi.BSDFPtr) -> mi.Bool:
 
 
 def choose(
-    scene: mi.Scene, sensor: mi.Sensor, aim: Aim, time: mi.Float, bsdf_1d: mi.Float, bsdf_2d: mi.Point2f, slot:
-    mi.Float, able: mi.Bool,
+    scene: mi.Scene, sensor: mi.Sensor, aim: Aim, time: mi.Float, bsdf_1d: mi.Float, bsdf_2d: mi.Point2f,
+    slot: mi.Float, able: mi.Bool,
 ) -> tuple[Aimed, mi.Float]:  # fmt: skip
     """Which of the lanes that are `able` are aimed, and where to; and the BSDF's one number, new for the others.
 

@@ -43,8 +43,9 @@ class Passage:
 
 
 def transmittance(
-    scene: mi.Scene, start: mi.Interaction3f, target: mi.Point3f, limit: mi.UInt32, active: mi.Bool, on_crossing:
-    Callable[[mi.Spectrum, mi.Bool], None] | None = None, loop_mode: str = "symbolic", tangents: bool = False,
+    scene: mi.Scene, start: mi.Interaction3f, target: mi.Point3f, limit: mi.UInt32, active: mi.Bool,
+    on_crossing: Callable[[mi.Spectrum, mi.Bool], None] | None = None, loop_mode: str = "symbolic",
+    tangents: bool = False,
 ) -> Passage:  # fmt: skip
     """Follow the segment from the interaction `start` to the point `target` through at most `limit` null surfaces.
 
@@ -112,8 +113,8 @@ class Connection:
 
 
 def connect(
-    plan: Plan, sensor: mi.Sensor, si: mi.SurfaceInteraction3f, ray: mi.Ray3f | None, sample: mi.Point2f, active:
-    mi.Bool, attached: bool = False,
+    plan: Plan, sensor: mi.Sensor, si: mi.SurfaceInteraction3f, ray: mi.Ray3f | None, sample: mi.Point2f,
+    active: mi.Bool, attached: bool = False,
 ) -> Connection:  # fmt: skip
     """Find where the vertex `si` appears on the film; film positions move with it if `attached`, else they do not.
 
@@ -179,8 +180,8 @@ def stand_in(connection: Connection) -> tuple[mi.Float, mi.Spectrum]:
 
 
 def passage(
-    plan: Plan, scene: mi.Scene, si: mi.SurfaceInteraction3f, depth: mi.UInt32, connection: Connection, seen: Seen |
-    None = None, loop_mode: str = "symbolic",
+    plan: Plan, scene: mi.Scene, si: mi.SurfaceInteraction3f, depth: mi.UInt32, connection: Connection,
+    seen: Seen | None = None, loop_mode: str = "symbolic",
 ) -> tuple[mi.Bool, mi.Spectrum]:  # fmt: skip
     """Where the sensor is seen, and the transmittance (C,) of masks on the way: traces the shadow ray.
 

@@ -94,8 +94,8 @@ def emission_of(
 
 
 def _emitter_ray(
-    samples: Samples, emitter: mi.EmitterPtr, time: mi.Float, number: mi.Float, position: mi.Point2f, direction:
-    mi.Point2f, active: mi.Bool,
+    samples: Samples, emitter: mi.EmitterPtr, time: mi.Float, number: mi.Float, position: mi.Point2f,
+    direction: mi.Point2f, active: mi.Bool,
 ) -> tuple[mi.Ray3f, mi.Spectrum]:  # fmt: skip
     """A ray that leaves each lane's emitter: from lamps that we place as `lamp_ray` has it, else as Mitsuba has it."""
     placed = samples.plan.placed_lamps

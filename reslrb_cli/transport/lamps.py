@@ -27,8 +27,8 @@ DEFENSIVE = 0.1  # share of what is drawn uniformly, not in proportion to radian
 
 
 def lamp_ray(
-    lamp: Lamp, areas: mi.Float | None, time: mi.Float, wavelength_sample: mi.Float, position: mi.Point2f, direction:
-    mi.Point2f, active: mi.Bool, evened: bool = False,
+    lamp: Lamp, areas: mi.Float | None, time: mi.Float, wavelength_sample: mi.Float, position: mi.Point2f,
+    direction: mi.Point2f, active: mi.Bool, evened: bool = False,
 ) -> tuple[mi.Ray3f, mi.Spectrum]:  # fmt: skip
     """A ray that leaves the lamp, and radiance over density (C,), from the numbers that Mitsuba takes.
 

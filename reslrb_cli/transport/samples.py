@@ -253,8 +253,8 @@ def make_samples(plan: Plan, scene: mi.Scene, sensor: mi.Sensor, seed: mi.UInt32
 
 
 def passes(
-    plan: Plan, scene: mi.Scene, sensor: mi.Sensor, seed: mi.UInt32, spp: int, spp_per_pass: int | None, table: Table |
-    None = None,
+    plan: Plan, scene: mi.Scene, sensor: mi.Sensor, seed: mi.UInt32, spp: int, spp_per_pass: int | None,
+    table: Table | None = None,
 ) -> list[Samples]:  # fmt: skip
     """All samples of an image, in passes of `spp_per_pass` samples per pixel, which must divide `spp`, or less.
 

@@ -195,8 +195,9 @@ def _radiance(plan: Plan, scene: mi.Scene, si: mi.SurfaceInteraction3f, active: 
 
 
 def _look(
-    plan: Plan, scene: mi.Scene, primary: PrimaryRay, on_surface: Callable[[_Look, mi.Spectrum, mi.Spectrum,
-    mi.Spectrum], None] | None, mode: str, tangents: bool = False,
+    plan: Plan, scene: mi.Scene, primary: PrimaryRay,
+    on_surface: Callable[[_Look, mi.Spectrum, mi.Spectrum, mi.Spectrum], None] | None, mode: str,
+    tangents: bool = False,
 ) -> _Look:  # fmt: skip
     def look(state: _Look) -> tuple[_Look]:
         with dr.suspend_grad():  # where shapes move, `visible.py` has the derivative
