@@ -127,16 +127,8 @@ class ChainState:
                  mi.Spectrum(0), rows(2), rows(channels), [mi.UInt32(0) for _ in 2 * Blocks.of(plan)])
             for _ in range(capacity)
         ]  # fmt: skip
-        return ChainState(
-            mi.Float(0),
-            slots,
-            [mi.UInt32(0)],
-            [mi.Matrix4d(1)],
-            rows(channels),
-            Blocks.of(plan),
-            Before.start(plan),
-            [],
-        )
+        latest, J, blocks = [mi.UInt32(0)], [mi.Matrix4d(1)], Blocks.of(plan)
+        return ChainState(mi.Float(0), slots, latest, J, rows(channels), blocks, Before.start(plan), [])
 
     def stored(self) -> ChainState:
         """What is left of it at the end of a path."""
@@ -283,12 +275,8 @@ class ChainReplay(SlotReplay):
 
     def start(self, product: Product) -> ReplayState:
         plan = self.p.plan
-        return ReplayState(
-            [one.row for one in self.kept],
-            mi.Bool(concerns_emission(plan)),
-            Blocks.of(plan),
-            Before.start(plan),
-        )
+        rows, begun = [one.row for one in self.kept], mi.Bool(concerns_emission(plan))
+        return ReplayState(rows, begun, Blocks.of(plan), Before.start(plan))
 
     def scattering(
         self, state: ReplayState, vertex: Vertex, connection: Connection, scattering: Scattering
@@ -297,8 +285,7 @@ class ChainReplay(SlotReplay):
         begun = state.begun | begins(plan, vertex)
         numbers, on = numbers_of(connection, scattering), scattering.active & begun
         jacobian = segment_jacobian(self.p.samples, vertex, state.before, numbers, None, on, self.damping)
-        blocks = state.blocks
-        entered = mi.Bool(False)
+        blocks, entered = state.blocks, mi.Bool(False)
         if blocks:
             passed, entered = blocks[0].past(jacobian.damped)
             blocks = [passed]
@@ -346,11 +333,8 @@ def differentiate(p: Pass, kept: list[Kept], damping: float) -> None:
         for one in kept:
             inside, weight = one.part(Blocks.of(p.plan))
             by_o, by_d = spread(emission.ray.d, dr.select(inside, one.row * weight, 0), mi.Bool(False))
-            B, origin, direction = (
-                B + adjoint_of_factor(one.adjoint, mi.Int32(0), dr.detach(emission.weight), 1),
-                origin + by_o,
-                direction + by_d,
-            )
+            B += adjoint_of_factor(one.adjoint, mi.Int32(0), dr.detach(emission.weight), 1)
+            origin, direction = origin + by_o, direction + by_d
         differentiate_start(p, dr.detach(Adjoint(origin, direction, B)))
     if p.plan.moving_shapes or p.plan.differentiate_bsdfs:  # else no segment has a parameter, and Dr.Jit refuses it
         replay = ChainReplay(p, kept, damping)

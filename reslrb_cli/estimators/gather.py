@@ -101,7 +101,7 @@ class Gathering(VertexHooks):
         if latest:
             last = needed(latest[0], depth)
         visibility = state.visibility.with_vertex(depth, connection.active, last)
-        S = [sum.plus(p.delta(connection.u, connection.active), C, depth, connection.active) for sum in state.S]
+        S = [total.plus(p.delta(connection.u, connection.active), C, depth, connection.active) for total in state.S]
         return GatherState(visibility, S, latest)
 
 

@@ -98,19 +98,8 @@ class Trail:
         return fits, dr.select(fits, number, PLACES)
 
 
-@dataclass
-class Onwards:
-    """Sums over all paths, by the cell that a ray leaves a vertex by (`transport/roulette.py`): the squares of what
-    paths still said at a throughput of 1 (voices * CELLS), voice by voice, the image last; the vertices that followed
-    (CELLS); the rays that left (CELLS)."""
-
-    squares: mi.Float
-    followed: mi.Float
-    left: mi.Float
-
-
-def walk_back(trail: Trail) -> Onwards:
-    """What all paths went on to say; what is not finite does not count.
+def walk_back(trail: Trail) -> tuple[mi.Float, mi.Float, mi.Float]:
+    """What all paths went on to say, as `Said` has it; what is not finite does not count.
 
     What roulette lets live it weights up by 1 / q: of all rays that leave, whether it lets them live or not, q times
     such a square and 1 / q times such a number of vertices have the means that they would have without it.
@@ -139,7 +128,7 @@ def walk_back(trail: Trail) -> Onwards:
         labels=("height", "after", "trail"),
         label="walk back over what is heard",
     )
-    return Onwards(squares, followed, left)
+    return squares, followed, left
 
 
 NAMES = ("onward", "frame")  # of its arrays
@@ -260,8 +249,7 @@ def bsdf_groups(plan: Plan) -> list[tuple[mi.BSDF, ...]]:
         return []
     if not plan.only_bsdfs:
         return [()]
-    alone = plan.only_bsdfs[: MOST_BSDFS - 1]
-    others = plan.only_bsdfs[MOST_BSDFS - 1 :]
+    alone, others = plan.only_bsdfs[: MOST_BSDFS - 1], plan.only_bsdfs[MOST_BSDFS - 1 :]
     return [*((bsdf,) for bsdf in alone), *([others] if others else [])]
 
 
@@ -351,14 +339,17 @@ class Hearing(Hooks):
 class Said:
     """What guided samples have said, evaluated: sums over paths.
 
-    `starts` (voices * cells), voice by voice, are squares by the cell that a path starts in; `onward` is what paths go
-    on to say from where they are; `whole` (rows * BINS) are squares by voice, the weights that paths left emitters
-    with, and their vertices. `places` (voices * blocks, or none) are squares of what was said at a block of the film,
-    as if no path had been aimed there.
+    `starts` (voices * cells), voice by voice, the image last, are squares by the cell that a path starts in. By the
+    cell that a ray leaves a vertex by (`transport/roulette.py`): `squares` (voices * CELLS) of what paths still said at
+    a throughput of 1, the vertices that `followed` and the rays that `left` (CELLS). `whole` (rows * BINS) are squares
+    by voice, the weights that paths left emitters with, and their vertices. `places` (voices * blocks, or none) are
+    squares of what was said at a block of the film, as if no path had been aimed there.
     """
 
     starts: mi.Float
-    onward: Onwards
+    squares: mi.Float
+    followed: mi.Float
+    left: mi.Float
     whole: mi.Float
     places: list[mi.Float]
 
@@ -374,9 +365,9 @@ class Said:
     def walked(self, paths: int) -> Walked:
         """What that says of where paths go on to."""
         *said, light, count = np.array(self.whole, np.float64).reshape(-1, BINS).sum(1) / paths
-        onward, shape = self.onward, (len(said), CELLS)
-        squares, followed, left = (np.array(sums) for sums in (onward.squares, onward.followed, onward.left))
-        return Walked(squares.reshape(shape), followed, left, np.array(said), float(light), 1 + float(count))
+        squares, followed, left = (np.array(sums) for sums in (self.squares, self.followed, self.left))
+        squares = squares.reshape(len(said), CELLS)
+        return Walked(squares, followed, left, np.array(said), float(light), 1 + float(count))
 
 
 def hear(samples: Samples, gradient: mi.TensorXf) -> Said:
@@ -401,7 +392,7 @@ def hear(samples: Samples, gradient: mi.TensorXf) -> Said:
         dr.scatter_reduce(dr.ReduceOp.Add, sums, value, drawn.cell + voice * cells, counts)
     # All is one kernel: what is evaluated apart would be traced again.
     whole = _sums([*squares, heard.light, mi.Float(heard.trail.count)], samples.width)
-    said = Said(sums, walk_back(heard.trail), whole, hooks.places)
+    said = Said(sums, *walk_back(heard.trail), whole, hooks.places)
     dr.eval(said)
     return said
 

@@ -300,24 +300,20 @@ class Guiding:
     @property
     def _apart(self) -> int:
         """How many sensors have tables of their own."""
-        return max(MOST_BYTES // self._each, 1)
-
-    @property
-    def _each(self) -> int:
         assert self.grid is not None
-        return sensor_bytes(self.grid)
+        return max(MOST_BYTES // sensor_bytes(self.grid), 1)
 
     def bytes(self, sensors: int) -> int:
         """What the tables for so many sensors take."""
-        return min(sensors, self._apart) * self._each
+        assert self.grid is not None
+        return min(sensors, self._apart) * sensor_bytes(self.grid)
 
     def state(self) -> tuple[dict[str, int], dict[str, Array]]:
         """What has been learned: the number of gradients of each sensor, and arrays by `<sensor>/<what>`."""
         arrays: dict[str, Array] = {}
         for number, learned in self.learned.items():
-            found = {"sums": learned.sums, "draws": learned.draws, "film": learned.film}
-            found |= self._onward(number).arrays()
-            arrays |= {f"{number}/{name}": array for name, array in found.items()}
+            found = {name: getattr(learned, name) for name in ("sums", "draws", "film")}
+            arrays |= {f"{number}/{name}": array for name, array in (found | self._onward(number).arrays()).items()}
         return {str(number): learned.calls for number, learned in self.learned.items()}, arrays
 
     def restore(self, calls: Mapping[str, int], take: Callable[[str], Array]) -> str | None:
@@ -328,17 +324,15 @@ class Guiding:
         assert self.grid is not None
         found = {}
         for number, count in calls.items():
-            sums, draws = (take(f"{number}/{name}") for name in ("sums", "draws"))
-            for name, array, rows in (("sums", sums, (2,)), ("draws", draws, ())):
-                if array.shape != (*rows, self.grid.cells) or not (np.isfinite(array) & (array >= 0)).all():
+            arrays = {name: take(f"{number}/{name}") for name in KNOWN}
+            shapes = {"sums": (2, self.grid.cells), "draws": (self.grid.cells,), "film": (2, arrays["film"].size // 2)}
+            for name, shape in shapes.items():
+                if arrays[name].shape != shape or not (np.isfinite(arrays[name]) & (arrays[name] >= 0)).all():
                     return f"{number}/{name}"
-            onward = Onward.taken({name: take(f"{number}/{name}") for name in NAMES})
+            onward = Onward.taken(arrays)
             if isinstance(onward, str):
                 return f"{number}/{onward}"
-            film = take(f"{number}/film")
-            if film.ndim != 2 or len(film) != 2 or not (np.isfinite(film) & (film >= 0)).all():
-                return f"{number}/film"
-            sums, draws, film = (array.astype(np.float32) for array in (sums, draws, film))
+            sums, draws, film = (arrays[name].astype(np.float32) for name in shapes)
             found[int(number)] = Learned(sums, draws, count, onward, film)
         self.learned, self._tables = found, {}
         return None
@@ -365,8 +359,7 @@ class Guiding:
             before = Learned.nothing(self.grid)
             before.calls = 1
         onward = self._onward(number).with_more(said.walked(paths))
-        draws = paths * (counts / self.grid.slots)
-        heard = said.by_start(self.grid.cells)
+        heard, draws = said.by_start(self.grid.cells), paths * (counts / self.grid.slots)
         learned = before.with_more(self.grid, heard, draws, onward, said.by_block())
         if learned.worse > WRONG and learned.calls % EVERY == 0:
             learned.calls = 0  # the scene has changed: it learns as often as it did at first
