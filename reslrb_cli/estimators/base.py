@@ -88,10 +88,6 @@ class Estimator(ABC):
     def kept(self, plan: Plan) -> Any:
         """All that memory holds of a path at once, a PyTree of the same form; only the types of its leaves count."""
 
-    def bytes_per_path(self, plan: Plan) -> int:
-        """Bytes that memory holds of each path."""
-        return sum(entry_bytes(self.kept(plan)))
-
     def scratch_bytes(self, plan: Plan) -> int:
         """Thread-local bytes of each path that is being traced, which the allocator does not see."""
         return 0

@@ -61,13 +61,7 @@ class AdjointSum:
 
     def plus(self, delta: mi.Spectrum, C: Product, index: mi.UInt32, active: mi.Bool) -> AdjointSum:
         """The sum with delta C of one more connection, that of vertex `index`."""
-        return self._shifted(dr.select(active, delta, 0), C, index)
-
-    def minus(self, delta: mi.Spectrum, C: Product, index: mi.UInt32, active: mi.Bool) -> AdjointSum:
-        """The sum without delta C of a connection that is in it."""
-        return self._shifted(dr.select(active, -delta, 0), C, index)
-
-    def _shifted(self, delta: mi.Spectrum, C: Product, index: mi.UInt32) -> AdjointSum:
+        delta = dr.select(active, delta, 0)
         value, rest = self._add(self.value, self.rest, delta * C.value())
         if not self.behind_zero:
             return type(self)(value, rest, [])
@@ -76,6 +70,10 @@ class AdjointSum:
             # A connection whose own factor is the zero one has a derivative there, and none in the prefix.
             term[c] = dr.select((zero >= 0) & (zero != mi.Int32(index)), term[c], 0)
         return type(self)(value, rest, list(self._add(self.behind_zero[0], self.behind_zero[1], term)))
+
+    def minus(self, delta: mi.Spectrum, C: Product, index: mi.UInt32, active: mi.Bool) -> AdjointSum:
+        """The sum without delta C of a connection that is in it."""
+        return self.plus(-delta, C, index, active)
 
     def adjoint_of_factor(self, f: mi.Spectrum, prefix: Product, rest: mi.Float | float) -> mi.Spectrum:
         """d(sum)/df (C,), for a factor `f * rest` of the path with this prefix, before all connections in the sum."""

@@ -58,7 +58,7 @@ class LightTracer:
 
         `freeze` says whether launches are recorded (`freezing.py`), `motion` how derivatives of what moves are taken,
         `guided` whether emission is drawn from what earlier paths said (`tables.py`),
-        `low_discrepancy` whether the numbers of a path's beginning are (`random.py`).
+        `low_discrepancy` whether the numbers of a path's beginning are (`sobol.py`).
         """
         if max_depth < -1:
             raise ValueError('"max_depth" must be -1 (no limit) or a value >= 0')
@@ -177,7 +177,7 @@ class LightTracer:
             film = parts[0].film
             block = film.block()
             in_passes(parts, splat_tangents, block)
-            return film.develop_tangent(block)
+            return film.develop(block, tangent=True)
 
     def freezes(self, parts: list[Samples]) -> bool:
         """Whether these samples are traced from a recording; large ones, and so several passes, gain little."""

@@ -210,17 +210,9 @@ class Samples:
         stream = self.stream(GUIDE_STREAM)
         return self.guide.draw(self.plan.grid, self.width, stream, choice, position, direction)
 
-    def visible_numbers(self) -> NumberStream:
-        """Random numbers for primary rays: the light paths are those of `ptracer` with or without them."""
-        return NumberStream(self.stream(VISIBLE_STREAM))
-
-    def small_lamp_numbers(self) -> NumberStream:
-        """Random numbers for points of lamps that are smaller than a pixel."""
-        return NumberStream(self.stream(SMALL_LAMP_STREAM))
-
-    def lamp_numbers(self, lamp: Lamp) -> NumberStream:
-        """Random numbers for points of a lamp that moves and is seen directly."""
-        return NumberStream(self.stream(LAMP_STREAM + lamp.index))
+    def numbers(self, name: int) -> NumberStream:
+        """Random numbers beside the sampler's own: the light paths are those of `ptracer` with or without them."""
+        return NumberStream(self.stream(name))
 
 
 class NumberStream:
@@ -236,22 +228,6 @@ class NumberStream:
         return mi.Point2f(self.generator.next_float32(), self.generator.next_float32())
 
 
-def make_samples(plan: Plan, scene: mi.Scene, sensor: mi.Sensor, seed: mi.UInt32, spp: int, total_spp: int) -> Samples:
-    """`spp` of `total_spp` samples per pixel; the film's full size counts, not the crop's, as for `ptracer`.
-
-    Raises ValueError where one pass would hold more than 2^32 - 1 paths.
-    """
-    film = Film(sensor)
-    width = spp * int(dr.prod(sensor.film().size()))
-    if width > PASS_PATHS:
-        raise ValueError(f"{width} paths in one pass are more than 2^32 - 1: set samples_per_pass below {spp}")
-    # Opaque: as literals they would give every sample count kernels of its own.
-    scale = dr.opaque(mi.Float, float(dr.prod(film.size)) / (float(dr.prod(sensor.film().size())) * total_spp))
-    fraction = dr.opaque(mi.Float, spp / total_spp)
-    net = None if plan.sequence is None else Net.of(width)
-    return Samples(scene, sensor, plan, film, mi.UInt32(seed), spp, width, scale, fraction, net=net)
-
-
 def passes(
     plan: Plan, scene: mi.Scene, sensor: mi.Sensor, seed: mi.UInt32, spp: int, spp_per_pass: int | None,
     table: Table | None = None,
@@ -259,7 +235,7 @@ def passes(
     """All samples of an image, in passes of `spp_per_pass` samples per pixel, which must divide `spp`, or less.
 
     The first pass has the seed itself, so that it traces what `ptracer` does. With a `table`, which belongs to the
-    plan's grid, emission is drawn from that.
+    plan's grid, emission is drawn from that. Raises ValueError for too many passes, or paths in one pass.
     """
     unit = spp if spp_per_pass is None else min(spp_per_pass, spp)
     if spp % unit:
@@ -273,9 +249,18 @@ def passes(
     others = [mi.sample_tea_32(mi.UInt32(seed), mi.UInt32(PASS_STREAM + p))[0] for p in range(1, len(sizes))]
     seeds = [mi.UInt32(seed), *others]
     dr.make_opaque(seeds)
-    made = {size: make_samples(plan, scene, sensor, seeds[0], size, spp) for size in set(sizes)}
-    if table is not None:
-        made = {size: replace(part, guide=Guide.of(table, part.width)) for size, part in made.items()}
+    film, pixels = Film(sensor), int(dr.prod(sensor.film().size()))  # not the crop's, as for `ptracer`
+    # Opaque: as literals these would give every sample count kernels of its own.
+    scale = dr.opaque(mi.Float, float(dr.prod(film.size)) / (float(pixels) * spp))
+
+    def part(size: int) -> Samples:
+        width, fraction = size * pixels, dr.opaque(mi.Float, size / spp)
+        if width > PASS_PATHS:
+            raise ValueError(f"{width} paths in one pass are more than 2^32 - 1: set samples_per_pass below {size}")
+        guide, net = None if table is None else Guide.of(table, width), None if plan.sequence is None else Net.of(width)
+        return Samples(scene, sensor, plan, film, seeds[0], size, width, scale, fraction, guide, net)
+
+    made = {size: part(size) for size in set(sizes)}
     return [replace(made[size], seed=s) for size, s in zip(sizes, seeds, strict=True)]
 
 

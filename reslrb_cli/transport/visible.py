@@ -29,7 +29,7 @@ from reslrb_cli.transport.emission import sample_time
 from reslrb_cli.transport.film import AdjointImage
 from reslrb_cli.transport.lamps import lamp_point
 from reslrb_cli.transport.plan import Plan
-from reslrb_cli.transport.samples import NumberStream, Samples
+from reslrb_cli.transport.samples import LAMP_STREAM, SMALL_LAMP_STREAM, VISIBLE_STREAM, NumberStream, Samples
 
 
 def moving_splats(samples: Samples) -> Iterator[tuple[mi.Point2f, mi.Spectrum, mi.Bool]]:
@@ -38,7 +38,7 @@ def moving_splats(samples: Samples) -> Iterator[tuple[mi.Point2f, mi.Spectrum, m
     u and C_0 have their derivatives where gradients are enabled; what they sum up to is already in the image.
     """
     for lamp in samples.plan.visible_moving_lamps:
-        point = _points(samples, (lamp,), mi.UInt32(lamp.index), samples.lamp_numbers(lamp), attached=True)
+        point = _points(samples, (lamp,), mi.UInt32(lamp.index), samples.numbers(LAMP_STREAM + lamp.index), True)
         # Points stay where they are on the lamp, so that nothing that moves has a part in their radiance.
         yield point.u, dr.select(point.active, dr.detach(point.radiance()) * point.weight, 0), point.active
 
@@ -54,7 +54,7 @@ def small_splat(samples: Samples) -> tuple[mi.Point2f, mi.Spectrum, mi.Bool]:
 
 def small_points(samples: Samples) -> Points:
     """Points on the lamps that are smaller than a pixel, which take turns; detached."""
-    lamps, numbers = samples.plan.small_lamps, samples.small_lamp_numbers()
+    lamps, numbers = samples.plan.small_lamps, samples.numbers(SMALL_LAMP_STREAM)
     count, lane = dr.opaque(mi.UInt32, samples.width), dr.arange(mi.UInt32, samples.width)
     turn, index = lane % len(lamps), mi.UInt32(lamps[0].index)
     for number, lamp in enumerate(lamps):
@@ -124,7 +124,7 @@ def primary_ray(samples: Samples) -> PrimaryRay:
 
     Their numbers are a stream of their own.
     """
-    plan, sensor, width, sampler = samples.plan, samples.sensor, samples.width, samples.visible_numbers()
+    plan, sensor, width, sampler = samples.plan, samples.sensor, samples.width, samples.numbers(VISIBLE_STREAM)
     size = sensor.film().crop_size()
     n_pixels = int(size[0] * size[1])
     lane = dr.arange(mi.UInt32, width)

@@ -331,7 +331,7 @@ def test_what_is_kept_of_a_path_is_what_is_counted(experiment, monkeypatch, esti
         loop.gradient(problem, 0, loop.Split())
         sensor = problem.scene.sensors()[0]
         plan = problem.integrator.plan(problem.scene, sensor, problem.selection.params)
-        counted, kept = problem.integrator.estimator.bytes_per_path(plan), sum(entry_bytes(states.pop()))
+        counted, kept = sum(entry_bytes(problem.integrator.estimator.kept(plan))), sum(entry_bytes(states.pop()))
         assert plan.track_zeros == zeros
         assert kept == counted if estimator in ("reservoir", "event") else kept <= counted <= kept + 128
         assert (problem.integrator.estimator.scratch_bytes(plan) > 0) == (estimator == "stack")
