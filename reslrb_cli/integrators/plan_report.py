@@ -357,10 +357,10 @@ def count(integrator: Reslrb, plan: Plan, scene: mi.Scene, sensor: mi.Sensor, kn
     dr.kernel_history_clear()
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True), dr.suspend_grad():
         if known:
-            lt.fused([samples], integrator.estimator, gradient)
+            lt.fused(integrator.estimator, [samples], gradient)
         else:
-            trace = lt.trace_image([samples], integrator.estimator)
-            lt.replay_all(trace, integrator.estimator, gradient)
+            _, state = lt.trace_image(integrator.estimator, [samples])
+            lt.replay_all(integrator.estimator, [samples], gradient, state)
         dr.eval()
         dr.sync_thread()
         history = dr.kernel_history((dr.KernelType.JIT,))

@@ -7,8 +7,9 @@ and gradients by one of the estimators. They know nothing of Mitsuba's plugins; 
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, ClassVar
 
 import drjit as dr
@@ -100,10 +101,7 @@ class LightTracer:
         self.preparation.expected = spp
 
     def plan(self, scene: mi.Scene, sensor: mi.Sensor, params: mi.SceneParameters | None = None) -> Plan:
-        """What a walk of this scene needs, with derivatives of `params`, if any.
-
-        Raises UnsupportedScene for what cannot work.
-        """
+        """What a walk of this scene needs, with derivatives of `params`, if any. Raises UnsupportedScene."""
         return self.preparation.plan(scene, sensor, params)
 
     def passes(self, job: Job, purpose: Purpose | None = None, delta: mi.TensorXf | None = None) -> list[Samples]:
@@ -154,19 +152,14 @@ class LightTracer:
 
     def image(self, job: Job, evaluate: bool = True) -> mi.TensorXf:
         """The image (H, W, C), without derivatives."""
-        estimator = self.image_estimator()
-
-        def image(samples: Samples) -> mi.TensorXf:
-            return image_of([samples], estimator)
-
+        work = partial(image_of, self.image_estimator())
         with dr.suspend_grad():
             parts = self.passes(replace(job, params=None))  # an image has no use for what derivatives ask of a walk
-            if evaluate and self.freezes(parts):
-                return self.preparation.recordings.call("image", parts[0], image)
-            result = image_of(parts, estimator)
-            if evaluate:
-                dr.eval(result)
-            return result
+            if not evaluate:
+                return work(parts)
+            image = self.launch("image", parts, work)
+            dr.eval(image)
+            return image
 
     def tangent(self, job: Job) -> mi.TensorXf:
         """The derivative (H, W, C) of the image along the tangents of the job's parameters (forward mode)."""
@@ -178,6 +171,16 @@ class LightTracer:
             block = film.block()
             in_passes(parts, splat_tangents, block)
             return film.develop(block, tangent=True)
+
+    def launch(
+        self, kind: str, parts: list[Samples], work: Callable[..., Any], *inputs: Any,
+        params: mi.SceneParameters | None = None,
+    ) -> Any:  # fmt: skip
+        """`work(parts, *inputs, params)`, or a recording of that, launched again; one pass need not know `params`."""
+        if self.freezes(parts):
+            recordings = self.preparation.recordings
+            return recordings.call(kind, parts[0], lambda part, *given: work([part], *given), *inputs)
+        return work(parts, *inputs) if params is None else work(parts, *inputs, params=params)
 
     def freezes(self, parts: list[Samples]) -> bool:
         """Whether these samples are traced from a recording; large ones, and so several passes, gain little."""
@@ -242,18 +245,9 @@ class Reslrb(LightTracer):
 
     def correlated(self, job: Job, derivative: Derivative) -> mi.TensorXf:
         """The image, and the gradient of the same samples with the dL/dI that `derivative(image)` returns."""
-        estimator = self.estimator
-
-        def recorded(samples: Samples) -> tuple[mi.TensorXf, Any]:
-            traced = trace_image([samples], estimator)
-            return traced.image, traced.state
-
         with dr.suspend_grad():
             parts = self.passes(job, Purpose.BOTH)
-            if self.freezes(parts):
-                traced = Trace(parts, *self.preparation.recordings.call("trace", parts[0], recorded))
-            else:
-                traced = trace_image(parts, estimator)
+            traced = Trace(parts, *self.launch("trace", parts, partial(trace_image, self.estimator)))
         gradient = derivative(traced.image)
         self._replay(traced, gradient, job.params)
         self.learn(job, gradient)
@@ -271,32 +265,16 @@ class Reslrb(LightTracer):
 
         One set of samples, traced once for both where the estimator can.
         """
-        estimator = self.estimator
-
-        def recorded(samples: Samples, gradient: mi.TensorXf) -> mi.TensorXf:
-            return fused([samples], estimator, gradient)
-
         with dr.suspend_grad():
             parts = self.passes(job, Purpose.BOTH, gradient)
-            if self.freezes(parts):
-                image = self.preparation.recordings.call("fused", parts[0], recorded, gradient)
-            else:
-                image = fused(parts, estimator, gradient, job.params)
+            image = self.launch("fused", parts, partial(fused, self.estimator), gradient, params=job.params)
         self.learn(job, gradient)
         return image
 
     def _replay(self, trace: Trace, gradient: mi.TensorXf, params: mi.SceneParameters | None) -> None:
-        estimator = self.estimator
-
-        def recorded(samples: Samples, gradient: mi.TensorXf, *state: Any) -> None:
-            replay_all(Trace([samples], None, *state), estimator, gradient)
-
+        kind, state = ("trace and replay", []) if trace.state is None else ("replay", [trace.state])
         with dr.suspend_grad():
-            if self.freezes(trace.samples):
-                kind, state = ("trace and replay", []) if trace.state is None else ("replay", [trace.state])
-                self.preparation.recordings.call(kind, trace.samples[0], recorded, gradient, *state)
-            else:
-                replay_all(trace, estimator, gradient, params)
+            self.launch(kind, trace.samples, partial(replay_all, self.estimator), gradient, *state, params=params)
 
 
 def _no_attached(estimator: str) -> str:
@@ -307,7 +285,7 @@ def _no_attached(estimator: str) -> str:
     )
 
 
-def image_of(samples: list[Samples], estimator: Estimator | None) -> mi.TensorXf:
+def image_of(estimator: Estimator | None, samples: list[Samples]) -> mi.TensorXf:
     """The image of all passes, as the estimator makes it where it makes one of its own (else None); nothing is kept."""
     film = samples[0].film
     block = film.block()
@@ -335,20 +313,21 @@ def forward(
 
 @dataclass
 class Trace:
-    """Samples that have been traced: their image, and what is kept of their paths if they fit in one pass.
-
-    Several passes keep nothing, which would grow with the number of passes: each is traced again before its replay.
-    """
+    """Samples that have been traced: their image, and what is kept of their paths if they fit in one pass."""
 
     samples: list[Samples]
     image: mi.TensorXf | None = None
     state: Any = None
 
 
-def trace_image(samples: list[Samples], estimator: Estimator) -> Trace:
-    """Trace all passes: the image, and what the estimator keeps of each path."""
+def trace_image(estimator: Estimator, samples: list[Samples]) -> tuple[mi.TensorXf, Any]:
+    """The image of all passes, and what the estimator keeps of each path.
+
+    Several passes keep nothing, which would grow with the number of passes: each is traced again before its replay.
+    """
+    state = None
     if len(samples) > 1:
-        trace = Trace(samples, image_of(samples, None if estimator.splats_all else estimator))
+        image = image_of(None if estimator.splats_all else estimator, samples)
     else:
         film = samples[0].film
         block = film.block()
@@ -356,9 +335,9 @@ def trace_image(samples: list[Samples], estimator: Estimator) -> Trace:
         # One kernel: all that it yields is evaluated together, since what came later would trace everything again.
         dr.schedule(block.tensor())
         dr.eval(state)
-        trace = Trace(samples, film.develop(block), state)
-    dr.eval(trace.image)
-    return trace
+        image = film.develop(block)
+    dr.eval(image)
+    return image, state
 
 
 def replay(samples: Samples, estimator: Estimator, state: Any, adjoint: AdjointImage) -> None:
@@ -368,21 +347,25 @@ def replay(samples: Samples, estimator: Estimator, state: Any, adjoint: AdjointI
 
 
 def replay_all(
-    trace: Trace, estimator: Estimator, gradient: mi.TensorXf, params: mi.SceneParameters | None = None
-) -> None:
-    """Add the gradient of the objective with dL/dI `gradient` (H, W, C) to `params`, which one pass need not know."""
-    adjoint = trace.samples[0].film.adjoint(gradient)
-    if trace.state is None:
-        differentiate_passes(trace.samples, estimator, None, adjoint, params)
+    estimator: Estimator, samples: list[Samples], gradient: mi.TensorXf, state: Any = None,
+    params: mi.SceneParameters | None = None,
+) -> None:  # fmt: skip
+    """Add the gradient of the objective with dL/dI `gradient` (H, W, C) to `params`, which one pass need not know.
+
+    `state` is what is kept of the paths of one pass; None: they are traced anew.
+    """
+    adjoint = samples[0].film.adjoint(gradient)
+    if state is None:
+        differentiate_passes(samples, estimator, None, adjoint, params)
         return
     # Isolated: on their way to the parameters gradients are evaluated, and with them all that they hang on, which is to
     # be one kernel. They set out once, at the end.
     with dr.isolate_grad():
-        replay(trace.samples[0], estimator, trace.state, adjoint)
+        replay(samples[0], estimator, state, adjoint)
 
 
 def fused(
-    samples: list[Samples], estimator: Estimator, gradient: mi.TensorXf, params: mi.SceneParameters | None = None
+    estimator: Estimator, samples: list[Samples], gradient: mi.TensorXf, params: mi.SceneParameters | None = None
 ) -> mi.TensorXf:
     """The image, and the same gradient, where dL/dI is known before either."""
     film = samples[0].film
@@ -392,12 +375,9 @@ def fused(
 
 
 def differentiate_passes(
-    samples: list[Samples],
-    estimator: Estimator,
-    block: mi.ImageBlock | None,
-    adjoint: AdjointImage,
+    samples: list[Samples], estimator: Estimator, block: mi.ImageBlock | None, adjoint: AdjointImage,
     params: mi.SceneParameters | None,
-) -> None:
+) -> None:  # fmt: skip
     """Trace samples whose dL/dI is known and add their derivatives, and to the block (None: none) their contributions.
 
     What is kept of a path goes from one to the other within the kernel, and takes no memory.
