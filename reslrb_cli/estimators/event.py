@@ -15,7 +15,7 @@ that they may depend on each other.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import drjit as dr
@@ -113,7 +113,7 @@ class EventSelection(VertexHooks):
                 event = dr.select(numbers[2 * k] * Q < q, this, event)
             pair = Slot(w, C.stored(), connection.u, event)
             slots.append(dr.select(is_taken(numbers[2 * k + 1], w * Q, W), pair, slot))
-        return EventState(state.Q, W, state.prefix, slots, numbers[::2])
+        return replace(state, W=W, slots=slots, numbers=numbers[::2])
 
     def scattering(
         self, state: EventState, vertex: Vertex, connection: Connection, scattering: Scattering

@@ -154,12 +154,9 @@ class Reservoir(Estimator):
     }
 
     def __init__(
-        self,
-        capacity: int = 1,
-        weight: str = "luminance",
-        image: str = "all",
+        self, capacity: int = 1, weight: str = "luminance", image: str = "all",
         jacobian_damping: float = JACOBIAN_DAMPING,
-    ) -> None:
+    ) -> None:  # fmt: skip
         one_of("weight", weight, ("luminance", "adjoint"))
         one_of("image", image, ("all", "retained"))
         at_least_one("capacity", capacity, CAPACITY)

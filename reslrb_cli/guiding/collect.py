@@ -64,7 +64,7 @@ class Trail:
 
     said: list[dr.Local]
     left: list[dr.Local]
-    weight: list[dr.Local]
+    roulette: list[dr.Local]
     count: mi.UInt32  # vertices so far
     later: list[mi.Spectrum | mi.Float]
 
@@ -90,7 +90,7 @@ class Trail:
     def survives(self, weight: mi.Float) -> None:
         """Write the weight of roulette there."""
         fits, place = self._place(self.count - 1)
-        write(self.weight, [weight], place, fits)
+        write(self.roulette, [weight], place, fits)
 
     @staticmethod
     def _place(number: mi.UInt32) -> tuple[mi.Bool, mi.UInt32]:
@@ -111,7 +111,7 @@ def walk_back(trail: Trail) -> tuple[mi.Float, mi.Float, mi.Float]:
 
     def body(height: mi.UInt32, after: list[mi.Spectrum | mi.Float], trail: Trail) -> Any:
         place = height - 1
-        cell, inverse, weight = (array.read(place) for array in (*trail.left, *trail.weight))
+        cell, inverse, weight = (array.read(place) for array in (*trail.left, *trail.roulette))
         leaves, q = inverse > 0, dr.rcp(weight)
         parts, image = after[:-1], after[-1]
         still = [*(dr.squared_norm(part * inverse) for part in parts), image * dr.square(inverse)]

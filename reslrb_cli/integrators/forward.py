@@ -9,7 +9,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
@@ -71,17 +71,24 @@ class Tangent:
     d_product: mi.Spectrum
 
 
-class TangentSplat(Hooks):
+class Tangents(Hooks):
+    """Splats of derivatives along the parameters' tangents; `dE` is that of emission."""
+
+    connects = False  # they evaluate connections themselves, with their derivatives
+
+    def __init__(self, samples: Samples, block: mi.ImageBlock, dE: mi.Spectrum) -> None:
+        self.samples, self.block, self.dE = samples, block, dE
+
+    def survived(self, state: Tangent, weight: mi.Float) -> Tangent:
+        return replace(state, d_product=state.d_product * weight)
+
+
+class TangentSplat(Tangents):
     """Splat the derivative of every connection in the direction of the parameters' tangents.
 
     By the product rule along the path, d(P s) = dP s + P ds and dC_i = dP c_i + P dc_i: nothing is divided, so that
     zero factors need no care.
     """
-
-    connects = False  # it evaluates them itself, with their derivatives
-
-    def __init__(self, samples: Samples, block: mi.ImageBlock, dE: mi.Spectrum) -> None:
-        self.samples, self.block, self.dE = samples, block, dE
 
     def start(self, product: Product) -> Tangent:
         return Tangent(mi.Spectrum(self.dE))
@@ -107,21 +114,17 @@ class TangentSplat(Hooks):
         ds = dr.select(scattered, df * (scattering.correction / scattering.pdf), 0)
         return Tangent(state.d_product * scattering.weight + P * ds)
 
-    def survived(self, state: Tangent, weight: mi.Float) -> Tangent:
-        return Tangent(state.d_product * weight)
-
 
 @dataclass
-class AttachedTangent:
+class AttachedTangent(Tangent):
     """Derivatives along the parameters' tangents: of the product of the factors so far, (C,), and of the ray."""
 
-    d_product: mi.Spectrum
     d_origin: mi.Vector3f
     d_direction: mi.Vector3f
     before: list[Before]
 
 
-class AttachedTangentSplat(Hooks):
+class AttachedTangentSplat(Tangents):
     """As `TangentSplat`, with rays, hit points and film positions that move:
 
     d(k_p(u) C) = dk_p/du du C + k_p dC,   dC = dP c + P dc         k_p: the filter's weight of pixel p
@@ -129,11 +132,6 @@ class AttachedTangentSplat(Hooks):
     A segment's derivatives are those by its ray, whose tangents are at hand, and by the scene's parameters, in one
     propagation.
     """
-
-    connects = False  # it evaluates them itself, with their derivatives
-
-    def __init__(self, samples: Samples, block: mi.ImageBlock, dE: mi.Spectrum) -> None:
-        self.samples, self.block, self.dE = samples, block, dE
 
     def start(self, product: Product) -> AttachedTangent:
         before = Before.start(self.samples.plan)
@@ -167,9 +165,6 @@ class AttachedTangentSplat(Hooks):
             s.film.add(self.block, pixel, dr.detach(k) * dC + dk * C, seen)
         d_product = dr.select(scattered, state.d_product * weight + P * ds, 0)
         return AttachedTangent(d_product, mi.Vector3f(d_origin), d_direction, Before.of(plan, vertex, scattering))
-
-    def survived(self, state: AttachedTangent, weight: mi.Float) -> AttachedTangent:
-        return AttachedTangent(state.d_product * weight, state.d_origin, state.d_direction, state.before)
 
 
 def reverse_recorded(samples: Samples, adjoint: AdjointImage) -> None:

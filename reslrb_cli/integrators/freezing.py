@@ -97,11 +97,10 @@ class Recordings:
 
 
 def _record(
-    kind: str,
-    plain: Callable[..., Any],
+    kind: str, plain: Callable[..., Any],
     common: tuple[mi.Scene, mi.Sensor, mi.UInt32, mi.Float, mi.Float, Guide | None, Net | None],
     inputs: tuple[Any, ...],
-) -> Any:
+) -> Any:  # fmt: skip
     """A recording, or None where there cannot be one.
 
     Dr.Jit finds that out after all has been computed and derivatives were added. So it is tried with a first input of

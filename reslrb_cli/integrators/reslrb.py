@@ -45,16 +45,9 @@ class LightTracer:
     image_apart = True
 
     def __init__(
-        self,
-        max_depth: int = -1,
-        rr_depth: int = 5,
-        hide_emitters: bool = False,
-        samples_per_pass: int | None = None,
-        freeze: bool = False,
-        motion: Motion | None = None,
-        guided: bool = False,
-        low_discrepancy: bool = False,
-    ) -> None:
+        self, max_depth: int = -1, rr_depth: int = 5, hide_emitters: bool = False, samples_per_pass: int | None = None,
+        freeze: bool = False, motion: Motion | None = None, guided: bool = False, low_discrepancy: bool = False,
+    ) -> None:  # fmt: skip
         """Raises ValueError, which names the option, where one has a value that it cannot have.
 
         `freeze` says whether launches are recorded (`freezing.py`), `motion` how derivatives of what moves are taken,
@@ -207,15 +200,9 @@ class Reslrb(LightTracer):
 
     @classmethod
     def of(
-        cls,
-        estimator: str = "reservoir",
-        attached: bool | str = "auto",
-        filter_normalization: str = "attached",
-        attached_sampling: str = "auto",
-        guiding: str = "off",
-        sequence: str = "independent",
-        **options: Any,
-    ) -> Reslrb:
+        cls, estimator: str = "reservoir", attached: bool | str = "auto", filter_normalization: str = "attached",
+        attached_sampling: str = "auto", guiding: str = "off", sequence: str = "independent", **options: Any,
+    ) -> Reslrb:  # fmt: skip
         """From the estimator's name and all options. Raises ValueError where one is wrong."""
         if estimator == "auto":
             raise ValueError(

@@ -173,15 +173,9 @@ def gradient_step(
 
 
 def known_step(
-    integrator: StepIntegrator | mi.Integrator,
-    scene: mi.Scene,
-    sensor: mi.Sensor | int,
-    gradient: mi.TensorXf,
-    *,
-    seed: int,
-    spp: int,
-    params: mi.SceneParameters | None = None,
-) -> StepResult:
+    integrator: StepIntegrator | mi.Integrator, scene: mi.Scene, sensor: mi.Sensor | int, gradient: mi.TensorXf, *,
+    seed: int, spp: int, params: mi.SceneParameters | None = None,
+) -> StepResult:  # fmt: skip
     """A step whose dL/dI, `gradient` (H, W, C), is known before its image: the loss is the sum of dL/dI times I.
 
     One set of samples for both; an estimator of `reslrb` that can splats and differentiates in one traversal. The rest
@@ -194,17 +188,9 @@ def known_step(
 
 
 def cross_step(
-    integrator: StepIntegrator | mi.Integrator,
-    scene: mi.Scene,
-    sensor: mi.Sensor | int,
-    objective: Objective,
-    *,
-    image_seed: int,
-    seed: int,
-    spp: int,
-    params: mi.SceneParameters | None = None,
-    on_samples: OnSamples | None = None,
-) -> None:
+    integrator: StepIntegrator | mi.Integrator, scene: mi.Scene, sensor: mi.Sensor | int, objective: Objective, *,
+    image_seed: int, seed: int, spp: int, params: mi.SceneParameters | None = None, on_samples: OnSamples | None = None,
+) -> None:  # fmt: skip
     """Add the gradient by the samples of `seed`, with dL/dI from the image of those of `image_seed`.
 
     Equal seeds are what `correlated` does, others `independent`. The rest is as in `gradient_step`.
@@ -238,13 +224,9 @@ def _job(scene: mi.Scene, sensor: mi.Sensor | int, seed: int, spp: int, params: 
 
 
 def _batched(
-    integrator: StepIntegrator,
-    job: Job,
-    objective: Objective,
-    batches: int,
-    first_batch: FirstBatch,
+    integrator: StepIntegrator, job: Job, objective: Objective, batches: int, first_batch: FirstBatch,
     on_samples: OnSamples | None,
-) -> StepResult:
+) -> StepResult:  # fmt: skip
     """A step in batches (design of Deng et al. 2022's dual buffer): batch b takes delta from the image of those before.
 
     No path sees a delta that it helped to make, so that the gradient of an L2 loss is unbiased, as with `independent`,

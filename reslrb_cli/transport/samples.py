@@ -23,11 +23,9 @@ from reslrb_cli.transport.sobol import Net, Points
 
 
 def in_passes(
-    samples: list[Samples],
-    work: Callable[[Samples, mi.ImageBlock | None], None],
-    block: mi.ImageBlock | None,
+    samples: list[Samples], work: Callable[[Samples, mi.ImageBlock | None], None], block: mi.ImageBlock | None,
     params: mi.SceneParameters | None = None,
-) -> None:
+) -> None:  # fmt: skip
     """Call `work(part, block)` for each pass. It splats into the block (None: nothing), and differentiates `params`
     (None: nothing)."""
     if len(samples) == 1:
