@@ -3,6 +3,9 @@
 Images and gradients of several passes are added up. In single precision a sum over all samples would lose the last of
 them (1e8 samples: a quarter of a pixel), so each pass has a block and gradients of its own, and these are added to one
 another.
+
+Random numbers are drawn in the order of Mitsuba's `ptracer`, used or not: from one seed both trace the same paths.
+Those of low discrepancy (`sobol.py`) take the place of the first.
 """
 
 from __future__ import annotations
