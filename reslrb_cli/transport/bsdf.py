@@ -72,7 +72,8 @@ def _singular_factor(
     """`f`, replaced where a delta lobe was sampled or light passed straight through, where that has derivatives."""
     if plan.differentiate_delta:
         delta = active & scattering.is_delta
-        bs, weight = bsdf.sample(importance_context(), si, scattering.sample_1, scattering.sample_2, delta)
+        sample_1 = _defensive(scattering.sample_1)[1] if plan.needs.has_perturbed_normals else scattering.sample_1
+        bs, weight = bsdf.sample(importance_context(), si, sample_1, scattering.sample_2, delta)
         pdf = bs.pdf
         if plan.differentiate_null:
             # A mask's weight carries the derivative of its opacity already, and so does its density. Other BSDFs divide
@@ -169,7 +170,7 @@ def scatter(
     indirect call, and in it what they have in common (looking up textures, mostly). Lanes that are `aimed` have the
     direction of their point, and the BSDF's own density of it.
     """
-    si, bsdf, context = hit.si, hit.bsdf, importance_context()
+    si, bsdf, context, drawn = hit.si, hit.bsdf, importance_context(), sample_1
 
     def both(
         self: mi.BSDF, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, sample_1: mi.Float, sample_2: mi.Point2f,
@@ -180,8 +181,7 @@ def scatter(
 
     with dr.suspend_grad(when=not attached):
         if plan.needs.has_perturbed_normals:
-            defensive = sample_1 < DEFENSIVE
-            sample_1 = dr.select(defensive, sample_1 / DEFENSIVE, (sample_1 - DEFENSIVE) / (1 - DEFENSIVE))
+            defensive, sample_1 = _defensive(sample_1)
         if connected is None:
             bs, weight = bsdf.sample(context, si, sample_1, sample_2, active)
             f_connection, sample = None, Sample(bs.wo, bs.pdf, weight, bs.eta, bs.sampled_type)
@@ -218,7 +218,7 @@ def scatter(
             correction=correction,
             is_delta=is_delta,
             is_null=is_null,
-            sample_1=sample_1,
+            sample_1=drawn,
             sample_2=sample_2,
             active=active & valid & (pdf > 0),
         )
@@ -273,6 +273,12 @@ def staying(plan: Plan, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, active: m
     return dr.select(
         smooth, replace(followed, wo=there, pdf=kept, weight=dr.replace_grad(sample.weight, f / kept)), followed
     )
+
+
+def _defensive(sample_1: mi.Float) -> tuple[mi.Bool, mi.Float]:
+    """Lanes that a perturbed BSDF does not draw itself, by their number, and what is left of that for the others."""
+    defensive = sample_1 < DEFENSIVE
+    return defensive, dr.select(defensive, sample_1 / DEFENSIVE, (sample_1 - DEFENSIVE) / (1 - DEFENSIVE))
 
 
 def _mixed(
