@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import functools
 import logging
 import os
 from importlib import metadata
@@ -56,11 +57,11 @@ def works_under(variant: str) -> bool:
     return variant.endswith(("_ad_rgb", "_ad_mono"))
 
 
-def check_variant() -> None:
+@functools.cache
+def check_variant(variant: str | None) -> None:
     """Raises BackendError where the variant that is set is none under which our integrators work, or none is set."""
     import mitsuba as mi
 
-    variant = mi.variant()
     if variant is None or not works_under(variant):
         is_set = (
             "no variant is set" if variant is None else f"variant {variant} is set, under which reslrb does not work"

@@ -24,14 +24,14 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from reslrb_cli.estimators.base import Pass, VertexHooks, entry_bytes
-from reslrb_cli.estimators.kept import Before, SurfacePoint, reach
+from reslrb_cli.estimators.base import Pass, VertexHooks, allocate, entry_bytes, places, read, vertices, write
+from reslrb_cli.estimators.kept import Before, SurfacePoint, segment_again
 from reslrb_cli.transport.bsdf import Scattering
 from reslrb_cli.transport.connection import Connection
 from reslrb_cli.transport.factors import Product
 from reslrb_cli.transport.plan import Plan
-from reslrb_cli.transport.random import Numbers
-from reslrb_cli.transport.walk import Vertex, segment
+from reslrb_cli.transport.samples import Numbers
+from reslrb_cli.transport.walk import Vertex
 
 
 @dataclass
@@ -57,20 +57,10 @@ class Frame:
         zeros = mi.Float(0), mi.Point2f(0), mi.Spectrum(0), mi.UInt32(0)
         return Frame(SurfacePoint.blank(plan), *zeros, aperture, Before.start(plan))
 
-    def members(self) -> list[dr.ArrayBase]:
-        """All arrays, in the order of `like`."""
-        plain = [self.sample_1, self.sample_2, self.prefix, self.connected]
-        before = [member for one in self.before for member in one.members()]
-        return [*self.point.numbers, *plain, *self.aperture, *before]
 
-    def like(self, members: list[dr.ArrayBase]) -> Frame:
-        """The frame of the same form that has these members."""
-        values = iter(members)
-        point = SurfacePoint([next(values) for _ in self.point.numbers])
-        sample_1, sample_2, prefix, connected = (next(values) for _ in range(4))
-        aperture = [next(values) for _ in self.aperture]
-        before = [one.like(list(values)) for one in self.before]
-        return Frame(point, sample_1, sample_2, prefix, connected, aperture, before)
+def blank_roulette(plan: Plan) -> list[mi.Float]:
+    """What is kept of a vertex's roulette, where it is played."""
+    return [mi.Float(0)] if plan.roulette else []
 
 
 @dataclass
@@ -102,18 +92,12 @@ class Pushing(VertexHooks):
 
     def start(self, product: Product) -> Pushed:
         plan = self.p.plan
-        stack = [dr.alloc_local(type(member), self.size + 1) for member in Frame.blank(plan).members()]
-        roulette = [dr.alloc_local(mi.Float, self.size + 1)] if plan.roulette else []
+        stack, roulette = allocate(Frame.blank(plan), self.size), allocate(blank_roulette(plan), self.size)
         return Pushed(mi.UInt32(0), mi.UInt32(0), mi.UInt32(0), stack, roulette, Before.start(plan))
-
-    def concerned(self, state: Pushed) -> mi.Bool:
-        return state.count > 0
 
     def wants(self, state: Pushed, vertex: Vertex) -> mi.Bool:
         """Where there is no image to splat into, connections behind something that is differentiated."""
-        if self.p.block is not None:
-            return mi.Bool(True)
-        return self.concerned(state) | self._begins(vertex)
+        return mi.Bool(True) if self.p.block is not None else self._useful(state, vertex)
 
     def goes_on(self, state: Pushed, vertex: Vertex) -> mi.Bool:
         return mi.Bool(True) if self.end is None else state.count < self.end
@@ -123,7 +107,7 @@ class Pushing(VertexHooks):
         if p.block is not None:
             C = vertex.product.times(connection.c, vertex.depth).scaled(p.scale)
             p.splat(connection.u, C.value(), seen)
-        pushed = vertex.active & (self.concerned(state) | self._begins(vertex))
+        pushed = vertex.active & self._useful(state, vertex)
         if self.end is not None:
             pushed = pushed & (state.count < self.end)
         frame = Frame(
@@ -136,8 +120,7 @@ class Pushing(VertexHooks):
             before=state.before,
         )
         place = dr.select(pushed, state.count % self.size, self.size)  # what is not pushed goes where nobody reads
-        for array, value in zip(state.stack, frame.members(), strict=True):
-            array.write(value, place, pushed)
+        write(state.stack, frame, place, pushed)
         count = state.count + dr.select(pushed, mi.UInt32(1), 0)
         needed, before = dr.select(seen & pushed, count, state.needed), Before.of(plan, vertex, scattering)
         return Pushed(count, needed, place, state.stack, state.roulette, before)
@@ -147,12 +130,10 @@ class Pushing(VertexHooks):
             array.write(weight, state.place, state.place < self.size)
         return state
 
-    def _begins(self, vertex: Vertex) -> mi.Bool:
-        """Lanes in which the vertex itself depends on a parameter."""
-        plan = self.p.plan
-        if plan.differentiate_emission or plan.moving_emission:
-            return mi.Bool(True)  # B_0 is asked for
-        return plan.moves(vertex.si.shape) | plan.differentiates(vertex.bsdf)
+    def _useful(self, state: Pushed, vertex: Vertex) -> mi.Bool:
+        """Lanes in which the vertex, or one before it, depends on a parameter."""
+        plan = self.p.plan  # where B_0 is asked for, all of them
+        return (state.count > 0) | (mi.Bool(True) if concerns_emission(plan) else begins(plan, vertex))
 
 
 @dataclass
@@ -180,7 +161,7 @@ def sweep(p: Pass, stack_size: int) -> Adjoint:
 
     dL/dI is known.
     """
-    size, longest = places(p.plan, stack_size), max(p.plan.max_depth - 1, 0)
+    size, longest = places(p.plan, stack_size), vertices(p.plan)
     pushed: Pushed = p.walk(Pushing(p, size))
     bottom = dr.select(pushed.count > size, pushed.count - size, 0)  # the first vertex that the ring still holds
     adjoint = walk_back(p, size, pushed, pushed.needed, bottom, Adjoint.zero())
@@ -206,7 +187,7 @@ def sweep(p: Pass, stack_size: int) -> Adjoint:
 
 def walk_back(p: Pass, size: int, pushed: Pushed, top: mi.UInt32, bottom: mi.UInt32, adjoint: Adjoint) -> Adjoint:
     """Differentiate the segments of the vertices number top - 1 to bottom, in this order. Traces no ray."""
-    plan, sensor, form = p.plan, p.samples.sensor, Frame.blank(p.plan)
+    plan, form = p.plan, Frame.blank(p.plan)
     assert p.adjoint is not None
     image = p.adjoint
 
@@ -214,7 +195,7 @@ def walk_back(p: Pass, size: int, pushed: Pushed, top: mi.UInt32, bottom: mi.UIn
         number: mi.UInt32, adjoint: Adjoint, stack: list[dr.Local], roulette: list[dr.Local]
     ) -> tuple[mi.UInt32, Adjoint, list[dr.Local], list[dr.Local]]:
         place = (number - 1) % size
-        frame = form.like([array.read(place) for array in stack])
+        frame = read(stack, form, place)
         r = roulette[0].read(place) if roulette else mi.Float(1)
         connected = frame.connected != 0
         scattered = dr.any(adjoint.B != 0) | dr.any(adjoint.origin != 0) | dr.any(adjoint.direction != 0)
@@ -225,8 +206,7 @@ def walk_back(p: Pass, size: int, pushed: Pushed, top: mi.UInt32, bottom: mi.UIn
         with dr.resume_grad():
             ray.o, ray.d = mi.Point3f(ray.o), mi.Vector3f(ray.d)
             dr.enable_grad(ray.o, ray.d)
-            si, bsdf, reaching, reached = reach(plan, frame.before, ray, pi, connected | scattered)
-            this = segment(plan, sensor, reaching, si, bsdf, numbers, connected, scattered, attached=True)
+            this, reached = segment_again(p.samples, frame.before, ray, pi, numbers, connected, scattered)
             there, following = this.connection, this.next_ray(attached=True)
             seen = connected & there.active
             delta = image.lookup(there.u, seen, plan.attached_normalization) * p.scale
@@ -248,10 +228,20 @@ def walk_back(p: Pass, size: int, pushed: Pushed, top: mi.UInt32, bottom: mi.UIn
     return adjoint
 
 
+def begins(plan: Plan, vertex: Vertex) -> mi.Bool:
+    """Lanes in which the vertex itself depends on a parameter."""
+    return plan.moves(vertex.si.shape) | plan.differentiates(vertex.bsdf)
+
+
+def concerns_emission(plan: Plan) -> bool:
+    """Whether a parameter has a part in the rays that leave the emitters, or in E."""
+    return plan.differentiate_emission or plan.moving_emission
+
+
 def differentiate_start(p: Pass, adjoint: Adjoint) -> None:
     """Add the derivatives of the rays that leave the emitters, and of E, where a parameter has a part in either."""
     plan = p.plan
-    if not (plan.differentiate_emission or plan.moving_emission):
+    if not concerns_emission(plan):
         return
     with dr.resume_grad(), dr.isolate_grad():
         emission = p.emission()
@@ -261,12 +251,6 @@ def differentiate_start(p: Pass, adjoint: Adjoint) -> None:
         dr.backward_from(objective, flags=dr.ADFlag.Default | dr.ADFlag.AllowNoGrad)
 
 
-def places(plan: Plan, stack_size: int) -> int:
-    """How many vertices a stack has room for: no more than a path can have, and one at least."""
-    return min(stack_size, max(plan.max_depth - 1, 1))
-
-
 def scratch_bytes(plan: Plan, stack_size: int) -> int:
     """Thread-local bytes of each path that is being traced."""
-    members = [*Frame.blank(plan).members(), *([mi.Float(0)] if plan.roulette else [])]
-    return sum(entry_bytes(members)) * (places(plan, stack_size) + 1)
+    return sum(entry_bytes([Frame.blank(plan), blank_roulette(plan)])) * (places(plan, stack_size) + 1)

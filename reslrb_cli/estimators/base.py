@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, fields, is_dataclass
-from typing import Any, ClassVar
+from typing import Any, ClassVar, TypeVar
 
 import drjit as dr
 import mitsuba as mi
@@ -17,6 +17,8 @@ from reslrb_cli.transport.film import AdjointImage
 from reslrb_cli.transport.plan import Plan
 from reslrb_cli.transport.samples import Samples
 from reslrb_cli.transport.walk import Hooks, Vertex, walk
+
+T = TypeVar("T")
 
 
 @dataclass
@@ -86,24 +88,53 @@ class Estimator(ABC):
     def kept(self, plan: Plan) -> Any:
         """All that memory holds of a path at once, a PyTree of the same form; only the types of its leaves count."""
 
-    def bytes_per_path(self, plan: Plan) -> int:
-        """Bytes that memory holds of each path."""
-        return sum(entry_bytes(self.kept(plan)))
-
     def scratch_bytes(self, plan: Plan) -> int:
         """Thread-local bytes of each path that is being traced, which the allocator does not see."""
         return 0
 
 
+def arrays(tree: Any) -> list[dr.ArrayBase]:
+    """All arrays of a PyTree of dataclasses and lists, in their order."""
+    if is_dataclass(tree):
+        tree = [getattr(tree, field.name) for field in fields(tree)]
+    return [array for part in tree for array in arrays(part)] if isinstance(tree, (list, tuple)) else [tree]
+
+
+def like(form: T, values: Iterator[dr.ArrayBase]) -> T:
+    """A PyTree of the same form, of the next of these arrays."""
+    made: Any = type(form)
+    if isinstance(form, list):
+        return made(like(part, values) for part in form)
+    if is_dataclass(form):
+        return made(*(like(getattr(form, field.name), values) for field in fields(form)))
+    return next(values)
+
+
 def entry_bytes(tree: Any) -> list[int]:
     """Bytes of one entry of each array in a PyTree."""
-    if is_dataclass(tree):
-        parts: Any = [getattr(tree, field.name) for field in fields(tree)]
-    elif isinstance(tree, (list, tuple)) or dr.depth_v(tree) > 1:
-        parts = tree
-    else:
-        return [dr.itemsize_v(tree)]
-    return [size for part in parts for size in entry_bytes(part)]
+    found = arrays(tree)
+    parts = [list(array) if dr.depth_v(array) > 1 else [] for array in found]
+    return [n for array, own in zip(found, parts, strict=True) for n in (entry_bytes(own) or [dr.itemsize_v(array)])]
+
+
+def allocate(form: Any, size: int) -> list[dr.Local]:
+    """Thread-local memory for so many PyTrees of this form, and one more place, for what nobody is to read.
+
+    No place of it can be written twice, be it that the first write is masked out: the second was seen to be lost
+    (Dr.Jit 1.5, LLVM).
+    """
+    return [dr.alloc_local(type(array), size + 1) for array in arrays(form)]
+
+
+def write(stack: list[dr.Local], value: Any, place: mi.UInt32, active: mi.Bool) -> None:
+    """Write a PyTree to a place of such memory."""
+    for array, member in zip(stack, arrays(value), strict=True):
+        array.write(member, place, active)
+
+
+def read(stack: list[dr.Local], form: T, place: mi.UInt32) -> T:
+    """The PyTree at a place."""
+    return like(form, (array.read(place) for array in stack))
 
 
 def differentiate_emission(p: Pass, weight: Callable[[mi.Spectrum], mi.Spectrum]) -> None:
@@ -145,24 +176,20 @@ def adjoint_of_factor(
 
 
 def differentiate_passage(
-    p: Pass,
-    si: mi.SurfaceInteraction3f,
-    depth: mi.UInt32,
-    connection: Connection,
-    active: mi.Bool,
-    adjoint: Callable[[mi.Spectrum], mi.Spectrum],
-) -> mi.Spectrum:
-    """Transmittance (C,) of the masks between a vertex and the sensor; adds its derivative.
+    p: Pass, si: mi.SurfaceInteraction3f, depth: mi.UInt32, connection: Connection, active: mi.Bool,
+    adjoint: PathAdjoint,
+) -> mi.Spectrum:  # fmt: skip
+    """Transmittance (C,) of the masks between a vertex and the sensor; adds its derivative, by that of the connection.
 
-    `adjoint(transmission)` is d(objective)/d(transmission) of one of them. One with a transmission of zero ends the
-    segment, so that none of them is ever the zero factor of a product. Only beside a zero factor is the transmittance
-    of use; where there is none, and no derivative either, nothing is traced.
+    A mask with a transmission of zero ends the segment, so that none is ever the zero factor of a product. Only beside
+    a zero factor is the transmittance of use; where there is none, and no derivative either, nothing is traced.
     """
     if not p.plan.passage_in_gradient:
         return mi.Spectrum(1)
 
     def differentiate(transmission: mi.Spectrum, hit: mi.Bool) -> None:
-        objective = dr.select(hit, adjoint(dr.detach(transmission)) * transmission, 0)
+        weight = adjoint_of_factor(adjoint, mi.Int32(NO_ZERO), dr.detach(transmission), 0)
+        objective = dr.select(hit, weight * transmission, 0)
         # Masks may be there and have no parameter that is differentiated.
         dr.backward_from(objective, flags=dr.ADFlag.Default | dr.ADFlag.AllowNoGrad)
 
@@ -170,6 +197,15 @@ def differentiate_passage(
         limit = p.plan.max_depth - depth - 1
         on_crossing = differentiate if p.plan.differentiate_null else None
         return transmittance(p.samples.scene, si, connection.target, limit, active, on_crossing).value
+
+
+def adjoint_of_connection(
+    p: Pass, vertex: Vertex, connection: Connection, active: mi.Bool, adjoint: PathAdjoint
+) -> mi.Spectrum:
+    """d(objective)/df (C,) of a connection's BSDF; adds the derivative of the masks on its way."""
+    rest = mi.Spectrum(dr.rcp(stand_in(connection)[0]))
+    rest *= differentiate_passage(p, vertex.si, vertex.depth, connection, active, adjoint)
+    return adjoint_of_factor(adjoint, vertex.depth, connection.f, rest)
 
 
 def contribution(p: Pass, vertex: Vertex, connection: Connection) -> Product:
@@ -193,6 +229,16 @@ class VertexHooks(Hooks):
         if self.p.block is not None or plan.differentiate_emission:
             return mi.Bool(True)
         return self.concerned(state) | plan.concerns(vertex.bsdf)
+
+
+def vertices(plan: Plan) -> int:
+    """The most vertices that a path can have."""
+    return max(plan.max_depth - 1, 0)
+
+
+def places(plan: Plan, stack_size: int) -> int:
+    """How many vertices a stack has room for: no more than a path can have, and one at least."""
+    return min(stack_size, max(vertices(plan), 1))
 
 
 def one_of(name: str, value: str, allowed: tuple[str, ...]) -> None:

@@ -37,16 +37,17 @@ from dataclasses import dataclass, replace
 import drjit as dr
 import mitsuba as mi
 
-from reslrb_cli.estimators.attached import Adjoint, differentiate_start
+from reslrb_cli.estimators.attached import Adjoint, begins, concerns_emission, differentiate_start
 from reslrb_cli.estimators.base import Pass, PathAdjoint, VertexHooks, adjoint_of_factor, contribution
 from reslrb_cli.estimators.jacobian import row_times, segment_jacobian, spread
-from reslrb_cli.estimators.kept import Before, is_staying, reach
+from reslrb_cli.estimators.kept import Before, is_staying, segment_again
+from reslrb_cli.estimators.selection import SlotReplay, chosen_by
 from reslrb_cli.transport.bsdf import Scattering
 from reslrb_cli.transport.connection import Connection
 from reslrb_cli.transport.factors import Product
 from reslrb_cli.transport.plan import Plan
-from reslrb_cli.transport.random import Numbers
-from reslrb_cli.transport.walk import Vertex, segment
+from reslrb_cli.transport.samples import Numbers
+from reslrb_cli.transport.walk import Vertex
 
 #: Vertices that are not specular in one block of a chain.
 BLOCK = 10
@@ -126,25 +127,12 @@ class ChainState:
                  mi.Spectrum(0), rows(2), rows(channels), [mi.UInt32(0) for _ in 2 * Blocks.of(plan)])
             for _ in range(capacity)
         ]  # fmt: skip
-        return ChainState(
-            mi.Float(0),
-            slots,
-            [mi.UInt32(0)],
-            [mi.Matrix4d(1)],
-            rows(channels),
-            Blocks.of(plan),
-            Before.start(plan),
-            [],
-        )
+        latest, J, blocks = [mi.UInt32(0)], [mi.Matrix4d(1)], Blocks.of(plan)
+        return ChainState(mi.Float(0), slots, latest, J, rows(channels), blocks, Before.start(plan), [])
 
     def stored(self) -> ChainState:
         """What is left of it at the end of a path."""
         return ChainState(self.W, self.slots, [], [], [], [], [], [])
-
-
-def begins(plan: Plan, vertex: Vertex) -> mi.Bool:
-    """Lanes in which the vertex itself has anything to differentiate."""
-    return plan.moves(vertex.si.shape) | plan.differentiates(vertex.bsdf)
 
 
 def numbers_of(connection: Connection, scattering: Scattering) -> Numbers:
@@ -156,27 +144,20 @@ class ChainSelection(VertexHooks):
     """Image pass: splat, chain Jacobians, and keep connections as `choose` says."""
 
     def __init__(
-        self,
-        p: Pass,
-        capacity: int,
-        damping: float,
-        splat: bool,
+        self, p: Pass, capacity: int, damping: float, splat: bool,
         weigh: Callable[[Connection, Product, mi.Float], mi.Float],
-        is_taken: Callable[[mi.Float, mi.Float, mi.Float], mi.Bool],
-    ) -> None:
-        """`weigh(connection, C, W)` is the selection weight w of a connection, W the sum before it; `is_taken(number,
-        w, W)` whether it takes a slot, W being the sum with it."""
+    ) -> None:  # fmt: skip
+        """`weigh(connection, C, W)` is the selection weight w of a connection, W the sum before it."""
         super().__init__(p)
         self.capacity, self.damping, self.splat = capacity, damping, splat
         self.numbers = capacity + len(Blocks.of(p.plan))
-        self.weigh, self.is_taken = weigh, is_taken
+        self.weigh = weigh
 
     def start(self, product: Product) -> ChainState:
         return ChainState.empty(self.p.plan, self.capacity)
 
     def concerned(self, state: ChainState) -> mi.Bool:
-        plan = self.p.plan
-        return mi.Bool(True) if plan.differentiate_emission or plan.moving_emission else state.latest[0] > 0
+        return mi.Bool(True) if concerns_emission(self.p.plan) else state.latest[0] > 0
 
     def wants(self, state: ChainState, vertex: Vertex) -> mi.Bool:
         if self.p.block is not None:
@@ -201,7 +182,7 @@ class ChainSelection(VertexHooks):
         candidate = connection.active & on
         numbers = numbers_of(connection, scattering)
         jacobian = segment_jacobian(
-            plan, p.samples.sensor, vertex, state.before, numbers, candidate, scattering.active & on, self.damping
+            p.samples, vertex, state.before, numbers, candidate, scattering.active & on, self.damping
         )
         w = dr.select(candidate, self.weigh(connection, C, state.W), 0)
         W = state.W + w
@@ -217,11 +198,7 @@ class ChainSelection(VertexHooks):
             C_rows=[row_times(row, J) + before for row, before in zip(jacobian.log_c, G, strict=True)],
             block=[number for blocks in state.blocks for number in (blocks.chosen, blocks.number + 1)],
         )
-        chosen_by = state.numbers[: self.capacity]
-        slots = [
-            dr.select(self.is_taken(number, w, W), this, slot)
-            for number, slot in zip(chosen_by, state.slots, strict=True)
-        ]
+        slots = chosen_by(state.numbers[: self.capacity], w, W, this, state.slots)
         on &= scattering.active
         G = [dr.select(on, before + row_times(row, J), before) for row, before in zip(jacobian.log_s, G, strict=True)]
         after = replace(state, W=W, slots=slots, latest=[latest], J=[dr.select(on, jacobian.ray @ J, J)], G=G)
@@ -289,33 +266,17 @@ class ReplayState:
     before: list[Before]
 
 
-class ChainReplay(VertexHooks):
+class ChainReplay(SlotReplay):
     """Replay up to the last vertex with anything to differentiate, and differentiate each segment's ray and factors."""
 
-    replaying = True
-    connects = False
-
     def __init__(self, p: Pass, kept: list[Kept], damping: float) -> None:
-        super().__init__(p)
+        super().__init__(p, [one.slot.last for one in kept])
         self.kept, self.damping = kept, damping
-        self.last = kept[0].slot.last
-        for other in kept[1:]:
-            self.last = dr.maximum(self.last, other.slot.last)
 
     def start(self, product: Product) -> ReplayState:
         plan = self.p.plan
-        return ReplayState(
-            [one.row for one in self.kept],
-            mi.Bool(plan.differentiate_emission or plan.moving_emission),
-            Blocks.of(plan),
-            Before.start(plan),
-        )
-
-    def goes_on(self, state: ReplayState, vertex: Vertex) -> mi.Bool:
-        return vertex.depth <= self.last
-
-    def is_followed(self, state: ReplayState, vertex: Vertex) -> mi.Bool:
-        return vertex.depth < self.last
+        rows, begun = [one.row for one in self.kept], mi.Bool(concerns_emission(plan))
+        return ReplayState(rows, begun, Blocks.of(plan), Before.start(plan))
 
     def scattering(
         self, state: ReplayState, vertex: Vertex, connection: Connection, scattering: Scattering
@@ -323,9 +284,8 @@ class ChainReplay(VertexHooks):
         plan, depth = self.p.plan, vertex.depth
         begun = state.begun | begins(plan, vertex)
         numbers, on = numbers_of(connection, scattering), scattering.active & begun
-        jacobian = segment_jacobian(plan, self.p.samples.sensor, vertex, state.before, numbers, None, on, self.damping)
-        blocks = state.blocks
-        entered = mi.Bool(False)
+        jacobian = segment_jacobian(self.p.samples, vertex, state.before, numbers, None, on, self.damping)
+        blocks, entered = state.blocks, mi.Bool(False)
         if blocks:
             passed, entered = blocks[0].past(jacobian.damped)
             blocks = [passed]
@@ -356,8 +316,7 @@ class ChainReplay(VertexHooks):
             connected, scattered = connected | own, scattered | (on & scattering.active)
         assert p.adjoint is not None
         with dr.resume_grad():
-            si, bsdf, ray, reached = reach(plan, before, vertex.ray, vertex.pi, connected | scattered)
-            this = segment(plan, p.samples.sensor, ray, si, bsdf, numbers, connected, scattered, attached=True)
+            this, reached = segment_again(p.samples, before, vertex.ray, vertex.pi, numbers, connected, scattered)
             there, following = this.connection, this.next_ray(attached=True)
             delta = p.adjoint.lookup(there.u, connected, plan.attached_normalization)
             own_part = dr.select(connected, dr.dot(by_c, reached * delta * there.f * there.weight), 0)
@@ -368,17 +327,14 @@ class ChainReplay(VertexHooks):
 
 def differentiate(p: Pass, kept: list[Kept], damping: float) -> None:
     """Add the derivatives of the kept connections."""
-    if p.plan.differentiate_emission or p.plan.moving_emission:
+    if concerns_emission(p.plan):
         emission = p.emission()
         B, origin, direction = mi.Spectrum(0), mi.Vector3f(0), mi.Vector3f(0)
         for one in kept:
             inside, weight = one.part(Blocks.of(p.plan))
             by_o, by_d = spread(emission.ray.d, dr.select(inside, one.row * weight, 0), mi.Bool(False))
-            B, origin, direction = (
-                B + adjoint_of_factor(one.adjoint, mi.Int32(0), dr.detach(emission.weight), 1),
-                origin + by_o,
-                direction + by_d,
-            )
+            B += adjoint_of_factor(one.adjoint, mi.Int32(0), dr.detach(emission.weight), 1)
+            origin, direction = origin + by_o, direction + by_d
         differentiate_start(p, dr.detach(Adjoint(origin, direction, B)))
     if p.plan.moving_shapes or p.plan.differentiate_bsdfs:  # else no segment has a parameter, and Dr.Jit refuses it
         replay = ChainReplay(p, kept, damping)

@@ -15,7 +15,7 @@ that they may depend on each other.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import drjit as dr
@@ -33,7 +33,7 @@ from reslrb_cli.estimators.base import (
     one_of,
 )
 from reslrb_cli.estimators.kept import Event, differentiate_event
-from reslrb_cli.estimators.reservoir import defended, is_taken, selection_weight, slot_adjoint
+from reslrb_cli.estimators.selection import at_least_share, is_taken, selection_weight, slot_adjoint
 from reslrb_cli.transport.bsdf import Scattering
 from reslrb_cli.transport.connection import Connection
 from reslrb_cli.transport.factors import Product
@@ -103,7 +103,7 @@ class EventSelection(VertexHooks):
         if plan.differentiate_null:
             q = mi.Float(1)  # the masks between vertex and sensor may have something to differentiate
         Q = state.Q + q
-        w = defended(w, state.W / dr.maximum(Q, 1))  # 1: the least Q that is not 0
+        w = at_least_share(w, state.W / dr.maximum(Q, 1))  # 1: the least Q that is not 0
         W = dr.fma(w, Q, state.W)
         this = Event.of_connection(plan, vertex, connection)
         slots = []
@@ -113,7 +113,7 @@ class EventSelection(VertexHooks):
                 event = dr.select(numbers[2 * k] * Q < q, this, event)
             pair = Slot(w, C.stored(), connection.u, event)
             slots.append(dr.select(is_taken(numbers[2 * k + 1], w * Q, W), pair, slot))
-        return EventState(state.Q, W, state.prefix, slots, numbers[::2])
+        return replace(state, W=W, slots=slots, numbers=numbers[::2])
 
     def scattering(
         self, state: EventState, vertex: Vertex, connection: Connection, scattering: Scattering

@@ -11,6 +11,7 @@ beyond the last bit trace their shadow rays again, so that memory is constant.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -20,15 +21,15 @@ from reslrb_cli.estimators.base import (
     Pass,
     PathAdjoint,
     VertexHooks,
-    adjoint_of_factor,
+    adjoint_of_connection,
     contribution,
     differentiate_emission,
-    differentiate_passage,
+    vertices,
 )
 from reslrb_cli.estimators.kept import AdjointSum
 from reslrb_cli.transport.bsdf import Scattering, tracked_factors
-from reslrb_cli.transport.connection import Connection, Seen, stand_in
-from reslrb_cli.transport.factors import NO_ZERO, Product
+from reslrb_cli.transport.connection import Connection, Seen
+from reslrb_cli.transport.factors import Product
 from reslrb_cli.transport.plan import Plan
 from reslrb_cli.transport.walk import Vertex
 
@@ -84,7 +85,7 @@ class Gathering(VertexHooks):
         p = self.p
         # The sum is all that derivatives of emission need.
         traced_again = p.adjoint is None or p.plan.differentiate_bsdfs
-        visibility = Visibility.none(vertices(p) if traced_again else 0)
+        visibility = Visibility.none(vertices(p.plan) if traced_again else 0)
         if p.adjoint is None:
             return GatherState(visibility, [], [])
         return GatherState(visibility, [AdjointSum.zero(p.plan.track_zeros)], [mi.UInt32(0)])
@@ -95,63 +96,48 @@ class Gathering(VertexHooks):
         p, depth, last = self.p, vertex.depth, vertex.depth
         C = contribution(p, vertex, connection)
         p.splat(connection.u, C.value(), connection.active)
-        latest = [latest_concerned(p, vertex, before) for before in state.latest]
+        # The latest vertex with anything to differentiate up to this one; 0: none.
+        latest = [dr.select(p.plan.concerns(vertex.bsdf), depth, before) for before in state.latest]
         if latest:
             last = needed(latest[0], depth)
         visibility = state.visibility.with_vertex(depth, connection.active, last)
-        return GatherState(visibility, [plus(p, S, vertex, connection, C) for S in state.S], latest)
+        S = [total.plus(p.delta(connection.u, connection.active), C, depth, connection.active) for total in state.S]
+        return GatherState(visibility, S, latest)
 
 
-@dataclass
-class Summed:
-    """State of a walk that sums: S_0 so far, `latest` as in GatherState, the last vertex that a replay has to visit."""
-
-    S: AdjointSum
-    latest: mi.UInt32
-    last: mi.UInt32
-
-
-class Summing(VertexHooks):
-    """Sum delta_i C_i along the same paths again, without shadow rays."""
+class Revisiting(VertexHooks):
+    """A walk along paths that were traced before, as far as there is need to, without shadow rays."""
 
     def __init__(self, p: Pass, visibility: Visibility) -> None:
         super().__init__(p)
         self.visibility = visibility
 
-    def start(self, product: Product) -> Summed:
-        return Summed(AdjointSum.zero(self.p.plan.track_zeros), mi.UInt32(0), mi.UInt32(0))
-
     def seen(self, vertex: Vertex) -> Seen:
-        return self.visibility.seen(vertex.depth, vertices(self.p))
+        return self.visibility.seen(vertex.depth, vertices(self.p.plan))
 
-    def goes_on(self, state: Summed, vertex: Vertex) -> mi.Bool:
+    def goes_on(self, state: Any, vertex: Vertex) -> mi.Bool:
         return vertex.depth < self.visibility.last
 
-    def connection(self, state: Summed, vertex: Vertex, connection: Connection, numbers: list[mi.Float]) -> Summed:
-        S = plus(self.p, state.S, vertex, connection, contribution(self.p, vertex, connection))
-        latest = latest_concerned(self.p, vertex, state.latest)
-        last = dr.select(connection.active, needed(latest, vertex.depth), state.last)
-        return Summed(S, latest, last)
+
+class Summing(Revisiting, Gathering):
+    """Sum delta_i C_i along the same paths again; of visibility, say which vertex is the last to visit once more."""
+
+    def start(self, product: Product) -> GatherState:
+        return GatherState(Visibility.none(0), [AdjointSum.zero(self.p.plan.track_zeros)], [mi.UInt32(0)])
 
 
-class Taking(VertexHooks):
+class Taking(Revisiting):
     """Replay: take each contribution off the sum again, and differentiate both factors of each vertex.
 
     `S` sums the connections of the vertices from `first` on; what comes before them is left alone. None: of all.
     """
 
     def __init__(self, p: Pass, visibility: Visibility, S: AdjointSum, first: mi.UInt32 | None = None) -> None:
-        super().__init__(p)
-        self.visibility, self.S, self.first = visibility, S, first
+        super().__init__(p, visibility)
+        self.S, self.first = S, first
 
     def start(self, product: Product) -> AdjointSum:
         return self.S
-
-    def seen(self, vertex: Vertex) -> Seen:
-        return self.visibility.seen(vertex.depth, vertices(self.p))
-
-    def goes_on(self, state: AdjointSum, vertex: Vertex) -> mi.Bool:
-        return vertex.depth < self.visibility.last
 
     def scattering(
         self, state: AdjointSum, vertex: Vertex, connection: Connection, scattering: Scattering
@@ -166,14 +152,7 @@ class Taking(VertexHooks):
         delta = p.delta(connection.u, connected)
         S = state.minus(delta, C, vertex.depth, connected)
         own = PathAdjoint(delta * C.nonzero, C)
-        rest_c = mi.Spectrum(dr.rcp(stand_in(connection)[0]))
-        if plan.needs.has_null:
-
-            def adjoint_of(transmission: mi.Spectrum) -> mi.Spectrum:
-                return adjoint_of_factor(own, mi.Int32(NO_ZERO), transmission, 0)
-
-            rest_c *= differentiate_passage(p, vertex.si, vertex.depth, connection, connected, adjoint_of)
-        weight_c = adjoint_of_factor(own, vertex.depth, connection.f, rest_c)
+        weight_c = adjoint_of_connection(p, vertex, connection, connected, own)
         weight_s = S.adjoint_of_factor(scattering.f, vertex.product, scattering.correction / scattering.pdf)
         connected, scattered = connected & useful, scattering.active & useful
         with dr.resume_grad():
@@ -182,25 +161,10 @@ class Taking(VertexHooks):
         return S
 
 
-def latest_concerned(p: Pass, vertex: Vertex, before: mi.UInt32) -> mi.UInt32:
-    """The latest vertex with anything to differentiate up to this one, `before` without it; 0: none."""
-    return dr.select(p.plan.concerns(vertex.bsdf), vertex.depth, before)
-
-
 def needed(latest: mi.UInt32, depth: mi.UInt32) -> mi.UInt32:
     """The last vertex that a replay has to visit for a connection from vertex `depth`: one after the latest with
     anything to differentiate, whose scattering is then sampled, or that vertex itself; 0: none."""
     return dr.select(latest > 0, dr.minimum(latest + 1, depth), 0)
-
-
-def vertices(p: Pass) -> int:
-    """The most vertices that a path of this pass can have."""
-    return max(p.plan.max_depth - 1, 0)
-
-
-def plus(p: Pass, S: AdjointSum, vertex: Vertex, connection: Connection, C: Product) -> AdjointSum:
-    """S + delta C."""
-    return S.plus(p.delta(connection.u, connection.active), C, vertex.depth, connection.active)
 
 
 class Gather(Estimator):
@@ -214,16 +178,15 @@ class Gather(Estimator):
 
     def backward(self, p: Pass, state: GatherState) -> None:
         visibility = state.visibility
-        if state.S:
-            [S] = state.S
-        else:
-            summed: Summed = p.walk(Summing(p, visibility), visibility.last > 0)
-            S, visibility = summed.S, Visibility(visibility.words, summed.last)
-            dr.eval(S, visibility)  # the emission and the replay both read them
+        if not state.S:
+            state = p.walk(Summing(p, visibility), visibility.last > 0)
+            visibility = Visibility(visibility.words, state.visibility.last)
+            dr.eval(state.S, visibility)  # the emission and the replay both read them
+        [S] = state.S
         differentiate_emission(p, S.adjoint_of_emission)
         if p.plan.differentiate_bsdfs:
             p.walk(Taking(p, visibility, S), visibility.last > 0)
 
     def kept(self, plan: Plan) -> GatherState:
-        visibility = Visibility.none(max(plan.max_depth - 1, 0))
+        visibility = Visibility.none(vertices(plan))
         return GatherState(visibility, [AdjointSum.zero(plan.track_zeros)], [mi.UInt32(0)])

@@ -19,10 +19,9 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from reslrb_cli.estimators.kept import Before, is_staying, reach
-from reslrb_cli.transport.plan import Plan
-from reslrb_cli.transport.random import Numbers
-from reslrb_cli.transport.walk import Vertex, segment
+from reslrb_cli.estimators.kept import Before, is_staying, segment_again
+from reslrb_cli.transport.samples import Numbers, Samples
+from reslrb_cli.transport.walk import Vertex
 
 AXES = 4
 
@@ -67,15 +66,9 @@ def spread(d: mi.Vector3f, row: mi.Vector4d, stays: mi.Bool) -> tuple[mi.Vector3
 
 
 def segment_jacobian(
-    plan: Plan,
-    sensor: mi.Sensor,
-    vertex: Vertex,
-    before: list[Before],
-    numbers: Numbers,
-    connected: mi.Bool | None,
-    scattered: mi.Bool,
-    damping: float,
-) -> SegmentJacobian:
+    samples: Samples, vertex: Vertex, before: list[Before], numbers: Numbers, connected: mi.Bool | None,
+    scattered: mi.Bool, damping: float,
+) -> SegmentJacobian:  # fmt: skip
     """The Jacobians of a vertex's segment; without `connected` (a mask) none of the connection's.
 
     Where a diffuse surface scatters, the next ray does not depend on the direction of the one before, so that the
@@ -94,8 +87,9 @@ def segment_jacobian(
         ray = mi.Ray3f(vertex.ray)
         ray.o = ray.o + frame.s * p[0] + frame.t * p[1] + vertex.ray.d * dr.select(stays, p[2], 0)
         ray.d = dr.normalize(ray.d + dr.select(stays, 0, frame.s * p[2] + frame.t * p[3]))
-        si, bsdf, ray, reached = reach(plan, before, ray, vertex.pi, connected | scattered, parameters=False)
-        this = segment(plan, sensor, ray, si, bsdf, numbers, connected, scattered, evaluates, attached=True)
+        this, reached = segment_again(
+            samples, before, ray, vertex.pi, numbers, connected, scattered, evaluates, parameters=False
+        )
         following, scattering, connection = this.next_ray(attached=True), this.scattering, this.connection
         factors = [reached * scattering.weight]
         if evaluates:
@@ -109,7 +103,7 @@ def segment_jacobian(
             dr.forward_from(axis, flags=dr.ADFlag.ClearInterior | dr.ADFlag.AllowNoGrad)
             changes.append([dr.detach(dr.grad(value)) for value in outputs])
             dr.clear_grad([axis, *outputs])
-    after = Before.of(plan, vertex, scattering)
+    after = Before.of(samples.plan, vertex, scattering)
     damped = scattered & (stays | ~scattering.is_delta)
     turned = dr.select(damped, damping * sign(numbers), 0)
     columns = []

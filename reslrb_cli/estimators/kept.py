@@ -33,11 +33,12 @@ import drjit as dr
 import mitsuba as mi
 
 from reslrb_cli.estimators.base import Pass, PathAdjoint, adjoint_of_factor, differentiate_passage
-from reslrb_cli.transport.bsdf import Scattering, evaluate, stays_behind, tracked_factor
+from reslrb_cli.transport.bsdf import Hit, Scattering, evaluate, stays_behind, tracked_factor
 from reslrb_cli.transport.connection import Connection, connect, stand_in
 from reslrb_cli.transport.factors import NO_ZERO, Product, showing
 from reslrb_cli.transport.plan import Plan
-from reslrb_cli.transport.walk import Vertex, find_following_vertex, find_vertex
+from reslrb_cli.transport.samples import Numbers, Samples
+from reslrb_cli.transport.walk import Segment, Vertex, find_following_vertex, find_vertex, segment
 
 
 @dataclass
@@ -60,13 +61,7 @@ class AdjointSum:
 
     def plus(self, delta: mi.Spectrum, C: Product, index: mi.UInt32, active: mi.Bool) -> AdjointSum:
         """The sum with delta C of one more connection, that of vertex `index`."""
-        return self._shifted(dr.select(active, delta, 0), C, index)
-
-    def minus(self, delta: mi.Spectrum, C: Product, index: mi.UInt32, active: mi.Bool) -> AdjointSum:
-        """The sum without delta C of a connection that is in it."""
-        return self._shifted(dr.select(active, -delta, 0), C, index)
-
-    def _shifted(self, delta: mi.Spectrum, C: Product, index: mi.UInt32) -> AdjointSum:
+        delta = dr.select(active, delta, 0)
         value, rest = self._add(self.value, self.rest, delta * C.value())
         if not self.behind_zero:
             return type(self)(value, rest, [])
@@ -75,6 +70,10 @@ class AdjointSum:
             # A connection whose own factor is the zero one has a derivative there, and none in the prefix.
             term[c] = dr.select((zero >= 0) & (zero != mi.Int32(index)), term[c], 0)
         return type(self)(value, rest, list(self._add(self.behind_zero[0], self.behind_zero[1], term)))
+
+    def minus(self, delta: mi.Spectrum, C: Product, index: mi.UInt32, active: mi.Bool) -> AdjointSum:
+        """The sum without delta C of a connection that is in it."""
+        return self.plus(-delta, C, index, active)
 
     def adjoint_of_factor(self, f: mi.Spectrum, prefix: Product, rest: mi.Float | float) -> mi.Spectrum:
         """d(sum)/df (C,), for a factor `f * rest` of the path with this prefix, before all connections in the sum."""
@@ -174,18 +173,17 @@ def _index(pointer: mi.BSDFPtr | mi.ShapePtr) -> mi.UInt32:
     return dr.reinterpret_array(mi.UInt32, pointer)
 
 
-def lobe(plan: Plan, scattering: Scattering) -> list[mi.UInt32 | mi.Float | mi.Point2f]:
-    """Which lobe was sampled (1: delta, 2: null), with which numbers; nothing where just smooth ones matter."""
+def lobe(plan: Plan, scattering: Scattering | None) -> list[mi.UInt32 | mi.Float | mi.Point2f]:
+    """Which lobe was sampled (1: delta, 2: null), with which numbers; nothing where just smooth ones matter.
+
+    Of no event (None) zeros of the same form.
+    """
     if not (plan.differentiate_delta or plan.differentiate_null):
         return []
+    if scattering is None:
+        return [mi.UInt32(0), mi.Float(0), mi.Point2f(0)]
     kind = dr.select(scattering.is_delta, mi.UInt32(1), 0) + dr.select(scattering.is_null, mi.UInt32(2), 0)
     return [kind, scattering.sample_1, scattering.sample_2]
-
-
-def blank_lobe(plan: Plan) -> list[mi.UInt32 | mi.Float | mi.Point2f]:
-    """Zeros of the same form."""
-    singular = plan.differentiate_delta or plan.differentiate_null
-    return [mi.UInt32(0), mi.Float(0), mi.Point2f(0)] if singular else []
 
 
 @dataclass
@@ -208,14 +206,6 @@ class Before:
         stays = stays_behind(plan, vertex.bsdf, scattering.is_delta)
         return [Before(SurfacePoint.of(plan, vertex), dr.select(stays, mi.UInt32(1), 0))]
 
-    def members(self) -> list[dr.ArrayBase]:
-        """All arrays, in the order of `like`."""
-        return [*self.point.numbers, self.stays]
-
-    def like(self, members: list[dr.ArrayBase]) -> Before:
-        """One of the same form that has these members."""
-        return Before(SurfacePoint(members[:-1]), members[-1])
-
 
 def is_staying(before: list[Before]) -> mi.Bool:
     """Lanes in which the vertex behind `before` stays where it is."""
@@ -223,23 +213,19 @@ def is_staying(before: list[Before]) -> mi.Bool:
 
 
 def reach(
-    plan: Plan,
-    before: list[Before],
-    ray: mi.Ray3f,
-    pi: mi.PreliminaryIntersection3f,
-    active: mi.Bool,
+    plan: Plan, before: list[Before], ray: mi.Ray3f, pi: mi.PreliminaryIntersection3f, active: mi.Bool,
     parameters: bool = True,
-) -> tuple[mi.SurfaceInteraction3f, mi.BSDFPtr, mi.Ray3f, mi.Spectrum]:
-    """The vertex where `ray` hits what `pi` says, its BSDF, the ray that reaches it, and a factor (C,) of value 1 that
-    carries the derivatives of s_{i-1} which belong to it.
+) -> tuple[Hit, mi.Spectrum]:  # fmt: skip
+    """The vertex where `ray` hits what `pi` says, and a factor (C,) of value 1 that carries the derivatives of s_{i-1}
+    which belong to it.
 
     Call under `dr.resume_grad()`, the ray being differentiable; without `parameters`, where it is resumed for the ray
     alone.
     """
     if not before:
-        return *find_vertex(ray, pi, active), ray, mi.Spectrum(1)
+        return find_vertex(ray, pi, active), mi.Spectrum(1)
     stays = active & is_staying(before)
-    slid, _ = find_vertex(ray, pi, active & ~stays)
+    slid = find_vertex(ray, pi, active & ~stays).si
     stayed, reaching, factor = find_following_vertex(ray, pi, stays)
     with dr.suspend_grad():
         other, other_bsdf = before[0].point.interaction(plan, stays)
@@ -251,7 +237,16 @@ def reach(
     si = dr.select(stays, stayed, slid)
     there = mi.Ray3f(ray)
     there.d = dr.select(stays, reaching.d, ray.d)
-    return si, si.bsdf(), there, dr.select(stays, changed, 1)
+    return Hit(si, si.bsdf(), there), dr.select(stays, changed, 1)
+
+
+def segment_again(
+    samples: Samples, before: list[Before], ray: mi.Ray3f, pi: mi.PreliminaryIntersection3f, numbers: Numbers,
+    connected: mi.Bool, scattered: mi.Bool, evaluates: bool = True, parameters: bool = True,
+) -> tuple[Segment, mi.Spectrum]:  # fmt: skip
+    """The segment from there, with attached derivatives, and that factor."""
+    hit, factor = reach(samples.plan, before, ray, pi, connected | scattered, parameters)
+    return segment(samples, hit, numbers, connected, scattered, evaluates, attached=True), factor
 
 
 @dataclass
@@ -274,37 +269,30 @@ class Event:
     @staticmethod
     def emission(plan: Plan) -> Event:
         """The event before the first vertex."""
-        own = [mi.Bool(False), mi.Point2f(0)] if plan.passage_in_gradient else []
-        point = SurfacePoint.blank(plan)
-        rest = [mi.Float(0)] if plan.track_zeros else []
-        return Event(mi.UInt32(0), point, mi.Vector3f(0), mi.Spectrum(0), rest, blank_lobe(plan), own)
+        rest, wo, f = [mi.Float(0)] if plan.track_zeros else [], mi.Vector3f(0), mi.Spectrum(0)
+        return Event(mi.UInt32(0), SurfacePoint.blank(plan), wo, f, rest, lobe(plan, None), _own(plan, None))
 
     @staticmethod
     def of_connection(plan: Plan, vertex: Vertex, connection: Connection) -> Event:
         """The BSDF of the vertex towards the sensor; index 0 where there is nothing to differentiate."""
         useful = mi.Bool(True) if plan.passage_in_gradient else plan.differentiates(vertex.bsdf)
-        return Event(
-            index=dr.select(useful, mi.UInt32(vertex.depth), 0),
-            point=SurfacePoint.of(plan, vertex),
-            wo=connection.wo,
-            f=connection.f,
-            rest=[dr.rcp(stand_in(connection)[0])] if plan.track_zeros else [],
-            lobe=blank_lobe(plan),
-            own=[mi.Bool(True), connection.sample] if plan.passage_in_gradient else [],
-        )
+        index, point = dr.select(useful, mi.UInt32(vertex.depth), 0), SurfacePoint.of(plan, vertex)
+        rest = [dr.rcp(stand_in(connection)[0])] if plan.track_zeros else []
+        return Event(index, point, connection.wo, connection.f, rest, lobe(plan, None), _own(plan, connection))
 
     @staticmethod
     def of_scattering(plan: Plan, vertex: Vertex, scattering: Scattering) -> Event:
         """The BSDF of the vertex along the path."""
-        return Event(
-            index=mi.UInt32(vertex.depth),
-            point=SurfacePoint.of(plan, vertex),
-            wo=scattering.wo,
-            f=scattering.f,
-            rest=[scattering.correction / scattering.pdf] if plan.track_zeros else [],
-            lobe=lobe(plan, scattering),
-            own=[mi.Bool(False), mi.Point2f(0)] if plan.passage_in_gradient else [],
-        )
+        rest = [scattering.correction / scattering.pdf] if plan.track_zeros else []
+        index, point, wo = mi.UInt32(vertex.depth), SurfacePoint.of(plan, vertex), scattering.wo
+        return Event(index, point, wo, scattering.f, rest, lobe(plan, scattering), _own(plan, None))
+
+
+def _own(plan: Plan, connection: Connection | None) -> list[mi.Bool | mi.Point2f]:
+    """`Event.own` of an event that is a connection's, or of another."""
+    if not plan.passage_in_gradient:
+        return []
+    return [mi.Bool(False), mi.Point2f(0)] if connection is None else [mi.Bool(True), connection.sample]
 
 
 def differentiate_event(p: Pass, kept: Event, adjoint: PathAdjoint, active: mi.Bool) -> None:
@@ -315,11 +303,7 @@ def differentiate_event(p: Pass, kept: Event, adjoint: PathAdjoint, active: mi.B
     if plan.passage_in_gradient:
         own, sample = kept.own
         connection = connect(plan, p.samples.sensor, si, kept.point.ray(), sample, active & own)
-
-        def adjoint_of(transmission: mi.Spectrum) -> mi.Spectrum:
-            return adjoint_of_factor(adjoint, mi.Int32(NO_ZERO), transmission, 0)
-
-        passed = differentiate_passage(p, si, kept.index, connection, active & own, adjoint_of)
+        passed = differentiate_passage(p, si, kept.index, connection, active & own, adjoint)
         rest = dr.select(own, rest * passed, rest)
     weight = adjoint_of_factor(adjoint, kept.index, kept.f, rest)
     active &= plan.differentiates(bsdf)

@@ -15,14 +15,13 @@ differentiate is no candidate.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar
 
 import drjit as dr
 import mitsuba as mi
 
 from reslrb_cli.config.files import CAPACITY
 from reslrb_cli.estimators import chain
-from reslrb_cli.estimators import chain as chain_replay
 from reslrb_cli.estimators.base import (
     Estimator,
     Pass,
@@ -35,6 +34,14 @@ from reslrb_cli.estimators.base import (
     one_of,
 )
 from reslrb_cli.estimators.kept import Event, differentiate_event
+from reslrb_cli.estimators.selection import (
+    SlotReplay,
+    at_least_share,
+    chosen_by,
+    inverse_probability,
+    selection_weight,
+    slot_adjoint,
+)
 from reslrb_cli.transport.bsdf import Scattering, tracked_factor
 from reslrb_cli.transport.connection import Connection
 from reslrb_cli.transport.factors import Product
@@ -42,17 +49,6 @@ from reslrb_cli.transport.plan import Plan
 from reslrb_cli.transport.walk import Vertex
 
 JACOBIAN_DAMPING = 0.1  # of attached derivatives: `estimators.jacobian`
-
-
-SHARE = 0.01  # the least share of a candidate in the weights up to it
-
-
-class Chosen(Protocol):
-    """What any slot holds of its connection: selection weight (0: it holds none), contribution, film position."""
-
-    w: mi.Float
-    C: Product
-    u: mi.Point2f
 
 
 @dataclass
@@ -88,49 +84,6 @@ class ReservoirState:
         return ReservoirState(mi.Float(0), [slot() for _ in range(capacity)], [mi.UInt32(0)])
 
 
-def selection_weight(p: Pass, weight: str, connection: Connection, C: Product) -> mi.Float:
-    """w of a connection: `luminance` of C, or `adjoint`, sum_c |delta_c C_c|.
-
-    Raises ValueError where the latter is asked for and delta is not known.
-    """
-    value = C.weight()
-    if weight == "luminance":
-        return mi.luminance(mi.Color3f(value)) if len(value) == 3 else mi.Float(value[0])
-    if p.adjoint is None:
-        raise ValueError('weight "adjoint" needs dL/dI before the paths are traced, which correlated samples lack')
-    return dr.sum(dr.abs(p.delta(connection.u, connection.active) * value))
-
-
-def is_taken(number: mi.Float, w: mi.Float, W: mi.Float) -> mi.Bool:
-    """Whether a candidate of weight `w` takes the slot, `W` being the sum up to it: with probability w / W.
-
-    A weight that is not finite is always taken, and so is all that follows: what is wrong must not be lost.
-    """
-    return (w != 0) & ((number * W < w) | ~dr.isfinite(W))
-
-
-def defended(w: mi.Float, W: mi.Float) -> mi.Float:
-    """A candidate's weight, raised to SHARE of all before it, W, unless it is 0.
-
-    What comes after a heavy connection may be all that some parameter has: it is chosen with a probability of SHARE at
-    least, where its own weight may be a millionth. What comes before needs no such care, since its parameters have a
-    part in the heavy one too.
-    """
-    least = SHARE * W
-    return dr.select((w != 0) & (w < least), least, w)  # a comparison: what is not a number stays
-
-
-def unselected(W: mi.Float, slot: Chosen, capacity: int) -> mi.Float:
-    """W / (m w): 1 over the probability of a slot's selection, shared among the slots; 0 where it holds nothing."""
-    return dr.select(slot.w != 0, W / (capacity * slot.w), 0)
-
-
-def slot_adjoint(p: Pass, W: mi.Float, slot: Chosen, capacity: int) -> PathAdjoint:
-    """Sensitivity of the objective to what a slot holds, standing for all that it was chosen from."""
-    delta = p.delta(slot.u, slot.w != 0)
-    return PathAdjoint(delta * slot.C.nonzero * unselected(W, slot, capacity), slot.C)
-
-
 class ReservoirSelection(VertexHooks):
     """Image pass: splat, and keep connections."""
 
@@ -153,14 +106,11 @@ class ReservoirSelection(VertexHooks):
         plan, candidate = self.p.plan, connection.active
         if self.splat and not plan.differentiate_emission:  # else every connection counts
             candidate = candidate & (self.concerned(state) | plan.concerns(vertex.bsdf))
-        w = defended(dr.select(candidate, selection_weight(self.p, self.weight, connection, C), 0), state.W)
+        w = at_least_share(dr.select(candidate, selection_weight(self.p, self.weight, connection, C), 0), state.W)
         W = state.W + w
         event = [Event.of_connection(plan, vertex, connection)] if plan.differentiate_bsdfs else []
         this = Slot(w, state.latest[0], C.stored(), connection.u, event)
-        slots = [
-            dr.select(is_taken(number, w, W), this, slot) for number, slot in zip(numbers, state.slots, strict=True)
-        ]
-        return ReservoirState(W, slots, state.latest)
+        return ReservoirState(W, chosen_by(numbers, w, W, this, state.slots), state.latest)
 
     def scattering(
         self, state: ReservoirState, vertex: Vertex, connection: Connection, scattering: Scattering
@@ -169,24 +119,12 @@ class ReservoirSelection(VertexHooks):
         return ReservoirState(state.W, state.slots, [latest])
 
 
-class ReservoirReplay(VertexHooks):
+class ReservoirReplay(SlotReplay):
     """Replay up to the last vertex that any slot has to differentiate before its own, and differentiate s_j."""
 
-    replaying = True
-    connects = False
-
     def __init__(self, p: Pass, slots: list[Slot], adjoints: list[PathAdjoint]) -> None:
-        super().__init__(p)
+        super().__init__(p, [slot.last for slot in slots])
         self.kept = list(zip(slots, adjoints, strict=True))
-        self.last = slots[0].last
-        for slot in slots[1:]:
-            self.last = dr.maximum(self.last, slot.last)
-
-    def goes_on(self, state: Any, vertex: Vertex) -> mi.Bool:
-        return vertex.depth <= self.last
-
-    def is_followed(self, state: Any, vertex: Vertex) -> mi.Bool:
-        return vertex.depth < self.last
 
     def scattering(self, state: Any, vertex: Vertex, connection: Connection, scattering: Scattering) -> Any:
         plan, bsdf, depth = self.p.plan, vertex.bsdf, vertex.depth
@@ -216,12 +154,9 @@ class Reservoir(Estimator):
     }
 
     def __init__(
-        self,
-        capacity: int = 1,
-        weight: str = "luminance",
-        image: str = "all",
+        self, capacity: int = 1, weight: str = "luminance", image: str = "all",
         jacobian_damping: float = JACOBIAN_DAMPING,
-    ) -> None:
+    ) -> None:  # fmt: skip
         one_of("weight", weight, ("luminance", "adjoint"))
         one_of("image", image, ("all", "retained"))
         at_least_one("capacity", capacity, CAPACITY)
@@ -237,23 +172,23 @@ class Reservoir(Estimator):
         if p.plan.attached:
 
             def weigh(connection: Connection, C: Product, W: mi.Float) -> mi.Float:
-                return defended(selection_weight(p, self.weight, connection, C), W)
+                return at_least_share(selection_weight(p, self.weight, connection, C), W)
 
             splat = self.image == "all"
-            selection = chain.ChainSelection(p, self.capacity, self.damping, splat, weigh, is_taken)
+            selection = chain.ChainSelection(p, self.capacity, self.damping, splat, weigh)
             state = p.walk(selection).stored()
         else:
             state = replace(p.walk(ReservoirSelection(p, self.capacity, self.weight, self.image == "all")), latest=[])
         if self.image == "retained":
             for slot in state.slots:
-                p.splat(slot.u, slot.C.value() * unselected(state.W, slot, self.capacity), slot.w != 0)
+                p.splat(slot.u, slot.C.value() * inverse_probability(state.W, slot, self.capacity), slot.w != 0)
         return state
 
     def backward(self, p: Pass, state: ReservoirState | chain.ChainState) -> None:
         if isinstance(state, chain.ChainState):
-            shares = [unselected(state.W, slot, self.capacity) for slot in state.slots]
-            kept = [chain_replay.Kept.of(p, slot, share) for slot, share in zip(state.slots, shares, strict=True)]
-            chain_replay.differentiate(p, kept, self.damping)
+            shares = [inverse_probability(state.W, slot, self.capacity) for slot in state.slots]
+            kept = [chain.Kept.of(p, slot, share) for slot, share in zip(state.slots, shares, strict=True)]
+            chain.differentiate(p, kept, self.damping)
             return
         adjoints = [slot_adjoint(p, state.W, slot, self.capacity) for slot in state.slots]
 

@@ -25,18 +25,23 @@ from reslrb_cli.estimators.base import (
     Pass,
     PathAdjoint,
     VertexHooks,
-    adjoint_of_factor,
+    adjoint_of_connection,
+    allocate,
     at_least_one,
     contribution,
     differentiate_emission,
-    differentiate_passage,
     entry_bytes,
+    places,
+    read,
+    vertices,
+    write,
 )
-from reslrb_cli.estimators.gather import Gather, GatherState, Taking, Visibility, vertices
-from reslrb_cli.estimators.kept import AdjointSum, PlainSum, SurfacePoint, blank_lobe, event, lobe
+from reslrb_cli.estimators.gather import Gather, GatherState, Taking, Visibility
+from reslrb_cli.estimators.kept import AdjointSum, PlainSum, SurfacePoint, event
+from reslrb_cli.estimators.kept import lobe as kept_lobe
 from reslrb_cli.transport.bsdf import Scattering, tracked_factors
-from reslrb_cli.transport.connection import Connection, Seen, stand_in
-from reslrb_cli.transport.factors import NO_ZERO, Product
+from reslrb_cli.transport.connection import Connection, Seen
+from reslrb_cli.transport.factors import Product
 from reslrb_cli.transport.plan import Plan
 from reslrb_cli.transport.walk import Splat, Vertex
 
@@ -66,21 +71,8 @@ class Frame:
         """A frame of zeros with the members that the plan needs."""
         zeros = [mi.Float(0), mi.Spectrum(0)] if plan.track_zeros else []
         wo = mi.Vector3f(0)
-        point, lobe = SurfacePoint.blank(plan), blank_lobe(plan)
+        point, lobe = SurfacePoint.blank(plan), kept_lobe(plan, None)
         return Frame(point, wo, wo, mi.Spectrum(0), mi.Spectrum(0), mi.Spectrum(0), zeros, lobe)
-
-    def members(self) -> list[dr.ArrayBase]:
-        """All arrays, in the order of `like`."""
-        plain = [self.wo_c, self.wo_s, self.weight_c, self.f_s, self.own]
-        return [*self.point.numbers, *plain, *self.zeros, *self.lobe]
-
-    def like(self, members: list[dr.ArrayBase]) -> Frame:
-        """The frame of the same form that has these members."""
-        values = iter(members)
-        point = SurfacePoint([next(values) for _ in self.point.numbers])
-        wo_c, wo_s, weight_c, f_s, own = (next(values) for _ in range(5))
-        zeros = [next(values) for _ in self.zeros]
-        return Frame(point, wo_c, wo_s, weight_c, f_s, own, zeros, list(values))
 
 
 @dataclass
@@ -105,35 +97,25 @@ class StackState:
     last: mi.UInt32
 
 
-def places(plan: Plan, stack_size: int) -> int:
-    """How many vertices a stack has room for: no more than a path can have, and one at least."""
-    return min(stack_size, max(plan.max_depth - 1, 1))
-
-
 class Pushing(VertexHooks):
-    """The way out: splat, and push vertices.
-
-    No place of thread-local memory can be written twice, be it that the first write is masked out: the second was seen
-    to be lost (Dr.Jit 1.5, LLVM). What is not pushed goes to one more place, which nobody reads.
-    """
+    """The way out: splat, and push vertices; what is not pushed goes where nobody reads."""
 
     def __init__(self, p: Pass, visibility: Visibility | None, stack_size: int) -> None:
         super().__init__(p)
         self.visibility, self.size = visibility, places(p.plan, stack_size)
-        self.bounded = vertices(p) > self.size
+        self.bounded = vertices(p.plan) > self.size
 
     def start(self, product: Product) -> Pushed:
         plan = self.p.plan
-        stack = [dr.alloc_local(type(member), self.size + 1) for member in Frame.blank(plan).members()]
         since, tail = PlainSum.zero(plan.track_zeros), AdjointSum.zero(plan.track_zeros)
         # Three zeros: state variables may not be one object.
-        return Pushed(stack, mi.UInt32(0), since, tail, mi.UInt32(0), mi.UInt32(0))
+        return Pushed(allocate(Frame.blank(plan), self.size), mi.UInt32(0), since, tail, mi.UInt32(0), mi.UInt32(0))
 
     def concerned(self, state: Pushed) -> mi.Bool:
         return state.height > 0
 
     def seen(self, vertex: Vertex) -> Seen | None:
-        return None if self.visibility is None else self.visibility.seen(vertex.depth, vertices(self.p))
+        return None if self.visibility is None else self.visibility.seen(vertex.depth, vertices(self.p.plan))
 
     def goes_on(self, state: Pushed, vertex: Vertex) -> mi.Bool:
         return mi.Bool(True) if self.visibility is None else vertex.depth < self.visibility.last
@@ -144,14 +126,7 @@ class Pushing(VertexHooks):
         p.splat(connection.u, C.value(), connected)
         delta = p.delta(connection.u, connected)
         own = PathAdjoint(dr.select(connected, delta * C.nonzero, 0), C)
-        rest_c = mi.Spectrum(dr.rcp(stand_in(connection)[0]))
-        if plan.needs.has_null:
-
-            def adjoint_of(transmission: mi.Spectrum) -> mi.Spectrum:
-                return adjoint_of_factor(own, mi.Int32(NO_ZERO), transmission, 0)
-
-            rest_c *= differentiate_passage(p, vertex.si, depth, connection, connected, adjoint_of)
-
+        weight_c = adjoint_of_connection(p, vertex, connection, connected, own)
         useful = vertex.active & plan.differentiates(vertex.bsdf)
         fits, first = useful, state.first
         if self.bounded:
@@ -168,14 +143,13 @@ class Pushing(VertexHooks):
             point=SurfacePoint.of(plan, vertex),
             wo_c=connection.wo,
             wo_s=scattering.wo,
-            weight_c=adjoint_of_factor(own, depth, connection.f, rest_c),
+            weight_c=weight_c,
             f_s=dr.select(scattering.active, scattering.f, 0),
             own=since.value,
             zeros=zeros,
-            lobe=lobe(plan, scattering),
+            lobe=kept_lobe(plan, scattering),
         )
-        for array, value in zip(state.stack, frame.members(), strict=True):
-            array.write(value, dr.select(fits, state.height, self.size), fits)
+        write(state.stack, frame, dr.select(fits, state.height, self.size), fits)
         height = state.height + dr.select(fits, mi.UInt32(1), 0)
         since = dr.select(fits, PlainSum.zero(plan.track_zeros), since)
         return Pushed(state.stack, height, since, tail, first, dr.select(connected, depth, state.last))
@@ -186,7 +160,7 @@ def walk_back(p: Pass, pushed: Pushed) -> AdjointSum:
     plan, form = p.plan, Frame.blank(p.plan)
 
     def body(height: mi.UInt32, A: AdjointSum, stack: list[dr.Local]) -> tuple[mi.UInt32, AdjointSum, list[dr.Local]]:
-        frame = form.like([array.read(height - 1) for array in stack])
+        frame = read(stack, form, height - 1)
         si, bsdf = frame.point.interaction(plan)
         rest_s = frame.zeros[0] if frame.zeros else 1
         weight_s = A.adjoint_of_factor(frame.f_s, Product.one(plan.track_zeros), rest_s)
@@ -245,7 +219,7 @@ class Stack(Estimator):
             state = self._sweep(p, state.visibility)
             dr.eval(state)
         differentiate_emission(p, state.S.adjoint_of_emission)
-        if vertices(p) > self.stack_size:
+        if vertices(p.plan) > self.stack_size:
             beyond = Visibility([], state.last)
             p.walk(Taking(p, beyond, state.tail, state.first), (state.first > 0) & (state.first <= state.last))
 
@@ -254,14 +228,14 @@ class Stack(Estimator):
             return []
         # Visibility is there from an image pass that did not know delta; the sweep's own state comes beside it.
         S = AdjointSum.zero(plan.track_zeros)
-        return [Visibility.none(max(plan.max_depth - 1, 0)), StackState(S, S, mi.UInt32(0), mi.UInt32(0))]
+        return [Visibility.none(vertices(plan)), StackState(S, S, mi.UInt32(0), mi.UInt32(0))]
 
     def scratch_bytes(self, plan: Plan) -> int:
         if plan.attached:
             return attached.scratch_bytes(plan, self.stack_size)
         if not plan.differentiate_bsdfs:
             return 0
-        return sum(entry_bytes(Frame.blank(plan).members())) * (places(plan, self.stack_size) + 1)
+        return sum(entry_bytes(Frame.blank(plan))) * (places(plan, self.stack_size) + 1)
 
     def _sweep(self, p: Pass, visibility: Visibility | None) -> StackState:
         active = True if visibility is None else visibility.last > 0

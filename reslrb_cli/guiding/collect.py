@@ -1,14 +1,14 @@
 """The words that guiding learns from: what light paths say, by the cells that they start in and go on through.
 
 Trail: the vertices of a path, kept until it ends, as only then is it known what it went on to say behind each of them.
-They lie in thread-local memory, the first PLACES of them; what later ones say is summed. From the last one back the sum
-over all later vertices is at hand when a vertex is reached, as in `estimators/stack.py`.
+They lie in thread-local memory, the first PLACES of them. From the last one back the sum over all later vertices is at
+hand when a vertex is reached, as in `estimators/stack.py`.
 
 Onward: what light paths go on to say from where they are, and whether they are worth following by that. Of every cell
-of place and direction (`transport/guide.py`) two means are learned over the rays that leave a vertex there: the square
-of what the path still says behind it if its throughput is 1 (m), and how many vertices still follow (c). A ray that
-leaves with throughput w goes on with probability q = min(1, max(LEAST, w s)). Of all q those make variance times work
-least for which
+of place and direction (`transport/roulette.py`) two means are learned over the rays that leave a vertex there: the
+square of what the path still says behind it if its throughput is 1 (m), and how many vertices still follow (c). A ray
+that leaves with throughput w goes on with probability q = min(1, max(LEAST, w s)). Of all q those make variance times
+work least for which
 
     s = sqrt(m W / (c V))        V: the mean square of what a whole path says; W: the mean number of its vertices
 
@@ -39,68 +39,58 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from reslrb_cli.estimators.base import allocate, write
 from reslrb_cli.transport.bsdf import Scattering
 from reslrb_cli.transport.connection import Connection
 from reslrb_cli.transport.emission import sample_time
 from reslrb_cli.transport.factors import Product
 from reslrb_cli.transport.film import AdjointImage, film_blocks
-from reslrb_cli.transport.guide import BITS, CELLS, SHAPE
 from reslrb_cli.transport.plan import Plan
+from reslrb_cli.transport.roulette import BITS, CELLS, SHAPE
 from reslrb_cli.transport.samples import Samples
 from reslrb_cli.transport.walk import Hooks, Vertex, walk
 
 Array = np.ndarray[Any, Any]
-
-
 PLACES = 32  # vertices
 
 
 @dataclass
 class Trail:
-    """Loop state. Of each vertex: what it says, by voice (C,), and about the image; the cell that its ray leaves by;
-    one over its throughput, 0 where none leaves; the weight of roulette.
+    """Loop state. Of each vertex: what it says, by voice (C,), and about the image; the cell that its ray leaves by,
+    and one over its throughput, 0 where none leaves; the weight of roulette.
 
-    No place of thread-local memory can be written twice; what finds no room goes to one more, which nobody reads.
+    What finds no room goes to one more place, which nobody reads; what those said is summed in `later`.
     """
 
-    parts: list[dr.Local]
-    image: dr.Local
-    cell: dr.Local
-    inverse: dr.Local
-    weight: dr.Local
+    said: list[dr.Local]
+    left: list[dr.Local]
+    roulette: list[dr.Local]
     count: mi.UInt32  # vertices so far
-    later: list[mi.Spectrum]  # what those said that found no room
-    later_image: mi.Float
+    later: list[mi.Spectrum | mi.Float]
 
     @staticmethod
     def begin(voices: int) -> Trail:
         """An empty one, for so many voices beside the image."""
-        parts = [dr.alloc_local(mi.Spectrum, PLACES + 1) for _ in range(voices)]
-        floats = [dr.alloc_local(mi.Float, PLACES + 1) for _ in range(3)]
-        cell = dr.alloc_local(mi.UInt32, PLACES + 1)
-        later = [mi.Spectrum(0) for _ in range(voices)]
-        return Trail(parts, floats[0], cell, floats[1], floats[2], mi.UInt32(0), later, mi.Float(0))
+        later = [*(mi.Spectrum(0) for _ in range(voices)), mi.Float(0)]
+        said, left = allocate(later, PLACES), allocate([mi.UInt32(0), mi.Float(0)], PLACES)
+        return Trail(said, left, allocate([mi.Float(0)], PLACES), mi.UInt32(0), later)
 
-    def said(self, parts: list[mi.Spectrum], image: mi.Float) -> Trail:
-        """With one more vertex, and what it says."""
+    def with_vertex(self, said: list[mi.Spectrum | mi.Float]) -> Trail:
+        """With one more vertex, and what it says, about the image last."""
         fits, place = self._place(self.count)
-        for array, part in zip(self.parts, parts, strict=True):
-            array.write(part, place, fits)
-        self.image.write(image, place, fits)
-        later = [a + dr.select(fits, 0, part) for a, part in zip(self.later, parts, strict=True)]
-        later_image = self.later_image + dr.select(fits, 0, image)
-        return replace(self, count=self.count + 1, later=later, later_image=later_image)
+        write(self.said, said, place, fits)
+        later = [a + dr.select(fits, 0, part) for a, part in zip(self.later, said, strict=True)]
+        return replace(self, count=self.count + 1, later=later)
 
     def leaves(self, cell: mi.UInt32, inverse: mi.Float) -> None:
         """Write how the ray of the vertex that was named last leaves it."""
         fits, place = self._place(self.count - 1)
-        self.cell.write(cell, place, fits)
-        self.inverse.write(inverse, place, fits)
+        write(self.left, [cell, inverse], place, fits)
 
     def survives(self, weight: mi.Float) -> None:
         """Write the weight of roulette there."""
         fits, place = self._place(self.count - 1)
-        self.weight.write(weight, place, fits)
+        write(self.roulette, [weight], place, fits)
 
     @staticmethod
     def _place(number: mi.UInt32) -> tuple[mi.Bool, mi.UInt32]:
@@ -108,71 +98,44 @@ class Trail:
         return fits, dr.select(fits, number, PLACES)
 
 
-@dataclass
-class Onwards:
-    """Sums over all paths, by the cell that a ray leaves a vertex by (`transport/guide.py`): the squares of what
-    paths still said at a throughput of 1 (voices * CELLS), voice by voice, the image last; the vertices that followed
-    (CELLS); the rays that left (CELLS)."""
-
-    squares: mi.Float
-    followed: mi.Float
-    left: mi.Float
-
-    def arrays(self, voices: int) -> tuple[Array, Array, Array]:
-        """The same in NumPy's arrays, the first of shape (voices, CELLS)."""
-        return np.array(self.squares).reshape(voices, CELLS), np.array(self.followed), np.array(self.left)
-
-
-def walk_back(trail: Trail) -> Onwards:
-    """What all paths went on to say; what is not finite does not count.
+def walk_back(trail: Trail) -> tuple[mi.Float, mi.Float, mi.Float]:
+    """What all paths went on to say, as `Said` has it; what is not finite does not count.
 
     What roulette lets live it weights up by 1 / q: of all rays that leave, whether it lets them live or not, q times
     such a square and 1 / q times such a number of vertices have the means that they would have without it.
     """
-    voices = len(trail.parts) + 1
-    squares, followed, left = (dr.zeros(mi.Float, rows * CELLS) for rows in (voices, 1, 1))
+    squares, followed, left = (dr.zeros(mi.Float, rows * CELLS) for rows in (len(trail.later), 1, 1))
 
     def add(target: mi.Float, value: mi.Float, cell: mi.UInt32, active: mi.Bool) -> None:
         dr.scatter_reduce(dr.ReduceOp.Add, target, value, cell, active & dr.isfinite(value) & (value > 0))
 
-    def body(height: mi.UInt32, after: list[mi.Spectrum], image: mi.Float, trail: Trail) -> Any:
+    def body(height: mi.UInt32, after: list[mi.Spectrum | mi.Float], trail: Trail) -> Any:
         place = height - 1
-        cell, inverse, weight = (array.read(place) for array in (trail.cell, trail.inverse, trail.weight))
-        leaves = inverse > 0
-        q = dr.rcp(weight)
-        for voice, still in enumerate(after):
-            add(squares, dr.squared_norm(still * inverse) * q, cell + voice * CELLS, leaves)
-        add(squares, image * dr.square(inverse) * q, cell + len(after) * CELLS, leaves)
+        cell, inverse, weight = (array.read(place) for array in (*trail.left, *trail.roulette))
+        leaves, q = inverse > 0, dr.rcp(weight)
+        parts, image = after[:-1], after[-1]
+        still = [*(dr.squared_norm(part * inverse) for part in parts), image * dr.square(inverse)]
+        for voice, square in enumerate(still):
+            add(squares, square * q, cell + voice * CELLS, leaves)
         add(followed, mi.Float(trail.count - height) * weight, cell, leaves)
         add(left, mi.Float(1), cell, leaves)
-        after = [still + array.read(place) for still, array in zip(after, trail.parts, strict=True)]
-        return place, after, image + trail.image.read(place), trail
+        return place, [still + array.read(place) for still, array in zip(after, trail.said, strict=True)], trail
 
     dr.while_loop(
-        state=(dr.minimum(trail.count, PLACES), trail.later, trail.later_image, trail),
-        cond=lambda height, after, image, trail: height > 0,
+        state=(dr.minimum(trail.count, PLACES), trail.later, trail),
+        cond=lambda height, after, trail: height > 0,
         body=body,
-        labels=("height", "after", "image", "trail"),
+        labels=("height", "after", "trail"),
         label="walk back over what is heard",
     )
-    return Onwards(squares, followed, left)
+    return squares, followed, left
 
 
 NAMES = ("onward", "frame")  # of its arrays
-
-
 KEEP = 0.75  # what of the past counts beside the newest walk
-
-
 SURE = 16.0
-
-
 LEAN = 100.0
-
-
 FLOOR = 0.1
-
-
 RAY = 0.2  # what a ray costs that meets nothing, in vertices
 
 
@@ -277,8 +240,6 @@ def _cubes(values: Array, level: int) -> Array:
 
 
 MOST_BSDFS = 6  # that are heard apart; the others are heard together
-
-
 BINS = 1024  # of sums over all paths, so that none loses small numbers
 
 
@@ -288,8 +249,7 @@ def bsdf_groups(plan: Plan) -> list[tuple[mi.BSDF, ...]]:
         return []
     if not plan.only_bsdfs:
         return [()]
-    alone = plan.only_bsdfs[: MOST_BSDFS - 1]
-    others = plan.only_bsdfs[MOST_BSDFS - 1 :]
+    alone, others = plan.only_bsdfs[: MOST_BSDFS - 1], plan.only_bsdfs[MOST_BSDFS - 1 :]
     return [*((bsdf,) for bsdf in alone), *([others] if others else [])]
 
 
@@ -324,17 +284,9 @@ class Hearing(Hooks):
         self.places = [dr.zeros(mi.Float, voices(samples.plan) * self.film.count)] if self.film else []
 
     def start(self, product: Product) -> Heard:
-        number = voices(self.samples.plan) - 1
-        light = dr.max(dr.abs(product.weight()))
-        sums = [mi.Spectrum(0) for _ in range(number)]
-        return Heard(
-            [mi.UInt32(0) for _ in self.groups],
-            sums,
-            mi.Float(0),
-            light,
-            Trail.begin(number),
-            [mi.Float(1)] if self.film else [],
-        )
+        number, factor = voices(self.samples.plan) - 1, [mi.Float(1)] if self.film else []
+        counts, sums = [mi.UInt32(0) for _ in self.groups], [mi.Spectrum(0) for _ in range(number)]
+        return Heard(counts, sums, mi.Float(0), dr.max(dr.abs(product.weight())), Trail.begin(number), factor)
 
     def _met(self, group: tuple[mi.BSDF, ...], vertex: Vertex) -> mi.UInt32:
         met = mi.Bool(not group)
@@ -362,7 +314,7 @@ class Hearing(Hooks):
                 place = block + voice * self.film.count
                 dr.scatter_reduce(dr.ReduceOp.Add, self.places[0], square / r, place, counts)
         sums = [total + part for total, part in zip(state.sums, parts, strict=True)]
-        return replace(state, sums=sums, image=state.image + image, trail=state.trail.said(parts, image))
+        return replace(state, sums=sums, image=state.image + image, trail=state.trail.with_vertex([*parts, image]))
 
     def scattering(self, state: Heard, vertex: Vertex, connection: Connection, scattering: Scattering) -> Heard:
         counts = [
@@ -387,14 +339,17 @@ class Hearing(Hooks):
 class Said:
     """What guided samples have said, evaluated: sums over paths.
 
-    `starts` (voices * cells), voice by voice, are squares by the cell that a path starts in; `onward` is what paths go
-    on to say from where they are; `whole` (rows * BINS) are squares by voice, the weights that paths left emitters
-    with, and their vertices. `places` (voices * blocks, or none) are squares of what was said at a block of the film,
-    as if no path had been aimed there.
+    `starts` (voices * cells), voice by voice, the image last, are squares by the cell that a path starts in. By the
+    cell that a ray leaves a vertex by (`transport/roulette.py`): `squares` (voices * CELLS) of what paths still said at
+    a throughput of 1, the vertices that `followed` and the rays that `left` (CELLS). `whole` (rows * BINS) are squares
+    by voice, the weights that paths left emitters with, and their vertices. `places` (voices * blocks, or none) are
+    squares of what was said at a block of the film, as if no path had been aimed there.
     """
 
     starts: mi.Float
-    onward: Onwards
+    squares: mi.Float
+    followed: mi.Float
+    left: mi.Float
     whole: mi.Float
     places: list[mi.Float]
 
@@ -410,7 +365,9 @@ class Said:
     def walked(self, paths: int) -> Walked:
         """What that says of where paths go on to."""
         *said, light, count = np.array(self.whole, np.float64).reshape(-1, BINS).sum(1) / paths
-        return Walked(*self.onward.arrays(len(said)), np.array(said), float(light), 1 + float(count))
+        squares, followed, left = (np.array(sums) for sums in (self.squares, self.followed, self.left))
+        squares = squares.reshape(len(said), CELLS)
+        return Walked(squares, followed, left, np.array(said), float(light), 1 + float(count))
 
 
 def hear(samples: Samples, gradient: mi.TensorXf) -> Said:
@@ -435,7 +392,7 @@ def hear(samples: Samples, gradient: mi.TensorXf) -> Said:
         dr.scatter_reduce(dr.ReduceOp.Add, sums, value, drawn.cell + voice * cells, counts)
     # All is one kernel: what is evaluated apart would be traced again.
     whole = _sums([*squares, heard.light, mi.Float(heard.trail.count)], samples.width)
-    said = Said(sums, walk_back(heard.trail), whole, hooks.places)
+    said = Said(sums, *walk_back(heard.trail), whole, hooks.places)
     dr.eval(said)
     return said
 

@@ -23,21 +23,20 @@ import mitsuba as mi
 import numpy as np
 
 from reslrb_cli.guiding.collect import KEEP, NAMES, Onward, Said
+from reslrb_cli.transport.aim import AIM_SLOTS, Aim
 from reslrb_cli.transport.emission import used_numbers
 from reslrb_cli.transport.film import BLOCKS, Blocks
-from reslrb_cli.transport.guide import AIM_SLOTS, CELL_BITS, CELLS, Aim, Survival, Table, apportion, box_of, make_grid
+from reslrb_cli.transport.guide import CELL_BITS, Table, apportion, make_grid
 from reslrb_cli.transport.plan import Grid
+from reslrb_cli.transport.roulette import CELLS, Survival, box_of
 from reslrb_cli.transport.samples import Samples
 
 Array = np.ndarray[Any, Any]
-
 
 #: Of neighbouring cells, along each number. A quarter in place of the twentieth leaves a cell a sixteenth of what was
 #: heard of it, and rooms 1.3 to 1.4 times the squares; with none, cells that few paths have met count for what these
 #: few said.
 BLUR = (0.05, 0.9, 0.05)
-
-
 FINE = 2.0  # cells, at most, for each path that has been heard
 
 
@@ -156,22 +155,11 @@ def _blurred(grid: Grid, values: Array) -> Array:
 
 
 EVERY = 16  # gradients of a sensor from one time that its table learns to the next; at first after 1, 2, 4 and 8
-
-
 WRONG = 1.5  # `Learned.worse` of a table that does harm; one that is worth nothing, and right, has 1
-
-
 LEAST_BITS = 16  # cells, log2, however many sensors there are
-
-
 MOST_BYTES = 2**26  # of all tables together; sensors for which there is no room share
-
-
 NOW = 0.2  # of the paths aimed for a gradient: by its own dL/dI, where that is known; the others by what was said
-
-
 LEARNING_STREAM = 0x1EA2  # seeds of the samples that tables learn from
-
 
 #: Names of the arrays of each sensor in what has been learned.
 KNOWN = ("sums", "draws", "film", *NAMES)
@@ -312,24 +300,20 @@ class Guiding:
     @property
     def _apart(self) -> int:
         """How many sensors have tables of their own."""
-        return max(MOST_BYTES // self._each, 1)
-
-    @property
-    def _each(self) -> int:
         assert self.grid is not None
-        return sensor_bytes(self.grid)
+        return max(MOST_BYTES // sensor_bytes(self.grid), 1)
 
     def bytes(self, sensors: int) -> int:
         """What the tables for so many sensors take."""
-        return min(sensors, self._apart) * self._each
+        assert self.grid is not None
+        return min(sensors, self._apart) * sensor_bytes(self.grid)
 
     def state(self) -> tuple[dict[str, int], dict[str, Array]]:
         """What has been learned: the number of gradients of each sensor, and arrays by `<sensor>/<what>`."""
         arrays: dict[str, Array] = {}
         for number, learned in self.learned.items():
-            found = {"sums": learned.sums, "draws": learned.draws, "film": learned.film}
-            found |= self._onward(number).arrays()
-            arrays |= {f"{number}/{name}": array for name, array in found.items()}
+            found = {name: getattr(learned, name) for name in ("sums", "draws", "film")}
+            arrays |= {f"{number}/{name}": array for name, array in (found | self._onward(number).arrays()).items()}
         return {str(number): learned.calls for number, learned in self.learned.items()}, arrays
 
     def restore(self, calls: Mapping[str, int], take: Callable[[str], Array]) -> str | None:
@@ -340,17 +324,15 @@ class Guiding:
         assert self.grid is not None
         found = {}
         for number, count in calls.items():
-            sums, draws = (take(f"{number}/{name}") for name in ("sums", "draws"))
-            for name, array, rows in (("sums", sums, (2,)), ("draws", draws, ())):
-                if array.shape != (*rows, self.grid.cells) or not (np.isfinite(array) & (array >= 0)).all():
+            arrays = {name: take(f"{number}/{name}") for name in KNOWN}
+            shapes = {"sums": (2, self.grid.cells), "draws": (self.grid.cells,), "film": (2, arrays["film"].size // 2)}
+            for name, shape in shapes.items():
+                if arrays[name].shape != shape or not (np.isfinite(arrays[name]) & (arrays[name] >= 0)).all():
                     return f"{number}/{name}"
-            onward = Onward.taken({name: take(f"{number}/{name}") for name in NAMES})
+            onward = Onward.taken(arrays)
             if isinstance(onward, str):
                 return f"{number}/{onward}"
-            film = take(f"{number}/film")
-            if film.ndim != 2 or len(film) != 2 or not (np.isfinite(film) & (film >= 0)).all():
-                return f"{number}/film"
-            sums, draws, film = (array.astype(np.float32) for array in (sums, draws, film))
+            sums, draws, film = (arrays[name].astype(np.float32) for name in shapes)
             found[int(number)] = Learned(sums, draws, count, onward, film)
         self.learned, self._tables = found, {}
         return None
@@ -377,8 +359,7 @@ class Guiding:
             before = Learned.nothing(self.grid)
             before.calls = 1
         onward = self._onward(number).with_more(said.walked(paths))
-        draws = paths * (counts / self.grid.slots)
-        heard = said.by_start(self.grid.cells)
+        heard, draws = said.by_start(self.grid.cells), paths * (counts / self.grid.slots)
         learned = before.with_more(self.grid, heard, draws, onward, said.by_block())
         if learned.worse > WRONG and learned.calls % EVERY == 0:
             learned.calls = 0  # the scene has changed: it learns as often as it did at first

@@ -14,10 +14,10 @@ import drjit as dr
 import mitsuba as mi
 
 from reslrb_cli.errors import UnsupportedScene
-from reslrb_cli.integrators import light_tracer as lt
-from reslrb_cli.integrators.context import Motion
-from reslrb_cli.integrators.light_tracer import Reversed
+from reslrb_cli.integrators.differentiated import Motion
+from reslrb_cli.integrators.forward import reverse_recorded, splat_tracked
 from reslrb_cli.integrators.protocol import Derivative, Job
+from reslrb_cli.integrators.reslrb import LightTracer
 from reslrb_cli.scene.deformation import Surroundings
 from reslrb_cli.transport.samples import Samples, in_passes
 
@@ -34,8 +34,30 @@ def _no_word_of_signals() -> Iterator[None]:
         logger.set_log_level(level)
 
 
-class Replayed:
-    """An integrator whose gradient is a pass of its own, such as `prb`."""
+class Reversed:
+    """An integrator whose gradient is a pass of its own, `backward`."""
+
+    def image(self, job: Job) -> mi.TensorXf:
+        """The image (H, W, C), without derivatives."""
+        raise NotImplementedError
+
+    def backward(self, job: Job, gradient: mi.TensorXf) -> None:
+        """Add the gradient of the objective with dL/dI `gradient` (H, W, C)."""
+        raise NotImplementedError
+
+    def correlated(self, job: Job, derivative: Derivative) -> mi.TensorXf:
+        """The image, and the gradient of the same samples with the dL/dI that `derivative(image)` returns."""
+        image = self.image(job)
+        self.backward(job, derivative(image))
+        return image
+
+    def known(self, job: Job, gradient: mi.TensorXf) -> mi.TensorXf:
+        """The same where dL/dI is known before the image."""
+        return self.correlated(job, lambda image: gradient)
+
+
+class Replayed(Reversed):
+    """One of Mitsuba's integrators whose gradient is a pass of its own, such as `prb`."""
 
     image_apart = True
 
@@ -44,27 +66,15 @@ class Replayed:
         self.surroundings = Surroundings()
 
     def image(self, job: Job) -> mi.TensorXf:
-        """The image, without derivatives."""
         self.surroundings.follow(job.scene)
         with dr.suspend_grad(), _no_word_of_signals():
             return self.plugin.render(job.scene, job.sensor, job.seed, job.spp)
 
     def backward(self, job: Job, gradient: mi.TensorXf) -> None:
-        """Add the gradient of the objective with dL/dI `gradient`."""
         self.surroundings.follow(job.scene)
         # Isolated, so that another view's propagation finds the edges above the scene's parameters intact.
         with dr.isolate_grad():
             self.plugin.render_backward(job.scene, job.params, gradient, job.sensor, job.seed, job.spp)
-
-    def correlated(self, job: Job, derivative: Derivative) -> mi.TensorXf:
-        """The image, and the gradient of the same samples."""
-        image = self.image(job)
-        self.backward(job, derivative(image))
-        return image
-
-    def known(self, job: Job, gradient: mi.TensorXf) -> mi.TensorXf:
-        """The same with a dL/dI that is known."""
-        return self.correlated(job, lambda image: gradient)
 
 
 class NaiveAD(Replayed):
@@ -93,11 +103,11 @@ class NaiveAD(Replayed):
 _MAY_LACK = dr.ADFlag.Default | dr.ADFlag.AllowNoGrad
 
 
-class WalkAd(Reversed):
+class WalkAd(LightTracer, Reversed):
     """The same walk under naive AD: for comparisons at equal seeds."""
 
     OPTIONS: ClassVar[Mapping[str, Any]] = {
-        **Reversed.OPTIONS,
+        **LightTracer.OPTIONS,
         "attached": False,
         "filter_normalization": "attached",
     }
@@ -113,7 +123,7 @@ class WalkAd(Reversed):
         film = parts[0].film
         block = film.block()
         for samples in parts:
-            lt.splat_tracked(samples, block)
+            splat_tracked(samples, block)
         return film.develop(block)
 
     def correlated(self, job: Job, derivative: Derivative) -> mi.TensorXf:
@@ -131,7 +141,7 @@ class WalkAd(Reversed):
             return dr.forward_to(self.graph(job))
 
 
-class Trajectory(Reversed):
+class Trajectory(LightTracer, Reversed):
     """The same walk in a loop that Dr.Jit itself reverses, from a record of its state in thread-local memory."""
 
     def __init__(self, max_depth: int = -1, **common: Any) -> None:
@@ -151,6 +161,6 @@ class Trajectory(Reversed):
 
             def differentiate(part: Samples, block: mi.ImageBlock | None) -> None:
                 with dr.isolate_grad():  # as in `replay_all`; without it the derivatives of textures are lost
-                    lt.reverse_recorded(part, adjoint)
+                    reverse_recorded(part, adjoint)
 
             in_passes(parts, differentiate, None, job.params)

@@ -1,114 +1,28 @@
 """Findings about a scene, its sensors and what is differentiated: what a light tracer finds out once, and keeps.
 
-- `Differentiated`: which parameters of the scene are being differentiated, and what that asks of a walk.
-- `bounces`: whether light that moves is scattered by a surface that is not specular, and then comes to be seen from
-  another one. Only there do the two ways of `attached_sampling`, `follow` and `stay` (`estimators/kept.py`), differ. In
-  a caustic of few segments light ends where it lands first.
-- `Renewal`: what was found out about the scene, and is no longer so once shapes have moved.
-- `attach`: the plan with attached derivatives, as `Motion` asks for them.
-- `Preparation`: all that was found out about one scene, kept while that scene is traced.
+`Preparation` is all of it; `Renewal` what was found out about the scene, and is no longer so once shapes have moved.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from numbers import Integral
 
 import drjit as dr
 import mitsuba as mi
 
-from reslrb_cli.errors import UnsupportedScene
 from reslrb_cli.guiding.tables import Guiding
+from reslrb_cli.integrators.differentiated import Differentiated, Motion, attach, bounces, with_shading_normals
 from reslrb_cli.integrators.freezing import Recordings
-from reslrb_cli.scene.catalog import parameter_kind
-from reslrb_cli.scene.deformation import BEAMS, PLACES, Surroundings, moving_obstacle
+from reslrb_cli.scene.deformation import Surroundings
 from reslrb_cli.scene.graph import SceneGraph, emitted_rays, interpolates_normals
 from reslrb_cli.scene.needs import check_supported, scene_needs
 from reslrb_cli.transport.aim import worthwhile
-from reslrb_cli.transport.bsdf import Scattering, stays_behind
-from reslrb_cli.transport.connection import Connection
-from reslrb_cli.transport.emission import sample_emission, used_numbers
-from reslrb_cli.transport.factors import Product
+from reslrb_cli.transport.emission import used_numbers
 from reslrb_cli.transport.film import film_blocks
 from reslrb_cli.transport.plan import Plan, make_plan
-from reslrb_cli.transport.random import make_coordinates
 from reslrb_cli.transport.samples import Samples, passes
-from reslrb_cli.transport.walk import Hooks, Vertex, walk
-
-#: Where a parameter of a BSDF is this small, paths are followed and chosen in spite of it.
-NEARLY_ZERO = 1e-2
-
-
-#: What is a factor of a BSDF's value, where a roughness, say, is none.
-FACTORS = ("reflectance", "transmittance", "base_color", "opacity", "weight")
-
-
-@dataclass(frozen=True)
-class Differentiated:
-    """What tracks derivatives.
-
-    `bsdf_nodes` are the nodes of BSDFs that have such parameters: textures, nested BSDFs, and meshes whose attributes
-    textures read. `emission_nodes` are those of what emitters emit: emitters, and their textures. `zeros` says whether
-    any of the parameters is zero, or, of those of BSDFs, nearly so. `shapes` are those that move, `emitters` those
-    whose rays do.
-    """
-
-    bsdf_nodes: tuple[mi.Object, ...]
-    emission_nodes: tuple[mi.Object, ...]
-    zeros: bool
-    shapes: tuple[mi.Shape, ...]
-    emitters: tuple[mi.Emitter, ...]
-
-    @property
-    def emission(self) -> bool:
-        """Whether what any emitter emits does."""
-        return bool(self.emission_nodes)
-
-    @property
-    def moves(self) -> bool:
-        """Whether anything moves that light leaves from or meets."""
-        return bool(self.shapes or self.emitters)
-
-
-def differentiated(params: mi.SceneParameters) -> Differentiated:
-    """Look through a scene's parameters for those with derivatives enabled.
-
-    Raises UnsupportedScene, with the reason, for one that light tracing has no derivative for, and would silently leave
-    at zero.
-    """
-    nodes: dict[mi.Object, None] = {}
-    emitting: dict[mi.Object, None] = {}
-    shapes: dict[mi.Shape, None] = {}
-    emitters: dict[mi.Emitter, None] = {}
-    zeros = False
-    with dr.resume_grad():  # where gradients are suspended, nothing says that it tracks them
-        enabled = {key: value for key, value in params.items() if dr.grad_enabled(value)}
-    for key, value in enabled.items():
-        kind, node = parameter_kind(params, key), params.properties[key][2]
-        if kind in ("bsdf", "attribute"):
-            nodes[node] = None
-        elif kind == "shape":
-            _refuse(key, moving_obstacle(node, key))
-            shapes[node] = None
-            if node.is_emitter():
-                emitters[node.emitter()] = None
-        elif kind == "emitter" and key.rpartition(".")[2] in (*PLACES, *BEAMS):
-            _refuse(key, moving_obstacle(node, key))
-            emitters[node] = None
-            continue  # no factor of a path
-        elif kind == "emitter":
-            emitting[node] = None
-        else:
-            _refuse(key, "light tracing has derivatives of what light meets and leaves from, not of the sensor")
-        dims = kind == "attribute" or (kind == "bsdf" and any(name in key for name in FACTORS))
-        if kind != "shape":
-            zeros = zeros or _has_singular(key, value, NEARLY_ZERO if dims else 0)
-    return Differentiated(tuple(nodes), tuple(emitting), zeros, tuple(shapes), tuple(emitters))
-
-
-def _refuse(key: str, reason: str | None) -> None:
-    if reason is not None:
-        raise UnsupportedScene(f"{key}: {reason}")
+from reslrb_cli.transport.sobol import make_coordinates
 
 
 def _has_singular(key: str, value: dr.ArrayBase, least: float) -> bool:
@@ -118,54 +32,6 @@ def _has_singular(key: str, value: dr.ArrayBase, least: float) -> bool:
     if {"opacity", "weight"} & set(key.split(".")):
         singular |= flat == 1
     return bool(dr.any(singular))
-
-
-#: Light paths that are looked at: of what they do not meet, the part in a derivative is small.
-PATHS = 2**16
-
-
-#: What is found is to be the same for all runs of a scene.
-SEED = 0xB0A2CE
-
-
-def bounces(plan: Plan, scene: mi.Scene, sensor: mi.Sensor) -> bool:
-    """Whether any of so many paths is such; `plan` is one with attached derivatives in which vertices stay."""
-    width, height = sensor.film().size()
-    spp = max(PATHS // int(width * height), 1)
-    with dr.suspend_grad():
-        [samples, *_] = passes(plan, scene, sensor, dr.opaque(mi.UInt32, SEED), spp, None)
-        found: Bounced = walk(samples, BouncedLight(plan, sample_emission(samples, samples.sampler()).emitter))
-        return bool(dr.any(found.seen))
-
-
-@dataclass
-class Bounced:
-    """Loop state: whether the path has met anything that moves, has then bounced, and has then been seen."""
-
-    moved: mi.Bool
-    bounced: mi.Bool
-    seen: mi.Bool
-
-
-class BouncedLight(Hooks):
-    """Follow what moves through bounces."""
-
-    def __init__(self, plan: Plan, emitter: mi.EmitterPtr) -> None:
-        self.plan, self.emitter = plan, emitter
-
-    def start(self, product: Product) -> Bounced:
-        moved = mi.Bool(False)
-        for moving in self.plan.moving_emitters:
-            moved |= self.emitter == mi.EmitterPtr(moving)
-        return Bounced(moved, mi.Bool(False), mi.Bool(False))
-
-    def connection(self, state: Bounced, vertex: Vertex, connection: Connection, numbers: list[mi.Float]) -> Bounced:
-        return Bounced(state.moved, state.bounced, state.seen | (connection.active & state.bounced))
-
-    def scattering(self, state: Bounced, vertex: Vertex, connection: Connection, scattering: Scattering) -> Bounced:
-        moved = state.moved | self.plan.moves(vertex.si.shape) | self.plan.differentiates(vertex.bsdf)
-        staying = scattering.active & stays_behind(self.plan, vertex.bsdf, scattering.is_delta)
-        return Bounced(moved, state.bounced | (moved & staying), state.seen)
 
 
 class Renewal:
@@ -196,76 +62,23 @@ class Renewal:
         return with_shading_normals(plan) if self._bent else plan
 
 
-def with_shading_normals(plan: Plan) -> Plan:
-    """The plan of a scene whose interpolated normals differ from its geometric ones."""
-    return replace(plan, needs=replace(plan.needs, has_shading_normals=True))
-
-
 def _vertices(mesh: mi.Mesh) -> tuple[mi.Float, mi.Float]:
     return mesh.vertex_positions_buffer(), mesh.vertex_normals_buffer()
 
 
-@dataclass(frozen=True)
-class Motion:
-    """How derivatives of what moves light are taken.
-
-    `attached` is `auto` (where a parameter moves anything), or says so; `filter_normalization` is `attached` or
-    `detached`, `sampling` one of `auto`, `follow` and `stay`. Raises ValueError for anything else. `obstacle` is the
-    reason where an integrator has none.
-    """
-
-    attached: bool | str = "auto"
-    filter_normalization: str = "attached"
-    obstacle: str | None = None
-    sampling: str = "follow"
-
-    def __post_init__(self) -> None:
-        if self.attached not in (True, False, "auto"):
-            raise ValueError('"attached" must be auto, true or false')
-        if self.filter_normalization not in ("attached", "detached"):
-            raise ValueError('"filter_normalization" must be attached or detached')
-        if self.sampling not in ("auto", "follow", "stay"):
-            raise ValueError('"attached_sampling" must be auto, follow or stay')
+def resolve_sensor(scene: mi.Scene, sensor: mi.Sensor | int) -> mi.Sensor:
+    """A sensor of the scene, given as itself or as its index. Raises ValueError for an index of none."""
+    if not isinstance(sensor, Integral):
+        return sensor
+    index, count = int(sensor), len(scene.sensors())
+    if not 0 <= index < count:
+        raise ValueError(f'"sensor" is {index}, but the scene has {sensors_in_words(count)}')
+    return scene.sensors()[index]
 
 
-def stays(plan: Plan, sampling: str, bsdfs: Sequence[mi.BSDF]) -> tuple[bool, bool]:
-    """`Plan.stays` and `Plan.glossy_follows`, for the BSDFs of a scene's surfaces."""
-    smooth = [bsdf.flags() for bsdf in bsdfs if mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)]
-    glossy = [mi.has_flag(flags, mi.BSDFFlags.Glossy) for flags in smooth]
-    if sampling == "follow" or plan.max_depth <= 2 or not glossy:
-        return False, False  # no light goes on behind a vertex that is not specular
-    return (True, False) if sampling == "stay" else (not all(glossy), any(glossy))
-
-
-def attach(plan: Plan, which: Differentiated, motion: Motion, sensor: mi.Sensor, bsdfs: Sequence[mi.BSDF]) -> Plan:
-    """The plan with attached derivatives, where they are asked for. Raises UnsupportedScene where there are none."""
-    if motion.attached is False and which.moves:
-        raise UnsupportedScene(
-            "attached: false leaves out the derivatives of parameters that move light; leave it at auto", "attached"
-        )
-    if not (which.moves or (motion.attached is True and (which.bsdf_nodes or which.emission))):
-        return plan
-    if motion.obstacle is not None:
-        raise UnsupportedScene(motion.obstacle, "estimator")
-    if plan.needs.has_null:
-        raise UnsupportedScene("attached derivatives do not go through masks and other surfaces with null lobes")
-    if sensor.film().rfilter().is_box_filter():
-        raise UnsupportedScene(
-            f"sensor {sensor.id()} has a box filter, whose splats do not change while they move inside of a pixel; "
-            "take a smooth one, such as gaussian, for derivatives of what moves light"
-        )
-    if any(interpolates_normals(shape) for shape in which.shapes):
-        plan = with_shading_normals(plan)  # a flat mesh is about to bend
-    staying, glossy_follows = stays(plan, motion.sampling, bsdfs)
-    return replace(
-        plan,
-        attached=True,
-        stays=staying,
-        glossy_follows=glossy_follows,
-        moving_shapes=which.shapes,
-        moving_emitters=which.emitters,
-        attached_normalization=motion.filter_normalization == "attached",
-    )
+def sensors_in_words(count: int) -> str:
+    """How many sensors a scene has, and their indices."""
+    return "one sensor, index 0" if count == 1 else f"{count} sensors, indices 0 to {count - 1}"
 
 
 def sensor_number(scene: mi.Scene, sensor: mi.Sensor) -> int:
@@ -292,6 +105,8 @@ class Preparation:
         # BSDFs of its surfaces that use a node, and under None all of them.
         self._owners: dict[mi.Object | None, list[mi.BSDF]] = {}
         self._bounce: dict[int, bool] = {}  # by sensor
+        # By the parameters, and the objects that have them.
+        self._differentiated: dict[tuple[tuple[str, mi.Object], ...], Differentiated] = {}
         self._track_zeros = False
         self._renewal: Renewal | None = None
         self.recordings = Recordings()
@@ -324,31 +139,48 @@ class Preparation:
         if self.guiding is not None and spp is not None:
             self._meet(spp, params is not None)
         if sensor.ptr not in self._plans:
-            check_supported(scene, sensor, self._hide_emitters)
-            needs = scene_needs(scene, sensor)
-            self._renewal = self._renewal or Renewal(scene)
-            settle(scene)
-            self._plans[sensor.ptr] = make_plan(needs, *self._depths, self._hide_emitters)
-            if self.guiding is not None or self._low_discrepancy:
-                made = self._renewal.renew(self._plans[sensor.ptr], scene)
-                [samples] = passes(made, scene, sensor, dr.opaque(mi.UInt32, 0), 1, None)
-                self._plans[sensor.ptr] = self._with_numbers(self._plans[sensor.ptr], samples)
+            self._plans[sensor.ptr] = self._first_plan(scene, sensor)
         assert self._renewal is not None
         plan = self._renewal.renew(self._plans[sensor.ptr], scene)
         if params is None:
             return plan
-        which = differentiated(params)
-        # Once needed, kept: otherwise kernels would be compiled anew whenever a texel enters or leaves zero.
-        self._track_zeros |= which.zeros
+        which = self._look_through(params)
         only = self._bsdfs(scene, which.bsdf_nodes)
-        plan = plan.differentiating(bool(which.bsdf_nodes), which.emission, self._track_zeros, only)
+        plan = plan.differentiating(bool(which.bsdf_nodes), bool(which.emission_nodes), self._track_zeros, only)
         drawn = tuple(lamp for lamp in plan.needs.lamps if lamp.texture in which.emission_nodes)
-        plan = attach(
-            replace(plan, evened_lamps=drawn), which, self._motion, sensor, SceneGraph.of(scene).surface_bsdfs()
-        )
+        plan = replace(plan, evened_lamps=drawn)
+        if which.shapes or which.emitters or self._motion.attached is True:
+            plan = attach(plan, which, self._motion, scene, sensor)
         if plan.stays and self._motion.sampling == "auto" and not self._bounces_in(plan, scene, sensor):
             return replace(plan, stays=False, glossy_follows=False)
         return plan
+
+    def _first_plan(self, scene: mi.Scene, sensor: mi.Sensor) -> Plan:
+        """The plan of images for a sensor that is new."""
+        check_supported(scene, sensor, self._hide_emitters)
+        needs = scene_needs(scene, sensor)
+        self._renewal = self._renewal or Renewal(scene)
+        settle(scene)
+        plan = make_plan(needs, *self._depths, self._hide_emitters)
+        if self.guiding is None and not self._low_discrepancy:
+            return plan
+        [samples] = passes(self._renewal.renew(plan, scene), scene, sensor, dr.opaque(mi.UInt32, 0), 1, None)
+        return self._with_numbers(plan, samples)
+
+    def _look_through(self, params: mi.SceneParameters) -> Differentiated:
+        """What of the parameters is differentiated now, and whether zeros have to be tracked.
+
+        Of what a parameter belongs to nothing changes; whether it tracks derivatives, and is zero, does.
+        """
+        with dr.resume_grad():  # where gradients are suspended, nothing says that it tracks them
+            enabled = {key: value for key, value in params.items() if dr.grad_enabled(value)}
+        these = tuple((key, params.properties[key][2]) for key in enabled)
+        if these not in self._differentiated:
+            self._differentiated[these] = Differentiated.of(params, enabled)
+        which = self._differentiated[these]
+        # Once needed, kept: otherwise kernels would be compiled anew whenever a texel enters or leaves zero.
+        self._track_zeros |= any(_has_singular(key, enabled[key], least) for key, least in which.least.items())
+        return which
 
     def _with_numbers(self, plan: Plan, samples: Samples) -> Plan:
         """The plan with what says how the numbers of its paths are drawn."""
@@ -389,6 +221,7 @@ class Preparation:
             self._plans.clear()
             self._owners.clear()
             self._bounce.clear()
+            self._differentiated.clear()
             self._met = 0
             self._renewal = None
             self.recordings.clear()

@@ -9,19 +9,27 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
 
-from reslrb_cli.estimators.kept import Before, reach
+from reslrb_cli.estimators.kept import Before, segment_again
 from reslrb_cli.transport.bsdf import Scattering, evaluate, tracked_factor
 from reslrb_cli.transport.connection import Connection, forward_derivatives, passage, transmittance
+from reslrb_cli.transport.emission import sample_emission
 from reslrb_cli.transport.factors import Product
 from reslrb_cli.transport.film import AdjointImage
-from reslrb_cli.transport.random import Numbers
-from reslrb_cli.transport.samples import Samples
-from reslrb_cli.transport.walk import Hooks, Splat, Vertex, segment
+from reslrb_cli.transport.samples import Numbers, Samples
+from reslrb_cli.transport.visible import (
+    differentiate_visible_emission,
+    moving_splats,
+    primary_ray,
+    small_splat,
+    splat_visible_emission,
+    visible_tangent,
+)
+from reslrb_cli.transport.walk import Hooks, Splat, Vertex, walk
 
 
 class TrackedSplat(Splat):
@@ -63,17 +71,24 @@ class Tangent:
     d_product: mi.Spectrum
 
 
-class TangentSplat(Hooks):
+class Tangents(Hooks):
+    """Splats of derivatives along the parameters' tangents; `dE` is that of emission."""
+
+    connects = False  # they evaluate connections themselves, with their derivatives
+
+    def __init__(self, samples: Samples, block: mi.ImageBlock, dE: mi.Spectrum) -> None:
+        self.samples, self.block, self.dE = samples, block, dE
+
+    def survived(self, state: Tangent, weight: mi.Float) -> Tangent:
+        return replace(state, d_product=state.d_product * weight)
+
+
+class TangentSplat(Tangents):
     """Splat the derivative of every connection in the direction of the parameters' tangents.
 
     By the product rule along the path, d(P s) = dP s + P ds and dC_i = dP c_i + P dc_i: nothing is divided, so that
     zero factors need no care.
     """
-
-    connects = False  # it evaluates them itself, with their derivatives
-
-    def __init__(self, samples: Samples, block: mi.ImageBlock, dE: mi.Spectrum) -> None:
-        self.samples, self.block, self.dE = samples, block, dE
 
     def start(self, product: Product) -> Tangent:
         return Tangent(mi.Spectrum(self.dE))
@@ -99,21 +114,17 @@ class TangentSplat(Hooks):
         ds = dr.select(scattered, df * (scattering.correction / scattering.pdf), 0)
         return Tangent(state.d_product * scattering.weight + P * ds)
 
-    def survived(self, state: Tangent, weight: mi.Float) -> Tangent:
-        return Tangent(state.d_product * weight)
-
 
 @dataclass
-class AttachedTangent:
+class AttachedTangent(Tangent):
     """Derivatives along the parameters' tangents: of the product of the factors so far, (C,), and of the ray."""
 
-    d_product: mi.Spectrum
     d_origin: mi.Vector3f
     d_direction: mi.Vector3f
     before: list[Before]
 
 
-class AttachedTangentSplat(Hooks):
+class AttachedTangentSplat(Tangents):
     """As `TangentSplat`, with rays, hit points and film positions that move:
 
     d(k_p(u) C) = dk_p/du du C + k_p dC,   dC = dP c + P dc         k_p: the filter's weight of pixel p
@@ -121,11 +132,6 @@ class AttachedTangentSplat(Hooks):
     A segment's derivatives are those by its ray, whose tangents are at hand, and by the scene's parameters, in one
     propagation.
     """
-
-    connects = False  # it evaluates them itself, with their derivatives
-
-    def __init__(self, samples: Samples, block: mi.ImageBlock, dE: mi.Spectrum) -> None:
-        self.samples, self.block, self.dE = samples, block, dE
 
     def start(self, product: Product) -> AttachedTangent:
         before = Before.start(self.samples.plan)
@@ -144,8 +150,7 @@ class AttachedTangentSplat(Hooks):
             dr.enable_grad(ray.o, ray.d)
             dr.set_grad(ray.o, mi.Point3f(state.d_origin))
             dr.set_grad(ray.d, state.d_direction)
-            si, bsdf, reaching, reached = reach(plan, state.before, ray, vertex.pi, seen | scattered)
-            this = segment(plan, s.sensor, reaching, si, bsdf, numbers, seen, scattered, attached=True)
+            this, reached = segment_again(s, state.before, ray, vertex.pi, numbers, seen, scattered)
             following, taps = this.next_ray(attached=True), s.film.taps(this.connection.u, plan.attached_normalization)
             # Selected: no other of these hangs on what that makes, which would be cleared on the way.
             connection, scattering = this.connection, this.scattering
@@ -161,5 +166,39 @@ class AttachedTangentSplat(Hooks):
         d_product = dr.select(scattered, state.d_product * weight + P * ds, 0)
         return AttachedTangent(d_product, mi.Vector3f(d_origin), d_direction, Before.of(plan, vertex, scattering))
 
-    def survived(self, state: AttachedTangent, weight: mi.Float) -> AttachedTangent:
-        return AttachedTangent(state.d_product * weight, state.d_origin, state.d_direction, state.before)
+
+def reverse_recorded(samples: Samples, adjoint: AdjointImage) -> None:
+    """Add the same derivatives by Dr.Jit's own reversal of the walk, which records the loop's state on the way."""
+    differentiate_visible_emission(samples, adjoint)
+    with dr.resume_grad():
+        S = walk(samples, RecordedObjective(samples, adjoint))
+        dr.backward_from(S, flags=dr.ADFlag.Default | dr.ADFlag.AllowNoGrad)
+
+
+def splat_tangents(samples: Samples, block: mi.ImageBlock) -> None:
+    """Add the forward-mode derivative of the samples' contributions to the block, exactly and in one traversal."""
+    plan, dE = samples.plan, mi.Spectrum(0)
+    with dr.resume_grad():
+        if plan.differentiate_emission:
+            E = sample_emission(samples, samples.sampler()).weight
+            [dE] = forward_derivatives(E)
+        if plan.visible_emission and (plan.differentiate_emission or plan.differentiate_null):
+            primary = primary_ray(samples)
+            tangent = visible_tangent(plan, samples.scene, primary)
+            samples.film.put(block, primary.u, tangent * primary.weight * samples.fraction, primary.active)
+        if plan.small_lamps and plan.differentiate_emission:
+            u, C, active = small_splat(samples)
+            [tangent] = forward_derivatives(C)
+            samples.film.put(block, u, tangent, active)
+    hooks = AttachedTangentSplat if plan.attached else TangentSplat
+    walk(samples, hooks(samples, block, dE))
+
+
+def splat_tracked(samples: Samples, block: mi.ImageBlock) -> None:
+    """Add the contributions with derivatives tracked to the block: naive AD, its memory proportional to depth."""
+    with dr.resume_grad():
+        splat_visible_emission(samples, block, "evaluated")
+        for u, C, active in moving_splats(samples):  # twice, so that the image stays as it is
+            samples.film.put(block, u, C, active, samples.plan.attached_normalization)
+            samples.film.put(block, dr.detach(u), -dr.detach(C), active)
+        walk(samples, TrackedSplat(samples, block, samples.plan.attached))

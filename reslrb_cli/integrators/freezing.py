@@ -18,32 +18,26 @@ import mitsuba as mi
 from reslrb_cli.errors import UnsupportedScene, is_machine_fault, is_out_of_memory
 from reslrb_cli.transport.film import Film
 from reslrb_cli.transport.guide import Guide
-from reslrb_cli.transport.random import Net
 from reslrb_cli.transport.samples import Samples
+from reslrb_cli.transport.sobol import Net
 
 logger = logging.getLogger(__name__)
-
 
 #: Paths beyond which nothing is recorded: Python does not show beside them, and the trials of a recording would.
 MOST_PATHS = 2**22
 
-
 #: Paths beyond which what comes once in a while is not: the trials take as long as three more passes.
 MOST_PATHS_APART = 2**17
-
 
 #: Recordings of one kind of call that are kept, for inputs that change in more than their values.
 KEPT = 4
 
-
 #: Calls after which a recording is in use, at most: Dr.Jit makes some twice before it trusts them.
 TRIALS = 4
-
 
 #: A call that is recorded more often than that gains nothing by it, and is made plainly from then on. Dr.Jit would warn
 #: after ten.
 MOST_RECORDINGS = 8
-
 
 #: Calls that are recorded: a script that makes a new sensor for every image would go on for ever.
 MOST_CALLS = 256
@@ -103,11 +97,10 @@ class Recordings:
 
 
 def _record(
-    kind: str,
-    plain: Callable[..., Any],
+    kind: str, plain: Callable[..., Any],
     common: tuple[mi.Scene, mi.Sensor, mi.UInt32, mi.Float, mi.Float, Guide | None, Net | None],
     inputs: tuple[Any, ...],
-) -> Any:
+) -> Any:  # fmt: skip
     """A recording, or None where there cannot be one.
 
     Dr.Jit finds that out after all has been computed and derivatives were added. So it is tried with a first input of

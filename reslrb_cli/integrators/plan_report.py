@@ -16,14 +16,14 @@ import drjit as dr
 import mitsuba as mi
 
 from reslrb_cli.guiding.tables import grid_for, sensor_bytes
-from reslrb_cli.integrators import light_tracer as lt
+from reslrb_cli.integrators import reslrb as lt
 from reslrb_cli.integrators.reslrb import Reslrb
 from reslrb_cli.scene.catalog import list_parameters
 from reslrb_cli.transport.film import film_blocks
 from reslrb_cli.transport.guide import even_table
 from reslrb_cli.transport.plan import UNBOUNDED, Plan
-from reslrb_cli.transport.random import make_coordinates
 from reslrb_cli.transport.samples import passes
+from reslrb_cli.transport.sobol import make_coordinates
 
 #: The feature that guiding is.
 GUIDED = "guided emission"
@@ -357,10 +357,10 @@ def count(integrator: Reslrb, plan: Plan, scene: mi.Scene, sensor: mi.Sensor, kn
     dr.kernel_history_clear()
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True), dr.suspend_grad():
         if known:
-            lt.fused([samples], integrator.estimator, gradient)
+            lt.fused(integrator.estimator, [samples], gradient)
         else:
-            trace = lt.trace_image([samples], integrator.estimator)
-            lt.replay_all(trace, integrator.estimator, gradient)
+            _, state = lt.trace_image(integrator.estimator, [samples])
+            lt.replay_all(integrator.estimator, [samples], gradient, state)
         dr.eval()
         dr.sync_thread()
         history = dr.kernel_history((dr.KernelType.JIT,))

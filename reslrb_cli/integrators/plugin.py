@@ -3,21 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from numbers import Integral
 from typing import Any, NoReturn
 
 import mitsuba as mi
 
 from reslrb_cli.backend.variant import check_variant, works_under
 from reslrb_cli.estimators import ESTIMATORS
-from reslrb_cli.integrators.baselines import NaiveAD, Replayed, Trajectory, WalkAd
-from reslrb_cli.integrators.protocol import Job, StepIntegrator
+from reslrb_cli.integrators.baselines import Trajectory, WalkAd
+from reslrb_cli.integrators.context import resolve_sensor
+from reslrb_cli.integrators.protocol import Job
 from reslrb_cli.integrators.reslrb import Reslrb
 
 #: Our integrators by the names of their plugins.
 TRACERS = ("reslrb", "walk_ad", "trajectory")
-
-
 _registered_with_callback = False
 
 
@@ -33,7 +31,7 @@ def register() -> None:
         _registered_with_callback = True
     if mi.variant() is not None:
         _on_variant(None, mi.variant())
-        check_variant()
+        check_variant(mi.variant())
 
 
 def make_tracer(type: str, options: Mapping[str, Any]) -> Reslrb | WalkAd | Trajectory:
@@ -46,27 +44,6 @@ def make_tracer(type: str, options: Mapping[str, Any]) -> Reslrb | WalkAd | Traj
     return WalkAd(**options) if type == "walk_ad" else Trajectory(**options)
 
 
-def interface_of(integrator: StepIntegrator | mi.Integrator) -> StepIntegrator:
-    """What a gradient step works with, of a plugin or of what already is that."""
-    if not isinstance(integrator, mi.Integrator):
-        return integrator
-    tracer: StepIntegrator | None = getattr(integrator, "tracer", None)  # of the plugins that are made here
-    if tracer is not None:
-        return tracer
-    return NaiveAD(integrator) if isinstance(integrator, mi.AdjointIntegrator) else Replayed(integrator)
-
-
-def resolve_sensor(scene: mi.Scene, sensor: mi.Sensor | int) -> mi.Sensor:
-    """A sensor of the scene, given as itself or as its index. Raises ValueError for an index of none."""
-    if not isinstance(sensor, Integral):
-        return sensor
-    index, count = int(sensor), len(scene.sensors())
-    if not 0 <= index < count:
-        has = "one sensor, index 0" if count == 1 else f"{count} sensors, indices 0 to {count - 1}"
-        raise ValueError(f'"sensor" is {index}, but the scene has {has}')
-    return scene.sensors()[index]
-
-
 def _on_variant(old: str | None, new: str) -> None:
     plugin = _plugin_class() if works_under(new) else _refuse
     for name in TRACERS:
@@ -75,7 +52,7 @@ def _on_variant(old: str | None, new: str) -> None:
 
 def _refuse(type: str, props: mi.Properties) -> NoReturn:
     """In place of a plugin under a variant that has none: that there is no such plugin would be no help."""
-    check_variant()
+    check_variant(mi.variant())
     raise AssertionError("called under such variants only")
 
 
@@ -86,7 +63,9 @@ def _plugin_class() -> type[mi.CppADIntegrator]:
         """One of our light tracers, under `mi.render`."""
 
         def __init__(self, type: str, props: mi.Properties) -> None:
-            options = _take_options(type, props)
+            # Of all that stays unread Mitsuba says that there is no such option; what is asked for counts as read.
+            names = _option_names(type, props.get("estimator", None) if type == "reslrb" else None)
+            options = {name: props.get(name) for name in names if name in props}
             # Before the base class sees it, which has another idea of a pass and warns.
             if "samples_per_pass" in props:
                 del props["samples_per_pass"]
@@ -117,12 +96,6 @@ def _plugin_class() -> type[mi.CppADIntegrator]:
             return f"{self.type}[max_depth = {self.max_depth}, rr_depth = {self.rr_depth}]"
 
     return LightTracerPlugin
-
-
-def _take_options(type: str, props: mi.Properties) -> dict[str, Any]:
-    """The options that an integrator of this type has. What stays unread Mitsuba reports as an error."""
-    estimator = props.get("estimator", None) if type == "reslrb" else None  # what is asked for counts as read
-    return {name: props.get(name) for name in _option_names(type, estimator) if name in props}
 
 
 def _option_names(type: str, estimator: str | None) -> list[str]:

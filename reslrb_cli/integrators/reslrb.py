@@ -1,21 +1,183 @@
-"""Reservoir light replay backpropagation: images and gradients by one of the estimators."""
+"""Light tracers: what ours have in common, reservoir light replay backpropagation, and what is done with samples.
+
+In common they have `ptracer`'s options, a plan, passes, the image and its tangent (`LightTracer`). `Reslrb` has images
+and gradients by one of the estimators. They know nothing of Mitsuba's plugins; `plugin.py` makes plugins of them.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import copy
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, ClassVar
 
 import drjit as dr
 import mitsuba as mi
+from typing_extensions import Self
 
+from reslrb_cli.errors import UnsupportedScene
 from reslrb_cli.estimators import ESTIMATORS
-from reslrb_cli.estimators.base import Estimator, one_of
-from reslrb_cli.guiding.tables import Purpose
-from reslrb_cli.integrators import light_tracer as lt
-from reslrb_cli.integrators.context import Motion
-from reslrb_cli.integrators.light_tracer import LightTracer
+from reslrb_cli.estimators.base import Estimator, Pass, one_of
+from reslrb_cli.guiding.collect import hear
+from reslrb_cli.guiding.tables import Purpose, learning_seed
+from reslrb_cli.integrators import freezing
+from reslrb_cli.integrators.context import Preparation, sensor_number
+from reslrb_cli.integrators.differentiated import Motion
+from reslrb_cli.integrators.forward import splat_tangents
 from reslrb_cli.integrators.protocol import Derivative, Job
-from reslrb_cli.transport.samples import Samples
+from reslrb_cli.transport.film import AdjointImage
+from reslrb_cli.transport.plan import Plan
+from reslrb_cli.transport.samples import Samples, finish_pass, in_passes, passes
+from reslrb_cli.transport.visible import differentiate_visible_emission, splat_visible_emission
+from reslrb_cli.transport.walk import Splat, walk
+
+
+class LightTracer:
+    """A light tracer without derivatives but for forward mode; OPTIONS are names and defaults as `ptracer` has them."""
+
+    OPTIONS: ClassVar[Mapping[str, Any]] = {
+        "max_depth": -1,
+        "rr_depth": 5,
+        "hide_emitters": False,
+        "samples_per_pass": None,
+    }
+    image_apart = True
+
+    def __init__(
+        self, max_depth: int = -1, rr_depth: int = 5, hide_emitters: bool = False, samples_per_pass: int | None = None,
+        freeze: bool = False, motion: Motion | None = None, guided: bool = False, low_discrepancy: bool = False,
+    ) -> None:  # fmt: skip
+        """Raises ValueError, which names the option, where one has a value that it cannot have.
+
+        `freeze` says whether launches are recorded (`freezing.py`), `motion` how derivatives of what moves are taken,
+        `guided` whether emission is drawn from what earlier paths said (`tables.py`),
+        `low_discrepancy` whether the numbers of a path's beginning are (`sobol.py`).
+        """
+        if max_depth < -1:
+            raise ValueError('"max_depth" must be -1 (no limit) or a value >= 0')
+        if rr_depth <= 0:
+            raise ValueError('"rr_depth" must be greater than zero')
+        if samples_per_pass is not None and samples_per_pass <= 0:
+            raise ValueError('"samples_per_pass" must be greater than zero')
+        self.max_depth, self.rr_depth, self.hide_emitters = max_depth, rr_depth, hide_emitters
+        self.samples_per_pass, self.freeze = samples_per_pass, freeze
+        self.preparation = Preparation(max_depth, rr_depth, hide_emitters, motion or Motion(), guided, low_discrepancy)
+
+    def with_options(self, *, samples_per_pass: int | None, freeze: bool) -> Self:
+        """The same with other passes, or without recordings; both share what they find out about a scene."""
+        other = copy.copy(self)
+        other.samples_per_pass, other.freeze = samples_per_pass, freeze
+        return other
+
+    def afresh(
+        self, *, guided: bool | None = None, images: bool | None = None, low_discrepancy: bool | None = None
+    ) -> Self:
+        """The same, which knows nothing of any scene yet, with other ways of drawing samples; None: as it has it.
+
+        Guided emission or none, `images`: of images too; low-discrepancy numbers or independent ones.
+        """
+        other = copy.copy(self)
+        other.preparation = self.preparation.afresh(guided, images, low_discrepancy)
+        return other
+
+    def to_measure(self) -> Self:
+        """This one, or, where it is guided, one with tables of its own: whoever measures steps before a run teaches
+        those of the run nothing, which is then the same whether they were measured now or by an earlier one."""
+        return self if self.preparation.guiding is None else self.afresh()
+
+    def expect(self, spp: int) -> None:
+        """Be told how many samples per pixel there are in each pass that tables learn from, whatever passes come first.
+
+        A run says so: it is then the same whether it begins or goes on.
+        """
+        self.preparation.expected = spp
+
+    def plan(self, scene: mi.Scene, sensor: mi.Sensor, params: mi.SceneParameters | None = None) -> Plan:
+        """What a walk of this scene needs, with derivatives of `params`, if any. Raises UnsupportedScene."""
+        return self.preparation.plan(scene, sensor, params)
+
+    def passes(self, job: Job, purpose: Purpose | None = None, delta: mi.TensorXf | None = None) -> list[Samples]:
+        """The samples of a job; where its `spp` is 0, the sensor's own number of them.
+
+        The `purpose` says what guided samples are drawn by; None: for the gradient, or the image where there is none.
+        So does dL/dI `delta` (H, W, C), which the samples have had no part in. Raises ValueError for an `spp` below 0.
+        """
+        if job.spp < 0:
+            raise ValueError(f'"spp" must be 0 (the sensor\'s own sample count) or more, not {job.spp}')
+        spp = job.spp or job.sensor.sampler().sample_count()
+        unit = min(self.samples_per_pass or spp, spp)
+        asked = self.preparation, job.params is None, unit
+        if asked not in job.plans:  # once a step, and not once a batch
+            job.plans[asked] = self.preparation.plan(job.scene, job.sensor, job.params, unit)
+        plan, table = job.plans[asked], None
+        guiding = self.preparation.guiding
+        if guiding is not None:
+            purpose = purpose or (Purpose.IMAGE if job.params is None else Purpose.GRADIENT)
+            if guiding.serves(purpose):
+                table = guiding.table(sensor_number(job.scene, job.sensor), purpose, delta)
+        return passes(plan, job.scene, job.sensor, job.seed, spp, self.samples_per_pass, table)
+
+    def learn(self, job: Job, gradient: mi.TensorXf) -> None:
+        """Have the tables learn, where they are due to, from other samples than those of the job; dL/dI is known.
+
+        After a gradient: what has been learned counts from the next one on.
+        """
+        guiding = self.preparation.guiding
+        if guiding is not None and guiding.due(sensor_number(job.scene, job.sensor)):
+            self.learn_now(job, gradient)
+
+    def learn_now(self, job: Job, gradient: mi.TensorXf) -> None:
+        """Have the tables learn, due or not."""
+        guiding = self.preparation.guiding
+        assert guiding is not None
+        with dr.suspend_grad():
+            samples = self.passes(replace(job, seed=learning_seed(job.seed)), Purpose.BOTH)[0]
+            if self.freezes([samples]) and samples.width <= freezing.MOST_PATHS_APART:
+                said = self.preparation.recordings.call("hear", samples, hear, gradient)
+            else:
+                said = hear(samples, gradient)
+            guiding.learn(sensor_number(job.scene, job.sensor), samples.width, said)
+
+    def image_estimator(self) -> Estimator | None:
+        """The estimator that makes images of its own; None where they show every connection."""
+        return None
+
+    def image(self, job: Job, evaluate: bool = True) -> mi.TensorXf:
+        """The image (H, W, C), without derivatives."""
+        work = partial(image_of, self.image_estimator())
+        with dr.suspend_grad():
+            parts = self.passes(replace(job, params=None))  # an image has no use for what derivatives ask of a walk
+            if not evaluate:
+                return work(parts)
+            image = self.launch("image", parts, work)
+            dr.eval(image)
+            return image
+
+    def tangent(self, job: Job) -> mi.TensorXf:
+        """The derivative (H, W, C) of the image along the tangents of the job's parameters (forward mode)."""
+        with dr.suspend_grad():
+            parts = self.passes(job)
+            if parts[0].plan.moving_emission:
+                raise UnsupportedScene("forward mode has no derivatives of emitters that move; take reverse mode")
+            film = parts[0].film
+            block = film.block()
+            in_passes(parts, splat_tangents, block)
+            return film.develop(block, tangent=True)
+
+    def launch(
+        self, kind: str, parts: list[Samples], work: Callable[..., Any], *inputs: Any,
+        params: mi.SceneParameters | None = None,
+    ) -> Any:  # fmt: skip
+        """`work(parts, *inputs, params)`, or a recording of that, launched again; one pass need not know `params`."""
+        if self.freezes(parts):
+            recordings = self.preparation.recordings
+            return recordings.call(kind, parts[0], lambda part, *given: work([part], *given), *inputs)
+        return work(parts, *inputs) if params is None else work(parts, *inputs, params=params)
+
+    def freezes(self, parts: list[Samples]) -> bool:
+        """Whether these samples are traced from a recording; large ones, and so several passes, gain little."""
+        return self.freeze and len(parts) == 1 and parts[0].width <= freezing.MOST_PATHS
 
 
 class Reslrb(LightTracer):
@@ -38,15 +200,9 @@ class Reslrb(LightTracer):
 
     @classmethod
     def of(
-        cls,
-        estimator: str = "reservoir",
-        attached: bool | str = "auto",
-        filter_normalization: str = "attached",
-        attached_sampling: str = "auto",
-        guiding: str = "off",
-        sequence: str = "independent",
-        **options: Any,
-    ) -> Reslrb:
+        cls, estimator: str = "reservoir", attached: bool | str = "auto", filter_normalization: str = "attached",
+        attached_sampling: str = "auto", guiding: str = "off", sequence: str = "independent", **options: Any,
+    ) -> Reslrb:  # fmt: skip
         """From the estimator's name and all options. Raises ValueError where one is wrong."""
         if estimator == "auto":
             raise ValueError(
@@ -59,15 +215,15 @@ class Reslrb(LightTracer):
         own = {name: options.pop(name) for name in kind.OPTIONS if name in options}
         obstacle = None if kind.attaches else _no_attached(estimator)
         motion = Motion(attached, filter_normalization, obstacle, attached_sampling)
-        if guiding == "auto":
-            raise ValueError('"guiding" auto needs an experiment to measure on (`reslrb optimize`); say on or off')
-        one_of("guiding", guiding, ("on", "off"))
-        if sequence == "auto":
-            raise ValueError(
-                '"sequence" auto needs an experiment to measure on (`reslrb optimize`); say independent or '
-                "low_discrepancy"
-            )
-        one_of("sequence", sequence, ("independent", "low_discrepancy"))
+        for name, value, values in (
+            ("guiding", guiding, ("on", "off")),
+            ("sequence", sequence, ("independent", "low_discrepancy")),
+        ):
+            if value == "auto":
+                raise ValueError(
+                    f'"{name}" auto needs an experiment to measure on (`reslrb optimize`); say {" or ".join(values)}'
+                )
+            one_of(name, value, values)
         low_discrepancy = sequence == "low_discrepancy"
         return cls(kind(**own), motion=motion, guided=guiding == "on", low_discrepancy=low_discrepancy, **options)
 
@@ -76,18 +232,9 @@ class Reslrb(LightTracer):
 
     def correlated(self, job: Job, derivative: Derivative) -> mi.TensorXf:
         """The image, and the gradient of the same samples with the dL/dI that `derivative(image)` returns."""
-        estimator = self.estimator
-
-        def trace(samples: Samples) -> tuple[mi.TensorXf, Any]:
-            result = lt.trace_image([samples], estimator)
-            return result.image, result.state
-
         with dr.suspend_grad():
             parts = self.passes(job, Purpose.BOTH)
-            if self.freezes(parts):
-                traced = lt.Trace(parts, *self.preparation.recordings.call("trace", parts[0], trace))
-            else:
-                traced = lt.trace_image(parts, estimator)
+            traced = Trace(parts, *self.launch("trace", parts, partial(trace_image, self.estimator)))
         gradient = derivative(traced.image)
         self._replay(traced, gradient, job.params)
         self.learn(job, gradient)
@@ -96,7 +243,7 @@ class Reslrb(LightTracer):
     def backward(self, job: Job, gradient: mi.TensorXf) -> None:
         """Add the gradient of the objective with dL/dI `gradient` (H, W, C)."""
         with dr.suspend_grad():
-            trace = lt.Trace(self.passes(job, delta=gradient))
+            trace = Trace(self.passes(job, delta=gradient))
         self._replay(trace, gradient, job.params)
         self.learn(job, gradient)
 
@@ -105,34 +252,16 @@ class Reslrb(LightTracer):
 
         One set of samples, traced once for both where the estimator can.
         """
-        estimator = self.estimator
-
-        def fused(samples: Samples, gradient: mi.TensorXf) -> mi.TensorXf:
-            return lt.fused([samples], estimator, gradient)
-
         with dr.suspend_grad():
             parts = self.passes(job, Purpose.BOTH, gradient)
-            if self.freezes(parts):
-                image = self.preparation.recordings.call("fused", parts[0], fused, gradient)
-            else:
-                image = lt.fused(parts, estimator, gradient, job.params)
+            image = self.launch("fused", parts, partial(fused, self.estimator), gradient, params=job.params)
         self.learn(job, gradient)
         return image
 
-    def _replay(self, trace: lt.Trace, gradient: mi.TensorXf, params: mi.SceneParameters | None) -> None:
-        estimator = self.estimator
-
-        def replay(samples: Samples, gradient: mi.TensorXf, *state: Any) -> None:
-            lt.replay_all(lt.Trace([samples], None, *state), estimator, gradient)
-
+    def _replay(self, trace: Trace, gradient: mi.TensorXf, params: mi.SceneParameters | None) -> None:
+        kind, state = ("trace and replay", []) if trace.state is None else ("replay", [trace.state])
         with dr.suspend_grad():
-            recordings = self.preparation.recordings
-            if not self.freezes(trace.samples):
-                lt.replay_all(trace, estimator, gradient, params)
-            elif trace.state is None:
-                recordings.call("trace and replay", trace.samples[0], replay, gradient)
-            else:
-                recordings.call("replay", trace.samples[0], replay, gradient, trace.state)
+            self.launch(kind, trace.samples, partial(replay_all, self.estimator), gradient, *state, params=params)
 
 
 def _no_attached(estimator: str) -> str:
@@ -141,3 +270,112 @@ def _no_attached(estimator: str) -> str:
         f"estimator {estimator} has no derivatives of what moves light: it would need the Jacobians that reservoir "
         f"takes at every vertex, and gain nothing by them; take {able}"
     )
+
+
+def image_of(estimator: Estimator | None, samples: list[Samples]) -> mi.TensorXf:
+    """The image of all passes, as the estimator makes it where it makes one of its own (else None); nothing is kept."""
+    film = samples[0].film
+    block = film.block()
+
+    def splat(part: Samples, own: mi.ImageBlock | None) -> None:
+        if estimator is not None:
+            forward(part, estimator, own)
+        else:
+            splat_visible_emission(part, own)
+            walk(part, Splat(part, own))
+
+    in_passes(samples, splat, block)
+    return film.develop(block)
+
+
+def forward(
+    samples: Samples, estimator: Estimator, block: mi.ImageBlock | None, adjoint: AdjointImage | None = None
+) -> Any:
+    """Trace the samples: add their contributions to the block (None: no image). What is kept of each path is returned,
+    and not evaluated."""
+    if block is not None:
+        splat_visible_emission(samples, block)
+    return estimator.forward(Pass(samples, block, adjoint))
+
+
+@dataclass
+class Trace:
+    """Samples that have been traced: their image, and what is kept of their paths if they fit in one pass."""
+
+    samples: list[Samples]
+    image: mi.TensorXf | None = None
+    state: Any = None
+
+
+def trace_image(estimator: Estimator, samples: list[Samples]) -> tuple[mi.TensorXf, Any]:
+    """The image of all passes, and what the estimator keeps of each path.
+
+    Several passes keep nothing, which would grow with the number of passes: each is traced again before its replay.
+    """
+    state = None
+    if len(samples) > 1:
+        image = image_of(None if estimator.splats_all else estimator, samples)
+    else:
+        film = samples[0].film
+        block = film.block()
+        state = forward(samples[0], estimator, block)
+        # One kernel: all that it yields is evaluated together, since what came later would trace everything again.
+        dr.schedule(block.tensor())
+        dr.eval(state)
+        image = film.develop(block)
+    dr.eval(image)
+    return image, state
+
+
+def replay(samples: Samples, estimator: Estimator, state: Any, adjoint: AdjointImage) -> None:
+    """Add the derivatives of the objective, whose derivative with respect to the film is `adjoint`."""
+    differentiate_visible_emission(samples, adjoint)
+    estimator.backward(Pass(samples, None, adjoint), state)
+
+
+def replay_all(
+    estimator: Estimator, samples: list[Samples], gradient: mi.TensorXf, state: Any = None,
+    params: mi.SceneParameters | None = None,
+) -> None:  # fmt: skip
+    """Add the gradient of the objective with dL/dI `gradient` (H, W, C) to `params`, which one pass need not know.
+
+    `state` is what is kept of the paths of one pass; None: they are traced anew.
+    """
+    adjoint = samples[0].film.adjoint(gradient)
+    if state is None:
+        differentiate_passes(samples, estimator, None, adjoint, params)
+        return
+    # Isolated: on their way to the parameters gradients are evaluated, and with them all that they hang on, which is to
+    # be one kernel. They set out once, at the end.
+    with dr.isolate_grad():
+        replay(samples[0], estimator, state, adjoint)
+
+
+def fused(
+    estimator: Estimator, samples: list[Samples], gradient: mi.TensorXf, params: mi.SceneParameters | None = None
+) -> mi.TensorXf:
+    """The image, and the same gradient, where dL/dI is known before either."""
+    film = samples[0].film
+    block = film.block()
+    differentiate_passes(samples, estimator, block, film.adjoint(gradient), params)
+    return film.develop(block)
+
+
+def differentiate_passes(
+    samples: list[Samples], estimator: Estimator, block: mi.ImageBlock | None, adjoint: AdjointImage,
+    params: mi.SceneParameters | None,
+) -> None:  # fmt: skip
+    """Trace samples whose dL/dI is known and add their derivatives, and to the block (None: none) their contributions.
+
+    What is kept of a path goes from one to the other within the kernel, and takes no memory.
+    """
+
+    def differentiate(part: Samples, own: mi.ImageBlock | None) -> None:
+        with dr.isolate_grad():  # as above
+            replay(part, estimator, forward(part, estimator, own, adjoint), adjoint)
+            image = [] if own is None else [own.tensor()]
+            dr.schedule(image)
+            if len(samples) > 1:
+                finish_pass(image)
+
+    in_passes(samples, differentiate, block, params)

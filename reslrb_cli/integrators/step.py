@@ -3,6 +3,10 @@
 correlated     one set of samples for image and gradient; what naive AD of one render does
 independent    the gradient's samples have a seed of their own; what `mi.render` does
 batched        the samples in batches, each with delta from the image of those before it (`_batched`)
+
+Derivatives of a loss that are not finite are refused, which is to say taken for 0, and counted (`Refused`). One NaN in
+dL/dI would make a gradient NaN wherever a path of that pixel passes, and some estimators would lose it on the way. Both
+are done in the kernel that computes dL/dI, and nobody waits for the count but who reads it.
 """
 
 from __future__ import annotations
@@ -18,23 +22,49 @@ import mitsuba as mi
 from reslrb_cli.backend.variant import check_variant
 from reslrb_cli.config.files import PASS_SAMPLES, PASSES
 from reslrb_cli.estimators.base import one_of
-from reslrb_cli.integrators.plugin import TRACERS, interface_of, make_tracer, resolve_sensor
-from reslrb_cli.integrators.protocol import Job, Refused, StepIntegrator
+from reslrb_cli.integrators.baselines import NaiveAD, Replayed
+from reslrb_cli.integrators.context import resolve_sensor
+from reslrb_cli.integrators.plugin import TRACERS, make_tracer
+from reslrb_cli.integrators.protocol import Job, StepIntegrator
 
 Adjoint = Literal["correlated", "independent", "batched"]
-
-
 FirstBatch = Literal["image", "again"]
-
-
 Objective = Callable[[Any], Any]
-
 
 #: Told of an image and of the dL/dI that its samples were differentiated with.
 OnSamples: TypeAlias = "Callable[[mi.TensorXf, mi.TensorXf], None]"
-
-
 BATCH_STREAM = 0xBA7C4E5  # keeps the batches' seeds apart from those of passes and of the second samples
+
+
+NONE = 0xFFFFFFFF
+
+
+@dataclass
+class Refused:
+    """Entries of dL/dI that were not finite: how many, and the first one's flat index, of width 1; the shape of dL/dI,
+    (H, W, C)."""
+
+    count: mi.UInt32 = field(default_factory=lambda: dr.zeros(mi.UInt32, 1))
+    first: mi.UInt32 = field(default_factory=lambda: dr.full(mi.UInt32, NONE, 1))
+    shape: tuple[int, ...] = (0, 0, 0)
+
+    def take(self, gradient: mi.TensorXf) -> mi.TensorXf:
+        """dL/dI with 0 for what is not finite, which is added to the count; neither is evaluated here."""
+        self.shape, flat = gradient.shape, gradient.array
+        bad = ~dr.isfinite(flat)
+        # Atomics of the lanes that are not finite alone: none where nothing is wrong.
+        dr.scatter_reduce(dr.ReduceOp.Add, self.count, mi.UInt32(1), mi.UInt32(0), bad, dr.ReduceMode.Direct)
+        index = dr.arange(mi.UInt32, dr.width(flat))
+        dr.scatter_reduce(dr.ReduceOp.Min, self.first, index, mi.UInt32(0), bad, dr.ReduceMode.Direct)
+        return type(gradient)(dr.select(bad, 0, flat), gradient.shape)
+
+    def entry(self) -> tuple[int, int, int] | None:
+        """Pixel (x, y) and channel of the first of them; None where there is none. Waits for the step."""
+        index = int(self.first[0])
+        if index == NONE:
+            return None
+        _, width, channels = self.shape
+        return index // channels % width, index // channels // width, index % channels
 
 
 @dataclass
@@ -66,6 +96,16 @@ def make_integrator(type: str, **options: Any) -> StepIntegrator:
     if properties.unqueried():
         raise ValueError(f"{type} has no option {', '.join(properties.unqueried())}")
     return interface_of(integrator)
+
+
+def interface_of(integrator: StepIntegrator | mi.Integrator) -> StepIntegrator:
+    """What a gradient step works with, of a plugin or of what already is that."""
+    if not isinstance(integrator, mi.Integrator):
+        return integrator
+    tracer: StepIntegrator | None = getattr(integrator, "tracer", None)  # of the plugins that are made here
+    if tracer is not None:
+        return tracer
+    return NaiveAD(integrator) if isinstance(integrator, mi.AdjointIntegrator) else Replayed(integrator)
 
 
 def render_image(integrator: StepIntegrator, scene: mi.Scene, sensor: mi.Sensor | int, seed: int, spp: int
@@ -101,7 +141,7 @@ def gradient_step(
     `spp` of 0 are the sensor's own number. Raises ValueError for numbers out of their range and for words that are
     none of the above, and BackendError under a variant of Mitsuba that reslrb does not work with.
     """
-    check_variant()
+    check_variant(mi.variant())
     one_of("adjoint", adjoint, get_args(Adjoint))
     one_of("first_batch", first_batch, get_args(FirstBatch))
     _check_number("spp", spp, 0, PASSES * PASS_SAMPLES)
@@ -133,15 +173,9 @@ def gradient_step(
 
 
 def known_step(
-    integrator: StepIntegrator | mi.Integrator,
-    scene: mi.Scene,
-    sensor: mi.Sensor | int,
-    gradient: mi.TensorXf,
-    *,
-    seed: int,
-    spp: int,
-    params: mi.SceneParameters | None = None,
-) -> StepResult:
+    integrator: StepIntegrator | mi.Integrator, scene: mi.Scene, sensor: mi.Sensor | int, gradient: mi.TensorXf, *,
+    seed: int, spp: int, params: mi.SceneParameters | None = None,
+) -> StepResult:  # fmt: skip
     """A step whose dL/dI, `gradient` (H, W, C), is known before its image: the loss is the sum of dL/dI times I.
 
     One set of samples for both; an estimator of `reslrb` that can splats and differentiates in one traversal. The rest
@@ -154,17 +188,9 @@ def known_step(
 
 
 def cross_step(
-    integrator: StepIntegrator | mi.Integrator,
-    scene: mi.Scene,
-    sensor: mi.Sensor | int,
-    objective: Objective,
-    *,
-    image_seed: int,
-    seed: int,
-    spp: int,
-    params: mi.SceneParameters | None = None,
-    on_samples: OnSamples | None = None,
-) -> None:
+    integrator: StepIntegrator | mi.Integrator, scene: mi.Scene, sensor: mi.Sensor | int, objective: Objective, *,
+    image_seed: int, seed: int, spp: int, params: mi.SceneParameters | None = None, on_samples: OnSamples | None = None,
+) -> None:  # fmt: skip
     """Add the gradient by the samples of `seed`, with dL/dI from the image of those of `image_seed`.
 
     Equal seeds are what `correlated` does, others `independent`. The rest is as in `gradient_step`.
@@ -198,13 +224,9 @@ def _job(scene: mi.Scene, sensor: mi.Sensor | int, seed: int, spp: int, params: 
 
 
 def _batched(
-    integrator: StepIntegrator,
-    job: Job,
-    objective: Objective,
-    batches: int,
-    first_batch: FirstBatch,
+    integrator: StepIntegrator, job: Job, objective: Objective, batches: int, first_batch: FirstBatch,
     on_samples: OnSamples | None,
-) -> StepResult:
+) -> StepResult:  # fmt: skip
     """A step in batches (design of Deng et al. 2022's dual buffer): batch b takes delta from the image of those before.
 
     No path sees a delta that it helped to make, so that the gradient of an L2 loss is unbiased, as with `independent`,

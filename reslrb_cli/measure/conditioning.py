@@ -20,7 +20,8 @@ import numpy as np
 from reslrb_cli.estimators.base import Pass
 from reslrb_cli.estimators.chain import ChainSelection, ChainState
 from reslrb_cli.estimators.jacobian import AXES
-from reslrb_cli.estimators.reservoir import JACOBIAN_DAMPING, is_taken, selection_weight
+from reslrb_cli.estimators.reservoir import JACOBIAN_DAMPING
+from reslrb_cli.estimators.selection import selection_weight
 from reslrb_cli.integrators.protocol import Job
 from reslrb_cli.integrators.reslrb import Reslrb
 from reslrb_cli.optimization.decisions import Sensitivity
@@ -108,7 +109,7 @@ def measure_chains(problem: Problem) -> list[ChainConditions]:
         def weigh(connection: Connection, C: Product, W: mi.Float) -> mi.Float:
             return selection_weight(p, "luminance", connection, C)
 
-        state = p.walk(Watched(ChainSelection(p, 1, damping, False, weigh, is_taken)))
+        state = p.walk(Watched(ChainSelection(p, 1, damping, False, weigh)))
         found = state.chain.slots[0].number > 0
         dr.eval(state.J, state.kept, found)
     box = scene.bbox()

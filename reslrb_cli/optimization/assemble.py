@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from reslrb_cli.config.schema import Config
-from reslrb_cli.integrators.light_tracer import LightTracer
+from reslrb_cli.integrators.reslrb import LightTracer
 from reslrb_cli.optimization.autotune.estimators import find_options
 from reslrb_cli.optimization.autotune.sampling import settle
 from reslrb_cli.optimization.errors import quantity

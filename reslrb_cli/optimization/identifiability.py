@@ -26,7 +26,7 @@ import numpy as np
 
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.integrators.freezing import MOST_PATHS
-from reslrb_cli.integrators.light_tracer import LightTracer
+from reslrb_cli.integrators.reslrb import LightTracer
 from reslrb_cli.integrators.step import known_step
 from reslrb_cli.optimization.loading import passes, samples_per_pass
 from reslrb_cli.optimization.problem import Problem

@@ -16,6 +16,7 @@ from reslrb_cli.config.integrators import Integrator
 from reslrb_cli.config.integrators import Reslrb as ReslrbConfig
 from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ConfigError, UnsupportedScene
+from reslrb_cli.integrators.context import sensors_in_words
 from reslrb_cli.integrators.freezing import MOST_PATHS_APART
 from reslrb_cli.integrators.protocol import StepIntegrator
 from reslrb_cli.integrators.reslrb import Reslrb
@@ -112,8 +113,7 @@ def choose_sensors(config: Config, scene: mi.Scene) -> list[int]:
         named = {f"scene.sensors[{place}]": sensor for place, sensor in enumerate(config.scene.sensors)}
     for key, sensor in named.items():
         if sensor >= count:
-            has = "one sensor, index 0" if count == 1 else f"{count} sensors, indices 0 to {count - 1}"
-            raise ConfigError(config.source, key, f"is {sensor}, but the scene has {has}")
+            raise ConfigError(config.source, key, f"is {sensor}, but the scene has {sensors_in_words(count)}")
     return list(named.values())
 
 

@@ -14,8 +14,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from reslrb_cli.integrators.protocol import Refused
-from reslrb_cli.integrators.step import gradient_step
+from reslrb_cli.integrators.step import Refused, gradient_step
 from reslrb_cli.optimization.nonfinite import Findings, RefusedAt, zero_nonfinite
 from reslrb_cli.optimization.optimizers import count_nonfinite, finite_square_norm
 from reslrb_cli.optimization.problem import Problem

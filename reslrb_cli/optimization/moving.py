@@ -19,8 +19,8 @@ import mitsuba as mi
 
 from reslrb_cli.config.integrators import Reslrb as ReslrbConfig
 from reslrb_cli.errors import ConfigError, UnsupportedScene
-from reslrb_cli.integrators.light_tracer import LightTracer
 from reslrb_cli.integrators.protocol import Job
+from reslrb_cli.integrators.reslrb import LightTracer
 from reslrb_cli.integrators.reslrb import Reslrb as Tracer
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.scene.deformation import where_moved

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from reslrb_cli.config.schema import Config
-from reslrb_cli.integrators.light_tracer import LightTracer
+from reslrb_cli.integrators.reslrb import LightTracer
 from reslrb_cli.integrators.step import OnSamples
 from reslrb_cli.optimization.decisions import Allowance, MemoryPlan
 from reslrb_cli.optimization.errors import ErrorMeter

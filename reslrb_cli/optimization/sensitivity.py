@@ -32,8 +32,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from reslrb_cli.integrators.light_tracer import LightTracer
 from reslrb_cli.integrators.protocol import first_channels
+from reslrb_cli.integrators.reslrb import LightTracer
 from reslrb_cli.integrators.step import gradient_step, render_image
 from reslrb_cli.optimization.decisions import Scaled, Sensitivity
 from reslrb_cli.optimization.optimizers import Bounds, Transform, Variable

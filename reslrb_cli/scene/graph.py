@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
-from functools import partial
+from functools import cached_property, partial
 from typing import Any
 
 import drjit as dr
@@ -122,17 +122,17 @@ class Lamp:
     parallel: bool
     texture: mi.Texture | None
 
-    @property
+    @cached_property
     def is_sphere(self) -> bool:
         """Whether the shape is a sphere."""
         return self.shape.class_name() == "Sphere"
 
-    @property
+    @cached_property
     def faces_by_area(self) -> bool:
         """Whether one of its faces is drawn in proportion to its area, as Mitsuba has it now."""
         return self.has_faces and self.texture is None
 
-    @property
+    @cached_property
     def has_faces(self) -> bool:
         """Whether the shape is a mesh of which each vertex can move."""
         return self.shape.is_mesh() and self.shape.class_name() != "Rectangle"

@@ -107,7 +107,7 @@ def load_for_script(file: str | os.PathLike[str], keys: Iterable[str] = (), /, *
     Raises `reslrb_cli.errors.ConfigError`, one line that says where, for a file that is missing or wrong, and
     BackendError under a variant that reslrb does not work with.
     """
-    check_variant()
+    check_variant(mi.variant())
     return load_scene(Path(file), options, keys=[keys] if isinstance(keys, str) else keys)
 
 

@@ -18,31 +18,53 @@ which is at most 1 / (1 - SHARE). A path that was aimed and meets something else
 does not see, ends. r has no derivative, as little as a weight of roulette.
 
 Positions on the film are drawn by blocks of pixels, AIM_UNIFORM of them evenly, the others by what earlier steps have
-found and by the step's own dL/dI, where that is known before its samples are drawn (`guide.Aim`).
+found and by the step's own dL/dI, where that is known before its samples are drawn (`Aim`).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
 
+from reslrb_cli.backend.memory import own_memory
+from reslrb_cli.scene.needs import SceneNeeds
 from reslrb_cli.transport.bsdf import Aimed
-from reslrb_cli.transport.film import film_blocks
-from reslrb_cli.transport.guide import AIM_SLOTS, Aim
-from reslrb_cli.transport.random import Numbers
-
-if TYPE_CHECKING:
-    from reslrb_cli.scene.needs import SceneNeeds
-    from reslrb_cli.transport.connection import Connection
-
+from reslrb_cli.transport.connection import Connection
+from reslrb_cli.transport.film import Blocks, film_blocks
 
 SHARE = 0.25  # of the paths that scatter
-
-
+AIM_UNIFORM = 0.2  # of these, how many are sent to places drawn evenly on the film, at least
+AIM_SLOTS = 1 << 17
 REACHED = 1 - 1e-3  # of the distance to a point, where nothing stands in the way: as far as shadow rays look
+
+
+@dataclass
+class Aim:
+    """Where on the film paths are sent: the block of each slot (SLOTS), and the density of each block's positions,
+    relative to an even one."""
+
+    slots: mi.UInt32
+    density: mi.Float
+
+    @staticmethod
+    def of(blocks: Blocks, wanted: NDArray[np.float64]) -> Aim:
+        """Blocks in proportion to `wanted` (rows * columns), nowhere negative, and UNIFORM of them evenly."""
+        even = blocks.areas() / blocks.areas().sum()
+        total = wanted.sum()
+        density = AIM_UNIFORM * even + (1 - AIM_UNIFORM) * (
+            wanted / total if np.isfinite(total) and total > 0 else even
+        )
+        # One each, so that there is none that no path is sent to; the others rounded along the blocks' order.
+        ends = np.rint(np.cumsum(density) * ((AIM_SLOTS - len(even)) / density.sum()))
+        counts = 1 + np.diff(ends, prepend=0).astype(np.int64)
+        return Aim(
+            own_memory(mi.UInt32, np.repeat(np.arange(len(counts), dtype=np.uint32), counts)),
+            own_memory(mi.Float, (counts / AIM_SLOTS / even).astype(np.float32)),
+        )
 
 
 @dataclass
@@ -69,14 +91,9 @@ class Pending:
         return Pending(aimed.share, dr.select(discrete, dr.inf, dr.detach(pdf)), dr.detach(distance))
 
     def factor(
-        self,
-        aim: Aim,
-        sensor: mi.Sensor,
-        si: mi.SurfaceInteraction3f,
-        ray: mi.Ray3f,
-        connection: Connection,
+        self, aim: Aim, sensor: mi.Sensor, si: mi.SurfaceInteraction3f, ray: mi.Ray3f, connection: Connection,
         visible: mi.Bool,
-    ) -> mi.Float:
+    ) -> mi.Float:  # fmt: skip
         """r at the vertex `si`, which `ray` reaches, and from which the sensor is `visible`; 0 where its path ends.
 
         `connection` is as from an emitter, without the correction for shading normals.
@@ -105,27 +122,22 @@ def aims_from(bsdf: mi.BSDFPtr) -> mi.Bool:
 
 
 def choose(
-    scene: mi.Scene,
-    sensor: mi.Sensor,
-    aim: Aim,
-    time: mi.Float,
-    numbers: Numbers,
-    slot: mi.Float,
-    able: mi.Bool,
-) -> tuple[Aimed, Numbers]:
-    """Which of the lanes that are `able` are aimed, and where to; and the numbers, made new for those that are not.
+    scene: mi.Scene, sensor: mi.Sensor, aim: Aim, time: mi.Float, bsdf_1d: mi.Float, bsdf_2d: mi.Point2f,
+    slot: mi.Float, able: mi.Bool,
+) -> tuple[Aimed, mi.Float]:  # fmt: skip
+    """Which of the lanes that are `able` are aimed, and where to; and the BSDF's one number, new for the others.
 
     The BSDF's one number chooses; `slot`, in [0, 1), and the BSDF's other two are the position on the film.
     """
     share, below = dr.select(able, mi.Float(SHARE), 0), dr.one_minus_epsilon(mi.Float)
-    active = numbers.bsdf_1d < share
-    own = dr.select(active, numbers.bsdf_1d / share, (numbers.bsdf_1d - share) / (1 - share))
+    active = bsdf_1d < share
+    own = dr.select(active, bsdf_1d / share, (bsdf_1d - share) / (1 - share))
     film = film_blocks(sensor)
     block = dr.gather(mi.UInt32, aim.slots, dr.minimum(mi.UInt32(slot * AIM_SLOTS), AIM_SLOTS - 1), active)
     begin = mi.Vector2f(block % film.columns, block // film.columns) * film.side
     end = dr.minimum(begin + film.side, mi.Vector2f(film.width, film.height))
-    u = dr.fma(numbers.bsdf_2d, end - begin, begin) / mi.Vector2f(film.width, film.height)
+    u = dr.fma(bsdf_2d, end - begin, begin) / mi.Vector2f(film.width, film.height)
     ray, _ = sensor.sample_ray(time, 0.5, mi.Point2f(u), mi.Point2f(0.5), active)
     pi = scene.ray_intersect_preliminary(ray, coherent=False, active=active)
     aimed = Aimed(active, dr.detach(ray(pi.t)), pi.is_valid(), share)
-    return aimed, replace(numbers, bsdf_1d=dr.clip(own, 0, below))
+    return aimed, dr.clip(own, 0, below)

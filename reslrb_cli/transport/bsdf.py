@@ -20,12 +20,19 @@ which is the adjoint BSDF by definition, and needs neither p nor reciprocity.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
 
 from reslrb_cli.transport.plan import Plan
+
+DEFENSIVE = 0.2  # share of samples that a perturbed BSDF does not draw itself
+
+
+def importance_context() -> mi.BSDFContext:
+    """BSDF queries of a path that carries importance towards the sensor, so that eta^2 is not applied twice."""
+    return mi.BSDFContext(mi.TransportMode.Importance)
 
 
 def tracked_factor(
@@ -40,28 +47,18 @@ def tracked_factor(
 
 
 def tracked_factors(
-    plan: Plan,
-    si: mi.SurfaceInteraction3f,
-    bsdf: mi.BSDFPtr,
-    connection_wo: mi.Vector3f,
-    connected: mi.Bool,
-    scattering: Scattering,
-    scattered: mi.Bool,
-) -> tuple[mi.Spectrum, mi.Spectrum]:
+    plan: Plan, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, connection_wo: mi.Vector3f, connected: mi.Bool,
+    scattering: Scattering, scattered: mi.Bool,
+) -> tuple[mi.Spectrum, mi.Spectrum]:  # fmt: skip
     """f (C,) towards the sensor and f along the path, both with derivatives, from one indirect call.
 
     Call under `dr.resume_grad()`.
     """
 
     def both(
-        self: mi.BSDF,
-        si: mi.SurfaceInteraction3f,
-        wo_c: mi.Vector3f,
-        wo_s: mi.Vector3f,
-        connected: mi.Bool,
-        smooth: mi.Bool,
-        any_: mi.Bool,
-    ) -> tuple[mi.Spectrum, mi.Spectrum]:
+        self: mi.BSDF, si: mi.SurfaceInteraction3f, wo_c: mi.Vector3f, wo_s: mi.Vector3f, connected: mi.Bool,
+        smooth: mi.Bool, any_: mi.Bool,
+    ) -> tuple[mi.Spectrum, mi.Spectrum]:  # fmt: skip
         return evaluate(plan, si, self, wo_c, connected), evaluate(plan, si, self, wo_s, smooth)
 
     smooth = scattered & ~(scattering.is_delta | scattering.is_null)
@@ -70,17 +67,13 @@ def tracked_factors(
 
 
 def _singular_factor(
-    plan: Plan,
-    si: mi.SurfaceInteraction3f,
-    bsdf: mi.BSDFPtr,
-    scattering: Scattering,
-    active: mi.Bool,
-    f: mi.Spectrum,
+    plan: Plan, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, scattering: Scattering, active: mi.Bool, f: mi.Spectrum
 ) -> mi.Spectrum:
     """`f`, replaced where a delta lobe was sampled or light passed straight through, where that has derivatives."""
     if plan.differentiate_delta:
         delta = active & scattering.is_delta
-        bs, weight = bsdf.sample(importance_context(), si, scattering.sample_1, scattering.sample_2, delta)
+        sample_1 = _defensive(scattering.sample_1)[1] if plan.needs.has_perturbed_normals else scattering.sample_1
+        bs, weight = bsdf.sample(importance_context(), si, sample_1, scattering.sample_2, delta)
         pdf = bs.pdf
         if plan.differentiate_null:
             # A mask's weight carries the derivative of its opacity already, and so does its density. Other BSDFs divide
@@ -93,12 +86,34 @@ def _singular_factor(
     return f
 
 
-DEFENSIVE = 0.2  # share of samples that a perturbed BSDF does not draw itself
+@dataclass
+class Hit:
+    """A vertex as light meets it: the surface interaction, its BSDF, and the ray that reaches it."""
+
+    si: mi.SurfaceInteraction3f
+    bsdf: mi.BSDFPtr
+    ray: mi.Ray3f
 
 
-def importance_context() -> mi.BSDFContext:
-    """BSDF queries of a path that carries importance towards the sensor, so that eta^2 is not applied twice."""
-    return mi.BSDFContext(mi.TransportMode.Importance)
+@dataclass
+class Sample:
+    """A BSDF's sample: local direction, density, weight (C,), relative index of refraction, and what kind it is."""
+
+    wo: mi.Vector3f
+    pdf: mi.Float
+    weight: mi.Spectrum
+    eta: mi.Float
+    lobe: mi.UInt32
+
+
+@dataclass
+class Aimed:
+    """Which lanes of an event are aimed, where to (`point`), whether there is anything, and their `share`."""
+
+    active: mi.Bool
+    point: mi.Point3f
+    found: mi.Bool
+    share: mi.Float
 
 
 @dataclass
@@ -146,66 +161,50 @@ def shading_correction(
 
 
 def scatter(
-    plan: Plan,
-    si: mi.SurfaceInteraction3f,
-    bsdf: mi.BSDFPtr,
-    ray: mi.Ray3f,
-    sample_1: mi.Float,
-    sample_2: mi.Point2f,
-    active: mi.Bool,
-    connection_wo: mi.Vector3f,
-    connected: mi.Bool | None,
-    attached: bool = False,
-    aimed: Aimed | None = None,
-) -> tuple[Scattering, mi.Spectrum | None]:
+    plan: Plan, hit: Hit, sample_1: mi.Float, sample_2: mi.Point2f, active: mi.Bool, connection_wo: mi.Vector3f,
+    connected: mi.Bool | None, attached: bool = False, aimed: Aimed | None = None,
+) -> tuple[Scattering, mi.Spectrum | None]:  # fmt: skip
     """Sample the next direction, and evaluate f (C,) towards `connection_wo` in `connected` lanes (None: in no lane).
 
     Detached, unless `attached`; `bsdf.py` has the derivatives of the factors alone. Both queries share one
     indirect call, and in it what they have in common (looking up textures, mostly). Lanes that are `aimed` have the
     direction of their point, and the BSDF's own density of it.
     """
-    context = importance_context()
+    si, bsdf, context, drawn = hit.si, hit.bsdf, importance_context(), sample_1
 
     def both(
-        self: mi.BSDF,
-        si: mi.SurfaceInteraction3f,
-        wo: mi.Vector3f,
-        sample_1: mi.Float,
-        sample_2: mi.Point2f,
-        connected: mi.Bool,
-        active: mi.Bool,
-        any_: mi.Bool,
-    ) -> tuple[mi.Spectrum, mi.Vector3f, mi.Float, mi.Float, mi.UInt32, mi.Spectrum]:
+        self: mi.BSDF, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, sample_1: mi.Float, sample_2: mi.Point2f,
+        connected: mi.Bool, active: mi.Bool, any_: mi.Bool,
+    ) -> tuple[mi.Spectrum, mi.Vector3f, mi.Float, mi.Float, mi.UInt32, mi.Spectrum]:  # fmt: skip
         bs, weight = self.sample(context, si, sample_1, sample_2, active)
         return evaluate(plan, si, self, wo, connected), bs.wo, bs.pdf, bs.eta, bs.sampled_type, weight
 
     with dr.suspend_grad(when=not attached):
         if plan.needs.has_perturbed_normals:
-            defensive = sample_1 < DEFENSIVE
-            sample_1 = dr.select(defensive, sample_1 / DEFENSIVE, (sample_1 - DEFENSIVE) / (1 - DEFENSIVE))
+            defensive, sample_1 = _defensive(sample_1)
         if connected is None:
             bs, weight = bsdf.sample(context, si, sample_1, sample_2, active)
-            f_connection, wo, pdf, eta, lobe = None, bs.wo, bs.pdf, bs.eta, bs.sampled_type
+            f_connection, sample = None, Sample(bs.wo, bs.pdf, weight, bs.eta, bs.sampled_type)
         else:
             # The last argument is taken for the mask of the call as a whole.
             f_connection, wo, pdf, eta, lobe, weight = dr.dispatch(
                 bsdf, both, si, connection_wo, sample_1, sample_2, connected, active, active | connected
             )
+            sample = Sample(wo, pdf, weight, eta, lobe)
         if plan.needs.has_perturbed_normals:
-            wo, pdf, eta, lobe = _mixed(si, bsdf, sample_2, defensive, active, wo, pdf, eta, lobe)
+            sample = _mixed(si, bsdf, sample_2, defensive, active, sample)
         if aimed is not None:
-            wo, pdf, weight, eta, lobe = _to_point(si, bsdf, aimed, wo, pdf, weight, eta, lobe)
-        if attached and plan.stays:
-            wo, pdf, weight = staying(plan, si, bsdf, active, wo, pdf, lobe, weight)
-        elif attached:
-            wo, pdf, weight = following(plan, si, bsdf, active, wo, pdf, lobe, weight)
+            sample = _to_point(si, bsdf, aimed, sample)
+        if attached:
+            sample = (staying if plan.stays else following)(plan, si, bsdf, active, sample)
+        wo, pdf, weight, lobe = sample.wo, sample.pdf, sample.weight, sample.lobe
         d = si.to_world(wo)
-        correction, valid = shading_correction(plan, si, -ray.d, d, wo)
+        correction, valid = shading_correction(plan, si, -hit.ray.d, d, wo)
         is_null = mi.has_flag(lobe, mi.BSDFFlags.Null) if plan.needs.has_null else mi.Bool(False)
         # BSDFFlags.Delta holds Null too.
         is_delta = mi.has_flag(lobe, mi.BSDFFlags.Delta) & ~is_null if plan.needs.has_delta_lobes else mi.Bool(False)
         if plan.needs.has_perturbed_normals:
-            correction = dr.select(is_delta, correction * _delta_correction(si.wi, wo, eta), correction)
+            correction = dr.select(is_delta, correction * _delta_correction(si.wi, wo, sample.eta), correction)
             singular = is_delta | is_null
             f = evaluate(plan, si, bsdf, wo, active & ~singular)
             weight = dr.select(singular, weight / (1 - DEFENSIVE), dr.select(pdf > 0, f / pdf, 0))
@@ -215,28 +214,19 @@ def scatter(
             wo=wo,
             d=d,
             pdf=pdf,
-            eta=eta,
+            eta=sample.eta,
             correction=correction,
             is_delta=is_delta,
             is_null=is_null,
-            sample_1=sample_1,
+            sample_1=drawn,
             sample_2=sample_2,
             active=active & valid & (pdf > 0),
         )
         return scattering, f_connection
 
 
-def following(
-    plan: Plan,
-    si: mi.SurfaceInteraction3f,
-    bsdf: mi.BSDFPtr,
-    active: mi.Bool,
-    wo: mi.Vector3f,
-    pdf: mi.Float,
-    lobe: mi.UInt32,
-    weight: mi.Spectrum,
-) -> tuple[mi.Vector3f, mi.Float, mi.Spectrum]:
-    """Direction, density and weight (C,) of a sample whose derivative is that of the integral it stands for.
+def following(plan: Plan, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, active: mi.Bool, sample: Sample) -> Sample:
+    """A sample whose derivative is that of the integral it stands for.
 
     Where all that a BSDF does to make a sample is smooth (or its choice of a lobe is weighed accordingly, as Mitsuba's
     dielectrics do), that is the derivative of the sample itself: the direction follows the surface, and a roughness.
@@ -245,8 +235,9 @@ def following(
     f / pdf is differentiated by f alone; their delta lobes keep the probability.
     """
     if not plan.needs.unfollowed:
-        return wo, pdf, weight
-    delta = mi.has_flag(lobe, mi.BSDFFlags.Delta)
+        return sample
+    wo, pdf, weight = sample.wo, sample.pdf, sample.weight
+    delta = mi.has_flag(sample.lobe, mi.BSDFFlags.Delta)
     fixed = mi.Bool(False)
     for other in plan.needs.unfollowed:
         fixed |= bsdf == mi.BSDFPtr(other)
@@ -255,7 +246,7 @@ def following(
     fixed = active & fixed & ~delta & (kept > 0)
     wo, pdf = dr.select(fixed, dr.detach(wo), wo), dr.select(fixed, kept, pdf)
     f = evaluate(plan, si, bsdf, wo, fixed)
-    return wo, pdf, dr.select(fixed, dr.replace_grad(weight, f / kept), weight)
+    return replace(sample, wo=wo, pdf=pdf, weight=dr.select(fixed, dr.replace_grad(weight, f / kept), weight))
 
 
 def stays_behind(plan: Plan, bsdf: mi.BSDFPtr, is_delta: mi.Bool) -> mi.Bool:
@@ -268,42 +259,32 @@ def stays_behind(plan: Plan, bsdf: mi.BSDFPtr, is_delta: mi.Bool) -> mi.Bool:
     return ~is_delta & ~mi.has_flag(bsdf.flags(), mi.BSDFFlags.Glossy)
 
 
-def staying(
-    plan: Plan,
-    si: mi.SurfaceInteraction3f,
-    bsdf: mi.BSDFPtr,
-    active: mi.Bool,
-    wo: mi.Vector3f,
-    pdf: mi.Float,
-    lobe: mi.UInt32,
-    weight: mi.Spectrum,
-) -> tuple[mi.Vector3f, mi.Float, mi.Spectrum]:
+def staying(plan: Plan, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, active: mi.Bool, sample: Sample) -> Sample:
     """The same where a smooth lobe's direction goes to a point that does not move with this vertex.
 
     That the direction changes with either end is left to the vertex at its far end (`estimators.attached`): here it
     stands still in the world, and f / pdf changes by f alone. Delta lobes are as in `following`.
     """
-    followed = following(plan, si, bsdf, active, wo, pdf, lobe, weight)
-    kept = dr.detach(pdf)
-    smooth = active & stays_behind(plan, bsdf, mi.has_flag(lobe, mi.BSDFFlags.Delta)) & (kept > 0)
-    there = si.to_local(dr.detach(si.to_world(wo)))
+    followed = following(plan, si, bsdf, active, sample)
+    kept = dr.detach(sample.pdf)
+    smooth = active & stays_behind(plan, bsdf, mi.has_flag(sample.lobe, mi.BSDFFlags.Delta)) & (kept > 0)
+    there = si.to_local(dr.detach(si.to_world(sample.wo)))
     f = evaluate(plan, si, bsdf, there, smooth)
-    stayed = there, kept, dr.replace_grad(weight, f / kept)
-    wo, pdf, weight = (dr.select(smooth, a, b) for a, b in zip(stayed, followed, strict=True))
-    return wo, pdf, weight
+    return dr.select(
+        smooth, replace(followed, wo=there, pdf=kept, weight=dr.replace_grad(sample.weight, f / kept)), followed
+    )
+
+
+def _defensive(sample_1: mi.Float) -> tuple[mi.Bool, mi.Float]:
+    """Lanes that a perturbed BSDF does not draw itself, by their number, and what is left of that for the others."""
+    defensive = sample_1 < DEFENSIVE
+    return defensive, dr.select(defensive, sample_1 / DEFENSIVE, (sample_1 - DEFENSIVE) / (1 - DEFENSIVE))
 
 
 def _mixed(
-    si: mi.SurfaceInteraction3f,
-    bsdf: mi.BSDFPtr,
-    sample_2: mi.Point2f,
-    defensive: mi.Bool,
-    active: mi.Bool,
-    wo: mi.Vector3f,
-    pdf: mi.Float,
-    eta: mi.Float,
-    lobe: mi.UInt32,
-) -> tuple[mi.Vector3f, mi.Float, mi.Float, mi.UInt32]:
+    si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, sample_2: mi.Point2f, defensive: mi.Bool, active: mi.Bool,
+    sample: Sample,
+) -> Sample:  # fmt: skip
     """A BSDF's sample, replaced by one of the cosine-weighted hemisphere in `defensive` lanes; the mixture's density.
 
     A BSDF with a perturbed normal samples around the normal as it is turned to wi, and its exchanged evaluation turns
@@ -311,34 +292,28 @@ def _mixed(
     """
     hemisphere = mi.warp.square_to_cosine_hemisphere(sample_2)
     hemisphere.z = dr.mulsign(hemisphere.z, mi.Frame3f.cos_theta(si.wi))
-    singular = mi.has_flag(lobe, mi.BSDFFlags.Delta) & ~defensive  # holds Null too
-    wo = dr.select(defensive, hemisphere, wo)
+    singular = mi.has_flag(sample.lobe, mi.BSDFFlags.Delta) & ~defensive  # holds Null too
+    wo = dr.select(defensive, hemisphere, sample.wo)
     same_side = mi.Frame3f.cos_theta(wo) * mi.Frame3f.cos_theta(si.wi) > 0
     other = dr.select(same_side, dr.abs(mi.Frame3f.cos_theta(wo)) * dr.inv_pi, 0)
-    own = dr.select(defensive, bsdf.pdf(importance_context(), si, wo, active & defensive), pdf)
+    own = dr.select(defensive, bsdf.pdf(importance_context(), si, wo, active & defensive), sample.pdf)
     pdf = (1 - DEFENSIVE) * own + dr.select(singular, 0, DEFENSIVE * other)
-    eta = dr.select(defensive, 1, eta)
-    return wo, pdf, eta, dr.select(defensive, mi.UInt32(int(mi.BSDFFlags.GlossyReflection)), lobe)
+    return Sample(wo, pdf, sample.weight, dr.select(defensive, 1, sample.eta), _glossy(defensive, sample.lobe))
 
 
-def _to_point(
-    si: mi.SurfaceInteraction3f,
-    bsdf: mi.BSDFPtr,
-    aimed: Aimed,
-    wo: mi.Vector3f,
-    pdf: mi.Float,
-    weight: mi.Spectrum,
-    eta: mi.Float,
-    lobe: mi.UInt32,
-) -> tuple[mi.Vector3f, mi.Float, mi.Spectrum, mi.Float, mi.UInt32]:
-    """A BSDF's sample (direction, density, weight (C,), eta, lobe), replaced by one towards their point in lanes that
-    are aimed; of density 0 where there is no point, or none of the BSDF's own samples goes there."""
+def _to_point(si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, aimed: Aimed, sample: Sample) -> Sample:
+    """A BSDF's sample, replaced by one towards their point in lanes that are aimed; of density 0 where there is no
+    point, or none of the BSDF's own samples goes there."""
     there = si.to_local(dr.normalize(aimed.point - si.p))
     f, own = bsdf.eval_pdf(importance_context(), si, there, aimed.active & aimed.found)
     own = dr.select(aimed.found, own, 0)
-    weight = dr.select(aimed.active, dr.select(own > 0, f / own, 0), weight)
-    wo, pdf, eta = (dr.select(aimed.active, a, b) for a, b in ((there, wo), (own, pdf), (mi.Float(1), eta)))
-    return wo, pdf, weight, eta, dr.select(aimed.active, mi.UInt32(int(mi.BSDFFlags.GlossyReflection)), lobe)
+    towards = Sample(there, own, dr.select(own > 0, f / own, 0), mi.Float(1), _glossy(aimed.active, sample.lobe))
+    return dr.select(aimed.active, towards, sample)
+
+
+def _glossy(mask: mi.Bool, lobe: mi.UInt32) -> mi.UInt32:
+    """What kind of a sample it is, made that of a glossy reflection in these lanes."""
+    return dr.select(mask, mi.UInt32(int(mi.BSDFFlags.GlossyReflection)), lobe)
 
 
 def _delta_correction(wi: mi.Vector3f, wo: mi.Vector3f, eta: mi.Float) -> mi.Float:
@@ -356,13 +331,3 @@ def evaluate(
     exchanged = type(si)(si)
     exchanged.wi = wo
     return bsdf.eval(mi.BSDFContext(mi.TransportMode.Radiance), exchanged, si.wi, active)
-
-
-@dataclass
-class Aimed:
-    """Which lanes of an event are aimed, where to (`point`), whether there is anything, and their `share`."""
-
-    active: mi.Bool
-    point: mi.Point3f
-    found: mi.Bool
-    share: mi.Float

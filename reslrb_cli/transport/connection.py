@@ -43,15 +43,10 @@ class Passage:
 
 
 def transmittance(
-    scene: mi.Scene,
-    start: mi.Interaction3f,
-    target: mi.Point3f,
-    limit: mi.UInt32,
-    active: mi.Bool,
-    on_crossing: Callable[[mi.Spectrum, mi.Bool], None] | None = None,
-    loop_mode: str = "symbolic",
+    scene: mi.Scene, start: mi.Interaction3f, target: mi.Point3f, limit: mi.UInt32, active: mi.Bool,
+    on_crossing: Callable[[mi.Spectrum, mi.Bool], None] | None = None, loop_mode: str = "symbolic",
     tangents: bool = False,
-) -> Passage:
+) -> Passage:  # fmt: skip
     """Follow the segment from the interaction `start` to the point `target` through at most `limit` null surfaces.
 
     Each crossing counts as a vertex, as it does for `path`. `on_crossing(transmission, active)` is called at each one
@@ -118,14 +113,9 @@ class Connection:
 
 
 def connect(
-    plan: Plan,
-    sensor: mi.Sensor,
-    si: mi.SurfaceInteraction3f,
-    ray: mi.Ray3f | None,
-    sample: mi.Point2f,
-    active: mi.Bool,
-    attached: bool = False,
-) -> Connection:
+    plan: Plan, sensor: mi.Sensor, si: mi.SurfaceInteraction3f, ray: mi.Ray3f | None, sample: mi.Point2f,
+    active: mi.Bool, attached: bool = False,
+) -> Connection:  # fmt: skip
     """Find where the vertex `si` appears on the film; film positions move with it if `attached`, else they do not.
 
     `ray` reaches the vertex; None: light begins there, on an emitter.
@@ -190,14 +180,9 @@ def stand_in(connection: Connection) -> tuple[mi.Float, mi.Spectrum]:
 
 
 def passage(
-    plan: Plan,
-    scene: mi.Scene,
-    si: mi.SurfaceInteraction3f,
-    depth: mi.UInt32,
-    connection: Connection,
-    seen: Seen | None = None,
-    loop_mode: str = "symbolic",
-) -> tuple[mi.Bool, mi.Spectrum]:
+    plan: Plan, scene: mi.Scene, si: mi.SurfaceInteraction3f, depth: mi.UInt32, connection: Connection,
+    seen: Seen | None = None, loop_mode: str = "symbolic",
+) -> tuple[mi.Bool, mi.Spectrum]:  # fmt: skip
     """Where the sensor is seen, and the transmittance (C,) of masks on the way: traces the shadow ray.
 
     No ray is traced in lanes in which `seen` knows the answer. In a scene without surfaces that light passes straight

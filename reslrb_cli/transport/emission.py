@@ -1,17 +1,4 @@
-"""The start of light paths: rays from the emitters.
-
-Light that leaves surfaces is sampled here (`lamp_ray`) where Mitsuba's own samples are wrong, or lack a derivative:
-
-sphere             Mitsuba turns the points of a sphere with its `to_world`, and not their normals
-directionalarea    it remembers the area that the shape had when it was loaded
-mesh that moves    it draws a face in proportion to its area, and so divides by the area of the whole. Both are
-                   constants to it; the density on face f is P_f / A_f(theta), of which P_f alone is one
-textured mesh that moves
-                   its points are looked up by a ray in the plane of texture coordinates, and Mitsuba differentiates
-                   them as if they moved along that ray
-textured lamp whose texture is differentiated
-                   it draws texels in proportion to their radiance, and so none that are black, which have derivatives
-                   as large as any
+"""The start of light paths: rays from the emitters, those of lamps as `lamps.py` has them where need be.
 
 `used_numbers` says which of the numbers that emission is drawn from the emitters of a scene make anything of.
 """
@@ -24,10 +11,9 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from reslrb_cli.scene.graph import Lamp
+from reslrb_cli.transport.lamps import DEFENSIVE, lamp_ray
 from reslrb_cli.transport.plan import Plan
-from reslrb_cli.transport.random import Numbered
-from reslrb_cli.transport.samples import Samples, face_area
+from reslrb_cli.transport.samples import NumberStream, Samples
 
 PROBES = 1024  # light paths that are looked at
 
@@ -52,105 +38,6 @@ def used_numbers(samples: Samples) -> list[bool]:
     return [not np.array_equal(found[:, 0], found[:, case], equal_nan=True) for case in range(1, len(cases))]
 
 
-DEFENSIVE = 0.1  # share of what is drawn uniformly, not in proportion to radiance that is differentiated
-
-
-def lamp_ray(
-    lamp: Lamp,
-    areas: mi.Float | None,
-    time: mi.Float,
-    wavelength_sample: mi.Float,
-    position: mi.Point2f,
-    direction: mi.Point2f,
-    active: mi.Bool,
-    evened: bool = False,
-) -> tuple[mi.Ray3f, mi.Spectrum]:
-    """A ray that leaves the lamp, and radiance over density (C,), from the numbers that Mitsuba takes.
-
-    `areas` are the sums of `sums_of_areas` for a mesh whose faces move, else None; `evened`: black texels are drawn,
-    too.
-    """
-    si, weight = lamp_point(lamp, areas, time, position, active, evened)
-    _, radiance = lamp.emitter.sample_wavelengths(si, wavelength_sample, active)
-    if lamp.parallel:
-        d = mi.Vector3f(si.sh_frame.n)  # of a mesh the interpolated one, as Mitsuba has it
-    else:
-        d, weight = si.to_world(mi.warp.square_to_cosine_hemisphere(direction)), weight * dr.pi
-    si.time = time
-    return si.spawn_ray(d), radiance * weight
-
-
-def lamp_point(
-    lamp: Lamp, areas: mi.Float | None, time: mi.Float, sample: mi.Point2f, active: mi.Bool, evened: bool = False
-) -> tuple[mi.SurfaceInteraction3f, mi.Float]:
-    """A point of the lamp, and the reciprocal of its density; both move with the lamp."""
-    if lamp.texture is not None and lamp.has_faces:
-        return _textured_point(lamp.shape, lamp.texture, sample, active, evened)
-    if lamp.texture is not None and evened:
-        ps, weight = _any_point(lamp.shape, lamp.texture, time, sample, active)
-    else:
-        ps, weight = lamp.emitter.sample_position(time, sample, active)
-    if lamp.is_sphere:
-        center = mi.traverse(lamp.shape)["to_world"] @ mi.Point3f(0)
-        outward = dr.normalize(ps.p - center)
-        ps.n = mi.Normal3f(-outward if lamp.shape.has_flipped_normals() else outward)
-    if areas is not None:
-        face = drawn_face(areas, sample.y)
-        area = face_area(lamp.shape, face)
-        weight = weight * (area / dr.detach(area))
-        si = mi.SurfaceInteraction3f(ps, mi.Color0f())
-        si.n = lamp.shape.face_normal(face)  # rays start off the face; they leave about `ps.n`, which is interpolated
-        return si, weight
-    return mi.SurfaceInteraction3f(ps, mi.Color0f()), weight
-
-
-def _textured_point(
-    mesh: mi.Mesh, texture: mi.Texture, sample: mi.Point2f, active: mi.Bool, evened: bool
-) -> tuple[mi.SurfaceInteraction3f, mi.Float]:
-    """The point that Mitsuba draws from a texture, or any, which stays where it is within its face as that moves."""
-    uv, density = _any_uv(texture, sample, active) if evened else texture.sample_position(sample, active)
-    active = active & (density != 0)
-    there = mesh.eval_parameterization(uv, mi.RayFlags.All | mi.RayFlags.FollowShape, active)
-    si = mi.SurfaceInteraction3f(mi.PositionSample3f(there), mi.Color0f())
-    si.n = there.n
-    return si, _weight(there, density, active)
-
-
-def _any_point(
-    shape: mi.Shape, texture: mi.Texture, time: mi.Float, sample: mi.Point2f, active: mi.Bool
-) -> tuple[mi.PositionSample3f, mi.Float]:
-    """What Mitsuba's emitter draws from a texture on a shape, or any other point of it."""
-    uv, density = _any_uv(texture, sample, active)
-    there = shape.eval_parameterization(uv, mi.RayFlags.All, active)
-    there.time = time
-    return mi.PositionSample3f(there), _weight(there, density, active)
-
-
-def _weight(there: mi.SurfaceInteraction3f, density: mi.Float, active: mi.Bool) -> mi.Float:
-    """The reciprocal of the density over area of a point that was drawn with this density of texture coordinates."""
-    return dr.select(active & there.is_valid(), dr.norm(dr.cross(there.dp_du, there.dp_dv)) / density, 0)
-
-
-def _any_uv(texture: mi.Texture, sample: mi.Point2f, active: mi.Bool) -> tuple[mi.Point2f, mi.Float]:
-    """Texture coordinates from a mixture of the texture's own density and the uniform one, and their density."""
-    with dr.suspend_grad():
-        even = sample.x < DEFENSIVE
-        x = dr.select(even, sample.x / DEFENSIVE, (sample.x - DEFENSIVE) / (1 - DEFENSIVE))
-        sample = mi.Point2f(x, sample.y)
-        uv, density = texture.sample_position(sample, active)
-        black = ~dr.isfinite(density)  # the whole texture: there is nothing in proportion to which to draw
-        uv = dr.select(even | black, sample, uv)
-        own = texture.pdf_position(uv, active)
-        return uv, dr.select(black, 1, (1 - DEFENSIVE) * own + DEFENSIVE)
-
-
-def drawn_face(areas: mi.Float, sample: mi.Float) -> mi.UInt32:
-    """The face that Mitsuba draws with this number, by these sums of areas."""
-    last = dr.width(areas) - 1
-    value = sample * dr.gather(mi.Float, areas, mi.UInt32(last))
-    return dr.binary_search(0, last, lambda index: dr.gather(mi.Float, areas, index) < value)
-
-
 @dataclass
 class Emission:
     """A ray that leaves an emitter. `weight` is E of the design notes: radiance over the density of the ray, (C,).
@@ -165,7 +52,7 @@ class Emission:
     guided: mi.Float | None = None
 
 
-def sample_time(plan: Plan, sensor: mi.Sensor, sampler: Numbered) -> mi.Float:
+def sample_time(plan: Plan, sensor: mi.Sensor, sampler: mi.Sampler | NumberStream) -> mi.Float:
     """A time within the shutter interval; draws a number only where the shutter is open for some time."""
     time = mi.Float(sensor.shutter_open())
     if plan.needs.moving_shutter:
@@ -207,14 +94,9 @@ def emission_of(
 
 
 def _emitter_ray(
-    samples: Samples,
-    emitter: mi.EmitterPtr,
-    time: mi.Float,
-    number: mi.Float,
-    position: mi.Point2f,
-    direction: mi.Point2f,
-    active: mi.Bool,
-) -> tuple[mi.Ray3f, mi.Spectrum]:
+    samples: Samples, emitter: mi.EmitterPtr, time: mi.Float, number: mi.Float, position: mi.Point2f,
+    direction: mi.Point2f, active: mi.Bool,
+) -> tuple[mi.Ray3f, mi.Spectrum]:  # fmt: skip
     """A ray that leaves each lane's emitter: from lamps that we place as `lamp_ray` has it, else as Mitsuba has it."""
     placed = samples.plan.placed_lamps
     lamps = {lamp.emitter: (lamp, samples.areas(lamp), lamp in samples.plan.evened_lamps) for lamp in placed}

@@ -19,11 +19,7 @@ import drjit as dr
 import mitsuba as mi
 
 NO_ZERO = -1  # no factor of this channel is zero
-
-
 MANY_ZEROS = -2  # two or more are: value and derivatives vanish
-
-
 DIM = 0.1  # the least that a factor counts in a weight, as a fraction of its stand-in
 
 

@@ -74,19 +74,16 @@ class Film:
             at, one = index * channels + c, showing(value[c % len(value)])
             dr.scatter_reduce(dr.ReduceOp.Add, block.tensor().array, one, at, inside)
 
-    def develop(self, block: mi.ImageBlock) -> mi.TensorXf:
-        """The image (H, W, channels) in the film's own pixel format; differentiable with respect to the block."""
+    def develop(self, block: mi.ImageBlock, tangent: bool = False) -> mi.TensorXf:
+        """The image (H, W, channels) in the film's own pixel format; differentiable with respect to the block.
+
+        The block's `tangent` becomes the image's alike, but for the opaque alpha channel.
+        """
         self.film.prepare([])
-        if block.channel_count() == len("RGBAW"):
+        if block.channel_count() == len("RGBAW") and not tangent:
             # Light tracing has no notion of coverage: every pixel is opaque.
             alpha = dr.arange(mi.UInt32, dr.prod(self.size)) * block.channel_count() + N_COLOR
             dr.scatter(block.tensor().array, mi.Float(1), alpha)
-        self.film.put_block(block)
-        return self.film.develop()
-
-    def develop_tangent(self, block: mi.ImageBlock) -> mi.TensorXf:
-        """Derivative of the image from that of the block: `develop` is linear but for the opaque alpha channel."""
-        self.film.prepare([])
         self.film.put_block(block)
         return self.film.develop()
 

@@ -1,19 +1,6 @@
-"""Guided emission and guided roulette: light paths start and go on where earlier ones had something to say.
+"""Guided emission: light paths start where earlier ones had something to say.
 
-Roulette: paths that go where earlier ones had little left to say end early. The scene's bounding box is cut into cubes,
-and the directions of each cube into octants. A path that leaves a vertex with throughput w (the largest channel,
-emission and the weights of earlier roulette included) goes on with probability
-
-    q = min(1, max(LEAST, w s))        s: the number of the cell that the vertex and the new direction lie in
-
-and counts for 1 / q if it does. The mean of whatever is computed from paths stays what it was for any s that does not
-depend on the random numbers that it is used with. How s is learned says `guiding/collect.py`.
-
-The more a path has been weighted up, the larger is its w, and so its q: since q is at least w s where it is below 1, no
-throughput is raised beyond 1 / s_0, where s is nowhere below s_0. Roulette on throughput alone is played beside it from
-`rr_depth` on, so that paths end that nothing else would end.
-
-Emission: a path's start is a point of the unit cube in four dimensions (two numbers for a place or a disk, two for a
+A path's start is a point of the unit cube in four dimensions (two numbers for a place or a disk, two for a
 direction) and a number that chooses an emitter. The cube is cut into cells, for each emitter its own. A cell k of
 measure v_k is drawn with probability p_k; within it numbers stay evenly spread, and the path's weight is multiplied by
 v_k / p_k. Whatever an emitter makes of its numbers, the mean of what a path contributes stays what it was, as long as
@@ -34,83 +21,15 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from numpy.typing import NDArray
 
 from reslrb_cli.backend.memory import own_memory
+from reslrb_cli.transport.aim import Aim
 from reslrb_cli.transport.film import Blocks
 from reslrb_cli.transport.plan import Grid, least_slots
+from reslrb_cli.transport.roulette import Survival
 
 Array = np.ndarray[Any, Any]
-
-
-BITS = 4  # cubes along each axis of the box, log2
-
-
-OCTANTS = 8
-
-
-CELLS = OCTANTS << (3 * BITS)
-
-
-SHAPE = (1 << BITS, 1 << BITS, 1 << BITS, OCTANTS)  # of an array of all cells
-
-
-LEAST = 0.5  # the smallest probability of going on
-
-
-@dataclass
-class Survival:
-    """`chances` (CELLS) are s of all cells; `corner` is where the box begins, `cubes` how many there are to a unit of
-    length along each axis. The latter two are opaque."""
-
-    chances: mi.Float
-    corner: mi.Point3f
-    cubes: mi.Vector3f
-
-    @staticmethod
-    def of(box: Array, chances: Array) -> Survival:
-        """For a box (2, 3), its lower and its upper corner."""
-        cubes = (1 << BITS) / np.where(box[1] > box[0], box[1] - box[0], np.inf)
-        own = own_memory(mi.Float, chances.astype(np.float32))
-        corner, per_unit = (
-            kind(*(dr.opaque(mi.Float, float(x)) for x in values))
-            for kind, values in ((mi.Point3f, box[0]), (mi.Vector3f, cubes))
-        )
-        return Survival(own, corner, per_unit)
-
-    @staticmethod
-    def certain() -> Survival:
-        """That of somebody who has learned nothing: all paths go on."""
-        return Survival.of(np.zeros((2, 3)), np.full(CELLS, np.inf))
-
-    def cell(self, o: mi.Point3f, d: mi.Vector3f) -> mi.UInt32:
-        """The cell of a ray that leaves `o`; what lies outside of the box counts to the nearest cube."""
-        place, most = dr.detach((o - self.corner) * self.cubes), (1 << BITS) - 1
-        result = mi.UInt32(0)
-        for k in range(3):
-            # A second bound in integers: what NaN becomes is not defined, and may not leave the table.
-            result = (result << BITS) | dr.minimum(mi.UInt32(dr.clip(place[k], 0, most)), most)
-        for k in range(3):
-            result = (result << 1) | dr.select(d[k] > 0, mi.UInt32(1), 0)
-        return result
-
-    def probability(self, o: mi.Point3f, d: mi.Vector3f, throughput: mi.Float) -> mi.Float:
-        """q of a ray that leaves `o` along `d`; detached."""
-        # A throughput that is not a number has q = LEAST: it is to be seen, not to vanish.
-        chance = dr.gather(mi.Float, self.chances, self.cell(o, d))
-        return dr.fmin(dr.fmax(dr.detach(throughput) * chance, LEAST), 1)
-
-
-def box_of(scene: mi.Scene) -> Array:
-    """The box (2, 3) of a scene's shapes, float32; of size 0 where it has none."""
-    bounds = scene.bbox()
-    box = np.array([np.array(bounds.min).ravel(), np.array(bounds.max).ravel()], np.float32)
-    return box if np.isfinite(box).all() and (box[1] >= box[0]).all() else np.zeros((2, 3), np.float32)
-
-
 CELL_BITS = 19  # cells of all emitters together, log2
-
-
 MOST_EMITTERS = 1024  # that have cells of their own; of more, neighbours share theirs
 
 
@@ -141,31 +60,6 @@ def apportion(grid: Grid, density: Array) -> Array:
     counts[1:] += ends[1:]
     counts[1:] -= ends[:-1]
     return counts.astype(np.int64)
-
-
-@dataclass
-class Aim:
-    """Where on the film paths are sent: the block of each slot (SLOTS), and the density of each block's positions,
-    relative to an even one."""
-
-    slots: mi.UInt32
-    density: mi.Float
-
-    @staticmethod
-    def of(blocks: Blocks, wanted: NDArray[np.float64]) -> Aim:
-        """Blocks in proportion to `wanted` (rows * columns), nowhere negative, and UNIFORM of them evenly."""
-        even = blocks.areas() / blocks.areas().sum()
-        total = wanted.sum()
-        density = AIM_UNIFORM * even + (1 - AIM_UNIFORM) * (
-            wanted / total if np.isfinite(total) and total > 0 else even
-        )
-        # One each, so that there is none that no path is sent to; the others rounded along the blocks' order.
-        ends = np.rint(np.cumsum(density) * ((AIM_SLOTS - len(even)) / density.sum()))
-        counts = 1 + np.diff(ends, prepend=0).astype(np.int64)
-        return Aim(
-            own_memory(mi.UInt32, np.repeat(np.arange(len(counts), dtype=np.uint32), counts)),
-            own_memory(mi.Float, (counts / AIM_SLOTS / even).astype(np.float32)),
-        )
 
 
 @dataclass
@@ -223,14 +117,8 @@ class Guide:
         return Guide(table, dr.opaque(mi.UInt64, width))
 
     def draw(
-        self,
-        grid: Grid,
-        width: int,
-        stream: mi.PCG32,
-        choice: mi.Float,
-        position: mi.Point2f,
-        direction: mi.Point2f,
-    ) -> Drawn:
+        self, grid: Grid, width: int, stream: mi.PCG32, choice: mi.Float, position: mi.Point2f, direction: mi.Point2f,
+    ) -> Drawn:  # fmt: skip
         """Where each of `width` lanes starts; `choice`, `position` and `direction` say where within its cell."""
         lane, jitter = mi.UInt64(dr.arange(mi.UInt32, width)), mi.UInt64(stream.next_uint32())
         slot = ((lane << 32) | jitter) // self.lanes >> (32 - (grid.slots.bit_length() - 1))
@@ -248,9 +136,3 @@ class Guide:
             begin, end = (dr.gather(mi.Float, self.table.edges, emitter + k) for k in (0, 1))
             choice = dr.minimum(dr.fma(choice, end - begin, begin), end * below)
         return Drawn(choice, mi.Point2f(numbers[0], numbers[1]), mi.Point2f(numbers[2], numbers[3]), cell, weight)
-
-
-AIM_UNIFORM = 0.2  # of these, how many are sent to places drawn evenly on the film, at least
-
-
-AIM_SLOTS = 1 << 17

@@ -12,17 +12,11 @@ import numpy as np
 from reslrb_cli.scene.deformation import Horizon
 from reslrb_cli.scene.graph import Lamp
 from reslrb_cli.scene.needs import SceneNeeds
-from reslrb_cli.transport.random import Coordinates
+from reslrb_cli.transport.sobol import Coordinates
 
 Array = np.ndarray[Any, Any]
-
-
 GUIDE_UNIFORM = 0.25  # share of paths that start evenly, at least
-
-
 SLOTS_PER_CELL = 4  # one of them is the even share
-
-
 SLOTS_OF_SEVERAL = 8  # where emitters have unequal shares, which are rounded up to whole slots
 
 

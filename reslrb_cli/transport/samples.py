@@ -3,11 +3,14 @@
 Images and gradients of several passes are added up. In single precision a sum over all samples would lose the last of
 them (1e8 samples: a quarter of a pixel), so each pass has a block and gradients of its own, and these are added to one
 another.
+
+Random numbers are drawn in the order of Mitsuba's `ptracer`, used or not: from one seed both trace the same paths.
+Those of low discrepancy (`sobol.py`) take the place of the first.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import drjit as dr
@@ -17,16 +20,15 @@ from reslrb_cli.config.files import PASS_PATHS, PASS_SAMPLES, PASSES
 from reslrb_cli.scene.graph import Lamp
 from reslrb_cli.transport.film import Film
 from reslrb_cli.transport.guide import Drawn, Guide, Table
+from reslrb_cli.transport.lamps import sums_of_areas
 from reslrb_cli.transport.plan import Plan
-from reslrb_cli.transport.random import Early, Net, Numbered, Points
+from reslrb_cli.transport.sobol import Net, Points
 
 
 def in_passes(
-    samples: list[Samples],
-    work: Callable[[Samples, mi.ImageBlock | None], None],
-    block: mi.ImageBlock | None,
+    samples: list[Samples], work: Callable[[Samples, mi.ImageBlock | None], None], block: mi.ImageBlock | None,
     params: mi.SceneParameters | None = None,
-) -> None:
+) -> None:  # fmt: skip
     """Call `work(part, block)` for each pass. It splats into the block (None: nothing), and differentiates `params`
     (None: nothing)."""
     if len(samples) == 1:
@@ -83,24 +85,41 @@ def finish_pass(*results: object) -> None:
 
 #: Names of the random streams beside the sampler's own, mixed into the seed.
 SELECTION_STREAM = 0x5E1EC7  # what hooks draw to select
-
-
 VISIBLE_STREAM = 0xD1EC7  # primary rays
-
-
 LAMP_STREAM = 0x1A3B5 << 12  # points of lamps; the lamp's number is added
-
-
 PASS_STREAM = 0x9A55E5  # seeds of the second pass and those after it
-
-
 SMALL_LAMP_STREAM = 0x57A25  # points of lamps that are smaller than a pixel
-
-
 GUIDE_STREAM = 0x6D1DE  # cells of emission
-
-
 NET_STREAM = 0x5EC0E  # scrambles of numbers of low discrepancy
+
+
+@dataclass
+class Numbers:
+    """What one segment draws: a point on the sensor's aperture, then two numbers and one for the BSDF."""
+
+    aperture: mi.Point2f
+    bsdf_2d: mi.Point2f
+    bsdf_1d: mi.Float
+
+    @staticmethod
+    def draw(sampler: mi.Sampler, active: mi.Bool) -> Numbers:
+        """The numbers of the next segment. Roulette's follows them, and is drawn by the walk."""
+        return Numbers(sampler.next_2d(active), sampler.next_2d(active), sampler.next_1d(active))
+
+    def of_early(self, early: list[Early], depth: mi.UInt32) -> Numbers:
+        """The same, but those for the BSDF as `early` has them for the first vertices; the first is of depth 1."""
+        bsdf = Early(self.bsdf_2d, self.bsdf_1d)
+        for bounce, own in enumerate(early):
+            bsdf = dr.select(depth == bounce + 1, own, bsdf)
+        return replace(self, bsdf_2d=bsdf.bsdf_2d, bsdf_1d=bsdf.bsdf_1d)
+
+
+@dataclass
+class Early:
+    """What the BSDF of one of the first vertices has, known before the path is traced."""
+
+    bsdf_2d: mi.Point2f
+    bsdf_1d: mi.Float
 
 
 @dataclass
@@ -126,7 +145,8 @@ class Samples:
 
     def __post_init__(self) -> None:
         # Now: in the midst of tracing they would cut a kernel in two.
-        self._areas = sums_of_areas(self.plan.reshaped_lamps)
+        lamps = self.plan.reshaped_lamps
+        self._areas = sums_of_areas(lamps) if lamps else []
 
     def areas(self, lamp: Lamp) -> mi.Float | None:
         """Sums of the areas of a lamp's faces, where these move; else None."""
@@ -191,20 +211,12 @@ class Samples:
         stream = self.stream(GUIDE_STREAM)
         return self.guide.draw(self.plan.grid, self.width, stream, choice, position, direction)
 
-    def visible_numbers(self) -> Numbered:
-        """Random numbers for primary rays: the light paths are those of `ptracer` with or without them."""
-        return _NumberStream(self.stream(VISIBLE_STREAM))
-
-    def small_lamp_numbers(self) -> Numbered:
-        """Random numbers for points of lamps that are smaller than a pixel."""
-        return _NumberStream(self.stream(SMALL_LAMP_STREAM))
-
-    def lamp_numbers(self, lamp: Lamp) -> Numbered:
-        """Random numbers for points of a lamp that moves and is seen directly."""
-        return _NumberStream(self.stream(LAMP_STREAM + lamp.index))
+    def numbers(self, name: int) -> NumberStream:
+        """Random numbers beside the sampler's own: the light paths are those of `ptracer` with or without them."""
+        return NumberStream(self.stream(name))
 
 
-class _NumberStream:
+class NumberStream:
     """The two methods of a Mitsuba sampler that emission asks for, over a bare generator."""
 
     def __init__(self, generator: mi.PCG32) -> None:
@@ -217,35 +229,14 @@ class _NumberStream:
         return mi.Point2f(self.generator.next_float32(), self.generator.next_float32())
 
 
-def make_samples(plan: Plan, scene: mi.Scene, sensor: mi.Sensor, seed: mi.UInt32, spp: int, total_spp: int) -> Samples:
-    """`spp` of `total_spp` samples per pixel; the film's full size counts, not the crop's, as for `ptracer`.
-
-    Raises ValueError where one pass would hold more than 2^32 - 1 paths.
-    """
-    film = Film(sensor)
-    width = spp * int(dr.prod(sensor.film().size()))
-    if width > PASS_PATHS:
-        raise ValueError(f"{width} paths in one pass are more than 2^32 - 1: set samples_per_pass below {spp}")
-    # Opaque: as literals they would give every sample count kernels of its own.
-    scale = dr.opaque(mi.Float, float(dr.prod(film.size)) / (float(dr.prod(sensor.film().size())) * total_spp))
-    fraction = dr.opaque(mi.Float, spp / total_spp)
-    net = None if plan.sequence is None else Net.of(width)
-    return Samples(scene, sensor, plan, film, mi.UInt32(seed), spp, width, scale, fraction, net=net)
-
-
 def passes(
-    plan: Plan,
-    scene: mi.Scene,
-    sensor: mi.Sensor,
-    seed: mi.UInt32,
-    spp: int,
-    spp_per_pass: int | None,
+    plan: Plan, scene: mi.Scene, sensor: mi.Sensor, seed: mi.UInt32, spp: int, spp_per_pass: int | None,
     table: Table | None = None,
-) -> list[Samples]:
+) -> list[Samples]:  # fmt: skip
     """All samples of an image, in passes of `spp_per_pass` samples per pixel, which must divide `spp`, or less.
 
     The first pass has the seed itself, so that it traces what `ptracer` does. With a `table`, which belongs to the
-    plan's grid, emission is drawn from that.
+    plan's grid, emission is drawn from that. Raises ValueError for too many passes, or paths in one pass.
     """
     unit = spp if spp_per_pass is None else min(spp_per_pass, spp)
     if spp % unit:
@@ -259,9 +250,18 @@ def passes(
     others = [mi.sample_tea_32(mi.UInt32(seed), mi.UInt32(PASS_STREAM + p))[0] for p in range(1, len(sizes))]
     seeds = [mi.UInt32(seed), *others]
     dr.make_opaque(seeds)
-    made = {size: make_samples(plan, scene, sensor, seeds[0], size, spp) for size in set(sizes)}
-    if table is not None:
-        made = {size: replace(part, guide=Guide.of(table, part.width)) for size, part in made.items()}
+    film, pixels = Film(sensor), int(dr.prod(sensor.film().size()))  # not the crop's, as for `ptracer`
+    # Opaque: as literals these would give every sample count kernels of its own.
+    scale = dr.opaque(mi.Float, float(dr.prod(film.size)) / (float(pixels) * spp))
+
+    def part(size: int) -> Samples:
+        width, fraction = size * pixels, dr.opaque(mi.Float, size / spp)
+        if width > PASS_PATHS:
+            raise ValueError(f"{width} paths in one pass are more than 2^32 - 1: set samples_per_pass below {size}")
+        guide, net = None if table is None else Guide.of(table, width), None if plan.sequence is None else Net.of(width)
+        return Samples(scene, sensor, plan, film, seeds[0], size, width, scale, fraction, guide, net)
+
+    made = {size: part(size) for size in set(sizes)}
     return [replace(made[size], seed=s) for size, s in zip(sizes, seeds, strict=True)]
 
 
@@ -269,17 +269,3 @@ def _parts(spp: int) -> list[int]:
     """The fewest parts of at most PASS_SAMPLES samples, of sizes that differ by 1 at most."""
     count = -(-spp // PASS_SAMPLES)
     return [spp // count + (part < spp % count) for part in range(count)]
-
-
-def sums_of_areas(lamps: Sequence[Lamp]) -> list[mi.Float]:
-    """Of each lamp, a mesh, the areas of its first faces, summed: (F,), evaluated and detached."""
-    with dr.suspend_grad():
-        found = [dr.cumsum(face_area(lamp.shape, dr.arange(mi.UInt32, lamp.shape.face_count()))) for lamp in lamps]
-        dr.eval(found)
-        return found
-
-
-def face_area(mesh: mi.Mesh, face: mi.UInt32) -> mi.Float:
-    """The area of a face of a mesh."""
-    a, b, c = (mesh.vertex_position(vertex) for vertex in mesh.face_indices(face))
-    return 0.5 * dr.norm(dr.cross(b - a, c - a))

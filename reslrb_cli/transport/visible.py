@@ -25,10 +25,11 @@ import mitsuba as mi
 
 from reslrb_cli.scene.graph import Lamp
 from reslrb_cli.transport.connection import connect, forward_derivatives, passage
-from reslrb_cli.transport.emission import lamp_point, sample_time
+from reslrb_cli.transport.emission import sample_time
+from reslrb_cli.transport.film import AdjointImage
+from reslrb_cli.transport.lamps import lamp_point
 from reslrb_cli.transport.plan import Plan
-from reslrb_cli.transport.random import Numbered
-from reslrb_cli.transport.samples import Samples
+from reslrb_cli.transport.samples import LAMP_STREAM, SMALL_LAMP_STREAM, VISIBLE_STREAM, NumberStream, Samples
 
 
 def moving_splats(samples: Samples) -> Iterator[tuple[mi.Point2f, mi.Spectrum, mi.Bool]]:
@@ -37,7 +38,9 @@ def moving_splats(samples: Samples) -> Iterator[tuple[mi.Point2f, mi.Spectrum, m
     u and C_0 have their derivatives where gradients are enabled; what they sum up to is already in the image.
     """
     for lamp in samples.plan.visible_moving_lamps:
-        yield _splat(samples, lamp)
+        point = _points(samples, (lamp,), mi.UInt32(lamp.index), samples.numbers(LAMP_STREAM + lamp.index), True)
+        # Points stay where they are on the lamp, so that nothing that moves has a part in their radiance.
+        yield point.u, dr.select(point.active, dr.detach(point.radiance()) * point.weight, 0), point.active
 
 
 def small_splat(samples: Samples) -> tuple[mi.Point2f, mi.Spectrum, mi.Bool]:
@@ -51,7 +54,7 @@ def small_splat(samples: Samples) -> tuple[mi.Point2f, mi.Spectrum, mi.Bool]:
 
 def small_points(samples: Samples) -> Points:
     """Points on the lamps that are smaller than a pixel, which take turns; detached."""
-    lamps, numbers = samples.plan.small_lamps, samples.small_lamp_numbers()
+    lamps, numbers = samples.plan.small_lamps, samples.numbers(SMALL_LAMP_STREAM)
     count, lane = dr.opaque(mi.UInt32, samples.width), dr.arange(mi.UInt32, samples.width)
     turn, index = lane % len(lamps), mi.UInt32(lamps[0].index)
     for number, lamp in enumerate(lamps):
@@ -77,14 +80,7 @@ class Points:
         return self.emitter.eval(self.si, self.active)
 
 
-def _splat(samples: Samples, lamp: Lamp) -> tuple[mi.Point2f, mi.Spectrum, mi.Bool]:
-    point = _points(samples, (lamp,), mi.UInt32(lamp.index), samples.lamp_numbers(lamp), attached=True)
-    # Points stay where they are on the lamp, so that nothing that moves has a part in their radiance.
-    radiance = dr.detach(point.radiance())
-    return point.u, dr.select(point.active, radiance * point.weight, 0), point.active
-
-
-def _points(samples: Samples, lamps: Sequence[Lamp], index: mi.UInt32, numbers: Numbered, attached: bool) -> Points:
+def _points(samples: Samples, lamps: Sequence[Lamp], index: mi.UInt32, numbers: NumberStream, attached: bool) -> Points:
     """A point of each lane's lamp, the one of that index in `scene.emitters()`."""
     plan, sensor = samples.plan, samples.sensor
     time = sample_time(plan, sensor, numbers)
@@ -128,7 +124,7 @@ def primary_ray(samples: Samples) -> PrimaryRay:
 
     Their numbers are a stream of their own.
     """
-    plan, sensor, width, sampler = samples.plan, samples.sensor, samples.width, samples.visible_numbers()
+    plan, sensor, width, sampler = samples.plan, samples.sensor, samples.width, samples.numbers(VISIBLE_STREAM)
     size = sensor.film().crop_size()
     n_pixels = int(size[0] * size[1])
     lane = dr.arange(mi.UInt32, width)
@@ -199,13 +195,10 @@ def _radiance(plan: Plan, scene: mi.Scene, si: mi.SurfaceInteraction3f, active: 
 
 
 def _look(
-    plan: Plan,
-    scene: mi.Scene,
-    primary: PrimaryRay,
-    on_surface: Callable[[_Look, mi.Spectrum, mi.Spectrum, mi.Spectrum], None] | None,
-    mode: str,
+    plan: Plan, scene: mi.Scene, primary: PrimaryRay,
+    on_surface: Callable[[_Look, mi.Spectrum, mi.Spectrum, mi.Spectrum], None] | None, mode: str,
     tangents: bool = False,
-) -> _Look:
+) -> _Look:  # fmt: skip
     def look(state: _Look) -> tuple[_Look]:
         with dr.suspend_grad():  # where shapes move, `visible.py` has the derivative
             si = scene.ray_intersect(state.ray, state.active)
@@ -232,3 +225,31 @@ def _look(
     state = _Look(mi.Bool(primary.active), primary.ray, mi.Spectrum(1), mi.Spectrum(0), mi.UInt32(0), d_state)
     (state,) = dr.while_loop((state,), lambda state: state.active, look, label="primary ray", mode=mode)
     return state
+
+
+def splat_visible_emission(samples: Samples, block: mi.ImageBlock, loop_mode: str = "symbolic") -> None:
+    """Add C_0 to the block."""
+    if samples.plan.visible_emission:
+        primary = primary_ray(samples)
+        radiance = visible_radiance(samples.plan, samples.scene, primary, loop_mode)
+        samples.film.put(block, primary.u, radiance * primary.weight * samples.fraction, primary.active)
+    if samples.plan.small_lamps:
+        samples.film.put(block, *small_splat(samples))
+
+
+def differentiate_visible_emission(samples: Samples, adjoint: AdjointImage) -> None:
+    """Add the derivatives of C_0."""
+    plan = samples.plan
+    if plan.visible_emission and (plan.differentiate_emission or plan.differentiate_null):
+        primary = primary_ray(samples)
+        delta = adjoint.lookup(primary.u, primary.active) * primary.weight * samples.fraction
+        differentiate_visible_radiance(plan, samples.scene, primary, delta)
+    if plan.small_lamps and plan.differentiate_emission:
+        with dr.resume_grad():
+            u, C, active = small_splat(samples)
+            objective = dr.dot(adjoint.lookup(u, active), C)
+            dr.backward_from(objective, flags=dr.ADFlag.Default | dr.ADFlag.AllowNoGrad)
+    if plan.visible_moving_lamps:
+        with dr.resume_grad():
+            for u, C, active in moving_splats(samples):
+                dr.backward_from(dr.dot(adjoint.lookup(u, active, plan.attached_normalization), C))

@@ -20,23 +20,20 @@ import drjit as dr
 import mitsuba as mi
 
 from reslrb_cli.transport.aim import Pending, aims_from, choose
-from reslrb_cli.transport.bsdf import Aimed, Scattering, evaluate, scatter, tracked_factor
+from reslrb_cli.transport.bsdf import Aimed, Hit, Scattering, evaluate, scatter, tracked_factor
 from reslrb_cli.transport.connection import Connection, Seen, connect, passage
 from reslrb_cli.transport.emission import sample_emission
 from reslrb_cli.transport.factors import Product
 from reslrb_cli.transport.plan import Plan
-from reslrb_cli.transport.random import Early, Numbers
-from reslrb_cli.transport.samples import SELECTION_STREAM, Samples
+from reslrb_cli.transport.roulette import first_eta, play
+from reslrb_cli.transport.samples import SELECTION_STREAM, Early, Numbers, Samples
 
 
 @dataclass
-class Vertex:
+class Vertex(Hit):
     """The current vertex as hooks see it; `product` does not include the vertex's own scattering."""
 
     pi: mi.PreliminaryIntersection3f
-    si: mi.SurfaceInteraction3f
-    bsdf: mi.BSDFPtr
-    ray: mi.Ray3f
     depth: mi.UInt32
     product: Product
     active: mi.Bool
@@ -126,12 +123,10 @@ class Segment:
         return ray if attached else dr.detach(ray)
 
 
-def find_vertex(
-    ray: mi.Ray3f, pi: mi.PreliminaryIntersection3f, active: mi.Bool
-) -> tuple[mi.SurfaceInteraction3f, mi.BSDFPtr]:
-    """The surface interaction where `ray` hits what `pi` says, and its BSDF."""
+def find_vertex(ray: mi.Ray3f, pi: mi.PreliminaryIntersection3f, active: mi.Bool) -> Hit:
+    """The vertex where `ray` hits what `pi` says."""
     si = pi.compute_surface_interaction(ray, mi.RayFlags.All, active)
-    return si, si.bsdf()
+    return Hit(si, si.bsdf(), ray)
 
 
 def find_following_vertex(
@@ -155,41 +150,26 @@ def find_following_vertex(
 
 
 def segment(
-    plan: Plan,
-    sensor: mi.Sensor,
-    ray: mi.Ray3f,
-    si: mi.SurfaceInteraction3f,
-    bsdf: mi.BSDFPtr,
-    numbers: Numbers,
-    connected: mi.Bool,
-    scattered: mi.Bool,
-    evaluates: bool = True,
-    tracked: bool = False,
-    attached: bool = False,
-    aimed: Aimed | None = None,
-) -> Segment:
-    """The segment from the vertex `si`, which `ray` reaches: connected in some lanes, scattered in some.
+    samples: Samples, hit: Hit, numbers: Numbers, connected: mi.Bool, scattered: mi.Bool, evaluates: bool = True,
+    tracked: bool = False, attached: bool = False, aimed: Aimed | None = None,
+) -> Segment:  # fmt: skip
+    """The segment from a vertex: connected in some lanes, scattered in some.
 
     Without `evaluates` the BSDF is not evaluated towards the sensor. With `tracked` the scattering weight carries the
     derivatives of the scene's parameters, where gradients are enabled, and the connection is left to be evaluated where
     it turns out to be visible; directions, densities and film positions have no derivatives then. With `attached` they
     have, and so has everything else. Lanes that are `aimed` scatter to their points.
     """
-    connection = connect(plan, sensor, si, ray, numbers.aperture, connected, attached)
+    plan, si = samples.plan, hit.si
+    connection = connect(plan, samples.sensor, si, hit.ray, numbers.aperture, connected, attached)
     wanted = connection.active if evaluates and not tracked else None
     scattering, connection.f = scatter(
-        plan, si, bsdf, ray, numbers.bsdf_1d, numbers.bsdf_2d, scattered, connection.wo, wanted, attached, aimed
+        plan, hit, numbers.bsdf_1d, numbers.bsdf_2d, scattered, connection.wo, wanted, attached, aimed
     )
     if tracked and not attached:
-        f = tracked_factor(plan, si, bsdf, scattering, scattering.active)
+        f = tracked_factor(plan, si, hit.bsdf, scattering, scattering.active)
         scattering.weight = dr.replace_grad(scattering.weight, f * (scattering.correction / scattering.pdf))
     return Segment(si, connection, scattering)
-
-
-ROULETTE_LIMIT = 0.95  # the largest probability of going on, as in `ptracer`
-
-
-DIMMEST = 1e-30  # the least emission that roulette knows, well above what single precision rounds to zero
 
 
 @dataclass
@@ -222,13 +202,7 @@ def walk(samples: Samples, hooks: Hooks, active: mi.Bool | bool = True) -> Any:
         product = product.times(emission.weight, mi.Int32(0))
         active &= product.alive()
         if plan.roulette:
-            # Relative to emission where that is dim: else light of small lamps, or in large units, would end at once.
-            light = dr.max(product.weight())
-            if emission.guided is None:
-                eta = dr.rsqrt(dr.clip(light, DIMMEST, 1))
-            else:
-                # As without the guide: paths that it has found would end for being many.
-                eta = dr.rsqrt(dr.clip(light / emission.guided, DIMMEST, 1)) * dr.rsqrt(emission.guided)
+            eta = first_eta(dr.max(product.weight()), emission.guided)
     state = hooks.start(product)
     active &= plan.max_depth > 1
     pi, active = intersect(plan, scene, emission.ray, active)
@@ -239,7 +213,8 @@ def walk(samples: Samples, hooks: Hooks, active: mi.Bool | bool = True) -> Any:
     def body(
         path: Path, state: Any, sampler: mi.Sampler, selection: mi.PCG32 | None
     ) -> tuple[Path, Any, mi.Sampler, mi.PCG32 | None]:
-        si, bsdf = find_vertex(path.ray, path.pi, path.active)
+        hit = find_vertex(path.ray, path.pi, path.active)
+        si, bsdf = hit.si, hit.bsdf
         numbers = Numbers.draw(sampler, path.active).of_early(path.early, path.depth)
         slot = None if aim is None else sampler.next_1d(path.active)
         seen = None
@@ -251,7 +226,7 @@ def walk(samples: Samples, hooks: Hooks, active: mi.Bool | bool = True) -> Any:
             r = before.factor(aim, sensor, si, path.ray, here, visible)
             path = replace(path, active=path.active & (r != 0), product=path.product.scaled(r))  # NaN goes on
             state = hooks.aimed(state, r)
-        vertex = Vertex(path.pi, si, bsdf, path.ray, path.depth, path.product, path.active)
+        vertex = Vertex(si, bsdf, path.ray, path.pi, path.depth, path.product, path.active)
 
         # ---- Connect to the sensor, and scatter ----
         connected = path.active & hooks.wants(state, vertex)
@@ -259,11 +234,11 @@ def walk(samples: Samples, hooks: Hooks, active: mi.Bool | bool = True) -> Any:
         aimed = None
         if aim is not None:
             able = active & aims_from(bsdf)
-            aimed, numbers = choose(scene, sensor, aim, path.ray.time, numbers, slot, able)
+            aimed, bsdf_1d = choose(scene, sensor, aim, path.ray.time, numbers.bsdf_1d, numbers.bsdf_2d, slot, able)
+            numbers = replace(numbers, bsdf_1d=bsdf_1d)
         this = segment(
-            plan, sensor, path.ray, si, bsdf, numbers, connected, active, hooks.connects, hooks.tracked,
-            hooks.attached, aimed,
-        )  # fmt: skip
+            samples, vertex, numbers, connected, active, hooks.connects, hooks.tracked, hooks.attached, aimed
+        )
         connection, scattering = this.connection, this.scattering
         if hooks.connects:
             if not (hooks.tracked or plan.track_zeros):
@@ -291,16 +266,10 @@ def walk(samples: Samples, hooks: Hooks, active: mi.Bool | bool = True) -> Any:
         # ---- Russian roulette ----
         number = sampler.next_1d(active)
         if plan.roulette or survival is not None:
-            throughput, q, playing = dr.max(dr.abs(product.weight())), mi.Float(1), mi.Bool(False)
-            if plan.roulette:
-                q = dr.minimum(throughput * dr.square(eta), ROULETTE_LIMIT)
-                playing = path.depth + 1 > plan.rr_depth
-            if survival is not None:
-                learned = survival.probability(si.p, scattering.d, throughput)
-                q, playing = dr.minimum(dr.select(playing, q, 1), learned), mi.Bool(True)
-            active &= ~playing | (number < q)
-            roulette_weight = dr.select(playing, dr.rcp(q), 1)
-            product, state = product.scaled(roulette_weight), hooks.survived(state, roulette_weight)
+            throughput = dr.max(dr.abs(product.weight()))
+            survives, weight = play(plan, survival, path.depth, throughput, eta, si.p, scattering.d, number)
+            active &= survives
+            product, state = product.scaled(weight), hooks.survived(state, weight)
 
         pending = []
         if aimed is not None:

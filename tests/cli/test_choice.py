@@ -317,17 +317,17 @@ def test_peak_memory_is_flat_in_samples_under_a_budget(experiment, adjoint):
 def test_what_is_kept_of_a_path_is_what_is_counted(experiment, monkeypatch, estimator, zeros):
     from reslrb_cli.config.loader import load
     from reslrb_cli.estimators.base import entry_bytes
-    from reslrb_cli.integrators import light_tracer
+    from reslrb_cli.integrators import reslrb
     from reslrb_cli.optimization import loop
     from reslrb_cli.optimization.assemble import assemble
 
-    states, forward = [], light_tracer.forward
+    states, forward = [], reslrb.forward
 
     def spy(*args):
         states.append(forward(*args))
         return states[-1]
 
-    monkeypatch.setattr(light_tracer, "forward", spy)
+    monkeypatch.setattr(reslrb, "forward", spy)
     value = 0.0 if zeros else 0.5
     settings = [f"integrator={{max_depth: 4, estimator: {estimator}}}", f"parameters[0].initial={value}"]
     for adjoint in ("correlated", "independent"):
@@ -335,7 +335,7 @@ def test_what_is_kept_of_a_path_is_what_is_counted(experiment, monkeypatch, esti
         loop.gradient(problem, 0, loop.Split())
         sensor = problem.scene.sensors()[0]
         plan = problem.integrator.plan(problem.scene, sensor, problem.selection.params)
-        counted, kept = problem.integrator.estimator.bytes_per_path(plan), sum(entry_bytes(states.pop()))
+        counted, kept = sum(entry_bytes(problem.integrator.estimator.kept(plan))), sum(entry_bytes(states.pop()))
         assert plan.track_zeros == zeros
         assert kept == counted if estimator in ("reservoir", "event") else kept <= counted <= kept + 128
         assert (problem.integrator.estimator.scratch_bytes(plan) > 0) == (estimator == "stack")

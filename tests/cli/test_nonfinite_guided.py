@@ -13,7 +13,7 @@ from turns import a_few
 
 from reslrb_cli.cli import nonfinite
 from reslrb_cli.guiding.tables import Guiding
-from reslrb_cli.integrators import light_tracer
+from reslrb_cli.integrators import reslrb
 from reslrb_cli.measure import nonfinite_trace
 from reslrb_cli.measure.nonfinite_trace import Witness
 
@@ -50,7 +50,7 @@ def note(monkeypatch: pytest.MonkeyPatch, module: ModuleType) -> Drawn:
 
 def differences(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], way: str) -> list[str]:
     """What is not of the run's last step in what its replay looked at."""
-    taken, looked_at = note(monkeypatch, light_tracer), note(monkeypatch, nonfinite_trace)
+    taken, looked_at = note(monkeypatch, reslrb), note(monkeypatch, nonfinite_trace)
     for seed in SEEDS.get(way, [1, 2, 3, 4, 5, 6, 7, 8]):
         taken.clear()
         _, err = optimize(capsys, *SETTINGS, *WAYS[way], f"run.seed={seed}")

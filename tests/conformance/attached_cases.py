@@ -92,6 +92,14 @@ def tilt_receiver(params: mi.SceneParameters, latents: Latents) -> None:
     params["receiver.to_world"] = moved @ mi.AffineTransform4f(transform(rotate=([1, 0, 0], -90)).matrix)
 
 
+def mapped() -> dict[str, Any]:
+    """The receiver with a normal map: a part of what it scatters is not drawn by its BSDF."""
+    normals = np.random.default_rng(3).uniform(0.35, 0.65, (4, 4, 3))
+    normals[..., 2] = 1
+    bsdf = {"type": "normalmap", "normalmap": bitmap(normals, "bilinear"), "bsdf": diffuse(0.7, 0.5, 0.6)}
+    return textured() | {"bsdf": bsdf}
+
+
 def stretch_slab(params: mi.SceneParameters, latents: Latents) -> None:
     """The slab's ripples times a number, and the slab lifted."""
     heights, rest = (mi.Float(rippled(2.0, 12, ripples).astype(np.float32).ravel()) for ripples in (1.0, 0.0))
@@ -111,6 +119,7 @@ CASES = [
                  SLAB | {"receiver.bsdf.reflectance.data": None, "lamp.emitter.radiance.value": None,
                          "shell.bsdf.reflectance.value": None}, depth=7),
     AttachedCase("bounces_4", enclosed, SLAB, depth=4),
+    AttachedCase("normal_map", lambda: enclosed(receiver=mapped()), SLAB, depth=6, stock=False, quick=True),
     AttachedCase("bounces_16", lambda: enclosed(albedo=0.9), SLAB, depth=16),
     AttachedCase("two_lenses", two_lenses, SLAB | {"x": 0.0, "size": 1.0}, move_ball, depth=9),
     AttachedCase("roulette", lambda: enclosed(albedo=0.9), SLAB, depth=10, stock=False, both={"rr_depth": 2}),

@@ -100,16 +100,16 @@ def _redraw(patch: pytest.MonkeyPatch, change: Any) -> None:
 
 def same_numbers(patch: pytest.MonkeyPatch) -> None:
     """Tables learn from the numbers of the step itself."""
-    from reslrb_cli.integrators import light_tracer
+    from reslrb_cli.integrators import reslrb
 
-    patch.setattr(light_tracer, "learning_seed", lambda seed: seed)
+    patch.setattr(reslrb, "learning_seed", lambda seed: seed)
 
 
 def learned_in_its_midst(patch: pytest.MonkeyPatch) -> None:
     """Tables learn from an image's samples before these are replayed, and so with another table."""
     from reslrb_cli.guiding.collect import hear
     from reslrb_cli.guiding.tables import Purpose
-    from reslrb_cli.integrators import light_tracer as lt
+    from reslrb_cli.integrators import reslrb as lt
     from reslrb_cli.integrators.reslrb import Reslrb
 
     right = Reslrb._replay

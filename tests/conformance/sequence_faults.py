@@ -9,9 +9,9 @@ import pytest
 
 def never_scrambled(patch: pytest.MonkeyPatch) -> None:
     """Points are those of the sequence itself, in every pass."""
-    from reslrb_cli.transport import random
+    from reslrb_cli.transport import sobol
 
-    patch.setattr(random, "scrambled", lambda point, shift, key: point)
+    patch.setattr(sobol, "scrambled", lambda point, shift, key: point)
 
 
 def scrambled_once(patch: pytest.MonkeyPatch) -> None:
@@ -30,10 +30,10 @@ def scrambled_once(patch: pytest.MonkeyPatch) -> None:
 
 def not_shifted(patch: pytest.MonkeyPatch) -> None:
     """Digits are permuted, but the permutation leaves the first point where it is."""
-    from reslrb_cli.transport import random
+    from reslrb_cli.transport import sobol
 
-    right = random.scrambled
-    patch.setattr(random, "scrambled", lambda point, shift, key: right(point, shift * 0, key))
+    right = sobol.scrambled
+    patch.setattr(sobol, "scrambled", lambda point, shift, key: right(point, shift * 0, key))
 
 
 def one_scramble_for_all(patch: pytest.MonkeyPatch) -> None:
@@ -49,7 +49,7 @@ def used_twice(patch: pytest.MonkeyPatch) -> None:
 def _renumbered(
     patch: pytest.MonkeyPatch, scramble: Any = lambda number: number, coordinate: Any = lambda number: number
 ) -> None:
-    from reslrb_cli.transport import random
+    from reslrb_cli.transport import sobol
 
     def next_1d(self: Any, independent: Any = None) -> Any:
         import drjit as dr
@@ -59,35 +59,35 @@ def _renumbered(
             net, self.net = self.net, None
             return net.stratified(self.lane, independent)
         shift, key = mi.sample_tea_32(self.seed, mi.UInt32(scramble(self.used)))
-        digits = random.point(self.lane, coordinate(self.used), self.digits)
+        digits = sobol.point(self.lane, coordinate(self.used), self.digits)
         self.used += 1
-        return random._float(dr.brev(random.scrambled(digits, shift, key)))
+        return sobol._float(dr.brev(sobol.scrambled(digits, shift, key)))
 
-    patch.setattr(random.Points, "next_1d", next_1d)
+    patch.setattr(sobol.Points, "next_1d", next_1d)
 
 
 def half_of_the_strata(patch: pytest.MonkeyPatch) -> None:
     """Lanes share the first number as if there were twice as many of them."""
-    from reslrb_cli.transport import random
+    from reslrb_cli.transport import sobol
 
-    right = random.Net.of
-    patch.setattr(random.Net, "of", staticmethod(lambda width: right(2 * width)))
+    right = sobol.Net.of
+    patch.setattr(sobol.Net, "of", staticmethod(lambda width: right(2 * width)))
 
 
 def without_jitter(patch: pytest.MonkeyPatch) -> None:
     """The first number is always where its stratum begins."""
-    from reslrb_cli.transport import random
+    from reslrb_cli.transport import sobol
 
-    right = random.Net.stratified
-    patch.setattr(random.Net, "stratified", lambda self, lane, jitter: right(self, lane, jitter * 0))
+    right = sobol.Net.stratified
+    patch.setattr(sobol.Net, "stratified", lambda self, lane, jitter: right(self, lane, jitter * 0))
 
 
 def squeezed(patch: pytest.MonkeyPatch) -> None:
     """Numbers end below 1."""
-    from reslrb_cli.transport import random
+    from reslrb_cli.transport import sobol
 
-    right = random._float
-    patch.setattr(random, "_float", lambda digits: right(digits) * 0.96)
+    right = sobol._float
+    patch.setattr(sobol, "_float", lambda digits: right(digits) * 0.96)
 
 
 def of_emission_again(patch: pytest.MonkeyPatch) -> None:
@@ -106,9 +106,9 @@ def of_emission_again(patch: pytest.MonkeyPatch) -> None:
 
 def shared_by_passes(patch: pytest.MonkeyPatch) -> None:
     """All passes of an image have the first one's seed."""
-    from reslrb_cli.integrators import light_tracer
+    from reslrb_cli.integrators import reslrb
 
-    right = light_tracer.passes
+    right = reslrb.passes
 
     def wrong(*given: Any) -> Any:
         parts = right(*given)
@@ -116,7 +116,7 @@ def shared_by_passes(patch: pytest.MonkeyPatch) -> None:
             part.seed = parts[0].seed
         return parts
 
-    patch.setattr(light_tracer, "passes", wrong)
+    patch.setattr(reslrb, "passes", wrong)
 
 
 def swapped_in_replays(patch: pytest.MonkeyPatch) -> None:

@@ -18,9 +18,8 @@ from reslrb_cli.guiding.tables import NOW, Learned, Purpose
 from reslrb_cli.integrators import context
 from reslrb_cli.measure.gradients import Case, relative
 from reslrb_cli.transport import aim
-from reslrb_cli.transport.aim import Pending
+from reslrb_cli.transport.aim import AIM_SLOTS, AIM_UNIFORM, Aim, Pending
 from reslrb_cli.transport.film import BLOCKS, Blocks
-from reslrb_cli.transport.guide import AIM_SLOTS, AIM_UNIFORM, Aim
 
 pytestmark = pytest.mark.usefixtures("llvm")
 

@@ -14,7 +14,7 @@ import pytest
 from measure.differenced import AttachedScene, compare_with_differences
 from measure.moving_light import SCENES, moved, point, room, smooth_texture, wall
 
-from reslrb_cli.integrators.context import stays
+from reslrb_cli.integrators.differentiated import stays
 from reslrb_cli.measure.comparison import Family, compare_expectations
 from reslrb_cli.measure.gradients import integrator, seeds
 from reslrb_cli.measure.scenes.moving import Move, Pose

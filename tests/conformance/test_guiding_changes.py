@@ -155,8 +155,8 @@ def test_tables_that_learn_no_more_stay_wrong(monkeypatch: pytest.MonkeyPatch) -
 
 @pytest.mark.long
 def test_tables_without_an_even_share_are_too_wrong(monkeypatch: pytest.MonkeyPatch) -> None:
-    from reslrb_cli.transport import guide
+    from reslrb_cli.transport import plan
 
-    monkeypatch.setattr(guide, "UNIFORM", 0.02)
-    monkeypatch.setattr(guide, "SLOTS_PER_CELL", 64)
+    monkeypatch.setattr(plan, "GUIDE_UNIFORM", 0.02)
+    monkeypatch.setattr(plan, "SLOTS_PER_CELL", 64)
     assert not holds(errors(32))

@@ -9,7 +9,8 @@ import pytest
 
 from reslrb_cli.guiding.collect import Onward
 from reslrb_cli.guiding.tables import Guiding, Learned
-from reslrb_cli.transport.guide import CELLS, make_grid
+from reslrb_cli.transport.guide import make_grid
+from reslrb_cli.transport.roulette import CELLS
 
 GRID = make_grid([True] * 4, [1.0, 3.0], 9)
 

@@ -244,15 +244,15 @@ def test_refused_with_the_reason(name: str):
 # ---- The code broken on purpose ----
 
 FAULTS = {
-    "area_of_faces_detached": ("mesh", "transport.emission:lamp_point", "area / dr.detach(area)", "mi.Float(1)"),
+    "area_of_faces_detached": ("mesh", "transport.lamps:lamp_point", "area / dr.detach(area)", "mi.Float(1)"),
     "start_does_not_move": ("parallel", "estimators.attached:differentiate_start",
                             "if plan.moving_emission:", "if False:"),
-    "normal_of_sphere_as_mitsuba_has_it": ("turned", "transport.emission:lamp_point",
+    "normal_of_sphere_as_mitsuba_has_it": ("turned", "transport.lamps:lamp_point",
                                            "if lamp.is_sphere:", "if False:"),
-    "parallel_light_off_the_face": ("parallel_mesh", "transport.emission:lamp_ray", "si.sh_frame.n", "si.n"),
-    "texture_looked_up_along_a_ray": ("textured_mesh", "transport.emission:_textured_point",
+    "parallel_light_off_the_face": ("parallel_mesh", "transport.lamps:lamp_ray", "si.sh_frame.n", "si.n"),
+    "texture_looked_up_along_a_ray": ("textured_mesh", "transport.lamps:_textured_point",
                                       "mi.RayFlags.All | mi.RayFlags.FollowShape", "mi.RayFlags.All"),
-    "density_detached": ("parallel", "transport.emission:lamp_ray",
+    "density_detached": ("parallel", "transport.lamps:lamp_ray",
                          "radiance * weight", "radiance * dr.detach(weight)"),
     "rays_detached": ("spot", "transport.emission:sample_emission",
                       "Emission(ray if plan.moving_emission else dr.detach(ray), weight, emitter)",
@@ -274,8 +274,7 @@ def test_fault(name: str, monkeypatch: pytest.MonkeyPatch):
 
 def test_faces_of_a_mesh_are_those_that_mitsuba_draws():
     from reslrb_cli.scene.graph import SceneGraph
-    from reslrb_cli.transport.emission import drawn_face
-    from reslrb_cli.transport.samples import sums_of_areas
+    from reslrb_cli.transport.lamps import drawn_face, sums_of_areas
 
     scene = load(over_floor(mesh()))
     [lamp] = SceneGraph.of(scene).find_lamps(scene)

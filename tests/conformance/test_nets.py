@@ -18,7 +18,7 @@ def coordinates(seed: int, width: int) -> np.ndarray:
     import drjit as dr
     import mitsuba as mi
 
-    from reslrb_cli.transport.random import Points
+    from reslrb_cli.transport.sobol import Points
 
     points = Points(dr.opaque(mi.UInt32, seed), width, None)
     return np.stack([np.array(points.next_1d(), np.float64) for _ in range(COORDINATES)])
@@ -29,7 +29,7 @@ def test_points_are_sobol_s() -> None:
     import drjit as dr
     import mitsuba as mi
 
-    from reslrb_cli.transport.random import point
+    from reslrb_cli.transport.sobol import point
 
     count = 2**15
     own = [dr.brev(point(dr.arange(mi.UInt32, count), c)) for c in range(COORDINATES)]
@@ -72,9 +72,9 @@ def independent(point: Any, shift: Any, key: Any) -> Any:
 
 @pytest.mark.parametrize("scramble", [unnested, independent])
 def test_another_scramble_is_found(scramble: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    from reslrb_cli.transport import random
+    from reslrb_cli.transport import sobol
 
-    monkeypatch.setattr(random, "scrambled", scramble)
+    monkeypatch.setattr(sobol, "scrambled", scramble)
     assert not fills(coordinates(1, 2**8), 8)
 
 
@@ -93,7 +93,7 @@ def test_the_first_number_is_stratified(width: int) -> None:
     import drjit as dr
     import mitsuba as mi
 
-    from reslrb_cli.transport.random import Net
+    from reslrb_cli.transport.sobol import Net
 
     net, some = Net.of(width), np.unique(np.linspace(0, width - 1, 1000).astype(np.int64))
     for jitter in (0.0, 0.5, float(dr.one_minus_epsilon(mi.Float))):

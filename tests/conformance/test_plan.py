@@ -13,6 +13,7 @@ import pytest
 from conformance.gradient_cases import FLOOR
 from turns import taking_turns
 
+from reslrb_cli.integrators.context import Preparation
 from reslrb_cli.integrators.plan_report import FEATURES, count, report_plan, tracking
 from reslrb_cli.integrators.step import known_step
 from reslrb_cli.measure.gradients import Case, integrator
@@ -202,3 +203,19 @@ def test_report_stops_counting_in_time():
     ours = integrator("reslrb", 4, estimator="gather")
     report = report_plan(ours, case.scene, case.scene.sensors()[0], case.params, case.keys, known=True, limit_s=0)
     assert all("not counted" in row.note for row in report.rows)
+
+
+def test_a_step_plans_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Not once a batch: for the image of the first batch, and for all that is differentiated."""
+    original, asked = Preparation.plan, []
+
+    def noting(self: Preparation, scene: Any, sensor: Any, params: Any = None, spp: int | None = None) -> Any:
+        asked.append(params is not None)
+        return original(self, scene, sensor, params, spp)
+
+    monkeypatch.setattr(Preparation, "plan", noting)
+    case, ours = Case(plain(), (FLOOR,)), integrator("reslrb", 5, estimator="stack", guiding="on")
+    for seed in range(3):
+        case.gradient(ours, seed, 16, adjoint="batched")
+        assert asked == [False, True]
+        asked.clear()

@@ -136,7 +136,7 @@ def evenly(guiding: str) -> Any:
     import mitsuba as mi
 
     from reslrb_cli.integrators.protocol import Job
-    from reslrb_cli.transport.random import Net
+    from reslrb_cli.transport.sobol import Net
 
     case = Case(BY_NAME["two_emitters"].scene(), [])
     ours = integrator("reslrb", guiding=guiding, samples_per_pass=1, **ON)

@@ -185,9 +185,9 @@ def test_radiance_counts_once_where_its_lamp_moves_too(size: float):
 
 SPLAT = "transport.visible:small_points"
 FAULTS = [
-    Fault("left_out", "third", "integrators.light_tracer:splat_visible_emission", "if samples.plan.small_lamps",
+    Fault("left_out", "third", "transport.visible:splat_visible_emission", "if samples.plan.small_lamps",
           "if False", frozenset({("stack", "ptracer")})),
-    Fault("not_differentiated", "third", "integrators.light_tracer:differentiate_visible_emission",
+    Fault("not_differentiated", "third", "transport.visible:differentiate_visible_emission",
           "plan.small_lamps and plan", "False and plan", frozenset({("stack", "walk_ad"), ("stack", "analytic")})),
     Fault("primary_rays_find_them_too", "third", "transport.visible:_radiance",
           "emitter != mi.EmitterPtr(lamp.emitter)", "mi.Bool(True)",

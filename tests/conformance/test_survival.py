@@ -15,7 +15,8 @@ from turns import a_few
 from reslrb_cli.estimators import ESTIMATORS
 from reslrb_cli.guiding.tables import Guiding, Purpose
 from reslrb_cli.measure.gradients import Case, relative
-from reslrb_cli.transport.guide import CELLS, Survival, Table
+from reslrb_cli.transport.guide import Table
+from reslrb_cli.transport.roulette import CELLS, Survival
 
 pytestmark = pytest.mark.usefixtures("llvm")
 
@@ -94,7 +95,7 @@ def test_what_would_bias_is_found(fault: Any, monkeypatch: pytest.MonkeyPatch) -
 
 def replayed_from(patch: pytest.MonkeyPatch, other: Callable[[Table], Table]) -> None:
     """The replay draws from what `other` makes of its table."""
-    from reslrb_cli.integrators import light_tracer as lt
+    from reslrb_cli.integrators import reslrb as lt
     from reslrb_cli.integrators.reslrb import Reslrb
 
     right = Reslrb._replay

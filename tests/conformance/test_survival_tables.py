@@ -16,7 +16,7 @@ from reslrb_cli.guiding.collect import FLOOR, LEAN, SURE, Onward, Walked
 from reslrb_cli.guiding.tables import Purpose, learning_seed
 from reslrb_cli.integrators.protocol import Job
 from reslrb_cli.measure.gradients import Case
-from reslrb_cli.transport.guide import BITS, CELLS, LEAST, SHAPE, Survival
+from reslrb_cli.transport.roulette import BITS, CELLS, LEAST, SHAPE, Survival
 
 pytestmark = pytest.mark.usefixtures("llvm")
 

@@ -67,7 +67,7 @@ def test_roulette_by_throughput_alone_loses_what_follows_a_dark_surface(monkeypa
 
 @pytest.mark.long
 def test_roulette_by_power_loses_dim_lamps(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr("reslrb_cli.transport.walk.DIMMEST", 1.0)
+    monkeypatch.setattr("reslrb_cli.transport.roulette.DIMMEST", 1.0)
     assert lost("emission_1e-25_roulette", "gather")
 
 

@@ -7,7 +7,7 @@ import types
 import drjit as dr
 import pytest
 
-from reslrb_cli.integrators.protocol import Refused
+from reslrb_cli.integrators.step import Refused
 from reslrb_cli.optimization import loop
 
 

@@ -1,8 +1,6 @@
-"""The random numbers of a light path, independent or of low discrepancy.
+"""Numbers of low discrepancy: Sobol's points, scrambled.
 
-Independent ones are drawn in the order of Mitsuba's `ptracer`, used or not: from one seed both trace the same paths.
-
-Numbers of low discrepancy have where light paths start, and how they first scatter, evenly spread over all paths. The
+They have where light paths start, and how they first scatter, evenly spread over all paths. The
 first number is stratified: lane i of n has it in the i-th n-th of [0, 1). So n need be no power of two, and paths
 that start alike are traced side by side. The others are Sobol's points with the lanes' numbers for indices. Of 2^k
 lanes in a row that begin at a multiple of 2^k, every box of area 2^-k along the first two of these, whose sides are
@@ -20,45 +18,13 @@ Digits are kept in reverse order, the first one lowest: sums and products carry 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache
-from typing import Protocol
 
 import drjit as dr
 import mitsuba as mi
 
-
-@dataclass
-class Numbers:
-    """What one segment draws: a point on the sensor's aperture, then two numbers and one for the BSDF."""
-
-    aperture: mi.Point2f
-    bsdf_2d: mi.Point2f
-    bsdf_1d: mi.Float
-
-    @staticmethod
-    def draw(sampler: mi.Sampler, active: mi.Bool) -> Numbers:
-        """The numbers of the next segment. Roulette's follows them, and is drawn by the walk."""
-        return Numbers(sampler.next_2d(active), sampler.next_2d(active), sampler.next_1d(active))
-
-    def of_early(self, early: list[Early], depth: mi.UInt32) -> Numbers:
-        """The same, but those for the BSDF as `early` has them for the first vertices; the first is of depth 1."""
-        bsdf = Early(self.bsdf_2d, self.bsdf_1d)
-        for bounce, own in enumerate(early):
-            bsdf = dr.select(depth == bounce + 1, own, bsdf)
-        return replace(self, bsdf_2d=bsdf.bsdf_2d, bsdf_1d=bsdf.bsdf_1d)
-
-
-@dataclass
-class Early:
-    """What the BSDF of one of the first vertices has, known before the path is traced."""
-
-    bsdf_2d: mi.Point2f
-    bsdf_1d: mi.Float
-
-
 DIGITS = 32
-
 
 #: Of each coordinate behind the first: the inner coefficients of its polynomial, one bit each, and its first numbers m.
 JOE_KUO: tuple[tuple[int, tuple[int, ...]], ...] = (
@@ -72,7 +38,6 @@ JOE_KUO: tuple[tuple[int, tuple[int, ...]], ...] = (
     (4, (1, 1, 5, 5, 5)),
     (7, (1, 1, 7, 11, 19)),
 )
-
 
 #: Scattering events whose numbers are coordinates: through a pane of glass, or around a corner.
 BOUNCES = 2
@@ -181,11 +146,3 @@ class Points:
 def _float(digits: mi.UInt32) -> mi.Float:
     """In [0, 1), of digits of which the first is the highest bit."""
     return mi.Float(digits >> 8) * 2.0**-24
-
-
-class Numbered(Protocol):
-    """What draws random numbers: a sampler, or a stream beside it."""
-
-    def next_1d(self) -> mi.Float: ...
-
-    def next_2d(self) -> mi.Point2f: ...

@@ -1,0 +1,201 @@
+"""Parameters that are differentiated, and what their derivatives ask of a walk, above all of those that move light.
+
+`Motion` says how the latter are taken, `attach` gives a plan with them. `bounces` finds out whether light that moves is
+scattered by a surface that is not specular, and then comes to be seen from another one. Only there do the two ways of
+`attached_sampling`, `follow` and `stay` (`estimators/kept.py`), differ: in a caustic of few segments light ends where
+it lands first.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+
+import drjit as dr
+import mitsuba as mi
+
+from reslrb_cli.errors import UnsupportedScene
+from reslrb_cli.scene.catalog import parameter_kind
+from reslrb_cli.scene.deformation import BEAMS, PLACES, moving_obstacle
+from reslrb_cli.scene.graph import SceneGraph, interpolates_normals
+from reslrb_cli.transport.bsdf import Scattering, stays_behind
+from reslrb_cli.transport.connection import Connection
+from reslrb_cli.transport.emission import sample_emission
+from reslrb_cli.transport.factors import Product
+from reslrb_cli.transport.plan import Plan
+from reslrb_cli.transport.samples import passes
+from reslrb_cli.transport.walk import Hooks, Vertex, walk
+
+#: Where a parameter of a BSDF is this small, paths are followed and chosen in spite of it.
+NEARLY_ZERO = 1e-2
+
+#: What is a factor of a BSDF's value, where a roughness, say, is none.
+FACTORS = ("reflectance", "transmittance", "base_color", "opacity", "weight")
+
+
+@dataclass(frozen=True)
+class Differentiated:
+    """What tracks derivatives.
+
+    `bsdf_nodes` are the nodes of BSDFs that have such parameters: textures, nested BSDFs, and meshes whose attributes
+    textures read. `emission_nodes` are those of what emitters emit: emitters, and their textures. `shapes` are those
+    that move, `emitters` those whose rays do. `least` are the parameters that are factors of a path, and the value from
+    which on downwards each counts as zero.
+    """
+
+    bsdf_nodes: tuple[mi.Object, ...]
+    emission_nodes: tuple[mi.Object, ...]
+    shapes: tuple[mi.Shape, ...]
+    emitters: tuple[mi.Emitter, ...]
+    least: dict[str, float]
+
+    @staticmethod
+    def of(params: mi.SceneParameters, keys: Iterable[str]) -> Differentiated:
+        """That of the parameters `keys`.
+
+        Raises UnsupportedScene, with the reason, for one that light tracing has no derivative for, and would silently
+        leave at zero.
+        """
+        nodes: dict[mi.Object, None] = {}
+        emitting: dict[mi.Object, None] = {}
+        shapes: dict[mi.Shape, None] = {}
+        emitters: dict[mi.Emitter, None] = {}
+        least: dict[str, float] = {}
+        for key in keys:
+            kind, node, obstacle = parameter_kind(params, key), params.properties[key][2], None
+            if kind in ("bsdf", "attribute"):
+                nodes[node] = None
+                dims = kind == "attribute" or any(name in key for name in FACTORS)
+                least[key] = NEARLY_ZERO if dims else 0
+            elif kind == "shape":
+                obstacle = moving_obstacle(node, key)
+                shapes[node] = None
+                if node.is_emitter():
+                    emitters[node.emitter()] = None
+            elif kind == "emitter" and key.rpartition(".")[2] in (*PLACES, *BEAMS):
+                obstacle = moving_obstacle(node, key)
+                emitters[node] = None
+            elif kind == "emitter":
+                emitting[node] = None
+                least[key] = 0
+            else:
+                obstacle = "light tracing has derivatives of what light meets and leaves from, not of the sensor"
+            if obstacle is not None:
+                raise UnsupportedScene(f"{key}: {obstacle}")
+        return Differentiated(tuple(nodes), tuple(emitting), tuple(shapes), tuple(emitters), least)
+
+
+@dataclass(frozen=True)
+class Motion:
+    """How derivatives of what moves light are taken.
+
+    `attached` is `auto` (where a parameter moves anything), or says so; `filter_normalization` is `attached` or
+    `detached`, `sampling` one of `auto`, `follow` and `stay`. Raises ValueError for anything else. `obstacle` is the
+    reason where an integrator has none.
+    """
+
+    attached: bool | str = "auto"
+    filter_normalization: str = "attached"
+    obstacle: str | None = None
+    sampling: str = "follow"
+
+    def __post_init__(self) -> None:
+        if self.attached not in (True, False, "auto"):
+            raise ValueError('"attached" must be auto, true or false')
+        if self.filter_normalization not in ("attached", "detached"):
+            raise ValueError('"filter_normalization" must be attached or detached')
+        if self.sampling not in ("auto", "follow", "stay"):
+            raise ValueError('"attached_sampling" must be auto, follow or stay')
+
+
+def stays(plan: Plan, sampling: str, bsdfs: Iterable[mi.BSDF]) -> tuple[bool, bool]:
+    """`Plan.stays` and `Plan.glossy_follows`, for the BSDFs of a scene's surfaces."""
+    smooth = [bsdf.flags() for bsdf in bsdfs if mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)]
+    glossy = [mi.has_flag(flags, mi.BSDFFlags.Glossy) for flags in smooth]
+    if sampling == "follow" or plan.max_depth <= 2 or not glossy:
+        return False, False  # no light goes on behind a vertex that is not specular
+    return (True, False) if sampling == "stay" else (not all(glossy), any(glossy))
+
+
+def attach(plan: Plan, which: Differentiated, motion: Motion, scene: mi.Scene, sensor: mi.Sensor) -> Plan:
+    """The plan with attached derivatives, where they are asked for. Raises UnsupportedScene where there are none."""
+    moves = bool(which.shapes or which.emitters)
+    if motion.attached is False and moves:
+        raise UnsupportedScene(
+            "attached: false leaves out the derivatives of parameters that move light; leave it at auto", "attached"
+        )
+    if not (moves or (motion.attached is True and (which.bsdf_nodes or which.emission_nodes))):
+        return plan
+    if motion.obstacle is not None:
+        raise UnsupportedScene(motion.obstacle, "estimator")
+    if plan.needs.has_null:
+        raise UnsupportedScene("attached derivatives do not go through masks and other surfaces with null lobes")
+    if sensor.film().rfilter().is_box_filter():
+        raise UnsupportedScene(
+            f"sensor {sensor.id()} has a box filter, whose splats do not change while they move inside of a pixel; "
+            "take a smooth one, such as gaussian, for derivatives of what moves light"
+        )
+    if any(interpolates_normals(shape) for shape in which.shapes):
+        plan = with_shading_normals(plan)  # a flat mesh is about to bend
+    staying, glossy_follows = stays(plan, motion.sampling, SceneGraph.of(scene).surface_bsdfs())
+    return replace(
+        plan,
+        attached=True,
+        stays=staying,
+        glossy_follows=glossy_follows,
+        moving_shapes=which.shapes,
+        moving_emitters=which.emitters,
+        attached_normalization=motion.filter_normalization == "attached",
+    )
+
+
+def with_shading_normals(plan: Plan) -> Plan:
+    """The plan of a scene whose interpolated normals differ from its geometric ones."""
+    return replace(plan, needs=replace(plan.needs, has_shading_normals=True))
+
+
+#: Light paths that are looked at: of what they do not meet, the part in a derivative is small.
+PATHS = 2**16
+
+#: What is found is to be the same for all runs of a scene.
+SEED = 0xB0A2CE
+
+
+def bounces(plan: Plan, scene: mi.Scene, sensor: mi.Sensor) -> bool:
+    """Whether any of so many paths is such; `plan` is one with attached derivatives in which vertices stay."""
+    width, height = sensor.film().size()
+    spp = max(PATHS // int(width * height), 1)
+    with dr.suspend_grad():
+        [samples, *_] = passes(plan, scene, sensor, dr.opaque(mi.UInt32, SEED), spp, None)
+        found: Bounced = walk(samples, BouncedLight(plan, sample_emission(samples, samples.sampler()).emitter))
+        return bool(dr.any(found.seen))
+
+
+@dataclass
+class Bounced:
+    """Loop state: whether the path has met anything that moves, has then bounced, and has then been seen."""
+
+    moved: mi.Bool
+    bounced: mi.Bool
+    seen: mi.Bool
+
+
+class BouncedLight(Hooks):
+    """Follow what moves through bounces."""
+
+    def __init__(self, plan: Plan, emitter: mi.EmitterPtr) -> None:
+        self.plan, self.emitter = plan, emitter
+
+    def start(self, product: Product) -> Bounced:
+        moved = mi.Bool(False)
+        for moving in self.plan.moving_emitters:
+            moved |= self.emitter == mi.EmitterPtr(moving)
+        return Bounced(moved, mi.Bool(False), mi.Bool(False))
+
+    def connection(self, state: Bounced, vertex: Vertex, connection: Connection, numbers: list[mi.Float]) -> Bounced:
+        return Bounced(state.moved, state.bounced, state.seen | (connection.active & state.bounced))
+
+    def scattering(self, state: Bounced, vertex: Vertex, connection: Connection, scattering: Scattering) -> Bounced:
+        moved = state.moved | self.plan.moves(vertex.si.shape) | self.plan.differentiates(vertex.bsdf)
+        staying = scattering.active & stays_behind(self.plan, vertex.bsdf, scattering.is_delta)
+        return Bounced(moved, state.bounced | (moved & staying), state.seen)

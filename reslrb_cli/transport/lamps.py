@@ -1,0 +1,130 @@
+"""Points on lamps, shapes that emit, and the rays that leave them.
+
+Light is sampled here (`lamp_ray`) where Mitsuba's own samples are wrong, or lack a derivative:
+
+sphere             Mitsuba turns the points of a sphere with its `to_world`, and not their normals
+directionalarea    it remembers the area that the shape had when it was loaded
+mesh that moves    it draws a face in proportion to its area, and so divides by the area of the whole. Both are
+                   constants to it; the density on face f is P_f / A_f(theta), of which P_f alone is one
+textured mesh that moves
+                   its points are looked up by a ray in the plane of texture coordinates, and Mitsuba differentiates
+                   them as if they moved along that ray
+textured lamp whose texture is differentiated
+                   it draws texels in proportion to their radiance, and so none that are black, which have derivatives
+                   as large as any
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import drjit as dr
+import mitsuba as mi
+
+from reslrb_cli.scene.graph import Lamp
+
+DEFENSIVE = 0.1  # share of what is drawn uniformly, not in proportion to radiance that is differentiated
+
+
+def lamp_ray(
+    lamp: Lamp, areas: mi.Float | None, time: mi.Float, wavelength_sample: mi.Float, position: mi.Point2f,
+    direction: mi.Point2f, active: mi.Bool, evened: bool = False,
+) -> tuple[mi.Ray3f, mi.Spectrum]:  # fmt: skip
+    """A ray that leaves the lamp, and radiance over density (C,), from the numbers that Mitsuba takes.
+
+    `areas` are the sums of `sums_of_areas` for a mesh whose faces move, else None; `evened`: black texels are drawn,
+    too.
+    """
+    si, weight = lamp_point(lamp, areas, time, position, active, evened)
+    _, radiance = lamp.emitter.sample_wavelengths(si, wavelength_sample, active)
+    if lamp.parallel:
+        d = mi.Vector3f(si.sh_frame.n)  # of a mesh the interpolated one, as Mitsuba has it
+    else:
+        d, weight = si.to_world(mi.warp.square_to_cosine_hemisphere(direction)), weight * dr.pi
+    si.time = time
+    return si.spawn_ray(d), radiance * weight
+
+
+def lamp_point(
+    lamp: Lamp, areas: mi.Float | None, time: mi.Float, sample: mi.Point2f, active: mi.Bool, evened: bool = False
+) -> tuple[mi.SurfaceInteraction3f, mi.Float]:
+    """A point of the lamp, and the reciprocal of its density; both move with the lamp."""
+    if lamp.texture is not None and lamp.has_faces:
+        return _textured_point(lamp.shape, lamp.texture, sample, active, evened)
+    if lamp.texture is not None and evened:
+        ps, weight = _any_point(lamp.shape, lamp.texture, time, sample, active)
+    else:
+        ps, weight = lamp.emitter.sample_position(time, sample, active)
+    if lamp.is_sphere:
+        center = mi.traverse(lamp.shape)["to_world"] @ mi.Point3f(0)
+        outward = dr.normalize(ps.p - center)
+        ps.n = mi.Normal3f(-outward if lamp.shape.has_flipped_normals() else outward)
+    if areas is not None:
+        face = drawn_face(areas, sample.y)
+        area = face_area(lamp.shape, face)
+        weight = weight * (area / dr.detach(area))
+        si = mi.SurfaceInteraction3f(ps, mi.Color0f())
+        si.n = lamp.shape.face_normal(face)  # rays start off the face; they leave about `ps.n`, which is interpolated
+        return si, weight
+    return mi.SurfaceInteraction3f(ps, mi.Color0f()), weight
+
+
+def _textured_point(
+    mesh: mi.Mesh, texture: mi.Texture, sample: mi.Point2f, active: mi.Bool, evened: bool
+) -> tuple[mi.SurfaceInteraction3f, mi.Float]:
+    """The point that Mitsuba draws from a texture, or any, which stays where it is within its face as that moves."""
+    uv, density = _any_uv(texture, sample, active) if evened else texture.sample_position(sample, active)
+    active = active & (density != 0)
+    there = mesh.eval_parameterization(uv, mi.RayFlags.All | mi.RayFlags.FollowShape, active)
+    si = mi.SurfaceInteraction3f(mi.PositionSample3f(there), mi.Color0f())
+    si.n = there.n
+    return si, _weight(there, density, active)
+
+
+def _any_point(
+    shape: mi.Shape, texture: mi.Texture, time: mi.Float, sample: mi.Point2f, active: mi.Bool
+) -> tuple[mi.PositionSample3f, mi.Float]:
+    """What Mitsuba's emitter draws from a texture on a shape, or any other point of it."""
+    uv, density = _any_uv(texture, sample, active)
+    there = shape.eval_parameterization(uv, mi.RayFlags.All, active)
+    there.time = time
+    return mi.PositionSample3f(there), _weight(there, density, active)
+
+
+def _weight(there: mi.SurfaceInteraction3f, density: mi.Float, active: mi.Bool) -> mi.Float:
+    """The reciprocal of the density over area of a point that was drawn with this density of texture coordinates."""
+    return dr.select(active & there.is_valid(), dr.norm(dr.cross(there.dp_du, there.dp_dv)) / density, 0)
+
+
+def _any_uv(texture: mi.Texture, sample: mi.Point2f, active: mi.Bool) -> tuple[mi.Point2f, mi.Float]:
+    """Texture coordinates from a mixture of the texture's own density and the uniform one, and their density."""
+    with dr.suspend_grad():
+        even = sample.x < DEFENSIVE
+        x = dr.select(even, sample.x / DEFENSIVE, (sample.x - DEFENSIVE) / (1 - DEFENSIVE))
+        sample = mi.Point2f(x, sample.y)
+        uv, density = texture.sample_position(sample, active)
+        black = ~dr.isfinite(density)  # the whole texture: there is nothing in proportion to which to draw
+        uv = dr.select(even | black, sample, uv)
+        own = texture.pdf_position(uv, active)
+        return uv, dr.select(black, 1, (1 - DEFENSIVE) * own + DEFENSIVE)
+
+
+def drawn_face(areas: mi.Float, sample: mi.Float) -> mi.UInt32:
+    """The face that Mitsuba draws with this number, by these sums of areas."""
+    last = dr.width(areas) - 1
+    value = sample * dr.gather(mi.Float, areas, mi.UInt32(last))
+    return dr.binary_search(0, last, lambda index: dr.gather(mi.Float, areas, index) < value)
+
+
+def sums_of_areas(lamps: Sequence[Lamp]) -> list[mi.Float]:
+    """Of each lamp, a mesh, the areas of its first faces, summed: (F,), evaluated and detached."""
+    with dr.suspend_grad():
+        found = [dr.cumsum(face_area(lamp.shape, dr.arange(mi.UInt32, lamp.shape.face_count()))) for lamp in lamps]
+        dr.eval(found)
+        return found
+
+
+def face_area(mesh: mi.Mesh, face: mi.UInt32) -> mi.Float:
+    """The area of a face of a mesh."""
+    a, b, c = (mesh.vertex_position(vertex) for vertex in mesh.face_indices(face))
+    return 0.5 * dr.norm(dr.cross(b - a, c - a))

@@ -1,0 +1,113 @@
+"""Russian roulette: on throughput, as in `ptracer`, and learned, by where a path goes.
+
+Learned: paths that go where earlier ones had little left to say end early. The scene's bounding box is cut into cubes,
+and the directions of each cube into octants. A path that leaves a vertex with throughput w (the largest channel,
+emission and the weights of earlier roulette included) goes on with probability
+
+    q = min(1, max(LEAST, w s))        s: the number of the cell that the vertex and the new direction lie in
+
+and counts for 1 / q if it does. The mean of whatever is computed from paths stays what it was for any s that does not
+depend on the random numbers that it is used with. How s is learned says `guiding/collect.py`.
+
+The more a path has been weighted up, the larger is its w, and so its q: since q is at least w s where it is below 1, no
+throughput is raised beyond 1 / s_0, where s is nowhere below s_0. Roulette on throughput alone is played beside it from
+`rr_depth` on, so that paths end that nothing else would end.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from reslrb_cli.backend.memory import own_memory
+from reslrb_cli.transport.plan import Plan
+
+Array = np.ndarray[Any, Any]
+
+LIMIT = 0.95  # the largest probability of going on by throughput alone, as in `ptracer`
+DIMMEST = 1e-30  # the least emission that roulette knows, well above what single precision rounds to zero
+BITS = 4  # cubes along each axis of the box, log2
+OCTANTS = 8
+CELLS = OCTANTS << (3 * BITS)
+SHAPE = (1 << BITS, 1 << BITS, 1 << BITS, OCTANTS)  # of an array of all cells
+LEAST = 0.5  # the smallest probability of going on
+
+
+@dataclass
+class Survival:
+    """`chances` (CELLS) are s of all cells; `corner` is where the box begins, `cubes` how many there are to a unit of
+    length along each axis. The latter two are opaque."""
+
+    chances: mi.Float
+    corner: mi.Point3f
+    cubes: mi.Vector3f
+
+    @staticmethod
+    def of(box: Array, chances: Array) -> Survival:
+        """For a box (2, 3), its lower and its upper corner."""
+        cubes = (1 << BITS) / np.where(box[1] > box[0], box[1] - box[0], np.inf)
+        own = own_memory(mi.Float, chances.astype(np.float32))
+        corner, per_unit = (
+            kind(*(dr.opaque(mi.Float, float(x)) for x in values))
+            for kind, values in ((mi.Point3f, box[0]), (mi.Vector3f, cubes))
+        )
+        return Survival(own, corner, per_unit)
+
+    @staticmethod
+    def certain() -> Survival:
+        """That of somebody who has learned nothing: all paths go on."""
+        return Survival.of(np.zeros((2, 3)), np.full(CELLS, np.inf))
+
+    def cell(self, o: mi.Point3f, d: mi.Vector3f) -> mi.UInt32:
+        """The cell of a ray that leaves `o`; what lies outside of the box counts to the nearest cube."""
+        place, most = dr.detach((o - self.corner) * self.cubes), (1 << BITS) - 1
+        result = mi.UInt32(0)
+        for k in range(3):
+            # A second bound in integers: what NaN becomes is not defined, and may not leave the table.
+            result = (result << BITS) | dr.minimum(mi.UInt32(dr.clip(place[k], 0, most)), most)
+        for k in range(3):
+            result = (result << 1) | dr.select(d[k] > 0, mi.UInt32(1), 0)
+        return result
+
+    def probability(self, o: mi.Point3f, d: mi.Vector3f, throughput: mi.Float) -> mi.Float:
+        """q of a ray that leaves `o` along `d`; detached."""
+        # A throughput that is not a number has q = LEAST: it is to be seen, not to vanish.
+        chance = dr.gather(mi.Float, self.chances, self.cell(o, d))
+        return dr.fmin(dr.fmax(dr.detach(throughput) * chance, LEAST), 1)
+
+
+def box_of(scene: mi.Scene) -> Array:
+    """The box (2, 3) of a scene's shapes, float32; of size 0 where it has none."""
+    bounds = scene.bbox()
+    box = np.array([np.array(bounds.min).ravel(), np.array(bounds.max).ravel()], np.float32)
+    return box if np.isfinite(box).all() and (box[1] >= box[0]).all() else np.zeros((2, 3), np.float32)
+
+
+def first_eta(light: mi.Float, guided: mi.Float | None) -> mi.Float:
+    """What a path's index of refraction begins with, for roulette alone: larger where emission, `light`, is dim.
+
+    Else light of small lamps, or in large units, would end at once. `guided` is what a guide has brought in, without
+    which this is computed: paths that it has found would end for being many.
+    """
+    if guided is None:
+        return dr.rsqrt(dr.clip(light, DIMMEST, 1))
+    return dr.rsqrt(dr.clip(light / guided, DIMMEST, 1)) * dr.rsqrt(guided)
+
+
+def play(
+    plan: Plan, survival: Survival | None, depth: mi.UInt32, throughput: mi.Float, eta: mi.Float, o: mi.Point3f,
+    d: mi.Vector3f, number: mi.Float,
+) -> tuple[mi.Bool, mi.Float]:  # fmt: skip
+    """Where a path goes on from vertex `depth`, which it leaves with the ray (o, d), and what it then counts for."""
+    q, playing = mi.Float(1), mi.Bool(False)
+    if plan.roulette:
+        q = dr.minimum(throughput * dr.square(eta), LIMIT)
+        playing = depth + 1 > plan.rr_depth
+    if survival is not None:
+        learned = survival.probability(o, d, throughput)
+        q, playing = dr.minimum(dr.select(playing, q, 1), learned), mi.Bool(True)
+    return ~playing | (number < q), dr.select(playing, dr.rcp(q), 1)
