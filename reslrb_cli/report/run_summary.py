@@ -16,7 +16,7 @@ from textwrap import wrap
 from typing import Any
 
 from reslrb_cli.records.decisions import PaidRecord, RivalRecord
-from reslrb_cli.report.format import count, duration, number, shorten, with_error
+from reslrb_cli.report.format import count, duration, line, number, shorten, with_error
 
 #: The verdict on a value that can be relied on, as recorded; all others say what keeps it from that.
 SETTLED, MOVING, UNDETERMINED = "settled", "still moving", "not determined"
@@ -407,11 +407,8 @@ def _table(keys: Sequence[str], titles: Sequence[str], rows: Sequence[Sequence[s
     first = min(max(map(len, (HEAD, *keys))), WIDEST_KEY, left)
     if first < min(max(map(len, keys)), NARROWEST_KEY):
         return []
-    lines = []
-    for key, row in [(HEAD, titles), *zip(keys, rows, strict=True)]:
-        cells = [shorten(key, first).ljust(first), *(cell.ljust(size) for cell, size in zip(row, widths, strict=True))]
-        lines.append(GAP.join(cells).rstrip())
-    return lines
+    named = [(HEAD, titles), *zip(keys, rows, strict=True)]
+    return [line([shorten(key, first), *row], [first, *widths]) for key, row in named]
 
 
 def _blocks(keys: Sequence[str], titles: Sequence[str], rows: Sequence[Sequence[str]], width: int) -> list[str]:
