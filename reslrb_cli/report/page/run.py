@@ -20,13 +20,13 @@ from markupsafe import Markup
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.optimization.autotune.efficiency import Outcome
 from reslrb_cli.optimization.correlated_bias import CorrelatedBias, share_words
-from reslrb_cli.records.decisions import GuidedRecord, SequenceRecord
+from reslrb_cli.records.decisions import GuidedRecord, RivalRecord, SequenceRecord
 from reslrb_cli.records.measurement_files import Origin
 from reslrb_cli.report.format import count, duration, number
 from reslrb_cli.report.page.images import image_rows, seen_tables, view_table
 from reslrb_cli.report.page.layout import Words, facts, key, lay_out, soft, table
 from reslrb_cli.report.page.values import convergence, parameter_table, texture_pictures
-from reslrb_cli.report.run_summary import certainty_words, error_line, paid_line, rival_line, units_differ, warnings
+from reslrb_cli.report.run_summary import certainty_words, error_line, measured_line, units_differ, warnings
 from reslrb_cli.report.sources import Run
 
 #: Steps that are left out of medians: the first ones compile kernels.
@@ -321,9 +321,9 @@ def record_parts(run: Run) -> dict[str, Markup]:
         "Plan": lambda: plan_table(manifest.get("plan")),
         "Choice of the estimator": lambda: (
             pilot_table(manifest.get("pilot"))
-            + soft(paid_line(GuidedRecord, manifest.get("guided")))
-            + soft(paid_line(SequenceRecord, manifest.get("sequence")))
-            + soft(rival_line(manifest.get("rival")))
+            + soft(measured_line(GuidedRecord, manifest.get("guided")))
+            + soft(measured_line(SequenceRecord, manifest.get("sequence")))
+            + soft(measured_line(RivalRecord, manifest.get("rival")))
         ),
         "Bias of correlated samples": lambda: correlated_bias_table(manifest.get("correlated_bias")),
         "Scale of the parameters": lambda: scaling_table(manifest.get("scaling")),
