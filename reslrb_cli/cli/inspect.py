@@ -25,6 +25,7 @@ from reslrb_cli.config.schema import Config
 from reslrb_cli.config.yaml_text import parse, write
 from reslrb_cli.errors import ConfigError, UnsupportedScene
 from reslrb_cli.records.manifest import read_manifest
+from reslrb_cli.report.format import table
 
 if TYPE_CHECKING:
     from reslrb_cli.integrators.plan_report import PlanReport
@@ -131,22 +132,13 @@ def plan_lines(report: PlanReport) -> list[str]:
     if report.kernels is not None:
         each = " + ".join(map(str, report.kernels))
         lines.append(f"estimator {report.estimator}, kernels of {each} operations")
-    rows = [
-        (
-            "needed" if row.needed else "left out",
-            row.feature,
-            "" if row.operations_with is None else str(row.operations_with),
-            "" if row.operations_without is None else str(row.operations_without),
-            row.reason + (f" ({row.note})" if row.note else ""),
-        )
-        for row in sorted(report.rows, key=lambda row: not row.needed)
-    ]
-    table = [("", "", "with", "without", "")] * (report.kernels is not None) + rows
-    widths = [max(len(row[column]) for row in table) for column in range(4)]
-    for a, b, c, d, reason in table:
-        counts = f"  {c.rjust(widths[2])}  {d.rjust(widths[3])}" if report.kernels is not None else ""
-        lines.append(f"{a.ljust(widths[0])}  {b.ljust(widths[1])}{counts}  {reason}".rstrip())
-    return lines
+    rows = [["", "", "with", "without", ""]] if report.kernels is not None else []
+    for row in sorted(report.rows, key=lambda row: not row.needed):
+        numbers = (row.operations_with, row.operations_without)
+        counts = [] if report.kernels is None else ["" if number is None else str(number) for number in numbers]
+        why = row.reason + (f" ({row.note})" if row.note else "")
+        rows.append(["needed" if row.needed else "left out", row.feature, *counts, why])
+    return lines + table(rows, "<<>><" if report.kernels is not None else "<")
 
 
 # --- parameters -------------------------------------------------------------------------------------------------------
@@ -163,12 +155,12 @@ def parameter_lines(infos: Sequence[ParameterInfo], wanted: Sequence[str], every
     shown = usable if everything else sorted(usable, key=lambda info: info.key not in marked)[:_LISTED]
     rows = [("* " * (info.key in marked) + info.key, _noted(info)) for info in shown]
     note = " (* in `parameters`)" if marked else ""
-    lines = [f"can be recovered: {len(usable) or 'none'}{note}", *(f"  {line}" for line in _columns(rows))]
+    lines = [f"can be recovered: {len(usable) or 'none'}{note}", *(f"  {line}" for line in table(rows))]
     if len(shown) < len(usable):
         lines.append(f"  and {len(usable) - len(shown)} more; --all lists them")
     if everything:
-        table = [(info.key, _value(info), _flags(info), str(info.obstacle)) for info in others]
-        return [*lines, f"others: {len(others)}", *(f"  {line}" for line in _columns(table))]
+        told = [(info.key, _value(info), _flags(info), str(info.obstacle)) for info in others]
+        return [*lines, f"others: {len(others)}", *(f"  {line}" for line in table(told))]
     if others:
         lines.append(f"others: {len(others)}; --all lists them")
         lines += [f"  {line}" for line in _reasons(others)]
@@ -179,7 +171,7 @@ def moving_lines(movable: Sequence[MovableSummary], everything: bool) -> list[st
     """What can be moved, and by what."""
     lines = [f"can be moved: {len(movable) or 'nothing'}"]
     if everything:
-        return lines + [f"  {line}" for line in _columns([(item.id, ", ".join(item.by)) for item in movable])]
+        return lines + [f"  {line}" for line in table([(item.id, ", ".join(item.by)) for item in movable])]
     groups: dict[str, list[str]] = {}
     for item in movable:
         groups.setdefault(" and ".join(item.by), []).append(item.id)
@@ -195,16 +187,8 @@ def _reasons(others: Sequence[ParameterInfo]) -> list[str]:
     for info in others:
         # What comes in brackets differs from one to the next.
         groups.setdefault(str(info.obstacle).partition(" (")[0].partition(";")[0], []).append(info.key)
-    width = len(str(max(map(len, groups.values()))))
     counted = sorted(groups.items(), key=lambda group: -len(group[1]))
-    return [f"{len(keys):{width}}  {reason}" for reason, keys in counted]
-
-
-def _columns(rows: Sequence[tuple[str, ...]]) -> list[str]:
-    if not rows:
-        return []
-    widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
-    return ["  ".join(text.ljust(width) for text, width in zip(row, widths, strict=True)).rstrip() for row in rows]
+    return table([(str(len(keys)), reason) for reason, keys in counted], "><")
 
 
 def _value(info: ParameterInfo) -> str:
@@ -229,8 +213,7 @@ def _noted(info: ParameterInfo) -> str:
 
 
 def _flags(info: ParameterInfo) -> str:
-    flags = ["differentiable" if info.differentiable else "not differentiable"]
-    return ", ".join([*flags, *(["discontinuous"] if info.discontinuous else [])])
+    return ("" if info.differentiable else "not ") + "differentiable" + ", discontinuous" * info.discontinuous
 
 
 def plain(value: object) -> Any:

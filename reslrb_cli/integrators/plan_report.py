@@ -42,9 +42,8 @@ class Feature:
     """One feature of a plan.
 
     `needed(plan)` says whether it is part of it; `present` (of a plan that has it) and `absent` say why. `toggle(plan)`
-    is the plan without it,
-    or with it, or the reason why there is no such plan; None: the step has it once all `parameters` of that kind are
-    differentiated.
+    is the plan without it, or with it, or the reason why there is no such plan; None: the step has it once all
+    `parameters` of that kind are differentiated.
     """
 
     name: str
@@ -91,32 +90,20 @@ def _zeros(plan: Plan) -> Plan | str:
     return replace(plan, track_zeros=not plan.track_zeros)
 
 
-def _delta(plan: Plan) -> Plan | str:
-    if not (plan.needs.has_delta_lobes and plan.differentiate_bsdfs):
-        return "there are no delta lobes, or no BSDF is differentiated"
-    return replace(plan, differentiate_delta=not plan.differentiate_delta)
+def _derivatives(need: str, member: str, absent: str) -> Callable[[Plan], Plan | str]:
+    """Toggle the derivatives of BSDFs with a property that the scene has to need; `absent` names what is missing."""
 
+    def toggle(plan: Plan) -> Plan | str:
+        if not (getattr(plan.needs, need) and plan.differentiate_bsdfs):
+            return f"there are no {absent}, or no BSDF is differentiated"
+        change: dict[str, Any] = {member: not getattr(plan, member)}
+        return replace(plan, **change)
 
-def _null(plan: Plan) -> Plan | str:
-    if not (plan.needs.has_null and plan.differentiate_bsdfs):
-        return "there are no such surfaces, or no BSDF is differentiated"
-    return replace(plan, differentiate_null=not plan.differentiate_null)
-
-
-def _attached(plan: Plan) -> Plan | str:
-    if not plan.attached:
-        return "nothing moves"
-    return "without them parameters that move light have no derivative"
+    return toggle
 
 
 def _at_rest(plan: Plan) -> Plan | str:
     return replace(plan, moving_emitters=()) if plan.moving_emission else "no emitter has a parameter that moves it"
-
-
-def _seen_moving(plan: Plan) -> Plan | str:
-    if not plan.visible_moving_lamps:
-        return "no lamp moves, or none is to be seen"
-    return "goes with visible emitters, and with moving ones"
 
 
 def _small(plan: Plan) -> Plan | str:
@@ -135,10 +122,6 @@ def _evened(plan: Plan) -> Plan | str:
         return replace(plan, evened_lamps=())
     textured = tuple(lamp for lamp in plan.needs.lamps if lamp.texture is not None)
     return replace(plan, evened_lamps=textured) if textured else "no lamp has a texture"
-
-
-def _placed(plan: Plan) -> Plan | str:
-    return "what Mitsuba makes of them is wrong" if plan.placed_lamps else "there are none"
 
 
 def _normalization(plan: Plan) -> Plan | str:
@@ -179,14 +162,6 @@ def _sequence(plan: Plan) -> Plan:
     return replace(plan, sequence=make_coordinates([True] * 4, len(plan.needs.emitters), plan.max_depth))
 
 
-def _several(plan: Plan) -> Plan | str:
-    return "follows from the number of emitters, in Mitsuba itself"
-
-
-def _emission(plan: Plan) -> Plan | None:
-    return replace(plan, differentiate_emission=False) if plan.differentiate_emission else None
-
-
 def _bsdfs(plan: Plan) -> Plan | None:
     if plan.differentiate_bsdfs:
         return plan.differentiating(False, plan.differentiate_emission, plan.track_zeros)
@@ -203,7 +178,7 @@ FEATURES = (
     Feature("visible emitters", lambda p: p.visible_emission, "an emitter may be seen directly",
             "hidden, or points and directions alone", _visible),
     Feature("several emitters", lambda p: len(p.needs.emitters) > 1, "one is drawn for each path",
-            "the only one is sampled", _several),
+            "the only one is sampled", lambda p: "follows from the number of emitters, in Mitsuba itself"),
     Feature("environment map", lambda p: p.environment_map, "its rays are placed by the walk",
             "none emits", _environment),
     Feature("roulette", lambda p: p.roulette, "rr_depth is below max_depth", "max_depth ends paths first", _roulette),
@@ -230,17 +205,19 @@ FEATURES = (
             "something may stand outside of them, or it focuses there", "the scene is between them, or none is a lens",
             _needs("lens_clip")),
     Feature("derivatives of emission", lambda p: p.differentiate_emission, "parameters of emitters",
-            "no parameter of an emitter", _emission, EMITTERS),
+            "no parameter of an emitter",
+            lambda p: replace(p, differentiate_emission=False) if p.differentiate_emission else None, EMITTERS),
     Feature("derivatives of BSDFs", lambda p: p.differentiate_bsdfs, "parameters of BSDFs",
             "no parameter of a BSDF: no path is replayed", _bsdfs, BSDFS),
     Feature("derivatives of all BSDFs", lambda p: p.differentiate_bsdfs and not p.only_bsdfs,
             "each has a parameter", "others have no parameter", _all_bsdfs, BSDFS),
     Feature("derivatives of delta lobes", lambda p: p.differentiate_delta, "a BSDF with parameters has such lobes",
-            "no BSDF with parameters has any", _delta),
+            "no BSDF with parameters has any", _derivatives("has_delta_lobes", "differentiate_delta", "delta lobes")),
     Feature("derivatives of null surfaces", lambda p: p.differentiate_null, "a BSDF with parameters is see-through",
-            "no BSDF with parameters is", _null),
+            "no BSDF with parameters is", _derivatives("has_null", "differentiate_null", "such surfaces")),
     Feature("attached derivatives", lambda p: p.attached, "a parameter moves what light leaves from or meets",
-            "nothing moves: directions and film positions are constants", _attached),
+            "nothing moves: directions and film positions are constants",
+            lambda p: "without them parameters that move light have no derivative" if p.attached else "nothing moves"),
     Feature("vertices that stay", lambda p: p.attached and p.stays,
             "behind diffuse bounces light goes on to the same place, so that edges at rest count",
             "all follow: nothing that moves is seen behind a diffuse bounce, or attached_sampling: follow", _staying),
@@ -248,11 +225,13 @@ FEATURES = (
             "emitters are at rest", _at_rest),
     Feature("moving lamps in view", lambda p: bool(p.visible_moving_lamps),
             "their outline moves in the image; what they cover, and shadows, do not", "no lamp that moves is seen",
-            _seen_moving),
+            lambda p: "goes with visible emitters, and with moving ones" if p.visible_moving_lamps
+            else "no lamp moves, or none is to be seen"),
     Feature("small lamps in view", lambda p: bool(p.small_lamps), "found by points on them, not by rays through pixels",
             "no lamp in view is smaller than a pixel", _small),
     Feature("placed lamps", lambda p: bool(p.placed_lamps), "spheres, parallel lamps, meshes that move: by the walk",
-            "Mitsuba samples all emitters", _placed),
+            "Mitsuba samples all emitters",
+            lambda p: "what Mitsuba makes of them is wrong" if p.placed_lamps else "there are none"),
     Feature("black texels of lamps", lambda p: bool(p.evened_lamps), "drawn too, since their derivative counts",
             "no texture of a lamp is differentiated: texels are drawn by their radiance", _evened),
     Feature(GUIDED, lambda p: p.grid is not None, _tables, "guiding: off", _guided),

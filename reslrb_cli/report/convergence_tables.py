@@ -21,7 +21,7 @@ from reslrb_cli.records.measurements import (
     RunMethodRecord,
     RunPointRecord,
 )
-from reslrb_cli.report.format import count, number, shorten
+from reslrb_cli.report.format import count, line, number, shorten
 
 #: Characters that a parameter's key may take.
 KEY_WIDTH = 28
@@ -69,9 +69,7 @@ class Table:
         return self._line(cells)
 
     def _line(self, cells: tuple[str, ...]) -> str:
-        parts = [f"{cell:<{width}}" for cell, width in zip(cells, self._widths, strict=False)]
-        parts += [f"{cell:>{width}}" for cell, width in zip(cells[2:], _WIDTHS[2:], strict=False)]
-        return "  ".join(parts).rstrip()
+        return line(cells, (*self._widths, *_WIDTHS[2:]), "<<>")
 
 
 def _range(value: Range | None) -> str:
@@ -111,13 +109,13 @@ def notes(records: Sequence[MethodRecord]) -> list[str]:
 def reference_line(record: ReferenceRecord) -> str:
     """What stands behind the errors of one parameter."""
     floor = record.message if record.reference_rmse is None else f"known to {record.reference_rmse:.2g}"
-    line = f"{shorten(record.parameter, KEY_WIDTH)}: {floor}, {record.repeats} steps of {record.method.label}"
+    words = f"{shorten(record.parameter, KEY_WIDTH)}: {floor}, {record.repeats} steps of {record.method.label}"
     if record.bias_z is not None:
         verdict = {True: "DIFFERS from", False: "agrees with", None: "not decided against"}[record.biased]
-        line += (
+        words += (
             f"; {verdict} {record.bias_reference}: max |z| {abs(record.bias_z):.1f} (limit {record.bias_z_limit:.1f})"
         )
-    return line
+    return words
 
 
 # --- the closing sentence ---------------------------------------------------------------------------------------------
@@ -210,9 +208,7 @@ class RunsTable:
                            band(record.first_s, 3), band(record.loss, 4), band(record.parameter_error, 4)))  # fmt: skip
 
     def _line(self, cells: tuple[str, ...]) -> str:
-        parts = [f"{cells[0]:<{self._width}}"]
-        parts += [f"{cell:>{width}}" for cell, width in zip(cells[1:], _RUNS_WIDTHS[1:], strict=False)]
-        return "  ".join(parts).rstrip()
+        return line(cells, (self._width, *_RUNS_WIDTHS[1:]), "<>")
 
 
 def band(value: Band | None, digits: int) -> str:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from itertools import zip_longest
 
 from reslrb_cli.errors import printable
 
@@ -59,3 +61,18 @@ def shorten(text: str, width: int) -> str:
     if kept < 2:
         return text[: max(width, 0)]
     return text[: kept - kept // 2] + ELLIPSIS + text[-(kept // 2) :]
+
+
+def line(cells: Sequence[str], widths: Sequence[int], align: str = "<") -> str:
+    """Cells that stand below those of other lines, in columns of `widths`; those that are left out are the last.
+
+    `align` has a letter for each column, `<` for flush left, `>` for flush right; its last goes for all that follow.
+    """
+    sides = align.ljust(len(cells), align[-1])
+    return "  ".join(f"{cell:{side}{width}}" for cell, side, width in zip(cells, sides, widths, strict=False)).rstrip()
+
+
+def table(rows: Sequence[Sequence[str]], align: str = "<") -> list[str]:
+    """The lines of a table, whose columns are as wide as what stands in them; `align` is as in `line`."""
+    widths = [max(map(len, column)) for column in zip_longest(*rows, fillvalue="")]
+    return [line(row, widths, align) for row in rows]

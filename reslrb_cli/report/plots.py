@@ -13,7 +13,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -32,7 +32,31 @@ from reslrb_cli.report.format import shorten
 from reslrb_cli.report.tables import integrator_name, reference_name
 from reslrb_cli.report.tonemap import color_map
 
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
 _MARKERS = "osD^vPX*<>"
+
+
+def _style(place: int) -> dict[str, Any]:
+    """How the curve of a place is drawn."""
+    return {"color": f"C{place % 10}", "marker": _MARKERS[place % len(_MARKERS)], "markersize": 5, "linewidth": 1.3}
+
+
+def _figure(inches: tuple[float, float]) -> Figure:
+    """A figure with a canvas of its own: pyplot would pick a backend for the whole process."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=inches, layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def _save(figure: Figure, path: Path, title: str) -> None:
+    """Write it as a PNG."""
+    figure.suptitle(title, fontsize="medium", parse_math=False)  # a path may hold a $
+    figure.savefig(path, format="png", dpi=150)
 
 
 #: What one curve is drawn from: a label, and records by the value of what was swept.
@@ -44,14 +68,10 @@ def plot_bench(series: Sequence[Series], path: Path, title: str, abscissa: str =
 
     Where a case ran out of memory or failed, a cross stands above the diagram of memory at that value.
     """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(11.0, 4.6), layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = _figure((11.0, 4.6))
     time_axis, memory_axis = figure.subplots(1, 2)
     for k, (label, records) in enumerate(series):
-        style = {"color": f"C{k % 10}", "marker": _MARKERS[k % len(_MARKERS)], "markersize": 5, "linewidth": 1.3}
+        style = _style(k)
         done = [(x, record) for x, record in records if record.step_ms is not None and record.peak_mib is not None]
         values = [x for x, _ in done]
         steps = [record.step_ms for _, record in done if record.step_ms is not None]
@@ -72,8 +92,7 @@ def plot_bench(series: Sequence[Series], path: Path, title: str, abscissa: str =
         crosses = " or ".join(words[end] for end in sorted(ends))
         memory_axis.set_title(f"×: {crosses}", fontsize="small", loc="left")
     time_axis.legend(fontsize="small")
-    figure.suptitle(title, fontsize="medium", parse_math=False)  # a path may hold a $
-    figure.savefig(path, format="png", dpi=150)
+    _save(figure, path, title)
 
 
 def _mark_ends(axis: Any, depths: list[int], color: Any, row: int) -> None:
@@ -98,14 +117,10 @@ def plot_convergence(
     points: Sequence[PointRecord], methods: Sequence[MethodRecord], path: Path, title: str
 ) -> None:  # fmt: skip
     """Write a PNG; the reference's own standard error is a dashed line, and biased methods say so in the legend."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
     keys = panels([record.parameter for record in methods])
     columns = min(len(keys), COLUMNS)
     rows = -(-len(keys) // columns)
-    figure = Figure(figsize=(1.0 + 6.2 * columns, 1.0 + 4.4 * rows), layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = _figure((1.0 + 6.2 * columns, 1.0 + 4.4 * rows))
     axes = figure.subplots(rows, columns, squeeze=False).ravel()
     labels = list(dict.fromkeys(record.method.label for record in methods))
     for axis, key in zip(axes, keys, strict=False):
@@ -113,8 +128,7 @@ def plot_convergence(
     for axis in axes[len(keys) :]:
         axis.set_visible(False)
     axes[0].legend(fontsize="small")
-    figure.suptitle(title, fontsize="medium", parse_math=False)  # a path may hold a $
-    figure.savefig(path, format="png", dpi=150)
+    _save(figure, path, title)
 
 
 def panels(parameters: Sequence[str]) -> list[str]:
@@ -138,7 +152,7 @@ def _draw_errors(
             continue
         drawn = True
         name = f"{label} (biased)" if record.biased else label
-        style = {"color": f"C{k % 10}", "marker": _MARKERS[k % len(_MARKERS)], "markersize": 5, "linewidth": 1.3}
+        style = _style(k)
         axis.plot([p.elapsed_s for p in curve], [p.relative_rmse for p in curve], label=name,
                   linestyle="--" if record.biased else "-", **style)  # fmt: skip
         few = [p for p in curve if p.repeats < FEW]
@@ -162,12 +176,8 @@ def _draw_errors(
 
 def plot_runs(points: Sequence[RunPointRecord], error_of: str, path: Path, title: str) -> None:
     """Write a PNG; a second panel for the error, which `error_of` names, where it is known."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
     panels = [("loss", "loss"), ("parameter_error", error_of)] if error_of else [("loss", "loss")]
-    figure = Figure(figsize=(1.0 + 6.2 * len(panels), 5.2), layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = _figure((1.0 + 6.2 * len(panels), 5.2))
     axes = figure.subplots(1, len(panels), squeeze=False).ravel()
     labels = list(dict.fromkeys(point.method.label for point in points))
     for axis, (of, name) in zip(axes, panels, strict=True):
@@ -178,8 +188,7 @@ def plot_runs(points: Sequence[RunPointRecord], error_of: str, path: Path, title
             axis.set_yscale("log")
         axis.grid(True, which="both", alpha=0.25)
     axes[0].legend(fontsize="small")
-    figure.suptitle(title, fontsize="medium", parse_math=False)  # a path may hold a $
-    figure.savefig(path, format="png", dpi=150)
+    _save(figure, path, title)
 
 
 def curve(points: Sequence[RunPointRecord], of: str) -> list[tuple[float, Band]]:
@@ -212,14 +221,10 @@ def plot_maps(record: GradcheckRecord, gradient: np.ndarray, reference: np.ndarr
     Both gradients have one scale, whose ends 1 % of the texels go beyond. An EXR of the same name has them as they
     are: the layers `gradient`, `reference`, `difference` (of the two) and `z`.
     """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
     colors = color_map(signed=True)
     sums = gradient.sum(-1), reference.sum(-1)
     end = float(np.quantile(np.abs(np.stack(sums)), 0.99)) or 1.0
-    figure = Figure(figsize=(13, 4.2), layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = _figure((13, 4.2))
     axes = figure.subplots(1, 3)
     titles = (integrator_name(record), reference_name(record), "difference in standard errors, z")
     for axis, image, limit, title in zip(axes, (*sums, z), (end, end, _MOST_Z), titles, strict=True):

@@ -8,6 +8,7 @@ How certain its values are is said in words, of the manifest's `results`, whose 
 
 from __future__ import annotations
 
+import math
 import shutil
 import sys
 from collections.abc import Mapping, Sequence
@@ -16,7 +17,7 @@ from textwrap import wrap
 from typing import Any
 
 from reslrb_cli.records.decisions import PaidRecord, RivalRecord
-from reslrb_cli.report.format import count, duration, number, shorten, with_error
+from reslrb_cli.report.format import count, duration, line, number, shorten, with_error
 
 #: The verdict on a value that can be relied on, as recorded; all others say what keeps it from that.
 SETTLED, MOVING, UNDETERMINED = "settled", "still moving", "not determined"
@@ -171,19 +172,12 @@ def noise_line(results: Mapping[str, Any]) -> str:
     return f"spread: by the noise of the run; noise and errors of targets{which} are not in it"
 
 
-def rival_line(measured: Mapping[str, Any] | None) -> str:
-    """How another integrator did beside the run's own; empty where none was tried."""
-    try:
-        return RivalRecord.from_json(dict(measured or {})).line(cost=True)
-    except TypeError:  # there was none, or another version's
-        return ""
-
-
-def paid_line(kind: type[PaidRecord], measured: Mapping[str, Any] | None) -> str:
-    """Whether another way of drawing samples paid; empty where that was not left to measurement."""
+def measured_line(kind: type[PaidRecord] | type[RivalRecord], measured: Mapping[str, Any] | None) -> str:
+    """What a measurement before the run came to, of another way of drawing samples or of another integrator; empty
+    where there was none."""
     try:
         return kind.from_json(dict(measured or {})).line(cost=True)
-    except TypeError:  # as above
+    except TypeError:  # there was none, or another version's
         return ""
 
 
@@ -261,15 +255,15 @@ def warnings(results: Mapping[str, Any], sign: str = "+-") -> list[str]:
     """What went wrong in a run that did not fail, plainly: a loss that did not fall, errors that rose, and values that
     cannot be relied on."""
     lines = []
-    trend = results.get("loss_trend") or {}
-    if trend.get("change") in ("rose", "flat") and not _image_improved(results):
+    trend, ratio = results.get("loss_trend") or {}, _image_ratio(results)
+    if trend.get("change") in ("rose", "flat") and not (ratio is not None and ratio < IMPROVED):
         start, end = (with_error(trend[at]["mean"], trend[at]["error"], sign) for at in ("start", "end"))
         less = trend["end"]["mean"] < trend["start"]["mean"]
         flat = "fell by no more than its noise" if less else "did not fall"
         lines.append(
             f"the loss {'rose' if trend['change'] == 'rose' else flat} ({start} at the start, {end} at the end)"
         )
-    if not trend and _image_rose(results):
+    if not trend and ratio is not None and ratio > ROSE_IF_SHORT:
         start, end = (number(results["image_loss"][at], 3) for at in ("initial", "final"))
         lines.append(f"the images got farther from their targets (loss {start} to {end})")
     worse = [key for key in results.get("worse") or () if key in results["parameter_rmse"]]
@@ -297,18 +291,14 @@ def _reasons(results: Mapping[str, Any]) -> list[str]:
     return found
 
 
-def _image_rose(results: Mapping[str, Any]) -> bool:
-    """Whether the saved images ended well farther from their targets than they began."""
+def _image_ratio(results: Mapping[str, Any]) -> float | None:
+    """The loss of the saved images, which have less noise than those of the iterations, at the end over that at the
+    start; None where one is not known."""
     losses = results.get("image_loss") or {}
     initial, final = losses.get("initial"), losses.get("final")
-    return initial is not None and final is not None and final > ROSE_IF_SHORT * initial
-
-
-def _image_improved(results: Mapping[str, Any]) -> bool:
-    """Whether the saved images, which have less noise than those of the iterations, came closer to their targets."""
-    losses = results.get("image_loss") or {}
-    initial, final = losses.get("initial"), losses.get("final")
-    return initial is not None and final is not None and final < IMPROVED * initial
+    if initial is None or final is None:
+        return None
+    return float(final / initial) if initial else math.inf if final else 1.0
 
 
 def _growth(pair: Mapping[str, float]) -> float:
@@ -407,11 +397,8 @@ def _table(keys: Sequence[str], titles: Sequence[str], rows: Sequence[Sequence[s
     first = min(max(map(len, (HEAD, *keys))), WIDEST_KEY, left)
     if first < min(max(map(len, keys)), NARROWEST_KEY):
         return []
-    lines = []
-    for key, row in [(HEAD, titles), *zip(keys, rows, strict=True)]:
-        cells = [shorten(key, first).ljust(first), *(cell.ljust(size) for cell, size in zip(row, widths, strict=True))]
-        lines.append(GAP.join(cells).rstrip())
-    return lines
+    named = [(HEAD, titles), *zip(keys, rows, strict=True)]
+    return [line([shorten(key, first), *row], [first, *widths]) for key, row in named]
 
 
 def _blocks(keys: Sequence[str], titles: Sequence[str], rows: Sequence[Sequence[str]], width: int) -> list[str]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -17,11 +17,12 @@ from reslrb_cli.records.measurement_files import Origin, Tell, read_lines, read_
 Array = np.ndarray[Any, Any]
 
 
-#: Figures that a record of a run has, or it is none; and those that it may have.
+#: Figures that a record of a run has, or it is none.
 _FIGURES = ("iteration", "elapsed_s", "step_ms", "codegen_ms", "peak_mib", "spp")
 
 
-_OPTIONAL_FIGURES = ("loss", "primal_ms", "adjoint_ms", "parameter_rmse")
+#: All that a record may have.
+_ALL_FIGURES = [field.name for field in fields(metrics.Record) if field.type in ("int", "float", "float | None")]
 
 
 #: Layers of a map of a gradient, as `gradcheck --images` writes them.
@@ -160,7 +161,7 @@ def _record(entry: dict[str, Any]) -> dict[str, Any] | None:
     for key in _FIGURES:
         if not _is_number(entry.get(key)):
             return None
-    for key in _OPTIONAL_FIGURES:
+    for key in _ALL_FIGURES:
         if not _is_number(entry.get(key)):
             entry[key] = None
     errors = entry.get("parameter_errors")

@@ -12,6 +12,7 @@ from collections.abc import Iterable, Mapping, Sequence
 
 from reslrb_cli.measure.conditioning import QUANTITIES, Conditioning
 from reslrb_cli.records.measurements import BenchRecord, GradcheckRecord, Kind, Reference, Spread, Verdict
+from reslrb_cli.report.format import line, table
 
 _BENCH_HEAD = (
     "depth", "", "step ms", "over baseline", "kernel ms", "over baseline", "codegen", "tracing", "cold ms", "peak MiB",
@@ -64,12 +65,9 @@ def _ratio(ratio: Spread | None) -> str:
     return "" if ratio is None else f"{ratio.median:.2f} [{ratio.min:.2f}, {ratio.max:.2f}]"
 
 
-def _line(cells: tuple[str, ...], label_width: int) -> str:
-    parts = [
-        f"{cell:<{label_width}}" if column == 1 else f"{cell:>{_BENCH_WIDTHS[column]}}"
-        for column, cell in enumerate(cells)
-    ]
-    return "  ".join(parts).rstrip()
+def _line(cells: Sequence[str], label_width: int) -> str:
+    before, _, *after = _BENCH_WIDTHS
+    return line(cells, (before, label_width, *after), "><>")
 
 
 _CHAIN_HEAD = ("vertices", "paths", "median", "99 %", "largest")
@@ -86,7 +84,7 @@ def conditioning_lines(measured: Conditioning) -> list[str]:
         rows.append((row.key, str(row.entries), *map(_number, numbers)))
     gradient, change, curvature, length = (_number(measured.spread(quantity)) for quantity in QUANTITIES)
     rows.append(("largest / smallest", "", "", gradient, "", change, curvature, length))
-    return _aligned(rows)
+    return table(rows, "<>")
 
 
 def chain_lines(measured: Conditioning) -> list[str]:
@@ -95,17 +93,7 @@ def chain_lines(measured: Conditioning) -> list[str]:
     for chain in measured.chains:
         numbers = (chain.median, chain.percentile_99, chain.largest)
         rows.append((str(chain.vertices), str(chain.paths), *map(_number, numbers)))
-    return _aligned(rows)
-
-
-def _aligned(rows: list[tuple[str, ...]]) -> list[str]:
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    return [
-        "  ".join(
-            [row[0].ljust(widths[0]), *(text.rjust(width) for text, width in zip(row[1:], widths[1:], strict=True))]
-        ).rstrip()
-        for row in rows
-    ]
+    return table(rows, "<>")
 
 
 def _number(value: float | None) -> str:
@@ -180,8 +168,8 @@ def summary_lines(records: Sequence[GradcheckRecord]) -> list[str]:
     """What it comes to: how many comparisons hold, what failed and by how much, and what was left open, and why."""
     count = {verdict: sum(record.verdict is verdict for record in records) for verdict in Verdict}
     open_ = [record for record in records if record.holds is None]
-    line = f"{count[Verdict.HOLDS]} of {len(records)} comparisons hold, {count[Verdict.FAILS]} fail"
-    lines = [line + (f", {len(open_)} leave the question open" if open_ else "")]
+    held = f"{count[Verdict.HOLDS]} of {len(records)} comparisons hold, {count[Verdict.FAILS]} fail"
+    lines = [held + (f", {len(open_)} leave the question open" if open_ else "")]
     if count[Verdict.NOT_MEASURED]:
         message = next(record.message for record in open_ if record.verdict is Verdict.NOT_MEASURED)
         lines.append(f"open: {count[Verdict.NOT_MEASURED]} not measured: {message}")
@@ -211,17 +199,19 @@ class Table:
         return self._line(cells(record))
 
     def _line(self, values: Sequence[str]) -> str:
-        parts = [f"{value:<{width}}" for value, width in zip(values, self._widths, strict=False)]
-        parts += [f"{value:>{width}}" for value, width in zip(values[3:], _GRADCHECK_WIDTHS[3:], strict=True)]
-        return "  ".join(parts).rstrip()
+        return line(values, (*self._widths, *_GRADCHECK_WIDTHS[3:]), "<<<>")
 
 
 def markdown_table(records: Iterable[GradcheckRecord], cases: bool = False) -> str:
     """The same as a Markdown table; with a first column of the records' cases if `cases`."""
     head = ("case", *HEAD) if cases else HEAD
     rows = [(record.case, *cells(record)) if cases else cells(record) for record in records]
+    return _markdown(head, rows)
+
+
+def _markdown(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     lines = [head, ["---"] * len(head), *rows]
-    return "".join(f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in line)} |\n" for line in lines)
+    return "".join(f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in row)} |\n" for row in lines)
 
 
 def _limited(value: float | None, limit: float | None, spec: str) -> str:
@@ -246,11 +236,11 @@ def suite_table(records: Iterable[GradcheckRecord], about: Mapping[str, str]) ->
         cases.setdefault(record.case, []).append(record)
     estimators = list(dict.fromkeys(r.estimator or r.integrator for rows in cases.values() for r in rows))
     head = ("case", "what it is about", "references", "seeds", *estimators)
-    lines = [head, ["---"] * len(head)]
+    lines = []
     for case, rows in cases.items():
         found = [_cell([r for r in rows if (r.estimator or r.integrator) == name]) for name in estimators]
         lines.append([f"`{case}`", about.get(case, ""), _references(rows), str(rows[0].seeds), *found])
-    return "".join(f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in line)} |\n" for line in lines)
+    return _markdown(head, lines)
 
 
 def limits(records: Iterable[GradcheckRecord]) -> tuple[float, float]:

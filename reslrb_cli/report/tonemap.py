@@ -164,13 +164,16 @@ def signed_end(values: Array) -> float:
 
 def colored(values: Array, signed: bool = False) -> bytes:
     """Values (H, W) from 0 to 1, or if `signed` from -1 to 1, in the colours of their scale, as a PNG."""
+    places = np.nan_to_num(values)
+    return as_png(color_map(signed)(np.clip((places + 1) / 2 if signed else places, 0.0, 1.0), bytes=True))
+
+
+def as_png(pixels: Array) -> bytes:
+    """A PNG of `pixels` (H, W, C), bytes."""
     from matplotlib.image import imsave
 
-    places = np.nan_to_num(values)
     buffer = io.BytesIO()
-    imsave(
-        buffer, color_map(signed)(np.clip((places + 1) / 2 if signed else places, 0.0, 1.0), bytes=True), format="png"
-    )
+    imsave(buffer, np.ascontiguousarray(pixels), format="png")
     return buffer.getvalue()
 
 

@@ -10,7 +10,7 @@ from report.test_page import Page
 from report.test_several import lines_drawn
 
 from reslrb_cli.report.page import render
-from reslrb_cli.report.page.markup import COLORS
+from reslrb_cli.report.page.layout import COLORS
 from reslrb_cli.report.sources import read_sources
 
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from reslrb_cli.records.atomic import write_atomically
-from reslrb_cli.report.page.markup import document, section
+from reslrb_cli.report.page.layout import document
 from reslrb_cli.report.page.measured import several_parts
 from reslrb_cli.report.page.run import guarded, header, run_parts
 from reslrb_cli.report.sources import Run, Source, read_run
@@ -53,8 +53,7 @@ def render(sources: Sequence[Source], live: bool = False) -> str:
         title, head, parts = run.name, guarded(partial(header, run)), list(run_parts(run).items())
     else:
         title, head, parts = several_parts(sources)
-    body = "".join(section(name, markup) for name, markup in parts)
-    return document(title, head + body, REFRESH_SECONDS if live else None)
+    return document(title, head, parts, REFRESH_SECONDS if live else None)
 
 
 def render_page(folder: Path) -> str:

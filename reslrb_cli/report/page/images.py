@@ -1,6 +1,6 @@
 """The images on the page: start, end, target and maps of every sensor, and tables of what they come to.
 
-- `show`, `embed`: arrays of linear values as pictures that a page holds in itself.
+- `show`, `show_map`: arrays as pictures that a page holds in itself, in their own colours and in those of a scale.
 - `gradient_maps`: maps of gradients of textures: the gradient, its reference, and their difference in standard errors.
 - `view_table`: what of every view counts: its share of the loss, its exposure, and the pixels that are left out.
 - `seen_tables`: errors as people see them, as tables: of images, and of recovered colours.
@@ -10,21 +10,22 @@
 from __future__ import annotations
 
 import base64
-import io
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+from markupsafe import Markup
 
 from reslrb_cli.optimization.targets import WORDS
 from reslrb_cli.records.images import load_image, read_layers
 from reslrb_cli.report.format import number
-from reslrb_cli.report.page.markup import breakable, figure, figures, soft, table, text
+from reslrb_cli.report.page.layout import Piece, Words, key, lay_out, soft, table, titled
 from reslrb_cli.report.sources import Run
 from reslrb_cli.report.tonemap import (
+    as_png,
     color_stops,
     colored,
     encode,
@@ -46,12 +47,22 @@ MOST_PIXELS = 640
 FEW_PIXELS = 256
 
 
+class Scale(NamedTuple):
+    """The scale of a map's colours: some of them, and what stands at its ends, and between them."""
+
+    stops: Sequence[str]
+    ends: Sequence[str]
+
+
 @dataclass(frozen=True)
 class Picture:
-    """A picture as a `data:` address, with its size, (width, height), in its own pixels."""
+    """A picture as a `data:` address, with its size, (width, height), in its own pixels; `caption` has lines."""
 
     uri: str
     size: tuple[int, int]
+    alt: str
+    caption: Sequence[Words]
+    scale: Scale | None = None
 
     @property
     def smooth(self) -> bool:
@@ -59,16 +70,33 @@ class Picture:
         return max(self.size) >= FEW_PIXELS
 
 
-def show(values: Array, exposure: float = 1.0) -> Picture:
-    """Linear values (H, W, C) times `exposure` as an sRGB picture; fewer channels than three are shown as grey."""
+def show(values: Array, alt: str, *caption: Words) -> Picture:
+    """Linear values (H, W, C) as an sRGB picture; fewer channels than three are shown as grey."""
     values = fit(np.nan_to_num(values[:, :, :3] if values.shape[2] >= 3 else values[:, :, :1], posinf=1e30))
-    encoded = np.round(255 * encode(np.clip(values * exposure, 0.0, 1.0))).astype(np.uint8)
-    return embed(_png(np.broadcast_to(encoded, (*encoded.shape[:2], 3))), encoded.shape)
+    encoded = np.round(255 * encode(np.clip(values, 0.0, 1.0))).astype(np.uint8)
+    return _embed(as_png(np.broadcast_to(encoded, (*encoded.shape[:2], 3))), encoded.shape, alt, caption)
 
 
-def embed(png: bytes, shape: tuple[int, ...]) -> Picture:
+def show_map(values: Array, end: float, alt: str, *caption: Words, signed: bool = False) -> Picture:
+    """Values (H, W, 1) in colours, from 0 to `end`, or if `signed` from -`end`, with the scale below the caption."""
+    grey = fit(values)[:, :, 0]
+    last = number(end)
+    ends = [f"−{last}", "0", f"{last} or more"] if signed else ["0", f"{last} or more"]
+    scale = Scale(color_stops(9, signed), ends)
+    about = f"{alt}, from {ends[0]} to {last}"
+    return _embed(colored(grey / end, signed), grey.shape, about, caption, scale)
+
+
+def _embed(
+    png: bytes, shape: tuple[int, ...], alt: str, caption: Sequence[Words], scale: Scale | None = None
+) -> Picture:
     """A PNG of an array of `shape`, (H, W, ...)."""
-    return Picture(f"data:image/png;base64,{base64.b64encode(png).decode()}", (shape[1], shape[0]))
+    return Picture(f"data:image/png;base64,{base64.b64encode(png).decode()}", (shape[1], shape[0]), alt, caption, scale)
+
+
+def gallery(pictures: Sequence[Picture], title: Words = "", remark: str = "") -> Markup:
+    """Pictures beside each other, below a title and a remark."""
+    return lay_out("gallery", pictures, title, remark)
 
 
 def fit(values: Array) -> Array:
@@ -87,14 +115,6 @@ def fit(values: Array) -> Array:
     return resample(values, (width, height))
 
 
-def _png(pixels: Array) -> bytes:
-    from matplotlib.image import imsave
-
-    buffer = io.BytesIO()
-    imsave(buffer, np.ascontiguousarray(pixels), format="png")
-    return buffer.getvalue()
-
-
 #: z at the ends of the scale.
 MOST_Z = 5.0
 
@@ -103,43 +123,39 @@ MOST_Z = 5.0
 MOST_MAPS = 40
 
 
-def gradient_maps(paths: Sequence[Path]) -> str:
+def gradient_maps(paths: Sequence[Path]) -> Markup:
     """A row for each file of layers; of both gradients the sum over channels, on one scale."""
-    rows = []
+    rows = Markup()
     for path in paths[:MOST_MAPS]:
         try:
             layers = read_layers(path)
         except (OSError, ValueError):
-            rows.append(f"<h3>{breakable(path.stem)}</h3>" + soft("This file is damaged."))
+            rows += gallery([], key(path.stem), "This file is damaged.")
             continue
         sums = {name: np.nan_to_num(layers[name].astype(np.float64)).sum(-1, keepdims=True)
                 for name in ("gradient", "reference", "z")}  # fmt: skip
         end = signed_end(np.stack([sums["gradient"], sums["reference"]]))
-        shown = [
-            map_figure(sums["gradient"], end, "gradient", "<b>gradient</b>, sum over channels", signed=True),
-            map_figure(sums["reference"], end, "reference", "<b>reference</b>, sum over channels", signed=True),
-            map_figure(sums["z"], MOST_Z, "z", "<b>difference</b> in standard errors", signed=True),
-        ]
-        rows.append(f"<h3>{breakable(path.stem)}</h3>{figures(shown)}")
-    if len(paths) > MOST_MAPS:
-        rows.append(soft(f"{len(paths) - MOST_MAPS} more maps are not shown."))
-    return "".join(rows)
+        shown = [show_map(sums[name], end, name, titled(name, ", sum over channels"), signed=True)
+                 for name in ("gradient", "reference")]  # fmt: skip
+        caption = titled("difference", " in standard errors")
+        rows += gallery([*shown, show_map(sums["z"], MOST_Z, "z", caption, signed=True)], key(path.stem))
+    return rows + soft(f"{len(paths) - MOST_MAPS} more maps are not shown." if len(paths) > MOST_MAPS else "")
 
 
-def view_table(views: Sequence[Mapping[str, Any]] | None, results: Mapping[str, Any]) -> str:
+def view_table(views: Sequence[Mapping[str, Any]] | None, results: Mapping[str, Any]) -> Markup:
     """A row for each view, and the loss of those that are held out.
 
     Nothing where there is but one, of which every pixel counts alike as it is.
     """
     if not views or (len(views) == 1 and not _is_special(views[0])):
-        return ""
+        return Markup()
     cells = [
         [
-            text(view["sensor"]),
-            "held out" if view["held_out"] else text(number(view["share"])),
-            text(_exposure(view, results)),
-            text(f"{view['left_out']} of {view['pixels']}"),
-            text("; ".join(_kinds(view))),
+            str(view["sensor"]),
+            "held out" if view["held_out"] else number(view["share"]),
+            _exposure(view, results),
+            f"{view['left_out']} of {view['pixels']}",
+            "; ".join(_kinds(view)),
         ]
         for view in views
     ]
@@ -178,59 +194,53 @@ _TOLD = "Each line: mean; median, 95 %, 99 % of the pixels or texels are below; 
 _MEASURES = {"ciede2000": "CIEDE2000", "itp": "ΔE ITP"}
 
 
-def seen_tables(runs: Sequence[Run]) -> str:
+def seen_tables(runs: Sequence[Run]) -> Markup:
     """The errors of the images and colours of runs, a line for each at the start and at the end."""
-    rows: list[list[str]] = []
-    colors: list[list[str]] = []
+    rows: list[list[Words]] = []
+    colors: list[list[Words]] = []
     notes, several = [], len(runs) > 1
     for run in runs:
         seen = run.results.get("seen") or {}
-        before = f"{breakable(run.name)} " if several else ""
+        before: list[str | Piece] = [key(run.name), " "] if several else []
         for suffix, about in (seen.get("images") or {}).items():
             sensor = f"sensor {suffix[1:]}, " if suffix else ""
-            rows += [_image_row(f"{before}{text(sensor)}{title}", about[moment]) for title, moment in _moments(about)]
-        for key, about in (seen.get("colors") or {}).items():
-            measure = _MEASURES.get(about.get("measure"), "")
+            rows += [_image_row([*before, f"{sensor}{title}"], about[moment]) for title, moment in _moments(about)]
+        for name, about in (seen.get("colors") or {}).items():
             pair = [_spread(about.get(moment)) for moment in ("initial", "final")]
-            colors.append([f"{before}{breakable(key)}", text(measure), *pair])
+            colors.append([[*before, key(name)], _MEASURES.get(about.get("measure"), ""), *pair])
         notes += [seen["note"]] if seen.get("note") and seen["note"] not in notes else []
     if not rows and not colors:
-        return ""
+        return Markup()
     drop = 5 if rows and not any(row[5] for row in rows) else None  # no column for what nobody measured
     head = [title for place, title in enumerate(_HEAD) if place != drop]
     shown = [[cell for place, cell in enumerate(row) if place != drop] for row in rows]
-    parts = [table(head, shown, "spreads"), table(("colour", "in", "start", "end"), colors, "spreads")]
-    return "".join(parts) + soft(_TOLD) + "".join(map(soft, notes))
+    tables = table(head, shown, "spreads") + table(("colour", "in", "start", "end"), colors, "spreads")
+    return tables + Markup().join(map(soft, (_TOLD, *notes)))
 
 
 def _moments(about: Mapping[str, Any]) -> list[tuple[str, str]]:
     return [(title, moment) for title, moment in (("start", "initial"), ("end", "final")) if moment in about]
 
 
-def _image_row(markup: str, errors: Mapping[str, Any]) -> list[str]:
-    ratio = errors.get("psnr_db")
-    psnr = f"{number(ratio, 4)} dB" if ratio is not None else "∞"
+def _image_row(name: Sequence[str | Piece], errors: Mapping[str, Any]) -> list[Words]:
+    ratio, ssim = errors.get("psnr_db"), errors.get("ssim")
     bad = errors.get("not_finite")
-    note = f'<br><span class="worse small">{text(bad)} pixels not finite</span>' if bad else ""
-    ssim = errors.get("ssim")
-    spreads = [_spread(errors.get(name)) for name in ("ciede2000", "itp", "flip", "absolute")]
     return [
-        markup + note,
-        f'<span class="number">{text(psnr)}</span>',
-        "too small" if ssim is None else text(number(ssim, 4)),
-        *spreads,
+        [*name, Piece(Piece(f"{bad} pixels not finite", "worse small") if bad else "", "below")],
+        Piece(f"{number(ratio, 4)} dB" if ratio is not None else "∞", "number"),
+        "too small" if ssim is None else number(ssim, 4),
+        *(_spread(errors.get(name)) for name in ("ciede2000", "itp", "flip", "absolute")),
     ]
 
 
-def _spread(told: Mapping[str, float] | None) -> str:
+def _spread(told: Mapping[str, float] | None) -> Words:
     """Mean, percentiles and maximum, in two lines; where all are the same, that."""
     if not told:
         return ""
     if told["mean"] == told["max"]:
-        return text(number(told["max"], 3))
-    shown = {name: f'<span class="number">{text(number(value, 3))}</span>' for name, value in told.items()}
-    rest = " ".join(shown[name] for name in ("p50", "p95", "p99", "max") if name in shown)
-    return f'{shown["mean"]}<br><span class="soft small">{rest}</span>'
+        return number(told["max"], 3)
+    rest = " ".join(number(told[name], 3) for name in ("p50", "p95", "p99", "max") if name in told)
+    return [Piece(number(told["mean"], 3), "numbers"), Piece(Piece(rest, "numbers"), "below")]
 
 
 #: Images between the first and the last that are shown of a sensor, at most.
@@ -240,7 +250,7 @@ MOST_BETWEEN = 12
 _OF_A_SENSOR = re.compile(r"(?:initial|final|target)(-\d+)?\.exr")
 
 
-def image_rows(run: Run) -> str:
+def image_rows(run: Run) -> Markup:
     """Of every sensor a row: the initial image, the final one, the target, and maps of error and dL/dI.
 
     A sensor's images have one exposure, that of the run's manifest, or else what suits the target. What is missing is
@@ -249,80 +259,51 @@ def image_rows(run: Run) -> str:
     folder, exposures = run.path / "images", shown_exposures(run.manifest.get("views"))
     suffixes = {match[1] or "" for path in folder.glob("*.exr") if (match := _OF_A_SENSOR.fullmatch(path.name))}
     ordered = sorted(suffixes, key=lambda suffix: int(suffix[1:] or 0))
-    return "".join(_row(folder, suffix, run.results, exposures.get(suffix)) for suffix in ordered)
+    return Markup().join(_row(folder, suffix, run.results, exposures.get(suffix)) for suffix in ordered)
 
 
-def _row(folder: Path, suffix: str, results: Mapping[str, Any], exposure: float | None) -> str:
+def _row(folder: Path, suffix: str, results: Mapping[str, Any], exposure: float | None) -> Markup:
     names = {"start": "initial", "end": "final", "target": "target"}
     loaded = {title: load_image(folder / f"{name}{suffix}.exr") for title, name in names.items()}
     exposure = exposure_for(loaded["target"]) if exposure is None else exposure
     sensor = f" of sensor {suffix[1:]}" if suffix else ""
     shown = [
-        _figure(image * exposure, f"{title}{sensor}", f"<b>{text(title)}</b>, {image.shape[1]}×{image.shape[0]}")
+        show(image * exposure, f"{title}{sensor}", titled(title, f", {image.shape[1]}×{image.shape[0]}"))
         for title, image in loaded.items()
         if image is not None
     ]
-    shown += _weight_figure(folder, suffix, sensor) + _error_figures(folder, suffix, results)
-    title = f"<h3>Sensor {text(suffix[1:])}</h3>" if suffix else ""
-    words = exposure_words(exposure, loaded["target"])
-    title += f'<p class="soft small">{text(words)}</p>' if words else ""
-    return title + figures(shown) + _between(folder, suffix, exposure)
-
-
-def _figure(image: Array, alt: str, markup: str) -> str:
-    picture = show(image)
-    return figure(picture.uri, picture.size, alt, markup, picture.smooth)
-
-
-def _weight_figure(folder: Path, suffix: str, sensor: str) -> list[str]:
-    """What pixels weigh, where not all count alike: black is left out."""
     weights = load_image(folder / f"weights{suffix}.exr")
-    if weights is None:
-        return []
-    share = weights[:, :, :1] / max(float(weights.max()), 1e-30)
-    return [_figure(share, f"mask{sensor}", "<b>mask</b>: black is left out of the loss")]
+    if weights is not None:  # not all pixels count alike
+        share = weights[:, :, :1] / max(float(weights.max()), 1e-30)
+        shown.append(show(share, f"mask{sensor}", titled("mask", ": black is left out of the loss")))
+    shown += _error_maps(folder, suffix, results)
+    title = f"Sensor {suffix[1:]}" if suffix else ""
+    between = _between(folder, suffix, exposure)
+    return gallery(shown, title, exposure_words(exposure, loaded["target"])) + (
+        gallery(between, "", "on the way:") if between else "")  # fmt: skip
 
 
-def _error_figures(folder: Path, suffix: str, results: Mapping[str, Any]) -> list[str]:
+def _error_maps(folder: Path, suffix: str, results: Mapping[str, Any]) -> list[Picture]:
     """The maps of |I - T| and of dL/dI, with their scales; without the first where it, or its scale, is missing."""
     about = (results.get("error_maps") or {}).get(f"error{suffix}")
     layers = read_comparison(folder, suffix)
     shown = []
     if about is not None and about.get("end") and "difference" in layers:
         grey = np.abs(layers["difference"].astype(np.float64)).mean(axis=2, keepdims=True)
-        caption = f"<b>|image − target|</b> at the end, mean {text(number(about['mean'], 3))}"
-        shown.append(map_figure(grey, about["end"], "error map", caption))
+        caption = titled("|image − target|", f" at the end, mean {number(about['mean'], 3)}")
+        shown.append(show_map(grey, about["end"], "error map", caption))
     if "gradient" in layers:
         total = np.nan_to_num(layers["gradient"].astype(np.float64)).sum(axis=2, keepdims=True)
-        caption = "<b>∂loss/∂image</b> at the end, sum over channels"
-        shown.append(map_figure(total, signed_end(total), "derivative of the loss", caption, signed=True))
+        caption = titled("∂loss/∂image", " at the end, sum over channels")
+        shown.append(show_map(total, signed_end(total), "derivative of the loss", caption, signed=True))
     return shown
 
 
-def map_figure(values: Array, end: float, alt: str, markup: str, signed: bool = False) -> str:
-    """Values (H, W, 1) in colours, from 0 to `end`, or if `signed` from -`end`, with the scale below the caption."""
-    grey = fit(values)[:, :, 0]
-    picture = embed(colored(grey / end, signed), grey.shape)
-    last = text(number(end))
-    low, middle = (f"−{last}", "<span>0</span>") if signed else ("0", "")
-    stops = ",".join(color_stops(9, signed))
-    scale = (
-        f'<div class="scale" style="background:linear-gradient(to right,{stops})"></div>'
-        f'<div class="ends"><span>{low}</span>{middle}<span>{last} or more</span></div>'
-    )
-    return figure(picture.uri, picture.size, f"{alt}, from {low} to {last}", markup + scale, picture.smooth)
-
-
-def _between(folder: Path, suffix: str, exposure: float) -> str:
+def _between(folder: Path, suffix: str, exposure: float) -> list[Picture]:
     """Images that were saved on the way, evenly chosen where they are many."""
     pattern = re.compile(rf"iteration-(\d+){suffix}\.exr")
     found = sorted((int(match[1]), path) for path in folder.iterdir() if (match := pattern.fullmatch(path.name)))
     if len(found) > MOST_BETWEEN:
         found = [found[round(place)] for place in np.linspace(0, len(found) - 1, MOST_BETWEEN)]
-    loaded = [(iteration, load_image(path)) for iteration, path in found]
-    shown = [
-        _figure(image * exposure, f"after {iteration} iterations", f"after {iteration} iterations")
-        for iteration, image in loaded
-        if image is not None
-    ]
-    return f'<p class="soft small">on the way:</p>{figures(shown)}' if shown else ""
+    named = [(f"after {iteration} iterations", load_image(path)) for iteration, path in found]
+    return [show(image * exposure, name, name) for name, image in named if image is not None]

@@ -15,22 +15,13 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any
 
+from markupsafe import Markup
+
 from reslrb_cli.records.measurements import GradcheckRecord, MissingRecord, Verdict, record_of
 from reslrb_cli.report.format import count, duration, number
+from reslrb_cli.report.page.diagrams import Curve, Titled, diagram, diagrams, legend
 from reslrb_cli.report.page.images import gradient_maps, image_rows, seen_tables
-from reslrb_cli.report.page.markup import (
-    Curve,
-    breakable,
-    diagram,
-    diagrams,
-    folded,
-    legend,
-    mark,
-    note,
-    soft,
-    table,
-    text,
-)
+from reslrb_cli.report.page.layout import Piece, Words, key, lay_out, soft, table
 from reslrb_cli.report.page.run import StepParts, bars, guarded, origin_facts, problems, record_parts
 from reslrb_cli.report.page.values import convergence_of_all, parameter_table, texture_pictures
 from reslrb_cli.report.run_summary import worst
@@ -47,23 +38,23 @@ SWEPT = {"max_depth": "path depth", "spp": "samples per pixel", "pixels": "pixel
 _ENDED = {"out_of_memory": "out of memory", "failed": "failed"}
 
 
-def bench(objects: Sequence[Entry]) -> tuple[str, int]:
+def bench(objects: Sequence[Entry]) -> tuple[Markup, int]:
     """Diagrams and a table; and how many lines are no records of a bench."""
     entries = [_with_sizes(entry) for entry in objects if "integrator" in entry and "status" in entry]
     labels = list(dict.fromkeys(map(label, entries)))
     varied = [name for name in SWEPT if len({entry[name] for entry in entries if entry.get(name)}) > 1] or ["max_depth"]
-    parts = [legend([Curve(name, (), (), place) for place, name in enumerate(labels)])]
+    parts = legend(labels)
     for name in varied:
         chosen = [
             entry for entry in entries if all(_is_usual(entry, other, entries) for other in varied if other != name)
         ]
         curves = [_curves(chosen, labels, name, what) for what in ("step_ms", "peak_mib")]
         drawn = zip(curves, ("time of a step (ms)", "peak memory (MiB)"), strict=True)
-        parts.append(diagrams(*(diagram(made, SWEPT[name], axis, log_x=2) for made, axis in drawn)))
+        parts += diagrams(*(Titled(diagram(made, SWEPT[name], axis, log_x=2)) for made, axis in drawn))
         others = [f"{SWEPT[other]} {number(_usual(other, entries))}" for other in varied if other != name]
-        parts.append(soft(f"At {', '.join(others)}." if others else ""))
-    parts += [soft(_conditions(entries, varied)), _bench_table(entries, labels, varied)]
-    return "".join(parts), len(objects) - len(entries)
+        parts += soft(f"At {', '.join(others)}." if others else "")
+    parts += soft(_conditions(entries, varied)) + _bench_table(entries, varied)
+    return parts, len(objects) - len(entries)
 
 
 def label(entry: Entry) -> str:
@@ -109,31 +100,34 @@ def _conditions(entries: Sequence[Entry], varied: Sequence[str]) -> str:
     return f"{words}Medians; bands and brackets go from the least to the greatest."
 
 
-def _bench_table(entries: Sequence[Entry], labels: Sequence[str], varied: Sequence[str]) -> str:
-    head = (
-        ["integrator"] + [SWEPT[name] for name in varied] + ["step", "kernels", "first step", "peak memory", "scratch"]
-    )
-    rows = []
+def _bench_table(entries: Sequence[Entry], varied: Sequence[str]) -> Markup:
+    head = ["integrator", *(SWEPT[name] for name in varied), "step", "kernels", "first step", "peak memory", "scratch"]
+    rows: list[list[Words]] = []
     for entry in sorted(entries, key=lambda entry: [entry.get(name) or 0 for name in varied]):
-        cells = [breakable(label(entry)), *(text(number(entry.get(name), 6)) for name in varied)]
+        cells: list[Words] = [key(label(entry)), *(number(entry.get(name), 6) for name in varied)]
         if entry["status"] in _ENDED:
-            rows.append([*cells, f'<span class="worse">{_ENDED[entry["status"]]}</span>', "", "", "", ""])
+            rows.append([*cells, Piece(_ENDED[entry["status"]], "worse"), "", "", "", ""])
             continue
         cold, scratch = entry.get("cold_ms"), entry.get("scratch_bytes")
         rows.append([
             *cells, _spread(entry.get("step_ms")), _spread(entry.get("kernel_ms")),
-            "" if cold is None else text(duration(cold / 1e3)),
-            "" if entry.get("peak_mib") is None else text(f"{entry['peak_mib']:.4g} MiB"),
-            "" if scratch is None else text(f"{scratch} B"),
+            "" if cold is None else duration(cold / 1e3),
+            "" if entry.get("peak_mib") is None else f"{entry['peak_mib']:.4g} MiB",
+            "" if scratch is None else f"{scratch} B",
         ])  # fmt: skip
     return table(head, rows, "dense")
 
 
-def _spread(times: Mapping[str, float] | None) -> str:
+def _spread(times: Mapping[str, float] | None) -> Words:
     if not times:
         return ""
-    ends = f"[{number(times['min'], 3)}, {number(times['max'], 3)}]"
-    return f'{text(number(times["median"], 3))} ms <span class="soft small">{text(ends)}</span>'
+    return _with_ends(f"{number(times['median'], 3)} ms", times, "min", "max")
+
+
+def _with_ends(words: str, interval: Mapping[str, float | None], low: str = "low", high: str = "high") -> Words:
+    """Words, and the ends of their interval where it has both."""
+    ends = [number(interval.get(end), 3) for end in (low, high)]
+    return [words, " ", Piece(f"[{', '.join(ends)}]", "soft small")] if all(ends) else words
 
 
 Naming = Callable[[Entry], str]
@@ -146,7 +140,7 @@ MOST_DRAWN = 8
 _SHARES = {"0.1": "to 10 %", "0.03": "to 3 %", "0.01": "to 1 %"}
 
 
-def convergence(objects: Sequence[Entry]) -> tuple[str, int]:
+def convergence(objects: Sequence[Entry]) -> tuple[Markup, int]:
     """All that was measured of gradients, of whole runs, and in words; and how many lines are none of that."""
     kinds = {kind: [entry for entry in objects if entry.get("kind") == kind]
              for kind in ("point", "method", "reference", "run_point", "run_method")}  # fmt: skip
@@ -154,17 +148,17 @@ def convergence(objects: Sequence[Entry]) -> tuple[str, int]:
     known = [entry for entries in kinds.values() for entry in entries]
     spps = len({entry.get("spp") for entry in known if entry.get("status", "ok") == "ok"})
     name = partial(method_label, with_spp=spps > 1)
-    markup = "".join(f"<p>{text(entry['line'])}</p>" for entry in said)
+    markup = Markup().join(lay_out("paragraph", entry["line"]) for entry in said)
     if kinds["point"] or kinds["method"]:
         markup += _steps(kinds["point"], kinds["method"], name)
     if kinds["run_point"] or kinds["run_method"]:
         markup += whole_runs(kinds["run_point"], kinds["run_method"], name)
-        markup += "".join(soft(f"{name(entry)}: {entry['message']}") for entry in kinds["run_method"]
+        markup += Markup().join(soft(f"{name(entry)}: {entry['message']}") for entry in kinds["run_method"]
                           if entry.get("message"))  # fmt: skip
     return markup, len(objects) - len(known) - len(said)
 
 
-def _steps(points: Sequence[Entry], methods: Sequence[Entry], name: Naming) -> str:
+def _steps(points: Sequence[Entry], methods: Sequence[Entry], name: Naming) -> Markup:
     """A diagram for each quantity, and a table of the methods."""
     labels = list(dict.fromkeys(map(name, [*methods, *points])))
     quantities = list(dict.fromkeys(map(quantity, [*points, *methods])))
@@ -172,15 +166,14 @@ def _steps(points: Sequence[Entry], methods: Sequence[Entry], name: Naming) -> s
     if len(quantities) == 2 and quantities[0] == "all":  # the only parameter is all of them
         del quantities[0]
     drawn = [_error_diagram(points, labels, what, name) for what in quantities[:MOST_DRAWN]]
-    parts = [legend([Curve(title, (), (), place) for place, title in enumerate(labels)]), diagrams(*drawn)]
+    parts = legend(labels) + diagrams(*drawn)
     if points:
-        parts.append(soft("Dots across: the standard error of the reference itself, below which nothing can be told."))
+        parts += soft("Dots across: the standard error of the reference itself, below which nothing can be told.")
     if len(quantities) > MOST_DRAWN:
-        parts.append(soft(f"{len(quantities) - MOST_DRAWN} more parameters are in the table alone."))
+        parts += soft(f"{len(quantities) - MOST_DRAWN} more parameters are in the table alone.")
     told = [entry for entry in methods if quantity(entry) in quantities]
-    parts.append(_error_table(told, quantities, name))
-    parts += [soft(f"{name(entry)}: {entry['message']}") for entry in told if entry.get("message")]
-    return "".join(parts)
+    parts += _error_table(told, quantities, name)
+    return parts + Markup().join(soft(f"{name(entry)}: {entry['message']}") for entry in told if entry.get("message"))
 
 
 def quantity(entry: Entry) -> str:
@@ -195,7 +188,7 @@ def method_label(entry: Entry, with_spp: bool = False) -> str:
     return ", ".join(part for part in parts if part)
 
 
-def _error_diagram(points: Sequence[Entry], labels: Sequence[str], what: str, naming: Naming) -> str:
+def _error_diagram(points: Sequence[Entry], labels: Sequence[str], what: str, naming: Naming) -> Titled:
     of_it = [entry for entry in points if quantity(entry) == what]
     curves = []
     for place, name in enumerate(labels):
@@ -203,25 +196,22 @@ def _error_diagram(points: Sequence[Entry], labels: Sequence[str], what: str, na
         curves.append(Curve(name, [_time(entry) for entry in rows], [entry.get("relative_rmse") for entry in rows],
                             place, points=True))  # fmt: skip
     floors = [value for entry in of_it if isinstance(value := entry.get("reference_rmse"), int | float) and value > 0]
-    markup = diagram(curves, "time (s)", "relative error", 10, sorted(floors)[len(floors) // 2 :][:1])
-    words = {"all": "all parameters", "image": "the image"}.get(what)
-    title = text(words) if words else breakable(what)
-    return f"<div><h3>{title}</h3>{markup}</div>" if markup else ""
+    drawing = diagram(curves, "time (s)", "relative error", 10, sorted(floors)[len(floors) // 2 :][:1])
+    return Titled(drawing, {"all": "all parameters", "image": "the image"}.get(what, key(what)))
 
 
 def _time(entry: Entry) -> float:
     return float(entry.get("elapsed_s") or 0.0)
 
 
-def _error_table(methods: Sequence[Entry], quantities: Sequence[str], naming: Naming) -> str:
+def _error_table(methods: Sequence[Entry], quantities: Sequence[str], naming: Naming) -> Markup:
     several = len(quantities) > 1
     head = ["method", *["of"] * several, "slope", "efficiency", "bias, z", *_SHARES.values()]
-    rows = []
+    rows: list[list[Words]] = []
     for entry in sorted(methods, key=lambda entry: quantities.index(quantity(entry))):
-        biased = ' <span class="worse">biased</span>' if entry.get("biased") else ""
-        name = [breakable(naming(entry)) + biased, *[breakable(quantity(entry))] * several]
-        if entry.get("status", "ok") != "ok":
-            ended = f'<span class="worse">{text(str(entry["status"]).replace("_", " "))}</span>'
+        biased = Piece("biased", "worse") if entry.get("biased") else ""
+        name: list[Words] = [[key(naming(entry)), " ", biased], *[key(quantity(entry))] * several]
+        if (ended := _ended(entry)) is not None:
             rows.append([*name, ended, *[""] * (len(head) - len(name) - 1)])
             continue
         seconds, beyond = entry.get("seconds_to") or {}, entry.get("extrapolated") or ()
@@ -232,46 +222,49 @@ def _error_table(methods: Sequence[Entry], quantities: Sequence[str], naming: Na
     return table(head, rows, "dense")
 
 
-def _bias(entry: Entry) -> str:
+def _ended(entry: Entry) -> Piece | None:
+    """How a method ended before it was measured; None where it was not."""
+    status = str(entry.get("status", "ok"))
+    return None if status == "ok" else Piece(status.replace("_", " "), "worse")
+
+
+def _bias(entry: Entry) -> Words:
     """The largest deviation in standard errors, and the limit that it keeps or exceeds."""
     z, limit = entry.get("bias_z"), entry.get("bias_z_limit")
     if not isinstance(z, int | float) or not isinstance(limit, int | float):
         return figure_of(z)
-    return text(f"{abs(z):.2g} {'<' if abs(z) < limit else '>'} {limit:.2g}")
+    return f"{abs(z):.2g} {'<' if abs(z) < limit else '>'} {limit:.2g}"
 
 
-def figure_of(value: Any) -> str:
+def figure_of(value: Any) -> Words:
     """A figure, and its interval where it has one: a number, or `{value, low, high}`."""
     if isinstance(value, Mapping):
-        ends = [number(value.get(end), 3) for end in ("low", "high")]
-        interval = f' <span class="soft small">[{text(", ".join(ends))}]</span>' if all(ends) else ""
-        return text(number(value.get("value"), 3)) + interval
-    return text(number(value, 3)) if isinstance(value, int | float) else ""
+        return _with_ends(number(value.get("value"), 3), value)
+    return number(value, 3) if isinstance(value, int | float) else ""
 
 
-def seconds_of(value: Any, extrapolated: bool) -> str:
+def seconds_of(value: Any, extrapolated: bool) -> Words:
     """A time; one that was extrapolated is marked, one that is never reached is a dash."""
     if not isinstance(value, int | float):
         return "—"
-    return text(duration(value)) + (' <span class="soft small">extrapolated</span>' if extrapolated else "")
+    return [duration(value), " ", Piece("extrapolated", "soft small")] if extrapolated else duration(value)
 
 
 #: What is drawn against time: its name in the records, and in words.
 _DRAWN = {"loss": "loss", "parameter_error": "parameter error"}
 
 
-def whole_runs(points: Sequence[Entry], methods: Sequence[Entry], naming: Naming) -> str:
+def whole_runs(points: Sequence[Entry], methods: Sequence[Entry], naming: Naming) -> Markup:
     """A diagram of the loss, one of the parameters' error where that is known, and a table; `naming` names a method."""
     labels = list(dict.fromkeys(map(naming, [*methods, *points])))
-    parts = [legend([Curve(title, (), (), place) for place, title in enumerate(labels)])]
-    parts.append(diagrams(*(_runs_diagram(points, labels, of, naming) for of in _DRAWN)))
+    parts = legend(labels) + diagrams(*(_runs_diagram(points, labels, of, naming) for of in _DRAWN))
     if points:
-        parts.append(soft("Whole optimisations at equal wall time, all costs counted. Medians over the seeds; bands "
-                          "and brackets go from the least to the greatest."))  # fmt: skip
-    return "".join([*parts, _runs_table(methods, naming)])
+        parts += soft("Whole optimisations at equal wall time, all costs counted. Medians over the seeds; bands "
+                      "and brackets go from the least to the greatest.")  # fmt: skip
+    return parts + _runs_table(methods, naming)
 
 
-def _runs_diagram(points: Sequence[Entry], labels: Sequence[str], of: str, naming: Naming) -> str:
+def _runs_diagram(points: Sequence[Entry], labels: Sequence[str], of: str, naming: Naming) -> Titled:
     curves = []
     for place, name in enumerate(labels):
         found: dict[float, list[float]] = {}
@@ -282,32 +275,28 @@ def _runs_diagram(points: Sequence[Entry], labels: Sequence[str], of: str, namin
         medians = [statistics.median(found[time]) for time in times]
         band = [min(found[time]) for time in times], [max(found[time]) for time in times]
         curves.append(Curve(name, times, medians, place, band, points=True))
-    markup = diagram(curves, "time of a run (s)", _DRAWN[of])
-    return f"<div><h3>{text(_DRAWN[of])}</h3>{markup}</div>" if markup else ""
+    return Titled(diagram(curves, "time of a run (s)", _DRAWN[of]), _DRAWN[of])
 
 
-def _runs_table(methods: Sequence[Entry], naming: Naming) -> str:
-    rows = []
+def _runs_table(methods: Sequence[Entry], naming: Naming) -> Markup:
+    rows: list[list[Words]] = []
     for entry in methods:
-        name = breakable(naming(entry))
-        if entry.get("status", "ok") != "ok":
-            name += f' <span class="worse">{text(str(entry["status"]).replace("_", " "))}</span>'
-        seconds = entry.get("elapsed_s")
+        ended, seconds = _ended(entry), entry.get("elapsed_s")
         rows.append([
-            name, text(number(entry["runs"])) if _is_number(entry.get("runs")) else "",
-            text(duration(float(seconds))) if isinstance(seconds, int | float) else "",
+            [key(naming(entry)), " ", ended or ""],
+            number(entry["runs"]) if _is_number(entry.get("runs")) else "",
+            duration(float(seconds)) if isinstance(seconds, int | float) else "",
             *(_band(entry.get(what)) for what in ("iterations", "first_s", "loss", "parameter_error")),
         ])  # fmt: skip
-    return table(["method", "runs", "time of each", "iterations", "s to the first", "final loss", "final error"], rows,
-                 "dense")  # fmt: skip
+    head = ["method", "runs", "time of each", "iterations", "s to the first", "final loss", "final error"]
+    return table(head, rows, "dense")
 
 
-def _band(value: Any) -> str:
+def _band(value: Any) -> Words:
     """A median, and the least and the greatest."""
     if not isinstance(value, Mapping) or not all(_is_number(value.get(end)) for end in ("median", "low", "high")):
         return ""
-    ends = ", ".join(number(value[end], 3) for end in ("low", "high"))
-    return text(number(value["median"], 3)) + f' <span class="soft small">[{text(ends)}]</span>'
+    return _with_ends(number(value["median"], 3), value)
 
 
 def _is_number(value: Any) -> bool:
@@ -318,10 +307,10 @@ def _is_number(value: Any) -> bool:
 MOST_NAMED = 3
 
 
-Parts = list[tuple[str, str]]
+Parts = list[tuple[str, Markup]]
 
 
-def several_parts(sources: Sequence[Source]) -> tuple[str, str, Parts]:
+def several_parts(sources: Sequence[Source]) -> tuple[str, Markup, Parts]:
     """The title of a page about `sources`, its head, and its parts: titles and markup."""
     names = [source.name for source in sources]
     more = f" and {len(names) - MOST_NAMED} more" if len(names) > MOST_NAMED else ""
@@ -334,14 +323,14 @@ def several_parts(sources: Sequence[Source]) -> tuple[str, str, Parts]:
     for run in runs:
         own = record_parts(run)
         facts = own.pop("Run")
-        folds = [folded(name, markup) for name, markup in own.items()]
-        parts.append((f"Run {run.name}", guarded(partial(problems, run)) + facts + "".join(folds)))
-    return title, f"<header><h1>{text(title)}</h1></header>", parts
+        folds = Markup().join(lay_out("folded", name, markup) for name, markup in own.items())
+        parts.append((f"Run {run.name}", guarded(partial(problems, run)) + facts + folds))
+    return title, lay_out("header", title), parts
 
 
 def run_comparison(runs: Sequence[Run]) -> Parts:
     """The parts in which runs lie beside each other."""
-    made: dict[str, Callable[[], str]] = {
+    made: dict[str, Callable[[], Markup]] = {
         "Runs": lambda: overview(runs),
         "Convergence": lambda: convergence_of_all(runs),
         "Time of an iteration": lambda: bars(runs),
@@ -353,37 +342,28 @@ def run_comparison(runs: Sequence[Run]) -> Parts:
     return [(title, guarded(make)) for title, make in made.items()]
 
 
-def overview(runs: Sequence[Run]) -> str:
+def overview(runs: Sequence[Run]) -> Markup:
     """A line for each run: how it ended, what it came to, and what an iteration took."""
-    head = (
-        "run",
-        "status",
-        "estimator",
-        "iterations",
-        "time",
-        "loss",
-        "parameter error",
-        "an iteration",
-        "peak memory",
-    )
+    head = ("run", "status", "estimator", "iterations", "time", "loss", "parameter error", "an iteration",
+            "peak memory")  # fmt: skip
     return table(head, [_line(run, place) for place, run in enumerate(runs)], "overview")
 
 
-def _line(run: Run, place: int) -> list[str]:
+def _line(run: Run, place: int) -> list[Words]:
     records, results, step = run.records, run.results, StepParts.of(run.records)
     losses = [record["loss"] for record in records if record["loss"] is not None]
     loss = results["loss"] if results.get("loss") is not None else losses[-1] if losses else None
-    cells: list[Any] = [
-        run.manifest.get("status", "unknown"),
+    return [
+        [Piece(place, "mark"), key(run.name)],
+        str(run.manifest.get("status", "unknown")),
         _estimator(run),
-        len(records),
+        str(len(records)),
         duration(records[-1]["elapsed_s"]) if records else "",
         number(loss),
         _final_error(run),
         "" if step is None else duration(step.step / 1e3),
         f"{max(record['peak_mib'] for record in records):.4g} MiB" if records else "",
     ]
-    return [mark(place) + breakable(run.name), *map(text, cells)]
 
 
 def _estimator(run: Run) -> str:
@@ -406,10 +386,10 @@ def _final_error(run: Run) -> str:
     return f"RMSE {number(known[-1], 3)}" if known else ""
 
 
-def _each(runs: Sequence[Run], make: Callable[[Run], str]) -> str:
+def _each(runs: Sequence[Run], make: Callable[[Run], Markup]) -> Markup:
     """What is made of each run, below its name; where that is damaged, a line that says so."""
     made = [(run, guarded(partial(make, run))) for run in runs]
-    return "".join(f"<h3>{breakable(run.name)}</h3>{markup}" for run, markup in made if markup)
+    return Markup().join(lay_out("heading", key(run.name)) + markup for run, markup in made if markup)
 
 
 #: What stands above a source, before its name.
@@ -421,35 +401,33 @@ HEADINGS = {"bench": "Cost of a step", "gradcheck": "Gradients against reference
 _BAD = (Verdict.FAILS,)
 
 
-def measured(source: Measurements | Maps) -> str:
+def measured(source: Measurements | Maps) -> Markup:
     """Everything that there is to show of it."""
     if isinstance(source, Maps):
         return gradient_maps(source.files)
-    makers: dict[str, Callable[[Sequence[Mapping[str, Any]]], tuple[str, int]]] = {
+    makers: dict[str, Callable[[Sequence[Mapping[str, Any]]], tuple[Markup, int]]] = {
         "bench": bench, "gradcheck": gradcheck, "convergence": convergence,
     }  # fmt: skip
     markup, unknown = makers[source.kind](source.objects)
     words = [f"{count(len(source.damaged), 'line')} could not be read (the first is line {source.damaged[0]})."] if (
         source.damaged) else []  # fmt: skip
     words += [f"{count(unknown, 'line')} of other kinds, or damaged, left out."] if unknown else []
-    return markup + "".join(map(soft, words)) + "".join(map(origin_facts, source.origins))
+    return markup + Markup().join([*map(soft, words), *map(origin_facts, source.origins)])
 
 
-def gradcheck(objects: Sequence[Mapping[str, Any]]) -> tuple[str, int]:
+def gradcheck(objects: Sequence[Mapping[str, Any]]) -> tuple[Markup, int]:
     """The comparisons as a table, what fails first, and what is missing; and how many lines are neither."""
     records = [record for entry in objects if (record := record_of(GradcheckRecord, entry)) is not None]
     missing = [found for entry in objects if (found := record_of(MissingRecord, entry)) is not None]
     several = len({record.case for record in records}) > 1
     head = ["case"] * several + list(HEAD)
-    rows = []
+    rows: list[list[Words]] = []
     for record in sorted(records, key=lambda record: record.verdict not in _BAD):
-        first, *rest = cells(record)
-        row = [breakable(record.case)] * several + [breakable(first), *map(text, rest)]
-        rows.append([*row[:-1], f'<span class="worse">{row[-1]}</span>' if record.verdict in _BAD else row[-1]])
-    lines = (
-        [f"<p>{text(line)}</p>" for line in summary_lines(records) if not line.startswith("FAILS")] if records else []
-    )
-    failed = [text(failure_line(record)) for record in records if record.verdict in _BAD]
-    lines += [f"<p>{text(found.line())}</p>" for found in missing]
-    markup = note(*failed, kind="failed") + "".join(lines) + table(head, rows, "dense")
-    return markup, len(objects) - len(records) - len(missing)
+        first, *rest, verdict = cells(record)
+        ended = Piece(verdict, "worse") if record.verdict in _BAD else verdict
+        rows.append([*[key(record.case)] * several, key(first), *rest, ended])
+    lines = [line for line in summary_lines(records) if not line.startswith("FAILS")] if records else []
+    lines += [found.line() for found in missing]
+    failed = [failure_line(record) for record in records if record.verdict in _BAD]
+    markup = lay_out("note", failed, "failed") + Markup().join(lay_out("paragraph", line) for line in lines)
+    return markup + table(head, rows, "dense"), len(objects) - len(records) - len(missing)

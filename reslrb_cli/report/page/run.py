@@ -15,15 +15,17 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
+from markupsafe import Markup
+
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.optimization.correlated_bias import CorrelatedBias, share_words
-from reslrb_cli.records.decisions import EstimatorRecord, GuidedRecord, SequenceRecord
+from reslrb_cli.records.decisions import EstimatorRecord, GuidedRecord, RivalRecord, SequenceRecord
 from reslrb_cli.records.measurement_files import Origin
 from reslrb_cli.report.format import count, duration, number
 from reslrb_cli.report.page.images import image_rows, seen_tables, view_table
-from reslrb_cli.report.page.markup import COLORS, breakable, facts, mark, note, soft, table, text
+from reslrb_cli.report.page.layout import Words, facts, key, lay_out, soft, table
 from reslrb_cli.report.page.values import convergence, parameter_table, texture_pictures
-from reslrb_cli.report.run_summary import certainty_words, error_line, paid_line, rival_line, units_differ, warnings
+from reslrb_cli.report.run_summary import certainty_words, error_line, measured_line, units_differ, warnings
 from reslrb_cli.report.sources import Run
 
 #: Steps that are left out of medians: the first ones compile kernels.
@@ -71,28 +73,25 @@ class StepParts:
         return f"{words}: {', '.join(parts)}" if parts else words
 
 
-def bars(runs: Sequence[Run]) -> str:
+#: The parts of an iteration, by place.
+PARTS = ("image and loss", "gradient", "whole step, not told apart", "update")
+
+
+def bars(runs: Sequence[Run]) -> Markup:
     """An iteration of each run as a bar of its parts, all on one scale; nothing where none has an iteration."""
-    known = [(run, parts) for run in runs if (parts := StepParts.of(run.records)) is not None]
+    known = [(run.name, _parts(parts)) for run in runs if (parts := StepParts.of(run.records)) is not None]
     if not known:
-        return ""
-    names = ("image and loss", "gradient", "whole step, not told apart", "update")
-    rows, used = [], set()
-    longest = max(sum(_parts(parts).values()) for _, parts in known) or 1.0
-    for run, parts in known:
-        pieces = _parts(parts)
-        used |= {place for place, value in pieces.items() if value > 0}
-        drawn = "".join(
-            f'<i style="width:{100 * value / longest:.3g}%;background:{COLORS[place]}" '
-            f'title="{names[place]}: {text(duration(value / 1e3))}"></i>'
-            for place, value in pieces.items()
-        )
-        total = text(duration(sum(pieces.values()) / 1e3))
-        rows.append(
-            f'<li>{breakable(run.name)} <span class="soft small">{total}</span><div class="bar">{drawn}</div></li>'
-        )
-    legend = "".join(f"<li>{mark(place)}{names[place]}</li>" for place in sorted(used))
-    return f'<ul class="bars">{"".join(rows)}</ul><ul class="legend">{legend}</ul>'
+        return Markup()
+    longest = max(sum(parts.values()) for _, parts in known) or 1.0
+    rows = [
+        (name, duration(sum(parts.values()) / 1e3), [
+            (place, f"{100 * value / longest:.3g}", f"{PARTS[place]}: {duration(value / 1e3)}")
+            for place, value in parts.items()
+        ])
+        for name, parts in known
+    ]  # fmt: skip
+    used = {place for _, parts in known for place, value in parts.items() if value > 0}
+    return lay_out("bars", rows, {place: PARTS[place] for place in sorted(used)})
 
 
 def _parts(parts: StepParts) -> dict[int, float]:
@@ -107,7 +106,7 @@ def _median(records: Sequence[Mapping[str, Any]], name: str) -> float | None:
     return statistics.median(known) if known else None
 
 
-def run_facts(run: Run) -> str:
+def run_facts(run: Run) -> Markup:
     """When, on what and how the run was, what it took, what it came to, and the commands that do it again."""
     manifest, records = run.manifest, run.records
     losses = (manifest.get("results") or {}).get("image_loss") or {}
@@ -118,22 +117,22 @@ def run_facts(run: Run) -> str:
         {
             "started": _moment(manifest.get("started")),
             "took": _wall(manifest),
-            "iterations": text(", ".join(part for part in (str(len(records)), spp) if part)),
+            "iterations": ", ".join(part for part in (str(len(records)), spp) if part),
             "time in iterations": _total(records),
-            "an iteration": "" if step is None else text(step.words()),
-            "loss of the saved images": text(" → ".join(number(loss) for loss in losses.values() if loss is not None)),
-            "peak memory": text(f"{max(record['peak_mib'] for record in records):.4g} MiB") if records else "",
+            "an iteration": "" if step is None else step.words(),
+            "loss of the saved images": " → ".join(number(loss) for loss in losses.values() if loss is not None),
+            "peak memory": f"{max(record['peak_mib'] for record in records):.4g} MiB" if records else "",
             **_hardware(manifest.get("device"), manifest.get("variant")),
-            "seed": text(manifest.get("seed", "")),
-            "configuration": breakable(manifest.get("config") or ""),
-            "command line": breakable(shlex.join(map(str, command))) if command else "",
+            "seed": str(manifest.get("seed", "")),
+            "configuration": key(manifest["config"]) if manifest.get("config") else "",
+            "command line": key(shlex.join(map(str, command))) if command else "",
             **_again(again),
             **_software(manifest.get("versions") or {}, manifest.get("platform")),
         }
     )
 
 
-def origin_facts(origin: Origin) -> str:
+def origin_facts(origin: Origin) -> Markup:
     """When and on what a file of measurements was made, the command that does it again, and versions."""
     return facts(
         {
@@ -145,21 +144,21 @@ def origin_facts(origin: Origin) -> str:
     )
 
 
-def _hardware(device: object, variant: object) -> dict[str, str]:
-    return {"device": text(device or ""), "variant": text(variant or "")}
+def _hardware(device: object, variant: object) -> dict[str, Words]:
+    return {"device": str(device or ""), "variant": str(variant or "")}
 
 
-def _again(command: Sequence[str]) -> dict[str, str]:
-    return {"to do it again": breakable(shlex.join(command)) if command else ""}
+def _again(command: Sequence[str]) -> dict[str, Words]:
+    return {"to do it again": key(shlex.join(command)) if command else ""}
 
 
-def _software(versions: Mapping[str, str], platform: object) -> dict[str, str]:
+def _software(versions: Mapping[str, str], platform: object) -> dict[str, Words]:
     named = ", ".join(f"{name} {version}" for name, version in versions.items())
-    return {"versions": text(named), "platform": text(platform or "")}
+    return {"versions": named, "platform": str(platform or "")}
 
 
 def _moment(started: Any) -> str:
-    return text(str(started).replace("T", " ").replace("+00:00", " UTC")) if started else ""
+    return str(started).replace("T", " ").replace("+00:00", " UTC") if started else ""
 
 
 def _wall(manifest: Mapping[str, Any]) -> str:
@@ -168,31 +167,31 @@ def _wall(manifest: Mapping[str, Any]) -> str:
     except (KeyError, ValueError):
         return ""
     pauses = ", and the time in which it was not at work" if manifest.get("resumed") else ""
-    return text(f"{duration((end - start).total_seconds())}, with its images and files{pauses}")
+    return f"{duration((end - start).total_seconds())}, with its images and files{pauses}"
 
 
 def _total(records: Sequence[Mapping[str, Any]]) -> str:
     if not records:
         return ""
     codegen = sum(record["codegen_ms"] for record in records) / 1e3
-    return text(f"{duration(records[-1]['elapsed_s'])}, of which {duration(codegen)} to generate and compile kernels")
+    return f"{duration(records[-1]['elapsed_s'])}, of which {duration(codegen)} to generate and compile kernels"
 
 
-def plan_table(plan: Mapping[str, Any] | None) -> str:
+def plan_table(plan: Mapping[str, Any] | None) -> Markup:
     """What a step is made of, and what the scene does not need of it."""
     if not plan:
-        return ""
+        return Markup()
     rows = sorted(plan["rows"], key=lambda row: not row["needed"])
-    cells = [[text(row["feature"]), "yes" if row["needed"] else "left out", text(row["reason"])] for row in rows]
+    cells = [[row["feature"], "yes" if row["needed"] else "left out", row["reason"]] for row in rows]
     return table(("part of a step", "needed", "why"), cells)
 
 
-def pilot_table(pilot: Mapping[str, Any] | None) -> str:
+def pilot_table(pilot: Mapping[str, Any] | None) -> Markup:
     """What the pilot measured of each estimator, the most efficient first, and what it chose."""
     try:
         outcome = EstimatorRecord.from_json(dict(pilot or {}))
     except TypeError:  # there was none, or another version's
-        return ""
+        return Markup()
     rows = sorted(outcome.rows, key=lambda row: -(row.efficiency or 0.0))
     best = rows[0].efficiency or 1.0 if rows else 1.0
     cells = []
@@ -200,78 +199,71 @@ def pilot_table(pilot: Mapping[str, Any] | None) -> str:
         name = ", ".join([row.estimator, *(f"{key} {value}" for key, value in row.options.items())])
         share = None if row.efficiency is None else row.efficiency / best
         time = "" if row.kernel_ms is None else duration(row.kernel_ms / 1e3)
-        cells.append([text(name), *map(text, (number(share, 3), number(row.variance, 3), time, row.rounds, row.note))])
+        cells.append([name, number(share, 3), number(row.variance, 3), time, str(row.rounds), row.note])
     head = ("estimator", "efficiency over the best", "variance", "kernels", "rounds", "note")
-    return f"<p>{text(outcome.line(cost=True))}</p>" + table(head, cells)
+    return lay_out("paragraph", outcome.line(cost=True)) + table(head, cells)
 
 
-def correlated_bias_table(measured: Mapping[str, Any] | None) -> str:
+def correlated_bias_table(measured: Mapping[str, Any] | None) -> Markup:
     """What was measured of the bias of `adjoint: correlated`, by parameter."""
     try:
         bias = CorrelatedBias.from_json(dict(measured or {}))
     except (TypeError, KeyError):  # there was none, or another version's
-        return ""
-    rows = []
+        return Markup()
+    rows: list[list[Words]] = []
     for row in bias.parameters:
         what = "larger than the gradient" if row.exceeds else "of the gradient" if row.along else "not seen"
-        rows.append([breakable(row.key), text(share_words(row, "±")), text(what)])
+        rows.append([key(row.key), share_words(row, "±"), what])
     line = f"Measured at the start, in {bias.rounds} rounds of {bias.spp} samples per pixel."
-    return f"<p>{text(bias.line() or line)}</p>" + table(("parameter", "share of the gradient", "bias"), rows)
+    return lay_out("paragraph", bias.line() or line) + table(("parameter", "share of the gradient", "bias"), rows)
 
 
-def scaling_table(scaling: Sequence[Mapping[str, Any]] | None) -> str:
+def scaling_table(scaling: Sequence[Mapping[str, Any]] | None) -> Markup:
     """What `scale: auto` measured of each parameter."""
-    head = (
-        "parameter",
-        "value",
-        "gradient",
-        "noise of a step",
-        "image change per unit",
-        "curvature",
-        "length",
-        "first step",
-    )
+    head = ("parameter", "value", "gradient", "noise of a step", "image change per unit", "curvature", "length",
+            "first step")  # fmt: skip
     names = ("value", "gradient", "noise", "change", "curvature", "length", "first_step")
-    rows = [[breakable(row["key"]), *(text(number(row.get(name), 3)) for name in names)] for row in scaling or ()]
-    return table(head, rows)
+    return table(head, [[key(row["key"]), *(number(row.get(name), 3) for name in names)] for row in scaling or ()])
 
 
-def memory_table(memory: Mapping[str, Any] | None) -> str:
+def memory_table(memory: Mapping[str, Any] | None) -> Markup:
     """How the memory budget was kept."""
     if not memory:
-        return ""
+        return Markup()
     expected = sum(memory["expected_bytes"].values())
     return facts(
         {
             "budget": _mib(memory["budget_bytes"]),
-            "passes": text(f"{memory['passes']} of {memory['samples_per_pass']} samples per pixel"),
+            "passes": f"{memory['passes']} of {memory['samples_per_pass']} samples per pixel",
             "expected": _mib(expected),
-            "used": text(f"{memory['peak_mib']:.4g} MiB") if memory.get("peak_mib") is not None else "",
+            "used": f"{memory['peak_mib']:.4g} MiB" if memory.get("peak_mib") is not None else "",
             "kept": "no" if memory.get("exceeded") else "yes",
         }
     )
 
 
 def _mib(count: float) -> str:
-    return text(f"{count / 2**20:.4g} MiB")
+    return f"{count / 2**20:.4g} MiB"
 
 
-def not_finite(tally: Mapping[str, Any] | None) -> str:
+def not_finite(tally: Mapping[str, Any] | None) -> Markup:
     """Values that were not finite, by parameter."""
     if not tally or not tally.get("iterations"):
-        return ""
-    rows = [[breakable(key), text(count)] for key, count in tally["by_parameter"].items()]
+        return Markup()
+    rows: list[list[Words]] = [[key(name), str(amount)] for name, amount in tally["by_parameter"].items()]
     line = f"{tally['values']} values were not finite, in {tally['iterations']} iterations; none reached a parameter."
-    return f"<p>{text(line)}</p>" + table(("parameter", "values of gradients and updates"), rows)
+    return lay_out("paragraph", line) + table(("parameter", "values of gradients and updates"), rows)
 
 
-def clamped(tally: Mapping[str, Any] | None) -> str:
+def clamped(tally: Mapping[str, Any] | None) -> Markup:
     """Gradients that were clamped, and the bias that this made."""
     if not tally or not tally.get("iterations"):
-        return ""
-    rows = [[breakable(key), text(number(bias))] for key, bias in tally["bias"].items()]
+        return Markup()
+    rows: list[list[Words]] = [[key(name), number(bias)] for name, bias in tally["bias"].items()]
     line = f"{tally['entries']} entries of gradients were clamped, in {tally['iterations']} iterations."
-    return f"<p>{text(line)}</p>" + table(("parameter", "bias, as the share of the gradient taken over the run"), rows)
+    return lay_out("paragraph", line) + table(
+        ("parameter", "bias, as the share of the gradient taken over the run"), rows
+    )
 
 
 #: Bytes of a configuration that is shown, at most.
@@ -281,34 +273,29 @@ MOST_CONFIG = 2**20
 DAMAGED = "This part cannot be shown: what was recorded of it is damaged."
 
 
-def header(run: Run) -> str:
+def header(run: Run) -> Markup:
     """The run's name, how it ended, what it came to, and what went wrong."""
     status, results, records = str(run.manifest.get("status", "unknown")), run.results, run.records
     parts = [f"{count(len(records), 'iteration')} in {duration(records[-1]['elapsed_s'])}"] if records else []
     parts += [f"loss {number(results['loss'])}"] if results.get("loss") is not None else []
     parts += [line for line in [error_line(results)] if line]
-    lead = f'<p class="lead">{text(", ".join(parts))}</p>' if parts else ""
-    title = f'<header><h1>{text(run.name)}</h1><span class="status {text(status)}">{text(status)}</span></header>'
-    return title + lead + problems(run)
+    return lay_out("header", run.name, status, ", ".join(parts)) + problems(run)
 
 
-def problems(run: Run) -> str:
+def problems(run: Run) -> Markup:
     """What went wrong in a run, and what of its records could not be read."""
-    failed = note(text(run.manifest["error"]), kind="failed") if run.manifest.get("error") else ""
-    lines = [f"{number_} could not be read." for number_ in [_lines(run)] if number_]
-    return failed + note(*map(text, [*warnings(run.results, "±"), *lines]))
+    lines = warnings(run.results, "±")
+    if run.damaged:
+        where = f"{count(len(run.damaged), 'line')} of metrics.jsonl (the first is line {run.damaged[0]})"
+        lines.append(f"{where} could not be read.")
+    error = run.manifest.get("error")
+    return lay_out("note", [error] if error else [], "failed") + lay_out("note", lines)
 
 
-def _lines(run: Run) -> str:
-    if not run.damaged:
-        return ""
-    return f"{count(len(run.damaged), 'line')} of metrics.jsonl (the first is line {run.damaged[0]})"
-
-
-def run_parts(run: Run) -> dict[str, str]:
+def run_parts(run: Run) -> dict[str, Markup]:
     """By title, what there is to show of a run beside its header, in order; what it does not have is empty."""
     results = run.results
-    parts: dict[str, Callable[[], str]] = {
+    parts: dict[str, Callable[[], Markup]] = {
         "Parameters": lambda: (
             parameter_table(results, "now" if run.at_work else "end")
             + _over_what(results)
@@ -323,29 +310,29 @@ def run_parts(run: Run) -> dict[str, str]:
     return {title: guarded(make) for title, make in parts.items()} | record_parts(run)
 
 
-def record_parts(run: Run) -> dict[str, str]:
+def record_parts(run: Run) -> dict[str, Markup]:
     """By title, those of the parts that tell how a run was done, of which nothing can be laid beside another run's."""
     results, manifest = run.results, run.manifest
-    parts: dict[str, Callable[[], str]] = {
+    parts: dict[str, Callable[[], Markup]] = {
         "Not finite": lambda: not_finite(results.get("nonfinite")),
         "Clamped gradients": lambda: clamped(results.get("clamped")),
         "Run": lambda: run_facts(run),
         "Plan": lambda: plan_table(manifest.get("plan")),
         "Choice of the estimator": lambda: (
             pilot_table(manifest.get("pilot"))
-            + soft(paid_line(GuidedRecord, manifest.get("guided")))
-            + soft(paid_line(SequenceRecord, manifest.get("sequence")))
-            + soft(rival_line(manifest.get("rival")))
+            + soft(measured_line(GuidedRecord, manifest.get("guided")))
+            + soft(measured_line(SequenceRecord, manifest.get("sequence")))
+            + soft(measured_line(RivalRecord, manifest.get("rival")))
         ),
         "Bias of correlated samples": lambda: correlated_bias_table(manifest.get("correlated_bias")),
         "Scale of the parameters": lambda: scaling_table(manifest.get("scaling")),
         "Memory budget": lambda: memory_table(manifest.get("memory")),
-        "Configuration": lambda: f"<pre>{text(_read(run.path / 'config.yaml'))}</pre>",
+        "Configuration": lambda: lay_out("pre", _read(run.path / "config.yaml")),
     }
     return {title: guarded(make) for title, make in parts.items()}
 
 
-def guarded(make: Callable[[], str]) -> str:
+def guarded(make: Callable[[], Markup]) -> Markup:
     """What `make` makes; where what it reads is damaged, or another version's, a line that says so.
 
     Whatever stands in a manifest comes from a file, and one part that cannot be shown is not to keep the others away.
@@ -353,16 +340,14 @@ def guarded(make: Callable[[], str]) -> str:
     try:
         return make()
     except Exception:
-        return note(DAMAGED)
+        return lay_out("note", [DAMAGED])
 
 
-def _over_what(results: Mapping[str, Any]) -> str:
+def _over_what(results: Mapping[str, Any]) -> Markup:
     """What the errors are taken over."""
-    if not results.get("parameter_rmse"):
-        return ""
     words = "Errors are root mean squares over the entries that light and sensor reach, in the parameter's unit"
     words += "; relative ones are shares of the root mean square of the truth." if units_differ(results) else "."
-    return soft(words)
+    return soft(words if results.get("parameter_rmse") else "")
 
 
 def _read(path: Path) -> str:

@@ -7,30 +7,19 @@ and errors of one run, or of several in one picture, against iterations and time
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from markupsafe import Markup
 
 from reslrb_cli.records.images import finite_range, read_mask, read_parameters
 from reslrb_cli.report.format import number
-from reslrb_cli.report.page.images import show
-from reslrb_cli.report.page.markup import (
-    COLORS,
-    MOST_POINTS,
-    Curve,
-    breakable,
-    diagram,
-    diagrams,
-    figure,
-    figures,
-    legend,
-    points_together,
-    soft,
-    table,
-    text,
-)
+from reslrb_cli.report.page.diagrams import MOST_POINTS, Curve, Titled, diagram, diagrams, legend, points_together
+from reslrb_cli.report.page.images import Picture, gallery, show
+from reslrb_cli.report.page.layout import COLORS, Piece, Words, key, lay_out, soft, table, titled
 from reslrb_cli.report.perceptual import PLACES, is_color
 from reslrb_cli.report.run_summary import is_settled, spread_words, units_differ, verdict_words
 from reslrb_cli.report.sources import Run
@@ -46,59 +35,57 @@ MOMENTS = (("start", "initial"), ("end", "final"), ("true", "true"))
 _FOLDERS = {"initial": "initial", "final": "", "true": "true"}
 
 
-def parameter_table(results: Mapping[str, Any], end: str = "end") -> str:
+def parameter_table(results: Mapping[str, Any], end: str = "end") -> Markup:
     """Value and error of each parameter at the start and at the end, and the true value where it is known."""
     parameters = results.get("parameters") or {}
     has_truth = any(about.get("true") for about in parameters.values())
     relative = units_differ(results)
     head = ["parameter", "start", end] + ["true"] * has_truth + ["RMSE"] * has_truth
     head += ["relative error"] * (has_truth and relative)
-    judged = any(verdict_words(results, key) for key in parameters)
+    judged = any(verdict_words(results, name) for name in parameters)
     head += ["spread", "verdict"] * judged
-    rows = []
-    for key, about in parameters.items():
-        swatches = _swatches(key, about)
-        cells = [_value(about.get(moment), swatches.get(moment, "")) for _, moment in MOMENTS]
-        row = [_name(key, about), *cells[: 2 + has_truth]]
-        if has_truth:
-            row.append(_error(results, "parameter_rmse", key))
-        if has_truth and relative:
-            row.append(_error(results, "relative_error", key))
-        row += [_spread(results, key), _verdict(results, key)] if judged else []
+    rows: list[list[Words]] = []
+    for name, about in parameters.items():
+        swatches = _swatches(name, about)
+        cells = [_value(about.get(moment), swatches.get(moment)) for _, moment in MOMENTS]
+        row = [_name(name, about), *cells[: 2 + has_truth]]
+        row += [_error(results, "parameter_rmse", name)] * has_truth
+        row += [_error(results, "relative_error", name)] * (has_truth and relative)
+        row += [Piece(spread_words(results, name, "±"), "number"), _verdict(results, name)] if judged else []
         rows.append(row)
     return table(head, rows, "parameters")
 
 
-def texture_pictures(folder: Path, results: Mapping[str, Any], current: Mapping[str, Array] | None = None) -> str:
+def texture_pictures(
+    folder: Path, results: Mapping[str, Any], current: Mapping[str, Array] | None = None
+) -> Markup:  # fmt: skip
     """Each texture at the start and at the end, the true one where it is known, and what of it light and sensor reach.
 
     `folder` is a run's `parameters/`; `current` are the values now, by key, of a run that has no end yet.
     """
-    parts = []
+    parts = Markup()
     archives = {moment: read_parameters(folder / sub) for moment, sub in _FOLDERS.items()}
     if current is not None:
         archives["final"] = dict(current)
     titles = {moment: "now" if moment == "final" and current is not None else title for title, moment in MOMENTS}
-    for key, about in (results.get("parameters") or {}).items():
-        arrays = {moment: _texture(archive, key) for moment, archive in archives.items()}
+    for name, about in (results.get("parameters") or {}).items():
+        arrays = {moment: _texture(archive, name) for moment, archive in archives.items()}
         exposure, words = _exposure(arrays), ""
         if about.get("quantity") in PLACES:
             arrays, words = _as_relief(arrays)
             exposure = 1.0
         shown = [
-            _figure(titles[moment], f"{titles[moment]}: {key}", array, about.get(moment), exposure)
+            _picture(titles[moment], name, array, about.get(moment), exposure)
             for _, moment in MOMENTS
             if (array := arrays[moment]) is not None
         ]
-        mask = _texture_mask(folder, key)
+        mask = _texture_mask(folder, name)
         if shown and mask is not None and not mask.all():
-            share = f"<b>reached</b> by light and sensor (white): {100 * mask.mean():.3g} %"
-            shown.append(_picture(mask[:, :, None].astype(np.float32), f"reached: {key}", share))
+            share = titled("reached", f" by light and sensor (white): {100 * mask.mean():.3g} %")
+            shown.append(show(mask[:, :, None].astype(np.float32), f"reached: {name}", share))
         if shown:
-            words = words or exposure_words(exposure)
-            parts.append(f"<h3>{breakable(key)}</h3>" + (f'<p class="soft small">{words}</p>' if words else ""))
-            parts.append(figures(shown))
-    return "".join(parts)
+            parts += gallery(shown, key(name), words or exposure_words(exposure))
+    return parts
 
 
 def _as_relief(arrays: Mapping[str, Array | None]) -> tuple[dict[str, Array | None], str]:
@@ -116,67 +103,52 @@ def _exposure(arrays: Mapping[str, Array | None]) -> float:
     return exposure_for(known) if known is not None and float(np.nanmax(known)) > 1 else 1.0
 
 
-def _figure(title: str, alt: str, array: Array, about: Mapping[str, Any] | None, exposure: float) -> str:
-    size = f"{array.shape[1]}×{array.shape[0]}"
-    caption = f"<b>{text(title)}</b>, {size}" + (f"<br>{_value(about, '')}" if about else "")
-    return _picture(array * exposure, alt, caption)
+def _picture(title: str, name: str, array: Array, about: Mapping[str, Any] | None, exposure: float) -> Picture:
+    caption: list[Words] = [titled(title, f", {array.shape[1]}×{array.shape[0]}")]
+    return show(array * exposure, f"{title}: {name}", *caption, *([_value(about)] if about else []))
 
 
-def _picture(array: Array, alt: str, markup: str) -> str:
-    picture = show(array)
-    return figure(picture.uri, picture.size, alt, markup, picture.smooth)
-
-
-def _name(key: str, about: Mapping[str, Any]) -> str:
+def _name(name: str, about: Mapping[str, Any]) -> Words:
     shape = "×".join(str(size) for size in about.get("shape") or ())
-    notes = [about.get("quantity") or "", shape if len(about.get("shape") or ()) != 1 or shape != "3" else ""]
+    notes = [about.get("quantity") or "", shape if shape != "3" else ""]
     reached = about.get("reached")
     notes += [f"{100 * reached:.3g} % reached"] if reached is not None and reached < 1 else []
-    line = ", ".join(note for note in notes if note)
-    return breakable(key) + (f'<br><span class="soft small">{text(line)}</span>' if line else "")
+    return [key(name), Piece(", ".join(note for note in notes if note), "below")]
 
 
-def _value(about: Mapping[str, Any] | None, swatch: str) -> str:
+def _value(about: Mapping[str, Any] | None, swatch: str | None = None) -> Words:
     if not about:
         return ""
+    shown = [Piece(swatch, "swatch")] if swatch else []
     if "value" in about:
         values = about["value"] if isinstance(about["value"], list) else [about["value"]]
-        return f"<span>{swatch}{_numbers(values)}</span>"
+        return [*shown, _numbers(values)]
     if about["min"] == about["max"]:
-        return f"<span>{swatch}{_number(about['min'])} throughout</span>"
-    ends = " to ".join(_number(about[end]) for end in ("min", "max"))
-    return f'<span>{swatch}mean {_numbers(about["mean"])}<br><span class="soft small">{ends}</span></span>'
+        return [*shown, _numbers([about["min"]]), " throughout"]
+    ends = Piece(Piece(" to ".join(number(about[end], 3) for end in ("min", "max")), "numbers"), "below")
+    return [*shown, "mean ", _numbers(about["mean"]), ends]
 
 
-def _numbers(values: Iterable[float | None]) -> str:
-    return " ".join(_number(value) for value in values)
+def _numbers(values: Iterable[float | None]) -> Piece:
+    return Piece(" ".join(number(value, 3) for value in values), "numbers")
 
 
-def _number(value: float | None) -> str:
-    return f'<span class="number">{text(number(value, 3))}</span>'
-
-
-def _error(results: Mapping[str, Any], kind: str, key: str) -> str:
-    pair = (results.get(kind) or {}).get(key)
+def _error(results: Mapping[str, Any], kind: str, name: str) -> Words:
+    pair = (results.get(kind) or {}).get(name)
     if pair is None:
         return ""
-    words = " → ".join(_number(pair.get(moment)) for moment in ("initial", "final") if pair.get(moment) is not None)
-    worse = key in (results.get("worse") or ())
-    return f'<span class="worse">{words}, worse</span>' if worse else f"<span>{words}</span>"
+    known = [number(pair[moment], 3) for moment in ("initial", "final") if pair.get(moment) is not None]
+    words = Piece(" → ".join(known), "numbers")
+    return Piece([words, ", worse"], "worse") if name in (results.get("worse") or ()) else words
 
 
-def _spread(results: Mapping[str, Any], key: str) -> str:
-    words = spread_words(results, key, "±")
-    return f'<span class="number">{text(words)}</span>' if words else ""
-
-
-def _verdict(results: Mapping[str, Any], key: str) -> str:
-    words = text(verdict_words(results, key))
-    return words if not words or is_settled(results, key) else f'<span class="worse">{words}</span>'
+def _verdict(results: Mapping[str, Any], name: str) -> Words:
+    words = verdict_words(results, name)
+    return words if is_settled(results, name) else Piece(words, "worse")
 
 
 def _swatches(key: str, about: Mapping[str, Any]) -> dict[str, str]:
-    """The colours of a parameter, by moment, all with one exposure: what is emitted, or beyond 1, is at most 1."""
+    """The colours of a parameter in CSS, by moment, with one exposure: what is emitted, or beyond 1, is at most 1."""
     colors = {}
     for _, moment in MOMENTS:
         found = about.get(moment) or {}
@@ -188,10 +160,7 @@ def _swatches(key: str, about: Mapping[str, Any]) -> dict[str, str]:
     brightest = max(float(color.max()) for color in colors.values())
     unit = brightest if brightest > 1 or (about.get("quantity") and brightest > 0) else 1.0
     shown = {moment: encode(np.clip(color / unit, 0, 1)) for moment, color in colors.items()}
-    return {
-        moment: '<i class="swatch" style="background:rgb({})"></i>'.format(",".join(f"{255 * c:.0f}" for c in color))
-        for moment, color in shown.items()
-    }
+    return {moment: f"rgb({','.join(f'{255 * c:.0f}' for c in color)})" for moment, color in shown.items()}
 
 
 def _texture(archive: Mapping[str, Array], key: str) -> Array | None:
@@ -218,7 +187,7 @@ ABSCISSAE = (("iteration", "iteration"), ("elapsed_s", "time in steps and update
 Record = Mapping[str, Any]
 
 
-def convergence(run: Run) -> str:
+def convergence(run: Run) -> Markup:
     """Loss, and errors by parameter where they are known, against iterations and against time."""
     if not run.records:
         when = (
@@ -226,55 +195,48 @@ def convergence(run: Run) -> str:
             if run.at_work
             else "was completed"
         )
-        return f"<p>No iteration {when}.</p>"
+        return lay_out("paragraph", f"No iteration {when}.")
     scales, relative = run.scales, units_differ(run.results)
     last = run.records[-1]["parameter_errors"]
     ends = {
-        key: error / (scales.get(key) or 1.0 if relative else 1.0) for key, error in last.items() if error is not None
+        name: error / (scales.get(name) or 1.0 if relative else 1.0)
+        for name, error in last.items()
+        if error is not None
     }
-    keys = [key for key in sorted(ends, key=lambda key: -ends[key]) if not relative or scales.get(key)]
-    drawn = keys[:MOST_CURVES]
-    errors = [(key, place, _error_curve(key, scales.get(key) if relative else None)) for place, key in enumerate(drawn)]
+    names = [name for name in sorted(ends, key=lambda name: -ends[name]) if not relative or scales.get(name)]
+    drawn = names[:MOST_CURVES]
+    errors = [(run, name, place, _error_curve(name, scales.get(name) if relative else None))
+              for place, name in enumerate(drawn)]  # fmt: skip
     what = "relative error" if relative else "RMSE"
-    parts = [
-        _both([(run, "loss", 0, _loss)], "loss"),
-        _both([(run, key, place, error) for key, place, error in errors], f"{what} by parameter"),
-        legend([Curve(key, (), (), place) for key, place, _ in errors]),
-    ]
-    if len(keys) > len(drawn):
-        words = f"The {MOST_CURVES} parameters that are the farthest off at the end; "
-        parts.append(soft(f"{words}{len(keys) - len(drawn)} more are not drawn."))
-    return "".join(parts) + _thinning([run])
+    curves = _both([(run, "loss", 0, _loss)], "loss") + _both(errors, f"{what} by parameter") + legend(drawn)
+    more, words = len(names) - len(drawn), f"The {MOST_CURVES} parameters that are the farthest off at the end; "
+    return curves + soft(f"{words}{more} more are not drawn." if more else "") + _thinning([run])
 
 
-def convergence_of_all(runs: Sequence[Run]) -> str:
+def convergence_of_all(runs: Sequence[Run]) -> Markup:
     """Loss and error of several runs in one picture; of parameters that several have, each in a picture of its own."""
     begun = [(place, run) for place, run in enumerate(runs) if run.records]
     if not begun:
-        return "<p>No iteration was completed.</p>"
-    parts = [legend([Curve(run.name, (), (), place) for place, run in begun])]
-    parts.append(_both([(run, run.name, place, _loss) for place, run in begun], "loss"))
+        return lay_out("paragraph", "No iteration was completed.")
+    parts = legend([run.name if run.records else "" for run in runs])
+    parts += _both([(run, run.name, place, _loss) for place, run in begun], "loss")
     absolute = not any(units_differ(run.results) for run in runs)
     total = _total_rmse if absolute else _total_relative
     label = "parameter RMSE" if absolute else "relative error"
-    parts.append(_both([(run, run.name, place, total(run)) for place, run in begun], f"{label}, all parameters"))
-    counts: dict[str, int] = {}
-    for _, run in begun:
-        for key in run.records[-1]["parameter_errors"]:
-            counts[key] = counts.get(key, 0) + 1
-    shared = [key for key, count in counts.items() if count > 1] if len(counts) > 1 else []
-    for key in shared[:MOST_SHARED]:
-        curves = [(run, run.name, place, _error_curve(key, None)) for place, run in begun]
-        drawn = _both(curves, "RMSE")
-        parts.append(f"<h3>{breakable(key)}</h3>{drawn}" if drawn else "")
+    parts += _both([(run, run.name, place, total(run)) for place, run in begun], f"{label}, all parameters")
+    counts = Counter(name for _, run in begun for name in run.records[-1]["parameter_errors"])
+    shared = [name for name, count in counts.items() if count > 1] if len(counts) > 1 else []
+    for name in shared[:MOST_SHARED]:
+        drawn = _both([(run, run.name, place, _error_curve(name, None)) for place, run in begun], "RMSE")
+        parts += lay_out("heading", key(name)) + drawn if drawn else drawn
     if len(shared) > MOST_SHARED:
-        parts.append(soft(f"{len(shared) - MOST_SHARED} more parameters that several runs have are not drawn."))
+        parts += soft(f"{len(shared) - MOST_SHARED} more parameters that several runs have are not drawn.")
     missing = [run.name for run in runs if not run.records]
-    parts.append(soft(f"No iteration was completed by: {', '.join(missing)}." if missing else ""))
-    return "".join(parts) + _thinning(runs)
+    parts += soft(f"No iteration was completed by: {', '.join(missing)}." if missing else "")
+    return parts + _thinning(runs)
 
 
-def _both(curves: Sequence[tuple[Run, str, int, Callable[[Record], float | None]]], label: str) -> str:
+def _both(curves: Sequence[tuple[Run, str, int, Callable[[Record], float | None]]], label: str) -> Markup:
     """The same curves in two diagrams beside each other, against iterations and against time."""
     drawn = []
     for name, caption in ABSCISSAE:
@@ -282,14 +244,14 @@ def _both(curves: Sequence[tuple[Run, str, int, Callable[[Record], float | None]
             Curve(title, [record[name] for record in run.records], [value(record) for record in run.records], place)
             for run, title, place, value in curves
         ]
-        drawn.append(diagram(made, caption, label))
+        drawn.append(Titled(diagram(made, caption, label)))
     return diagrams(*drawn)
 
 
-def _thinning(runs: Sequence[Run]) -> str:
+def _thinning(runs: Sequence[Run]) -> Markup:
     most = max((points_together(len(run.records)) for run in runs), default=1)
     if most <= 1:
-        return ""
+        return Markup()
     if len(runs) == 1:
         return soft(f"Each point is the mean of {most} iterations.")
     return soft(f"Of runs with more than {MOST_POINTS} iterations each point is the mean of some, at most {most}.")
