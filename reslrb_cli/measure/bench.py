@@ -25,11 +25,12 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+from reslrb_cli.config.loader import dump
 from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.measure import resume_store
 from reslrb_cli.measure.methods import WIDTHS, Case, Sweep
-from reslrb_cli.measure.processes import GROWTH, MAX_ROUNDS, NO_TIME, Arena, Contestant, Ended, Pace, Stopped
+from reslrb_cli.measure.processes import GROWTH, MAX_ROUNDS, NO_TIME, Contestant, Ended, Pace, Stopped
 from reslrb_cli.measure.resume_store import Earlier
 from reslrb_cli.measure.tasks import start_process
 from reslrb_cli.records.measurement_files import Kept
@@ -238,6 +239,13 @@ def _ratio(run: Run, baseline: Run, key: str) -> Spread | None:
 MAX_WARM_UPS = 4
 
 
+#: Where the cases of a depth together hold more than this share of the memory, each releases its own after a step.
+MEMORY_SHARE = 0.7
+
+
+MIB = 2**20
+
+
 #: First steps that take longer are told of as they are done, in seconds.
 SLOW = 10.0
 
@@ -262,16 +270,15 @@ def bench(
     book = book or Book(sweep)
     values = book.to_do()
     pace = Pace(sweep.budget_s - spent_s, len(values), sweep.rounds)
-    common = {"variant": sweep.variant, "objective": sweep.objective, "memory_limit": sweep.memory_limit}
-    arena = Arena(pace, stop, say, common, sweep.memory)
+    warned: set[str] = set()
     for number, value in enumerate(values):
         if pace.over():
             say(f"not measured: {sweep.name(*values[number:])}: {NO_TIME}")
             return
         pace.begin_depth()
-        runs = book.runs[value] = _begin(book, value, arena, start)
+        runs = book.runs[value] = _begin(book, value, start)
         try:
-            _measure(runs, sweep.name(value), arena, between)
+            _measure(sweep, runs, sweep.name(value), pace, stop, say, warned, between)
             stopped = False
         except Stopped:
             stopped = True
@@ -304,7 +311,7 @@ def _needed(pace: Pace, runs: list[Run], left: int) -> str:
     return f"; all of it takes about {whole_s:.0f} s"
 
 
-def _begin(book: Book, value: int, arena: Arena, start: Callable[[dict[str, Any]], Any]) -> list[Run]:
+def _begin(book: Book, value: int, start: Callable[[dict[str, Any]], Any]) -> list[Run]:
     """The cases at one value, with what has been measured of them; those that ended at it are not begun again."""
     before = {run.case.label: run for run in book.runs.get(value, ())}
     runs = []
@@ -314,46 +321,71 @@ def _begin(book: Book, value: int, arena: Arena, start: Callable[[dict[str, Any]
             may_refuse = book.sweep.may_refuse(case)
             run = before.get(case.label) or Run(process=None, may_refuse=may_refuse, case=case, config=config)
             if run.alive:
-                swept = book.sweep.swept
-                width = {f"{swept}_width": value} if swept in WIDTHS else {}
-                run.process = start(arena.first(run.config, **width))
+                run.process = start(_first(book.sweep, run, value))
             runs.append(run)
     return runs
 
 
-def _measure(runs: list[Run], name: str, arena: Arena, between: Callable[[], None]) -> None:
+def _first(sweep: Sweep, run: Run, value: int) -> dict[str, Any]:
+    first: dict[str, Any] = {
+        "config": dump(run.config),
+        "source": str(run.config.source),
+        "variant": sweep.variant,
+        "objective": sweep.objective,
+        "memory_limit": sweep.memory_limit,
+    }
+    if sweep.swept in WIDTHS:
+        first[f"{sweep.swept}_width"] = value
+    return first
+
+
+def _measure(
+    sweep: Sweep,
+    runs: list[Run],
+    name: str,
+    pace: Pace,
+    stop: Callable[[], bool],
+    say: Callable[[str], None],
+    warned: set[str],
+    between: Callable[[], None],
+) -> None:
     def alive() -> list[Run]:
         return [run for run in runs if run.at_work]
 
-    def tight() -> bool:
-        return arena.is_tight(sum(run.cold["peak_mib"] for run in alive() if run.cold is not None))
-
-    pace, stop = arena.pace, arena.stop
     for run in alive():
         answer = run.answer(stop, pace.over)
         if answer is not None:
             run.size, run.texels = (answer["width"], answer["height"]), answer.get("texels")
-            arena.warn(answer)
+            for line in answer.get("warnings", ()):
+                if line not in warned:  # every process loads the same scene
+                    warned.add(line)
+                    say(line)
     for run in alive():
         before = run.cold
         run.cold = run.step(0, True, False, stop, pace.over) or before
         if run.alive and run.cold is not None and run.cold["step_ms"] > 1e3 * SLOW:
-            arena.say(f"{name}, {run.case.label}: the first step took {run.cold['step_ms'] / 1e3:.0f} s")
+            say(f"{name}, {run.case.label}: the first step took {run.cold['step_ms'] / 1e3:.0f} s")
         for _ in range(MAX_WARM_UPS):
-            answer = run.step(0, False, tight(), stop, pace.over) if run.alive else None
+            answer = run.step(0, False, _tight(sweep, runs), stop, pace.over) if run.alive else None
             if answer is None or not answer["new_kernels"]:
                 break
-    release = tight()
-    if release:
-        arena.say(f"{name}: together the cases need more than the memory; each releases its own after a step")
+    tight = _tight(sweep, runs)
+    if tight:
+        say(f"{name}: together the cases need more than the memory; each releases its own after a step")
     # Rounds go on from those of an earlier session, whose numbers made the seeds, until all have enough of them.
     first = 1 + max((round for run in runs for round in run.steps), default=-1)
     pace.begin_rounds(min((len(run.steps) for run in alive()), default=0))
     done = 0
     while alive() and pace.another(done):
-        for run in arena.in_turn(alive(), done):
-            answer = run.step(first + done + 1, False, release, stop)
+        turn = alive()
+        for run in turn[done % len(turn) :] + turn[: done % len(turn)]:
+            answer = run.step(first + done + 1, False, tight, stop)
             if answer is not None:
                 run.steps[first + done] = answer
         done += 1
         between()
+
+
+def _tight(sweep: Sweep, runs: list[Run]) -> bool:
+    held = sum(run.cold["peak_mib"] for run in runs if run.cold is not None and run.at_work) * MIB
+    return held > MEMORY_SHARE * sweep.memory

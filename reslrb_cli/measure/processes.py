@@ -19,14 +19,12 @@ import subprocess
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
-from reslrb_cli.config.loader import dump
-from reslrb_cli.config.schema import Config
-from reslrb_cli.errors import ExitCode, ReslrbError, mentions_memory
+from reslrb_cli.errors import ReslrbError, mentions_memory
 from reslrb_cli.records.measurements import BenchStatus
 
 POLL_SECONDS = 0.05
@@ -299,60 +297,3 @@ class Pace:
             return True
         now = self._now()
         return now + (now - self._rounds_start) / done <= (self._end if done < MIN_ROUNDS else self._depth_end)
-
-
-T = TypeVar("T")
-
-
-MIB = 2**20
-
-
-#: Where those under way together hold more than this share of the memory, each releases its own after a step.
-MEMORY_SHARE = 0.7
-
-
-class Arena:
-    """Processes that take turns, one computing at a time: what all who measure so share.
-
-    Time is kept by `pace`, and nobody waits for an answer once `stop()`. `say` is told what is to be known, `once` for
-    all processes. All start from `common`, what every first message has, in a machine of `memory` bytes.
-    """
-
-    def __init__(
-        self, pace: Pace, stop: Callable[[], bool], say: Callable[[str], None], common: Mapping[str, Any], memory: int
-    ) -> None:
-        self.pace, self.stop, self.say = pace, stop, say
-        self._common, self._memory, self._said = dict(common), memory, set[str]()
-
-    def first(self, config: Config, **more: Any) -> dict[str, Any]:
-        """The message that a process starts by, for it to load `config`."""
-        return {"config": dump(config), "source": str(config.source)} | self._common | more
-
-    def once(self, line: str) -> None:
-        """Say what several processes may have to say."""
-        if line not in self._said:
-            self._said.add(line)
-            self.say(line)
-
-    def warn(self, opening: Mapping[str, Any] | None) -> None:
-        """Say what loading the scene warned of, as every process tells it first."""
-        for line in (opening or {}).get("warnings", ()):
-            self.once(line)
-
-    def is_tight(self, held_mib: float) -> bool:
-        """Whether those under way, which hold so much at their peaks, are to release their memory after each step."""
-        return held_mib * MIB > MEMORY_SHARE * self._memory
-
-    @staticmethod
-    def in_turn(those: Sequence[T], turn: int) -> list[T]:
-        """All of them, each time with another one first."""
-        start = turn % max(len(those), 1)
-        return [*those[start:], *those[:start]]
-
-    @staticmethod
-    def insist(on: Contestant, name: str) -> None:
-        """Raise Refused where what nothing can be measured without has ended."""
-        if on.end is not None:
-            memory = on.end.status is BenchStatus.OUT_OF_MEMORY
-            code = ExitCode.OUT_OF_MEMORY if memory else ExitCode.CHECK_FAILED
-            raise Refused(f"--reference {name}: {on.end.reason}", code)

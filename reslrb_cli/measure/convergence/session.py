@@ -17,14 +17,16 @@ import numpy as np
 
 from reslrb_cli.config.loader import dump
 from reslrb_cli.config.schema import Config
+from reslrb_cli.errors import ExitCode
 from reslrb_cli.measure import resume_store
 from reslrb_cli.measure.convergence.setup import Member, Role, share_turns
 from reslrb_cli.measure.convergence.statistics import FEWEST, FEWEST_FOR_SLOPE
 from reslrb_cli.measure.methods import Case, Plan
-from reslrb_cli.measure.processes import Arena, Contestant, Ended, Pace, Stopped
+from reslrb_cli.measure.processes import Contestant, Ended, Pace, Refused, Stopped
 from reslrb_cli.measure.resume_store import Earlier
 from reslrb_cli.measure.tasks import start_process
 from reslrb_cli.records.measurement_files import Kept
+from reslrb_cli.records.measurements import BenchStatus
 
 #: What is kept says that it is of this.
 KIND = "convergence"
@@ -115,9 +117,11 @@ MOST_ROUNDS = 256
 AFTERWARDS, AFTERWARDS_S = 0.03, 2.0
 
 
-def left_s(budget_s: float, spent_s: float) -> float:
-    """Seconds of a budget that are for measuring, where some have gone before."""
-    return max((1 - AFTERWARDS) * budget_s - AFTERWARDS_S - spent_s, 0.0)
+#: Where all together hold more than this share of the memory, each releases its own after a step.
+MEMORY_SHARE = 0.7
+
+
+MIB = 2**20
 
 
 #: Light paths of a step of an independent reference, whose samples per pixel are its own: naive AD keeps all paths.
@@ -153,10 +157,9 @@ class Session:
         self.facts: dict[str, Any] = {}
         self.judges: dict[str, Member] = {}
         self._stop, self._say, self._start, self._now, self._began = stop, say, start, now, now() - spent_s
-        self._pace = Pace(left_s(plan.budget_s, spent_s), 1, plan.rounds, now, MOST_ROUNDS)
-        arrays = str(folder / "arrays.npz")
-        common = {"variant": plan.variant, "memory_limit": plan.memory_limit, "arrays": arrays}
-        self._arena = Arena(self._pace, stop, say, common, plan.memory)
+        budget_s = max((1 - AFTERWARDS) * plan.budget_s - AFTERWARDS_S - spent_s, 0.0)
+        self._pace = Pace(budget_s, 1, plan.rounds, now, MOST_ROUNDS)
+        self._warned: set[str] = set()
 
     def slices(self) -> dict[str, slice]:
         """Where each parameter (or the image) stands in a sample."""
@@ -200,23 +203,30 @@ class Session:
 
     # --- before the rounds --------------------------------------------------------------------------------------------
 
+    def _first(self, config: Config) -> dict[str, Any]:
+        return {"config": dump(config), "source": str(config.source), "variant": self.plan.variant,
+                "memory_limit": self.plan.memory_limit, "arrays": str(self.folder / "arrays.npz")}  # fmt: skip
+
     def _survey(self) -> bool:
         """Ask what stands as a reference, and have dL/dI made; False where time is up over it."""
         plan = self.plan
         if self._earlier is not None:
             self.facts = restore_facts(self._earlier, self.folder / "arrays.npz")
             return True
-        first = self._arena.first(plan.reference_config, objective=plan.objective)
+        first = self._first(plan.reference_config) | {"objective": plan.objective}
         surveyor = Contestant(self._start(first, "surveyed"), False)
         try:
             opening = surveyor.answer(self._stop, self._pace.over)
-            self._arena.warn(opening)
+            self._warn(opening)
             ask = {**plan.camera, "budget_s": plan.budget_s if plan.rounds is None else None}
             question = {"out": first["arrays"], "ask": ask}
             answer = None if opening is None else surveyor.ask(question, self._stop, self._pace.over)
         finally:
             surveyor.process.close()
-        self._arena.insist(surveyor, plan.reference.label)
+        if surveyor.end is not None:
+            memory = surveyor.end.status is BenchStatus.OUT_OF_MEMORY
+            line = f"--reference {plan.reference.label}: {surveyor.end.reason}"
+            raise Refused(line, ExitCode.OUT_OF_MEMORY if memory else ExitCode.CHECK_FAILED)
         self.facts = answer or {}
         if answer is None:
             self._say(
@@ -255,8 +265,10 @@ class Session:
         if role is Role.INDEPENDENT and config.integrator.options().get("samples_per_pass") is None:
             spp = min(spp, max(INDEPENDENT_PATHS // self.facts["pixels"], 1))
         method = plan.method(case, config, spp, objective != "loss", role is not Role.CASE)
-        mode, purpose = {"fixed": "known"}.get(objective, objective), f"convergence, {role.value} {method.label}"
-        first = self._arena.first(config, mode=mode, purpose=purpose)
+        first = self._first(config) | {
+            "mode": {"fixed": "known"}.get(objective, objective),
+            "purpose": f"convergence, {role.value} {method.label}",
+        }
         member = Member(
             process=self._start(first, "sampled_steps"),
             may_refuse=role is Role.INDEPENDENT or (role is Role.CASE and plan.default),
@@ -272,7 +284,7 @@ class Session:
     def _warm_up(self) -> None:
         for member in self.members:
             if member.alive:
-                self._arena.warn(member.answer(self._stop, self._pace.over))
+                self._warn(member.answer(self._stop, self._pace.over))
         for member in self.members:
             warm = member.alive and member.warm_up(self._tight(), self._stop, self._pace.over)
             if member.refusal is not None:
@@ -288,8 +300,14 @@ class Session:
         share_turns([member for member in self.members if member.alive], self.plan.rounds is not None)
 
     def _tight(self) -> bool:
-        cold = (member.cold for member in self.members if member.alive)
-        return self._arena.is_tight(sum(each["peak_mib"] for each in cold if each is not None))
+        held = sum(member.cold["peak_mib"] for member in self.members if member.cold is not None and member.alive) * MIB
+        return held > MEMORY_SHARE * self.plan.memory
+
+    def _warn(self, opening: dict[str, Any] | None) -> None:
+        for line in (opening or {}).get("warnings", ()):
+            if line not in self._warned:  # every process loads the same scene
+                self._warned.add(line)
+                self._say(line)
 
     # --- the rounds ---------------------------------------------------------------------------------------------------
 
@@ -306,7 +324,8 @@ class Session:
         tight = self._tight()
         self._pace.begin_rounds(self._before)
         while alive and self.rounds < most and self._pace.another(self.rounds - self._before):
-            for member in self._arena.in_turn(alive, self.rounds):
+            start = self.rounds % len(alive)
+            for member in alive[start:] + alive[:start]:
                 member.turn(self.rounds, tight, self._stop)
             self.rounds += 1
             alive = [member for member in self.members if member.alive]

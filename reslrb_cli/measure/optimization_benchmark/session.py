@@ -15,8 +15,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from reslrb_cli.config.loader import dump
 from reslrb_cli.config.schema import Config
-from reslrb_cli.measure.convergence.session import AFTERWARDS, AFTERWARDS_S, Start, left_s
+from reslrb_cli.errors import ExitCode
+from reslrb_cli.measure.convergence.session import AFTERWARDS, AFTERWARDS_S, MEMORY_SHARE, MIB, Start
 from reslrb_cli.measure.methods import RunsPlan, Side
 from reslrb_cli.measure.optimization_benchmark.rank import (
     POINTS,
@@ -28,7 +30,7 @@ from reslrb_cli.measure.optimization_benchmark.rank import (
     settings,
     times,
 )
-from reslrb_cli.measure.processes import NO_TIME, Arena, Contestant, Pace, Stopped
+from reslrb_cli.measure.processes import NO_TIME, Contestant, Pace, Refused, Stopped
 from reslrb_cli.measure.resume_store import Earlier
 from reslrb_cli.measure.tasks import start_process
 from reslrb_cli.records.measurement_files import Kept
@@ -79,7 +81,10 @@ class Judging:
         """An answer; None where the budget was spent over it. Raises Refused where the process ended."""
         judge = self._contestant
         answer = judge.ask(question, self._stop, self._over)
-        Arena.insist(judge, self._label)
+        if judge.end is not None:
+            memory = judge.end.status is BenchStatus.OUT_OF_MEMORY
+            line = f"--reference {self._label}: {judge.end.reason}"
+            raise Refused(line, ExitCode.OUT_OF_MEMORY if memory else ExitCode.CHECK_FAILED)
         return answer
 
     def close(self) -> None:
@@ -129,13 +134,11 @@ class RunsSession:
         self.plan, self.folder, self.runs, self.limit_s = plan, folder, list[Run](), 0.0
         self.facts: dict[str, Any] = {}
         self._stop, self._say, self._start, self._now, self._began = stop, say, start, now, now() - spent_s
-        self._budget_s = left_s(plan.budget_s, spent_s)
+        self._budget_s = max((1 - AFTERWARDS) * plan.budget_s - AFTERWARDS_S - spent_s, 0.0)
         self._pace, self._end = Pace(self._budget_s, 1, None, now), now() + self._budget_s
         self._judge: Judging | None = None
         self._startup_s = self._wave_s = 0.0
-        targets = str(folder / "targets.npz")
-        common = {"variant": plan.variant, "memory_limit": plan.memory_limit, "targets": targets}
-        self._arena = Arena(self._pace, stop, say, common, plan.memory)
+        self._said: set[str] = set()
         self._seeds = 0  # those of which all runs are over
         if earlier is not None:
             self.facts, self.limit_s, self._seeds = (
@@ -180,7 +183,9 @@ class RunsSession:
     # --- before the runs ----------------------------------------------------------------------------------------------
 
     def _first(self, config: Config) -> dict[str, Any]:
-        return self._arena.first(config, masked=self.facts.get("masked", False))
+        return {"config": dump(config), "source": str(config.source), "variant": self.plan.variant,
+                "memory_limit": self.plan.memory_limit, "targets": str(self.folder / "targets.npz"),
+                "masked": self.facts.get("masked", False)}  # fmt: skip
 
     def _prepare(self) -> bool:
         """Start what judges, and have it make the target; False where time is up over it."""
@@ -189,7 +194,7 @@ class RunsSession:
         judge = self._judge = Judging(process, plan.reference.label, self._stop, self._pace.over)
         opening = judge.open()
         if opening is not None:
-            self._arena.warn(opening)
+            self._warn(opening)
             self._startup_s = max(self._now() - began - opening["loading_s"], 0.0)
             if self._earlier is not None:
                 self.facts = judge.restore(targets, self._earlier)
@@ -259,7 +264,8 @@ class RunsSession:
                 wave.append(run)
                 self._open(run)
             for turn, until_s in enumerate(times(self.limit_s)):
-                for run in self._arena.in_turn(wave, turn):
+                start = turn % max(len(wave), 1)
+                for run in wave[start:] + wave[:start]:
                     point = self._advance(run, until_s, wave)
                     if point is not None:
                         run.points.append(point)
@@ -300,10 +306,10 @@ class RunsSession:
         if opening is None:
             self._say_end(run)
             return
-        self._arena.warn(opening)
+        self._warn(opening)
         run.counted_s = opening["loading_s"]
         for line in opening["chose"]:
-            self._arena.once(f"{run.method.label}: {line}")
+            self._once(f"{run.method.label}: {line}")
 
     def _late(self, left_s: float, grace: float = GRACE) -> Callable[[], bool]:
         """Whether the whole is over, or a run has been waited for longer than what is left of its time."""
@@ -313,8 +319,9 @@ class RunsSession:
     def _advance(self, run: Run, until_s: float, wave: list[Run]) -> RunPointRecord | None:
         """Where a run stands at some time; None where that cannot be known any more."""
         if run.alive:
-            tight = self._arena.is_tight(sum(other.peak_mib for other in wave if other.alive))
-            question = {"until_s": until_s, "limit_s": self.limit_s, "out": str(run.out), "release": tight}
+            held = sum(other.peak_mib for other in wave if other.alive) * MIB
+            question = {"until_s": until_s, "limit_s": self.limit_s, "out": str(run.out),
+                        "release": held > MEMORY_SHARE * self.plan.memory}  # fmt: skip
             left_s = max(self.limit_s - run.counted_s, 0.0)
             late = self._late(left_s, GRACE if run.first_s is None else CUT)
             answer = run.ask(question, self._stop, late)
@@ -332,7 +339,7 @@ class RunsSession:
         """Keep an answer, and have new values judged; False where the budget was spent over that."""
         run.first_s, run.peak_mib = answer["first_s"], answer["peak_mib"]
         if answer["finished_s"] is not None:
-            self._arena.once(f"{run.method.label}: all iterations were done after {answer['finished_s']:.3g} s; "
+            self._once(f"{run.method.label}: all iterations were done after {answer['finished_s']:.3g} s; "
                        "raise run.iterations to have it go on")  # fmt: skip
         if answer["iteration"] == run.state.iteration:
             return True
@@ -352,3 +359,12 @@ class RunsSession:
             self._say(f"{run.method.label}, seed {run.seed}: {run.end.status.value}: {run.end.reason}")
         elif not self._pace.over():
             self._say(f"{run.method.label}, seed {run.seed}: cut off in iteration {run.state.iteration + 1}")
+
+    def _warn(self, opening: dict[str, Any]) -> None:
+        for line in opening.get("warnings", ()):
+            self._once(line)
+
+    def _once(self, line: str) -> None:
+        if line not in self._said:
+            self._said.add(line)
+            self._say(line)
