@@ -77,14 +77,14 @@ def measure_runs(
         session = RunsSession(
             plan, folder, lambda: interrupts.requested, echo, spent_s=spent_s, earlier=earlier, device=where
         )
-        points += [point for run in session.runs for point in run.points]  # of earlier sessions
+        points += [point for run in session.members for point in run.points]  # of earlier sessions
 
         def show(point: RunPointRecord) -> None:
             if point.elapsed_s == session.limit_s:
                 echo(table.point(point, session.run_of(point).first_s))
 
         def found() -> tuple[list[RunMethodRecord], list[RunBestRecord], str]:
-            now = outcome(session.runs, session.limit_s, plan.names)
+            now = outcome(session.members, session.limit_s, plan.names)
             bests = [replace(record, line=best_line(record)) for record in now.bests]
             return now.methods, bests, runs_closing_sentence(now.loss, now.error, session.limit_s)
 
