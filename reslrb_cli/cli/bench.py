@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from reslrb_cli.config.schema import Config
     from reslrb_cli.measure.bench import Book, Result
     from reslrb_cli.measure.methods import Sweep
-    from reslrb_cli.records.measurements import BenchRecord
+    from reslrb_cli.records.measurements import BenchRecord, BenchStatus
 
 
 #: What is compared where the user names nothing.
@@ -50,6 +50,50 @@ class Size(click.ParamType):
         return int(size)
 
 
+budget_option = click.option(
+    "--budget", type=click.FloatRange(min=0), default=240.0, show_default=True, metavar="SECONDS",
+    help="Time for the whole, loading and compiling included; what it does not suffice for is named, with what it "
+         "would take.",
+)  # fmt: skip
+
+
+memory_limit_option = click.option(
+    "--memory-limit", type=Size(),
+    help="Address space of each process, e.g. 2GiB (CPU only); default: the machine's memory.",
+)  # fmt: skip
+
+
+def files_of(resumed: Path | None, json_file: Path | None, plot_file: Path | None) -> tuple[Path | None, Path | None]:
+    """The files of `--json` and `--plot`, by default that of `--resume` and one beside it. Raises ConfigError."""
+    json_file = json_file or resumed
+    if json_file is not None and plot_file is None:
+        plot_file = json_file.with_suffix(".png")
+    for option, path in (("--json", json_file), ("--plot", plot_file)):
+        check_writable(option, path)
+    return json_file, plot_file
+
+
+def machine_of(config: Config, memory_limit: int | None) -> dict[str, Any]:
+    """What computes, as a `Measurement` has it: variant, memory, and the limit of each process. Raises ConfigError."""
+    from reslrb_cli.backend.doctor import memory_bytes
+    from reslrb_cli.backend.variant import choose
+
+    variant, _ = choose(config.variant)
+    on_gpu, memory = variant.startswith("cuda"), memory_bytes(variant)
+    if on_gpu and memory_limit is not None:
+        raise ConfigError("--memory-limit", "", f"bounds address space, which says nothing of {variant}'s memory")
+    return {"variant": variant, "memory": memory, "memory_limit": memory_limit or (None if on_gpu else memory)}
+
+
+def exit_code(done: bool, states: set[BenchStatus]) -> ExitCode:
+    """A comparison in which something could be measured is `done`; else what kept it from that decides."""
+    from reslrb_cli.records.measurements import BenchStatus
+
+    if done:
+        return ExitCode.DONE
+    return ExitCode.OUT_OF_MEMORY if states == {BenchStatus.OUT_OF_MEMORY} else ExitCode.CHECK_FAILED
+
+
 @click.command("bench")
 @optional_experiment_arguments
 @click.option("--sweep", "swept", type=click.Choice(["depth", "spp", "film", "texture"]), default="depth",
@@ -68,11 +112,8 @@ class Size(click.ParamType):
               help="Entry of that list that times are divided by; default: ptracer, or else the first.")  # fmt: skip
 @click.option("--objective", type=click.Choice(["fixed", "l2"]), default="fixed", show_default=True,
               help="fixed: dL/dI is given before the image; l2: it comes from the image, by run.adjoint.")  # fmt: skip
-@click.option("--memory-limit", type=Size(),
-              help="Address space of each process, e.g. 2GiB (CPU only); default: the machine's memory.")  # fmt: skip
-@click.option("--budget", type=click.FloatRange(min=0), default=240.0, show_default=True, metavar="SECONDS",
-              help="Time for the whole, loading and compiling included; what it does not suffice for is named, with "
-                   "what it would take.")  # fmt: skip
+@memory_limit_option
+@budget_option
 @click.option("--rounds", type=click.IntRange(min=1, max=COUNT.max), metavar="N",
               help="Number of steps of each, whatever time they take, those of --resume included.")  # fmt: skip
 @resume_option
@@ -104,9 +145,8 @@ def command(
     --json has written can be gone on from, however the process ended.
     """
     began = time.monotonic()
-    from reslrb_cli.backend.doctor import device_name, memory_bytes
+    from reslrb_cli.backend.doctor import device_name
     from reslrb_cli.backend.installation import load_packages
-    from reslrb_cli.backend.variant import choose
     from reslrb_cli.config.loader import load, loads
 
     load_packages()  # before what follows asks for them
@@ -115,6 +155,7 @@ def command(
     from reslrb_cli.measure.methods import SWEPT, Sweep, choose_baseline, depths, parse_cases, usual_values
     from reslrb_cli.measure.resume_store import Earlier
     from reslrb_cli.measure.scenes import small
+    from reslrb_cli.records.measurements import BenchStatus
 
     if config_file is None:
         config = loads(small.CORNELL_BOX, small.CORNELL_BOX_SOURCE, overrides)
@@ -124,24 +165,14 @@ def command(
         reason = "goes with --sweep depth" if values is None else "does not go with --values"
         raise ConfigError("--max-depth", "", f"{reason}; take --set integrator.max_depth={max_depth}")
     cases = parse_cases(integrators or INTEGRATORS, deep=swept == "depth")
-    json_file = json_file or resumed
-    if json_file is not None and plot_file is None:
-        plot_file = json_file.with_suffix(".png")
-    for option, path in (("--json", json_file), ("--plot", plot_file)):
-        check_writable(option, path)
-    variant, _ = choose(config.variant)
-    if variant.startswith("cuda") and memory_limit is not None:
-        raise ConfigError("--memory-limit", "", f"bounds address space, which says nothing of {variant}'s memory")
-    memory = memory_bytes(variant)
+    json_file, plot_file = files_of(resumed, json_file, plot_file)
     sweep = Sweep(
+        **machine_of(config, memory_limit),
         config=config,
-        variant=variant,
         cases=cases,
         baseline=choose_baseline(cases, baseline),
         values=sorted(values or (depths(max_depth) if swept == "depth" else usual_values(swept, config))),
         objective=objective,
-        memory_limit=memory_limit or (None if variant.startswith("cuda") else memory),
-        memory=memory,
         budget_s=budget,
         rounds=rounds,
         default=integrators is None,
@@ -149,8 +180,9 @@ def command(
     )
     sweep.check()
     earlier = None if resumed is None else Earlier(KIND, resumed, *read_earlier(resumed))
-    book = Book(sweep, device_name(variant), earlier)
-    echo(f"{device_name(variant)}, {variant}; {allowance(budget, rounds, 'round')}")
+    device = device_name(sweep.variant)
+    book = Book(sweep, device, earlier)
+    echo(f"{device}, {sweep.variant}; {allowance(budget, rounds, 'round')}")
     echo(_conditions(config, sweep))
     results, interrupted = _run(sweep, book, json_file, began)
     if plot_file is not None and results:
@@ -158,9 +190,10 @@ def command(
 
         series = [(case.label, [(r.value, r.record) for r in results if r.case == case]) for case in cases]
         abscissa = "path depth" if swept == "depth" else SWEPT[swept]
-        plot_bench(series, plot_file, f"{device_name(variant)}\n{_conditions(config, sweep)}", abscissa)
+        plot_bench(series, plot_file, f"{device}\n{_conditions(config, sweep)}", abscissa)
         echo(f"look at {os.path.relpath(plot_file)}")
-    return ExitCode.INTERRUPTED if interrupted else _exit_code(results)
+    states = {result.record.status for result in results}
+    return ExitCode.INTERRUPTED if interrupted else exit_code(BenchStatus.OK in states, states)
 
 
 def _run(sweep: Sweep, book: Book, json_file: Path | None, began: float) -> tuple[list[Result], bool]:
@@ -209,13 +242,3 @@ def _conditions(config: Config, sweep: Sweep) -> str:
     delta = "dL/dI known before" if sweep.objective == "fixed" else f"l2, adjoint {config.adjoint}"
     limit = "" if sweep.memory_limit is None else f", {sweep.memory_limit / 2**30:.2f} GiB each"
     return ", ".join([*parts, roulette, delta, f"ratios over {sweep.baseline.label}{limit}"])
-
-
-def _exit_code(results: list[Result]) -> ExitCode:
-    """A sweep in which something could be measured is done; else what kept it from that decides."""
-    from reslrb_cli.records.measurements import BenchStatus
-
-    states = {result.record.status for result in results}
-    if BenchStatus.OK in states:
-        return ExitCode.DONE
-    return ExitCode.OUT_OF_MEMORY if states == {BenchStatus.OUT_OF_MEMORY} else ExitCode.CHECK_FAILED

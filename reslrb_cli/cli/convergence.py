@@ -9,22 +9,21 @@ import os
 import shutil
 import tempfile
 import time
-from collections.abc import Sequence
-from contextlib import ExitStack
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from reslrb_cli.cli.bench import Size
+from reslrb_cli.cli.bench import budget_option, exit_code, files_of, machine_of, memory_limit_option
 from reslrb_cli.cli.options import (
     COUNT,
     Counts,
     Factors,
     Keeper,
     allowance,
-    check_writable,
     experiment_arguments,
     is_given,
     origin_of,
@@ -33,23 +32,32 @@ from reslrb_cli.cli.options import (
 )
 from reslrb_cli.cli.terminal import Interrupts, echo
 from reslrb_cli.errors import ConfigError, ExitCode
-from reslrb_cli.measure.methods import RunsPlan
-from reslrb_cli.measure.optimization_benchmark.rank import KIND, check, outcome
-from reslrb_cli.measure.optimization_benchmark.session import RunsSession
-from reslrb_cli.measure.processes import abandon_all
-from reslrb_cli.measure.resume_store import Earlier
-from reslrb_cli.records.measurement_files import Line
-from reslrb_cli.records.measurements import BenchStatus, RunBestRecord, RunMethodRecord, RunPointRecord, SummaryRecord
-from reslrb_cli.report.convergence_tables import RunsTable, best_line, runs_closing_sentence, runs_notes
 from reslrb_cli.report.format import WITHOUT_BORDER, count
-from reslrb_cli.report.plots import plot_runs
 
 if TYPE_CHECKING:
     from reslrb_cli.measure.convergence.judgement import Results
     from reslrb_cli.measure.convergence.session import Session
-    from reslrb_cli.measure.methods import Plan
-    from reslrb_cli.records.measurements import MethodRecord
+    from reslrb_cli.measure.methods import Plan, RunsPlan
+    from reslrb_cli.measure.optimization_benchmark.session import RunsSession
+    from reslrb_cli.measure.resume_store import Earlier
+    from reslrb_cli.records.measurement_files import Line
+    from reslrb_cli.records.measurements import MethodRecord, RunBestRecord, RunMethodRecord, RunPointRecord
     from reslrb_cli.report.convergence_tables import Table
+
+
+@contextmanager
+def _workplace() -> Iterator[tuple[Path, Interrupts]]:
+    """A folder for what processes write, and the user's wish to stop; neither outlives what is done in it."""
+    from reslrb_cli.measure.processes import abandon_all
+
+    with tempfile.TemporaryDirectory(prefix="reslrb-convergence-") as name:
+
+        def tidy() -> None:
+            abandon_all()
+            shutil.rmtree(name, ignore_errors=True)
+
+        with Interrupts(last_act=tidy) as interrupts:
+            yield Path(name), interrupts
 
 
 def measure_runs(
@@ -59,32 +67,32 @@ def measure_runs(
 
     `resumed` is the JSON file that is gone on from, if any.
     """
+    from reslrb_cli.measure.optimization_benchmark.rank import KIND, check, outcome
+    from reslrb_cli.measure.optimization_benchmark.session import RunsSession
+    from reslrb_cli.measure.resume_store import Earlier
+    from reslrb_cli.records.measurements import SummaryRecord
+    from reslrb_cli.report.convergence_tables import RunsTable, best_line, runs_closing_sentence, runs_notes
+    from reslrb_cli.report.plots import plot_runs
+
     points: list[RunPointRecord] = []
     earlier = None if resumed is None else Earlier(KIND, resumed, *read_earlier(resumed))
     if earlier is not None:
         check(plan, earlier, where)
     echo(f"{where}; {allowance(plan.budget_s, None, 'run')}")
-    with ExitStack() as stack:
-        folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="reslrb-convergence-")))
-
-        def tidy() -> None:
-            abandon_all()
-            shutil.rmtree(folder, ignore_errors=True)
-
-        interrupts = stack.enter_context(Interrupts(last_act=tidy))
+    with _workplace() as (folder, interrupts):
         table = RunsTable(list(plan.names))
         spent_s = time.monotonic() - began
         session = RunsSession(
             plan, folder, lambda: interrupts.requested, echo, spent_s=spent_s, earlier=earlier, device=where
         )
-        points += [point for run in session.runs for point in run.points]  # of earlier sessions
+        points += [point for run in session.members for point in run.points]  # of earlier sessions
 
         def show(point: RunPointRecord) -> None:
             if point.elapsed_s == session.limit_s:
                 echo(table.point(point, session.run_of(point).first_s))
 
         def found() -> tuple[list[RunMethodRecord], list[RunBestRecord], str]:
-            now = outcome(session.runs, session.limit_s, plan.names)
+            now = outcome(session.members, session.limit_s, plan.names)
             bests = [replace(record, line=best_line(record)) for record in now.bests]
             return now.methods, bests, runs_closing_sentence(now.loss, now.error, session.limit_s)
 
@@ -135,10 +143,8 @@ def _runs_conditions(plan: RunsPlan, session: RunsSession) -> str:
 
 def _runs_exit_code(records: list[RunMethodRecord]) -> ExitCode:
     """A comparison in which something was optimised is done; else what kept it from that decides."""
-    if any(record.iterations is not None and record.iterations.high > 0 for record in records):
-        return ExitCode.DONE
-    states = {record.status for record in records}
-    return ExitCode.OUT_OF_MEMORY if states == {BenchStatus.OUT_OF_MEMORY} else ExitCode.CHECK_FAILED
+    done = any(record.iterations is not None and record.iterations.high > 0 for record in records)
+    return exit_code(done, {record.status for record in records})
 
 
 #: The most seeds of --runs.
@@ -160,9 +166,7 @@ MOST_RUNS = 100
 @click.option("--rates", type=Factors(), metavar="LIST",
               help="With --runs: each method tries its learning rates times each of these, e.g. 0.3,1,3, and is "
                    "compared at its best.")  # fmt: skip
-@click.option("--budget", type=click.FloatRange(min=0), default=240.0, show_default=True, metavar="SECONDS",
-              help="Time for the whole, loading and compiling included; what it does not suffice for is named, with "
-                   "what it would take.")  # fmt: skip
+@budget_option
 @click.option("--rounds", type=click.IntRange(min=1, max=COUNT.max), metavar="N",
               help="Number of turns of each, whatever time they take, those of --resume included: the same steps on "
                    "every machine.")  # fmt: skip
@@ -171,8 +175,7 @@ MOST_RUNS = 100
 @click.option("--reference", metavar="METHOD", default="reslrb:stack", show_default=True,
               help="What errors are taken from: the mean of many steps of this one.")  # fmt: skip
 @resume_option
-@click.option("--memory-limit", type=Size(),
-              help="Address space of each process, e.g. 2GiB (CPU only); default: the machine's memory.")  # fmt: skip
+@memory_limit_option
 @click.option("--json", "json_file", type=click.Path(path_type=Path, dir_okay=False),
               help="Write one object a line: points, methods and references.")  # fmt: skip
 @click.option("--plot", "plot_file", type=click.Path(path_type=Path, dir_okay=False),
@@ -201,13 +204,11 @@ def command(
     ended. docs/convergence.md explains the columns.
     """
     began = time.monotonic()
-    from reslrb_cli.backend.doctor import device_name, memory_bytes
+    from reslrb_cli.backend.doctor import device_name
     from reslrb_cli.backend.installation import load_packages
-    from reslrb_cli.backend.variant import choose
     from reslrb_cli.config.loader import load
 
     load_packages()  # before what follows asks for them
-    from reslrb_cli.cli.options import read_earlier
     from reslrb_cli.measure.convergence.session import KIND, check
     from reslrb_cli.measure.methods import DEFAULT, DEFAULTS, Plan, RunsPlan, parse_cases
     from reslrb_cli.measure.resume_store import Earlier
@@ -221,36 +222,26 @@ def command(
     stands = parse_cases(reference, "--reference", deep=False)
     if len(stands) != 1:
         raise ConfigError("--reference", "", "errors are taken from one method; name one")
-    json_file = json_file or resumed
-    if json_file is not None and plot_file is None:
-        plot_file = json_file.with_suffix(".png")
-    for option, path in (("--json", json_file), ("--plot", plot_file)):
-        check_writable(option, path)
-    variant, _ = choose(config.variant)
-    if variant.startswith("cuda") and memory_limit is not None:
-        raise ConfigError("--memory-limit", "", f"bounds address space, which says nothing of {variant}'s memory")
-    memory = memory_bytes(variant)
+    json_file, plot_file = files_of(resumed, json_file, plot_file)
     settings: dict[str, Any] = {
+        **machine_of(config, memory_limit),
         "config": config,
-        "variant": variant,
         "cases": cases,
         "reference": stands[0],
         "objective": objective if runs is None else "loss",
-        "memory_limit": memory_limit or (None if variant.startswith("cuda") else memory),
-        "memory": memory,
         "budget_s": budget,
         "rounds": rounds,
         "default": integrators is None,
         "spps": spps or (),
     }
-    where = f"{device_name(variant)}, {variant}"
+    device = device_name(settings["variant"])
+    where = f"{device}, {settings['variant']}"
     if runs is not None:
         whole = RunsPlan(**settings, runs=runs, rates=rates or ())
         whole.check()
         return measure_runs(whole, resumed, json_file, plot_file, began, where)
     plan = Plan(**settings)
     plan.check()
-    device = device_name(variant)
     earlier = None if resumed is None else Earlier(KIND, resumed, *read_earlier(resumed))
     if earlier is not None:
         check(plan, earlier, device)
@@ -261,7 +252,9 @@ def command(
 
         plot_convergence(results.points, results.methods, plot_file, f"{where}\n{conditions}")
         echo(f"look at {os.path.relpath(plot_file)}")
-    return ExitCode.INTERRUPTED if interrupted else _exit_code(results)
+    done = any(record.relative_rmse is not None for record in results.methods)
+    states = {record.status for record in results.methods}
+    return ExitCode.INTERRUPTED if interrupted else exit_code(done, states)
 
 
 def _refuse_with_runs() -> None:
@@ -279,27 +272,13 @@ def _run(
     plan: Plan, json_file: Path | None, began: float, earlier: Earlier | None, device: str
 ) -> tuple[Results, str, bool]:
     """Measure, print and write; returns the results, the conditions in words, and whether the user interrupted."""
-    import shutil
-    import tempfile
-    from contextlib import ExitStack
-
-    from reslrb_cli.cli.options import Keeper, origin_of
-    from reslrb_cli.cli.terminal import Interrupts
     from reslrb_cli.measure.convergence.judgement import Judgement
     from reslrb_cli.measure.convergence.session import Session
     from reslrb_cli.measure.convergence.setup import Role
-    from reslrb_cli.measure.processes import abandon_all
     from reslrb_cli.records.measurements import SummaryRecord
     from reslrb_cli.report.convergence_tables import closing_sentence, notes, reference_line
 
-    with ExitStack() as stack:
-        folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="reslrb-convergence-")))
-
-        def tidy() -> None:
-            abandon_all()
-            shutil.rmtree(folder, ignore_errors=True)
-
-        interrupts = stack.enter_context(Interrupts(last_act=tidy))
+    with _workplace() as (folder, interrupts):
         spent_s = time.monotonic() - began
         session = Session(
             plan, folder, lambda: interrupts.requested, echo, spent_s=spent_s, earlier=earlier, device=device
@@ -356,8 +335,6 @@ def _shown(records: Sequence[MethodRecord]) -> list[str]:
 
 def _conditions(plan: Plan, session: Session) -> str:
     """What was measured, in one line."""
-    from reslrb_cli.report.format import WITHOUT_BORDER
-
     config, facts = plan.config, session.facts
     depth, rr_depth = config.integrator.max_depth, config.integrator.rr_depth
     roulette = "no roulette" if 0 <= depth < rr_depth else f"roulette from depth {rr_depth}"
@@ -366,13 +343,3 @@ def _conditions(plan: Plan, session: Session) -> str:
     parts = [str(config.source), f"{spp} spp", roulette, what, facts.get("pictures", "")]
     parts.append(WITHOUT_BORDER if facts.get("masked") else "")
     return ", ".join(part for part in parts if part)
-
-
-def _exit_code(results: Results) -> ExitCode:
-    """A comparison in which something could be measured is done; else what kept it from that decides."""
-    from reslrb_cli.records.measurements import BenchStatus
-
-    if any(record.relative_rmse is not None for record in results.methods):
-        return ExitCode.DONE
-    states = {record.status for record in results.methods}
-    return ExitCode.OUT_OF_MEMORY if states == {BenchStatus.OUT_OF_MEMORY} else ExitCode.CHECK_FAILED

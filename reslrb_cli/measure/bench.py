@@ -25,10 +25,10 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from reslrb_cli.config.loader import dump
 from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.measure import resume_store
+from reslrb_cli.measure.arena import in_turn, is_tight
 from reslrb_cli.measure.methods import WIDTHS, Case, Sweep
 from reslrb_cli.measure.processes import GROWTH, MAX_ROUNDS, NO_TIME, Contestant, Ended, Pace, Stopped
 from reslrb_cli.measure.resume_store import Earlier
@@ -50,16 +50,12 @@ class Book:
     def __init__(self, sweep: Sweep, device: str = "", before: Earlier | None = None) -> None:
         self.sweep, self.runs, self.done = sweep, dict[int, list[Run]](), set[int]()
         self.left_out: list[Case] = []
-        self._settings = resume_store.settings(
-            sweep.config,
-            sweep.variant,
+        self._settings = sweep.settings(
             device,
-            integrators=[case.label for case in sweep.cases],
             baseline=sweep.baseline.label,
             values=list(sweep.values),
             objective=sweep.objective,
             sweep=sweep.swept,
-            **{"memory limit": sweep.memory_limit},
         )
         if before is not None:
             before.check(self._settings)
@@ -239,13 +235,6 @@ def _ratio(run: Run, baseline: Run, key: str) -> Spread | None:
 MAX_WARM_UPS = 4
 
 
-#: Where the cases of a depth together hold more than this share of the memory, each releases its own after a step.
-MEMORY_SHARE = 0.7
-
-
-MIB = 2**20
-
-
 #: First steps that take longer are told of as they are done, in seconds.
 SLOW = 10.0
 
@@ -321,22 +310,10 @@ def _begin(book: Book, value: int, start: Callable[[dict[str, Any]], Any]) -> li
             may_refuse = book.sweep.may_refuse(case)
             run = before.get(case.label) or Run(process=None, may_refuse=may_refuse, case=case, config=config)
             if run.alive:
-                run.process = start(_first(book.sweep, run, value))
+                width = {f"{book.sweep.swept}_width": value} if book.sweep.swept in WIDTHS else {}
+                run.process = start(book.sweep.first(config) | {"objective": book.sweep.objective} | width)
             runs.append(run)
     return runs
-
-
-def _first(sweep: Sweep, run: Run, value: int) -> dict[str, Any]:
-    first: dict[str, Any] = {
-        "config": dump(run.config),
-        "source": str(run.config.source),
-        "variant": sweep.variant,
-        "objective": sweep.objective,
-        "memory_limit": sweep.memory_limit,
-    }
-    if sweep.swept in WIDTHS:
-        first[f"{sweep.swept}_width"] = value
-    return first
 
 
 def _measure(
@@ -377,8 +354,7 @@ def _measure(
     pace.begin_rounds(min((len(run.steps) for run in alive()), default=0))
     done = 0
     while alive() and pace.another(done):
-        turn = alive()
-        for run in turn[done % len(turn) :] + turn[: done % len(turn)]:
+        for run in in_turn(alive(), done):
             answer = run.step(first + done + 1, False, tight, stop)
             if answer is not None:
                 run.steps[first + done] = answer
@@ -387,5 +363,4 @@ def _measure(
 
 
 def _tight(sweep: Sweep, runs: list[Run]) -> bool:
-    held = sum(run.cold["peak_mib"] for run in runs if run.cold is not None and run.at_work) * MIB
-    return held > MEMORY_SHARE * sweep.memory
+    return is_tight(sweep, (run.cold["peak_mib"] for run in runs if run.cold is not None and run.at_work))

@@ -17,11 +17,12 @@ from typing import Any
 from reslrb_cli.config.base import SEED_END
 from reslrb_cli.config.integrators import ESTIMATOR_OPTIONS, UNDECIDED, Prb, Ptracer, Trajectory, WalkAd
 from reslrb_cli.config.integrators import Reslrb as ReslrbConfig
-from reslrb_cli.config.loader import with_integrator
+from reslrb_cli.config.loader import dump, with_integrator
 from reslrb_cli.config.parameters import ByWord, ParameterSpec
 from reslrb_cli.config.schema import Config
 from reslrb_cli.config.yaml_text import parse
 from reslrb_cli.errors import ConfigError
+from reslrb_cli.measure import resume_store
 from reslrb_cli.records.measurements import Method
 
 #: Options that a case takes over from the configuration's integrator, where it knows them.
@@ -207,27 +208,48 @@ def usual_values(swept: str, config: Config) -> list[int]:
     return list(WIDTHS[swept])
 
 
-@dataclass(frozen=True)
-class Sweep:
-    """What is measured: at each of `values` of what is `swept`.
+@dataclass(frozen=True, kw_only=True)
+class Measurement:
+    """What every measurement by processes has; `memory_limit` is of each, None: none.
 
-    `memory_limit` is of each process, None: none; `memory` is what the machine has, in bytes.
-
-    `rounds` is None where `budget_s` decides their number; else there are so many, whatever time they take. Of the
-    `cases`, those that cannot do what the scene asks for are left out where they are the `default` ones.
+    `memory` is what the machine has, in bytes. `rounds` is None where `budget_s` decides their number; else there are
+    so many, whatever time they take. Of the `cases`, those that cannot do what the scene asks for are left out where
+    they are the `default` ones.
     """
 
     config: Config
     variant: str
     cases: Sequence[Case]
-    baseline: Case
-    values: Sequence[int]
     objective: str
     memory_limit: int | None
     memory: int
     budget_s: float
     rounds: int | None = None
     default: bool = False
+
+    def first(self, config: Config) -> dict[str, Any]:
+        """What a process is told first, to measure `config`."""
+        return {"config": dump(config), "source": str(config.source), "variant": self.variant,
+                "memory_limit": self.memory_limit}  # fmt: skip
+
+    def settings(self, device: str, **options: Any) -> dict[str, Any]:
+        """What has to be the same in all sessions, as JSON has it; see `resume_store.settings`."""
+        return resume_store.settings(
+            self.config,
+            self.variant,
+            device,
+            integrators=[case.label for case in self.cases],
+            **options,
+            **{"memory limit": self.memory_limit},
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sweep(Measurement):
+    """What is measured: at each of `values` of what is `swept`, times over those of the `baseline`."""
+
+    baseline: Case
+    values: Sequence[int]
     swept: str = "depth"
 
     def may_refuse(self, case: Case) -> bool:
@@ -281,24 +303,14 @@ IMAGES = 8
 ALL = "all"
 
 
-@dataclass(frozen=True)
-class Plan:
-    """What is measured; `memory_limit` is of each process, None: none; `memory` is what the machine has, in bytes.
+@dataclass(frozen=True, kw_only=True)
+class Plan(Measurement):
+    """What is measured, and what errors are taken from, the `reference`.
 
-    Of the `cases` those that cannot do what the scene asks for are left out where they are the `default` ones. `rounds`
-    is None where `budget_s` decides their number; `spps` are samples per pixel of a step, nothing for those of `run`.
+    `spps` are samples per pixel of a step, nothing for those of `run`.
     """
 
-    config: Config
-    variant: str
-    cases: Sequence[Case]
     reference: Case
-    objective: str
-    memory_limit: int | None
-    memory: int
-    budget_s: float
-    rounds: int | None = None
-    default: bool = False
     spps: Sequence[int] = ()
 
     @property
@@ -366,7 +378,7 @@ class Side:
     rate: float | None = None
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class RunsPlan(Plan):
     """What is measured; see `Plan`. `runs` is the number of seeds, which all methods have in common.
 

@@ -39,7 +39,7 @@ def test_known_curves_have_known_medians_and_bands(tmp_path: Path) -> None:
             values = [1.0] * 3 if done == 0 else [played.gain**done * (1 + seed / 100) for seed in range(3)]
             assert (band.low, band.median, band.high) == pytest.approx(tuple(values))
         assert [point.elapsed_s for point in own if point.seed == 1] == times(session.limit_s)
-    records = method_records(session.runs, session.limit_s)
+    records = method_records(session.members, session.limit_s)
     assert [(record.method.label, record.runs) for record in records] == [("ptracer", 3), ("reslrb:stack", 3)]
     for record, played in zip(records, (slow, fast), strict=True):
         done = iterations_by(session.limit_s, played)
@@ -109,11 +109,11 @@ def test_a_method_that_ends_is_recorded_and_the_rest_goes_on(tmp_path: Path) -> 
     session, _, said = play(tmp_path, Stage(ptracer=Pretence(ends_s=2.0)), plan())
     assert "ptracer, seed 0: out_of_memory: ended by SIGKILL" in said
     assert len([line for line in said if line.startswith("ptracer")]) == 1  # another seed would need as much
-    ended, sound = method_records(session.runs, session.limit_s)
+    ended, sound = method_records(session.members, session.limit_s)
     assert (ended.status, ended.runs, ended.loss) == (BenchStatus.OUT_OF_MEMORY, 0, None)
     assert runs_notes([ended, sound]) == ["ptracer: 1 of 1 ended before their time: ended by SIGKILL"]
     assert sound.runs == 3
-    verdict = find_best(finals(session.runs, session.limit_s, "loss"))
+    verdict = find_best(finals(session.members, session.limit_s, "loss"))
     assert "reslrb:stack, the only one that was measured" in runs_closing_sentence(verdict, None, session.limit_s)
 
 
@@ -134,7 +134,7 @@ def test_an_interrupt_keeps_what_is_done(tmp_path: Path, after: int) -> None:
     session, points, _ = play(tmp_path, Stage(), plan(), lambda: next(answers) > after)
     assert len(points) < len(whole)
     assert points == whole[: len(points)]
-    assert sum(record.runs for record in method_records(session.runs, session.limit_s)) == len(
+    assert sum(record.runs for record in method_records(session.members, session.limit_s)) == len(
         [point for point in points if point.elapsed_s == session.limit_s]
     )
 
@@ -154,8 +154,8 @@ def test_runs_that_all_compile_for_too_long_end_after_the_first_seed(tmp_path: P
     played = Pretence(first_s=500.0)
     session, points, said = play(tmp_path, Stage(ptracer=played, reslrb_stack=played), plan())
     assert {point.seed for point in points} == {0}
-    assert find_best(finals(session.runs, session.limit_s, "loss")) is None
-    assert _runs_exit_code(method_records(session.runs, session.limit_s)) == ExitCode.CHECK_FAILED
+    assert find_best(finals(session.members, session.limit_s, "loss")) is None
+    assert _runs_exit_code(method_records(session.members, session.limit_s)) == ExitCode.CHECK_FAILED
     assert said[-1].startswith("no method came to an iteration in the")
 
 
@@ -233,7 +233,7 @@ def test_records_and_lines(tmp_path: Path) -> None:
     assert list(line) == ["kind", "label", "integrator", "estimator", "capacity", "adjoint", "spp", "seed", "elapsed_s",
                           "iteration", "loss", "parameter_error"]  # fmt: skip
     assert line["kind"] == "run_point"
-    record = method_records(session.runs, session.limit_s)[1]
+    record = method_records(session.members, session.limit_s)[1]
     line = json.loads(record.to_json())
     assert (line["kind"], line["label"], line["status"]) == ("run_method", "reslrb:stack", "ok")
     assert set(line["loss"]) == {"median", "low", "high"}

@@ -47,7 +47,7 @@ def test_each_method_counts_at_its_best_rate(tmp_path: Path) -> None:
     assert [what.config_at(side).optimizer.learning_rate for side in what.sides] == pytest.approx(
         [0.01, 0.02, 0.08] * 2
     )
-    found = outcome(session.runs, session.limit_s, what.names)
+    found = outcome(session.members, session.limit_s, what.names)
     assert [record.method.label for record in found.methods] == labels
     assert found.error is not None
     assert (found.error.best, found.error.beats) == ("ptracer", ["reslrb:stack"])
@@ -69,7 +69,7 @@ def test_each_method_counts_at_its_best_rate(tmp_path: Path) -> None:
 def test_without_rates_there_are_ratios_of_enough_seeds_alone(tmp_path: Path) -> None:
     for runs, count in ((4, 0), (5, 2)):
         session, _, _ = play(tmp_path, Stage(), plan(runs=runs))
-        found = outcome(session.runs, session.limit_s, plan().names)
+        found = outcome(session.members, session.limit_s, plan().names)
         assert len(found.bests) == count
         assert all(best.at is None and best.to == "ptracer" and best.label == "reslrb:stack" for best in found.bests)
         assert all("rates" not in best_line(best) for best in found.bests)
@@ -78,15 +78,15 @@ def test_without_rates_there_are_ratios_of_enough_seeds_alone(tmp_path: Path) ->
 def test_a_seed_that_was_broken_off_does_not_count(tmp_path: Path) -> None:
     """Of three seeds the last is over for one method alone: medians are over the two that both have."""
     session, _, _ = play(tmp_path, Stage(ptracer=Pretence(0.9)), plan(rates=RATES))
-    last = [run for run in session.runs if run.seed == 2]
+    last = [run for run in session.members if run.seed == 2]
     last[0].points[-1] = replace(last[0].points[-1], loss=0.0, parameter_error=0.0)  # it would be the best
     for run in last[1:]:
         run.points.pop()
-    found = outcome(session.runs, session.limit_s, plan(rates=RATES).names)
+    found = outcome(session.members, session.limit_s, plan(rates=RATES).names)
     assert [record.runs for record in found.methods] == [3, 2, 2, 2, 2, 2]
     assert {best.runs for best in found.bests} == {2}
     first = next(best for best in found.bests if best.of == "parameter_error")
-    ends = [run.points[-1].parameter_error for run in session.runs if run.method.label == first.at and run.seed < 2]
+    ends = [run.points[-1].parameter_error for run in session.members if run.method.label == first.at and run.seed < 2]
     assert [first.value.low, first.value.high] == sorted(ends)
 
 

@@ -48,11 +48,11 @@ def test_seeds_go_on_with_the_same_target_and_the_same_time(tmp_path: Path) -> N
     assert said == ["old"]
     assert {seed for _, seed in stage.turns} == {2, 3}
     assert second.limit_s == first.limit_s
-    assert [run.seed for run in second.runs] == [0, 0, 1, 1, 2, 2, 3, 3]
-    assert all(len(run.points) == POINTS and run.complete(second.limit_s) for run in second.runs)
-    for before, run in zip(first.runs, second.runs, strict=False):
+    assert [run.seed for run in second.members] == [0, 0, 1, 1, 2, 2, 3, 3]
+    assert all(len(run.points) == POINTS and run.complete(second.limit_s) for run in second.members)
+    for before, run in zip(first.members, second.members, strict=False):
         assert before.points == run.points
-    records = method_records(second.runs, second.limit_s)
+    records = method_records(second.members, second.limit_s)
     assert [record.runs for record in records] == [4, 4]
     # The cost to the first iteration is that of all four.
     assert records[0].first_s is not None
@@ -65,7 +65,7 @@ def test_a_seed_that_was_broken_off_is_made_anew(tmp_path: Path, after: int) -> 
     whole, _ = play(tmp_path / "a", Stage(), plan())
     stopped, _ = play(tmp_path / "b", Stage(), plan(), after=after)
     kept = stopped.keep()
-    over = sum(run.complete(stopped.limit_s) for run in stopped.runs) // 2
+    over = sum(run.complete(stopped.limit_s) for run in stopped.members) // 2
     if over == 0:
         assert kept is None
         return
@@ -73,7 +73,7 @@ def test_a_seed_that_was_broken_off_is_made_anew(tmp_path: Path, after: int) -> 
     stage = Stage()
     second, _ = play(tmp_path / "c", stage, plan(), again(stopped, tmp_path / "c.samples.npz"))
     assert {seed for _, seed in stage.turns} == set(range(over, 3))
-    assert [run.points for run in second.runs] == [run.points for run in whole.runs]
+    assert [run.points for run in second.members] == [run.points for run in whole.members]
 
 
 def test_what_had_no_memory_is_not_tried_again(tmp_path: Path) -> None:
@@ -81,7 +81,7 @@ def test_what_had_no_memory_is_not_tried_again(tmp_path: Path) -> None:
     stage = Stage()
     second, _ = play(tmp_path / "b", stage, plan(runs=2, budget_s=300.0), again(first, tmp_path / "c.samples.npz"))
     assert {name for name, _ in stage.turns} == {"reslrb_stack"}
-    ended, sound = method_records(second.runs, second.limit_s)
+    ended, sound = method_records(second.members, second.limit_s)
     assert (ended.status, ended.runs, sound.runs) == (BenchStatus.OUT_OF_MEMORY, 0, 2)
 
 
@@ -91,13 +91,13 @@ def test_a_budget_without_room_for_one_seed_says_what_it_takes(tmp_path: Path) -
     stage = Stage()
     second, said = play(tmp_path / "b", stage, plan(runs=3, budget_s=20.0), earlier)
     assert stage.now < 20
-    assert len(second.runs) == 4
+    assert len(second.members) == 4
     kept = second.keep()
     assert kept is not None
     assert kept[0]["runs"] == earlier.head["runs"]  # nothing is lost
     needed = float(said[-1].split("allow more than ")[1].split(" s")[0])
     more, _ = play(tmp_path / "c", Stage(), plan(runs=3, budget_s=needed + 1), earlier)
-    assert len(more.runs) == 6
+    assert len(more.members) == 6
 
 
 @pytest.mark.parametrize(

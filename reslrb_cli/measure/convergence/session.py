@@ -8,8 +8,7 @@ what biases are judged by, where it is not among what is compared. All have seed
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -17,16 +16,14 @@ import numpy as np
 
 from reslrb_cli.config.loader import dump
 from reslrb_cli.config.schema import Config
-from reslrb_cli.errors import ExitCode
 from reslrb_cli.measure import resume_store
+from reslrb_cli.measure.arena import Arena, in_turn, is_tight
 from reslrb_cli.measure.convergence.setup import Member, Role, share_turns
 from reslrb_cli.measure.convergence.statistics import FEWEST, FEWEST_FOR_SLOPE
 from reslrb_cli.measure.methods import Case, Plan
-from reslrb_cli.measure.processes import Contestant, Ended, Pace, Refused, Stopped
+from reslrb_cli.measure.processes import Ended
 from reslrb_cli.measure.resume_store import Earlier
-from reslrb_cli.measure.tasks import start_process
 from reslrb_cli.records.measurement_files import Kept
-from reslrb_cli.records.measurements import BenchStatus
 
 #: What is kept says that it is of this.
 KIND = "convergence"
@@ -34,16 +31,7 @@ KIND = "convergence"
 
 def settings(plan: Plan, device: str = "") -> dict[str, Any]:
     """What has to be the same in all sessions."""
-    return resume_store.settings(
-        plan.config,
-        plan.variant,
-        device,
-        objective=plan.objective,
-        integrators=[case.label for case in plan.cases],
-        reference=plan.reference.label,
-        spp=list(plan.spps),
-        **{"memory limit": plan.memory_limit},
-    )
+    return plan.settings(device, objective=plan.objective, reference=plan.reference.label, spp=list(plan.spps))
 
 
 def check(plan: Plan, before: Earlier, device: str = "") -> None:
@@ -109,57 +97,19 @@ def kept(
 MEMORY = 2**30
 
 
-#: The most rounds.
-MOST_ROUNDS = 256
-
-
-#: Share of the budget, and seconds beside it, that are left for the statistics and the picture.
-AFTERWARDS, AFTERWARDS_S = 0.03, 2.0
-
-
-#: Where all together hold more than this share of the memory, each releases its own after a step.
-MEMORY_SHARE = 0.7
-
-
-MIB = 2**20
-
-
 #: Light paths of a step of an independent reference, whose samples per pixel are its own: naive AD keeps all paths.
 INDEPENDENT_PATHS = 2**18
 
 
-#: Starts a process by its first message and the name of what it does, a function of `tasks.py`.
-Start = Callable[[dict[str, Any], str], Any]
+class Session(Arena[Plan, Member]):
+    """Processes under way and what they have sampled; see `Arena`.
 
-
-class Session:
-    """Processes under way and what they have sampled; arrays go by way of `folder`, which is the caller's to remove.
-
-    `facts` are the survey's; of the budget `spent_s` have gone before. `judges` has the members that stand for an
-    independent stock integrator, by its name. What an `earlier` session, which `resuming.check` has accepted, has
-    sampled counts, and is gone on from. `device` is what computes, in words.
+    `judges` has the members that stand for an independent stock integrator, by its name.
     """
 
-    def __init__(
-        self,
-        plan: Plan,
-        folder: Path,
-        stop: Callable[[], bool],
-        say: Callable[[str], None],
-        start: Start = start_process,
-        now: Callable[[], float] = time.monotonic,
-        spent_s: float = 0.0,
-        earlier: Earlier | None = None,
-        device: str = "",
-    ) -> None:
-        self._earlier, self._before, self.device = earlier, 0, device
-        self.plan, self.folder, self.members, self.rounds = plan, folder, list[Member](), 0
-        self.facts: dict[str, Any] = {}
+    def _set_up(self) -> None:
+        self.rounds = self._before = 0
         self.judges: dict[str, Member] = {}
-        self._stop, self._say, self._start, self._now, self._began = stop, say, start, now, now() - spent_s
-        budget_s = max((1 - AFTERWARDS) * plan.budget_s - AFTERWARDS_S - spent_s, 0.0)
-        self._pace = Pace(budget_s, 1, plan.rounds, now, MOST_ROUNDS)
-        self._warned: set[str] = set()
 
     def slices(self) -> dict[str, slice]:
         """Where each parameter (or the image) stands in a sample."""
@@ -179,17 +129,13 @@ class Session:
 
         Raises Refused where what may not be left out cannot begin.
         """
-        self._pace.begin_depth()
-        try:
-            if self._survey():
-                self._begin()
-                self._warm_up()
-                yield from self._take_turns()
-        except Stopped:
-            return
-        finally:
-            for member in self.members:
-                member.process.close()
+        return self._taking_turns(self._course())
+
+    def _course(self) -> Iterator[int]:
+        if self._survey():
+            self._begin()
+            self._warm_up()
+            yield from self._take_turns()
         self._say_what_it_takes()
 
     def keep(self) -> tuple[dict[str, Any], dict[str, np.ndarray]] | None:
@@ -203,30 +149,18 @@ class Session:
 
     # --- before the rounds --------------------------------------------------------------------------------------------
 
-    def _first(self, config: Config) -> dict[str, Any]:
-        return {"config": dump(config), "source": str(config.source), "variant": self.plan.variant,
-                "memory_limit": self.plan.memory_limit, "arrays": str(self.folder / "arrays.npz")}  # fmt: skip
-
     def _survey(self) -> bool:
         """Ask what stands as a reference, and have dL/dI made; False where time is up over it."""
         plan = self.plan
         if self._earlier is not None:
             self.facts = restore_facts(self._earlier, self.folder / "arrays.npz")
             return True
-        first = self._first(plan.reference_config) | {"objective": plan.objective}
-        surveyor = Contestant(self._start(first, "surveyed"), False)
-        try:
-            opening = surveyor.answer(self._stop, self._pace.over)
-            self._warn(opening)
+        first = self._first(plan.reference_config, "arrays") | {"objective": plan.objective}
+        opening, answer = self._open_referee(first, "surveyed"), None
+        if opening is not None:
             ask = {**plan.camera, "budget_s": plan.budget_s if plan.rounds is None else None}
-            question = {"out": first["arrays"], "ask": ask}
-            answer = None if opening is None else surveyor.ask(question, self._stop, self._pace.over)
-        finally:
-            surveyor.process.close()
-        if surveyor.end is not None:
-            memory = surveyor.end.status is BenchStatus.OUT_OF_MEMORY
-            line = f"--reference {plan.reference.label}: {surveyor.end.reason}"
-            raise Refused(line, ExitCode.OUT_OF_MEMORY if memory else ExitCode.CHECK_FAILED)
+            answer = self._ask_referee({"out": first["arrays"], "ask": ask})
+        self._close_referee()
         self.facts = answer or {}
         if answer is None:
             self._say(
@@ -236,12 +170,9 @@ class Session:
 
     def _begin(self) -> None:
         plan, facts = self.plan, self.facts
-        for case in plan.cases:
-            reason = facts["without"].get(case.type)
-            if plan.default and reason is not None:
-                self._say(f"left out: {case.label}: {reason}")
+        self._say_left_out()
         for case, spp in plan.entries:
-            if not plan.default or case.type not in facts["without"]:
+            if self._takes_part(case.type):
                 self._add(Role.CASE, case, plan.config_of(case, spp), plan.objective)
         self._add(Role.REFERENCE, plan.reference, plan.reference_config, self._noise_free)
         for name in dict.fromkeys(name for name in facts["independent"].values() if name is not None):
@@ -265,7 +196,7 @@ class Session:
         if role is Role.INDEPENDENT and config.integrator.options().get("samples_per_pass") is None:
             spp = min(spp, max(INDEPENDENT_PATHS // self.facts["pixels"], 1))
         method = plan.method(case, config, spp, objective != "loss", role is not Role.CASE)
-        first = self._first(config) | {
+        first = self._first(config, "arrays") | {
             "mode": {"fixed": "known"}.get(objective, objective),
             "purpose": f"convergence, {role.value} {method.label}",
         }
@@ -284,7 +215,7 @@ class Session:
     def _warm_up(self) -> None:
         for member in self.members:
             if member.alive:
-                self._warn(member.answer(self._stop, self._pace.over))
+                self._warn(member.answer(self._stop, self._pace.over) or {})
         for member in self.members:
             warm = member.alive and member.warm_up(self._tight(), self._stop, self._pace.over)
             if member.refusal is not None:
@@ -300,14 +231,7 @@ class Session:
         share_turns([member for member in self.members if member.alive], self.plan.rounds is not None)
 
     def _tight(self) -> bool:
-        held = sum(member.cold["peak_mib"] for member in self.members if member.cold is not None and member.alive) * MIB
-        return held > MEMORY_SHARE * self.plan.memory
-
-    def _warn(self, opening: dict[str, Any] | None) -> None:
-        for line in (opening or {}).get("warnings", ()):
-            if line not in self._warned:  # every process loads the same scene
-                self._warned.add(line)
-                self._say(line)
+        return is_tight(self.plan, (m.cold["peak_mib"] for m in self.members if m.cold is not None and m.alive))
 
     # --- the rounds ---------------------------------------------------------------------------------------------------
 
@@ -324,8 +248,7 @@ class Session:
         tight = self._tight()
         self._pace.begin_rounds(self._before)
         while alive and self.rounds < most and self._pace.another(self.rounds - self._before):
-            start = self.rounds % len(alive)
-            for member in alive[start:] + alive[:start]:
+            for member in in_turn(alive, self.rounds):
                 member.turn(self.rounds, tight, self._stop)
             self.rounds += 1
             alive = [member for member in self.members if member.alive]
@@ -358,7 +281,7 @@ class Session:
         if not warm or self.plan.rounds is not None:
             return
         # What has not compiled is taken to take as long as what has.
-        needed = self._budget_for(self._fewest, share=1 + len(late) / len(warm))
+        needed = self._budget_of(self._fewest, share=1 + len(late) / len(warm))
         advice = f"allow about {needed:.0f} s with --budget, or name fewer --integrators, or take a smaller film"
         fact = f"figures need {FEWEST} rounds" if self._before < FEWEST else "no round was added"
         self._say(f"{fact}; {advice}")
@@ -368,11 +291,11 @@ class Session:
         if not few or self.plan.rounds is not None:
             return
         rounds = max(-(-FEWEST_FOR_SLOPE // m.count) for m in few) - self._before
-        names, needed = ", ".join(member.label for member in few), self._budget_for(rounds)
+        names, needed = ", ".join(member.label for member in few), self._budget_of(rounds)
         advice = f"allow about {needed:.0f} s with --budget, or take fewer samples per step with --spp"
         self._say(f"no slope of {names}: it takes {FEWEST_FOR_SLOPE} steps of each; {advice}")
 
-    def _budget_for(self, rounds: int, share: float = 1.0) -> float:
+    def _budget_of(self, rounds: int, share: float = 1.0) -> float:
         """Seconds for so many rounds of this session, `share` times as much work as what has been measured."""
         before = self._now() - self._began - (self.rounds - self._before) * self._round_s
-        return (share * (before + rounds * self._round_s) + AFTERWARDS_S) / (1 - AFTERWARDS)
+        return self._budget_for(share * (before + rounds * self._round_s))

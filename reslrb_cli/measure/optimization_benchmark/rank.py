@@ -203,16 +203,7 @@ ROUNDING = 1e-3
 
 def settings(plan: RunsPlan, device: str = "") -> dict[str, Any]:
     """What has to be the same in all sessions; the number of runs does not."""
-    return resume_store.settings(
-        plan.config,
-        plan.variant,
-        device,
-        integrators=[case.label for case in plan.cases],
-        reference=plan.reference.label,
-        spp=list(plan.spps),
-        rates=list(plan.rates),
-        **{"memory limit": plan.memory_limit},
-    )
+    return plan.settings(device, reference=plan.reference.label, spp=list(plan.spps), rates=list(plan.rates))
 
 
 def check(plan: RunsPlan, before: Earlier, device: str = "") -> None:

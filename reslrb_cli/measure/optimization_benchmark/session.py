@@ -2,23 +2,18 @@
 
 A drift of the machine so hits all methods of a seed alike. Each run starts from an empty cache of kernels, and has the
 same time as every other; where it stands at some times, which all have in common, is judged by another process
-meanwhile. That the others wait for this costs them nothing but what it does to the caches.
-
-That process is `Judging`, as the session sees it: it makes the target, or takes over an earlier one's.
+meanwhile. That the others wait for this costs them nothing but what it does to the caches. It makes
+the target too, or takes over an earlier one's.
 """
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
-from reslrb_cli.config.loader import dump
 from reslrb_cli.config.schema import Config
-from reslrb_cli.errors import ExitCode
-from reslrb_cli.measure.convergence.session import AFTERWARDS, AFTERWARDS_S, MEMORY_SHARE, MIB, Start
+from reslrb_cli.measure.arena import Arena, in_turn, is_tight
 from reslrb_cli.measure.methods import RunsPlan, Side
 from reslrb_cli.measure.optimization_benchmark.rank import (
     POINTS,
@@ -30,67 +25,10 @@ from reslrb_cli.measure.optimization_benchmark.rank import (
     settings,
     times,
 )
-from reslrb_cli.measure.processes import NO_TIME, Contestant, Pace, Refused, Stopped
+from reslrb_cli.measure.processes import NO_TIME
 from reslrb_cli.measure.resume_store import Earlier
-from reslrb_cli.measure.tasks import start_process
 from reslrb_cli.records.measurement_files import Kept
 from reslrb_cli.records.measurements import BenchStatus, Method, RunPointRecord
-
-
-class Judging:
-    """A `process` under way that answers until `stop()`, or until time is up, `over()`; `label` names its integrator.
-
-    `late` says that time was up over one of its answers.
-    """
-
-    def __init__(self, process: Any, label: str, stop: Callable[[], bool], over: Callable[[], bool]) -> None:
-        self._contestant = Contestant(process, False)
-        self._label, self._stop, self._over = label, stop, over
-
-    @property
-    def late(self) -> bool:
-        """Whether time was up over one of its answers."""
-        return self._contestant.late
-
-    def open(self) -> dict[str, Any] | None:
-        """What it says first, its scene loaded; None where time was up."""
-        return self._contestant.answer(self._stop, self._over)
-
-    def prepare(self, targets: Path, **ask: float | bool) -> dict[str, Any]:
-        """Have it make the targets, and write them; `ask` and the facts that it returns are those of `judge.prepare`.
-
-        There are none where time was up.
-        """
-        return self.ask({"prepare": ask, "out": str(targets)}) or {}
-
-    def restore(self, targets: Path, earlier: Earlier) -> dict[str, Any]:
-        """Have it judge as that of an earlier session; returns its facts, with what a judgement takes now.
-
-        Raises ConfigError where it finds another loss of the initial values.
-        """
-        restore_targets(earlier, targets)
-        facts: dict[str, Any] = earlier.head["facts"]
-        ask = {"spp": facts["spp"], "masked": facts["masked"]}
-        found = self.ask({"restore": ask, "targets": str(targets)})
-        if found is None:
-            return facts
-        check_judge(earlier, found)
-        return facts | {"judge_s": found["judge_s"]}
-
-    def ask(self, question: dict[str, Any]) -> dict[str, Any] | None:
-        """An answer; None where the budget was spent over it. Raises Refused where the process ended."""
-        judge = self._contestant
-        answer = judge.ask(question, self._stop, self._over)
-        if judge.end is not None:
-            memory = judge.end.status is BenchStatus.OUT_OF_MEMORY
-            line = f"--reference {self._label}: {judge.end.reason}"
-            raise Refused(line, ExitCode.OUT_OF_MEMORY if memory else ExitCode.CHECK_FAILED)
-        return answer
-
-    def close(self) -> None:
-        """End the process."""
-        self._contestant.process.close()
-
 
 #: The share of the time that judging is to take, unless that leaves images with too few samples.
 JUDGED = 0.15
@@ -110,108 +48,85 @@ GRACE, GRACE_S = 0.05, 0.5
 CUT = 0.5
 
 
-class RunsSession:
-    """Runs under way, and where they stood; what they write goes to `folder`, which is the caller's to remove.
+class RunsSession(Arena[RunsPlan, Run]):
+    """Runs under way, and where they stood; see `Arena`. The referee judges where they stand.
 
-    `facts` are the judge's, `limit_s` is the time of each run, once it is known; of the budget `spent_s` have gone
-    before. What an `earlier` session, which `resuming.check` has accepted, has made counts, and is gone on from; each
-    run has as much time as there. `device` is what computes, in words.
+    `limit_s` is the time of each run, once it is known: that of an earlier session where there is one.
     """
 
-    def __init__(
-        self,
-        plan: RunsPlan,
-        folder: Path,
-        stop: Callable[[], bool],
-        say: Callable[[str], None],
-        start: Start = start_process,
-        now: Callable[[], float] = time.monotonic,
-        spent_s: float = 0.0,
-        earlier: Earlier | None = None,
-        device: str = "",
-    ) -> None:
-        self._earlier, self.device = earlier, device
-        self.plan, self.folder, self.runs, self.limit_s = plan, folder, list[Run](), 0.0
-        self.facts: dict[str, Any] = {}
-        self._stop, self._say, self._start, self._now, self._began = stop, say, start, now, now() - spent_s
-        self._budget_s = max((1 - AFTERWARDS) * plan.budget_s - AFTERWARDS_S - spent_s, 0.0)
-        self._pace, self._end = Pace(self._budget_s, 1, None, now), now() + self._budget_s
-        self._judge: Judging | None = None
-        self._startup_s = self._wave_s = 0.0
-        self._said: set[str] = set()
+    def _set_up(self) -> None:
+        self.limit_s = self._startup_s = self._wave_s = 0.0
         self._seeds = 0  # those of which all runs are over
-        if earlier is not None:
-            self.facts, self.limit_s, self._seeds = (
-                earlier.head["facts"],
-                earlier.head["limit_s"],
-                earlier.head["seeds"],
-            )
-            self.runs = restore(earlier, plan)
+        self._targets = self.folder / "targets.npz"
+        if self._earlier is not None:
+            head = self._earlier.head
+            self.facts, self.limit_s, self._seeds = head["facts"], head["limit_s"], head["seeds"]
+            self.members = restore(self._earlier, self.plan)
 
     def keep(self) -> Kept | None:
         """What a later session needs to go on; None where no seed is over."""
         if self._earlier is None and not self._seeds:
             return None
-        targets = self.folder / "targets.npz"
-        if self._earlier is not None and not targets.exists():
+        if self._earlier is not None and not self._targets.exists():
             return self._earlier.head, self._earlier.arrays
-        return kept(settings(self.plan, self.device), self.facts, targets, self.limit_s, self.runs, self._seeds)
+        return kept(
+            settings(self.plan, self.device), self.facts, self._targets, self.limit_s, self.members, self._seeds
+        )
 
     def run(self) -> Iterator[RunPointRecord]:
         """Measure; yield where runs stand as it is known. Ends early, with what is done, once `stop()`.
 
         Raises Refused where what may not be left out cannot begin.
         """
-        try:
-            if self._prepare():
-                sides = self._sides()
-                if self._divide(len(sides)):
-                    yield from self._waves(sides)
-        except Stopped:
-            return
-        finally:
-            for run in self.runs:
-                if run.process is not None:
-                    run.process.close()
-            if self._judge is not None:
-                self._judge.close()
+        return self._taking_turns(self._course())
+
+    def _course(self) -> Iterator[RunPointRecord]:
+        if self._prepare():
+            self._say_left_out()
+            sides = [side for side in self.plan.sides if self._takes_part(side.case.type)]
+            if self._divide(len(sides)):
+                yield from self._waves(sides)
 
     def run_of(self, point: RunPointRecord) -> Run:
         """The run that a point is of."""
-        return next(run for run in self.runs if (run.method, run.seed) == (point.method, point.seed))
+        return next(run for run in self.members if (run.method, run.seed) == (point.method, point.seed))
 
     # --- before the runs ----------------------------------------------------------------------------------------------
 
-    def _first(self, config: Config) -> dict[str, Any]:
-        return {"config": dump(config), "source": str(config.source), "variant": self.plan.variant,
-                "memory_limit": self.plan.memory_limit, "targets": str(self.folder / "targets.npz"),
-                "masked": self.facts.get("masked", False)}  # fmt: skip
+    def _start_message(self, config: Config) -> dict[str, Any]:
+        return self._first(config, "targets") | {"masked": self.facts.get("masked", False)}
 
     def _prepare(self) -> bool:
         """Start what judges, and have it make the target; False where time is up over it."""
-        plan, began, targets = self.plan, self._now(), self.folder / "targets.npz"
-        process = self._start(self._first(plan.reference_config), "judged_runs")
-        judge = self._judge = Judging(process, plan.reference.label, self._stop, self._pace.over)
-        opening = judge.open()
+        plan, began = self.plan, self._now()
+        opening, answer = self._open_referee(self._start_message(plan.reference_config), "judged_runs"), None
         if opening is not None:
-            self._warn(opening)
             self._startup_s = max(self._now() - began - opening["loading_s"], 0.0)
-            if self._earlier is not None:
-                self.facts = judge.restore(targets, self._earlier)
-            else:
-                image_s = JUDGED * self._budget_s / (len(plan.sides) * plan.runs * POINTS)
-                self.facts = judge.prepare(targets, budget_s=self._budget_s, image_s=image_s, **plan.camera)
-        if judge.late:
+            answer = self._make_targets() if self._earlier is None else self._take_over(self._earlier)
+        if answer is None:
             self._say(f"the budget of {plan.budget_s:g} s was spent before there was a target; allow several times it")
-        return not judge.late
+            return False
+        self.facts = self.facts | answer
+        return True
 
-    def _sides(self) -> list[Side]:
-        """What is compared: of the default list, what cannot do the scene is left out, and named."""
-        plan, without = self.plan, self.facts["without"] if self.plan.default else {}
-        for case in plan.cases:
-            if case.type in without:
-                self._say(f"left out: {case.label}: {without[case.type]}")
-        return [side for side in plan.sides if side.case.type not in without]
+    def _make_targets(self) -> dict[str, Any] | None:
+        """The facts of `evaluate.prepare`; None where time was up."""
+        image_s = JUDGED * self._budget_s / (len(self.plan.sides) * self.plan.runs * POINTS)
+        ask = {"budget_s": self._budget_s, "image_s": image_s, **self.plan.camera}
+        return self._ask_referee({"prepare": ask, "out": str(self._targets)})
+
+    def _take_over(self, earlier: Earlier) -> dict[str, Any] | None:
+        """What a judgement takes now, by an earlier session's targets; None where time was up.
+
+        Raises ConfigError where the initial values have another loss.
+        """
+        restore_targets(earlier, self._targets)
+        ask = {name: self.facts[name] for name in ("spp", "masked")}
+        found = self._ask_referee({"restore": ask, "targets": str(self._targets)})
+        if found is None:
+            return None
+        check_judge(earlier, found)
+        return {"judge_s": found["judge_s"]}
 
     def _divide(self, methods: int) -> bool:
         """Give each run its time; False where there is too little."""
@@ -234,7 +149,7 @@ class RunsSession:
 
     def _needed(self, seconds: float) -> float:
         """The budget that leaves so many seconds from now on."""
-        return (self._now() - self._began + seconds + AFTERWARDS_S) / (1 - AFTERWARDS)
+        return self._budget_for(self._now() - self._began + seconds)
 
     def _has_room(self, wave_s: float) -> bool:
         """Whether all runs of one seed, which have the time of those before them, are done within the budget."""
@@ -251,7 +166,7 @@ class RunsSession:
 
     def _waves(self, sides: list[Side]) -> Iterator[RunPointRecord]:
         if self._earlier is not None:
-            sides = [side for side in sides if self.plan.method_of(side) not in self._gone(self.runs)]
+            sides = [side for side in sides if self.plan.method_of(side) not in self._gone(self.members)]
         for number, seed in enumerate(self.plan.seeds):
             if number < self._seeds:
                 continue
@@ -264,8 +179,7 @@ class RunsSession:
                 wave.append(run)
                 self._open(run)
             for turn, until_s in enumerate(times(self.limit_s)):
-                start = turn % max(len(wave), 1)
-                for run in wave[start:] + wave[:start]:
+                for run in in_turn(wave, turn):
                     point = self._advance(run, until_s, wave)
                     if point is not None:
                         run.points.append(point)
@@ -290,14 +204,14 @@ class RunsSession:
     def _begin(self, side: Side, seed: int) -> Run:
         plan, config = self.plan, self.plan.seeded(self.plan.config_at(side), seed)
         run = Run(
-            process=self._start(self._first(config), "whole_runs"),
+            process=self._start(self._start_message(config), "whole_runs"),
             may_refuse=plan.default,
             method=plan.method_of(side),
             seed=seed,
-            out=self.folder / f"values-{len(self.runs)}.npz",
+            out=self.folder / f"values-{len(self.members)}.npz",
             state=RunPointRecord(plan.method_of(side), seed, 0.0, 0, self.facts["loss"], self.facts["error"]),
         )
-        self.runs.append(run)
+        self.members.append(run)
         return run
 
     def _open(self, run: Run) -> None:
@@ -319,9 +233,8 @@ class RunsSession:
     def _advance(self, run: Run, until_s: float, wave: list[Run]) -> RunPointRecord | None:
         """Where a run stands at some time; None where that cannot be known any more."""
         if run.alive:
-            held = sum(other.peak_mib for other in wave if other.alive) * MIB
             question = {"until_s": until_s, "limit_s": self.limit_s, "out": str(run.out),
-                        "release": held > MEMORY_SHARE * self.plan.memory}  # fmt: skip
+                        "release": is_tight(self.plan, (other.peak_mib for other in wave if other.alive))}  # fmt: skip
             left_s = max(self.limit_s - run.counted_s, 0.0)
             late = self._late(left_s, GRACE if run.first_s is None else CUT)
             answer = run.ask(question, self._stop, late)
@@ -343,8 +256,7 @@ class RunsSession:
                        "raise run.iterations to have it go on")  # fmt: skip
         if answer["iteration"] == run.state.iteration:
             return True
-        assert self._judge is not None, "it is started first"
-        judged = self._judge.ask({"values": str(run.out)})
+        judged = self._ask_referee({"values": str(run.out)})
         if judged is None:
             return False
         run.state = replace(
@@ -359,12 +271,3 @@ class RunsSession:
             self._say(f"{run.method.label}, seed {run.seed}: {run.end.status.value}: {run.end.reason}")
         elif not self._pace.over():
             self._say(f"{run.method.label}, seed {run.seed}: cut off in iteration {run.state.iteration + 1}")
-
-    def _warn(self, opening: dict[str, Any]) -> None:
-        for line in opening.get("warnings", ()):
-            self._once(line)
-
-    def _once(self, line: str) -> None:
-        if line not in self._said:
-            self._said.add(line)
-            self._say(line)

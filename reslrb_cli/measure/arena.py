@@ -1,0 +1,162 @@
+"""Workers that take turns: what `convergence` and its `--runs` have in common, from their start to their end.
+
+As they take turns, one computing at a time, a drift of the machine hits all alike. One more worker, the referee, is
+there for all of them: it makes what they are compared by, and nothing is measured where it fails.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import Any, Generic, TypeVar
+
+from reslrb_cli.config.schema import Config
+from reslrb_cli.errors import ExitCode
+from reslrb_cli.measure.methods import Measurement, Plan
+from reslrb_cli.measure.processes import Contestant, Pace, Refused, Stopped
+from reslrb_cli.measure.resume_store import Earlier
+from reslrb_cli.measure.tasks import start_process
+from reslrb_cli.records.measurements import BenchStatus
+
+#: The most rounds.
+MOST_ROUNDS = 256
+
+
+#: Share of the budget, and seconds beside it, that are left for the statistics and the picture.
+AFTERWARDS, AFTERWARDS_S = 0.03, 2.0
+
+
+#: Where all together hold more than this share of the memory, each releases its own after a step.
+MEMORY_SHARE = 0.7
+
+
+MIB = 2**20
+
+
+#: Starts a process by its first message and the name of what it does, a function of `tasks.py`.
+Start = Callable[[dict[str, Any], str], Any]
+
+
+Worker = TypeVar("Worker", bound=Contestant)
+
+
+Item = TypeVar("Item")
+
+
+Measured = TypeVar("Measured", bound=Plan)
+
+
+def in_turn(workers: Sequence[Item], round: int) -> list[Item]:
+    """The workers in the order of a round: who begins changes from round to round."""
+    start = round % max(len(workers), 1)
+    return [*workers[start:], *workers[:start]]
+
+
+def is_tight(plan: Measurement, held_mib: Iterable[float]) -> bool:
+    """Whether workers that hold so many MiB each have to release what they can after a step."""
+    return sum(held_mib) * MIB > MEMORY_SHARE * plan.memory
+
+
+class Arena(Generic[Measured, Worker]):
+    """Workers under way, `members`; what they write goes to `folder`, which is the caller's to remove.
+
+    `facts` are the referee's; of the budget `spent_s` have gone before. What an `earlier` session, which `check` has
+    accepted, has measured counts, and is gone on from. `device` is what computes, in words.
+    """
+
+    def __init__(
+        self,
+        plan: Measured,
+        folder: Path,
+        stop: Callable[[], bool],
+        say: Callable[[str], None],
+        start: Start = start_process,
+        now: Callable[[], float] = time.monotonic,
+        spent_s: float = 0.0,
+        earlier: Earlier | None = None,
+        device: str = "",
+    ) -> None:
+        self.plan, self.folder, self.device, self._earlier = plan, folder, device, earlier
+        self.members: list[Worker] = []
+        self.facts: dict[str, Any] = {}
+        self._stop, self._say, self._start, self._now, self._began = stop, say, start, now, now() - spent_s
+        self._budget_s = max((1 - AFTERWARDS) * plan.budget_s - AFTERWARDS_S - spent_s, 0.0)
+        self._pace, self._end = Pace(self._budget_s, 1, plan.rounds, now, MOST_ROUNDS), now() + self._budget_s
+        self._referee: Contestant | None = None
+        self._said: set[str] = set()
+        self._set_up()
+
+    def _set_up(self) -> None:
+        """Begin what a kind of session has beside all this."""
+
+    def _taking_turns(self, course: Iterator[Item]) -> Iterator[Item]:
+        """What `course` yields, until it ends or `stop()`; no worker is left then."""
+        self._pace.begin_depth()
+        try:
+            yield from course
+        except Stopped:
+            return
+        finally:
+            self._close_referee()
+            for member in self.members:
+                if member.process is not None:
+                    member.process.close()
+
+    def _budget_for(self, seconds: float) -> float:
+        """The budget that leaves so many seconds for measuring, from the beginning on."""
+        return (seconds + AFTERWARDS_S) / (1 - AFTERWARDS)
+
+    # --- the referee --------------------------------------------------------------------------------------------------
+
+    def _open_referee(self, first: dict[str, Any], does: str) -> dict[str, Any] | None:
+        """Start it; what it says first, its scene loaded; None where time was up. Raises as `_ask_referee`."""
+        self._referee = Contestant(self._start(first, does), False)
+        opening = self._referee.answer(self._stop, self._pace.over)
+        self._check_referee()
+        self._warn(opening or {})
+        return opening
+
+    def _ask_referee(self, question: dict[str, Any]) -> dict[str, Any] | None:
+        """An answer; None where the budget was spent over it. Raises Refused where the process ended."""
+        assert self._referee is not None, "it is opened first"
+        answer = self._referee.ask(question, self._stop, self._pace.over)
+        self._check_referee()
+        return answer
+
+    def _check_referee(self) -> None:
+        end = None if self._referee is None else self._referee.end
+        if end is not None:
+            line = f"--reference {self.plan.reference.label}: {end.reason}"
+            memory = end.status is BenchStatus.OUT_OF_MEMORY
+            raise Refused(line, ExitCode.OUT_OF_MEMORY if memory else ExitCode.CHECK_FAILED)
+
+    def _close_referee(self) -> None:
+        if self._referee is not None:
+            self._referee.process.close()
+
+    # --- what is said -------------------------------------------------------------------------------------------------
+
+    def _first(self, config: Config, arrays: str) -> dict[str, Any]:
+        """A worker's first message, with the file of the referee's arrays by the name `arrays`."""
+        return self.plan.first(config) | {arrays: str(self.folder / f"{arrays}.npz")}
+
+    def _warn(self, opening: dict[str, Any]) -> None:
+        """Say what loading warned of, once: every process loads the same scene."""
+        for line in opening.get("warnings", ()):
+            self._once(line)
+
+    def _once(self, line: str) -> None:
+        if line not in self._said:
+            self._said.add(line)
+            self._say(line)
+
+    def _say_left_out(self) -> None:
+        """Name what nobody named and cannot do the scene: of the default list alone."""
+        for case in self.plan.cases:
+            if self.plan.default and case.type in self.facts["without"]:
+                self._say(f"left out: {case.label}: {self.facts['without'][case.type]}")
+
+    def _takes_part(self, type: str) -> bool:
+        """Whether methods of this type are measured."""
+        return not self.plan.default or type not in self.facts["without"]
