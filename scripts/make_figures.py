@@ -37,7 +37,6 @@ SCENES = {
 
 #: Of the experiments that move light, samples per pixel and exposure of the target's picture.
 EXPERIMENTS = {"lens_pose": (4096, 1.0), "caustic_heightmap": (4096, 0.6)}
-
 Image = np.ndarray[Any, Any]
 
 

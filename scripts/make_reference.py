@@ -15,7 +15,6 @@ from reslrb_cli.config.schema import Config
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 
-
 #: The example of the reference page, as a file in `configs/` would hold it.
 EXAMPLE = """\
 # Recover the floor texture of a Cornell box from a rendered target.
@@ -44,7 +43,6 @@ run:
   spp: 16
   adjoint: correlated
 """
-
 
 _HEAD = """\
 # Configuration

@@ -18,7 +18,6 @@ import OpenEXR
 from PIL import Image as Picture
 
 SCENES = Path(__file__).resolve().parent.parent / "scenes"
-
 Image = np.ndarray  # (H, W, 3) float32, linear Rec. 709
 
 

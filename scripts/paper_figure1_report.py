@@ -17,14 +17,10 @@ from reslrb_cli.report.tonemap import encode
 
 #: Inches: a panel's side, what is between two, and above one.
 PANEL, GAP, TITLE = 2.1, 0.08, 0.24
-
-
 DPI = 100
-
 
 #: Blue where heights are to rise, red where they are to fall; white where nothing is to be gained.
 COLORS = ("#053061", "#4393c3", "#ffffff", "#d6604d", "#67001f")
-
 
 #: Of the texels of our gradient with the most samples, so many go beyond the scale.
 BEYOND = 0.01

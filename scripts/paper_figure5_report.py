@@ -17,14 +17,10 @@ from reslrb_cli.report.tonemap import encode
 
 #: Inches: a panel's width, what is between two, and above one.
 PANEL, GAP, TITLE = 3.6, 0.08, 0.24
-
-
 DPI = 100
-
 
 #: As in the paper: blue negative, grey zero, red positive.
 COLORS = ("#0a2fb0", "#8a8a8a", "#c01818")
-
 
 #: Of the texels, so many go beyond the scale; and so many standard errors are its end in the z map.
 BEYOND, FAR = 0.01, 5.0

@@ -22,15 +22,11 @@ from reslrb_cli.seeds import seed
 
 MIB = 2**20
 
-
 #: On a GPU address space says nothing of the memory that arrays take.
 VARIANT = "llvm_ad_rgb"
 
-
 #: Who takes gradients: the experiment's own integrator.
 OWN = "own"
-
-
 _ADJOINT = "adjoint.npy"
 
 

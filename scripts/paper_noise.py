@@ -14,7 +14,6 @@ from reslrb_cli.statistics import jackknife_variance
 #: Of the interval that is told; whether the expected ratio holds is asked at `ALPHA`.
 CONFIDENCE = 0.95
 
-
 #: A ratio that is known no better than by this factor, less 1, says nothing.
 WIDEST = 0.2
 

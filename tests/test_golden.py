@@ -8,7 +8,6 @@ import pytest
 from golden import golden
 
 CONTENT = json.loads(golden.VALUES.read_text())
-
 pytestmark = pytest.mark.long
 
 

@@ -13,7 +13,6 @@ from reslrb_cli.optimization.views import to_tensor
 from reslrb_cli.transport.guide import even_table, make_grid
 
 pytestmark = pytest.mark.usefixtures("llvm")
-
 ALIGNMENT = 64  # bytes; what Dr.Jit's own memory has
 
 

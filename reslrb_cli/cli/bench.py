@@ -32,8 +32,6 @@ if TYPE_CHECKING:
 
 #: What is compared where the user names nothing.
 INTEGRATORS = "ptracer,reslrb:reservoir,reslrb:event,reslrb:gather,reslrb:stack,trajectory"
-
-
 _UNITS = {"": 1, "k": 10**3, "M": 10**6, "G": 10**9, "Ki": 2**10, "Mi": 2**20, "Gi": 2**30}
 
 
@@ -55,7 +53,6 @@ budget_option = click.option(
     help="Time for the whole, loading and compiling included; what it does not suffice for is named, with what it "
          "would take.",
 )  # fmt: skip
-
 
 memory_limit_option = click.option(
     "--memory-limit", type=Size(),

@@ -92,7 +92,6 @@ def _is_scene(file: Path) -> bool:
 #: Sensors, and parameters that can be recovered, without `--all`.
 LISTED_SENSORS, _LISTED = 3, 30
 
-
 #: And what can be moved.
 _MOVED = 10
 

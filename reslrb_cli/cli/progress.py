@@ -20,18 +20,14 @@ from reslrb_cli.report.format import shorten
 #: Without a terminal a line is written after each tenth of the iterations, and when this many seconds have passed.
 SECONDS_PER_LINE = 10.0
 
-
 #: What takes less has no bar.
 LEAST_SECONDS = 1.0
-
 
 #: A key in a line has at most so many characters.
 KEY_WIDTH = 32
 
-
 #: Cells that the bar has at least; what would leave it fewer is said in fewer words.
 LEAST_BAR = 8
-
 
 #: The line around the bar, the most telling first; `{desc}` is what `descriptions` says.
 FRAMES = (
@@ -39,7 +35,6 @@ FRAMES = (
     "{percentage:3.0f}%|{bar}| {n_fmt}/{total_fmt}, {remaining} left, {desc}",
     "{percentage:3.0f}%|{bar}| {desc}",
 )
-
 
 #: Where there is no room for any of them.
 LEAST_FRAME = "{percentage:3.0f}%|{bar}|"

@@ -44,8 +44,6 @@ from reslrb_cli.records.atomic import remove_unfinished
 
 #: What a terminal sends for Ctrl-C, what `kill` and batch systems send, and what a terminal sends when it is closed.
 SIGNALS = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
-
-
 _LEAVE = b"\0"  # no signal has the number 0
 
 

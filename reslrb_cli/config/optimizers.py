@@ -44,7 +44,6 @@ class LogL2(Loss, json_schema_extra=NEEDS_TYPE):
 
 
 AnyLoss = Annotated[L2 | L1 | RelativeL2 | LogL2, ByType("l2")]
-
 _Decay = Annotated[float, Field(ge=0, lt=1)]
 
 

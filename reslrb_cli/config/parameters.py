@@ -109,7 +109,6 @@ _EACH_ONCE = must(each_once, lambda _: "must name each once")
 #: One name or several.
 Names = Annotated[list[Name], Field(min_length=1), BeforeValidator(list_of_one), _EACH_ONCE, _NAMES]
 
-
 _TEXELS = must(
     lambda size: min(size) >= 2 and size[0] * size[1] <= PIXELS,
     lambda size: f"must be at least [2, 2], and have at most {PIXELS} texels, not {list(size)}",

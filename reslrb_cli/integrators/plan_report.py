@@ -28,10 +28,8 @@ from reslrb_cli.transport.sobol import make_coordinates
 #: The feature that guiding is.
 GUIDED = "guided emission"
 
-
 #: And that which evenly spread numbers are.
 SEQUENCE = "low-discrepancy numbers"
-
 
 #: Kinds of parameters that features come with.
 EMITTERS, BSDFS = "emitter", "bsdf"
@@ -248,10 +246,7 @@ FEATURES = (
             _needs("bsdfs_read_geometry")),
 )  # fmt: skip
 
-
 PATHS = 64  # traced to have kernels compiled
-
-
 LARGE = 100  # operations; smaller kernels develop images and prepare textures
 
 

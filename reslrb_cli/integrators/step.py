@@ -34,8 +34,6 @@ Objective = Callable[[Any], Any]
 #: Told of an image and of the dL/dI that its samples were differentiated with.
 OnSamples: TypeAlias = "Callable[[mi.TensorXf, mi.TensorXf], None]"
 BATCH_STREAM = 0xBA7C4E5  # keeps the batches' seeds apart from those of passes and of the second samples
-
-
 NONE = 0xFFFFFFFF
 
 

@@ -22,28 +22,17 @@ from reslrb_cli.records.measurements import BenchStatus
 #: The most rounds.
 MOST_ROUNDS = 256
 
-
 #: Share of the budget, and seconds beside it, that are left for the statistics and the picture.
 AFTERWARDS, AFTERWARDS_S = 0.03, 2.0
 
-
 #: Where all together hold more than this share of the memory, each releases its own after a step.
 MEMORY_SHARE = 0.7
-
-
 MIB = 2**20
-
 
 #: Starts a process by its first message and the name of what it does, a function of `tasks.py`.
 Start = Callable[[dict[str, Any], str], Any]
-
-
 Worker = TypeVar("Worker", bound=Contestant)
-
-
 Item = TypeVar("Item")
-
-
 Measured = TypeVar("Measured", bound=Plan)
 
 

@@ -234,7 +234,6 @@ def _ratio(run: Run, baseline: Run, key: str) -> Spread | None:
 #: Steps after the cold one until no new kernel comes, at most.
 MAX_WARM_UPS = 4
 
-
 #: First steps that take longer are told of as they are done, in seconds.
 SLOW = 10.0
 

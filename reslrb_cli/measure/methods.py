@@ -31,17 +31,12 @@ SHARED = (
     *UNDECIDED,
 )
 
-
 #: The estimator of a case that names none, as that of the plugin.
 PLUGIN_ESTIMATOR = "reservoir"
 
-
 #: Options of a case that are those of `run`, for itself alone.
 ADJOINT = ("adjoint", "batches", "first_batch")
-
-
 _TYPES = {str(kind.model_fields["type"].default): kind for kind in (ReslrbConfig, Ptracer, Prb, WalkAd, Trajectory)}
-
 
 #: Options that make an estimator another one, in records.
 _ESTIMATOR_OPTIONS = {option for options in ESTIMATOR_OPTIONS.values() for option in options} - {"capacity"}
@@ -51,8 +46,6 @@ _ESTIMATOR_OPTIONS |= set(UNDECIDED)
 
 
 _OPTION = "--integrators"
-
-
 _ITEM = re.compile(r"(?P<type>\w+)(?::(?P<estimator>\w+))?(?:\((?P<options>.*)\))?")
 
 
@@ -192,10 +185,8 @@ def depths(max_depth: int) -> list[int]:
 #: What can be swept, and what it is called where a single value of it is named.
 SWEPT = {"depth": "depth", "spp": "spp", "film": "film width", "texture": "texture width"}
 
-
 #: Samples per pixel that are measured where the user names none, as shares of those of the experiment.
 SHARES = (0.25, 0.5, 1, 2, 4)
-
 
 #: Widths that are measured where the user names none, in pixels or texels.
 WIDTHS = {"film": (32, 64, 128, 256), "texture": (16, 64, 256, 1024)}
@@ -277,7 +268,6 @@ class Sweep(Measurement):
 #: What is estimated: the gradient with dL/dI held, the gradient of the configuration's loss, or the image.
 OBJECTIVES = ("fixed", "loss", "image")
 
-
 #: What is compared where the user names nothing, by objective.
 DEFAULTS = {
     "fixed": "ptracer,prb,reslrb:reservoir,reslrb:event,reslrb:gather,reslrb:stack",
@@ -285,19 +275,15 @@ DEFAULTS = {
     "image": "ptracer,prb,reslrb:stack",
 }
 
-
 #: What errors are taken from where the user names nothing.
 REFERENCE = "reslrb:stack"
-
 
 #: A depth at which roulette never begins.
 NEVER = 1_000_000
 
-
 #: Images that dL/dI is held at in turn where the loss is the configuration's: the noise of a single one would look like
 #: a bias of those that take dL/dI from images of their own.
 IMAGES = 8
-
 
 #: All parameters together.
 ALL = "all"

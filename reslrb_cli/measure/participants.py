@@ -42,18 +42,14 @@ from reslrb_cli.scene.visibility import interior
 #: Light paths of one gradient, as near as whole samples per pixel come.
 PATHS = 2**16
 
-
 #: Directions of finite differences and of forward mode for each parameter.
 DIRECTIONS = 2
-
 
 #: The same of parameters that move light.
 MOVING_DIRECTIONS = 3
 
-
 #: A depth at which roulette never begins.
 NEVER = 1_000_000
-
 
 #: What attached derivatives that are compared with each reference have, where that is not as the user has it. Naive AD
 #: follows everywhere, and `ptracer` does not differentiate the filter's normalisation, as differences do.
@@ -63,14 +59,11 @@ ALIKE: dict[Reference, dict[str, str]] = {
     Reference.FINITE_DIFFERENCE: {"filter_normalization": "attached"},
 }
 
-
 #: References that trace paths from the sensor, of which the film's border takes nothing.
 CAMERA_PATHS = {Reference.PRB, Reference.PATH}
 
-
 #: The integrator whose images are differenced: ours, without roulette where paths end without.
 DIFFERENCED = "differenced"
-
 
 #: Seeds that the step of finite differences is chosen with.
 PILOT_SEEDS = 2

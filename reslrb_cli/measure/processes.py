@@ -29,14 +29,11 @@ from reslrb_cli.records.measurements import BenchStatus
 
 POLL_SECONDS = 0.05
 
-
 #: How long the end of a killed process is waited for: it may still be writing into its folder.
 ABANDON_SECONDS = 5.0
 
-
 #: A process that crashes with as much of its limit in use is taken to have died of it.
 CLOSE_TO_LIMIT = 0.75
-
 
 #: Signals by which a program ends when it goes on after an allocation that failed.
 _CRASHES = (signal.SIGSEGV, signal.SIGABRT, signal.SIGBUS)
@@ -160,7 +157,6 @@ class Process:
 #: Those that have not been closed.
 _at_work: list[Process] = []
 
-
 #: Held while one is made, and from `abandon_all` on.
 _making = threading.Lock()
 
@@ -227,14 +223,10 @@ class Contestant:
 
 
 MIN_ROUNDS = 3
-
-
 MAX_ROUNDS = 25
-
 
 #: How much more of the time is for the next depth, whose kernels take longer to compile and to run.
 GROWTH = 1.3
-
 
 #: What is said of what a budget did not suffice for.
 NO_TIME = "the budget was spent; allow more with --budget"

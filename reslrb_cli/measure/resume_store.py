@@ -18,10 +18,8 @@ from reslrb_cli.records.manifest import versions
 #: Of what is kept; another one is not gone on from.
 VERSION = 2
 
-
 #: What a setting is called that one side does not have.
 _ABSENT = "not given"
-
 
 #: Characters that are shown of a setting.
 _SHOWN = 60

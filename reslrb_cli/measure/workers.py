@@ -20,13 +20,9 @@ from reslrb_cli.errors import BackendError, ConfigError, is_out_of_memory, menti
 
 _BITS = {"i1": 8, "half": 16, "float": 32, "double": 64, "ptr": 64}
 
-
 #: One array holds its entries for all lanes of a vector (LLVM): `alloca float, i32 112`.
 _LLVM_ARRAY = re.compile(r"%arr_\w+ = alloca (\w+), i32 (\d+)")
-
-
 _LLVM_LANES = re.compile(r"%index_next = add i64 %index, (\d+)")
-
 
 #: ... or those of one thread (CUDA): `.local .align 4 .b32 arr_12[7];`.
 _PTX_ARRAY = re.compile(r"\.local \.align \d+ \.[a-z]+(\d+) arr_\w+\[(\d+)\]")
@@ -57,7 +53,6 @@ def _bits(kind: str) -> int:
 
 #: A case that has begun: what it says first, and what answers each question.
 Begun = tuple[dict[str, Any], Callable[[dict[str, Any]], dict[str, Any]]]
-
 
 #: Begins a case, by the message that describes it.
 Begin = Callable[[dict[str, Any]], Begun]

@@ -16,7 +16,6 @@ from reslrb_cli.scene.values import resample
 
 Array = np.ndarray[Any, Any]
 
-
 #: What emitters emit; parameters of the same quantity have the same unit.
 _EMITTED = {
     "AreaLight": "radiance",

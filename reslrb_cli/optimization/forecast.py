@@ -36,10 +36,8 @@ from reslrb_cli.records.metrics import Record
 #: Seconds of a step beyond which steps of fewer samples stand for it, and that those are to take.
 LONG_STEP, SHORT_STEP = 2.0, 0.7
 
-
 #: Seconds of a step up to which two of them are taken for their memory.
 WAIT = 15.0
-
 
 #: Steps until all is compiled and recorded; steps that are timed, at least, at most, and for so many seconds.
 WARM_UP, LEAST, MOST, SECONDS = 5, 4, 40, 5.0

@@ -29,7 +29,6 @@ from reslrb_cli.seeds import seed
 #: Paths in one pass. Baselines keep the state of every path in memory; 2**22 of them stay below 2 GB.
 PATHS_PER_PASS = 2**22
 
-
 #: Samples per pixel of images that are saved between the first and the last, at least.
 BETWEEN_SPP = 64
 

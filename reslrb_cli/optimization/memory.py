@@ -41,10 +41,8 @@ if TYPE_CHECKING:
 #: Images of the film's size that a step has at once: block, image, loss's parts, gradient, adjoint; a batch's too.
 FILM_IMAGES = 12
 
-
 #: Copies of a parameter: gradients, the optimiser's moments, their next values, the best of a run.
 PARAMETER_COPIES = 9
-
 
 #: And those of a clamp: what is usual, the sums over the iterations, and their next values.
 CLAMP_COPIES = 7
@@ -110,10 +108,8 @@ def _replicas(entries: int) -> int:
 
 logger = logging.getLogger(__name__)
 
-
 #: Bytes that an entry of a parameter takes at the least: value, the optimiser's, gradient, and the array it is set by.
 ENTRY_BYTES = 4 * 4
-
 
 #: Bytes of a step of which a word is said at once, since to make them takes a while.
 MUCH = 2**31
@@ -209,22 +205,17 @@ def _texture_bytes(config: Config) -> dict[int, int]:
 #: Bytes that every machine has.
 SMALL = 2**28
 
-
 #: Bytes that a pixel takes at the least: five images (block, image, dL/dI, its adjoint, target) of three floats.
 PIXEL_BYTES = 5 * 3 * 4
-
 
 #: What a step takes at the least of what is estimated, by `run.adjoint`: 0.93, 0.58 and 0.44 of it were seen.
 SURE = {"batched": 0.8, "independent": 0.5, "correlated": 0.4}
 
-
 #: Integrators whose loops are evaluated, and bytes of a path's state there at the least: ray, throughput, generator.
 NAIVE, PATH_BYTES = ("ptracer", "walk_ad"), 48
 
-
 #: Bytes of thread-local memory that `trajectory` records of a vertex, as `bench` measured it.
 RECORD_BYTES = 60
-
 
 #: Light paths of a run beyond which a word is said of them, and how many a second that word reckons with.
 MANY_PATHS, RATE = 1e11, 1e7

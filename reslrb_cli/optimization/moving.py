@@ -103,7 +103,6 @@ def is_at_border(samples: Samples, u: mi.Point2f) -> mi.Bool:
 #: The share of moving light at the border from which on it is worth a word.
 NOTICED = 0.01
 
-
 #: Samples per pixel that it is measured with.
 SPP = 8
 

@@ -19,7 +19,6 @@ from reslrb_cli.errors import NonFinite
 
 OnNonFinite = Literal["stop", "skip", "zero"]
 
-
 #: Iterations in a row in which something sat out, after which a run ends.
 PATIENCE = 10
 

@@ -46,7 +46,6 @@ from reslrb_cli.records.metrics import Clamped
 
 Bounds = tuple[float, float] | None
 
-
 #: Where u ends: x keeps off the sigmoid's bounds by 1e-7 of their distance, and neither under- nor overflows.
 SIGMOID_END, EXPONENT_END = 16.0, 80.0
 
@@ -168,8 +167,6 @@ def sgd(learning_rate: float, momentum: float = 0.0) -> Any:
 
 #: Yields a stored array, by its name, of the type and shape of another.
 Take = Callable[[str, Any], Any]
-
-
 OPTIMIZERS: dict[str, Callable[..., Any]] = {"adam": adam, "adamw": adamw, "rmsprop": rmsprop, "sgd": sgd}
 
 

@@ -79,26 +79,20 @@ class Best:
 
 Array = np.ndarray[Any, Any]
 
-
 #: A run of fewer iterations is not judged, and so many are the least that are averaged.
 LEAST_ITERATIONS, LEAST_WINDOW = 20, 5
-
 
 #: How sure a difference has to be (one-sided).
 CONFIDENCE = 0.99
 
-
 #: A fall by no more than this share of the start is none, where noise hides it.
 MOST_FALL = 0.25
-
 
 #: An error has to rise by this share to be called worse, and in a run that is too short to know its wandering.
 WORSE, WORSE_IF_SHORT = 0.01, 0.1
 
-
 #: √2 Φ⁻¹(3/4): the median difference of two values from a normal distribution of standard deviation 1.
 _MEDIAN_DIFFERENCE = 0.9539
-
 
 #: The standard error of a median over that of a mean, for a normal distribution.
 _MEDIAN_ERROR = 1.2533

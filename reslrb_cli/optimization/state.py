@@ -71,8 +71,6 @@ def like(value: Any, array: Array) -> Any:
 
 
 T = TypeVar("T")
-
-
 _TYPES = {dr.VarType.Float32: "float32", dr.VarType.Float64: "float64", dr.VarType.UInt32: "uint32"}
 
 

@@ -37,7 +37,6 @@ if TYPE_CHECKING:
 
 Array = np.ndarray[Any, Any]
 
-
 #: What pixels of each kind are said to do.
 WORDS = {
     "specular": "see smooth glass or mirrors",

@@ -81,7 +81,6 @@ def log_l2(
 
 LOSSES: dict[str, Callable[..., mi.Float]] = {"l1": l1, "l2": l2, "relative_l2": relative_l2, "log_l2": log_l2}
 
-
 #: Those whose derivative is linear in the image, so that its noise averages out.
 QUADRATIC = ("l2", "relative_l2")
 
@@ -93,7 +92,6 @@ def make_loss(type: str, **options: float) -> Loss:
 
 
 Array = np.ndarray[Any, Any]
-
 
 #: The key of an exposure that all views share.
 SHARED = "exposure"

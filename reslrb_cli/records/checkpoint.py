@@ -36,21 +36,15 @@ from reslrb_cli.records.atomic import unfinished, write_atomically
 
 Array = np.ndarray[Any, Any]
 
-
 #: Bytes of an archive: a state of a dozen arrays for each of a few hundred million numbers. They are all looked at.
 MOST_BYTES = 2**34
 
-
 #: Entries of an archive, some twenty for each parameter.
 MOST_ENTRIES = 100_000
-
-
 _DAMAGED = "an entry has another checksum than was written"
-
 
 #: Kinds of numbers that a run writes: floats, integers, truth values.
 _KINDS = "fiub"
-
 
 #: What the values of an array have to be: what is added up may be infinite, and some callers say themselves, and where,
 #: what is wrong with a value.
@@ -179,18 +173,13 @@ def _read_head(stream: IO[bytes], size: int | None) -> Head:
 
 
 STATE_FILE, PREVIOUS_FILE_NAME = "state.npz", "previous.npz"
-
-
 NONFINITE_FILE_NAME = "nonfinite.npz"
-
 
 #: What the JSON of a state says that it is. Another number where the same words mean something else.
 FORMAT = 1
 
-
 #: What file systems say that have no second names of files.
 _NO_LINKS = {errno.EPERM, errno.EMLINK, errno.ENOSYS, errno.EOPNOTSUPP, errno.EXDEV, errno.EACCES}
-
 
 #: Bytes of that JSON; the largest part is a configuration, or a pilot's table.
 _MOST_JSON = 2**24

@@ -25,14 +25,8 @@ from reslrb_cli.report.format import count, line, number, shorten
 
 #: Characters that a parameter's key may take.
 KEY_WIDTH = 28
-
-
 _FIGURES = ("step s", "steps", "error", "slope", "efficiency", "max |z| (limit)")
-
-
 _HEAD = ("", "parameter", *_FIGURES, *(f"s to {target:.0%}" for target in TARGETS))
-
-
 _WIDTHS = (0, 0, 8, 5, 8, 20, 24, 16) + (9,) * len(TARGETS)
 
 
@@ -179,8 +173,6 @@ def _times(one: MethodRecord, other: MethodRecord) -> str:
 
 
 _RUNS_HEAD = ("", "seed", "iterations", "first s", "loss", "error")
-
-
 _RUNS_WIDTHS = (0, 8, 20, 20, 30, 30)
 
 

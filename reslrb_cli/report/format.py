@@ -11,7 +11,6 @@ from reslrb_cli.errors import printable
 #: What stands in place of the middle of a shortened key.
 ELLIPSIS = "..."
 
-
 #: What is said of a comparison of paths from the camera with paths from the lights.
 WITHOUT_BORDER = "without the film's border, where light paths lose what camera paths see"
 

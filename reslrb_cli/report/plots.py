@@ -104,10 +104,7 @@ def _mark_ends(axis: Any, depths: list[int], color: Any, row: int) -> None:
 
 #: Panels at most: all together, and the first parameters.
 PANELS = 6
-
-
 COLUMNS = 3
-
 
 #: Points of fewer averages are hollow: they scatter.
 FEW = 4

@@ -21,38 +21,28 @@ from reslrb_cli.report.format import count, duration, line, number, shorten, wit
 
 #: The verdict on a value that can be relied on, as recorded; all others say what keeps it from that.
 SETTLED, MOVING, UNDETERMINED = "settled", "still moving", "not determined"
-
-
 NOISE, UNSEEN = "below the noise", "not seen"
-
 
 #: What of a spread the target's noise makes, at least, where that is what hides a value.
 OF_TARGET = 0.7
 
-
 #: Where a value has gone and has to go farther than this share of what its steps allow, they are too short.
 REACHED = 0.5
-
 
 #: More iterations than this many times those of a run are not proposed, nor fewer.
 LEAST_LONGER, MOST_LONGER = 2, 5
 
-
 #: What a rate is divided by where the loss rose, and the samples of a noisy target are multiplied by.
 LOWER, MORE_SAMPLES = 3, 16
-
 
 #: What is proposed, that which makes the others of no use first.
 ORDER = ("a lower rate", "scale: auto", "a higher rate", "more iterations", "more samples for it")
 
-
 #: Quantities of what emits, which may be of any size.
 EMITTED = ("radiance", "irradiance", "intensity")
 
-
 #: Parameters with one verdict that are named.
 MOST_NAMED = 3
-
 
 #: A key in a line of text has at most so many characters, and beside a verdict.
 PARTNER_WIDTH = 40
@@ -205,15 +195,12 @@ def _about(results: Mapping[str, Any], key: str) -> dict[str, Any]:
 #: What of its loss an image that came closer has left, at most.
 IMPROVED = 0.9
 
-
 #: In a run that is too short to know the noise of its loss, by how much that of the saved images has to rise; and a
 #: target that has fewer samples than so many steps is noisy itself.
 ROSE_IF_SHORT, FEW_STEPS = 1.1, 16
 
-
 #: In a run of fewer iterations losses tell nothing.
 LEAST_JUDGED = 20
-
 
 #: A key in a line of text has at most so many characters.
 KEY_WIDTH = 60
@@ -313,18 +300,14 @@ def _from_to(pair: Mapping[str, float | None]) -> str:
 #: Parameters that are listed; a run with more says so, and its page has them all.
 MOST_LISTED = 12
 
-
 #: A key in the table has at most so many characters, and at least.
 WIDEST_KEY, NARROWEST_KEY = 48, 24
-
 
 #: Columns where there is no terminal.
 NO_TERMINAL = 200
 
-
 #: What stands over the keys, and between two columns.
 HEAD, GAP = "parameter", "  "
-
 
 #: Columns of values: what stands above each, and its name in the results.
 MOMENTS = (("start", "initial"), ("end", "final"), ("true", "true"))

@@ -16,14 +16,11 @@ from reslrb_cli.records.measurement_files import Origin, Tell, read_lines, read_
 
 Array = np.ndarray[Any, Any]
 
-
 #: Figures that a record of a run has, or it is none.
 _FIGURES = ("iteration", "elapsed_s", "step_ms", "codegen_ms", "peak_mib", "spp")
 
-
 #: All that a record may have.
 _ALL_FIGURES = [field.name for field in fields(metrics.Record) if field.type in ("int", "float", "float | None")]
-
 
 #: Layers of a map of a gradient, as `gradcheck --images` writes them.
 MAP_LAYERS = ("gradient", "reference", "z")

@@ -19,7 +19,6 @@ _BENCH_HEAD = (
     "scratch B", "n",
 )  # fmt: skip
 
-
 _BENCH_WIDTHS = (7, 0, 9, 19, 9, 19, 7, 7, 8, 9, 9, 3)
 
 
@@ -71,8 +70,6 @@ def _line(cells: Sequence[str], label_width: int) -> str:
 
 
 _CHAIN_HEAD = ("vertices", "paths", "median", "99 %", "largest")
-
-
 _CONDITIONING_HEAD = ("parameter", "entries", "value", "gradient", "noise", "image / unit", "curvature", "length")
 
 
@@ -103,14 +100,9 @@ def _number(value: float | None) -> str:
 HEAD = ("parameter", "integrator", "reference", "seeds", "rel. L2", "z rms", "max |z|", "cosine", "variance",
         "detectable", "verdict")  # fmt: skip
 
-
 #: The first three columns are text; 0 is as wide as what stands in it.
 _GRADCHECK_WIDTHS = (0, 0, 0, 5, 17, 11, 11, 8, 8, 10, 0)
-
-
 _REFERENCES = {Reference.FINITE_DIFFERENCE: "differences", Reference.FORWARD_MODE: "forward mode"}
-
-
 _KINDS = {Kind.EQUAL_SEEDS: ", equal seeds"}
 
 

@@ -20,22 +20,17 @@ from reslrb_cli.records.images import load_image, read_layers, write_layers
 
 Array = np.ndarray[Any, Any]
 
-
 #: The level of an image is shown as it is where it lies in this range, else brought to `BRIGHT`.
 LEAST_BRIGHT, MOST_BRIGHT, BRIGHT = 0.25, 1.6, 0.8
-
 
 #: The level is that below which so many of the pixels are, and so much of their light but for that of FIREFLIES.
 MOST_PIXELS, MOST_LIGHT = 0.99, 0.9
 
-
 #: The share of the pixels, the brightest, whose light does not count.
 FIREFLIES = 1e-3
 
-
 #: Pixels that see a lamp count where they raise the level by no more than this factor, or where the others are too few.
 LAMPS, LEAST_OTHERS = 3.0, 0.05
-
 
 #: What is clipped of an image is said where it is a larger share of it.
 LEAST_CLIPPED = 0.005
@@ -106,10 +101,8 @@ def encode(values: Array) -> Array:
 #: Matplotlib's map: dark where the images agree.
 COLORS = "inferno"
 
-
 #: Of what has a sign: blue where it is negative, grey at zero, red where it is positive.
 SIGNED = ("#053061", "#4393c3", "#bdbdbd", "#d6604d", "#67001f")
-
 
 #: So large a share of the pixels lies within the scale; beyond are fireflies.
 WITHIN = 0.99

@@ -70,15 +70,11 @@ MAY_CHANGE = re.compile(
     r"|optimizer\.learning_rate|parameters\[\d+\]\.learning_rate(\..*)?"
 )
 
-
 #: Those that say where a run is written, which its folder says itself.
 _PLACE = ("run.name", "run.output")
 
-
 #: Differing settings that an error names.
 _SHOWN = 3
-
-
 Change = tuple[Any, Any]
 
 

@@ -49,7 +49,6 @@ from reslrb_cli.runs.prepare import Course
 
 logger = logging.getLogger(__name__)
 
-
 #: Why a part is missing from a folder whose process ended before it came to that part.
 NOT_YET = "not written yet"
 
@@ -180,7 +179,6 @@ def check_memory(manifest: Manifest, problem: Problem, record: Record) -> None:
 
 #: Images with more pixels take some seconds to be compared, and that is said.
 MANY_PIXELS = 5e5
-
 
 #: What the end of a run writes beside checkpoint and parameters, for which room is kept: a manifest, and lists.
 RESERVE_BYTES = 1 << 16

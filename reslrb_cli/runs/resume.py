@@ -22,10 +22,8 @@ from reslrb_cli.runs.prepare import Change, Course, changes, check_changes, dige
 
 Say = Callable[[str], None]
 
-
 #: The variants that `variant` may name, `auto` left out.
 VARIANTS = [name for name in get_args(Config.model_fields["variant"].annotation) if name != "auto"]
-
 
 #: Characters of the settings in a state, which has every default written out: those of a file are fewer.
 _MOST_CONFIG = 4 * CONFIG_BYTES

@@ -27,7 +27,6 @@ from reslrb_cli.backend.memory import own_memory
 from reslrb_cli.transport.plan import Plan
 
 Array = np.ndarray[Any, Any]
-
 LIMIT = 0.95  # the largest probability of going on by throughput alone, as in `ptracer`
 DIMMEST = 1e-30  # the least emission that roulette knows, well above what single precision rounds to zero
 BITS = 4  # cubes along each axis of the box, log2

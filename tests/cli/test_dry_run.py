@@ -27,7 +27,6 @@ from reslrb_cli.records.decisions import RivalRecord
 from reslrb_cli.records.manifest import read_manifest
 
 pytestmark = pytest.mark.usefixtures("llvm")
-
 SETS = ["scene.size=[96, 64]", "run.iterations=8", "run.final_spp=4"]
 
 

@@ -26,7 +26,6 @@ from reslrb_cli.scene.parameters import select_parameters
 from reslrb_cli.scene.values import resample
 
 pytestmark = pytest.mark.usefixtures("llvm")
-
 LAMP = "lamp.emitter.radiance.value"
 #: A texture, a colour and a motion, which is what a value can be shaped like.
 PARAMETERS = f"""[{{key: {tiny.KEY}, initial: 0.5, bounds: [0, 1]}}, {{key: {LAMP}, initial: [3, 4, 5]}},

@@ -19,7 +19,6 @@ from reslrb_cli.records.images import load_image
 from reslrb_cli.records.run_folder import read_value
 
 pytestmark = pytest.mark.usefixtures("llvm")
-
 SIZE = 12
 #: A sheet of 5x5 corners over a lamp's light; the cameras of the file replace this one.
 SCENE = """<scene version="3.0.0">

@@ -12,7 +12,6 @@ from click.testing import CliRunner
 from reslrb_cli.cli import main
 
 pytestmark = pytest.mark.usefixtures("llvm")
-
 CONFIG = Path(__file__).resolve().parents[2] / "configs" / "cornell_floor.yaml"
 TINY = ["--set", "scene.options={resx: 16, resy: 16}", "--set", "integrator.max_depth=4"]
 

@@ -29,7 +29,6 @@ WAYS = {
 #: Seeds that are tried in turn until one meets the texel when tables have learned; what they meet changes with whatever
 #: changes tables. Of `again` these meet it in the third batch of a step whose second one taught them.
 SEEDS = {"again": [5, 15, 16, 28, 23]}
-
 Drawn = list[tuple[int, dict[str, np.ndarray] | None]]
 
 

@@ -15,7 +15,6 @@ from reslrb_cli.optimization.assemble import assemble_scene
 from reslrb_cli.scene.load import load_scene
 
 pytestmark = pytest.mark.usefixtures("llvm")
-
 SCENES = {"studio": (write_studio, (32, 32)), "terrace": (write_terrace, (32, 24))}
 #: What `init` begins with: colours by their share, but of nothing that is a mirror alone.
 FIRST = {

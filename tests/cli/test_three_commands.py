@@ -15,7 +15,6 @@ from cli.calling import done, settings
 from reslrb_cli.records.manifest import read_manifest
 
 pytestmark = pytest.mark.usefixtures("llvm")
-
 EXPOSURE = 0.8
 #: What the scene file says of these, and what the photograph shows: two walls, and something to sit on.
 GUESS = "0.5, 0.5, 0.5"

@@ -19,7 +19,6 @@ from reslrb_cli.integrators.step import make_integrator, render_image
 SAME = 3e-4
 #: How much of its samples `agreement` takes; less for the tests that use `samples` (conftest.py).
 SHARE = 1.0
-
 WHITE = {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.8, 0.7, 0.6]}}
 RED = {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.7, 0.3, 0.2]}}
 

@@ -17,7 +17,6 @@ from reslrb_cli.measure.gradients import Case, integrator, seeds
 from reslrb_cli.measure.scenes.small import texture
 
 pytestmark = pytest.mark.usefixtures("llvm")
-
 SPP = 4
 COUNT = 64
 ADJOINTS = {

@@ -19,7 +19,6 @@ from reslrb_cli.errors import UnsupportedScene
 from reslrb_cli.measure.gradients import integrator, relative
 
 pytestmark = pytest.mark.usefixtures("llvm")
-
 ROUNDING = 3e-5
 QUICK = ("slab", "bounce")
 SAMPLING = ("follow", "stay")

@@ -21,7 +21,6 @@ from reslrb_cli.measure.scenes.moving import Move, Pose
 from reslrb_cli.measure.scenes.small import diffuse
 
 pytestmark = pytest.mark.usefixtures("llvm")
-
 WHITE = diffuse(0.8, 0.7, 0.6)
 BRUSHED = {"type": "roughconductor", "material": "none", "alpha": 0.4, "sample_visible": False}
 

@@ -16,7 +16,6 @@ from reslrb_cli.measure.gradients import integrator
 from reslrb_cli.optimization.moving import border_share, warn_of_border
 
 pytestmark = pytest.mark.usefixtures("llvm")
-
 RADIUS = 2.0  # of Mitsuba's gaussian filter, pixels
 
 

@@ -16,7 +16,6 @@ from reslrb_cli.measure.gradients import Case, integrator, seeds
 from reslrb_cli.measure.scenes.small import diffuse, room
 
 pytestmark = pytest.mark.usefixtures("llvm")
-
 FLOOR = ("floor.brdf_0.reflectance.value",)
 ALL = (*FLOOR, *(f"{name}.reflectance.value" for name in ("wall.brdf_0", "side.brdf_0", "cave.bsdf")))
 MAX_DEPTH, SPP = 8, 16

@@ -15,7 +15,6 @@ from turns import a_few, taking_turns
 from reslrb_cli.measure.gradients import Case, integrator, relative, seeds
 
 pytestmark = pytest.mark.usefixtures("llvm")
-
 EXACT = {"gather": {}, "stack": {}, "stack_of_2": {"estimator": "stack", "stack_size": 2}}
 RANDOM = {
     "reservoir": {},

@@ -16,7 +16,6 @@ from reslrb_cli.measure.gradients import Case, integrator, relative
 from reslrb_cli.measure.scenes.small import camera
 
 pytestmark = pytest.mark.usefixtures("llvm")
-
 BY_NAME = {case.name: case for case in CASES}
 #: Mitsuba's thin lens keeps an array that a recording does not see.
 NOT_RECORDED = ("thin_lens",)

@@ -14,7 +14,6 @@ from turns import a_few
 from reslrb_cli.measure.gradients import Case, integrator, relative, seeds
 
 pytestmark = pytest.mark.usefixtures("llvm")
-
 BY_NAME = {case.name: case for case in CASES}
 
 #: Where stock `ptracer` is right and traces the same paths: not masks, rotated environment maps, bump and normal maps,

@@ -20,7 +20,6 @@ from reslrb_cli.integrators.step import known_step, render_image
 from reslrb_cli.measure.gradients import Case, integrator, relative, seeds
 
 pytestmark = pytest.mark.usefixtures("llvm")
-
 BY_NAME = {case.name: case for case in CASES}
 NAMES = ("texture", "two_emitters", "envmap", "roulette", "passes", "gaussian", "area_texture", "glass", "mask", "rgba")
 FEW = ["two_emitters"]

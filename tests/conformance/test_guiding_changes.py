@@ -12,7 +12,6 @@ from reslrb_cli.measure.gradients import Case, integrator, seeds
 from reslrb_cli.measure.scenes.small import SIZE, diffuse, rgb, texture, transform
 
 pytestmark = pytest.mark.usefixtures("llvm")
-
 SPP = 64
 #: Steps with the one opening, and with the other: it slides when tables have just learned, and do not again for as long
 #: as they ever do.

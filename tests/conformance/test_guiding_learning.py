@@ -18,7 +18,6 @@ from reslrb_cli.transport.guide import Table, apportion, make_grid
 from reslrb_cli.transport.plan import Grid
 
 pytestmark = pytest.mark.usefixtures("llvm")
-
 SIDE = 16  # pixels of the film
 
 

@@ -15,7 +15,6 @@ from reslrb_cli.integrators.step import make_integrator
 from reslrb_cli.measure.gradients import seeds
 
 pytestmark = pytest.mark.usefixtures("llvm")
-
 MOVING = {case.name: case for case in (*attached_cases.CASES, *moving_lamps.CASES)}
 
 

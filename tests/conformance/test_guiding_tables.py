@@ -14,7 +14,6 @@ from reslrb_cli.transport.guide import Guide, Table, apportion, even_table, make
 from reslrb_cli.transport.plan import GUIDE_UNIFORM, Grid
 
 pytestmark = pytest.mark.usefixtures("llvm")
-
 SCENES = {case.name: case.scene for case in CASES}
 GRIDS = {
     "one": make_grid([True] * 4, [1.0]),

@@ -76,7 +76,6 @@ ENVIRONMENTS = [name for name in EMITTERS if name.startswith(("constant", "envma
 #: Stock light tracing places the disk of an environment map wrongly, and does not connect through masks.
 NOT_PTRACER = [name for name in EMITTERS if name.startswith("envmap") or "mask" in name]
 
-
 #: Those that by default `ptracer` alone is a reference of: like one of the others they are there for.
 BY_PTRACER = ("area", "textured area", "spot", "textured spot", "directional", "sunsky")
 

@@ -28,7 +28,6 @@ from turns import a_few, taking_turns
 from reslrb_cli.integrators.step import gradient_step, make_integrator
 
 pytestmark = pytest.mark.usefixtures("samples")
-
 TWO_SIDED = {"type": "twosided", "bsdf": RED}
 
 

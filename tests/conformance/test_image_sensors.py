@@ -20,7 +20,6 @@ from conformance.scenes import (
 from turns import a_few
 
 pytestmark = pytest.mark.usefixtures("samples")
-
 CROP = {"crop_offset_x": 7, "crop_offset_y": 5, "crop_width": 17, "crop_height": 13}
 FILTERS = ("box", "tent", "gaussian", "mitchell", "catmullrom", "lanczos")
 FORMATS = ("rgba", "luminance", "luminance_alpha", "xyz", "xyza")

@@ -16,7 +16,6 @@ from reslrb_cli.measure.gradients import Case, integrator
 from reslrb_cli.scene.load import load_scene
 
 pytestmark = pytest.mark.usefixtures("llvm")
-
 ROOT = Path(__file__).resolve().parents[2]
 
 #: The shipped scenes and what is optimised in them.

@@ -10,7 +10,6 @@ from reslrb_cli.measure.gradients import Case, integrator
 from reslrb_cli.measure.scenes.small import diffuse, room, texture
 
 pytestmark = pytest.mark.usefixtures("llvm")
-
 FLOOR = "floor.brdf_0.reflectance.data"
 SPP = 256
 

@@ -9,7 +9,6 @@ import pytest
 from scipy.stats import qmc
 
 pytestmark = pytest.mark.usefixtures("llvm")
-
 COORDINATES = 10
 
 

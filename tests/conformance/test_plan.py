@@ -20,7 +20,6 @@ from reslrb_cli.measure.gradients import Case, integrator
 from reslrb_cli.measure.scenes.small import camera, diffuse, rgb, room, texture, transform
 
 pytestmark = pytest.mark.usefixtures("llvm")
-
 ESTIMATORS = ("reservoir", "gather", "event", "stack")
 #: Those whose draws follow from few features; `event` draws among what can be differentiated.
 STEADY = ("reservoir", "gather", "stack")
@@ -108,7 +107,6 @@ OMISSIONS = [
     ("delta lobes", plain, (FLOOR,), ()),
     ("lens sampling", plain, (FLOOR,), ()),
 ]
-
 
 #: Of each row, by default, one estimator: the next of those whose kernels are to shrink.
 QUICK = [(shrinks or STEADY)[number % len(shrinks or STEADY)] for number, (*_, shrinks) in enumerate(OMISSIONS)]

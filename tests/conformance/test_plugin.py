@@ -22,7 +22,6 @@ from reslrb_cli.measure.gradients import Case, integrator, relative, seeds
 from reslrb_cli.measure.scenes.small import camera, lamp, rgb, room
 
 pytestmark = pytest.mark.usefixtures("llvm")
-
 ROOT = Path(__file__).resolve().parents[2]
 
 SCRIPT = """

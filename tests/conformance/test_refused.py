@@ -14,7 +14,6 @@ from reslrb_cli.measure.gradients import Case, integrator
 from reslrb_cli.measure.scenes.small import bitmap, camera, diffuse, lamp, load, rgb, texture
 
 pytestmark = pytest.mark.usefixtures("llvm")
-
 PIXELS = ((5, 9), (8, 8), (11, 3))  # row, column
 INTEGRATORS = {
     "reservoir": ("reslrb", {"estimator": "reservoir"}),

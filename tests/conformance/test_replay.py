@@ -17,12 +17,10 @@ from reslrb_cli.transport.emission import sample_emission
 from reslrb_cli.transport.walk import Hooks
 
 pytestmark = pytest.mark.usefixtures("llvm")
-
 BY_NAME = {case.name: case for case in CASES}
 #: Every way in which random numbers are drawn: delta lobes, masks, an aperture, several emitters, roulette.
 NAMES = ("texture", "roulette", "thin_lens", "plastic", "blend", "glass", "mirror", "bumpmap", "mask",
          "mask_texture_in_view", "area_texture", "envmap", "two_emitters", "visible_lamp")  # fmt: skip
-
 
 NONE = 0xFFFFFFFF
 

@@ -23,7 +23,6 @@ from reslrb_cli.integrators.step import make_integrator
 from reslrb_cli.measure.gradients import Case, integrator, relative, seeds
 
 pytestmark = pytest.mark.usefixtures("llvm")
-
 BY_NAME = {case.name: case for case in CASES}
 MOVING = {case.name: case for case in (*attached_cases.CASES, *moving_lamps.CASES)}
 NAMES = ("texture", "two_emitters", "envmap", "roulette", "passes", "area_texture", "glass", "mask", "point", "plastic")

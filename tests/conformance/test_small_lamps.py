@@ -22,7 +22,6 @@ from reslrb_cli.measure.scenes.small import camera, diffuse, load, rgb, room, tr
 from reslrb_cli.scene import graph
 
 pytestmark = pytest.mark.usefixtures("llvm")
-
 KEY = f"{RADIANCE}.value"
 SPECKS = ("speck.emitter.radiance.value", "other.emitter.radiance.value")
 
@@ -199,7 +198,6 @@ FAULTS = [
     Fault("one_lamp_for_all", "two", SPLAT, "dr.select(turn == number, mi.UInt32(lamp.index), index)", "index",
           frozenset({("stack", "ptracer")})),
 ]  # fmt: skip
-
 
 #: Of the default suite.
 QUICK = ("left_out", "primary_rays_find_them_too")

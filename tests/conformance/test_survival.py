@@ -19,7 +19,6 @@ from reslrb_cli.transport.guide import Table
 from reslrb_cli.transport.roulette import CELLS, Survival
 
 pytestmark = pytest.mark.usefixtures("llvm")
-
 NAMES = ("texture", "two_emitters", "envmap", "roulette", "glass", "mask", "mask_texture_in_view")
 BOX = np.array([[-1.0, -2.0, 0.0], [3.0, 2.0, 0.0]], np.float32)  # flat
 

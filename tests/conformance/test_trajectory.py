@@ -13,7 +13,6 @@ from reslrb_cli.measure.gradients import Case, integrator, relative
 from reslrb_cli.measure.scenes.small import diffuse, room, transform
 
 pytestmark = pytest.mark.usefixtures("llvm")
-
 BY_NAME = {case.name: case for case in CASES}
 FEW = ("texture", "passes", "glass", "area_texture", "envmap")
 NAMES = ("texture", "roulette", "passes", "gaussian", "thin_lens", "plastic", "glass", "bumpmap", "area_texture",

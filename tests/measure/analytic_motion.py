@@ -25,10 +25,8 @@ from reslrb_cli.measure.scenes.small import glass, lit_square, rectangle, rgb, t
 
 Array = NDArray[np.float64]
 
-
 #: Reflectance of the receiver, as `setting` has it.
 RHO = np.array([0.8, 0.7, 0.6])
-
 
 #: Area of a pixel on the receiver.
 PIXEL = (2 / SIZE) ** 2

@@ -14,7 +14,6 @@ from reslrb_cli.measure.scenes.moving import AMPLITUDES, Move, moving_case
 #: Pixels of a film, each way.
 SIZE = 32
 
-
 #: At how many seeds truncation is measured, by differences of twice the step: one in so many, and at least that many.
 ONE_IN, EXTRAPOLATED = 4, 3
 

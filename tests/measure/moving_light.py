@@ -41,11 +41,7 @@ from reslrb_cli.measure.scenes.small import (
 )
 
 Array = NDArray[np.float64]
-
-
 GLASS = glass()
-
-
 ROUGH = {"type": "roughdielectric", "int_ior": 1.5, "ext_ior": 1.0, "alpha": 0.1}
 
 
@@ -210,9 +206,7 @@ GLASS_SCENES = [
                   options={"max_depth": 3, "attached": True}),
 ]  # fmt: skip
 
-
 MIRROR = {"type": "conductor", "material": "none", "specular_reflectance": rgb(0.9, 0.8, 0.7)}
-
 
 #: Its samples do not depend on the incident direction: those of visible normals have derivatives of heavy tails.
 BRUSHED = {"type": "roughconductor", "material": "none", "alpha": 0.1, "sample_visible": False}
@@ -242,7 +236,6 @@ MIRRORS_SCENES = [
                   lambda scene: [Number("mirror.bsdf.alpha.value")], spp=256,
                   options={"max_depth": 3, "attached": True}),
 ]  # fmt: skip
-
 
 AIM = ("tx", "ty", "tz", "rx", "rz")
 
@@ -334,7 +327,6 @@ def moved(scene: Any) -> list[Move]:
 #: A path from the lamp through both surfaces of the slab to the floor, a wall, and the camera.
 OPTIONS = {"max_depth": 5}
 
-
 ROOMS_SCENES = [
     AttachedScene("bounce", "a slab that lights a wall by way of the floor",
                   lambda: room(wall=wall(diffuse(0.8, 0.7, 0.6))), moved, spp=512, seeds=32, options=OPTIONS),
@@ -343,7 +335,6 @@ ROOMS_SCENES = [
     AttachedScene("bounce_corner", "the same into a corner of two walls", corner, moved,
                   spp=512, seeds=32, options=OPTIONS),
 ]  # fmt: skip
-
 
 SCENES: dict[str, AttachedScene] = {
     scene.name: scene for scene in (*GLASS_SCENES, *MIRRORS_SCENES, *PLACES_SCENES, *ROOMS_SCENES)

@@ -19,7 +19,6 @@ UNGUIDED = ["integrator.guiding=off", "integrator.sequence=independent"]
 SMALL = ["scene.options={resx: 24, resy: 24}", "target.render.spp=16", "run.spp=16", *UNGUIDED]
 #: Of glass against air, as the scene names them.
 IOR = 1.5046 / 1.000277
-
 pytestmark = pytest.mark.usefixtures("llvm")
 
 

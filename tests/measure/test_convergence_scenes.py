@@ -15,7 +15,6 @@ from reslrb_cli.config.loader import load
 from reslrb_cli.measure.convergence.statistics import GROUPS, Reference, Samples
 
 pytestmark = [pytest.mark.usefixtures("llvm"), pytest.mark.long]
-
 ROOT = Path(__file__).resolve().parents[2]
 OURS = "reslrb:reservoir,reslrb:event,reslrb:gather,reslrb:stack"
 #: Without roulette, which naive AD does not differentiate rightly.

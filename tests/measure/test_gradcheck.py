@@ -31,7 +31,6 @@ from reslrb_cli.report.tables import summary_lines
 from reslrb_cli.scene.visibility import interior
 
 pytestmark = pytest.mark.usefixtures("llvm")
-
 SMALL = ["scene.options.size=32", "scene.options.texture=4", "run.spp=8", "integrator.max_depth=4"]
 
 

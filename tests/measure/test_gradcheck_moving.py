@@ -20,7 +20,6 @@ from reslrb_cli.measure.scenes.small import room as corner
 from reslrb_cli.records.measurements import Kind, Reference, Verdict
 
 pytestmark = pytest.mark.usefixtures("llvm")
-
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 
 

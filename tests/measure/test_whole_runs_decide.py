@@ -17,7 +17,6 @@ from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.views import target_arrays
 
 pytestmark = pytest.mark.usefixtures("llvm")
-
 SIZE = ["scene.size=[32, 32]", "run.spp=64", "run.iterations=2", "run.measuring=1000"]
 
 

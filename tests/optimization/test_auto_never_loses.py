@@ -33,7 +33,6 @@ from reslrb_cli.records.decisions import LEAST_IMAGE, PaidRecord
 from reslrb_cli.records.images import write_file
 
 pytestmark = [pytest.mark.usefixtures("llvm"), pytest.mark.long]
-
 FOLDER = Path(__file__).resolve().parents[2] / "configs"
 SHIPPED = sorted(str(path.relative_to(FOLDER).with_suffix("")) for path in FOLDER.rglob("*.yaml"))
 #: Films of which a step takes a second at the most.

@@ -30,7 +30,6 @@ from reslrb_cli.records.checkpoint import STATE_FILE, open_state
 from reslrb_cli.records.manifest import read_manifest
 
 pytestmark = pytest.mark.usefixtures("llvm")
-
 AUTO = ["integrator.guiding=auto", "scene.size=[32, 32]", "run.spp=64", "run.iterations=2", "run.certainty=false"]
 AUTO += ["run.measuring=1000"]  # though iterations are so few
 RUN = Path("runs/tiny")

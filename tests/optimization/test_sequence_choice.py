@@ -26,7 +26,6 @@ from reslrb_cli.records.checkpoint import STATE_FILE, open_state
 from reslrb_cli.records.manifest import read_manifest
 
 pytestmark = pytest.mark.usefixtures("llvm")
-
 SMALL = ["scene.size=[16, 16]", "run.spp=64", "run.iterations=2", "run.certainty=false", "run.measuring=1000"]
 AUTO = ["integrator.sequence=auto", *SMALL]
 BOTH = ["integrator.guiding=auto", *AUTO]

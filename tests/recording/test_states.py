@@ -117,7 +117,6 @@ EVIL: dict[str, tuple[dict[str, Any], dict[str, Any], str]] = {
     "a best that is none": ({}, {"best": 0}, f"lacks `best/{tiny.KEY}`"),
 }  # fmt: skip
 
-
 FEW = ("NaN", "a shape", "a value above its bound", "one value below its bound", "a best out of bounds",
        "a foreign value", "NaN moments", "objects", "no state", "iterations", "more iterations than lines", "units",
        "scaling", "a configuration", "a version")  # fmt: skip

@@ -21,7 +21,6 @@ from reslrb_cli.scene.parameters import Selection, select_parameters
 from reslrb_cli.scene.xml.read import Description
 
 pytestmark = pytest.mark.usefixtures("llvm")
-
 BITMAP = '<string name="filename" value="{}"/><string name="format" value="variant"/>'
 EIGHT_BITS = '<string name="filename" value="{}"/>'
 #: Every way in which a scene says what can be recovered: by number, colour, image, index, mesh and place, with and

@@ -12,7 +12,6 @@ from reslrb_cli.errors import ConfigError
 from reslrb_cli.scene.load import load_scene
 
 pytestmark = pytest.mark.usefixtures("llvm")
-
 ROOT = Path(__file__).resolve().parents[2]
 SHIPPED = sorted((ROOT / "scenes").rglob("*.xml"))
 #: A scene in which one thing can be exchanged for another; each stands in a line of its own.
@@ -60,7 +59,6 @@ def assert_same(found: dict[str, Any], expected: dict[str, Any]) -> None:
 
 #: Of the shipped scenes, those whose images are compared too.
 RENDERED = ("cornell_floor", "grey_room", "caustic_heightmap")
-
 
 #: The others have nothing that these do not have; their textures take seconds.
 SIMILAR = ("lens_pose", "caustic_slab", "caustic_heightmap")

@@ -13,7 +13,6 @@ from reslrb_cli.scene.load import load_scene
 from reslrb_cli.scene.xml import read
 
 pytestmark = pytest.mark.usefixtures("llvm")
-
 HEAD = '<scene version="3.0.0"><sensor type="perspective"/><emitter type="constant"/><shape type="sphere"/>\n'
 TEXTURE = (
     '<bsdf type="diffuse">\n<texture type="bitmap" name="reflectance"><string name="filename" value="{}"/></texture>'

@@ -15,7 +15,6 @@ from reslrb_cli.errors import ConfigError
 from reslrb_cli.scene.load import load_scene
 
 pytestmark = pytest.mark.usefixtures("llvm")
-
 SENSOR = '<sensor type="perspective"><film type="hdrfilm"/></sensor>'
 LAMP = '<shape type="sphere"><emitter type="area"><rgb name="radiance" value="$power"/></emitter></shape>'
 #: Seven kinds of objects, most of them without an id, and several of a kind.

@@ -17,7 +17,6 @@ from reslrb_cli.scene.visibility import visible_texels
 
 ROOT = Path(__file__).resolve().parents[2]
 NAMES = ("cornell_floor", "grey_room", "caustic_slab", "furnace", "lens_pose", "caustic_heightmap")
-
 pytestmark = pytest.mark.usefixtures("llvm")
 
 

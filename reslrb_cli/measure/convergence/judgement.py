@@ -33,7 +33,6 @@ from reslrb_cli.records.measurements import (
 #: matter of rounding to each.
 STOCK_ROUNDING = 1e-3
 
-
 #: What is said of noise with heavy tails.
 HEAVY = "single steps carry the variance: intervals are too narrow, and more steps may show more"
 

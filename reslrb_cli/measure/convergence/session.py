@@ -96,7 +96,6 @@ def kept(
 #: What the samples of all together may take in memory, in bytes.
 MEMORY = 2**30
 
-
 #: Light paths of a step of an independent reference, whose samples per pixel are its own: naive AD keeps all paths.
 INDEPENDENT_PATHS = 2**18
 

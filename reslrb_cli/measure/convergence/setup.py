@@ -43,26 +43,20 @@ from reslrb_cli.seeds import seed
 #: Steps after the first until no new kernel comes, at most.
 MAX_WARM_UPS = 4
 
-
 #: A turn of one that compares is as long as a step of the slowest, but no longer than so many seconds.
 TURN_S = 2.0
-
 
 #: Steps of less than so many seconds are taken at least two a turn: the first makes good what others did to the caches.
 SHORT_S = 1.0
 
-
 #: The most steps of one turn.
 MOST_STEPS = 8
-
 
 #: Turns of references, in those of all that are compared together.
 SHARES = {"reference": 0.5, "independent": 0.35}
 
-
 #: Steps of a turn where their number is not to depend on time.
 FIXED = {"case": 2, "reference": 8, "independent": 4}
-
 
 #: The most steps of a reference's turn.
 MOST_REFERENCE_STEPS = 64
@@ -178,18 +172,14 @@ def _fitting(turn_s: float, step_s: float, least: int, most: int) -> int:
 #: Light paths of the target, and of all images that dL/dI is held at together, where time does not count.
 PATHS = {"fixed": 2**21, "loss": 2**23}
 
-
 #: The most of them where it does.
 MOST_PATHS = 2**24
-
 
 #: Share of the time that they may take, target and images.
 SHARE = {"fixed": 0.1, "loss": 0.25}
 
-
 #: Light paths that their speed is measured with.
 TRIAL = 2**16
-
 
 #: The purpose of those images' samples.
 _PURPOSE = "convergence, dL/dI"

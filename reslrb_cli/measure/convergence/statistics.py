@@ -27,16 +27,13 @@ from reslrb_cli.statistics import jackknife_variance
 #: Of all intervals.
 CONFIDENCE = 0.95
 
-
 #: Fewer turns, or rows of a reference, have no standard error worth the name.
 FEWEST = 3
-
 
 #: Steps from which on there are so many groups of them, which a slope's interval comes from; the longest average is as
 #: long as a group. The errors of shorter averages than these, of a single colour say, have logarithms so skewed that
 #: intervals are too narrow.
 GROUPS = {32: 8, 16: 4}
-
 
 #: Fewer steps have no slope.
 FEWEST_FOR_SLOPE = min(GROUPS)

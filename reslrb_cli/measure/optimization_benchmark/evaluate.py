@@ -39,14 +39,11 @@ from reslrb_cli.records.metrics import Record
 
 Array = np.ndarray[Any, Any]
 
-
 #: The purpose of the samples of the images.
 _PURPOSE = "convergence, runs"
 
-
 #: The share of the time that the target may take.
 TARGET_SHARE = 0.1
-
 
 #: The fewest samples per pixel of the images, whatever they take: the noise of fewer would be all that losses show.
 LEAST_SPP = 16

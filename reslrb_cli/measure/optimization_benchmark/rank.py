@@ -67,10 +67,8 @@ def times(limit_s: float) -> list[float]:
 #: Fewer seeds than these say nothing of how far a median of theirs may be off.
 LEAST_SEEDS = 5
 
-
 #: Times that seeds are drawn anew, and what they are drawn by: the same runs have the same interval.
 RESAMPLES, RESAMPLED_BY = 4000, 15
-
 
 #: What share of the resamples an interval holds.
 CONFIDENCE = 0.95
@@ -195,7 +193,6 @@ def _least_p(one: int, other: int) -> float:
 
 #: What is kept says that it is of this.
 KIND = "convergence --runs"
-
 
 #: Losses of the same values on the same samples differ by rounding alone, relatively: far less than this.
 ROUNDING = 1e-3

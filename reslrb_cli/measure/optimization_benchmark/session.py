@@ -33,15 +33,12 @@ from reslrb_cli.records.measurements import BenchStatus, Method, RunPointRecord
 #: The share of the time that judging is to take, unless that leaves images with too few samples.
 JUDGED = 0.15
 
-
 #: No run has less time than this, in seconds.
 LEAST_S = 0.5
-
 
 #: What is left for a run's being late: a share of its time, and seconds beside it. One that has not come to its first
 #: iteration by then is cut off.
 GRACE, GRACE_S = 0.05, 0.5
-
 
 #: The share of its time by which any other run may be late before it is cut off: it ends by itself, and copies of its
 #: values, which take none of its time, take some of ours.

@@ -88,7 +88,6 @@ def vertices(scene: Any, name: str) -> np.ndarray:
 #: the slope of a smooth dL/dI by a few percent within each pixel, which steps would have to be small against.
 FILTER = {"type": "gaussian", "stddev": 0.7}
 
-
 #: The name of the amplitudes among the parameters.
 AMPLITUDES = "amplitudes"
 

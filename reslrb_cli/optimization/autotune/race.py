@@ -55,13 +55,11 @@ TIMING_NOISE = 1.1
 CONFIDENCE = 0.95
 #: What is left of a sum where nothing should be, as a share of it.
 ROUNDING = 1e-12
-
 Say = Callable[[str], None]
 Record = TypeVar("Record", bound=Finding)
 Gradients = dict[str, Array]
 #: A gain and the ends of its interval; nothing where it cannot be told.
 Gain = tuple[float, float, float] | tuple[None, None, None]
-
 logger = logging.getLogger(__name__)
 
 

@@ -45,7 +45,6 @@ SETTLED_SHARE = 0.8
 LEAST_CORRELATION = 0.5
 #: The noise of gradients is at most so much like their curvature: some of it is each one's own.
 LIKE = 0.95
-
 Gradients = dict[str, Array]
 Values = list[float | None] | None
 

@@ -18,7 +18,6 @@ from reslrb_cli.report.sources import Run, Source, read_run
 
 Array = np.ndarray[Any, Any]
 
-
 #: Seconds after which the page of a run that is still at work loads itself again.
 REFRESH_SECONDS = 5
 

@@ -14,23 +14,18 @@ from reslrb_cli.report.page.layout import COLORS, Words, key, lay_out
 
 Array = np.ndarray[Any, Any]
 
-
 #: Points of a curve, at most; of a longer one each is the mean of some.
 MOST_POINTS = 600
 
-
 #: An axis is logarithmic where its values span more than this factor, and has ticks between its decades up to that one.
 LEAST_LOG, MOST_LABELLED = 5.0, 300.0
-
 
 #: Inches of a diagram; at its left, those of the axis's label and of a letter at its marks. Matplotlib would find out
 #: by drawing everything twice.
 WIDTH, HEIGHT, LABEL, LETTER = 5.2, 2.9, 0.34, 0.078
 
-
 #: What matplotlib is told to draw text and lines in, and is then replaced by the page's own colour.
 _INK = "#010203"
-
 
 _CURVES = {
     "svg.fonttype": "none", "svg.hashsalt": "reslrb", "font.size": 10, "axes.linewidth": 0.6,

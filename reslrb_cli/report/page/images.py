@@ -38,10 +38,8 @@ from reslrb_cli.report.tonemap import (
 
 Array = np.ndarray[Any, Any]
 
-
 #: Pixels of a picture's longer side, at most: a page is sent around.
 MOST_PIXELS = 640
-
 
 #: A picture with fewer pixels at its longer side is shown with squares for pixels.
 FEW_PIXELS = 256
@@ -118,7 +116,6 @@ def fit(values: Array) -> Array:
 #: z at the ends of the scale.
 MOST_Z = 5.0
 
-
 #: Maps on a page, at most: of a folder with more, the first.
 MOST_MAPS = 40
 
@@ -186,11 +183,7 @@ def _kinds(view: Mapping[str, Any]) -> list[str]:
 
 
 _HEAD = ("image", "PSNR", "SSIM", "CIEDE2000", "ΔE ITP", "HDR-FLIP", "|image − target|")
-
-
 _TOLD = "Each line: mean; median, 95 %, 99 % of the pixels or texels are below; the greatest."
-
-
 _MEASURES = {"ciede2000": "CIEDE2000", "itp": "ΔE ITP"}
 
 
@@ -245,8 +238,6 @@ def _spread(told: Mapping[str, float] | None) -> Words:
 
 #: Images between the first and the last that are shown of a sensor, at most.
 MOST_BETWEEN = 12
-
-
 _OF_A_SENSOR = re.compile(r"(?:initial|final|target)(-\d+)?\.exr")
 
 

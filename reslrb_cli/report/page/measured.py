@@ -30,11 +30,8 @@ from reslrb_cli.report.tables import HEAD, cells, failure_line, summary_lines
 
 Entry = Mapping[str, Any]
 
-
 #: What can be varied: its name in the records, in words, and what they are called where they are fixed.
 SWEPT = {"max_depth": "path depth", "spp": "samples per pixel", "pixels": "pixels of the film", "texels": "texels"}
-
-
 _ENDED = {"out_of_memory": "out of memory", "failed": "failed"}
 
 
@@ -132,11 +129,8 @@ def _with_ends(words: str, interval: Mapping[str, float | None], low: str = "low
 
 Naming = Callable[[Entry], str]
 
-
 #: Quantities that are drawn, at most: all parameters together, the image, then single ones.
 MOST_DRAWN = 8
-
-
 _SHARES = {"0.1": "to 10 %", "0.03": "to 3 %", "0.01": "to 1 %"}
 
 
@@ -305,8 +299,6 @@ def _is_number(value: Any) -> bool:
 
 #: Names in the title of a page.
 MOST_NAMED = 3
-
-
 Parts = list[tuple[str, Markup]]
 
 
@@ -395,7 +387,6 @@ def _each(runs: Sequence[Run], make: Callable[[Run], Markup]) -> Markup:
 #: What stands above a source, before its name.
 HEADINGS = {"bench": "Cost of a step", "gradcheck": "Gradients against references",
             "convergence": "Error against run time", "maps": "Maps of gradients"}  # fmt: skip
-
 
 #: Verdicts that are told as a failure is.
 _BAD = (Verdict.FAILS,)

@@ -268,8 +268,6 @@ def clamped(tally: Mapping[str, Any] | None) -> Markup:
 
 #: Bytes of a configuration that is shown, at most.
 MOST_CONFIG = 2**20
-
-
 DAMAGED = "This part cannot be shown: what was recorded of it is damaged."
 
 

@@ -27,11 +27,8 @@ from reslrb_cli.report.tonemap import encode, exposure_for, exposure_words
 
 Array = np.ndarray[Any, Any]
 
-
 #: Where a run folder has the values of a moment, below `parameters/`.
 MOMENTS = (("start", "initial"), ("end", "final"), ("true", "true"))
-
-
 _FOLDERS = {"initial": "initial", "final": "", "true": "true"}
 
 
@@ -176,14 +173,9 @@ def _texture_mask(folder: Path, key: str) -> Array | None:
 #: Curves in one diagram of one run, at most: those of the parameters that are the farthest off at the end.
 MOST_CURVES = len(COLORS)
 
-
 #: Parameters of several runs that have diagrams of their own, at most.
 MOST_SHARED = 6
-
-
 ABSCISSAE = (("iteration", "iteration"), ("elapsed_s", "time in steps and updates (s)"))
-
-
 Record = Mapping[str, Any]
 
 
