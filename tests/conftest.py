@@ -11,8 +11,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from compilation import leave_out_optimisations
-from threads import compute_alone
+from compilation import compute_alone, leave_out_optimisations
 
 import reslrb_cli  # noqa: F401  # chooses libLLVM, so it comes before any test imports Mitsuba
 from reslrb_cli.backend.variant import set_variant

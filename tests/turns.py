@@ -1,11 +1,15 @@
-"""Parameters of which the default suite runs a part: a few of many names; of pairs each name and each way."""
+"""Parameters of which the default suite runs a part, and a scene of somebody else, if it is there."""
 
 from __future__ import annotations
 
+import os
 from collections.abc import Collection, Iterable, Sequence
+from pathlib import Path
 from typing import Any
 
 import pytest
+
+# Parameters of which the default suite runs a part: a few of many names; of pairs each name and each way.
 
 
 def name_of(one: Any) -> str:
@@ -42,3 +46,18 @@ def taking_turns(
         for one in names for turn, other in enumerate(ways)
     ]  # fmt: skip
     return pytest.mark.parametrize((name, way), pairs)
+
+
+# A scene of somebody else, which is not part of the project: where it is, if it is there.
+
+_BESIDE = Path(__file__).parents[2] / "shared" / "scenes" / "grey-white-room"
+
+
+def real_room() -> Path:
+    """The room's file: in the folder that RESLRB_GREY_WHITE_ROOM names, or beside the repository; else skips."""
+    folder = Path(os.environ.get("RESLRB_GREY_WHITE_ROOM") or _BESIDE)
+    if not (folder / "scene.xml").exists():
+        pytest.skip(
+            f"The Grey & White Room (Wig42, CC BY 3.0) is not in {folder}; set RESLRB_GREY_WHITE_ROOM to its folder"
+        )
+    return folder / "scene.xml"

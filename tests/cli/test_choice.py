@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from cli.calling import read_metrics
 from cli.test_optimize import CONFIG, KEY, SCENE
+from cli.tiny import read_metrics
 from turns import a_few, taking_turns
 
 from reslrb_cli.cli import main

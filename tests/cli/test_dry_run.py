@@ -11,8 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from cli.calling import read_metrics
-from cli.tiny import write_experiment
+from cli.tiny import read_metrics, write_experiment
 
 from reslrb_cli.cli import main
 from reslrb_cli.config.files import in_words

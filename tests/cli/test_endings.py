@@ -1,22 +1,30 @@
-"""How a run ends, in process: each part alone, the manifest first, nothing lost, and the truth in the folder."""
+"""How a run ends, of itself, by a signal, or because its folder goes: nothing lost, and the truth in the folder."""
 
 from __future__ import annotations
 
+import json
 import os
+import shutil
 import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
 from unittest import mock
 
 import numpy as np
 import pytest
-from cli.calling import read_metrics
-from cli.failing import RUN, failing_last, full, lines
-from cli.tiny import COMPLETE, KEY, faults, files
+from cli.tiny import COMPLETE, KEY, RUN, failing_last, faults, files, full, lines, read_metrics
+from compilation import search_path
 
 from reslrb_cli.cli import main
-from reslrb_cli.cli.terminal import SIGNALS
+from reslrb_cli.cli.terminal import SIGNALS, Interrupts
 from reslrb_cli.records import metrics
 from reslrb_cli.records.manifest import read_content
 from reslrb_cli.runs import recorder as recording
+
+# How a run ends, in process: each part alone, the manifest first, nothing lost, and the truth in the folder.
 
 
 @pytest.mark.parametrize("optimize", ["real page"], indirect=True)
@@ -28,9 +36,6 @@ def test_a_run_that_ends_well_is_complete(optimize):
     assert (content["status"], content["missing"], content["error"]) == ("finished", {}, None)
     assert content["process"]["pid"] == os.getpid()
     assert "report.html" in out
-
-
-# --- signals ----------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("number", SIGNALS)
@@ -78,9 +83,6 @@ def test_a_run_that_is_ended_at_once_is_interrupted(optimize, during, monkeypatc
     assert content["ended"]
 
 
-# --- checkpoints and locks --------------------------------------------------------------------------------------------
-
-
 def test_there_is_a_checkpoint_before_the_first_iteration(optimize, monkeypatch):
     seen = []
 
@@ -113,9 +115,6 @@ def test_a_run_in_progress_is_not_replaced(optimize, during):
     assert len(read_metrics(RUN)) == 5
     assert optimize("--force", "--quiet")[0] == 0
     assert sorted(os.listdir("runs")) == ["tiny"]
-
-
-# --- failures, part by part -------------------------------------------------------------------------------------------
 
 
 #: By the part that fails: what writes it, how often that is called before the end, and what is not there.
@@ -200,3 +199,326 @@ def test_memory_that_runs_out_at_the_end_keeps_what_was_found(optimize, monkeypa
     assert code == 4
     assert lines(err)[-1] == read_content(RUN)["error"]
     assert COMPLETE - files(RUN) == {"images/final.exr", "images/final.png"}
+
+
+# Signals: a wish to stop, the end at once, and no exception out of a handler.
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def start(script: str, *, shell: str = "", argv0: str = "") -> subprocess.Popen[str]:
+    """A process that runs `script` and has printed `ready`."""
+    command = [sys.executable, "-c", f"import os, signal, sys, threading, time\n{script}"]
+    if shell:
+        command = ["sh", "-c", f'{shell}; exec "$@"', "sh", *command]
+    environment = {**os.environ, "PYTHONPATH": search_path(ROOT)}
+    process = subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment, bufsize=0
+    )
+    assert process.stdout is not None
+    assert process.stdout.readline() == "ready\n", process.communicate()
+    return process
+
+
+def end(process: subprocess.Popen[str]) -> tuple[int, str, str]:
+    out, err = process.communicate(timeout=30)
+    return process.returncode, out, err
+
+
+@pytest.mark.parametrize("number", SIGNALS)
+def test_the_first_signal_only_leaves_a_mark(number):
+    before = [signal.getsignal(other) for other in SIGNALS]
+    with Interrupts() as interrupts:
+        assert not interrupts.requested
+        os.kill(os.getpid(), number)
+        time.sleep(0.05)
+        assert interrupts.requested
+    assert [signal.getsignal(other) for other in SIGNALS] == before
+    assert not [thread for thread in threading.enumerate() if thread.name == "interrupts"]
+
+
+def test_one_within_another_takes_its_place_and_gives_it_back():
+    with Interrupts() as outer:
+        for _ in range(2):
+            with Interrupts() as inner:
+                os.kill(os.getpid(), signal.SIGTERM)
+                time.sleep(0.05)
+                assert inner.requested
+        assert not outer.requested
+        os.kill(os.getpid(), signal.SIGTERM)
+        time.sleep(0.05)
+        assert outer.requested
+
+
+def test_in_another_thread_nothing_happens():
+    seen = []
+
+    def work():
+        with Interrupts() as interrupts:
+            seen.append(interrupts.requested)
+
+    thread = threading.Thread(target=work)
+    thread.start()
+    thread.join()
+    assert seen == [False]
+
+
+def test_a_signal_in_a_recording_does_not_break_it(llvm):
+    """Raised as an exception there, it becomes an error that looks like a call that cannot be recorded."""
+    import drjit as dr
+    import mitsuba as mi
+
+    @dr.freeze
+    def double(x):
+        os.kill(os.getpid(), signal.SIGINT)
+        return x * 2
+
+    with Interrupts() as interrupts:
+        assert dr.all(double(dr.opaque(mi.Float, 3, 4)) == 6)
+        assert interrupts.requested
+
+
+WITHIN = "from reslrb_cli.cli.terminal import Interrupts\n"
+FIRST = WITHIN + "with Interrupts(tolerated=0): print('ready', flush=True); time.sleep(60)"
+
+
+@pytest.mark.parametrize("number", SIGNALS)
+def test_where_none_is_tolerated_the_first_one_ends_the_process(number):
+    process = start(FIRST)
+    process.send_signal(number)
+    assert end(process) == (130, "", "interrupted\n")
+
+
+def test_the_second_one_ends_it_after_a_last_act(tmp_path):
+    script = f"""
+from pathlib import Path
+from reslrb_cli.records.atomic import write_atomically
+def act(): print("the last act", flush=True)
+def write(file):
+    print("ready", flush=True)
+    time.sleep(60)
+{WITHIN}
+with Interrupts(last_act=act, notice="stopping"):
+    write_atomically(Path({str(tmp_path / "file")!r}), write)
+"""
+    process = start(script)
+    process.send_signal(signal.SIGTERM)
+    assert process.stderr is not None
+    assert process.stderr.readline() == "stopping\n"
+    assert len(list(tmp_path.iterdir())) == 1
+    process.send_signal(signal.SIGINT)
+    assert end(process) == (130, "the last act\n", "interrupted\n")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_two_that_come_while_a_kernel_runs_are_two():
+    """Python's own handler would see one, when the kernel has ended."""
+    script = (
+        WITHIN
+        + """
+import hashlib
+with Interrupts():
+    print("ready", flush=True)
+    # in C, without Python's lock: as while a kernel runs
+    hashlib.pbkdf2_hmac("sha256", b"x", b"y", 200_000_000)
+"""
+    )
+    process = start(script)
+    started = time.monotonic()
+    for _ in range(2):
+        time.sleep(0.2)
+        process.send_signal(signal.SIGINT)
+    assert end(process) == (130, "", "interrupted\n")
+    assert time.monotonic() - started < 20
+
+
+def test_a_last_act_that_fails_prevents_nothing():
+    script = WITHIN + "with Interrupts(tolerated=0, last_act=lambda: 1 / 0): print('ready', flush=True); time.sleep(60)"
+    process = start(script)
+    process.send_signal(signal.SIGHUP)
+    assert end(process) == (130, "", "interrupted\n")
+
+
+def test_what_was_ignored_from_the_start_stays_ignored():
+    process = start(FIRST, shell="trap '' HUP INT")  # as nohup does
+    for number in (signal.SIGHUP, signal.SIGINT):
+        process.send_signal(number)
+    time.sleep(0.2)
+    assert process.poll() is None
+    process.send_signal(signal.SIGTERM)
+    assert end(process)[0] == 130
+
+
+@pytest.mark.parametrize("stream", ["2>&-", "2>/dev/full"])
+def test_a_last_word_that_cannot_be_said_is_left_out(stream):
+    process = start(FIRST, shell=f"exec {stream}")
+    process.send_signal(signal.SIGTERM)
+    assert end(process)[0] == 130
+
+
+PROGRAM = """
+import click
+from reslrb_cli.cli import _Main, run
+@click.command("waiting")
+def command():
+    print("ready", flush=True)
+    time.sleep(60)
+_Main.get_command = lambda *_args: command
+sys.argv = ["reslrb", "waiting"]
+"""
+
+
+@pytest.mark.parametrize("number", SIGNALS)
+def test_a_command_that_knows_of_no_signals_is_ended(number):
+    process = start(PROGRAM + "run()")
+    process.send_signal(number)
+    assert end(process) == (130, "", "interrupted\n")
+
+
+def test_no_signal_changes_how_a_command_that_is_done_ends():
+    script = (
+        PROGRAM
+        + """
+command.callback = lambda: 5
+import atexit
+atexit.register(lambda: print("ready", flush=True) or time.sleep(0.5))
+run()
+"""
+    )
+    process = start(script)
+    for number in SIGNALS:
+        process.send_signal(number)
+    assert end(process) == (5, "", "")
+
+
+def test_while_the_program_is_loaded_ctrl_c_has_no_traceback():
+    script = """
+sys.argv = ["/usr/bin/reslrb"]
+import subprocess
+def wait(*_args, **_options):
+    print("ready", flush=True)
+    time.sleep(60)
+subprocess.run = wait  # what looks for libLLVM
+os.environ.pop("DRJIT_LIBLLVM_PATH", None)
+import reslrb_cli
+"""
+    process = start(script)
+    process.send_signal(signal.SIGINT)
+    assert end(process) == (-signal.SIGINT, "", "")
+
+
+RENDERS = """
+import reslrb_cli, mitsuba as mi
+from reslrb_cli.integrators.step import make_integrator, render_image
+
+mi.set_variant("llvm_ad_rgb")
+scene, integrator = mi.load_dict(mi.cornell_box()), make_integrator("ptracer", max_depth=2)
+print("ready", flush=True)
+threading.Timer(0.1, os.kill, (os.getpid(), signal.SIGINT)).start()
+try:
+    for number in range(10000):
+        render_image(integrator, scene, 0, number, 4)
+except KeyboardInterrupt:
+    print("interrupted")
+"""
+
+
+def test_mitsuba_does_not_write_of_signals_where_results_go():
+    code, out, err = end(start(RENDERS))
+    assert (code, out) == (0, "interrupted\n"), err
+
+
+# Run folders that are removed, emptied, moved or replaced while a run is at work.
+
+
+def test_a_folder_that_is_removed_ends_the_run(optimize, during):
+    during(lambda record: shutil.rmtree(RUN) if record.iteration == 1 else None)
+    code, out, err = optimize("--set", "run.iterations=50")
+    assert (code, out) == (6, "")
+    [line] = lines(err)
+    assert "runs/tiny: has gone while the run went on; " in line
+    assert line.endswith("runs/tiny was removed or moved away")
+    assert os.listdir("runs") == []
+
+
+def test_what_is_in_a_folder_is_removed_and_what_can_be_kept_is(optimize, during):
+    """As by `rm -rf` that has not come to the folder itself: what is then written is what the last line names."""
+
+    def remove(record):
+        if record.iteration == 1:
+            for path in RUN.iterdir():
+                shutil.rmtree(path) if path.is_dir() else path.unlink()
+
+    during(remove)
+    code, out, err = optimize("--set", "run.iterations=50")
+    assert (code, faults(RUN, code, err), out) == (6, [], "")
+    [line] = lines(err)
+    assert "runs/tiny/metrics.jsonl: has been removed while the run went on; " in line
+    assert "; kept: the state after 3 of 3 iterations, in " in line
+    assert line.endswith("runs/tiny/checkpoint")
+    content = read_content(RUN)
+    assert (content["status"], content["error"], content["results"]["iterations"]) == ("failed", line, 3)
+    assert content["missing"] == {"final images": "the run failed"}
+    with np.load(RUN / "checkpoint" / "state.npz") as state:
+        assert int(state["iteration"]) == 3
+        kept = state[f"parameter/{KEY}"]
+    with np.load(RUN / "parameters" / "parameters.npz") as values:
+        assert np.array_equal(values[KEY], kept)
+
+
+@pytest.mark.parametrize(("fails", "kept"), [(set(), "values after 3"), ({"write_parameters"}, None)])
+def test_the_last_line_says_what_is_there_without_a_state(optimize, during, monkeypatch, fails, kept):
+    """The state cannot be written, and the one that there was has been removed."""
+
+    def remove(record):
+        if record.iteration == 1:
+            shutil.rmtree(RUN / "checkpoint")
+            shutil.rmtree(RUN / "parameters")
+            (RUN / "metrics.jsonl").unlink()
+
+    during(remove)
+    failing_last(monkeypatch, "save_checkpoint")
+    for name in fails:
+        failing_last(monkeypatch, name, calls=2)
+    code, _, err = optimize()
+    assert (code, faults(RUN, code, err)) == (6, [])
+    line = read_content(RUN)["error"]
+    assert lines(err)[-1] == line
+    if kept is None:
+        assert line.endswith("; nothing of the run was kept")
+    else:
+        assert f"; kept: the {kept} iterations, in " in line
+        assert line.endswith("runs/tiny/parameters; no state to go on from")
+    assert (RUN / "parameters" / "parameters.npz").exists() == (kept is not None)
+    assert not (RUN / "checkpoint" / "state.npz").exists()
+
+
+def test_another_run_that_has_taken_the_name_is_left_alone(optimize, during):
+    seen = []
+
+    def take(record):
+        if record.iteration == 1:
+            RUN.rename("runs/moved")
+            RUN.mkdir()
+            (RUN / "theirs").write_text("another run")
+        elif record.iteration == 2:
+            seen.append(record)
+
+    during(take)
+    code, out, err = optimize("--set", "run.checkpoint_every={iterations: 1}")
+    assert (code, out, os.listdir(RUN)) == (6, "", ["theirs"])
+    assert seen == []  # at once, not when all is done
+    [line] = lines(err)
+    assert "runs/tiny: has gone while the run went on; " in line
+    assert line.endswith("runs/tiny was removed or moved away; what is there now is another's, and was left as it is")
+
+
+def test_a_folder_that_was_moved_keeps_what_it_has(optimize, during):
+    during(lambda record: RUN.rename("runs/moved") if record.iteration == 1 else None)
+    code, _, err = optimize()
+    assert code == 6
+    assert lines(err)[-1].endswith("runs/tiny was removed or moved away")
+    moved = Path("runs/moved")
+    assert len((moved / "metrics.jsonl").read_text().splitlines()) == 2
+    assert read_content(moved)["status"] == "running"
+    assert json.loads((moved / "manifest.json").read_text())

@@ -9,8 +9,8 @@ from pathlib import Path
 import mitsuba as mi
 import pytest
 import yaml
-from cli.calling import reslrb, settings
 from cli.every_plugin import FEW, PAGE, ROWS, Row, page, write_files
+from cli.tiny import reslrb, settings
 from turns import a_few
 
 from reslrb_cli.backend.installation import package_folder, shipped_plugins

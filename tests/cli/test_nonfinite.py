@@ -1,4 +1,4 @@
-"""Planted faults: what a run does about them, and whether the command that it prints finds them."""
+"""Planted faults that are not finite: what a run does, and `inspect --nonfinite` of it."""
 
 from __future__ import annotations
 
@@ -7,13 +7,21 @@ import logging
 import re
 import shlex
 from pathlib import Path
+from types import ModuleType
 
+import drjit as dr
 import numpy as np
 import pytest
 from turns import a_few
 
-from reslrb_cli.cli import main
+from reslrb_cli.cli import main, nonfinite
+from reslrb_cli.guiding.tables import Guiding
+from reslrb_cli.integrators import reslrb
+from reslrb_cli.measure import nonfinite_trace
+from reslrb_cli.measure.nonfinite_trace import Witness
 from reslrb_cli.optimization import views
+
+# Planted faults: what a run does about them, and whether the command that it prints finds them.
 
 SCENE = """<scene version="3.0.0">
     <default name="format" value="rgb"/> <default name="power" value="8"/> <default name="wall" value="wall.exr"/>
@@ -58,7 +66,7 @@ KEY = "poster.reflectance.value"
 
 
 @pytest.fixture
-def experiment(llvm, tmp_path, monkeypatch):
+def spoilt_experiment(llvm, tmp_path, monkeypatch):
     """A folder with a scene, textures, a target and a configuration, and the working directory in it."""
     import mitsuba as mi
 
@@ -74,7 +82,7 @@ def experiment(llvm, tmp_path, monkeypatch):
     logging.getLogger("reslrb_cli").handlers.clear()
 
 
-def reslrb(capsys, *args):
+def reslrb_nonfinite(capsys, *args):
     """Run the command line in this process; return exit code, standard output and standard error."""
     with pytest.raises(SystemExit) as end:
         main.main([str(arg) for arg in args])
@@ -85,7 +93,7 @@ def reslrb(capsys, *args):
 def optimize(capsys, *sets, code=5):
     """A run that ends with this code; its standard output and error."""
     arguments = [argument for setting in sets for argument in ("--set", setting)]
-    found, out, err = reslrb(capsys, "optimize", "config.yaml", *arguments)
+    found, out, err = reslrb_nonfinite(capsys, "optimize", "config.yaml", *arguments)
     assert found == code, err
     assert "Traceback" not in err
     return out, err
@@ -96,9 +104,9 @@ def inspect(capsys, err):
     [command] = set(re.findall(r"where: (reslrb inspect .* --nonfinite)", err))
     program, *arguments = shlex.split(command)
     assert program == "reslrb"
-    code, out, _ = reslrb(capsys, *arguments)
+    code, out, _ = reslrb_nonfinite(capsys, *arguments)
     assert code == 0
-    code, as_json, _ = reslrb(capsys, *arguments, "--json")
+    code, as_json, _ = reslrb_nonfinite(capsys, *arguments, "--json")
     assert code == 0
     report = json.loads(as_json)
     assert out.startswith(f"iteration {report['iteration']}, sensor 0, pixel")
@@ -113,7 +121,7 @@ STOP = "run.on_nonfinite=stop"
 
 
 @pytest.mark.parametrize("film", a_few(["rgb", "rgba"], ["rgba"]))
-def test_a_texel_that_is_not_a_number(experiment, capsys, film):
+def test_a_texel_that_is_not_a_number(spoilt_experiment, capsys, film):
     _, err = optimize(capsys, STOP, f"scene.options={{wall: spoilt.exr, format: {film}}}")
     assert "not finite in iteration 0" in err.splitlines()[-1]
     iteration, [offender], text = inspect(capsys, err)
@@ -130,21 +138,21 @@ def test_a_texel_that_is_not_a_number(experiment, capsys, film):
     assert f"path {at['path']} of 1024" in text
 
 
-def test_a_light_that_overflows(experiment, capsys):
+def test_a_light_that_overflows(spoilt_experiment, capsys):
     _, err = optimize(capsys, STOP, "scene.options={power: 3e38}")
     _, [offender], _ = inspect(capsys, err)
     assert offender["quantity"] == "emission E"
     assert (offender["value"], offender["where"]["vertex"]) == (["inf"] * 3, 0)
 
 
-def test_a_sum_that_overflows(experiment, capsys):
+def test_a_sum_that_overflows(spoilt_experiment, capsys):
     _, err = optimize(capsys, STOP, "scene.options={power: 2e36}")
     _, [offender], _ = inspect(capsys, err)
     assert "finite" in offender["quantity"]
     assert min(offender["value"]) > 1e30
 
 
-def test_a_derivative_that_is_not_finite(experiment, capsys):
+def test_a_derivative_that_is_not_finite(spoilt_experiment, capsys):
     """A reflectance of 0.5 + sqrt(x) at x = 0."""
     _register_root()
     Path("scene.xml").write_text(SCENE.replace("REFLECTANCE", '<texture type="root" name="reflectance"/>'))
@@ -155,7 +163,7 @@ def test_a_derivative_that_is_not_finite(experiment, capsys):
     assert offender["where"]["surface"] == "poster_shape"
 
 
-def test_the_replay_has_the_parameters_of_then(experiment, capsys):
+def test_the_replay_has_the_parameters_of_then(spoilt_experiment, capsys):
     """A reflectance that is not a number once x has moved by more than 0.015, in iteration 2."""
     import drjit as dr
 
@@ -203,7 +211,7 @@ def root_of_pixel(image, target, weights=None):
 
 
 @pytest.mark.parametrize("kind", ["stop", "skip", "zero"])
-def test_a_loss_whose_derivative_is_not_finite(experiment, capsys, monkeypatch, kind):
+def test_a_loss_whose_derivative_is_not_finite(spoilt_experiment, capsys, monkeypatch, kind):
     monkeypatch.setitem(views.LOSSES, "l2", root_of_pixel)
     _, err = optimize(capsys, f"run.on_nonfinite={kind}", code=5 if kind == "stop" else 0)
     assert "dL/dI in 1 entry, the first at pixel (5, 3), channel 1, of sensor 0" in err
@@ -216,7 +224,7 @@ def test_a_loss_whose_derivative_is_not_finite(experiment, capsys, monkeypatch, 
     assert moved.all() if kind == "zero" else not moved.any()
 
 
-def test_what_was_done_is_kept(experiment, capsys, monkeypatch):
+def test_what_was_done_is_kept(spoilt_experiment, capsys, monkeypatch):
     """A fault in the second iteration: the run folder is whole, and the parameters are those of then."""
     calls = []
 
@@ -241,11 +249,11 @@ def test_what_was_done_is_kept(experiment, capsys, monkeypatch):
     assert "1 values were not finite" in (folder / "report.html").read_text()
     calls.clear()
     monkeypatch.setitem(views.LOSSES, "l2", views.l2)
-    code, out, _ = reslrb(capsys, "inspect", "runs/config/config.yaml", "--nonfinite")
+    code, out, _ = reslrb_nonfinite(capsys, "inspect", "runs/config/config.yaml", "--nonfinite")
     assert (code, out) == (1, "iteration 1: all is finite this time\n")
 
 
-def test_the_last_line_counts(experiment, capsys, monkeypatch):
+def test_the_last_line_counts(spoilt_experiment, capsys, monkeypatch):
     monkeypatch.setitem(views.LOSSES, "l2", root_of_pixel)
     out, err = optimize(capsys, "run.on_nonfinite=zero", code=0)
     assert "3 values not finite in 3 iterations" in out.splitlines()[-1]
@@ -253,7 +261,7 @@ def test_the_last_line_counts(experiment, capsys, monkeypatch):
 
 
 @pytest.mark.parametrize("adjoint", a_few(["independent", "batched"], ["batched"]))
-def test_each_set_of_samples_is_looked_at(experiment, capsys, adjoint):
+def test_each_set_of_samples_is_looked_at(spoilt_experiment, capsys, adjoint):
     _, err = optimize(
         capsys, STOP, "scene.options={wall: spoilt.exr}", f"run.adjoint={adjoint}", "run.memory_budget=64"
     )
@@ -262,17 +270,17 @@ def test_each_set_of_samples_is_looked_at(experiment, capsys, adjoint):
     assert f"the first at pixel ({', '.join(map(str, offender['pixel']))})" in err
 
 
-def test_there_must_be_something_to_show(experiment, capsys):
-    code, _, err = reslrb(capsys, "inspect", "config.yaml", "--nonfinite")
+def test_there_must_be_something_to_show(spoilt_experiment, capsys):
+    code, _, err = reslrb_nonfinite(capsys, "inspect", "config.yaml", "--nonfinite")
     assert (code, len(err.splitlines())) == (2, 2)
     assert "is not in a run folder" in err
     optimize(capsys, code=0)
-    code, _, err = reslrb(capsys, "inspect", "runs/config/config.yaml", "--nonfinite")
+    code, _, err = reslrb_nonfinite(capsys, "inspect", "runs/config/config.yaml", "--nonfinite")
     assert code == 2
     assert "met no value that was not finite" in err
 
 
-def test_a_clamp_reports_its_bias(experiment, capsys):
+def test_a_clamp_reports_its_bias(spoilt_experiment, capsys):
     """At 1 sample per pixel gradients scatter: with k = 1 the clamp acts."""
     sets = ("optimizer.clamp_gradient=1", "run.spp=1", "run.iterations=6")
     out, _ = optimize(capsys, *sets, code=0)
@@ -286,7 +294,7 @@ def test_a_clamp_reports_its_bias(experiment, capsys):
     assert sum(record["clamped"]["entries"] for record in records) == tally["entries"]
 
 
-def test_paths_from_the_sensor_are_not_looked_at(experiment, capsys):
+def test_paths_from_the_sensor_are_not_looked_at(spoilt_experiment, capsys):
     prb = "integrator={type: prb, max_depth: 4}"
     _, err = optimize(capsys, STOP, "scene.options={wall: spoilt.exr}", prb)
     _, [offender], _ = inspect(capsys, err)
@@ -295,7 +303,7 @@ def test_paths_from_the_sensor_are_not_looked_at(experiment, capsys):
     assert offender["where"] is None
 
 
-def test_emitters_that_are_seen_are_looked_at(experiment, capsys):
+def test_emitters_that_are_seen_are_looked_at(spoilt_experiment, capsys):
     """The lamp, turned towards the camera beside the poster, at a depth of 1: there are no light paths at all."""
     at_camera = SCENE.replace('<rotate x="1" angle="180"/><translate x="0" y="0" z="5"/>', '<scale value="0.1"/>')
     Path("scene.xml").write_text(
@@ -312,7 +320,7 @@ def test_emitters_that_are_seen_are_looked_at(experiment, capsys):
     "integrator",
     a_few(["walk_ad", "ptracer", "reslrb, estimator: reservoir", "reslrb, estimator: event"], ["ptracer"]),
 )
-def test_other_integrators_have_the_same_paths(experiment, capsys, integrator):
+def test_other_integrators_have_the_same_paths(spoilt_experiment, capsys, integrator):
     found = []
     for type in (integrator, "reslrb, estimator: gather"):
         chosen = f"integrator={{type: {type}, max_depth: 4}}"
@@ -321,7 +329,7 @@ def test_other_integrators_have_the_same_paths(experiment, capsys, integrator):
     assert found[0] == found[1]
 
 
-def test_passes_that_a_budget_made_are_replayed(experiment, capsys):
+def test_passes_that_a_budget_made_are_replayed(spoilt_experiment, capsys):
     sets = (STOP, "scene.options={wall: spoilt.exr}", "run.spp=1024", "integrator.estimator=reservoir")
     _, err = optimize(capsys, *sets, "run.memory_budget=1e-3", code=2)
     least = int(re.search(r"allow at least (\d+) MiB", err)[1])
@@ -331,3 +339,83 @@ def test_passes_that_a_budget_made_are_replayed(experiment, capsys):
     assert f"the first at pixel ({', '.join(map(str, offender['pixel']))})" in err
     assert ", pass " in offender["where"]["samples"]
     assert offender["quantity"] == "connection factor c"
+
+
+# `inspect --nonfinite` of guided runs: the step's paths start where the tables of then had them start.
+
+#: So few paths that the spoilt texel is met for the first time behind many iterations.
+SETTINGS = ["integrator.guiding=on", "scene.options={wall: spoilt.exr}", "run.iterations=60", "run.on_nonfinite=stop"]
+#: Ways to take a step; `again` has tables learn between the batches of a step.
+WAYS = {
+    "correlated": ["run.adjoint=correlated", "run.spp=2"],
+    "independent": ["run.adjoint=independent", "run.spp=2"],
+    "batched": ["run.adjoint=batched", "run.spp=4"],
+    "again": ["run.adjoint=batched", "run.first_batch=again", "run.batches=3", "run.spp=3"],
+}
+#: Seeds that are tried in turn until one meets the texel when tables have learned; what they meet changes with whatever
+#: changes tables. Of `again` these meet it in the third batch of a step whose second one taught them.
+SEEDS = {"again": [5, 15, 16, 28, 23]}
+Drawn = list[tuple[int, dict[str, np.ndarray] | None]]
+
+
+def note(monkeypatch: pytest.MonkeyPatch, module: ModuleType) -> Drawn:
+    """The seed of all samples that `module` makes from now on, and the table that they are drawn from, if any."""
+    drawn: Drawn = []
+    passes = module.passes
+
+    def noting(plan, scene, sensor, seed, spp, samples_per_pass, table=None):
+        entries = {} if table is None else {name: value for name, value in vars(table).items() if dr.is_array_v(value)}
+        held = None if table is None else {name: np.array(value) for name, value in entries.items()}
+        drawn.append((int(seed[0]), held))
+        return passes(plan, scene, sensor, seed, spp, samples_per_pass, table)
+
+    monkeypatch.setattr(module, "passes", noting)
+    return drawn
+
+
+def differences(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], way: str) -> list[str]:
+    """What is not of the run's last step in what its replay looked at."""
+    taken, looked_at = note(monkeypatch, reslrb), note(monkeypatch, nonfinite_trace)
+    for seed in SEEDS.get(way, [1, 2, 3, 4, 5, 6, 7, 8]):
+        taken.clear()
+        _, err = optimize(capsys, *SETTINGS, *WAYS[way], f"run.seed={seed}")
+        told = re.search(r"not finite in iteration (\d+): .*the first at pixel \((\d+), (\d+)\)", err)
+        if told is not None and int(told[1]) > 0:
+            break
+    run = taken[:]
+    assert told is not None, err
+    assert int(told[1]) > 0  # tables have learned
+    iteration, offenders, _ = inspect(capsys, err)
+    assert iteration == int(told[1])
+    seeds = list(dict.fromkeys(seed for seed, _ in looked_at))
+    found = [] if len(seeds) == len({seed for seed, _ in run if seed in seeds}) > 0 else ["other seeds"]
+    for seed in seeds:
+        own, there = ([table for number, table in drawn if number == seed] for drawn in (run, looked_at))
+        found += [] if len(there) == 2 * len(own) else [f"{len(there)} sets in place of {len(own)}"]
+        for one, other in zip(own, there, strict=False):  # it was inspected twice
+            assert one is not None
+            assert one
+            if other is None or any(not np.array_equal(other[name], value) for name, value in one.items()):
+                found.append("another table")
+    for each in offenders:
+        x, y, _ = each["where"]["position"]
+        spoilt = each["where"]["surface"] == "wall_shape" and (int(x + 4), int(y + 4)) == (1, 4)
+        found += [] if spoilt and each["pixel"] == [int(told[2]), int(told[3])] else ["another vertex"]
+    return found
+
+
+@pytest.mark.parametrize("way", a_few(WAYS, ["correlated", "again"]))
+def test_it_is_the_step_of_the_run(spoilt_experiment, capsys, monkeypatch, way):
+    assert differences(monkeypatch, capsys, way) == []
+
+
+@pytest.mark.parametrize("fault", ["untaught", "not learned on", "out of order"])
+def test_other_tables_are_seen(spoilt_experiment, capsys, fault, monkeypatch):
+    """Tables that know nothing, that do not learn between the batches of a step, or that are those of another batch."""
+    if fault == "untaught":
+        monkeypatch.setattr(nonfinite, "_teach", lambda problem, saved, archive: None)
+    elif fault == "not learned on":
+        monkeypatch.setattr(Witness, "learn", lambda self, number, samples, adjoint: self.drawn.pop())
+    else:
+        monkeypatch.setattr(Witness, "learn", Guiding.learn)
+    assert "another table" in differences(monkeypatch, capsys, "again")

@@ -1,4 +1,4 @@
-"""`reslrb optimize`, `render` and `inspect` on a scene of three surfaces, from the command line to the run folder."""
+"""`optimize`, `render`, `inspect` on small scenes: one view and several, textures and what moves light."""
 
 from __future__ import annotations
 
@@ -13,10 +13,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from cli.calling import read_metrics
+from cli.elsewhere import WALLS, cornell_box
+from cli.tiny import read_metrics, write_experiment
+from click.testing import CliRunner
+from optimization import glass
 from turns import a_few
 
 from reslrb_cli.cli import main
+from reslrb_cli.records.manifest import read_manifest
+
+# `reslrb optimize`, `render` and `inspect` on a scene of three surfaces, from the command line to the run folder.
 
 SCENE = """<scene version="3.0.0">
     <sensor type="perspective" id="camera">
@@ -95,7 +101,7 @@ def reslrb(capsys, *args):
     return int(end.value.code or 0), out, err
 
 
-def read_manifest(folder):
+def read_manifest_optimize(folder):
     return json.loads((Path(folder) / "manifest.json").read_text())
 
 
@@ -118,7 +124,7 @@ def test_a_texture_is_recovered(experiment, capsys, type):
     assert names("runs/box") == FOLDER
     records = read_metrics("runs/box")
     assert [record["iteration"] for record in records] == list(range(40))
-    manifest = read_manifest("runs/box")
+    manifest = read_manifest_optimize("runs/box")
     assert (manifest["status"], manifest["variant"], manifest["seed"]) == ("finished", "llvm_ad_rgb", 0)
     errors = manifest["results"]["parameter_rmse"][KEY]
     assert errors["initial"] == pytest.approx(records[0]["parameter_rmse"])
@@ -142,7 +148,7 @@ def test_a_texture_is_recovered_by_way_of_a_transform(experiment, capsys, transf
     code, _, err = reslrb(capsys, "optimize", "box.yaml", *(word for each in sets for word in ("--set", each)))
     assert code == 0, err
     assert f"scale auto: {KEY} moves in steps of" in err
-    manifest, records = read_manifest("runs/box"), read_metrics("runs/box")
+    manifest, records = read_manifest_optimize("runs/box"), read_metrics("runs/box")
     errors = manifest["results"]["parameter_rmse"][KEY]
     assert errors["initial"] == pytest.approx(np.sqrt(np.mean((experiment - 0.5) ** 2)), rel=1e-5)
     assert errors["final"] < 0.4 * errors["initial"]
@@ -209,7 +215,7 @@ def test_a_target_file_gives_no_parameter_error(experiment, capsys):
     assert reslrb(capsys, "optimize", "file.yaml", "--set", "run.iterations=2")[0] == 0
     records = read_metrics("runs/file")
     assert records[0]["parameter_rmse"] is None
-    assert read_manifest("runs/file")["results"]["parameter_rmse"] == {}
+    assert read_manifest_optimize("runs/file")["results"]["parameter_rmse"] == {}
 
 
 @pytest.mark.parametrize("freeze", [pytest.param(False, marks=pytest.mark.long), True])
@@ -342,10 +348,150 @@ def test_ctrl_c_leaves_a_complete_run_folder(experiment):
     assert "Traceback" not in err
     assert "runs/box/report.html" in out.splitlines()[-1]
     assert names("runs/box") == FOLDER
-    manifest, records = read_manifest("runs/box"), read_metrics("runs/box")
+    manifest, records = read_manifest_optimize("runs/box"), read_metrics("runs/box")
     assert manifest["status"] == "interrupted"
     assert manifest["results"]["iterations"] == len(records)
     assert {"initial.exr", "final.exr", "target.exr"} <= set(names("runs/box/images"))
     assert {f"{KEY}.exr", "parameters.json", "parameters.npz"} <= set(names("runs/box/parameters"))
     with np.load("runs/box/checkpoint/state.npz") as state:
         assert int(state["iteration"]) == len(records)
+
+
+# Whole runs with several views, from the command line to the manifest and the page.
+
+#: Where eight cameras stand before the Cornell box.
+EYES = tuple(f"{x:.2f}, {y:.2f}, 3.6" for x, y in ((-0.8, 0), (0.8, 0), (0, 0.6), (0, -0.6), (-0.6, 0.5), (0.6, 0.5),
+             (-0.6, -0.5), (0.6, -0.5)))  # fmt: skip
+
+
+def optimize(config: str, *settings: str) -> dict:
+    sets = [text for setting in settings for text in ("--set", setting)]
+    with pytest.raises(SystemExit) as end:
+        main(["optimize", config, "--force", *sets])
+    assert end.value.code in (0, None)
+    manifest = read_manifest(Path("runs") / Path(config).stem)
+    assert manifest is not None
+    return manifest
+
+
+@pytest.mark.long
+def test_eight_cameras_two_held_out(llvm, tmp_path, monkeypatch):
+    """The walls from six of eight cameras, three of them an iteration: what the other two see comes closer as well."""
+    (tmp_path / "scene.xml").write_text(cornell_box(24, eyes=EYES))
+    true = ", ".join(f"{key}: {value}" for key, value in WALLS.items())
+    (tmp_path / "box.yaml").write_text(
+        f"""
+variant: llvm_ad_rgb
+scene: {{file: scene.xml}}
+views: [{", ".join(f"{{sensor: {number}}}" for number in range(8))}]
+target: {{render: {{spp: 512, parameters: {{{true}}}}}}}
+parameters: [{", ".join(f"{{key: {key}, initial: 0.5, bounds: [0, 1]}}" for key in WALLS)}]
+integrator: {{max_depth: 4, estimator: stack}}
+run: {{iterations: 120, spp: 16, views_per_iteration: 3, held_out: [2, 5]}}
+"""
+    )
+    monkeypatch.chdir(tmp_path)
+    manifest = optimize("box.yaml")
+    results = manifest["results"]
+    assert [view["sensor"] for view in manifest["views"] if view["held_out"]] == [2, 5]
+    assert results["held_out"]["final"] < 0.5 * results["held_out"]["initial"]
+    seen = [record["held_out"] for record in read_metrics(Path("runs/box")) if record["held_out"] is not None]
+    assert len(seen) == 12
+    assert np.mean(seen[-3:]) < seen[0]
+    assert results["rmse"]["final"] < 0.05 < results["rmse"]["initial"]
+
+
+def test_a_run_tells_of_its_views(llvm, tmp_path, monkeypatch, capsys):
+    """Mask, exposure and shares are in the manifest, in `images/` and on the page."""
+    import mitsuba as mi
+
+    write_experiment(tmp_path)
+    pixels = np.random.default_rng(3).integers(20, 200, (8, 8, 3), dtype=np.uint8)
+    pixels[2, 3] = 255
+    mi.Bitmap(pixels).write(str(tmp_path / "photo.png"))
+    monkeypatch.chdir(tmp_path)
+    manifest = optimize("tiny.yaml", "target={file: photo.png, exposure: 0.8}", "run.iterations=1", "run.final_spp=4")
+    [view] = manifest["views"]
+    assert (view["kinds"], view["left_out"], view["exposure"]) == ({"clipped": 1}, 1, 0.8)
+    assert "view 0: 1 of 64 pixels (1.6%) are left out: 1 are clipped" in capsys.readouterr().err
+    weights = np.array(mi.Bitmap("runs/tiny/images/weights.exr"))
+    assert np.argwhere(weights[:, :, 0] == 0).tolist() == [[2, 3]]
+    page = Path("runs/tiny/report.html").read_text()
+    assert "1 of 64" in page
+    assert "black is left out of the loss" in page
+    assert "0.8" in page[page.index("pixels left out") :]
+
+
+# Runs whose parameters move light, from the command line to the run folder.
+
+PARAMETERS = (
+    "parameters=[{motion: {of: lamp, free: [translation]}, learning_rate: 0.02}, {key: slab.vertex_positions, "
+    "learning_rate: 1e-3}, {heightmap: {mesh: slab, resolution: [3, 2]}}]"
+)
+
+
+def optimize_motion(tmp_path, *sets):
+    path = glass.write_experiment(tmp_path)
+    sets = [word for override in (f"run.output={tmp_path / 'runs'}", *sets) for word in ("--set", override)]
+    return main.main(["optimize", str(path), "--quiet", *sets], standalone_mode=False)
+
+
+def test_what_moves_is_recorded_by_its_names(tmp_path, llvm, capsys):
+    motion = "{motion: {of: lamp, free: [translation]}, learning_rate: 0.02, bounds: [-0.01, 0.01]}"
+    heightmap = "{heightmap: {mesh: slab, resolution: [3, 2]}, learning_rate: 1e-3}"
+    assert optimize_motion(tmp_path, f"parameters=[{motion}, {heightmap}]") == 0
+    folder = tmp_path / "runs" / "glass"
+    stored = json.loads((folder / "parameters" / "parameters.json").read_text())
+    assert list(stored) == ["lamp.translation", "slab.heightmap"]
+    assert np.abs(stored["lamp.translation"]["value"]).max() == pytest.approx(0.01)  # its bounds
+    assert stored["slab.heightmap"] == {"shape": [2, 3, 1], "file": "slab.heightmap.exr"}
+    true = json.loads((folder / "parameters" / "true" / "parameters.json").read_text())
+    assert np.allclose(true["lamp.translation"]["value"], [0.05, 0.1, -0.05])
+    records = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
+    assert list(records[-1]["parameter_errors"]) == ["lamp.translation", "slab.heightmap"]
+    assert records[-1]["parameter_errors"]["lamp.translation"] < records[0]["parameter_errors"]["lamp.translation"]
+    assert records[-1]["nonfinite"] == 0
+    page = (folder / "report.html").read_text()
+    assert "lamp.<wbr>translation" in page or "lamp.translation" in page
+
+
+@pytest.mark.long
+def test_vertices_are_a_parameter_like_others(tmp_path, llvm):
+    key = "slab.vertex_positions"
+    sets = (f"parameters=[{{key: {key}}}]", "target.render.parameters={}", "optimizer.learning_rate=1e-3")
+    assert optimize_motion(tmp_path, *sets) == 0
+    with np.load(tmp_path / "runs" / "glass" / "parameters" / "parameters.npz") as last:
+        moved = last[key]
+    with np.load(tmp_path / "runs" / "glass" / "parameters" / "initial" / "parameters.npz") as first:
+        assert 1e-4 < np.abs(moved - first[key]).max() < 0.1
+
+
+@pytest.mark.parametrize(
+    ("override", "line"),
+    [
+        (PARAMETERS, "parameters[2].heightmap.mesh: `slab.vertex_positions` is what parameters[1] recovers"),
+        ("integrator.estimator=event", "integrator.estimator: estimator event has no derivatives of what moves light"),
+        ("scene.options.filter=box", "scene.file: sensor camera has a box filter"),
+        ("parameters[0].motion.of=nothing", "parameters[0].motion.of: there is no `nothing` in the scene"),
+        (
+            "target.render.parameters={lamp.rotation: 3}",
+            "parameters.lamp.rotation: `lamp.rotation` belongs",
+        ),
+    ],
+)
+def test_errors_are_one_located_line(tmp_path, llvm, override, line):
+    path = glass.write_experiment(tmp_path)
+    result = CliRunner().invoke(main, ["optimize", str(path), "--set", override])
+    assert result.exit_code == 2
+    assert line in result.output
+    assert "Traceback" not in result.output
+
+
+def test_inspect_says_whose_edges_move(tmp_path, llvm):
+    path = glass.write_experiment(tmp_path)
+    parameters = "parameters=[{motion: {of: [slab, lamp]}}]"
+    output = CliRunner().invoke(main, ["inspect", str(path), "--no-counts", "--set", parameters]).output
+    assert "can be moved: 5" in output
+    assert "by motion and heightmap: slab" in output
+    assert "silhouettes and shadow edges of slab are not in its derivatives" in output
+    assert "edges of lamp" not in output

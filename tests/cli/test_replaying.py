@@ -13,7 +13,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from cli.test_nonfinite import CONFIG, KEY, PLAIN, SCENE, reslrb
+from cli.test_nonfinite import CONFIG, KEY, PLAIN, SCENE
+from cli.test_nonfinite import reslrb_nonfinite as reslrb
 
 from reslrb_cli.cli import main
 from reslrb_cli.records.decisions import GuidedRecord

@@ -7,8 +7,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from cli.calling import read_metrics
-from cli.test_optimize import CONFIG, KEY, SCENE, read_manifest, reslrb
+from cli.test_optimize import CONFIG, KEY, SCENE, reslrb
+from cli.test_optimize import read_manifest_optimize as read_manifest
+from cli.tiny import read_metrics
 
 from reslrb_cli.records.images import read_layers
 

@@ -1,10 +1,8 @@
-"""Runs that are hit at random moments, and runs on disks that are too small: what is left is whole, and true.
-
-A few of each by default; `-m long` has as many as it takes to hit every part of a run.
-"""
+"""Runs and measurements that are killed, or whose disk is full: what is left is whole, and enough to go on from."""
 
 from __future__ import annotations
 
+import json
 import os
 import random
 import re
@@ -18,13 +16,22 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from cli.tiny import COMPLETE, faults, files, start, write_experiment
+from cli.tiny import COMPLETE, ROOT, faults, files, start, write_experiment
 from compilation import search_path
 
+from reslrb_cli.cli.options import Keeper, read_earlier
 from reslrb_cli.cli.terminal import SIGNALS
+from reslrb_cli.errors import ConfigError
+from reslrb_cli.records import measurement_files
 from reslrb_cli.records.manifest import read_content, read_manifest
+from reslrb_cli.records.measurement_files import LineFile
+from reslrb_cli.records.measurements import SummaryRecord
+from reslrb_cli.runs import recorder
 
-pytestmark = pytest.mark.usefixtures("llvm")
+# Runs that are hit at random moments, and runs on disks that are too small: what is left is whole, and true.
+#
+# A few of each by default; `-m long` has as many as it takes to hit every part of a run.
+
 #: Moments of a run: it has printed this, or its folder holds that file.
 MOMENTS = {"loading": "variant ", "the target": "rendering ", "the mask": "finding ", "iterations": "metrics.jsonl"}
 LONG = ["--set", "run.iterations=20000"]
@@ -62,6 +69,7 @@ def hit(process: subprocess.Popen[str], number: int, times: int) -> tuple[int, s
     return process.returncode, err
 
 
+@pytest.mark.usefixtures("llvm")
 @pytest.mark.parametrize("times", [1, pytest.param(2, marks=pytest.mark.long)])
 @pytest.mark.parametrize("moment", MOMENTS)
 def test_ctrl_c_at_every_stage(experiment: Path, moment: str, times: int) -> None:
@@ -77,6 +85,7 @@ def test_ctrl_c_at_every_stage(experiment: Path, moment: str, times: int) -> Non
         assert COMPLETE - {"metrics.jsonl"} <= files(run)
 
 
+@pytest.mark.usefixtures("llvm")
 def test_a_killed_run_can_be_read_and_replaced(experiment: Path) -> None:
     process = start(experiment, *LONG)
     run = experiment / "runs" / "tiny"
@@ -119,6 +128,7 @@ def storm(experiment: Path, number: int, count: int, times: int = 1) -> Counter[
     return seen
 
 
+@pytest.mark.usefixtures("llvm")
 @pytest.mark.parametrize(
     ("number", "count"),
     [
@@ -130,13 +140,11 @@ def test_a_storm(experiment: Path, number: int, count: int) -> None:
     assert sum(storm(experiment, number, count).values()) == count
 
 
+@pytest.mark.usefixtures("llvm")
 @pytest.mark.long
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_storm_of_two(experiment: Path, number: int) -> None:
     assert {code for code, _ in storm(experiment, number, 10, times=2)} <= {0, 130, -number}
-
-
-# --- disks ------------------------------------------------------------------------------------------------------------
 
 
 def mount(place: Path, kib: int) -> None:
@@ -155,6 +163,7 @@ SIZES = [8, 192]
 ALL_SIZES = [4, 8, 12, 16, 24, 32, 48, 64, 80, 96, 104, 112, 120, 128, 144, 160, 176, 256, 384, 512, 768, 1024]
 
 
+@pytest.mark.usefixtures("llvm")
 @pytest.mark.parametrize("kib", [*SIZES, *(pytest.param(kib, marks=pytest.mark.long) for kib in ALL_SIZES)])
 def test_a_small_disk(experiment: Path, disk: Path, kib: int) -> None:
     mount(disk, kib)
@@ -185,6 +194,7 @@ def test_a_small_disk(experiment: Path, disk: Path, kib: int) -> None:
         assert f"kept: {kept}, in " in line
 
 
+@pytest.mark.usefixtures("llvm")
 def test_a_disk_that_is_full_before_the_run(experiment: Path, disk: Path) -> None:
     mount(disk, 64)
     (disk / "other").write_bytes(bytes(64 << 10))
@@ -194,9 +204,7 @@ def test_a_disk_that_is_full_before_the_run(experiment: Path, disk: Path) -> Non
     assert os.listdir(disk) == ["other"]
 
 
-# --- terminals --------------------------------------------------------------------------------------------------------
-
-
+@pytest.mark.usefixtures("llvm")
 @pytest.mark.parametrize("streams", ["2>&-", pytest.param("2>/dev/full >&-", marks=pytest.mark.long)])
 def test_a_run_without_a_terminal(experiment: Path, streams: str) -> None:
     script = "import sys; sys.argv = ['reslrb', 'optimize', 'tiny.yaml']; from reslrb_cli.cli import run; run()"
@@ -208,6 +216,7 @@ def test_a_run_without_a_terminal(experiment: Path, streams: str) -> None:
     assert COMPLETE <= files(experiment / "runs" / "tiny")
 
 
+@pytest.mark.usefixtures("llvm")
 def test_a_terminal_that_is_closed(experiment: Path) -> None:
     """Its progress bar goes nowhere, and the hang-up ends the run in order."""
     fcntl, pty, termios = (pytest.importorskip(name) for name in ("fcntl", "pty", "termios"))
@@ -226,3 +235,170 @@ def test_a_terminal_that_is_closed(experiment: Path) -> None:
     process.wait(timeout=60)
     assert (process.returncode, faults(run, 130, "")) == (130, [])
     assert COMPLETE <= files(run)
+
+
+# Files of measurements while these go on: whole, current, and enough to go on from.
+
+
+def lines(*words: str) -> list[SummaryRecord]:
+    return [SummaryRecord(word) for word in words]
+
+
+def read(path: Path) -> list[str]:
+    """What stands in the lines after the first, which says what measured."""
+    origin, *others = [json.loads(line) for line in path.read_text().splitlines()]
+    assert origin == {"kind": "summary", "line": "here"}
+    return [line["line"] for line in others]
+
+
+class Measurement:
+    """A measurement whose lines and samples a test changes as it goes on."""
+
+    def __init__(self, file: Path) -> None:
+        self.final, self.now, self.rows = lines(), lines(), np.zeros(0)
+        self.keeper = Keeper(file, *lines("here"), lambda: self.final, lambda: self.now, self.kept)
+
+    def kept(self) -> measurement_files.Kept | None:
+        return ({"rows": len(self.rows)}, {"rows": self.rows}) if len(self.rows) else None
+
+
+def test_both_files_are_current_and_those_of_another_measurement_go(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(measurement_files, "PAGE_SECONDS", 0.0)
+    monkeypatch.setattr(measurement_files, "PAGE_SHARE", 0.0)
+    file = tmp_path / "c.jsonl"
+    file.write_text("old\n")
+    measurement_files.write_samples(measurement_files.samples_file(file), {"rows": 9}, {})
+    (tmp_path / ".c.samples.npz.999999999.part").write_bytes(b"what a killed process left")
+    measured = Measurement(file)
+    assert (file.read_text(), read_earlier(file)[0]) == ("old\n", {"rows": 9})  # until there is something
+    measured.now = lines("a")
+    measured.keeper.refresh()
+    assert read(file) == ["a"]
+    with pytest.raises(ConfigError, match=r"c\.samples\.npz: no such file"):
+        read_earlier(file)
+    measured.final, measured.now, measured.rows = lines("a"), lines("b"), np.ones(3)
+    measured.keeper.refresh()
+    assert read(file) == ["a", "b"]
+    head, arrays = read_earlier(file)
+    assert (head, list(arrays["rows"])) == ({"rows": 3}, [1.0] * 3)
+    measured.keeper.finish(lines("a", "c"))
+    assert read(file) == ["a", "c"]
+    assert {path.name for path in tmp_path.iterdir()} == {"c.jsonl", "c.samples.npz"}
+
+
+def test_it_is_written_every_few_seconds_and_costs_a_twentieth(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    now, written = [100.0], []
+    monkeypatch.setattr(recorder.time, "monotonic", lambda: now[0])
+    measured = Measurement(tmp_path / "c.jsonl")
+
+    def slowly(path: Path, head: object, arrays: object) -> None:
+        written.append(now[0])
+        now[0] += 1.0
+
+    monkeypatch.setattr("reslrb_cli.cli.options.write_samples", slowly)
+    measured.rows = np.ones(1)
+    for _ in range(100):
+        measured.keeper.refresh()
+        now[0] += 1.0
+    assert len(written) in (4, 5)
+    assert np.diff(written).min() >= 20
+
+
+def test_what_cannot_be_written_on_the_way_ends_nothing_and_is_told_in_the_end(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = tmp_path / "c.jsonl"
+    measured = Measurement(file)
+    measured.keeper.refresh()
+
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device", str(file))
+
+    monkeypatch.setattr("reslrb_cli.records.measurement_files.write_atomically", full)
+    measured.keeper.refresh()
+    with pytest.raises(OSError, match="No space left"):
+        measured.keeper.finish(lines("a"))
+
+
+def test_samples_that_are_too_large_are_not_kept_and_that_is_said(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(measurement_files, "MOST_SAMPLES_BYTES", 100)
+    measured = Measurement(tmp_path / "c.jsonl")
+    measured.rows = np.ones(13)
+    measured.keeper.finish(lines("a"))
+    assert "--resume cannot go on from it" in capsys.readouterr().out
+    assert not measurement_files.samples_file(tmp_path / "c.jsonl").exists()
+
+
+def test_a_pipe_has_each_line_once_as_it_comes(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    reader = os.open(tmp_path / "pipe", os.O_RDONLY | os.O_NONBLOCK)
+    file = LineFile(tmp_path / "pipe")
+    file.write(lines("a"), lines("not yet"))
+    assert os.read(reader, 1000) == b'{"kind": "summary", "line": "a"}\n'
+    file.write(lines("a", "b"))
+    assert os.read(reader, 1000) == b'{"kind": "summary", "line": "b"}\n'
+    file.close()
+    os.close(reader)
+    assert [path.name for path in tmp_path.iterdir()] == ["pipe"]
+
+
+def test_what_a_link_points_to_is_written(tmp_path: Path) -> None:
+    (tmp_path / "link").symlink_to(tmp_path / "c.jsonl")
+    LineFile(tmp_path / "link").write(lines("here", "a"))
+    assert (tmp_path / "link").is_symlink()
+    assert read(tmp_path / "c.jsonl") == ["a"]
+
+
+# Measurements whose process is killed: what was measured until then stands in their files, and is gone on from.
+
+BENCH = ["bench", "tiny.yaml", "--integrators", "reslrb:stack", "--max-depth", "2"]
+CONVERGENCE = ["convergence", "tiny.yaml", "--integrators", "reslrb:stack"]
+
+
+def start_measuring(folder: Path, *args: str) -> subprocess.Popen[str]:
+    script = "import sys; sys.argv[0] = 'reslrb'; from reslrb_cli.cli import run; run()"
+    environment = {**os.environ, "PYTHONPATH": search_path(ROOT)}
+    return subprocess.Popen(
+        [sys.executable, "-c", script, *args],
+        cwd=folder, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+
+
+def repeats(file: Path) -> set[int]:
+    return {
+        entry["repeats"] for entry in map(json.loads, file.read_text().splitlines()) if entry.get("status") is not None
+    }
+
+
+@pytest.mark.usefixtures("llvm")
+@pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="sends SIGKILL")
+@pytest.mark.parametrize(
+    ("command", "steps"),
+    [(BENCH, 1), pytest.param(CONVERGENCE, 2, marks=pytest.mark.long)],
+    ids=["bench", "convergence"],
+)
+def test_a_killed_measurement_is_gone_on_from(tmp_path: Path, command: list[str], steps: int) -> None:
+    """It is killed as soon as its first rounds are on the disk; of some thousands only a few are taken then."""
+    write_experiment(tmp_path)
+    file, kept = tmp_path / "c.jsonl", tmp_path / "c.samples.npz"
+    process = start_measuring(tmp_path, *command, "--rounds", "1000000", "--json", file.name)
+    end = time.monotonic() + 60
+    while not (file.exists() and kept.exists()) and time.monotonic() < end:
+        time.sleep(0.02)
+    process.kill()
+    process.communicate()
+    assert process.returncode == -signal.SIGKILL
+    text = file.read_text()
+    assert text.endswith("}\n")
+    assert all(json.loads(line) for line in text.splitlines())
+    # The next writing is seconds away, so that it is one round that stands there.
+    process = start_measuring(tmp_path, *command, "--rounds", "4", "--resume", file.name)
+    out, err = process.communicate(timeout=60)
+    assert process.returncode == 0, out + err
+    assert repeats(file) == {4 * steps}
+    assert {path.name for path in tmp_path.iterdir()} >= {"c.png"}
+    assert not list(tmp_path.glob(".c.*"))

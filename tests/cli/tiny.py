@@ -1,7 +1,8 @@
-"""An experiment of 8x8 pixels that takes a second, and what the tests of its endings share."""
+"""Commands called within the tests' own process, and an experiment of 8x8 pixels that takes a second."""
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import signal
@@ -10,9 +11,68 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from click.testing import CliRunner, Result
 from compilation import search_path
 
+from reslrb_cli.cli import main
 from reslrb_cli.records.manifest import read_content, read_manifest
+from reslrb_cli.runs import prepare
+from reslrb_cli.runs import recorder as recording
+
+# The commands as they are called, within the tests' own process.
+
+
+def reslrb(*arguments: object) -> Result:
+    """What `reslrb ARGUMENTS` said, and its exit code."""
+    return CliRunner().invoke(main, [str(argument) for argument in arguments])
+
+
+def done(*arguments: object) -> Result:
+    """The same of a call that has to succeed."""
+    result = reslrb(*arguments)
+    assert result.exit_code == 0, result.output
+    return result
+
+
+def settings(*given: str) -> list[str]:
+    """`--set` for each of them."""
+    return [word for setting in given for word in ("--set", setting)]
+
+
+def read_metrics(folder: Path | str) -> list[dict[str, Any]]:
+    """The lines of a run's metrics, oldest first."""
+    return [json.loads(line) for line in (Path(folder) / "metrics.jsonl").read_text().splitlines()]
+
+
+# What goes wrong while a tiny run is at work, and what it then says.
+
+RUN = Path("runs/tiny")
+
+
+def full(*args, **options):
+    raise OSError(errno.ENOSPC, "No space left on device", "runs/tiny/x")
+
+
+def lines(text):
+    """The lines of standard error that are no progress."""
+    return [
+        line for line in text.splitlines() if not line.startswith(("variant ", "rendering ", "finding ", *"123456789"))
+    ]
+
+
+def failing_last(monkeypatch, name, failure=full, calls=1):
+    """Have `recording.<name>`, or what keeps the state, fail, but for its first `calls` calls."""
+    holder = prepare if name == "save_checkpoint" else recording
+    real, seen = getattr(holder, name), []
+
+    def sometimes(*args, **options):
+        seen.append(args)
+        return real(*args, **options) if len(seen) <= calls else failure()
+
+    monkeypatch.setattr(holder, name, sometimes)
+
+
+# An experiment of 8x8 pixels that takes a second, and what the tests of its endings share.
 
 ROOT = Path(__file__).resolve().parents[2]
 KEY = "poster.reflectance.data"

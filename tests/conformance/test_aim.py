@@ -1,4 +1,4 @@
-"""Scattering that is aimed at what the sensor sees: means stay, whatever it sees and however it is aimed."""
+"""Scattering that is aimed at what the sensor sees, and guided emission where light is followed: means stay."""
 
 from __future__ import annotations
 
@@ -8,20 +8,26 @@ from typing import Any
 import numpy as np
 import pytest
 from agreement import compare
+from conformance import attached_cases, moving_lamps
 from conformance.test_guiding import SPP, guided, sample, samples, seeds
-from conformance.test_survival import replayed_from, replays_agree
+from conformance.test_survival import by_harsh_table, replayed_from, replays_agree
 from turns import a_few
 
 from reslrb_cli.estimators import ESTIMATORS
 from reslrb_cli.guiding import tables as guiding
 from reslrb_cli.guiding.tables import NOW, Learned, Purpose
 from reslrb_cli.integrators import context
+from reslrb_cli.integrators.step import make_integrator
 from reslrb_cli.measure.gradients import Case, relative
+from reslrb_cli.measure.gradients import seeds as seeds_guiding_moving
 from reslrb_cli.transport import aim
 from reslrb_cli.transport.aim import AIM_SLOTS, AIM_UNIFORM, Aim, Pending
 from reslrb_cli.transport.film import BLOCKS, Blocks
 
 pytestmark = pytest.mark.usefixtures("llvm")
+
+
+# Scattering that is aimed at what the sensor sees: means stay, whatever it sees and however it is aimed.
 
 NAMES = (
     *("roughconductor", "roughplastic", "plastic", "blend", "roughdielectric", "principled"),
@@ -41,7 +47,7 @@ NAMES = (
 FEW = ["roughplastic", "crop", "plastic_beside_mask"]
 
 
-@pytest.fixture(autouse=True)
+@pytest.fixture
 def everywhere(monkeypatch: pytest.MonkeyPatch) -> None:
     """Aim in scenes without glossy surfaces, too."""
     monkeypatch.setattr(context, "worthwhile", lambda needs, max_depth: max_depth > 2)
@@ -65,9 +71,7 @@ def askew(scene: Case, ours: Any, factor: float = 1.5) -> None:
     tables._tables.clear()
 
 
-# ---- The means -------------------------------------------------------------------------------------------------------
-
-
+@pytest.mark.usefixtures("everywhere")
 @pytest.mark.parametrize("name", a_few(NAMES, FEW))
 def test_means_are_those_of_unguided_samples(name: str) -> None:
     assert means_hold(name, 32)
@@ -80,6 +84,7 @@ def means_hold(name: str, count: int) -> Any:
     return result
 
 
+@pytest.mark.usefixtures("everywhere")
 @pytest.mark.parametrize("estimator", a_few(ESTIMATORS, ["reservoir", "gather"]))
 @pytest.mark.parametrize("adjoint", a_few(["correlated", "independent", "batched"], ["batched"]))
 def test_every_way_of_a_step_has_the_mean_of_the_unguided(estimator: str, adjoint: str) -> None:
@@ -90,6 +95,7 @@ def test_every_way_of_a_step_has_the_mean_of_the_unguided(estimator: str, adjoin
     assert result
 
 
+@pytest.mark.usefixtures("everywhere")
 def test_sequences_of_low_discrepancy_have_the_same_means() -> None:
     scene, ours, plain = aimed("roughplastic", sequence="low_discrepancy")
     assert compare(samples(scene, ours, 32), samples(scene, plain, 32, 1), block=None)
@@ -166,6 +172,7 @@ FAULTS = {
 }
 
 
+@pytest.mark.usefixtures("everywhere")
 @pytest.mark.parametrize("name", a_few(FAULTS, ["without_factor", "of_even_density"]))
 def test_what_would_bias_is_found(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     fault, case, count = FAULTS[name]
@@ -173,9 +180,7 @@ def test_what_would_bias_is_found(name: str, monkeypatch: pytest.MonkeyPatch) ->
     assert not means_hold(case, count)
 
 
-# ---- Replays ---------------------------------------------------------------------------------------------------------
-
-
+@pytest.mark.usefixtures("everywhere")
 @pytest.mark.parametrize("fault", [False, True])
 @pytest.mark.parametrize("name", a_few(["roughplastic", "plastic", "mask_texture_in_view"], ["plastic"]))
 def test_a_replay_follows_the_paths_that_were_traced(name: str, fault: bool, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -185,6 +190,7 @@ def test_a_replay_follows_the_paths_that_were_traced(name: str, fault: bool, mon
     assert replays_agree(lambda kind: aimed(name, estimator=kind)[:2]) is not fault
 
 
+@pytest.mark.usefixtures("everywhere")
 def test_a_recorded_step_is_the_step() -> None:
     """Recordings have the table that there is, not the one that they were made with."""
     (scene, ours, _), (_, frozen, _) = (guided("roughplastic", 0, freeze=freeze) for freeze in (False, True))
@@ -196,9 +202,7 @@ def test_a_recorded_step_is_the_step() -> None:
     assert frozen.preparation.recordings.counts()["fused"] > 0
 
 
-# ---- Tables ----------------------------------------------------------------------------------------------------------
-
-
+@pytest.mark.usefixtures("everywhere")
 @pytest.mark.parametrize("size", [(1, 1), (9, 7), (160, 90), (1000, 3), (1920, 1080)])
 def test_blocks_part_the_film_and_their_densities_are_those_of_their_slots(size: tuple[int, int]) -> None:
     import mitsuba as mi
@@ -227,6 +231,7 @@ def test_blocks_part_the_film_and_their_densities_are_those_of_their_slots(size:
     assert nothing.max() < 2.5
 
 
+@pytest.mark.usefixtures("everywhere")
 def test_paths_are_sent_where_something_was_said() -> None:
     _, ours, _ = guided("roughplastic", 2)
     tables = ours.preparation.guiding
@@ -237,6 +242,7 @@ def test_paths_are_sent_where_something_was_said() -> None:
         assert np.corrcoef(density, row)[0, 1] > 0.99
 
 
+@pytest.mark.usefixtures("everywhere")
 @pytest.mark.parametrize("purpose", Purpose)
 def test_paths_of_a_gradient_are_sent_where_its_own_dl_di_is_large(purpose: Purpose) -> None:
     import mitsuba as mi
@@ -255,6 +261,7 @@ def test_paths_of_a_gradient_are_sent_where_its_own_dl_di_is_large(purpose: Purp
     assert known.min() > 0.85 * AIM_UNIFORM
 
 
+@pytest.mark.usefixtures("everywhere")
 @pytest.mark.parametrize("size", [(9, 7), (1000, 30)])
 def test_means_of_blocks(size: tuple[int, int]) -> None:
     import mitsuba as mi
@@ -274,9 +281,58 @@ def test_means_of_blocks(size: tuple[int, int]) -> None:
     assert (film.root_means(mi.TensorXf(0 * np.ones_like(image))) == 0).all()
 
 
+@pytest.mark.usefixtures("everywhere")
 def test_only_scenes_with_glossy_surfaces_pay_for_it(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(context, "worthwhile", aim.worthwhile)
     for name, expected in (("roughplastic", True), ("texture", False), ("thin_lens", False), ("bumpmap", False)):
         scene, ours, _ = guided(name, 1)
         assert ours.preparation.plan(scene.scene, scene.scene.sensors()[0], scene.params).aimed is expected
         assert (ours.preparation.guiding.table(0, Purpose.BOTH).aim is not None) is expected
+
+
+# Guided emission where light is followed: numbers of emission are held, so that its weight is a constant.
+
+MOVING = {case.name: case for case in (*attached_cases.CASES, *moving_lamps.CASES)}
+
+
+@pytest.mark.parametrize("name", a_few(["latents", "spot", "mesh", "bounces_4"], ["spot"]))
+def test_means_of_what_moves_are_those_of_unguided_samples(name: str) -> None:
+    means_of_motion_hold(name, "stack")
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", ["latents", "mesh", "bounces_4"])
+def test_means_by_reservoir_are_those_of_unguided_samples(name: str) -> None:
+    means_of_motion_hold(name, "reservoir")
+
+
+@pytest.mark.parametrize("name", a_few(["latents", "mesh", "bounces_4"], ["bounces_4"]))
+@pytest.mark.parametrize("estimator", a_few(["stack", "reservoir"], ["stack"]))
+def test_means_hold_where_paths_end_by_a_table(name: str, estimator: str) -> None:
+    means_of_motion_hold(name, estimator, harsh=True)
+
+
+def means_of_motion_hold(name: str, estimator: str, harsh: bool = False) -> None:
+    moving = MOVING[name].moving()
+    found = {}
+    for block, guided_by in enumerate(("on", "off")):
+        ours = make_integrator("reslrb", max_depth=5, rr_depth=1000, estimator=estimator, guiding=guided_by)
+        if guided_by == "on":
+            learn(moving, ours)
+            if harsh:
+                by_harsh_table(ours.preparation.guiding)
+        rows = [moving.gradient(ours, seed, 16) for seed in seeds_guiding_moving(32, block)]
+        found[guided_by] = np.stack([np.concatenate(list(row.values())) for row in rows])
+    result = compare(found["on"], found["off"], block=None)
+    print(name, estimator, result)
+    assert np.abs(found["on"]).max() > 0
+    assert result
+
+
+def learn(moving: Any, ours: Any) -> None:
+    """Four steps that the tables learn from, after which they learn no more."""
+    for seed in range(4):
+        moving.gradient(ours, 9000 + seed, 16)
+    guiding = ours.preparation.guiding
+    assert [learned.calls for learned in guiding.learned.values()] == [4]
+    guiding.due = lambda number: False

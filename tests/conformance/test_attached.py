@@ -1,29 +1,37 @@
-"""Derivatives of what moves light: `stack` against naive AD of the same paths, ours and Mitsuba's.
-
-At equal seeds rounding alone is between them, so that a distance is a fault, and not noise. `walk_ad` shares our walk's
-faults; `ptracer` shares none, but its shadow rays start a little off the surface, which is what the two references are
-apart by. So a fault of the walk shows where `stack` is farther from `ptracer` than that.
-"""
+"""Derivatives of what moves light: against naive AD of the same paths, forward mode, and at edges."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import replace
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, replace
 from typing import Any
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 import pytest
-from conformance.attached_cases import CASES, AttachedCase
-from conformance.attached_faults import FAULTS, AttachedFault
-from conformance.moving import Moving, enclosed
+from conformance.attached_cases import CASES, FAULTS, AttachedCase, AttachedFault
+from conformance.moving import WHITE, Moving, Place, beam, camera, enclosed, flat, rippled, sheet, under_glass
+from measure.moving_light import SCENES
 from measure.test_mutations import plant
+from turns import taking_turns
 
+from reslrb_cli import register
+from reslrb_cli.errors import UnsupportedScene
 from reslrb_cli.integrators.protocol import StepIntegrator
 from reslrb_cli.measure.comparison import Family, compare_expectations
 from reslrb_cli.measure.gradients import integrator, relative, seeds
+from reslrb_cli.measure.scenes.small import bitmap, diffuse, rgb, transform
 from reslrb_cli.records.measurements import Verdict
 
 pytestmark = pytest.mark.usefixtures("llvm")
+
+
+# Derivatives of what moves light: `stack` against naive AD of the same paths, ours and Mitsuba's.
+#
+# At equal seeds rounding alone is between them, so that a distance is a fault, and not noise. `walk_ad` shares our
+# walk's faults; `ptracer` shares none, but its shadow rays start a little off the surface, which is what the two
+# references are apart by. So a fault of the walk shows where `stack` is farther from `ptracer` than that.
 
 #: What Mitsuba's own light tracer differs by, relative to the entries, over many seeds (`measure.gradcheck`).
 STOCK_ROUNDING = 1e-3
@@ -144,9 +152,6 @@ def test_normalization_of_the_filter_makes_a_difference():
     assert relative(attached["slab.vertex_positions"], naive["slab.vertex_positions"]) < case.limit
 
 
-# ---- The code broken on purpose ----
-
-
 def test_enough_faults():
     assert len(FAULTS) >= 10
     assert {fault.case for fault in FAULTS} <= set(BY_NAME)
@@ -164,3 +169,246 @@ def test_fault(fault: AttachedFault, monkeypatch: pytest.MonkeyPatch):
     plant(fault, monkeypatch)
     with pytest.raises(AssertionError):
         check(replace(BY_NAME[fault.case], stock=fault.stock))
+
+
+# Forward mode where light moves, against the gradient at equal seeds: <weights, J v> = <J^T weights, v>.
+
+ROUNDING = 3e-5
+QUICK = ("slab", "bounce")
+SAMPLING = ("follow", "stay")
+
+
+def distance(name: str, sampling: str) -> float:
+    """The largest deviation of all derivatives, relative to the largest of them."""
+    case, options = SCENES[name].case(), dict(SCENES[name].options)
+    options |= {"attached_sampling": sampling}
+    tracer = integrator("reslrb", **options, estimator="stack")
+    gradient = case.gradient(tracer, 100, 16)
+    tangents = np.array([case.tangent(tracer, direction, 100, 16) for direction in np.eye(len(gradient))[:3]])
+    assert np.abs(gradient[:3]).min() > 0
+    return float(np.abs(tangents - gradient[:3]).max() / np.abs(gradient).max())
+
+
+@taking_turns("name", QUICK, "sampling", SAMPLING)
+def test_forward_against_backward(name: str, sampling: str):
+    assert_forward_is_backward(name, sampling)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("sampling", SAMPLING)
+@pytest.mark.parametrize("name", ["rough_surface", "mirror", "sphere_lens", "moved_receiver", "rough_surface_alpha"])
+def test_forward_against_backward_in_other_scenes(name: str, sampling: str):
+    assert_forward_is_backward(name, sampling)
+
+
+def assert_forward_is_backward(name: str, sampling: str) -> None:
+    """Up to rounding."""
+    found = distance(name, sampling)
+    print(name, sampling, found)
+    assert found < ROUNDING
+
+
+@dataclass(frozen=True)
+class Fault:
+    """As `plant` takes it."""
+
+    right: str
+    wrong: str
+    where: str = "integrators.forward:AttachedTangentSplat.scattering"
+
+
+FORWARD_FAULTS = {
+    "slab": Fault("dr.set_grad(ray.d, state.d_direction)", "pass"),
+    "mirror": Fault(" + dk * C", ""),
+    "rough_surface": Fault("state.d_product * c + P * dc", "P * dc"),
+}
+
+
+@pytest.mark.parametrize("fault", FORWARD_FAULTS.values(), ids=FORWARD_FAULTS)
+def test_it_fits_the_forward_code(fault: Fault, monkeypatch: pytest.MonkeyPatch):
+    plant(fault, monkeypatch)
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(n, marks=() if n == "slab" else pytest.mark.long) for n in FORWARD_FAULTS]
+)
+def test_fault_of_forward_mode(name: str, monkeypatch: pytest.MonkeyPatch):
+    plant(FORWARD_FAULTS[name], monkeypatch)
+    assert distance(name, "stay") > 30 * ROUNDING
+
+
+class Script:
+    """As Mitsuba's users write it: a slab under `mi.render`, whose ripples grow by an amplitude."""
+
+    def __init__(self, normalization: str) -> None:
+        register()
+        self.scene = mi.load_dict(under_glass())
+        self.params = mi.traverse(self.scene)
+        self.shared = {"max_depth": 5, "hide_emitters": True, "filter_normalization": normalization}
+
+    def render(self, **plugin: Any) -> tuple[mi.Float, mi.TensorXf]:
+        """The amplitude, which tracks derivatives, and the image."""
+        positions, rest = (mi.Float(rippled(2.0, 12, ripples).astype(np.float32).ravel()) for ripples in (1.0, 0.0))
+        amplitude = mi.Float(1)
+        dr.enable_grad(amplitude)
+        self.params["slab.vertex_positions"] = rest + (positions - rest) * amplitude
+        self.params.update()
+        integrator = mi.load_dict(plugin | self.shared)
+        return amplitude, mi.render(self.scene, self.params, integrator=integrator, spp=16, seed=1)
+
+    def tangent(self, **plugin: Any) -> np.ndarray:
+        """The image's derivative."""
+        amplitude, image = self.render(**plugin)
+        dr.forward(amplitude)
+        return np.array(dr.grad(image))
+
+
+@pytest.mark.parametrize("normalization", ["attached", pytest.param("detached", marks=pytest.mark.long)])
+def test_as_a_plugin(normalization: str):
+    """`dr.forward` of a script against its `dr.backward`, for a random dL/dI: a wrong pixel shows."""
+    script, plugin = Script(normalization), {"type": "reslrb", "estimator": "stack"}
+    tangent = np.float64(script.tangent(**plugin))
+    weights = np.random.default_rng(1).uniform(-1, 1, tangent.shape)
+    amplitude, image = script.render(**plugin)
+    dr.backward(dr.sum(image * mi.TensorXf(weights.astype(np.float32)), axis=None))
+    assert np.abs(tangent).max() > 0
+    assert abs(np.sum(tangent * weights) - dr.grad(amplitude)[0]) < ROUNDING * np.linalg.norm(tangent)
+
+
+@pytest.mark.long  # forward mode of naive AD is compiled for a minute
+@pytest.mark.parametrize("normalization", ["attached", "detached"])
+def test_as_a_plugin_every_pixel_is_that_of_naive_ad(normalization: str):
+    script = Script(normalization)
+    ours, naive = script.tangent(type="reslrb", estimator="stack"), script.tangent(type="walk_ad", attached=True)
+    assert np.abs(naive).max() > 0
+    assert relative(ours, naive) < ROUNDING
+
+
+def test_a_lamp_that_moves_is_refused():
+    case = SCENES["moved_point"].case()
+    with pytest.raises(UnsupportedScene, match="forward mode has no derivatives of emitters that move"):
+        case.tangent(integrator("reslrb", 2, estimator="stack"), np.array([1.0, 0, 0]), 1, 4)
+
+
+# Attached derivatives where something is at its edge: light that is reflected whole, that grazes, that meets nothing
+# or black, glass that is none, meshes that are flat and begin to bend.
+
+#: What is left of derivatives that cancel; those of rippled glass are a million times as large.
+NOTHING = 1e-4
+SLAB = {"slab.vertex_positions": None}
+
+
+@dataclass(frozen=True)
+class Edge:
+    """As `Moving` takes it; with `dark` no light arrives, and every derivative is zero."""
+
+    scene: Callable[[], dict[str, Any]]
+    start: dict[str, Any] = field(default_factory=lambda: dict(SLAB))
+    place: Place | None = None
+    depth: int = 5
+    dark: bool = False
+    limit: float = 1e-4
+
+
+def slanted(degrees: float) -> dict[str, Any]:
+    """Parallel light that comes at this angle from the vertical."""
+    angle = np.deg2rad(degrees)
+    origin = [1.2 * float(np.sin(angle)), 2.0 + 1.2 * float(np.cos(angle)), 0.0]
+    to_world = mi.ScalarTransform4f().look_at(origin, [0, 2, 0], [0, 0, 1]) @ mi.ScalarTransform4f().scale(0.3)
+    return beam() | {"to_world": to_world}
+
+
+def glass(index: float) -> dict[str, Any]:
+    """Smooth glass."""
+    return {"type": "dielectric", "int_ior": index, "ext_ior": 1.0}
+
+
+def lit_from_within(bsdf: dict[str, Any], intensity: float = 5.0) -> dict[str, Any]:
+    """A point between the slab's two sides: most of its light is reflected whole."""
+    light = {"type": "point", "position": [0.05, 2.1, 0], "intensity": rgb(*[intensity] * 3)}
+    return enclosed(bsdf, lamp=light)
+
+
+EDGES = {
+    "total_internal_reflection": Edge(lambda: lit_from_within(glass(1.5)), depth=8, limit=5e-4),
+    "index_3": Edge(lambda: lit_from_within(glass(3.0)), depth=8, limit=5e-4),
+    "index_1": Edge(lambda: under_glass(glass(1.0))),
+    "rough_index_1.001": Edge(lambda: enclosed({"type": "roughdielectric", "alpha": 0.1, "int_ior": 1.001}),
+                              limit=5e-4),
+    "grazing": Edge(lambda: enclosed(top=None, lamp=slanted(85)), limit=5e-4),
+    "along_the_surface": Edge(lambda: enclosed(top=None, lamp=slanted(89.99)), limit=5e-3),
+    "meets_nothing": Edge(lambda: under_glass(lamp=beam() | {"to_world": transform(translate=[0, 5, 0],
+                                                             rotate=([1, 0, 0], -90))}), dark=True),
+    "black_receiver": Edge(lambda: under_glass(receiver=flat(diffuse(0, 0, 0))), dark=True),
+    "black_texel_before": Edge(lambda: enclosed(receiver=flat({"type": "diffuse", "reflectance": bitmap(
+        np.array([[[0, 0.5, 0.3], [0.6, 0, 0]], [[0.4, 0.4, 0.4], [0, 0, 0]]]))}),
+        other=flat(WHITE, -0.5)), SLAB | {"receiver.bsdf.reflectance.data": None}),
+    "absorbing_glass": Edge(lambda: under_glass(glass(1.5) | {"specular_transmittance": rgb(0, 0.5, 1)})),
+    "camera_at_the_origin": Edge(lambda: under_glass(receiver=flat(WHITE, -1), camera=camera() | {
+        "to_world": mi.ScalarTransform4f().look_at([0, 0, 0], [0, -1, 0], [0, 0, -1])})),
+    "flat_and_parallel": Edge(lambda: under_glass(slab=sheet("slab", glass(1.5), 2.0, ripples=0.0))),
+    "a_rectangle_of_glass": Edge(lambda: under_glass(slab=flat(glass(1.5), 2.0)), {"y": 2.0},
+                                     lambda params, latents: _lift(params, latents), limit=1e-3),
+}  # fmt: skip
+
+
+def _lift(params: mi.SceneParameters, latents: dict[str, Any]) -> None:
+    up = mi.AffineTransform4f().translate(mi.Vector3f(0.3 * latents["y"], latents["y"], 0))
+    params["slab.to_world"] = up @ mi.AffineTransform4f(transform(rotate=([1, 0, 0], -90)).matrix)
+
+
+QUICK_EDGES = ("meets_nothing",)
+
+
+@pytest.mark.parametrize("name", [pytest.param(n, marks=() if n in QUICK_EDGES else pytest.mark.long) for n in EDGES])
+def test_at_the_edge(name: str):
+    edge = EDGES[name]
+    moving = Moving(edge.scene(), edge.start, edge.place)
+    options = {"hide_emitters": True}
+    ours = moving.gradient(integrator("reslrb", edge.depth, estimator="stack", attached_sampling="follow", **options))
+    naive = moving.gradient(integrator("walk_ad", edge.depth, attached=True, **options))
+    for key, value in ours.items():
+        assert np.isfinite(value).all(), key
+        if edge.dark:
+            assert not value.any()
+        elif np.abs(naive[key]).max() > NOTHING:
+            print(name, key, relative(value, naive[key]))
+            assert relative(value, naive[key]) < edge.limit, key
+        else:
+            assert np.abs(value).max() < NOTHING
+    assert edge.dark or any(value.any() for value in naive.values())
+
+
+def bending(bsdf: dict[str, Any]) -> Moving:
+    """A flat mesh that reflects parallel light from the side, and bends by `size` times the ripples."""
+    flat_, rippled = (sheet("slab", bsdf, 2.0, ripples=ripples) for ripples in (0.0, 1.0))
+    first, last = (np.array(mesh.vertex_positions_buffer()) for mesh in (flat_, rippled))
+
+    def place(params: mi.SceneParameters, latents: dict[str, Any]) -> None:
+        params["slab.vertex_positions"] = mi.Float(first) + mi.Float(last - first) * latents["size"]
+
+    return Moving(enclosed(bsdf, slab=flat_, top=None, lamp=slanted(40)), {"size": 0.0}, place)
+
+
+def test_a_flat_mesh_that_bends_has_its_shading_normals():
+    """An image without parameters, of the same integrator, before and after: the plan is renewed."""
+    moving = bending(glass(1.5))
+    ours, options = integrator("reslrb", 5, hide_emitters=True), {"seed": 1, "spp": 32}
+    sensor = moving.loaded.sensors()[0]
+    assert not ours.plan(moving.loaded, sensor).needs.has_shading_normals
+    moving.value(ours, **options)
+    bent = moving.value(ours, size=3.0, **options)
+    assert ours.plan(moving.loaded, sensor).needs.has_shading_normals
+    other = integrator("reslrb", 5, hide_emitters=True)
+    assert bent == pytest.approx(moving.value(other, size=3.0, **options), rel=1e-4)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("size", [0.0, 0.5])
+def test_the_derivative_of_a_flat_mesh_knows_that_it_will_bend(size: float):
+    moving = bending(glass(1.5))
+    moving.start["size"] = np.float64(size)
+    ours = moving.gradient(integrator("reslrb", 5, estimator="stack", filter_normalization="detached",
+                                      attached_sampling="follow", hide_emitters=True))  # fmt: skip
+    stock = moving.gradient(integrator("ptracer", 5, hide_emitters=True))
+    assert relative(ours["size"], stock["size"]) < 1e-3

@@ -1,14 +1,16 @@
-"""Emitters that move: derivatives by where they are, against finite differences with common random numbers."""
+"""Emitters that move, and light that moves at the film's border."""
 
 from __future__ import annotations
 
+import types
 from functools import partial
 from typing import Any
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from conformance.moving import Moving, flat
+from conformance.moving import SIZE, Moving, camera, flat
 from conformance.moving_lamps import CASES, PIVOT, LampCase, mesh, over_floor, smooth_weights, surface
 from measure.faults import Fault
 from measure.test_mutations import plant
@@ -16,14 +18,18 @@ from turns import a_few
 
 from reslrb_cli.errors import UnsupportedScene
 from reslrb_cli.integrators.plan_report import count, tracking
-from reslrb_cli.integrators.protocol import StepIntegrator
+from reslrb_cli.integrators.protocol import Job, StepIntegrator
 from reslrb_cli.integrators.step import render_image
 from reslrb_cli.measure.comparison import Family, compare_expectations
 from reslrb_cli.measure.gradients import integrator, relative, seeds
 from reslrb_cli.measure.scenes.small import diffuse, load, rgb, transform
+from reslrb_cli.optimization.moving import border_share, warn_of_border
 from reslrb_cli.records.measurements import Verdict
 
 pytestmark = pytest.mark.usefixtures("llvm")
+
+
+# Emitters that move: derivatives by where they are, against finite differences with common random numbers.
 
 #: What derivatives may differ by from finite differences, relative to the root mean square of those of a case.
 CLOSE = 0.005
@@ -74,9 +80,6 @@ def test_naive_ad(case: LampCase):
     for name, value in ours.items():
         size = np.sqrt(np.mean([float(other @ other) for other in naive.values()]))
         assert abs(value - naive[name])[0] <= 5e-5 * max(size, abs(naive[name][0])), name
-
-
-# ---- What Mitsuba keeps from before a shape moved ----
 
 
 def image(scene: Any, name: str = "reslrb", spp: int = 64, **options: Any) -> np.ndarray:
@@ -150,9 +153,6 @@ def test_a_sphere_that_is_turned_shines_outward():
     assert found == pytest.approx(expected, rel=0.02)
 
 
-# ---- Lamps that are seen ----
-
-
 def seen(lamp: Any, **changes: Any) -> Moving:
     """A lamp that faces the camera from the floor."""
 
@@ -216,8 +216,6 @@ def test_one_kernel_has_it_all(kind: str, emitter: str):
     assert len(kernels) == 1
 
 
-# ---- What is refused ----
-
 REFUSED = {
     "envmap": ({"type": "envmap", "data": None}, "light.to_world", "drawn from what it shows"),
     "sunsky": ({"type": "sunsky"}, "light.to_world", "drawn from what it shows"),
@@ -240,8 +238,6 @@ def test_refused_with_the_reason(name: str):
     with pytest.raises(UnsupportedScene, match=f"{key}: .*{reason}"):
         integrator("reslrb", estimator="stack").plan(scene, scene.sensors()[0], params)
 
-
-# ---- The code broken on purpose ----
 
 FAULTS = {
     "area_of_faces_detached": ("mesh", "transport.lamps:lamp_point", "area / dr.detach(area)", "mi.Float(1)"),
@@ -285,3 +281,83 @@ def test_faces_of_a_mesh_are_those_that_mitsuba_draws():
     normal, corner = lamp.shape.face_normal(face), lamp.shape.vertex_position(lamp.shape.face_indices(face)[0])
     assert np.abs(np.array((ps.p - corner).x * normal.x + (ps.p - corner).y * normal.y + (ps.p - corner).z * normal.z)
                   ).max() < 1e-5  # fmt: skip
+
+
+# Light that moves at the film's border is measured and warned of.
+
+RADIUS = 2.0  # of Mitsuba's gaussian filter, pixels
+
+
+def moving(scale: float, film: dict[str, Any] | None = None, **things: Any) -> Moving:
+    """A parallel lamp that lights a square of this size, straight below it, of a floor that is seen to 1.73."""
+    lamp = surface("rectangle", "directionalarea")
+    down = mi.ScalarTransform4f().translate([0, 4, 0]) @ mi.ScalarTransform4f().rotate([1, 0, 0], 90)
+    lamp["to_world"] = down @ mi.ScalarTransform4f().scale(scale)
+    scene = over_floor(lamp, **things)
+    scene["camera"] = scene["camera"] | {"film": camera(**(film or {}))["film"]}
+
+    def place(params: mi.SceneParameters, latents: dict[str, Any]) -> None:
+        shift = mi.AffineTransform4f().translate(mi.Vector3f(latents["x"], 0, 0))
+        params["light.to_world"] = shift @ mi.AffineTransform4f((down @ mi.ScalarTransform4f().scale(scale)).matrix)
+
+    return Moving(scene, {"x": 0.0}, place)
+
+
+def tracked(case: Moving) -> None:
+    """Have the lamp's place track derivatives."""
+    x = dr.opaque(mi.Float, 0)
+    dr.enable_grad(x)
+    case.set({"x": x})
+
+
+def share(case: Moving) -> float:
+    """The measured share."""
+    ours = integrator("reslrb", 2, estimator="stack")
+    return border_share(ours, Job(case.loaded, case.loaded.sensors()[0], dr.opaque(mi.UInt32, 3), 64, case.params))
+
+
+def test_light_that_covers_the_film_is_at_its_border_as_far_as_the_filter_reaches():
+    case = moving(3)
+    tracked(case)
+    assert share(case) == pytest.approx(1 - (1 - 2 * RADIUS / SIZE) ** 2, rel=0.03)
+
+
+def test_light_within_the_film_is_not():
+    case = moving(1)
+    tracked(case)
+    assert share(case) == 0
+
+
+def test_what_rests_does_not_count():
+    case = moving(1, sun={"type": "directional", "direction": [0, -1, 0]})
+    tracked(case)
+    assert share(case) == 0
+
+
+def test_nothing_moves():
+    assert share(moving(3)) == 0
+
+
+def test_a_crop_window_has_a_border_of_its_own():
+    crop = {"crop_offset_x": 8, "crop_offset_y": 8, "crop_width": 16, "crop_height": 16}
+    case = moving(3, crop)
+    tracked(case)
+    assert share(case) == pytest.approx(1 - (1 - 4 * RADIUS / SIZE) ** 2, rel=0.03)
+
+
+@pytest.mark.parametrize(("scale", "lines"), [(3, 1), (1, 0)])
+def test_a_run_is_told_once_a_view(scale: float, lines: int):
+    case, said = moving(scale), []
+    tracked(case)
+    problem: Any = types.SimpleNamespace(
+        integrator=integrator("reslrb", 2, estimator="stack"), scene=case.loaded, sensors=[0],
+        config=types.SimpleNamespace(run=types.SimpleNamespace(seed=1)),
+        selection=types.SimpleNamespace(params=case.params))  # fmt: skip
+    warn_of_border(problem, said.append)
+    assert len(said) == lines
+    assert all(line.startswith("view 0: 2") and "% of the light that moves" in line for line in said)
+
+
+def test_other_integrators_are_not_asked():
+    problem: Any = types.SimpleNamespace(integrator=integrator("ptracer", 2))
+    warn_of_border(problem, pytest.fail)

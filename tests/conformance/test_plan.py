@@ -1,25 +1,31 @@
-"""What a scene does not need is left out: the kernels shrink, and no result changes.
-
-Each omission is undone by force, and the same step, of the same random numbers, is traced with and without it.
-"""
+"""What a scene does not need is left out: kernels shrink, and no result changes."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from typing import Any
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 import pytest
 from conformance.gradient_cases import FLOOR
 from turns import taking_turns
 
+from reslrb_cli.estimators import gather, reservoir, stack
 from reslrb_cli.integrators.context import Preparation
 from reslrb_cli.integrators.plan_report import FEATURES, count, report_plan, tracking
-from reslrb_cli.integrators.step import known_step
-from reslrb_cli.measure.gradients import Case, integrator
+from reslrb_cli.integrators.step import gradient_step, known_step, make_integrator
+from reslrb_cli.measure.gradients import Case, integrator, seeds
 from reslrb_cli.measure.scenes.small import camera, diffuse, rgb, room, texture, transform
 
 pytestmark = pytest.mark.usefixtures("llvm")
+
+
+# What a scene does not need is left out: the kernels shrink, and no result changes.
+#
+# Each omission is undone by force, and the same step, of the same random numbers, is traced with and without it.
+
 ESTIMATORS = ("reservoir", "gather", "event", "stack")
 #: Those whose draws follow from few features; `event` draws among what can be differentiated.
 STEADY = ("reservoir", "gather", "stack")
@@ -217,3 +223,118 @@ def test_a_step_plans_once(monkeypatch: pytest.MonkeyPatch) -> None:
         case.gradient(ours, seed, 16, adjoint="batched")
         assert asked == [False, True]
         asked.clear()
+
+
+# What comes after the last vertex with anything to differentiate, or has no such vertex, costs nothing.
+#
+# That results stay right is for test_estimators.py, whose cases differentiate one surface of several.
+
+FLOOR_ALONE = ("floor.brdf_0.reflectance.value",)
+ALL = (*FLOOR_ALONE, *(f"{name}.reflectance.value" for name in ("wall.brdf_0", "side.brdf_0", "cave.bsdf")))
+MAX_DEPTH, SPP = 8, 16
+
+
+@pytest.fixture(scope="module")
+def scene(llvm: str) -> dict:
+    """The corner of a room in a bright cave: few vertices of a path are on the floor."""
+    return room(cave={"type": "sphere", "radius": 8.0, "flip_normals": True, "bsdf": diffuse(0.9, 0.9, 0.9)})
+
+
+@pytest.mark.parametrize(
+    ("estimator", "owner", "method", "what"),
+    [
+        ("gather", gather.Taking, "__init__", lambda arguments: arguments[1].last),
+        ("reservoir", reservoir.ReservoirReplay, "__init__", lambda arguments: arguments[1][0].last),
+        ("stack", stack, "walk_back", lambda arguments: arguments[1].height),
+    ],
+)
+@pytest.mark.parametrize("adjoint", ["independent", "correlated"])
+def test_vertices_after_the_last_to_differentiate_are_not_visited_again(
+    scene: dict,
+    monkeypatch: pytest.MonkeyPatch,
+    estimator: str,
+    owner: Any,
+    method: str,
+    what: Callable[[Any], Any],
+    adjoint: str,
+) -> None:
+    original, means = getattr(owner, method), []
+
+    def noting(*arguments: Any) -> Any:
+        own = arguments[1:] if method == "__init__" else arguments
+        means.append(float(np.mean(np.array(what(own), dtype=float))))
+        return original(*arguments)
+
+    monkeypatch.setattr(owner, method, noting)
+    for keys in (FLOOR_ALONE, ALL):
+        Case(scene, keys).gradient(integrator("reslrb", MAX_DEPTH, estimator=estimator), 1, SPP, adjoint=adjoint)
+    print(estimator, adjoint, means)
+    assert len(means) == 2
+    assert 0 < means[0] < 0.7 * means[1]
+
+
+def test_connections_without_anything_to_differentiate_are_no_candidates(scene: dict) -> None:
+    case = Case(scene, FLOOR_ALONE)
+
+    def gradients(**options: str) -> np.ndarray:
+        return case.gradients(integrator("reslrb", MAX_DEPTH, **options), seeds(24), SPP, adjoint="correlated")
+
+    exact = gradients(estimator="gather")
+    # What selection adds to the variance. The retained image needs every connection as a candidate.
+    ours, of_all = (
+        np.square(gradients(estimator="reservoir", image=image) - exact).sum() for image in ("all", "retained")
+    )
+    print(ours / of_all)
+    assert ours < 0.7 * of_all
+
+
+def test_without_an_image_the_others_are_not_even_connected(scene: dict, monkeypatch: pytest.MonkeyPatch) -> None:
+    original, shares = stack.walk_back, []
+
+    def noting(p: Any, pushed: stack.Pushed) -> Any:
+        shares.append(float(np.mean(np.array(pushed.last > 0, dtype=float))))
+        return original(p, pushed)
+
+    monkeypatch.setattr(stack, "walk_back", noting)
+    for keys in (FLOOR_ALONE, ALL):
+        Case(scene, keys).gradient(integrator("reslrb", MAX_DEPTH, estimator="stack"), 1, SPP, adjoint="independent")
+    print(shares)
+    assert 0 < shares[0] < 0.7 * shares[1]
+
+
+# Steps in which no light path meets anything: their gradient is zero, and nothing fails.
+
+
+def lit_from_behind() -> mi.Scene:
+    """A wall, and a lamp that shines the other way."""
+    lamp = mi.ScalarTransform4f().translate([0, 0, 5])
+    return mi.load_dict({
+        "type": "scene",
+        "sensor": {
+            "type": "perspective", "fov": 50.0,
+            "to_world": mi.ScalarTransform4f().look_at(origin=[0, 0, 4], target=[0, 0, 0], up=[0, 1, 0]),
+            "film": {"type": "hdrfilm", "width": 4, "height": 4, "rfilter": {"type": "box"}},
+        },
+        "wall": {"type": "rectangle", "bsdf": {"type": "diffuse"}},
+        "lamp": {"type": "rectangle", "to_world": lamp, "emitter": {"type": "area"}},
+    }, optimize=False)  # fmt: skip
+
+
+@pytest.mark.parametrize("adjoint", ["correlated", "independent", "batched"])
+@pytest.mark.parametrize("name", ["ptracer", "reslrb"])
+def test_the_gradient_is_zero(name: str, adjoint: str) -> None:
+    scene = lit_from_behind()
+    params = mi.traverse(scene)
+    [key] = [key for key in params.keys() if key.startswith("wall") and key.endswith("reflectance.value")]  # noqa: SIM118
+    dr.enable_grad(params[key])
+    params.update()
+    options: dict[str, Any] = {"batches": 2} if adjoint == "batched" else {}
+
+    def loss(image: Any) -> Any:
+        return dr.mean(dr.square(image - 0.5).array)
+
+    integrator = make_integrator(name, max_depth=3)
+    step = gradient_step(integrator, scene, 0, loss, spp=4, seed=1, adjoint=adjoint, params=params, **options)
+    dr.eval(step.loss)
+    assert np.array(step.loss) == pytest.approx(0.25)
+    assert (np.array(dr.grad(params[key])) == 0).all()

@@ -1,4 +1,4 @@
-"""Numbers of low discrepancy: evenly spread, and unbiased in every way of a step; what could bias is planted."""
+"""Numbers of low discrepancy: evenly spread, and unbiased in every way of a step."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from conformance import attached_cases, moving_lamps, sequence_faults
 from conformance.gradient_cases import CASES
 from conformance.test_guiding import guided, sample, samples
 from conformance.test_kernels import nothing_is_compiled_without, steps_compile_nothing
+from scipy.stats import qmc
 from turns import a_few
 
 import reslrb_cli
@@ -23,6 +24,10 @@ from reslrb_cli.integrators.step import make_integrator
 from reslrb_cli.measure.gradients import Case, integrator, relative, seeds
 
 pytestmark = pytest.mark.usefixtures("llvm")
+
+
+# Numbers of low discrepancy: evenly spread, and unbiased in every way of a step; what could bias is planted.
+
 BY_NAME = {case.name: case for case in CASES}
 MOVING = {case.name: case for case in (*attached_cases.CASES, *moving_lamps.CASES)}
 NAMES = ("texture", "two_emitters", "envmap", "roulette", "passes", "area_texture", "glass", "mask", "point", "plastic")
@@ -36,9 +41,6 @@ def both(name: str, **options: Any) -> tuple[Case, Any, Any]:
     case = BY_NAME[name]
     own = {"estimator": "stack"} | {k: v for k, v in case.options.items() if k != "image"} | case.both | options
     return Case(case.scene(), case.keys), integrator("reslrb", **own, **ON), integrator("reslrb", **own)
-
-
-# ---- The means -------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", a_few(NAMES, ["glass"]))
@@ -95,9 +97,6 @@ def test_there_is_less_noise_where_these_numbers_say_where_light_goes() -> None:
     variances = [samples(scene, each, 24, block).var(0, ddof=1).sum() for block, each in enumerate((ours, plain))]
     print(variances[1] / variances[0])
     assert variances[1] > 2 * variances[0]
-
-
-# ---- The numbers -----------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("guiding", ["off", "on"])
@@ -173,9 +172,6 @@ def expected(numbers: int) -> np.ndarray:
     return np.concatenate([np.full(8 * numbers, LANES / 8), np.full(4 * pairs, LANES / 4)])
 
 
-# ---- Replays ---------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("name", a_few(["two_emitters", "glass", "mask_texture_in_view", "passes"], ["glass"]))
 def test_exact_estimators_agree_at_equal_seeds(name: str) -> None:
     """A replay that drew other numbers than the trace would not."""
@@ -202,9 +198,6 @@ def test_a_recorded_step_is_the_step() -> None:
     assert frozen.preparation.recordings.counts()["fused"] > 0
 
 
-# ---- What it costs ---------------------------------------------------------------------------------------------------
-
-
 def test_with_independent_numbers_nothing_of_it_is_compiled() -> None:
     nothing_is_compiled_without(SEQUENCE, *both("two_emitters"))
 
@@ -223,3 +216,97 @@ def test_the_plugin_has_the_option() -> None:
     assert plugin.tracer.plan(scene.scene, scene.scene.sensors()[0]).sequence is not None
     with pytest.raises(RuntimeError, match='"sequence" must be one of independent, low_discrepancy, not "halton"'):
         mi.load_dict({"type": "reslrb", "sequence": "halton"})
+
+
+# Points of low discrepancy: Sobol's, and as evenly spread when they are scrambled.
+
+COORDINATES = 10
+
+
+def coordinates(seed: int, width: int) -> np.ndarray:
+    """All coordinates of a pass's points, (COORDINATES, width), the stratified one left out."""
+    import drjit as dr
+    import mitsuba as mi
+
+    from reslrb_cli.transport.sobol import Points
+
+    points = Points(dr.opaque(mi.UInt32, seed), width, None)
+    return np.stack([np.array(points.next_1d(), np.float64) for _ in range(COORDINATES)])
+
+
+def test_points_are_sobol_s() -> None:
+    """Of 2^15 points in a row all are among SciPy's, which come in another order."""
+    import drjit as dr
+    import mitsuba as mi
+
+    from reslrb_cli.transport.sobol import point
+
+    count = 2**15
+    own = [dr.brev(point(dr.arange(mi.UInt32, count), c)) for c in range(COORDINATES)]
+    mine = np.stack([np.array(digits, np.uint64) for digits in own], 1)
+    theirs = (qmc.Sobol(COORDINATES, scramble=False, bits=32).random(count) * 2**32).astype(np.uint64)
+    np.testing.assert_array_equal(mine[np.lexsort(mine.T)], theirs[np.lexsort(theirs.T)])
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize("k", [3, 8])
+def test_boxes_of_the_first_two_hold_one_point_each(k: int, seed: int) -> None:
+    assert fills(coordinates(seed, 7 * 2**k), k)
+
+
+def fills(points: np.ndarray, k: int) -> bool:
+    """Whether of each 2^k points in a row each box of area 2^-k holds one, along the first two and along each alone."""
+    for part in points.reshape(COORDINATES, -1, 2**k).transpose(1, 0, 2):
+        boxes = [
+            (part[0] * 2**a).astype(int) * 2 ** (k - a) + (part[1] * 2 ** (k - a)).astype(int) for a in range(k + 1)
+        ]
+        for cells in (*boxes, *(part * 2**k).astype(int)):
+            if not np.array_equal(np.sort(cells), np.arange(2**k)):
+                return False
+    return True
+
+
+def unnested(point: Any, shift: Any, key: Any) -> Any:
+    """Sums carry from later digits to those before them."""
+    import drjit as dr
+
+    return dr.brev(dr.brev(point) * (key | 1) + shift)
+
+
+def independent(point: Any, shift: Any, key: Any) -> Any:
+    """Points have nothing to do with one another."""
+    import mitsuba as mi
+
+    return mi.sample_tea_32(point, shift)[0]
+
+
+@pytest.mark.parametrize("scramble", [unnested, independent])
+def test_another_scramble_is_found(scramble: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    from reslrb_cli.transport import sobol
+
+    monkeypatch.setattr(sobol, "scrambled", scramble)
+    assert not fills(coordinates(1, 2**8), 8)
+
+
+def test_scrambles_differ() -> None:
+    """From seed to seed, and from one coordinate to the next: first digits agree as often as not."""
+    same = []
+    for seed in range(128):
+        first = coordinates(seed, 1)[:, 0] < 0.5
+        same.append(np.concatenate([first, first[1:] == first[:-1]]))
+    shares = np.mean(same, 0)
+    assert (np.abs(shares - 0.5) < 5 * 0.5 / 128**0.5).all()
+
+
+@pytest.mark.parametrize("width", [1, 1000, 3 * 2**24 + 1])
+def test_the_first_number_is_stratified(width: int) -> None:
+    import drjit as dr
+    import mitsuba as mi
+
+    from reslrb_cli.transport.sobol import Net
+
+    net, some = Net.of(width), np.unique(np.linspace(0, width - 1, 1000).astype(np.int64))
+    for jitter in (0.0, 0.5, float(dr.one_minus_epsilon(mi.Float))):
+        numbers = np.array(net.stratified(mi.UInt32(some), mi.Float(jitter)), np.float64)
+        assert (np.abs(numbers * width - some - jitter) < 1e-3 + width * 2.0**-24).all()
+        assert numbers.max() < 1

@@ -1,4 +1,4 @@
-"""Roulette by what paths can still say: means stay, whatever the table, and replays follow the same paths."""
+"""Roulette by what paths can still say: what is learned, and that means stay."""
 
 from __future__ import annotations
 
@@ -13,12 +13,18 @@ from conformance.test_guiding import SPP, guided, sample, samples, seeds
 from turns import a_few
 
 from reslrb_cli.estimators import ESTIMATORS
-from reslrb_cli.guiding.tables import Guiding, Purpose
+from reslrb_cli.guiding.collect import FLOOR, LEAN, SURE, Onward, Walked
+from reslrb_cli.guiding.tables import Guiding, Purpose, learning_seed
+from reslrb_cli.integrators.protocol import Job
 from reslrb_cli.measure.gradients import Case, relative
 from reslrb_cli.transport.guide import Table
-from reslrb_cli.transport.roulette import CELLS, Survival
+from reslrb_cli.transport.roulette import BITS, CELLS, LEAST, SHAPE, Survival
 
 pytestmark = pytest.mark.usefixtures("llvm")
+
+
+# Roulette by what paths can still say: means stay, whatever the table, and replays follow the same paths.
+
 NAMES = ("texture", "two_emitters", "envmap", "roulette", "glass", "mask", "mask_texture_in_view")
 BOX = np.array([[-1.0, -2.0, 0.0], [3.0, 2.0, 0.0]], np.float32)  # flat
 
@@ -38,9 +44,6 @@ def by_harsh_table(guiding: Guiding, factor: float = 1.0) -> None:
     for purpose in Purpose:
         table, counts = guiding._table(0, purpose)
         guiding._tables[0, purpose] = replace(table, survival=survival), counts
-
-
-# ---- The means -------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", a_few(NAMES, ["two_emitters"]))
@@ -87,9 +90,6 @@ def of_another_cell(patch: pytest.MonkeyPatch) -> None:
 def test_what_would_bias_is_found(fault: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     fault(monkeypatch)
     assert not means_hold("two_emitters", 32)
-
-
-# ---- Replays ---------------------------------------------------------------------------------------------------------
 
 
 def replayed_from(patch: pytest.MonkeyPatch, other: Callable[[Table], Table]) -> None:
@@ -144,3 +144,210 @@ def test_a_recorded_step_is_the_step() -> None:
         both = [sample(scene, harsh(scene, each, factor), 5) for each in (ours, frozen)]
         assert relative(*both) < 1e-4
     assert frozen.preparation.recordings.counts()["fused"] > 0
+
+
+# What is learned of where paths go on to, and what they end by: against sums in NumPy.
+
+
+def test_cells_are_those_of_place_and_octant_and_none_is_outside() -> None:
+    import mitsuba as mi
+
+    random = np.random.default_rng(2)
+    o = random.uniform(-3, 4, (3, 1000)).astype(np.float32)
+    d = random.normal(size=(3, 1000)).astype(np.float32)
+    o[:, 0], o[0, 1], o[1, 2] = np.nan, np.inf, -np.inf
+    cell = np.array(Survival.of(BOX, np.ones(CELLS)).cell(mi.Point3f(*o), mi.Vector3f(*d)))
+    assert (cell < CELLS).all()
+    size = np.where(BOX[1] > BOX[0], BOX[1] - BOX[0], np.inf)
+    cube = np.clip(np.floor((o.T[3:] - BOX[0]) / size * 2**BITS), 0, 2**BITS - 1).astype(int)
+    octant = (d.T[3:] > 0) @ np.array([4, 2, 1])
+    expected = np.ravel_multi_index((*cube.T, octant), (2**BITS, 2**BITS, 2**BITS, 8))
+    assert (cell[3:] != expected).mean() < 0.01  # on a border, by rounding
+    assert len(np.unique(cell)) > 500
+
+
+def test_the_probability_is_bounded_on_both_sides() -> None:
+    """Of what is not a number too, which has to be seen."""
+    import mitsuba as mi
+
+    throughput = mi.Float([0.0, 1e-30, 0.1, 0.5, 1e30, np.inf, np.nan])
+    for chance, expected in (
+        (1.0, [LEAST, LEAST, LEAST, 0.5, 1, 1, LEAST]),
+        (0.0, [LEAST] * 7),
+        (np.inf, [LEAST, 1, 1, 1, 1, 1, LEAST]),
+    ):
+        survival = Survival.of(BOX, np.full(CELLS, chance))
+        q = survival.probability(mi.Point3f(0), mi.Vector3f(1), throughput)
+        np.testing.assert_allclose(np.array(q), expected)
+        raised = np.array(throughput)[:5] / np.array(q)[:5]
+        assert (raised <= np.maximum(np.array(throughput)[:5], 1 / chance if chance else np.inf)).all()
+
+
+def walked(**changes: Any) -> Walked:
+    zeros = np.zeros(CELLS)
+    return replace(Walked(np.zeros((2, CELLS)), zeros, zeros, np.array([4.0, 9.0]), 2.0, 3.0), **changes)
+
+
+def cell_of(x: int, y: int, z: int) -> int:
+    return int(np.ravel_multi_index((x, y, z, 3), SHAPE))
+
+
+def test_cells_lean_on_those_about_them_and_none_is_given_up() -> None:
+    """The formula of the docstring where a cell is well known; of one that nobody has met, that of its neighbours."""
+    left = np.zeros(CELLS)
+    loud, near, quiet, far = (cell_of(*cube) for cube in ((10, 10, 10), (10, 10, 11), (1, 1, 1), (1, 14, 1)))
+    left[[loud, quiet]] = 1e6
+    squares = np.zeros((2, CELLS))
+    squares[0, loud], squares[1, loud] = 1e6 * 0.25 * 4, 1e6 * 0.5 * 9
+    onward = Onward.nothing(BOX).with_more(walked(squares=squares, followed=2.0 * left, left=left))
+    for share, square in ((1.0, 0.25), (0.0, 0.5), (0.5, 0.375)):
+        s = onward.chances(share)
+        # (squares in units of light squared over what was said) / (what follows, and what a ray costs)
+        assert s[loud] == pytest.approx(SURE * np.sqrt(square * 4 / 2.2 * 3) / 2, rel=2e-3)
+        assert s[quiet] == pytest.approx(SURE * np.sqrt(FLOOR * square / 2 * 4 / 2.2 * 3) / 2, rel=2e-3)
+        assert (s >= s[quiet] * (1 - 1e-6)).all()
+        assert s[near] == pytest.approx(s[loud], rel=1e-3)  # in the same larger cube
+        assert s[far] == pytest.approx(s[loud] / np.sqrt(2), rel=1e-3)  # near neither
+    assert 1e6 > 1e3 * LEAN
+
+
+def test_walks_in_which_nothing_was_said_teach_nothing() -> None:
+    onward = Onward.nothing(BOX)
+    assert np.isinf(onward.chances(1.0)).all()
+    for said, light in (([0.0, 1.0], 1.0), ([1.0, 0.0], 1.0), ([np.nan, 1.0], 1.0), ([1.0, 1.0], 0.0)):
+        assert onward.with_more(walked(said=np.array(said), light=light)) is onward
+
+
+def test_where_no_ray_has_left_a_vertex_all_go_on() -> None:
+    """As in a scene whose paths are not followed beyond their first surface."""
+    known = Onward.nothing(BOX).with_more(walked())
+    assert known.light > 0
+    for share in (0.0, 0.5, 1.0):
+        assert np.isposinf(known.chances(share)).all()
+
+
+def test_what_is_known_does_not_depend_on_the_unit_of_light() -> None:
+    """Throughputs are as bright as the light is: s is in proportion to one over that."""
+    random = np.random.default_rng(3)
+    squares, left = random.gamma(0.2, size=(2, CELLS)), random.integers(0, 300, CELLS).astype(float)
+    known = walked(squares=squares, followed=2 * left, left=left)
+    s = Onward.nothing(BOX).with_more(known).chances(0.5)
+    for unit in (1e-12, 1e12):
+        brighter = replace(known, said=known.said * unit**2, light=known.light * unit)
+        np.testing.assert_allclose(Onward.nothing(BOX).with_more(brighter).chances(0.5) * unit, s, rtol=1e-5)
+
+
+def walk_of(scene: Case, ours: Any, seed: int) -> Walked:
+    """What a walk shows that a table would learn from."""
+    from reslrb_cli.guiding.collect import hear
+
+    leaves = scene.leaves()
+    job = Job(scene.scene, scene.scene.sensors()[0], learning_seed(seed), SPP, scene.params)
+    samples = ours.passes(job, Purpose.BOTH)[0]
+    found = hear(samples, scene.adjoint).walked(samples.width)
+    scene.release(leaves)
+    return found
+
+
+def heard(name: str, change: Callable[[Case, Any], None], count: int, block: int) -> np.ndarray:
+    """What walks of two bounces show of what follows the first, by the octant that rays leave into: squares of each
+    voice, vertices, rays; one row for each seed."""
+    scene, ours, _ = guided(name, 3, max_depth=3)
+    change(scene, ours)
+    rows = []
+    for seed in seeds(count, block):
+        found = walk_of(scene, ours, seed)
+        parts = [*found.squares, found.followed, found.left]
+        rows.append(np.concatenate([part.astype(np.float64).reshape(-1, 8).sum(0) for part in parts]))
+    return np.stack(rows)
+
+
+def certain(scene: Case, ours: Any) -> None:
+    """Have all paths go on."""
+    harsh(scene, ours, np.inf)
+
+
+@pytest.mark.parametrize("fault", [None, "square", "length"])
+def test_what_is_heard_is_what_there_is_whatever_roulette_ends(fault: str | None, monkeypatch: Any) -> None:
+    """Weights of roulette are taken out again: a table that learned its own weights would feed on itself."""
+    from reslrb_cli.guiding import collect
+
+    if fault is not None:
+        right = collect.Trail.survives
+        power = {"square": 3.0, "length": 0.0}[fault]
+        monkeypatch.setattr(collect.Trail, "survives", lambda self, weight: right(self, weight**power))
+    result = compare(heard("two_emitters", harsh, 24, 0), heard("two_emitters", certain, 24, 1), block=None)
+    print(fault, result)
+    assert bool(result) == (fault is None)
+
+
+def test_what_follows_a_bounce_is_heard_where_its_ray_left() -> None:
+    """Against sums in NumPy over the paths of the same seed, vertex by vertex, of what they say about the image."""
+    import drjit as dr
+    import mitsuba as mi
+
+    from reslrb_cli.transport.walk import Hooks, walk
+
+    class Keeping(Hooks):
+        """Of each path: where it leaves the first vertex, its throughput then, and what the second one says."""
+
+        def __init__(self, width: int) -> None:
+            self.kept = dr.zeros(mi.Float, 10 * width)
+            self.lane = 10 * dr.arange(mi.UInt32, width)
+
+        def keep(self, first: int, active: Any, *values: Any) -> None:
+            for k, value in enumerate(values):
+                dr.scatter(self.kept, mi.Float(value), self.lane + (first + k), active)
+
+        def connection(self, state: Any, vertex: Any, connection: Any, numbers: Any) -> Any:
+            C = vertex.product.times(connection.c, vertex.depth).value()
+            self.keep(8, vertex.depth == 2, dr.select(connection.active, dr.squared_norm(C), 0), 1)
+            return state
+
+        def scattering(self, state: Any, vertex: Any, connection: Any, scattering: Any) -> Any:
+            weight = dr.max(vertex.product.times(scattering.weight, vertex.depth).value())
+            self.keep(0, (vertex.depth == 1) & scattering.active, 1, weight, *vertex.si.p, *scattering.d)
+            return state
+
+    scene, ours, _ = guided("two_emitters", 1, max_depth=3)
+    certain(scene, ours)
+    found = walk_of(scene, ours, 5)
+    job = Job(scene.scene, scene.scene.sensors()[0], learning_seed(5), SPP, scene.params)
+    leaves = scene.leaves()  # what is differentiated has a part in how lamps are drawn
+    [samples] = ours.passes(job, Purpose.BOTH)
+    scene.release(leaves)
+    hooks = Keeping(samples.width)
+    with dr.suspend_grad():
+        dr.eval(walk(samples, hooks), hooks.kept)
+    rows = np.array(hooks.kept, np.float64).reshape(-1, 10)
+    rows = rows[(rows[:, 0] > 0) & (rows[:, 1] > 0)].T
+    cell = np.array(samples.guide.table.survival.cell(mi.Point3f(*rows[2:5]), mi.Vector3f(*rows[5:8])))
+    for values, sums in ((rows[0], found.left), (rows[9], found.followed), (rows[8] / rows[1] ** 2, found.squares[-1])):
+        assert values.any()
+        np.testing.assert_allclose(np.bincount(cell, values, CELLS), sums, rtol=1e-3, atol=1e-6 * sums.max())
+
+
+def test_vertices_that_find_no_room_are_summed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of walks of two bounces rays leave the first vertex alone: there is room for that, or for both."""
+    from reslrb_cli.guiding import collect
+
+    scene, ours, _ = guided("two_emitters", 1, max_depth=3)
+    found = []
+    for places in (32, 1):
+        monkeypatch.setattr(collect, "PLACES", places)
+        found.append(walk_of(scene, ours, 5))
+    assert found[0].left.sum() > 0
+    for name in ("squares", "followed", "left"):
+        np.testing.assert_allclose(getattr(found[1], name), getattr(found[0], name), rtol=1e-4)
+
+
+def test_tables_that_have_learned_end_paths_that_say_little() -> None:
+    """Walks of equal seeds get shorter."""
+    scene, ours, _ = guided("roulette", 4, rr_depth=100)
+    lengths = []
+    for table in ("learned", "certain"):
+        if table == "certain":
+            certain(scene, ours)
+        lengths.append(walk_of(scene, ours, 7).length)
+    print(lengths)
+    assert lengths[0] < lengths[1]

@@ -89,7 +89,7 @@ import reslrb_cli
 sys.path.insert(0, {tests!r})
 from reslrb_cli.backend.variant import set_variant
 set_variant("llvm_ad_rgb")
-from threads import compute_alone
+from compilation import compute_alone
 compute_alone()
 from reslrb_cli.cli import main
 main.main(sys.argv[1:], prog_name="reslrb")

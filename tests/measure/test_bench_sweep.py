@@ -1,20 +1,28 @@
-"""The order of a sweep, and what becomes of cases that end: with processes that only pretend."""
+"""Sweeps of `bench`: their order, what they vary, what becomes of cases that end, and going on."""
 
 from __future__ import annotations
 
+import json
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
-from measure.pretended import Pretended
+from measure.pretended_steps import Pretended
 
+from reslrb_cli.cli import main
 from reslrb_cli.config.loader import loads
 from reslrb_cli.errors import ConfigError
-from reslrb_cli.measure.bench import Result, bench
-from reslrb_cli.measure.methods import Sweep, choose_baseline, depths, parse_cases
+from reslrb_cli.measure.bench import KIND, Book, Result, bench
+from reslrb_cli.measure.methods import Sweep, choose_baseline, depths, parse_cases, usual_values
 from reslrb_cli.measure.processes import MAX_ROUNDS, MIN_ROUNDS, Pace, Refused, Stopped
+from reslrb_cli.measure.resume_store import Earlier
 from reslrb_cli.records.measurements import BenchStatus, Spread
+from reslrb_cli.report.plots import plot_bench
+from reslrb_cli.report.tables import table_head, table_line
+
+# The order of a sweep, and what becomes of cases that end: with processes that only pretend.
 
 CONFIG = """\
 scene: {file: scene.xml}
@@ -26,7 +34,7 @@ run: {spp: 4}
 LIST = "ptracer,reslrb:stack,walk_ad"
 
 
-@pytest.fixture(autouse=True)
+@pytest.fixture
 def _clean() -> None:
     Pretended.log, Pretended.ends, Pretended.refusing, Pretended.alive = [], {}, set(), 0
 
@@ -48,6 +56,7 @@ def run(what: Sweep, stop: Callable[[], bool] = lambda: False) -> list[Result]:
     return rows
 
 
+@pytest.mark.usefixtures("_clean")
 def test_steps_are_interleaved_and_the_order_turns() -> None:
     run(sweep(values=[2]))
     types = ["ptracer", "reslrb", "walk_ad"]
@@ -56,6 +65,7 @@ def test_steps_are_interleaved_and_the_order_turns() -> None:
     assert Pretended.log == warm + rounds
 
 
+@pytest.mark.usefixtures("_clean")
 def test_records() -> None:
     rows = run(sweep())
     assert [(row.record.integrator, row.record.max_depth) for row in rows] == [
@@ -73,6 +83,7 @@ def test_records() -> None:
     assert rows[0].step_ratio == Spread(1.0, 1.0, 1.0)
 
 
+@pytest.mark.usefixtures("_clean")
 @pytest.mark.parametrize("question", [0, 1, 2, 5], ids=["loading", "cold", "warming up", "in a round"])
 def test_a_case_that_ends_is_recorded_and_the_rest_goes_on(question: int) -> None:
     Pretended.ends = {("walk_ad", 2): question}
@@ -86,22 +97,26 @@ def test_a_case_that_ends_is_recorded_and_the_rest_goes_on(question: int) -> Non
     assert rows[5].record.status is BenchStatus.OK  # it is tried again at the next depth
 
 
+@pytest.mark.usefixtures("_clean")
 def test_without_a_baseline_there_are_no_ratios() -> None:
     Pretended.ends = {("ptracer", 2): 1}
     rows = run(sweep())
     assert [row.step_ratio is None for row in rows] == [True, True, True, False, False, False]
 
 
+@pytest.mark.usefixtures("_clean")
 def test_another_baseline() -> None:
     rows = run(sweep(baseline="reslrb:stack", values=[2]))
     assert [row.step_ratio and row.step_ratio.median for row in rows] == [2.0, 1.0, 2.5]
 
 
+@pytest.mark.usefixtures("_clean")
 def test_all_may_end() -> None:
     Pretended.ends = {(name, 2): 1 for name in ("ptracer", "reslrb", "walk_ad")}
     assert {row.record.status for row in run(sweep(values=[2]))} == {BenchStatus.OUT_OF_MEMORY}
 
 
+@pytest.mark.usefixtures("_clean")
 @pytest.mark.parametrize(("after", "kept"), [(5, []), (14, [1, 1, 1]), (13, [1, 1]), (33, [3, 3, 3, 1])])
 def test_a_stop_keeps_what_is_done(after: int, kept: list[int]) -> None:
     answers = iter(range(1000))
@@ -110,6 +125,7 @@ def test_a_stop_keeps_what_is_done(after: int, kept: list[int]) -> None:
     assert all(row.record.status is BenchStatus.OK for row in rows)
 
 
+@pytest.mark.usefixtures("_clean")
 def test_cases_that_need_the_memory_of_each_other_release_it() -> None:
     asked: list[bool] = []
 
@@ -124,6 +140,7 @@ def test_cases_that_need_the_memory_of_each_other_release_it() -> None:
     assert "memory" in said[0]
 
 
+@pytest.mark.usefixtures("_clean")
 def test_pace_divides_the_budget() -> None:
     now = [0.0]
     pace, spent = Pace(100.0, 3, now=lambda: now[0]), Pace(200.0, 2, now=lambda: now[0])
@@ -151,6 +168,7 @@ def test_pace_divides_the_budget() -> None:
     assert [cheap.another(done) for done in (MAX_ROUNDS - 1, MAX_ROUNDS)] == [True, False]
 
 
+@pytest.mark.usefixtures("_clean")
 @pytest.mark.parametrize(
     ("budget_s", "measured", "left"),
     [
@@ -205,6 +223,7 @@ def spent(budget_s: float, monkeypatch: pytest.MonkeyPatch) -> tuple[dict[int, l
     return found, said, now[0]
 
 
+@pytest.mark.usefixtures("_clean")
 def test_what_every_process_warns_of_is_said_once() -> None:
     class Warning(Pretended):
         def answer(self, stop: Callable[[], bool]) -> dict[str, Any]:
@@ -216,12 +235,14 @@ def test_what_every_process_warns_of_is_said_once() -> None:
     assert said == ["scene.xml:3: old"]
 
 
+@pytest.mark.usefixtures("_clean")
 def test_depths() -> None:
     assert depths(2) == [2]
     assert depths(16) == [2, 4, 8, 16]
     assert depths(20) == [2, 4, 8, 16, 20]
 
 
+@pytest.mark.usefixtures("_clean")
 def test_options_of_cases() -> None:
     cases = parse_cases("reslrb:reservoir(capacity=4, weight=adjoint), ptracer(rr_depth=3),prb,reslrb")
     config = loads(CONFIG, "x.yaml")
@@ -232,6 +253,7 @@ def test_options_of_cases() -> None:
     assert "samples_per_pass" not in options[2]
 
 
+@pytest.mark.usefixtures("_clean")
 def test_cases_may_have_an_adjoint_of_their_own() -> None:
     case, other, third = parse_cases("reslrb:stack(adjoint=batched,batches=2),ptracer(adjoint=correlated),prb")
     config = loads(CONFIG, "x.yaml", ["run.adjoint=batched"])
@@ -245,6 +267,7 @@ def test_cases_may_have_an_adjoint_of_their_own() -> None:
     assert case.at(loads(CONFIG, "x.yaml"), 9, known=False).run.batches == 2
 
 
+@pytest.mark.usefixtures("_clean")
 @pytest.mark.parametrize(
     ("text", "line"),
     [
@@ -266,11 +289,13 @@ def test_wrong_lists_are_located(text: str, line: str) -> None:
     assert line in str(caught.value)
 
 
+@pytest.mark.usefixtures("_clean")
 def test_an_unknown_baseline_is_located() -> None:
     with pytest.raises(ConfigError, match=r"--baseline: `prb` is none of ptracer, reslrb:stack"):
         sweep(baseline="prb")
 
 
+@pytest.mark.usefixtures("_clean")
 def test_what_nobody_named_is_left_out_where_it_refuses():
     Pretended.refusing = {"reslrb"}
     lines: list[str] = []
@@ -281,9 +306,240 @@ def test_what_nobody_named_is_left_out_where_it_refuses():
     assert Pretended.alive == 0
 
 
+@pytest.mark.usefixtures("_clean")
 @pytest.mark.parametrize(("refusing", "default"), [("reslrb", False), ("ptracer", True)])
 def test_what_somebody_named_or_divides_by_is_not_left_out(refusing: str, default: bool):
     Pretended.refusing = {refusing}
     with pytest.raises(Refused, match="what moves light"):
         list(bench(sweep(default=default), lambda: False, lambda line: None, Pretended))
     assert Pretended.alive == 0
+
+
+# What `bench --sweep` varies: samples, and sizes of film and textures; with processes that only pretend.
+
+
+class Sized(Pretended):
+    """Costs as many milliseconds as it has samples, pixels and texels; at the first depth that is asked for."""
+
+    firsts: list[dict[str, Any]] = []  # noqa: RUF012 (shared by all)
+
+    def __init__(self, first: dict[str, Any]) -> None:
+        super().__init__(first)
+        self.first, self.spp = first, loads(first["config"], "x.yaml").run.spp
+        Sized.firsts.append(first)
+
+    def answer(self, stop: Any) -> dict[str, Any]:
+        answer = super().answer(stop)
+        width, texture = self.first.get("film_width", 6), self.first.get("texture_width", 3)
+        if "width" in answer:
+            return {"width": width, "height": width - 1, "texels": texture**2}
+        return answer | {"step_ms": float(self.spp * width * texture)}
+
+
+@pytest.fixture
+def _clean_values() -> None:
+    Pretended.log, Pretended.ends, Pretended.refusing, Pretended.alive, Sized.firsts = [], {}, set(), 0, []
+
+
+def run_swept(swept: str, values: list[int], **changes: Any) -> tuple[list[Result], list[str]]:
+    cases, said = parse_cases(LIST, deep=False), list[str]()
+    settings: dict[str, Any] = {
+        "config": loads(CONFIG, Path("x.yaml"), ["integrator.max_depth=5"]), "variant": "llvm_ad_rgb", "cases": cases,
+        "baseline": choose_baseline(cases, None), "values": values, "objective": "fixed", "memory_limit": None,
+        "memory": 2**40, "budget_s": 0.0, "rounds": 3, "swept": swept,
+    }  # fmt: skip
+    what = Sweep(**(settings | changes))
+    what.check()
+    rows = [row for some in bench(what, lambda: False, said.append, Sized) for row in some]
+    assert Pretended.alive == 0
+    return rows, said
+
+
+@pytest.mark.usefixtures("_clean_values")
+@pytest.mark.parametrize(
+    ("swept", "expected"),
+    [
+        ("spp", [(2, 5, 6, 9, 36.0), (8, 5, 6, 9, 144.0)]),
+        ("film", [(4, 5, 2, 9, 24.0), (4, 5, 8, 9, 96.0)]),
+        ("texture", [(4, 5, 6, 4, 48.0), (4, 5, 6, 64, 192.0)]),
+    ],
+)
+def test_one_thing_is_varied_and_all_else_is_as_it_was(swept: str, expected: list[tuple[Any, ...]]) -> None:
+    rows, said = run_swept(swept, [2, 8])
+    assert said == []
+    assert [row.value for row in rows] == [2] * 3 + [8] * 3
+    of_one = [row.record for row in rows if row.case.type == "walk_ad"]
+    assert [(r.spp, r.max_depth, r.width, r.texels, r.step_ms and r.step_ms.median) for r in of_one] == expected
+    names = {"spp": set(), "film": {"film_width"}, "texture": {"texture_width"}}[swept]
+    assert all({name for name in first if name.endswith("_width")} == names for first in Sized.firsts)
+
+
+@pytest.mark.usefixtures("_clean_values")
+def test_the_table_begins_with_what_is_swept_and_the_picture_is_drawn(tmp_path: Path) -> None:
+    Pretended.ends = {("walk_ad", 5): 2}
+    rows, _ = run_swept("film", [16, 128])
+    labels = LIST.split(",")
+    assert table_head(labels, "film").split()[:2] == ["film", "step"]
+    lines = [table_line(row.case.label, row.value, row.record, None, None, labels) for row in rows]
+    assert [line.split()[:2] for line in lines] == [[str(width), name] for width in (16, 128) for name in labels]
+    assert lines[2].endswith("out_of_memory")
+    series = [(label, [(row.value, row.record) for row in rows if row.case.label == label]) for label in labels]
+    plot_bench(series, tmp_path / "x.png", "x", "film width")
+    assert {row.record.status for row in rows} == {BenchStatus.OK, BenchStatus.OUT_OF_MEMORY}
+    assert (tmp_path / "x.png").read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.usefixtures("_clean_values")
+def test_what_there_was_no_time_for_is_named_by_what_is_swept() -> None:
+    assert run_swept("texture", [8, 64], rounds=None)[1] == [
+        "not measured: texture width 8, 64: the budget was spent; allow more with --budget"
+    ]
+
+
+@pytest.mark.usefixtures("_clean_values")
+def test_samples_that_cannot_be_are_located() -> None:
+    with pytest.raises(ConfigError, match=r"--integrators ptracer: integrator.samples_per_pass: 2 does not divide"):
+        run_swept("spp", [4, 3])
+
+
+@pytest.mark.usefixtures("_clean_values")
+def test_usual_values() -> None:
+    config = loads(CONFIG, Path("x.yaml"))
+    assert usual_values("spp", config) == [1, 2, 4, 8, 16]
+    assert usual_values("spp", loads(CONFIG, Path("x.yaml"), ["run.spp=2"])) == [1, 2, 4, 8]
+    assert usual_values("film", config) == [32, 64, 128, 256]
+
+
+@pytest.mark.usefixtures("_clean_values")
+@pytest.mark.parametrize(
+    ("args", "line"),
+    [
+        (("--sweep", "film", "--max-depth", "4"), "--max-depth: goes with --sweep depth; take --set integrator.max"),
+        (("--values", "2", "--max-depth", "4"), "--max-depth: does not go with --values"),
+        (("--sweep", "size"), "'size' is not one of 'depth', 'spp', 'film', 'texture'"),
+        (("--sweep", "spp", "--values", "4,4"), "`4,4` names a number twice"),
+        (("--sweep", "spp", "--integrators", "ptracer(max_depth=3)"), "all share one max_depth"),
+    ],
+)
+def test_bad_input_is_one_located_line(args: tuple[str, ...], line: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main(["bench", *args], prog_name="reslrb")
+    assert ended.value.code == 2
+    printed = capsys.readouterr()
+    assert printed.out == ""
+    assert line in printed.err
+    assert len(printed.err.splitlines()) == 1
+
+
+# A `bench` that goes on from another one: what counts, what is measured again, and what is refused.
+
+
+def measure(what: Sweep, before: Earlier | None = None, stop: Callable[[], bool] = lambda: False) -> Book:
+    book = Book(what, "", before)
+    list(bench(what, stop, lambda line: None, Pretended, book))
+    assert Pretended.alive == 0
+    return book
+
+
+def again(book: Book) -> Earlier:
+    """What a book keeps, as it comes back from the disk."""
+    kept = book.kept()
+    assert kept is not None
+    head, arrays = kept
+    return Earlier(KIND, Path("b.jsonl"), json.loads(json.dumps(head)), arrays)
+
+
+@pytest.mark.usefixtures("_clean")
+def test_rounds_go_on_and_the_records_are_those_of_one_session() -> None:
+    """The pretended steps take longer from round to round, so that every figure shows which rounds it is of."""
+    short = measure(sweep(rounds=3))
+    Pretended.log.clear()
+    whole = measure(sweep(rounds=7), again(short))
+    asked = [round for depth, name, round in Pretended.log if (depth, name) == (2, "ptracer") and round > 0]
+    assert asked == [4, 5, 6, 7]  # whose seeds are new
+    expected = measure(sweep(rounds=7)).results()
+    assert [result.record for result in whole.results()] == [result.record for result in expected]
+    assert [result.step_ratio for result in whole.results()] == [result.step_ratio for result in expected]
+    assert {result.record.repeats for result in whole.results()} == {7}
+
+
+@pytest.mark.usefixtures("_clean")
+@pytest.mark.parametrize("after", [5, 14, 20, 33, 40])
+def test_what_a_stop_has_left_is_measured(after: int) -> None:
+    answers = iter(range(1000))
+    stopped = measure(sweep(), stop=lambda: next(answers) > after)
+    if stopped.kept() is None:
+        assert not any(result.record.repeats for result in stopped.results())
+        return
+    whole = measure(sweep(), again(stopped))
+    labels = [case.label for case in sweep().cases]
+    assert [(result.value, result.case.label) for result in whole.results()] == [(v, c) for v in (2, 4) for c in labels]
+    assert all(result.record.repeats >= 3 for result in whole.results())
+
+
+@pytest.mark.usefixtures("_clean")
+def test_depths_that_are_done_are_not_begun_again() -> None:
+    Pretended.ends = {("walk_ad", 2): 4}
+    first = measure(sweep(values=[2, 4], rounds=3), stop=lambda: len(Pretended.log) > 31)
+    assert {result.value for result in first.results()} == {2, 4}
+    Pretended.log.clear()
+    Pretended.ends = {}
+    whole = measure(sweep(values=[2, 4], rounds=3), again(first))
+    assert {depth for depth, _, _ in Pretended.log} == {4}
+    ended = whole.results()[2]
+    assert (ended.record.status, ended.reason) == (BenchStatus.OUT_OF_MEMORY, "ended by SIGSEGV")
+
+
+@pytest.mark.usefixtures("_clean")
+def test_what_refused_stays_left_out() -> None:
+    Pretended.refusing = {"reslrb"}
+    first = measure(sweep(default=True))
+    Pretended.log.clear()
+    whole = measure(sweep(default=True, rounds=5), again(first))
+    assert {name for _, name, _ in Pretended.log} == {"ptracer", "walk_ad"}
+    assert {result.record.repeats for result in whole.results()} == {5}
+
+
+@pytest.mark.usefixtures("_clean")
+@pytest.mark.parametrize(
+    ("change", "line"),
+    [
+        ({"config": loads(CONFIG, Path("x.yaml"), ["run.spp=8"])}, "run.spp is 4 there, 8 here"),
+        ({"cases": parse_cases("ptracer,walk_ad")}, "integrators is ['ptracer', 'reslrb:stack', 'walk_ad'] there"),
+        ({"values": [2, 8]}, "values is [2, 4] there, [2, 8] here"),
+        ({"objective": "l2"}, "objective is fixed there, l2 here"),
+        ({"swept": "spp"}, "sweep is depth there, spp here"),
+        ({"memory_limit": 2**30}, "memory limit is None there, 1073741824 here"),
+        ({"variant": "cuda_ad_rgb"}, "variant is llvm_ad_rgb there, cuda_ad_rgb here"),
+    ],
+)
+def test_only_the_same_is_gone_on_from(change: dict[str, Any], line: str) -> None:
+    first = measure(sweep())
+    with pytest.raises(ConfigError, match=re.escape(f"--resume: b.jsonl is of another measurement: {line}")):
+        Book(sweep(**({"rounds": 5} | change)), "", again(first))
+    with pytest.raises(ConfigError, match=r"b\.jsonl has all of it, 3 rounds each; more are measured with a larger"):
+        Book(sweep(), "", again(first))
+
+
+@pytest.mark.usefixtures("_clean")
+def test_a_scene_that_has_changed_is_another_one(tmp_path: Path) -> None:
+    (tmp_path / "scene.xml").write_text("<scene/>")
+    what = sweep(config=loads(CONFIG, tmp_path / "x.yaml"))
+    first = again(measure(what))
+    (tmp_path / "scene.xml").write_text("<scene></scene>")
+    with pytest.raises(ConfigError, match=r"the content of scene\.file has changed"):
+        Book(what, "", first)
+
+
+@pytest.mark.usefixtures("_clean")
+def test_what_is_under_way_is_in_the_book_between_rounds() -> None:
+    """So that a process that is killed in the midst of a depth leaves all rounds but the last."""
+    book, seen = Book(sweep(values=[2])), []
+
+    def between() -> None:
+        kept = book.kept()
+        assert kept is not None
+        seen.append([len(run["steps"]) for run in kept[0]["values"][0][1]])
+
+    list(bench(book.sweep, lambda: False, lambda line: None, Pretended, book, between))
+    assert seen == [[1] * 3, [2] * 3, [3] * 3]

@@ -1,18 +1,28 @@
-"""What `convergence` makes of methods whose cost, noise and bias are known: with processes that only pretend."""
+"""What `convergence` makes of methods whose cost, noise and bias are known; references, curves, scenes."""
 
 from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from cli.tiny import KEY, write_experiment
 from measure.pretended_steps import SHAPES, Pretence, Stage, of, plan, play
+from scipy import stats
 
+from reslrb_cli.cli import main
+from reslrb_cli.config.loader import load
 from reslrb_cli.measure.convergence.judgement import HEAVY, Judgement
-from reslrb_cli.measure.convergence.setup import Role
+from reslrb_cli.measure.convergence.setup import Role, Sampler, survey
+from reslrb_cli.measure.convergence.statistics import GROUPS, Reference, Samples
+from reslrb_cli.measure.methods import IMAGES
+from reslrb_cli.optimization.assemble import assemble_scene
 from reslrb_cli.records.measurements import BenchStatus
 from reslrb_cli.report.convergence_tables import closing_sentence, notes
+
+# What `convergence` makes of methods whose cost, noise and bias are known: with processes that only pretend.
 
 
 def test_cost_error_slope_and_efficiency_are_those_of_the_methods(tmp_path: Path) -> None:
@@ -154,3 +164,342 @@ def test_lines_of_json(tmp_path: Path) -> None:
     assert method["bias_z"] > 0
     assert [json.loads(r.to_json())["kind"] for r in results.references] == ["reference"] * 3
     assert {r.parameter for r in results.methods} == {*SHAPES, "all"}
+
+
+# Errors, slopes, efficiencies and times from samples whose law is known.
+
+REPETITIONS = 200
+#: How many of the repetitions may cover the truth where each does with a probability of 95 %: all but one in 1000.
+LEAST, MOST = (int(stats.binom.ppf(p, REPETITIONS, 0.95)) for p in (0.0005, 0.9995))
+TRUTH = np.random.default_rng(2).uniform(0.5, 2.0, 40)
+SIGNAL = float(TRUTH @ TRUTH)
+SECONDS = 0.2
+
+
+def noise(random: np.random.Generator, count: int) -> np.ndarray:
+    """(count, 40) with a variance of 3 and 0.2 in each entry, the larger part common to many."""
+    common = np.random.default_rng(1).standard_normal((4, 40))
+    common *= np.sqrt(3.0 / np.square(common).sum(0))
+    return random.standard_normal((count, 4)) @ common + np.sqrt(0.2) * random.standard_normal((count, 40))
+
+
+VARIANCE = 3.2 * 40
+
+
+def make(seed: int, steps: int = 48, rows: int = 24, per_row: int = 6, per_turn: int = 2, bias: float = 0.0) -> Samples:
+    random = np.random.default_rng(1000 + seed)
+    means = TRUTH + noise(random, rows * per_row).reshape(rows, per_row, -1).mean(1)
+    values, turns = TRUTH * (1 + bias) + noise(random, steps), np.arange(steps) // per_turn
+    seconds = SECONDS * random.gamma(40, 1 / 40, steps // per_turn)
+    return Samples(values, turns, seconds, Reference(means))
+
+
+def test_errors_are_those_of_averages_and_the_references_own_is_subtracted() -> None:
+    """Of a reference as noisy as averages of 6 steps, which unsubtracted makes averages of 32 look twice as bad."""
+    made = [make(seed, steps=64, rows=6, per_row=1) for seed in range(REPETITIONS)]
+    for level in range(6):
+        found = [samples.points()[level] for samples in made]
+        assert {point.steps for point in found} == {2**level}
+        assert {point.repeats for point in found} == {64 // 2**level}
+        assert found[0].elapsed_s == pytest.approx(2**level * made[0].step_s)
+        # A point drowns, and is None, where the estimate of its square is negative; squares are what is unbiased.
+        squares = [
+            float(np.square(s.deviations[: 64 // 2**level * 2**level].reshape(-1, 2**level, 40).mean(1)).sum(1).mean())
+            - s.reference.noise
+            for s in made
+        ]
+        told = [0.0 if p.relative_rmse is None else p.relative_rmse**2 * s.reference.signal
+                for p, s in zip(found, made, strict=True)]  # fmt: skip
+        np.testing.assert_allclose(told, np.maximum(squares, 0), rtol=1e-9, atol=1e-9)
+        error = stats.sem(squares)
+        assert abs(np.mean(squares) - VARIANCE / 2**level) < 4 * error
+    assert VARIANCE / 32 + np.mean([s.reference.noise for s in made]) > 4 * VARIANCE / 32
+
+
+def test_the_floor_and_the_signal() -> None:
+    made = [make(seed).reference for seed in range(REPETITIONS)]
+    for values, truth in (([r.noise for r in made], VARIANCE / 144), ([r.signal for r in made], SIGNAL)):
+        assert abs(np.mean(values) - truth) < 4 * stats.sem(values)
+    assert made[0].floor == pytest.approx(np.sqrt(made[0].noise / made[0].signal))
+    assert Reference(np.random.default_rng(1).standard_normal((8, 5)) * 0.0).floor is None
+
+
+def test_what_is_left_out_of_a_reference() -> None:
+    reference = make(1, rows=5).reference
+    moved, noises, signals = reference.without
+    for k in range(5):
+        rest = Reference(np.delete(reference.rows, k, axis=0))
+        np.testing.assert_allclose(reference.mean + moved[k], rest.mean)
+        assert (noises[k], signals[k]) == pytest.approx((rest.noise, rest.signal))
+
+
+@pytest.mark.parametrize(("steps", "rows"), [(48, 24), (16, 8), (192, 48)])
+def test_the_intervals_cover_what_they_say(steps: int, rows: int) -> None:
+    """By 200 repetitions: of efficiency, which 1 / (relative variance * seconds) is, and of the slope, -1/2."""
+    truth, covered, slopes = SIGNAL / VARIANCE / SECONDS, 0, 0
+    for seed in range(REPETITIONS):
+        samples = make(seed, steps, rows)
+        estimate, slope = samples.efficiency(), samples.slope()
+        assert estimate is not None
+        assert slope is not None
+        interval = estimate.exponential()
+        covered += interval.low <= truth <= interval.high
+        slopes += slope.interval().low <= -0.5 <= slope.interval().high
+    assert LEAST <= covered <= MOST
+    assert LEAST <= slopes <= MOST
+
+
+@pytest.mark.parametrize("steps", [16, 32, 64])
+def test_the_intervals_of_a_single_colour_cover_too(steps: int) -> None:
+    """Its three channels deviate together, so that every error is the square of one normal number."""
+    covered, slopes = 0, 0
+    for seed in range(REPETITIONS):
+        random = np.random.default_rng(seed)
+        own, others = (1 + 0.1 * random.standard_normal((count, 1)) * np.ones(3) for count in (steps, 400))
+        samples = Samples(own, np.arange(steps) // 2, np.ones(steps // 2), Reference(others.reshape(40, 10, 3).mean(1)))
+        efficiency, slope = samples.efficiency(), samples.slope()
+        assert efficiency is not None
+        assert slope is not None
+        covered += efficiency.exponential().low <= 100 <= efficiency.exponential().high
+        slopes += slope.interval().low <= -0.5 <= slope.interval().high
+    assert LEAST <= covered <= MOST
+    assert LEAST <= slopes <= MOST
+
+
+def test_the_interval_of_a_biased_method_covers_too() -> None:
+    bias = 0.6
+    truth, covered = SIGNAL / (VARIANCE + bias**2 * SIGNAL) / SECONDS, 0
+    for seed in range(REPETITIONS):
+        estimate = make(seed, bias=bias).efficiency(biased=True)
+        assert estimate is not None
+        covered += estimate.exponential().low <= truth <= estimate.exponential().high
+    assert LEAST <= covered <= MOST
+    unbiased = make(0, bias=bias).efficiency(biased=False)
+    assert unbiased is not None
+    assert unbiased.exponential().low > truth
+
+
+def test_a_bias_flattens_the_slope() -> None:
+    slope = make(3, steps=256, bias=0.5).slope()
+    assert slope is not None
+    assert slope.interval().low > -0.4
+    assert np.sqrt(make(3, steps=256, bias=0.5).squared_bias) == pytest.approx(0.5, rel=0.2)
+
+
+def test_seeds_that_repeat_flatten_the_slope() -> None:
+    good = make(4, steps=64)
+    values = np.repeat(good.deviations[::4] + good.reference.mean, 4, axis=0)
+    slope = Samples(values, good.turns, good.seconds, good.reference).slope()
+    assert slope is not None
+    assert slope.interval().low > -0.45
+
+
+def test_times() -> None:
+    """As sqrt(variance / steps) says; beyond the steps, or below the floor, extrapolated; never less than a step."""
+    samples = make(5, steps=64, rows=200)
+    relative = samples.variance
+    for target in (0.5, 0.2, 0.01):
+        seconds, beyond = samples.seconds_to(target, biased=False)
+        steps = max(relative / target**2, 1.0)
+        assert seconds == pytest.approx(steps * samples.step_s)
+        assert beyond is (steps > 64 or target < samples.reference.floor)
+    assert [samples.seconds_to(target, False)[1] for target in (0.5, 0.01)] == [False, True]
+    assert samples.seconds_to(100.0, False) == (samples.step_s, False)
+    rough = make(5, steps=64, rows=3, per_row=1)
+    assert rough.reference.floor > 0.3
+    assert rough.seconds_to(0.3, False)[1]  # within the steps, but not to be told
+
+
+def test_times_that_a_bias_forbids() -> None:
+    samples = make(6, steps=256, rows=100, bias=0.2)
+    size = float(np.sqrt(samples.squared_bias))
+    assert samples.seconds_to(0.9 * size, biased=True) == (None, False)
+    assert samples.seconds_to(0.9 * size, biased=False)[0] is not None
+    seconds, _ = samples.seconds_to(2 * size, biased=True)
+    assert seconds == pytest.approx(samples.variance / (3 * size**2) * samples.step_s)
+
+
+def test_too_few_steps_have_no_intervals() -> None:
+    assert make(7, steps=4, per_turn=2).efficiency() is None
+    assert make(7, steps=6, per_turn=2).efficiency() is not None
+    assert make(7, steps=15, per_turn=1).slope() is None
+    assert make(7, steps=16, per_turn=1).slope() is not None
+
+
+# `convergence` on the scenes that come with their configurations: fixed seeds, and steps that no clock counts.
+
+ROOT = Path(__file__).resolve().parents[2]
+OURS = "reslrb:reservoir,reslrb:event,reslrb:gather,reslrb:stack"
+#: Without roulette, which naive AD does not differentiate rightly.
+PTRACER = "ptracer(rr_depth=1000000)"
+#: Probability that all slopes of a scene are within their intervals, widened for their number.
+CONFIDENCE = 0.99
+
+
+def methods(folder: Path, scene: str, size: tuple[int, int], *args: str) -> list[dict]:
+    """The lines of all methods, of a film of this size."""
+    file = folder / "c.jsonl"
+    film = [f"--set=scene.options.resx={size[0]}", f"--set=scene.options.resy={size[1]}"]
+    with pytest.raises(SystemExit) as ended:
+        main(["convergence", str(ROOT / f"configs/{scene}.yaml"), *film, *args, "--json", str(file)])
+    assert not ended.value.code
+    lines = [json.loads(line) for line in file.read_text().splitlines()]
+    for line in lines:
+        if line["kind"] == "reference" and line["bias_z"] is not None:
+            assert line["biased"] is not True, line
+    return [line for line in lines if line["kind"] == "method"]
+
+
+@pytest.mark.usefixtures("llvm")
+@pytest.mark.long
+@pytest.mark.parametrize(
+    ("scene", "size", "spp", "rounds", "cases"),
+    [
+        ("cornell_floor", (64, 64), 8, 32, f"{PTRACER},prb,{OURS}"),
+        ("grey_room", (64, 48), 32, 24, f"prb,{OURS}"),
+        ("caustic_slab", (64, 64), 16, 32, f"{PTRACER},{OURS}"),
+    ],
+)
+def test_unbiased_methods(tmp_path: Path, scene: str, size: tuple[int, int], spp: int, rounds: int, cases: str) -> None:
+    """Slopes are -1/2 within their intervals, and no method deviates from an independent one."""
+    args = [f"--set=run.spp={spp}", "--integrators", cases, "--rounds", str(rounds)]
+    found = methods(tmp_path, scene, size, *args)
+    assert {line["label"] for line in found} == set(cases.split(","))
+    keys = {line["parameter"] for line in found}
+    count = len({line["label"] for line in found}) * max(len(keys) - 1, 1)
+    # The intervals are of 95 %, by Student's t with as many degrees of freedom as there are groups of steps less one.
+    for line in found:
+        freedom = next(groups for steps, groups in GROUPS.items() if line["steps"] >= steps) - 1
+        wider = stats.t.isf((1 - CONFIDENCE) / 2 / count, freedom) / stats.t.isf(0.025, freedom)
+        assert line["biased"] is not True, line
+        assert abs(line["bias_z"]) < line["bias_z_limit"], line
+        slope = line["slope"]
+        assert abs(slope["value"] + 0.5) < wider * (slope["high"] - slope["value"]), line
+    assert {line["biased"] for line in found if line["parameter"] != "all"} == {False}
+
+
+@pytest.mark.usefixtures("llvm")
+@pytest.mark.long
+def test_what_correlated_samples_do_to_the_loss(tmp_path: Path) -> None:
+    cases = ",".join(f"reslrb:stack(adjoint={adjoint})" for adjoint in ("correlated", "independent", "batched"))
+    args = ["--objective", "loss", "--set=run.spp=4", "--integrators", cases, "--rounds", "32"]
+    found = [line for line in methods(tmp_path, "cornell_floor", (64, 64), *args) if line["parameter"] == "all"]
+    assert {line["adjoint"]: line["biased"] for line in found} == {
+        "correlated": True,
+        "independent": False,
+        "batched": False,
+    }
+
+
+@pytest.mark.usefixtures("llvm")
+@pytest.mark.long
+def test_the_intervals_cover_what_they_say_on_a_scene(tmp_path: Path) -> None:
+    """200 repetitions with the noise of real steps; the truth is that of all steps together. No clock takes part."""
+    from reslrb_cli.measure.convergence.setup import Sampler, survey
+    from reslrb_cli.optimization.assemble import assemble_scene
+
+    write_experiment(tmp_path)
+    config = load(tmp_path / "tiny.yaml")
+    _, arrays = survey(assemble_scene(config), "fixed", camera=False, named=False, budget_s=None)
+    sampler = Sampler(config, "known", arrays)
+    repetitions, steps, rows, per_row = 200, 24, 12, 4
+    taken = steps + rows * per_row
+    pool = np.stack([sampler.step(seed, 16, 0)[0] for seed in range(repetitions * taken)]).astype(np.float64)
+    everything = Reference(pool)
+    truth = everything.signal / pool.var(0, ddof=1).sum()
+    covered = {"efficiency": 0, "slope": 0}
+    for part in pool.reshape(repetitions, taken, -1):
+        reference = Reference(part[steps:].reshape(rows, per_row, -1).mean(1))
+        samples = Samples(part[:steps], np.arange(steps) // 2, np.ones(steps // 2), reference)
+        efficiency, slope = samples.efficiency(), samples.slope()
+        assert efficiency is not None
+        assert slope is not None
+        covered["efficiency"] += efficiency.exponential().low <= truth <= efficiency.exponential().high
+        covered["slope"] += slope.interval().low <= -0.5 <= slope.interval().high
+    least, most = (stats.binom.ppf(p, repetitions, 0.95) for p in (0.0005, 0.9995))
+    print(covered)
+    assert all(least <= count <= most for count in covered.values()), covered
+
+
+# What is found out before anything is measured: references, dL/dI, and the border of the film.
+
+GAUSSIAN = ('<rfilter type="box"/>', '<rfilter type="gaussian"/>')
+
+
+def problem(folder: Path, *changes: tuple[str, str], overrides: tuple[str, ...] = ()) -> Any:
+    write_experiment(folder)
+    text = (folder / "scene.xml").read_text()
+    for old, new in changes:
+        assert old in text
+        text = text.replace(old, new)
+    (folder / "scene.xml").write_text(text)
+    return assemble_scene(load(folder / "tiny.yaml", list(overrides)))
+
+
+def asked(what: Any, objective: str = "fixed", camera: bool = False, named: bool = True) -> Any:
+    return survey(what, objective, camera=camera, named=named, budget_s=0.1)
+
+
+@pytest.mark.usefixtures("llvm")
+def test_facts(tmp_path: Path) -> None:
+    facts, arrays = asked(problem(tmp_path))
+    assert (facts["keys"], facts["shapes"]) == ([KEY], {KEY: [4, 4, 3]})
+    assert (facts["independent"], facts["why"], facts["without"]) == ({KEY: "ptracer"}, {KEY: ""}, {})
+    assert (facts["pixels"], facts["masked"]) == (64, False)
+    assert (arrays["adjoints"].shape, arrays["target-0"].shape) == ((1, 8, 8, 3), (8, 8, 3))
+    assert arrays["mask"].all()
+
+
+@pytest.mark.usefixtures("llvm")
+def test_the_loss_has_several_images(tmp_path: Path) -> None:
+    _, arrays = asked(problem(tmp_path), "loss")
+    assert arrays["adjoints"].shape == (IMAGES, 8, 8, 3)
+    assert len({adjoint.tobytes() for adjoint in arrays["adjoints"]}) == IMAGES
+
+
+@pytest.mark.usefixtures("llvm")
+@pytest.mark.parametrize(
+    ("camera", "change", "masked"),
+    [(True, GAUSSIAN, True), (False, GAUSSIAN, False), (True, ("box", "box"), False)],
+)
+def test_the_border_is_left_out_where_camera_paths_take_part(
+    tmp_path: Path, camera: bool, change: tuple[str, str], masked: bool
+) -> None:
+    facts, arrays = asked(problem(tmp_path, change), camera=camera)
+    assert facts["masked"] is masked
+    inside = arrays["mask"][:, :, 0] == 1
+    assert inside.all() is not masked
+    assert bool(inside[4, 4])
+    adjoint = np.abs(arrays["adjoints"][0]).sum(2)
+    assert (adjoint[~inside] == 0).all()
+    assert adjoint[4, 4] > 0
+    facts, arrays = asked(problem(tmp_path, change), "image", camera=camera)
+    assert (facts["shapes"], set(arrays)) == ({"image": [8, 8, 3]}, {"mask"})
+
+
+@pytest.mark.usefixtures("llvm")
+def test_what_is_right_for_nothing_is_told(tmp_path: Path) -> None:
+    facts, arrays = asked(problem(tmp_path, ("area", "directionalarea"), GAUSSIAN), camera=True, named=False)
+    assert list(facts["without"]) == ["prb"]
+    assert "directionalarea" in facts["without"]["prb"]
+    assert facts["independent"] == {KEY: "ptracer"}
+    assert arrays["mask"].all()  # it takes no part
+
+
+@pytest.mark.usefixtures("llvm")
+@pytest.mark.parametrize("mode", ["known", "loss", "image"])
+def test_steps_are_repeatable_and_the_border_counts_nothing(tmp_path: Path, mode: str) -> None:
+    what = problem(tmp_path, GAUSSIAN, overrides=("run.adjoint=independent",))
+    _, arrays = asked(what, "image" if mode == "image" else "loss", camera=True)
+    sampler = Sampler(what.config, mode, arrays)
+    row, times = sampler.step(3, 4, 0)
+    assert row.shape == ((192,) if mode == "image" else (48,))
+    assert row.any()
+    assert times.wall_ms > 0
+    again = sampler.step(3, 4, 0)[0]
+    np.testing.assert_allclose(again, row, rtol=1e-4, atol=1e-6)
+    assert not np.allclose(sampler.step(4, 4, 0)[0], row)
+    if mode == "image":
+        assert (row.reshape(8, 8, 3)[arrays["mask"][:, :, 0] == 0] == 0).all()
+    if mode == "known":
+        assert not np.allclose(sampler.step(3, 4, 1)[0], row, rtol=1e-6, atol=0)

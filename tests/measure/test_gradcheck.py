@@ -1,19 +1,35 @@
-"""Gradcheck on a small Cornell box: it holds as the code stands, and what is broken on purpose is found and named."""
+"""Gradcheck: it holds as the code stands, finds what is broken on purpose, goes on from another one."""
 
 from __future__ import annotations
 
+from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 from conformance.gradient_cases import CASES
+from measure.faults import checked
+from measure.faults import room as room_moving
+from measure.test_statistics import NAMES, Pretended
 from turns import a_few
 
-from reslrb_cli.config.loader import loads
+from reslrb_cli.config.loader import load, loads
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.integrators import forward
+from reslrb_cli.measure import sampling
 from reslrb_cli.measure.gradcheck import Gradcheck, Result
-from reslrb_cli.measure.gradients import Case, choose_step, directions, integrator, natural_bounds
+from reslrb_cli.measure.gradients import (
+    Case,
+    choose_step,
+    directions,
+    integrator,
+    moves_light,
+    natural_bounds,
+    smooth_rows,
+    smooth_weights,
+)
 from reslrb_cli.measure.methods import all_estimators, parse_estimators
 from reslrb_cli.measure.participants import Participants, Settings
 from reslrb_cli.measure.references import (
@@ -24,13 +40,18 @@ from reslrb_cli.measure.references import (
     ptracer_gradient,
     ptracer_image,
 )
+from reslrb_cli.measure.resume_store import Earlier
+from reslrb_cli.measure.sampling import FEWEST, KIND, Sampling, settings
 from reslrb_cli.measure.scenes import small
-from reslrb_cli.measure.scenes.small import camera, diffuse, rgb, room, transform
-from reslrb_cli.records.measurements import Kind, Reference, Verdict
+from reslrb_cli.measure.scenes.small import camera, diffuse, lamp, rgb, room, transform
+from reslrb_cli.measure.scenes.small import room as corner
+from reslrb_cli.records.measurement_files import read_samples, write_samples
+from reslrb_cli.records.measurements import GradcheckRecord, Kind, Reference, Verdict
 from reslrb_cli.report.tables import summary_lines
 from reslrb_cli.scene.visibility import interior
 
-pytestmark = pytest.mark.usefixtures("llvm")
+# Gradcheck on a small Cornell box: it holds as the code stands, and what is broken on purpose is found and named.
+
 SMALL = ["scene.options.size=32", "scene.options.texture=4", "run.spp=8", "integrator.max_depth=4"]
 
 
@@ -45,6 +66,7 @@ def failures(results: list[Result]) -> set[tuple[str | None, str]]:
     return {(record.estimator, record.reference.value) for record in found}
 
 
+@pytest.mark.usefixtures("llvm")
 def test_it_holds():
     results = check("integrator.rr_depth=2")
     assert failures(results) == set()
@@ -66,6 +88,7 @@ def test_it_holds():
     assert maps[0].z.shape == (4, 4)
 
 
+@pytest.mark.usefixtures("llvm")
 @pytest.mark.parametrize("drawn", a_few(["guiding=on", "sequence=low_discrepancy"], ["guiding=on"]))
 def test_paths_that_are_drawn_otherwise_agree_with_naive_ad_in_expectation(drawn: str):
     records = [result.record for result in check(f"integrator.{drawn}", estimators="stack", seeds=16)]
@@ -74,6 +97,7 @@ def test_paths_that_are_drawn_otherwise_agree_with_naive_ad_in_expectation(drawn
     assert kinds == {Kind.EXPECTATION}
 
 
+@pytest.mark.usefixtures("llvm")
 def test_a_selection_weight_that_is_wrong(monkeypatch: pytest.MonkeyPatch):
     """The reservoir alone is wrong, by a fifth: all references of it say so, and none of the others'."""
     from reslrb_cli.estimators import reservoir
@@ -84,6 +108,7 @@ def test_a_selection_weight_that_is_wrong(monkeypatch: pytest.MonkeyPatch):
     assert found == {("reservoir", name) for name in ("walk_ad", "ptracer", "finite_difference", "forward_mode")}
 
 
+@pytest.mark.usefixtures("llvm")
 def test_a_derivative_that_is_wrong_by_little(monkeypatch: pytest.MonkeyPatch):
     from reslrb_cli.estimators import stack
 
@@ -93,11 +118,13 @@ def test_a_derivative_that_is_wrong_by_little(monkeypatch: pytest.MonkeyPatch):
     assert found == {("stack", name) for name in ("walk_ad", "finite_difference", "forward_mode")}
 
 
+@pytest.mark.usefixtures("llvm")
 def test_forward_mode_without_the_weight_of_roulette(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(forward.TangentSplat, "survived", lambda self, state, weight: state)
     assert failures(check("integrator.rr_depth=1", estimators="stack")) == {("stack", "forward_mode")}
 
 
+@pytest.mark.usefixtures("llvm")
 def test_a_fault_of_the_walk_is_none_of_its_own_references(monkeypatch: pytest.MonkeyPatch):
     """Connections that are a third too strong: image and stock reference differ, naive AD and differences do not."""
     from reslrb_cli.transport import walk as segment
@@ -113,6 +140,7 @@ def test_a_fault_of_the_walk_is_none_of_its_own_references(monkeypatch: pytest.M
     assert failures(check(estimators="stack")) == {(None, "ptracer"), ("stack", "ptracer")}
 
 
+@pytest.mark.usefixtures("llvm")
 def test_rows_come_as_they_are_measured():
     """The first is there before the last estimator has taken a step, and what one row measured the next one uses."""
     config = loads(small.CORNELL_BOX, small.CORNELL_BOX_SOURCE, SMALL)
@@ -131,6 +159,7 @@ def test_rows_come_as_they_are_measured():
     ]
 
 
+@pytest.mark.usefixtures("llvm")
 def test_what_the_budget_does_not_suffice_for_is_named():
     config = loads(small.CORNELL_BOX, small.CORNELL_BOX_SOURCE, SMALL)
     ticks = iter(range(10_000))
@@ -146,6 +175,7 @@ def test_what_the_budget_does_not_suffice_for_is_named():
     )
 
 
+@pytest.mark.usefixtures("llvm")
 def test_what_is_interrupted_is_compared_with_what_is_done():
     config = loads(small.CORNELL_BOX, small.CORNELL_BOX_SOURCE, SMALL)
     asked = iter(range(10_000))
@@ -159,6 +189,7 @@ def test_what_is_interrupted_is_compared_with_what_is_done():
     assert list(fresh.run(lambda: True, lambda line: None)) == []
 
 
+@pytest.mark.usefixtures("llvm")
 def test_estimators_have_the_options_of_the_configuration():
     config = loads(
         small.CORNELL_BOX, small.CORNELL_BOX_SOURCE, ["integrator.estimator=reservoir", "integrator.capacity=4"]
@@ -177,9 +208,7 @@ def test_estimators_have_the_options_of_the_configuration():
             parse_estimators(text)
 
 
-# ---- What counts as a reference ----
-
-
+@pytest.mark.usefixtures("llvm")
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
 def test_references_are_those_of_the_conformance_tests(case):
     """The rules allow what each case was judged by, and refuse both stock integrators where differences alone were."""
@@ -194,6 +223,7 @@ def test_references_are_those_of_the_conformance_tests(case):
             assert reasons[case.reference](at, key) is None
 
 
+@pytest.mark.usefixtures("llvm")
 def test_references_refuse_what_they_cannot_do():
     scene = Case(room(floor={"type": "twosided", "bsdf": diffuse(0, 0, 0)}), ["floor.brdf_0.reflectance.value"])
     [key], sensor = scene.keys, scene.scene.sensors()[0]
@@ -212,6 +242,7 @@ def test_references_refuse_what_they_cannot_do():
     )
 
 
+@pytest.mark.usefixtures("llvm")
 def test_ptracer_is_no_reference_where_clip_planes_cut():
     lens = {"type": "thinlens", "aperture_radius": 0.05, "focus_distance": 4.0}
 
@@ -225,6 +256,7 @@ def test_ptracer_is_no_reference_where_clip_planes_cut():
     assert "before the sensor's near clip" in why(near_clip=4.0)
 
 
+@pytest.mark.usefixtures("llvm")
 def test_path_loses_what_masks_reflect_before_nothing():
     """A veil of opacity 0.4 and a lamp: the stock `path` shows 0.4 of what it is to show, `prb` and ours all of it."""
     veil = {"type": "mask", "opacity": 0.4, "bsdf": {"type": "twosided", "bsdf": diffuse(0.7, 0.6, 0.3)}}
@@ -238,6 +270,7 @@ def test_path_loses_what_masks_reflect_before_nothing():
     assert abs(path / ours - 0.4) < 0.02
 
 
+@pytest.mark.usefixtures("llvm")
 def test_a_wide_filter_has_no_weights_along_the_border():
     sensor = Case(room(camera=camera("gaussian")), []).scene.sensors()[0]
     inside = interior((16, 16, 3), sensor)
@@ -246,6 +279,7 @@ def test_a_wide_filter_has_no_weights_along_the_border():
     assert interior((16, 16, 3), Case(room(), []).scene.sensors()[0]).all()
 
 
+@pytest.mark.usefixtures("llvm")
 @pytest.mark.parametrize(
     ("reference", "dark"), [(Reference.PATH, True), (Reference.PRB, True), (Reference.PTRACER, False)]
 )
@@ -259,9 +293,7 @@ def test_images_are_compared_without_the_border_that_paths_from_the_lights_leave
     np.testing.assert_allclose(image[inside], case.image(integrators["walk_ad"], 1, 16)[inside], rtol=1e-3, atol=1e-5)
 
 
-# ---- Finite differences ----
-
-
+@pytest.mark.usefixtures("llvm")
 def test_a_step_has_the_truncation_error_that_it_says():
     """The image is a cubic in the albedo, whose differences are wrong by h^2 times the third derivative."""
     key = "side.brdf_0.reflectance.value"
@@ -278,6 +310,7 @@ def test_a_step_has_the_truncation_error_that_it_says():
             assert chosen.truncation < 1e-3 * abs(exact)
 
 
+@pytest.mark.usefixtures("llvm")
 def test_a_step_that_is_lost_in_rounding_is_not_taken():
     """Rounding of the scene, the same for all seeds, is no truncation: it grows as the step shrinks."""
 
@@ -290,6 +323,7 @@ def test_a_step_that_is_lost_in_rounding_is_not_taken():
     assert chosen.step == 0.01
 
 
+@pytest.mark.usefixtures("llvm")
 def test_directions_stay_within_the_bounds():
     key = "floor.brdf_0.reflectance.value"
     scene = Case(room(floor={"type": "twosided", "bsdf": diffuse(0, 0.5, 1)}), [key])
@@ -300,3 +334,214 @@ def test_directions_stay_within_the_bounds():
     assert natural_bounds("bsdf", np.array([1.5])) == (0, np.inf)
     assert natural_bounds("emitter", np.array([0.2])) == (0, np.inf)
     assert natural_bounds("bsdf", np.array([-1.5])) == (-np.inf, np.inf)
+
+
+# Gradcheck of parameters that move light: which references count, and which estimators take part.
+
+CONFIGS = Path(__file__).resolve().parents[2] / "configs"
+
+
+@pytest.mark.usefixtures("llvm")
+def test_a_lamp_that_moves():
+    records = checked(room_moving("lamp_over_floor.xml", "lamp.position"), "stack", 4)
+    of = {record.reference: record for record in records if record.parameter is not None}
+    assert of[Reference.WALK_AD].kind is Kind.EQUAL_SEEDS
+    assert of[Reference.WALK_AD].holds
+    assert of[Reference.FINITE_DIFFERENCE].holds
+    assert of[Reference.FINITE_DIFFERENCE].relative_l2 < 5e-3
+    assert of[Reference.PTRACER].verdict is Verdict.NO_REFERENCE
+    assert "an emitter that moves" in of[Reference.PTRACER].message
+    assert Reference.FORWARD_MODE not in of
+
+
+@pytest.mark.usefixtures("llvm")
+def test_who_takes_part():
+    config = room_moving("lamp_over_floor.xml", "lamp.position")
+    some = Gradcheck(Settings(config, all_estimators(config), 0, 3, named=False))
+    assert [case.label for case in some.participants.listed] == ["reslrb:reservoir", "reslrb:stack"]
+    assert {row.label for row in some.rows if row.key is not None} == {"reslrb:reservoir", "reslrb:stack"}
+    with pytest.raises(ConfigError, match="gather has no derivatives of what moves light; take reservoir, stack"):
+        Gradcheck(Settings(config, parse_estimators("gather,stack"), 0, 3))
+    still = room_moving("lamp_over_floor.xml", "floor.bsdf.reflectance.value")
+    all_of_them = Gradcheck(Settings(still, all_estimators(still), 0, 3, named=False))
+    assert len(all_of_them.participants.listed) == 4
+
+
+@pytest.mark.usefixtures("llvm")
+def test_ways_to_differentiate_the_film():
+    """Beside differences the filter's normalisation has its derivative, beside `ptracer` none; naive AD follows."""
+    parts = Gradcheck(
+        Settings(room_moving("wavy_glass.xml", "top.vertex_positions"), parse_estimators("stack"), 0, 3)
+    ).participants
+    assert parts.stock == {"top.vertex_positions": Reference.PTRACER}
+    assert parts.sampled("reslrb:stack", Reference.WALK_AD) == "reslrb:stack, as walk_ad"
+    assert parts.sampled("reslrb:stack", Reference.FINITE_DIFFERENCE) == "reslrb:stack"
+    assert parts.sampled("reslrb:stack", Reference.PTRACER) == "reslrb:stack, as ptracer"
+    assert set(parts.integrators) >= {"reslrb:stack", "reslrb:stack, as walk_ad", "reslrb:stack, as ptracer"}
+    assert parts.forward_mode
+
+
+@pytest.mark.usefixtures("llvm")
+@pytest.mark.parametrize("name", ["caustic_heightmap", pytest.param("lens_pose", marks=pytest.mark.long)])
+def test_forward_mode_of_what_is_a_function(name: str):
+    """Heights and motions are not in the scene: tangents have to reach what is, as gradients come back from there."""
+    small = ["scene.options={resx: 16, resy: 16}", "run.spp=4", "target.render.spp=4"]
+    parts = Participants(Settings(load(CONFIGS / f"{name}.yaml", small), parse_estimators("stack"), 0, 3))
+    [label] = (case.label for case in parts.listed)
+    gradient, slices = parts.gradient(label, 1), parts.slices()
+    for key in parts.case.keys:
+        along = [gradient @ direction.vector for direction in parts.directions[key]]
+        print(key, along, parts.tangents(label, key, 1))
+        assert gradient[slices[key]].any()
+        np.testing.assert_allclose(parts.tangents(label, key, 1), along, rtol=1e-3, atol=1e-4 * np.abs(along).max())
+
+
+@pytest.mark.usefixtures("llvm")
+def test_references_of_what_moves():
+    scene = corner(camera=camera("gaussian"), ball={"type": "sphere", "radius": 0.3, "bsdf": diffuse(0.5, 0.5, 0.5)},
+                   lamp=lamp(radiance=1.0))  # fmt: skip
+    case = Case(scene, [])
+
+    def at(*moved: str) -> Situation:
+        sensor = case.scene.sensors()[0]
+        return Situation.of(case.scene, sensor, case.params, 4, True, True, moved)
+
+    assert moves_light(case.params, "ball.to_world")
+    assert moves_light(case.params, "lamp.translation")
+    assert not moves_light(case.params, "ball.bsdf.reflectance.value")
+    assert ptracer_gradient(at("ball.to_world"), "ball.to_world") is None
+    assert "emitter" in (ptracer_gradient(at("lamp.to_world"), "lamp.to_world") or "")
+    assert "emitter" in (ptracer_gradient(at("ball.to_world", "lamp.to_world"), "ball.translation") or "")
+    assert "moves light" in (prb_gradient(at("ball.to_world"), "ball.to_world") or "")
+
+
+@pytest.mark.usefixtures("llvm")
+def test_smooth_directions():
+    """Neighbours move alike: otherwise the least step would fold a mesh."""
+    points = np.stack(np.meshgrid(np.linspace(0, 1, 50), [0.0], np.linspace(0, 1, 50)), -1).reshape(-1)
+    for row in smooth_rows("top.vertex_positions", points, 5.0, 3):
+        field = row.reshape(50, 50, 3)
+        assert 0.01 < np.abs(field).max() < 0.5
+        assert np.abs(np.diff(field, axis=0)).max() < 0.1 * np.abs(field).max() + 1e-12
+    [relief] = smooth_rows("top.heightmap", np.zeros((20, 30)), 5.0, 1)
+    assert relief.shape == (600,)
+    [turn] = smooth_rows("top.rotation", np.zeros(3), 5.0, 1)
+    assert 5 <= np.abs(turn).max() <= 10
+    weights = smooth_weights(16, 24)
+    assert weights.mean() == pytest.approx(1)
+    assert weights[0].max() == weights[:, -1].max() == 0
+
+
+# A gradcheck that goes on from another one: at the same seeds it comes to what a single one comes to.
+
+
+def check_again(
+    seeds: int, file: Path, earlier: Earlier | None = None, after: int = 10**6
+) -> tuple[list[GradcheckRecord], Earlier]:
+    """The records, and what the check keeps, by way of the disk; it is stopped after so many looks at the clock."""
+    config = loads(small.CORNELL_BOX, small.CORNELL_BOX_SOURCE, SMALL)
+    what = Settings(config, parse_estimators("stack"), 0, seeds)
+    made, looks = Gradcheck(what, earlier=earlier), iter(range(10**6))
+    records = [result.record for result in made.run(lambda: next(looks) > after, lambda line: None)]
+    kept = made.kept(settings(what, "llvm_ad_rgb", ""))
+    assert kept is not None
+    write_samples(file, *kept)
+    return records, Earlier(KIND, Path("g.jsonl"), *read_samples(file))
+
+
+def test_more_seeds_are_added_to_those_of_the_file(llvm: None, tmp_path: Path) -> None:
+    """One was interrupted in the midst of its differences, whose step had been chosen."""
+    whole, _ = check_again(6, tmp_path / "a.npz")
+    part, earlier = check_again(4, tmp_path / "b.npz", after=15)
+    assert {record.seeds for record in part if record.reference is Reference.FINITE_DIFFERENCE} < {3, 4}
+    assert earlier.head["steps"]
+    more, _ = check_again(6, tmp_path / "c.npz", earlier)
+    assert [(r.reference, r.verdict, r.seeds) for r in more] == [(r.reference, r.verdict, r.seeds) for r in whole]
+    for one, other in zip(more, whole, strict=True):
+        # What differs by rounding alone has no figures that would be the same twice.
+        noisy = one.reference is Reference.PTRACER
+        for name in ("relative_l2", "z_max", "z_rms", "variance_ratio") if noisy else ("relative_l2",):
+            assert getattr(one, name) == pytest.approx(getattr(other, name), rel=1e-2, abs=1e-4), (one.reference, name)
+    assert {record.verdict for record in more} == {Verdict.HOLDS}
+    with pytest.raises(ConfigError, match=r"g\.jsonl has 6 seeds already; name more with --seeds"):
+        check_again(6, tmp_path / "d.npz", Earlier(KIND, Path("g.jsonl"), *read_samples(tmp_path / "c.npz")))
+
+
+@pytest.mark.parametrize(
+    ("change", "line"),
+    [
+        ({"spp": 8}, "spp is None there, 8 here"),
+        ({"integrators": parse_estimators("event")}, "estimators is ['reslrb:stack'] there"),
+        ({"config": loads(small.CORNELL_BOX, small.CORNELL_BOX_SOURCE, ["run.seed=3"])}, "run.seed is 0 there, 3 here"),
+    ],
+)
+def test_only_the_same_is_gone_on_from(change: dict[str, Any], line: str) -> None:
+    what = Settings(loads(small.CORNELL_BOX, small.CORNELL_BOX_SOURCE), parse_estimators("stack"), 0, 4)
+    head = {"version": 2, "kind": KIND, "settings": settings(what, "llvm_ad_rgb", "")}
+    with pytest.raises(ConfigError) as caught:
+        Earlier(KIND, Path("g.jsonl"), head, {}).check(settings(replace(what, **change), "llvm_ad_rgb", ""))
+    assert f"--resume: g.jsonl is of another measurement: {line}" in str(caught.value)
+
+
+class Directed(Pretended):
+    """Participants that write down which seeds they are asked for."""
+
+    seeds: dict[str, list[int]] = {}  # noqa: RUF012 (looked at by the test)
+
+    def __init__(self, settings: Any) -> None:
+        super().__init__(settings)
+        Directed.seeds = {}
+
+    def gradient(self, label: str, seed: int) -> np.ndarray:
+        Directed.seeds.setdefault(label, []).append(seed)
+        return super().gradient(label, seed)
+
+    def choose_steps(self, key: str) -> None:
+        super().choose_steps(key)
+        self.directions[key] = [replace(self.directions[key][0], step=0.01, truncation=0.5)]
+
+
+def sampled(budget_s: float, earlier: Earlier | None = None, seeds: int | None = None) -> tuple[Sampling, float]:
+    clock = [0.0]
+    listed = [SimpleNamespace(label="reslrb:event"), SimpleNamespace(label="reslrb:stack")]
+    what: Any = SimpleNamespace(budget_s=budget_s, seeds=seeds, integrators=listed, clock=clock, spent_s=0.0)
+    made = Sampling(what, lambda: clock[0], earlier)
+    made.expect(NAMES)
+    for name in NAMES:
+        made.take(name, lambda: False, lambda line: None)
+    return made, clock[0]
+
+
+def again(made: Sampling) -> Earlier:
+    kept = made.kept({})
+    assert kept is not None
+    return Earlier(KIND, Path("g.jsonl"), *kept)
+
+
+def test_a_second_budget_adds_seeds_that_are_new_and_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sampling, "Participants", Directed)
+    first, _ = sampled(60.0)
+    before = {name: len(first.of(name)) for name in NAMES if len(first._samples.get(name, ())) > 0}
+    firsts = dict(Directed.seeds)
+    second, seconds = sampled(90.0, again(first))
+    assert seconds <= 90.0
+    assert all(len(second.of(name)) > before.get(name, 0) for name in NAMES)
+    for label, seeds in Directed.seeds.items():
+        assert not set(seeds) & set(firsts.get(label, ()))
+    # The step of differences is that of the first session, and is not chosen again.
+    assert second.participants.directions["a"][0].step == 0.01
+    assert second.participants.directions["a"][0].truncation == 0.5
+    assert ("differences", "a") not in before or ("choose", "a") not in second.participants.known
+
+
+@pytest.mark.parametrize("budget_s", [12.0, 30.0])
+def test_a_budget_that_is_too_small_says_what_the_fewest_take(budget_s: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sampling, "Participants", Directed)
+    made, _ = sampled(budget_s)
+    assert any(len(made._samples.get(name, ())) < FEWEST for name in NAMES)
+    needed_s = made.needed_s()
+    assert needed_s is not None
+    assert needed_s > budget_s
+    enough, seconds = sampled(1.3 * needed_s)
+    assert {name: len(enough._samples[name]) >= FEWEST for name in NAMES} == dict.fromkeys(NAMES, True)
+    assert seconds <= 1.3 * needed_s

@@ -1,18 +1,21 @@
-"""The share of a derivative that attached gradients lack, where it is known."""
+"""The share of a derivative that attached gradients lack, and those gradients against finite differences."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import drjit as dr
 import numpy as np
 import pytest
 from measure.analytic_motion import centre_of_gravity, parallel
-from measure.differenced import AttachedScene
+from measure.differenced import AttachedScene, Differenced, compare_with_differences
 from measure.faults import room
-from measure.moving_light import setting
+from measure.moving_light import ROOMS_SCENES as ROOMS
+from measure.moving_light import SCENES, setting
 
 from reslrb_cli.cli import main
 from reslrb_cli.errors import ConfigError
@@ -21,17 +24,21 @@ from reslrb_cli.measure import missing as missing_check
 from reslrb_cli.measure.gradients import Case, Direction, integrator, seeds
 from reslrb_cli.measure.missing import Missing, MissingCheck
 from reslrb_cli.measure.scenes.analytic import fresnel
-from reslrb_cli.measure.scenes.moving import Pose
+from reslrb_cli.measure.scenes.moving import Displacement, Move, Pose, smooth_fields, vertices
 from reslrb_cli.measure.scenes.small import transform
 from reslrb_cli.optimization import targets
 from reslrb_cli.records.measurements import LEAST, NOTHING, MissingRecord
+from reslrb_cli.transport import bsdf, connection
 from reslrb_cli.transport.film import AdjointImage
+from reslrb_cli.transport.walk import Segment
+
+# The share of a derivative that attached gradients lack, where it is known.
 
 HALF, EDGE, HEIGHT, TILT, IOR, SLAB = 0.6, 0.2, 1.4, 0.5, 1.5, 0.3
 SPP, SEEDS = 64, 24
 
 
-@pytest.fixture(autouse=True)
+@pytest.fixture
 def _quiet(llvm: str) -> None:
     import mitsuba as mi
 
@@ -93,6 +100,7 @@ def slab_share() -> float:
     return float(abs(border / (inside + border)))
 
 
+@pytest.mark.usefixtures("_quiet")
 @pytest.mark.long
 def test_a_texture_lacks_nothing():
     """Neither do colours: nothing moves."""
@@ -107,6 +115,7 @@ def test_a_texture_lacks_nothing():
     assert "nothing is missing" in record.line()
 
 
+@pytest.mark.usefixtures("_quiet")
 @pytest.mark.parametrize(
     ("scene", "known"),
     [
@@ -123,6 +132,7 @@ def test_known_shares(scene: Callable[[], AttachedScene], known: float):
     assert abs(found - known) < 4 * error + 1e-9
 
 
+@pytest.mark.usefixtures("_quiet")
 def test_a_fault_is_seen(monkeypatch: pytest.MonkeyPatch):
     """Of a gradient without what lands elsewhere, that is missing too."""
     right = AdjointImage.lookup
@@ -131,6 +141,7 @@ def test_a_fault_is_seen(monkeypatch: pytest.MonkeyPatch):
     assert abs(found - EDGE / HALF) > 10 * error
 
 
+@pytest.mark.usefixtures("_quiet")
 def test_steps_that_are_lost_in_rounding():
     """Rounding that is the same for all seeds is seen in how the extrapolation changes."""
 
@@ -146,6 +157,7 @@ def test_steps_that_are_lost_in_rounding():
     assert 0.005 < found.directions[0].step < 0.05
 
 
+@pytest.mark.usefixtures("_quiet")
 def test_what_is_lost_in_noise_has_no_share():
     random = np.random.default_rng(0)
     found = Missing([Direction(np.ones(2), "both")] * 2)
@@ -157,6 +169,7 @@ def test_what_is_lost_in_noise_has_no_share():
     assert line == "lamp.position: the derivative itself is less than what 16 seeds could see"
 
 
+@pytest.mark.usefixtures("_quiet")
 def test_errors_are_right():
     """Over many made measurements, the deviation from the known share is of the size of the stated error."""
     random, z = np.random.default_rng(1), []
@@ -189,6 +202,7 @@ run: {{iterations: 3, spp: 16}}
 """
 
 
+@pytest.mark.usefixtures("_quiet")
 def test_the_command_and_more_seeds(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
@@ -218,6 +232,7 @@ def test_the_command_and_more_seeds(
     assert "is of another measurement: directions is 2 there, None here" in capsys.readouterr().err
 
 
+@pytest.mark.usefixtures("_quiet")
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -236,6 +251,7 @@ def test_what_does_not_go_together(
     assert message in capsys.readouterr().err
 
 
+@pytest.mark.usefixtures("_quiet")
 def test_a_loss_without_a_derivative(monkeypatch: pytest.MonkeyPatch):
     """Without a segment to the floor all images are black, the target too, which is refused before."""
     monkeypatch.setattr(targets, "_check_light", lambda problem, say: None)
@@ -243,3 +259,73 @@ def test_a_loss_without_a_derivative(monkeypatch: pytest.MonkeyPatch):
     config = config.model_copy(update={"integrator": config.integrator.model_copy(update={"max_depth": 1})})
     with pytest.raises(ConfigError, match="no derivative"):
         MissingCheck(config, 0, 2, 16, 1)
+
+
+# Derivatives of what moves light against finite differences: a few scenes by default, all with `-m long`.
+
+#: Of the root mean square of the derivatives.
+ERROR, STANDARD_ERROR = 5e-3, 1e-3
+
+
+@pytest.mark.usefixtures("_quiet")
+def test_enough():
+    assert len(SCENES) >= 16
+
+
+#: Rooms in which light bounces are too noisy for that; `test_attached_sampling.py` has them.
+STEADY = [name for name in SCENES if name not in {room.name for room in ROOMS}]
+
+
+@pytest.mark.usefixtures("_quiet")
+@pytest.mark.long
+@pytest.mark.parametrize("name", STEADY)
+def test_every_scene(name: str):
+    found = compare_with_differences(SCENES[name])
+    print(name, found)
+    assert found.error < ERROR, found
+    assert found.standard_error < STANDARD_ERROR, found
+
+
+def beam(only: tuple[float, float, float], seeds: int = 2) -> Differenced:
+    """A slab in parallel light, of which some coordinates move, by a few directions."""
+
+    def moves(scene: Any) -> list[Move]:
+        return [Displacement("top.vertex_positions", smooth_fields(vertices(scene, "top"), 3, 1.0) * np.array(only))]
+
+    return compare_with_differences(replace(SCENES["slab_beam"], moves=moves), count=seeds)
+
+
+@pytest.mark.usefixtures("_quiet")
+def test_a_slab_whose_surface_bends():
+    found = beam((0, 1, 0), 4)
+    assert found.error < ERROR, found
+    assert found.standard_error < STANDARD_ERROR, found
+
+
+@pytest.mark.usefixtures("_quiet")
+def test_a_receiver_that_moves():
+    found = compare_with_differences(replace(SCENES["moved_receiver"], spp=16), count=3)
+    assert found.error < ERROR, found
+    assert found.standard_error < STANDARD_ERROR, found
+
+
+@pytest.mark.usefixtures("_quiet")
+def test_slopes_of_the_shading_correction_without_its_jumps(monkeypatch: pytest.MonkeyPatch):
+    """Faces that slide through the light: within each the correction has a slope, at their edges it jumps back."""
+    right = bsdf.shading_correction
+
+    def tracked(plan: Any, *rest: Any) -> Any:
+        return right(replace(plan, attached_normalization=False), *rest)
+
+    slides = (1, 0, 1)
+    assert beam(slides).error < ERROR
+    for module in (bsdf, connection):
+        monkeypatch.setattr(module, "shading_correction", tracked)
+    assert beam(slides).error > 2 * ERROR
+
+
+@pytest.mark.usefixtures("_quiet")
+def test_a_ray_that_does_not_follow_its_surface(monkeypatch: pytest.MonkeyPatch):
+    right = Segment.next_ray
+    monkeypatch.setattr(Segment, "next_ray", lambda self, attached=False: dr.detach(right(self, attached)))
+    assert beam((0, 1, 0)).error > 10 * ERROR

@@ -1,12 +1,38 @@
-"""The statistics that the conformance tests rest on: they hold for equal expectations, and see a small bias."""
+"""Whether two gradients agree: the statistics, what they see, and how a budget is spent on them."""
 
 from __future__ import annotations
+
+import json
+from dataclasses import asdict
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 from agreement import blocks, compare
 
-from reslrb_cli.measure.comparison import combined_z_rms, effective_entries, sidak, z_rms_limit, z_scores
+from reslrb_cli.measure import sampling
+from reslrb_cli.measure.comparison import (
+    Family,
+    combined_z_rms,
+    compare_equal_seeds,
+    compare_expectations,
+    divisions,
+    effective_entries,
+    entry_count,
+    overall,
+    parts,
+    sidak,
+    tail_weight,
+    z_rms_limit,
+    z_scores,
+)
+from reslrb_cli.measure.gradients import Direction
+from reslrb_cli.measure.sampling import FEWEST, LEAST_SEEDS, MOST_SEEDS, Name, Sampling
+from reslrb_cli.records.measurements import GradcheckRecord, Kind, Reference, Verdict
+from reslrb_cli.report.tables import Table, failure_line, markdown_table
+
+# The statistics that the conformance tests rest on: they hold for equal expectations, and see a small bias.
 
 
 def noise(seed: int, shape=(12, 32, 32, 3), mean: float = 1.0) -> np.ndarray:
@@ -85,3 +111,271 @@ def test_correlated_entries_are_not_counted_each():
         failed += not result
         assert not compare(a + np.repeat([0.0, 0, 1.6, 0, 0], 12), b, block=None)
     assert failed <= 9  # of 200, at 1 % for either criterion: more in one of 60 cases
+
+
+# Whether two gradients agree: what is equal holds, what is not fails, and what cannot be told is not called a pass.
+
+FAMILY = Family(rows=20, entries=400, alpha=1e-4)
+TRUTH = np.linspace(-2, 3, 24)
+
+
+def noisy(seed: int, count: int = 16, size: float = 0.2, truth: np.ndarray = TRUTH) -> np.ndarray:
+    return truth + size * np.random.default_rng(seed).normal(size=(count, len(truth)))
+
+
+@pytest.mark.parametrize("paired", [True, False])
+def test_equal_expectations_hold(paired: bool):
+    results = [compare_expectations(noisy(k), noisy(k + 100), FAMILY, paired=paired) for k in range(50)]
+    assert {result.verdict for result in results} == {Verdict.HOLDS}
+    assert np.mean([result.z_rms for result in results]) == pytest.approx(1, abs=0.05)
+    assert results[0].cosine == pytest.approx(1, abs=0.01)
+    assert np.mean([result.variance_ratio for result in results]) == pytest.approx(1, abs=0.1)
+
+
+@pytest.mark.parametrize("paired", [True, False])
+def test_a_deviation_of_the_size_that_is_called_detectable_is_seen(paired: bool):
+    seen = []
+    for k in range(100):
+        reference = noisy(k + 100)
+        size = compare_expectations(noisy(k), reference, FAMILY, paired=paired).detectable
+        seen.append(compare_expectations(noisy(k) + size * TRUTH, reference, FAMILY, paired=paired).verdict)
+    assert seen.count(Verdict.FAILS) >= 85  # 90 are expected, and more by z rms
+
+
+def test_shared_noise_sharpens_a_paired_comparison():
+    reference = noisy(1)
+    close = reference + 1e-3 * np.random.default_rng(2).normal(size=reference.shape)
+    assert compare_expectations(close, reference, FAMILY).detectable < 0.01
+    assert compare_expectations(close * 1.01, reference, FAMILY).verdict is Verdict.FAILS
+    assert compare_expectations(close * 1.01, reference, FAMILY, paired=False).verdict is Verdict.HOLDS
+
+
+def test_exact_values_and_what_they_may_be_wrong_by():
+    assert compare_expectations(noisy(1), TRUTH, FAMILY).verdict is Verdict.HOLDS
+    assert compare_expectations(noisy(1), TRUTH + 0.5, FAMILY).verdict is Verdict.FAILS
+    assert compare_expectations(noisy(1), TRUTH + 0.5, FAMILY, bias=0.5).verdict is Verdict.HOLDS
+    assert compare_expectations(noisy(1), TRUTH + 1.0, FAMILY, bias=0.5).verdict is Verdict.FAILS
+
+
+def test_what_noise_hides_is_unresolved():
+    result = compare_expectations(noisy(1, size=20), noisy(2, size=20), FAMILY)
+    assert result.verdict is Verdict.UNRESOLVED
+    assert result.detectable > 1
+
+
+def test_a_single_seed_that_carries_the_variance_is_no_pass():
+    ours = noisy(1)
+    ours[3] += 100
+    assert compare_expectations(ours, noisy(2), FAMILY).verdict is Verdict.HEAVY_TAILED
+
+
+def test_tails_of_noise_that_is_nothing_beside_the_reference_own_error_do_not_matter():
+    reference = np.ones((16, 4))
+    ours = reference + 1e-4
+    ours[3] += 3e-2  # one seed carries the variance, of a standard error of 2e-3
+    assert compare_expectations(ours, reference, FAMILY, bias=5e-3).verdict is Verdict.HEAVY_TAILED
+    assert compare_expectations(ours, reference, FAMILY, bias=5e-2).verdict is Verdict.HOLDS
+    assert compare_expectations(ours + 0.1, reference, FAMILY, bias=5e-2).verdict is Verdict.FAILS
+    assert tail_weight(ours) > 0.9
+    assert abs(tail_weight(noisy(3, 30))) < 0.1
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_what_is_not_finite_fails(value: float):
+    ours = noisy(1)
+    ours[2, 3] = value
+    for result in (compare_expectations(ours, noisy(2), FAMILY), compare_equal_seeds(ours, noisy(2))):
+        assert result.verdict is Verdict.FAILS
+        assert result.message == "the gradient has 1 entries that are not finite"
+
+
+def test_a_gradient_that_is_zero_on_one_side_fails():
+    zero = np.zeros((16, 24))
+    assert compare_expectations(zero, noisy(1), FAMILY).verdict is Verdict.FAILS
+    assert compare_expectations(noisy(1), zero, FAMILY).verdict is Verdict.FAILS
+    assert compare_equal_seeds(noisy(1), zero).verdict is Verdict.FAILS
+    assert compare_expectations(zero, zero, FAMILY).verdict is Verdict.UNREACHED
+
+
+def test_equal_seeds_are_compared_by_relative_l2():
+    ours = noisy(1)
+    assert compare_equal_seeds(ours * (1 + 1e-5), ours).verdict is Verdict.HOLDS
+    result = compare_equal_seeds(ours * (1 + 1e-3), ours)
+    assert (result.verdict, result.relative_l2) == (Verdict.FAILS, pytest.approx(1e-3))
+
+
+def test_limits_grow_with_the_table():
+    assert Family(1, 1, 0.05).z_max_limit == pytest.approx(1.96, abs=0.01)
+    assert Family(50, 1000).z_max_limit > Family(1, 10).z_max_limit
+    assert Family(50, 1000).z_rms_limit(10) > Family(1, 10).z_rms_limit(10)
+
+
+def test_parts_of_a_texture_and_what_takes_all_of_it_in():
+    shape, rng = (20, 30, 3), np.random.default_rng(0)
+    gradient = rng.normal(size=(2, 20 * 30 * 3))
+    tiles, whole = parts(gradient, shape, 8), overall(gradient)
+    assert tiles.shape == (2, 8 * 8 * 3)
+    assert whole.shape == (2, 17)
+    assert whole[:, -1] == pytest.approx(gradient.sum(1))
+    assert tiles.sum(1) == pytest.approx(gradient.sum(1))
+    grid = gradient.reshape(2, 20, 30, 3)
+    assert tiles[1, 0] == pytest.approx(grid[1, :2, :3, 0].sum())
+    # Two texels of one tile change places: sums are the same, projections are not.
+    swapped = grid.copy()
+    swapped[:, 0, 0], swapped[:, 0, 1] = grid[:, 0, 1], grid[:, 0, 0]
+    assert parts(swapped.reshape(2, -1), shape, 8) == pytest.approx(tiles)
+    assert np.abs(overall(swapped.reshape(2, -1)) - whole)[:, :-1].max() > 0.1
+
+
+@pytest.mark.parametrize(
+    ("shape", "count", "finest"),
+    [((), 1, 0), ((3,), 4, 0), ((4, 4, 3), 49, 0), ((1, 500, 1), 8 + 17, 8), ((1000,), 64 + 17, 8)],
+)
+def test_entry_count(shape: tuple[int, ...], count: int, finest: int):
+    assert (entry_count(shape), divisions(shape)[0]) == (count, finest)
+
+
+def test_a_texture_that_few_paths_meet_is_compared_in_larger_tiles():
+    """Rare, skewed samples in every texel: equal in expectation, and far from normal in single tiles."""
+    shape, tiled, coarser = (16, 16, 3), [], []
+    for k in range(30):
+        rng = np.random.default_rng(k)
+        ours, reference = (rng.exponential(1, (10, 768)) * (rng.random((10, 768)) < p) / p for p in (0.05, 1))
+        coarser.append(compare_expectations(ours, reference, FAMILY, shape=shape).verdict)
+        tiled.append(compare_expectations(parts(ours, shape, 8), parts(reference, shape, 8), FAMILY).verdict)
+    assert tiled.count(Verdict.FAILS) > 10
+    assert coarser.count(Verdict.HOLDS) == 30
+    assert compare_expectations(ours * 4, reference, FAMILY, shape=shape).verdict is Verdict.FAILS
+
+
+def record(**changes) -> GradcheckRecord:
+    values = {"case": "a.yaml", "parameter": "floor.data", "integrator": "reslrb", "estimator": "stack",
+              "reference": Reference.PTRACER, "kind": Kind.EXPECTATION, "seeds": 16, "verdict": Verdict.FAILS,
+              "relative_l2": 0.0312, "z_rms": 3.2, "z_rms_limit": 1.5, "z_max": 9.1, "z_max_limit": 5.2,
+              "detectable": 0.02}  # fmt: skip
+    return GradcheckRecord(**values | changes)
+
+
+def test_a_record_is_a_line_and_comes_back() -> None:
+    found = record(verdict=Verdict.UNRESOLVED, parameter=None)
+    line = json.loads(found.to_json())
+    assert {"case", "parameter", "integrator", "estimator", "reference", "seeds", "relative_l2", "z_rms", "z_max",
+            "cosine", "variance_ratio", "holds"} <= set(line)  # fmt: skip
+    assert (line["reference"], line["verdict"], line["holds"]) == ("ptracer", "unresolved", None)
+    assert json.loads(record(relative_l2=float("inf")).to_json())["relative_l2"] is None
+    assert json.loads(record().to_json())["holds"] is False
+    assert GradcheckRecord.of(json.loads(json.dumps(asdict(found)))) == found
+    with pytest.raises(ValueError, match="validation error"):
+        GradcheckRecord.of({"case": "a", "colour": 3})
+
+
+def test_table_and_the_line_of_a_failure():
+    table = Table([record()])
+    assert table.head().split() == ["parameter", "integrator", "reference", "seeds", "rel.", "L2", "z", "rms", "max",
+                                    "|z|", "cosine", "variance", "detectable", "verdict"]  # fmt: skip
+    assert table.line(record()).split() == ["floor.data", "reslrb:stack", "ptracer", "16", "3.1e-02", "3.20", ">",
+                                            "1.50", "9.1", ">", "5.2", "2.0%", "fails"]  # fmt: skip
+    assert failure_line(record()) == (
+        "a.yaml: floor.data: reslrb:stack against ptracer: z rms 3.2, limit 1.5; max |z| 9.1, limit 5.2; "
+        "the means differ by 3.12%"
+    )
+    lines = markdown_table([record(), record(verdict=Verdict.HOLDS)], cases=True).splitlines()
+    assert lines[0].startswith("| case | parameter | integrator |")
+    assert lines[2].startswith("| a.yaml | floor.data | reslrb:stack | ptracer | 16 | 3.1e-02 |")
+    assert [line.replace(r"\|", "").count("|") for line in lines] == [13] * 4
+
+
+# How a gradcheck spends its budget: with samples that only pretend, on a clock of their own.
+
+NAMES: list[Name] = [
+    ("image", "walk_ad"), ("image", "ptracer"), ("gradient", "reslrb:event"), ("gradient", "walk_ad"),
+    ("gradient", "ptracer"), ("differences", "a"), ("tangents", "a"), ("gradient", "reslrb:stack"),
+]  # fmt: skip
+
+
+class Pretended:
+    """Participants whose samples cost `sample_s` each, and `compile_s` more when they are taken for the first time."""
+
+    compile_s, sample_s, load_s = 5.0, 0.1, 2.0
+
+    def __init__(self, settings: Any) -> None:
+        self.now, self.known, self.exact = settings.clock, set(), {}
+        self.case = SimpleNamespace(initial={"a": np.zeros(3)})
+        self.listed = [SimpleNamespace(label="reslrb:event"), SimpleNamespace(label="reslrb:stack")]
+        self.integrators = dict.fromkeys(label for _, label in NAMES)
+        self.directions = {"a": [Direction(np.ones(3), "both")]}
+        self.now[0] += self.load_s
+
+    def _sample(self, *name: str) -> np.ndarray:
+        self.now[0] += self.sample_s + (0.0 if name in self.known else self.compile_s)
+        self.known.add(name)
+        return np.zeros(3)
+
+    def gradient(self, label: str, seed: int) -> np.ndarray:
+        return self._sample("gradient", label)
+
+    def picture(self, label: str, seed: int) -> np.ndarray:
+        return self._sample("image", label)
+
+    def differences(self, key: str, seed: int) -> np.ndarray:
+        return self._sample("differences", key)
+
+    def tangents(self, label: str, key: str, seed: int) -> np.ndarray:
+        return self._sample("tangents", key)
+
+    def choose_steps(self, key: str) -> None:
+        self._sample("choose", key)
+
+    def stock_labels(self) -> list[str]:
+        return ["ptracer"]
+
+
+@pytest.fixture
+def _pretend(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sampling, "Participants", Pretended)
+
+
+def spent(budget_s: float, seeds: int | None = None) -> tuple[dict[Name, int], float, list[str]]:
+    """Samples by name of those that were enough, the time that it took, and what was said."""
+    clock, said = [0.0], []
+    listed = [SimpleNamespace(label="reslrb:event"), SimpleNamespace(label="reslrb:stack")]
+    settings: Any = SimpleNamespace(budget_s=budget_s, seeds=seeds, integrators=listed, clock=clock, spent_s=0.0)
+    made = Sampling(settings, now=lambda: clock[0])
+    made.expect(NAMES)
+    counts = {name: len(made.of(name)) for name in NAMES if made.take(name, lambda: False, said.append)}
+    return counts, clock[0], said
+
+
+@pytest.mark.usefixtures("_pretend")
+def test_a_budget_that_suffices_for_all_is_kept_and_used() -> None:
+    counts, seconds, said = spent(90.0)
+    assert list(counts) == NAMES
+    assert 70.0 < seconds <= 90.0
+    assert min(counts.values()) >= LEAST_SEEDS
+    assert max(counts.values()) > LEAST_SEEDS
+    assert said[0].startswith("image walk_ad: seeds ")
+    assert said[0].endswith("of which the first 5.1 s")
+
+
+@pytest.mark.usefixtures("_pretend")
+def test_a_budget_without_end_takes_no_more_than_is_of_use() -> None:
+    counts, _, _ = spent(1e6)
+    cheap = [name for name in NAMES if name[0] == "image" or (name[0] == "gradient" and name[1] != "walk_ad")]
+    assert {name: MOST_SEEDS if name in cheap else LEAST_SEEDS for name in NAMES} == counts
+
+
+@pytest.mark.usefixtures("_pretend")
+@pytest.mark.parametrize("budget_s", [0.0, 1.0, 8.0, 20.0, 40.0])
+def test_a_budget_that_compiling_exceeds_is_overrun_by_one_first_sample(budget_s: float) -> None:
+    counts, seconds, _ = spent(budget_s)
+    assert seconds <= max(budget_s, 2.0) + 5.2 + 0.1
+    assert len(counts) < len(NAMES)
+    assert all(count >= FEWEST for count in counts.values())
+    assert bool(counts) == (budget_s > 2.0)
+
+
+@pytest.mark.usefixtures("_pretend")
+def test_a_number_of_seeds_is_kept_whatever_it_takes() -> None:
+    counts, seconds, _ = spent(0.0, seeds=5)
+    assert counts == dict.fromkeys(NAMES, 5)
+    assert seconds > 40.0

@@ -1,10 +1,13 @@
-"""Long runs: neither memory nor the time of a step grows; and what grows is seen."""
+"""Long runs: neither memory nor time grows; clock and allocator against costs that are planted."""
 
 from __future__ import annotations
 
+import math
+import statistics
 import sys
 import time
 from collections.abc import Iterator
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -12,21 +15,26 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from cli.tiny import write_experiment
+from cli.tiny import read_metrics, write_experiment
 from optimization.endurance import watch
 from optimization.toy import make_problem
 
+from reslrb_cli.cli import main
 from reslrb_cli.config.loader import load
 from reslrb_cli.estimators import ESTIMATORS
 from reslrb_cli.optimization import loop
 from reslrb_cli.optimization.assemble import assemble
+from reslrb_cli.records.clock import MIB, StepClock, peak_mib, reset_peak
+from reslrb_cli.runs import prepare
+from reslrb_cli.runs import recorder as recording
 
-pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+# Long runs: neither memory nor the time of a step grows; and what grows is seen.
 
 #: Iterations of the toy, by default, and of a block of these.
 FEW, BLOCK = 600, 2
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
 @pytest.mark.long
 @pytest.mark.parametrize("estimator", ESTIMATORS)
 def test_ten_thousand_iterations(tmp_path: Path, estimator: str) -> None:
@@ -46,6 +54,7 @@ def toy(tmp_path: Path, steps: Any) -> Iterator[Any]:
     steps.calls.clear()
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
 def test_the_loop_does_not_grow(toy: Any) -> None:
     """Its memory: so few iterations say little of time on a machine whose load changes."""
     watched = watch(loop.optimize(toy.problem), BLOCK)
@@ -53,6 +62,7 @@ def test_the_loop_does_not_grow(toy: Any) -> None:
     assert [fault for fault in watched.faults() if not fault.startswith("steps")] == []
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
 def test_a_leak_is_seen(toy: Any) -> None:
     kept = []
 
@@ -65,6 +75,7 @@ def test_a_leak_is_seen(toy: Any) -> None:
     assert any(fault.startswith("the allocator's peak grows by ") for fault in found), found
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
 def test_a_leak_beside_the_allocator_is_seen(toy: Any) -> None:
     kept = []
 
@@ -77,6 +88,7 @@ def test_a_leak_beside_the_allocator_is_seen(toy: Any) -> None:
     assert fault.startswith("memory grows by ")
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
 def test_a_slowdown_is_seen(toy: Any) -> None:
     def slow(call: int) -> float:
         until = time.process_time() + 1e-3 * call / FEW  # a fifth of a step or so, at the end
@@ -88,3 +100,131 @@ def test_a_slowdown_is_seen(toy: Any) -> None:
     watched = watch(loop.optimize(toy.problem), BLOCK)
     print(watched)
     assert any(fault.startswith("steps grow by ") for fault in watched.faults())
+
+
+# Clock and allocator's peak against costs that are planted: a kernel, a sleep, files that take long, a leak.
+
+#: Lanes of the kernels, and turns of the loop of the cheaper one: some ten milliseconds.
+LANES, TURNS = 2**16, 256
+SLEEP_S = 0.2
+
+
+def chain(turns: int) -> None:
+    """Launch a kernel whose only cost is a chain of so many dependent operations a lane."""
+
+    def turn(number: mi.UInt, value: mi.Float) -> tuple[mi.UInt, mi.Float]:
+        return number + 1, dr.fma(value, mi.Float(0.999), mi.Float(0.5))
+
+    end = dr.opaque(mi.UInt, turns)
+    state = (mi.UInt(0), dr.arange(mi.Float, LANES))
+    _, value = dr.while_loop(state, lambda number, value: number < end, turn, mode="symbolic")
+    dr.eval(value)
+
+
+def test_a_kernel_of_known_cost() -> None:
+    """As many times the operations are as many times the time, by the history as by the wall; and twice is twice.
+
+    Of the least of several repetitions, taken in turns, so that what else the machine does is not in them: more of them
+    where it does much. The same kernel is launched.
+    """
+    clock = StepClock()
+    kernel_ms: dict[int, float] = {}
+    wall_ms: dict[int, float] = {}
+    for repetition in range(64):
+        for turns, launches in ((TURNS, 1), (16 * TURNS, 1), (16 * TURNS + 1, 2)):
+            with clock.step() as step:
+                for _ in range(launches):
+                    chain(turns)
+            assert step.kernel_ms + step.codegen_ms <= 1.01 * step.wall_ms + 0.1
+            if repetition == 0:  # which compiles
+                continue
+            assert step.new_kernels == 0
+            kernel_ms[turns] = min(step.kernel_ms, kernel_ms.get(turns, math.inf))
+            wall_ms[turns] = min(step.wall_ms, wall_ms.get(turns, math.inf))
+        if repetition >= 7 and _as_expected(kernel_ms, wall_ms):
+            return
+    raise AssertionError((kernel_ms, wall_ms))
+
+
+def _as_expected(kernel_ms: dict[int, float], wall_ms: dict[int, float]) -> bool:
+    short, long, twice = kernel_ms.values()
+    wall = wall_ms[16 * TURNS]
+    return bool(
+        long / short == pytest.approx(16, rel=0.35)
+        and twice / long == pytest.approx(2, rel=0.25)
+        and long == pytest.approx(wall, rel=0.25)  # there is hardly anything else
+    )
+
+
+def test_what_python_does_in_a_step_is_no_kernel() -> None:
+    clock = StepClock()
+    with clock.step():
+        chain(TURNS)
+    with clock.step() as times:
+        chain(TURNS)
+        time.sleep(SLEEP_S)
+    assert times.wall_ms > 1e3 * SLEEP_S
+    assert times.kernel_ms < 0.5e3 * SLEEP_S
+    before = clock.elapsed_s
+    time.sleep(SLEEP_S)  # between steps
+    with clock.counted():
+        pass
+    assert clock.elapsed_s - before < 0.5 * SLEEP_S
+
+
+@pytest.mark.parametrize("what", ["MetricsWriter.write", "save_checkpoint"])
+def test_files_that_take_long_are_in_no_time_of_a_run(
+    what: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A disk that takes 0.2 s for every line, or every checkpoint, which are written after each iteration here."""
+    write_experiment(tmp_path)
+    monkeypatch.chdir(tmp_path)
+    holder: Any = recording.MetricsWriter if what == "MetricsWriter.write" else prepare
+    name = what.rpartition(".")[2]
+    written, slept = getattr(holder, name), []
+
+    def slowly(*arguments: Any, **options: Any) -> Any:
+        slept.append(SLEEP_S)
+        time.sleep(SLEEP_S)
+        return written(*arguments, **options)
+
+    monkeypatch.setattr(holder, name, slowly)
+    with pytest.raises(SystemExit) as ended:
+        main.main(["optimize", "tiny.yaml", "--set", "run={iterations: 8, spp: 4, checkpoint_every: {iterations: 1}}"])
+    assert not ended.value.code
+    assert len(slept) >= 8
+    times = [record["elapsed_s"] for record in read_metrics(Path("runs/tiny"))]
+    warm = [after - before for before, after in pairwise(times[2:])]
+    assert statistics.median(warm) < 0.5 * SLEEP_S
+
+
+def test_arrays_that_a_step_holds_are_in_the_peak_also_when_it_lets_go_of_them() -> None:
+    backend = dr.backend_v(mi.Float)
+    reset_peak()
+    before = peak_mib(backend)
+    array = dr.full(mi.Float, 1, 4 * 2**20)
+    dr.make_opaque(array)
+    assert peak_mib(backend) - before == pytest.approx(4 * 4 * 2**20 / MIB, rel=0.01)
+    del array
+    assert peak_mib(backend) - before == pytest.approx(16, rel=0.01)
+    reset_peak()
+    assert peak_mib(backend) == pytest.approx(before, abs=0.1)
+
+
+def test_a_leak_shows_in_the_peak_of_a_run(tmp_path: Path, steps: Any) -> None:
+    """Two MiB that each iteration leaves behind; without them the peak is flat."""
+    peaks: dict[bool, list[float]] = {}
+    for leaks in (False, True):
+        reset_peak()
+        left = []
+        problem = steps.problem = make_problem(tmp_path, sets=["run.iterations=6"])
+        peaks[leaks] = []
+        for record in loop.optimize(problem):
+            peaks[leaks].append(record.peak_mib)
+            if leaks:
+                left.append(dr.full(mi.Float, 1, 2**19))
+                dr.make_opaque(left[-1])
+        del left
+    sound, leaking = (np.diff(peaks[leaks])[1:] for leaks in (False, True))
+    assert (np.abs(sound) < 0.1).all()
+    assert leaking == pytest.approx(np.full(len(leaking), 2.0), rel=0.05)

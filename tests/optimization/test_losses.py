@@ -1,4 +1,4 @@
-"""Losses against NumPy, values and gradients."""
+"""Losses, exposures and masks: values, gradients, and what counts."""
 
 from __future__ import annotations
 
@@ -6,8 +6,18 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from agreement import compare
+from cli.tiny import KEY, write_experiment
 
-from reslrb_cli.optimization.views import LOSSES, make_loss
+from reslrb_cli.config.loader import load
+from reslrb_cli.errors import ConfigError
+from reslrb_cli.optimization.assemble import assemble
+from reslrb_cli.optimization.identifiability import check_exposures, find_ambiguous
+from reslrb_cli.optimization.loop import optimize
+from reslrb_cli.optimization.sensitivity import measure_sensitivities, sample_gradient, see_images, take_gradient
+from reslrb_cli.optimization.views import LOSSES, View, make_loss, view_records
+
+# Losses against NumPy, values and gradients.
 
 EPSILON = 0.02
 REFERENCES = {
@@ -70,3 +80,265 @@ def test_black_and_negative_pixels_stay_finite(name):
 def test_a_nan_is_not_hidden(name):
     image = mi.TensorXf(np.array([[[np.nan], [1.0]]], dtype=np.float32))
     assert np.isnan(np.array(make_loss(name)(image, mi.TensorXf(np.ones((1, 2, 1), dtype=np.float32)))))
+
+
+# Exposures that are recovered: their gradient, and where the images cannot tell them from parameters.
+
+#: Exposures that gradients are taken at.
+AT = {"auto": [1.3], "per_channel": [1.3, 0.7, 2.0]}
+ROUNDS = 200
+LAMP = "lamp.emitter.radiance.value"
+
+
+@pytest.fixture
+def folder(tmp_path):
+    write_experiment(tmp_path)
+    return tmp_path
+
+
+def make(folder, *sets):
+    return assemble(load(folder / "tiny.yaml", list(sets)))
+
+
+def set_exposure(problem, values):
+    slot = problem.selection.slot("exposure")
+    slot.set(np.array(values, np.float32).reshape(slot.get().shape))
+    leaf = problem.optimizer["exposure"]
+    problem.optimizer._scene["exposure"] = type(leaf)(problem.selection.value("exposure"))
+    dr.enable_grad(problem.optimizer["exposure"])
+
+
+@pytest.mark.parametrize("kind", AT)
+@pytest.mark.parametrize("adjoint", ["batched", "independent", "correlated"])
+def test_the_gradient_is_that_of_the_mean_image(folder, kind, adjoint):
+    """dL/dE of `l2` is the sum of 2 (E I - T) I over all entries, over their number; I is the mean image.
+
+    With the samples of dL/dI the noise of I would add its variance, which `correlated` shows.
+    """
+    problem = make(folder, f"target.exposure={kind}", f"run.adjoint={adjoint}", "run.spp=8")
+    set_exposure(problem, AT[kind])
+    rows = []
+    for round in range(ROUNDS):
+        sample_gradient(problem, problem.integrator, round, "exposure", 8)
+        rows.append(take_gradient(problem)["exposure"])
+    image, target = problem.render(0, 8192, 0, "mean").astype(np.float64), np.array(problem.views[0].target)
+    exact = 2 * (np.array(AT[kind]) * image - target) * image / image.size
+    exact = exact.sum((0, 1)) if kind == "per_channel" else np.array([exact.sum()])
+    reference = np.stack([exact, exact])  # without noise to speak of
+    found = compare(np.array(rows, np.float64)[:, None, None], reference[:, None, None], 1)
+    assert found.holds == (adjoint != "correlated"), found
+
+
+@pytest.mark.parametrize("views", ["auto", "[auto]"])
+def test_what_the_images_cannot_tell_apart_is_refused(folder, views):
+    """All light, or all that it falls on directly, scales the image as the exposure does."""
+    wall = make(folder, f"target.exposure={views}", "integrator.max_depth=2")
+    with pytest.raises(ConfigError, match=f"cannot tell `exposure.*` from `{KEY}`") as error:
+        check_exposures(wall)
+    assert error.value.key == "target.exposure"
+    lamp = make(folder, f"target.exposure={views}", f"parameters=[{{key: {LAMP}, initial: 5}}]")
+    found = find_ambiguous(lamp)
+    assert found is not None
+    assert found.parameters == [LAMP]
+    known = make(folder, "target.exposure=2", f"parameters=[{{key: {LAMP}, initial: 5}}]")
+    check_exposures(known)
+
+
+def test_a_colour_beside_a_known_one_is_recovered_with_the_exposure(folder):
+    scene = folder / "scene.xml"
+    scene.write_text(scene.read_text().replace("</scene>", """
+        <shape type="rectangle" id="side">
+            <transform name="to_world"><scale value="0.3"/><translate x="0.6" z="0.5"/></transform>
+            <bsdf type="diffuse"><rgb name="reflectance" value="0.1, 0.6, 0.3"/></bsdf>
+        </shape></scene>"""))  # fmt: skip
+    plain = make(folder, "parameters[0].initial=scene")
+    image = 0.6 * plain.render(0, 4096, 0, "photo")
+    side = "side.bsdf.reflectance.value"
+    mi.Bitmap(image.astype(np.float32)).write(str(folder / "photo.exr"))
+    problem = make(
+        folder, "target={file: photo.exr, exposure: auto}",
+        f"parameters=[{{key: {side}, initial: 0.3, bounds: [0, 1]}}]",
+        "run.iterations=100", "run.spp=256", "optimizer.schedule=cosine", "integrator.max_depth=3",
+    )  # fmt: skip
+    values = [problem.selection.array("exposure").copy() for _ in optimize(problem)]
+    assert abs(float(values[-1]) - 0.6) < 0.02
+    np.testing.assert_allclose(problem.selection.array(side), [0.1, 0.6, 0.3], atol=0.04)
+
+
+# Masks: which pixels they leave out, and that nothing of those counts.
+
+#: Pixels (y, x) of the target that are not to be trusted, one of each kind.
+CLIPPED, CLEAR, BROKEN = (1, 2), (3, 4), (5, 6)
+GLASS = """
+    <shape type="sphere" id="ball">
+        <float name="radius" value="0.4"/> <point name="center" x="0" y="0" z="1"/> <bsdf type="{}"/>
+    </shape>
+</scene>"""
+
+
+@pytest.fixture
+def masked_folder(tmp_path):
+    """The tiny experiment, with a PNG of 8 bits and an EXR as photographs."""
+    write_experiment(tmp_path)
+    rng = np.random.default_rng(1)
+    pixels = rng.integers(40, 200, (8, 8, 4), dtype=np.uint8)
+    pixels[:, :, 3] = 255
+    pixels[CLIPPED][1] = 255
+    pixels[CLEAR][3] = 0
+    mi.Bitmap(pixels).write(str(tmp_path / "photo.png"))
+    floats = rng.uniform(0.1, 2, (8, 8, 3)).astype(np.float32)
+    floats[BROKEN][2] = np.nan
+    mi.Bitmap(floats).write(str(tmp_path / "photo.exr"))
+    return tmp_path
+
+
+def make_masked(folder, *sets):
+    said = []
+    problem = assemble(load(folder / "tiny.yaml", ["target.render=null", *sets]), said.append)
+    return problem, [line for line in said if line.startswith("view ")]
+
+
+def left_out(problem):
+    """The pixels (y, x) that have no weight."""
+    [view] = problem.views
+    return [] if view.weights is None else [tuple(at) for at in np.argwhere(np.array(view.weights)[:, :, 0] == 0)]
+
+
+@pytest.mark.parametrize("name", LOSSES)
+def test_a_masked_loss_is_that_of_what_is_left(name):
+    rng = np.random.default_rng(2)
+    image, target = (rng.uniform(0.1, 2, (4, 5, 3)).astype(np.float32) for _ in range(2))
+    weights = np.where(rng.uniform(size=(4, 5)) > 0.4, rng.uniform(0.5, 3, (4, 5)), 0)
+    image[weights == 0], target[weights == 0] = np.inf, np.nan
+    view = View(0, make_loss(name))
+    view.see(target, weights)
+    leaf = mi.TensorXf(image)
+    dr.enable_grad(leaf)
+    loss = view.compare(leaf)
+    dr.backward(loss)
+
+    kept, total = weights > 0, 0.0
+    for y, x in np.argwhere(kept):
+        pixel = (slice(y, y + 1), slice(x, x + 1))
+        one = make_loss(name)(mi.TensorXf(image[pixel].copy()), mi.TensorXf(target[pixel].copy()))
+        total += weights[y, x] * float(one[0])
+    np.testing.assert_allclose(float(loss[0]), total / weights.sum(), rtol=1e-5)
+    gradient = np.array(dr.grad(leaf))
+    assert np.isfinite(gradient).all()
+    assert not gradient[~kept].any()
+    assert gradient[kept].all()
+
+
+def test_kinds_of_a_file(masked_folder):
+    problem, lines = make_masked(masked_folder, "target.file=photo.png")
+    assert left_out(problem) == [CLIPPED, CLEAR]
+    [record] = view_records(problem.views)
+    assert (record["kinds"], record["left_out"]) == ({"clipped": 1, "alpha": 1}, 2)
+    assert lines == ["view 0: 2 of 64 pixels (3.1%) are left out: 1 are clipped, 1 have alpha 0"]
+    assert left_out(make_masked(masked_folder, "target.file=photo.png", "target.mask={clipped: false}")[0]) == [CLEAR]
+    problem, lines = make_masked(masked_folder, "target.file=photo.png", "target.mask=none")
+    assert (left_out(problem), lines) == ([], [])
+
+
+def test_photograph_and_weights_are_turned_each_by_its_own_exif(masked_folder):
+    """The same picture upright, and upside down with an EXIF that says so, make the same target and mask."""
+    from PIL import Image  # comes with matplotlib
+
+    pixels = np.random.default_rng(2).integers(40, 200, (8, 8, 3), dtype=np.uint8)
+    pixels[1, 2] = 255
+    weights = np.full((8, 8), 255, np.uint8)
+    weights[5, 1] = 0
+    for name, orientation in (("up", 1), ("down", 3)):
+        for kind, array in (("photo", pixels), ("weights", weights)):
+            image = Image.fromarray(array if orientation == 1 else array[::-1, ::-1])
+            exif = image.getexif()
+            exif[0x0112] = orientation
+            image.save(masked_folder / f"{kind}-{name}.png", exif=exif)
+    only = "target.mask={file: weights-%s.png, border: false}"
+    upright, _ = make_masked(masked_folder, "target.file=photo-up.png", only % "up")
+    said = []
+    sets = ["target.render=null", "target.file=photo-down.png", only % "down"]
+    turned = assemble(load(masked_folder / "tiny.yaml", sets), said.append)
+    assert left_out(turned) == left_out(upright) == [(1, 2), (5, 1)]
+    np.testing.assert_array_equal(np.array(turned.views[0].target), np.array(upright.views[0].target))
+    assert f"{masked_folder}/photo-down.png: turned by 180 degrees, as its EXIF orientation says" in said
+
+
+def test_values_that_are_not_finite(masked_folder):
+    problem, _ = make_masked(masked_folder, "target.file=photo.exr")
+    assert left_out(problem) == [BROKEN]
+    assert np.isfinite(np.array(problem.views[0].target)).all()
+    with pytest.raises(ConfigError, match="not finite") as error:
+        make_masked(masked_folder, "target.file=photo.exr", "target.mask={nonfinite: false}")
+    assert error.value.key == "target.file"
+
+
+def test_weights_of_a_file(masked_folder):
+    weights = np.full((8, 8, 1), 128, np.uint8)
+    weights[0, 0], weights[7, 7] = 0, 255
+    mi.Bitmap(weights).write(str(masked_folder / "weights.png"))
+    problem, _ = make_masked(masked_folder, "target.file=photo.png", "target.mask=weights.png")
+    found = np.array(problem.views[0].weights)[:, :, 0]
+    assert left_out(problem) == [(0, 0)]  # alone: what is clipped counts
+    np.testing.assert_allclose(found[7, 7] / found[1, 2], 255 / 128, rtol=1e-5)
+    np.testing.assert_allclose(found.mean(), 1, rtol=1e-5)
+    problem, _ = make_masked(masked_folder, "target.file=photo.png", "target.mask={file: weights.png}")
+    assert left_out(problem) == [(0, 0), CLIPPED, CLEAR]
+    with pytest.raises(ConfigError) as error:
+        make_masked(masked_folder, "target.file=photo.png", "target.mask=missing.png")
+    assert error.value.key == "target.mask.file"
+
+
+@pytest.mark.parametrize(("maker", "count"), [("prb", 48), ("reslrb", 0)])
+def test_the_border_is_left_out_where_one_is_not_light_traced(masked_folder, maker, count):
+    scene = masked_folder / "scene.xml"
+    scene.write_text(scene.read_text().replace('rfilter type="box"', 'rfilter type="gaussian"'))
+    render = f"target.render={{spp: 4, integrator: {{type: {maker}, max_depth: 3}}}}"
+    assert len(left_out(assemble(load(masked_folder / "tiny.yaml", [render])))) == count
+    assert not left_out(assemble(load(masked_folder / "tiny.yaml", [render, "target.mask={border: false}"])))
+    if maker == "prb":  # paths from the camera lose nothing there
+        same = ["integrator={type: prb, max_depth: 3}", render]
+        assert not left_out(assemble(load(masked_folder / "tiny.yaml", same)))
+
+
+@pytest.mark.parametrize(("bsdf", "kind"), [("conductor", "specular"), ("plastic", "mixed")])
+def test_what_light_tracing_cannot_see(masked_folder, bsdf, kind):
+    scene = masked_folder / "scene.xml"
+    scene.write_text(scene.read_text().replace("</scene>", GLASS.format(bsdf)))
+    problem, lines = make_masked(masked_folder, "target.file=photo.png")
+    masked = problem.views[0].masked
+    if kind == "specular":
+        assert 0 < masked.counts()["specular"] < 40
+        assert (3, 3) in left_out(problem)
+        return
+    assert masked.counts().keys() == {"clipped", "alpha"}
+    assert masked.stay["mixed"] > 0
+    assert "see coats, blends or thin panes and stay (mask_mixed: true leaves them out)" in lines[0]
+    problem, _ = make_masked(masked_folder, "target.file=photo.png", "target.mask_mixed=true")
+    assert problem.views[0].masked.counts()["mixed"] == masked.stay["mixed"]
+
+
+def test_an_empty_mask_is_refused(masked_folder):
+    mi.Bitmap(np.zeros((8, 8, 3), np.float32)).write(str(masked_folder / "nothing.exr"))
+    with pytest.raises(ConfigError, match=r"leaves nothing to compare .*64 have weight 0 in the mask's file") as error:
+        make_masked(masked_folder, "target.file=photo.png", "target.mask=nothing.exr")
+    assert error.value.key == "target.mask"
+
+
+def test_nothing_of_what_is_left_out_counts(masked_folder):
+    """Neither gradients, as the pilot takes them, nor sensitivities see what an alpha of 0 hides."""
+    found = []
+    for value in (60, 200):
+        pixels = np.array(mi.Bitmap(str(masked_folder / "photo.png")))
+        pixels[CLEAR] = (value, value, value, 0)
+        mi.Bitmap(pixels).write(str(masked_folder / "photo.png"))
+        problem, _ = make_masked(masked_folder, "target.file=photo.png")
+        sample_gradient(problem, problem.integrator, 0, "test", 4)
+        [gradient] = take_gradient(problem).values()
+        found.append((gradient, measure_sensitivities(problem, 2)))
+    np.testing.assert_array_equal(found[0][0], found[1][0])
+    assert found[0][1] == found[1][1]
+    problem, _ = make_masked(masked_folder, "target.file=photo.png", "run.spp=256")
+    [image] = see_images(problem)
+    assert not image[CLEAR].any()
+    assert image[4, 4].all()

@@ -1,16 +1,26 @@
-"""Parameters in a few numbers, and results that are there whenever a run ends."""
+"""Results: parameters in a few numbers, their errors, the best of them, and images that are saved."""
 
 from __future__ import annotations
 
 import json
+import math
+from dataclasses import replace
+from pathlib import Path
 
+import mitsuba as mi
 import numpy as np
 import pytest
 from optimization.toy import make_problem
-from records.test_metrics import make_record
+from records.test_metrics import RECORD, make_record
 
-from reslrb_cli.optimization import loop
-from reslrb_cli.optimization.results import Results, summary
+from reslrb_cli.config.loader import load, loads
+from reslrb_cli.optimization import loading, loop
+from reslrb_cli.optimization.assemble import assemble_scene
+from reslrb_cli.optimization.errors import ErrorMeter, nearest, quantity
+from reslrb_cli.optimization.results import WINDOW, Best, Results, summary
+from reslrb_cli.scene.values import resample
+
+# Parameters in a few numbers, and results that are there whenever a run ends.
 
 
 def test_small_parameters_are_told_by_all_their_numbers():
@@ -85,3 +95,222 @@ def test_an_image_of_each_sensor_is_asked_for(tmp_path):
     assert results.to_json()["image_loss"]["final"] is None
     results.see("final", problem.views[1], image)
     assert results.to_json()["image_loss"]["final"] == pytest.approx(0.04, rel=1e-4)
+
+
+# Errors of parameters: over what is reached, in units that add up or do not, and at resolutions that differ.
+
+
+def texture(height, width, seed=0):
+    return np.random.default_rng(seed).uniform(0.1, 0.9, (height, width, 3)).astype(np.float32)
+
+
+def everything(array):
+    return np.ones(array.shape[:2] if array.ndim == 3 else array.shape, dtype=bool)
+
+
+def meter_of(truth, quantities=None):
+    return ErrorMeter(truth, {key: everything(value) for key, value in truth.items()}, quantities)
+
+
+def test_errors_are_taken_over_the_mask(tmp_path):
+    problem = make_problem(tmp_path)
+    problem.truth["albedo"] = np.array(problem.optimizer["albedo"]) + np.array([[[1.0], [50.0]], [[2.0], [3.0]]])
+    meter = problem.error_meter()
+    errors = meter.errors(problem.selection.array)
+    assert errors["albedo"] == pytest.approx(np.sqrt((1 + 4 + 9) / 3), rel=1e-5)
+    assert meter.total(errors) == pytest.approx(np.sqrt((1 + 4 + 9) / 3), rel=1e-5)
+    truth = problem.truth["albedo"][problem.masks["albedo"]]
+    assert meter.scales["albedo"] == pytest.approx(np.sqrt(np.mean(truth**2)), rel=1e-5)
+    problem.masks["albedo"][:] = False
+    meter = problem.error_meter()
+    assert meter.errors(problem.selection.array) == {}
+    assert meter.total({}) is None
+
+
+def test_the_error_of_several_parameters_counts_their_entries():
+    meter = meter_of({"a.reflectance": np.zeros(3), "b.alpha": np.zeros(())})
+    errors = meter.errors(lambda key: np.full((3,) if key.startswith("a") else (), 1.0 if key.startswith("a") else 3.0))
+    assert errors == {"a.reflectance": 1.0, "b.alpha": 3.0}
+    assert meter.total(errors) == pytest.approx(np.sqrt((3 * 1 + 9) / 4))
+
+
+def test_units_that_differ_are_not_added_up():
+    truth = {"wall": np.full(3, 0.5), "lamp": np.full(3, 2e6)}
+    values = {"wall": np.full(3, 0.6), "lamp": np.full(3, 1e6)}
+    meter = meter_of(truth, {"wall": "", "lamp": "intensity"})
+    errors = meter.errors(values.__getitem__)
+    assert not meter.one_unit
+    assert meter.total(errors) is None
+    assert meter.relative(errors) == {"wall": pytest.approx(0.2), "lamp": pytest.approx(0.5)}
+    same = meter_of(truth, {"wall": "radiance", "lamp": "radiance"})
+    assert same.one_unit
+    assert same.total(errors) == pytest.approx(1e6 / np.sqrt(2), rel=1e-6)
+
+
+def test_units_of_what_has_no_error_do_not_matter():
+    """A lamp that nothing reaches has no error that could be added."""
+    masks = {"wall": np.ones(3, bool), "lamp": np.zeros(3, bool)}
+    meter = ErrorMeter({"wall": np.ones(3), "lamp": np.ones(3)}, masks, {"wall": "", "lamp": "intensity"})
+    assert meter.one_unit
+    assert meter.errors(lambda key: np.zeros(3)) == {"wall": 1.0}
+
+
+def test_a_black_truth_has_no_relative_error():
+    meter = meter_of({"soot": np.zeros(3), "wall": np.ones(3)})
+    assert meter.relative({"soot": 0.3, "wall": 0.5}) == {"wall": 0.5}
+
+
+@pytest.mark.parametrize(("own", "true"), [((4, 6), (8, 12)), ((16, 12), (8, 6)), ((4, 12), (8, 6)), ((5, 7), (8, 8))])
+def test_another_resolution_is_compared_on_the_finer_grid(own, true):
+    value, truth = texture(*own, seed=1), texture(*true, seed=2)
+    mask = np.ones(own, dtype=bool)
+    mask[: own[0] // 2] = False
+    grid = max(own[0], true[0]), max(own[1], true[1])
+    expected = (resample(value, grid[::-1]) - resample(truth, grid[::-1]))[nearest(mask, grid)]
+    error = ErrorMeter({"t": truth}, {"t": mask}).errors(lambda key: value)["t"]
+    assert error == pytest.approx(np.sqrt(np.mean(np.square(expected, dtype=np.float64))), rel=1e-5)
+    flat = ErrorMeter({"t": np.full_like(truth, 0.3)}, {"t": mask}).errors(lambda key: np.full_like(value, 0.5))
+    assert flat["t"] == pytest.approx(0.2, rel=1e-5)
+
+
+def test_the_truth_at_its_own_resolution_is_resampled_by_nothing():
+    value, truth = texture(4, 4, seed=1), texture(4, 4, seed=2)
+    error = meter_of({"t": truth}).errors(lambda key: value)["t"]
+    assert error == pytest.approx(np.sqrt(np.mean(np.square(value - truth, dtype=np.float64))), rel=1e-6)
+
+
+def test_a_mask_on_a_finer_grid():
+    mask = np.array([[True, False], [False, False]])
+    expected = np.zeros((4, 6), dtype=bool)
+    expected[:2, :3] = True
+    assert np.array_equal(nearest(mask, (4, 6)), expected)
+    assert np.array_equal(nearest(expected, (2, 2)), mask)
+
+
+IMAGE = {"type": "bitmap", "raw": True}
+EMITTERS = {
+    "area": ({"type": "rectangle", "light": {"type": "area"}}, "emitter.radiance.value", "radiance"),
+    "point": ({"type": "point"}, "intensity.value", "intensity"),
+    "spot": ({"type": "spot"}, "intensity.value", "intensity"),
+    "spot's texture": ({"type": "spot"}, "texture.value", ""),
+    "directional": ({"type": "directional"}, "irradiance.value", "irradiance"),
+    "constant": ({"type": "constant"}, "radiance.value", "radiance"),
+    "envmap": ({"type": "envmap"}, "data", "radiance"),
+    "envmap's scale": ({"type": "envmap"}, "scale", ""),
+    "projector": ({"type": "projector"}, "irradiance.data", "irradiance"),
+    "projector's scale": ({"type": "projector"}, "scale", ""),
+    "sky": ({"type": "sunsky"}, "turbidity", ""),
+    "bsdf": ({"type": "rectangle", "light": {"type": "area"}}, "bsdf.reflectance.value", ""),
+    "roughness": ({"type": "roughconductor"}, "alpha.value", ""),
+}
+
+
+@pytest.mark.parametrize("name", EMITTERS)
+def test_quantities(name):
+    scene, key, expected = EMITTERS[name]
+    bitmap = mi.Bitmap(np.ones((4, 4, 3), dtype=np.float32))
+    if scene["type"] == "envmap":
+        scene = {**scene, "bitmap": bitmap}
+    if scene["type"] == "projector":
+        scene = {**scene, "irradiance": {**IMAGE, "bitmap": bitmap}}
+    params = mi.traverse(mi.load_dict(scene))
+    assert quantity(params, key) == expected
+
+
+# The best parameters of a run: by the mean of some losses, or by views that are held out.
+
+
+def seen(losses, held_out=None):
+    best = Best(held_out is not None)
+    for number, loss in enumerate(losses):
+        held = held_out[number] if held_out is not None else None
+        best.see(replace(RECORD, iteration=number, loss=loss, held_out=held), {"a": number})
+    return best
+
+
+def test_noise_is_not_taken_for_the_best():
+    """One lucky loss at the start, and less of it on the average later."""
+    losses = [0.01] + [1.0] * 20 + [0.5] * 15 + [0.9] * 20
+    best = seen(losses)
+    means = [np.mean(losses[end - WINDOW : end]) for end in range(WINDOW, len(losses) + 1)]
+    assert best.iteration == int(np.argmin(means)) + WINDOW - 1
+    assert best.values == {"a": best.iteration}
+    assert best.loss == pytest.approx(0.5)
+
+
+def test_there_is_none_before_the_window_is_full():
+    assert seen([1.0] * (WINDOW - 1)).to_json() is None
+    assert seen([1.0] * WINDOW).to_json()["iteration"] == WINDOW - 1
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf])
+def test_what_is_not_finite_is_never_the_best(bad):
+    assert seen([bad] * 30).iteration is None
+    assert seen([*[bad] * 5, *[2.0] * 30]).iteration == 5 + WINDOW - 1
+
+
+def test_views_that_are_held_out_decide():
+    held_out = [3.0, None, 1.0, None, 2.0]
+    best = seen([5.0, 4.0, 3.0, 2.0, 1.0], held_out)
+    assert (best.iteration, best.loss, best.values) == (2, 1.0, {"a": 2})
+
+
+@pytest.mark.parametrize("at", [3, 12, 25])
+def test_it_goes_on_from_what_it_was(at):
+    losses = list(np.random.default_rng(3).uniform(size=40))
+    whole, part = seen(losses), seen(losses[:at])
+    again = Best(False)
+    records = [replace(RECORD, iteration=number, loss=loss) for number, loss in enumerate(losses)]
+    again.recall(records[:at])
+    if part.iteration is not None:
+        again.restore(part.iteration, part.loss, part.values)
+    for record in records[at:]:
+        again.see(record, {"a": record.iteration})
+    assert again.to_json() == whole.to_json()
+    assert again.values == whole.values
+
+
+# Images that are saved: which of them are recorded.
+
+CONFIG = Path(__file__).resolve().parents[2] / "configs" / "stiff" / "lamp.yaml"
+TINY = ["scene.options={resx: 12, resy: 12}", "integrator.max_depth=2", "integrator.freeze=true"]
+
+
+@pytest.mark.parametrize(("most", "recorded"), [(12 * 12 * 8, True), (12 * 12 * 8 - 1, False)])
+def test_only_small_images_are_recorded(monkeypatch, most, recorded):
+    """The trials of a recording render an image three times more: no gain where that takes long, and it comes once."""
+    monkeypatch.setattr(loading, "MOST_PATHS_APART", most)
+    problem = assemble_scene(load(CONFIG, TINY))
+    image = problem.render(0, 8, 0, "saved image")
+    assert bool(problem.integrator.preparation.recordings.counts()) == recorded
+    problem = replace(problem, integrator=problem.integrator.with_options(samples_per_pass=None, freeze=False))
+    assert np.array_equal(image, problem.render(0, 8, 0, "saved image"))
+
+
+def test_passes_of_a_large_image_are_not_recorded(monkeypatch):
+    """However small the last of them is."""
+    monkeypatch.setattr(loading, "PATHS_PER_PASS", 12 * 12 * 4)
+    monkeypatch.setattr(loading, "MOST_PATHS_APART", 12 * 12 * 3)
+    problem = assemble_scene(load(CONFIG, TINY))
+    problem.render(0, 5, 0, "saved image")
+    assert not problem.integrator.preparation.recordings.counts()
+
+
+def test_a_run_with_ptracer_says_where_a_lens_is_not_clipped(tmp_path, caplog):
+    lens = '<float name="aperture_radius" value="0.1"/><float name="focus_distance" value="3"/>'
+    (tmp_path / "scene.xml").write_text(
+        f'<scene version="3.0.0"><sensor type="thinlens" id="eye"><float name="far_clip" value="4"/>{lens}</sensor>'
+        '<emitter type="point"/><shape type="rectangle" id="floor">'
+        '<transform name="to_world"><translate z="5"/></transform></shape></scene>'
+    )
+
+    def lines(integrator: str) -> list[str]:
+        own = "parameters: [{key: floor.bsdf.reflectance.value}]"
+        text = f"scene: {{file: scene.xml}}\ntarget: {{render: {{}}}}\n{own}\nintegrator: {{type: {integrator}}}\n"
+        caplog.clear()
+        assemble_scene(loads(text, tmp_path / "c.yaml", []))
+        return [record.getMessage() for record in caplog.records]
+
+    assert lines("reslrb") == []
+    [line] = lines("ptracer")
+    assert "sensor eye: ptracer does not clip what a `thinlens` sees" in line

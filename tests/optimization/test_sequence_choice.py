@@ -1,31 +1,46 @@
-"""`sequence: auto` in whole runs of a small scene: what is decided, what is then traced, and what is kept of it.
-
-Times are given, so that it is decided alike on every machine; variances are those of the scene.
-"""
+"""`sequence: auto`: decided on fabricated steps and in whole runs of a small scene."""
 
 from __future__ import annotations
 
 import gc
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
-from optimization.deciding import begin, fix_times, inspected, operations
-from recording.going_on import optimize
+from optimization.deciding import SIZES, World, begin, fix_times, inspected, operations
+from runs.going_on import optimize
 from turns import a_few
 
 from reslrb_cli.config.loader import load
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.measure.methods import parse_cases
 from reslrb_cli.optimization.assemble import assemble
-from reslrb_cli.optimization.autotune.sampling import StepTrial
+from reslrb_cli.optimization.autotune.race import (
+    GUIDING_SHARE,
+    ITERATIONS,
+    LEARNINGS,
+    LEAST_ROUNDS,
+    LOOKS,
+    PLANNED,
+    SEQUENCE_SHARE,
+    Sizes,
+)
+from reslrb_cli.optimization.autotune.race import SHARE as PILOT_SHARE
+from reslrb_cli.optimization.autotune.sampling import SEQUENCE_LONGER, SequencePilot, StepTrial, planned, share_left
+from reslrb_cli.optimization.decisions import Allowance
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.records.cache import PilotCache
 from reslrb_cli.records.checkpoint import STATE_FILE, open_state
+from reslrb_cli.records.decisions import GuidedRecord, SequenceRecord
 from reslrb_cli.records.manifest import read_manifest
 
-pytestmark = pytest.mark.usefixtures("llvm")
+# `sequence: auto` in whole runs of a small scene: what is decided, what is then traced, and what is kept of it.
+#
+# Times are given, so that it is decided alike on every machine; variances are those of the scene.
+
 SMALL = ["scene.size=[16, 16]", "run.spp=64", "run.iterations=2", "run.certainty=false", "run.measuring=1000"]
 AUTO = ["integrator.sequence=auto", *SMALL]
 BOTH = ["integrator.guiding=auto", *AUTO]
@@ -52,6 +67,7 @@ def is_even(problem: Problem) -> bool:
     return problem.integrator.plan(problem.scene, problem.scene.sensors()[0]).sequence is not None
 
 
+@pytest.mark.usefixtures("llvm")
 def test_on_is_evenly_spread_and_off_has_nothing_of_it(experiment: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Off, a step's kernels are, operation by operation, those of `sequence: independent`."""
     counts = []
@@ -107,6 +123,7 @@ def spied(monkeypatch: pytest.MonkeyPatch, settings: list[str], guided_ms: float
     return seen
 
 
+@pytest.mark.usefixtures("llvm")
 @pytest.mark.parametrize("guiding", a_few(["auto, on", "auto, off", "on", "off"], ["auto, on", "on"]))
 def test_it_is_measured_with_guiding_as_that_was_decided(
     guiding: str, experiment: Path, monkeypatch: pytest.MonkeyPatch
@@ -134,6 +151,7 @@ def test_it_is_measured_with_guiding_as_that_was_decided(
         assert table[0][1] == held[0][1]
 
 
+@pytest.mark.usefixtures("llvm")
 def test_alone_it_takes_the_place_of_guiding_where_that_is_better(
     experiment: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -168,6 +186,7 @@ def test_alone_it_takes_the_place_of_guiding_where_that_is_better(
     assert is_even(again)
 
 
+@pytest.mark.usefixtures("llvm")
 def test_a_table_of_its_own_for_either_is_seen(experiment: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from reslrb_cli.integrators.context import Preparation
 
@@ -176,6 +195,7 @@ def test_a_table_of_its_own_for_either_is_seen(experiment: Path, monkeypatch: py
         spied(monkeypatch, BOTH, 0.1)
 
 
+@pytest.mark.usefixtures("llvm")
 def test_a_run_says_so_once_remembers_it_and_writes_it_down(
     experiment: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -207,6 +227,7 @@ def test_a_run_says_so_once_remembers_it_and_writes_it_down(
     assert row.endswith("sequence: auto, which a run decides by measurement")
 
 
+@pytest.mark.usefixtures("llvm")
 @pytest.mark.long  # the run says so too
 def test_a_dry_run_measures_it_for_the_run(
     experiment: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
@@ -218,6 +239,7 @@ def test_a_dry_run_measures_it_for_the_run(
     assert not RUN.exists()
 
 
+@pytest.mark.usefixtures("llvm")
 def test_what_is_compared_is_named() -> None:
     """In measurements `auto` of the experiment is off, and is refused where somebody writes it."""
     config = load(Path(__file__).parents[2] / "configs" / "furnace.yaml")
@@ -231,6 +253,7 @@ def test_what_is_compared_is_named() -> None:
     assert left.at(config, 4, known=False, auto=True).integrator.options()["sequence"] == "auto"
 
 
+@pytest.mark.usefixtures("llvm")
 def test_a_script_is_told_that_it_has_to_say() -> None:
     from reslrb_cli.integrators.step import make_integrator
 
@@ -238,9 +261,142 @@ def test_a_script_is_told_that_it_has_to_say() -> None:
         make_integrator("reslrb", sequence="auto")
 
 
+@pytest.mark.usefixtures("llvm")
 def test_who_says_which_has_nothing_measured(experiment: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(StepTrial, "take", lambda *args: pytest.fail("measured"))
     for sequence in ("independent", "low_discrepancy"):
         problem = made([f"integrator.sequence={sequence}", *SMALL])
         assert problem.sequence is None
         assert is_even(problem) == (sequence == "low_discrepancy")
+
+
+# Whether low-discrepancy numbers pay, decided on fabricated steps; and what of a run's time may be measured away.
+
+
+def world(variance: float, time: float, **options: Any) -> World:
+    """Nothing is learned in it, but where `options` say so."""
+    return World(variance, time, **{"learns": False, "pilot": SequencePilot, **options})
+
+
+def sizes(share: float, step: int = 64) -> Sizes:
+    return replace(SIZES, step=step, call=step, part=step, longer=SEQUENCE_LONGER, planned=planned(share))
+
+
+@pytest.mark.parametrize(
+    ("options", "on"),
+    [
+        ({"variance": 0.05, "time": 1.1}, True),
+        ({"variance": 0.6, "time": 1.1}, True),
+        ({"variance": 1.0, "time": 1.0}, False),
+        ({"variance": 0.95, "time": 1.1}, False),
+        ({"variance": 2.0, "time": 1.1}, False),
+        ({"variance": 0.05, "time": 1.1, "image": 3.0}, False),  # the image would pay for it
+        ({"variance": 0.05, "time": 1.1, "image": 0.9}, True),
+        ({"variance": 0.05, "time": 1.1, "image": 3.0, "alone": True}, False),  # one switch is for both
+        ({"variance": 0.05, "time": 1.1, "image": 0.9, "alone": True}, True),
+        ({"variance": 0.05, "time": 1.1, "sparse": True}, True),
+    ],
+)
+def test_it_is_on_where_it_pays(options: dict[str, Any], on: bool) -> None:
+    one = world(**options)
+    record = one.run(sizes(0.02), 0.02)
+    assert record.low_discrepancy == on
+    assert record.setting == ("low_discrepancy" if on else "independent")
+    assert record.low < 1 / (one.variance * (1.1 if one.time > 1 else 1.0)) < record.high or one.alone
+    assert record.line().startswith(f"sequence {record.setting}: {record.gain:.2g} times the efficiency here (")
+    assert (record.note != "") == (not on and record.low > 1)
+    assert all(call[0] != "learn" for call in one.calls)
+
+
+def on_by_accident(**options: Any) -> int:
+    """Of 100 worlds, in how many it is on."""
+    return sum(world(**options, seed=seed).run(sizes(0.05), 0.05).low_discrepancy for seed in range(100))
+
+
+def test_where_it_gains_nothing_it_is_hardly_ever_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    # 2.5 are expected on this side, were times not allowed to be off, and one more for the looks before the last.
+    assert on_by_accident(variance=0.9, time=1 / 0.9) <= 9
+    # A fault that takes the gain itself for what it is at least is seen by that.
+    gain = SequencePilot._gain
+    monkeypatch.setattr(SequencePilot, "_gain", lambda *args: (lambda g: (g[0], g[0], g[2]))(gain(*args)))
+    assert on_by_accident(variance=0.9, time=1 / 0.9) > 30
+
+
+def test_a_table_that_has_yet_to_learn_does_so_before_all_steps_that_count() -> None:
+    one = world(0.1, 1.1, learns=True)
+    record = one.run(sizes(0.05), 0.05)
+    assert record.low_discrepancy
+    kinds = [call[0] for call in one.calls]
+    assert kinds[:4] == [False, False, "learn", "learn"]
+    assert kinds.count("learn") == LEARNINGS
+    assert kinds[4:] == [True, *[False, True] * record.rounds]
+    # Both sides go on learning: what that takes is no part of the gain.
+    assert record.gain == pytest.approx(1 / (0.1 * 1.1), rel=0.2)
+
+
+@pytest.mark.parametrize("share", [0.0, SEQUENCE_SHARE, 0.01, 0.02, PILOT_SHARE])
+@pytest.mark.parametrize("step", [8, 64, 1024])
+@pytest.mark.parametrize("overhead", [0.0, 0.1, 10.0])
+@pytest.mark.parametrize("time", [0.9, 1.1, 3.0])
+def test_its_share_is_kept(share: float, step: int, overhead: float, time: float) -> None:
+    one = world(0.1, time, overhead=overhead)
+    used = sizes(share, step)
+    record = one.run(used, share)
+    if record.gain is None:
+        assert "to measure it would cost more than" in record.note or "too few to tell" in record.note
+        assert not record.low_discrepancy
+        # A step is what it takes to know what one takes.
+        assert record.share * ITERATIONS * (step + overhead) <= max(
+            used.trial + overhead, 1.3 * share * ITERATIONS * (step + overhead)
+        )
+    else:
+        assert LEAST_ROUNDS <= record.rounds <= LOOKS * used.rounds
+        assert record.share <= share * 1.3
+
+
+def test_the_more_is_left_the_longer_steps_are() -> None:
+    trials = [sizes(share, 1024).trial for share in (0.0, SEQUENCE_SHARE, 0.01, 0.02, 0.05)]
+    assert trials == sorted(trials)
+    assert trials[0] == 1
+    assert 30 < trials[1] < trials[2] < trials[3]
+    assert sizes(0.05, 1024).planned == PLANNED
+    assert world(0.1, 1.1).run(sizes(SEQUENCE_SHARE, 1024), SEQUENCE_SHARE).low_discrepancy
+
+
+class Spent:
+    """The problem of a run of which measuring has taken these shares so far."""
+
+    def __init__(self, pilot: float | None, guided: float | None) -> None:
+        self.pilot = None if pilot is None else SimpleNamespace(share=pilot)
+        self.guided = None if guided is None else GuidedRecord(guided=True, share=guided)
+
+
+@pytest.mark.parametrize("pilot", [None, 0.02, PILOT_SHARE - GUIDING_SHARE])
+def test_all_that_is_measured_takes_one_share(pilot: float | None) -> None:
+    """What guiding may take, then what the sequence may, and what both have, come what may."""
+    ample = Allowance(1.0, 1e9, 0.0, 1.0)
+    for_guiding = share_left(Spent(pilot, None), ample, SEQUENCE_SHARE)  # type: ignore[arg-type]
+    assert for_guiding == pytest.approx(PILOT_SHARE - SEQUENCE_SHARE - (pilot or 0))
+    assert for_guiding >= GUIDING_SHARE - SEQUENCE_SHARE - 1e-12
+    left = share_left(Spent(pilot, for_guiding), ample)  # type: ignore[arg-type]
+    assert left == pytest.approx(SEQUENCE_SHARE)
+    assert share_left(Spent(pilot, 0.5), ample) == 0  # type: ignore[arg-type]
+
+
+def test_a_record_survives_json_and_nothing_else_is_one() -> None:
+    record = world(0.1, 1.1).run(sizes(0.02), 0.02)
+    data = record.to_json()
+    assert SequenceRecord.from_json(data) == record
+    wrong = ({}, {**data, "low_discrepancy": 1}, {**data, "gain": "2"}, {**data, "guided": True})
+    for each in wrong:
+        with pytest.raises(TypeError):
+            SequenceRecord.from_json(each)
+    with pytest.raises(TypeError):
+        GuidedRecord.from_json(data)
+
+
+def test_no_noise_is_no_gain(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(World, "_noisy", lambda self, random, variance: np.ones(4))
+    record = world(0.1, 1.1).run(sizes(0.02), 0.02)
+    assert not record.low_discrepancy
+    assert record.note == "gradients have no noise"

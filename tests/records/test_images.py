@@ -1,4 +1,4 @@
-"""Images are whole or absent, in every format, and show what they were given."""
+"""Images and EXR files of named layers: whole or absent, and showing what they were given."""
 
 from __future__ import annotations
 
@@ -8,13 +8,16 @@ import sys
 import numpy as np
 import pytest
 
-pytestmark = pytest.mark.usefixtures("llvm")
+from reslrb_cli.records.images import read_layers, write_layers
+
+# Images are whole or absent, in every format, and show what they were given.
 
 
 def make_image(channels=3):
     return np.random.default_rng(3).uniform(0, 1, (40, 30, channels)).astype(np.float32)
 
 
+@pytest.mark.usefixtures("llvm")
 @pytest.mark.parametrize("suffix", [".exr", ".hdr", ".pfm", ".png", ".jpg", ".jpeg"])
 def test_every_format_can_be_read_back(tmp_path, suffix):
     import mitsuba as mi
@@ -32,6 +35,7 @@ def test_every_format_can_be_read_back(tmp_path, suffix):
     assert [path.name for path in tmp_path.iterdir()] == [f"a.key{suffix}"]
 
 
+@pytest.mark.usefixtures("llvm")
 @pytest.mark.parametrize("suffix", [".exr", ".png"])
 def test_an_image_that_does_not_fit_is_not_there(tmp_path, file_size_limit, suffix):
     from reslrb_cli.records.images import write_file
@@ -46,6 +50,7 @@ def test_an_image_that_does_not_fit_is_not_there(tmp_path, file_size_limit, suff
     assert path.read_bytes() == b"what was there before"
 
 
+@pytest.mark.usefixtures("llvm")
 def test_parameters_and_masks_are_written_like_that(tmp_path, file_size_limit):
     from reslrb_cli.records.images import write_mask, write_parameters
 
@@ -57,6 +62,7 @@ def test_parameters_and_masks_are_written_like_that(tmp_path, file_size_limit):
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.usefixtures("llvm")
 def test_a_heightmap_is_seen_from_its_lowest_point_to_its_highest(tmp_path):
     from matplotlib.image import imread
 
@@ -71,6 +77,7 @@ def test_a_heightmap_is_seen_from_its_lowest_point_to_its_highest(tmp_path):
     assert imread(tmp_path / "wall.data.png").max() < 0.1
 
 
+@pytest.mark.usefixtures("llvm")
 def test_a_checkpoint_that_does_not_fit_leaves_the_one_before(tmp_path, file_size_limit, monkeypatch):
     from reslrb_cli.records.checkpoint import save_checkpoint
 
@@ -84,3 +91,59 @@ def test_a_checkpoint_that_does_not_fit_leaves_the_one_before(tmp_path, file_siz
         assert int(state["iteration"]) == 1
     gc.collect()
     assert said == []
+
+
+# EXR files of named layers: whole or absent, readable by others, and never a surprise when they are damaged.
+
+
+def layers():
+    generator = np.random.default_rng(4)
+    shapes = {"image": (6, 5, 3), "z": (6, 5), "grey": (6, 5, 1), "alpha": (6, 5, 4), "spectrum": (6, 5, 12)}
+    return {name: generator.normal(size=shape).astype(np.float32) for name, shape in shapes.items()}
+
+
+def test_layers_are_read_as_they_were_written(tmp_path):
+    written = layers()
+    write_layers(tmp_path / "a.exr", written)
+    read = read_layers(tmp_path / "a.exr")
+    assert set(read) == set(written)
+    for name, array in written.items():
+        np.testing.assert_array_equal(read[name], array[:, :, None] if array.ndim == 2 else array)
+    assert [path.name for path in tmp_path.iterdir()] == ["a.exr"]
+
+
+def test_other_programs_find_the_channels(tmp_path):
+    """Mitsuba's reader, by the names that every reader knows."""
+    import mitsuba as mi
+
+    written = layers()
+    write_layers(tmp_path / "a.exr", {name: written[name] for name in ("image", "z")})
+    bitmap = mi.Bitmap(str(tmp_path / "a.exr"))
+    fields = {field.name: place for place, field in enumerate(bitmap.struct_())}
+    assert set(fields) == {"image.R", "image.G", "image.B", "z.Y"}
+    np.testing.assert_array_equal(np.array(bitmap)[:, :, fields["image.G"]], written["image"][:, :, 1])
+
+
+def test_an_image_without_layers_is_one_without_a_name(tmp_path, llvm):
+    from reslrb_cli.records.images import write_image
+
+    image = np.abs(layers()["image"])
+    write_image(tmp_path / "a", image)
+    np.testing.assert_array_equal(read_layers(tmp_path / "a.exr")[""], image)
+
+
+def test_one_that_does_not_fit_is_not_there(tmp_path, file_size_limit):
+    with file_size_limit(300), pytest.raises(OSError, match=r"a\.exr"):
+        write_layers(tmp_path / "a.exr", layers())
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_damaged_files_are_said_to_be(tmp_path):
+    write_layers(tmp_path / "a.exr", layers())
+    whole = (tmp_path / "a.exr").read_bytes()
+    for damaged in (b"", b"no image", whole[:60], whole[: len(whole) // 2]):
+        (tmp_path / "b.exr").write_bytes(damaged)
+        with pytest.raises(ValueError, match=r"b\.exr"):
+            read_layers(tmp_path / "b.exr")
+    with pytest.raises(OSError, match="gone"):
+        read_layers(tmp_path / "gone.exr")

@@ -1,12 +1,14 @@
-"""Run folders: names, what --force may replace, and that nothing half-made stays."""
+"""Run folders, their manifests, and the cache of what earlier runs measured."""
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import shutil
 import subprocess
 import sys
+import threading
 from pathlib import Path
 
 import pytest
@@ -15,9 +17,13 @@ from compilation import search_path
 from reslrb_cli.config.files import NAME_BYTES
 from reslrb_cli.config.schema import check_name
 from reslrb_cli.errors import ConfigError, MachineError
-from reslrb_cli.records.lock import FolderLock
-from reslrb_cli.records.manifest import Manifest, Status, read_manifest
+from reslrb_cli.records import manifest as manifests
+from reslrb_cli.records.cache import MOST, PilotCache, cache_folder, key_of
+from reslrb_cli.records.lock import FolderLock, Holder
+from reslrb_cli.records.manifest import MANIFEST_FILE, Manifest, Status, read_manifest
 from reslrb_cli.records.run_folder import RunFolder, check_output
+
+# Run folders: names, what --force may replace, and that nothing half-made stays.
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -156,9 +162,6 @@ def test_a_full_disk_is_no_fault_of_the_configuration(tmp_path, monkeypatch):
     assert names(tmp_path) == []
 
 
-# --- who works in it --------------------------------------------------------------------------------------------------
-
-
 def test_a_folder_in_use_is_not_replaced(tmp_path):
     with RunFolder.create("c.yaml", tmp_path, "run", False, "mine: 1\n", make_manifest()) as folder:
         who = rf"^c\.yaml: run\.name: .*/run is in use by a run \(process {os.getpid()} on .*, since 2.*\)"
@@ -272,3 +275,131 @@ def test_the_end_is_written(tmp_path):
     assert content["ended"] >= content["started"]
     assert "manifest.json" in names(folder.path)
     assert not [name for name in names(folder.path) if name.endswith(".part")]
+
+
+# Manifests: what they say once their process has gone.
+
+
+def abandoned(folder: Path) -> Manifest:
+    """The manifest of a run whose process, with a lock, has gone."""
+    manifest = make_manifest(process=Holder.here(locked=True))
+    manifest.write(folder)
+    return manifest
+
+
+def stored(folder: Path):
+    return json.loads((folder / MANIFEST_FILE).read_text())
+
+
+def test_a_run_that_was_killed_is_interrupted(tmp_path):
+    abandoned(tmp_path)
+    (tmp_path / "metrics.jsonl").write_text('{"iteration": 0}\n{"itera')
+    (tmp_path / ".report.html.77.part").write_text("half")
+    os.utime(tmp_path / "metrics.jsonl", (2e9, 2e9))
+    assert stored(tmp_path)["status"] == "running"
+    content = read_manifest(tmp_path)
+    assert (content["status"], content["ended"]) == ("interrupted", "2033-05-18T03:33:20+00:00")
+    assert "ended before the run did" in content["error"]
+    # on the disk too, with what the process left behind
+    assert stored(tmp_path) == content == read_manifest(tmp_path)
+    assert (tmp_path / "metrics.jsonl").read_text() == '{"iteration": 0}\n'
+    assert sorted(os.listdir(tmp_path)) == [MANIFEST_FILE, "metrics.jsonl"]
+
+
+def test_a_run_that_goes_on_is_running(tmp_path):
+    abandoned(tmp_path)
+    with FolderLock(tmp_path):
+        assert read_manifest(tmp_path)["status"] == "running"
+    assert stored(tmp_path)["status"] == "running"
+
+
+def test_a_reader_who_may_not_write_is_told_the_same(tmp_path, monkeypatch):
+    abandoned(tmp_path)
+
+    def fail(*args, **options):
+        raise OSError(errno.EROFS, "Read-only file system")
+
+    monkeypatch.setattr(manifests, "write_atomically", fail)
+    assert read_manifest(tmp_path)["status"] == "interrupted"
+    assert stored(tmp_path)["status"] == "running"
+
+
+@pytest.mark.parametrize("status", [Status.FINISHED, Status.INTERRUPTED, Status.FAILED])
+def test_what_has_ended_stays_as_it_ended(tmp_path, status):
+    abandoned(tmp_path).end(tmp_path, status, "a line")
+    before = stored(tmp_path)
+    assert read_manifest(tmp_path) == before
+    assert (before["status"], before["error"]) == (status.value, "a line")
+
+
+@pytest.mark.parametrize("text", ["", "{", "[]", '{"program": "other"}', "[" * 100_000, "\udcff"])
+def test_what_is_no_manifest_of_ours(tmp_path, text):
+    (tmp_path / MANIFEST_FILE).write_bytes(text.encode(errors="surrogateescape"))
+    assert read_manifest(tmp_path) is None
+    assert read_manifest(tmp_path / "nowhere") is None
+
+
+def test_the_last_word_of_a_process_that_ends_at_once_stays(tmp_path, monkeypatch):
+    monkeypatch.setattr(manifests, "_WRITING", threading.Lock())
+    manifest = make_manifest()
+    manifest.write(tmp_path)
+    for work in (
+        lambda: manifest.end_for_good(tmp_path, Status.INTERRUPTED),
+        lambda: manifest.end(tmp_path, Status.FINISHED),  # the thread that works knows nothing of it
+    ):
+        thread = threading.Thread(target=work, daemon=True)
+        thread.start()
+        thread.join(timeout=0.5)
+    assert thread.is_alive()
+    assert stored(tmp_path)["status"] == "interrupted"
+
+
+# The cache of pilots' outcomes.
+
+
+def test_entries_are_kept(tmp_path: Path) -> None:
+    PilotCache(tmp_path / "new").put("a", {"x": 1})
+    PilotCache(tmp_path / "new").put("b", {"x": 2})
+    cache = PilotCache(tmp_path / "new")
+    assert cache.get("a") == {"x": 1}
+    assert cache.get("b") == {"x": 2}
+    assert cache.get("c") is None
+
+
+def test_the_oldest_go(tmp_path: Path) -> None:
+    cache = PilotCache(tmp_path)
+    (tmp_path / "pilot.json").write_text(json.dumps({str(k): {"x": k} for k in range(MOST)}))
+    cache.put("new", {"x": -1})
+    assert cache.get("0") is None
+    assert cache.get("1") == {"x": 1}
+    assert cache.get("new") == {"x": -1}
+
+
+@pytest.mark.parametrize("content", ["", "{", "[1]", '{"a": 3}', "\xff"])
+def test_a_broken_file_is_empty_and_mended(tmp_path: Path, content: str) -> None:
+    (tmp_path / "pilot.json").write_bytes(content.encode("latin-1"))
+    cache = PilotCache(tmp_path)
+    assert cache.get("a") is None
+    cache.put("a", {"x": 1})
+    assert cache.get("a") == {"x": 1}
+
+
+def test_no_place_to_write_is_no_error(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    PilotCache(tmp_path / "file" / "deeper").put("a", {})
+    assert PilotCache(tmp_path / "file" / "deeper").get("a") is None
+
+
+def test_where_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("RESLRB_CACHE", "/own")
+    assert cache_folder() == Path("/own")
+    monkeypatch.delenv("RESLRB_CACHE")
+    monkeypatch.setenv("XDG_CACHE_HOME", "/xdg")
+    assert cache_folder() == Path("/xdg/reslrb")
+    monkeypatch.delenv("XDG_CACHE_HOME")
+    assert cache_folder() == Path.home() / ".cache" / "reslrb"
+
+
+def test_keys_tell_apart_what_differs() -> None:
+    assert key_of({"a": 1, "b": [2]}) == key_of({"b": [2], "a": 1})
+    assert key_of({"a": 1}) != key_of({"a": 2})

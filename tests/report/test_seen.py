@@ -6,7 +6,7 @@ import sys
 
 import numpy as np
 import pytest
-from report.run_folder import FLOOR, LAMP, make_run, texture
+from report.measured import FLOOR, LAMP, make_run, texture
 
 from reslrb_cli.records.images import load_image
 from reslrb_cli.report import perceptual

@@ -1,13 +1,27 @@
-"""One page about several runs and measurements: what stands on it, and what is damaged or hostile in it."""
+"""One page about several runs and measurements, whole optimisations, versions and commands."""
 
 from __future__ import annotations
 
 import json
 import re
+from pathlib import Path
 
 import pytest
-from report.measured import convergence_lines, write_bench, write_convergence, write_gradcheck, write_maps
-from report.run_folder import FLOOR, LAMP, MEMORY, PILOT, SCALING, make_run
+from report.measured import (
+    FLOOR,
+    LAMP,
+    MEMORY,
+    ORIGIN,
+    PILOT,
+    SCALING,
+    convergence_lines,
+    make_run,
+    runs_lines,
+    write_bench,
+    write_convergence,
+    write_gradcheck,
+    write_maps,
+)
 from report.test_page import EVIL, Page, pixels
 
 from reslrb_cli.errors import ConfigError
@@ -16,6 +30,8 @@ from reslrb_cli.report.page import render
 from reslrb_cli.report.page.layout import COLORS
 from reslrb_cli.report.page.run import DAMAGED
 from reslrb_cli.report.sources import Maps, Measurements, Run, read_sources
+
+# One page about several runs and measurements: what stands on it, and what is damaged or hostile in it.
 
 PLAN = {"integrator": "reslrb", "estimator": "stack", "rows": [
     {"feature": "roulette", "needed": False, "reason": "paths are short"},
@@ -297,3 +313,100 @@ def test_many_runs_have_colours_and_dashes(tmp_path):
     assert lines_drawn(markup)[0] == list(COLORS)
     assert markup.count("border-top-style:dashed") >= 2
     assert "run00, run01, run02 and 7 more" in Page(markup).sections[""]
+
+
+# Whole optimisations on a page: their curves, bands and table.
+
+
+def test_whole_runs(tmp_path):
+    lines = [*runs_lines(), {"kind": "run_method", "label": "prb", "status": "out_of_memory", "message": "<ended>"}]
+    lines += [{"kind": "run_best", "label": "x", "line": "error of x: 0.5 [0.4, 0.6] times that of ptracer"}]
+    (tmp_path / "c.jsonl").write_text("".join(json.dumps(line) + "\n" for line in [*lines, {"kind": "news"}]))
+    markup = render(read_sources([tmp_path / "c.jsonl"]))
+    page, title = Page(markup), "Error against run time: c.jsonl"
+    assert page.row(title, "ptracer, batched")[1:] == [
+        "3", "4 s", "30 [28, 33]", "1.5 [1.4, 1.7]", "2.5 [1.25, 3.75]", "0.25 [0.125, 0.375]"]  # fmt: skip
+    assert page.row(title, "prb")[:2] == ["prb out of memory", ""]
+    assert "prb: <ended>" in page.sections[title]
+    assert "best by the loss is reslrb:stack" in page.sections[title]
+    assert "1 line of other kinds" in page.sections[title]
+    assert "0.5 [0.4, 0.6] times that of ptracer" in page.sections[title]
+    assert lines_drawn(markup) == [list(COLORS[:2])] * 2  # loss, and the parameters' error
+
+
+def test_curves_of_whole_runs_are_medians_with_bands_from_the_least_to_the_greatest(tmp_path, monkeypatch):
+    drawn = []
+    monkeypatch.setattr("reslrb_cli.report.page.measured.diagram", lambda curves, *_: drawn.append(curves) or "")
+    (tmp_path / "c.jsonl").write_text("".join(json.dumps(line) + "\n" for line in runs_lines()))
+    render(read_sources([tmp_path / "c.jsonl"]))
+    losses, errors = drawn
+    assert [curve.name for curve in losses] == ["ptracer, batched", "reslrb:stack, batched"]
+    assert (losses[0].xs, losses[0].ys) == ([1.0, 2.0, 4.0], [10.0, 5.0, 2.5])
+    assert losses[0].band == ([5.0, 2.5, 1.25], [15.0, 7.5, 3.75])
+    assert errors[1].ys == pytest.approx([0.2, 0.1, 0.05])
+
+
+def test_whole_runs_beside_gradients_and_runs_without_figures(tmp_path):
+    lines = [*convergence_lines(), *runs_lines(finite=False), {"kind": "run_point"}, {"kind": "run_method"}]
+    (tmp_path / "c.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    markup = render(read_sources([tmp_path / "c.jsonl"]))
+    assert lines_drawn(markup) == [list(COLORS[:2])] * 2  # of the gradients, and of the runs' errors
+    assert "of other kinds" not in markup
+
+
+# Versions, and the command that does it again, on the page of every kind of file.
+
+
+def write_runs(path: Path) -> None:
+    path.write_text("".join(json.dumps(line) + "\n" for line in runs_lines()))
+
+
+KINDS = {
+    "Cost of a step": write_bench,
+    "Gradients against references": write_gradcheck,
+    "Error against run time": write_convergence,
+    "Error against run time, whole runs": write_runs,
+}
+
+
+@pytest.mark.parametrize("heading", KINDS)
+def test_the_page_says_what_does_it_again(tmp_path: Path, heading: str) -> None:
+    file = tmp_path / "a.jsonl"
+    KINDS[heading](file)
+    title = f"{heading.partition(',')[0]}: a.jsonl"
+    without = page_of(file)
+    assert "versions" not in without.sections[title]  # an older file
+    file.write_text(ORIGIN.to_json() + "\n" + file.read_text())
+    markup = render(read_sources([file]))
+    page = page_of(file)
+    assert DAMAGED not in markup
+    assert "left out" not in page.sections[title]
+    assert "reslrb bench 'my <box>.yaml'" in page.sections[title]
+    for words in ("mitsuba 3.9.1", "Plan 9", "a machine, 3 threads", "llvm_ad_rgb", "2026-01-02 03:04:05 UTC"):
+        assert words in page.sections[title]
+    assert without.cells[title][:2] == page.cells[title][:2]
+
+
+def test_two_files_in_one_have_two_origins(tmp_path: Path) -> None:
+    write_bench(tmp_path / "a")
+    other = json.loads(ORIGIN.to_json()) | {"command": ["reslrb", "bench", "--rounds", "7"]}
+    text = (tmp_path / "a").read_text()
+    (tmp_path / "a").write_text(f"{ORIGIN.to_json()}\n{text}{json.dumps(other)}\n{text}")
+    told = page_of(tmp_path / "a").sections["Cost of a step: a"]
+    assert told.count("to do it again") == 2
+    assert "reslrb bench --rounds 7" in told
+
+
+def test_an_origin_alone_is_no_measurement(tmp_path: Path) -> None:
+    (tmp_path / "a").write_text(ORIGIN.to_json() + "\n")
+    with pytest.raises(ConfigError, match="holds no line that"):
+        read_sources([tmp_path / "a"])
+
+
+def test_a_damaged_origin_leaves_the_rest(tmp_path: Path) -> None:
+    write_bench(tmp_path / "a")
+    text = (tmp_path / "a").read_text()
+    (tmp_path / "a").write_text(json.dumps({"kind": "origin", "command": 3, "versions": "x"}) + "\n" + text)
+    markup = render(read_sources([tmp_path / "a"]))
+    assert DAMAGED not in markup
+    assert "to do it again" not in markup

@@ -1,27 +1,43 @@
-"""What a scene needs, and scenes that light tracing cannot render."""
+"""What a scene needs, how deep its paths are, what a sensor sees, and glass that rays jump over."""
 
 from __future__ import annotations
 
 import gc
+import logging
 from collections.abc import Iterator
+from pathlib import Path
 
+import mitsuba as mi
 import numpy as np
 import pytest
 
 from reslrb_cli.errors import UnsupportedScene
 from reslrb_cli.scene.catalog import summarise
+from reslrb_cli.scene.load import load_scene, warn_once
 from reslrb_cli.scene.needs import check_camera_paths, check_supported, light_obstacle, look, scene_needs
+from reslrb_cli.scene.visibility import (
+    DEPTHS,
+    LOST,
+    SeenSpecular,
+    find_depth,
+    sees_lamps,
+    sees_specular,
+    visible_texels,
+)
+
+# What a scene needs, and scenes that light tracing cannot render.
 
 GLASS = {"type": "dielectric"}
 
 
-@pytest.fixture(autouse=True)
+@pytest.fixture
 def _without_scenes_of_before() -> Iterator[None]:
     """Mitsuba asks all emitters that there are, also a `timed_sunsky` of a scene that an error still holds."""
     yield
     gc.collect()
 
 
+@pytest.mark.usefixtures("_without_scenes_of_before")
 def test_plain_scene(make_scene):
     scene = make_scene()
     needs = scene_needs(scene, scene.sensors()[0])
@@ -33,6 +49,7 @@ def test_plain_scene(make_scene):
     check_supported(scene, scene.sensors()[0])
 
 
+@pytest.mark.usefixtures("_without_scenes_of_before")
 def test_everything(make_scene):
     scene = make_scene(
         camera={"type": "thinlens", "aperture_radius": 0.1, "shutter_close": 1.0},
@@ -48,6 +65,7 @@ def test_everything(make_scene):
     assert needs.moving_shutter
 
 
+@pytest.mark.usefixtures("_without_scenes_of_before")
 @pytest.mark.parametrize("flat", [True, False])
 def test_shading_normals(make_scene, tmp_path, flat):
     import mitsuba as mi
@@ -62,6 +80,7 @@ def test_shading_normals(make_scene, tmp_path, flat):
     assert scene_needs(scene, scene.sensors()[0]).has_shading_normals is not flat
 
 
+@pytest.mark.usefixtures("_without_scenes_of_before")
 def test_nested_bsdfs_and_groups_are_seen(make_scene, tmp_path):
     import mitsuba as mi
 
@@ -74,6 +93,7 @@ def test_nested_bsdfs_and_groups_are_seen(make_scene, tmp_path):
     assert summarise(scene).shapes == {"Rectangle": 1, "PLYMesh": 1}
 
 
+@pytest.mark.usefixtures("_without_scenes_of_before")
 def test_view(make_scene):
     import mitsuba as mi
 
@@ -89,11 +109,13 @@ def test_view(make_scene):
     check_supported(scene, scene.sensors()[0])  # black, but rightly so
 
 
+@pytest.mark.usefixtures("_without_scenes_of_before")
 def test_mask_in_front_is_looked_through(make_scene):
     scene = make_scene(veil={"type": "sphere", "radius": 2, "bsdf": {"type": "null"}})
     assert look(scene, scene.sensors()[0]) == look(make_scene(), make_scene().sensors()[0])
 
 
+@pytest.mark.usefixtures("_without_scenes_of_before")
 @pytest.mark.parametrize(
     ("changes", "hide_emitters", "reason"),
     [
@@ -119,11 +141,13 @@ def test_refused(make_scene, changes, hide_emitters, reason):
         check_supported(scene, scene.sensors()[0], hide_emitters)
 
 
+@pytest.mark.usefixtures("_without_scenes_of_before")
 def test_specular_scene_with_a_visible_light(make_scene):
     scene = make_scene(plane={"type": "rectangle", "bsdf": GLASS}, sky={"type": "constant"})
     check_supported(scene, scene.sensors()[0])
 
 
+@pytest.mark.usefixtures("_without_scenes_of_before")
 def test_summary(make_scene):
     summary = summarise(make_scene())
     assert summary.emitters == {"PointLight": 1}
@@ -139,12 +163,14 @@ def test_summary(make_scene):
     assert by_key["plane.to_world"].obstacle.startswith("is recovered as a motion")
 
 
+@pytest.mark.usefixtures("_without_scenes_of_before")
 def test_summary_of_what_cannot_be_rendered(make_scene):
     sensor = summarise(make_scene(camera={"type": "orthographic"})).sensors[0]
     assert sensor.view is None
     assert "OrthographicCamera" in sensor.obstacle
 
 
+@pytest.mark.usefixtures("_without_scenes_of_before")
 def test_fractions_are_of_the_crop_window(make_scene):
     import mitsuba as mi
 
@@ -156,6 +182,7 @@ def test_fractions_are_of_the_crop_window(make_scene):
     assert np.isclose(look(make_scene(), make_scene().sensors()[0]).smooth, 0.45, atol=0.15)
 
 
+@pytest.mark.usefixtures("_without_scenes_of_before")
 def test_light_that_camera_paths_cannot_find_is_refused_for_prb(make_scene):
     scene = make_scene()
     check_camera_paths(scene, scene.sensors()[0])
@@ -170,6 +197,7 @@ WARM = {"type": "roughconductor", "alpha": {"type": "blackbody", "temperature": 
 REF = {"type": "ref", "id": "group"}
 
 
+@pytest.mark.usefixtures("_without_scenes_of_before")
 @pytest.mark.parametrize(
     ("changes", "reason"),
     [
@@ -193,12 +221,14 @@ def test_what_no_integrator_knows_is_refused_alike(make_scene, changes, reason):
     assert "integrator.type" not in said[0]
 
 
+@pytest.mark.usefixtures("_without_scenes_of_before")
 def test_a_medium_that_rays_cannot_meet_is_nobodys(make_scene):
     scene = make_scene(group={"type": "shapegroup", "fog": FOG})
     check_supported(scene, scene.sensors()[0])
     check_camera_paths(scene, scene.sensors()[0])
 
 
+@pytest.mark.usefixtures("_without_scenes_of_before")
 @pytest.mark.parametrize(
     ("changes", "way"),
     [
@@ -217,6 +247,7 @@ def test_the_way_out_is_named_where_there_is_one(make_scene, changes, way):
         check_supported(scene, scene.sensors()[0])
 
 
+@pytest.mark.usefixtures("_without_scenes_of_before")
 @pytest.mark.parametrize(("bsdf", "same"), [("hair", False), ("pplastic", True), ("principled", True)])
 def test_a_material_is_refused_to_light_paths_that_differs_with_light_and_view_exchanged(make_scene, bsdf, same):
     import mitsuba as mi
@@ -231,3 +262,265 @@ def test_a_material_is_refused_to_light_paths_that_differs_with_light_and_view_e
         values.append(np.array(material.eval(mi.BSDFContext(), si, wo)).ravel() / np.array(wo.z))
     assert np.allclose(*values, rtol=1e-3) is same
     assert (light_obstacle(scene, scene.sensors()[0]) is None) is same
+
+
+# How deep paths have to be: in a closed sphere that glows, whose light of every depth is known.
+
+
+def inside(albedo: float) -> mi.Scene:
+    """A camera in a sphere of that albedo that emits 1: paths of at most d segments show the sum of albedo^k, k < d."""
+    return mi.load_dict(
+        {
+            "type": "scene",
+            "sensor": {"type": "perspective", "fov": 60, "film": {"type": "hdrfilm", "width": 8, "height": 8}},
+            "sphere": {
+                "type": "sphere",
+                "flip_normals": True,
+                "emitter": {"type": "area", "radiance": {"type": "rgb", "value": 1.0}},
+                "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": albedo}},
+            },
+        }
+    )
+
+
+@pytest.mark.usefixtures("llvm")
+@pytest.mark.parametrize(("albedo", "segments"), [(0.5, 8), (0.7, 16), (0.85, 32), (0.97, 64)])
+def test_what_is_missing_is_what_longer_paths_would_add(albedo: float, segments: int) -> None:
+    found = find_depth(inside(albedo), 0)
+    assert found.segments == segments
+    if segments == DEPTHS[-1]:
+        assert found.missing is None
+        return
+    exact = (albedo**segments - albedo ** DEPTHS[-1]) / (1 - albedo ** DEPTHS[-1])
+    assert found.missing == pytest.approx(exact, rel=0.1)
+    assert albedo**segments < LOST < albedo ** (segments // 2)
+
+
+# Which texels a sensor sees.
+
+KEY = "floor.reflectance.data"
+
+
+def test_all_of_an_open_floor(make_scene):
+    scene = make_scene()
+    mask = visible_texels(scene, scene.sensors(), KEY)
+    assert mask.shape == (4, 6)
+    assert mask.all()
+
+
+def test_crop_window_and_orientation(make_scene):
+    import mitsuba as mi
+
+    # The lower left quarter of the film: its rows run downwards, the texture's rows with v, upwards.
+    film = {"type": "hdrfilm", "width": 16, "height": 16, "crop_offset_x": 0, "crop_offset_y": 8, "crop_width": 8,
+            "crop_height": 8}  # fmt: skip
+    to_world = mi.ScalarTransform4f().look_at(origin=[0, 0, 3], target=[0, 0, 0], up=[0, 1, 0])
+    scene = make_scene(camera={"type": "perspective", "fov": 60, "to_world": to_world, "film": film})
+    expected = np.zeros((4, 6), dtype=bool)
+    expected[:2, :3] = True
+    assert np.array_equal(visible_texels(scene, scene.sensors(), KEY), expected)
+
+
+def test_pixels_that_are_left_out_show_nothing(make_scene):
+    """As a mask has them: those of the film's left half, (H, W)."""
+    scene = make_scene()
+    height, width = (int(n) for n in reversed(scene.sensors()[0].film().crop_size()))
+    kept = np.ones((height, width), dtype=bool)
+    kept[:, : width // 2] = False
+    expected = np.zeros((4, 6), dtype=bool)
+    expected[:, 3:] = True
+    assert np.array_equal(visible_texels(scene, scene.sensors(), KEY, [kept]), expected)
+    assert visible_texels(scene, scene.sensors(), KEY, [None]).all()
+
+
+def test_hidden_texels_and_what_hides(make_scene):
+    import mitsuba as mi
+
+    half = mi.ScalarTransform4f().translate([0.5, 0, 0.01]).scale([0.5, 1, 1])
+    expected = np.ones((4, 6), dtype=bool)
+    expected[:, 3:] = False
+    for bsdf in ({"type": "diffuse"}, {"type": "dielectric"}):  # a light path cannot connect through glass
+        scene = make_scene(lid={"type": "rectangle", "to_world": half, "bsdf": bsdf})
+        assert np.array_equal(visible_texels(scene, scene.sensors(), KEY), expected)
+    scene = make_scene(lid={"type": "rectangle", "to_world": half, "bsdf": {"type": "null"}})
+    assert visible_texels(scene, scene.sensors(), KEY).all()
+
+
+def test_nested_shared_and_repeated(make_scene):
+    import mitsuba as mi
+
+    values = mi.TensorXf(np.full((4, 6, 3), 0.5, np.float32))
+    scale = mi.ScalarTransform4f().scale([3, 2, 1])
+    texture = {"type": "bitmap", "raw": True, "data": values, "to_uv": scale}
+    scene = make_scene(floor={"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": texture}})
+    assert visible_texels(scene, scene.sensors(), "floor.brdf_0.reflectance.data").all()
+
+
+def test_emission_is_not_a_matter_of_sight(make_scene):
+    import mitsuba as mi
+
+    sky = {"type": "envmap", "bitmap": mi.Bitmap(np.ones((4, 8, 3), np.float32))}
+    scene = make_scene(sky=sky)
+    assert visible_texels(scene, scene.sensors(), "sky.data").all()
+
+
+# Pixels that see smooth specular lobes: which surfaces count, through what, and how far the filter spreads them.
+
+#: Columns of a film of 16x8 pixels, in a view of 4 by 2, that a pane from 0 to 1 covers.
+COVERED = slice(8, 12)
+MIRROR = {"type": "conductor"}
+DIFFUSE = {"type": "diffuse"}
+BLEND = {"type": "blendbsdf", "weight": 0.5, "one": {"type": "twosided", "bsdf": DIFFUSE}, "two": MIRROR}
+
+
+def seen(bsdf: dict, filter: str = "box", in_front: dict | None = None) -> SeenSpecular:
+    """What a sensor sees of a pane, two rows high, before a diffuse wall, with another pane before all of it."""
+    T = mi.ScalarTransform4f
+    scene = {
+        "type": "scene",
+        "sensor": {
+            "type": "perspective",
+            "fov": 2 * np.degrees(np.arctan(2 / 100)),
+            "to_world": T().look_at(origin=[0, 0, 100], target=[0, 0, 0], up=[0, 1, 0]),
+            "film": {"type": "hdrfilm", "width": 16, "height": 8, "rfilter": {"type": filter}},
+        },
+        "light": {"type": "constant"},
+        "wall": {"type": "rectangle", "to_world": T().translate([0, 0, -1]).scale(9), "bsdf": DIFFUSE},
+        "pane": {
+            "type": "rectangle",
+            "to_world": T().translate([0.5, 0, 0]).scale([0.499, 0.2, 1]),
+            "bsdf": bsdf,
+        },
+    }
+    if in_front is not None:
+        scene["front"] = {"type": "rectangle", "to_world": T().translate([0, 0, 1]).scale(9), "bsdf": in_front}
+    loaded = mi.load_dict(scene, optimize=False)
+    return sees_specular(loaded, loaded.sensors()[0])
+
+
+def pixels(margin: int = 0) -> np.ndarray:
+    """The pixels of the pane, and so many around it."""
+    mask = np.zeros((8, 16), dtype=bool)
+    mask[3 - margin : 5 + margin, COVERED.start - margin : COVERED.stop + margin] = True
+    return mask
+
+
+@pytest.mark.usefixtures("llvm")
+@pytest.mark.parametrize(
+    ("bsdf", "kind"),
+    [
+        (MIRROR, "alone"),
+        ({"type": "dielectric"}, "alone"),
+        ({"type": "twosided", "bsdf": MIRROR}, "alone"),
+        ({"type": "plastic"}, "mixed"),
+        ({"type": "thindielectric"}, "mixed"),
+        (BLEND, "mixed"),
+        (DIFFUSE, None),
+        ({"type": "roughconductor"}, None),
+        ({"type": "roughplastic"}, None),
+    ],
+    ids=lambda value: value["type"] if isinstance(value, dict) else "",
+)
+def test_which_surfaces_count(bsdf: dict, kind: str | None) -> None:
+    found = seen(bsdf)
+    for name in ("alone", "mixed"):
+        expected = pixels() if name == kind else np.zeros((8, 16), dtype=bool)
+        assert np.array_equal(getattr(found, name), expected), name
+
+
+@pytest.mark.usefixtures("llvm")
+def test_glass_is_seen_through_what_lets_light_pass() -> None:
+    veil = {"type": "mask", "opacity": 0.5, "bsdf": DIFFUSE}
+    found = seen(MIRROR, in_front=veil)
+    assert np.array_equal(found.alone, pixels())
+    assert not seen(MIRROR, in_front=DIFFUSE).alone.any()
+
+
+@pytest.mark.usefixtures("llvm")
+@pytest.mark.parametrize(("filter", "margin"), [("tent", 1), ("gaussian", 2)])
+def test_the_filter_spreads_it(filter: str, margin: int) -> None:
+    assert np.array_equal(seen(MIRROR, filter).alone, pixels(margin))
+
+
+@pytest.mark.usefixtures("llvm")
+@pytest.mark.parametrize("size", [16, 300])
+@pytest.mark.parametrize("sensor", [{}, {"type": "thinlens", "aperture_radius": 2.0, "focus_distance": 50.0}])
+def test_pixels_that_see_lamps(size: int, sensor: dict) -> None:
+    T = mi.ScalarTransform4f
+    scene = {
+        "type": "scene",
+        "sensor": {
+            "type": "perspective",
+            "fov": 2 * np.degrees(np.arctan(2 / 100)),
+            "to_world": T().look_at(origin=[0, 0, 100], target=[0, 0, 0], up=[0, 1, 0]),
+            "film": {"type": "hdrfilm", "width": size, "height": size // 2, "rfilter": {"type": "box"}},
+        }
+        | sensor,
+        "wall": {"type": "rectangle", "to_world": T().translate([0, 0, -1]).scale(9), "bsdf": DIFFUSE},
+        "veil": {"type": "rectangle", "to_world": T().translate([0, 0, 1]).scale(9), "bsdf": {"type": "null"}},
+    }
+    dark = mi.load_dict(scene | {"light": {"type": "point", "position": [0, 0, 50]}}, optimize=False)
+    assert not sees_lamps(dark, dark.sensors()[0]).any()
+    place = T().translate([0.5, 0, 0]).scale([0.5, 0.25, 1])  # columns 1/2 to 3/4, rows 3/8 to 5/8, where it is sharp
+    lamp = {"type": "rectangle", "to_world": place, "emitter": {"type": "area"}}
+    lit = mi.load_dict(scene | {"lamp": lamp}, optimize=False)
+    found = sees_lamps(lit, lit.sensors()[0])
+    assert found.shape == (size // 2, size)
+    height, width = (np.arange(n) + 0.5 for n in found.shape)
+    x, y = width / size, height / (size // 2)
+    inside = ((y > 3 / 8) & (y < 5 / 8))[:, None] & ((x > 1 / 2) & (x < 3 / 4))
+    assert found[inside].all()
+    # A lens that is focused on half the distance spreads a lamp over the whole of this film.
+    near = 2.0 / 4 * 1.1 if sensor else 1.5 / min(size // 2, 128)
+    far = ((y < 3 / 8 - 2 * near) | (y > 5 / 8 + 2 * near))[:, None] | ((x < 1 / 2 - near) | (x > 3 / 4 + near))
+    assert not found[far].any()
+    assert found.sum() > (1.5 if sensor else 0.9) * inside.sum()
+
+
+# Glass that rays jump over is warned of when a scene is loaded.
+
+OFFSET = 8.94e-5 * (1 + 3)  # of a ray, where the slab is
+
+SCENE = """\
+<scene version="3.0.0">
+  <sensor type="perspective"/>
+  <emitter type="point"><point name="position" value="0, 6, 0"/></emitter>
+  <bsdf type="dielectric" id="glass"/>
+  <shape type="rectangle" id="floor">
+    <transform name="to_world"><scale value="3"/><rotate x="1" angle="-90"/></transform></shape>
+  <shape type="rectangle" id="top"><ref id="glass"/>
+    <transform name="to_world"><scale value="2"/><rotate x="1" angle="-90"/><translate y="3"/></transform></shape>
+  <shape type="rectangle" id="bottom"><ref id="glass"/>
+    <transform name="to_world"><scale value="2"/><rotate x="1" angle="90"/><translate y="{bottom}"/></transform></shape>
+  {more}
+</scene>
+"""
+
+
+def warnings(tmp_path: Path, caplog: pytest.LogCaptureFixture, thickness: float, more: str = "") -> list[str]:
+    file = tmp_path / "scene.xml"
+    file.write_text(SCENE.format(bottom=3 - thickness, more=more))
+    warn_once.cache_clear()
+    caplog.clear()
+    with caplog.at_level(logging.WARNING):
+        load_scene(file)
+    return [record.getMessage() for record in caplog.records]
+
+
+@pytest.mark.parametrize("offsets", [0.5, 3, 8])
+def test_thin(offsets: float, tmp_path: Path, caplog: pytest.LogCaptureFixture, llvm: str) -> None:
+    [line] = warnings(tmp_path, caplog, offsets * OFFSET)
+    assert "light passes through surfaces" in line
+    assert "make the glass thicker" in line
+    measured = float(line.partition(" that are ")[2].split()[0])
+    assert 0.8 * offsets < measured < 1.4 * offsets  # obliquely it is thicker
+
+
+@pytest.mark.parametrize("thickness", [15 * OFFSET, 0.2])
+def test_thick(thickness: float, tmp_path: Path, caplog: pytest.LogCaptureFixture, llvm: str) -> None:
+    assert warnings(tmp_path, caplog, thickness) == []
+
+
+def test_a_ball_is_thin_at_its_rim_alone(tmp_path: Path, caplog: pytest.LogCaptureFixture, llvm: str) -> None:
+    place = '<float name="radius" value="0.5"/><point name="center" value="0, 1, 0"/>'
+    assert warnings(tmp_path, caplog, 0.3, f'<shape type="sphere">{place}<ref id="glass"/></shape>') == []

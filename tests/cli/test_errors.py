@@ -1,0 +1,451 @@
+"""Errors of commands: one line, its exit code; sizes that no machine holds are refused at once."""
+
+from __future__ import annotations
+
+import errno
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import click
+import pytest
+from cli.tiny import ROOT, SCENE, write_experiment
+from compilation import search_path
+
+from reslrb_cli.backend import memory
+from reslrb_cli.cli import _Main, main
+from reslrb_cli.config.loader import load
+from reslrb_cli.config.schema import Config
+from reslrb_cli.errors import (
+    BackendError,
+    ConfigError,
+    ExitCode,
+    MachineError,
+    NonFinite,
+    OutOfMemory,
+    UnsupportedScene,
+)
+from reslrb_cli.optimization import memory as announced
+from reslrb_cli.optimization import memory as room
+from reslrb_cli.optimization.assemble import assemble_scene
+from reslrb_cli.scene import load as scene_load
+
+# Every error that a user can cause ends in one line and its exit code; `--help` works, and at once.
+
+COMMANDS = main.list_commands(click.Context(main))
+
+
+def call(*args: str) -> int:
+    """Runs the command line in this process and returns its exit code."""
+    with pytest.raises(SystemExit) as ended:
+        main(list(args), prog_name="reslrb")
+    assert isinstance(ended.value.code, int)
+    return int(ended.value.code)
+
+
+@pytest.fixture
+def raising(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Makes every command raise the error that a test puts into `failing.error`."""
+
+    @click.command("failing")
+    def command() -> None:
+        raise failing[0]
+
+    monkeypatch.setattr(_Main, "get_command", lambda *_args: command)
+
+
+failing: list[BaseException] = []
+
+
+@pytest.mark.usefixtures("raising")
+@pytest.mark.parametrize(
+    ("error", "code", "line"),
+    [
+        (ConfigError("a.yaml", "run.spp", "must be\n positive"), 2, "a.yaml: run.spp: must be positive"),
+        (UnsupportedScene("media are not supported"), 2, "media are not supported"),
+        (BackendError("no libLLVM"), 3, "no libLLVM"),
+        (OutOfMemory("out of memory"), 4, "out of memory"),
+        (NonFinite("loss is nan"), 5, "loss is nan"),
+        (KeyboardInterrupt(), 130, "interrupted"),
+        (click.BadParameter("not a number"), 2, "not a number"),
+        (click.FileError("x.yaml", "gone"), 2, "x.yaml"),
+        (MemoryError(), 4, "out of memory (host)"),
+        (RuntimeError("jit_malloc(): out of memory! Could not\nallocate"), 4, "Could not allocate"),
+        (RuntimeError("jit_free(): unknown address <0xffffffffffffffff>!"), 4, "out of memory"),
+        (RuntimeError("CUDA_ERROR_OUT_OF_MEMORY"), 4, "out of memory"),
+        (PermissionError(13, "Permission denied", "runs/x"), 2, "runs/x: Permission denied"),
+        (MachineError("runs/x: the disk is full"), 6, "runs/x: the disk is full"),
+        (OSError(errno.ENOSPC, "No space left on device", "x.json"), 6, "x.json: No space left on device"),
+        (OSError(errno.EIO, "Input/output error"), 6, "Input/output error"),
+        (RuntimeError('cuda_check(): API error 0700 (CUDA_ERROR_ILLEGAL_ADDRESS): "x"\n in a.cpp'), 6, "0700"),
+        (RuntimeError("jit_llvm_compile(): could not add module: x"), 6, "the driver or its compiler failed: jit_llvm"),
+        (RuntimeError("jit_llvm_compile(): could not allocate 5 bytes of memory!"), 4, "out of memory"),
+    ],
+)
+def test_exit_codes(capsys: pytest.CaptureFixture[str], error: BaseException, code: int, line: str) -> None:
+    failing[:] = [error]
+    assert call("failing") == code
+    told = capsys.readouterr()
+    assert line in told.err
+    assert len(told.err.strip().splitlines()) == 1
+    assert told.out == ""
+
+
+@pytest.mark.usefixtures("raising")
+@pytest.mark.parametrize("by", ["option", "variable"])
+def test_debug_shows_the_traceback(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, by: str
+) -> None:
+    failing[:] = [ConfigError("a.yaml", "run.spp", "must be positive")]
+    if by == "variable":
+        monkeypatch.setenv("RESLRB_DEBUG", "1")
+    assert call(*(["--debug"] if by == "option" else []), "failing") == ExitCode.USAGE
+    assert "Traceback" in capsys.readouterr().err
+    monkeypatch.delenv("RESLRB_DEBUG", raising=False)
+    call("failing")
+    assert "Traceback" not in capsys.readouterr().err
+
+
+@pytest.mark.usefixtures("raising")
+def test_a_fault_of_ours_keeps_its_traceback() -> None:
+    failing[:] = [ZeroDivisionError("ours")]
+    with pytest.raises(ZeroDivisionError, match="ours"):
+        main(["failing"])
+
+
+@pytest.mark.parametrize(
+    ("args", "line"),
+    [
+        ([], "reslrb: Missing command"),
+        (["optimise"], "reslrb: No such command"),
+        (["--nope"], "reslrb: No such option"),
+        (["doctor", "--nope"], "reslrb doctor: No such option"),
+    ],
+)
+def test_usage_errors_are_one_line(capsys: pytest.CaptureFixture[str], args: list[str], line: str) -> None:
+    assert call(*args) == ExitCode.USAGE
+    told = capsys.readouterr().err.strip()
+    assert told.startswith(line)
+    assert len(told.splitlines()) == 1
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_help_of_every_command(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert call(command, "--help") == ExitCode.DONE
+    assert capsys.readouterr().out.startswith(f"Usage: reslrb {command}")
+
+
+def test_help_is_fast_and_loads_no_command() -> None:
+    script = (
+        "import sys\nfrom reslrb_cli.cli import main\n"
+        "try: main(['--help'], prog_name='reslrb')\n"
+        "finally: assert not {'mitsuba', 'drjit', 'numpy', 'pydantic'} & set(sys.modules)"
+    )
+    times = []
+    for _ in range(3):
+        start = time.perf_counter()
+        done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+        times.append(time.perf_counter() - start)
+    assert all(name in done.stdout for name in COMMANDS)
+    assert min(times) < 1
+
+
+def test_doctor_reports_as_json(llvm: str) -> None:
+    import json
+
+    script = "from reslrb_cli.cli import main; main(['doctor', '--json'])"
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    report = json.loads(done.stdout)
+    assert report["variant"] in ("llvm_ad_rgb", "cuda_ad_rgb")
+    assert report["packages"]["mitsuba"]
+    assert {backend["variant"] for backend in report["backends"]} == {"llvm_ad_rgb", "cuda_ad_rgb"}
+
+
+# What no machine holds is refused at once, in one located line with the reason; what is merely large goes on.
+
+#: Seconds of the processor that a process may take until it has said so, Python and Mitsuba loaded.
+SECONDS = 5.0
+TRAJECTORY = "{type: trajectory, max_depth: 70000}"
+#: Overrides, the place in the line, and what it says: what is wrong, why, and what would be right.
+REFUSED = {
+    "film": (["scene.size=[100000, 100000]"], "scene.size: must have at most 134217728 pixels, not 10000000000: each"),
+    "smaller film": (["scene.size=[20000, 20000]"], "scene.size: must have at most 134217728 pixels, not 400000000: "),
+    "stack": (
+        ["integrator.stack_size=1000000", "integrator.max_depth=-1"],
+        "integrator.stack_size: 1000000 vertices need as many places of thread-local memory, which has no more than",
+    ),
+    "samples": (
+        ["scene.size=[256, 256]", "run.spp=1000000000"],
+        "run.spp: 1000000000 makes 17174036480 light paths in one pass, and no pass has more than 4294967295: set "
+        "integrator.samples_per_pass to 62500, or lower run.spp",
+    ),
+    "passes": (
+        ["scene.size=[8, 8]", "run.spp=1000000000", "integrator.samples_per_pass=1000"],
+        "run.spp: 1000000000 makes 250000 passes of a step, and no step has more than 65536: set "
+        "integrator.samples_per_pass to 250000",
+    ),
+    "capacity": (
+        ["integrator={estimator: reservoir, capacity: 1000000}"],
+        "integrator.capacity: must be at most 1024, not 1000000: each connection that is kept is code of its own",
+    ),
+    "depth": (
+        ["integrator.max_depth=1000000"],
+        "integrator.max_depth: must be at most 65535 segments, or -1 for no limit, not 1000000: Russian roulette ends",
+    ),
+    "record": (
+        [f"integrator={TRAJECTORY}"],
+        "integrator.max_depth: must be less than 65536, not 70000: the record of a path has room for as many vertices",
+    ),
+}
+
+
+@pytest.fixture
+def experiment(tmp_path: Path) -> Path:
+    write_experiment(tmp_path)
+    return tmp_path
+
+
+def refused(folder: Path, *sets: str) -> tuple[str, float]:
+    """The one line that `optimize` ends with, exit code 2, and the seconds of the processor that it took."""
+    import resource
+
+    script = "import sys; sys.argv[0] = 'reslrb'; from reslrb_cli.cli import run; run()"
+    overrides = [word for text in sets for word in ("--set", text)]
+    environment = {**os.environ, "PYTHONPATH": search_path(ROOT), "RESLRB_CACHE": str(folder / "cache")}
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    done = subprocess.run(
+        [sys.executable, "-c", script, "optimize", "tiny.yaml", "--quiet", *overrides],
+        cwd=folder, env=environment, capture_output=True, text=True, timeout=120, check=False,
+    )  # fmt: skip
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    assert (done.returncode, done.stdout) == (2, ""), done.stderr
+    [line] = done.stderr.splitlines()
+    assert not (folder / "runs").exists()
+    return line, after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+
+
+@pytest.mark.usefixtures("llvm")
+@pytest.mark.parametrize("case", REFUSED)
+def test_refused_before_mitsuba_is_loaded(case: str, experiment: Path) -> None:
+    sets, said = REFUSED[case]
+    with pytest.raises(ConfigError) as error:
+        load(experiment / "tiny.yaml", sets)
+    assert said in str(error.value)
+
+
+@pytest.mark.usefixtures("llvm")
+def test_refused_within_seconds(experiment: Path) -> None:
+    """The slowest way: the film's size stands in the scene's file, so that Mitsuba and the scene are loaded first."""
+    (experiment / "scene.xml").write_text(SCENE.replace('name="width" value="8"', 'name="width" value="65536"'))
+    line, seconds = refused(experiment, "run.spp=1000000")
+    assert line.startswith("tiny.yaml: run.spp: 1000000 makes ")
+    assert line.endswith("set integrator.samples_per_pass to 6250, or lower run.spp")
+    assert seconds < SECONDS
+    (experiment / "scene.xml").write_text(SCENE.replace('value="8"', 'value="20000"'))
+    line, seconds = refused(experiment)
+    assert line.startswith(
+        f"{experiment}/scene.xml:5: a film of 20000x20000 pixels; it must have at most 134217728, si"
+    )
+    assert seconds < SECONDS
+
+
+def obstacle(folder: Path, *sets: str) -> str:
+    with pytest.raises(ConfigError) as error:
+        assemble_scene(load(folder / "tiny.yaml", sets))
+    return str(error.value)
+
+
+@pytest.fixture
+def little(monkeypatch: pytest.MonkeyPatch) -> int:
+    """A machine on which so many bytes are free."""
+    free = 2**30
+    monkeypatch.setattr(room, "free_bytes", lambda variant: free)
+    return free
+
+
+@pytest.mark.usefixtures("llvm")
+def test_what_needs_more_than_is_free(experiment: Path, little: int) -> None:
+    line = obstacle(experiment, "scene.size=[6000, 4000]")
+    said = "scene.size: a film of 6000x4000 pixels takes at least 1.3 GiB, and 1 GiB are free; take at most 5181x3454"
+    assert line.endswith(said)
+    line = obstacle(experiment, "parameters[0].resolution=[10000, 10000]")
+    assert line.endswith("parameters[0].resolution: 10000x10000 texels takes at least 1.5 GiB, and 1 GiB are free; "
+                         "take at most 8192x8192")  # fmt: skip
+    (experiment / "scene.xml").write_text(SCENE.replace('value="8"', 'value="5000"'))
+    assert "scene.file: a film of 5000x5000 pixels takes at least 1.4 GiB" in obstacle(experiment)
+
+
+@pytest.mark.usefixtures("llvm")
+def test_a_step_that_needs_more_than_is_free(experiment: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """By the estimate that `memory_budget` goes by, of which a step takes a part at the least."""
+    from reslrb_cli.optimization.autotune.estimators import find_options
+
+    def find(*sets: str) -> None:
+        find_options(assemble_scene(load(experiment / "tiny.yaml", ["scene.size=[512, 512]", "run.spp=64", *sets])))
+
+    monkeypatch.setattr(room, "SMALL", 0)
+    naive = "integrator={type: ptracer, max_depth: 3}"
+    # Bytes that are free, in MiB. What the scene's file does not say of the texture, its channels, makes the difference
+    # between the first two.
+    for free, sets, said in (
+        (40, ["parameters[0].resolution=[512, 512]"], "scene.size: a film of 512x512 pixels and 512x512 texels, with "
+                                                      "which a step takes at least 48.8 MiB, and 40 MiB are free; "),
+        (64, ["parameters[0].resolution=[512, 512]"], "scene.file: a step takes about "),
+        (32, ["run.adjoint=correlated"], "run.spp: a step takes about "),
+        (32, [naive], "run.spp: ptracer keeps the state of all 4194304 light paths of a pass, at least 192 MiB, and "),
+    ):  # fmt: skip
+        monkeypatch.setattr(room, "free_bytes", lambda variant, free=free: free * 2**20)
+        with pytest.raises(ConfigError) as error:
+            find(*sets)
+        assert said in str(error.value)
+    monkeypatch.setattr(room, "free_bytes", lambda variant: 2**28)
+    for sets in (["parameters[0].resolution=[512, 512]"], [naive]):
+        find(*sets)
+
+
+@pytest.fixture
+def unbuilt(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is said has to be said before anything is made of the scene."""
+
+    def never(*args: object) -> None:
+        raise AssertionError("the scene is built")
+
+    monkeypatch.setattr(scene_load, "build", never)
+
+
+@pytest.mark.usefixtures("llvm")
+def test_what_the_scene_says_of_its_film_is_known_before_it_is_built(
+    experiment: Path, monkeypatch: pytest.MonkeyPatch, unbuilt: None
+) -> None:
+    monkeypatch.setattr(room, "free_bytes", lambda variant: 2**34)
+    sides = SCENE.replace('value="8"', 'value="11500"', 1).replace('value="8"', 'value="11500"', 1)
+    (experiment / "scene.xml").write_text(sides)
+    line = obstacle(experiment, "parameters[0].resolution=[8000, 8000]")
+    said = (
+        "scene.file: a film of 11500x11500 pixels and 8000x8000 texels, with which a step takes at least 22.6 GiB, and "
+    )
+    assert line.endswith(f"{said}16 GiB are free; take a smaller film or coarser textures")
+    assert obstacle(experiment, "run.spp=1000000").endswith("set integrator.samples_per_pass to 25, or lower run.spp")
+    window = '<integer name="crop_width" value="100"/> <integer name="crop_height" value="50"/> <rfilter'
+    for scene, sets in (
+        (sides.replace("<rfilter", window), []),
+        (sides, ["run.memory_budget=2GiB"]),
+        (sides, ["integrator={type: prb, max_depth: 3}"]),
+        (SCENE.replace("</scene>", sides[sides.index("<sensor") : sides.index("<bsdf")] + "</scene>"), []),
+        (SCENE.replace(SCENE[SCENE.index("<film") : SCENE.index("</film>") + 7], ""), []),
+    ):
+        (experiment / "scene.xml").write_text(scene)
+        with pytest.raises(AssertionError, match="the scene is built"):
+            assemble_scene(load(experiment / "tiny.yaml", sets))
+
+
+@pytest.mark.usefixtures("llvm")
+def test_of_what_is_large_and_fits_a_line_is_said_before_it_is_built(
+    experiment: Path, monkeypatch: pytest.MonkeyPatch, unbuilt: None, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(room, "free_bytes", lambda variant: 2**35)
+    caplog.set_level("INFO")
+    for sets, lines in (
+        (["scene.size=[11500, 11500]", "parameters[0].resolution=[8000, 8000]"],
+         ["a film of 11500x11500 pixels and 8000x8000 texels: a step takes at least 22.6 GiB, of 32 GiB that are free; "
+          "loading takes a while"]),
+        (["scene.size=[1000, 1000]", "parameters[0].resolution=[1000, 1000]"], []),
+    ):  # fmt: skip
+        caplog.clear()
+        with pytest.raises(AssertionError, match="the scene is built"):
+            assemble_scene(load(experiment / "tiny.yaml", sets))
+        assert [record.getMessage() for record in caplog.records if "loading" in record.getMessage()] == lines
+
+
+@pytest.mark.usefixtures("llvm")
+def test_a_budget_chooses_passes_that_can_be(experiment: Path) -> None:
+    from reslrb_cli.optimization.autotune.estimators import find_options
+
+    sets = ["scene.size=[256, 256]", "run.spp=1000000000", "run.memory_budget=640"]
+    [option] = find_options(assemble_scene(load(experiment / "tiny.yaml", sets)))
+    assert option.memory is not None
+    assert (option.memory.samples_per_pass, option.memory.passes) == (62500, 4000)
+
+
+@pytest.mark.usefixtures("llvm")
+def test_a_long_run_is_told_of(experiment: Path) -> None:
+    config = load(experiment / "tiny.yaml", ["run.iterations=1000000", "run.spp=65536"])
+    problem = assemble_scene(config)
+    line = room.outlook(config, problem.scene, problem.sensors)
+    assert line is not None
+    assert line.startswith("4.19e+06 light paths an iteration, 4.19e+12 in all: the run takes 4.9 days at 10 million")
+    assert room.outlook(load(experiment / "tiny.yaml"), problem.scene, problem.sensors) is None
+
+
+@pytest.mark.usefixtures("llvm")
+def test_what_fits_is_not_refused(experiment: Path, little: int) -> None:
+    config = load(experiment / "tiny.yaml", ["scene.size=[4000, 4000]", "parameters[0].resolution=[8000, 8000]"])
+    announced.check_announced(config)  # which allocates nothing
+
+
+@pytest.mark.usefixtures("llvm")
+def test_a_stack_that_no_thread_has_room_for(experiment: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from reslrb_cli.optimization.autotune.estimators import find_options
+
+    def find(*sets: str) -> None:
+        find_options(assemble_scene(load(experiment / "tiny.yaml", ["integrator.max_depth=-1", *sets])))
+
+    monkeypatch.setattr(room, "local_bytes", lambda: 2**19)
+    find("integrator.stack_size=4000")
+    with pytest.raises(ConfigError) as error:
+        find("integrator.stack_size=8000")
+    said = str(error.value)
+    assert "integrator.stack_size: 8000 vertices take 625.1 KiB of a thread's stack for each path, which has" in said
+    most = int(said.partition("take at most ")[2].split()[0])
+    find(f"integrator.stack_size={most}")
+    find("integrator={type: trajectory, max_depth: 8000}")
+    with pytest.raises(ConfigError, match=r"integrator\.max_depth: the record of 9000 segments does not fit "):
+        find("integrator={type: trajectory, max_depth: 9000}")
+
+
+@pytest.mark.usefixtures("llvm")
+@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+def test_free_memory_is_no_more_than_a_limit(monkeypatch: pytest.MonkeyPatch) -> None:
+    import resource
+
+    free = memory.free_bytes("llvm_ad_rgb")
+    assert 2**20 < free < 2**50
+    monkeypatch.setattr(resource, "getrlimit", lambda kind: (2**40, 2**40) if free > 2**40 else (2**31, 2**31))
+    assert memory.free_bytes("llvm_ad_rgb") <= free
+
+
+@pytest.mark.usefixtures("llvm")
+@pytest.mark.parametrize(
+    "sets",
+    [
+        ["integrator.max_depth=-1"],
+        ["integrator.max_depth=65535"],
+        ["integrator.max_depth=8", "integrator.stack_size=1000000"],  # paths have no more than seven vertices
+        ["scene.size=[256, 256]", "run.spp=1000000000", "integrator.samples_per_pass=62500"],
+        ["scene.size=[8, 8]", "run.spp=1000000"],
+        ["scene.size=[256, 256]", "run.spp=1000000000", "run.memory_budget=64"],  # by which passes are chosen
+        ["scene.size=[11000, 11000]"],
+        ["run.iterations=2000000000", "run.final_spp=1000000"],
+    ],
+)
+def test_large_is_not_refused(sets: list[str], experiment: Path) -> None:
+    assert isinstance(load(experiment / "tiny.yaml", sets), Config)
+
+
+@pytest.mark.usefixtures("llvm")
+def test_a_mesh_and_a_texture_that_are_too_large(experiment: Path) -> None:
+    """Sparse files: they say that they are large, and take no room on the disk."""
+    import struct
+
+    with (experiment / "mesh.ply").open("wb") as file:
+        file.truncate(2**42)
+    mesh = '<shape type="ply"><string name="filename" value="mesh.ply"/></shape></scene>'
+    (experiment / "scene.xml").write_text(SCENE.replace("</scene>", mesh))
+    assert "filename: " in (line := obstacle(experiment))
+    assert "mesh.ply has 4 TiB, and " in line
+    attributes = b"dataWindow\0box2i\0" + struct.pack("<i4i", 16, 0, 0, 59999, 59999)
+    (experiment / "poster.exr").write_bytes(b"\x76\x2f\x31\x01\x02\0\0\0" + attributes + b"\0" * 100)
+    (experiment / "scene.xml").write_text(SCENE)
+    assert "poster.exr is 60000x60000 pixels; more than 134217728 are not read" in obstacle(experiment)

@@ -1,0 +1,399 @@
+"""What reaches the terminal: text and never commands, a bar of any width, and nothing where it cannot be written."""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import io
+import json
+import logging
+import os
+import re
+import select
+import struct
+import subprocess
+import sys
+import termios
+from pathlib import Path
+
+import click
+import numpy as np
+import pytest
+from cli.test_nonfinite import CONFIG, SCENE
+from cli.test_nonfinite import reslrb_nonfinite as reslrb
+from compilation import search_path
+from records.test_metrics import make_record
+
+from reslrb_cli.cli import _Main, main
+from reslrb_cli.cli import progress as module
+from reslrb_cli.cli.progress import Progress, Reading, descriptions
+from reslrb_cli.cli.terminal import Forgiving, forgiving_output
+from reslrb_cli.optimization.errors import ErrorMeter
+from reslrb_cli.records.measurement_files import read_lines
+
+# Names from scenes, files and arguments reach the terminal and the log as text, never as commands.
+
+ESC, TURNED = "\x1b[31m", "\u202e"
+
+
+@pytest.fixture
+def experiment(llvm, tmp_path, monkeypatch):
+    """An experiment of which folder, file, surface and material have escape sequences in their names."""
+    import mitsuba as mi
+
+    folder = tmp_path / f"f{ESC}"
+    folder.mkdir()
+    mi.Bitmap(np.full((8, 8, 3), 0.5, np.float32)).write(str(folder / "wall.exr"))
+    mi.Bitmap(np.full((8, 8, 3), 0.2, np.float32)).write(str(folder / "target.exr"))
+    scene = SCENE.replace("REFLECTANCE", '<rgb name="reflectance" value="0.6, 0.5, 0.4"/>')
+    # XML holds no control characters; a mark that turns the direction of writing does as much harm in a key.
+    (folder / "scene.xml").write_text(scene.replace('"poster"', f'"pos{TURNED}ter"'))
+    (folder / "c.yaml").write_text(CONFIG.replace("poster.", "Diffuse_1."))
+    monkeypatch.chdir(tmp_path)
+    return folder
+
+
+def test_inspect(experiment, capsys):
+    code, out, err = reslrb(capsys, "inspect", experiment / "c.yaml", "--no-counts")
+    assert code == 0
+    assert not {"\x1b", TURNED} & set(out + err)
+    assert "id `pos\\u202eter` cannot stand in a key: named Diffuse_1" in err
+    assert "Diffuse_1.reflectance.value" in out
+    code, out, _ = reslrb(capsys, "inspect", experiment / "c.yaml", "--no-counts", "--json")
+    assert not {"\x1b", TURNED} & set(out)
+    assert "Diffuse_1.reflectance.value" in [entry["key"] for entry in json.loads(out)["parameters"]]
+
+
+def test_a_run_and_its_errors(experiment, capsys):
+    arguments = ("--set", "run.iterations=1", "--set", 'run.output="o\\e[31m"', "--set", "run.name=n")
+    code, out, err = reslrb(capsys, "optimize", experiment / "c.yaml", *arguments)
+    assert code == 0
+    assert "\x1b" not in out + err
+    assert "look at o\\x1b[31m/n/report.html" in out
+    assert "\x1b" not in Path(f"o{ESC}/n/report.html").read_text().partition("</title>")[0]
+    manifest = json.loads(Path(f"o{ESC}/n/manifest.json").read_text())
+    assert "\x1b" not in manifest["config"] + "".join(manifest["command_line"])
+    for wrong in ("c.yaml", "none.yaml"):
+        code, out, err = reslrb(capsys, "optimize", experiment / wrong, "--set", 'parameters[0].key="x\\e[31m"')
+        assert code == 2
+        assert "\x1b" not in out + err
+
+
+def test_a_run_whose_configuration_is_called_by_bytes_that_are_not_utf8(experiment, capsys, monkeypatch):
+    path = experiment.parent / "c\udcff.yaml"
+    monkeypatch.setattr("sys.argv", ["reslrb", "optimize", str(path), ESC])
+    path.write_text((experiment / "c.yaml").read_text().replace("file: ", f"file: {experiment}/".replace(ESC, "*")))
+    os.rename(experiment, str(experiment).replace(ESC, "*"))
+    code, _, err = reslrb(capsys, "optimize", path, "--set", "run.iterations=1")
+    assert code == 0, err
+    assert Path("runs/c/report.html").exists()
+    manifest = json.loads(Path("runs/c/manifest.json").read_text())
+    assert "c\\udcff.yaml" in manifest["config"]
+    assert manifest["command_line"][2:] == [manifest["config"], "\\x1b[31m"]
+
+
+def test_usage(capsys):
+    code, out, err = reslrb(capsys, "optimize", f"--{ESC}")
+    assert code == 2
+    assert "\x1b" not in out + err
+    assert "No such option" in err
+
+
+def test_the_log(capsys):
+    reslrb(capsys, "optimize", "none.yaml")
+    logging.getLogger("reslrb_cli.x").warning("%s: %s", f"a{ESC}", "b\nc")
+    assert capsys.readouterr().err == "a\\x1b[31m: b\\nc\n"
+
+
+def test_long_keys_make_files(experiment, capsys):
+    long = "k" * 120  # longer ids are replaced
+    scene = (experiment / "scene.xml").read_text()
+    (experiment / "scene.xml").write_text(scene.replace('id="wall"', f'id="{long}"'))
+    key = f"parameters=[{{key: {long}.reflectance.data, initial: 0.4}}]"
+    code, _, err = reslrb(capsys, "optimize", experiment / "c.yaml", "--set", key, "--set", "run.iterations=1")
+    assert code == 0, err
+    entries = json.loads(Path("runs/c/parameters/parameters.json").read_text())
+    assert (Path("runs/c/parameters") / entries[f"{long}.reflectance.data"]["file"]).exists()
+
+
+def test_an_image_whose_name_is_not_utf8(experiment, capsys, monkeypatch):
+    monkeypatch.chdir(experiment)
+    code, out, err = reslrb(capsys, "render", "c.yaml", "-o", "\udcff.png")
+    assert code == 0, err
+    assert out.startswith("\\udcff.png: ")
+    assert os.path.getsize("\udcff.png") > 0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "what"),
+    [
+        (("render", "c.yaml", "-o", "pipe.png"), "--output: pipe.png is not a regular file"),
+        (("render", "c.yaml", "-o", "x.bmp"), "--output: x.bmp has no known image format"),
+        (("render", "c.yaml", "-o", "x.png", "--spp", "99999999999999"), "is not in the range 1<=x<=2147483647."),
+        (("gradcheck", "c.yaml", "--json", "pipe.png"), "--json: cannot write pipe.png: nobody reads from that pipe"),
+        (("bench", "c.yaml", "--memory-limit", "9" * 400 + "GiB"), "is no size; write it as in 2GiB or 500MB."),
+        (("bench", "c.yaml", "--max-depth", "99999999999999"), "is not in the range 2<=x<=2147483647."),
+    ],
+)
+def test_outputs_and_counts(experiment, capsys, monkeypatch, arguments, what):
+    monkeypatch.chdir(experiment)
+    os.mkfifo("pipe.png")
+    code, out, err = reslrb(capsys, *arguments)
+    assert (code, out) == (2, "")
+    assert what in err
+    assert not Path("x.png").exists()
+
+
+def test_a_working_directory_that_is_gone(experiment, capsys, monkeypatch):
+    gone = experiment / "gone"
+    gone.mkdir()
+    monkeypatch.chdir(gone)
+    gone.rmdir()
+    code, _, err = reslrb(capsys, "inspect", experiment / "c.yaml")
+    assert code in (2, 6)
+    assert err == "the working directory: No such file or directory\n"
+
+
+# Output that cannot be written ends nothing, says nothing, and changes no exit code.
+
+ROOT = Path(__file__).resolve().parents[2]
+PROGRAM = "from reslrb_cli.cli import main; main(prog_name='reslrb')"
+
+
+class Failing(io.StringIO):
+    """A stream that fails with `error` whenever something is written or flushed."""
+
+    def __init__(self, error: Exception) -> None:
+        super().__init__()
+        self.error = error
+
+    def write(self, text: str) -> int:
+        raise self.error
+
+    def flush(self) -> None:
+        raise self.error
+
+
+FAILURES = [BrokenPipeError(errno.EPIPE, "Broken pipe"), OSError(errno.ENOSPC, "full"), OSError(errno.EIO, "hung up"),
+            ValueError("I/O operation on closed file")]  # fmt: skip
+
+
+@pytest.mark.parametrize("failure", [*FAILURES, None], ids=str)
+def test_a_command_does_not_see_that_its_streams_fail(monkeypatch: pytest.MonkeyPatch, failure: Exception) -> None:
+    seen = []
+
+    @click.command("talking")
+    def command() -> int:
+        from tqdm import tqdm
+
+        logging.getLogger("reslrb_cli").warning("a line in the log")
+        for stream in (sys.stdout, sys.stderr):
+            click.echo("a line", file=stream)
+            print("another", file=stream, flush=True)
+            with tqdm(total=2, file=stream) as bar:
+                bar.update()
+                bar.refresh()
+        seen.append("the end")
+        return 5
+
+    monkeypatch.setattr(_Main, "get_command", lambda *_args: command)
+    monkeypatch.setattr(sys, "stdout", None if failure is None else Failing(failure))
+    monkeypatch.setattr(sys, "stderr", None if failure is None else Failing(failure))
+    before = sys.stdout, sys.stderr
+    with pytest.raises(SystemExit) as end:
+        main(["talking"])
+    assert end.value.code == 5
+    assert seen == ["the end"]
+    assert (sys.stdout, sys.stderr) == before
+
+
+def test_the_last_line_of_an_error_may_fail_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "stderr", Failing(FAILURES[0]))
+    with pytest.raises(SystemExit) as end:
+        main(["no such command"])
+    assert end.value.code == 2
+
+
+def test_what_can_be_written_is_written(capsys: pytest.CaptureFixture[str]) -> None:
+    with forgiving_output():
+        click.echo("to one")
+        click.echo("to the other", err=True)
+    assert capsys.readouterr() == ("to one\n", "to the other\n")
+
+
+def test_characters_that_the_stream_lacks_are_spelled_out() -> None:
+    raw = io.BytesIO()
+    stream = Forgiving(io.TextIOWrapper(raw, encoding="ascii"))
+    stream.write("runs/ü\udcff\n")
+    stream.flush()
+    assert raw.getvalue() == b"runs/\\xfc\\udcff\n"
+
+
+def test_a_stream_without_a_terminal_is_none() -> None:
+    closed = io.StringIO()
+    closed.close()
+    assert not Forgiving(None).isatty()
+    assert not Forgiving(closed).isatty()
+
+
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="needs /dev/full")
+@pytest.mark.parametrize("streams", ["2>&-", ">&-", "<&- >&- 2>&-", ">/dev/full", "2>/dev/full", ">/dev/full 2>&1"])
+@pytest.mark.parametrize(("arguments", "code"), [("--version", 0), ("--nope", 2)])
+def test_python_has_nothing_to_add_at_its_end(tmp_path: Path, streams: str, arguments: str, code: int) -> None:
+    script = f'"{sys.executable}" -c "{PROGRAM}" {arguments} {streams}'
+    environment = {**os.environ, "PYTHONPATH": search_path(ROOT)}
+    done = subprocess.run(["sh", "-c", script], capture_output=True, text=True, env=environment, check=False)
+    assert done.returncode == code
+    assert "Exception" not in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+def test_a_reader_that_has_gone_ends_nothing() -> None:
+    script = "from reslrb_cli.cli.terminal import forgiving_output\nimport sys\nsys.stdin.read()\n"
+    script += (
+        "with forgiving_output():\n  for number in range(10000): print(number)\n  print('error', file=sys.stderr)\n"
+    )
+    environment = {**os.environ, "PYTHONPATH": search_path(ROOT)}
+    run = subprocess.Popen([sys.executable, "-c", script], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+                           stderr=subprocess.PIPE, env=environment)  # fmt: skip
+    assert run.stdout is not None
+    run.stdout.close()
+    _, err = run.communicate()
+    assert (run.returncode, err) == (0, b"error\n")
+
+
+def test_no_file_takes_the_place_of_a_closed_stream(tmp_path: Path) -> None:
+    script = "from reslrb_cli.cli.terminal import forgiving_output\n"
+    script += f"with forgiving_output(): print(open({str(tmp_path / 'file')!r}, 'w').fileno() > 2)"
+    command = f'"{sys.executable}" -c "{script}" 2>&- <&-'
+    environment = {**os.environ, "PYTHONPATH": search_path(ROOT)}
+    done = subprocess.run(["sh", "-c", command], capture_output=True, text=True, env=environment, check=False)
+    assert done.stdout == "True\n"
+
+
+# Progress on terminals of any width: a bar, the percentage and the loss, and no number that is cut.
+
+LAMP = "a_lamp_with_a_name_of_some_length.emitter.radiance.value"
+
+
+def make_meter(units):
+    truth = {"wall.reflectance.value": np.full(3, 0.5), LAMP: np.full(3, 2e6)}
+    masks = {key: np.ones(3, dtype=bool) for key in truth}
+    return ErrorMeter(truth, masks, {LAMP: "radiance"} if units == 2 else None)
+
+
+def record(number, units):
+    errors = {"wall.reflectance.value": 0.4321 / (1 + number), LAMP: 1.357913e6}
+    return make_record(
+        iteration=number,
+        loss=0.0123456 * 10 ** -(number % 4),
+        parameter_errors=errors,
+        parameter_rmse=None if units == 2 else 0.2468 / (1 + number),
+    )
+
+
+def shown(monkeypatch, width, units, iterations=30, resize=None):
+    """What stood on a terminal of that width, frame by frame."""
+    master, slave = os.openpty()
+    fcntl.ioctl(slave, termios.TIOCSWINSZ, struct.pack("HHHH", 24, width, 0, 0))
+    with os.fdopen(slave, "w") as terminal:
+        monkeypatch.setattr(sys, "stderr", terminal)
+        text = b""
+        with Progress(iterations, quiet=False, meter=make_meter(units)) as progress:
+            progress._bar.mininterval = 0
+            for number in range(iterations):
+                if resize and number == iterations // 2:
+                    fcntl.ioctl(slave, termios.TIOCSWINSZ, struct.pack("HHHH", 24, resize, 0, 0))
+                progress.show(record(number, units))
+                text += os.read(master, 1 << 16)
+    os.close(master)
+    return [frame for frame in re.split(r"[\r\n]+", text.decode()) if frame.strip()]
+
+
+@pytest.mark.parametrize("units", [1, 2])
+@pytest.mark.parametrize("width", [40, 60, 80, 120, 200])
+def test_every_width_has_a_bar_the_percentage_and_the_loss(monkeypatch, width, units):
+    frames = shown(monkeypatch, width, units)
+    assert len(frames) >= 30
+    assert max(map(len, frames)) <= width
+    for number in range(30):
+        loss = f"loss {record(number, units).loss:.4g}"
+        assert any(re.search(rf"^ *\d+%\|.{{8,}}\|.*{re.escape(loss)}(,|$)", frame) for frame in frames), loss
+    words = frames[-1].partition("loss")[2]
+    if width >= 60:
+        error = "relative error 0.679" if units == 2 else f"RMSE {0.2468 / 30:.4g}"
+        assert error in words
+    assert ("00:00 left" in frames[-1] or "<00:00" in frames[-1]) == (width >= 80)
+    assert (LAMP[-14:] in words) == (units == 2 and width >= 120)
+
+
+def test_a_terminal_that_changes_its_width(monkeypatch):
+    frames = shown(monkeypatch, 120, 2, resize=40)
+    assert len(frames[3]) > 110
+    for frame in frames[-8:]:
+        assert len(frame) <= 40
+        assert re.search(r"\d%\|.{8,}\| loss [\d.e-]+$", frame), frame
+    frames = shown(monkeypatch, 40, 2, resize=120)
+    assert "at worst" not in frames[3]
+    assert "at worst" in frames[-1]
+
+
+def test_hardly_any_room(monkeypatch):
+    frames = shown(monkeypatch, 14, 1)
+    assert max(map(len, frames)) <= 14
+    assert all(re.fullmatch(r" *\d+%\|.*\|", frame) for frame in frames)
+
+
+def test_an_error_is_told_where_it_is_known():
+    meter = make_meter(2)
+    assert descriptions(make_record(), meter) == ["loss 0.5"]
+    long, short, loss = descriptions(record(0, 2), meter)
+    assert long.startswith("loss 0.01235, relative error 0.8642 at worst (wall.reflectance.value)")
+    assert (short, loss) == ("loss 0.01235, relative error 0.8642", "loss 0.01235")
+    assert descriptions(record(0, 1), make_meter(1))[0] == "loss 0.01235, parameter RMSE 0.2468"
+
+
+def test_keys_are_shortened_in_the_middle_and_cannot_steer_the_terminal():
+    key = "\x1b[31mred" + "x" * 60 + ".value"
+    meter = ErrorMeter(
+        {key: np.ones(3), "b": np.ones(1)}, {key: np.ones(3, bool), "b": np.ones(1, bool)}, {"b": "radiance"}
+    )
+    text = descriptions(make_record(parameter_errors={key: 0.5, "b": 0.1}), meter)[0]
+    assert "\x1b" not in text
+    assert re.search(r"\(\\x1b\S+\.\.\.\S+\.value\)$", text)
+    assert len(text) < 90
+
+
+def write_metrics(folder, lines=20_000):
+    file = folder / "metrics.jsonl"
+    file.write_text('{"iteration": 1, "loss": 0.25}\n' * lines)
+    return file
+
+
+def test_reading_a_long_file_has_a_bar(monkeypatch, tmp_path):
+    monkeypatch.setattr(module, "LEAST_SECONDS", 0.0)
+    master, slave = os.openpty()
+    fcntl.ioctl(slave, termios.TIOCSWINSZ, struct.pack("HHHH", 24, 100, 0, 0))
+    with os.fdopen(slave, "w") as terminal:
+        monkeypatch.setattr(sys, "stderr", terminal)
+        with Reading() as tell:
+            assert len(read_lines(write_metrics(tmp_path), tell).objects) == 20_000
+        text = ""
+        while not text.endswith("\n") and select.select([master], [], [], 5)[0]:  # what was written arrives in pieces
+            text += os.read(master, 1 << 16).decode()
+    os.close(master)
+    assert re.search(r"reading .*metrics.jsonl: +\d+%\|.*/605k ", text)
+    assert text.endswith("drawing\r\n")
+
+
+def test_without_a_terminal_a_line_is_written_now_and_then(monkeypatch, tmp_path, capsys):
+    file = write_metrics(tmp_path)
+    with Reading() as tell:
+        read_lines(file, tell)
+    assert capsys.readouterr().err == ""  # it took no time
+    monkeypatch.setattr(module, "SECONDS_PER_LINE", 0.0)
+    with Reading() as tell:
+        read_lines(file, tell)
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 4
+    assert re.fullmatch(r"reading .*metrics.jsonl: 124 KiB of 605.5 KiB", lines[0])

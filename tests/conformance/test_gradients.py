@@ -1,0 +1,532 @@
+"""Gradients of every estimator: at equal seeds, in expectation, by forward mode, and where factors are zero."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pytest
+from agreement import Agreement, compare
+from conformance.gradient_cases import (
+    _IN_VIEW,
+    AT_EQUAL_SEEDS,
+    CASES,
+    FLOOR,
+    IN_EXPECTATION,
+    GradientCase,
+    _mask,
+    floor,
+)
+from conformance.scenes import plugin
+from turns import a_few, taking_turns
+
+from reslrb_cli.errors import UnsupportedScene
+from reslrb_cli.integrators.step import gradient_step, known_step, make_integrator, render_image, sample_sets
+from reslrb_cli.measure.gradients import Case, integrator, relative, seeds
+from reslrb_cli.measure.scenes.small import bitmap, diffuse, lamp, rgb, room, texture, transform
+
+pytestmark = pytest.mark.usefixtures("llvm")
+
+
+# Every estimator in every case: exact ones equal naive AD of the same paths, the others do in expectation.
+#
+# The cases' own references (test_gradient_reference.py) say that naive AD of our walk is right. Here it is the
+# reference at equal seeds, which sees what a test over many seeds cannot.
+
+EXACT = {"gather": {}, "stack": {}, "stack_of_2": {"estimator": "stack", "stack_size": 2}}
+RANDOM = {
+    "reservoir": {},
+    "reservoir_of_4": {"estimator": "reservoir", "capacity": 4},
+    "event": {},
+    "event_of_4": {"estimator": "event", "capacity": 4},
+}
+BY_ADJOINT = {
+    "reservoir_by_adjoint": {"estimator": "reservoir", "weight": "adjoint"},
+    "event_by_adjoint": {"estimator": "event", "weight": "adjoint"},
+}
+#: Options that belong to the reservoir alone.
+OF_RESERVOIR = {"image"}
+
+
+def estimator(case: GradientCase, name: str, options: dict):
+    """The integrator of a case with this estimator."""
+    own = {key: value for key, value in case.options.items() if key not in OF_RESERVOIR}
+    return integrator("reslrb", **case.both | own | {"estimator": name} | options)
+
+
+@taking_turns("case", CASES, "adjoint", ("correlated", "independent"), AT_EQUAL_SEEDS)
+def test_exact_estimators_equal_naive_ad(case: GradientCase, adjoint: str):
+    scene = Case(case.scene(), case.keys)
+    own = {key: value for key, value in case.options.items() if key not in OF_RESERVOIR}
+    reference = scene.gradient(integrator("walk_ad", **case.both | own), 5, case.spp, adjoint=adjoint)
+    for name, options in EXACT.items():
+        ours = scene.gradient(estimator(case, name, options), 5, case.spp, adjoint=adjoint)
+        error = relative(ours, reference)
+        print(case.name, adjoint, name, f"{error:.1e}")
+        assert error < 1e-4, f"{name}, {adjoint}: {error:.1e}"
+
+
+def agree(case: GradientCase, count: int, candidates: dict[str, dict], adjoint: str) -> None:
+    """Compare each candidate with `gather` over `count` other seeds."""
+    scene = Case(case.scene(), case.keys)
+    reference = scene.gradients(estimator(case, "gather", {}), seeds(count, 1), case.spp, adjoint=adjoint)
+    for name, options in candidates.items():
+        ours = scene.gradients(estimator(case, name, options), seeds(count), case.spp, adjoint=adjoint)
+        result = compare(ours, reference, block=None)
+        print(case.name, name, result)
+        assert result, name
+        assert np.isfinite(ours).all()
+
+
+FEW = ("texture", "roulette", "crop", "glass", "mask_texture_in_view", "area_texture", "two_emitters")
+
+
+@pytest.mark.parametrize("case", a_few([case for case in CASES if case.name in FEW], ["texture"]))
+def test_random_estimators_agree(case: GradientCase):
+    agree(case, 16, RANDOM, "correlated")
+    agree(case, 16, BY_ADJOINT, "independent")
+
+
+def test_event_agrees_where_lobes_are_not_connected():
+    [case] = [case for case in CASES if case.name == "glass"]
+    agree(case, 16, {"event": {}}, "correlated")
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
+def test_random_estimators_agree_over_many_seeds(case: GradientCase):
+    count = 200 if case.name in FEW else 40
+    agree(case, count, RANDOM, "correlated")
+    agree(case, count, BY_ADJOINT, "independent")
+
+
+@pytest.mark.parametrize("name", ["reservoir", "gather", "event", "stack"])
+@pytest.mark.parametrize("max_depth", [0, 1])
+def test_without_light_paths_the_gradient_is_zero(name: str, max_depth: int):
+    case = next(case for case in CASES if case.name == "texture")
+    scene = Case(case.scene(), case.keys)
+    assert not scene.gradient(integrator("reslrb", estimator=name, max_depth=max_depth), 3, 4).any()
+
+
+# The reservoir estimator's gradient against `ptracer`, `prb` and finite differences: equal in expectation.
+
+#: The noise of a comparison may be so much of the gradient, else it could not see a wrong one.
+RESOLUTION = 0.1
+
+
+def agreement(case: GradientCase, count: int) -> Agreement:
+    """Compare gradients over `count` seeds each."""
+    scene = Case(case.scene(), case.keys)
+    ours = scene.gradients(integrator("reslrb", **case.both | case.options), seeds(count), case.spp)
+    if case.reference == "fd":
+        image = integrator("reslrb", **case.both)
+        directions = scene.directions(max(2, count // 16))
+        ours = ours @ directions.T
+        reference = np.array([
+            [scene.difference(image, direction, seed, case.spp, case.step, case.sides) for direction in directions]
+            for seed in seeds(count, 1)
+        ])  # fmt: skip
+    else:
+        reference = scene.gradients(integrator(case.reference, **case.both), seeds(count, 1), case.spp)
+    size = np.linalg.norm(reference.mean(0))
+    noise = np.linalg.norm(np.hypot(ours.std(0), reference.std(0))) / np.sqrt(count)
+    assert noise < RESOLUTION * size, f"{case.name}: standard error {noise / size:.1%} of the gradient"
+    return compare(ours, reference, block=None)
+
+
+@pytest.mark.parametrize("case", a_few(CASES, IN_EXPECTATION))
+def test_gradient(case: GradientCase):
+    result = agreement(case, 16)
+    print(case.name, case.reference, result)
+    assert result
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
+def test_gradient_over_64_seeds(case: GradientCase):
+    result = agreement(case, 64)
+    print(case.name, case.reference, result)
+    assert result
+
+
+# Naive AD of our walk, forward mode, and the reservoir, each against the others at equal seeds.
+
+BY_NAME = {case.name: case for case in CASES}
+
+#: Where stock `ptracer` is right and traces the same paths: not masks, rotated environment maps, bump and normal maps,
+#: nor where its directions move with a parameter, nor textures of lamps, whose black texels it does not draw.
+SAME_PATHS = ("texture", "gaussian", "crop", "rgba", "thin_lens", "twosided", "mirror", "glass", "area",
+              "point", "spot", "projector", "directional", "directionalarea", "constant")  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    "name",
+    a_few(SAME_PATHS, ("texture", "crop", "thin_lens", "projector")),
+)
+def test_walk_ad_is_ptracer(name: str):
+    case = BY_NAME[name]
+    scene = Case(case.scene(), case.keys)
+    options = case.both | {"hide_emitters": True}
+    ours = scene.gradient(integrator("walk_ad", **options), 3, 64)
+    assert relative(ours, scene.gradient(integrator("ptracer", **options), 3, 64)) < 1e-4
+
+
+def forward(scene: Case, integrator: Any, seed: int, spp: int) -> np.ndarray:
+    """The image's derivative along the first of the random directions of the parameters, as Mitsuba's users get it."""
+    import drjit as dr
+    import mitsuba as mi
+
+    def tangent() -> Any:
+        image = mi.render(scene.scene, scene.params, integrator=integrator, seed=seed, seed_grad=seed + 1, spp=spp)
+        return dr.forward_to(image)
+
+    return scene.along(scene.directions(1)[0], tangent)[:, :, :3]  # derivative of alpha: none
+
+
+#: Forward mode by default: what it does along a path (emission, factors, delta lobes, masks, what is seen), with
+#: films and sensors; the other cases hold other BSDFs and emitters, to which it is the same.
+QUICK = ("texture", "roulette", "thin_lens", "glass", "mask_texture_in_view", "two_emitters", "visible_lamp")
+
+
+@pytest.mark.parametrize("name", a_few([n for n in BY_NAME if n not in ("texture_prb", "retained")], QUICK))
+def test_forward_mode_is_walk_ad(name: str):
+    case = BY_NAME[name]
+    scene, options = Case(case.scene(), case.keys), case.both | case.options
+    tangent = forward(scene, plugin("reslrb", **options), 3, 32)
+    naive = forward(scene, plugin("walk_ad", **options), 3, 32)
+    assert np.abs(naive).max() > 0
+    assert relative(tangent, naive) < 1e-5
+    # The adjoint of the same derivative: <weights, J v> = <J^T weights, v>, at the seed that forward mode had.
+    gradient = scene.gradient(integrator("walk_ad", **options), 4, 32)
+    assert np.sum(naive * np.array(scene.weights)) == pytest.approx(gradient @ scene.directions(1)[0], rel=1e-3)
+
+
+@pytest.mark.parametrize("name", a_few(["texture", "roulette", "glass", "blend", "visible_lamp"], ["texture"]))
+def test_forward_against_backward(name: str):
+    """<weights, J v> against <J^T weights, v>, where J^T is the reservoir's."""
+    case = BY_NAME[name]
+    scene = Case(case.scene(), case.keys)
+    options = case.both | case.options
+    ours = plugin("reslrb", **options)
+    direction = np.abs(scene.directions(1)[0])
+    scene.directions = lambda count: direction[None]  # one sign, so that the product is not lost in its noise
+    tangents = np.array([np.sum(forward(scene, ours, s, case.spp) * np.array(scene.weights)) for s in seeds(16)])
+    gradients = scene.gradients(integrator("reslrb", **options), seeds(16, 1), case.spp) @ direction
+    result = compare(tangents[:, None], gradients[:, None], block=None)
+    assert result
+    assert result.relative_error < 0.03
+
+
+# Factors that are exactly zero: their derivative is finite, and neither estimator may lose it.
+#
+# The image is a polynomial in each parameter, so that finite differences, one-sided where the domain ends, are exact
+# up to rounding as long as the paths do not depend on the parameter; otherwise they are compared in expectation.
+
+
+def tiles(*texels: tuple[float, ...]) -> dict:
+    """A texture with these columns; two rows and columns is the least that Mitsuba takes."""
+    return bitmap(
+        np.broadcast_to(np.array(texels, float).reshape(1, len(texels), -1), (2, len(texels), len(texels[0])))
+    )
+
+
+def matte(texture: dict) -> dict:
+    return {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": texture}}
+
+
+def blend(weight: dict) -> dict:
+    return {"type": "blendbsdf", "weight": weight, "first": diffuse(0.8, 0.3, 0.2), "second": diffuse(0.1, 0.6, 0.4)}
+
+
+@dataclass(frozen=True)
+class ZeroCase:
+    """`sides`: which way the domain goes on. `fixed_paths`: paths do not depend on the parameters."""
+
+    name: str
+    scene: Callable[[], dict]
+    keys: tuple[str, ...]
+    sides: str = "up"
+    fixed_paths: bool = True
+    step: float = 0.1
+    spp: int = 64
+    max_depth: int = 4
+    lost: str = ""  # why the derivative is not found, where it is known not to be
+
+
+CLIPPED = "Mitsuba clips opacities and weights to [0, 1], and Dr.Jit's clip has no derivative at the lower end"
+NOT_SAMPLED = "what has a probability of zero is not sampled, here light that passes an opaque mask"
+
+ZERO_CASES = [
+    ZeroCase("texel_zero_in_one_channel", lambda: floor(matte(tiles((0.5, 0.0, 0.4), (0.6, 0.3, 0.0)))), (FLOOR,)),
+    ZeroCase("texel_zero_in_all", lambda: floor(matte(tiles((0, 0, 0), (0.6, 0.3, 0.5)))), (FLOOR,)),
+    ZeroCase("everything_black", lambda: room(floor=matte(tiles((0, 0, 0), (0, 0, 0))), wall=matte(rgb(0, 0, 0)),
+                                              side=matte(rgb(0.5, 0, 0.5))),
+             (FLOOR, "wall.brdf_0.reflectance.value", "side.brdf_0.reflectance.value"), max_depth=5),
+    ZeroCase("lamp_zero_in_one_channel", lambda: room(lamp=lamp(radiance=rgb(2, 0, 3))),
+             ("lamp.emitter.radiance.value", "floor.brdf_0.reflectance.value")),
+    ZeroCase("lamp_zero_in_all", lambda: room(lamp=lamp(radiance=rgb(0, 0, 0))), ("lamp.emitter.radiance.value",)),
+    ZeroCase("lamp_and_texel_zero", lambda: floor(matte(tiles((0, 0.4, 0), (0.6, 0.3, 0.5))),
+                                                  lamp=lamp(radiance=rgb(0, 2, 3))),
+             ("lamp.emitter.radiance.value", FLOOR)),
+    ZeroCase("lamp_texture_zero_in_one_channel",
+             lambda: room(lamp=lamp(radiance=tiles((4, 0, 3), (1, 2, 5)))), ("lamp.emitter.radiance.data",),
+             fixed_paths=False),
+    ZeroCase("lamp_texture_zero_in_all", lambda: room(lamp=lamp(radiance=tiles((0, 0, 0), (1, 2, 5)))),
+             ("lamp.emitter.radiance.data",), fixed_paths=False),
+    ZeroCase("point_zero", lambda: room(lamp=None, light={"type": "point", "position": [0.5, 0.9, 0.8],
+                                                           "intensity": rgb(0, 1, 0)}), ("light.intensity.value",)),
+    ZeroCase("constant_zero", lambda: room(lamp=None, light={"type": "constant", "radiance": rgb(0, 1, 0)}),
+             ("light.radiance.value",), spp=128),
+    ZeroCase("opacity_0", lambda: _mask(0.0), ("veil.bsdf.opacity.value",), fixed_paths=False, spp=256, lost=CLIPPED),
+    ZeroCase("opacity_1", lambda: _mask(1.0), ("veil.bsdf.opacity.value",), "down",
+             fixed_paths=False, spp=256, lost=NOT_SAMPLED),
+    ZeroCase("opacity_0_in_view", lambda: _mask(0.0, **_IN_VIEW), ("veil.bsdf.opacity.value",),
+             fixed_paths=False, lost=CLIPPED),
+    ZeroCase("opacity_1_in_view", lambda: _mask(1.0, **_IN_VIEW), ("veil.bsdf.opacity.value",), "down",
+             fixed_paths=False, lost=NOT_SAMPLED),
+    ZeroCase("opacity_near_0", lambda: _mask(0.08), ("veil.bsdf.opacity.value",), "both", fixed_paths=False, step=0.08,
+             spp=512),
+    ZeroCase("opacity_near_1", lambda: _mask(0.92, **_IN_VIEW), ("veil.bsdf.opacity.value",), "both",
+             fixed_paths=False, step=0.08, spp=256),
+    ZeroCase("blend_0", lambda: floor(blend(tiles((0,), (0.4,)))), ("floor.weight.data",),
+             fixed_paths=False, lost=CLIPPED),
+    ZeroCase("blend_1", lambda: floor(blend(tiles((1,), (0.4,)))), ("floor.weight.data",), "down", fixed_paths=False),
+    ZeroCase("mirror_zero", lambda: room(lamp=lamp(radiance=rgb(9, 9, 9)), floor={
+                 "type": "blendbsdf", "weight": 0.5, "first": diffuse(0.5, 0.5, 0.5),
+                 "second": {"type": "roughconductor", "alpha": 0.3, "specular_reflectance": rgb(0.8, 0, 0)}}),
+             ("floor.bsdf_1.specular_reflectance.value",)),
+]  # fmt: skip
+
+
+def directions(case: ZeroCase, scene: Case) -> np.ndarray:
+    """The parameters' axes, or a few directions into the domain where there are many parameters: (K, P)."""
+    size = sum(len(value) for value in scene.initial.values())
+    return np.eye(size) if case.fixed_paths or size <= 2 else np.abs(scene.directions(2))
+
+
+def differences(case: ZeroCase, scene: Case, along: np.ndarray, count: int, block: int) -> np.ndarray:
+    """Finite differences: (N, K)."""
+    image = integrator("walk_ad", case.max_depth)
+    return np.array([
+        [scene.difference(image, direction, seed, case.spp, case.step, case.sides) for direction in along]
+        for seed in seeds(count, block)
+    ])  # fmt: skip
+
+
+#: Of the default suite: zeros of texels, lamps, blends and mirrors once; of what is lost, one.
+QUICK_ZERO = ("texel_zero_in_one_channel", "lamp_texture_zero_in_all", "blend_1", "mirror_zero")
+
+
+def parameters() -> list:
+    """The cases; those whose derivative is known to be lost have to fail."""
+    return [
+        pytest.param(case, id=case.name,
+                     marks=[*([pytest.mark.xfail(reason=case.lost, strict=True)] if case.lost else []),
+                            *([] if case.name in QUICK_ZERO else [pytest.mark.long])])
+        for case in ZERO_CASES
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize("case", parameters())
+def test_zero(case: ZeroCase):
+    scene, count = Case(case.scene(), case.keys), 12 if case.lost else 16
+    along = directions(case, scene)
+    ours = scene.gradients(integrator("reslrb", case.max_depth), seeds(count), case.spp) @ along.T
+    naive = scene.gradients(integrator("walk_ad", case.max_depth), seeds(count), case.spp) @ along.T
+    if case.fixed_paths:
+        # At equal seeds nothing but rounding is between naive AD and differences: two seeds tell.
+        assert relative(naive[:2], differences(case, scene, along, 2, 0)) < 2e-3
+        reference = naive
+    else:
+        reference = differences(case, scene, along, count, 1)
+        result = compare(naive, reference, block=None)
+        print(case.name, "walk_ad", result)
+        assert result, f"walk_ad {result}"
+    result = compare(ours, reference, block=None)
+    print(case.name, result)
+    assert result
+    assert (np.abs(ours.mean(0)) > 3 * ours.std(0) / np.sqrt(count)).mean() > 0.5, "zero within noise"
+
+
+# `trajectory`, Dr.Jit's own reversal of the walk, has the gradient of `walk_ad` at equal seeds.
+
+FEW_TRAJECTORIES = ("texture", "passes", "glass", "area_texture", "envmap")
+NAMES = ("texture", "roulette", "passes", "gaussian", "thin_lens", "plastic", "glass", "bumpmap", "area_texture",
+         "envmap", "visible_lamp")  # fmt: skip
+
+
+def options(case: GradientCase) -> dict:
+    return {name: value for name, value in {**case.options, **case.both}.items() if name != "image"}
+
+
+@taking_turns("name", NAMES, "adjoint", ("correlated", "independent"), FEW_TRAJECTORIES)
+def test_equal_seeds_give_equal_gradients(name: str, adjoint: str) -> None:
+    named = BY_NAME[name]
+    case = Case(named.scene(), named.keys)
+    expected = case.gradient(integrator("walk_ad", **options(named)), 3, 8, adjoint=adjoint)
+    found = case.gradient(integrator("trajectory", **options(named)), 3, 8, adjoint=adjoint)
+    assert np.abs(expected).sum() > 0
+    assert relative(found, expected) < 2e-5
+
+
+def test_masks_without_parameters_are_passed() -> None:
+    mask = {"type": "mask", "opacity": 0.4, "bsdf": {"type": "twosided", "bsdf": diffuse(0.7, 0.6, 0.3)}}
+    placed = transform(translate=[0.1, 0.2, 0.2], rotate=([1, 0, 0], -80), scale=0.5)
+    case = Case(room(veil={"type": "rectangle", "to_world": placed, "bsdf": mask}), ("floor.brdf_0.reflectance.value",))
+    expected = case.gradient(integrator("walk_ad", 6), 3, 8)
+    assert np.abs(expected).sum() > 0
+    assert relative(case.gradient(integrator("trajectory", 6), 3, 8), expected) < 2e-5
+
+
+def test_masks_with_parameters_are_refused() -> None:
+    named = BY_NAME["mask"]
+    case = Case(named.scene(), named.keys)
+    with pytest.raises(UnsupportedScene, match="masks"):
+        case.gradient(integrator("trajectory"), 3, 8)
+
+
+def test_endless_paths_are_refused() -> None:
+    with pytest.raises(Exception, match="max_depth"):
+        make_integrator("trajectory", max_depth=-1)
+
+
+@pytest.mark.parametrize("name", ["ptracer", "trajectory", "walk_ad", "reservoir", "gather", "stack"])
+def test_a_known_adjoint_gives_image_and_gradient_of_a_correlated_step(name: str) -> None:
+    import drjit as dr
+
+    named = BY_NAME["texture"]
+    case = Case(named.scene(), named.keys)
+    chosen = integrator("reslrb", estimator=name) if name in ("reservoir", "gather", "stack") else integrator(name)
+    [key, *_] = case.keys
+
+    def run(known: bool) -> tuple[np.ndarray, np.ndarray, float]:
+        dr.enable_grad(case.params[key])
+        dr.set_grad(case.params[key], 0)
+        case.params.update()
+        common = {"seed": 5, "spp": 8, "params": case.params}
+        if known:
+            step = known_step(chosen, case.scene, 0, case.weights, **common)
+        else:
+            step = gradient_step(chosen, case.scene, 0, case.objective, **common)
+        return np.array(step.image), np.array(dr.grad(case.params[key])), float(np.array(step.loss).item())
+
+    for expected, found in zip(run(False), run(True), strict=True):
+        np.testing.assert_allclose(found, expected, rtol=2e-4, atol=2e-5 * np.abs(expected).max())
+
+
+# Which samples delta comes from.
+#
+# With one set for image and gradient an L2 gradient is biased by the image's noise; with an independent set, or in
+# batches, it is not.
+
+SPP = 4
+COUNT = 64
+ADJOINTS = {
+    "correlated": {"adjoint": "correlated"},
+    "independent": {"adjoint": "independent"},
+    "two batches": {"adjoint": "batched", "batches": 2},
+    "four batches": {"adjoint": "batched", "batches": 4},
+    "first batch again": {"adjoint": "batched", "batches": 2, "first_batch": "again"},
+}
+
+
+@pytest.fixture(scope="module")
+def case_of_two() -> Case:
+    bsdf = {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": texture(3, 4)}}
+    return Case(floor(bsdf), [FLOOR])
+
+
+@pytest.fixture(scope="module")
+def reference(case_of_two: Case) -> tuple:
+    """Target, and the gradient of the L2 loss: delta at the mean image, over many samples."""
+    import mitsuba as mi
+
+    tracer = integrator("reslrb")
+    mean = np.mean([render_image(tracer, case_of_two.scene, 0, 50_000 + i, 1024) for i in range(8)], axis=0)
+    target = mi.TensorXf((mean * np.random.default_rng(3).uniform(0.7, 1.2, mean.shape)).astype(np.float32))
+    delta = 2 * (mi.TensorXf(mean.astype(np.float32)) - target) / mean.size
+    exact = integrator("reslrb", estimator="gather")
+
+    def step(seed: int) -> np.ndarray:
+        return case_of_two.gradient(exact, seed, 256, step=lambda *args, **options: known_step(
+            *args[:3], delta, seed=options["seed"], spp=options["spp"], params=options["params"]))  # fmt: skip
+
+    return target, np.stack([step(seed) for seed in seeds(16, 70)])
+
+
+def l2(target):
+    """Mean square difference from the target."""
+    import drjit as dr
+
+    return lambda image: dr.mean(dr.square(image - target), axis=None)
+
+
+def agreement_adjoint(case: Case, reference: tuple, name: str, estimator: str = "stack") -> Agreement:
+    target, expected = reference
+    tracer = integrator("reslrb", estimator=estimator)
+    objective = l2(target)
+    ours = [case.gradient(tracer, seed, SPP, objective, **ADJOINTS[name]) for seed in seeds(COUNT)]
+    return compare(np.stack(ours), expected, block=None)
+
+
+@pytest.mark.parametrize(
+    "name",
+    a_few(["independent", "two batches", "four batches", "first batch again"], ["two batches", "first batch again"]),
+)
+def test_l2_gradient_is_unbiased(case_of_two: Case, reference: tuple, name: str):
+    result = agreement_adjoint(case_of_two, reference, name)
+    print(name, result)
+    assert result
+
+
+def test_correlated_samples_are_measurably_biased(case_of_two: Case, reference: tuple):
+    result = agreement_adjoint(case_of_two, reference, "correlated")
+    print("correlated", result)
+    assert not result
+    assert np.abs(result.z).max() > 2 * result.threshold
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("estimator", ["reservoir", "gather", "event"])
+def test_batches_serve_every_estimator(case_of_two: Case, reference: tuple, estimator: str):
+    result = agreement_adjoint(case_of_two, reference, "four batches", estimator)
+    print(estimator, result)
+    assert result
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", ["ptracer", "walk_ad", "prb"])
+def test_batches_serve_the_baselines(case_of_two: Case, reference: tuple, name: str):
+    target, expected = reference
+    tracer, objective = integrator(name), l2(target)
+    ours = [case_of_two.gradient(tracer, seed, SPP, objective, **ADJOINTS["four batches"]) for seed in seeds(COUNT)]
+    result = compare(np.stack(ours), expected, block=None)
+    print(name, result)
+    assert result
+
+
+@pytest.mark.parametrize("batches", [1, 3])
+def test_batches_that_do_not_divide_are_refused(case_of_two: Case, reference: tuple, batches: int):
+    with pytest.raises(
+        ValueError, match='"batches" must be a whole number from 2' if batches < 2 else "multiple of the batches"
+    ):
+        case_of_two.gradient(integrator("reslrb"), 1, SPP, l2(reference[0]), adjoint="batched", batches=batches)
+
+
+@pytest.mark.parametrize("name", ["correlated", "independent", "four batches"])
+def test_sample_sets_are_those_of_a_step(case_of_two: Case, name: str):
+    tracer, results = integrator("reslrb", estimator="stack"), []
+
+    def step(*args, **options):
+        results.append(gradient_step(*args, **options))
+
+    gradient = case_of_two.gradient(tracer, 3, SPP, step=step, **ADJOINTS[name])
+    sets = [(int(seed[0]), spp) for _, seed, spp in sample_sets(3, {"spp": SPP, "batches": 4, **ADJOINTS[name]})]
+    images = [np.array(render_image(tracer, case_of_two.scene, 0, seed, spp)) for seed, spp in sets]
+    expected = np.mean(images, axis=0) if name == "four batches" else images[0]
+    np.testing.assert_allclose(np.array(results[0].image), expected, rtol=1e-4, atol=1e-5)
+    # the objective is linear, so that dL/dI is the same for all samples; the first batch gives an image alone
+    own = [case_of_two.gradient(tracer, seed, spp) for seed, spp in (sets[1:] or sets)]
+    np.testing.assert_allclose(gradient, np.mean(own, axis=0), rtol=1e-3, atol=1e-5 * np.abs(gradient).max())

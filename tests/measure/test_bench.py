@@ -1,0 +1,362 @@
+"""`reslrb bench`: from the command line, its processes, and where parameters move light."""
+
+from __future__ import annotations
+
+import gc
+import io
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import pytest
+from measure.faults import room
+
+from reslrb_cli.cli import main
+from reslrb_cli.measure.methods import parse_cases
+from reslrb_cli.measure.processes import Ended, Process, Refused, Stopped, last_words
+from reslrb_cli.measure.stepper import Stepper
+from reslrb_cli.measure.workers import scratch_bytes
+from reslrb_cli.records.clock import peak_mib, reset_peak
+from reslrb_cli.records.measurements import BenchStatus
+
+# `reslrb bench` from the command line, on a scene of 16x16 pixels.
+
+KEYS = ["integrator", "estimator", "capacity", "max_depth", "rr_depth", "spp", "width", "height", "status", "step_ms",
+        "kernel_ms", "codegen_ms", "tracing_ms", "cold_ms", "cold_codegen_ms", "peak_mib", "scratch_bytes",
+        "repeats", "texels"]  # fmt: skip
+SMALL = ["--set", "scene.options.size=16", "--set", "run.spp=1", "--rounds", "3"]
+
+
+def call(*args: str) -> int:
+    with pytest.raises(SystemExit) as ended:
+        main(["bench", *args], prog_name="reslrb")
+    return int(ended.value.code or 0)
+
+
+def read(path: Path) -> list[dict]:
+    lines = [json.loads(line) for line in path.read_text().splitlines()]
+    assert lines[0]["kind"] == "origin"
+    return lines[1:]
+
+
+@pytest.mark.usefixtures("llvm")
+def test_two_depths(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = tmp_path / "bench.json"
+    names = "ptracer,reslrb:stack,reslrb:reservoir(capacity=2)"
+    assert call(*SMALL, "--max-depth", "4", "--integrators", names, "--json", str(file)) == 0
+    rows = read(file)
+    assert [list(row) for row in rows] == [KEYS] * 6
+    assert [(row["integrator"], row["estimator"], row["capacity"], row["max_depth"]) for row in rows] == [
+        entry
+        for depth in (2, 4)
+        for entry in (
+            ("ptracer", None, None, depth),
+            ("reslrb", "stack", None, depth),
+            ("reslrb", "reservoir", 2, depth),
+        )
+    ]
+    for row in rows:
+        assert (row["status"], row["spp"], row["width"], row["height"], row["repeats"]) == ("ok", 1, 16, 16, 3)
+        for key in ("step_ms", "kernel_ms"):
+            assert 0 < row[key]["min"] <= row[key]["median"] <= row[key]["max"]
+        assert row["step_ms"]["median"] > row["kernel_ms"]["median"]
+        assert row["cold_ms"] > row["step_ms"]["median"]
+        assert row["cold_ms"] > row["cold_codegen_ms"] > row["codegen_ms"]["median"] >= 0
+        # Each step is the sum of its parts; medians are not.
+        parts = [row[key] for key in ("kernel_ms", "codegen_ms", "tracing_ms")]
+        assert sum(part["min"] for part in parts) <= 1.001 * row["step_ms"]["min"]
+        assert sum(part["max"] for part in parts) >= 0.999 * row["step_ms"]["max"]
+        assert row["tracing_ms"]["min"] > 0
+        assert row["peak_mib"] > 0
+    assert [row["scratch_bytes"] > 0 for row in rows] == [False, True, False] * 2
+    # Three vertices in place of one, and one place for what is not pushed.
+    assert rows[4]["scratch_bytes"] == 2 * rows[1]["scratch_bytes"]
+    assert (tmp_path / "bench.png").read_bytes().startswith(b"\x89PNG")
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split()[:2] for line in lines[3:9]] == [
+        [str(depth), name] for depth in (2, 4) for name in names.split(",")
+    ]
+
+
+@pytest.mark.usefixtures("llvm")
+def test_l2(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """And a cold step finds no kernel that was compiled before, wherever those are kept."""
+    monkeypatch.setenv("DRJIT_CACHE_DIR", str(tmp_path / "kernels"))
+    file = tmp_path / "bench.json"
+    names = "trajectory,prb"
+    args = ["--max-depth", "2", "--integrators", names, "--objective", "l2", "--json", str(file)]
+    assert call(*SMALL, *args, "--plot", str(tmp_path / "other.png")) == 0
+    assert [row["status"] for row in read(file)] == ["ok"] * 2
+    assert (tmp_path / "other.png").exists()
+    assert not (tmp_path / "bench.png").exists()
+    assert not (tmp_path / "kernels").exists()
+
+
+@pytest.mark.usefixtures("llvm")
+def test_a_budget_that_suffices_for_nothing_says_so(capsys: pytest.CaptureFixture[str]) -> None:
+    assert call("--budget", "0", "--max-depth", "4", "--integrators", "reslrb:stack") == 1
+    assert "not measured: depth 2, 4: the budget was spent; allow more with --budget" in capsys.readouterr().err
+
+
+@pytest.mark.usefixtures("llvm")
+def test_no_memory(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = tmp_path / "bench.json"
+    args = ["--max-depth", "4", "--integrators", "ptracer", "--memory-limit", "100MiB", "--json", str(file)]
+    assert call(*SMALL, *args) == 4
+    rows = read(file)
+    assert [list(row) for row in rows] == [KEYS] * 2
+    assert [row["status"] for row in rows] == ["out_of_memory"] * 2
+    assert rows[0]["step_ms"] is None
+    assert "depth 2, ptracer: " in capsys.readouterr().out
+
+
+@pytest.mark.usefixtures("llvm")
+def test_a_case_that_fails_says_why(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = tmp_path / "bench.json"
+    (tmp_path / "scene.xml").write_text(MASKED.replace("to_world", "toWorld"))
+    (tmp_path / "x.yaml").write_text(
+        "scene: {file: scene.xml}\ntarget: {render: {}}\nparameters: [{key: veil.opacity.value}]\n"
+    )
+    args = ["--max-depth", "2", "--integrators", "reslrb:gather,trajectory", "--json", str(file)]
+    assert call(str(tmp_path / "x.yaml"), *args, "--set", "run.spp=1", "--rounds", "3") == 0
+    assert [row["status"] for row in read(file)] == ["ok", "failed"]
+    printed = capsys.readouterr()
+    assert "depth 2, trajectory: UnsupportedScene: trajectory: Dr.Jit cannot reverse" in printed.out
+    assert printed.err.count("toWorld") == 1  # both processes mend the scene
+
+
+@pytest.mark.usefixtures("llvm")
+@pytest.mark.parametrize("limit", ["200MiB", "420MiB"])
+def test_what_ends_at_a_low_limit_ended_for_want_of_memory(limit: str, tmp_path: Path) -> None:
+    file = tmp_path / "bench.json"
+    args = ["--max-depth", "2", "--integrators", "reslrb:stack", "--memory-limit", limit, "--json", str(file)]
+    assert call(*SMALL, *args) in (0, 4)  # how much a process needs depends on the number of cores
+    assert read(file)[0]["status"] in ("ok", "out_of_memory")
+
+
+@pytest.mark.usefixtures("llvm")
+@pytest.mark.parametrize(
+    ("args", "line"),
+    [
+        (["none.yaml"], "none.yaml: no such file"),
+        (
+            ["--set", "scene.options.colour=3", "--max-depth", "2", "--integrators", "reslrb:stack"],
+            "scene.options.colour: the options are",
+        ),
+        (["--memory-limit", "much"], "`much` is no size"),
+        (["--max-depth", "1"], "--max-depth"),
+        (["--integrators", "pt"], "--integrators pt: integrator.type"),
+        (["--baseline", "prb"], "--baseline: `prb` is none of"),
+        (["--json", "no/such/folder.json"], "--json: cannot write"),
+    ],
+)
+def test_wrong_calls_are_one_located_line(args: list[str], line: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert call(*args) == 2
+    [error] = capsys.readouterr().err.strip().splitlines()
+    assert line in error
+
+
+@pytest.mark.usefixtures("llvm")
+@pytest.mark.skipif(os.name != "posix", reason="sends signals")
+def test_a_second_signal_leaves_neither_processes_nor_files(tmp_path: Path) -> None:
+    folder = tmp_path / "temporary"
+    folder.mkdir()
+    command = [sys.executable, "-c", "from reslrb_cli.cli import run; run()", "bench", *SMALL, "--max-depth", "1024"]
+    process = subprocess.Popen(
+        [*command, "--integrators", "reslrb:stack"],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=os.environ | {"TMPDIR": str(folder)},
+    )  # fmt: skip
+    assert process.stdout is not None
+    for line in process.stdout:
+        if line.split()[:1] == ["2"]:  # the first depth is done, and the processes of the second are at work
+            break
+    while not any(folder.iterdir()):
+        time.sleep(0.01)
+    for number in (signal.SIGTERM, signal.SIGHUP):
+        process.send_signal(number)
+    _, err = process.communicate(timeout=30)
+    assert (process.returncode, "Traceback" in err) == (130, False)
+    assert list(folder.iterdir()) == []
+
+
+@pytest.mark.usefixtures("llvm")
+def test_ctrl_c_keeps_what_is_done(tmp_path: Path) -> None:
+    file = tmp_path / "bench.json"
+    command = [sys.executable, "-c", "from reslrb_cli.cli import main; main()", "bench", *SMALL, "--max-depth", "1024"]
+    process = subprocess.Popen(
+        [*command, "--integrators", "reslrb:stack", "--json", str(file)],
+        stdout=subprocess.PIPE, text=True, env=os.environ | {"PYTHONUNBUFFERED": "1"},
+    )  # fmt: skip
+    end = time.monotonic() + 60
+    while not (file.exists() and file.read_text().count("\n") >= 2) and time.monotonic() < end:
+        time.sleep(0.05)
+    process.send_signal(signal.SIGINT)
+    output, _ = process.communicate(timeout=30)
+    assert process.returncode == 130
+    rows = read(file)
+    assert rows
+    origin = json.loads(file.read_text().partition("\n")[0])
+    assert origin["command"] == ["reslrb", *command[3:], "--integrators", "reslrb:stack", "--json", str(file)]
+    assert [list(row) for row in rows] == [KEYS] * len(rows)
+    assert (tmp_path / "bench.png").exists()
+    assert "look at" in output
+
+
+MASKED = """<scene version="3.0.0">
+    <sensor type="perspective">
+        <transform name="to_world"><lookat origin="0, 0, 4" target="0, 0, 0" up="0, 1, 0"/></transform>
+        <film type="hdrfilm"><integer name="width" value="8"/> <integer name="height" value="8"/>
+            <rfilter type="box"/></film>
+    </sensor>
+    <bsdf type="mask" id="veil"><float name="opacity" value="0.5"/> <bsdf type="diffuse"/></bsdf>
+    <shape type="rectangle"><ref id="veil"/></shape>
+    <emitter type="point"><point name="position" x="0" y="1" z="3"/></emitter>
+</scene>
+"""
+
+
+# What `bench` measures where parameters move light: every integrator that can takes steps, and memory stays flat.
+
+
+def peak(name: str, depth: int) -> float:
+    """Of a cold step, in MiB, beyond what the scene and what was loaded before it take."""
+    [case] = parse_cases(name)
+    stepper = Stepper(case.at(room("wavy_glass.xml", "top.vertex_positions"), depth, known=True), "fixed")
+    gc.collect()
+    dr.flush_malloc_cache()
+    reset_peak()
+    before = peak_mib(dr.backend_v(mi.Float))
+    cold = stepper.step(0, True, False)
+    warm = stepper.step(1, False, False)
+    assert warm["kernel_ms"] > 0
+    return float(cold["peak_mib"]) - before
+
+
+def peaks(name: str) -> list[float]:
+    return [peak(name, depth) for depth in (4, 16)]
+
+
+@pytest.mark.usefixtures("llvm")
+@pytest.mark.long
+def test_memory_of_stack_does_not_grow_with_depth():
+    shallow, deep = peaks("reslrb:stack")
+    assert 0 < shallow  # else the watermark sees nothing
+    assert deep < 1.1 * shallow  # so small that what the allocator rounds to shows
+
+
+@pytest.mark.usefixtures("llvm")
+@pytest.mark.long
+def test_memory_of_naive_ad_does():
+    shallow, deep = peaks("ptracer")
+    assert deep > 2 * shallow > 4 * peak("reslrb:stack", 4)
+
+
+# How the end of a process is read, and what kernels say of thread-local memory.
+
+FIRST = {"memory_limit": None}
+FAILED, OUT_OF_MEMORY = BenchStatus.FAILED, BenchStatus.OUT_OF_MEMORY
+
+
+def end_of(script: str, limit: int | None = None) -> Ended:
+    process = Process(
+        {"memory_limit": limit}, command=[sys.executable, "-c", f"import json, os, signal, sys, time\n{script}"]
+    )
+    try:
+        with pytest.raises(Ended) as caught:
+            process.answer(lambda: False)
+        return caught.value
+    finally:
+        process.close()
+
+
+@pytest.mark.parametrize(
+    ("script", "status", "reason"),
+    [
+        ("os.kill(os.getpid(), signal.SIGKILL)", OUT_OF_MEMORY, "ended by SIGKILL"),
+        ("os.kill(os.getpid(), signal.SIGSEGV)", FAILED, "ended by SIGSEGV"),
+        ("sys.exit(7)", FAILED, "ended by exit code 7"),
+        ("raise ValueError('of all things')", FAILED, "ended by exit code 1: ValueError: of all things"),
+        ("sys.stderr.write('std::bad_alloc\\n'); sys.stderr.flush(); os.abort()", OUT_OF_MEMORY, "SIGABRT: std::bad"),
+        ("sys.stderr.write('>>> jit_malloc(): out of memory!\\nir\\n'); sys.exit(1)", OUT_OF_MEMORY, "1: jit_malloc()"),
+        ("print(json.dumps({'failure': 'failed', 'reason': 'why'}), flush=True); time.sleep(9)", FAILED, "why"),
+    ],
+)
+def test_ends_are_told_apart(script: str, status: BenchStatus, reason: str) -> None:
+    end = end_of(script)
+    assert end.status is status
+    assert reason in end.reason
+
+
+def test_a_crash_close_to_the_limit_is_one_of_memory() -> None:
+    crash = "time.sleep(0.3); os.kill(os.getpid(), signal.SIGSEGV)"
+    end = end_of(crash, limit=4 * 2**20)  # not set by this process, but in use many times over
+    assert end.status is OUT_OF_MEMORY
+    assert "of 4 MiB in use" in end.reason
+    assert end_of(crash, limit=2**50).status is FAILED
+
+
+def test_a_refusal_holds_for_all() -> None:
+    answer = {"failure": "refused", "reason": "x.yaml: scene.file: no such file", "exit_code": 2}
+    process = Process(FIRST, command=[sys.executable, "-c", f"import json; print(json.dumps({answer!r}))"])
+    with pytest.raises(Refused, match=r"scene\.file: no such file") as caught:
+        process.answer(lambda: False)
+    assert caught.value.exit_code == 2
+    process.close()
+
+
+def test_waiting_can_be_stopped() -> None:
+    process = Process(FIRST, command=[sys.executable, "-c", "import time; time.sleep(60)"])
+    with pytest.raises(Stopped):
+        process.answer(lambda: True)
+    process.close()
+    process.close()
+
+
+def test_last_words() -> None:
+    assert last_words("") == ""
+    assert last_words("a\n\n b \n") == "b"
+    assert last_words("a\n>>> jit_malloc(): out of memory\nmore\n") == "jit_malloc(): out of memory"
+
+
+LLVM = """
+    %arr_1 = alloca float, i32 112, align 64
+    %arr_3 = alloca i8, i32 112, align 16
+    %arr_5 = alloca i64, i32 112, align 128
+    %buffer = alloca i8, i32 1368, align 64
+    %index_next = add i64 %index, 16
+"""
+PTX = """
+    .local .align 4 .b32 arr_12[7];
+    .local .align 8 .b64 arr_13[7];
+    .local .align 4 .b8 other[64];
+"""
+
+
+@pytest.mark.parametrize(("ir", "expected"), [(LLVM, 7 * (4 + 1 + 8)), (PTX, 7 * (4 + 8)), ("", 0)])
+def test_scratch_bytes_of_a_kernel(ir: str, expected: int) -> None:
+    assert scratch_bytes([{}, {"ir": io.StringIO(ir)}, {"ir": ""}]) == expected
+
+
+@pytest.mark.usefixtures("llvm")
+@pytest.mark.parametrize(("entries", "expected"), [(0, 0), (5, 40), (9, 72)])
+def test_scratch_bytes_of_a_real_kernel(entries: int, expected: int) -> None:
+    import drjit as dr
+    import mitsuba as mi
+
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        dr.kernel_history_clear()
+        index = dr.opaque(mi.UInt32, 1, 64) % max(entries, 1)
+        value: Any = mi.Float(index)
+        if entries:
+            memory = dr.alloc_local(mi.Point2f, entries)
+            memory.write(mi.Point2f(value), index)
+            value = dr.sum(memory.read(index + 0))
+        dr.eval(value)
+        assert scratch_bytes(dr.kernel_history()) == expected

@@ -1,0 +1,249 @@
+"""What is judged without the film's border, and `prb` beside the estimator of a run."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from cli.test_optimize import CONFIG, KEY, SCENE
+from measure import pretended_runs, pretended_steps
+from measure.test_convergence import GAUSSIAN, problem
+
+from reslrb_cli.cli import main
+from reslrb_cli.config.loader import dump, load
+from reslrb_cli.measure import prb_comparison
+from reslrb_cli.measure.methods import parse_cases
+from reslrb_cli.measure.optimization_benchmark import evaluate
+from reslrb_cli.measure.references import leave_out_border
+from reslrb_cli.optimization.assemble import assemble
+from reslrb_cli.optimization.autotune import race
+from reslrb_cli.optimization.views import set_targets
+from reslrb_cli.records.decisions import RivalRecord
+from reslrb_cli.records.manifest import read_manifest
+
+# `prb` beside the estimator of a run: when it is tried, what is said of it, and what its interval is worth.
+
+OWN = "{max_depth: 3, guiding: off, sequence: independent}"
+AUTO = CONFIG.replace("{type: ptracer, max_depth: 3}", OWN).replace("iterations: 25", "iterations: 2, measuring: 1000")
+POINT = """<emitter type="point" id="bulb"><point name="position" x="0" y="0" z="2"/>
+    <rgb name="intensity" value="3, 3, 3"/></emitter>"""
+GLASS = """<shape type="sphere"><float name="radius" value="0.2"/><point name="center" x="0" y="0" z="1"/>
+    <bsdf type="dielectric"/></shape>"""
+
+
+@pytest.fixture
+def experiment(llvm, tmp_path, monkeypatch):
+    import mitsuba as mi
+
+    mi.Bitmap(np.full((4, 4, 3), 0.6, dtype=np.float32)).write(str(tmp_path / "poster.exr"))
+    (tmp_path / "scene.xml").write_text(SCENE)
+    (tmp_path / "box.yaml").write_text(AUTO)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("RESLRB_CACHE", str(tmp_path / "cache"))
+    logging.getLogger("reslrb_cli").setLevel(logging.INFO)
+
+
+def optimize(capsys, *settings):
+    capsys.readouterr()
+    with pytest.raises(SystemExit) as end:
+        main(["optimize", "box.yaml", "--force", *(word for setting in settings for word in ("--set", setting))])
+    assert not end.value.code
+    return capsys.readouterr().err, read_manifest(Path("runs/box"))
+
+
+def test_it_is_measured_once_and_remembered(experiment, capsys):
+    err, manifest = optimize(capsys)
+    found = RivalRecord.from_json(manifest["rival"])
+    assert found.integrator == "prb"
+    if found.advantage is not None:
+        assert found.low < found.advantage < found.high
+        assert prb_comparison.LEAST_ROUNDS <= found.rounds <= prb_comparison.MOST_ROUNDS
+        assert (f"{found.line()}; --set" in err) == found.is_better
+        assert found.line(cost=True).replace("&", "&amp;") in Path("runs/box/report.html").read_text()
+    err, again = optimize(capsys)
+    assert again["rival"] == {**manifest["rival"], "cached": True}
+    assert "measuring" not in err
+
+
+def test_the_tables_of_a_guided_run_learn_nothing_from_it(experiment: None) -> None:
+    """A run begins alike whether this was measured now or by an earlier one."""
+    problem = assemble(load("box.yaml", ["integrator.guiding=on"]))
+    assert prb_comparison.measure_rival(problem, None, lambda line: None) is not None
+    assert problem.integrator.preparation.guiding.learned == {}
+
+
+def test_it_is_not_tried_where_nobody_chose_an_estimator(experiment, capsys, monkeypatch):
+    """And a better one is one line, one that may be no better none."""
+    from reslrb_cli.runs import prepare
+
+    err, manifest = optimize(capsys, "integrator.estimator=stack")
+    assert manifest["rival"] is None
+    assert "prb" not in err
+    better = RivalRecord(integrator="prb", rounds=8, spp=4, advantage=5.0, low=3.0, high=8.0, measure_s=1.5)
+    monkeypatch.setattr(prepare, "measure_rival", lambda problem, cache, say: better)
+    err, manifest = optimize(capsys, "integrator.estimator=stack")
+    assert f"{better.line()}; --set integrator.type=prb" in err
+    assert better.line(cost=True).startswith("prb: 5 times the efficiency here (3 to 8) (measured in 1.5 s")
+    assert manifest["rival"] == better.to_json()
+    no_better = RivalRecord(integrator="prb", rounds=8, advantage=1.5, low=0.9, high=2.5)
+    monkeypatch.setattr(prepare, "measure_rival", lambda problem, cache, say: no_better)
+    assert "prb" not in optimize(capsys, "integrator.estimator=stack")[0]
+
+
+@pytest.mark.parametrize(("extra", "applies"), [("", True), (GLASS + POINT, False)])
+def test_it_is_tried_where_it_finds_the_light(experiment, extra, applies):
+    from reslrb_cli.optimization.assemble import assemble_scene
+
+    Path("scene.xml").write_text(SCENE.replace("</scene>", f"{extra}</scene>"))
+    assert (prb_comparison.why_not(assemble_scene(load("box.yaml", []))) is None) == applies
+
+
+def samples(sd, count, seed, entries=200):
+    random = np.random.default_rng(seed)
+    return [{KEY: (1 + sd * random.normal(size=entries)).astype(np.float32)} for _ in range(count)]
+
+
+@pytest.mark.parametrize("entries", [3, 200])
+def test_the_interval_holds_the_truth_as_often_as_it_says(entries):
+    """Four times the variance at half the time; without what single times may be off, the level is the nominal one."""
+    inside = 0
+    for seed in range(200):
+        own, other = samples(2.0, 8, 2 * seed, entries), samples(1.0, 8, 2 * seed + 1, entries)
+        value, low, high = race.compare(own, [2.0] * 8, other, [4.0] * 8)
+        low, high = low * race.TIMING_NOISE, high / race.TIMING_NOISE
+        assert low < value < high
+        inside += low < 2.0 < high
+    # 190 of 200 are expected; fewer than 176 have a probability of 1e-4.
+    assert inside >= 176
+
+
+def test_equals_are_hardly_ever_called_better():
+    better = sum(
+        race.compare(samples(1.0, 8, 2 * seed), [3.0] * 8, samples(1.0, 8, 2 * seed + 1), [3.0] * 8)[1] > 1
+        for seed in range(200)
+    )
+    assert better <= 13  # 5 are expected on this side without what times may be off
+
+
+def test_no_noise_is_no_comparison():
+    still = [{KEY: np.ones(4, np.float32)}] * 6
+    assert race.compare(still, [1.0] * 6, samples(1.0, 6, 1, 4), [1.0] * 6) == (None, None, None)
+
+
+def test_gradients_of_no_light_tell_nothing():
+    none = [{KEY: np.zeros(3, dtype=np.float32)} for _ in range(8)]
+    assert race.compare(none, [1.0] * 8, none, [1.0] * 8) == (None, None, None)
+
+
+# Whole runs and light paths against camera paths: all are judged, and optimised, without the film's border.
+
+
+@pytest.mark.parametrize("loss", ["l2", "log_l2"])
+def test_pixels_along_the_border_count_nothing(llvm: None, tmp_path: Path, loss: str) -> None:
+    """With a filter of a radius of two pixels; what is inside counts as before."""
+    what = problem(tmp_path, GAUSSIAN, overrides=(f"loss.type={loss}",))
+    target = mi.TensorXf(np.random.default_rng(1).uniform(0.5, 1.5, (8, 8, 3)).astype(np.float32))
+    [view] = what.views
+    view.see(np.array(target))
+    change = np.zeros((8, 8, 3), np.float32)
+    change[2:-2, 2:-2] = 0.3
+    inner, outer = target + mi.TensorXf(change), target + mi.TensorXf(0.3 - change)
+    expected = float(view.compare(inner)[0]) * 64 / 16  # the mean over what is inside
+    assert leave_out_border(what)
+    assert float(view.compare(inner)[0]) == pytest.approx(expected, rel=1e-5)
+    assert float(view.compare(outer)[0]) == pytest.approx(0.0, abs=1e-9)
+    gradient = what.image_gradient(view, np.array(target) + 0.3)
+    assert (gradient[2:-2, 2:-2] != 0).all()
+    gradient[2:-2, 2:-2] = 0
+    assert not gradient.any()
+
+
+def test_a_box_filter_has_no_border(llvm: None, tmp_path: Path) -> None:
+    what = problem(tmp_path)
+    what.views[0].see(np.ones((8, 8, 3), np.float32))
+    assert not leave_out_border(what)
+    assert what.views[0].weights is None
+
+
+def test_what_a_mask_leaves_out_stays_out(llvm: None, tmp_path: Path) -> None:
+    what = problem(tmp_path, GAUSSIAN)
+    weights = np.ones((8, 8), np.float32)
+    weights[3, 3] = 0
+    what.views[0].see(np.ones((8, 8, 3), np.float32), weights)
+    assert leave_out_border(what)
+    kept = np.array(what.views[0].weights)[:, :, 0]
+    assert np.count_nonzero(kept) == 15
+    assert kept[3, 3] == 0
+    assert kept.mean() == pytest.approx(1)
+
+
+@pytest.mark.parametrize("camera", [True, False])
+def test_all_processes_of_whole_runs_leave_it_out(llvm: None, tmp_path: Path, camera: bool) -> None:
+    """The judge says so, also one that takes over; a run that is told so optimises without it."""
+    what = problem(tmp_path, GAUSSIAN)
+    first: dict[str, Any] = {"config": dump(what.config), "source": "tiny.yaml", "targets": str(tmp_path / "t.npz")}
+    _, ask = evaluate.begin_judging(first)
+    prepared = {"budget_s": 0.1, "image_s": 0.01, "camera": camera, "named": True}
+    facts = ask({"prepare": prepared, "out": first["targets"]})
+    assert facts["masked"] is camera
+    _, again = evaluate.begin_judging(first)
+    taken = again({"restore": {"spp": facts["spp"], "masked": camera}, "targets": first["targets"]})
+    assert taken["loss"] == pytest.approx(facts["loss"], rel=1e-4)
+    assert taken["error"] == pytest.approx(facts["error"], rel=1e-4)
+    losses = {}
+    for masked in (camera, not camera):
+        other = problem(tmp_path, GAUSSIAN)
+        with np.load(first["targets"]) as targets:
+            set_targets(other.views, targets)
+        if masked:
+            leave_out_border(other)
+        losses[masked] = evaluate.Judge(other, facts["spp"]).loss(evaluate.copies(other))
+    assert facts["loss"] == pytest.approx(losses[camera], rel=1e-4)
+    assert losses[True] != pytest.approx(losses[False], rel=1e-2)
+
+    seen: list[bool] = []
+
+    def optimize(what: Any, progress: Any) -> Any:
+        image = mi.TensorXf(np.array(what.views[0].target))
+        image[0] = 9.0
+        seen.append(float(what.views[0].compare(image)[0]) == 0)
+        return iter(())
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(evaluate, "optimize", optimize)
+        evaluate.begin_run(first | {"masked": camera})
+    assert seen == [camera]
+    dr.sync_thread()
+
+
+CAMERA_CASES = [
+    ("ptracer,reslrb:stack", "reslrb:stack", (False, True)),
+    ("prb,reslrb:stack", "reslrb:stack", (True, True)),
+    ("reslrb:stack", "prb", (True, True)),  # what errors are taken from is a side too
+]
+
+
+@pytest.mark.parametrize(("cases", "reference", "expected"), CAMERA_CASES)
+def test_camera_paths_are_seen_wherever_they_take_part(
+    tmp_path: Path, cases: str, reference: str, expected: tuple[bool, bool]
+) -> None:
+    changes: dict[str, Any] = {"reference": parse_cases(reference)[0]}
+    stage = pretended_steps.Stage()
+    pretended_steps.play(tmp_path, stage, pretended_steps.plan(cases, rounds=3, **changes))
+    [ask] = [question["ask"] for question in stage.asked if "ask" in question]
+    assert (ask["camera"], ask["named"]) == expected
+    runs = pretended_runs.Stage()
+    pretended_runs.play(tmp_path, runs, pretended_runs.plan(cases, runs=1, **changes))
+    assert (runs.prepared["camera"], runs.prepared["named"]) == expected
+
+
+def test_of_the_default_list_camera_paths_may_be_left_out(tmp_path: Path) -> None:
+    stage = pretended_steps.Stage()
+    pretended_steps.play(tmp_path, stage, pretended_steps.plan("prb,reslrb:stack", rounds=3, default=True))
+    [ask] = [question["ask"] for question in stage.asked if "ask" in question]
+    assert (ask["camera"], ask["named"]) == (True, False)

@@ -1,0 +1,328 @@
+"""How certain a run's values are: verdicts on runs whose truth is known, views, and when nothing is measured."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from optimization.judged import (
+    ALPHA,
+    CONFIG,
+    HIDDEN,
+    LEFT,
+    OTHER_TWIN,
+    POSTER,
+    RIGHT,
+    TWIN,
+    WALL,
+    Outcome,
+    Toy,
+    lamp,
+    run,
+    write_scene,
+)
+from optimization.toy import make_problem
+
+from reslrb_cli.optimization.uncertainty import measuring
+from reslrb_cli.optimization.uncertainty.measuring import LEAST_ITERATIONS, Certainty
+
+# What is said of runs whose truth is known, half of them made to fail: verdicts are right, and none is too kind.
+
+SETTLED, MOVING, BOUND = "settled", "still moving", "at its bound"
+NOISE, UNDETERMINED, NONE = "below the noise", "not determined", "no effect"
+FAST = "initial: 1.0, bounds: [0, 1000], learning_rate: 0.15"
+SLOW = "initial: 1.0, bounds: [0, 1000], learning_rate: 0.02"
+COLOR, METAL = "initial: 0.5, bounds: [0, 1]", "initial: 0.5, bounds: [0.02, 1]"
+
+WORK = [
+    Toy("a lamp", {LEFT: FAST}, {LEFT: SETTLED}, ("run.spp=128",)),
+    Toy("two lamps", {LEFT: FAST, RIGHT: FAST}, {LEFT: SETTLED, RIGHT: SETTLED},
+        ("run.spp=512", "run.iterations=200", "optimizer.schedule=cosine")),
+    Toy("a colour", {WALL: COLOR}, {WALL: SETTLED}, ("run.spp=64",)),
+    Toy("a texture", {POSTER: COLOR}, {POSTER: SETTLED}, ("run.spp=128", "run.iterations=150")),
+    Toy("a roughness", {ALPHA: METAL}, {ALPHA: SETTLED}, ("run.spp=128",)),
+    Toy("rmsprop, cosine", {WALL: COLOR}, {WALL: SETTLED},
+        ("run.spp=64", "optimizer={type: rmsprop, learning_rate: 0.01, schedule: cosine}")),
+    Toy("in its logarithm", {LEFT: "initial: 1.0, transform: log, bounds: [0.01, 1000], learning_rate: 0.05"},
+        {LEFT: SETTLED}, ("run.spp=128", "run.iterations=150")),
+    Toy("relative loss", {LEFT: FAST}, {LEFT: SETTLED}, ("run.spp=128", "loss={type: relative_l2}")),
+    Toy("colour and roughness", {WALL: COLOR, ALPHA: METAL}, {WALL: SETTLED, ALPHA: SETTLED}, ("run.spp=256",)),
+    Toy("scaled", {LEFT: "initial: 1.0, bounds: [0, 1000]", WALL: COLOR}, {LEFT: SETTLED, WALL: SETTLED},
+        ("run.spp=256", "run.iterations=200", "optimizer={scale: auto, schedule: cosine}")),
+]  # fmt: skip
+FAIL = [
+    Toy("a lamp, too slow", {LEFT: SLOW}, {LEFT: MOVING}, ("run.iterations=40", "run.spp=64")),
+    Toy("a roughness, too slow", {ALPHA: "initial: 0.6, bounds: [0.02, 1], learning_rate: 0.003"}, {ALPHA: MOVING},
+        ("run.iterations=30", "run.spp=64")),
+    Toy("a texture, too slow", {POSTER: "initial: 0.95, bounds: [0, 1], learning_rate: 0.001"}, {POSTER: MOVING},
+        ("run.iterations=30", "run.spp=256")),
+    Toy("a colour's bound", {WALL: "initial: 0.2, bounds: [0, 0.3]"}, {WALL: BOUND}, ("run.spp=64",)),
+    Toy("a roughness's bound", {ALPHA: "initial: 0.6, bounds: [0.4, 1]"}, {ALPHA: BOUND}, ("run.spp=64",)),
+    Toy("a lamp that lights nothing", {HIDDEN: FAST, LEFT: FAST}, {HIDDEN: NONE}, ("run.spp=64",)),
+    Toy("alike", {TWIN: "initial: 2.0, bounds: [0, 1000], learning_rate: 0.05",
+                  OTHER_TWIN: "initial: 5.0, bounds: [0, 1000], learning_rate: 0.05"},
+        {TWIN: UNDETERMINED, OTHER_TWIN: UNDETERMINED}, ("run.spp=128",)),
+    Toy("alike, too bright", {TWIN: "initial: 8.0, bounds: [0, 1000], learning_rate: 0.1",
+                              OTHER_TWIN: "initial: 3.0, bounds: [0, 1000], learning_rate: 0.1"},
+        {TWIN: UNDETERMINED, OTHER_TWIN: UNDETERMINED}, ("run.spp=256",)),
+    Toy("a lamp's noise", {TWIN: FAST}, {TWIN: NOISE}, ("run.spp=1", "run.adjoint=independent")),
+    Toy("a texture's noise", {POSTER: COLOR}, {POSTER: NOISE}, ("run.spp=4",)),
+]  # fmt: skip
+#: Of the long runs, those that every change is tried with.
+SHORT = [FAIL[0], FAIL[3], FAIL[6]]
+
+
+@pytest.fixture(scope="module")
+def folder(llvm, tmp_path_factory):
+    path = tmp_path_factory.mktemp("judged")
+    write_scene(path)
+    return path
+
+
+def told(toy: Toy, found: Outcome) -> str:
+    lines = [toy.name]
+    for key, about in found.certainty.parameters.items():
+        error = np.sqrt(np.mean(np.square(found.errors[key])))
+        lines.append(f"    {key}: {about.verdict} {about.shares}, error {error:.3g}, spread {about.spread}")
+    return "\n".join(lines)
+
+
+def verdicts(toy: Toy, found: Outcome) -> dict[str, str]:
+    return {key: found.certainty.parameters[key].verdict for key in toy.right}
+
+
+@pytest.mark.parametrize("toy", SHORT, ids=lambda toy: toy.name)
+def test_what_fails_is_told_for_what_it_is(folder, toy):
+    found = run(folder, toy)
+    assert verdicts(toy, found) == toy.right, told(toy, found)
+    if toy is FAIL[6]:
+        assert found.certainty.parameters[TWIN].partner == OTHER_TWIN
+        assert found.certainty.parameters[OTHER_TWIN].partner == TWIN
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("seed", range(5))
+def test_verdicts_of_twenty_runs(folder, seed):
+    right, kind, ratios = [], [], []
+    for toy in WORK + FAIL:
+        found = run(folder, toy, seed)
+        print(told(toy, found))
+        right.append(verdicts(toy, found) == toy.right)
+        if toy in FAIL:
+            kind += [(toy.name, key) for key, verdict in verdicts(toy, found).items() if verdict == SETTLED]
+            continue
+        for key, about in found.certainty.parameters.items():
+            if about.verdict == SETTLED:
+                errors = found.errors[key].ravel()
+                ratios += list(errors / np.resize(np.array(about.spread, dtype=float), errors.shape))
+    wrong = [toy.name for toy, holds in zip(WORK + FAIL, right, strict=True) if not holds]
+    print(f"{sum(right)} of {len(right)} right; wrong: {wrong}; errors over spreads, rms {np.std(ratios):.2f}")
+    assert not kind
+    assert sum(right) >= 18, wrong
+    assert np.sqrt(np.mean(np.square(ratios))) < 1.5  # a spread that is too small would be worse than none
+
+
+#: Parameters, and the target's samples per pixel, whose noise is most of what is wrong with them.
+NOISY = {
+    "a colour": ({WALL: COLOR}, 64), "a roughness": ({ALPHA: METAL}, 64), "a lamp": ({LEFT: FAST}, 64),
+    "colour and roughness": ({WALL: COLOR, ALPHA: METAL}, 64), "a texture": ({POSTER: COLOR}, 64),
+    "a colour, few samples": ({WALL: COLOR}, 16), "a texture, many samples": ({POSTER: COLOR}, 512),
+}  # fmt: skip
+
+
+def noisy(name: str, seed: int, loss: str) -> Toy:
+    parameters, spp = NOISY[name]
+    settings = (f"target={{render: {{spp: {spp}, seed: {seed}}}}}", f"loss={{type: {loss}}}", "run.spp=64",
+                "run.iterations=120", "optimizer.schedule=cosine")  # fmt: skip
+    return Toy(name, parameters, {}, settings)
+
+
+def test_noise_of_a_rendered_target_is_in_the_spread(folder):
+    """By its samples: a quarter of the variance with four times as many. Without it nothing but the run's is left."""
+    found = {}
+    for spp in (16, 256):
+        toy = noisy("a colour", 0, "l2")
+        about = run(folder, Toy("", toy.parameters, {}, (*toy.settings, f"target.render.spp={spp}"))).certainty
+        assert (about.target_noise, about.target_spp) == ("measured", spp)
+        found[spp] = about.parameters[WALL]
+    of_target = {spp: np.mean(about.of_target) for spp, about in found.items()}
+    assert 2 < of_target[16] / of_target[256] < 8
+    assert np.all(np.array(found[16].spread) > 0.9 * np.array(found[16].of_target))
+    assert found[16].verdict == NOISE
+    assert of_target[16] > 0.03
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("loss", ["l2", "relative_l2"])
+@pytest.mark.parametrize("name", NOISY)
+def test_the_truth_is_within_spreads_that_have_the_targets_noise(folder, name, loss):
+    """Over many noisy targets: errors are as large as they are said to be, and most of that is the target's."""
+    z, without, settled = [], [], 0
+    for seed in range(12):
+        found = run(folder, noisy(name, seed, loss), seed)
+        for key, about in found.certainty.parameters.items():
+            if about.spread is None:
+                continue
+            errors = np.ravel(found.errors[key])
+            spread, of_target = (np.resize(np.array(part, dtype=float), errors.shape)
+                                 for part in (about.spread, about.of_target))  # fmt: skip
+            z += list(errors / spread)
+            without += list(errors / np.sqrt(np.maximum(spread**2 - of_target**2, 1e-4 * spread**2)))
+            settled += about.verdict == SETTLED and bool(np.sqrt(np.mean(np.square(errors / spread))) > 3)
+    size, bare = (np.sqrt(np.nanmean(np.square(each))) for each in (z, without))
+    print(f"{name}, {loss}: {len(z)} errors over spreads, rms {size:.2f}; without the target's noise {bare:.2f}")
+    # A relative loss weighs what noise has darkened, by which it is pulled further than its spread says.
+    assert 0.3 < size < (1.5 if loss == "l2" else 2.5)
+    assert bare > 1.5
+    assert not settled
+
+
+# Five lamps and four roughnesses at once: whatever is wrong of them is told to be.
+
+LAMPS = {
+    "a": (-2.4, "9, 6, 4"),
+    "b": (-1.2, "3, 5, 8"),
+    "c": (0.1, "4, 4, 4"),
+    "d": (1.2, "6, 2, 5"),
+    "e": (2.6, "2, 7, 3"),
+}
+PLATES = {"p": (-0.9, -0.8, 0.1), "q": (0.9, -0.8, 0.2), "r": (-0.9, 0.8, 0.35), "s": (0.9, 0.8, 0.5)}
+SCENE = """<scene version="3.0.0">
+    <sensor type="perspective">
+        <float name="fov" value="42"/>
+        <transform name="to_world"><lookat origin="0, -0.5, 4" target="0, 0, 0" up="0, 1, 0"/></transform>
+        <film type="hdrfilm">
+            <integer name="width" value="24"/> <integer name="height" value="24"/>
+            <string name="pixel_format" value="rgb"/> <rfilter type="box"/>
+        </film>
+    </sensor>
+    <shape type="rectangle" id="back">
+        <transform name="to_world"><scale value="3"/><translate z="-0.5"/></transform>
+        <bsdf type="diffuse"><rgb name="reflectance" value="0.6, 0.4, 0.25"/></bsdf>
+    </shape>
+    BODY
+</scene>
+"""
+#: How far off a value may be that is said to be settled: in standard deviations of its spread, and as a share of it.
+SPREADS, SHARE = 3.0, 0.15
+
+
+def plate(name: str, x: float, y: float, alpha: float) -> str:
+    return f"""<shape type="rectangle" id="{name}">
+        <transform name="to_world"><scale value="0.55"/><translate x="{x}" y="{y}"/></transform>
+        <bsdf type="roughconductor"><float name="alpha" value="{alpha}"/></bsdf>
+    </shape>"""
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("spp", [4, 64])
+def test_wrong_values_are_told_to_be(llvm, tmp_path, spp):
+    shapes = [lamp(name, x, radiance, 0.4) for name, (x, radiance) in LAMPS.items()]
+    shapes += [plate(name, *place) for name, place in PLATES.items()]
+    (tmp_path / "scene.xml").write_text(SCENE.replace("BODY", "\n".join(shapes)))
+    (tmp_path / "toy.yaml").write_text(CONFIG.replace("wall.reflectance.value", "p.bsdf.alpha.value"))
+    radiance = {
+        f"{name}.emitter.radiance.value": "initial: 1.0, bounds: [0, 1000], learning_rate: 0.1" for name in LAMPS
+    }
+    alphas = {f"{name}.bsdf.alpha.value": "initial: 0.6, bounds: [0.02, 1]" for name in PLATES}
+    found = run(tmp_path, Toy("many", radiance | alphas, {}, (f"run.spp={spp}",)))
+    kind, wrong = [], 0
+    for key, about in found.certainty.parameters.items():
+        relative = np.abs(found.errors[key]).max() / np.abs(found.true[key]).max()
+        off = relative > SHARE
+        wrong += off
+        spread = "" if about.spread is None else np.array2string(np.array(about.spread, dtype=float), precision=3)
+        print(f"{key}: {about.verdict}, off by {100 * relative:.0f} %, spread {spread}, {about.partner or ''}")
+        if about.verdict == "settled" and off:
+            far = np.abs(found.errors[key]).ravel() > SPREADS * np.array(about.spread, dtype=float)
+            kind += [key] if far.any() else []
+    print(
+        f"{wrong} of {len(found.certainty.parameters)} wrong; measured in {found.certainty.share:.3f} of the run's time"
+    )
+    assert wrong >= 3  # else nothing is shown
+    assert not kind
+
+
+# How certain values are beside an exposure and under a mask: what a mask takes away is missed, and named.
+
+EXPOSURE = "exposure"
+COLOR_OF_BACK = {WALL: "initial: 0.5, bounds: [0, 1]"}
+SETTINGS = ("run.spp=64", "target.exposure=auto")
+#: What it takes to tell them apart by what little is known in view.
+ENOUGH = ("run.spp=512", "run.iterations=200", "optimizer.schedule=cosine", "target.exposure=auto")
+SUBPIXELS = 4
+
+
+def write_mask(folder: Path) -> None:
+    """Leave out every pixel that sees anything but the wall."""
+    scene = mi.load_file(str(folder / "scene.xml"), optimize=False)
+    sensor, (width, height) = scene.sensors()[0], scene.sensors()[0].film().size()
+    x, y = np.meshgrid(*(np.arange(SUBPIXELS * size) + 0.5 for size in (width, height)))
+    position = mi.Point2f(x.ravel() / (SUBPIXELS * width), y.ravel() / (SUBPIXELS * height))
+    ray, _ = sensor.sample_ray(0.0, 0.5, position, mi.Point2f(0.5))
+    back = next(shape for shape in scene.shapes() if shape.id() == "back")
+    hit = np.array(scene.ray_intersect(ray).shape == mi.ShapePtr(back)).reshape(height, SUBPIXELS, width, SUBPIXELS)
+    weights = hit.all(axis=(1, 3)).astype(np.float32)
+    assert 20 < weights.sum() < 0.9 * weights.size
+    mi.Bitmap(weights[:, :, None]).write(str(folder / "mask.exr"))
+
+
+@pytest.fixture(scope="module")
+def folder_of_views(llvm: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("views")
+    write_scene(path)
+    write_mask(path)
+    return path
+
+
+@pytest.mark.long
+def test_a_known_poster_in_view_tells_exposure_from_colour(folder_of_views: Path) -> None:
+    found = run(folder_of_views, Toy("seen", COLOR_OF_BACK, {}, ENOUGH))
+    verdicts = {key: about.verdict for key, about in found.certainty.parameters.items()}
+    assert verdicts == {WALL: "settled", EXPOSURE: "settled"}, found.certainty
+    for key, about in found.certainty.parameters.items():
+        spread = np.array(about.spread, dtype=float)
+        assert np.all(np.abs(np.ravel(found.errors[key])) < 4 * spread), key
+
+
+def test_where_a_mask_leaves_out_what_is_known_one_makes_up_for_the_other(folder_of_views: Path) -> None:
+    found = run(folder_of_views, Toy("masked", COLOR_OF_BACK, {}, (*SETTINGS, "target.mask=mask.exr")))
+    wall, exposure = (found.certainty.parameters[key] for key in (WALL, EXPOSURE))
+    assert wall.verdict == exposure.verdict == "not determined", found.certainty
+    assert (wall.partner, exposure.partner) == (EXPOSURE, WALL)
+
+
+# When nothing is measured of how certain values are: runs that are short, and those that are told to stop.
+
+
+def test_short_runs_and_stopped_ones_go_without(tmp_path, monkeypatch):
+    problem, asked = make_problem(tmp_path), []
+
+    def sample(problem, integrator, number, purpose, spp):
+        asked.append(number)
+
+    monkeypatch.setattr(measuring, "sample_gradient", sample)
+    certainty, before = Certainty(problem), problem.values()["albedo"].copy()
+    assert certainty.measure(LEAST_ITERATIONS - 1, 1.0, lambda: False) is None
+    assert certainty.measure(100, 1.0, lambda: True) is None
+    assert asked == []
+    assert certainty.measure(100, 1.0, lambda: len(asked) == 2) is None  # Ctrl-C in the midst of it
+    assert asked == [0, 1]
+    np.testing.assert_array_equal(problem.values()["albedo"], before)
+
+
+def test_a_failure_leaves_no_gradient_behind(tmp_path, monkeypatch):
+    import drjit as dr
+
+    problem = make_problem(tmp_path)
+
+    def fail(problem, *others):
+        dr.set_grad(problem.optimizer["albedo"], 1.0)
+        raise RuntimeError("no more memory")
+
+    monkeypatch.setattr(measuring, "sample_gradient", fail)
+    with pytest.raises(RuntimeError, match="no more memory"):
+        Certainty(problem).measure(100, 1.0, lambda: False)
+    assert not np.any(np.array(problem.optimizer.gradient("albedo")))

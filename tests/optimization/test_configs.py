@@ -1,0 +1,61 @@
+"""Shipped configurations: the stiff ones are stiff, and what moves light is recovered."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from reslrb_cli.config.loader import load
+from reslrb_cli.measure.conditioning import measure_conditioning
+from reslrb_cli.optimization.assemble import assemble
+from reslrb_cli.optimization.identifiability import find_reached
+from reslrb_cli.optimization.loop import optimize
+
+# The stiff experiments in `configs/stiff/`: they load, and are as stiff as they say.
+
+CONFIGS = Path(__file__).resolve().parents[2] / "configs" / "stiff"
+SMALL = ["scene.options={resx: 16, resy: 16}", "target.render.spp=16"]
+
+
+def test_each_is_known_here():
+    assert {path.stem for path in CONFIGS.iterdir()} == {"lamp", "plate", "wall"}
+
+
+MORE = [("plate", "change"), ("wall", "gradient")]
+
+
+@pytest.mark.parametrize(
+    ("name", "quantity"),
+    [("lamp", "change"), *(pytest.param(*each, marks=pytest.mark.long) for each in MORE)],
+)
+def test_sensitivities_differ_by_a_million(name, quantity):
+    """By the parameters' units, or, of single entries, by how many they are."""
+    spp = "run.spp=1024" if name == "wall" else "run.spp=64"
+    measured = measure_conditioning(assemble(load(CONFIGS / f"{name}.yaml", [*SMALL, spp])), samples=4)
+    assert measured.spread(quantity) > 1e6
+    assert measured.spread("length") is not None
+
+
+# The shipped configurations whose parameters move light recover them to a tenth.
+
+MOVING_CONFIGS = Path(__file__).resolve().parents[2] / "configs"
+
+
+def slopes(heights: np.ndarray) -> np.ndarray:
+    return np.concatenate([np.diff(heights[..., 0], axis=axis).ravel() for axis in (0, 1)])
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", ["lens_pose", "caustic_heightmap"])
+def test_it_is_recovered_to_a_tenth(name):
+    problem = assemble(load(MOVING_CONFIGS / f"{name}.yaml"))
+    start = problem.values()
+    problem = find_reached(problem)
+    for _ in optimize(problem):
+        pass
+    for key, value in problem.values().items():
+        measure = slopes if key.endswith(".heightmap") else np.ravel
+        true = measure(problem.truth[key])
+        assert np.linalg.norm(measure(value) - true) < 0.1 * np.linalg.norm(measure(start[key]) - true), key

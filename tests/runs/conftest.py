@@ -1,0 +1,34 @@
+"""What the tests of runs that go on share."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from cli import tiny
+from runs.going_on import optimize
+
+from reslrb_cli.runs import recorder as recording
+
+
+@pytest.fixture(scope="module")
+def interrupted(llvm: str, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """The folder of a run that has done 4 of 6 iterations, its states those after 4 and 3."""
+    folder = tmp_path_factory.mktemp("interrupted")
+    tiny.write_experiment(folder)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        patch.setenv("RESLRB_CACHE", str(folder / "cache"))
+        patch.setattr(recording, "write_report", lambda folder, *now: (folder / "report.html").write_text("<html>"))
+        patch.setattr(recording, "seen_errors", lambda folder, results: {})
+        iterate = recording.Recording._iterate
+        patch.setattr(
+            recording.Recording, "_iterate", lambda self, show, stop: iterate(self, show, lambda: self.done == 4)
+        )
+        code = optimize(
+            "tiny.yaml", "--quiet", "--set", "run={iterations: 6, checkpoint_every: {iterations: 1}, spp: 4}"
+        )
+        assert code == 130
+        patch.setattr(recording.Recording, "_iterate", iterate)
+        yield folder / "runs/tiny"

@@ -1,0 +1,373 @@
+"""A run that goes on ends where it would have ended, bit by bit; so does one that is killed."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from cli import tiny
+from cli.test_storms import mount
+from compilation import search_path
+from runs.going_on import (
+    MOTION,
+    begin_alone,
+    differences,
+    left_over,
+    optimize,
+    records_of,
+    run_and_kill,
+    state_of,
+    work_alone,
+)
+from turns import a_few
+
+from reslrb_cli.cli import main
+from reslrb_cli.guiding.tables import Learned
+from reslrb_cli.optimization import loop, optimizers
+from reslrb_cli.records.checkpoint import STATE_FILE, open_state
+from reslrb_cli.records.manifest import read_manifest
+
+# A run that goes on ends where it would have ended: bit by bit, with one thread.
+
+RUN = Path("runs/tiny")
+#: Enough for the best to be known when the run is killed.
+ITERATIONS = [
+    word
+    for setting in ("run.iterations=18", "run.checkpoint_every={iterations: 6}", "run.certainty=false")
+    for word in ("--set", setting)
+]
+BATCHED = ["run.spp=8", "run.adjoint=batched"]
+
+#: The texture alone.
+SIMPLE = ["--set", f"parameters=[{{key: {tiny.KEY}, initial: 0.5, bounds: [0, 1]}}]"]
+#: From so far away that losses fall from the first iteration to the last.
+FALLING = ["--set", f"parameters=[{{key: {tiny.KEY}, initial: 0.05, bounds: [0, 1]}}]"]
+
+#: Settings by name. Every optimiser, schedule and transform; what is measured before the first iteration; views.
+CASES: dict[str, list[str]] = {
+    "adam": [],
+    "adamw, cosine": ["optimizer.type=adamw", "optimizer.schedule=cosine"],
+    "rmsprop, exponential": ["optimizer.type=rmsprop", "optimizer.schedule=exponential"],
+    "sgd": ["optimizer.type=sgd", "optimizer.learning_rate=0.5"],
+    "momentum, clamp": ["optimizer={type: sgd, momentum: 0.8, learning_rate: 0.1, clamp_gradient: 2}"],
+    "clamp": ["optimizer.clamp_gradient=1.5"],
+    "log": ["parameters[1].transform=log", "parameters[1].bounds=[0.1, 20]"],
+    "sigmoid, momentum": ["parameters[0].transform=sigmoid", "optimizer={type: sgd, momentum: 0.8}"],
+    "softplus": ["parameters[1].transform=softplus", "parameters[1].bounds=[0.1, 20]"],
+    "scale auto": ["optimizer.scale=auto"],
+    "scale auto, sigmoid, rmsprop": [
+        "optimizer={type: rmsprop, scale: auto, clamp_gradient: 3, schedule: cosine}",
+        "parameters[0].transform=sigmoid",
+    ],
+    "views": ["scene.sensors=all", "run.views_per_iteration=1"],
+    "held out": ["scene.sensors=all", "run.views_per_iteration=1", "run.held_out=[2]", "optimizer.scale=auto"],
+    "exposure": [
+        "parameters=[{key: poster.reflectance.data, initial: 0.5, bounds: [0.3, 0.7]}]",
+        "views=[{sensor: 0}, {sensor: 1, exposure: auto}]",
+    ],
+    "motion": [f"parameters[2]={MOTION}"],
+    "motion, scale auto": [f"parameters[2]={MOTION}", "optimizer.scale=auto", "scene.sensors=all"],
+    "certainty": ["run.certainty=true", "run.iterations=24", "run.checkpoint_every={iterations: 5}"],
+    "correlated": ["run.adjoint=correlated"],
+    "independent, l1": ["run.adjoint=independent", "loss.type=l1"],
+    "batched": BATCHED,
+    "reservoir": [*BATCHED, "integrator.estimator=reservoir"],
+    "event": [*BATCHED, "integrator.estimator=event"],
+    "gather": [*BATCHED, "integrator.estimator=gather"],
+    "guided": [*BATCHED, "integrator.guiding=on", "integrator.estimator=stack"],
+    "pilot": ["integrator.estimator=auto", "parameters=[{key: poster.reflectance.data, initial: 0.5, bounds: [0, 1]}]"],
+    "passes": [*BATCHED, "integrator.samples_per_pass=1"],
+    "budget": [*BATCHED, "run.memory_budget=8"],
+    "prb": ["integrator={type: prb, max_depth: 3}", "parameters=[{key: poster.reflectance.data, initial: 0.5}]"],
+}
+FEW = ("scale auto, sigmoid, rmsprop", "held out")
+#: After how many iterations a run is killed, and how many its newest state has then; what certainty asks for is noted
+#: at four fifths of the iterations, which has to be before that.
+KILLED: dict[str, tuple[int, int]] = {"certainty": (23, 20)}
+
+
+@pytest.fixture
+def experiment(llvm: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    begin_alone(tmp_path, monkeypatch)
+    return tmp_path
+
+
+@pytest.mark.parametrize("case", a_few(CASES, FEW))
+def test_a_killed_run_goes_on_as_if_nothing_had_been(
+    case: str, experiment: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It was killed three iterations after its newest state, which are done again."""
+    sets = [word for setting in CASES[case] for word in ("--set", setting)]
+    at, newest = KILLED.get(case, (15, 12))
+    whole, left = run_and_kill(monkeypatch, at, *ITERATIONS, *sets)
+    shutil.rmtree(experiment / "cache", ignore_errors=True)  # nor what an earlier pilot learned
+    assert int(state_of(left)["iteration"]) == newest
+    assert optimize("--resume", str(left), "--quiet") == 0
+    assert differences(whole, left) == []
+    assert left_over(left) == []
+    assert [record["iteration"] for record in records_of(left)] == list(range(len(records_of(whole))))
+    manifest = json.loads((left / "manifest.json").read_text())
+    assert manifest["status"] == "finished"
+    [resumed] = manifest["resumed"]
+    assert (resumed["iteration"], resumed["changed"]) == (newest, {})
+
+
+def test_a_run_goes_on_whose_tables_were_just_found_wrong(experiment: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its newest state is that of a moment at which gradients are counted anew."""
+    right = Learned.with_more
+
+    def wrong(*given: Any) -> Learned:
+        return replace(right(*given), worse=2.0)
+
+    monkeypatch.setattr(Learned, "with_more", wrong)
+    settings = [*CASES["guided"], "run.iterations=9", "run.checkpoint_every={iterations: 5}"]
+    sets = [word for setting in settings for word in ("--set", setting)]
+    whole, left = run_and_kill(monkeypatch, 7, *ITERATIONS, *sets)
+    archive, values = open_state(left / "checkpoint" / STATE_FILE)
+    archive.close()
+    assert values["guiding"] == {"0": 0}
+    assert optimize("--resume", str(left), "--quiet") == 0
+    assert differences(whole, left) == []
+
+
+def test_a_run_that_went_on_can_go_on_again(experiment: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """And a finished one has more iterations, as many as it would have had at once."""
+    assert optimize("tiny.yaml", "--quiet", *ITERATIONS, *SIMPLE, "--set", "run.name=whole") == 0
+    assert optimize("tiny.yaml", "--quiet", *ITERATIONS, "--set", "run.iterations=7", *SIMPLE) == 0
+    for iterations in (13, 18):
+        assert optimize("--resume", str(RUN), "--quiet", "--set", f"run.iterations={iterations}") == 0
+    assert differences(Path("runs/whole"), RUN) == []
+    resumed = json.loads((RUN / "manifest.json").read_text())["resumed"]
+    assert [(each["iteration"], each["changed"]) for each in resumed] == [
+        (7, {"run.iterations": [7, 13]}), (13, {"run.iterations": [13, 18]})
+    ]  # fmt: skip
+
+
+def _without_moments(self, values, units, take):
+    for key, own in self._own.items():
+        own[key] = values[key]
+
+
+def _another_seed(run_seed, iteration, view, purpose):
+    from reslrb_cli.seeds import seed
+
+    return seed(run_seed, iteration + 1, view, purpose)
+
+
+@pytest.mark.parametrize(
+    "fault",
+    a_few(["no moments", "no clamp", "another seed", "no best", "no squares", "metrics not cut back"], ["no moments"]),
+)
+def test_what_is_not_taken_up_is_missed(fault: str, experiment: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Planted: each part of the state is left out in turn."""
+    from reslrb_cli.optimization import optimizers as clamping
+    from reslrb_cli.optimization import results
+    from reslrb_cli.optimization.uncertainty.measuring import Certainty
+    from reslrb_cli.runs import resume
+
+    # A state in the last fifth of the run has all parts; and losses that fall have the best of the run after it.
+    sets = ["--set", "optimizer.clamp_gradient=1.5", "--set", "run.checkpoint_every={iterations: 15}"]
+    whole, left = run_and_kill(monkeypatch, 17, *ITERATIONS, *sets, *FALLING)
+    places = {
+        "no moments": (optimizers.Optimizer, "restore", _without_moments),
+        "no clamp": (clamping.GradientClamp, "restore", lambda self, *given: None),
+        "another seed": (loop, "seed", _another_seed),
+        "no best": (results.Best, "recall", lambda self, records: None),
+        "no squares": (Certainty, "restore", lambda self, *given: None),
+        "metrics not cut back": (resume, "cut_back", lambda folder, records, size: None),
+    }
+    monkeypatch.setattr(*places[fault])
+    assert optimize("--resume", str(left), "--quiet") == 0
+    assert differences(whole, left) != []
+
+
+def test_a_state_is_what_it_was_when_it_was_taken(experiment: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A failure in the midst of an update leaves the state of the last whole iteration to be kept."""
+    step, calls = optimizers.Optimizer.step, []
+
+    def failing(self, factor, skip=()):
+        calls.append(factor)
+        done = step(self, factor, skip)
+        if len(calls) == 6:
+            raise RuntimeError("in the midst")
+        return done
+
+    monkeypatch.setattr(optimizers.Optimizer, "step", failing)
+    with pytest.raises(RuntimeError, match="in the midst"):
+        main.main(["optimize", "tiny.yaml", "--quiet", *ITERATIONS, *SIMPLE])
+    monkeypatch.setattr(optimizers.Optimizer, "step", step)
+    assert int(state_of(RUN)["iteration"]) == len(records_of(RUN)) == 5
+    assert optimize("tiny.yaml", "--quiet", *ITERATIONS, *SIMPLE, "--set", "run.name=whole") == 0
+    assert optimize("--resume", str(RUN), "--quiet") == 0
+    assert differences(Path("runs/whole"), RUN) == []
+
+
+def test_the_best_values_are_those_of_the_least_mean(experiment: Path) -> None:
+    assert optimize("tiny.yaml", "--quiet", *ITERATIONS, *SIMPLE) == 0
+    losses = [record["loss"] for record in records_of(RUN)]
+    means = [np.mean(losses[end - 10 : end]) for end in range(10, 19)]
+    found = json.loads((RUN / "manifest.json").read_text())["results"]["best"]
+    assert found["iteration"] == int(np.argmin(means)) + 9
+    assert found["loss"] == pytest.approx(min(means), rel=1e-12)
+    assert (RUN / "parameters/best/parameters.npz").exists()
+
+
+# Runs that are killed at random moments, and on disks that are too small, until they have come to their end.
+
+#: The program, whose steps one thread computes.
+SCRIPT = f"""import sys; sys.path[:0] = [{str(tiny.ROOT)!r}, {str(tiny.ROOT / "tests")!r}]; sys.argv[0] = 'reslrb'
+import pytest, reslrb_cli
+from runs.going_on import work_alone
+work_alone(pytest.MonkeyPatch())
+from reslrb_cli.cli import run; run()"""
+#: A state after each iteration: a good part of the time goes into writing them.
+SETS = ["--set", "run.checkpoint_every={iterations: 1}", "--set", "run.certainty=false", "--quiet"]
+
+
+def start(folder: Path, *args: str, script: str = SCRIPT) -> subprocess.Popen[str]:
+    environment = {**os.environ, "RESLRB_CACHE": str(folder / "cache"), "PYTHONPATH": search_path(tiny.ROOT)}
+    return subprocess.Popen(
+        [sys.executable, "-c", script, "optimize", *args],
+        cwd=folder, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+
+
+def end(process: subprocess.Popen[str]) -> tuple[int, str]:
+    _, err = process.communicate(timeout=300)
+    return process.returncode, err
+
+
+def count(run: Path) -> int:
+    """Lines of the metrics."""
+    path = run / "metrics.jsonl"
+    return path.read_bytes().count(b"\n") if path.exists() else 0
+
+
+def kill_at_random(process: subprocess.Popen[str], run: Path, chance: random.Random) -> None:
+    """In the midst of its iterations, for the most part; else whenever it may be."""
+    if chance.random() < 0.2:
+        time.sleep(chance.uniform(0, 4))
+    else:
+        before, limit = count(run), time.monotonic() + 60
+        while count(run) <= before and process.poll() is None and time.monotonic() < limit:
+            time.sleep(0.005)
+        time.sleep(chance.uniform(0, 0.3))
+    process.kill()
+    process.communicate()
+
+
+@pytest.mark.usefixtures("llvm")
+@pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="sends SIGKILL")
+@pytest.mark.parametrize(
+    ("kills", "iterations"), [(1, 30), pytest.param(50, 1200, marks=pytest.mark.long)], ids=["one", "fifty"]
+)
+def test_a_run_that_is_killed_again_and_again_ends_where_the_other_does(
+    tmp_path: Path, kills: int, iterations: int
+) -> None:
+    tiny.write_experiment(tmp_path)
+    length = ["--set", f"run.iterations={iterations}"]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(tmp_path)
+        patch.setenv("RESLRB_CACHE", str(tmp_path / "cache"))
+        work_alone(patch)
+        assert optimize("tiny.yaml", *SETS, *length, "--set", "run.name=whole") == 0
+    run, chance = tmp_path / "runs/tiny", random.Random(11)
+    process = start(tmp_path, "tiny.yaml", *SETS, *length)
+    lives, done = 1, 0
+    while lives <= kills:
+        kill_at_random(process, run, chance)
+        if run.exists():
+            manifest = read_manifest(run)
+            assert manifest is not None
+            assert manifest["status"] in ("interrupted", "finished")
+            assert left_over(run) == []  # a reader has put it right
+            if (run / "checkpoint/state.npz").exists():
+                done = int(state_of(run)["iteration"])
+                assert done <= count(run)
+                process = start(tmp_path, "--resume", str(run), "--quiet")
+            else:
+                shutil.rmtree(run)
+                process = start(tmp_path, "tiny.yaml", *SETS, *length)
+        else:
+            process = start(tmp_path, "tiny.yaml", *SETS, *length)
+        lives += 1
+    code, err = end(process)
+    print(f"{lives} lives, {done} iterations before the last")
+    assert (code, err) == (0, "")
+    assert differences(tmp_path / "runs/whole", run) == []
+    assert [record["iteration"] for record in records_of(run)] == list(range(iterations))
+    assert read_manifest(run)["status"] == "finished"  # type: ignore[index]
+
+
+SIZES = [8, 16, 32, 48, 64, 80, 96, 112, 128, 144, 160, 192, 256, 384, 512, 1024]
+
+
+@pytest.mark.usefixtures("llvm")
+@pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="sends SIGKILL")
+@pytest.mark.long
+@pytest.mark.parametrize("kib", SIZES)
+def test_a_run_whose_disk_was_full_goes_on_when_there_is_room(tmp_path: Path, disk: Path, kib: int) -> None:
+    tiny.write_experiment(tmp_path)
+    mount(disk, kib)
+    output = ["--set", f"run.output={disk}/runs"]
+    code, err = end(start(tmp_path, "tiny.yaml", *SETS, "--set", "run.iterations=20000", *output))
+    run = disk / "runs/tiny"
+    assert code == 6, err
+    if not run.exists():
+        return
+    assert left_over(run) == []
+    assert read_manifest(run)["status"] == "failed"  # type: ignore[index]
+    subprocess.run(["mount", "-o", "remount,size=8m", disk], check=True)
+    if not (run / "checkpoint/state.npz").exists():
+        code, err = end(start(tmp_path, "--resume", str(run), "--quiet"))
+        assert (code, err) == (2, f"{run}: has no checkpoint/state.npz: the run ended before it kept anything\n")
+        return
+    iterations = int(state_of(run)["iteration"]) + 12
+    length = ["--set", f"run.iterations={iterations}"]
+    assert end(start(tmp_path, "--resume", str(run), "--quiet", *length)) == (0, "")
+    assert end(start(tmp_path, "tiny.yaml", *SETS, *length)) == (0, "")
+    # What certainty asks for is noted at four fifths of the iterations, which were 20000 before.
+    found = differences(tmp_path / "runs/tiny", run)
+    assert [name for name in found if "squares/" not in name] == []
+
+
+@pytest.mark.usefixtures("llvm")
+@pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="sends SIGKILL")
+@pytest.mark.long
+def test_with_several_threads_it_is_no_farther_off_than_runs_are_from_each_other(tmp_path: Path) -> None:
+    """Twice the largest distance among five whole runs, as large as sums in another order make it."""
+    tiny.write_experiment(tmp_path)
+    script = "import sys; sys.argv[0] = 'reslrb'; from reslrb_cli.cli import run; run()"
+    sets = [*SETS, "--set", "run.iterations=80", "--set", "run.spp=1024", "--set", "run.adjoint=batched"]
+    for number in range(5):
+        assert end(start(tmp_path, "tiny.yaml", *sets, "--set", f"run.name=whole-{number}", script=script))[0] == 0
+    process = start(tmp_path, "tiny.yaml", *sets, script=script)
+    run = tmp_path / "runs/tiny"
+    for _ in range(3):
+        before = count(run)
+        while count(run) < before + 10 and process.poll() is None:
+            time.sleep(0.005)
+        process.kill()
+        process.communicate()
+        process = start(tmp_path, "--resume", str(run), "--quiet", script=script)
+    assert end(process)[0] == 0
+    values = [
+        state_of(tmp_path / "runs" / name)[f"parameter/{tiny.KEY}"]
+        for name in (*(f"whole-{number}" for number in range(5)), "tiny")
+    ]
+    *whole, resumed = [value.astype(np.float64) for value in values]
+    farthest = max(float(np.abs(a - b).max()) for a in whole for b in whole)
+    distance = min(float(np.abs(resumed - each).max()) for each in whole)
+    print(f"distance {distance:.3g}, among whole runs {farthest:.3g}")
+    assert distance <= 2 * farthest

@@ -1,0 +1,488 @@
+"""Images: formats, colour spaces, photographs, and files that are no whole images."""
+
+from __future__ import annotations
+
+import os
+import struct
+import time
+import zlib
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from reslrb_cli.errors import ConfigError, OutOfMemory
+from reslrb_cli.scene import images
+from reslrb_cli.scene.images import decode_srgb, orientation_of, read_bitmap, read_image
+from reslrb_cli.scene.proposal import open_photograph, write_smaller
+
+pytestmark = pytest.mark.usefixtures("llvm")
+
+
+# Files that are no whole images: cut off, padded, damaged, larger than they could be, and no files at all.
+#
+# And whole ones whose EXIF says how they are to be turned.
+
+
+def picture():
+    """(H, W, 3) float32 with detail everywhere."""
+    y, x = np.mgrid[0:96, 0:128].astype(np.float32)
+    noise = np.random.default_rng(3).uniform(0, 0.3, (96, 128, 3)).astype(np.float32)
+    return noise + np.stack([x / 200, y / 200, (x + y) / 400], axis=-1)
+
+
+@pytest.fixture(
+    params=["a.jpg", "progressive.jpg", "restarts.jpg", "a.png", "a.exr", "a.hdr", "a.pfm", "a.ppm", "a.bmp"]
+)
+def image(request, tmp_path):
+    """A whole image file of each format that can be read."""
+    import mitsuba as mi
+    from PIL import Image  # comes with matplotlib
+
+    path = tmp_path / request.param
+    array = picture() if path.suffix in (".exr", ".hdr", ".pfm") else (255 * picture()).astype(np.uint8)
+    if request.param in ("progressive.jpg", "restarts.jpg", "a.bmp"):
+        options = {"progressive.jpg": {"progressive": True}, "restarts.jpg": {"restart_marker_rows": 2}}
+        Image.fromarray(array).save(path, **options.get(request.param, {}))
+    else:
+        mi.Bitmap(array).write(str(path))
+    return path
+
+
+def refused(path, **options):
+    """The message for a file that is refused, which is located in it."""
+    with pytest.raises(ConfigError) as caught:
+        read_image(path, **options)
+    line = str(caught.value)
+    assert line.startswith(f"{path}: ")
+    return line.removeprefix(f"{path}: ")
+
+
+def test_a_whole_file_is_read(image, capfd):
+    assert read_image(image, size=(128, 96)).shape == (96, 128, 3)
+    image.write_bytes(image.read_bytes() + b"\0" * 500)  # what cameras and copies put behind the image
+    assert read_image(image).shape == (96, 128, 3)
+    assert capfd.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize("share", [0.0, 0.001, 0.25, 0.5, 0.75, 0.9, 0.99, 1.0])
+def test_a_file_that_is_cut_off_is_refused(image, share, capfd):
+    data = image.read_bytes()
+    image.write_bytes(data[: min(int(share * len(data)), len(data) - 1)])
+    assert refused(image).startswith(("is cut off", "is damaged or cut off", "is not an image that can be read"))
+    assert capfd.readouterr() == ("", "")  # libjpeg's own words do not reach the terminal
+
+
+@pytest.mark.parametrize("share", [0.25, 0.5, 0.9])
+@pytest.mark.parametrize("padding", ["zeros", "the end"])
+def test_a_file_that_is_cut_off_and_padded_is_refused(image, share, padding, capfd):
+    if image.suffix in (".pfm", ".ppm", ".bmp") or (image.suffix == ".exr" and share > 0.5):
+        pytest.skip("zeros are black pixels, or part of the last lines, which have no check sum")
+    data = image.read_bytes()
+    begin, end = data[: int(share * len(data))], data[-12:] if padding == "the end" else b""
+    if image.suffix == ".jpg":
+        end = b"\xff\xd9"
+    zeros = b"\0" * (len(data) - len(begin) - len(end)) if padding == "zeros" else b""
+    image.write_bytes(begin + zeros + end)
+    assert "is damaged or cut off" in refused(image) or image.suffix == ".png"
+    assert capfd.readouterr() == ("", "")
+
+
+def test_a_hole_in_the_midst_of_a_jpeg_is_refused(tmp_path):
+    import mitsuba as mi
+
+    path = tmp_path / "a.jpg"
+    mi.Bitmap((255 * picture()).astype(np.uint8)).write(str(path))
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2 : len(data) // 2 + 512] = b"\0" * 512
+    path.write_bytes(data)
+    assert "is damaged or cut off (Corrupt JPEG data" in refused(path)
+
+
+def test_what_libjpeg_says_is_heard_where_standard_error_is_closed(tmp_path, monkeypatch):
+    import mitsuba as mi
+
+    path = tmp_path / "a.jpg"
+    mi.Bitmap((255 * picture()).astype(np.uint8)).write(str(path))
+
+    def closed(_number):
+        raise OSError(9, "Bad file descriptor")
+
+    monkeypatch.setattr(images.os, "dup", closed)
+    assert read_image(path).shape == (96, 128, 3)
+
+
+def png(width, height, data=b""):
+    """A PNG file that says that it is of that size."""
+
+    def chunk(kind, content):
+        return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", zlib.crc32(kind + content))
+
+    head = chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0))
+    return b"\x89PNG\r\n\x1a\n" + head + chunk(b"IDAT", zlib.compress(data)) + chunk(b"IEND", b"")
+
+
+def exr(right, bottom):
+    """The head of an EXR file that says that it is of that size."""
+
+    def attribute(name, kind, content):
+        return name + b"\0" + kind + b"\0" + struct.pack("<i", len(content)) + content
+
+    window = struct.pack("<4i", 0, 0, right, bottom)
+    return b"\x76\x2f\x31\x01\x02\0\0\0" + attribute(b"dataWindow", b"box2i", window) + b"\0"
+
+
+@pytest.mark.parametrize(
+    ("name", "data"),
+    [
+        ("a.png", png(60_000, 60_000, bytes(20_000_000))),
+        ("a.exr", exr(59_999, 59_999)),
+        ("a.hdr", b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 60000 +X 60000\n" + bytes(20_000)),
+        ("a.pfm", b"PF\n60000 60000\n-1.0\n" + bytes(20_000)),
+        ("a.ppm", b"P6\n# a comment\n60000 60000\n255\n" + bytes(20_000)),
+        ("a.jpg", b"\xff\xd8\xff\xc0\0\x11\x08\xea\x60\xea\x60\x03\x01\x22\0\x02\x11\x01\x03\x11\x01\xff\xd9"),
+        ("a.bmp", b"BM" + bytes(16) + struct.pack("<ii", 60_000, -60_000) + bytes(100)),
+    ],
+)
+def test_what_says_that_it_is_huge_is_not_decoded(tmp_path, monkeypatch, name, data):
+    path = tmp_path / name
+    path.write_bytes(data)
+    monkeypatch.setattr(images, "mi", None)  # so that nothing can be
+    assert refused(path) == "is 60000x60000 pixels; more than 134217728 are not read"
+    assert refused(path, size=(6, 4)) == "is 60000x60000 pixels; it must be 6x4"
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        b"",
+        b"GIF89a" + bytes(100),
+        png(0, 7),
+        b"\x89PNG\r\n\x1a\n" + bytes(100),
+        exr(-1, 5),
+        b"\x76\x2f\x31\x01" + b"\x01" * 100,
+        b"#?RADIANCE\n\n",
+        b"PF\n4 99999999999999999999\n",
+        b"\xff\xd8\xff\xd9",
+        b"BM",
+    ],
+)
+def test_heads_that_say_nothing(tmp_path, data):
+    path = tmp_path / "a.png"
+    path.write_bytes(data)
+    assert refused(path).startswith("is not an image that can be read (EXR, PNG")
+
+
+def test_a_jpeg_of_empty_parts_takes_no_time(tmp_path, monkeypatch):
+    monkeypatch.setattr(images, "_MOST_PARTS", 1000)
+    path = tmp_path / "a.jpg"
+    path.write_bytes(b"\xff\xd8" + b"\xff\xe0\0\x02" * 2000)
+    assert refused(path).startswith("is not an image")
+
+
+@pytest.mark.parametrize("kind", ["pipe", "device", "sparse"])
+def test_what_is_no_regular_file_is_not_read(tmp_path, kind):
+    path = tmp_path / "a.png"
+    if kind == "pipe":
+        os.mkfifo(path)
+    elif kind == "device":
+        path.symlink_to("/dev/zero")
+    else:
+        path.touch()
+        os.truncate(path, 2**40)
+    assert refused(path).startswith("has 1 TiB; more than 2 GiB" if kind == "sparse" else f"is a {kind}, not a regular")
+
+
+def test_an_allocation_that_fails_is_no_damage(tmp_path, monkeypatch):
+    class Full:
+        def Bitmap(self, _path):
+            raise MemoryError("std::bad_alloc")
+
+    path = tmp_path / "a.png"
+    path.write_bytes(png(2, 2, bytes(14)))
+    assert read_bitmap(path).width() == 2
+    monkeypatch.setattr(images, "mi", Full())
+    with pytest.raises((MemoryError, OutOfMemory)):
+        read_bitmap(path)
+
+
+@pytest.mark.parametrize("width", [7, 8, 40, 300])
+def test_the_lines_of_a_radiance_image_are_looked_at_before_they_are_decoded(width, tmp_path):
+    """Mitsuba writes past its memory where one of them is no runs, which the first ones are."""
+    import mitsuba as mi
+
+    path = tmp_path / "a.hdr"
+    array = np.random.default_rng(5).uniform(0, 2, (9, width, 3)).astype(np.float32)
+    array[2:5] = 0.5  # long runs, too
+    mi.Bitmap(array).write(str(path))
+    assert np.allclose(read_image(path), array, atol=0.01)
+    if width < 8:
+        return
+    data = path.read_bytes()
+    start = bytes((2, 2, width >> 8, width & 255))
+    lines = [place for place in range(len(data)) if data[place : place + 4] == start]
+    for place, there in (
+        (lines[3], b"\xff"),
+        (lines[1] + 3, b"\x07"),
+        (lines[2] + 4, b"\x00"),
+    ):
+        path.write_bytes(data[:place] + there + data[place + 1 :])
+        assert refused(path).startswith(("is cut off", "is damaged or cut off"))
+        with pytest.raises(images.DamagedImage):
+            images.image_size(path)
+
+
+def with_orientation(path, orientation, channels=3):
+    """A picture of 7x5 pixels in a file whose EXIF has this orientation, as Pillow writes it."""
+    from PIL import Image  # comes with matplotlib
+
+    pixels = np.random.default_rng(1).integers(0, 255, (5, 7, channels), dtype=np.uint8)
+    image = Image.fromarray(pixels if channels > 1 else pixels[:, :, 0])
+    exif = image.getexif()
+    exif[0x0112] = orientation
+    image.save(path, exif=exif)
+    return path
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+@pytest.mark.parametrize(("name", "channels"), [("a.jpg", 3), ("a.jpg", 1), ("a.png", 4), ("a.png", 3)])
+def test_what_is_seen_upright_is_what_pillow_makes_of_it(name, channels, orientation, tmp_path):
+    from PIL import Image, ImageOps
+
+    path = with_orientation(tmp_path / name, orientation, channels)
+    raw, seen = read_bitmap(path), read_bitmap(path, upright=True)
+    expected = np.array(ImageOps.exif_transpose(Image.open(path))).reshape(*seen.size()[::-1], channels)
+    assert orientation_of(path) == orientation
+    assert np.array_equal(np.array(seen).reshape(expected.shape), expected)
+    assert list(raw.size()) == [7, 5]
+    assert (seen.pixel_format(), seen.srgb_gamma()) == (raw.pixel_format(), raw.srgb_gamma())
+    size = (5, 7) if orientation >= 5 else (7, 5)
+    assert list(read_bitmap(path, size, upright=True).size()) == list(size)
+    if orientation >= 5:
+        with pytest.raises(ConfigError, match=r"is 5x7 pixels, turned by 90 degrees .* it must be 7x5"):
+            read_bitmap(path, (7, 5), upright=True)
+
+
+def exif(entries, order=">", place=8, count=None):
+    """What EXIF says, from its entries (tag, type, count, value)."""
+    head = (b"MM\0*" if order == ">" else b"II*\0") + struct.pack(f"{order}I", place)
+    body = struct.pack(f"{order}H", len(entries) if count is None else count)
+    return head + body + b"".join(struct.pack(f"{order}HHIHH", *entry, 0) for entry in entries)
+
+
+def jpeg_with(path, *contents, kind=0xE1):
+    """A JPEG of 7x5 pixels with these application segments behind its head."""
+    import mitsuba as mi
+
+    mi.Bitmap(np.full((5, 7, 3), 128, np.uint8)).write(str(path))
+    data = path.read_bytes()
+    parts = b"".join(b"\xff" + bytes([kind]) + struct.pack(">H", len(content) + 2) + content for content in contents)
+    path.write_bytes(data[:2] + parts + data[2:])
+    return path
+
+
+SIX = (0x0112, 3, 1, 6)
+
+
+@pytest.mark.parametrize("order", "<>")
+def test_entries_before_the_orientation_and_other_segments_are_passed_over(order, tmp_path):
+    entries = [(0x010F, 2, 4, 0x4142), (0x0110, 2, 4, 0x4142), SIX, (0x0112, 3, 1, 3)]
+    data = b"Exif\0\0" + exif(entries, order)
+    path = jpeg_with(tmp_path / "a.jpg", b"http://ns.adobe.com/xap/1.0/\0<x/>", data, b"Exif\0\0" + exif([]))
+    assert orientation_of(path) == 6
+    assert list(read_bitmap(path, upright=True).size()) == [5, 7]
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        b"",
+        b"MM\0*",
+        b"XX\0*" + exif([SIX])[4:],
+        exif([SIX])[:-4],  # cut off within the entry
+        exif([SIX], place=2**32 - 1),
+        exif([SIX], place=4),  # a directory that begins within what points to it
+        exif([], count=65535),
+        exif([], count=65535) + bytes(60_000),
+        exif([(0x0112, 3, 1, 0)]),
+        exif([(0x0112, 3, 1, 9)]),
+        exif([(0x0112, 3, 2**32 - 1, 6)]),
+        exif([(0x0112, 2, 1, 6)]),
+        exif([(0x8769, 4, 1, 0), (0x014A, 4, 1, 0)] * 1000),  # directories within directories, all of them this one
+    ],
+)
+def test_exif_that_says_nothing_turns_nothing(data, tmp_path):
+    start = time.monotonic()
+    for path in (
+        jpeg_with(tmp_path / "a.jpg", b"Exif\0\0" + data),
+        png_with(tmp_path / "a.png", data),
+    ):
+        assert orientation_of(path) == 1
+        assert list(read_bitmap(path, upright=True).size()) == [7, 5]
+    assert time.monotonic() - start < 5
+
+
+def png_with(path, data):
+    """A PNG of 7x5 pixels with this EXIF data behind its head."""
+    import mitsuba as mi
+
+    mi.Bitmap(np.full((5, 7, 3), 128, np.uint8)).write(str(path))
+    whole, head = path.read_bytes(), 8 + 25
+    chunk = struct.pack(">I", len(data)) + b"eXIf" + data + struct.pack(">I", zlib.crc32(b"eXIf" + data))
+    path.write_bytes(whole[:head] + chunk + whole[head:])
+    return path
+
+
+def test_a_png_whose_exif_is_longer_than_its_file_is_cut_off(tmp_path):
+    path = png_with(tmp_path / "a.png", exif([SIX]))
+    assert orientation_of(path) == 6
+    data = bytearray(path.read_bytes())
+    data[33:37] = b"\x7f\xff\xff\xff"
+    path.write_bytes(data)
+    assert refused(path).startswith("is cut off")
+
+
+def test_a_texture_is_read_as_it_lies_and_that_is_said(tmp_path, caplog):
+    path = with_orientation(tmp_path / "a.png", 8)
+    assert read_image(path).shape == (5, 7, 3)
+    assert f"{path}: is read as it lies in the file, not turned by 90 degrees counter" in caplog.text
+
+
+# Images: formats, colour spaces, and what is refused.
+
+
+def write(path, array):
+    import mitsuba as mi
+
+    mi.Bitmap(np.ascontiguousarray(array)).write(str(path))
+    return path
+
+
+def srgb(value: float) -> float:
+    """Linear value of an sRGB-encoded one (IEC 61966-2-1)."""
+    return value / 12.92 if value <= 0.04045 else ((value + 0.055) / 1.055) ** 2.4
+
+
+@pytest.mark.parametrize("type_", [np.float16, np.float32])
+def test_exr_is_linear(tmp_path, type_):
+    values = np.linspace(0, 5, 3 * 4 * 3).astype(type_).reshape(3, 4, 3)
+    image = read_image(write(tmp_path / "a.exr", values), size=(4, 3))
+    assert image.dtype == np.float32
+    assert np.array_equal(image, values.astype(np.float32))
+
+
+def test_png_is_srgb_by_default(tmp_path):
+    values = np.tile(np.arange(0, 256, 17, dtype=np.uint8)[None, :, None], (2, 1, 3))
+    path = write(tmp_path / "a.png", values)
+    expected = [srgb(v / 255) for v in range(0, 256, 17)]
+    assert np.allclose(read_image(path)[0, :, 0], expected, atol=1e-6)
+    assert np.allclose(read_image(path, "srgb")[0, :, 0], expected, atol=1e-6)
+    assert np.allclose(read_image(path, "linear")[0, :, 0], np.arange(0, 256, 17) / 255, atol=1e-6)
+
+
+def test_float_files_can_be_srgb(tmp_path):
+    path = write(tmp_path / "a.exr", np.full((2, 2, 3), 0.5, np.float32))
+    assert np.allclose(read_image(path, "srgb"), srgb(0.5))
+
+
+def test_jpg_and_hdr(tmp_path):
+    jpg = read_image(write(tmp_path / "a.jpg", np.full((8, 8, 3), 128, np.uint8)))
+    assert np.allclose(jpg, srgb(128 / 255), atol=0.01)
+    hdr = read_image(write(tmp_path / "a.hdr", np.full((8, 8, 3), 3.0, np.float32)))
+    assert np.allclose(hdr, 3, rtol=0.01)
+
+
+def test_alpha_is_dropped_and_grey_becomes_rgb(tmp_path):
+    rgba = np.full((2, 2, 4), 0.25, np.float32)
+    assert read_image(write(tmp_path / "a.exr", rgba)).shape == (2, 2, 3)
+    grey = read_image(write(tmp_path / "g.exr", np.full((2, 2, 1), 0.25, np.float32)))
+    assert grey.shape == (2, 2, 3)
+    assert np.array_equal(grey, np.full((2, 2, 3), 0.25, np.float32))
+
+
+def image_with(value):
+    array = np.ones((4, 6, 3), np.float32)
+    array[2, 5, 1] = value
+    return array
+
+
+@pytest.mark.parametrize(
+    ("array", "what"),
+    [
+        (np.ones((4, 5, 3), np.float32), "is 5x4 pixels; it must be 6x4"),
+        (image_with(np.nan), r"pixel \(5, 2\), channel G, is nan: not finite \(1 pixels in all\)"),
+        (image_with(np.inf), "is inf: not finite"),
+        (image_with(-0.5), "is -0.5: negative"),
+        (np.ones((4, 6, 7), np.float32), "has 7 channels"),
+    ],
+)
+def test_refused(tmp_path, array, what):
+    path = write(tmp_path / "a.exr", array)
+    with pytest.raises(ConfigError, match=what) as error:
+        read_image(path, size=(6, 4))
+    assert str(error.value).startswith(f"{path}: ")
+
+
+def test_missing_and_unreadable(tmp_path):
+    with pytest.raises(ConfigError, match="no such file"):
+        read_image(tmp_path / "none.png")
+    with pytest.raises(ConfigError, match="is a folder"):
+        read_image(tmp_path)
+    for name in ("a.exr", "a.png", "a.txt"):
+        (tmp_path / name).write_text("no image")
+        with pytest.raises(ConfigError, match="is not an image"):
+            read_image(tmp_path / name)
+
+
+# Photographs at the size of a film: means of light, and marks of what is clipped or transparent that stay.
+
+
+def smaller(path: Path, values: np.ndarray, size: tuple[int, int]) -> Path:
+    """The file `values` as an image, and then with fewer pixels."""
+    bitmap = mi.Bitmap(np.ascontiguousarray(values))
+    bitmap.set_srgb_gamma(values.dtype.kind == "u")
+    source = path / ("photo.png" if values.dtype.kind == "u" else "photo.exr")
+    bitmap.write(str(source))
+    photo = open_photograph(source)
+    assert photo.is_integer is (values.dtype.kind == "u")
+    written = path / f"small{source.suffix}"
+    write_smaller(photo, size, written)
+    return written
+
+
+def test_pixels_are_means_of_light(tmp_path: Path) -> None:
+    values = np.random.default_rng(0).integers(0, 250, (12, 20, 3), dtype=np.uint8)
+    found = read_image(smaller(tmp_path, values, (5, 4)))
+    expected = decode_srgb(values.astype(np.float32) / 255).reshape(4, 3, 5, 4, 3).mean(axis=(1, 3))
+    assert np.allclose(found, expected, atol=2e-5)  # of 16 bits
+
+
+def test_pixels_take_their_share_of_those_between_them(tmp_path: Path) -> None:
+    values = np.random.default_rng(0).uniform(0, 5, (5, 7, 3)).astype(np.float32)
+    found = read_image(smaller(tmp_path, values, (3, 2)))
+    fine = np.repeat(np.repeat(values, 2, axis=0), 3, axis=1)  # by which both sizes divide
+    assert np.allclose(found, fine.reshape(2, 5, 3, 7, 3).mean(axis=(1, 3)), rtol=1e-5)
+
+
+def test_what_is_clipped_in_part_stays_clipped(tmp_path: Path) -> None:
+    values = np.full((8, 8, 3), 100, dtype=np.uint8)
+    values[2, 6, 1] = 255
+    pixels = np.array(mi.Bitmap(str(smaller(tmp_path, values, (2, 2)))))
+    assert np.argwhere(pixels == 65535).tolist() == [[0, 1, 1]]
+
+
+def test_what_is_transparent_in_part_stays_transparent(tmp_path: Path) -> None:
+    values = np.full((8, 8, 4), 100, dtype=np.uint8)
+    values[5, 1, 3] = 0
+    pixels = np.array(mi.Bitmap(str(smaller(tmp_path, values, (2, 2)))))
+    assert np.argwhere(pixels[:, :, 3] == 0).tolist() == [[1, 0]]
+    assert (np.delete(pixels[:, :, 3].ravel(), 2) == 65535).all()
+
+
+def test_what_is_not_finite_stays_so_and_reaches_no_other(tmp_path: Path) -> None:
+    values = np.ones((6, 6, 3), dtype=np.float32)
+    values[0, 5, 2] = np.inf
+    pixels = np.array(mi.Bitmap(str(smaller(tmp_path, values, (3, 3)))))
+    assert np.argwhere(~np.isfinite(pixels)).tolist() == [[0, 2, 2]]
+    assert np.allclose(pixels[np.isfinite(pixels)], 1)

@@ -1,0 +1,350 @@
+"""The choice of libLLVM and of the variant, and memory that is Dr.Jit's own."""
+
+from __future__ import annotations
+
+import logging
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from reslrb_cli.backend import llvm, variant
+from reslrb_cli.backend import probe as probe_module
+from reslrb_cli.backend.memory import own_memory
+from reslrb_cli.backend.probe import Probe, probe
+from reslrb_cli.backend.shared_library import missing_library
+from reslrb_cli.errors import BackendError, ExitCode
+from reslrb_cli.optimization.state import like
+from reslrb_cli.optimization.views import to_tensor
+from reslrb_cli.transport.guide import even_table, make_grid
+
+# The choice of libLLVM: which of several, which ones are refused, and what the user is told.
+
+Machine = Callable[..., list[Path]]
+
+
+@pytest.fixture
+def _forget(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Each test searches anew, without the choice that the tests themselves run under."""
+    monkeypatch.delenv(llvm.VARIABLE, raising=False)
+    for cached in (llvm.choose, llvm._examine):
+        cached.cache_clear()
+    yield
+    for cached in (llvm.choose, llvm._examine):
+        cached.cache_clear()
+
+
+@pytest.fixture
+def machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Machine:
+    """`machine({"libLLVM-15.so.1": "loads"})` lays out a machine with these libraries alone.
+
+    Each says what its trial does: prints a version, or exits with a message of the dynamic loader.
+    """
+    trial = tmp_path / "forecast.py"
+    trial.write_text(
+        "import sys\ntext = open(sys.argv[1]).read()\n"
+        "sys.exit(text) if ' ' in text else print(text)\n"
+        "if text == 'abort': __import__('os').abort()\n"
+    )
+
+    def make(libraries: dict[str, str]) -> list[Path]:
+        paths = []
+        for name, behaviour in libraries.items():
+            path = tmp_path / "lib" / name
+            path.parent.mkdir(exist_ok=True)
+            path.write_text(behaviour)
+            paths.append(path)
+        monkeypatch.setattr(llvm, "_folders", lambda: iter([tmp_path / "lib"]))
+        monkeypatch.setattr(llvm, "_loader_cache", list)
+        monkeypatch.setattr(llvm.shared_library, "__file__", str(trial))
+        return paths
+
+    return make
+
+
+@pytest.mark.usefixtures("_forget")
+@pytest.mark.parametrize(
+    ("name", "version"),
+    [
+        ("libLLVM-15.so.1", 15),
+        ("libLLVM-14.0.6.so.1", 14),
+        ("libLLVM-19.so", 19),
+        ("libLLVM.so.19.1", 19),
+        ("libLLVM.so.22.1", 22),
+        ("libLLVM.21.1.dylib", 21),
+        ("libLLVM.so", None),
+        ("libLLVM.dylib", None),
+        ("libLLVMSPIRVLib.so.19.1", None),
+        ("libLLVM-19.a", None),
+    ],
+)
+def test_version_from_name(name: str, version: int | None) -> None:
+    assert llvm.version_from_name(Path("/lib") / name) == version
+
+
+@pytest.mark.usefixtures("_forget")
+def test_the_newest_that_loads_is_chosen(machine: Machine) -> None:
+    machine(
+        {
+            "libLLVM-14.so.1": "must-not-be-tried",
+            "libLLVM.so.19.1": "19.1.7",
+            "libLLVM.so.20.1": "20.1.2",
+            "libLLVM.so.22.1": "libz3.so.4: cannot open shared object file: No such file or directory",
+            "libLLVM.so.23.1": "abort",
+        }
+    )
+    library, passed_over = llvm.choose()
+    assert library is not None
+    assert (library.path.name, library.version) == ("libLLVM.so.20.1", "20.1.2")
+    reasons = {other.path.name: other.fault for other in passed_over}
+    assert reasons["libLLVM.so.22.1"] == "it needs libz3.so.4, which is missing"
+    assert "ended a process" in reasons["libLLVM.so.23.1"]
+
+
+@pytest.mark.usefixtures("_forget")
+def test_a_file_whose_name_tells_no_version_is_tried(machine: Machine) -> None:
+    machine({"libLLVM.so": "21.1.0", "libLLVM.so.20.1": "20.1.2"})
+    library = llvm.require()
+    assert library.version == "21.1.0"
+
+
+@pytest.mark.usefixtures("_forget")
+@pytest.mark.parametrize("name", ["libLLVM-14.so.1", "libLLVM-15.so.1", "libLLVM-16.so.1", "libLLVM-18.so.1"])
+def test_old_versions_are_refused(machine: Machine, name: str) -> None:
+    machine({name: "must-not-be-tried"})
+    with pytest.raises(BackendError, match=f"{name}: version 1[4-8] is too old") as refused:
+        llvm.require()
+    assert refused.value.exit_code is ExitCode.BACKEND
+
+
+@pytest.mark.usefixtures("_forget")
+@pytest.mark.parametrize("said", ["unknown", "16.0.6"])
+def test_an_old_version_behind_a_plain_name_is_refused(machine: Machine, said: str) -> None:
+    machine({"libLLVM.so": said})
+    with pytest.raises(BackendError, match="is too old"):
+        llvm.require()
+
+
+@pytest.mark.usefixtures("_forget")
+def test_a_machine_without_one_is_told_what_to_install(machine: Machine) -> None:
+    machine({})
+    with pytest.raises(BackendError, match=r"none found\); install"):
+        llvm.require()
+
+
+@pytest.mark.usefixtures("_forget")
+@pytest.mark.parametrize(
+    ("name", "behaviour", "reason"),
+    [
+        ("libLLVM-15.so.1", "15.0.6", "version 15 is too old"),
+        ("libLLVM.so", "unknown", "version before 16 is too old"),
+        ("other.so", "libedit.so.2: cannot open shared object file: No such file", "it needs libedit.so.2"),
+    ],
+)
+def test_the_users_own_choice_is_refused_too(
+    machine: Machine, monkeypatch: pytest.MonkeyPatch, name: str, behaviour: str, reason: str
+) -> None:
+    good, named = machine({"libLLVM.so.19.1": "19.1.7", name: behaviour})
+    monkeypatch.setenv(llvm.VARIABLE, str(named))
+    with pytest.raises(BackendError, match=f"{llvm.VARIABLE}=.*{reason}"):
+        llvm.require()
+    monkeypatch.setenv(llvm.VARIABLE, str(good))
+    assert llvm.require().path == good
+
+
+@pytest.mark.usefixtures("_forget")
+def test_prepare_hands_the_choice_to_dr_jit(machine: Machine, monkeypatch: pytest.MonkeyPatch) -> None:
+    (path,) = machine({"libLLVM.so.19.1": "19.1.7"})
+    monkeypatch.setenv(llvm.VARIABLE, "")
+    monkeypatch.delitem(sys.modules, "drjit", raising=False)
+    llvm.prepare()
+    assert os.environ[llvm.VARIABLE] == str(path)
+
+
+@pytest.mark.usefixtures("_forget")
+def test_prepare_leaves_the_users_choice_alone(machine: Machine, monkeypatch: pytest.MonkeyPatch) -> None:
+    machine({"libLLVM.so.19.1": "19.1.7"})
+    monkeypatch.setenv(llvm.VARIABLE, "/somewhere/libLLVM.so")
+    llvm.prepare()
+    assert os.environ[llvm.VARIABLE] == "/somewhere/libLLVM.so"
+
+
+@pytest.mark.usefixtures("_forget")
+@pytest.mark.parametrize(
+    ("message", "library"),
+    [
+        ("libz3.so.4: cannot open shared object file: No such file or directory", "libz3.so.4"),
+        ("ImportError: libatomic.so.1: cannot open shared object file: No such file", "libatomic.so.1"),
+        (
+            "raise ImportError('libz3.so.4: cannot open shared object file')\nlibm.so.6: cannot open shared object",
+            "libm.so.6",
+        ),
+        ("dlopen(...): Library not loaded: @rpath/libz3.4.dylib\n  Referenced from: ...", "libz3.4.dylib"),
+        ("/nope/libLLVM.so: cannot open shared object file: No such file or directory", None),
+        ("/lib/libLLVM.so: undefined symbol: x", None),
+    ],
+)
+def test_missing_library(message: str, library: str | None) -> None:
+    assert missing_library(message) == library
+
+
+@pytest.mark.usefixtures("_forget")
+@pytest.mark.skipif(shutil.which("cc") is None or sys.platform != "linux", reason="needs a C compiler")
+def test_a_library_finds_its_needs_beside_it(tmp_path: Path) -> None:
+    (tmp_path / "a.c").write_text("int one(void) { return 1; }")
+    (tmp_path / "b.c").write_text("int one(void); int two(void) { return one() + 1; }")
+    build = ["cc", "-shared", "-fPIC", "-o"]
+    subprocess.run([*build, "libneed.so.1.2", "-Wl,-soname,libneed.so.1", "a.c"], cwd=tmp_path, check=True)
+    subprocess.run([*build, "libuser.so", "b.c", "./libneed.so.1.2"], cwd=tmp_path, check=True)
+    script = (
+        "import sys; from pathlib import Path; from reslrb_cli.backend import shared_library\n"
+        "print(shared_library.load(Path(sys.argv[1])).two())"
+    )
+    command = [sys.executable, "-c", script, str(tmp_path / "libuser.so")]
+    assert subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip() == "2"
+    (tmp_path / "libneed.so.1.2").unlink()
+    assert "libneed.so.1" in subprocess.run(command, capture_output=True, text=True, check=False).stderr
+
+
+@pytest.mark.usefixtures("_forget")
+@pytest.mark.parametrize("name", ["libLLVM-15.so.1", "libLLVM-14.so.1"])
+def test_the_command_line_exits_with_3(tmp_path: Path, name: str) -> None:
+    (tmp_path / name).write_bytes(b"")
+    script = "from reslrb_cli.cli import main; main(prog_name='reslrb')"
+    env = {**os.environ, llvm.VARIABLE: str(tmp_path / name), "DRJIT_LIBCUDA_PATH": "/nonexistent"}
+    done = subprocess.run(
+        [sys.executable, "-c", script, "doctor"], capture_output=True, text=True, env=env, check=False
+    )
+    assert done.returncode == ExitCode.BACKEND
+    assert "is too old" in done.stdout
+    assert "Traceback" not in done.stderr
+    assert len(done.stderr.splitlines()) == 1
+
+
+# The choice of the variant: CUDA where a ray can be traced on it, LLVM elsewhere, and a reason where neither.
+
+
+def test_auto_takes_cuda_where_it_works(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(variant, "missing_cuda", lambda _name: "")
+    assert variant.choose("auto") == ("cuda_ad_rgb", "")
+    monkeypatch.setattr(variant, "missing_cuda", lambda _name: "no OptiX")
+    assert variant.choose("auto") == ("llvm_ad_rgb", "; no CUDA: no OptiX")
+
+
+def test_a_driver_is_not_enough(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(variant.ctypes, "CDLL", lambda _name: None)
+    monkeypatch.setattr(variant, "probe", lambda _name: Probe("jit_optix_api_init(): could not be loaded"))
+    assert "optix" in variant.missing_cuda()
+
+
+def test_cuda_without_a_driver_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("DRJIT_LIBCUDA_PATH", "/nonexistent/libcuda.so.1")
+    with pytest.raises(BackendError, match="no NVIDIA driver") as refused:
+        variant.set_variant("cuda_ad_rgb")
+    assert refused.value.exit_code is ExitCode.BACKEND
+
+
+def test_set_variant_logs_its_choice(llvm: str, caplog: pytest.LogCaptureFixture) -> None:
+    with caplog.at_level(logging.INFO):
+        assert variant.set_variant("llvm_ad_rgb") == "llvm_ad_rgb"
+    assert "variant llvm_ad_rgb (libLLVM " in caplog.text
+
+
+def test_the_trial_compiles_and_traces(llvm: str) -> None:
+    result = probe("llvm_ad_rgb")
+    assert result.failure == ""
+    assert result.compile_ms is not None
+    assert result.ray_ms is not None
+
+
+@pytest.mark.parametrize(
+    ("script", "failure"),
+    [
+        ("raise RuntimeError('no such device')", "RuntimeError: no such device"),
+        ("import os, sys; print('LLVM ERROR: x', file=sys.stderr, flush=True); os.abort()", "signal 6: LLVM ERROR: x"),
+        ("raise ImportError('libatomic.so.1: cannot open shared object file: ...')", "needs libatomic.so.1"),
+        ("raise SystemExit(3)", "ended with code 3"),
+    ],
+)
+def test_a_trial_that_fails_is_told_in_a_line(monkeypatch: pytest.MonkeyPatch, script: str, failure: str) -> None:
+    monkeypatch.setattr(probe_module, "_SCRIPT", script)
+    assert failure in probe.__wrapped__("llvm_ad_rgb").failure
+
+
+def test_an_old_libllvm_taken_by_dr_jit_itself_is_refused(llvm: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    import drjit as dr
+
+    monkeypatch.setattr(dr.detail, "llvm_version", lambda: (15, 0, 6))
+    with pytest.raises(BackendError, match="took libLLVM 15"):
+        variant.set_variant("llvm_ad_rgb")
+
+
+def test_an_unknown_variant_is_refused(llvm: str) -> None:
+    with pytest.raises(BackendError, match="has no variant llvm_ad_taste"):
+        variant.set_variant("llvm_ad_taste")
+
+
+def test_broken_mitsuba_is_told_in_a_line(llvm: str) -> None:
+    script = (
+        "import sys; sys.modules['drjit'] = None\n"
+        "from reslrb_cli.backend.variant import set_variant; set_variant('llvm_ad_rgb')"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
+    assert "BackendError: Mitsuba cannot be loaded" in done.stderr.splitlines()[-1]
+
+
+# What comes from NumPy lies in Dr.Jit's own memory, so that kernels and recordings fit whatever comes next.
+
+ALIGNMENT = 64  # bytes; what Dr.Jit's own memory has
+
+
+def address(array):
+    """Where the memory of a Dr.Jit array lies."""
+    return np.array(array, copy=False).ctypes.data
+
+
+def lying_at(offset, values):
+    """A NumPy array that begins so many bytes after a multiple of ALIGNMENT."""
+    values = np.asarray(values)
+    room = np.empty(values.nbytes + 2 * ALIGNMENT, np.uint8)
+    begin = -room.ctypes.data % ALIGNMENT + offset
+    array = room[begin : begin + values.nbytes].view(values.dtype)
+    array[:] = values
+    return array
+
+
+@pytest.mark.usefixtures("llvm")
+@pytest.mark.parametrize("offset", [0, 4, 16, 32])
+@pytest.mark.parametrize(
+    ("kind", "values"),
+    [
+        ("Float", np.float32([-0.0, np.nan, np.inf, 1e-45, 3.0])),
+        ("UInt32", np.uint32([0, 1, 2**32 - 1])),
+        ("Float", np.float32([7.0])),
+    ],
+)
+def test_bits_are_kept_and_memory_is_not_numpy_s(kind, values, offset):
+    given = lying_at(offset, values)
+    copy = own_memory(getattr(mi, kind), given)
+    assert address(copy) % ALIGNMENT == 0
+    assert address(copy) != given.ctypes.data
+    given[:] = 5  # whoever shared its memory would see that
+    assert np.array(copy).tobytes() == values.tobytes()
+
+
+@pytest.mark.usefixtures("llvm")
+def test_whatever_is_taken_up_again_and_again_lies_so():
+    image = lying_at(16, np.arange(12, dtype=np.float32)).reshape(2, 2, 3)
+    assert address(to_tensor(image).array) % ALIGNMENT == 0
+    value = dr.ones(mi.TensorXf, (2, 2, 3))
+    assert address(like(value, image).array) % ALIGNMENT == 0
+    for _ in range(8):  # NumPy's own memory lies otherwise every time
+        table = even_table(make_grid([True] * 4, [1.0, 2.0], 14))
+        assert [address(part) % ALIGNMENT for part in (table.slots, table.weights, table.edges)] == [0, 0, 0]
