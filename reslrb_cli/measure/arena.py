@@ -11,12 +11,13 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
+from reslrb_cli.backend.installation import python_command
 from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ExitCode
 from reslrb_cli.measure.methods import Measurement, Plan
-from reslrb_cli.measure.processes import Contestant, Pace, Refused, Stopped
+from reslrb_cli.measure.processes import Contestant, Pace, Process, Refused, Stopped
 from reslrb_cli.measure.resume_store import Earlier
-from reslrb_cli.measure.tasks import start_process
+from reslrb_cli.measure.workers import Begin, Begun
 from reslrb_cli.records.measurements import BenchStatus
 
 #: The most rounds.
@@ -29,7 +30,7 @@ AFTERWARDS, AFTERWARDS_S = 0.03, 2.0
 MEMORY_SHARE = 0.7
 MIB = 2**20
 
-#: Starts a process by its first message and the name of what it does, a function of `tasks.py`.
+#: Starts a process by its first message and the name of what it does, a function of this file.
 Start = Callable[[dict[str, Any], str], Any]
 Worker = TypeVar("Worker", bound=Contestant)
 Item = TypeVar("Item")
@@ -45,6 +46,12 @@ def in_turn(workers: Sequence[Item], round: int) -> list[Item]:
 def is_tight(plan: Measurement, held_mib: Iterable[float]) -> bool:
     """Whether workers that hold so many MiB each have to release what they can after a step."""
     return sum(held_mib) * MIB > MEMORY_SHARE * plan.memory
+
+
+def start_process(first: dict[str, Any], does: str = "measured_steps") -> Process:
+    """A process that does what the function `does` of this file returns; `first` is its first message."""
+    imports = f"from reslrb_cli.measure.arena import {does}\nfrom reslrb_cli.measure.workers import run"
+    return Process(first, python_command(f"{imports}\nrun({does})"))
 
 
 class Arena(Generic[Measured, Worker]):
@@ -149,3 +156,45 @@ class Arena(Generic[Measured, Worker]):
     def _takes_part(self, type: str) -> bool:
         """Whether methods of this type are measured."""
         return not self.plan.default or type not in self.facts["without"]
+
+
+def measured_steps() -> Begin:
+    """Steps as `bench` measures them. Whatever is imported for it is, here and in the function below."""
+    from reslrb_cli.config.loader import loads
+    from reslrb_cli.measure.stepper import Stepper
+
+    def begin(first: dict[str, Any]) -> Begun:
+        config = loads(first["config"], first["source"])
+        stepper = Stepper(config, first["objective"], first.get("film_width"), first.get("texture_width"))
+        size = {"width": stepper.size[0], "height": stepper.size[1], "texels": stepper.texels}
+        return size, lambda question: stepper.step(question["round"], question["cold"], question["release"])
+
+    return begin
+
+
+def surveyed() -> Begin:
+    """What `convergence` asks before it measures."""
+    from reslrb_cli.measure.convergence.setup import begin_survey
+
+    return begin_survey
+
+
+def sampled_steps() -> Begin:
+    """Steps as `convergence` measures them, with what they estimate."""
+    from reslrb_cli.measure.convergence.setup import begin_sampling
+
+    return begin_sampling
+
+
+def judged_runs() -> Begin:
+    """What whole optimisations are judged by."""
+    from reslrb_cli.measure.optimization_benchmark.evaluate import begin_judging
+
+    return begin_judging
+
+
+def whole_runs() -> Begin:
+    """A whole optimisation, bit by bit."""
+    from reslrb_cli.measure.optimization_benchmark.evaluate import begin_run
+
+    return begin_run

@@ -28,11 +28,10 @@ from typing import Any
 from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.measure import resume_store
-from reslrb_cli.measure.arena import in_turn, is_tight
+from reslrb_cli.measure.arena import in_turn, is_tight, start_process
 from reslrb_cli.measure.methods import WIDTHS, Case, Sweep
 from reslrb_cli.measure.processes import GROWTH, MAX_ROUNDS, NO_TIME, Contestant, Ended, Pace, Stopped
 from reslrb_cli.measure.resume_store import Earlier
-from reslrb_cli.measure.tasks import start_process
 from reslrb_cli.records.measurement_files import Kept
 from reslrb_cli.records.measurements import BenchRecord, BenchStatus, Spread
 

@@ -18,8 +18,7 @@ import mitsuba as mi
 import numpy as np
 
 from reslrb_cli.estimators.base import Pass
-from reslrb_cli.estimators.chain import ChainSelection, ChainState
-from reslrb_cli.estimators.jacobian import AXES
+from reslrb_cli.estimators.chain import AXES, ChainSelection, ChainState
 from reslrb_cli.estimators.reservoir import JACOBIAN_DAMPING
 from reslrb_cli.estimators.selection import selection_weight
 from reslrb_cli.integrators.protocol import Job

@@ -14,7 +14,7 @@ from measure.differenced import AttachedScene, compare_with_differences
 from measure.moving_light import SCENES, moved, point, room, shelf, smooth_texture, wall
 from measure.test_mutations import plant
 
-from reslrb_cli.estimators import chain, jacobian
+from reslrb_cli.estimators import chain
 from reslrb_cli.integrators.differentiated import stays
 from reslrb_cli.integrators.step import gradient_step
 from reslrb_cli.measure.comparison import Family, compare_expectations
@@ -121,7 +121,7 @@ def test_no_bias_in_blocks(monkeypatch: pytest.MonkeyPatch):
 @pytest.mark.long
 def test_without_a_random_sign_there_is_bias(monkeypatch: pytest.MonkeyPatch):
     """Else that there is none would show nothing."""
-    monkeypatch.setattr(jacobian, "sign", lambda numbers: 1)
+    monkeypatch.setattr(chain, "sign", lambda numbers: 1)
     found = bias(ONE, "follow", 12, jacobian_damping=0.5)
     print(found)
     assert abs(found.value) > 10 * found.error

@@ -19,9 +19,20 @@ from markupsafe import Markup
 
 from reslrb_cli.records.measurements import GradcheckRecord, MissingRecord, Verdict, record_of
 from reslrb_cli.report.format import count, duration, number
-from reslrb_cli.report.page.diagrams import Curve, Titled, diagram, diagrams, legend
 from reslrb_cli.report.page.images import gradient_maps, image_rows, seen_tables
-from reslrb_cli.report.page.layout import Piece, Words, key, lay_out, soft, table
+from reslrb_cli.report.page.layout import (
+    Curve,
+    Piece,
+    Titled,
+    Words,
+    diagram,
+    diagrams,
+    key,
+    lay_out,
+    legend,
+    soft,
+    table,
+)
 from reslrb_cli.report.page.run import StepParts, bars, guarded, origin_facts, problems, record_parts
 from reslrb_cli.report.page.values import convergence_of_all, parameter_table, texture_pictures
 from reslrb_cli.report.run_summary import worst

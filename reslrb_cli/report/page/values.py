@@ -17,9 +17,24 @@ from markupsafe import Markup
 
 from reslrb_cli.records.images import finite_range, read_mask, read_parameters
 from reslrb_cli.report.format import number
-from reslrb_cli.report.page.diagrams import MOST_POINTS, Curve, Titled, diagram, diagrams, legend, points_together
 from reslrb_cli.report.page.images import Picture, gallery, show
-from reslrb_cli.report.page.layout import COLORS, Piece, Words, key, lay_out, soft, table, titled
+from reslrb_cli.report.page.layout import (
+    COLORS,
+    MOST_POINTS,
+    Curve,
+    Piece,
+    Titled,
+    Words,
+    diagram,
+    diagrams,
+    key,
+    lay_out,
+    legend,
+    points_together,
+    soft,
+    table,
+    titled,
+)
 from reslrb_cli.report.perceptual import PLACES, is_color
 from reslrb_cli.report.run_summary import is_settled, spread_words, units_differ, verdict_words
 from reslrb_cli.report.sources import Run
