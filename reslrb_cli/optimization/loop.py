@@ -15,8 +15,7 @@ import drjit as dr
 import mitsuba as mi
 
 from reslrb_cli.integrators.step import Refused, gradient_step
-from reslrb_cli.optimization.nonfinite import Findings, RefusedAt, zero_nonfinite
-from reslrb_cli.optimization.optimizers import count_nonfinite, finite_square_norm
+from reslrb_cli.optimization.nonfinite import Findings, RefusedAt, count_nonfinite, finite_square_norm, zero_nonfinite
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.sensitivity import rescale
 from reslrb_cli.optimization.state import State

@@ -105,3 +105,19 @@ def zero_nonfinite(parameter: Any) -> None:
     """Set the entries of a parameter's gradient that are not finite to 0."""
     gradient = dr.grad(parameter)
     dr.set_grad(parameter, dr.select(dr.isfinite(gradient), gradient, 0))
+
+
+def flat(value: Any) -> Any:
+    """All entries of a tensor or a (nested) array in a row."""
+    return value.array if dr.is_tensor_v(value) else dr.ravel(value)
+
+
+def count_nonfinite(value: Any) -> Any:
+    """The number of NaN and infinite entries of a tensor or a (nested) array, as a width-1 array."""
+    return dr.count(~dr.isfinite(flat(value)))
+
+
+def finite_square_norm(value: Any) -> Any:
+    """The sum of squares of the finite entries, as a width-1 array."""
+    entries = flat(value)
+    return dr.sum(dr.select(dr.isfinite(entries), dr.square(entries), 0.0))

@@ -42,6 +42,7 @@ import drjit.opt as dropt
 import mitsuba as mi
 import numpy as np
 
+from reslrb_cli.optimization.nonfinite import count_nonfinite, flat
 from reslrb_cli.records.metrics import Clamped
 
 Bounds = tuple[float, float] | None
@@ -380,22 +381,6 @@ def _leaf(value: Any) -> Any:
 def clamp(value: Any, bounds: tuple[float, float] | None) -> Any:
     """Project `value` onto `bounds` (low, high), after an update. None, or an infinite side, is no bound."""
     return value if bounds is None else dr.clip(value, bounds[0], bounds[1])
-
-
-def flat(value: Any) -> Any:
-    """All entries of a tensor or a (nested) array in a row."""
-    return value.array if dr.is_tensor_v(value) else dr.ravel(value)
-
-
-def count_nonfinite(value: Any) -> Any:
-    """The number of NaN and infinite entries of a tensor or a (nested) array, as a width-1 array."""
-    return dr.count(~dr.isfinite(flat(value)))
-
-
-def finite_square_norm(value: Any) -> Any:
-    """The sum of squares of the finite entries, as a width-1 array."""
-    entries = flat(value)
-    return dr.sum(dr.select(dr.isfinite(entries), dr.square(entries), 0.0))
 
 
 DECAY = 0.95

@@ -65,6 +65,11 @@ class Problem:
     sequence: SequenceRecord | None = None
     memory: MemoryPlan | None = None
 
+    def decisions(self) -> dict[str, dict[str, Any] | None]:
+        """What was measured and planned before the first iteration, as manifests and checkpoints have it, by name."""
+        made = {"pilot": self.pilot, "guided": self.guided, "sequence": self.sequence, "memory": self.memory}
+        return {name: None if each is None else each.to_json() for name, each in made.items()}
+
     def apply(self, others: Mapping[str, Any] | None = None) -> None:
         """Hand the optimiser's values to the scene, or, of the keys in `others`, those."""
         values = {key: self.optimizer[key] for key in self.selection.keys}

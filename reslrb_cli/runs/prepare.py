@@ -167,24 +167,15 @@ def manifest_of(problem: Problem, variant: str, config_file: Path) -> Manifest:
         # What no light path can deal with, primary rays may not either.
         lamps = sees_lamps(problem.scene, sensor) if unsupported_part(problem.scene, sensor) is None else None
         record["shown"] = exposure_for(np.array(view.target), lamps)
-    manifest.pilot = None if problem.pilot is None else problem.pilot.to_json()
-    manifest.guided = None if problem.guided is None else problem.guided.to_json()
-    manifest.sequence = None if problem.sequence is None else problem.sequence.to_json()
-    manifest.memory = None if problem.memory is None else problem.memory.to_json()
+    for name, decided in problem.decisions().items():
+        setattr(manifest, name, decided)
     return manifest
 
 
 def fixed_of(problem: Problem, variant: str) -> dict[str, Any]:
     """What every checkpoint says of the experiment: by it another process assembles the same problem."""
-    return {
-        "config": dump(problem.config),
-        "variant": variant,
-        "files": digests(problem.config),
-        "pilot": None if problem.pilot is None else problem.pilot.to_json(),
-        "guided": None if problem.guided is None else problem.guided.to_json(),
-        "sequence": None if problem.sequence is None else problem.sequence.to_json(),
-        "memory": None if problem.memory is None else problem.memory.to_json(),
-    }
+    files = digests(problem.config)
+    return {"config": dump(problem.config), "variant": variant, "files": files, **problem.decisions()}
 
 
 def digests(config: Config) -> dict[str, str]:

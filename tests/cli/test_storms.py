@@ -34,7 +34,7 @@ from reslrb_cli.runs import recorder
 
 #: Moments of a run: it has printed this, or its folder holds that file.
 MOMENTS = {"loading": "variant ", "the target": "rendering ", "the mask": "finding ", "iterations": "metrics.jsonl"}
-LONG = ["--set", "run.iterations=20000"]
+LONG = ["-v", "--set", "run.iterations=20000"]
 
 
 @pytest.fixture

@@ -12,8 +12,8 @@ from optimization.toy import make_problem
 
 from reslrb_cli.errors import NonFinite
 from reslrb_cli.optimization import loop
-from reslrb_cli.optimization.nonfinite import PATIENCE
-from reslrb_cli.optimization.optimizers import DECAY, GradientClamp, count_nonfinite, finite_square_norm
+from reslrb_cli.optimization.nonfinite import PATIENCE, count_nonfinite, finite_square_norm
+from reslrb_cli.optimization.optimizers import DECAY, GradientClamp
 from reslrb_cli.records.clock import StepClock
 from reslrb_cli.records.metrics import ClampTally
 
