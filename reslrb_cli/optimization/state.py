@@ -18,12 +18,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, Generic, TypeVar
 
 import drjit as dr
 import numpy as np
+from pydantic import Field, TypeAdapter, ValidationError
 
 from reslrb_cli.backend.memory import own_memory
 from reslrb_cli.errors import ConfigError
@@ -32,7 +33,7 @@ from reslrb_cli.integrators.reslrb import Reslrb
 from reslrb_cli.optimization.autotune.estimators import Candidate
 from reslrb_cli.optimization.autotune.race import is_auto
 from reslrb_cli.optimization.autotune.sampling import as_decided
-from reslrb_cli.optimization.decisions import Estimate, MemoryPlan, Scaled, Sensitivity
+from reslrb_cli.optimization.decisions import MemoryPlan, Scaled
 from reslrb_cli.optimization.nonfinite import NonFinitePolicy
 from reslrb_cli.optimization.optimizers import GradientClamp
 from reslrb_cli.records.checkpoint import Archive
@@ -72,6 +73,27 @@ def like(value: Any, array: Array) -> Any:
 
 T = TypeVar("T")
 _TYPES = {dr.VarType.Float32: "float32", dr.VarType.Float64: "float64", dr.VarType.UInt32: "uint32"}
+
+
+@dataclass(frozen=True)
+class Kind(Generic[T]):
+    """What a plain value is, and what is said of one that is not so."""
+
+    adapter: TypeAdapter[T]
+    words: str
+
+
+Positive = Annotated[float, Field(gt=0, lt=1e300)]
+COUNT = Kind[int](TypeAdapter(Annotated[int, Field(ge=0, lt=2**31)]), "is no count")
+FROM_ONE = Kind[int](TypeAdapter(Annotated[int, Field(ge=1, lt=2**31)]), "is no count")
+NUMBER = Kind[float](TypeAdapter(Annotated[float, Field(ge=0, lt=1e300)]), "is no number")
+#: With None for what was not finite.
+NUMBERS = Kind[list[float | None]](TypeAdapter(list[Annotated[float, Field(lt=1e300)] | None]), "is no list of numbers")
+PAIR = Kind[list[float]](
+    TypeAdapter(Annotated[list[Positive], Field(min_length=2, max_length=2)]), "is no pair of positive numbers"
+)
+TEXT, TEXTS = Kind[str](TypeAdapter(str), "is no text"), Kind[list[str]](TypeAdapter(list[str]), "is no list of texts")
+MAPPING = Kind[dict[str, Any]](TypeAdapter(dict[str, Any]), "is no mapping")
 
 
 class Stored:
@@ -137,76 +159,36 @@ class Stored:
             at = at.get(part) if isinstance(at, dict) else None
         return at
 
+    def read(self, kind: Kind[T], *path: str) -> T:
+        """What stands at a place of the JSON, of a kind."""
+        try:
+            return kind.adapter.validate_python(self.value(*path), strict=True)
+        except ValidationError:
+            raise self.wrong(".".join(path), kind.words) from None
+
     def keys_of(self, name: str, known: Mapping[str, Any]) -> list[str]:
         """The keys of a mapping, all of which are known."""
-        found = self.value(name)
-        if not isinstance(found, dict):
-            raise self.wrong(name, "is no mapping")
-        for key in found:
-            if key not in known:
-                raise self.wrong(f"{name}.{key}", "is of a parameter that the run does not have")
-        return list(found)
+        mapping = self.read(MAPPING, name)
+        found = list(mapping)
+        foreign = [key for key in found if key not in known]
+        if foreign:
+            raise self.wrong(f"{name}.{foreign[0]}", "is of a parameter that the run does not have")
+        return found
 
-    def count(self, *path: str, least: int = 1) -> int:
-        """An integer of 31 bits, at least `least`."""
-        value = self.value(*path)
-        if type(value) is not int or not least <= value < 2**31:
-            raise self.wrong(".".join(path), "is no count")
-        return value
-
-    def number(self, *path: str) -> float:
-        """A number that is finite and not negative."""
-        value = self.value(*path)
-        if not is_number(value) or value < 0:
-            raise self.wrong(".".join(path), "is no number")
-        return float(value)
-
-    def numbers(self, *path: str) -> list[float]:
-        """A list of numbers; NaN in place of null, as which JSON has what was not finite."""
-        value = self.value(*path)
-        if not isinstance(value, list) or not all(each is None or is_number(each) for each in value):
-            raise self.wrong(".".join(path), "is no list of numbers")
-        return [math.nan if each is None else float(each) for each in value]
-
-    def pair(self, *path: str) -> tuple[float, float]:
-        """Two positive numbers."""
-        found = self.numbers(*path)
-        if len(found) != 2 or not min(found) > 0:
-            raise self.wrong(".".join(path), "is no pair of positive numbers")
-        return found[0], found[1]
-
-    def text(self, *path: str) -> str:
-        """Text."""
-        value = self.value(*path)
-        if not isinstance(value, str):
-            raise self.wrong(".".join(path), "is no text")
-        return value
-
-    def texts(self, *path: str) -> list[str]:
-        """A list of texts."""
-        value = self.value(*path)
-        if not isinstance(value, list) or not all(isinstance(each, str) for each in value):
-            raise self.wrong(".".join(path), "is no list of texts")
-        return value
-
-    def scaling(self, keys: Sequence[str]) -> list[dict[str, Any]] | None:
+    def scaling(self, keys: Sequence[str]) -> list[Scaled] | None:
         """What `scale: auto` measured of each parameter; None where it has not."""
         rows = self.value("scaling")
         if rows is None:
             return None
-        names = {field.name for field in fields(Sensitivity)} | {"own_length", "first_step"}
         if not isinstance(rows, list) or [isinstance(row, dict) and row.get("key") for row in rows] != list(keys):
             raise self.wrong("scaling", "does not have the run's parameters")
+        found = []
         for row in rows:
-            others = [value for name, value in row.items() if name != "key"]
-            if set(row) != names or not all(value is None or is_number(value) for value in others):
-                raise self.wrong("scaling", f"of {row['key']} is not what is measured")
-        return rows
-
-
-def is_number(value: Any) -> bool:
-    """Whether a value of JSON is a finite number."""
-    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1e300
+            try:
+                found.append(Scaled.from_json(row))
+            except TypeError:
+                raise self.wrong("scaling", f"of {row['key']} is not what is measured") from None
+        return found
 
 
 def stored_value(problem: Problem, prefix: str, key: str, value: Any) -> dict[str, Array]:
@@ -274,22 +256,22 @@ class State:
         """Go on from what a snapshot of the same experiment left. Raises ConfigError where `stored` holds another."""
         problem, optimizer = self.problem, self.problem.optimizer
         values = {key: stored.scene_value(problem, "parameter", key) for key in problem.selection.keys}
-        units = {key: stored.pair("units", key) for key in stored.keys_of("units", values)}
+        pairs = {key: stored.read(PAIR, "units", key) for key in stored.keys_of("units", values)}
+        units = {key: (length, gain) for key, (length, gain) in pairs.items()}
         for key in values:
             if optimizer.is_moved_apart(key) and key not in units:
                 raise stored.wrong(f"units.{key}", "is missing")
         optimizer.restore(values, units, lambda name, like: stored.take(f"optimizer/{name}", like))
-        counts = {key: stored.count("clamp", key) for key in stored.keys_of("clamp", values)}
+        counts = {key: stored.read(FROM_ONE, "clamp", key) for key in stored.keys_of("clamp", values)}
         if self.clamp is not None:
             self.clamp.restore(counts, values, lambda name, like: stored.take(f"clamp/{name}", like))
-        self.iteration = stored.count("iteration", least=0)
-        self.clock.elapsed_s, self.peak_mib = stored.number("elapsed_s"), stored.number("peak_mib")
-        self.policy.standstill = stored.count("standstill", least=0)
+        self.iteration = stored.read(COUNT, "iteration")
+        self.clock.elapsed_s, self.peak_mib = stored.read(NUMBER, "elapsed_s"), stored.read(NUMBER, "peak_mib")
+        self.policy.standstill = stored.read(COUNT, "standstill")
         guiding = guiding_of(problem)
         if guiding is not None:
             _restore_guiding(problem, guiding, stored)
-        rows = stored.scaling(list(values))
-        self.sensitivities = None if rows is None else [Scaled(**row) for row in rows]
+        self.sensitivities = stored.scaling(list(values))
         problem.apply()
 
 
@@ -311,7 +293,7 @@ def _restore_guiding(problem: Problem, guiding: Guiding, stored: Stored) -> None
     gradients = stored.value("guiding")
     if not isinstance(gradients, dict) or not all(name in names for name in gradients):
         raise stored.wrong("guiding", "does not have the gradients of sensors by their numbers")
-    counts = {name: stored.count("guiding", name, least=0) for name in gradients}
+    counts = {name: stored.read(COUNT, "guiding", name) for name in gradients}
     wrong = restore_tables(problem, guiding, counts, lambda name: stored.archive.array(f"guiding/{name}", kind="f"))
     if wrong is not None:
         raise stored.wrong(f"guiding/{wrong}", "is not what was learned of this scene")
@@ -405,12 +387,11 @@ class Settled:
 
     def _memory(self, now: MemoryPlan) -> MemoryPlan:
         """The plan of the run, whose passes decide in what order samples are summed up."""
-        size, passes = (self.stored.count("memory", name) for name in ("samples_per_pass", "passes"))
+        size, passes = (self.stored.read(FROM_ONE, "memory", name) for name in ("samples_per_pass", "passes"))
         if size * passes != now.samples_per_pass * now.passes:
             raise self.stored.wrong("memory", f"has {passes} passes of {size} samples")
-        names = [each.name for each in fields(Estimate)]
-        expected = [self.stored.value("memory", "expected_bytes", name) for name in names]
-        if not all(is_number(each) and math.floor(each) == each for each in expected):
-            raise self.stored.wrong("memory.expected_bytes", "is no estimate")
-        estimate: dict[str, Any] = dict(zip(names, expected, strict=True))
-        return MemoryPlan(now.budget_bytes, size, passes, Estimate(**estimate))
+        try:
+            stored = MemoryPlan.from_json(self.stored.value("memory"))
+        except TypeError:
+            raise self.stored.wrong("memory", "is no plan") from None
+        return MemoryPlan(now.budget_bytes, size, passes, stored.expected_bytes)

@@ -10,6 +10,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
@@ -32,7 +33,7 @@ from reslrb_cli.optimization.correlated_bias import measure_correlated_bias
 from reslrb_cli.optimization.moving import warn_of_border
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.results import Best, Results
-from reslrb_cli.optimization.state import State, Stored, stored_value
+from reslrb_cli.optimization.state import COUNT, NUMBER, NUMBERS, TEXTS, State, Stored, stored_value
 from reslrb_cli.optimization.uncertainty.measuring import Certainty
 from reslrb_cli.optimization.views import view_records
 from reslrb_cli.records.cache import PilotCache
@@ -286,12 +287,13 @@ class Course:
             }
             for key, array in values.items():
                 stored.check_bounds(problem, f"best/{key}", key, array)
-            self.best.restore(stored.count("best", "iteration", least=0), stored.number("best", "loss"), values)
-        self.results.recall({name: stored.numbers("images", name) for name in ("trained", "held_out")})
+            self.best.restore(stored.read(COUNT, "best", "iteration"), stored.read(NUMBER, "best", "loss"), values)
+        seen = {name: stored.read(NUMBERS, "images", name) for name in ("trained", "held_out")}
+        self.results.recall({name: [math.nan if x is None else x for x in losses] for name, losses in seen.items()})
         squares = {}
-        for key in stored.texts("certainty", "keys"):
+        for key in stored.read(TEXTS, "certainty", "keys"):
             kept = problem.optimizer.squares(key) if key in problem.selection.keys else None
             if kept is not None:
                 squares[key] = stored.take(f"squares/{key}", kept[0])
-        self.certainty.restore(stored.count("certainty", "seen", least=0), squares)
+        self.certainty.restore(stored.read(COUNT, "certainty", "seen"), squares)
         self._snapshot = self.state.capture()

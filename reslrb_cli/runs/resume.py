@@ -13,7 +13,7 @@ from reslrb_cli.config.loader import dump, load, loads
 from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ConfigError, MachineError, is_machine_fault
 from reslrb_cli.optimization.assemble import assemble
-from reslrb_cli.optimization.state import Settled, Stored
+from reslrb_cli.optimization.state import COUNT, TEXT, Settled, Stored
 from reslrb_cli.records.checkpoint import PREVIOUS_FILE_NAME, STATE_FILE, open_state
 from reslrb_cli.records.manifest import Manifest, Status, now, versions
 from reslrb_cli.records.metrics import Record, cut_back, read_records
@@ -55,7 +55,7 @@ class Earlier:
     @property
     def variant(self) -> str:
         """The variant that the run began with, whatever `auto` would choose here. Raises ConfigError."""
-        variant = self.stored.text("variant")
+        variant = self.stored.read(TEXT, "variant")
         if variant not in VARIANTS:
             raise self.stored.wrong("variant", "is none of those that a run can have")
         return variant
@@ -143,15 +143,15 @@ def open_earlier(run: Path, config_file: Path | None, overrides: tuple[str, ...]
         said: list[str] = []
         stored = _read_state(folder, said)
         stack.callback(stored.archive.close)
-        if len(stored.text("config")) > _MOST_CONFIG:
+        if len(stored.read(TEXT, "config")) > _MOST_CONFIG:
             raise stored.wrong("config", "is too long")
-        began = loads(stored.text("config"), stored.path)
+        began = loads(stored.read(TEXT, "config"), stored.path)
         config, source = _read_config(run, config_file, overrides, stored)
         elsewhere = config.run.output != source.run.output or config.run.name != source.run.name
         found = changes(began, config)
         asked = changes(source, config)
         changed = check_changes(found, lambda key: "--set" if key in asked else config.source, run)
-        iteration, last = stored.count("iteration", least=0), stored.value("last")
+        iteration, last = stored.read(COUNT, "iteration"), stored.value("last")
         if config.run.iterations < iteration:
             reason = f"is {config.run.iterations}; the run has done {iteration} already"
             raise ConfigError(config.source, "run.iterations", reason)
@@ -177,7 +177,7 @@ def _read_state(folder: RunFolder, said: list[str]) -> Stored:
             continue
         if failures or name == PREVIOUS_FILE_NAME:
             why = str(failures[0]) if failures else f"{folder.checkpoint / STATE_FILE}: is missing"
-            said.append(f"{why}; going on from the state before, after {stored.count('iteration', least=0)} iterations")
+            said.append(f"{why}; going on from the state before, after {stored.read(COUNT, 'iteration')} iterations")
         return stored
     if failures:
         raise failures[0]
@@ -192,7 +192,7 @@ def _read_config(
     if config_file is not None or own.exists():
         path = own if config_file is None else config_file
         return load(path, list(overrides)), load(path)
-    text = stored.text("config")
+    text = stored.read(TEXT, "config")
     return loads(text, own, list(overrides)), loads(text, own)
 
 
