@@ -140,7 +140,7 @@ class Stored:
         """Raise ConfigError where an entry of the value `name` of the parameter `key` is none that a run comes to.
 
         A run goes on with the bounds that it began with, and each of its updates ends within them: what lies outside
-        was not written by it. (Bounds cannot change: `recording.changes`.)
+        was not written by it. (Bounds cannot change: `runs.prepare.changes`.)
         """
         spec = problem.selection.spec(key)
         low, high = spec.bounds or (-math.inf, math.inf)

@@ -88,7 +88,7 @@ class Change:
 
 
 def row_of(problem: Problem, key: str) -> Array:
-    """A parameter's value in a row, as its gradient is (`samples.take_gradient`), an environment map's halo in it."""
+    """A parameter's value in a row, as its gradient is (`take_gradient`), an environment map's halo in it."""
     return np.array(dr.detach(problem.optimizer[key]), dtype=np.float64).ravel()
 
 
