@@ -23,13 +23,12 @@ from reslrb_cli.config.loader import loads, parse_override
 from reslrb_cli.config.yaml_text import write
 from reslrb_cli.errors import ConfigError, UnsupportedScene, printable
 from reslrb_cli.records.atomic import write_atomically
-from reslrb_cli.scene.proposal import Proposal
-from reslrb_cli.scene.visibility import Depth
 
 if TYPE_CHECKING:
     import mitsuba as mi
 
-    from reslrb_cli.scene.proposal import Photograph
+    from reslrb_cli.scene.proposal import Photograph, Proposal
+    from reslrb_cli.scene.visibility import Depth
     from reslrb_cli.scene.xml.read import Description
 
 

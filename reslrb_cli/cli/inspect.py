@@ -17,9 +17,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from reslrb_cli.cli.nonfinite import show_offenders, without_nan
 from reslrb_cli.cli.options import overrides_option, start_variant
-from reslrb_cli.cli.terminal import echo
+from reslrb_cli.cli.terminal import echo, without_nan
 from reslrb_cli.config.loader import loads, parse_override, read_text
 from reslrb_cli.config.schema import Config
 from reslrb_cli.config.yaml_text import parse, write
@@ -280,6 +279,8 @@ def command(
         raise ConfigError(path, subject.missing[0], "missing; --conditioning measures a complete experiment")
     start_variant(config)
     if nonfinite:
+        from reslrb_cli.cli.nonfinite import show_offenders
+
         return show_offenders(config, as_json)
 
     from reslrb_cli.optimization.loading import load_configured

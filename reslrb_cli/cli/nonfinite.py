@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -19,7 +18,7 @@ import click
 import mitsuba as mi
 import numpy as np
 
-from reslrb_cli.cli.terminal import echo
+from reslrb_cli.cli.terminal import echo, without_nan
 from reslrb_cli.config.integrators import Reslrb as ReslrbConfig
 from reslrb_cli.config.loader import with_integrator
 from reslrb_cli.config.schema import Config
@@ -185,15 +184,6 @@ def offender_lines(offender: Offender, iteration: int) -> list[str]:
     if offender.image is not None and offender.target is not None:
         lines.append(f"  image {_numbers(offender.image)}, target {_numbers(offender.target)}")
     return lines
-
-
-def without_nan(value: Any) -> Any:
-    """The same with numbers that are not finite as text, "nan", "inf" and "-inf": JSON has none."""
-    if isinstance(value, dict):
-        return {key: without_nan(entry) for key, entry in value.items()}
-    if isinstance(value, list | tuple):
-        return [without_nan(entry) for entry in value]
-    return str(value) if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def _numbers(values: list[float]) -> str:

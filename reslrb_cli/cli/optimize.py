@@ -16,20 +16,18 @@ from typing import TYPE_CHECKING
 
 import click
 
-from reslrb_cli.backend.memory import resident_bytes
 from reslrb_cli.cli.options import optional_experiment_arguments, read_config, start_variant
 from reslrb_cli.cli.terminal import echo
-from reslrb_cli.config.files import in_words
+from reslrb_cli.config.files import in_words, rough_duration
 from reslrb_cli.config.loader import dump
 from reslrb_cli.errors import ExitCode, printable
-from reslrb_cli.records.clock import rough_duration
-from reslrb_cli.records.run_folder import RunFolder, check_output
 
 if TYPE_CHECKING:
     from reslrb_cli.config.schema import Config
     from reslrb_cli.optimization.forecast import Forecast
     from reslrb_cli.optimization.problem import Problem
     from reslrb_cli.records.manifest import Manifest
+    from reslrb_cli.records.run_folder import RunFolder
     from reslrb_cli.runs.prepare import Course
 
 
@@ -84,6 +82,8 @@ class Before:
 
 def memory_lines(forecast: Forecast, budget: int | None) -> list[str]:
     """What the iterations take, by part, beside what is free, and what `memory_budget` allows."""
+    from reslrb_cli.backend.memory import resident_bytes
+
     allowed = "" if budget is None else f", run.memory_budget allows {in_words(budget)}"
     lines = [
         f"memory of the iterations: {in_words(forecast.peak)} at the most; {in_words(forecast.free)} are free{allowed}"
@@ -162,6 +162,8 @@ def command(
 
 
 def _begin(config_file: Path, overrides: tuple[str, ...], force: bool, dry_run: bool, quiet: bool) -> int:
+    from reslrb_cli.records.run_folder import RunFolder, check_output
+
     config = read_config(config_file, overrides)
     run = config.run
     check_output(config_file, run.output, run.folder_name, force)
@@ -181,6 +183,7 @@ def _begin(config_file: Path, overrides: tuple[str, ...], force: bool, dry_run: 
 
 
 def _resume(run: Path, config_file: Path | None, overrides: tuple[str, ...], quiet: bool) -> int:
+    from reslrb_cli.records.run_folder import check_output
     from reslrb_cli.runs.resume import open_earlier
 
     with open_earlier(run, config_file, overrides) as earlier:

@@ -35,7 +35,6 @@ from reslrb_cli.records.measurement_files import (
     samples_file,
     write_samples,
 )
-from reslrb_cli.records.run_folder import checkpoint_of
 
 
 def origin_of(variant: str) -> Origin:
@@ -106,6 +105,8 @@ def read_recovered(run: Path, overrides: tuple[str, ...]) -> Config:
 
     Raises ConfigError, located in the folder, where it is no run's or holds no values.
     """
+    from reslrb_cli.records.run_folder import checkpoint_of
+
     checkpoint_of(run)
     config = read_config(run / "config.yaml", overrides)
     start = RunValue(run=run.absolute())

@@ -129,3 +129,11 @@ def _check(path: Path, status: os.stat_result, most: int | None) -> None:
         raise ConfigError(path, "", f"is {names.get(kind, 'something else')}, not a regular file")
     if most is not None and status.st_size > most:
         raise ConfigError(path, "", f"has {in_words(status.st_size)}; more than {in_words(most)} are not read")
+
+
+def rough_duration(seconds: float) -> str:
+    """Seconds in words: `0.4 s`, `12 min`, `5.2 h`, `3.1 days`."""
+    for unit, name in ((86400, "days"), (3600, "h"), (60, "min")):
+        if seconds >= 2 * unit:
+            return f"{seconds / unit:.1f} {name}"
+    return f"{seconds:.2g} s" if seconds < 10 else f"{seconds:.0f} s"

@@ -5,15 +5,16 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
-
-import numpy as np
+from typing import TYPE_CHECKING, Any
 
 from reslrb_cli.config.loader import dump
 from reslrb_cli.config.schema import Config
 from reslrb_cli.config.yaml_text import parse
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.records.manifest import versions
+
+if TYPE_CHECKING:
+    import numpy as np
 
 #: Of what is kept; another one is not gone on from.
 VERSION = 2

@@ -20,7 +20,7 @@ import mitsuba as mi
 
 from reslrb_cli.backend.doctor import resident_paths
 from reslrb_cli.backend.memory import free_bytes, local_bytes
-from reslrb_cli.config.files import in_words
+from reslrb_cli.config.files import in_words, rough_duration
 from reslrb_cli.config.integrators import Reslrb as ReslrbConfig
 from reslrb_cli.config.integrators import divisors, passes_obstacle
 from reslrb_cli.config.parameters import ParameterSpec
@@ -30,7 +30,7 @@ from reslrb_cli.estimators.base import entry_bytes
 from reslrb_cli.integrators.reslrb import Reslrb
 from reslrb_cli.integrators.reslrb import Reslrb as Tracer
 from reslrb_cli.optimization.decisions import Estimate
-from reslrb_cli.records.clock import MIB, peak_mib, reset_peak, rough_duration
+from reslrb_cli.records.clock import MIB, peak_mib, reset_peak
 from reslrb_cli.scene.xml.check import FilmSize, film_sizes
 from reslrb_cli.scene.xml.read import Description
 

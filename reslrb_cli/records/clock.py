@@ -94,11 +94,3 @@ def peak_mib(backend: Any) -> float:
     Thread-local memory (`dr.Local`) is not in it.
     """
     return float(dr.detail.malloc_watermark(backend)) / MIB
-
-
-def rough_duration(seconds: float) -> str:
-    """Seconds in words: `0.4 s`, `12 min`, `5.2 h`, `3.1 days`."""
-    for unit, name in ((86400, "days"), (3600, "h"), (60, "min")):
-        if seconds >= 2 * unit:
-            return f"{seconds / unit:.1f} {name}"
-    return f"{seconds:.2g} s" if seconds < 10 else f"{seconds:.0f} s"

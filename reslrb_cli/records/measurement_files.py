@@ -20,15 +20,16 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import IO, Any, ClassVar
-
-import numpy as np
+from typing import IO, TYPE_CHECKING, Any, ClassVar
 
 from reslrb_cli.config.files import in_words, open_file
 from reslrb_cli.errors import ConfigError, printable
 from reslrb_cli.records.atomic import remove_parts_of, write_atomically
 from reslrb_cli.records.manifest import now, versions
 from reslrb_cli.records.metrics import MOST_BYTES, Line
+
+if TYPE_CHECKING:
+    import numpy as np
 
 logger = logging.getLogger(__name__)
 
@@ -178,7 +179,7 @@ def read_origin(entry: Mapping[str, Any]) -> Origin | None:
 MOST_SAMPLES_BYTES = 2**28
 
 #: A head, which JSON can hold, and arrays by name.
-Kept = tuple[dict[str, Any], dict[str, np.ndarray]]
+Kept = tuple[dict[str, Any], dict[str, "np.ndarray"]]
 _HEAD = "head"
 
 
@@ -194,12 +195,16 @@ def are_kept(arrays: Mapping[str, np.ndarray]) -> bool:
 
 def write_samples(path: Path, head: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> None:
     """Write the file atomically: `head`, which JSON can hold, and the arrays. Raises OSError."""
+    import numpy as np  # whoever asks for help of a command has no need of it
+
     content: dict[str, Any] = {_HEAD: np.array(json.dumps(head)), **arrays}
     write_atomically(path, lambda file: np.savez(file, **content))
 
 
 def read_samples(path: Path) -> Kept:
     """What `write_samples` wrote. Raises ConfigError, located in the file, where it is none of that."""
+    import numpy as np
+
     try:
         with open_file(path) as file, np.load(file, allow_pickle=False) as arrays:
             if any(entry.compress_type != zipfile.ZIP_STORED for entry in arrays.zip.infolist()):

@@ -14,14 +14,14 @@ import pytest
 from cli.tiny import read_metrics, write_experiment
 
 from reslrb_cli.cli import main
-from reslrb_cli.config.files import in_words
+from reslrb_cli.config.files import in_words, rough_duration
 from reslrb_cli.config.integrators import largest_pass, passes_obstacle
 from reslrb_cli.config.loader import load
 from reslrb_cli.optimization import forecast as trial
 from reslrb_cli.optimization.assemble import assemble
 from reslrb_cli.optimization.forecast import make_forecast
 from reslrb_cli.optimization.loop import optimize
-from reslrb_cli.records.clock import MIB, rough_duration
+from reslrb_cli.records.clock import MIB
 from reslrb_cli.records.decisions import RivalRecord
 from reslrb_cli.records.manifest import read_manifest
 

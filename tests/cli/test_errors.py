@@ -137,6 +137,20 @@ def test_help_of_every_command(command: str, capsys: pytest.CaptureFixture[str])
     assert capsys.readouterr().out.startswith(f"Usage: reslrb {command}")
 
 
+def test_help_of_a_command_loads_nothing_heavy() -> None:
+    """Whatever takes a tenth of a second to import is imported where it is called."""
+    script = (
+        "import json, sys\nfrom reslrb_cli.cli import main\n"
+        "try: main([sys.argv[1], '--help'], prog_name='reslrb')\n"
+        "finally: print(json.dumps(sorted({'mitsuba', 'drjit', 'numpy', 'scipy', 'matplotlib'} & set(sys.modules))))"
+    )
+    found = {}
+    for command in COMMANDS:
+        done = subprocess.run([sys.executable, "-c", script, command], capture_output=True, text=True, check=True)
+        found[command] = done.stdout.splitlines()[-1]
+    assert found == dict.fromkeys(COMMANDS, "[]")
+
+
 def test_help_is_fast_and_loads_no_command() -> None:
     script = (
         "import sys\nfrom reslrb_cli.cli import main\n"
