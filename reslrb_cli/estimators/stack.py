@@ -103,7 +103,6 @@ class Pushing(VertexHooks):
     def __init__(self, p: Pass, visibility: Visibility | None, stack_size: int) -> None:
         super().__init__(p)
         self.visibility, self.size = visibility, places(p.plan, stack_size)
-        self.bounded = vertices(p.plan) > self.size
 
     def start(self, product: Product) -> Pushed:
         plan = self.p.plan
@@ -128,31 +127,46 @@ class Pushing(VertexHooks):
         own = PathAdjoint(dr.select(connected, delta * C.nonzero, 0), C)
         weight_c = adjoint_of_connection(p, vertex, connection, connected, own)
         useful = vertex.active & plan.differentiates(vertex.bsdf)
-        fits, first = useful, state.first
-        if self.bounded:
-            full = state.height >= self.size
-            fits = useful & ~full
-            first = dr.select((first == 0) & useful & full, depth, first)
-        since = state.since.plus(delta, C, depth, connected & (first == 0))
-        tail = state.tail.plus(delta, C, depth, connected & (first != 0)) if self.bounded else state.tail
-        zeros = []
-        if plan.track_zeros:
-            rest_s = dr.select(scattering.active, scattering.correction / scattering.pdf, 0)
-            zeros = [rest_s, since.behind_zero[0]]
-        frame = Frame(
-            point=SurfacePoint.of(plan, vertex),
-            wo_c=connection.wo,
-            wo_s=scattering.wo,
-            weight_c=weight_c,
-            f_s=dr.select(scattering.active, scattering.f, 0),
-            own=since.value,
-            zeros=zeros,
-            lobe=kept_lobe(plan, scattering),
+        return push(
+            plan, state, self.size, vertex, useful, connection.wo, weight_c, scattering, [(delta, C, connected)]
         )
-        write(state.stack, frame, dr.select(fits, state.height, self.size), fits)
-        height = state.height + dr.select(fits, mi.UInt32(1), 0)
-        since = dr.select(fits, PlainSum.zero(plan.track_zeros), since)
-        return Pushed(state.stack, height, since, tail, first, dr.select(connected, depth, state.last))
+
+
+def push(
+    plan: Plan, state: Pushed, size: int, vertex: Vertex, useful: mi.Bool, wo_c: mi.Vector3f, weight_c: mi.Spectrum,
+    scattering: Scattering, found: list[tuple[mi.Spectrum, Product, mi.Bool]],
+) -> Pushed:  # fmt: skip
+    """The state with a vertex on the stack, where it is `useful` and there is room, and what it has `found`: delta, C,
+    and the lanes."""
+    depth, bounded = vertex.depth, vertices(plan) > size
+    fits, first = useful, state.first
+    if bounded:
+        full = state.height >= size
+        fits = useful & ~full
+        first = dr.select((first == 0) & useful & full, depth, first)
+    since, tail, last = state.since, state.tail, state.last
+    for delta, C, active in found:
+        since = since.plus(delta, C, depth, active & (first == 0))
+        tail = tail.plus(delta, C, depth, active & (first != 0)) if bounded else tail
+        last = dr.select(active, depth, last)
+    zeros = []
+    if plan.track_zeros:
+        rest_s = dr.select(scattering.active, scattering.correction / scattering.pdf, 0)
+        zeros = [rest_s, since.behind_zero[0]]
+    frame = Frame(
+        point=SurfacePoint.of(plan, vertex),
+        wo_c=wo_c,
+        wo_s=scattering.wo,
+        weight_c=weight_c,
+        f_s=dr.select(scattering.active, scattering.f, 0),
+        own=since.value,
+        zeros=zeros,
+        lobe=kept_lobe(plan, scattering),
+    )
+    write(state.stack, frame, dr.select(fits, state.height, size), fits)
+    height = state.height + dr.select(fits, mi.UInt32(1), 0)
+    since = dr.select(fits, PlainSum.zero(plan.track_zeros), since)
+    return Pushed(state.stack, height, since, tail, first, last)
 
 
 def walk_back(p: Pass, pushed: Pushed) -> AdjointSum:

@@ -18,6 +18,7 @@ from reslrb_cli.scene.deformation import Surroundings
 from reslrb_cli.scene.graph import SceneGraph, emitted_rays, interpolates_normals
 from reslrb_cli.scene.needs import check_supported, scene_needs
 from reslrb_cli.transport.aim import worthwhile
+from reslrb_cli.transport.densities import EmitterDensities
 from reslrb_cli.transport.emission import used_numbers
 from reslrb_cli.transport.film import film_blocks
 from reslrb_cli.transport.plan import Plan, make_plan
@@ -108,6 +109,8 @@ class Preparation:
         # By the parameters, and the objects that have them.
         self._differentiated: dict[tuple[tuple[str, mi.Object], ...], Differentiated] = {}
         self._track_zeros = False
+        self.paths = "light"
+        self._emitters: EmitterDensities | None = None
         self._renewal: Renewal | None = None
         self.recordings = Recordings()
 
@@ -119,7 +122,7 @@ class Preparation:
         made = Preparation(*self._depths, self._hide_emitters, self._motion, guided, low_discrepancy)
         if made.guiding is not None:
             made.guiding.images = (own is None or own.images) if images is None else images
-        made.expected = self.expected
+        made.expected, made.paths = self.expected, self.paths
         return made
 
     def draw_from(self, guiding: Guiding, scene: mi.Scene) -> None:
@@ -155,14 +158,22 @@ class Preparation:
             return replace(plan, stays=False, glossy_follows=False)
         return plan
 
+    def emitters(self, scene: mi.Scene) -> EmitterDensities:
+        """The densities of the scene's emitters, whose plans have been asked for."""
+        if self._emitters is None:
+            self._emitters = EmitterDensities.of(next(iter(self._plans.values())), scene)
+        return self._emitters
+
     def _first_plan(self, scene: mi.Scene, sensor: mi.Sensor) -> Plan:
         """The plan of images for a sensor that is new."""
         check_supported(scene, sensor, self._hide_emitters)
         needs = scene_needs(scene, sensor)
         self._renewal = self._renewal or Renewal(scene)
         settle(scene)
-        plan = make_plan(needs, *self._depths, self._hide_emitters)
-        if self.guiding is None and not self._low_discrepancy:
+        plan = replace(make_plan(needs, *self._depths, self._hide_emitters), paths=self.paths)
+        if plan.weighs:
+            plan = self._renewal.renew(plan, scene)  # the horizon
+        if plan.paths == "camera" or (self.guiding is None and not self._low_discrepancy):
             return plan
         [samples] = passes(self._renewal.renew(plan, scene), scene, sensor, dr.opaque(mi.UInt32, 0), 1, None)
         return self._with_numbers(plan, samples)
@@ -224,6 +235,7 @@ class Preparation:
             self._differentiated.clear()
             self._met = 0
             self._renewal = None
+            self._emitters = None
             self.recordings.clear()
             if self.guiding is not None:
                 self.guiding.clear()

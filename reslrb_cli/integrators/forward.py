@@ -179,10 +179,10 @@ def splat_tangents(samples: Samples, block: mi.ImageBlock) -> None:
     """Add the forward-mode derivative of the samples' contributions to the block, exactly and in one traversal."""
     plan, dE = samples.plan, mi.Spectrum(0)
     with dr.resume_grad():
-        if plan.differentiate_emission:
+        if plan.differentiate_emission and not plan.camera:
             E = sample_emission(samples, samples.sampler()).weight
             [dE] = forward_derivatives(E)
-        if plan.visible_emission and (plan.differentiate_emission or plan.differentiate_null):
+        if plan.visible_emission and plan.paths == "light" and (plan.differentiate_emission or plan.differentiate_null):
             primary = primary_ray(samples)
             tangent = visible_tangent(plan, samples.scene, primary)
             samples.film.put(block, primary.u, tangent * primary.weight * samples.fraction, primary.active)
@@ -190,6 +190,8 @@ def splat_tangents(samples: Samples, block: mi.ImageBlock) -> None:
             u, C, active = small_splat(samples)
             [tangent] = forward_derivatives(C)
             samples.film.put(block, u, tangent, active)
+    if plan.camera:
+        return
     hooks = AttachedTangentSplat if plan.attached else TangentSplat
     walk(samples, hooks(samples, block, dE))
 

@@ -19,6 +19,7 @@ from typing_extensions import Self
 from reslrb_cli.errors import UnsupportedScene
 from reslrb_cli.estimators import ESTIMATORS
 from reslrb_cli.estimators.base import Estimator, Pass, one_of
+from reslrb_cli.estimators.camera import differentiate_camera_paths, splat_camera_paths, splat_camera_tangents
 from reslrb_cli.guiding.collect import hear
 from reslrb_cli.guiding.tables import Purpose, learning_seed
 from reslrb_cli.integrators import freezing
@@ -33,6 +34,9 @@ from reslrb_cli.transport.visible import differentiate_visible_emission, splat_v
 from reslrb_cli.transport.walk import Splat, walk
 
 
+PATHS = ("light", "camera", "both")
+
+
 class LightTracer:
     """A light tracer without derivatives but for forward mode; OPTIONS are names and defaults as `ptracer` has them."""
 
@@ -43,6 +47,9 @@ class LightTracer:
         "samples_per_pass": None,
     }
     image_apart = True
+    #: Which paths there are, and the share of light paths in the samples where there are both kinds.
+    paths: str = "light"
+    light_share: float = 0.5
 
     def __init__(
         self, max_depth: int = -1, rr_depth: int = 5, hide_emitters: bool = False, samples_per_pass: int | None = None,
@@ -93,6 +100,16 @@ class LightTracer:
         """
         self.preparation.expected = spp
 
+    def have_paths(self, paths: str, light_share: float) -> None:
+        """Have light paths, camera paths, or both, `light_share` of the samples being light paths; a share of 0 or 1
+        leaves one kind of them."""
+        if not 0 <= light_share <= 1:
+            raise ValueError(f'"light_share" must lie in [0, 1], not {light_share}')
+        if paths == "both" and light_share in (0, 1):
+            paths = "light" if light_share else "camera"
+        self.paths, self.light_share = paths, light_share
+        self.preparation.paths = paths
+
     def plan(self, scene: mi.Scene, sensor: mi.Sensor, params: mi.SceneParameters | None = None) -> Plan:
         """What a walk of this scene needs, with derivatives of `params`, if any. Raises UnsupportedScene."""
         return self.preparation.plan(scene, sensor, params)
@@ -116,7 +133,10 @@ class LightTracer:
             purpose = purpose or (Purpose.IMAGE if job.params is None else Purpose.GRADIENT)
             if guiding.serves(purpose):
                 table = guiding.table(sensor_number(job.scene, job.sensor), purpose, delta)
-        return passes(plan, job.scene, job.sensor, job.seed, spp, self.samples_per_pass, table)
+        emitters = self.preparation.emitters(job.scene) if plan.weighs else None
+        return passes(
+            plan, job.scene, job.sensor, job.seed, spp, self.samples_per_pass, table, self.light_share, emitters
+        )
 
     def learn(self, job: Job, gradient: mi.TensorXf) -> None:
         """Have the tables learn, where they are due to, from other samples than those of the job; dL/dI is known.
@@ -162,7 +182,7 @@ class LightTracer:
                 raise UnsupportedScene("forward mode has no derivatives of emitters that move; take reverse mode")
             film = parts[0].film
             block = film.block()
-            in_passes(parts, splat_tangents, block)
+            in_passes(parts, _splat_tangents, block)
             return film.develop(block, tangent=True)
 
     def launch(
@@ -192,6 +212,8 @@ class Reslrb(LightTracer):
         "attached_sampling": "auto",
         "guiding": "off",
         "sequence": "independent",
+        "paths": "light",
+        "light_share": 0.5,
     }
 
     def __init__(self, estimator: Estimator, **common: Any) -> None:
@@ -200,10 +222,12 @@ class Reslrb(LightTracer):
 
     @classmethod
     def of(
-        cls, estimator: str = "reservoir", attached: bool | str = "auto", filter_normalization: str = "attached",
-        attached_sampling: str = "auto", guiding: str = "off", sequence: str = "independent", **options: Any,
+        cls, estimator: str | None = None, attached: bool | str = "auto", filter_normalization: str = "attached",
+        attached_sampling: str = "auto", guiding: str = "off", sequence: str = "independent", paths: str = "light",
+        light_share: float = 0.5, **options: Any,
     ) -> Reslrb:  # fmt: skip
         """From the estimator's name and all options. Raises ValueError where one is wrong."""
+        estimator = estimator or ("stack" if paths == "camera" else cls.OPTIONS["estimator"])
         if estimator == "auto":
             raise ValueError(
                 '"estimator" auto needs an experiment to measure on (`reslrb optimize`); as a plugin, name one of '
@@ -218,6 +242,7 @@ class Reslrb(LightTracer):
         for name, value, values in (
             ("guiding", guiding, ("on", "off")),
             ("sequence", sequence, ("independent", "low_discrepancy")),
+            ("paths", paths, PATHS),
         ):
             if value == "auto":
                 raise ValueError(
@@ -225,7 +250,9 @@ class Reslrb(LightTracer):
                 )
             one_of(name, value, values)
         low_discrepancy = sequence == "low_discrepancy"
-        return cls(kind(**own), motion=motion, guided=guiding == "on", low_discrepancy=low_discrepancy, **options)
+        made = cls(kind(**own), motion=motion, guided=guiding == "on", low_discrepancy=low_discrepancy, **options)
+        made.have_paths(paths, light_share)
+        return made
 
     def image_estimator(self) -> Estimator | None:
         return None if self.estimator.splats_all else self.estimator
@@ -272,17 +299,28 @@ def _no_attached(estimator: str) -> str:
     )
 
 
+def _splat_tangents(samples: Samples, block: mi.ImageBlock) -> None:
+    """Add the forward-mode derivative of all paths' image to the block."""
+    splat_tangents(samples, block)
+    for side in samples.sides():
+        if side.plan.camera:
+            splat_camera_tangents(side, block)
+
+
 def image_of(estimator: Estimator | None, samples: list[Samples]) -> mi.TensorXf:
     """The image of all passes, as the estimator makes it where it makes one of its own (else None); nothing is kept."""
     film = samples[0].film
     block = film.block()
 
     def splat(part: Samples, own: mi.ImageBlock | None) -> None:
-        if estimator is not None:
-            forward(part, estimator, own)
-        else:
-            splat_visible_emission(part, own)
-            walk(part, Splat(part, own))
+        splat_visible_emission(part, own)
+        for side in part.sides():
+            if side.plan.camera:
+                splat_camera_paths(side, own)
+            elif estimator is not None:
+                estimator.forward(Pass(side, own, None))
+            else:
+                walk(side, Splat(side, own))
 
     in_passes(samples, splat, block)
     return film.develop(block)
@@ -295,7 +333,16 @@ def forward(
     and not evaluated."""
     if block is not None:
         splat_visible_emission(samples, block)
-    return estimator.forward(Pass(samples, block, adjoint))
+    state = None
+    for side in samples.sides():
+        p = Pass(side, block, adjoint)
+        if not side.plan.camera:
+            state = estimator.forward(p)
+        elif adjoint is not None:
+            differentiate_camera_paths(p)
+        elif block is not None:
+            splat_camera_paths(side, block)
+    return state
 
 
 @dataclass
@@ -327,10 +374,18 @@ def trace_image(estimator: Estimator, samples: list[Samples]) -> tuple[mi.Tensor
     return image, state
 
 
-def replay(samples: Samples, estimator: Estimator, state: Any, adjoint: AdjointImage) -> None:
-    """Add the derivatives of the objective, whose derivative with respect to the film is `adjoint`."""
+def replay(
+    samples: Samples, estimator: Estimator, state: Any, adjoint: AdjointImage, done: bool = False
+) -> None:
+    """Add the derivatives of the objective, whose derivative with respect to the film is `adjoint`; `done`: those of
+    camera paths are there, from their only traversal."""
     differentiate_visible_emission(samples, adjoint)
-    estimator.backward(Pass(samples, None, adjoint), state)
+    for side in samples.sides():
+        p = Pass(side, None, adjoint)
+        if not side.plan.camera:
+            estimator.backward(p, state)
+        elif not done:
+            differentiate_camera_paths(p)
 
 
 def replay_all(
@@ -372,7 +427,7 @@ def differentiate_passes(
 
     def differentiate(part: Samples, own: mi.ImageBlock | None) -> None:
         with dr.isolate_grad():  # as above
-            replay(part, estimator, forward(part, estimator, own, adjoint), adjoint)
+            replay(part, estimator, forward(part, estimator, own, adjoint), adjoint, done=True)
             image = [] if own is None else [own.tensor()]
             dr.schedule(image)
             if len(samples) > 1:

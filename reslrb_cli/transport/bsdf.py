@@ -21,6 +21,7 @@ which is the adjoint BSDF by definition, and needs neither p nor reciprocity.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -30,9 +31,10 @@ from reslrb_cli.transport.plan import Plan
 DEFENSIVE = 0.2  # share of samples that a perturbed BSDF does not draw itself
 
 
-def importance_context() -> mi.BSDFContext:
-    """BSDF queries of a path that carries importance towards the sensor, so that eta^2 is not applied twice."""
-    return mi.BSDFContext(mi.TransportMode.Importance)
+def context_of(plan: Plan) -> mi.BSDFContext:
+    """BSDF queries of a walk's paths: those from the light carry importance towards the sensor, so that eta^2 is not
+    applied twice."""
+    return mi.BSDFContext(mi.TransportMode.Radiance if plan.camera else mi.TransportMode.Importance)
 
 
 def tracked_factor(
@@ -72,8 +74,8 @@ def _singular_factor(
     """`f`, replaced where a delta lobe was sampled or light passed straight through, where that has derivatives."""
     if plan.differentiate_delta:
         delta = active & scattering.is_delta
-        sample_1 = _defensive(scattering.sample_1)[1] if plan.needs.has_perturbed_normals else scattering.sample_1
-        bs, weight = bsdf.sample(importance_context(), si, sample_1, scattering.sample_2, delta)
+        sample_1 = _defensive(scattering.sample_1)[1] if mixes(plan) else scattering.sample_1
+        bs, weight = bsdf.sample(context_of(plan), si, sample_1, scattering.sample_2, delta)
         pdf = bs.pdf
         if plan.differentiate_null:
             # A mask's weight carries the derivative of its opacity already, and so does its density. Other BSDFs divide
@@ -133,6 +135,71 @@ class Scattering:
     sample_1: mi.Float
     sample_2: mi.Point2f
     active: mi.Bool
+    ways: Ways | None = None
+
+
+@dataclass
+class Ways:
+    """What weights are made of (`weights.py`): densities of directions at a vertex, as solid angle, where they are asked
+    for; else None.
+
+    `p` is that of the sampled direction, `back` that of the way back in the other side's walk; `ahead` and `ahead_back`
+    the same of the connection, or the next event. `valid` and `ahead_valid`: both directions lie on consistent sides, as
+    light paths ask for.
+    """
+
+    p: mi.Float
+    back: mi.Float | None = None
+    ahead: mi.Float | None = None
+    ahead_back: mi.Float | None = None
+    valid: mi.Bool | bool = True
+    ahead_valid: mi.Bool | bool = True
+
+
+def mixes(plan: Plan) -> bool:
+    """Whether directions are drawn from a mixture: by light paths, at perturbed normals."""
+    return plan.needs.has_perturbed_normals and not plan.camera
+
+
+def density(
+    plan: Plan, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr | mi.BSDF, wo: mi.Vector3f, active: mi.Bool, camera: bool
+) -> mi.Float:
+    """The density of solid angle with which a walk from one side draws the direction `wo` of smooth lobes."""
+    side = replace(plan, camera=camera)
+    own = bsdf.pdf(context_of(side), si, wo, active)
+    if not mixes(side):
+        return own
+    same_side = mi.Frame3f.cos_theta(wo) * mi.Frame3f.cos_theta(si.wi) > 0
+    other = dr.select(same_side, dr.abs(mi.Frame3f.cos_theta(wo)) * dr.inv_pi, 0)
+    return (1 - DEFENSIVE) * own + DEFENSIVE * other
+
+
+def _back(
+    plan: Plan, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr | mi.BSDF, wo: mi.Vector3f, active: mi.Bool
+) -> mi.Float:
+    """The density of the way back along `wo` and `si.wi`, in the other side's walk."""
+    turned = type(si)(si)
+    turned.wi = wo
+    return density(plan, turned, bsdf, si.wi, active, not plan.camera)
+
+
+def _ways(
+    plan: Plan, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr | mi.BSDF, connection_wo: mi.Vector3f,
+    connected: mi.Bool | None, wo: mi.Vector3f, pdf: mi.Float, active: mi.Bool,
+) -> tuple[mi.Float, ...]:  # fmt: skip
+    """The densities of `Ways`, 0 for those that nobody asks for."""
+    zero = mi.Float(0)
+    p, back, ahead, ahead_back = pdf, zero, zero, zero
+    if plan.needs.samples_otherwise:
+        p = density(plan, si, bsdf, wo, active, plan.camera)
+    if plan.weighs:
+        back = _back(plan, si, bsdf, wo, active)
+    if connected is not None:
+        if plan.camera:
+            ahead = density(plan, si, bsdf, connection_wo, connected, True)
+        if plan.weighs:
+            ahead_back = _back(plan, si, bsdf, connection_wo, connected)
+    return p, back, ahead, ahead_back
 
 
 def shading_correction(
@@ -151,6 +218,8 @@ def shading_correction(
     wi_dot_n, wo_dot_n = dr.dot(n, wi_world), dr.dot(n, wo_world)
     cos_i, cos_o = mi.Frame3f.cos_theta(si.wi), mi.Frame3f.cos_theta(wo)
     valid = (wi_dot_n * cos_i > 0) & (wo_dot_n * cos_o > 0)
+    if plan.camera:
+        return mi.Float(1), valid
     if plan.needs.has_perturbed_normals:
         return dr.select(valid, dr.abs(wo_dot_n / wi_dot_n), 0), valid
     correction = dr.select(valid, dr.abs((cos_i * wo_dot_n) / (cos_o * wi_dot_n)), 0)
@@ -170,40 +239,52 @@ def scatter(
     indirect call, and in it what they have in common (looking up textures, mostly). Lanes that are `aimed` have the
     direction of their point, and the BSDF's own density of it.
     """
-    si, bsdf, context, drawn = hit.si, hit.bsdf, importance_context(), sample_1
+    si, bsdf, context, drawn = hit.si, hit.bsdf, context_of(plan), sample_1
+    weighed = plan.camera or plan.weighs
+    later = weighed and (mixes(plan) or aimed is not None)  # the direction is not the BSDF's own
+    densities: tuple[mi.Float, ...] = ()
 
     def both(
         self: mi.BSDF, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, sample_1: mi.Float, sample_2: mi.Point2f,
         connected: mi.Bool, active: mi.Bool, any_: mi.Bool,
-    ) -> tuple[mi.Spectrum, mi.Vector3f, mi.Float, mi.Float, mi.UInt32, mi.Spectrum]:  # fmt: skip
+    ) -> tuple[Any, ...]:  # fmt: skip
         bs, weight = self.sample(context, si, sample_1, sample_2, active)
-        return evaluate(plan, si, self, wo, connected), bs.wo, bs.pdf, bs.eta, bs.sampled_type, weight
+        ways = _ways(plan, si, self, wo, connected, bs.wo, bs.pdf, active) if weighed and not later else ()
+        return evaluate(plan, si, self, wo, connected), bs.wo, bs.pdf, bs.eta, bs.sampled_type, weight, *ways
 
     with dr.suspend_grad(when=not attached):
-        if plan.needs.has_perturbed_normals:
+        if mixes(plan):
             defensive, sample_1 = _defensive(sample_1)
         if connected is None:
             bs, weight = bsdf.sample(context, si, sample_1, sample_2, active)
             f_connection, sample = None, Sample(bs.wo, bs.pdf, weight, bs.eta, bs.sampled_type)
         else:
             # The last argument is taken for the mask of the call as a whole.
-            f_connection, wo, pdf, eta, lobe, weight = dr.dispatch(
+            f_connection, wo, pdf, eta, lobe, weight, *densities = dr.dispatch(
                 bsdf, both, si, connection_wo, sample_1, sample_2, connected, active, active | connected
             )
             sample = Sample(wo, pdf, weight, eta, lobe)
-        if plan.needs.has_perturbed_normals:
-            sample = _mixed(si, bsdf, sample_2, defensive, active, sample)
+        if mixes(plan):
+            sample = _mixed(plan, si, bsdf, sample_2, defensive, active, sample)
         if aimed is not None:
-            sample = _to_point(si, bsdf, aimed, sample)
+            sample = _to_point(plan, si, bsdf, aimed, sample)
         if attached:
             sample = (staying if plan.stays else following)(plan, si, bsdf, active, sample)
         wo, pdf, weight, lobe = sample.wo, sample.pdf, sample.weight, sample.lobe
         d = si.to_world(wo)
         correction, valid = shading_correction(plan, si, -hit.ray.d, d, wo)
+        ways = None
+        if weighed:
+            if later or connected is None:
+                densities = _ways(plan, si, bsdf, connection_wo, connected, wo, pdf, active)
+            _, ahead_valid = shading_correction(plan, si, -hit.ray.d, si.to_world(connection_wo), connection_wo)
+            ways = Ways(*(dr.detach(value) for value in densities), valid, ahead_valid)
+        if plan.camera:
+            valid = mi.Bool(True)
         is_null = mi.has_flag(lobe, mi.BSDFFlags.Null) if plan.needs.has_null else mi.Bool(False)
         # BSDFFlags.Delta holds Null too.
         is_delta = mi.has_flag(lobe, mi.BSDFFlags.Delta) & ~is_null if plan.needs.has_delta_lobes else mi.Bool(False)
-        if plan.needs.has_perturbed_normals:
+        if mixes(plan):
             correction = dr.select(is_delta, correction * _delta_correction(si.wi, wo, sample.eta), correction)
             singular = is_delta | is_null
             f = evaluate(plan, si, bsdf, wo, active & ~singular)
@@ -221,6 +302,7 @@ def scatter(
             sample_1=drawn,
             sample_2=sample_2,
             active=active & valid & (pdf > 0),
+            ways=ways,
         )
         return scattering, f_connection
 
@@ -282,7 +364,7 @@ def _defensive(sample_1: mi.Float) -> tuple[mi.Bool, mi.Float]:
 
 
 def _mixed(
-    si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, sample_2: mi.Point2f, defensive: mi.Bool, active: mi.Bool,
+    plan: Plan, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, sample_2: mi.Point2f, defensive: mi.Bool, active: mi.Bool,
     sample: Sample,
 ) -> Sample:  # fmt: skip
     """A BSDF's sample, replaced by one of the cosine-weighted hemisphere in `defensive` lanes; the mixture's density.
@@ -296,16 +378,18 @@ def _mixed(
     wo = dr.select(defensive, hemisphere, sample.wo)
     same_side = mi.Frame3f.cos_theta(wo) * mi.Frame3f.cos_theta(si.wi) > 0
     other = dr.select(same_side, dr.abs(mi.Frame3f.cos_theta(wo)) * dr.inv_pi, 0)
-    own = dr.select(defensive, bsdf.pdf(importance_context(), si, wo, active & defensive), sample.pdf)
+    own = dr.select(defensive, bsdf.pdf(context_of(plan), si, wo, active & defensive), sample.pdf)
     pdf = (1 - DEFENSIVE) * own + dr.select(singular, 0, DEFENSIVE * other)
     return Sample(wo, pdf, sample.weight, dr.select(defensive, 1, sample.eta), _glossy(defensive, sample.lobe))
 
 
-def _to_point(si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, aimed: Aimed, sample: Sample) -> Sample:
+def _to_point(
+    plan: Plan, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, aimed: Aimed, sample: Sample
+) -> Sample:
     """A BSDF's sample, replaced by one towards their point in lanes that are aimed; of density 0 where there is no
     point, or none of the BSDF's own samples goes there."""
     there = si.to_local(dr.normalize(aimed.point - si.p))
-    f, own = bsdf.eval_pdf(importance_context(), si, there, aimed.active & aimed.found)
+    f, own = bsdf.eval_pdf(context_of(plan), si, there, aimed.active & aimed.found)
     own = dr.select(aimed.found, own, 0)
     towards = Sample(there, own, dr.select(own > 0, f / own, 0), mi.Float(1), _glossy(aimed.active, sample.lobe))
     return dr.select(aimed.active, towards, sample)
@@ -326,8 +410,8 @@ def evaluate(
     plan: Plan, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr | mi.BSDF, wo: mi.Vector3f, active: mi.Bool
 ) -> mi.Spectrum:
     """A smooth lobe's bsdf * cos (C,) towards `wo`, for a path that carries importance."""
-    if not plan.needs.has_perturbed_normals:
-        return bsdf.eval(importance_context(), si, wo, active)
+    if not mixes(plan):
+        return bsdf.eval(context_of(plan), si, wo, active)
     exchanged = type(si)(si)
     exchanged.wi = wo
     return bsdf.eval(mi.BSDFContext(mi.TransportMode.Radiance), exchanged, si.wi, active)

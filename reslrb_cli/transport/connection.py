@@ -110,6 +110,7 @@ class Connection:
     sample: mi.Point2f  # of the aperture
     f: mi.Spectrum | None = None
     c: mi.Spectrum | None = None
+    p_camA: mi.Float | None = None  # the density of area here of the camera paths of a pixel, where paths are weighed
 
 
 def connect(
@@ -132,7 +133,11 @@ def connect(
         correction, valid = mi.Float(1), mi.Bool(True)
         if ray is not None:
             correction, valid = shading_correction(plan, si, -ray.d, ds.d, wo)
-        return Connection(importance * correction, ds.uv, target, wo, active & valid & sees, sample)
+        p_camA = None
+        if plan.weighs:
+            cos = -dr.dot(ds.d, dr.normalize(ds.n))
+            p_camA = film_density(sensor, cos) * dr.abs(dr.dot(si.n, ds.d)) / dr.square(ds.dist)
+        return Connection(importance * correction, ds.uv, target, wo, active & valid & sees, sample, p_camA=p_camA)
 
 
 def _clip(plan: Plan, sensor: mi.Sensor, ds: mi.DirectionSample3f) -> tuple[mi.Bool, mi.Point3f]:
@@ -157,12 +162,17 @@ def _importance(sensor: mi.Sensor, ds: mi.DirectionSample3f, sees: mi.Bool) -> m
     Mitsuba's own is zero wherever a film would end whose principal point is not shifted, or a thin lens focuses outside
     of the clip planes.
     """
-    film = sensor.film()
-    size, crop = film.size(), film.crop_size()
-    half = dr.tan(dr.deg2rad(mi.Float(mi.traverse(sensor)["x_fov"])) / 2)
-    area = 4 * half**2 * (int(size.y) / int(size.x)) * (int(dr.prod(crop)) / int(dr.prod(size)))
+    pixels = int(dr.prod(sensor.film().crop_size()))
     cos = -dr.dot(ds.d, dr.normalize(ds.n))
-    return mi.Spectrum(dr.select(sees, dr.rcp(area * cos**3 * ds.dist**2), 0))
+    return mi.Spectrum(dr.select(sees, film_density(sensor, cos) / (pixels * ds.dist**2), 0))
+
+
+def film_density(sensor: mi.Sensor, cos: mi.Float) -> mi.Float:
+    """The density of directions, of this cosine to the axis, of camera rays through one pixel."""
+    size = sensor.film().size()
+    half = dr.tan(dr.deg2rad(mi.Float(mi.traverse(sensor)["x_fov"])) / 2)
+    pixel = 4 * half**2 * (int(size.y) / int(size.x)) / int(dr.prod(size))
+    return dr.rcp(pixel * cos**3)
 
 
 @dataclass

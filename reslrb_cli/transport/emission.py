@@ -43,13 +43,15 @@ class Emission:
     """A ray that leaves an emitter. `weight` is E of the design notes: radiance over the density of the ray, (C,).
 
     `weight` tracks derivatives of emission where they are enabled; ray and density do where emitters move.
-    `guided` is the part of `weight` that a guide has brought in; None without one.
+    `guided` is the part of `weight` that a guide has brought in; None without one. `position` are the numbers that the
+    place was drawn with.
     """
 
     ray: mi.Ray3f
     weight: mi.Spectrum
     emitter: mi.EmitterPtr
     guided: mi.Float | None = None
+    position: mi.Point2f | None = None
 
 
 def sample_time(plan: Plan, sensor: mi.Sensor, sampler: mi.Sampler | NumberStream) -> mi.Float:
@@ -78,7 +80,7 @@ def emission_of(
     plan, scene = samples.plan, samples.scene
     if not (plan.environment_map or plan.placed_lamps):
         ray, weight, emitter = scene.sample_emitter_ray(time, wavelength_sample, sample_2, sample_3, True)
-        return Emission(ray if plan.moving_emission else dr.detach(ray), weight, emitter)
+        return Emission(ray if plan.moving_emission else dr.detach(ray), weight, emitter, position=sample_2)
 
     index, index_weight, reused = scene.sample_emitter(wavelength_sample, True)
     emitter = dr.gather(mi.EmitterPtr, scene.emitters_dr(), index)
@@ -90,7 +92,8 @@ def emission_of(
             ray, weight = (dr.select(is_environment, a, b) for a, b in zip((ray, weight), other, strict=True))
     else:
         ray, weight = _emitter_ray(samples, emitter, time, reused, sample_2, sample_3, mi.Bool(True))
-    return Emission(ray if plan.moving_emission else dr.detach(ray), weight * dr.detach(index_weight), emitter)
+    ray = ray if plan.moving_emission else dr.detach(ray)
+    return Emission(ray, weight * dr.detach(index_weight), emitter, position=sample_2)
 
 
 def _emitter_ray(

@@ -10,6 +10,7 @@ Into blocks of pixels a film is divided where what is said at a place of it is l
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 
 import drjit as dr
@@ -25,15 +26,17 @@ N_COLOR = 3  # a film's block holds R, G, B, perhaps alpha, and a weight that li
 class Film:
     """The film of one sensor as light tracing uses it: image blocks to splat into, adjoint images to look up."""
 
-    def __init__(self, sensor: mi.Sensor) -> None:
-        self.film = sensor.film()
+    def __init__(self, sensor: mi.Sensor, whole: bool = False) -> None:
+        """`whole`: each pixel is divided by the part of its filter that lies on the film, as stock integrators do that
+        begin at the sensor; else pixels at the border lack what falls off the film, as for `ptracer`."""
+        self.film, self.whole = sensor.film(), whole
         self.film.prepare([])
         self.size = self.film.crop_size()
         self.offset = self.film.crop_offset()
 
     def block(self) -> mi.ImageBlock:
         """An empty image block that covers the crop window; filter weights are normalised per splat."""
-        block = self.film.create_block(normalize=True, borders=False)
+        block = self.film.create_block(normalize=not self.whole, borders=False)
         block.set_offset(self.offset)
         block.set_coalesce(False)  # splats of neighbouring lanes land anywhere
         return block
@@ -85,7 +88,17 @@ class Film:
             alpha = dr.arange(mi.UInt32, dr.prod(self.size)) * block.channel_count() + N_COLOR
             dr.scatter(block.tensor().array, mi.Float(1), alpha)
         self.film.put_block(block)
-        return self.film.develop()
+        image = self.film.develop()
+        return image / self._filter_on_film(image.shape) if self.whole else image
+
+    def _filter_on_film(self, shape: tuple[int, ...]) -> mi.TensorXf:
+        """What of each pixel's filter lies on the film, for an image of this shape (H, W, channels)."""
+        rfilter = self.film.rfilter()
+        rows, columns = (_integrals(rfilter, int(n)) for n in (self.size.y, self.size.x))
+        part = np.repeat(np.outer(rows, columns)[:, :, None], shape[2], axis=2)
+        if shape[2] in (2, 4):
+            part[:, :, -1] = 1  # alpha is what it is
+        return mi.TensorXf(part.astype(np.float32))
 
     def adjoint(self, image_gradient: mi.TensorXf) -> AdjointImage:
         """dL/d(block) from dL/d(developed image): what `AdjointImage` looks up."""
@@ -115,7 +128,7 @@ class AdjointImage:
 
         Without `normalization` the sum that the filter's weights are divided by has no derivative, as in Mitsuba.
         """
-        if self.filter.is_box_filter():
+        if self.filter.is_box_filter():  # 1 within a pixel, with or without division by its sum
             pixel = mi.Point2u(mi.Point2i(dr.floor(u)))
             inside = active & (pixel.x < self.film.size.x) & (pixel.y < self.film.size.y)
             return self._pixel(pixel, inside)
@@ -132,6 +145,8 @@ class AdjointImage:
 
     def _filtered(self, u: mi.Point2f, active: mi.Bool, normalization: bool) -> mi.Spectrum:
         first, (weights_x, weights_y), total = filter_weights(self.filter, u)
+        if self.film.whole:
+            total = mi.Float(1)
         if not normalization:
             total = dr.detach(total)
         delta = mi.Spectrum(0)
@@ -141,6 +156,22 @@ class AdjointImage:
                 inside = active & (pixel.x < self.film.size.x) & (pixel.y < self.film.size.y)
                 delta += self._pixel(pixel, inside) * (weights_x[x] * weights_y[y])
         return delta * dr.select(total != 0, dr.rcp(total), 0)
+
+
+STEPS = 256  # of a filter's integral, in each pixel
+
+
+@functools.lru_cache(maxsize=16)
+def _integrals(rfilter: mi.ReconstructionFilter, n: int) -> NDArray[np.float64]:
+    """The integral of the filter (n,) of each of `n` pixels in a row, over these pixels alone."""
+    radius = float(rfilter.radius())
+    taps = int(np.ceil(radius - 0.5))  # pixels on each side that the filter reaches into
+    x = (np.arange((2 * taps + 1) * STEPS) + 0.5) / STEPS - taps - 0.5
+    parts = np.array(rfilter.eval(mi.Float(x.astype(np.float32))), np.float64).reshape(2 * taps + 1, STEPS).mean(1)
+    ends = np.concatenate([[0.0], np.cumsum(parts)])
+    pixel = np.arange(n)
+    first, last = np.maximum(taps - pixel, 0), np.minimum(taps + n - pixel, 2 * taps + 1)
+    return np.asarray(ends[last] - ends[first])
 
 
 def filter_weights(

@@ -137,6 +137,9 @@ class Plan:
     horizon: Horizon | None = None
     # The cells that emission is guided by, where it is.
     grid: Grid | None = None
+    # Which paths there are: `light`, `camera`, or `both`; and whether this walk's begin at the sensor.
+    paths: str = "light"
+    camera: bool = False
     # Whether guided paths may be aimed at what the sensor sees (`aim.py`), where nothing moves.
     aims: bool = False
     # The numbers of low discrepancy, where there are any.
@@ -146,6 +149,21 @@ class Plan:
     def aimed(self) -> bool:
         """Whether guided paths are aimed."""
         return self.aims and not self.attached
+
+    @property
+    def weighs(self) -> bool:
+        """Whether what a path finds is weighed against what paths from the other side find."""
+        return self.paths == "both"
+
+    @property
+    def samples_emitters(self) -> bool:
+        """Whether there is an emitter that next event estimation can find."""
+        return any(name != "DirectionalArea" for name in self.needs.emitters)
+
+    @property
+    def has_light_at_points(self) -> bool:
+        """Whether any emitter has no extent: a point, or a direction."""
+        return any(name not in ("AreaLight", "DirectionalArea") for name in self.needs.emitters)
 
     @property
     def moving_emission(self) -> bool:

@@ -18,6 +18,7 @@ import mitsuba as mi
 
 from reslrb_cli.config.files import PASS_PATHS, PASS_SAMPLES, PASSES
 from reslrb_cli.scene.graph import Lamp
+from reslrb_cli.transport.densities import EmitterDensities
 from reslrb_cli.transport.film import Film
 from reslrb_cli.transport.guide import Drawn, Guide, Table
 from reslrb_cli.transport.lamps import sums_of_areas
@@ -87,6 +88,7 @@ def finish_pass(*results: object) -> None:
 SELECTION_STREAM = 0x5E1EC7  # what hooks draw to select
 VISIBLE_STREAM = 0xD1EC7  # primary rays
 LAMP_STREAM = 0x1A3B5 << 12  # points of lamps; the lamp's number is added
+CAMERA_STREAM = 0xCA3E2A  # seeds of camera paths, beside those of light paths
 PASS_STREAM = 0x9A55E5  # seeds of the second pass and those after it
 SMALL_LAMP_STREAM = 0x57A25  # points of lamps that are smaller than a pixel
 GUIDE_STREAM = 0x6D1DE  # cells of emission
@@ -126,6 +128,7 @@ class Early:
 class Samples:
     """The samples of one pass. `seed` is an opaque UInt32; `width` is the number of light paths.
 
+    They are light paths, or, where the plan says so, camera paths, of which `width` is the number then.
     `scale` (width 1) brings a sum over light paths to an image; of all samples of that image, these are the part
     `fraction` (width 1). With a `guide` emission is drawn from its table, with a `net` numbers are of low discrepancy.
     """
@@ -141,6 +144,12 @@ class Samples:
     fraction: mi.Float
     guide: Guide | None = None
     net: Net | None = None
+    #: Where paths from both sides are weighed against one another: all light paths over the camera paths of a pixel
+    #: (width 1), and the emitters' densities.
+    ratio: mi.Float | None = None
+    emitters: EmitterDensities | None = None
+    #: The camera paths of the same pass, beside light paths.
+    camera: Samples | None = None
     _areas: list[mi.Float] = field(init=False)  # of the lamps that are reshaped: `sums_of_areas`
 
     def __post_init__(self) -> None:
@@ -155,11 +164,18 @@ class Samples:
 
     def sampler(self) -> mi.Sampler:
         """A sampler at the beginning of these samples' stream."""
-        sampler = self.sensor.sampler().clone()
-        sampler.set_sample_count(self.spp)
-        sampler.set_samples_per_wavefront(self.spp)
+        if self.plan.paths != "light":  # whose number of paths may be any; the sensor's may ask for so many in a pixel
+            sampler = mi.load_dict({"type": "independent"})
+        else:
+            sampler = self.sensor.sampler().clone()
+            sampler.set_sample_count(self.spp)
+            sampler.set_samples_per_wavefront(self.spp)
         sampler.seed(self.seed, self.width)
         return sampler
+
+    def sides(self) -> list[Samples]:
+        """These samples, and the camera paths beside them."""
+        return [self] if self.camera is None else [self, self.camera]
 
     def stream(self, name: int) -> mi.PCG32:
         """Random numbers beside the sampler's own.
@@ -231,12 +247,13 @@ class NumberStream:
 
 def passes(
     plan: Plan, scene: mi.Scene, sensor: mi.Sensor, seed: mi.UInt32, spp: int, spp_per_pass: int | None,
-    table: Table | None = None,
+    table: Table | None = None, light_share: float = 1, emitters: EmitterDensities | None = None,
 ) -> list[Samples]:  # fmt: skip
     """All samples of an image, in passes of `spp_per_pass` samples per pixel, which must divide `spp`, or less.
 
     The first pass has the seed itself, so that it traces what `ptracer` does. With a `table`, which belongs to the
-    plan's grid, emission is drawn from that. Raises ValueError for too many passes, or paths in one pass.
+    plan's grid, emission is drawn from that. Of the samples of each pass `light_share` are light paths where the plan has
+    both kinds of paths, and then the `emitters` have their densities. Raises ValueError for too many passes, or paths in one pass.
     """
     unit = spp if spp_per_pass is None else min(spp_per_pass, spp)
     if spp % unit:
@@ -250,19 +267,62 @@ def passes(
     others = [mi.sample_tea_32(mi.UInt32(seed), mi.UInt32(PASS_STREAM + p))[0] for p in range(1, len(sizes))]
     seeds = [mi.UInt32(seed), *others]
     dr.make_opaque(seeds)
-    film, pixels = Film(sensor), int(dr.prod(sensor.film().size()))  # not the crop's, as for `ptracer`
+    film, pixels = Film(sensor, plan.paths != "light"), int(dr.prod(sensor.film().size()))  # not the crop's, as for `ptracer`
     # Opaque: as literals these would give every sample count kernels of its own.
     scale = dr.opaque(mi.Float, float(dr.prod(film.size)) / (float(pixels) * spp))
 
     def part(size: int) -> Samples:
         width, fraction = size * pixels, dr.opaque(mi.Float, size / spp)
+        if plan.paths == "camera":
+            return _camera_samples(plan, scene, sensor, film, size, size * int(dr.prod(film.size)), fraction)
+        if plan.paths == "both":
+            return _of_both(plan, scene, sensor, film, size, fraction, light_share, table, emitters)
         if width > PASS_PATHS:
             raise ValueError(f"{width} paths in one pass are more than 2^32 - 1: set samples_per_pass below {size}")
         guide, net = None if table is None else Guide.of(table, width), None if plan.sequence is None else Net.of(width)
         return Samples(scene, sensor, plan, film, seeds[0], size, width, scale, fraction, guide, net)
 
     made = {size: part(size) for size in set(sizes)}
-    return [replace(made[size], seed=s) for size, s in zip(sizes, seeds, strict=True)]
+    return [_seeded(made[size], s) for size, s in zip(sizes, seeds, strict=True)]
+
+
+def _seeded(samples: Samples, seed: mi.UInt32) -> Samples:
+    """The same samples with another seed."""
+    camera = samples.camera
+    if camera is not None:
+        apart = mi.sample_tea_32(seed, mi.UInt32(CAMERA_STREAM))[0]
+        dr.make_opaque(apart)
+        camera = replace(camera, seed=apart)
+    return replace(samples, seed=seed, camera=camera)
+
+
+def _camera_samples(
+    plan: Plan, scene: mi.Scene, sensor: mi.Sensor, film: Film, spp: int, width: int, fraction: mi.Float,
+) -> Samples:  # fmt: skip
+    """So many camera paths, which are this `fraction` of an image's samples."""
+    if width > PASS_PATHS:
+        raise ValueError(f"{width} paths in one pass are more than 2^32 - 1: set samples_per_pass below {spp}")
+    scale = dr.opaque(mi.Float, float(dr.prod(film.size)) / width) * fraction
+    dr.make_opaque(scale)
+    plan = replace(plan, camera=True)
+    return Samples(scene, sensor, plan, film, mi.UInt32(0), spp, width, scale, fraction)
+
+
+def _of_both(
+    plan: Plan, scene: mi.Scene, sensor: mi.Sensor, film: Film, spp: int, fraction: mi.Float, light_share: float,
+    table: Table | None, emitters: EmitterDensities | None,
+) -> Samples:  # fmt: skip
+    """Light paths and camera paths together as many as `spp` samples per pixel are; one of each at least."""
+    pixels, crop = int(dr.prod(sensor.film().size())), int(dr.prod(film.size))
+    width = max(round(light_share * spp * pixels), 1)
+    n_camera = max(round((1 - light_share) * spp * crop), 1)
+    camera = _camera_samples(plan, scene, sensor, film, spp, n_camera, fraction)
+    ratio = dr.opaque(mi.Float, width / (n_camera / crop))
+    scale = dr.opaque(mi.Float, crop / width) * fraction
+    dr.make_opaque(scale)
+    guide, net = None if table is None else Guide.of(table, width), None if plan.sequence is None else Net.of(width)
+    camera = replace(camera, ratio=ratio, emitters=emitters)
+    return Samples(scene, sensor, plan, film, mi.UInt32(0), spp, width, scale, fraction, guide, net, ratio, emitters, camera)
 
 
 def _parts(spp: int) -> list[int]:

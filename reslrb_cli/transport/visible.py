@@ -229,7 +229,7 @@ def _look(
 
 def splat_visible_emission(samples: Samples, block: mi.ImageBlock, loop_mode: str = "symbolic") -> None:
     """Add C_0 to the block."""
-    if samples.plan.visible_emission:
+    if samples.plan.visible_emission and samples.plan.paths == "light":
         primary = primary_ray(samples)
         radiance = visible_radiance(samples.plan, samples.scene, primary, loop_mode)
         samples.film.put(block, primary.u, radiance * primary.weight * samples.fraction, primary.active)
@@ -240,7 +240,7 @@ def splat_visible_emission(samples: Samples, block: mi.ImageBlock, loop_mode: st
 def differentiate_visible_emission(samples: Samples, adjoint: AdjointImage) -> None:
     """Add the derivatives of C_0."""
     plan = samples.plan
-    if plan.visible_emission and (plan.differentiate_emission or plan.differentiate_null):
+    if plan.visible_emission and plan.paths == "light" and (plan.differentiate_emission or plan.differentiate_null):
         primary = primary_ray(samples)
         delta = adjoint.lookup(primary.u, primary.active) * primary.weight * samples.fraction
         differentiate_visible_radiance(plan, samples.scene, primary, delta)

@@ -27,6 +27,7 @@ from reslrb_cli.transport.factors import Product
 from reslrb_cli.transport.plan import Plan
 from reslrb_cli.transport.roulette import first_eta, play
 from reslrb_cli.transport.samples import SELECTION_STREAM, Early, Numbers, Samples
+from reslrb_cli.transport.weights import Rivals, cosine, leave_emitter, weight_of_connection
 
 
 @dataclass
@@ -184,6 +185,7 @@ class Path:
     eta: mi.Float  # accumulated relative index of refraction, for roulette alone; begins larger where emission is dim
     early: list[Early]  # numbers of the first vertices, where they are of low discrepancy; never changed
     pending: list[Pending]  # how the last event was aimed, where any are; a replay has no use for it
+    rivals: list[Rivals]  # where camera paths look for the same light
 
 
 def walk(samples: Samples, hooks: Hooks, active: mi.Bool | bool = True) -> Any:
@@ -206,9 +208,12 @@ def walk(samples: Samples, hooks: Hooks, active: mi.Bool | bool = True) -> Any:
     state = hooks.start(product)
     active &= plan.max_depth > 1
     pi, active = intersect(plan, scene, emission.ray, active)
-    path = Path(active, mi.UInt32(1), emission.ray, pi, product, eta, samples.early_numbers(), [])
+    path = Path(active, mi.UInt32(1), emission.ray, pi, product, eta, samples.early_numbers(), [], [])
     if aim is not None and not hooks.replaying:
         path.pending = [Pending.nothing()]
+    if plan.weighs:
+        assert samples.emitters is not None
+        path.rivals = [leave_emitter(plan, samples.emitters, scene, emission)]
 
     def body(
         path: Path, state: Any, sampler: mi.Sampler, selection: mi.PCG32 | None
@@ -240,6 +245,13 @@ def walk(samples: Samples, hooks: Hooks, active: mi.Bool | bool = True) -> Any:
             samples, vertex, numbers, connected, active, hooks.connects, hooks.tracked, hooks.attached, aimed
         )
         connection, scattering = this.connection, this.scattering
+        rivals = []
+        for before_here in path.rivals:  # one, or none
+            arrived = before_here.arrive(si, path.ray)
+            ways, cos = scattering.ways, cosine(si, scattering.d)
+            connection.weight *= weight_of_connection(arrived, connection.p_camA, samples.ratio, ways.ahead_back)
+            behind = arrived.after(mi.Float(0), arrived.M + arrived.V * ways.back, scattering, cos)
+            rivals = [dr.select(scattering.is_null, before_here.after_null(arrived), behind)]
         if hooks.connects:
             if not (hooks.tracked or plan.track_zeros):
                 # No shadow ray where neither light nor its derivative would arrive.
@@ -258,6 +270,7 @@ def walk(samples: Samples, hooks: Hooks, active: mi.Bool | bool = True) -> Any:
         if hooks.replaying:
             sampler.next_1d(active)  # roulette's
             active &= hooks.is_followed(state, vertex)
+            path = replace(path, rivals=rivals)
             return _next(path, active, this.next_ray(hooks.attached)), state, sampler, selection
         product = path.product.times(scattering.weight, path.depth)
         eta = path.eta * dr.detach(scattering.eta)
@@ -274,7 +287,7 @@ def walk(samples: Samples, hooks: Hooks, active: mi.Bool | bool = True) -> Any:
         pending = []
         if aimed is not None:
             pending = [Pending.of(aimed, si, scattering.pdf, scattering.is_delta | scattering.is_null)]
-        path = replace(path, product=product, eta=eta, pending=pending)
+        path = replace(path, product=product, eta=eta, pending=pending, rivals=rivals)
         return _next(path, active, this.next_ray(hooks.attached)), state, sampler, selection
 
     def _next(path: Path, active: mi.Bool, ray: mi.Ray3f) -> Path:

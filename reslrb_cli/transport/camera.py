@@ -1,0 +1,398 @@
+"""The one camera-path loop: a ray through the film, the light that is met, next event estimation, scattering, roulette.
+
+What is done with the light that is found is the hooks' to say, as in the walk from the light (`walk.py`), with which it
+shares the scattering, the factors and the numbers of a segment. Light is found in two ways, which are weighed against
+one another, and against light paths where there are any (`weights.py`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from reslrb_cli.transport.bsdf import Scattering, evaluate, scatter, tracked_factor
+from reslrb_cli.transport.connection import Connection, film_density, passage
+from reslrb_cli.transport.densities import Place, density_of_rays
+from reslrb_cli.transport.emission import sample_time
+from reslrb_cli.transport.factors import Product
+from reslrb_cli.transport.plan import Plan
+from reslrb_cli.transport.roulette import play
+from reslrb_cli.transport.samples import Samples
+from reslrb_cli.transport.walk import Vertex
+from reslrb_cli.transport.weights import Rivals, cosine
+
+
+@dataclass
+class FilmRay:
+    """A ray through film position `u` (pixels, relative to the crop window), and `weight` (C,): the sensor's importance
+    times what brings a sum over lanes to an image. `near` is how far before its origin the sensor's aperture lies."""
+
+    ray: mi.Ray3f
+    u: mi.Point2f
+    weight: mi.Spectrum
+    near: mi.Float
+    active: mi.Bool
+
+
+def film_ray(samples: Samples, sampler: mi.Sampler) -> FilmRay:
+    """A ray for each lane: as many in each pixel of the crop window, or one more."""
+    plan, sensor, size = samples.plan, samples.sensor, samples.film.size
+    n_pixels = int(dr.prod(size))
+    lane = dr.arange(mi.UInt32, samples.width)
+    pixel = lane % n_pixels
+    count = dr.opaque(mi.UInt32, samples.width)  # as a literal it would give every sample count a kernel of its own
+    per_pixel = mi.Float(count // n_pixels + dr.select(pixel < count % n_pixels, mi.UInt32(1), 0))
+    time = sample_time(plan, sensor, sampler)
+    u = mi.Point2f(pixel % int(size[0]), pixel // int(size[0])) + _within_pixel(samples, lane, pixel, per_pixel)
+    aperture = sampler.next_2d() if sensor.needs_aperture_sample() else mi.Point2f(0.5)
+    ray, weight = sensor.sample_ray(time, 0.5, u / mi.Vector2f(size), aperture, True)
+    near = mi.Float(0)
+    if plan.weighs:
+        near = mi.Float(mi.traverse(sensor)["near_clip"]) / dr.dot(ray.d, axis_of(sensor))
+    weight = weight * (samples.fraction * dr.rcp(dr.maximum(per_pixel, 1)))
+    return FilmRay(dr.detach(ray), u, dr.detach(weight), near, per_pixel > 0)
+
+
+def _within_pixel(samples: Samples, lane: mi.UInt32, pixel: mi.UInt32, per_pixel: mi.Float) -> mi.Point2f:
+    """Places within their pixel, [0, 1)^2, spread evenly over the samples of each: Hammersley's points, turned by a
+    random offset of the pixel's own. Unevenly spread, what the filter makes of them would be noise."""
+    number = lane // int(dr.prod(samples.film.size))
+    x, y = (mi.Float(word) * 2**-32 for word in mi.sample_tea_32(pixel, samples.seed))
+    inverse = mi.Float(dr.brev(number)) * 2**-32
+    place = mi.Point2f(x + mi.Float(number) / dr.maximum(per_pixel, 1), y + inverse)
+    return dr.minimum(place - dr.floor(place), dr.one_minus_epsilon(mi.Float))
+
+
+def axis_of(sensor: mi.Sensor) -> mi.Vector3f:
+    """The direction that a sensor looks in."""
+    return dr.normalize(dr.detach(sensor.world_transform() @ mi.Vector3f(0, 0, 1)))
+
+
+@dataclass
+class Met:
+    """Light that a camera path meets: radiance `Le` (C,), detached, and its weight w_H, 0 where it does not count."""
+
+    Le: mi.Spectrum
+    weight: mi.Float
+    active: mi.Bool
+    emitter: mi.EmitterPtr
+    si: mi.SurfaceInteraction3f
+
+    def radiance(self) -> mi.Spectrum:
+        """The same radiance, with its derivative where there is any."""
+        return self.emitter.eval(self.si, self.active)
+
+
+@dataclass
+class NextEvent(Connection):
+    """A connection of a camera path's vertex to a point on an emitter, or a direction of one.
+
+    `weight` is everything of the contribution but BSDF and transmittance, (C,): Le w_N / density; `scale` is that
+    without the radiance, `Le` (C,) the radiance, detached; `through` (C,) the transmittance; `target` the point on the
+    emitter.
+    """
+
+    Le: mi.Spectrum | None = None
+    through: mi.Spectrum | None = None
+    scale: mi.Float | None = None
+    ds: mi.DirectionSample3f | None = None
+
+    def radiance(self, scene: mi.Scene, si: mi.SurfaceInteraction3f) -> mi.Spectrum:
+        """The radiance that arrives, with its derivative where there is any."""
+        return scene.eval_emitter_direction(si, self.ds, self.active)
+
+
+class CameraHooks:
+    """What is done along a camera path. All are pure but for the derivatives that they add; none draws a number.
+
+    Hooks that are `tracked` keep derivatives of the factors in the loop's state, which is then evaluated vertex by
+    vertex (naive AD).
+    """
+
+    tracked: bool = False
+
+    def start(self, first: FilmRay) -> Any:
+        """State before the first vertex, any PyTree."""
+        return []
+
+    def goes_on(self, state: Any, vertex: Vertex) -> mi.Bool:
+        """Lanes that go on from this vertex, as far as the hooks care."""
+        return mi.Bool(True)
+
+    def vertex(
+        self, state: Any, vertex: Vertex, met: Met | None, event: NextEvent | None, scattering: Scattering
+    ) -> Any:  # fmt: skip
+        """Called at each vertex, and where a ray leaves the scene; None: there is nothing to meet, or to sample."""
+        return state
+
+    def survived(self, state: Any, weight: mi.Float) -> Any:
+        """Called with the weight that roulette has just given the path's product."""
+        return state
+
+
+@dataclass
+class CameraPath:
+    """Loop state of one camera path.
+
+    `before` is the last vertex that is no null event, `events` counts them, `M` is 1 / p of the last of them (0: the
+    sensor, or a delta event) where light paths are no rivals.
+    """
+
+    active: mi.Bool
+    depth: mi.UInt32
+    ray: mi.Ray3f
+    pi: mi.PreliminaryIntersection3f
+    product: Product
+    eta: mi.Float
+    before: mi.Point3f
+    events: mi.UInt32
+    M: list[mi.Float]
+    rivals: list[Rivals]
+
+
+def camera_walk(samples: Samples, hooks: CameraHooks, active: mi.Bool | bool = True) -> tuple[FilmRay, Any]:
+    """Trace one camera path per lane of `samples`, in `active` lanes: the rays, and the final state of `hooks`."""
+    plan, scene = samples.plan, samples.scene
+    sampler = samples.sampler()
+    surrounded = plan.needs.environment is not None
+    first = film_ray(samples, sampler)
+    state = hooks.start(first)
+    active = first.active & mi.Bool(active) & (plan.max_depth > 0)
+
+    def intersect(ray: mi.Ray3f, active: mi.Bool) -> tuple[mi.PreliminaryIntersection3f, mi.Bool]:
+        pi = scene.ray_intersect_preliminary(ray, coherent=False, active=active)
+        if not surrounded:
+            active = active & pi.is_valid()
+            pi.valid = mi.Bool(True)  # in active lanes
+        if not plan.needs.has_instances:
+            pi.instance = dr.zeros(mi.ShapePtr)
+        return pi, active
+
+    if plan.hide_emitters:
+        first.ray = _behind_lamps(scene, first.ray, active)
+    pi, active = intersect(first.ray, active)
+    M, rivals = [mi.Float(0)], []
+    if plan.weighs:
+        p_cam = film_density(samples.sensor, dr.dot(first.ray.d, axis_of(samples.sensor)))
+        M, rivals = [], [Rivals(samples.ratio / p_cam, mi.Float(0), mi.Float(first.near))]
+    path = CameraPath(
+        active, mi.UInt32(1), first.ray, pi, Product.one(plan.track_zeros, hooks.tracked), mi.Float(1),
+        mi.Point3f(first.ray.o), mi.UInt32(0), M, rivals,
+    )  # fmt: skip
+
+    def body(path: CameraPath, state: Any, sampler: mi.Sampler) -> tuple[CameraPath, Any, mi.Sampler]:
+        si = path.pi.compute_surface_interaction(path.ray, mi.RayFlags.All, path.active)
+        bsdf = si.bsdf()
+        vertex = Vertex(si, bsdf, path.ray, path.pi, path.depth, path.product, path.active)
+        hit = path.active & si.is_valid() if surrounded else path.active
+        goes_on = hooks.goes_on(state, vertex)
+
+        # ---- Light that is met ----
+        met = _meet(samples, path, si) if plan.needs.has_visible_emitters else None
+
+        # ---- Sample an emitter, and scatter ----
+        active = hit & (path.depth + 1 <= plan.max_depth) & goes_on
+        numbers = sampler.next_2d(active)
+        bsdf_1d, bsdf_2d = sampler.next_1d(active), sampler.next_2d(active)
+        event = _next_event(samples, si, bsdf, numbers, active) if plan.samples_emitters else None
+        scattered = active & (path.depth + 1 <= plan.max_depth - int(not plan.needs.has_visible_emitters))
+        wo = mi.Vector3f(0) if event is None else event.wo
+        connected = None if event is None else event.active
+        scattering, f = scatter(plan, vertex, bsdf_1d, bsdf_2d, scattered, wo, connected)
+        arrived = [own.arrive(si, path.ray) for own in path.rivals]
+        if hooks.tracked:
+            tracked = tracked_factor(plan, si, bsdf, scattering, scattering.active)
+            scattering.weight = dr.replace_grad(scattering.weight, tracked * (scattering.correction / scattering.pdf))
+        if event is not None:
+            _weigh(samples, path, arrived, si, event, scattering)
+            event.f = f
+            if not (hooks.tracked or plan.track_zeros):
+                event.active = event.active & ~dr.all(f * event.weight == 0)  # NaN arrives
+            with dr.suspend_grad(when=not plan.differentiate_null):
+                seen = passage(plan, scene, si, path.depth, event, loop_mode=mode)
+            event.active, event.through = seen
+            weight = event.weight
+            if hooks.tracked:
+                event.f = evaluate(plan, si, bsdf, event.wo, event.active)
+                weight = event.radiance(scene, si) * event.scale
+            else:
+                event.f = dr.select(event.active, event.f, 0)
+            event.c = dr.select(event.active, event.f * event.through * weight, 0)
+        state = hooks.vertex(state, vertex, met, event, scattering)
+        product = path.product.times(scattering.weight, path.depth)
+        eta = path.eta * dr.detach(scattering.eta)
+        active = scattering.active & product.alive()
+
+        # ---- Russian roulette ----
+        number = sampler.next_1d(active)
+        if plan.roulette:
+            throughput = dr.max(dr.abs(product.weight()))
+            survives, weight = play(plan, None, path.depth, throughput, eta, si.p, scattering.d, number)
+            active &= survives
+            product, state = product.scaled(weight), hooks.survived(state, weight)
+
+        path = _behind(plan, path, arrived, si, scattering)
+        ray = dr.detach(si.spawn_ray(scattering.d))
+        pi, active = intersect(ray, active)
+        path = replace(
+            path, active=active, depth=path.depth + 1, ray=ray, pi=pi, product=product, eta=eta
+        )  # fmt: skip
+        return path, state, sampler
+
+    mode = "evaluated" if hooks.tracked else "symbolic"
+    _, state, _ = dr.while_loop(
+        state=(path, state, sampler),
+        cond=lambda path, state, sampler: path.active,
+        body=body,
+        labels=("path", "state", "sampler"),
+        label="camera path",
+        mode=mode,
+    )
+    return first, state
+
+
+def _behind_lamps(scene: mi.Scene, ray: mi.Ray3f, active: mi.Bool) -> mi.Ray3f:
+    """The rays from behind the lamps that they meet first, which are hidden."""
+
+    def body(active: mi.Bool, ray: mi.Ray3f) -> tuple[mi.Bool, mi.Ray3f]:
+        si = scene.ray_intersect(ray, active)
+        lamp = active & si.is_valid() & (si.emitter(scene) != dr.zeros(mi.EmitterPtr))
+        return lamp, dr.select(lamp, si.spawn_ray(ray.d), ray)
+
+    _, ray = dr.while_loop((mi.Bool(active), mi.Ray3f(ray)), lambda active, ray: active, body, label="hidden lamps")
+    return ray
+
+
+def _meet(samples: Samples, path: CameraPath, si: mi.SurfaceInteraction3f) -> Met:
+    """The light at `si`, or, where the ray has left the scene, from there."""
+    plan, scene = samples.plan, samples.scene
+    emitter = si.emitter(scene, path.active)
+    active = path.active & (emitter != dr.zeros(mi.EmitterPtr))
+    direct = path.events == 0
+    if plan.hide_emitters:
+        active &= ~direct
+    for lamp in plan.small_lamps:  # whose direct light `visible.py` has
+        active &= ~(direct & (emitter == mi.EmitterPtr(lamp.emitter)))
+    for lamp in plan.needs.lamps:
+        if lamp.parallel:
+            active &= emitter != mi.EmitterPtr(lamp.emitter)
+    with dr.suspend_grad():
+        Le = emitter.eval(si, active)
+        reference = dr.zeros(mi.Interaction3f)
+        reference.p, reference.time = path.before, path.ray.time
+        ds = mi.DirectionSample3f(scene, si, reference)
+        indirect = active & ~direct
+        p_D = scene.pdf_emitter_direction(reference, ds, indirect)
+        if not path.rivals:
+            rivals = p_D * path.M[0]
+        else:
+            [own] = path.rivals
+            table = samples.emitters
+            choice = dr.gather(mi.Float, table.choice, dr.reinterpret_array(mi.UInt32, emitter), indirect)
+            place = p_D / choice
+            if plan.needs.lamps:
+                cos = dr.abs(dr.dot(ds.n, ds.d))
+                place = dr.select(emitter.is_environment(), place, place * cos / dr.square(ds.dist))
+            e = density_of_rays(plan, table, Place(emitter, place, si.uv, -path.ray.d), indirect)
+            rivals = p_D * own.M + e * own.V
+        weight = dr.select(active, dr.select(direct, 1, dr.rcp(1 + rivals)), 0)
+    return Met(dr.select(active, Le, 0), weight, active, emitter, si)
+
+
+def _next_event(
+    samples: Samples, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, numbers: mi.Point2f, active: mi.Bool
+) -> NextEvent:  # fmt: skip
+    """A point on an emitter, or a direction of one; `weight` and `scale` are not weighed yet."""
+    scene = samples.scene
+    active = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
+    with dr.suspend_grad():
+        if any(lamp.parallel for lamp in samples.plan.needs.lamps):
+            ds, weight = _sample_some(samples, si, numbers, active)
+        else:
+            ds, weight = scene.sample_emitter_direction(si, numbers, False, active)
+    active = active & (ds.pdf > 0)
+    zero = mi.Point2f(0)
+    return NextEvent(
+        weight, zero, ds.p, si.to_local(ds.d), active, zero,
+        Le=dr.select(active, weight * ds.pdf, 0), scale=dr.select(active, dr.rcp(ds.pdf), 0), ds=ds,
+    )  # fmt: skip
+
+
+def _sample_some(
+    samples: Samples, si: mi.SurfaceInteraction3f, numbers: mi.Point2f, active: mi.Bool
+) -> tuple[mi.DirectionSample3f, mi.Spectrum]:  # fmt: skip
+    """What `sample_emitter_direction` does, where a scene has emitters that cannot be sampled so."""
+    scene = samples.scene
+    unseen = {lamp.emitter for lamp in samples.plan.needs.lamps if lamp.parallel}
+    index, weight, reused = scene.sample_emitter(numbers.x, active)
+    emitter = dr.gather(mi.EmitterPtr, scene.emitters_dr(), index, active)
+
+    def sample(
+        self: mi.Emitter, si: mi.SurfaceInteraction3f, sample: mi.Point2f, active: mi.Bool
+    ) -> tuple[mi.DirectionSample3f, mi.Spectrum]:  # fmt: skip
+        if self in unseen:
+            return dr.zeros(mi.DirectionSample3f), mi.Spectrum(0)
+        return self.sample_direction(si, sample, active)
+
+    ds, radiance = dr.dispatch(emitter, sample, si, mi.Point2f(reused, numbers.y), active)
+    ds.pdf /= weight
+    return ds, radiance * weight
+
+
+def _weigh(
+    samples: Samples, path: CameraPath, arrived: list[Rivals], si: mi.SurfaceInteraction3f, event: NextEvent,
+    scattering: Scattering,
+) -> None:  # fmt: skip
+    """Multiply w_N to a next event."""
+    plan, ds, ways = samples.plan, event.ds, scattering.ways
+    p = dr.select(ds.delta, 0, ways.ahead)
+    rivals = p / ds.pdf
+    if arrived:
+        [own] = arrived
+        table = samples.emitters
+        choice = dr.gather(mi.Float, table.choice, dr.reinterpret_array(mi.UInt32, ds.emitter), event.active)
+        place, g = ds.pdf / choice, mi.Float(1)
+        if plan.needs.lamps:
+            on_lamp = ~ds.delta & ~ds.emitter.is_environment()
+            place = dr.select(on_lamp, place * dr.abs(dr.dot(ds.n, ds.d)) / dr.square(ds.dist), place)
+        if plan.has_light_at_points:
+            distant = mi.Bool(False)
+            if "DirectionalEmitter" in plan.needs.emitters:
+                distant = mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.Infinite)
+            g = dr.select(ds.delta & ~distant, dr.square(ds.dist), 1)
+        e = density_of_rays(plan, table, Place(ds.emitter, place, ds.uv, -ds.d), event.active)
+        m = dr.select(path.events == 0, own.M, own.V * ways.ahead_back)
+        m = dr.select(ways.ahead_valid, m, 0)
+        joined = m * e * cosine(si, ds.d) / (ds.pdf * g)
+        rivals += dr.select(joined > 0, joined, 0)
+    weight = dr.detach(dr.select(event.active, dr.rcp(1 + rivals), 0))
+    event.weight, event.scale = event.weight * weight, event.scale * weight
+
+
+def _behind(
+    plan: Plan, path: CameraPath, arrived: list[Rivals], si: mi.SurfaceInteraction3f, scattering: Scattering
+) -> CameraPath:  # fmt: skip
+    """The path with what a vertex's event makes of its weights."""
+    ways = scattering.ways
+    renewed = dr.rcp(ways.p)
+    null = scattering.is_null
+    M = [dr.select(scattering.is_delta, 0, renewed) for _ in path.M]
+    rivals = []
+    for own, here in zip(path.rivals, arrived, strict=True):
+        m = dr.select(path.events == 0, here.M, here.V * ways.back)
+        # Light paths go through none of the vertices at which directions lie on inconsistent sides.
+        m = dr.select(ways.valid, m, 0)
+        rivals.append(replace(here, V=dr.select(ways.valid, here.V, 0)).after(
+            renewed, m, scattering, cosine(si, scattering.d)))  # fmt: skip
+    before, events = mi.Point3f(si.p), path.events + 1
+    if plan.needs.has_null:
+        M = [dr.select(null, old, new) for old, new in zip(path.M, M, strict=True)]
+        rivals = [
+            dr.select(null, own.after_null(here), new)
+            for own, here, new in zip(path.rivals, arrived, rivals, strict=True)
+        ]
+        before, events = dr.select(null, path.before, before), dr.select(null, path.events, events)
+    return replace(path, before=before, events=events, M=M, rivals=rivals)

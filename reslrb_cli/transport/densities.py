@@ -1,0 +1,157 @@
+"""Densities of the rays that a scene's emitters send out, known of any ray, and not of those alone that were sampled.
+
+Mitsuba has none: they are those of its own `sample_ray`, and of the rays that are placed here (`emission.py`, `lamps.py`).
+
+    lamp                 choice / area * cos / pi;  textured, in proportion to its texture
+    constant, map, sky   choice p(d) / (pi r^2)         r: of the sphere around the scene
+    directional          choice / (pi r^2)
+    point, spot          choice / (4 pi), choice / (the cone's solid angle)
+    projector            choice p(u) / (A cos^3)        A: the area of its picture at a distance of 1
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from reslrb_cli.scene.graph import Lamp, SceneGraph
+from reslrb_cli.transport.lamps import DEFENSIVE
+from reslrb_cli.transport.plan import Plan
+
+EVEN, TEXTURED, ENVIRONMENT, PROJECTOR, UNSEEN = range(5)  # how the density of an emitter's rays is found
+
+
+@dataclass
+class EmitterDensities:
+    """Densities of a scene's emitters by their numbers in Dr.Jit's registry (as pointers are), (R,) each, opaque.
+
+    `choice`: the probability that an emitter is picked. `emitted`: e, or what is left of it beside the density of a
+    place or a direction that depends on a texture. `kind`: which of these.
+    """
+
+    choice: mi.Float
+    emitted: mi.Float
+    kind: mi.UInt32
+
+    @staticmethod
+    def of(plan: Plan, scene: mi.Scene) -> EmitterDensities:
+        """Those of all emitters of a scene."""
+        emitters = scene.emitters()
+        numbers = [int(dr.reinterpret_array(mi.UInt32, mi.EmitterPtr(emitter))[0]) for emitter in emitters]
+        sampled = np.array([float(np.ravel(emitter.sampling_weight())[0]) for emitter in emitters])
+        choice, emitted, kind = (np.zeros(max(numbers) + 1) for _ in range(3))
+        lamps = {lamp.index: lamp for lamp in plan.needs.lamps}
+        for index, (emitter, number) in enumerate(zip(emitters, numbers, strict=True)):
+            choice[number] = sampled[index] / sampled.sum()
+            own, kind[number] = _ray_density(plan, emitter, lamps.get(index), index == plan.needs.environment)
+            emitted[number] = choice[number] * own
+        made = [kind_of(array.astype(dtype)) for kind_of, array, dtype in (
+            (mi.Float, choice, np.float32), (mi.Float, emitted, np.float32), (mi.UInt32, kind, np.uint32))]  # fmt: skip
+        dr.make_opaque(made)
+        return EmitterDensities(*made)
+
+
+def _ray_density(plan: Plan, emitter: mi.Emitter, lamp: Lamp | None, surrounds: bool) -> tuple[float, int]:
+    """What of an emitter's e is the same for all its rays, and how the rest is found."""
+    name = emitter.class_name()
+    disk = 0.0 if plan.horizon is None else 1 / (np.pi * plan.horizon.radius**2)
+    if lamp is not None:
+        if lamp.parallel:
+            return 0.0, UNSEEN  # its rays leave along the normal: neither next event nor a camera path finds them
+        if lamp.texture is not None:
+            return 1 / np.pi, TEXTURED
+        return 1 / (np.pi * float(np.ravel(lamp.shape.surface_area())[0])), EVEN
+    if surrounds:
+        return (disk / (4 * np.pi), EVEN) if name == "ConstantBackgroundEmitter" else (disk, ENVIRONMENT)
+    if name == "DirectionalEmitter":
+        return disk, EVEN
+    if name == "SpotLight":
+        return 1 / (2 * np.pi * (1 - _cosine_of_cutoff(emitter))), EVEN
+    if name == "Projector":
+        return 1 / _projected_area(emitter), PROJECTOR
+    return 1 / (4 * np.pi), EVEN
+
+
+def _cosine_of_cutoff(spot: mi.Emitter) -> float:
+    """The cosine of the angle at which the cone ends that a spot's rays are drawn from; its plugin does not tell it."""
+    place, rim = mi.Point2f(0.5), mi.Point2f(1 - 1e-7, 0.5)  # the end of the unit disk
+    axis = np.ravel(mi.traverse(spot)["to_world"] @ mi.Vector3f(0, 0, 1))
+    d = np.ravel(spot.sample_ray(0, 0.5, place, rim, True)[0].d)
+    return min(float(axis @ d / np.linalg.norm(axis)), 1 - 1e-7)
+
+
+def _projected_area(projector: mi.Emitter) -> float:
+    """The area of a projector's picture at a distance of 1."""
+    params = mi.traverse(projector)
+    toward = params["to_world"] @ mi.Vector3f(mi.Float([0.0, 1e-3, 0.0]), mi.Float([0.0, 0.0, 1e-3]), 1)
+    si = dr.zeros(mi.SurfaceInteraction3f, 3)
+    si.p = params["to_world"] @ mi.Point3f(0) + toward
+    uv = np.array(projector.sample_direction(si, mi.Point2f(0.5), True)[0].uv)
+    across, down = uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0]
+    return 1e-6 / max(abs(float(across[0] * down[1] - across[1] * down[0])), 1e-12)
+
+
+@dataclass
+class Place:
+    """Where light leaves an emitter, as its density needs to know: `own` is the density of the place (of a lamp, over
+    its area), or of the direction (of what surrounds the scene), with which next event estimation draws it, without the
+    choice of the emitter; `uv` are texture coordinates, `d` is the direction that light leaves in."""
+
+    emitter: mi.EmitterPtr
+    own: mi.Float
+    uv: mi.Point2f
+    d: mi.Vector3f
+
+
+def density_of_rays(plan: Plan, table: EmitterDensities, at: Place, active: mi.Bool) -> mi.Float:
+    """e of the rays that leave there."""
+    number = dr.reinterpret_array(mi.UInt32, at.emitter)
+    e = dr.gather(mi.Float, table.emitted, number, active)
+    textured = any(lamp.texture is not None for lamp in plan.needs.lamps)
+    mapped = plan.needs.environment is not None and not _constant_environment(plan)
+    if not (textured or mapped or "Projector" in plan.needs.emitters):
+        return e
+    kind = dr.gather(mi.UInt32, table.kind, number, active)
+    factor = mi.Float(1)
+    if textured:
+        own = mi.Float(at.own)
+        for lamp in plan.evened_lamps:
+            own = dr.select(at.emitter == mi.EmitterPtr(lamp.emitter), _evened(lamp, at, active), own)
+        factor = dr.select(kind == TEXTURED, own, factor)
+    if mapped:
+        own = at.own
+        if plan.environment_map and plan.differentiate_emission:
+            own = dr.select(dr.isfinite(own), (1 - DEFENSIVE) * own + DEFENSIVE * dr.inv_four_pi, dr.inv_four_pi)
+        factor = dr.select(kind == ENVIRONMENT, own, factor)
+    if "Projector" in plan.needs.emitters:
+        factor = dr.select(kind == PROJECTOR, _projected(at, active & (kind == PROJECTOR)), factor)
+    return e * factor
+
+
+def _constant_environment(plan: Plan) -> bool:
+    return plan.needs.emitters[plan.needs.environment] == "ConstantBackgroundEmitter"
+
+
+def _evened(lamp: Lamp, at: Place, active: mi.Bool) -> mi.Float:
+    """The density over the area of a lamp whose points are drawn from its texture, and some of them evenly."""
+    here = active & (at.emitter == mi.EmitterPtr(lamp.emitter))
+    there = lamp.shape.eval_parameterization(at.uv, mi.RayFlags.All, here)
+    stretch = dr.norm(dr.cross(there.dp_du, there.dp_dv))
+    drawn = at.own * stretch
+    return dr.select(dr.isfinite(drawn), (1 - DEFENSIVE) * drawn + DEFENSIVE, 1) / stretch
+
+
+def _projected(at: Place, active: mi.Bool) -> mi.Float:
+    """The density of a projector's directions, but for the area of its picture; `at.uv` are those of the picture."""
+
+    def density(self: mi.Emitter, uv: mi.Point2f, d: mi.Vector3f, active: mi.Bool) -> mi.Float:
+        if self.class_name() != "Projector":
+            return mi.Float(0)
+        picture = next(child for child in SceneGraph.of(self).objects if isinstance(child, mi.Texture))
+        axis = dr.normalize(dr.detach(mi.traverse(self)["to_world"] @ mi.Vector3f(0, 0, 1)))
+        return picture.pdf_position(uv, active) / dr.dot(axis, d) ** 3
+
+    return dr.dispatch(at.emitter, density, at.uv, at.d, active)

@@ -1,0 +1,156 @@
+"""Weights of paths that are looked for from both sides: one path, one contribution, shared out (balance heuristic).
+
+A path z_0 (sensor), z_1 .. z_{K-1} (surfaces), z_K (on an emitter) can be found in three ways: a camera path meets the
+emitter (H), its last vertex z_{K-1} samples the emitter (N, next event), or a light path's last vertex z_1 connects to
+the sensor (L). Each way's weight is its density over the sum of all three, so that w_H + w_N + w_L = 1. They depend on
+the path alone, and have no derivative.
+
+Two numbers go along with each walk: M, the density of the rival that joins at the newest vertex, over one's own, and V,
+that of the rivals from further back. p and p~ are the BSDF's density of the direction taken, and of the one back in the
+other walk; c is the |cosine| of the direction taken, d the length of the segment; N is the number of all light paths
+over that of the camera paths of a pixel, p_cam the sensor's density of a direction for one pixel. Of an emitter e is
+the density of its rays (of place and direction) over the cosine there, where it is a surface, and p_D the density with
+which next event estimation draws its directions as a vertex sees them; both with the choice of the emitter.
+
+    every arrival     M *= d^2 (not from infinity);  M, V /= |cos| at the surface that is reached
+    camera walk       start: M = N / p_cam, V = 0.    m = M at the first vertex, V p~ at later ones
+      next event      w_N = 1 / (1 + p / p_D + m e c / (p_D g))    g: d^2 for a light at a point, else 1; p = 0 for both
+      smooth event    V = (c / p) m,  M = 1 / p         delta event   V *= c,  M = 0
+      light is met    w_H = 1 / (1 + p_D M + e V)       of M and V before the arrival; 1 where it is seen directly
+    light walk        at the first vertex: M = p_D g / (e |cos|),  V = 1 / (e |cos|); V = 0 for delta lights
+      connection      w_L = 1 / (1 + p_camA / N (M + V p~))        p_camA: p_cam as a density of area at the vertex
+      smooth event    V = (c / p) (M + V p~), then M = 0 for good  delta event   V *= c,  M = 0
+
+A null event is no vertex: M and V stay, and d runs on. Roulette, guiding and aiming stay out of the weights, which sum
+to 1 all the same. Source: Georgiev 2012, "Implementing Vertex Connection and Merging", whose recursion weighs all
+connections; this is its restriction to three ways.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import drjit as dr
+import mitsuba as mi
+
+from reslrb_cli.transport.bsdf import Scattering
+from reslrb_cli.transport.densities import EmitterDensities, Place, density_of_rays
+from reslrb_cli.transport.emission import Emission
+from reslrb_cli.transport.lamps import lamp_point
+from reslrb_cli.transport.plan import Plan
+
+FROM_INFINITY = -1e30  # the length of a path that comes from there, so far
+
+
+@dataclass
+class Rivals:
+    """M and V of a walk, before the arrival at its current vertex, and d since the last vertex that is no null event;
+    loop state.
+
+    `sphere` holds, where any lamp is a sphere (whose p_D depends on the vertex), the number of the shape that the path
+    comes from, 0 for others, and the cosine at which it left.
+    """
+
+    M: mi.Float
+    V: mi.Float
+    distance: mi.Float
+    sphere: list[mi.UInt32 | mi.Float] = field(default_factory=list)
+
+    def arrive(self, si: mi.SurfaceInteraction3f, ray: mi.Ray3f, near: mi.Float | float = 0) -> Rivals:
+        """Those at the vertex `si`, which `ray` reaches; `near` is how far before its origin the segment began."""
+        d = self.distance + si.t + near
+        cos = dr.maximum(dr.abs(dr.dot(si.n, ray.d)), 1e-12)
+        M = self.M * dr.select(d < 0, 1, dr.square(d)) / cos
+        if self.sphere:
+            number, left = self.sphere
+            ds = dr.zeros(mi.DirectionSample3f)
+            ds.d, ds.dist = -ray.d, d
+            ds.p = dr.fma(ds.d, d, si.p)
+            ds.n = mi.Normal3f(ds.d * left)  # as far as its density goes by the angle there
+            shape = dr.reinterpret_array(mi.ShapePtr, number)
+            p_D = shape.pdf_direction(si, ds, number != 0)
+            M = dr.select(number != 0, self.M * p_D / cos, M)
+        return Rivals(M, self.V / cos, d, self.sphere)
+
+    def after_null(self, arrived: Rivals) -> Rivals:
+        """Those behind a null event, at which `arrived` are those of the vertex."""
+        return replace(self, distance=arrived.distance)
+
+    def after(self, renewed: mi.Float, joined: mi.Float, scattering: Scattering, cos: mi.Float) -> Rivals:
+        """Those behind an event at which they arrived: M is `renewed` by a smooth one, and V made of `joined`."""
+        p, is_delta = scattering.ways.p, scattering.is_delta
+        V = dr.select(is_delta, self.V * cos, dr.select(joined > 0, cos / p * joined, 0))
+        sphere = [mi.UInt32(0), mi.Float(0)] if self.sphere else []
+        return Rivals(dr.select(is_delta, 0, renewed), V, mi.Float(0), sphere)
+
+
+def cosine(si: mi.SurfaceInteraction3f, d: mi.Vector3f) -> mi.Float:
+    """|cos| of a direction at a surface."""
+    return dr.abs(dr.dot(si.n, d))
+
+
+# ---- The walk from the light ----
+
+
+def leave_emitter(plan: Plan, table: EmitterDensities, scene: mi.Scene, emission: Emission) -> Rivals:
+    """Those of a light path on its way to its first vertex."""
+    ray, emitter = emission.ray, emission.emitter
+    choice = dr.gather(mi.Float, table.choice, dr.reinterpret_array(mi.UInt32, emitter))
+    lamps = {lamp.emitter: lamp for lamp in plan.needs.lamps}
+    environment = None if plan.needs.environment is None else scene.environment()
+
+    def leave(
+        self: mi.Emitter, time: mi.Float, position: mi.Point2f, o: mi.Point3f, d: mi.Vector3f, active: mi.Bool
+    ) -> tuple[mi.Float, mi.Float, mi.Point2f, mi.Float, mi.Float]:  # fmt: skip
+        """Its density of places or directions, the cosine, texture coordinates, whether there is a V, and d so far."""
+        one, zero = mi.Float(1), mi.Float(0)
+        lamp = lamps.get(self)
+        if lamp is not None and not lamp.parallel:
+            si, weight = lamp_point(lamp, None, time, position, active, lamp in plan.evened_lamps)
+            own = dr.rcp(weight)
+            if lamp in plan.evened_lamps:
+                there = lamp.shape.eval_parameterization(si.uv, mi.RayFlags.All, active)
+                own = lamp.texture.pdf_position(si.uv, active) / dr.norm(dr.cross(there.dp_du, there.dp_dv))
+                own = dr.select(dr.isfinite(own), own, 0)
+            return own, dr.abs(dr.dot(si.n, d)), si.uv, one, zero
+        if self == environment:
+            ds = dr.zeros(mi.DirectionSample3f)
+            ds.d = -d
+            return self.pdf_direction(dr.zeros(mi.Interaction3f), ds, active), one, mi.Point2f(0), one, far
+        if self.class_name() == "Projector":
+            si = dr.zeros(mi.SurfaceInteraction3f)
+            si.p = o + d
+            return one, one, self.sample_direction(si, mi.Point2f(0.5), active)[0].uv, zero, zero
+        distant = self.class_name() == "DirectionalEmitter"
+        return one, one, mi.Point2f(0), zero, far if distant else zero
+
+    far = mi.Float(FROM_INFINITY)
+    with dr.suspend_grad():
+        own, cos, uv, surface, distance = dr.dispatch(
+            emitter, leave, ray.time, emission.position, ray.o, ray.d, mi.Bool(True)
+        )
+        e = density_of_rays(plan, table, Place(emitter, own, uv, ray.d), mi.Bool(True))
+        unseen = mi.Bool(False)
+        sphere: list[mi.UInt32 | mi.Float] = []
+        M = choice * own / (e * dr.maximum(cos, 1e-12))
+        spheres = [lamp for lamp in plan.needs.lamps if lamp.is_sphere and lamp.texture is None and not lamp.parallel]
+        if spheres:
+            number = mi.UInt32(0)
+            for lamp in spheres:
+                shape = dr.reinterpret_array(mi.UInt32, mi.ShapePtr(lamp.shape))
+                number = dr.select(emitter == mi.EmitterPtr(lamp.emitter), shape, number)
+            sphere, M = [number, cos], dr.select(number != 0, choice / e, M)
+        for lamp in plan.needs.lamps:
+            if lamp.parallel:
+                unseen |= emitter == mi.EmitterPtr(lamp.emitter)
+        # Nothing else finds what has no density.
+        M, V = (dr.select(unseen | ~dr.isfinite(x), 0, x) for x in (M, surface / e))
+        return Rivals(M, V, distance, sphere)
+
+
+def weight_of_connection(
+    arrived: Rivals, p_camA: mi.Float, N: mi.Float, back: mi.Float
+) -> mi.Float:  # fmt: skip
+    """w_L of a connection to the sensor, by the density `back`, p~, of the way from there on."""
+    rivals = p_camA / N * (arrived.M + arrived.V * back)
+    return dr.rcp(1 + dr.select(p_camA > 0, rivals, 0))
