@@ -19,6 +19,7 @@ from reslrb_cli.transport.samples import Samples
 from reslrb_cli.transport.walk import Hooks, Vertex, walk
 
 T = TypeVar("T")
+STACK_SIZE = 64  # vertices
 
 
 @dataclass
@@ -74,6 +75,7 @@ class Estimator(ABC):
     OPTIONS: ClassVar[dict[str, Any]] = {}
     exact: ClassVar[bool] = False  # every connection of a path counts, as under naive AD of the same paths
     attaches: ClassVar[bool] = False  # it has derivatives of what moves light
+    stack_size: int = STACK_SIZE  # that of stacks of vertices, where there are any
     splats_all: bool = True  # the image shows every connection, so that an image alone needs no estimator
 
     @abstractmethod

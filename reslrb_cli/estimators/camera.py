@@ -19,9 +19,9 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from reslrb_cli.estimators.base import Pass, PathAdjoint, allocate, differentiate_passage, entry_bytes, places, vertices
+from reslrb_cli.estimators.base import STACK_SIZE, Pass, PathAdjoint, allocate, differentiate_passage, entry_bytes, places, vertices
 from reslrb_cli.estimators.kept import AdjointSum, PlainSum
-from reslrb_cli.estimators.stack import STACK_SIZE, Frame, Pushed, push, walk_back
+from reslrb_cli.estimators.stack import Frame, Pushed, push, walk_back
 from reslrb_cli.transport.bsdf import Scattering, evaluate, tracked_factor, tracked_factors
 from reslrb_cli.transport.camera import CameraHooks, FilmRay, Met, NextEvent, camera_walk
 from reslrb_cli.transport.connection import forward_derivatives, transmittance

@@ -21,6 +21,7 @@ import mitsuba as mi
 
 from reslrb_cli.estimators import attached
 from reslrb_cli.estimators.base import (
+    STACK_SIZE,
     Estimator,
     Pass,
     PathAdjoint,
@@ -44,8 +45,6 @@ from reslrb_cli.transport.connection import Connection, Seen
 from reslrb_cli.transport.factors import Product
 from reslrb_cli.transport.plan import Plan
 from reslrb_cli.transport.walk import Splat, Vertex
-
-STACK_SIZE = 64  # vertices
 
 
 @dataclass
@@ -120,13 +119,15 @@ class Pushing(VertexHooks):
         return mi.Bool(True) if self.visibility is None else vertex.depth < self.visibility.last
 
     def scattering(self, state: Pushed, vertex: Vertex, connection: Connection, scattering: Scattering) -> Pushed:
-        p, plan, depth, connected = self.p, self.p.plan, vertex.depth, connection.active
+        p, plan, connected = self.p, self.p.plan, connection.active
         C = contribution(p, vertex, connection)
         p.splat(connection.u, C.value(), connected)
         delta = p.delta(connection.u, connected)
         own = PathAdjoint(dr.select(connected, delta * C.nonzero, 0), C)
-        weight_c = adjoint_of_connection(p, vertex, connection, connected, own)
         useful = vertex.active & plan.differentiates(vertex.bsdf)
+        # Beyond the stack a second walk has the derivatives, those of masks before the sensor among them.
+        beyond = (state.first != 0) | (useful & (state.height >= self.size))
+        weight_c = adjoint_of_connection(p, vertex, connection, connected & ~beyond, own)
         return push(
             plan, state, self.size, vertex, useful, connection.wo, weight_c, scattering, [(delta, C, connected)]
         )

@@ -17,9 +17,7 @@ import mitsuba as mi
 
 from reslrb_cli.errors import UnsupportedScene, is_machine_fault, is_out_of_memory
 from reslrb_cli.transport.film import Film
-from reslrb_cli.transport.guide import Guide
 from reslrb_cli.transport.samples import Samples
-from reslrb_cli.transport.sobol import Net
 
 logger = logging.getLogger(__name__)
 
@@ -64,9 +62,10 @@ class Recordings:
         """
         s = samples
         # Sensors that share a recording have it made anew whenever another one's turn comes.
-        key = (kind, s.plan, s.spp, s.width, tuple(s.film.size), s.sensor.ptr)
+        widths = tuple(side.width for side in s.sides())
+        key = (kind, s.plan, s.spp, widths, tuple(s.film.size), s.sensor.ptr)
         plain = _on_samples(samples, function)
-        common = (s.scene, s.sensor, s.seed, s.scale, s.fraction, s.guide, s.net)
+        common = (s.scene, s.sensor, *(_arrays(side) for side in s.sides()))
         if key not in self._functions and len(self._functions) < MOST_CALLS:
             self._functions[key] = _record(kind, plain, common, inputs)
         recorded = self._functions.get(key)
@@ -97,9 +96,7 @@ class Recordings:
 
 
 def _record(
-    kind: str, plain: Callable[..., Any],
-    common: tuple[mi.Scene, mi.Sensor, mi.UInt32, mi.Float, mi.Float, Guide | None, Net | None],
-    inputs: tuple[Any, ...],
+    kind: str, plain: Callable[..., Any], common: tuple[Any, ...], inputs: tuple[Any, ...],
 ) -> Any:  # fmt: skip
     """A recording, or None where there cannot be one.
 
@@ -142,13 +139,22 @@ def _without_garbage_collection() -> Iterator[None]:
 def _on_samples(samples: Samples, function: Callable[..., Any]) -> Callable[..., Any]:
     """`function` with everything that a recording has to see as an argument of its own."""
     # Only these: arrays would be constants of the recording, and a scene would never be freed.
-    plan, spp, width = samples.plan, samples.spp, samples.width
+    sides = [(side.plan, side.spp, side.width) for side in samples.sides()]
 
-    def on_samples(
-        scene: mi.Scene, sensor: mi.Sensor, seed: mi.UInt32, scale: mi.Float, fraction: mi.Float, guide: Guide | None,
-        net: Net | None, *inputs: Any,
-    ) -> Any:  # fmt: skip
-        film = Film(sensor)
-        return function(Samples(scene, sensor, plan, film, seed, spp, width, scale, fraction, guide, net), *inputs)
+    def on_samples(scene: mi.Scene, sensor: mi.Sensor, *given: Any) -> Any:
+        film, made = Film(sensor, sides[0][0].paths != "light"), []
+        for (plan, spp, width), arrays in zip(sides, given, strict=False):
+            seed, *others = arrays
+            made.append(Samples(scene, sensor, plan, film, seed, spp, width, *others))
+        first, *camera = made
+        if camera:
+            first.camera = camera[0]
+        return function(first, *given[len(sides) :])
 
     return on_samples
+
+
+def _arrays(samples: Samples) -> tuple[Any, ...]:
+    """What of samples a recording has to see, in the order of their members."""
+    s = samples
+    return s.seed, s.scale, s.fraction, s.guide, s.net, s.ratio, s.emitters

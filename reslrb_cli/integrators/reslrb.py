@@ -339,7 +339,7 @@ def forward(
         if not side.plan.camera:
             state = estimator.forward(p)
         elif adjoint is not None:
-            differentiate_camera_paths(p)
+            differentiate_camera_paths(p, estimator.stack_size)
         elif block is not None:
             splat_camera_paths(side, block)
     return state
@@ -385,7 +385,7 @@ def replay(
         if not side.plan.camera:
             estimator.backward(p, state)
         elif not done:
-            differentiate_camera_paths(p)
+            differentiate_camera_paths(p, estimator.stack_size)
 
 
 def replay_all(

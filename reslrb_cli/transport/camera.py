@@ -194,11 +194,11 @@ def camera_walk(samples: Samples, hooks: CameraHooks, active: mi.Bool | bool = T
         met = _meet(samples, path, si) if plan.needs.has_visible_emitters else None
 
         # ---- Sample an emitter, and scatter ----
-        active = hit & (path.depth + 1 <= plan.max_depth) & goes_on
+        active = hit & (path.depth + 1 <= plan.max_depth)
         numbers = sampler.next_2d(active)
         bsdf_1d, bsdf_2d = sampler.next_1d(active), sampler.next_2d(active)
         event = _next_event(samples, si, bsdf, numbers, active) if plan.samples_emitters else None
-        scattered = active & (path.depth + 1 <= plan.max_depth - int(not plan.needs.has_visible_emitters))
+        scattered = active & goes_on & (path.depth + 1 <= plan.max_depth - int(not plan.needs.has_visible_emitters))
         wo = mi.Vector3f(0) if event is None else event.wo
         connected = None if event is None else event.active
         scattering, f = scatter(plan, vertex, bsdf_1d, bsdf_2d, scattered, wo, connected)

@@ -30,6 +30,7 @@ class Film:
         """`whole`: each pixel is divided by the part of its filter that lies on the film, as stock integrators do that
         begin at the sensor; else pixels at the border lack what falls off the film, as for `ptracer`."""
         self.film, self.whole = sensor.film(), whole
+        self.integrals = _integrals(self.film.rfilter()) if whole else []
         self.film.prepare([])
         self.size = self.film.crop_size()
         self.offset = self.film.crop_offset()
@@ -93,12 +94,19 @@ class Film:
 
     def _filter_on_film(self, shape: tuple[int, ...]) -> mi.TensorXf:
         """What of each pixel's filter lies on the film, for an image of this shape (H, W, channels)."""
-        rfilter = self.film.rfilter()
-        rows, columns = (_integrals(rfilter, int(n)) for n in (self.size.y, self.size.x))
-        part = np.repeat(np.outer(rows, columns)[:, :, None], shape[2], axis=2)
-        if shape[2] in (2, 4):
-            part[:, :, -1] = 1  # alpha is what it is
-        return mi.TensorXf(part.astype(np.float32))
+        height, width, channels = shape
+        lane = dr.arange(mi.UInt32, height * width * channels)
+        pixel = lane // channels
+        part = mi.Float(1)
+        for place, n in ((pixel % width, width), (pixel // width, height)):
+            inside = mi.Float(0)
+            for offset, integral in self.integrals:
+                there = mi.Int32(place) + offset
+                inside += dr.select((there >= 0) & (there < n), integral, 0)
+            part *= inside
+        if channels in (2, 4):
+            part = dr.select(lane % channels == channels - 1, 1, part)  # alpha is what it is
+        return mi.TensorXf(part, shape)
 
     def adjoint(self, image_gradient: mi.TensorXf) -> AdjointImage:
         """dL/d(block) from dL/d(developed image): what `AdjointImage` looks up."""
@@ -161,17 +169,13 @@ class AdjointImage:
 STEPS = 256  # of a filter's integral, in each pixel
 
 
-@functools.lru_cache(maxsize=16)
-def _integrals(rfilter: mi.ReconstructionFilter, n: int) -> NDArray[np.float64]:
-    """The integral of the filter (n,) of each of `n` pixels in a row, over these pixels alone."""
-    radius = float(rfilter.radius())
-    taps = int(np.ceil(radius - 0.5))  # pixels on each side that the filter reaches into
+@functools.lru_cache(maxsize=64)
+def _integrals(rfilter: mi.ReconstructionFilter) -> list[tuple[int, float]]:
+    """The integral of a pixel's filter over each pixel that it reaches into along one axis, by its offset."""
+    taps = int(np.ceil(float(rfilter.radius()) - 0.5))
     x = (np.arange((2 * taps + 1) * STEPS) + 0.5) / STEPS - taps - 0.5
-    parts = np.array(rfilter.eval(mi.Float(x.astype(np.float32))), np.float64).reshape(2 * taps + 1, STEPS).mean(1)
-    ends = np.concatenate([[0.0], np.cumsum(parts)])
-    pixel = np.arange(n)
-    first, last = np.maximum(taps - pixel, 0), np.minimum(taps + n - pixel, 2 * taps + 1)
-    return np.asarray(ends[last] - ends[first])
+    values = np.array(rfilter.eval(mi.Float(x.astype(np.float32))), np.float64)
+    return list(zip(range(-taps, taps + 1), values.reshape(-1, STEPS).mean(1).tolist(), strict=True))
 
 
 def filter_weights(
