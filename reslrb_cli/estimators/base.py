@@ -198,7 +198,10 @@ def differentiate_passage(
     with dr.resume_grad(when=p.plan.differentiate_null):
         limit = p.plan.max_depth - depth - 1
         on_crossing = differentiate if p.plan.differentiate_null else None
-        return transmittance(p.samples.scene, si, connection.target, limit, active, on_crossing).value
+        past_lamps = p.plan.passes_lamps
+        return transmittance(
+            p.samples.scene, si, connection.target, limit, active, on_crossing, past_lamps=past_lamps
+        ).value
 
 
 def adjoint_of_connection(

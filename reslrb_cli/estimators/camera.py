@@ -19,7 +19,16 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from reslrb_cli.estimators.base import STACK_SIZE, Pass, PathAdjoint, allocate, differentiate_passage, entry_bytes, places, vertices
+from reslrb_cli.estimators.base import (
+    STACK_SIZE,
+    Pass,
+    PathAdjoint,
+    allocate,
+    differentiate_passage,
+    entry_bytes,
+    places,
+    vertices,
+)
 from reslrb_cli.estimators.kept import AdjointSum, PlainSum
 from reslrb_cli.estimators.stack import Frame, Pushed, push, walk_back
 from reslrb_cli.transport.bsdf import Scattering, evaluate, tracked_factor, tracked_factors
@@ -119,8 +128,8 @@ class Pushing(Differentiating):
         if event is not None:
             through = event.through
             if plan.differentiate_null:
-                C = P_c = found[-1][0]
-                adjoint = PathAdjoint(dr.select(event.active, self.delta * P_c.nonzero, 0), C)
+                C = found[-1][0]
+                adjoint = PathAdjoint(dr.select(event.active, self.delta * C.nonzero, 0), C)
                 through = differentiate_passage(p, vertex.si, vertex.depth, event, event.active, adjoint)
             weight_c = dr.select(event.active, self.delta * P * event.weight * through, 0)
             wo_c = event.wo
@@ -139,6 +148,7 @@ class Pushing(Differentiating):
             if met is not None:
                 objective += dr.select(met.active, weight * met.weight * met.radiance(), 0)
             if event is not None:
+                assert event.f is not None
                 towards = dr.detach(event.f * event.through * event.scale)
                 radiance = event.radiance(self.p.samples.scene, vertex.si)
                 objective += dr.select(event.active, weight * towards * radiance, 0)
@@ -208,7 +218,7 @@ class Tangent:
     """Derivatives along the parameters' tangents: of the product of the factors so far, and of the radiance, (C,)."""
 
     d_product: mi.Spectrum
-    dL: mi.Spectrum
+    d_radiance: mi.Spectrum
 
 
 class Tangents(CameraHooks):
@@ -226,7 +236,7 @@ class Tangents(CameraHooks):
     def vertex(
         self, state: Tangent, vertex: Vertex, met: Met | None, event: NextEvent | None, scattering: Scattering
     ) -> Tangent:  # fmt: skip
-        s, plan, P, dP, dL = self.samples, self.samples.plan, vertex.product.value(), state.d_product, state.dL
+        s, plan, P, dP, dL = self.samples, self.samples.plan, vertex.product.value(), state.d_product, state.d_radiance
         si, bsdf, zero = vertex.si, vertex.bsdf, mi.Spectrum(0)
         through, d_through = mi.Spectrum(1), zero
         if event is not None and plan.needs.has_null:
@@ -242,6 +252,7 @@ class Tangents(CameraHooks):
         if met is not None:
             dL = dL + dr.select(met.active, (dP * met.Le + P * dLe_h) * met.weight, 0)
         if event is not None:
+            assert event.f is not None
             f_c, Le = event.f, event.Le
             c = f_c * Le * through
             dc = (df_c * Le + f_c * dLe_n) * through + f_c * Le * d_through
@@ -253,4 +264,4 @@ class Tangents(CameraHooks):
 def splat_camera_tangents(samples: Samples, block: mi.ImageBlock) -> None:
     """Add the forward-mode derivative of the image of camera paths to the block."""
     first, state = camera_walk(samples, Tangents(samples))
-    samples.film.put(block, first.u, state.dL * first.weight, first.active)
+    samples.film.put(block, first.u, state.d_radiance * first.weight, first.active)

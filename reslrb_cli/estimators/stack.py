@@ -126,8 +126,10 @@ class Pushing(VertexHooks):
         own = PathAdjoint(dr.select(connected, delta * C.nonzero, 0), C)
         useful = vertex.active & plan.differentiates(vertex.bsdf)
         # Beyond the stack a second walk has the derivatives, those of masks before the sensor among them.
-        beyond = (state.first != 0) | (useful & (state.height >= self.size))
-        weight_c = adjoint_of_connection(p, vertex, connection, connected & ~beyond, own)
+        if plan.differentiate_null and vertices(plan) > self.size:
+            connected = connected & (state.first == 0) & ~(useful & (state.height >= self.size))
+        weight_c = adjoint_of_connection(p, vertex, connection, connected, own)
+        connected = connection.active
         return push(
             plan, state, self.size, vertex, useful, connection.wo, weight_c, scattering, [(delta, C, connected)]
         )

@@ -110,12 +110,18 @@ class WalkAd(LightTracer, Reversed):
         **LightTracer.OPTIONS,
         "attached": False,
         "filter_normalization": "attached",
+        "paths": "light",
+        "light_share": 0.5,
     }
     image_apart = False
 
-    def __init__(self, attached: bool = False, filter_normalization: str = "attached", **common: Any) -> None:
+    def __init__(
+        self, attached: bool = False, filter_normalization: str = "attached", paths: str = "light",
+        light_share: float = 0.5, **common: Any,
+    ) -> None:  # fmt: skip
         """`attached`: rays and film positions have their derivatives too."""
         super().__init__(motion=Motion(attached, filter_normalization), **common)
+        self.have_paths(paths, light_share)
 
     def graph(self, job: Job) -> mi.TensorXf:
         """The image (H, W, C) with its whole graph; to be called where gradients are enabled."""

@@ -16,7 +16,7 @@ from reslrb_cli.integrators.differentiated import Differentiated, Motion, attach
 from reslrb_cli.integrators.freezing import Recordings
 from reslrb_cli.scene.deformation import Surroundings
 from reslrb_cli.scene.graph import SceneGraph, emitted_rays, interpolates_normals
-from reslrb_cli.scene.needs import check_supported, scene_needs
+from reslrb_cli.scene.needs import check_paths, scene_needs
 from reslrb_cli.transport.aim import worthwhile
 from reslrb_cli.transport.densities import EmitterDensities
 from reslrb_cli.transport.emission import used_numbers
@@ -153,6 +153,10 @@ class Preparation:
         drawn = tuple(lamp for lamp in plan.needs.lamps if lamp.texture in which.emission_nodes)
         plan = replace(plan, evened_lamps=drawn)
         if which.shapes or which.emitters or self._motion.attached is True:
+            if self.paths != "light":  # from here on for images, too: those of one run are of one kind
+                self.paths = "light"
+                self._plans.clear()
+                return self.plan(scene, sensor, params, spp)
             plan = attach(plan, which, self._motion, scene, sensor)
         if plan.stays and self._motion.sampling == "auto" and not self._bounces_in(plan, scene, sensor):
             return replace(plan, stays=False, glossy_follows=False)
@@ -166,7 +170,7 @@ class Preparation:
 
     def _first_plan(self, scene: mi.Scene, sensor: mi.Sensor) -> Plan:
         """The plan of images for a sensor that is new."""
-        check_supported(scene, sensor, self._hide_emitters)
+        check_paths(scene, sensor, self.paths, self._hide_emitters)
         needs = scene_needs(scene, sensor)
         self._renewal = self._renewal or Renewal(scene)
         settle(scene)

@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 import drjit as dr
 import mitsuba as mi
 
+from reslrb_cli.estimators.camera import splat_camera_paths
 from reslrb_cli.estimators.kept import Before, segment_again
 from reslrb_cli.transport.bsdf import Scattering, evaluate, tracked_factor
 from reslrb_cli.transport.connection import Connection, forward_derivatives, passage, transmittance
@@ -97,7 +98,10 @@ class TangentSplat(Tangents):
         s, P, scattered = self.samples, vertex.product.value(), scattering.active
         if s.plan.needs.has_null:
             limit = s.plan.max_depth - vertex.depth - 1
-            through = transmittance(s.scene, vertex.si, connection.target, limit, connection.active, tangents=True)
+            through = transmittance(
+                s.scene, vertex.si, connection.target, limit, connection.active, tangents=True,
+                past_lamps=s.plan.passes_lamps,
+            )  # fmt: skip
             seen, passed, d_passed = through.reached, through.value, through.tangent[0]
         else:
             (seen, passed), d_passed = passage(s.plan, s.scene, vertex.si, vertex.depth, connection), mi.Spectrum(0)
@@ -203,4 +207,8 @@ def splat_tracked(samples: Samples, block: mi.ImageBlock) -> None:
         for u, C, active in moving_splats(samples):  # twice, so that the image stays as it is
             samples.film.put(block, u, C, active, samples.plan.attached_normalization)
             samples.film.put(block, dr.detach(u), -dr.detach(C), active)
-        walk(samples, TrackedSplat(samples, block, samples.plan.attached))
+        for side in samples.sides():
+            if side.plan.camera:
+                splat_camera_paths(side, block, tracked=True)
+            else:
+                walk(side, TrackedSplat(side, block, side.plan.attached))

@@ -33,7 +33,6 @@ from reslrb_cli.transport.samples import Samples, finish_pass, in_passes, passes
 from reslrb_cli.transport.visible import differentiate_visible_emission, splat_visible_emission
 from reslrb_cli.transport.walk import Splat, walk
 
-
 PATHS = ("light", "camera", "both")
 
 
@@ -103,6 +102,7 @@ class LightTracer:
     def have_paths(self, paths: str, light_share: float) -> None:
         """Have light paths, camera paths, or both, `light_share` of the samples being light paths; a share of 0 or 1
         leaves one kind of them."""
+        one_of("paths", paths, PATHS)
         if not 0 <= light_share <= 1:
             raise ValueError(f'"light_share" must lie in [0, 1], not {light_share}')
         if paths == "both" and light_share in (0, 1):
@@ -237,12 +237,16 @@ class Reslrb(LightTracer):
             raise ValueError(f'"estimator" must be one of {", ".join(ESTIMATORS)}, not "{estimator}"')
         kind = ESTIMATORS[estimator]
         own = {name: options.pop(name) for name in kind.OPTIONS if name in options}
+        if paths == "camera" and estimator != "stack":
+            raise ValueError(
+                f'"estimator" {estimator} chooses among the connections of light paths, of which paths: camera has '
+                "none; leave it out, or take stack"
+            )
         obstacle = None if kind.attaches else _no_attached(estimator)
         motion = Motion(attached, filter_normalization, obstacle, attached_sampling)
         for name, value, values in (
             ("guiding", guiding, ("on", "off")),
             ("sequence", sequence, ("independent", "low_discrepancy")),
-            ("paths", paths, PATHS),
         ):
             if value == "auto":
                 raise ValueError(

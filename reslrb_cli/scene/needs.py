@@ -148,6 +148,18 @@ def scene_needs(scene: Any, sensor: Any) -> SceneNeeds:
     )
 
 
+def check_paths(scene: Any, sensor: Any, paths: str, hide_emitters: bool = False) -> None:
+    """Raise UnsupportedScene, with the reason and the way out, where these paths (`light`, `camera`, `both`) cannot
+    render `scene`."""
+    if paths == "light":
+        check_supported(scene, sensor, hide_emitters)
+        return
+    if (obstacle := _film_obstacle(sensor) or camera_obstacle(scene, sensor, beside_light=paths == "both")) is not None:
+        raise UnsupportedScene(f"{obstacle}; take integrator.paths: light")
+    if paths == "both" and (obstacle := unsupported_part(scene, sensor) or _unsampled(scene)) is not None:
+        raise UnsupportedScene(f"{obstacle}; take integrator.paths: camera")
+
+
 def check_supported(scene: Any, sensor: Any, hide_emitters: bool = False) -> None:
     """Raise UnsupportedScene, with the reason and the way out, where light tracing cannot render `scene`."""
     if (obstacle := light_obstacle(scene, sensor, hide_emitters)) is not None:
@@ -174,16 +186,29 @@ def light_obstacle(scene: Any, sensor: Any, hide_emitters: bool = False) -> str 
     """The reason why light tracing cannot render `scene` for `sensor`; None where it can."""
     if (obstacle := unsupported_part(scene, sensor)) is not None:
         return obstacle
-    try:
-        emitted_rays(scene, mi.Float(0.5), mi.Point2f(0.5), mi.Point2f(0.5))
-    except UnsupportedScene as error:
-        return str(error)
+    if (obstacle := _unsampled(scene)) is not None:
+        return obstacle
     view, name = look(scene, sensor), sensor.id()
     if view.specular > 0 and view.smooth == 0 and (hide_emitters or view.emission == 0):
         return (
             f"only smooth specular surfaces (glass, mirrors) face sensor {name}: light paths cannot connect to it from "
             "them; let it see a rough surface"
         )
+    return None
+
+
+def _unsampled(scene: Any) -> str | None:
+    """The reason why Mitsuba cannot sample rays of some emitter; None where it can."""
+    try:
+        emitted_rays(scene, mi.Float(0.5), mi.Point2f(0.5), mi.Point2f(0.5))
+    except UnsupportedScene as error:
+        return str(error)
+    return None
+
+
+def _film_obstacle(sensor: Any) -> str | None:
+    if sensor.film().class_name() != "HDRFilm":
+        return f"sensor {sensor.id()} has a {sensor.film().class_name()}; paths are splatted on an `hdrfilm`"
     return None
 
 
@@ -196,18 +221,22 @@ def stock_clip(needs: SceneNeeds) -> str | None:
     return None
 
 
-def camera_obstacle(scene: Any, sensor: Any) -> str | None:
-    """The reason why paths from `sensor` cannot render `scene`, without tracing a ray; None where they can."""
+def camera_obstacle(scene: Any, sensor: Any, beside_light: bool = False) -> str | None:
+    """The reason why paths from `sensor` cannot render `scene`, without tracing a ray; None where they can.
+
+    `beside_light`: what they cannot find is left to light paths.
+    """
     graph = SceneGraph.of(scene)
     if (obstacle := _unknown_part(scene, sensor, graph)) is not None:
         return obstacle
     for emitter in scene.emitters():
-        if emitter.class_name() == "DirectionalArea":
+        if emitter.class_name() == "DirectionalArea" and not beside_light:
             what = "which camera paths cannot find and `prb` cannot evaluate"
             return f"emitter {emitter.id()} is a `directionalarea`, {what}"
     half, si = mi.Point2f(0.5), _somewhere()
     calls = [(f"send rays from sensor {sensor.id()}", partial(sensor.sample_ray_differential, 0, 0.5, half, half))]
-    for emitter in _one_of_a_kind(graph, scene.emitters()):
+    found = [emitter for emitter in scene.emitters() if emitter.class_name() != "DirectionalArea"]
+    for emitter in _one_of_a_kind(graph, found):
         calls.append((f"find emitter {emitter.id()} from a surface", partial(emitter.sample_direction, si, half)))
     return _first_failure(calls)
 
@@ -219,8 +248,8 @@ def unsupported_part(scene: Any, sensor: Any) -> str | None:
         return obstacle
     if sensor.class_name() not in SENSORS:
         return f"sensor {name} is a {sensor.class_name()}; light paths connect to `perspective` and `thinlens` sensors"
-    if sensor.film().class_name() != "HDRFilm":
-        return f"sensor {name} has a {sensor.film().class_name()}; light paths are splatted on an `hdrfilm`"
+    if (obstacle := _film_obstacle(sensor)) is not None:
+        return obstacle
     for bsdf in graph.of_type(mi.BSDF):
         if (plugin := _ONE_WAY.get(bsdf.class_name())) is not None:
             why = "which is not the same with light and view exchanged: light paths would render another material"

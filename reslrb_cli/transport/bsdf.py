@@ -20,6 +20,7 @@ which is the adjoint BSDF by definition, and needs neither p nor reciprocity.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -135,25 +136,31 @@ class Scattering:
     sample_1: mi.Float
     sample_2: mi.Point2f
     active: mi.Bool
-    ways: Ways | None = None
+    own_ways: Ways | None = None
+
+    @property
+    def ways(self) -> Ways:
+        """What weights are made of, in walks that have any."""
+        assert self.own_ways is not None
+        return self.own_ways
 
 
 @dataclass
 class Ways:
-    """What weights are made of (`weights.py`): densities of directions at a vertex, as solid angle, where they are asked
-    for; else None.
+    """What weights are made of (`weights.py`): densities of directions at a vertex, of solid angle; 0 where
+    nobody asks.
 
-    `p` is that of the sampled direction, `back` that of the way back in the other side's walk; `ahead` and `ahead_back`
-    the same of the connection, or the next event. `valid` and `ahead_valid`: both directions lie on consistent sides, as
-    light paths ask for.
+    `p` is that of the sampled direction, `back` that of the way back in the other side's walk; `ahead` and
+    `ahead_back` the same of the connection, or the next event. `valid` and `ahead_valid`: both directions lie on
+    consistent sides, as light paths ask for.
     """
 
     p: mi.Float
-    back: mi.Float | None = None
-    ahead: mi.Float | None = None
-    ahead_back: mi.Float | None = None
-    valid: mi.Bool | bool = True
-    ahead_valid: mi.Bool | bool = True
+    back: mi.Float
+    ahead: mi.Float
+    ahead_back: mi.Float
+    valid: mi.Bool
+    ahead_valid: mi.Bool
 
 
 def mixes(plan: Plan) -> bool:
@@ -231,25 +238,27 @@ def shading_correction(
 
 def scatter(
     plan: Plan, hit: Hit, sample_1: mi.Float, sample_2: mi.Point2f, active: mi.Bool, connection_wo: mi.Vector3f,
-    connected: mi.Bool | None, attached: bool = False, aimed: Aimed | None = None,
+    connected: mi.Bool | None, attached: bool = False, aimed: Aimed | None = None, weighed: mi.Bool | None = None,
 ) -> tuple[Scattering, mi.Spectrum | None]:  # fmt: skip
     """Sample the next direction, and evaluate f (C,) towards `connection_wo` in `connected` lanes (None: in no lane).
 
     Detached, unless `attached`; `bsdf.py` has the derivatives of the factors alone. Both queries share one
     indirect call, and in it what they have in common (looking up textures, mostly). Lanes that are `aimed` have the
-    direction of their point, and the BSDF's own density of it.
+    direction of their point, and the BSDF's own density of it. In `weighed` lanes the densities of that direction are
+    asked for (`Ways`).
     """
     si, bsdf, context, drawn = hit.si, hit.bsdf, context_of(plan), sample_1
-    weighed = plan.camera or plan.weighs
-    later = weighed and (mixes(plan) or aimed is not None)  # the direction is not the BSDF's own
-    densities: tuple[mi.Float, ...] = ()
+    ways_asked = plan.camera or plan.weighs
+    later = ways_asked and (mixes(plan) or aimed is not None)  # the direction is not the BSDF's own
+    densities: Sequence[mi.Float] = ()
 
     def both(
         self: mi.BSDF, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, sample_1: mi.Float, sample_2: mi.Point2f,
         connected: mi.Bool, active: mi.Bool, any_: mi.Bool,
     ) -> tuple[Any, ...]:  # fmt: skip
         bs, weight = self.sample(context, si, sample_1, sample_2, active)
-        ways = _ways(plan, si, self, wo, connected, bs.wo, bs.pdf, active) if weighed and not later else ()
+        here = None if weighed is None else connected  # nothing from outside of the call
+        ways = _ways(plan, si, self, wo, here, bs.wo, bs.pdf, active) if ways_asked and not later else ()
         return evaluate(plan, si, self, wo, connected), bs.wo, bs.pdf, bs.eta, bs.sampled_type, weight, *ways
 
     with dr.suspend_grad(when=not attached):
@@ -274,11 +283,12 @@ def scatter(
         d = si.to_world(wo)
         correction, valid = shading_correction(plan, si, -hit.ray.d, d, wo)
         ways = None
-        if weighed:
+        if ways_asked:
             if later or connected is None:
-                densities = _ways(plan, si, bsdf, connection_wo, connected, wo, pdf, active)
+                densities = _ways(plan, si, bsdf, connection_wo, weighed, wo, pdf, active)
             _, ahead_valid = shading_correction(plan, si, -hit.ray.d, si.to_world(connection_wo), connection_wo)
-            ways = Ways(*(dr.detach(value) for value in densities), valid, ahead_valid)
+            p, back, ahead, ahead_back = (dr.detach(value) for value in densities)
+            ways = Ways(p, back, ahead, ahead_back, valid, ahead_valid)
         if plan.camera:
             valid = mi.Bool(True)
         is_null = mi.has_flag(lobe, mi.BSDFFlags.Null) if plan.needs.has_null else mi.Bool(False)
@@ -302,7 +312,7 @@ def scatter(
             sample_1=drawn,
             sample_2=sample_2,
             active=active & valid & (pdf > 0),
-            ways=ways,
+            own_ways=ways,
         )
         return scattering, f_connection
 
@@ -364,8 +374,8 @@ def _defensive(sample_1: mi.Float) -> tuple[mi.Bool, mi.Float]:
 
 
 def _mixed(
-    plan: Plan, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, sample_2: mi.Point2f, defensive: mi.Bool, active: mi.Bool,
-    sample: Sample,
+    plan: Plan, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, sample_2: mi.Point2f, defensive: mi.Bool,
+    active: mi.Bool, sample: Sample,
 ) -> Sample:  # fmt: skip
     """A BSDF's sample, replaced by one of the cosine-weighted hemisphere in `defensive` lanes; the mixture's density.
 

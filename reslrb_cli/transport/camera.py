@@ -86,7 +86,7 @@ class Met:
         return self.emitter.eval(self.si, self.active)
 
 
-@dataclass
+@dataclass(kw_only=True)
 class NextEvent(Connection):
     """A connection of a camera path's vertex to a point on an emitter, or a direction of one.
 
@@ -95,14 +95,23 @@ class NextEvent(Connection):
     emitter.
     """
 
-    Le: mi.Spectrum | None = None
-    through: mi.Spectrum | None = None
-    scale: mi.Float | None = None
-    ds: mi.DirectionSample3f | None = None
+    Le: mi.Spectrum
+    scale: mi.Float
+    ds: mi.DirectionSample3f
+    through: mi.Spectrum
+    unseen: frozenset[mi.Emitter]  # emitters that cannot be asked for what arrives from them
 
     def radiance(self, scene: mi.Scene, si: mi.SurfaceInteraction3f) -> mi.Spectrum:
         """The radiance that arrives, with its derivative where there is any."""
-        return scene.eval_emitter_direction(si, self.ds, self.active)
+        if not self.unseen:
+            return scene.eval_emitter_direction(si, self.ds, self.active)
+
+        def radiance(
+            emitter: mi.Emitter, si: mi.SurfaceInteraction3f, ds: mi.DirectionSample3f, active: mi.Bool
+        ) -> mi.Spectrum:
+            return mi.Spectrum(0) if emitter in self.unseen else emitter.eval_direction(si, ds, active)
+
+        return dr.dispatch(self.ds.emitter, radiance, si, self.ds, self.active)
 
 
 class CameraHooks:
@@ -172,7 +181,9 @@ def camera_walk(samples: Samples, hooks: CameraHooks, active: mi.Bool | bool = T
         return pi, active
 
     if plan.hide_emitters:
+        begun = first.ray.o
         first.ray = _behind_lamps(scene, first.ray, active)
+        first.near = first.near + dr.norm(first.ray.o - begun)
     pi, active = intersect(first.ray, active)
     M, rivals = [mi.Float(0)], []
     if plan.weighs:
@@ -201,7 +212,7 @@ def camera_walk(samples: Samples, hooks: CameraHooks, active: mi.Bool | bool = T
         scattered = active & goes_on & (path.depth + 1 <= plan.max_depth - int(not plan.needs.has_visible_emitters))
         wo = mi.Vector3f(0) if event is None else event.wo
         connected = None if event is None else event.active
-        scattering, f = scatter(plan, vertex, bsdf_1d, bsdf_2d, scattered, wo, connected)
+        scattering, f = scatter(plan, vertex, bsdf_1d, bsdf_2d, scattered, wo, connected, weighed=connected)
         arrived = [own.arrive(si, path.ray) for own in path.rivals]
         if hooks.tracked:
             tracked = tracked_factor(plan, si, bsdf, scattering, scattering.active)
@@ -291,6 +302,7 @@ def _meet(samples: Samples, path: CameraPath, si: mi.SurfaceInteraction3f) -> Me
         else:
             [own] = path.rivals
             table = samples.emitters
+            assert table is not None
             choice = dr.gather(mi.Float, table.choice, dr.reinterpret_array(mi.UInt32, emitter), indirect)
             place = p_D / choice
             if plan.needs.lamps:
@@ -307,10 +319,11 @@ def _next_event(
 ) -> NextEvent:  # fmt: skip
     """A point on an emitter, or a direction of one; `weight` and `scale` are not weighed yet."""
     scene = samples.scene
+    unseen = frozenset(lamp.emitter for lamp in samples.plan.needs.lamps if lamp.parallel)
     active = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
     with dr.suspend_grad():
-        if any(lamp.parallel for lamp in samples.plan.needs.lamps):
-            ds, weight = _sample_some(samples, si, numbers, active)
+        if unseen:
+            ds, weight = _sample_some(samples, unseen, si, numbers, active)
         else:
             ds, weight = scene.sample_emitter_direction(si, numbers, False, active)
     active = active & (ds.pdf > 0)
@@ -318,15 +331,16 @@ def _next_event(
     return NextEvent(
         weight, zero, ds.p, si.to_local(ds.d), active, zero,
         Le=dr.select(active, weight * ds.pdf, 0), scale=dr.select(active, dr.rcp(ds.pdf), 0), ds=ds,
+        through=mi.Spectrum(1), unseen=unseen,
     )  # fmt: skip
 
 
 def _sample_some(
-    samples: Samples, si: mi.SurfaceInteraction3f, numbers: mi.Point2f, active: mi.Bool
+    samples: Samples, unseen: frozenset[mi.Emitter], si: mi.SurfaceInteraction3f, numbers: mi.Point2f,
+    active: mi.Bool,
 ) -> tuple[mi.DirectionSample3f, mi.Spectrum]:  # fmt: skip
     """What `sample_emitter_direction` does, where a scene has emitters that cannot be sampled so."""
     scene = samples.scene
-    unseen = {lamp.emitter for lamp in samples.plan.needs.lamps if lamp.parallel}
     index, weight, reused = scene.sample_emitter(numbers.x, active)
     emitter = dr.gather(mi.EmitterPtr, scene.emitters_dr(), index, active)
 
@@ -353,6 +367,7 @@ def _weigh(
     if arrived:
         [own] = arrived
         table = samples.emitters
+        assert table is not None
         choice = dr.gather(mi.Float, table.choice, dr.reinterpret_array(mi.UInt32, ds.emitter), event.active)
         place, g = ds.pdf / choice, mi.Float(1)
         if plan.needs.lamps:
@@ -381,7 +396,7 @@ def _behind(
     null = scattering.is_null
     M = [dr.select(scattering.is_delta, 0, renewed) for _ in path.M]
     rivals = []
-    for own, here in zip(path.rivals, arrived, strict=True):
+    for here in arrived:
         m = dr.select(path.events == 0, here.M, here.V * ways.back)
         # Light paths go through none of the vertices at which directions lie on inconsistent sides.
         m = dr.select(ways.valid, m, 0)

@@ -45,14 +45,14 @@ class Passage:
 def transmittance(
     scene: mi.Scene, start: mi.Interaction3f, target: mi.Point3f, limit: mi.UInt32, active: mi.Bool,
     on_crossing: Callable[[mi.Spectrum, mi.Bool], None] | None = None, loop_mode: str = "symbolic",
-    tangents: bool = False,
+    tangents: bool = False, past_lamps: bool = False,
 ) -> Passage:  # fmt: skip
     """Follow the segment from the interaction `start` to the point `target` through at most `limit` null surfaces.
 
     Each crossing counts as a vertex, as it does for `path`. `on_crossing(transmission, active)` is called at each one
     with its transmission (C,), tracked where gradients are enabled, to take its derivative there and then.
     With `tangents`, the derivative along the parameters' tangents is carried along (forward mode); call it where
-    gradients are suspended then, since the loop itself must not track any.
+    gradients are suspended then, since the loop itself must not track any. `past_lamps`: those are no obstacle.
     """
 
     def body(passage: Passage, ray: mi.Ray3f) -> tuple[Passage, mi.Ray3f]:
@@ -68,11 +68,16 @@ def transmittance(
         tangent = passage.tangent
         if tangents:
             tangent = [dr.select(hit, tangent[0] * transmission + passage.value * d_transmission, tangent[0])]
-        blocked = hit & (dr.all(transmission == 0) | (passage.crossings >= limit))
+        lamp = mi.Bool(False)
+        if past_lamps:
+            lamp = hit & (si.emitter(scene) != dr.zeros(mi.EmitterPtr))
+            transmission = dr.select(lamp, 1, transmission)
+            tangent = [dr.select(lamp, passage.tangent[0], own) for own in tangent]
+        blocked = hit & ~lamp & (dr.all(transmission == 0) | (passage.crossings >= limit))
         state = Passage(
             active=hit & ~blocked,
             value=dr.select(hit, passage.value * transmission, passage.value),
-            crossings=passage.crossings + dr.select(hit, mi.UInt32(1), 0),
+            crossings=passage.crossings + dr.select(hit & ~lamp, mi.UInt32(1), 0),
             reached=passage.reached | (passage.active & ~hit),
             tangent=tangent,
         )
@@ -110,7 +115,7 @@ class Connection:
     sample: mi.Point2f  # of the aperture
     f: mi.Spectrum | None = None
     c: mi.Spectrum | None = None
-    p_camA: mi.Float | None = None  # the density of area here of the camera paths of a pixel, where paths are weighed
+    p_cam: mi.Float | None = None  # the density of area here of the camera paths of a pixel, where paths are weighed
 
 
 def connect(
@@ -133,11 +138,11 @@ def connect(
         correction, valid = mi.Float(1), mi.Bool(True)
         if ray is not None:
             correction, valid = shading_correction(plan, si, -ray.d, ds.d, wo)
-        p_camA = None
+        p_cam = None
         if plan.weighs:
             cos = -dr.dot(ds.d, dr.normalize(ds.n))
-            p_camA = film_density(sensor, cos) * dr.abs(dr.dot(si.n, ds.d)) / dr.square(ds.dist)
-        return Connection(importance * correction, ds.uv, target, wo, active & valid & sees, sample, p_camA=p_camA)
+            p_cam = film_density(sensor, cos) * dr.abs(dr.dot(si.n, ds.d)) / dr.square(ds.dist)
+        return Connection(importance * correction, ds.uv, target, wo, active & valid & sees, sample, p_cam=p_cam)
 
 
 def _clip(plan: Plan, sensor: mi.Sensor, ds: mi.DirectionSample3f) -> tuple[mi.Bool, mi.Point3f]:
@@ -200,9 +205,14 @@ def passage(
     naive AD needs it evaluated.
     """
     active, one = connection.active, mi.Spectrum(1)
-    if plan.needs.has_null:
+    past_lamps = plan.passes_lamps
+    if past_lamps:  # where camera rays begin behind them
+        active = active & (si.emitter(scene) == dr.zeros(mi.EmitterPtr))
+    if plan.needs.has_null or past_lamps:
         limit = plan.max_depth - depth - 1
-        through = transmittance(scene, si, connection.target, limit, active, loop_mode=loop_mode)
+        through = transmittance(
+            scene, si, connection.target, limit, active, loop_mode=loop_mode, past_lamps=past_lamps
+        )
         return through.reached, through.value
     if seen is None:
         return active & ~scene.ray_test(si.spawn_ray_to(connection.target), active), one

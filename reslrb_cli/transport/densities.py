@@ -1,6 +1,7 @@
 """Densities of the rays that a scene's emitters send out, known of any ray, and not of those alone that were sampled.
 
-Mitsuba has none: they are those of its own `sample_ray`, and of the rays that are placed here (`emission.py`, `lamps.py`).
+Mitsuba has none: they are those of its own `sample_ray`, and of the rays that are placed here (`emission.py`,
+`lamps.py`).
 
     lamp                 choice / area * cos / pi;  textured, in proportion to its texture
     constant, map, sky   choice p(d) / (pi r^2)         r: of the sphere around the scene
@@ -132,6 +133,7 @@ def density_of_rays(plan: Plan, table: EmitterDensities, at: Place, active: mi.B
 
 
 def _constant_environment(plan: Plan) -> bool:
+    assert plan.needs.environment is not None
     return plan.needs.emitters[plan.needs.environment] == "ConstantBackgroundEmitter"
 
 

@@ -156,6 +156,11 @@ class Plan:
         return self.paths == "both"
 
     @property
+    def passes_lamps(self) -> bool:
+        """Whether connections to the sensor pass lamps, which are hidden from its rays."""
+        return self.weighs and self.hide_emitters and not self.camera and bool(self.needs.lamps)
+
+    @property
     def samples_emitters(self) -> bool:
         """Whether there is an emitter that next event estimation can find."""
         return any(name != "DirectionalArea" for name in self.needs.emitters)

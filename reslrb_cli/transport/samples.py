@@ -252,8 +252,9 @@ def passes(
     """All samples of an image, in passes of `spp_per_pass` samples per pixel, which must divide `spp`, or less.
 
     The first pass has the seed itself, so that it traces what `ptracer` does. With a `table`, which belongs to the
-    plan's grid, emission is drawn from that. Of the samples of each pass `light_share` are light paths where the plan has
-    both kinds of paths, and then the `emitters` have their densities. Raises ValueError for too many passes, or paths in one pass.
+    plan's grid, emission is drawn from that. Of the samples of each pass `light_share` are light paths where the plan
+    has both kinds of paths, and then the `emitters` have their densities. Raises ValueError for too many passes, or
+    paths in one pass.
     """
     unit = spp if spp_per_pass is None else min(spp_per_pass, spp)
     if spp % unit:
@@ -267,7 +268,7 @@ def passes(
     others = [mi.sample_tea_32(mi.UInt32(seed), mi.UInt32(PASS_STREAM + p))[0] for p in range(1, len(sizes))]
     seeds = [mi.UInt32(seed), *others]
     dr.make_opaque(seeds)
-    film, pixels = Film(sensor, plan.paths != "light"), int(dr.prod(sensor.film().size()))  # not the crop's, as for `ptracer`
+    film, pixels = Film(sensor, plan.paths != "light"), int(dr.prod(sensor.film().size()))  # as for `ptracer`
     # Opaque: as literals these would give every sample count kernels of its own.
     scale = dr.opaque(mi.Float, float(dr.prod(film.size)) / (float(pixels) * spp))
 
@@ -322,7 +323,8 @@ def _of_both(
     dr.make_opaque(scale)
     guide, net = None if table is None else Guide.of(table, width), None if plan.sequence is None else Net.of(width)
     camera = replace(camera, ratio=ratio, emitters=emitters)
-    return Samples(scene, sensor, plan, film, mi.UInt32(0), spp, width, scale, fraction, guide, net, ratio, emitters, camera)
+    own = scale, fraction, guide, net, ratio, emitters, camera
+    return Samples(scene, sensor, plan, film, mi.UInt32(0), spp, width, *own)
 
 
 def _parts(spp: int) -> list[int]:

@@ -165,8 +165,9 @@ def segment(
     connection = connect(plan, samples.sensor, si, hit.ray, numbers.aperture, connected, attached)
     wanted = connection.active if evaluates and not tracked else None
     scattering, connection.f = scatter(
-        plan, hit, numbers.bsdf_1d, numbers.bsdf_2d, scattered, connection.wo, wanted, attached, aimed
-    )
+        plan, hit, numbers.bsdf_1d, numbers.bsdf_2d, scattered, connection.wo, wanted, attached, aimed,
+        connection.active if plan.weighs else None,
+    )  # fmt: skip
     if tracked and not attached:
         f = tracked_factor(plan, si, hit.bsdf, scattering, scattering.active)
         scattering.weight = dr.replace_grad(scattering.weight, f * (scattering.correction / scattering.pdf))
@@ -249,7 +250,7 @@ def walk(samples: Samples, hooks: Hooks, active: mi.Bool | bool = True) -> Any:
         for before_here in path.rivals:  # one, or none
             arrived = before_here.arrive(si, path.ray)
             ways, cos = scattering.ways, cosine(si, scattering.d)
-            connection.weight *= weight_of_connection(arrived, connection.p_camA, samples.ratio, ways.ahead_back)
+            connection.weight *= weight_of_connection(arrived, connection.p_cam, samples.ratio, ways.ahead_back)
             behind = arrived.after(mi.Float(0), arrived.M + arrived.V * ways.back, scattering, cos)
             rivals = [dr.select(scattering.is_null, before_here.after_null(arrived), behind)]
         if hooks.connects:

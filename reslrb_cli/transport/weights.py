@@ -108,7 +108,7 @@ def leave_emitter(plan: Plan, table: EmitterDensities, scene: mi.Scene, emission
         if lamp is not None and not lamp.parallel:
             si, weight = lamp_point(lamp, None, time, position, active, lamp in plan.evened_lamps)
             own = dr.rcp(weight)
-            if lamp in plan.evened_lamps:
+            if lamp.texture is not None and lamp in plan.evened_lamps:
                 there = lamp.shape.eval_parameterization(si.uv, mi.RayFlags.All, active)
                 own = lamp.texture.pdf_position(si.uv, active) / dr.norm(dr.cross(there.dp_du, there.dp_dv))
                 own = dr.select(dr.isfinite(own), own, 0)
