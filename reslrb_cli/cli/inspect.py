@@ -439,5 +439,5 @@ def sampling_of(subject: Subject, option: str) -> tuple[str, str]:
     try:
         record = kind.from_json(dict((subject.run or {}).get(name) or {}))
     except (TypeError, ValueError):  # there is no run yet, or its manifest is damaged
-        return UNDECIDED[option], f"{option}: auto, which a run decides by measurement"
+        return str(UNDECIDED[option]), f"{option}: auto, which a run decides by measurement"
     return record.setting, f"{option}: auto, {record.why()}"

@@ -89,7 +89,12 @@ ESTIMATOR_OPTIONS: dict[str, tuple[str, ...]] = {
 }
 
 #: Those that `auto` leaves to measurement beside any estimator, with what they are where nothing is measured.
-UNDECIDED: dict[str, str] = {"guiding": "off", "sequence": "independent"}
+UNDECIDED: dict[str, str | float] = {
+    "paths": "light",
+    "light_share": 0.5,
+    "guiding": "off",
+    "sequence": "independent",
+}
 
 #: Every option that says which estimator, and how.
 _ANY_ESTIMATORS = {"estimator", *(option for options in ESTIMATOR_OPTIONS.values() for option in options)}
@@ -123,6 +128,20 @@ class Reslrb(AttachingTracer):
     stack_size: Count = 64
     """Vertices of a path that fit into thread-local memory; longer paths are traced a second time. Only with estimator
     `stack`."""
+    paths: Literal["auto", "light", "camera", "both"] = "auto"
+    """Where paths begin. `light`: at the emitters, which finds caustics and light through glass, but shows mirrors and
+    clear glass black; `camera`: at the sensor, which finds what mirrors and glass show, and most light of rooms, but no
+    caustics of small lamps (with estimators `auto` and `stack`); `both`: each path is weighed by how likely either
+    side was to find it, so that the image has all light. `auto`: where a few steps of each, before the first iteration,
+    show which is the most efficient here. What moves light has light paths alone. Left out it is `auto` with estimator
+    `auto`, and `light` with one that is named."""
+    light_share: Annotated[
+        Annotated[float, Field(ge=0, le=1, allow_inf_nan=False), mark("number")]
+        | Annotated[Literal["auto"], mark("text")],
+        Discriminator(lambda value: MARK + ("text" if isinstance(value, str) else "number")),
+    ] = "auto"
+    """Which share of the samples are light paths where `paths` are `both`; with 0 or 1 nothing of the other side is
+    compiled. `auto`: measured with the choice of paths; 0.5 with an estimator that is named."""
     guiding: Literal["auto", "on", "off"] = "auto"
     """Whether light paths start where those of earlier steps had something to say about gradient and image, at least a
     quarter of them anywhere, and end where those had little left to say; in scenes with glossy surfaces they are also
@@ -157,6 +176,14 @@ class Reslrb(AttachingTracer):
                 f"{self.stack_size} vertices need as many places of thread-local memory, which has no more than "
                 f"{LOCAL_ENTRIES}; leave it at 64: longer paths are traced a second time, and nothing of them is lost",
             )
+        if self.paths == "camera" and self.estimator not in ("auto", "stack"):
+            raise located(
+                "estimator",
+                f"`{self.estimator}` chooses among the connections of light paths, of which paths: camera has none; "
+                "leave it out, or take stack",
+            )
+        if self.light_share not in ("auto", UNDECIDED["light_share"]) and self.paths in ("light", "camera"):
+            raise located("light_share", f"has no effect with paths: {self.paths}, but with both; remove it")
         for option in sorted(self._foreign() & self.model_fields_set):
             owners = " or ".join(f"`{name}`" for name, options in ESTIMATOR_OPTIONS.items() if option in options)
             raise located(option, f"has no effect with estimator `{self.estimator}`, but with {owners}; remove it")

@@ -29,6 +29,7 @@ from reslrb_cli.transport.sobol import make_coordinates
 GUIDED = "guided emission"
 
 #: And that which evenly spread numbers are.
+PATHS_FROM = "camera paths"
 SEQUENCE = "low-discrepancy numbers"
 
 #: Kinds of parameters that features come with.
@@ -154,6 +155,12 @@ def _guided(plan: Plan) -> Plan:
     return replace(plan, grid=grid_for([True] * 4, [1.0] * len(plan.needs.emitters), 1))
 
 
+def _paths(plan: Plan) -> Plan | str:
+    if plan.attached:
+        return "what moves light has light paths alone"
+    return replace(plan, paths="light" if plan.paths != "light" else "camera")
+
+
 def _sequence(plan: Plan) -> Plan:
     if plan.sequence is not None:
         return replace(plan, sequence=None)
@@ -232,6 +239,7 @@ FEATURES = (
             lambda p: "what Mitsuba makes of them is wrong" if p.placed_lamps else "there are none"),
     Feature("black texels of lamps", lambda p: bool(p.evened_lamps), "drawn too, since their derivative counts",
             "no texture of a lamp is differentiated: texels are drawn by their radiance", _evened),
+    Feature(PATHS_FROM, lambda p: p.paths != "light", lambda p: f"paths: {p.paths}", "paths: light", _paths),
     Feature(GUIDED, lambda p: p.grid is not None, _tables, "guiding: off", _guided),
     Feature("aimed scattering", lambda p: p.aimed, "a quarter of scattered paths go where the sensor looks",
             "only guided paths are, in scenes with glossy surfaces, where nothing moves", _aimed),
@@ -322,8 +330,10 @@ def count(integrator: Reslrb, plan: Plan, scene: mi.Scene, sensor: mi.Sensor, kn
     """Operations of each large kernel of a step by this plan."""
     with dr.suspend_grad():
         table = None if plan.grid is None else even_table(plan.grid, film_blocks(sensor) if plan.aimed else None)
-        [samples] = passes(plan, scene, sensor, 0, 1, None, table)
-        samples = replace(samples, width=PATHS)
+        emitters = integrator.preparation.emitters(scene) if plan.weighs else None
+        [samples] = passes(plan, scene, sensor, 0, 1, None, table, integrator.light_share, emitters)
+        camera = samples.camera and replace(samples.camera, width=PATHS)
+        samples = replace(samples, width=PATHS, camera=camera)
         channels = samples.film.film.base_channels_count()
         size = samples.film.size
         gradient = dr.full(mi.TensorXf, 1.0, (int(size.y), int(size.x), int(channels)))

@@ -1,6 +1,7 @@
 """The findings of a run: what it measured before its first iteration, as manifest, checkpoints and the cache have it.
 
 EstimatorRecord                the most efficient estimator, and how each that was tried did
+PathsRecord                    from which side paths are traced
 GuidedRecord, SequenceRecord   ways of drawing samples that were left to measurement: whether they pay
 RivalRecord                    another integrator that would have been the better choice
 """
@@ -143,6 +144,25 @@ class PaidRecord(Finding):
 
     def why(self) -> str:
         return _times(self.gain, self.low, self.high, self.note)
+
+
+@dataclass(frozen=True, kw_only=True)
+class PathsRecord(PaidRecord):
+    """Of where paths begin: `paths` (light, camera, both), of which `light_share` are light paths where both are.
+
+    The gain is that over light paths alone.
+    """
+
+    paths: str
+    light_share: float = 0.5
+
+    @property
+    def setting(self) -> str:
+        return self.paths
+
+    def decision(self) -> str:
+        share = f", {100 * self.light_share:.3g} % light paths" if self.paths == "both" else ""
+        return f"paths {self.paths}{share}"
 
 
 @dataclass(frozen=True, kw_only=True)
