@@ -17,7 +17,6 @@ from __future__ import annotations
 
 import math
 import statistics
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -131,6 +130,7 @@ def settle_estimator(tuner: race.Tuner, options: Sequence[Candidate]) -> None:
         return
     problem, chosen = tuner.problem, options[0]
     if len(options) > 1 and chosen.options:
+        later = [need for option, need in race.LATER.items() if race.is_auto(problem.config, option)]
 
         def usual(note: str) -> EstimatorRecord:
             """It has been the best, or within a few percent of it, wherever that was measured (docs/benchmarks.md)."""
@@ -140,7 +140,8 @@ def settle_estimator(tuner: race.Tuner, options: Sequence[Candidate]) -> None:
         pilot = tuner.decide(
             EstimatorRecord,
             of={},
-            needs=(race.ESTIMATOR_NEEDS, *(race.LATER[option][0] for option in _later(problem.config))),
+            needs=(race.ESTIMATOR_NEEDS, *later),
+            later=later,
             integrator=options[0].integrator,
             measure=lambda allowance: run_pilot(problem, options, allowance),
             unmeasured=usual,
@@ -151,11 +152,6 @@ def settle_estimator(tuner: race.Tuner, options: Sequence[Candidate]) -> None:
     tuner.take(integrator=chosen.integrator, memory=chosen.memory)
     if chosen.memory is not None:
         tuner.take(samples_per_pass=chosen.memory.samples_per_pass)
-
-
-def _later(config: Config) -> list[str]:
-    """The options that are measured once the estimator is settled."""
-    return [option for option in race.LATER if race.is_auto(config, option)]
 
 
 # --- the pilot --------------------------------------------------------------------------------------------------------
@@ -189,17 +185,10 @@ def run_pilot(problem: Problem, options: Sequence[Candidate], allowance: Allowan
     if problem.samples_per_pass is not None:  # the user's own passes
         unit = sets * min(problem.samples_per_pass, run.spp // sets)
     # What is measured later has its part of what it may cost; guiding leaves some of its own for the sequence.
-    later = [race.LATER[option] for option in _later(problem.config)]
-    reserved = max((share for _, share in later), default=0.0)
-    kernels, began = sum(needs[0] for needs, _ in later), time.perf_counter()
-    share = min(race.SHARE, allowance.iterations_left(race.ESTIMATOR_NEEDS[0] + kernels) / race.ITERATIONS) - reserved
-
-    def compiles() -> bool:
-        """Whether there is time for the kernels of one more candidate, with those of what is measured later."""
-        spent = replace(allowance, spent_s=allowance.spent_s + time.perf_counter() - began)
-        return spent.affords((1 + kernels, reserved * race.ITERATIONS))
-
-    return Pilot(options, step, run.spp, unit, share, compiles).run()
+    later = [iterations for option, (_, iterations) in race.LATER.items() if race.is_auto(problem.config, option)]
+    share = race.SHARE - max(later, default=0.0) / race.ITERATIONS
+    share = min(share, allowance.iterations_left(race.ESTIMATOR_NEEDS[0]) / race.ITERATIONS)
+    return Pilot(options, step, run.spp, unit, share, allowance).run()
 
 
 def sample_variance(values: list[Array]) -> float:
@@ -219,6 +208,8 @@ DROPPED = ((2, 1.5), (4, 1.25))
 MOST_ROUNDS = 12
 #: Share of a step's other costs that kernels may have for nothing.
 FREE = 0.25
+#: All the time that is wanted.
+AMPLE = Allowance(1.0, run_s=math.inf, compile_s=0.0, iteration_s=0.0)
 
 
 @dataclass(eq=False)
@@ -242,7 +233,7 @@ class Pilot(race.Race):
     """One pilot. `step(candidate, round, spp)` takes a step; equal rounds have equal seeds.
 
     `spp` are those of the run, of which the pilot uses a multiple of `unit`, and `share` is what it may cost of one.
-    `compiles` says whether there is time for the kernels of one more candidate.
+    Nothing is begun that `allowance` has no time for.
     """
 
     def __init__(
@@ -252,13 +243,13 @@ class Pilot(race.Race):
         spp: int,
         unit: int = 1,
         share: float = race.SHARE,
-        compiles: Callable[[], bool] = lambda: True,
+        allowance: Allowance = AMPLE,
     ) -> None:
         super().__init__()
         labels = {candidate.label for candidate in candidates}
         # What a budget of memory left out says nothing of others.
         self._candidates = [c if c.parent in {None, *labels} else replace(c, parent=None) for c in candidates]
-        self._step, self._share, self._compiles = step, share, compiles
+        self._step, self._share, self._allowance = step, share, allowance
         self._spp, self._unit, self._pilot_spp = spp, unit, unit
         self._entries: list[_Entry] = []
         self._notes: dict[str, str] = {}
@@ -329,7 +320,14 @@ class Pilot(race.Race):
         return race.ITERATIONS * min(max(e.wall - e.time, 0.0) + e.time * scale for e in self._entries if e.steps)
 
     def _affords(self, entry: _Entry) -> bool:
-        return self._spent_ms + entry.wall <= PLANNED * self._share * self._run_ms()
+        if self._spent_ms + entry.wall > PLANNED * self._share * self._run_ms():
+            return False
+        return entry.wall <= 1e3 * self._allowance.left_s
+
+    def _affords_another(self, relative: _Entry) -> bool:
+        """Whether there is time for a first step of a candidate like this one, and a step that counts."""
+        allowance = self._allowance
+        return self._affords(relative) and allowance.compile_s + 2e-3 * relative.wall <= allowance.left_s
 
     # --- judging ------------------------------------------------------------------------------------------------------
 
@@ -392,7 +390,7 @@ class Pilot(race.Race):
             bound = self._bound(candidate, parent)
             if bound * race.TIMING_NOISE < best:
                 self._notes[candidate.label] = f"not measured: at most {bound / best:.2f} of the best's efficiency"
-            elif not (self._affords(parent) and self._compiles()):
+            elif not self._affords_another(parent):
                 self._notes[candidate.label] = (
                     f"not measured: no more than {100 * self._share:.2g} % of the run is to be spent"
                 )

@@ -30,7 +30,7 @@ import numpy as np
 from reslrb_cli.backend.doctor import device_name
 from reslrb_cli.config.schema import Config
 from reslrb_cli.integrators.reslrb import Reslrb as Tracer
-from reslrb_cli.optimization.decisions import Allowance
+from reslrb_cli.optimization.decisions import Allowance, Need
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.sensitivity import sample_gradient, take_gradient
 from reslrb_cli.records.cache import PilotCache, key_of
@@ -45,11 +45,15 @@ ITERATIONS = 200
 #: guiding pays is planned for (where it is not clear by then, it may take what the pilot has left of its own), and that
 #: of the sequence is left by what is measured before.
 SHARE, GUIDING_SHARE, SEQUENCE_SHARE = 0.05, 0.025, 0.005
-#: What measurements take at least that say anything: kernels to compile, in those of one step, and iterations' worth of
-#: work. Compiling is that of both kinds of steps, and of walks that are learned from.
+#: What measurements take at least that say anything. Compiling is that of both kinds of steps, and of walks that are
+#: learned from.
 ESTIMATOR_NEEDS, GUIDING_NEEDS, SEQUENCE_NEEDS = (4.0, 4.0), (2.5, 3.0), (2.5, 1.0)
-#: What is measured once the estimator is settled.
-LATER = {"guiding": (GUIDING_NEEDS, GUIDING_SHARE), "sequence": (SEQUENCE_NEEDS, SEQUENCE_SHARE)}
+#: What is measured once the estimator is settled, by option: the time that is kept aside for it, all that is planned.
+#: What it takes at the least would be too little where kernels are there: first steps take their time all the same.
+LATER = {
+    "guiding": (GUIDING_NEEDS[0], GUIDING_SHARE * ITERATIONS),
+    "sequence": (SEQUENCE_NEEDS[0], SEQUENCE_SHARE * ITERATIONS),
+}
 #: Relative error of a single time that must not decide anything.
 TIMING_NOISE = 1.1
 CONFIDENCE = 0.95
@@ -94,16 +98,18 @@ class Tuner:
         self,
         kind: type[Record],
         of: dict[str, Any],
-        needs: Sequence[tuple[float, float]],
+        needs: Sequence[Need],
         integrator: Tracer,
         measure: Callable[[Allowance], Record],
         unmeasured: Callable[[str], Record],
         fits: Callable[[Record], bool] = lambda record: True,
+        later: Sequence[Need] = (),
     ) -> Record:
         """What an earlier run measured and kept, if it `fits`; else what `measure` finds now, which is kept.
 
         `of` is what that depends on besides the situation, `needs` what measuring by steps of `integrator` and others
-        takes at least that says anything (`Allowance.affords`), `unmeasured` the decision without, with a note.
+        takes at least that says anything (`Allowance.affords`), `unmeasured` the decision without, with a note. What is
+        to be measured `later` has its time kept aside.
         """
         key = ""
         if self._cache is not None:
@@ -121,9 +127,8 @@ class Tuner:
             return record
         if not allowance.spent_s:
             self.say("measuring what pays here, before the first iteration")
-        start = time.perf_counter()
-        record = measure(allowance)
-        allowance.spent_s += time.perf_counter() - start
+        with allowance.spending(later):
+            record = measure(allowance)
         logger.debug(allowance.line())
         if self._cache is not None:
             self._cache.put(key, record.to_json())

@@ -143,7 +143,7 @@ def share_left(problem: Problem, allowance: Allowance, reserved: float = 0.0, ke
     """What earlier measurements left of the share of 200 iterations that all of them may cost, but for what is
     `reserved`, and no more than there is time for in a run as short as this, with `kernels` to compile."""
     spent = sum(each.share for each in (problem.pilot, problem.guided) if each is not None)
-    return max(min(race.SHARE - spent, allowance.iterations_left(kernels) / race.ITERATIONS) - reserved, 0.0)
+    return max(min(race.SHARE - spent - reserved, allowance.iterations_left(kernels) / race.ITERATIONS), 0.0)
 
 
 # --- guiding ----------------------------------------------------------------------------------------------------------
@@ -191,6 +191,7 @@ def _guided(tuner: race.Tuner, trials: list[StepTrial]) -> GuidedRecord:
         integrator=problem.integrator,
         measure=measure,
         unmeasured=lambda note: GuidedRecord(guided=False, note=f"{note}; {why or 'it pays in long runs'}"),
+        later=[(0.0, race.LATER["sequence"][1])] if sequence else [],
     )
 
 
