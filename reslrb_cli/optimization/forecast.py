@@ -25,6 +25,7 @@ from reslrb_cli.optimization.assemble import assemble_scene
 from reslrb_cli.optimization.autotune.estimators import find_options
 from reslrb_cli.optimization.autotune.sampling import lessons, settle
 from reslrb_cli.optimization.loop import optimize
+from reslrb_cli.optimization.memory import plans
 from reslrb_cli.optimization.problem import Problem, saved_spp
 from reslrb_cli.optimization.state import guiding_of
 from reslrb_cli.optimization.targets import make_targets
@@ -273,8 +274,5 @@ def _scratch(problem: Problem) -> int:
     integrator = problem.integrator
     if not isinstance(integrator, Tracer):
         return 0
-    plans = [
-        integrator.plan(problem.scene, problem.scene.sensors()[index], problem.selection.params)
-        for index in problem.sensors
-    ]
-    return max(integrator.estimator.scratch_bytes(plan) for plan in plans) * resident_paths()
+    each = (integrator.estimator.scratch_bytes(plan) for plan in plans(problem, integrator))
+    return max(each) * resident_paths()
