@@ -25,7 +25,7 @@ from reslrb_cli.config.integrators import divisors, passes_obstacle
 from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.estimators.base import entry_bytes
-from reslrb_cli.integrators.reslrb import Reslrb
+from reslrb_cli.integrators.reslrb import LightTracer, Reslrb
 from reslrb_cli.optimization.decisions import Estimate
 from reslrb_cli.optimization.loading import pass_spp
 from reslrb_cli.optimization.problem import Problem
@@ -77,7 +77,7 @@ def pixels_of(scene: mi.Scene, sensors: Sequence[int]) -> list[int]:
     return [int(dr.prod(scene.sensors()[index].film().size())) for index in sensors]
 
 
-def plans(problem: Problem, integrator: Reslrb) -> list[Plan]:
+def plans(problem: Problem, integrator: LightTracer) -> list[Plan]:
     """What a step has to do, by view."""
     sensors, params = problem.scene.sensors(), problem.selection.params
     return [integrator.plan(problem.scene, sensors[index], params) for index in problem.sensors]
