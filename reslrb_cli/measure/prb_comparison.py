@@ -7,7 +7,6 @@ efficient it is.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 from reslrb_cli.integrators.step import make_integrator
 from reslrb_cli.measure.gradients import moves_light
@@ -105,6 +104,6 @@ class RivalTurns(race.Turns[RivalRecord]):
     def _times(self, other: bool, images: bool) -> list[float]:
         return [step.kernel_ms for step in self._steps[other]]
 
-    def _record(self, other: bool, images: bool, gain: race.Gain, picture: race.Gain, note: str) -> RivalRecord:
-        found: dict[str, Any] = dict(zip(("advantage", "low", "high"), gain, strict=True)) | self._cost()
-        return RivalRecord(integrator=RIVAL, rounds=len(self._steps[True]), spp=self._sizes.trial, note=note, **found)
+    def _record(self, note: str, gain: race.Gain = race.NOTHING, *others: object) -> RivalRecord:
+        found = dict(zip(("advantage", "low", "high"), gain, strict=True)) | self._found(note)
+        return RivalRecord(integrator=RIVAL, **found)

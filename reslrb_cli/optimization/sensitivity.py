@@ -63,10 +63,14 @@ def take_gradient(problem: Problem) -> dict[str, Array]:
     """The gradients that have been accumulated, each in a row, 0 where they are not finite; they are cleared."""
     taken = {}
     for key, value in problem.gradients().items():
-        gradient = np.array(value, dtype=np.float32)
-        taken[key] = np.nan_to_num(gradient, nan=0.0, posinf=0.0, neginf=0.0).ravel()
+        taken[key] = finite(np.array(value, dtype=np.float32)).ravel()
         problem.optimizer.clear_gradient(key)
     return taken
+
+
+def finite(values: Array) -> Array:
+    """The values, 0 where they are not finite."""
+    return np.nan_to_num(values, nan=0.0, posinf=0.0, neginf=0.0)
 
 
 def unrecorded(integrator: Any) -> Any:

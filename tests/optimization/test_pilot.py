@@ -14,11 +14,11 @@ from reslrb_cli.optimization.autotune.race import GUIDING_SHARE, ITERATIONS, SHA
 from reslrb_cli.optimization.decisions import Allowance
 from reslrb_cli.records.decisions import EstimatorRecord
 
-STACK, GATHER = Candidate({"estimator": "stack"}, True), Candidate({"estimator": "gather"}, True)
-RESERVOIR = Candidate({"estimator": "reservoir", "capacity": 1}, False)
-RESERVOIR_4 = Candidate({"estimator": "reservoir", "capacity": 4}, False, parent=RESERVOIR.label, varies_slots=True)
-EVENT = Candidate({"estimator": "event", "capacity": 1}, False)
-ADJOINT = Candidate({"estimator": "event", "capacity": 1, "weight": "adjoint"}, False, parent=EVENT.label)
+STACK, GATHER = Candidate({"estimator": "stack"}), Candidate({"estimator": "gather"})
+RESERVOIR = Candidate({"estimator": "reservoir", "capacity": 1})
+RESERVOIR_4 = Candidate({"estimator": "reservoir", "capacity": 4}, RESERVOIR.label)
+EVENT = Candidate({"estimator": "event", "capacity": 1})
+ADJOINT = Candidate({"estimator": "event", "capacity": 1, "weight": "adjoint"}, EVENT.label)
 ALL = [STACK, GATHER, RESERVOIR, EVENT, RESERVOIR_4, ADJOINT]
 
 

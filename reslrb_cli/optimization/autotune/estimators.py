@@ -43,27 +43,39 @@ from reslrb_cli.statistics import Array, sum_of_squares
 class Candidate:
     """An estimator with its options, and where it is ready to run its `integrator`; `memory` where there is a budget.
 
-    `exact`: it uses every connection. `passes` are those of a step in the pilot; other passes are other paths.
-    `parent`: the label of a candidate than which it is no faster; where it is the same estimator with more slots for
-    connections, `varies_slots`.
+    `parent`: the label of a candidate than which it is no faster. Candidates of other passes trace other paths.
     """
 
     options: dict[str, Any]
-    exact: bool
-    passes: int = 1
     parent: str | None = None
-    varies_slots: bool = False
     integrator: Any = None
     memory: MemoryPlan | None = None
 
     @property
     def label(self) -> str:
         """The estimator in words."""
-        return _label(**self.options)
+        options = dict(self.options)
+        return ", ".join([options.pop("estimator", ""), *(f"{key} {value}" for key, value in options.items())])
+
+    @property
+    def exact(self) -> bool:
+        """Whether it uses every connection."""
+        name = self.options.get("estimator")
+        return name in ESTIMATORS and ESTIMATORS[name].exact
+
+    @property
+    def passes(self) -> int:
+        """Passes of a step in the pilot: two where the run has more, which take as many traversals."""
+        return 2 if self.memory is not None and self.memory.passes > 1 else 1
 
 
-def _label(estimator: str = "", **options: Any) -> str:
-    return ", ".join([estimator, *(f"{key} {value}" for key, value in options.items())])
+def _parent(options: dict[str, Any]) -> str | None:
+    """The label of a candidate than which one with these options is no faster."""
+    name, is_plain = options.get("estimator"), options.get("capacity", 1) == 1 and "weight" not in options
+    if is_plain and name not in ("gather", "reservoir"):
+        return None
+    # Which traces its paths once, where these trace them twice.
+    return Candidate({"estimator": "event" if is_plain else name, "capacity": 1}).label
 
 
 def find_options(problem: Problem) -> list[Candidate]:
@@ -103,7 +115,7 @@ def _fitting(problem: Problem, integrator: ReslrbConfig, choices: list[dict[str,
         made.expect(pass_spp(problem.config))
         check_memory(problem, made)
         if budget is None:
-            options.append(_candidate(choice, made))
+            options.append(Candidate(choice, _parent(choice), made))
             continue
         samples = run.spp // race.sets_of(problem.config)
         size, expected = choose_samples(problem, made, samples, budget, fixed)
@@ -112,7 +124,8 @@ def _fitting(problem: Problem, integrator: ReslrbConfig, choices: list[dict[str,
             continue
         if size < samples:
             made = made.with_options(samples_per_pass=size, freeze=made.freeze)
-        options.append(_candidate(choice, made, MemoryPlan(budget, size, samples // size, expected)))
+        plan = MemoryPlan(budget, size, samples // size, expected)
+        options.append(Candidate(choice, _parent(choice), made, plan))
     if not options:
         mib = -(-min(least) // MIB)
         reason = f"one sample per pixel takes about {mib:.0f} MiB (scene, targets, images of a step, parameters, paths)"
@@ -134,8 +147,9 @@ def settle_estimator(tuner: race.Tuner, options: Sequence[Candidate]) -> None:
 
         def usual(note: str) -> EstimatorRecord:
             """It has been the best, or within a few percent of it, wherever that was measured (docs/benchmarks.md)."""
-            note += "; every connection, in one traversal"
-            return EstimatorRecord(chosen=options[0].options, label=options[0].label, note=note)
+            return EstimatorRecord(
+                chosen=chosen.options, label=chosen.label, note=f"{note}; every connection, in one traversal"
+            )
 
         pilot = tuner.decide(
             EstimatorRecord,
@@ -155,18 +169,6 @@ def settle_estimator(tuner: race.Tuner, options: Sequence[Candidate]) -> None:
 
 
 # --- the pilot --------------------------------------------------------------------------------------------------------
-
-
-def _candidate(options: dict[str, Any], integrator: Tracer, memory: MemoryPlan | None = None) -> Candidate:
-    """As the pilot sees it: with two passes where the run has more, which take as many traversals."""
-    name, slots, parent = options.get("estimator", ""), options.get("capacity", 1) > 1, None
-    if slots or "weight" in options:
-        parent = _label(estimator=name, capacity=1)
-    elif name in ("gather", "reservoir"):  # which trace their paths twice, where `event` traces them once
-        parent = _label(estimator="event", capacity=1)
-    exact, several = name in ESTIMATORS and ESTIMATORS[name].exact, memory is not None and memory.passes > 1
-    varies = slots and "weight" not in options
-    return Candidate(options, exact, 2 if several else 1, parent, varies, integrator, memory)
 
 
 def run_pilot(problem: Problem, options: Sequence[Candidate], allowance: Allowance) -> EstimatorRecord:
@@ -336,19 +338,17 @@ class Pilot(race.Race):
         return [e for e in self._entries if e.candidate.exact and e.candidate.passes == passes]
 
     def _scales(self) -> dict[str, float]:
-        """Mean square norm of each parameter's gradient."""
+        """Mean square norm of each parameter's gradient, where it is not 0."""
         every = [g for e in self._entries if e.candidate.exact for g in e.gradients]
-        every = every or [g for e in self._entries for g in e.gradients]
-        return {key: float(np.mean([sum_of_squares(g[key]) for g in every])) for key in every[0]}
+        return race.scales(every or [g for e in self._entries for g in e.gradients])
 
     def _variance(self, entry: _Entry) -> float:
-        scales = {key: scale for key, scale in self._scales().items() if scale > 0}
         # The exact gradient of each round on the same paths.
         references: list[race.Gradients] = max(
             (each.gradients for each in self._exact(entry.candidate.passes)), key=len, default=[]
         )
         total = 0.0
-        for key, scale in scales.items():
+        for key, scale in self._scales().items():
             own = [g[key] for g in entry.gradients]
             exact = [g[key] for g in references]
             total += sample_variance(exact if len(exact) > 1 else own) / scale
@@ -377,16 +377,16 @@ class Pilot(race.Race):
     def _promising(self) -> list[_Entry]:
         """Measure those that could be the best, by what is known of their relatives."""
         best = max(self._efficiency(entry) for entry in self._entries)
-        labels: dict[str | None, _Entry] = {entry.candidate.label: entry for entry in self._entries}
+        measured = {entry.candidate.label: entry for entry in self._entries}
+        parents = {candidate.label: candidate.parent for candidate in self._candidates}
         found = []
         for candidate in self._candidates:
             if candidate.parent is None:
                 continue
-            relative = candidate
-            parent = labels.get(candidate.parent)
-            while parent is None:  # that was left out as well: it would have been no faster than its own
-                [relative] = [c for c in self._candidates if c.label == relative.parent]
-                parent = labels.get(relative.label)
+            label = candidate.parent
+            while label not in measured:  # that was left out as well: it would have been no faster than its own
+                label = parents[label] or ""
+            parent = measured[label]
             bound = self._bound(candidate, parent)
             if bound * race.TIMING_NOISE < best:
                 self._notes[candidate.label] = f"not measured: at most {bound / best:.2f} of the best's efficiency"
@@ -400,7 +400,7 @@ class Pilot(race.Race):
                 if self._affords(entry):
                     self._measure(entry)
                 found.append(entry)
-                labels[candidate.label] = entry
+                measured[candidate.label] = entry
         return found
 
     def _bound(self, candidate: Candidate, relative: _Entry) -> float:
@@ -409,9 +409,9 @@ class Pilot(race.Race):
         exact = self._exact(candidate.passes)
         if not any(entry.gradients for entry in exact) or candidate.passes != relative.candidate.passes:
             return math.inf
-        least = self._variance(exact[0])
-        if candidate.parent == relative.candidate.label and candidate.varies_slots:
-            least += (self._variance(relative) - least) / candidate.options["capacity"]
+        least, slots = self._variance(exact[0]), candidate.options.get("capacity", 1)
+        if slots > 1 and "weight" not in candidate.options and candidate.parent == relative.candidate.label:
+            least += (self._variance(relative) - least) / slots
         return 1 / (least * max(relative.time, 1e-6))
 
     def _outcome(self) -> EstimatorRecord:
@@ -419,13 +419,11 @@ class Pilot(race.Race):
         best, measured = ranked[0], {entry.candidate.label: entry for entry in self._entries}
         rows = []
         for candidate in self._candidates:
-            name, options = candidate.options["estimator"], {**candidate.options}
-            del options["estimator"]
-            entry, row = measured.get(candidate.label), TriedEstimator(name, options, 0)
+            options, entry = dict(candidate.options), measured.get(candidate.label)
+            found: tuple[int, float | None, float | None, float | None] = (0, None, None, None)
             if entry is not None:
-                time, variance = entry.time, self._variance(entry)
-                row = TriedEstimator(name, options, len(entry.steps), time, variance, self._efficiency(entry))
-            rows.append(replace(row, note=self._notes.get(candidate.label, "")))
+                found = len(entry.steps), entry.time, self._variance(entry), self._efficiency(entry)
+            rows.append(TriedEstimator(options.pop("estimator"), options, *found, self._notes.get(candidate.label, "")))
         return EstimatorRecord(
             chosen=best.candidate.options,
             label=best.candidate.label,
@@ -434,6 +432,5 @@ class Pilot(race.Race):
             advantage=self._efficiency(best) / self._efficiency(ranked[1]) if len(ranked) > 1 else None,
             next_label=ranked[1].candidate.label if len(ranked) > 1 else None,
             share=self._spent_ms / self._run_ms(),
-            measure_s=self._spent_ms / 1e3,
-            compile_s=self._compile_ms / 1e3,
+            **self._cost(),
         )

@@ -64,6 +64,7 @@ Record = TypeVar("Record", bound=Finding)
 Gradients = dict[str, Array]
 #: A gain and the ends of its interval; nothing where it cannot be told.
 Gain = tuple[float, float, float] | tuple[None, None, None]
+NOTHING: Gain = (None, None, None)
 logger = logging.getLogger(__name__)
 
 
@@ -232,12 +233,11 @@ def compare(
 
     Gradients are those of each step by parameter (three steps or more), times those of steps in any unit.
     """
-    scales = {key: float(np.mean([sum_of_squares(g[key]) for g in (*own, *other)])) for key in own[0]}
-    scales = {key: scale for key, scale in scales.items() if scale > 0}
-    found = [_log_variances(gradients, scales) for gradients in (own, other)] if scales else [None]  # of no light, say
+    units = scales([*own, *other])
+    found = [_log_variances(gradients, units) for gradients in (own, other)] if units else [None]  # of no light, say
     known = [each for each in found if each is not None]
     if len(known) < 2:
-        return None, None, None
+        return NOTHING
     from scipy.special import stdtrit  # late: every run imports this module, and few come here
 
     times = statistics.median(own_ms) / max(statistics.median(other_ms), 1e-6)
@@ -246,6 +246,12 @@ def compare(
     half = float(stdtrit(min(len(own), len(other)) - 1, (1 + confidence) / 2)) * math.sqrt(variance)
     factor = math.exp(min(half, 50.0)) * TIMING_NOISE
     return advantage, advantage / factor, advantage * factor
+
+
+def scales(gradients: Sequence[Gradients]) -> dict[str, float]:
+    """The mean square norm of each parameter's gradient, of those that have any."""
+    found = {key: float(np.mean([sum_of_squares(g[key]) for g in gradients])) for key in gradients[0]}
+    return {key: scale for key, scale in found.items() if scale > 0}
 
 
 def _log_variances(gradients: Sequence[Gradients], scales: dict[str, float]) -> tuple[float, Array] | None:
@@ -281,7 +287,7 @@ class Race:
         self._compile_ms += step.compile_ms
         return step
 
-    def _cost(self) -> dict[str, float]:
+    def _cost(self) -> dict[str, Any]:
         """Of the record."""
         return {"measure_s": self._spent_ms / 1e3, "compile_s": self._compile_ms / 1e3}
 
@@ -373,7 +379,9 @@ class Turns(Race, Generic[Record]):
         # What Python takes is the same for both.
         kernels = (1 + self._sizes.longer) * (plain.kernel_ms + plain.image_ms)
         if not self._learned(kernels + 2 * plain.beside_ms):
-            return self._off(f"to measure it would cost more than {100 * self._most:.2g} % of {ITERATIONS} iterations")
+            return self._record(
+                f"to measure it would cost more than {100 * self._most:.2g} % of {ITERATIONS} iterations"
+            )
         self._first(take(True, 0, spp))
         for round in range(1, 1 + self.LOOKS * self._sizes.rounds):
             both = [self._spend(take(other, round, spp)) for other in (False, True)]
@@ -459,27 +467,26 @@ class Turns(Race, Generic[Record]):
 
     def _decided(self) -> Record:
         if len(self._steps[False]) < self.LEAST:
-            return self._off(f"{len(self._steps[False])} steps of both are too few to tell")
+            return self._record(f"{len(self._steps[False])} steps of both are too few to tell")
         picture = self._image_gain()
         images = self._images(picture)
         gain = self._gain(images or not self._apart)
         if gain[1] is None:
-            return self._off("gradients have no noise")
+            return self._record("gradients have no noise")
         note = ""
         if gain[1] > 1 and not (images or self._apart):
             whose = "images have" if self._sizes.alone else "the image, of the same samples, has"
             note = f"{whose} {picture[0]:.2g} times the efficiency"
         on = gain[1] > 1 and not note
-        return self._record(on, on and images, gain, picture, note)
+        return self._record(note, gain, picture, on, on and images)
 
-    def _off(self, note: str) -> Record:
-        return self._record(False, False, (None, None, None), (None, None, None), note)
-
-    def _record(self, other: bool, images: bool, gain: Gain, picture: Gain, note: str) -> Record:
-        found = dict(zip(("gain", "low", "high"), gain, strict=True)) | self._cost()
+    def _record(
+        self, note: str, gain: Gain = NOTHING, picture: Gain = NOTHING, other: bool = False, images: bool = False
+    ) -> Record:
+        found = self._found(note) | dict(zip(("gain", "low", "high"), gain, strict=True))
         found |= dict(zip(("image_gain", "image_low", "image_high"), picture, strict=True))
-        share = self._spent_ms / (ITERATIONS * self._iteration_ms)
-        rounds = len(self._steps[True])
-        return self._decide(
-            other, images, {**found, "rounds": rounds, "spp": self._sizes.trial, "share": share, "note": note}
-        )
+        return self._decide(other, images, found | {"share": self._spent_ms / (ITERATIONS * self._iteration_ms)})
+
+    def _found(self, note: str) -> dict[str, Any]:
+        """What all records of decisions by turns hold."""
+        return {"rounds": len(self._steps[True]), "spp": self._sizes.trial, "note": note, **self._cost()}
