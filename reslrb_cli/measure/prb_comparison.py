@@ -45,7 +45,15 @@ def measure_rival(problem: Problem, cache: PilotCache | None, say: Callable[[str
         planned = float(run.spp * MOST_ROUNDS)  # as many samples as there are
         sizes = race.Sizes(run.spp, spp, spp, False, MOST_ROUNDS, 0.0, LONGER, planned)
         share, most = (min(each, left / race.ITERATIONS) for each in (SHARE, MOST_SHARE))
-        return RivalTurns(RivalTrial(problem), sizes, 1.0, share, most).run()
+        options, clock = problem.config.integrator.options(), StepClock()
+        rival = make_integrator(RIVAL, **{name: options[name] for name in ("max_depth", "rr_depth", "hide_emitters")})
+        # A recording would cost more than so few steps save.
+        own = problem.integrator.to_measure().with_options(samples_per_pass=None, freeze=False)
+
+        def take(other: bool, round: int, spp: int) -> race.Step:
+            return race.measured_step(problem, rival if other else own, clock, round, spp)
+
+        return RivalTurns(take, sizes, 1.0, share, most).run()
 
     beside = [pilot.chosen, guided and guided.guided, sequence and sequence.low_discrepancy]
     return race.Tuner(problem, say, cache).decide(
@@ -79,21 +87,6 @@ def _samples(problem: Problem, iterations: float) -> int:
     run, unit = problem.config.run, race.sets_of(problem.config)
     share = min(iterations / ((1 + LONGER) * MOST_ROUNDS), 1.0)
     return max(int(share * run.spp) // unit, 1) * unit
-
-
-class RivalTrial(race.Trial):
-    """Steps of the run, as they are or by `prb`."""
-
-    def __init__(self, problem: Problem) -> None:
-        options = problem.config.integrator.options()
-        rival = make_integrator(RIVAL, **{name: options[name] for name in ("max_depth", "rr_depth", "hide_emitters")})
-        # A recording would cost more than so few steps save.
-        own = problem.integrator.to_measure().with_options(samples_per_pass=None, freeze=False)
-        self._problem, self._clock, self._integrators = problem, StepClock(), {True: rival, False: own}
-
-    def take(self, other: bool, round: int, spp: int) -> race.Step:
-        """One step of all views."""
-        return race.measured_step(self._problem, self._integrators[other], self._clock, round, spp)
 
 
 class RivalTurns(race.Turns[RivalRecord]):

@@ -21,7 +21,7 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -38,11 +38,8 @@ from reslrb_cli.optimization.loading import choose_sensors
 from reslrb_cli.scene.cameras import read_cameras
 from reslrb_cli.scene.parameters import Selection
 
-
-class Loss(Protocol):
-    """A loss with its options bound."""
-
-    def __call__(self, image: mi.TensorXf, target: mi.TensorXf, weights: mi.TensorXf | None = None, /) -> mi.Float: ...
+#: A loss with its options bound, of an image, its target, and weights, if there are any.
+Loss = Callable[..., "mi.Float"]
 
 
 def _mean(values: mi.TensorXf, weights: mi.TensorXf | None) -> mi.Float:
@@ -81,7 +78,7 @@ def log_l2(
     return _mean(dr.square(difference), weights)
 
 
-LOSSES: dict[str, Callable[..., mi.Float]] = {"l1": l1, "l2": l2, "relative_l2": relative_l2, "log_l2": log_l2}
+LOSSES: dict[str, Loss] = {"l1": l1, "l2": l2, "relative_l2": relative_l2, "log_l2": log_l2}
 
 #: Those whose derivative is linear in the image, so that its noise averages out.
 QUADRATIC = ("l2", "relative_l2")

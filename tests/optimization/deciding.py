@@ -77,12 +77,9 @@ class World:
 
     def run(self, sizes: Sizes = SIZES, share: float = 2 * GUIDING_SHARE) -> Any:
         """The record of what is decided."""
-        return self.pilot(
-            self,
-            replace(sizes, rounds=ROUNDS_OF_FEW if self.entries < FEW_ENTRIES else ROUNDS, alone=self.alone),
-            1.0,
-            share,
-        ).run()
+        rounds = ROUNDS_OF_FEW if self.entries < FEW_ENTRIES else ROUNDS
+        sizes, learn = replace(sizes, rounds=rounds, alone=self.alone), self.learn if self.learns else None
+        return self.pilot(self.take, sizes, 1.0, share, learn=learn).run()
 
 
 def begin(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Path:

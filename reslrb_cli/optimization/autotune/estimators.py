@@ -283,7 +283,7 @@ class Pilot(race.Race):
     def _warm_up(self, candidate: Candidate) -> _Entry:
         """Compile the kernels of a candidate, and keep its gradient if that counts."""
         counts = self._first_steps_count
-        first = self._first(self._step(candidate, 0, self._pilot_spp if counts else self._unit))
+        first = self._spend(self._step(candidate, 0, self._pilot_spp if counts else self._unit), first=True)
         entry = _Entry(candidate, gradients=[first.gradients] if counts else [])
         self._entries.append(entry)
         return entry
@@ -292,7 +292,7 @@ class Pilot(race.Race):
         round = len(entry.gradients)
         measured = self._step(entry.candidate, round, self._pilot_spp)
         if measured.compile_ms > measured.wall_ms:  # a first step after all, whose times say nothing
-            self._first(measured)
+            self._spend(measured, first=True)
             measured = self._step(entry.candidate, round, self._pilot_spp)
         self._spend(measured)
         entry.steps.append(measured)

@@ -276,15 +276,10 @@ class Race:
     def __init__(self) -> None:
         self._spent_ms = self._compile_ms = 0.0
 
-    def _first(self, step: Step) -> Step:
-        """Count a step that had its kernels compiled, whose times tell nothing else."""
-        self._compile_ms += step.wall_ms + step.compile_ms
-        return step
-
-    def _spend(self, step: Step) -> Step:
-        """Count a step."""
-        self._spent_ms += step.wall_ms
-        self._compile_ms += step.compile_ms
+    def _spend(self, step: Step, first: bool = False) -> Step:
+        """Count a step; of a `first` one, which had its kernels compiled, times tell nothing else."""
+        self._spent_ms += 0.0 if first else step.wall_ms
+        self._compile_ms += step.compile_ms + (step.wall_ms if first else 0.0)
         return step
 
     def _cost(self) -> dict[str, Any]:
@@ -335,36 +330,28 @@ class Sizes:
         return max(min(int(LEARNING_SHARE * self.step), self.part), 1)
 
 
-class Trial:
-    """What is measured. Equal rounds have equal seeds, others than those of any walk that is learned from.
-
-    `learns` says whether there is a table that has yet to learn; none has one here.
-    """
-
-    @property
-    def learns(self) -> bool:
-        return False
-
-    def learn(self, round: int, spp: int) -> Step:
-        """Have the table learn, from a walk of `spp` samples per pixel; what is not given is left at 0."""
-        raise NotImplementedError
-
-    def take(self, other: bool, round: int, spp: int) -> Step:
-        """A step as it is, or one the other way; from what the table has learned, which stays as it is."""
-        raise NotImplementedError
+#: A step as it is, or one the other way, of a round and so many samples per pixel; from what the table has learned,
+#: which stays as it is. Equal rounds have equal seeds, others than those of any walk that is learned from.
+Take = Callable[[bool, int, int], Step]
+#: Have the table learn, from a walk of a round and so many samples per pixel; what is not given is left at 0.
+Learn = Callable[[int, int], Step]
 
 
 class Turns(Race, Generic[Record]):
-    """One decision. `views` is how many times the views of an iteration are those of a step here, `share` what of
-    ITERATIONS this may cost, and `most` what of them the least number of rounds may, where that is more."""
+    """One decision, by steps that `take` takes, and walks that `learn` does, where a table has yet to learn. `views` is
+    how many times the views of an iteration are those of a step here, `share` what of ITERATIONS this may cost, and
+    `most` what of them the least number of rounds may, where that is more."""
 
     LEAST, LOOKS = LEAST_ROUNDS, LOOKS
     #: Whether it is decided apart for images that have samples of their own.
     APART = False
 
-    def __init__(self, trial: Trial, sizes: Sizes, views: float, share: float, most: float = 0.0) -> None:
+    def __init__(
+        self, take: Take, sizes: Sizes, views: float, share: float, most: float = 0.0, learn: Learn | None = None
+    ) -> None:
         super().__init__()
-        self._trial, self._sizes, self._views, self._share, self._most = trial, sizes, views, share, max(share, most)
+        self._take, self._learn, self._sizes, self._views = take, learn, sizes, views
+        self._share, self._most = share, max(share, most)
         self._apart = self.APART and sizes.alone
         self._plain: list[Step] = []  # all steps as they are whose times count
         self._steps: dict[bool, list[Step]] = {False: [], True: []}
@@ -372,8 +359,8 @@ class Turns(Race, Generic[Record]):
 
     def run(self) -> Record:
         """Measure, and decide."""
-        spp, take = self._sizes.trial, self._trial.take
-        self._first(take(False, 0, spp))
+        spp, take = self._sizes.trial, self._take
+        self._spend(take(False, 0, spp), first=True)
         plain = self._spend(take(False, 0, spp))
         self._plain.append(plain)
         # What Python takes is the same for both.
@@ -382,7 +369,7 @@ class Turns(Race, Generic[Record]):
             return self._record(
                 f"to measure it would cost more than {100 * self._most:.2g} % of {ITERATIONS} iterations"
             )
-        self._first(take(True, 0, spp))
+        self._spend(take(True, 0, spp), first=True)
         for round in range(1, 1 + self.LOOKS * self._sizes.rounds):
             both = [self._spend(take(other, round, spp)) for other in (False, True)]
             for other, step in enumerate(both):
@@ -396,18 +383,18 @@ class Turns(Race, Generic[Record]):
 
     def _learned(self, round_ms: float) -> bool:
         """Have the table learn, if it has not; False where that, and rounds of so long, cannot be afforded."""
-        if not self._trial.learns:
+        if self._learn is None:
             return self._affords(self.LEAST * round_ms)
-        walk = self._trial.learn(0, self._sizes.learning)
+        walk = self._learn(0, self._sizes.learning)
         if not self._affords(walk.wall_ms + self.LEAST * round_ms):
-            self._first(walk)
+            self._spend(walk, first=True)
             return False
         self._walk = self._spend(walk)
         # What one walk more would gain is little beside what rounds that are too few leave open.
         rounds = max(self._sizes.rounds // 2, self.LEAST)
         for number in range(1, LEARNINGS):
             if self._affords(self._walk.wall_ms + rounds * round_ms):
-                self._walk = self._spend(self._trial.learn(number, self._sizes.learning))
+                self._walk = self._spend(self._learn(number, self._sizes.learning))
         return True
 
     @property

@@ -186,7 +186,7 @@ def _guided(tuner: race.Tuner, trials: list[StepTrial]) -> GuidedRecord:
         share = share_left(problem, allowance, race.SEQUENCE_SHARE if sequence else 0.0, race.GUIDING_NEEDS[0])
         plain, guided = (problem.integrator.afresh(guided=on) for on in (False, True))
         trials.append(StepTrial(problem, "guiding", plain, guided))
-        return GuidingPilot(trials[-1], plan, trials[-1].part_of_views(), share).run()
+        return trials[-1].turns(GuidingPilot, plan, share)
 
     return tuner.decide(
         GuidedRecord,
@@ -210,8 +210,7 @@ def _sequence(tuner: race.Tuner, trials: list[StepTrial]) -> SequenceRecord:
         """What is found in that share of the run; `guided`: with the other numbers, None: as the run is."""
         even = plain.afresh(guided=guided, low_discrepancy=True)
         trials.append(StepTrial(problem, name, plain.afresh(low_discrepancy=False), even, *trials[-1:]))
-        plan = sizes(problem, SEQUENCE_LONGER, planned(share))
-        return SequencePilot(trials[-1], plan, trials[-1].part_of_views(), share).run()
+        return trials[-1].turns(SequencePilot, sizes(problem, SEQUENCE_LONGER, planned(share)), share)
 
     def measure(allowance: Allowance) -> SequenceRecord:
         if found is None or not found.guided:
@@ -239,7 +238,7 @@ def _sequence(tuner: race.Tuner, trials: list[StepTrial]) -> SequenceRecord:
 # --- steps ------------------------------------------------------------------------------------------------------------
 
 
-class StepTrial(race.Trial):
+class StepTrial:
     """Steps of a problem by `plain`, or by `other`; they leave neither gradient nor change behind.
 
     `views` are those that are looked at. Where either is guided, both that are draw from one table: that of `earlier`,
@@ -274,12 +273,14 @@ class StepTrial(race.Trial):
         self._slopes = [self._slope(view) for view in self.views]
         take_gradient(problem)  # recovered exposures have some of these
 
-    def part_of_views(self) -> float:
-        """How many times the views of an iteration are those of a step here."""
-        return len(self._problem.drawn(0)) / len(self.views)
+    def turns(self, kind: type[race.Turns[race.Record]], sizes: race.Sizes, share: float) -> race.Record:
+        """What is found by these steps in turns."""
+        part_of_views = len(self._problem.drawn(0)) / len(self.views)
+        return kind(self.take, sizes, part_of_views, share, learn=self.learn if self._learns else None).run()
 
     @property
-    def learns(self) -> bool:
+    def _learns(self) -> bool:
+        """Whether there is a table that has yet to learn."""
         return self.table is not None and not self.table.learned
 
     def _slope(self, view: View) -> mi.TensorXf:
@@ -297,7 +298,7 @@ class StepTrial(race.Trial):
         jobs = [self._job(view, self._seed(round, view, "learned from"), spp) for view in self.views]
         compile_ms = 0.0
         assert self.table is not None
-        if self.learns:
+        if self._learns:
             compile_ms = self._teach(self.table, jobs).wall_ms
             self.table.forget()
         taken = race.timed(self._teach(self.table, jobs))
