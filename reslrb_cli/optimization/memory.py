@@ -1,12 +1,8 @@
-"""The memory of a run: whether there is room, said before anything is allocated, and passes within a budget.
+"""The memory of a run: what a step takes, the passes that keep it within a budget, and whether there is room.
 
-- How much memory a step takes, and the passes that keep it within a budget: `estimate`, `choose_samples`.
-- Whether there is room for what a configuration and a scene's file say of their sizes, before anything is built:
-  `check_announced`, `check_described`. Films and textures of a hundred million entries take a minute to make; that
-  there is no room for them is known before.
-- Whether there is room for what a configuration asks for, with the reason where there is none: the other checks.
-
-Held against what is free are lower bounds, so that nothing is refused that the machine can hold.
+What configuration and scene file say of sizes is checked before anything is built (`check_announced`,
+`check_described`): films and textures of a hundred million entries take a minute to make. Held against what is free are
+lower bounds, so that nothing is refused that the machine can hold.
 """
 
 from __future__ import annotations

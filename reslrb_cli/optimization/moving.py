@@ -1,12 +1,8 @@
 """Experiments whose parameters move light: what the film's border cuts off, and checks of what cannot be followed.
 
-Light that moves at the film's border has its derivative cut off there. A splat that moves across the border leaves the
-film, or enters it: no sample knows of that, since what lies outside is not traced. How much of the derivative is
-missing goes with how much of what moves lands there (`border_share`); where that is much, a word is said before the
-optimisation (`warn_of_border`).
-
-Where an integrator, or the scene, cannot follow what moves, an error says so, located in the configuration
-(`check_moving`).
+A splat that moves across the film's border leaves the film, or enters it: no sample knows of that, since what lies
+outside is not traced. How much of the derivative is missing goes with how much of what moves lands there
+(`border_share`); where that is much, a word is said before the optimisation (`warn_of_border`).
 """
 
 from __future__ import annotations
@@ -40,8 +36,8 @@ def border_share(tracer: LightTracer, job: Job) -> float:
 
     At the border is what the reconstruction filter spreads beyond it. 0 where nothing moves.
     """
+    at_border, total = 0.0, 0.0
     with dr.suspend_grad():
-        at_border, total = 0.0, 0.0
         for samples in tracer.passes(job):
             if not samples.plan.attached:
                 return 0.0

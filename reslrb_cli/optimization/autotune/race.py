@@ -10,6 +10,12 @@
 - `Turns`: whether another way of taking steps pays, by steps of both in turns, whose gradients estimate the same. Times
   are those of kernels, and, alike for both, what goes on beside them in a run for as many samples, which counts where
   iterations take milliseconds. A table that steps draw from is learned first, of other paths than theirs, and held.
+
+For another option of which two ways are compared: its record in `records/decisions.py` (a `PaidRecord`); its row in
+`LATER`; in `sampling.py` a `Turns` that makes the record (`SequencePilot`), a function beside `_sequence` that has
+`Tuner.decide` find it, by a `StepTrial` of two integrators, and lines in `settle_sampling` that take it. Of more than
+two ways, or of a number, each has its turns with the best so far. What traces equal paths, and goes with the estimator,
+is an option of `candidates` in `estimators.py` instead.
 """
 
 from __future__ import annotations
@@ -354,7 +360,7 @@ class Turns(Race, Generic[Record]):
         self._share, self._most = share, max(share, most)
         self._apart = self.APART and sizes.alone
         self._plain: list[Step] = []  # all steps as they are whose times count
-        self._steps: dict[bool, list[Step]] = {False: [], True: []}
+        self._steps: tuple[list[Step], list[Step]] = ([], [])  # of either kind
         self._walk = Step()
 
     def run(self) -> Record:
@@ -366,16 +372,14 @@ class Turns(Race, Generic[Record]):
         # What Python takes is the same for both.
         kernels = (1 + self._sizes.longer) * (plain.kernel_ms + plain.image_ms)
         if not self._learned(kernels + 2 * plain.beside_ms):
-            return self._record(
-                f"to measure it would cost more than {100 * self._most:.2g} % of {ITERATIONS} iterations"
-            )
+            share = f"{100 * self._most:.2g} % of {ITERATIONS} iterations"
+            return self._record(f"to measure it would cost more than {share}")
         self._spend(take(True, 0, spp), first=True)
         for round in range(1, 1 + self.LOOKS * self._sizes.rounds):
-            both = [self._spend(take(other, round, spp)) for other in (False, True)]
-            for other, step in enumerate(both):
-                self._steps[bool(other)].append(step)
-            self._plain.append(both[0])
-            if not self._affords(sum(step.wall_ms for step in both)):
+            for other in (False, True):
+                self._steps[other].append(self._spend(take(other, round, spp)))
+            self._plain.append(self._steps[False][-1])
+            if not self._affords(sum(steps[-1].wall_ms for steps in self._steps)):
                 break
             if round % self._sizes.rounds == 0 and self._is_clear():
                 break
@@ -430,16 +434,16 @@ class Turns(Race, Generic[Record]):
 
     def _gain(self, images: bool, confidence: float = CONFIDENCE) -> Gain:
         """Of the gradient, as part of steps whose images are drawn the other way or not."""
-        gradients = [[step.gradients for step in self._steps[other]] for other in (False, True)]
-        return compare(gradients[0], self._times(False, images), gradients[1], self._times(True, images), confidence)
+        own, other = ([step.gradients for step in steps] for steps in self._steps)
+        return compare(own, self._times(False, images), other, self._times(True, images), confidence)
 
     def _image_gain(self) -> Gain:
         """Of the image: of samples of its own, where it has them, else of those that serve the gradient too."""
-        images = [[step.images for step in self._steps[other]] for other in (False, True)]
-        times = [self._times(other, False) for other in (False, True)]
+        own, other = ([step.images for step in steps] for steps in self._steps)
+        times = [self._times(each, False) for each in (False, True)]
         if self._sizes.alone:  # what goes on beside kernels counts once, with the gradient
-            times = [[step.image_ms for step in self._steps[other]] for other in (False, True)]
-        return compare(images[0], times[0], images[1], times[1])
+            times = [[step.image_ms for step in steps] for steps in self._steps]
+        return compare(own, times[0], other, times[1])
 
     def _is_clear(self) -> bool:
         """Whether no more steps are needed: it is not on by accident, or off at all events."""
