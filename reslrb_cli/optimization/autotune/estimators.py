@@ -79,21 +79,43 @@ def _parent(options: dict[str, Any]) -> str | None:
 
 
 def find_options(problem: Problem) -> list[Candidate]:
-    """What the run may use in place of `problem.integrator`, where that is left to measurement; else nothing.
+    """What the run may use in place of `problem.integrator`, where that is left to measurement or has to keep a budget,
+    each with the samples of its passes; else nothing.
 
     Needs no targets. Raises ConfigError where no estimator keeps the memory budget.
     """
-    config = problem.config
-    if not isinstance(config.integrator, ReslrbConfig):
+    config, run, budget = problem.config, problem.config.run, problem.config.run.budget_bytes
+    integrator, choices = config.integrator, [dict[str, Any]()]
+    if not isinstance(integrator, ReslrbConfig):
         check_baseline(problem)
         return []
-    if config.integrator.estimator == "auto":
+    if integrator.estimator == "auto":
         choices = [{"estimator": ATTACHED}] if is_attached(problem) else candidates(config)
-        return _fitting(problem, config.integrator, choices)
-    if config.run.memory_budget is None:
+    elif budget is None:
         check_memory(problem, problem.integrator)
         return []
-    return _fitting(problem, config.integrator, [{}])
+    options, least, fixed = [], [], 0 if budget is None else standing()
+    samples = run.spp // race.sets_of(config)
+    for choice in choices:
+        made = Tracer.of(**(integrator.chosen(**choice) if choice else integrator.undecided_off()).options())
+        made.expect(pass_spp(config))
+        check_memory(problem, made)
+        memory = None
+        if budget is not None:
+            size, expected = choose_samples(problem, made, samples, budget, fixed)
+            if size == 0:
+                least.append(expected.total)
+                continue
+            if size < samples:
+                made = made.with_options(samples_per_pass=size, freeze=made.freeze)
+            memory = MemoryPlan(budget, size, samples // size, expected)
+        options.append(Candidate(choice, _parent(choice), made, memory))
+    if not options:
+        mib = -(-min(least) // MIB)
+        reason = f"one sample per pixel takes about {mib:.0f} MiB (scene, targets, images of a step, parameters, paths)"
+        reason += f"; allow at least {mib:.0f} MiB, beside which Python, libraries and kernels are not counted"
+        raise ConfigError(config.source, "run.memory_budget", reason)
+    return options
 
 
 def candidates(config: Config) -> list[dict[str, Any]]:
@@ -103,35 +125,6 @@ def candidates(config: Config) -> list[dict[str, Any]]:
     if config.adjoint != "correlated":
         found += [{"estimator": "reservoir", "capacity": m, "weight": "adjoint"} for m in (1, 4)]
     return found
-
-
-def _fitting(problem: Problem, integrator: ReslrbConfig, choices: list[dict[str, Any]]) -> list[Candidate]:
-    """The candidates that keep the budget, each with the samples of its passes."""
-    run, budget, least, options = problem.config.run, problem.config.run.budget_bytes, [], []
-    fixed = 0 if budget is None else standing()
-    for choice in choices:
-        own = (integrator.chosen(**choice) if choice else integrator.undecided_off()).options()
-        made = Tracer.of(**own)
-        made.expect(pass_spp(problem.config))
-        check_memory(problem, made)
-        if budget is None:
-            options.append(Candidate(choice, _parent(choice), made))
-            continue
-        samples = run.spp // race.sets_of(problem.config)
-        size, expected = choose_samples(problem, made, samples, budget, fixed)
-        if size == 0:
-            least.append(expected.total)
-            continue
-        if size < samples:
-            made = made.with_options(samples_per_pass=size, freeze=made.freeze)
-        plan = MemoryPlan(budget, size, samples // size, expected)
-        options.append(Candidate(choice, _parent(choice), made, plan))
-    if not options:
-        mib = -(-min(least) // MIB)
-        reason = f"one sample per pixel takes about {mib:.0f} MiB (scene, targets, images of a step, parameters, paths)"
-        reason += f"; allow at least {mib:.0f} MiB, beside which Python, libraries and kernels are not counted"
-        raise ConfigError(problem.config.source, "run.memory_budget", reason)
-    return options
 
 
 def settle_estimator(tuner: race.Tuner, options: Sequence[Candidate]) -> None:
@@ -147,9 +140,8 @@ def settle_estimator(tuner: race.Tuner, options: Sequence[Candidate]) -> None:
 
         def usual(note: str) -> EstimatorRecord:
             """It has been the best, or within a few percent of it, wherever that was measured (docs/benchmarks.md)."""
-            return EstimatorRecord(
-                chosen=chosen.options, label=chosen.label, note=f"{note}; every connection, in one traversal"
-            )
+            note += "; every connection, in one traversal"
+            return EstimatorRecord(chosen=chosen.options, label=chosen.label, note=note)
 
         pilot = tuner.decide(
             EstimatorRecord,
