@@ -22,6 +22,7 @@ from reslrb_cli.backend.memory import free_bytes
 from reslrb_cli.config.schema import Config
 from reslrb_cli.integrators.reslrb import Reslrb
 from reslrb_cli.optimization.assemble import assemble
+from reslrb_cli.optimization.autotune.race import sets_of
 from reslrb_cli.optimization.autotune.sampling import lessons
 from reslrb_cli.optimization.loop import optimize
 from reslrb_cli.optimization.memory import plans
@@ -58,9 +59,7 @@ class Steps:
 def measure_steps(problem: Problem) -> Steps:
     """What a step of the run takes, measured or by two smaller ones."""
     config = problem.config
-    unit = config.run.batches if config.adjoint == "batched" else 1
-    unit *= problem.samples_per_pass or 1
-    whole = config.run.spp
+    unit, whole = sets_of(config) * (problem.samples_per_pass or 1), config.run.spp
     if unit >= whole:
         return _measure(problem, whole)
     first = _measure(problem, unit)

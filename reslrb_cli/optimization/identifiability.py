@@ -101,9 +101,8 @@ def sensitivity(problem: Problem) -> dict[str, Array]:
             at = seed(run.seed, 0, sensor, f"reach, pass {number}")
             known_step(integrator, problem.scene, sensor, ones, seed=at, spp=part, params=problem.selection.params)
             for key, gradient in problem.gradients().items():
-                nonzero = problem.selection.shown(key, gradient) != 0
+                found[key] = (problem.selection.shown(key, gradient) != 0) | found.get(key, False)
                 problem.optimizer.clear_gradient(key)
-                found[key] = found[key] | nonzero if key in found else nonzero
     return found
 
 

@@ -106,8 +106,8 @@ def measure_sensitivities(problem: Problem, samples: int) -> list[Sensitivity]:
     for round in range(samples):
         taken = sample_gradient(problem, problem.integrator, round, _PURPOSE, problem.config.run.spp)
         for key, gradient in taken.items():
-            finite = dr.select(dr.isfinite(gradient), gradient, 0)
-            total[key] = finite if round == 0 else total[key] + finite
+            known = dr.select(dr.isfinite(gradient), gradient, 0)
+            total[key] = known if round == 0 else total[key] + known
         for key, gradient in take_gradient(problem).items():
             rows[key].append(gradient.astype(np.float64))
     base = see_images(problem)

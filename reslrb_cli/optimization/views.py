@@ -120,12 +120,8 @@ class Exposure:
 
     def of_array(self, image: Array) -> Array:
         """E I of an image (H, W, C or more), its alpha as it is."""
-        value = np.atleast_1d(np.array(self.now(), np.float32).ravel())
-        if np.all(value == 1):
-            return image
         factor = np.ones(image.shape[2], np.float32)
-        colors = 1 if image.shape[2] <= 2 else 3
-        factor[:colors] = value
+        factor[: 1 if image.shape[2] <= 2 else 3] = np.array(self.now(), np.float32).ravel()
         return image * factor
 
     def add_gradient(self, leaf: Any, channels: int, image: mi.TensorXf, gradient: mi.TensorXf) -> None:
