@@ -7,7 +7,6 @@ efficient it is.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 from reslrb_cli.integrators.step import make_integrator
 from reslrb_cli.measure.gradients import moves_light
@@ -46,7 +45,15 @@ def measure_rival(problem: Problem, cache: PilotCache | None, say: Callable[[str
         planned = float(run.spp * MOST_ROUNDS)  # as many samples as there are
         sizes = race.Sizes(run.spp, spp, spp, False, MOST_ROUNDS, 0.0, LONGER, planned)
         share, most = (min(each, left / race.ITERATIONS) for each in (SHARE, MOST_SHARE))
-        return RivalTurns(RivalTrial(problem), sizes, 1.0, share, most).run()
+        options, clock = problem.config.integrator.options(), StepClock()
+        rival = make_integrator(RIVAL, **{name: options[name] for name in ("max_depth", "rr_depth", "hide_emitters")})
+        # A recording would cost more than so few steps save.
+        own = problem.integrator.to_measure().with_options(samples_per_pass=None, freeze=False)
+
+        def take(other: bool, round: int, spp: int) -> race.Step:
+            return race.measured_step(problem, rival if other else own, clock, round, spp)
+
+        return RivalTurns(take, sizes, 1.0, share, most).run()
 
     beside = [pilot.chosen, guided and guided.guided, sequence and sequence.low_discrepancy]
     return race.Tuner(problem, say, cache).decide(
@@ -82,21 +89,6 @@ def _samples(problem: Problem, iterations: float) -> int:
     return max(int(share * run.spp) // unit, 1) * unit
 
 
-class RivalTrial(race.Trial):
-    """Steps of the run, as they are or by `prb`."""
-
-    def __init__(self, problem: Problem) -> None:
-        options = problem.config.integrator.options()
-        rival = make_integrator(RIVAL, **{name: options[name] for name in ("max_depth", "rr_depth", "hide_emitters")})
-        # A recording would cost more than so few steps save.
-        own = problem.integrator.to_measure().with_options(samples_per_pass=None, freeze=False)
-        self._problem, self._clock, self._integrators = problem, StepClock(), {True: rival, False: own}
-
-    def take(self, other: bool, round: int, spp: int) -> race.Step:
-        """One step of all views."""
-        return race.measured_step(self._problem, self._integrators[other], self._clock, round, spp)
-
-
 class RivalTurns(race.Turns[RivalRecord]):
     """One decision: whether `prb` is the more efficient. What Python takes beside the kernels is left out."""
 
@@ -105,6 +97,6 @@ class RivalTurns(race.Turns[RivalRecord]):
     def _times(self, other: bool, images: bool) -> list[float]:
         return [step.kernel_ms for step in self._steps[other]]
 
-    def _record(self, other: bool, images: bool, gain: race.Gain, picture: race.Gain, note: str) -> RivalRecord:
-        found: dict[str, Any] = dict(zip(("advantage", "low", "high"), gain, strict=True)) | self._cost()
-        return RivalRecord(integrator=RIVAL, rounds=len(self._steps[True]), spp=self._sizes.trial, note=note, **found)
+    def _record(self, note: str, gain: race.Gain = race.NOTHING, *others: object) -> RivalRecord:
+        found = dict(zip(("advantage", "low", "high"), gain, strict=True)) | self._found(note)
+        return RivalRecord(integrator=RIVAL, **found)

@@ -104,19 +104,16 @@ def assemble_scene(config: Config, scene: Any = None, values: Mapping[str, Array
         integrator=make_configured(config.integrator),
         optimizer=make_optimizer(config, selection),
         samples_per_pass=samples_per_pass(config),
-        quantities={key: _quantity(selection, key) for key in selection.keys},
+        quantities={
+            key: "" if key in selection.factors else selection.quantity(key) or quantity(selection.params, key)
+            for key in selection.keys
+        },
     )
     if isinstance(problem.integrator, LightTracer):
         problem.integrator.expect(pass_spp(config))
     problem.apply()
     check_moving(problem)
     return problem
-
-
-def _quantity(selection: Selection, key: str) -> str:
-    if key in selection.factors:
-        return ""
-    return selection.quantity(key) or quantity(selection.params, key)
 
 
 def _check_values(selection: Selection, values: Mapping[str, Array]) -> None:

@@ -160,7 +160,6 @@ def _with_error(products: Array, function: Callable[[Array], float]) -> tuple[fl
     """`function` of the means over r != s of (K, R, R) inner products (K,), and its standard error."""
 
     def at(left: Array) -> float:
-        """Of (K, S, S) products."""
         off_diagonal = left.sum(axis=(1, 2)) - np.trace(left, axis1=1, axis2=2)
         return float(function(off_diagonal / (left.shape[1] * (left.shape[1] - 1))))
 

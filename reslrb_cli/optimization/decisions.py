@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 from reslrb_cli.records.clock import MIB
@@ -46,6 +49,10 @@ class MemoryPlan(Jsonable):
         return f"run.memory_budget: {used / MIB:.1f} MiB were used, more than the {allowed} that it allows"
 
 
+#: Time as a multiple of what a run has: kernels to compile, in those of one step, and iterations' worth of work.
+Need = tuple[float, float]
+
+
 @dataclass
 class Allowance:
     """Seconds that all measuring before the first iteration may take: a share of what the run itself will, `run_s`.
@@ -59,16 +66,29 @@ class Allowance:
     compile_s: float
     iteration_s: float
     spent_s: float = 0.0
+    aside_s: float = 0.0
+    since_s: float | None = None
 
     @property
     def left_s(self) -> float:
-        """What has not been spent."""
-        return max(self.share * self.run_s - self.spent_s, 0.0)
+        """What has not been spent, up to now, nor is kept aside."""
+        running = 0.0 if self.since_s is None else time.perf_counter() - self.since_s
+        return max(self.share * self.run_s - self.spent_s - self.aside_s - running, 0.0)
 
-    def affords(self, *needs: tuple[float, float]) -> bool:
-        """Whether there is time for all of these: kernels of so many steps to compile, and so many iterations' worth
-        of work."""
-        return sum(k * self.compile_s + n * self.iteration_s for k, n in needs) <= self.left_s
+    def affords(self, *needs: Need) -> bool:
+        """Whether there is time for all of these."""
+        return self._seconds(needs) <= self.left_s
+
+    def _seconds(self, needs: Sequence[Need]) -> float:
+        return sum(kernels * self.compile_s + iterations * self.iteration_s for kernels, iterations in needs)
+
+    @contextmanager
+    def spending(self, later: Sequence[Need]) -> Iterator[None]:
+        """Count the block's time as spent; what is measured `later` has its time kept aside until the block ends."""
+        self.aside_s, self.since_s = self._seconds(later), time.perf_counter()
+        yield
+        self.spent_s += time.perf_counter() - self.since_s
+        self.aside_s, self.since_s = 0.0, None
 
     def iterations_left(self, kernels: float) -> float:
         """The iterations' worth of work that there is time for, once the kernels of so many steps are compiled."""

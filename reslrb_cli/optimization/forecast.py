@@ -20,14 +20,14 @@ import mitsuba as mi
 from reslrb_cli.backend.doctor import resident_paths
 from reslrb_cli.backend.memory import free_bytes
 from reslrb_cli.config.schema import Config
-from reslrb_cli.integrators.reslrb import Reslrb as Tracer
-from reslrb_cli.optimization.assemble import assemble_scene
-from reslrb_cli.optimization.autotune.estimators import find_options
-from reslrb_cli.optimization.autotune.sampling import lessons, settle
+from reslrb_cli.integrators.reslrb import Reslrb
+from reslrb_cli.optimization.assemble import assemble
+from reslrb_cli.optimization.autotune.race import sets_of
+from reslrb_cli.optimization.autotune.sampling import lessons
 from reslrb_cli.optimization.loop import optimize
+from reslrb_cli.optimization.memory import plans
 from reslrb_cli.optimization.problem import Problem, saved_spp
 from reslrb_cli.optimization.state import guiding_of
-from reslrb_cli.optimization.targets import make_targets
 from reslrb_cli.optimization.uncertainty.measuring import LEAST_ITERATIONS
 from reslrb_cli.records.cache import PilotCache
 from reslrb_cli.records.clock import MIB
@@ -45,10 +45,12 @@ WARM_UP, LEAST, MOST, SECONDS = 5, 4, 40, 5.0
 
 @dataclass(frozen=True)
 class Steps:
-    """Steps of `spp` samples per pixel: seconds of one, what the first took longer, compiling apart, and the peak."""
+    """Steps of `spp` samples per pixel, one an iteration: seconds of one (`iteration_s`), what the first take longer
+    when all kernels are there (`start_s`), what compiling them took now, and bytes of the allocator at the most, as
+    `peak_mib` in `metrics.jsonl` has them."""
 
     spp: int
-    step_s: float
+    iteration_s: float
     start_s: float
     compile_s: float
     peak: int
@@ -57,21 +59,19 @@ class Steps:
 def measure_steps(problem: Problem) -> Steps:
     """What a step of the run takes, measured or by two smaller ones."""
     config = problem.config
-    unit = config.run.batches if config.adjoint == "batched" else 1
-    unit *= problem.samples_per_pass or 1
-    whole = config.run.spp
+    unit, whole = sets_of(config) * (problem.samples_per_pass or 1), config.run.spp
     if unit >= whole:
         return _measure(problem, whole)
     first = _measure(problem, unit)
-    if first.step_s * whole / unit <= LONG_STEP:
+    if first.iteration_s * whole / unit <= LONG_STEP:
         steps = _measure(problem, whole)
         return replace(steps, compile_s=first.compile_s + steps.compile_s)
-    small = max(min(int(SHORT_STEP / max(first.step_s, 1e-6)), whole // unit // 2), 1) * unit
+    small = max(min(int(SHORT_STEP / max(first.iteration_s, 1e-6)), whole // unit // 2), 1) * unit
     one, two = _measure(problem, small), _measure(problem, 2 * small)
     share = (whole - small) / small
-    step_s = one.step_s + share * max(two.step_s - one.step_s, 0.0)
-    peak = _peak(problem, whole) if step_s <= WAIT else int(one.peak + share * max(two.peak - one.peak, 0))
-    return Steps(two.spp, step_s, two.start_s, first.compile_s + one.compile_s + two.compile_s, peak)
+    iteration_s = one.iteration_s + share * max(two.iteration_s - one.iteration_s, 0.0)
+    peak = _peak(problem, whole) if iteration_s <= WAIT else int(one.peak + share * max(two.peak - one.peak, 0))
+    return Steps(two.spp, iteration_s, two.start_s, first.compile_s + one.compile_s + two.compile_s, peak)
 
 
 def _peak(problem: Problem, spp: int) -> int:
@@ -137,29 +137,18 @@ VERDICTS = 30
 
 
 @dataclass(frozen=True)
-class Forecast:
-    """Bytes of the iterations, by part (`parts`; all that the allocator gives out adds up to `peak`), and beside them
-    `scratch`, thread-local; seconds of the run, by part. `iteration_s` is one iteration, `start_s` what the first ones
-    take longer when all kernels are there, `compile_s` what compiling them took now, `spp` the samples of the steps
-    that were measured."""
+class Forecast(Steps):
+    """Steps that were measured, and what they say of the run: bytes by part (`parts` add up to `peak`), and beside
+    them `scratch`, thread-local, and what is `free`; seconds of what comes before and after its `iterations`."""
 
     parts: dict[str, int]
     scratch: int
     free: int
     iterations: int
-    iteration_s: float
-    start_s: float
-    compile_s: float
     pilot_s: float
     target_s: float
     images_s: float
     verdicts_s: float
-    spp: int
-
-    @property
-    def peak(self) -> int:
-        """Bytes of the allocator at the most, as `peak_mib` in `metrics.jsonl` has them."""
-        return sum(self.parts.values())
 
     @property
     def elapsed_s(self) -> float:
@@ -184,41 +173,33 @@ def make_forecast(
     measures what it does before its first iteration: with its integrator settled, and its parameters where they begin.
     Raises ConfigError and UnsupportedScene as the run would, and what its steps raise.
     """
-    problem = assemble_scene(_with_short_target(config))
-    options = find_options(problem)
-    buffers = _buffers(problem)
-    problem = replace(make_targets(problem, say), truth={})  # errors are no part of a step
-    problem = settle(problem, options, say, cache)
-    image_s = _image_seconds(problem)
+    # Errors are no part of a step.
+    problem = replace(assemble(_with_short_target(config), say, cache), truth={})
+    image_s, views = _image_seconds(problem), len(problem.views)
     before(problem)
     say("measuring a few steps")
-    steps, scratch = measure_steps(problem), _scratch(problem)
+    steps, scratch, integrator = measure_steps(problem), 0, problem.integrator
+    if isinstance(integrator, Reslrb):  # of all paths that are traced at a time
+        scratch = (
+            max(integrator.estimator.scratch_bytes(plan) for plan in plans(problem, integrator)) * resident_paths()
+        )
     run, measured = config.run, (problem.pilot, problem.guided, problem.sequence)
-    targets = sum(4 * int(dr.prod(view.target.shape)) for view in problem.views)
-    parts = {
-        "geometry": buffers["geometry"],
-        "textures and other values of the scene": buffers["values"],
-        "targets": targets,
-        "optimiser's state": _state_bytes(problem),
-    }
-    parts["images of a step, gradients, what is kept of paths (reservoir)"] = max(steps.peak - sum(parts.values()), 0)
+    parts = _parts(problem)
+    rest = max(steps.peak - sum(parts.values()), 0)
+    parts["images of a step, gradients, what is kept of paths (reservoir)"] = rest
     between = run.iterations // run.images_every if run.images_every else 0
     images = 2 * saved_spp(problem, between=False) + between * saved_spp(problem, between=True)
-    render = config.target.render
-    views = len(problem.views)
+    has_verdicts = run.certainty and run.iterations >= LEAST_ITERATIONS
     return Forecast(
+        **{**vars(steps), "peak": sum(parts.values())},
         parts=parts,
         scratch=scratch,
         free=free_bytes(mi.variant()),
         iterations=run.iterations,
-        iteration_s=steps.step_s,
-        start_s=steps.start_s,
-        compile_s=steps.compile_s,
         pilot_s=sum(each.measure_s + each.compile_s for each in measured if each and not each.cached),
-        target_s=0.0 if render is None else image_s * render.spp * views,
+        target_s=image_s * config.target.render.spp * views if config.target.render else 0.0,
         images_s=image_s * images * views,
-        verdicts_s=VERDICTS * steps.step_s if run.certainty and run.iterations >= LEAST_ITERATIONS else 0.0,
-        spp=steps.spp,
+        verdicts_s=VERDICTS * steps.iteration_s if has_verdicts else 0.0,
     )
 
 
@@ -242,39 +223,26 @@ def _image_seconds(problem: Problem) -> float:
     return (time.perf_counter() - begin) / spp
 
 
-# --- what memory is for -----------------------------------------------------------------------------------------------
-
-
-def _buffers(problem: Problem) -> dict[str, int]:
-    """Bytes of the scene's values that a script can reach, those of shapes apart."""
-    found = {"geometry": 0, "values": 0}
+def _parts(problem: Problem) -> dict[str, int]:
+    """Bytes that stand beside a step: the scene's values that a script can reach, targets, the optimiser's state."""
+    geometry = values = 0
     params = problem.selection.params
     for key in params.properties:
         value = params[key]
-        if isinstance(value, dr.ArrayBase):
-            name = key.rpartition(".")[2]
-            part = "geometry" if name.startswith(("vertex_", "faces", "to_world")) else "values"
-            found[part] += _bytes(value)
-    return found
+        if not isinstance(value, dr.ArrayBase):
+            continue
+        if key.rpartition(".")[2].startswith(("vertex_", "faces", "to_world")):
+            geometry += _bytes(value)
+        else:
+            values += _bytes(value)
+    return {
+        "geometry": geometry,
+        "textures and other values of the scene": values,
+        "targets": sum(_bytes(view.target) for view in problem.views),
+        "optimiser's state": sum(_bytes(v) for v in problem.optimizer.state().values() if isinstance(v, dr.ArrayBase)),
+    }
 
 
 def _bytes(value: dr.ArrayBase) -> int:
     """Bytes of an array of Dr.Jit."""
     return int(dr.prod(dr.shape(value))) * int(dr.itemsize_v(value))
-
-
-def _state_bytes(problem: Problem) -> int:
-    """Bytes of the optimiser's state: values and moments."""
-    return sum(_bytes(value) for value in problem.optimizer.state().values() if isinstance(value, dr.ArrayBase))
-
-
-def _scratch(problem: Problem) -> int:
-    """Thread-local bytes of all paths that are traced at a time."""
-    integrator = problem.integrator
-    if not isinstance(integrator, Tracer):
-        return 0
-    plans = [
-        integrator.plan(problem.scene, problem.scene.sensors()[index], problem.selection.params)
-        for index in problem.sensors
-    ]
-    return max(integrator.estimator.scratch_bytes(plan) for plan in plans) * resident_paths()

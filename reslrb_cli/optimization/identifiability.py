@@ -15,7 +15,6 @@ has an eigenvalue near 0; its eigenvector says which values are in the combinati
 
 from __future__ import annotations
 
-import dataclasses
 import logging
 from collections.abc import Sequence
 from dataclasses import replace
@@ -81,7 +80,8 @@ def shown_texels(problem: Problem, key: str) -> Array | None:
 def _visible(problem: Problem, key: str, pixels: Sequence[Array | None] = ()) -> Array:
     """The texels that views that are trained on show, in these pixels, or in any."""
     sensors = [problem.scene.sensors()[view.sensor] for view in problem.trained]
-    return _without_halo(visible_texels(problem.scene, sensors, key, pixels), problem.selection.array(key).shape[1])
+    seen, halo = visible_texels(problem.scene, sensors, key, pixels), problem.selection.slot(key).halo
+    return seen[:, halo : seen.shape[1] - halo]
 
 
 def sensitivity(problem: Problem) -> dict[str, Array]:
@@ -101,31 +101,9 @@ def sensitivity(problem: Problem) -> dict[str, Array]:
             at = seed(run.seed, 0, sensor, f"reach, pass {number}")
             known_step(integrator, problem.scene, sensor, ones, seed=at, spp=part, params=problem.selection.params)
             for key, gradient in problem.gradients().items():
-                nonzero = np.array(gradient != 0.0)
+                found[key] = (problem.selection.shown(key, gradient) != 0) | found.get(key, False)
                 problem.optimizer.clear_gradient(key)
-                found[key] = found[key] | nonzero if key in found else nonzero
-    return {key: _like(problem.selection.array(key), value) for key, value in found.items()}
-
-
-def _like(array: Array, mask: Array) -> Array:
-    """`mask` in the shape of `array`, without the halo columns that an environment map's tensor has."""
-    if array.ndim == 3 and mask.ndim == 3:
-        mask = _without_halo(mask, array.shape[1])
-    return mask.reshape(array.shape)
-
-
-def _without_halo(mask: Array, width: int) -> Array:
-    """The middle `width` columns of a mask (H, W, ...)."""
-    halo = (mask.shape[1] - width) // 2
-    return mask[:, halo : halo + width]
-
-
-@dataclasses.dataclass(frozen=True)
-class Ambiguous:
-    """Values that can change together without the images showing it: exposures, and parameters."""
-
-    exposures: list[str]
-    parameters: list[str]
+    return found
 
 
 def check_exposures(problem: Problem) -> None:
@@ -137,16 +115,17 @@ def check_exposures(problem: Problem) -> None:
     found = find_ambiguous(problem) if problem.selection.factors else None
     if found is None:
         return
-    both = " and ".join(f"`{key}`" for key in found.exposures), ", ".join(f"`{key}`" for key in found.parameters)
-    raise ConfigError(
-        problem.config.source,
-        _place(problem, found.exposures[0]),
-        f"the images cannot tell {both[0]} from {both[1]}: changed together, they look the same; give one of them a "
-        "number, such as exposure: 1, or remove a parameter whose value is known",
-    )
+    (exposure, *_), parameters = found
+    what = " and ".join(f"`{key}`" for key in found[0]) + " from " + ", ".join(f"`{key}`" for key in parameters)
+    reason = f"the images cannot tell {what}: changed together, they look the same; give one of them a number, such as "
+    place = "target.exposure"
+    for number, spec in enumerate(problem.config.views or ()):
+        if spec.exposure is not None and exposure == f"{SHARED}.{spec.sensor}":
+            place = f"views[{number}].exposure"
+    raise ConfigError(problem.config.source, place, f"{reason}exposure: 1, or remove a parameter whose value is known")
 
 
-def find_ambiguous(problem: Problem) -> Ambiguous | None:
+def find_ambiguous(problem: Problem) -> tuple[list[str], list[str]] | None:
     """The first combination of exposures and parameters that the images do not show; None where there is none."""
     problem.apply()
     base = _row(problem)
@@ -169,16 +148,8 @@ def find_ambiguous(problem: Problem) -> Ambiguous | None:
         exposures = [key for key in parts if key in factors]
         parameters = [key for key in parts if key not in factors]
         if value < LEAST and exposures and parameters:
-            return Ambiguous(exposures, parameters)
+            return exposures, parameters
     return None
-
-
-def _place(problem: Problem, key: str) -> str:
-    """Where the exposure of that key stands in the configuration."""
-    for number, spec in enumerate(problem.config.views or ()):
-        if spec.exposure is not None and key == f"{SHARED}.{spec.sensor}":
-            return f"views[{number}].exposure"
-    return "target.exposure"
 
 
 def _row(problem: Problem) -> Array:

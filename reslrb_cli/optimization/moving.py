@@ -1,12 +1,8 @@
 """Experiments whose parameters move light: what the film's border cuts off, and checks of what cannot be followed.
 
-Light that moves at the film's border has its derivative cut off there. A splat that moves across the border leaves the
-film, or enters it: no sample knows of that, since what lies outside is not traced. How much of the derivative is
-missing goes with how much of what moves lands there (`border_share`); where that is much, a word is said before the
-optimisation (`warn_of_border`).
-
-Where an integrator, or the scene, cannot follow what moves, an error says so, located in the configuration
-(`check_moving`).
+A splat that moves across the film's border leaves the film, or enters it: no sample knows of that, since what lies
+outside is not traced. How much of the derivative is missing goes with how much of what moves lands there
+(`border_share`); where that is much, a word is said before the optimisation (`warn_of_border`).
 """
 
 from __future__ import annotations
@@ -22,6 +18,7 @@ from reslrb_cli.errors import ConfigError, UnsupportedScene
 from reslrb_cli.integrators.protocol import Job
 from reslrb_cli.integrators.reslrb import LightTracer
 from reslrb_cli.integrators.reslrb import Reslrb as Tracer
+from reslrb_cli.optimization.memory import plans
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.scene.deformation import where_moved
 from reslrb_cli.seeds import seed
@@ -39,8 +36,8 @@ def border_share(tracer: LightTracer, job: Job) -> float:
 
     At the border is what the reconstruction filter spreads beyond it. 0 where nothing moves.
     """
+    at_border, total = 0.0, 0.0
     with dr.suspend_grad():
-        at_border, total = 0.0, 0.0
         for samples in tracer.passes(job):
             if not samples.plan.attached:
                 return 0.0
@@ -117,10 +114,10 @@ def warn_of_border(problem: Problem, warn: Callable[[str], None]) -> None:
         number = dr.opaque(mi.UInt32, seed(problem.config.run.seed, 0, index, "border"))
         share = border_share(tracer, Job(problem.scene, sensor, number, SPP, problem.selection.params))
         if share > NOTICED:
-            warn(
+            line = (
                 f"view {index}: {share:.0%} of the light that moves lands at the film's border, where its derivative "
-                "is cut off; a view in which all of it stays inside has none of that"
             )
+            warn(f"{line}is cut off; a view in which all of it stays inside has none of that")
 
 
 #: The estimator of those that `auto` chooses from that has derivatives of what moves light.
@@ -135,38 +132,25 @@ def is_attached(problem: Problem) -> bool:
 
 def check_moving(problem: Problem) -> None:
     """Raise ConfigError, located, where the integrator cannot differentiate what moves."""
-    config, params = problem.config, problem.selection.params
-    moved = where_moved(params, problem.selection.scene_keys)
     if not is_attached(problem):
         return
-    kind = config.integrator.type
+    config, moved = problem.config, where_moved(problem.selection.params, problem.selection.scene_keys)
+    kind, tracer = config.integrator.type, problem.integrator
     if moved and kind in ("prb", "trajectory"):
-        raise ConfigError(
-            config.source,
-            "integrator.type",
-            f"{kind} has no derivatives of what moves light, as `{moved[0].key}` does; take reslrb or ptracer",
-        )
-    tracer = problem.integrator
+        reason = f"{kind} has no derivatives of what moves light, as `{moved[0].key}` does; take reslrb or ptracer"
+        raise ConfigError(config.source, "integrator.type", reason)
     if isinstance(config.integrator, ReslrbConfig) and config.integrator.estimator == "auto":
         tracer = Tracer.of(**config.integrator.chosen(estimator=ATTACHED).options())
-    for index in problem.sensors:
-        sensor = problem.scene.sensors()[index]
-        if not isinstance(tracer, LightTracer):
-            _check_filter(problem, sensor)
-            continue
+    if isinstance(tracer, LightTracer):
         try:
-            tracer.plan(problem.scene, sensor, params)
+            plans(problem, tracer)
         except UnsupportedScene as error:
             key = f"integrator.{error.option}" if error.option else "scene.file"
             raise ConfigError(config.source, key, str(error)) from error
-
-
-def _check_filter(problem: Problem, sensor: mi.Sensor) -> None:
-    """The same for Mitsuba's own light tracer, whose splats have no derivative through a box filter either."""
-    if sensor.film().rfilter().is_box_filter():
-        raise ConfigError(
-            problem.config.source,
-            "scene.file",
-            f"sensor {sensor.id()} has a box filter, whose splats do not change while they move inside of a pixel; "
-            "take a smooth one, such as gaussian, for derivatives of what moves light",
-        )
+        return
+    for index in problem.sensors:  # the splats of Mitsuba's own light tracer have no derivative through a box filter
+        sensor = problem.scene.sensors()[index]
+        if sensor.film().rfilter().is_box_filter():
+            reason = f"sensor {sensor.id()} has a box filter, whose splats do not change while they move inside of a "
+            reason += "pixel; take a smooth one, such as gaussian, for derivatives of what moves light"
+            raise ConfigError(config.source, "scene.file", reason)

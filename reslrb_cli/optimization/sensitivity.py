@@ -63,10 +63,14 @@ def take_gradient(problem: Problem) -> dict[str, Array]:
     """The gradients that have been accumulated, each in a row, 0 where they are not finite; they are cleared."""
     taken = {}
     for key, value in problem.gradients().items():
-        gradient = np.array(value, dtype=np.float32)
-        taken[key] = np.nan_to_num(gradient, nan=0.0, posinf=0.0, neginf=0.0).ravel()
+        taken[key] = finite(np.array(value, dtype=np.float32)).ravel()
         problem.optimizer.clear_gradient(key)
     return taken
+
+
+def finite(values: Array) -> Array:
+    """The values, 0 where they are not finite."""
+    return np.nan_to_num(values, nan=0.0, posinf=0.0, neginf=0.0)
 
 
 def unrecorded(integrator: Any) -> Any:
@@ -102,8 +106,8 @@ def measure_sensitivities(problem: Problem, samples: int) -> list[Sensitivity]:
     for round in range(samples):
         taken = sample_gradient(problem, problem.integrator, round, _PURPOSE, problem.config.run.spp)
         for key, gradient in taken.items():
-            finite = dr.select(dr.isfinite(gradient), gradient, 0)
-            total[key] = finite if round == 0 else total[key] + finite
+            known = dr.select(dr.isfinite(gradient), gradient, 0)
+            total[key] = known if round == 0 else total[key] + known
         for key, gradient in take_gradient(problem).items():
             rows[key].append(gradient.astype(np.float64))
     base = see_images(problem)

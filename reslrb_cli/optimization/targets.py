@@ -9,13 +9,11 @@ from __future__ import annotations
 import gc
 from collections.abc import Callable
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
 
 import mitsuba as mi
 import numpy as np
 
 from reslrb_cli.config.schema import Config
-from reslrb_cli.config.views import Mask
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.optimization.errors import comparison_grid
 from reslrb_cli.optimization.loading import (
@@ -26,16 +24,11 @@ from reslrb_cli.optimization.loading import (
     make_configured,
     render_in_passes,
 )
-from reslrb_cli.optimization.views import Masked, View, color_channels
+from reslrb_cli.optimization.problem import Problem
+from reslrb_cli.optimization.views import Array, Masked, View, Wanted, color_channels
 from reslrb_cli.scene.images import Photo, read_photo, read_weights, turned_line
 from reslrb_cli.scene.parameters import Selection, set_values
 from reslrb_cli.scene.visibility import interior, sees_specular
-
-if TYPE_CHECKING:
-    from reslrb_cli.optimization.problem import Problem
-
-
-Array = np.ndarray[Any, Any]
 
 #: What pixels of each kind are said to do.
 WORDS = {
@@ -49,26 +42,24 @@ WORDS = {
 }
 
 
-def mask_of(config: Config, mask: Mask, mixed: bool, key: str, scene: mi.Scene, sensor: int, photo: Photo | None
-            ) -> Masked:  # fmt: skip
-    """Find the pixels of the view through `sensor` that `mask` leaves out; `key` is where it stands in `config`.
+def mask_of(config: Config, wanted: Wanted, scene: mi.Scene, photo: Photo | None) -> Masked:
+    """Find the pixels of a view that its mask leaves out; `photo` is the target's file, None of a rendered one.
 
-    `photo` is the target's file, None of a rendered one. Raises ConfigError where the file of weights is wrong.
+    Raises ConfigError where the file of weights is wrong.
     """
-    film = scene.sensors()[sensor].film()
-    width, height = (int(n) for n in film.crop_size())
-    found = Masked()
+    mask, sensor, found = wanted.mask, scene.sensors()[wanted.sensor], Masked()
+    width, height = (int(n) for n in sensor.film().crop_size())
     if _lacks_light(config, photo is None):
-        if mask.specular or mixed:
-            seen = sees_specular(scene, scene.sensors()[sensor])
+        if mask.specular or wanted.mask_mixed:
+            seen = sees_specular(scene, sensor)
             if mask.specular:
                 found.left_out["specular"] = seen.alone
-            if mixed:
+            if wanted.mask_mixed:
                 found.left_out["mixed"] = seen.mixed
             elif (count := int(seen.mixed.sum())) > 0:
                 found.stay["mixed"] = count
         if mask.border:
-            found.left_out["border"] = ~interior((height, width), scene.sensors()[sensor])
+            found.left_out["border"] = ~interior((height, width), sensor)
     if photo is not None:
         kinds = {"clipped": photo.clipped, "alpha": photo.transparent, "nonfinite": photo.nonfinite}
         found.left_out |= {kind: pixels for kind, pixels in kinds.items() if getattr(mask, kind)}
@@ -76,7 +67,7 @@ def mask_of(config: Config, mask: Mask, mixed: bool, key: str, scene: mi.Scene, 
         try:
             found.weights = read_weights(mask.file, (width, height), are_upright(config))
         except ConfigError as error:
-            raise ConfigError(config.source, f"{key}.file", error.message) from None
+            raise ConfigError(config.source, f"{wanted.mask_key}.file", error.message) from None
         found.left_out["file"] = found.weights == 0
     return found
 
@@ -112,15 +103,24 @@ def make_targets(problem: Problem, say: Callable[[str], None]) -> Problem:
 
     `say` is told what takes long, and what of the targets is left out. Raises ConfigError.
     """
-    if problem.config.target.file is not None:
-        _check_count(problem)
+    config, files, upright = problem.config, problem.config.target.file, are_upright(problem.config)
+    if files is not None and len(files) != len(problem.views):
+        reason = f"must name one image for each sensor; images: {len(files)}, sensors: {len(problem.views)}"
+        raise ConfigError(config.source, "target.file", reason)
     for view in problem.views:
-        if view.wanted.file is not None:
-            photo = _read_photo(problem, view)
-            line = turned_line(view.wanted.file, are_upright(problem.config))
-            if line is not None:
-                say(line)
-            _see(problem, view, photo.image, photo, say)
+        wanted, film = view.wanted, problem.scene.sensors()[view.sensor].film()
+        if wanted.file is None:
+            continue
+        size = (int(film.crop_size()[0]), int(film.crop_size()[1]))
+        space, gamma, nonfinite = config.target.color_space, config.target.gamma, wanted.mask.nonfinite
+        try:
+            photo = read_photo(wanted.file, space, size, gamma, upright, nonfinite=nonfinite)
+        except ConfigError as error:
+            raise ConfigError(config.source, wanted.file_key, error.message) from None
+        line = turned_line(wanted.file, upright)
+        if line is not None:
+            say(line)
+        _see(problem, view, photo.image, photo, say)
     if problem.config.target.render is not None:
         problem = replace(problem, truth=_render_targets(problem, say))
         gc.collect()  # a second scene takes part in all that is traced, until it is gone
@@ -145,16 +145,16 @@ def _check_light(problem: Problem, say: Callable[[str], None]) -> None:
 def _see(problem: Problem, view: View, image: Array, photo: Photo | None, say: Callable[[str], None]) -> None:
     """Give a view its target, (H, W, C), and leave out what its mask does; `photo` is what was read, if it was."""
     wanted, config = view.wanted, problem.config
-    target = _fit(problem, image, view.sensor)
-    view.masked = mask_of(config, wanted.mask, wanted.mask_mixed, wanted.mask_key, problem.scene, view.sensor, photo)
+    colors = color_channels(problem.scene.sensors()[view.sensor].film())
+    if colors == 1 and image.shape[2] >= 3:
+        image = image[:, :, :3] @ LUMINANCE[:, None]
+    target = image[:, :, :colors]
+    view.masked = mask_of(config, wanted, problem.scene, photo)
     weights = view.masked.total(target.shape[:2])
     line = mask_line(f"view {view.sensor}", view.masked, weights)
     if not weights.any():
-        raise ConfigError(
-            config.source,
-            wanted.mask_key,
-            f"leaves nothing to compare ({line}); switch kinds off, such as {{specular: false}}, or set it to none",
-        )
+        advice = "switch kinds off, such as {specular: false}, or set it to none"
+        raise ConfigError(config.source, wanted.mask_key, f"leaves nothing to compare ({line}); {advice}")
     if line is not None:
         say(line)
     view.see(target, weights)
@@ -196,34 +196,3 @@ def set_true_values(config: Config, scene: mi.Scene) -> Selection:
     render = config.target.render
     assert render is not None, "called for rendered targets only"
     return set_values(scene, config.parameters, render.parameters, config.source, "target.render.parameters")
-
-
-def _check_count(problem: Problem) -> None:
-    files, sensors = problem.config.target.file or [], problem.sensors
-    if len(files) != len(sensors):
-        raise ConfigError(
-            problem.config.source,
-            "target.file",
-            f"must name one image for each sensor; images: {len(files)}, sensors: {len(sensors)}",
-        )
-
-
-def _read_photo(problem: Problem, view: View) -> Photo:
-    """Read the target file of a view. Raises ConfigError."""
-    config, wanted = problem.config, view.wanted
-    assert wanted.file is not None, "called for target files only"
-    width, height = (int(n) for n in problem.scene.sensors()[view.sensor].film().crop_size())
-    upright, nonfinite, size = are_upright(config), wanted.mask.nonfinite, (width, height)
-    space, gamma = config.target.color_space, config.target.gamma
-    try:
-        return read_photo(wanted.file, space, size, gamma, upright, nonfinite=nonfinite)
-    except ConfigError as error:
-        raise ConfigError(config.source, wanted.file_key, error.message) from None
-
-
-def _fit(problem: Problem, image: Array, sensor: int) -> Array:
-    """`image` with as many channels as the film of `sensor` has without its alpha."""
-    colors = color_channels(problem.scene.sensors()[sensor].film())
-    if colors == 1 and image.shape[2] >= 3:
-        image = image[:, :, :3] @ LUMINANCE[:, None]
-    return image[:, :, :colors]

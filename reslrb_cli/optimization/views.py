@@ -15,11 +15,13 @@
 
 from __future__ import annotations
 
+import functools
 import hashlib
+import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -29,18 +31,15 @@ from reslrb_cli.backend.memory import own_memory
 from reslrb_cli.config.optimizers import Loss as LossConfig
 from reslrb_cli.config.parameters import Settings
 from reslrb_cli.config.schema import Config
-from reslrb_cli.config.views import Mask
+from reslrb_cli.config.views import Mask, ViewSpec
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.integrators.protocol import first_channels
 from reslrb_cli.optimization.loading import choose_sensors
 from reslrb_cli.scene.cameras import read_cameras
 from reslrb_cli.scene.parameters import Selection
 
-
-class Loss(Protocol):
-    """A loss with its options bound."""
-
-    def __call__(self, image: mi.TensorXf, target: mi.TensorXf, weights: mi.TensorXf | None = None, /) -> mi.Float: ...
+#: A loss with its options bound, of an image, its target, and weights, if there are any.
+Loss = Callable[..., "mi.Float"]
 
 
 def _mean(values: mi.TensorXf, weights: mi.TensorXf | None) -> mi.Float:
@@ -79,7 +78,7 @@ def log_l2(
     return _mean(dr.square(difference), weights)
 
 
-LOSSES: dict[str, Callable[..., mi.Float]] = {"l1": l1, "l2": l2, "relative_l2": relative_l2, "log_l2": log_l2}
+LOSSES: dict[str, Loss] = {"l1": l1, "l2": l2, "relative_l2": relative_l2, "log_l2": log_l2}
 
 #: Those whose derivative is linear in the image, so that its noise averages out.
 QUADRATIC = ("l2", "relative_l2")
@@ -87,8 +86,7 @@ QUADRATIC = ("l2", "relative_l2")
 
 def make_loss(type: str, **options: float) -> Loss:
     """Return the loss of that name with its options bound. Raises KeyError for an unknown name."""
-    function = LOSSES[type]
-    return lambda image, target, weights=None: function(image, target, weights, **options)
+    return functools.partial(LOSSES[type], **options)
 
 
 Array = np.ndarray[Any, Any]
@@ -122,12 +120,8 @@ class Exposure:
 
     def of_array(self, image: Array) -> Array:
         """E I of an image (H, W, C or more), its alpha as it is."""
-        value = np.atleast_1d(np.array(self.now(), np.float32).ravel())
-        if np.all(value == 1):
-            return image
         factor = np.ones(image.shape[2], np.float32)
-        colors = 1 if image.shape[2] <= 2 else 3
-        factor[:colors] = value
+        factor[: 1 if image.shape[2] <= 2 else 3] = np.array(self.now(), np.float32).ravel()
         return image * factor
 
     def add_gradient(self, leaf: Any, channels: int, image: mi.TensorXf, gradient: mi.TensorXf) -> None:
@@ -141,15 +135,6 @@ class Exposure:
         else:
             total = dr.sum(each)
         dr.accum_grad(leaf, total / dr.detach(leaf))
-
-
-def add_exposure(selection: Selection, key: str, kind: str, channels: int) -> None:
-    """Recover an exposure, in its logarithm, from 1 on: `auto`, or `per_channel` of a film with that many channels."""
-    if key in selection.factors:
-        return
-    one = mi.Color3f(1) if kind == "per_channel" and channels == 3 else mi.Float(1)
-    value = one + dr.opaque(mi.Float, 0)
-    selection.add_factor(key, value, Settings(initial=1.0, transform="log"))
 
 
 @dataclass(frozen=True)
@@ -175,32 +160,46 @@ class Wanted:
 
 def wanted_views(config: Config, scene: mi.Scene) -> list[Wanted]:
     """What is wanted of every view. Raises ConfigError for a sensor that is not there, or cannot be held out."""
-    sensors = choose_sensors(config, scene)
-    wanted = _of_views(config) if config.views is not None else _of_sensors(config, sensors)
-    if config.scene.cameras is not None and config.target.render is None:
-        images = [camera.image for camera in read_cameras(config.scene.cameras)]
-        wanted = [
-            replace(one, file=images[one.sensor], file_key="scene.cameras") if one.file is None else one
-            for one in wanted
-        ]
-    held_out = _held_out(config, scene, sensors)
+    sensors, target, images = choose_sensors(config, scene), config.target, {}
+    if config.scene.cameras is not None and target.render is None:
+        images = {sensor: camera.image for sensor, camera in enumerate(read_cameras(config.scene.cameras))}
+    specs, held_out, wanted = _view_specs(config, sensors), _held_out(config, scene, sensors), []
     if held_out == set(sensors):
         raise ConfigError(config.source, "run.held_out", "leaves no view to train on")
-    for one in wanted:
-        if one.sensor in held_out and isinstance(one.exposure, str) and one.exposure_key != SHARED:
-            raise ConfigError(
-                config.source,
-                "run.held_out",
-                f"has sensor {one.sensor}, whose own exposure nothing else tells; give it a number, or all views one",
+    for number, spec in enumerate(specs):
+        place = f"views[{number}]"
+        file_key = f"{place}.target"
+        if spec.target is None:
+            file_key = "scene.cameras"
+        elif config.views is None:
+            file_key = "target.file" if len(target.file or ()) == 1 else f"target.file[{number}]"
+        exposure = target.exposure if spec.exposure is None else spec.exposure
+        assert not isinstance(exposure, list), "checked with the configuration"
+        wanted.append(
+            Wanted(
+                spec.sensor,
+                file=images.get(spec.sensor) if spec.target is None else spec.target,
+                file_key=file_key,
+                mask=target.mask if spec.mask is None else spec.mask,
+                mask_mixed=target.mask_mixed if spec.mask_mixed is None else spec.mask_mixed,
+                mask_key="target.mask" if spec.mask is None else f"{place}.mask",
+                exposure=exposure,
+                exposure_key=SHARED if spec.exposure is None else f"{SHARED}.{spec.sensor}",
+                weight=spec.weight,
+                loss=spec.loss,
+                held_out=spec.sensor in held_out,
             )
-    trained = len(wanted) - len(held_out)
-    if (config.run.views_per_iteration or 1) > trained:
-        raise ConfigError(
-            config.source,
-            "run.views_per_iteration",
-            f"is {config.run.views_per_iteration}; views that are trained on: {trained}",
         )
-    return [replace(one, held_out=one.sensor in held_out) for one in wanted]
+        if spec.sensor in held_out and isinstance(exposure, str) and spec.exposure is not None:
+            reason = (
+                f"has sensor {spec.sensor}, whose own exposure nothing else tells; give it a number, or all views one"
+            )
+            raise ConfigError(config.source, "run.held_out", reason)
+    trained, asked = len(wanted) - len(held_out), config.run.views_per_iteration or 1
+    if asked > trained:
+        reason = f"is {asked}; views that are trained on: {trained}"
+        raise ConfigError(config.source, "run.views_per_iteration", reason)
+    return wanted
 
 
 def _held_out(config: Config, scene: mi.Scene, sensors: list[int]) -> set[int]:
@@ -214,52 +213,22 @@ def _held_out(config: Config, scene: mi.Scene, sensors: list[int]) -> set[int]:
     return found
 
 
-def _of_sensors(config: Config, sensors: list[int]) -> list[Wanted]:
-    """What the short forms, `scene.sensors` and `target`, say of each view."""
-    target = config.target
-    files, exposures = target.file or [], target.exposure
-    if isinstance(exposures, list) and len(exposures) != len(sensors):
-        raise ConfigError(
-            config.source,
-            "target.exposure",
-            f"must have one entry for each sensor; entries: {len(exposures)}, sensors: {len(sensors)}",
-        )
+def _view_specs(config: Config, sensors: list[int]) -> list[ViewSpec]:
+    """What is said of each view: `views`, or the short forms, `scene.sensors` and `target`, as if they were that."""
+    if config.views is not None:
+        return config.views
+    files, exposures = config.target.file or [], config.target.exposure
+    own: list[Any] = [None] * len(sensors)
+    if isinstance(exposures, list):
+        own = exposures
+        if len(own) != len(sensors):
+            reason = f"must have one entry for each sensor; entries: {len(own)}, sensors: {len(sensors)}"
+            raise ConfigError(config.source, "target.exposure", reason)
+    targets = [*files[: len(sensors)], *[None] * (len(sensors) - len(files))]
     return [
-        Wanted(
-            sensor,
-            file=files[number] if number < len(files) else None,
-            file_key="target.file" if len(files) == 1 else f"target.file[{number}]",
-            mask=target.mask,
-            mask_mixed=target.mask_mixed,
-            exposure=exposures[number] if isinstance(exposures, list) else exposures,
-            exposure_key=f"{SHARED}.{sensor}" if isinstance(exposures, list) else SHARED,
-        )
-        for number, sensor in enumerate(sensors)
+        ViewSpec.model_construct(sensor=sensor, target=target, exposure=exposure)
+        for sensor, target, exposure in zip(sensors, targets, own, strict=True)
     ]
-
-
-def _of_views(config: Config) -> list[Wanted]:
-    """What `views` say of each view, and `target` of what they leave open."""
-    assert config.views is not None
-    assert not isinstance(config.target.exposure, list), "checked with the configuration"
-    target, found = config.target, []
-    for number, spec in enumerate(config.views):
-        own = spec.exposure is not None
-        found.append(
-            Wanted(
-                spec.sensor,
-                file=spec.target,
-                file_key=f"views[{number}].target",
-                mask=target.mask if spec.mask is None else spec.mask,
-                mask_mixed=target.mask_mixed if spec.mask_mixed is None else spec.mask_mixed,
-                mask_key="target.mask" if spec.mask is None else f"views[{number}].mask",
-                exposure=config.target.exposure if spec.exposure is None else spec.exposure,
-                exposure_key=f"{SHARED}.{spec.sensor}" if own else SHARED,
-                weight=spec.weight,
-                loss=spec.loss,
-            )
-        )
-    return found
 
 
 @dataclass
@@ -357,23 +326,19 @@ def slope(loss: Callable[[mi.TensorXf], mi.Float], image: Array) -> Array:
 
 def view_records(views: list[View]) -> list[dict[str, Any]]:
     """What a run's manifest says of its views: share of the loss, pixels, how many are left out, and of which kinds."""
-    found = []
-    for view in views:
-        height, width, channels = view.target.shape
-        left_out = 0 if view.weights is None else int((np.array(view.weights) == 0).sum()) // channels
-        found.append(
-            {
-                "sensor": view.sensor,
-                "share": view.share,
-                "held_out": view.held_out,
-                "exposure": view.exposure.key or view.exposure.fixed,
-                "pixels": height * width,
-                "left_out": left_out,
-                "kinds": view.masked.counts(),
-                "counted": view.masked.stay,
-            }
-        )
-    return found
+    return [
+        {
+            "sensor": view.sensor,
+            "share": view.share,
+            "held_out": view.held_out,
+            "exposure": view.exposure.key or view.exposure.fixed,
+            "pixels": math.prod(view.target.shape[:2]),
+            "left_out": 0 if view.weights is None else int((np.array(view.weights)[:, :, 0] == 0).sum()),
+            "kinds": view.masked.counts(),
+            "counted": view.masked.stay,
+        }
+        for view in views
+    ]
 
 
 def make_views(config: Config, scene: mi.Scene) -> list[View]:
@@ -391,13 +356,15 @@ def make_views(config: Config, scene: mi.Scene) -> list[View]:
 def expose(views: list[View], scene: mi.Scene, selection: Selection) -> None:
     """Give views their exposures, and have `selection` recover those that are not known."""
     for view in views:
-        wanted = view.wanted
-        if isinstance(wanted.exposure, str):
-            colors = color_channels(scene.sensors()[view.sensor].film())
-            add_exposure(selection, wanted.exposure_key, wanted.exposure, colors)
-            view.exposure = Exposure(key=wanted.exposure_key, values=selection.factors)
-        else:
-            view.exposure = Exposure(fixed=wanted.exposure)
+        kind, key = view.wanted.exposure, view.wanted.exposure_key
+        if not isinstance(kind, str):
+            view.exposure = Exposure(fixed=kind)
+            continue
+        view.exposure = Exposure(key=key, values=selection.factors)
+        if key not in selection.factors:  # recovered in its logarithm, from 1 on
+            each = kind == "per_channel" and color_channels(scene.sensors()[view.sensor].film()) == 3
+            one = mi.Color3f(1) if each else mi.Float(1)
+            selection.add_factor(key, one + dr.opaque(mi.Float, 0), Settings(initial=1.0, transform="log"))
 
 
 def color_channels(film: mi.Film) -> int:

@@ -28,6 +28,8 @@ from reslrb_cli.optimization.autotune.sampling import (
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.records.clock import StepClock
 
+SMALL = ["scene.size=[32, 32]", "run.spp=64", "run.iterations=2", "run.certainty=false"]
+SMALL += ["run.measuring=1000"]  # though iterations are so few
 SIZES = Sizes(step=64, call=16, part=16, alone=False, rounds=ROUNDS, lessons=1 / 7, longer=GUIDING_LONGER)
 
 
@@ -77,12 +79,9 @@ class World:
 
     def run(self, sizes: Sizes = SIZES, share: float = 2 * GUIDING_SHARE) -> Any:
         """The record of what is decided."""
-        return self.pilot(
-            self,
-            replace(sizes, rounds=ROUNDS_OF_FEW if self.entries < FEW_ENTRIES else ROUNDS, alone=self.alone),
-            1.0,
-            share,
-        ).run()
+        rounds = ROUNDS_OF_FEW if self.entries < FEW_ENTRIES else ROUNDS
+        sizes, learn = replace(sizes, rounds=rounds, alone=self.alone), self.learn if self.learns else None
+        return self.pilot(self.take, sizes, 1.0, share, learn=learn).run()
 
 
 def begin(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
@@ -106,6 +105,11 @@ def fix_times(monkeypatch: pytest.MonkeyPatch, other_ms: Mapping[str, float]) ->
         return taken
 
     monkeypatch.setattr(StepTrial, "take", timed)
+
+
+def is_even(problem: Problem) -> bool:
+    """Whether paths have low-discrepancy numbers."""
+    return problem.integrator.plan(problem.scene, problem.scene.sensors()[0]).sequence is not None
 
 
 def operations(problem: Problem) -> list[int]:

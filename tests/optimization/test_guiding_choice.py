@@ -1,4 +1,4 @@
-"""`guiding: auto`: decided on fabricated steps and in whole runs of a small scene."""
+"""`guiding: auto`: decided on fabricated steps and in whole runs of a small scene; and what `sequence: auto` shares."""
 
 from __future__ import annotations
 
@@ -9,17 +9,18 @@ from typing import Any
 
 import numpy as np
 import pytest
-from optimization.deciding import SIZES, World, begin, fix_times, inspected, operations
+from optimization.deciding import SIZES, SMALL, World, begin, fix_times, inspected, is_even, operations
 from runs.going_on import begin_alone, differences, left_over, optimize, run_and_kill
-from turns import a_few
 
 from reslrb_cli.config.loader import load
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.guiding.tables import Guiding, Purpose
+from reslrb_cli.integrators.step import make_integrator
 from reslrb_cli.measure.methods import parse_cases
 from reslrb_cli.optimization import assemble as assembling
 from reslrb_cli.optimization import loop
 from reslrb_cli.optimization.assemble import assemble
+from reslrb_cli.optimization.autotune import estimators, race
 from reslrb_cli.optimization.autotune.race import (
     GUIDING_SHARE,
     ITERATIONS,
@@ -29,6 +30,7 @@ from reslrb_cli.optimization.autotune.race import (
     TIMING_NOISE,
     Sizes,
     Step,
+    Turns,
 )
 from reslrb_cli.optimization.autotune.sampling import (
     FEW_ENTRIES,
@@ -36,16 +38,18 @@ from reslrb_cli.optimization.autotune.sampling import (
     ROUNDS,
     ROUNDS_OF_FEW,
     GuidingPilot,
+    SequencePilot,
     StepTrial,
     lessons,
     sizes,
     table_bytes,
 )
+from reslrb_cli.optimization.decisions import Allowance
 from reslrb_cli.optimization.forecast import _with_learning
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.records.cache import PilotCache
 from reslrb_cli.records.checkpoint import STATE_FILE, open_state
-from reslrb_cli.records.decisions import GuidedRecord
+from reslrb_cli.records.decisions import EstimatorRecord, GuidedRecord, PaidRecord, SequenceRecord
 from reslrb_cli.records.manifest import read_manifest
 
 # `guiding: auto` in whole runs of a small scene: what is decided, what is then traced, and what is kept of it.
@@ -53,9 +57,11 @@ from reslrb_cli.records.manifest import read_manifest
 # Times are given, so that it is decided alike on every machine; variances are those of the scene, whose lamp sends
 # one path in twenty to where anything is seen.
 
-AUTO = ["integrator.guiding=auto", "scene.size=[32, 32]", "run.spp=64", "run.iterations=2", "run.certainty=false"]
-AUTO += ["run.measuring=1000"]  # though iterations are so few
+AUTO = ["integrator.guiding=auto", *SMALL]
 RUN = Path("runs/tiny")
+#: A problem's field for what is decided on an option, and the option's words, off and on.
+FIELD = {"guiding": "guided", "sequence": "sequence"}
+WORDS = {"guiding": ("off", "on"), "sequence": ("independent", "low_discrepancy")}
 
 
 @pytest.fixture
@@ -73,31 +79,34 @@ def decided(monkeypatch: pytest.MonkeyPatch, guided_ms: float, *settings: str, *
 
 
 @pytest.mark.usefixtures("llvm")
-@pytest.mark.parametrize("adjoint", a_few(["batched", "correlated", "independent"], ["batched"]))
-def test_on_is_guided_and_off_has_nothing_of_it(
-    adjoint: str, experiment: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    ("option", "adjoint"),
+    [
+        ("guiding", "batched"),
+        ("sequence", "batched"),
+        *(pytest.param("guiding", adjoint, marks=pytest.mark.long) for adjoint in ("correlated", "independent")),
+    ],
+)
+def test_on_is_on_and_off_has_nothing_of_it(
+    option: str, adjoint: str, experiment: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Off, a step's kernels are, operation by operation, those of `guiding: off`."""
-    counts = []
-    for guided_ms, settings in ((1.0, AUTO), (1000.0, AUTO), (1.0, AUTO[1:])):
-        take_times(monkeypatch, guided_ms)
+    """Off, a step's kernels are, operation by operation, those of who says so."""
+    counts, name = [], FIELD[option]
+    for other_ms, asked in ((0.1, True), (1000.0, True), (0.1, False)):
+        fix_times(monkeypatch, {option: other_ms})
+        settings = [*SMALL, f"integrator.{option}=auto"] if asked else SMALL
         problem = assemble(load("tiny.yaml", [*settings, f"run.adjoint={adjoint}"]))
-        found, guiding = problem.guided, problem.integrator.preparation.guiding
+        found, guiding = getattr(problem, name), problem.integrator.preparation.guiding
         print(found)
-        if settings is not AUTO:
-            assert found is guiding is None
-        elif guided_ms == 1:
-            assert found is not None
-            assert found.guided
-            assert found.images
-            assert guiding is not None
-            assert guiding.learned == {}  # the run begins with an empty table
-        else:
-            assert found is not None
-            assert not found.guided
-            assert found.high is not None
-            assert found.high < 1
-            assert guiding is None
+        assert [each for each in FIELD.values() if getattr(problem, each)] == ([name] if asked else [])
+        is_on = asked and other_ms < 1
+        if asked:
+            assert (found.low or 0) > 1 if is_on else (found.high or 2) < 1
+            assert found.setting == WORDS[option][is_on]
+            assert getattr(found, "images", is_on) == is_on
+        assert (guiding is not None) == (is_on and option == "guiding")
+        assert guiding is None or guiding.learned == {}  # the run begins with an empty table
+        assert is_even(problem) == (is_on and option == "sequence")
         assert not any(np.any(np.array(problem.optimizer.gradient(key))) for key in problem.selection.keys)
         counts.append(operations(problem))
         del problem, guiding
@@ -195,36 +204,41 @@ def test_faults_of_that_are_seen(fault: str, experiment: Path, monkeypatch: pyte
 
 
 @pytest.mark.usefixtures("llvm")
+@pytest.mark.parametrize(("option", "part"), [("guiding", "guided emission"), ("sequence", "low-discrepancy numbers")])
 def test_a_run_says_so_once_remembers_it_and_writes_it_down(
-    experiment: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    option: str, part: str, experiment: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    take_times(monkeypatch, 1.0)
-    sets = [word for text in AUTO for word in ("--set", text)]
-    assert optimize("tiny.yaml", *sets) == 0
+    fix_times(monkeypatch, {option: 0.1})
+    settings, name = [f"integrator.{option}=auto", *SMALL], FIELD[option]
+    assert optimize("tiny.yaml", *(word for text in settings for word in ("--set", text))) == 0
     said = capsys.readouterr().err
-    found = read_manifest(RUN)["guided"]
-    assert found["guided"]
+    found = read_manifest(RUN)[name]
+    assert found["guided" if option == "guiding" else "low_discrepancy"]
     assert not found["cached"]
-    assert f"guiding on: {found['gain']:.2g} times the efficiency here ({found['low']:.2g} to " in said
-    assert "guiding: auto" in (RUN / "config.yaml").read_text()
-    assert f"guiding on: {found['gain']:.2g} times" in (RUN / "report.html").read_text()
+    gain = f"{found['gain']:.2g} times the efficiency here ("
+    line = f"{option} {WORDS[option][True]}: {gain}"
+    assert f"{line}{found['low']:.2g} to {found['high']:.2g})" in said
+    assert f"{option}: auto" in (RUN / "config.yaml").read_text()
+    assert line in (RUN / "report.html").read_text()
     archive, values = open_state(RUN / "checkpoint" / STATE_FILE)
     archive.close()
-    assert values["guided"] == found
-    assert values["guiding"]["0"] > 0
+    assert values[name] == found
+    assert option != "guiding" or values["guiding"]["0"] > 0
     told: list[str] = []
-    again = assemble(load("tiny.yaml", AUTO), told.append, PilotCache())
-    assert again.guided is not None
-    assert again.guided.to_json() == {**found, "cached": True}
-    assert told[-1] == again.guided.line()
-    assert again.guided.line(cost=True) == f"{told[-1]} (as an earlier run measured)"
-    row = next(line for line in inspected(capsys, str(RUN)) if "guided emission" in line)
+    again = assemble(load("tiny.yaml", settings), told.append, PilotCache())
+    record = getattr(again, name)
+    assert record.to_json() == {**found, "cached": True}
+    assert told[-1] == record.line()
+    assert record.line(cost=True) == f"{told[-1]} (as an earlier run measured)"
+    assert is_even(again) == (option == "sequence")
+    row = next(line for line in inspected(capsys, str(RUN)) if part in line)
     assert row.split()[0] == "needed"
-    assert "65536 cells, 6.1 MiB" in row  # no more than the 16,384 paths of a batch can tell apart
-    assert f"guiding: auto, {found['gain']:.2g} times the efficiency here (" in row
-    row = next(line for line in inspected(capsys, "tiny.yaml", "--set", AUTO[0]) if "guided emission" in line)
+    # No more cells than the 16,384 paths of a batch can tell apart.
+    assert option != "guiding" or "65536 cells, 6.1 MiB" in row
+    assert f"{option}: auto, {gain}" in row
+    row = next(line for line in inspected(capsys, "tiny.yaml", "--set", settings[0]) if part in line)
     assert row.startswith("  left out")
-    assert row.endswith("guiding: auto, which a run decides by measurement")
+    assert row.endswith(f"{option}: auto, which a run decides by measurement")
 
 
 @pytest.mark.usefixtures("llvm")
@@ -270,6 +284,30 @@ def test_a_memory_budget_without_room_for_tables_leaves_it_off(
 
 
 @pytest.mark.usefixtures("llvm")
+@pytest.mark.parametrize("compile_s", [0.01, 0.5])
+def test_estimators_leave_guiding_its_time(experiment: Path, monkeypatch: pytest.MonkeyPatch, compile_s: float) -> None:
+    """In a run of a hundred iterations there is none for both, whether kernels are there or not."""
+
+    def allowed(self: race.Tuner, integrator: Any) -> Allowance:
+        self.take(allowance=self.problem.allowance or Allowance(0.1, 100.0, compile_s, 1.0))
+        assert self.problem.allowance is not None
+        return self.problem.allowance
+
+    def slow(problem: Problem, options: Any, allowance: Allowance) -> EstimatorRecord:
+        allowance.spent_s += 7.6
+        return EstimatorRecord(chosen=options[0].options, label=options[0].label)
+
+    monkeypatch.setattr(race.Tuner, "allowance", allowed)
+    monkeypatch.setattr(estimators, "run_pilot", slow)
+    fix_times(monkeypatch, {"guiding": 1.0, "sequence": 1.0, "sequence alone": 1000.0})
+    problem = assemble(load("tiny.yaml", [*AUTO, "integrator={max_depth: 3}"]))
+    assert problem.pilot is not None
+    assert problem.pilot.note.startswith("not measured")
+    assert problem.guided is not None
+    assert problem.guided.rounds > 0
+
+
+@pytest.mark.usefixtures("llvm")
 def test_a_damaged_outcome_is_measured_anew(experiment: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     class Damaged(PilotCache):
         def get(self, key: str) -> dict[str, Any] | None:
@@ -283,30 +321,28 @@ def test_a_damaged_outcome_is_measured_anew(experiment: Path, monkeypatch: pytes
 
 
 @pytest.mark.usefixtures("llvm")
-def test_what_is_compared_is_named() -> None:
+@pytest.mark.parametrize("option", ["guiding", "sequence"])
+def test_who_compares_or_writes_a_script_has_to_say(option: str) -> None:
     """In measurements `auto` of the experiment is off, and is refused where somebody writes it."""
+    named = ("on", "off") if option == "guiding" else WORDS[option]
     config = load(Path(__file__).parents[2] / "configs" / "furnace.yaml")
-    [plain, asked] = parse_cases("reslrb:stack,reslrb:gather(guiding=auto)")
-    assert plain.at(config, 4, known=True).integrator.options()["guiding"] == "off"
-    with pytest.raises(ConfigError, match="compare `on` with `off`"):
+    [plain, asked] = parse_cases(f"reslrb:stack,reslrb:gather({option}=auto)")
+    assert plain.at(config, 4, known=True).integrator.options()[option] == WORDS[option][False]
+    with pytest.raises(ConfigError, match=f"compare `{named[0]}` with `{named[1]}`"):
         asked.at(config, 4, known=True)
+    with pytest.raises(ValueError, match=f"say {named[0]} or {named[1]}"):
+        make_integrator("reslrb", **{option: "auto"})
 
 
 @pytest.mark.usefixtures("llvm")
-def test_a_script_is_told_that_it_has_to_say() -> None:
-    from reslrb_cli.integrators.step import make_integrator
-
-    with pytest.raises(ValueError, match="say on or off"):
-        make_integrator("reslrb", guiding="auto")
-
-
-@pytest.mark.usefixtures("llvm")
-def test_who_says_on_or_off_has_nothing_measured(experiment: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("option", ["guiding", "sequence"])
+def test_who_says_which_has_nothing_measured(option: str, experiment: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(StepTrial, "take", lambda *args: pytest.fail("measured"))
-    for guiding in ("on", "off"):
-        problem = assemble(load("tiny.yaml", [*AUTO[1:], f"integrator.guiding={guiding}"]))
-        assert problem.guided is None
-        assert (problem.integrator.preparation.guiding is not None) == (guiding == "on")
+    for is_on, word in enumerate(WORDS[option]):
+        problem = assemble(load("tiny.yaml", [f"integrator.{option}={word}", *SMALL]))
+        assert problem.guided is problem.sequence is None
+        assert (problem.integrator.preparation.guiding is not None) == (is_on and option == "guiding")
+        assert is_even(problem) == (is_on and option == "sequence")
 
 
 # Whether guided emission pays, decided on fabricated steps: what is on, what is off, at what cost, how sure.
@@ -466,24 +502,25 @@ def test_what_is_not_clear_is_looked_at_longer() -> None:
     assert close.run(share=0.3 * GUIDING_SHARE).rounds < SIZES.rounds
 
 
-def test_no_noise_is_no_gain() -> None:
-    class Still(World):
-        def _noisy(self, random: np.random.Generator, variance: float) -> np.ndarray:
-            return np.ones(4)
-
-    record = Still().run()
-    assert not record.guided
+@pytest.mark.parametrize("pilot", [GuidingPilot, SequencePilot])
+def test_no_noise_is_no_gain(pilot: type[Turns[Any]], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(World, "_noisy", lambda self, random, variance: np.ones(4))
+    record = World(pilot=pilot).run()
+    assert record.setting in ("off", "independent")
     assert record.note == "gradients have no noise"
 
 
-def test_a_record_survives_json_and_nothing_else_is_one() -> None:
-    record = World(0.1, 2.2).run()
+@pytest.mark.parametrize(("kind", "pilot"), [(GuidedRecord, GuidingPilot), (SequenceRecord, SequencePilot)])
+def test_a_record_survives_json_and_nothing_else_is_one(kind: type[PaidRecord], pilot: type[Turns[Any]]) -> None:
+    record = World(0.1, 2.2, pilot=pilot).run()
     data = record.to_json()
-    assert GuidedRecord.from_json(data) == record
-    assert GuidedRecord.from_json(World(0.1, 2.2, overhead=1e4, python=1e6).run().to_json()).gain is None
-    for wrong in ({}, {**data, "guided": 1}, {**data, "gain": "2"}, {**data, "rounds": 1.5}, {**data, "more": 1}):
+    assert kind.from_json(data) == record
+    assert kind.from_json(World(0.1, 2.2, overhead=1e4, python=1e6, pilot=pilot).run().to_json()).gain is None
+    switch = "guided" if kind is GuidedRecord else "low_discrepancy"
+    others = {"guided": True, "low_discrepancy": True, "rounds": 1.5, "more": 1, "gain": "2", switch: 1}
+    for wrong in ({}, *({**data, key: value} for key, value in others.items())):
         with pytest.raises(TypeError):
-            GuidedRecord.from_json(wrong)
+            kind.from_json(wrong)
 
 
 def test_walks_that_are_learned_from_come_before_all_steps_that_are_guided() -> None:

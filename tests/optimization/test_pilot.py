@@ -3,20 +3,22 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from reslrb_cli.optimization import decisions
 from reslrb_cli.optimization.autotune.estimators import Candidate, Pilot
 from reslrb_cli.optimization.autotune.race import GUIDING_SHARE, ITERATIONS, SHARE, Step
 from reslrb_cli.optimization.decisions import Allowance
 from reslrb_cli.records.decisions import EstimatorRecord
 
-STACK, GATHER = Candidate({"estimator": "stack"}, True), Candidate({"estimator": "gather"}, True)
-RESERVOIR = Candidate({"estimator": "reservoir", "capacity": 1}, False)
-RESERVOIR_4 = Candidate({"estimator": "reservoir", "capacity": 4}, False, parent=RESERVOIR.label, varies_slots=True)
-EVENT = Candidate({"estimator": "event", "capacity": 1}, False)
-ADJOINT = Candidate({"estimator": "event", "capacity": 1, "weight": "adjoint"}, False, parent=EVENT.label)
+STACK, GATHER = Candidate({"estimator": "stack"}), Candidate({"estimator": "gather"})
+RESERVOIR = Candidate({"estimator": "reservoir", "capacity": 1})
+RESERVOIR_4 = Candidate({"estimator": "reservoir", "capacity": 4}, RESERVOIR.label)
+EVENT = Candidate({"estimator": "event", "capacity": 1})
+ADJOINT = Candidate({"estimator": "event", "capacity": 1, "weight": "adjoint"}, EVENT.label)
 ALL = [STACK, GATHER, RESERVOIR, EVENT, RESERVOIR_4, ADJOINT]
 
 
@@ -114,9 +116,28 @@ def test_relatives_of_what_cannot_win_are_not_compiled() -> None:
 def test_nothing_more_is_compiled_where_there_is_no_time() -> None:
     changed = {EVENT.label: 3.0, ADJOINT.label: 3.0}
     world = World({**times(), **changed}, {EVENT.label: 2.0, RESERVOIR.label: 1.0})
-    outcome = Pilot(ALL, world.step, 64, compiles=lambda: False).run()
+    slow = Allowance(0.1, run_s=1e6, compile_s=1e6, iteration_s=1.0)
+    outcome = Pilot(ALL, world.step, 64, allowance=slow).run()
     assert ADJOINT.label not in {name for name, _, _ in world.calls}
     assert "no more than" in outcome.rows[-1].note
+
+
+def test_what_is_kept_aside_is_not_spent(monkeypatch: pytest.MonkeyPatch) -> None:
+    """First steps count in what a run has time for, though their kernels are there."""
+    now, world = [0.0], World(times(), {RESERVOIR.label: 0.1, EVENT.label: 0.1}, overhead=500.0)
+    monkeypatch.setattr(decisions, "time", SimpleNamespace(perf_counter=lambda: now[0]))
+
+    def step(candidate: Candidate, round: int, spp: int) -> Step:
+        taken = world.step(candidate, round, spp)
+        now[0] += 1.0 if (candidate.label, spp) not in {call[::2] for call in world.calls[:-1]} else taken.wall_ms / 1e3
+        return taken
+
+    allowance = Allowance(0.1, run_s=200.0, compile_s=0.0, iteration_s=1.14)
+    with allowance.spending([(2.5, 5.0)]):
+        Pilot(ALL, step, 64, allowance=allowance).run()
+    assert {STACK.label, EVENT.label} <= {name for name, _, _ in world.calls}
+    assert allowance.affords((2.5, 4.9))  # times of steps are estimates
+    assert allowance.left_s == pytest.approx(20 - allowance.spent_s)
 
 
 def test_an_allowance_is_what_is_left_of_a_share_of_the_run() -> None:

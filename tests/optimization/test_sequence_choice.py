@@ -10,12 +10,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from optimization.deciding import SIZES, World, begin, fix_times, inspected, operations
+from optimization.deciding import SIZES, SMALL, World, begin, fix_times, is_even, operations
 from runs.going_on import optimize
 from turns import a_few
 
 from reslrb_cli.config.loader import load
-from reslrb_cli.errors import ConfigError
 from reslrb_cli.measure.methods import parse_cases
 from reslrb_cli.optimization.assemble import assemble
 from reslrb_cli.optimization.autotune.race import (
@@ -33,15 +32,12 @@ from reslrb_cli.optimization.autotune.sampling import SEQUENCE_LONGER, SequenceP
 from reslrb_cli.optimization.decisions import Allowance
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.records.cache import PilotCache
-from reslrb_cli.records.checkpoint import STATE_FILE, open_state
-from reslrb_cli.records.decisions import GuidedRecord, SequenceRecord
-from reslrb_cli.records.manifest import read_manifest
+from reslrb_cli.records.decisions import GuidedRecord
 
 # `sequence: auto` in whole runs of a small scene: what is decided, what is then traced, and what is kept of it.
 #
 # Times are given, so that it is decided alike on every machine; variances are those of the scene.
 
-SMALL = ["scene.size=[16, 16]", "run.spp=64", "run.iterations=2", "run.certainty=false", "run.measuring=1000"]
 AUTO = ["integrator.sequence=auto", *SMALL]
 BOTH = ["integrator.guiding=auto", *AUTO]
 RUN = Path("runs/tiny")
@@ -60,37 +56,6 @@ def take_times(
 
 def made(settings: list[str], **options: Any) -> Problem:
     return assemble(load("tiny.yaml", settings), **options)
-
-
-def is_even(problem: Problem) -> bool:
-    """Whether paths have low-discrepancy numbers."""
-    return problem.integrator.plan(problem.scene, problem.scene.sensors()[0]).sequence is not None
-
-
-@pytest.mark.usefixtures("llvm")
-def test_on_is_evenly_spread_and_off_has_nothing_of_it(experiment: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Off, a step's kernels are, operation by operation, those of `sequence: independent`."""
-    counts = []
-    for even_ms, settings in ((0.1, AUTO), (1000.0, AUTO), (0.1, SMALL)):
-        take_times(monkeypatch, even_ms)
-        problem = made(settings)
-        found = problem.sequence
-        print(found)
-        assert problem.guided is None
-        if settings is SMALL:
-            assert found is None
-        else:
-            assert found is not None
-            assert found.low_discrepancy == (even_ms < 1)
-            assert (found.low or 0) > 1 if even_ms < 1 else (found.high or 2) < 1
-        assert is_even(problem) == (even_ms < 1 and settings is AUTO)
-        assert not any(np.any(np.array(problem.optimizer.gradient(key))) for key in problem.selection.keys)
-        counts.append(operations(problem))
-        del problem
-        gc.collect()  # scenes that are alive at the same time show in each other's kernels
-    on, off, plain = counts
-    assert off == plain
-    assert on != plain
 
 
 def spied(monkeypatch: pytest.MonkeyPatch, settings: list[str], guided_ms: float) -> list[tuple[str, Any, Any, bool]]:
@@ -196,38 +161,6 @@ def test_a_table_of_its_own_for_either_is_seen(experiment: Path, monkeypatch: py
 
 
 @pytest.mark.usefixtures("llvm")
-def test_a_run_says_so_once_remembers_it_and_writes_it_down(
-    experiment: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    take_times(monkeypatch, 0.1)
-    sets = [word for text in AUTO for word in ("--set", text)]
-    assert optimize("tiny.yaml", *sets) == 0
-    said = capsys.readouterr().err
-    found = read_manifest(RUN)["sequence"]
-    assert found["low_discrepancy"]
-    assert not found["cached"]
-    line = f"sequence low_discrepancy: {found['gain']:.2g} times the efficiency here ("
-    assert f"{line}{found['low']:.2g} to {found['high']:.2g})" in said
-    assert "sequence: auto" in (RUN / "config.yaml").read_text()
-    assert line in (RUN / "report.html").read_text()
-    archive, values = open_state(RUN / "checkpoint" / STATE_FILE)
-    archive.close()
-    assert values["sequence"] == found
-    told: list[str] = []
-    again = made(AUTO, say=told.append, cache=PilotCache())
-    assert again.sequence is not None
-    assert again.sequence.to_json() == {**found, "cached": True}
-    assert told[-1] == again.sequence.line()
-    assert is_even(again)
-    row = next(line for line in inspected(capsys, str(RUN)) if "low-discrepancy numbers" in line)
-    assert row.split()[0] == "needed"
-    assert f"sequence: auto, {found['gain']:.2g} times the efficiency here (" in row
-    row = next(line for line in inspected(capsys, "tiny.yaml", "--set", AUTO[0]) if "low-discrepancy" in line)
-    assert row.startswith("  left out")
-    assert row.endswith("sequence: auto, which a run decides by measurement")
-
-
-@pytest.mark.usefixtures("llvm")
 @pytest.mark.long  # the run says so too
 def test_a_dry_run_measures_it_for_the_run(
     experiment: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
@@ -241,33 +174,11 @@ def test_a_dry_run_measures_it_for_the_run(
 
 @pytest.mark.usefixtures("llvm")
 def test_what_is_compared_is_named() -> None:
-    """In measurements `auto` of the experiment is off, and is refused where somebody writes it."""
     config = load(Path(__file__).parents[2] / "configs" / "furnace.yaml")
-    [plain, asked] = parse_cases("reslrb:stack,reslrb:gather(sequence=auto)")
-    assert plain.at(config, 4, known=True).integrator.options()["sequence"] == "independent"
-    with pytest.raises(ConfigError, match="compare `independent` with `low_discrepancy`"):
-        asked.at(config, 4, known=True)
     [even, left] = parse_cases("reslrb:stack(sequence=low_discrepancy),reslrb:auto(sequence=auto)")
     assert even.estimator == "stack(sequence=low_discrepancy)"
     assert left.estimator == "auto"
     assert left.at(config, 4, known=False, auto=True).integrator.options()["sequence"] == "auto"
-
-
-@pytest.mark.usefixtures("llvm")
-def test_a_script_is_told_that_it_has_to_say() -> None:
-    from reslrb_cli.integrators.step import make_integrator
-
-    with pytest.raises(ValueError, match="say independent or low_discrepancy"):
-        make_integrator("reslrb", sequence="auto")
-
-
-@pytest.mark.usefixtures("llvm")
-def test_who_says_which_has_nothing_measured(experiment: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(StepTrial, "take", lambda *args: pytest.fail("measured"))
-    for sequence in ("independent", "low_discrepancy"):
-        problem = made([f"integrator.sequence={sequence}", *SMALL])
-        assert problem.sequence is None
-        assert is_even(problem) == (sequence == "low_discrepancy")
 
 
 # Whether low-discrepancy numbers pay, decided on fabricated steps; and what of a run's time may be measured away.
@@ -381,22 +292,3 @@ def test_all_that_is_measured_takes_one_share(pilot: float | None) -> None:
     left = share_left(Spent(pilot, for_guiding), ample)  # type: ignore[arg-type]
     assert left == pytest.approx(SEQUENCE_SHARE)
     assert share_left(Spent(pilot, 0.5), ample) == 0  # type: ignore[arg-type]
-
-
-def test_a_record_survives_json_and_nothing_else_is_one() -> None:
-    record = world(0.1, 1.1).run(sizes(0.02), 0.02)
-    data = record.to_json()
-    assert SequenceRecord.from_json(data) == record
-    wrong = ({}, {**data, "low_discrepancy": 1}, {**data, "gain": "2"}, {**data, "guided": True})
-    for each in wrong:
-        with pytest.raises(TypeError):
-            SequenceRecord.from_json(each)
-    with pytest.raises(TypeError):
-        GuidedRecord.from_json(data)
-
-
-def test_no_noise_is_no_gain(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(World, "_noisy", lambda self, random, variance: np.ones(4))
-    record = world(0.1, 1.1).run(sizes(0.02), 0.02)
-    assert not record.low_discrepancy
-    assert record.note == "gradients have no noise"

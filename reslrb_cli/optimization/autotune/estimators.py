@@ -17,7 +17,6 @@ from __future__ import annotations
 
 import math
 import statistics
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -44,45 +43,79 @@ from reslrb_cli.statistics import Array, sum_of_squares
 class Candidate:
     """An estimator with its options, and where it is ready to run its `integrator`; `memory` where there is a budget.
 
-    `exact`: it uses every connection. `passes` are those of a step in the pilot; other passes are other paths.
-    `parent`: the label of a candidate than which it is no faster; where it is the same estimator with more slots for
-    connections, `varies_slots`.
+    `parent`: the label of a candidate than which it is no faster. Candidates of other passes trace other paths.
     """
 
     options: dict[str, Any]
-    exact: bool
-    passes: int = 1
     parent: str | None = None
-    varies_slots: bool = False
     integrator: Any = None
     memory: MemoryPlan | None = None
 
     @property
     def label(self) -> str:
         """The estimator in words."""
-        return _label(**self.options)
+        options = dict(self.options)
+        return ", ".join([options.pop("estimator", ""), *(f"{key} {value}" for key, value in options.items())])
+
+    @property
+    def exact(self) -> bool:
+        """Whether it uses every connection."""
+        name = self.options.get("estimator")
+        return name in ESTIMATORS and ESTIMATORS[name].exact
+
+    @property
+    def passes(self) -> int:
+        """Passes of a step in the pilot: two where the run has more, which take as many traversals."""
+        return 2 if self.memory is not None and self.memory.passes > 1 else 1
 
 
-def _label(estimator: str = "", **options: Any) -> str:
-    return ", ".join([estimator, *(f"{key} {value}" for key, value in options.items())])
+def _parent(options: dict[str, Any]) -> str | None:
+    """The label of a candidate than which one with these options is no faster."""
+    name, is_plain = options.get("estimator"), options.get("capacity", 1) == 1 and "weight" not in options
+    if is_plain and name not in ("gather", "reservoir"):
+        return None
+    # Which traces its paths once, where these trace them twice.
+    return Candidate({"estimator": "event" if is_plain else name, "capacity": 1}).label
 
 
 def find_options(problem: Problem) -> list[Candidate]:
-    """What the run may use in place of `problem.integrator`, where that is left to measurement; else nothing.
+    """What the run may use in place of `problem.integrator`, where that is left to measurement or has to keep a budget,
+    each with the samples of its passes; else nothing.
 
     Needs no targets. Raises ConfigError where no estimator keeps the memory budget.
     """
-    config = problem.config
-    if not isinstance(config.integrator, ReslrbConfig):
+    config, run, budget = problem.config, problem.config.run, problem.config.run.budget_bytes
+    integrator, choices = config.integrator, [dict[str, Any]()]
+    if not isinstance(integrator, ReslrbConfig):
         check_baseline(problem)
         return []
-    if config.integrator.estimator == "auto":
+    if integrator.estimator == "auto":
         choices = [{"estimator": ATTACHED}] if is_attached(problem) else candidates(config)
-        return _fitting(problem, config.integrator, choices)
-    if config.run.memory_budget is None:
+    elif budget is None:
         check_memory(problem, problem.integrator)
         return []
-    return _fitting(problem, config.integrator, [{}])
+    options, least, fixed = [], [], 0 if budget is None else standing()
+    samples = run.spp // race.sets_of(config)
+    for choice in choices:
+        made = Tracer.of(**(integrator.chosen(**choice) if choice else integrator.undecided_off()).options())
+        made.expect(pass_spp(config))
+        check_memory(problem, made)
+        memory = None
+        if budget is not None:
+            size, expected = choose_samples(problem, made, samples, budget, fixed)
+            if size == 0:
+                least.append(expected.total)
+                continue
+            if size < samples:
+                made = made.with_options(samples_per_pass=size, freeze=made.freeze)
+            memory = MemoryPlan(budget, size, samples // size, expected)
+        options.append(Candidate(choice, _parent(choice), made, memory))
+    if not options:
+        mib = -(-min(least) // MIB)
+        reason = f"one sample per pixel takes about {mib:.0f} MiB (scene, targets, images of a step, parameters, paths)"
+        reason += f"; allow at least {mib:.0f} MiB, beside which Python, libraries and kernels are not counted"
+        raise ConfigError(config.source, "run.memory_budget", reason)
+    return options
 
 
 def candidates(config: Config) -> list[dict[str, Any]]:
@@ -94,34 +127,6 @@ def candidates(config: Config) -> list[dict[str, Any]]:
     return found
 
 
-def _fitting(problem: Problem, integrator: ReslrbConfig, choices: list[dict[str, Any]]) -> list[Candidate]:
-    """The candidates that keep the budget, each with the samples of its passes."""
-    run, budget, least, options = problem.config.run, problem.config.run.budget_bytes, [], []
-    fixed = 0 if budget is None else standing()
-    for choice in choices:
-        own = (integrator.chosen(**choice) if choice else integrator.undecided_off()).options()
-        made = Tracer.of(**own)
-        made.expect(pass_spp(problem.config))
-        check_memory(problem, made)
-        if budget is None:
-            options.append(_candidate(choice, made))
-            continue
-        samples = run.spp // race.sets_of(problem.config)
-        size, expected = choose_samples(problem, made, samples, budget, fixed)
-        if size == 0:
-            least.append(expected.total)
-            continue
-        if size < samples:
-            made = made.with_options(samples_per_pass=size, freeze=made.freeze)
-        options.append(_candidate(choice, made, MemoryPlan(budget, size, samples // size, expected)))
-    if not options:
-        mib = -(-min(least) // MIB)
-        reason = f"one sample per pixel takes about {mib:.0f} MiB (scene, targets, images of a step, parameters, paths)"
-        reason += f"; allow at least {mib:.0f} MiB, beside which Python, libraries and kernels are not counted"
-        raise ConfigError(problem.config.source, "run.memory_budget", reason)
-    return options
-
-
 def settle_estimator(tuner: race.Tuner, options: Sequence[Candidate]) -> None:
     """Have the integrator of the tuner's problem be the best of the options; of several a pilot finds it.
 
@@ -131,16 +136,18 @@ def settle_estimator(tuner: race.Tuner, options: Sequence[Candidate]) -> None:
         return
     problem, chosen = tuner.problem, options[0]
     if len(options) > 1 and chosen.options:
+        later = [need for option, need in race.LATER.items() if race.is_auto(problem.config, option)]
 
         def usual(note: str) -> EstimatorRecord:
             """It has been the best, or within a few percent of it, wherever that was measured (docs/benchmarks.md)."""
             note += "; every connection, in one traversal"
-            return EstimatorRecord(chosen=options[0].options, label=options[0].label, note=note)
+            return EstimatorRecord(chosen=chosen.options, label=chosen.label, note=note)
 
         pilot = tuner.decide(
             EstimatorRecord,
             of={},
-            needs=(race.ESTIMATOR_NEEDS, *(race.LATER[option][0] for option in _later(problem.config))),
+            needs=(race.ESTIMATOR_NEEDS, *later),
+            later=later,
             integrator=options[0].integrator,
             measure=lambda allowance: run_pilot(problem, options, allowance),
             unmeasured=usual,
@@ -153,24 +160,7 @@ def settle_estimator(tuner: race.Tuner, options: Sequence[Candidate]) -> None:
         tuner.take(samples_per_pass=chosen.memory.samples_per_pass)
 
 
-def _later(config: Config) -> list[str]:
-    """The options that are measured once the estimator is settled."""
-    return [option for option in race.LATER if race.is_auto(config, option)]
-
-
 # --- the pilot --------------------------------------------------------------------------------------------------------
-
-
-def _candidate(options: dict[str, Any], integrator: Tracer, memory: MemoryPlan | None = None) -> Candidate:
-    """As the pilot sees it: with two passes where the run has more, which take as many traversals."""
-    name, slots, parent = options.get("estimator", ""), options.get("capacity", 1) > 1, None
-    if slots or "weight" in options:
-        parent = _label(estimator=name, capacity=1)
-    elif name in ("gather", "reservoir"):  # which trace their paths twice, where `event` traces them once
-        parent = _label(estimator="event", capacity=1)
-    exact, several = name in ESTIMATORS and ESTIMATORS[name].exact, memory is not None and memory.passes > 1
-    varies = slots and "weight" not in options
-    return Candidate(options, exact, 2 if several else 1, parent, varies, integrator, memory)
 
 
 def run_pilot(problem: Problem, options: Sequence[Candidate], allowance: Allowance) -> EstimatorRecord:
@@ -189,17 +179,10 @@ def run_pilot(problem: Problem, options: Sequence[Candidate], allowance: Allowan
     if problem.samples_per_pass is not None:  # the user's own passes
         unit = sets * min(problem.samples_per_pass, run.spp // sets)
     # What is measured later has its part of what it may cost; guiding leaves some of its own for the sequence.
-    later = [race.LATER[option] for option in _later(problem.config)]
-    reserved = max((share for _, share in later), default=0.0)
-    kernels, began = sum(needs[0] for needs, _ in later), time.perf_counter()
-    share = min(race.SHARE, allowance.iterations_left(race.ESTIMATOR_NEEDS[0] + kernels) / race.ITERATIONS) - reserved
-
-    def compiles() -> bool:
-        """Whether there is time for the kernels of one more candidate, with those of what is measured later."""
-        spent = replace(allowance, spent_s=allowance.spent_s + time.perf_counter() - began)
-        return spent.affords((1 + kernels, reserved * race.ITERATIONS))
-
-    return Pilot(options, step, run.spp, unit, share, compiles).run()
+    later = [iterations for option, (_, iterations) in race.LATER.items() if race.is_auto(problem.config, option)]
+    share = race.SHARE - max(later, default=0.0) / race.ITERATIONS
+    share = min(share, allowance.iterations_left(race.ESTIMATOR_NEEDS[0]) / race.ITERATIONS)
+    return Pilot(options, step, run.spp, unit, share, allowance).run()
 
 
 def sample_variance(values: list[Array]) -> float:
@@ -219,6 +202,8 @@ DROPPED = ((2, 1.5), (4, 1.25))
 MOST_ROUNDS = 12
 #: Share of a step's other costs that kernels may have for nothing.
 FREE = 0.25
+#: All the time that is wanted.
+AMPLE = Allowance(1.0, run_s=math.inf, compile_s=0.0, iteration_s=0.0)
 
 
 @dataclass(eq=False)
@@ -242,7 +227,7 @@ class Pilot(race.Race):
     """One pilot. `step(candidate, round, spp)` takes a step; equal rounds have equal seeds.
 
     `spp` are those of the run, of which the pilot uses a multiple of `unit`, and `share` is what it may cost of one.
-    `compiles` says whether there is time for the kernels of one more candidate.
+    Nothing is begun that `allowance` has no time for.
     """
 
     def __init__(
@@ -252,13 +237,13 @@ class Pilot(race.Race):
         spp: int,
         unit: int = 1,
         share: float = race.SHARE,
-        compiles: Callable[[], bool] = lambda: True,
+        allowance: Allowance = AMPLE,
     ) -> None:
         super().__init__()
         labels = {candidate.label for candidate in candidates}
         # What a budget of memory left out says nothing of others.
         self._candidates = [c if c.parent in {None, *labels} else replace(c, parent=None) for c in candidates]
-        self._step, self._share, self._compiles = step, share, compiles
+        self._step, self._share, self._allowance = step, share, allowance
         self._spp, self._unit, self._pilot_spp = spp, unit, unit
         self._entries: list[_Entry] = []
         self._notes: dict[str, str] = {}
@@ -290,7 +275,7 @@ class Pilot(race.Race):
     def _warm_up(self, candidate: Candidate) -> _Entry:
         """Compile the kernels of a candidate, and keep its gradient if that counts."""
         counts = self._first_steps_count
-        first = self._first(self._step(candidate, 0, self._pilot_spp if counts else self._unit))
+        first = self._spend(self._step(candidate, 0, self._pilot_spp if counts else self._unit), first=True)
         entry = _Entry(candidate, gradients=[first.gradients] if counts else [])
         self._entries.append(entry)
         return entry
@@ -299,7 +284,7 @@ class Pilot(race.Race):
         round = len(entry.gradients)
         measured = self._step(entry.candidate, round, self._pilot_spp)
         if measured.compile_ms > measured.wall_ms:  # a first step after all, whose times say nothing
-            self._first(measured)
+            self._spend(measured, first=True)
             measured = self._step(entry.candidate, round, self._pilot_spp)
         self._spend(measured)
         entry.steps.append(measured)
@@ -329,7 +314,14 @@ class Pilot(race.Race):
         return race.ITERATIONS * min(max(e.wall - e.time, 0.0) + e.time * scale for e in self._entries if e.steps)
 
     def _affords(self, entry: _Entry) -> bool:
-        return self._spent_ms + entry.wall <= PLANNED * self._share * self._run_ms()
+        if self._spent_ms + entry.wall > PLANNED * self._share * self._run_ms():
+            return False
+        return entry.wall <= 1e3 * self._allowance.left_s
+
+    def _affords_another(self, relative: _Entry) -> bool:
+        """Whether there is time for a first step of a candidate like this one, and a step that counts."""
+        allowance = self._allowance
+        return self._affords(relative) and allowance.compile_s + 2e-3 * relative.wall <= allowance.left_s
 
     # --- judging ------------------------------------------------------------------------------------------------------
 
@@ -338,19 +330,17 @@ class Pilot(race.Race):
         return [e for e in self._entries if e.candidate.exact and e.candidate.passes == passes]
 
     def _scales(self) -> dict[str, float]:
-        """Mean square norm of each parameter's gradient."""
+        """Mean square norm of each parameter's gradient, where it is not 0."""
         every = [g for e in self._entries if e.candidate.exact for g in e.gradients]
-        every = every or [g for e in self._entries for g in e.gradients]
-        return {key: float(np.mean([sum_of_squares(g[key]) for g in every])) for key in every[0]}
+        return race.scales(every or [g for e in self._entries for g in e.gradients])
 
     def _variance(self, entry: _Entry) -> float:
-        scales = {key: scale for key, scale in self._scales().items() if scale > 0}
         # The exact gradient of each round on the same paths.
         references: list[race.Gradients] = max(
             (each.gradients for each in self._exact(entry.candidate.passes)), key=len, default=[]
         )
         total = 0.0
-        for key, scale in scales.items():
+        for key, scale in self._scales().items():
             own = [g[key] for g in entry.gradients]
             exact = [g[key] for g in references]
             total += sample_variance(exact if len(exact) > 1 else own) / scale
@@ -379,20 +369,20 @@ class Pilot(race.Race):
     def _promising(self) -> list[_Entry]:
         """Measure those that could be the best, by what is known of their relatives."""
         best = max(self._efficiency(entry) for entry in self._entries)
-        labels: dict[str | None, _Entry] = {entry.candidate.label: entry for entry in self._entries}
+        measured = {entry.candidate.label: entry for entry in self._entries}
+        parents = {candidate.label: candidate.parent for candidate in self._candidates}
         found = []
         for candidate in self._candidates:
             if candidate.parent is None:
                 continue
-            relative = candidate
-            parent = labels.get(candidate.parent)
-            while parent is None:  # that was left out as well: it would have been no faster than its own
-                [relative] = [c for c in self._candidates if c.label == relative.parent]
-                parent = labels.get(relative.label)
+            label = candidate.parent
+            while label not in measured:  # that was left out as well: it would have been no faster than its own
+                label = parents[label] or ""
+            parent = measured[label]
             bound = self._bound(candidate, parent)
             if bound * race.TIMING_NOISE < best:
                 self._notes[candidate.label] = f"not measured: at most {bound / best:.2f} of the best's efficiency"
-            elif not (self._affords(parent) and self._compiles()):
+            elif not self._affords_another(parent):
                 self._notes[candidate.label] = (
                     f"not measured: no more than {100 * self._share:.2g} % of the run is to be spent"
                 )
@@ -402,7 +392,7 @@ class Pilot(race.Race):
                 if self._affords(entry):
                     self._measure(entry)
                 found.append(entry)
-                labels[candidate.label] = entry
+                measured[candidate.label] = entry
         return found
 
     def _bound(self, candidate: Candidate, relative: _Entry) -> float:
@@ -411,9 +401,9 @@ class Pilot(race.Race):
         exact = self._exact(candidate.passes)
         if not any(entry.gradients for entry in exact) or candidate.passes != relative.candidate.passes:
             return math.inf
-        least = self._variance(exact[0])
-        if candidate.parent == relative.candidate.label and candidate.varies_slots:
-            least += (self._variance(relative) - least) / candidate.options["capacity"]
+        least, slots = self._variance(exact[0]), candidate.options.get("capacity", 1)
+        if slots > 1 and "weight" not in candidate.options and candidate.parent == relative.candidate.label:
+            least += (self._variance(relative) - least) / slots
         return 1 / (least * max(relative.time, 1e-6))
 
     def _outcome(self) -> EstimatorRecord:
@@ -421,13 +411,11 @@ class Pilot(race.Race):
         best, measured = ranked[0], {entry.candidate.label: entry for entry in self._entries}
         rows = []
         for candidate in self._candidates:
-            name, options = candidate.options["estimator"], {**candidate.options}
-            del options["estimator"]
-            entry, row = measured.get(candidate.label), TriedEstimator(name, options, 0)
+            options, entry = dict(candidate.options), measured.get(candidate.label)
+            found: tuple[int, float | None, float | None, float | None] = (0, None, None, None)
             if entry is not None:
-                time, variance = entry.time, self._variance(entry)
-                row = TriedEstimator(name, options, len(entry.steps), time, variance, self._efficiency(entry))
-            rows.append(replace(row, note=self._notes.get(candidate.label, "")))
+                found = len(entry.steps), entry.time, self._variance(entry), self._efficiency(entry)
+            rows.append(TriedEstimator(options.pop("estimator"), options, *found, self._notes.get(candidate.label, "")))
         return EstimatorRecord(
             chosen=best.candidate.options,
             label=best.candidate.label,
@@ -436,6 +424,5 @@ class Pilot(race.Race):
             advantage=self._efficiency(best) / self._efficiency(ranked[1]) if len(ranked) > 1 else None,
             next_label=ranked[1].candidate.label if len(ranked) > 1 else None,
             share=self._spent_ms / self._run_ms(),
-            measure_s=self._spent_ms / 1e3,
-            compile_s=self._compile_ms / 1e3,
+            **self._cost(),
         )

@@ -10,6 +10,12 @@
 - `Turns`: whether another way of taking steps pays, by steps of both in turns, whose gradients estimate the same. Times
   are those of kernels, and, alike for both, what goes on beside them in a run for as many samples, which counts where
   iterations take milliseconds. A table that steps draw from is learned first, of other paths than theirs, and held.
+
+For another option of which two ways are compared: its record in `records/decisions.py` (a `PaidRecord`); its row in
+`LATER`; in `sampling.py` a `Turns` that makes the record (`SequencePilot`), a function beside `_sequence` that has
+`Tuner.decide` find it, by a `StepTrial` of two integrators, and lines in `settle_sampling` that take it. Of more than
+two ways, or of a number, each has its turns with the best so far. What traces equal paths, and goes with the estimator,
+is an option of `candidates` in `estimators.py` instead.
 """
 
 from __future__ import annotations
@@ -30,7 +36,7 @@ import numpy as np
 from reslrb_cli.backend.doctor import device_name
 from reslrb_cli.config.schema import Config
 from reslrb_cli.integrators.reslrb import Reslrb as Tracer
-from reslrb_cli.optimization.decisions import Allowance
+from reslrb_cli.optimization.decisions import Allowance, Need
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.sensitivity import sample_gradient, take_gradient
 from reslrb_cli.records.cache import PilotCache, key_of
@@ -45,11 +51,15 @@ ITERATIONS = 200
 #: guiding pays is planned for (where it is not clear by then, it may take what the pilot has left of its own), and that
 #: of the sequence is left by what is measured before.
 SHARE, GUIDING_SHARE, SEQUENCE_SHARE = 0.05, 0.025, 0.005
-#: What measurements take at least that say anything: kernels to compile, in those of one step, and iterations' worth of
-#: work. Compiling is that of both kinds of steps, and of walks that are learned from.
+#: What measurements take at least that say anything. Compiling is that of both kinds of steps, and of walks that are
+#: learned from.
 ESTIMATOR_NEEDS, GUIDING_NEEDS, SEQUENCE_NEEDS = (4.0, 4.0), (2.5, 3.0), (2.5, 1.0)
-#: What is measured once the estimator is settled.
-LATER = {"guiding": (GUIDING_NEEDS, GUIDING_SHARE), "sequence": (SEQUENCE_NEEDS, SEQUENCE_SHARE)}
+#: What is measured once the estimator is settled, by option: the time that is kept aside for it, all that is planned.
+#: What it takes at the least would be too little where kernels are there: first steps take their time all the same.
+LATER = {
+    "guiding": (GUIDING_NEEDS[0], GUIDING_SHARE * ITERATIONS),
+    "sequence": (SEQUENCE_NEEDS[0], SEQUENCE_SHARE * ITERATIONS),
+}
 #: Relative error of a single time that must not decide anything.
 TIMING_NOISE = 1.1
 CONFIDENCE = 0.95
@@ -60,6 +70,7 @@ Record = TypeVar("Record", bound=Finding)
 Gradients = dict[str, Array]
 #: A gain and the ends of its interval; nothing where it cannot be told.
 Gain = tuple[float, float, float] | tuple[None, None, None]
+NOTHING: Gain = (None, None, None)
 logger = logging.getLogger(__name__)
 
 
@@ -94,16 +105,18 @@ class Tuner:
         self,
         kind: type[Record],
         of: dict[str, Any],
-        needs: Sequence[tuple[float, float]],
+        needs: Sequence[Need],
         integrator: Tracer,
         measure: Callable[[Allowance], Record],
         unmeasured: Callable[[str], Record],
         fits: Callable[[Record], bool] = lambda record: True,
+        later: Sequence[Need] = (),
     ) -> Record:
         """What an earlier run measured and kept, if it `fits`; else what `measure` finds now, which is kept.
 
         `of` is what that depends on besides the situation, `needs` what measuring by steps of `integrator` and others
-        takes at least that says anything (`Allowance.affords`), `unmeasured` the decision without, with a note.
+        takes at least that says anything (`Allowance.affords`), `unmeasured` the decision without, with a note. What is
+        to be measured `later` has its time kept aside.
         """
         key = ""
         if self._cache is not None:
@@ -121,9 +134,8 @@ class Tuner:
             return record
         if not allowance.spent_s:
             self.say("measuring what pays here, before the first iteration")
-        start = time.perf_counter()
-        record = measure(allowance)
-        allowance.spent_s += time.perf_counter() - start
+        with allowance.spending(later):
+            record = measure(allowance)
         logger.debug(allowance.line())
         if self._cache is not None:
             self._cache.put(key, record.to_json())
@@ -227,12 +239,11 @@ def compare(
 
     Gradients are those of each step by parameter (three steps or more), times those of steps in any unit.
     """
-    scales = {key: float(np.mean([sum_of_squares(g[key]) for g in (*own, *other)])) for key in own[0]}
-    scales = {key: scale for key, scale in scales.items() if scale > 0}
-    found = [_log_variances(gradients, scales) for gradients in (own, other)] if scales else [None]  # of no light, say
+    units = scales([*own, *other])
+    found = [_log_variances(gradients, units) for gradients in (own, other)] if units else [None]  # of no light, say
     known = [each for each in found if each is not None]
     if len(known) < 2:
-        return None, None, None
+        return NOTHING
     from scipy.special import stdtrit  # late: every run imports this module, and few come here
 
     times = statistics.median(own_ms) / max(statistics.median(other_ms), 1e-6)
@@ -241,6 +252,12 @@ def compare(
     half = float(stdtrit(min(len(own), len(other)) - 1, (1 + confidence) / 2)) * math.sqrt(variance)
     factor = math.exp(min(half, 50.0)) * TIMING_NOISE
     return advantage, advantage / factor, advantage * factor
+
+
+def scales(gradients: Sequence[Gradients]) -> dict[str, float]:
+    """The mean square norm of each parameter's gradient, of those that have any."""
+    found = {key: float(np.mean([sum_of_squares(g[key]) for g in gradients])) for key in gradients[0]}
+    return {key: scale for key, scale in found.items() if scale > 0}
 
 
 def _log_variances(gradients: Sequence[Gradients], scales: dict[str, float]) -> tuple[float, Array] | None:
@@ -265,18 +282,13 @@ class Race:
     def __init__(self) -> None:
         self._spent_ms = self._compile_ms = 0.0
 
-    def _first(self, step: Step) -> Step:
-        """Count a step that had its kernels compiled, whose times tell nothing else."""
-        self._compile_ms += step.wall_ms + step.compile_ms
+    def _spend(self, step: Step, first: bool = False) -> Step:
+        """Count a step; of a `first` one, which had its kernels compiled, times tell nothing else."""
+        self._spent_ms += 0.0 if first else step.wall_ms
+        self._compile_ms += step.compile_ms + (step.wall_ms if first else 0.0)
         return step
 
-    def _spend(self, step: Step) -> Step:
-        """Count a step."""
-        self._spent_ms += step.wall_ms
-        self._compile_ms += step.compile_ms
-        return step
-
-    def _cost(self) -> dict[str, float]:
+    def _cost(self) -> dict[str, Any]:
         """Of the record."""
         return {"measure_s": self._spent_ms / 1e3, "compile_s": self._compile_ms / 1e3}
 
@@ -324,58 +336,50 @@ class Sizes:
         return max(min(int(LEARNING_SHARE * self.step), self.part), 1)
 
 
-class Trial:
-    """What is measured. Equal rounds have equal seeds, others than those of any walk that is learned from.
-
-    `learns` says whether there is a table that has yet to learn; none has one here.
-    """
-
-    @property
-    def learns(self) -> bool:
-        return False
-
-    def learn(self, round: int, spp: int) -> Step:
-        """Have the table learn, from a walk of `spp` samples per pixel; what is not given is left at 0."""
-        raise NotImplementedError
-
-    def take(self, other: bool, round: int, spp: int) -> Step:
-        """A step as it is, or one the other way; from what the table has learned, which stays as it is."""
-        raise NotImplementedError
+#: A step as it is, or one the other way, of a round and so many samples per pixel; from what the table has learned,
+#: which stays as it is. Equal rounds have equal seeds, others than those of any walk that is learned from.
+Take = Callable[[bool, int, int], Step]
+#: Have the table learn, from a walk of a round and so many samples per pixel; what is not given is left at 0.
+Learn = Callable[[int, int], Step]
 
 
 class Turns(Race, Generic[Record]):
-    """One decision. `views` is how many times the views of an iteration are those of a step here, `share` what of
-    ITERATIONS this may cost, and `most` what of them the least number of rounds may, where that is more."""
+    """One decision, by steps that `take` takes, and walks that `learn` does, where a table has yet to learn. `views` is
+    how many times the views of an iteration are those of a step here, `share` what of ITERATIONS this may cost, and
+    `most` what of them the least number of rounds may, where that is more."""
 
     LEAST, LOOKS = LEAST_ROUNDS, LOOKS
     #: Whether it is decided apart for images that have samples of their own.
     APART = False
 
-    def __init__(self, trial: Trial, sizes: Sizes, views: float, share: float, most: float = 0.0) -> None:
+    def __init__(
+        self, take: Take, sizes: Sizes, views: float, share: float, most: float = 0.0, learn: Learn | None = None
+    ) -> None:
         super().__init__()
-        self._trial, self._sizes, self._views, self._share, self._most = trial, sizes, views, share, max(share, most)
+        self._take, self._learn, self._sizes, self._views = take, learn, sizes, views
+        self._share, self._most = share, max(share, most)
         self._apart = self.APART and sizes.alone
         self._plain: list[Step] = []  # all steps as they are whose times count
-        self._steps: dict[bool, list[Step]] = {False: [], True: []}
+        self._steps: tuple[list[Step], list[Step]] = ([], [])  # of either kind
         self._walk = Step()
 
     def run(self) -> Record:
         """Measure, and decide."""
-        spp, take = self._sizes.trial, self._trial.take
-        self._first(take(False, 0, spp))
+        spp, take = self._sizes.trial, self._take
+        self._spend(take(False, 0, spp), first=True)
         plain = self._spend(take(False, 0, spp))
         self._plain.append(plain)
         # What Python takes is the same for both.
         kernels = (1 + self._sizes.longer) * (plain.kernel_ms + plain.image_ms)
         if not self._learned(kernels + 2 * plain.beside_ms):
-            return self._off(f"to measure it would cost more than {100 * self._most:.2g} % of {ITERATIONS} iterations")
-        self._first(take(True, 0, spp))
+            share = f"{100 * self._most:.2g} % of {ITERATIONS} iterations"
+            return self._record(f"to measure it would cost more than {share}")
+        self._spend(take(True, 0, spp), first=True)
         for round in range(1, 1 + self.LOOKS * self._sizes.rounds):
-            both = [self._spend(take(other, round, spp)) for other in (False, True)]
-            for other, step in enumerate(both):
-                self._steps[bool(other)].append(step)
-            self._plain.append(both[0])
-            if not self._affords(sum(step.wall_ms for step in both)):
+            for other in (False, True):
+                self._steps[other].append(self._spend(take(other, round, spp)))
+            self._plain.append(self._steps[False][-1])
+            if not self._affords(sum(steps[-1].wall_ms for steps in self._steps)):
                 break
             if round % self._sizes.rounds == 0 and self._is_clear():
                 break
@@ -383,18 +387,18 @@ class Turns(Race, Generic[Record]):
 
     def _learned(self, round_ms: float) -> bool:
         """Have the table learn, if it has not; False where that, and rounds of so long, cannot be afforded."""
-        if not self._trial.learns:
+        if self._learn is None:
             return self._affords(self.LEAST * round_ms)
-        walk = self._trial.learn(0, self._sizes.learning)
+        walk = self._learn(0, self._sizes.learning)
         if not self._affords(walk.wall_ms + self.LEAST * round_ms):
-            self._first(walk)
+            self._spend(walk, first=True)
             return False
         self._walk = self._spend(walk)
         # What one walk more would gain is little beside what rounds that are too few leave open.
         rounds = max(self._sizes.rounds // 2, self.LEAST)
         for number in range(1, LEARNINGS):
             if self._affords(self._walk.wall_ms + rounds * round_ms):
-                self._walk = self._spend(self._trial.learn(number, self._sizes.learning))
+                self._walk = self._spend(self._learn(number, self._sizes.learning))
         return True
 
     @property
@@ -430,16 +434,16 @@ class Turns(Race, Generic[Record]):
 
     def _gain(self, images: bool, confidence: float = CONFIDENCE) -> Gain:
         """Of the gradient, as part of steps whose images are drawn the other way or not."""
-        gradients = [[step.gradients for step in self._steps[other]] for other in (False, True)]
-        return compare(gradients[0], self._times(False, images), gradients[1], self._times(True, images), confidence)
+        own, other = ([step.gradients for step in steps] for steps in self._steps)
+        return compare(own, self._times(False, images), other, self._times(True, images), confidence)
 
     def _image_gain(self) -> Gain:
         """Of the image: of samples of its own, where it has them, else of those that serve the gradient too."""
-        images = [[step.images for step in self._steps[other]] for other in (False, True)]
-        times = [self._times(other, False) for other in (False, True)]
+        own, other = ([step.images for step in steps] for steps in self._steps)
+        times = [self._times(each, False) for each in (False, True)]
         if self._sizes.alone:  # what goes on beside kernels counts once, with the gradient
-            times = [[step.image_ms for step in self._steps[other]] for other in (False, True)]
-        return compare(images[0], times[0], images[1], times[1])
+            times = [[step.image_ms for step in steps] for steps in self._steps]
+        return compare(own, times[0], other, times[1])
 
     def _is_clear(self) -> bool:
         """Whether no more steps are needed: it is not on by accident, or off at all events."""
@@ -454,27 +458,26 @@ class Turns(Race, Generic[Record]):
 
     def _decided(self) -> Record:
         if len(self._steps[False]) < self.LEAST:
-            return self._off(f"{len(self._steps[False])} steps of both are too few to tell")
+            return self._record(f"{len(self._steps[False])} steps of both are too few to tell")
         picture = self._image_gain()
         images = self._images(picture)
         gain = self._gain(images or not self._apart)
         if gain[1] is None:
-            return self._off("gradients have no noise")
+            return self._record("gradients have no noise")
         note = ""
         if gain[1] > 1 and not (images or self._apart):
             whose = "images have" if self._sizes.alone else "the image, of the same samples, has"
             note = f"{whose} {picture[0]:.2g} times the efficiency"
         on = gain[1] > 1 and not note
-        return self._record(on, on and images, gain, picture, note)
+        return self._record(note, gain, picture, on, on and images)
 
-    def _off(self, note: str) -> Record:
-        return self._record(False, False, (None, None, None), (None, None, None), note)
-
-    def _record(self, other: bool, images: bool, gain: Gain, picture: Gain, note: str) -> Record:
-        found = dict(zip(("gain", "low", "high"), gain, strict=True)) | self._cost()
+    def _record(
+        self, note: str, gain: Gain = NOTHING, picture: Gain = NOTHING, other: bool = False, images: bool = False
+    ) -> Record:
+        found = self._found(note) | dict(zip(("gain", "low", "high"), gain, strict=True))
         found |= dict(zip(("image_gain", "image_low", "image_high"), picture, strict=True))
-        share = self._spent_ms / (ITERATIONS * self._iteration_ms)
-        rounds = len(self._steps[True])
-        return self._decide(
-            other, images, {**found, "rounds": rounds, "spp": self._sizes.trial, "share": share, "note": note}
-        )
+        return self._decide(other, images, found | {"share": self._spent_ms / (ITERATIONS * self._iteration_ms)})
+
+    def _found(self, note: str) -> dict[str, Any]:
+        """What all records of decisions by turns hold."""
+        return {"rounds": len(self._steps[True]), "spp": self._sizes.trial, "note": note, **self._cost()}

@@ -33,7 +33,7 @@ from reslrb_cli.optimization.autotune.estimators import Candidate, settle_estima
 from reslrb_cli.optimization.decisions import Allowance
 from reslrb_cli.optimization.moving import is_attached
 from reslrb_cli.optimization.problem import Problem
-from reslrb_cli.optimization.sensitivity import take_gradient
+from reslrb_cli.optimization.sensitivity import finite, take_gradient
 from reslrb_cli.optimization.views import View, slope, to_tensor
 from reslrb_cli.records.cache import PilotCache
 from reslrb_cli.records.clock import StepClock, StepTimes
@@ -126,7 +126,7 @@ def lessons(problem: Problem) -> float:
 def sizes(problem: Problem, longer: float, planned: float = race.PLANNED) -> race.Sizes:
     """The samples of the run's steps, and what is planned of those that are taken here."""
     run, adjoint = problem.config.run, problem.config.adjoint
-    call = run.spp // run.batches if adjoint == "batched" else run.spp
+    call = run.spp // race.sets_of(problem.config)
     part = min(problem.samples_per_pass or call, call)
     entries = sum(problem.selection.array(key).size for key in problem.selection.keys)
     sets = run.spp / call * len(problem.drawn(0))
@@ -143,10 +143,10 @@ def share_left(problem: Problem, allowance: Allowance, reserved: float = 0.0, ke
     """What earlier measurements left of the share of 200 iterations that all of them may cost, but for what is
     `reserved`, and no more than there is time for in a run as short as this, with `kernels` to compile."""
     spent = sum(each.share for each in (problem.pilot, problem.guided) if each is not None)
-    return max(min(race.SHARE - spent, allowance.iterations_left(kernels) / race.ITERATIONS) - reserved, 0.0)
+    return max(min(race.SHARE - spent - reserved, allowance.iterations_left(kernels) / race.ITERATIONS), 0.0)
 
 
-# --- guiding ----------------------------------------------------------------------------------------------------------
+# --- what is decided --------------------------------------------------------------------------------------------------
 
 
 class GuidingPilot(race.Turns[GuidedRecord]):
@@ -164,23 +164,29 @@ class GuidingPilot(race.Turns[GuidedRecord]):
         return GuidedRecord(guided=other, images=images, **found)
 
 
+class SequencePilot(race.Turns[SequenceRecord]):
+    """One decision: low-discrepancy numbers, or independent ones."""
+
+    def _decide(self, other: bool, images: bool, found: dict[str, Any]) -> SequenceRecord:
+        return SequenceRecord(low_discrepancy=other, **found)
+
+
 def _guided(tuner: race.Tuner, trials: list[StepTrial]) -> GuidedRecord:
-    """Whether the problem's integrator, whose estimator is settled, is to be guided."""
+    """Whether the problem's integrator, whose estimator is settled, is to be guided; `trials` gets the steps of it."""
     problem = tuner.problem
     if problem.memory is not None:
         free, needed = problem.memory.budget_bytes - problem.memory.expected_bytes.total, table_bytes(problem)
         if needed > free:
-            note = f"run.memory_budget has no room for tables of {in_words(needed)}"
-            return GuidedRecord(guided=False, note=note)
+            return GuidedRecord(guided=False, note=f"run.memory_budget has no room for tables of {in_words(needed)}")
     sequence = race.is_auto(problem.config, "sequence")
     why = suits_even_numbers(problem) if sequence else None
     plan = sizes(problem, GUIDING_LONGER)
 
     def measure(allowance: Allowance) -> GuidedRecord:
+        share = share_left(problem, allowance, race.SEQUENCE_SHARE if sequence else 0.0, race.GUIDING_NEEDS[0])
         plain, guided = (problem.integrator.afresh(guided=on) for on in (False, True))
         trials.append(StepTrial(problem, "guiding", plain, guided))
-        share = share_left(problem, allowance, race.SEQUENCE_SHARE if sequence else 0.0, race.GUIDING_NEEDS[0])
-        return GuidingPilot(trials[-1], plan, trials[-1].part_of_views(), share).run()
+        return trials[-1].turns(GuidingPilot, plan, share)
 
     return tuner.decide(
         GuidedRecord,
@@ -191,48 +197,35 @@ def _guided(tuner: race.Tuner, trials: list[StepTrial]) -> GuidedRecord:
         integrator=problem.integrator,
         measure=measure,
         unmeasured=lambda note: GuidedRecord(guided=False, note=f"{note}; {why or 'it pays in long runs'}"),
+        later=[(0.0, race.LATER["sequence"][1])] if sequence else [],
     )
-
-
-# --- the sequence -----------------------------------------------------------------------------------------------------
-
-
-class SequencePilot(race.Turns[SequenceRecord]):
-    """One decision: low-discrepancy numbers, or independent ones."""
-
-    def _decide(self, other: bool, images: bool, found: dict[str, Any]) -> SequenceRecord:
-        return SequenceRecord(low_discrepancy=other, **found)
 
 
 def _sequence(tuner: race.Tuner, trials: list[StepTrial]) -> SequenceRecord:
     """Which sequence the problem's integrator, guided or not, is to have; `trials`: what guiding was measured on."""
     problem, found = tuner.problem, tuner.problem.guided
-    plain = problem.integrator
+    plain, is_guided = problem.integrator, problem.integrator.preparation.guiding is not None
 
     def pilot(name: str, guided: bool | None, share: float) -> SequenceRecord:
         """What is found in that share of the run; `guided`: with the other numbers, None: as the run is."""
         even = plain.afresh(guided=guided, low_discrepancy=True)
-        earlier = trials[-1] if trials else None
-        trials.append(StepTrial(problem, name, plain.afresh(low_discrepancy=False), even, earlier))
-        plan = sizes(problem, SEQUENCE_LONGER, planned(share))
-        return SequencePilot(trials[-1], plan, trials[-1].part_of_views(), share).run()
+        trials.append(StepTrial(problem, name, plain.afresh(low_discrepancy=False), even, *trials[-1:]))
+        return trials[-1].turns(SequencePilot, sizes(problem, SEQUENCE_LONGER, planned(share)), share)
 
     def measure(allowance: Allowance) -> SequenceRecord:
-        alone = None
-        if found is not None and found.guided:
-            # Guided paths start in cells of their own, within which little is left to spread evenly: where numbers
-            # that are say nearly all, as under a beam through glass, they do better alone.
-            share = share_left(problem, allowance, kernels=2 * race.SEQUENCE_NEEDS[0])
-            alone = replace(pilot("sequence alone", False, share / 2), alone=True)
-            if alone.low_discrepancy:
-                return alone
-        spent = 0.0 if alone is None else alone.share
-        record = pilot("sequence", None, share_left(problem, allowance, spent, race.SEQUENCE_NEEDS[0]))
-        costs = ("measure_s", "compile_s", "share") if alone is not None else ()
+        if found is None or not found.guided:
+            return pilot("sequence", None, share_left(problem, allowance, kernels=race.SEQUENCE_NEEDS[0]))
+        # Guided paths start in cells of their own, within which little is left to spread evenly: where numbers
+        # that are say nearly all, as under a beam through glass, they do better alone.
+        share = share_left(problem, allowance, kernels=2 * race.SEQUENCE_NEEDS[0])
+        alone = replace(pilot("sequence alone", False, share / 2), alone=True)
+        if alone.low_discrepancy:
+            return alone
+        record = pilot("sequence", None, share_left(problem, allowance, alone.share, race.SEQUENCE_NEEDS[0]))
+        costs = ("measure_s", "compile_s", "share")
         return replace(record, **{name: getattr(record, name) + getattr(alone, name) for name in costs})
 
     def unmeasured(note: str) -> SequenceRecord:
-        is_guided = plain.preparation.guiding is not None
         why = "guided paths gain little by others" if is_guided else suits_even_numbers(problem)
         note = f"{note}; {why or 'evenly spread ones have been no loss in any scene'}"
         return SequenceRecord(low_discrepancy=not is_guided, note=note)
@@ -245,7 +238,7 @@ def _sequence(tuner: race.Tuner, trials: list[StepTrial]) -> SequenceRecord:
 # --- steps ------------------------------------------------------------------------------------------------------------
 
 
-class StepTrial(race.Trial):
+class StepTrial:
     """Steps of a problem by `plain`, or by `other`; they leave neither gradient nor change behind.
 
     `views` are those that are looked at. Where either is guided, both that are draw from one table: that of `earlier`,
@@ -259,10 +252,16 @@ class StepTrial(race.Trial):
         self._problem, self._what, self._clock = problem, what, StepClock()
         self._adjoint = problem.config.adjoint
         # Of their own: tables and recordings of other sample counts end with them.
-        made = {False: plain, True: other}
-        self._tracers = {o: one.with_options(samples_per_pass=None, freeze=one.freeze) for o, one in made.items()}
-        self._guided = [one for one in self._tracers.values() if one.preparation.guiding is not None]
-        self.table: Guiding | None = self._one_table(None if earlier is None else earlier.table)
+        self._tracers = [one.with_options(samples_per_pass=None, freeze=one.freeze) for one in (plain, other)]
+        self._guided = [one for one in self._tracers if one.preparation.guiding is not None]
+        self.table: Guiding | None = earlier.table if earlier is not None and self._guided else None
+        if self._guided:
+            own = self._guided[0].preparation.guiding
+            assert own is not None
+            self.table = self.table or own
+            self.table.images, self.table.held = own.images, True  # steps are not to teach it
+            for tracer in self._guided:
+                tracer.preparation.draw_from(self.table, problem.scene)
         problem.apply()
         if earlier is not None:
             self.views: list[View] = earlier.views
@@ -274,31 +273,21 @@ class StepTrial(race.Trial):
         self._slopes = [self._slope(view) for view in self.views]
         take_gradient(problem)  # recovered exposures have some of these
 
-    def _one_table(self, learned: Guiding | None) -> Guiding | None:
-        """What all that are guided draw from; None where none is."""
-        if not self._guided:
-            return None
-        own = self._guided[0].preparation.guiding
-        assert own is not None
-        table = learned or own
-        table.images, table.held = own.images, True  # steps are not to teach it
-        for tracer in self._guided:
-            tracer.preparation.draw_from(table, self._problem.scene)
-        return table
-
-    def part_of_views(self) -> float:
-        """How many times the views of an iteration are those of a step here."""
-        return len(self._problem.drawn(0)) / len(self.views)
+    def turns(self, kind: type[race.Turns[race.Record]], sizes: race.Sizes, share: float) -> race.Record:
+        """What is found by these steps in turns."""
+        part_of_views = len(self._problem.drawn(0)) / len(self.views)
+        return kind(self.take, sizes, part_of_views, share, learn=self.learn if self._learns else None).run()
 
     @property
-    def learns(self) -> bool:
+    def _learns(self) -> bool:
+        """Whether there is a table that has yet to learn."""
         return self.table is not None and not self.table.learned
 
     def _slope(self, view: View) -> mi.TensorXf:
         """dL/dI, which is held; 0 where it is not finite."""
         spp = max(int(IMAGE_SHARE * self._problem.config.run.spp), 1)
         image = render_image(self._tracers[False], self._problem.scene, view.sensor, self._seed(0, view, "image"), spp)
-        return to_tensor(np.nan_to_num(slope(view.objective, np.array(image)), nan=0.0, posinf=0.0, neginf=0.0))
+        return to_tensor(finite(slope(view.objective, np.array(image))))
 
     def learn(self, round: int, spp: int) -> race.Step:
         """Have the table learn, and be ready to be drawn from, as it is from then on.
@@ -309,7 +298,7 @@ class StepTrial(race.Trial):
         jobs = [self._job(view, self._seed(round, view, "learned from"), spp) for view in self.views]
         compile_ms = 0.0
         assert self.table is not None
-        if self.learns:
+        if self._learns:
             compile_ms = self._teach(self.table, jobs).wall_ms
             self.table.forget()
         taken = race.timed(self._teach(self.table, jobs))
@@ -375,5 +364,4 @@ class StepTrial(race.Trial):
 def _few(image: mi.TensorXf) -> Array:
     """Values of an image, spread over it, 0 where they are not finite."""
     values = np.array(image, dtype=np.float32).ravel()
-    values = values[:: -(-values.size // MOST_VALUES)]
-    return np.nan_to_num(values, nan=0.0, posinf=0.0, neginf=0.0)
+    return finite(values[:: -(-values.size // MOST_VALUES)])
