@@ -128,20 +128,21 @@ class Reslrb(AttachingTracer):
     stack_size: Count = 64
     """Vertices of a path that fit into thread-local memory; longer paths are traced a second time. Only with estimator
     `stack`."""
-    paths: Literal["auto", "light", "camera", "both"] = "auto"
+    paths: Literal["auto", "light", "camera", "both"] = "light"
     """Where paths begin. `light`: at the emitters, which finds caustics and light through glass, but shows mirrors and
     clear glass black; `camera`: at the sensor, which finds what mirrors and glass show, and most light of rooms, but no
     caustics of small lamps (with estimators `auto` and `stack`); `both`: each path is weighed by how likely either
-    side was to find it, so that the image has all light. `auto`: where a few steps of each, before the first iteration,
-    show which is the most efficient here. What moves light has light paths alone. Left out it is `auto` with estimator
-    `auto`, and `light` with one that is named."""
+    side was to find it, so that the image has all light. `auto`: `both`, or `camera` where that finds all light and a
+    few steps of each, before the first iteration, show that it is the more efficient; `light` where nothing else can
+    render the scene. What moves light has light paths alone."""
     light_share: Annotated[
         Annotated[float, Field(ge=0, le=1, allow_inf_nan=False), mark("number")]
         | Annotated[Literal["auto"], mark("text")],
         Discriminator(lambda value: MARK + ("text" if isinstance(value, str) else "number")),
     ] = "auto"
     """Which share of the samples are light paths where `paths` are `both`; with 0 or 1 nothing of the other side is
-    compiled. `auto`: measured with the choice of paths; 0.5 with an estimator that is named."""
+    compiled. `auto`: the most efficient by a few steps of each before the first iteration, 0.5 where nothing is
+    measured."""
     guiding: Literal["auto", "on", "off"] = "auto"
     """Whether light paths start where those of earlier steps had something to say about gradient and image, at least a
     quarter of them anywhere, and end where those had little left to say; in scenes with glossy surfaces they are also

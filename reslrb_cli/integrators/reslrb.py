@@ -77,14 +77,17 @@ class LightTracer:
         return other
 
     def afresh(
-        self, *, guided: bool | None = None, images: bool | None = None, low_discrepancy: bool | None = None
-    ) -> Self:
+        self, *, guided: bool | None = None, images: bool | None = None, low_discrepancy: bool | None = None,
+        paths: str | None = None, light_share: float | None = None,
+    ) -> Self:  # fmt: skip
         """The same, which knows nothing of any scene yet, with other ways of drawing samples; None: as it has it.
 
-        Guided emission or none, `images`: of images too; low-discrepancy numbers or independent ones.
+        Guided emission or none, `images`: of images too; low-discrepancy numbers or independent ones; other `paths`, of
+        which `light_share` are light paths.
         """
         other = copy.copy(self)
         other.preparation = self.preparation.afresh(guided, images, low_discrepancy)
+        other.have_paths(paths or self.paths, self.light_share if light_share is None else light_share)
         return other
 
     def to_measure(self) -> Self:

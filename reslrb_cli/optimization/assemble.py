@@ -20,10 +20,11 @@ from reslrb_cli.optimization.loading import (
     load_configured,
     make_configured,
     pass_spp,
+    paths_of,
     samples_per_pass,
 )
 from reslrb_cli.optimization.memory import check_announced, check_described, check_films, outlook
-from reslrb_cli.optimization.moving import check_moving
+from reslrb_cli.optimization.moving import check_moving, moves_anything
 from reslrb_cli.optimization.problem import Problem, make_optimizer
 from reslrb_cli.optimization.state import Settled
 from reslrb_cli.optimization.targets import make_targets
@@ -76,7 +77,7 @@ def load_for_rendering(config: Config, initial: bool) -> tuple[Any, list[int], A
     scene = load_configured(config, selects=False)
     sensors = choose_sensors(config, scene)
     check_integrator(config, config.integrator, scene, sensors)
-    integrator = make_configured(config.integrator)
+    integrator = make_configured(config.integrator, paths_of(config.integrator, scene, sensors))
     return scene, sensors, integrator, samples_per_pass(config)
 
 
@@ -90,8 +91,11 @@ def assemble_scene(config: Config, scene: Any = None, values: Mapping[str, Array
     scene = load_configured(config, functools.partial(check_described, config)) if scene is None else scene
     views = make_views(config, scene)
     check_films(config, scene, [view.sensor for view in views])
-    check_integrator(config, config.integrator, scene, [view.sensor for view in views])
+    sensors = [view.sensor for view in views]
     selection = select_parameters(scene, config.parameters, config.source)
+    moves = moves_anything(config, selection)
+    check_integrator(config, config.integrator, scene, sensors, moves)
+    paths = paths_of(config.integrator, scene, sensors, moves)
     expose(views, scene, selection)
     if values is not None:
         _check_values(selection, values)
@@ -101,7 +105,9 @@ def assemble_scene(config: Config, scene: Any = None, values: Mapping[str, Array
         scene=scene,
         views=views,
         selection=selection,
-        integrator=make_configured(config.integrator),
+        integrator=make_configured(config.integrator, paths),
+        paths=paths,
+        moves=moves,
         optimizer=make_optimizer(config, selection),
         samples_per_pass=samples_per_pass(config),
         quantities={

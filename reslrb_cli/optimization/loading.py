@@ -22,7 +22,7 @@ from reslrb_cli.integrators.protocol import StepIntegrator
 from reslrb_cli.integrators.reslrb import Reslrb
 from reslrb_cli.integrators.step import make_integrator, render_image
 from reslrb_cli.scene.load import load_scene, warn_once
-from reslrb_cli.scene.needs import check_camera_paths, check_supported, scene_needs, stock_clip
+from reslrb_cli.scene.needs import check_camera_paths, check_paths, paths_obstacle, scene_needs, stock_clip
 from reslrb_cli.scene.xml.read import Description
 from reslrb_cli.seeds import seed
 
@@ -125,12 +125,36 @@ def are_upright(config: Config) -> bool:
     return config.scene.cameras is None
 
 
-def check_integrator(config: Config, integrator: Integrator, scene: mi.Scene, sensors: list[int]) -> None:
+def paths_of(integrator: Integrator, scene: mi.Scene, sensors: list[int], moves: bool = False) -> str:
+    """Which paths make the images of `integrator`: `light`, `camera`, or `both`; of what `moves` light, `light`.
+
+    Where that is left to measurement it is `both`, of which that makes `camera` or another share, or what can render
+    the scene at all.
+    """
+    if not isinstance(integrator, ReslrbConfig):
+        return "light" if integrator.type in LIGHT_TRACERS else "camera"
+    if moves:
+        return "light"
+    if integrator.paths == "both" and integrator.light_share in (0, 1):
+        return "light" if integrator.light_share else "camera"
+    if integrator.paths != "auto":
+        return integrator.paths
+    looked = [scene.sensors()[sensor] for sensor in sensors]
+    for kind in ("both", "camera"):
+        if all(paths_obstacle(scene, sensor, kind) is None for sensor in looked):
+            return kind
+    return "light"
+
+
+def check_integrator(
+    config: Config, integrator: Integrator, scene: mi.Scene, sensors: list[int], moves: bool = False
+) -> None:
     """Raise ConfigError, located in the scene's file, where `integrator` cannot render `scene` through `sensors`."""
     try:
+        paths = paths_of(integrator, scene, sensors, moves)
         for sensor in sensors:
             if integrator.type in LIGHT_TRACERS:
-                check_supported(scene, scene.sensors()[sensor], integrator.hide_emitters)
+                check_paths(scene, scene.sensors()[sensor], paths, integrator.hide_emitters)
                 if integrator.type == "ptracer":
                     _warn_of_clipping(config, scene.sensors()[sensor], scene)
             else:
@@ -145,16 +169,24 @@ def _warn_of_clipping(config: Config, sensor: mi.Sensor, scene: mi.Scene) -> Non
         warn_once(f"{config.scene.file}: sensor {sensor.id()}: ptracer {wrong}; reslrb is right there")
 
 
-def make_configured(integrator: Integrator) -> StepIntegrator:
-    """The integrator that a configuration describes; all estimators have the same image, so for `auto` any will do.
+def make_configured(integrator: Integrator, paths: str) -> StepIntegrator:
+    """The integrator that a configuration describes, with these `paths` (`paths_of`); all estimators have the same
+    image, so for `auto` any will do.
 
     What is not decided yet (`guiding`, `sequence`) is off.
     """
     if isinstance(integrator, ReslrbConfig):
-        auto = integrator.estimator == "auto"
-        integrator = integrator.chosen(estimator="reservoir") if auto else integrator.undecided_off()
+        integrator = settled_config(integrator, {}, paths)
     options: dict[str, Any] = integrator.options()
     return make_integrator(integrator.type, **options)
+
+
+def settled_config(integrator: ReslrbConfig, chosen: dict[str, Any], paths: str) -> ReslrbConfig:
+    """The same with the `chosen` estimator and its options, and these `paths`; what is undecided is off."""
+    if not chosen and integrator.estimator == "auto":
+        chosen = {"estimator": "stack" if paths == "camera" else "reservoir"}
+    made = integrator.chosen(**chosen) if chosen else integrator.undecided_off()
+    return made.model_copy(update={"paths": paths})
 
 
 def pass_spp(config: Config) -> int:

@@ -14,13 +14,16 @@ import drjit as dr
 import mitsuba as mi
 
 from reslrb_cli.config.integrators import Reslrb as ReslrbConfig
+from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ConfigError, UnsupportedScene
 from reslrb_cli.integrators.protocol import Job
 from reslrb_cli.integrators.reslrb import LightTracer
 from reslrb_cli.integrators.reslrb import Reslrb as Tracer
+from reslrb_cli.optimization.loading import settled_config
 from reslrb_cli.optimization.memory import plans
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.scene.deformation import where_moved
+from reslrb_cli.scene.parameters import Selection
 from reslrb_cli.seeds import seed
 from reslrb_cli.transport.bsdf import Scattering
 from reslrb_cli.transport.connection import Connection
@@ -126,8 +129,13 @@ ATTACHED = "stack"
 
 def is_attached(problem: Problem) -> bool:
     """Whether the parameters of `problem` move anything that light leaves from or meets, or are to be taken so."""
-    attached = problem.config.integrator.options().get("attached", "auto")
-    return attached is True or bool(where_moved(problem.selection.params, problem.selection.scene_keys))
+    return moves_anything(problem.config, problem.selection)
+
+
+def moves_anything(config: Config, selection: Selection) -> bool:
+    """Whether the selected parameters move anything that light leaves from or meets, or are to be taken so."""
+    attached = config.integrator.options().get("attached", "auto")
+    return attached is True or bool(where_moved(selection.params, selection.scene_keys))
 
 
 def check_moving(problem: Problem) -> None:
@@ -140,7 +148,7 @@ def check_moving(problem: Problem) -> None:
         reason = f"{kind} has no derivatives of what moves light, as `{moved[0].key}` does; take reslrb or ptracer"
         raise ConfigError(config.source, "integrator.type", reason)
     if isinstance(config.integrator, ReslrbConfig) and config.integrator.estimator == "auto":
-        tracer = Tracer.of(**config.integrator.chosen(estimator=ATTACHED).options())
+        tracer = Tracer.of(**settled_config(config.integrator, {"estimator": ATTACHED}, "light").options())
     if isinstance(tracer, LightTracer):
         try:
             plans(problem, tracer)

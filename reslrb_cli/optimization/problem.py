@@ -17,7 +17,7 @@ from reslrb_cli.optimization.errors import ErrorMeter
 from reslrb_cli.optimization.loading import BETWEEN_SPP, render_in_passes
 from reslrb_cli.optimization.optimizers import Optimizer, make_transform
 from reslrb_cli.optimization.views import View, slope, to_tensor
-from reslrb_cli.records.decisions import EstimatorRecord, GuidedRecord, SequenceRecord
+from reslrb_cli.records.decisions import EstimatorRecord, GuidedRecord, Jsonable, PathsRecord, SequenceRecord
 from reslrb_cli.scene.parameters import Selection
 from reslrb_cli.seeds import seed
 
@@ -57,17 +57,25 @@ class Problem:
     quantities: dict[str, str] = field(default_factory=dict)
     #: The integrator's own bound on the samples of a pass.
     samples_per_pass: int | None = None
+    #: Which paths make the images: `light`, `camera`, or `both` (`loading.paths_of`).
+    paths: str = "light"
+    #: Whether parameters move anything that light leaves from or meets.
+    moves: bool = False
     #: What measuring before the first iteration may take, where anything was left to it, and was not known already.
     allowance: Allowance | None = None
     #: What was measured and planned before the first iteration, where it was.
     pilot: EstimatorRecord | None = None
+    sides: PathsRecord | None = None
     guided: GuidedRecord | None = None
     sequence: SequenceRecord | None = None
     memory: MemoryPlan | None = None
 
     def decisions(self) -> dict[str, dict[str, Any] | None]:
         """What was measured and planned before the first iteration, as manifests and checkpoints have it, by name."""
-        made = {"pilot": self.pilot, "guided": self.guided, "sequence": self.sequence, "memory": self.memory}
+        made: dict[str, Jsonable | None] = {"pilot": self.pilot, "guided": self.guided, "sequence": self.sequence}
+        made["memory"] = self.memory
+        if self.sides is not None:
+            made["paths"] = self.sides
         return {name: None if each is None else each.to_json() for name, each in made.items()}
 
     def apply(self, others: Mapping[str, Any] | None = None) -> None:

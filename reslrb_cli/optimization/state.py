@@ -32,13 +32,13 @@ from reslrb_cli.guiding.tables import Guiding
 from reslrb_cli.integrators.reslrb import Reslrb
 from reslrb_cli.optimization.autotune.estimators import Candidate
 from reslrb_cli.optimization.autotune.race import is_auto
-from reslrb_cli.optimization.autotune.sampling import as_decided
+from reslrb_cli.optimization.autotune.sampling import as_decided, with_sides
 from reslrb_cli.optimization.decisions import MemoryPlan, Scaled
 from reslrb_cli.optimization.nonfinite import NonFinitePolicy
 from reslrb_cli.optimization.optimizers import GradientClamp
 from reslrb_cli.records.checkpoint import Archive
 from reslrb_cli.records.clock import StepClock
-from reslrb_cli.records.decisions import EstimatorRecord, Finding, GuidedRecord, SequenceRecord
+from reslrb_cli.records.decisions import EstimatorRecord, Finding, GuidedRecord, PathsRecord, SequenceRecord
 
 if TYPE_CHECKING:
     from reslrb_cli.optimization.problem import Problem
@@ -345,6 +345,9 @@ class Settled:
     def settle(self, problem: Problem, options: Sequence[Candidate]) -> Problem:
         """Choose what the run had chosen: the pilot's estimator, the samples of a pass, and how samples are drawn."""
         problem, guided, sequence = self._estimator(problem, options), None, None
+        if is_auto(problem.config, "paths"):
+            sides = self._found(PathsRecord, "paths", "is not what measuring which paths pay finds")
+            problem = replace(problem, sides=sides, integrator=with_sides(problem.integrator, sides))
         if is_auto(problem.config, "guiding"):
             guided = self._found(GuidedRecord, "guided", "is not what measuring whether guiding pays finds")
         if is_auto(problem.config, "sequence"):

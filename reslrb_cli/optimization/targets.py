@@ -17,11 +17,11 @@ from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.optimization.errors import comparison_grid
 from reslrb_cli.optimization.loading import (
-    LIGHT_TRACERS,
     are_upright,
     check_integrator,
     load_configured,
     make_configured,
+    paths_of,
     render_in_passes,
 )
 from reslrb_cli.optimization.problem import Problem
@@ -42,14 +42,15 @@ WORDS = {
 }
 
 
-def mask_of(config: Config, wanted: Wanted, scene: mi.Scene, photo: Photo | None) -> Masked:
-    """Find the pixels of a view that its mask leaves out; `photo` is the target's file, None of a rendered one.
+def mask_of(config: Config, wanted: Wanted, scene: mi.Scene, photo: Photo | None, lacking: bool) -> Masked:
+    """Find the pixels of a view that its mask leaves out; `photo` is the target's file, None of a rendered one, and
+    `lacking` whether target and image differ by what light paths lack.
 
     Raises ConfigError where the file of weights is wrong.
     """
     mask, sensor, found = wanted.mask, scene.sensors()[wanted.sensor], Masked()
     width, height = (int(n) for n in sensor.film().crop_size())
-    if _lacks_light(config, photo is None):
+    if lacking:
         if mask.specular or wanted.mask_mixed:
             seen = sees_specular(scene, sensor)
             if mask.specular:
@@ -82,16 +83,6 @@ def mask_line(name: str, masked: Masked, weights: Array) -> str | None:
     parts = [f"{count} {WORDS[kind]}" for kind, count in counts.items()]
     line = f"{name}: {left} of {total} pixels ({left / total:.1%}) are left out"
     return "; ".join([line + (f": {', '.join(parts)}" if parts else ""), *stay])
-
-
-def _lacks_light(config: Config, rendered: bool) -> bool:
-    """Whether target and image differ by what light tracing lacks: one of the two is light traced, the other is not.
-
-    A photograph has all light.
-    """
-    render = config.target.render
-    maker = (render.integrator or config.integrator).type if rendered and render is not None else "camera"
-    return (maker in LIGHT_TRACERS) != (config.integrator.type in LIGHT_TRACERS)
 
 
 #: Weights of linear sRGB in luminance, as Mitsuba has them.
@@ -149,7 +140,12 @@ def _see(problem: Problem, view: View, image: Array, photo: Photo | None, say: C
     if colors == 1 and image.shape[2] >= 3:
         image = image[:, :, :3] @ LUMINANCE[:, None]
     target = image[:, :, :colors]
-    view.masked = mask_of(config, wanted, problem.scene, photo)
+    render, made_of = config.target.render, "camera"  # a photograph has all light
+    if photo is None and render is not None:
+        made_of = paths_of(render.integrator or config.integrator, problem.scene, problem.sensors, problem.moves)
+    # Light paths lack what the others have.
+    lacking = (made_of == "light") != (problem.paths == "light")
+    view.masked = mask_of(config, wanted, problem.scene, photo, lacking)
     weights = view.masked.total(target.shape[:2])
     line = mask_line(f"view {view.sensor}", view.masked, weights)
     if not weights.any():
@@ -176,8 +172,9 @@ def _render_targets(problem: Problem, say: Callable[[str], None]) -> dict[str, A
         if grid is not None:
             say(f"{key} has another resolution than its true value: compared, resampled, at {grid[1]}x{grid[0]}")
     chosen = render.integrator or config.integrator
-    check_integrator(config, chosen, true_scene, problem.sensors)
-    integrator = make_configured(chosen)
+    check_integrator(config, chosen, true_scene, problem.sensors, problem.moves)
+    paths = paths_of(chosen, true_scene, problem.sensors, problem.moves)
+    integrator = make_configured(chosen, paths)
     multiple = chosen.options().get("samples_per_pass")
     for view in problem.views:
         if view.wanted.file is not None:

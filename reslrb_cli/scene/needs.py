@@ -153,11 +153,26 @@ def check_paths(scene: Any, sensor: Any, paths: str, hide_emitters: bool = False
     render `scene`."""
     if paths == "light":
         check_supported(scene, sensor, hide_emitters)
-        return
+    elif (obstacle := paths_obstacle(scene, sensor, paths)) is not None:
+        raise UnsupportedScene(obstacle)
+
+
+def paths_obstacle(scene: Any, sensor: Any, paths: str) -> str | None:
+    """The reason why these paths (`camera`, `both`) cannot render `scene`, with the way out; None where they can."""
     if (obstacle := _film_obstacle(sensor) or camera_obstacle(scene, sensor, beside_light=paths == "both")) is not None:
-        raise UnsupportedScene(f"{obstacle}; take integrator.paths: light")
+        return f"{obstacle}; take integrator.paths: light"
     if paths == "both" and (obstacle := unsupported_part(scene, sensor) or _unsampled(scene)) is not None:
-        raise UnsupportedScene(f"{obstacle}; take integrator.paths: camera")
+        return f"{obstacle}; take integrator.paths: camera"
+    return None
+
+
+def camera_finds_all(scene: Any) -> bool:
+    """Whether paths from the sensor find all light, and none of it by rare accident: where no surface is specular or
+    glossy, and no emitter shines along its normal alone."""
+    if any(emitter.class_name() == "DirectionalArea" for emitter in scene.emitters()):
+        return False
+    bundled = int(mi.BSDFFlags.Delta) & ~int(mi.BSDFFlags.Null) | int(mi.BSDFFlags.Glossy)
+    return not any(int(bsdf.flags()) & bundled for bsdf in SceneGraph.of(scene).surface_bsdfs())
 
 
 def check_supported(scene: Any, sensor: Any, hide_emitters: bool = False) -> None:

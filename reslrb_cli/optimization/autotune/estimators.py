@@ -30,7 +30,7 @@ from reslrb_cli.estimators import ESTIMATORS
 from reslrb_cli.integrators.reslrb import Reslrb as Tracer
 from reslrb_cli.optimization.autotune import race
 from reslrb_cli.optimization.decisions import Allowance, MemoryPlan
-from reslrb_cli.optimization.loading import pass_spp
+from reslrb_cli.optimization.loading import pass_spp, settled_config
 from reslrb_cli.optimization.memory import check_baseline, check_memory, choose_samples, standing
 from reslrb_cli.optimization.moving import ATTACHED, is_attached
 from reslrb_cli.optimization.problem import Problem
@@ -90,14 +90,16 @@ def find_options(problem: Problem) -> list[Candidate]:
         check_baseline(problem)
         return []
     if integrator.estimator == "auto":
-        choices = [{"estimator": ATTACHED}] if is_attached(problem) else candidates(config)
+        # Camera paths have one, too: there is nothing among whose connections to choose.
+        alone = is_attached(problem) or problem.paths == "camera"
+        choices = [{"estimator": ATTACHED}] if alone else candidates(config)
     elif budget is None:
         check_memory(problem, problem.integrator)
         return []
     options, least, fixed = [], [], 0 if budget is None else standing()
     samples = run.spp // race.sets_of(config)
     for choice in choices:
-        made = Tracer.of(**(integrator.chosen(**choice) if choice else integrator.undecided_off()).options())
+        made = Tracer.of(**settled_config(integrator, choice, problem.paths).options())
         made.expect(pass_spp(config))
         check_memory(problem, made)
         memory = None

@@ -50,13 +50,14 @@ ITERATIONS = 200
 #: Share of a run of ITERATIONS that all measuring but for that of `prb` may cost, compilation apart; that of whether
 #: guiding pays is planned for (where it is not clear by then, it may take what the pilot has left of its own), and that
 #: of the sequence is left by what is measured before.
-SHARE, GUIDING_SHARE, SEQUENCE_SHARE = 0.05, 0.025, 0.005
+SHARE, GUIDING_SHARE, SEQUENCE_SHARE, PATHS_SHARE = 0.05, 0.025, 0.005, 0.015
 #: What measurements take at least that say anything. Compiling is that of both kinds of steps, and of walks that are
 #: learned from.
-ESTIMATOR_NEEDS, GUIDING_NEEDS, SEQUENCE_NEEDS = (4.0, 4.0), (2.5, 3.0), (2.5, 1.0)
+ESTIMATOR_NEEDS, GUIDING_NEEDS, SEQUENCE_NEEDS, PATHS_NEEDS = (4.0, 4.0), (2.5, 3.0), (2.5, 1.0), (1.5, 2.0)
 #: What is measured once the estimator is settled, by option: the time that is kept aside for it, all that is planned.
 #: What it takes at the least would be too little where kernels are there: first steps take their time all the same.
 LATER = {
+    "paths": (PATHS_NEEDS[0], PATHS_SHARE * ITERATIONS),
     "guiding": (GUIDING_NEEDS[0], GUIDING_SHARE * ITERATIONS),
     "sequence": (SEQUENCE_NEEDS[0], SEQUENCE_SHARE * ITERATIONS),
 }
@@ -160,7 +161,10 @@ class Tuner:
 
 def is_auto(config: Config, option: str) -> bool:
     """Whether this option of the integrator is left to measurement."""
-    return bool(config.integrator.options().get(option) == "auto")
+    options = config.integrator.options()
+    if option == "paths":  # of both kinds the share is measured alike
+        return options.get("paths") == "auto" or (options.get("paths"), options.get("light_share")) == ("both", "auto")
+    return bool(options.get(option) == "auto")
 
 
 def sets_of(config: Config) -> int:

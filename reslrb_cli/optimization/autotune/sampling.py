@@ -1,8 +1,10 @@
 """The sampling of a run, settled before its first iteration: guided emission, and the sequence of numbers.
 
-Each is settled where it is left to measurement, guiding first. Steps drawn one way take turns with steps drawn the
-other (`race.Turns`), with dL/dI held at one image's (`StepTrial`):
+Each is settled where it is left to measurement: which paths there are, guiding, and then the sequence. Steps drawn one
+way take turns with steps drawn the other (`race.Turns`), with dL/dI held at one image's (`StepTrial`):
 
+- `PathsPilot`: another share of light paths, or camera paths alone, unguided. One share after the other takes its turns
+  with the best so far, from one half on to the side that was found to be the better, as long as one is.
 - `GuidingPilot`: guided emission, from a table that is learned first, and held. To a guided step's time is added its
   part of what a run of that length learns: each time one more walk of one pass, with what Python does for a new table,
   often at first and then rarely. Short steps make the table less worth than a run's, which has learned from more, and
@@ -37,7 +39,8 @@ from reslrb_cli.optimization.sensitivity import finite, take_gradient
 from reslrb_cli.optimization.views import View, slope, to_tensor
 from reslrb_cli.records.cache import PilotCache
 from reslrb_cli.records.clock import StepClock, StepTimes
-from reslrb_cli.records.decisions import GuidedRecord, SequenceRecord
+from reslrb_cli.records.decisions import GuidedRecord, PathsRecord, SequenceRecord
+from reslrb_cli.scene.needs import camera_finds_all
 from reslrb_cli.seeds import seed
 from reslrb_cli.statistics import Array
 
@@ -45,6 +48,9 @@ from reslrb_cli.statistics import Array
 ROUNDS, ROUNDS_OF_FEW, FEW_ENTRIES = 8, 16, 64
 #: A guided step, or one with low-discrepancy numbers, may take so many times as long as another.
 GUIDING_LONGER, SEQUENCE_LONGER = 3.0, 1.25
+#: The share of light paths that is begun with, and those that are tried then: fewer, as long as they are better; or
+#: more. Steps of another share may take so many times as long. A share is tried where so much of the time is left.
+FIRST_SHARE, SHARES, PATHS_LONGER, LEAST_TURNS = 0.5, ((0.2, 0.05, 0.0), (0.8, 0.95)), 2.0, 0.2
 #: What of the share the rounds of the sequence are planned for; the first step takes a part too, and is no round.
 ROUNDS_SHARE = 0.8
 #: Views that are looked at, spread over those that are trained on, and values of each one's image.
@@ -61,9 +67,28 @@ def settle(problem: Problem, options: Sequence[Candidate], say: race.Say, cache:
     """
     tuner = race.Tuner(problem, say, cache)
     settle_estimator(tuner, options)
+    settle_paths(tuner)
     settle_sampling(tuner)
-    tuner.tell(tuner.problem.pilot, tuner.problem.guided, tuner.problem.sequence)
+    problem = tuner.problem
+    tuner.tell(problem.pilot, problem.sides, problem.guided, problem.sequence)
     return tuner.problem
+
+
+def settle_paths(tuner: race.Tuner) -> None:
+    """Have the integrator, whose estimator is settled, trace the paths that pay here, as far as that is left to
+    measurement, and both kinds can render the scene."""
+    problem = tuner.problem
+    if not race.is_auto(problem.config, "paths") or problem.paths != "both":
+        return
+    sides = _paths(tuner)
+    tuner.take(sides=sides, integrator=with_sides(problem.integrator, sides))
+
+
+def with_sides(integrator: Any, sides: PathsRecord | None) -> Any:
+    """An integrator that traces the paths that were decided on, where they were."""
+    if sides is None:
+        return integrator
+    return integrator.afresh(paths=sides.paths, light_share=sides.light_share)
 
 
 def settle_sampling(tuner: race.Tuner) -> None:
@@ -72,6 +97,8 @@ def settle_sampling(tuner: race.Tuner) -> None:
     """
     config, plain, memory = tuner.problem.config, tuner.problem.integrator, tuner.problem.memory
     trials: list[StepTrial] = []  # what was measured on so far
+    if plain.paths == "camera":  # nothing begins at the emitters
+        return
     if race.is_auto(config, "guiding"):
         guided = _guided(tuner, trials)
         tuner.take(guided=guided, integrator=as_decided(plain, guided, None))
@@ -100,6 +127,8 @@ def as_decided(integrator: Any, guided: GuidedRecord | None, sequence: SequenceR
 def table_bytes(problem: Problem) -> int:
     """Bytes of the tables of all sensors, if `problem.integrator` is guided, or were."""
     made = problem.integrator.afresh(guided=True)
+    if made.paths == "camera":
+        return 0
     made.plan(problem.scene, problem.scene.sensors()[problem.sensors[0]])  # cuts the grid
     return int(made.preparation.guiding.bytes(len(problem.sensors)))
 
@@ -142,7 +171,7 @@ def planned(share: float) -> float:
 def share_left(problem: Problem, allowance: Allowance, reserved: float = 0.0, kernels: float = 0.0) -> float:
     """What earlier measurements left of the share of 200 iterations that all of them may cost, but for what is
     `reserved`, and no more than there is time for in a run as short as this, with `kernels` to compile."""
-    spent = sum(each.share for each in (problem.pilot, problem.guided) if each is not None)
+    spent = sum(each.share for each in (problem.pilot, problem.sides, problem.guided) if each is not None)
     return max(min(race.SHARE - spent - reserved, allowance.iterations_left(kernels) / race.ITERATIONS), 0.0)
 
 
@@ -171,6 +200,65 @@ class SequencePilot(race.Turns[SequenceRecord]):
         return SequenceRecord(low_discrepancy=other, **found)
 
 
+class PathsPilot(race.Turns[PathsRecord]):
+    """One decision: other paths, or those that there are."""
+
+    def _decide(self, other: bool, images: bool, found: dict[str, Any]) -> PathsRecord:
+        return PathsRecord(paths="other" if other else "both", **found)
+
+
+def _paths(tuner: race.Tuner) -> PathsRecord:
+    """Which share of the paths are to be light paths."""
+    problem = tuner.problem
+
+    def measure(allowance: Allowance) -> PathsRecord:
+        best, trials, records = FIRST_SHARE, list[StepTrial](), list[PathsRecord]()
+        left = min(race.PATHS_SHARE, allowance.iterations_left(race.PATHS_NEEDS[0]) / race.ITERATIONS)
+
+        def gains(share: float) -> bool:
+            """Whether this share is better than the best so far, which it is from then on if so."""
+            nonlocal best
+            spent = sum(record.share for record in records)
+            if left - spent < LEAST_TURNS * race.PATHS_SHARE:
+                return False
+            own, other = (_of_share(problem, value) for value in (best, share))
+            trials.append(StepTrial(problem, f"paths {share:g}", own, other, *trials[-1:]))
+            each = (left - spent) if share in (SHARES[0][-1], SHARES[1][-1]) else (left - spent) / 2
+            record = trials[-1].turns(PathsPilot, sizes(problem, PATHS_LONGER, planned(each)), each)
+            records.append(record)
+            if record.paths == "other":
+                best = share
+            return record.paths == "other"
+
+        for shares in SHARES:
+            alone = 0.0 in shares and not camera_finds_all(problem.scene)
+            for share in shares:
+                if (alone and share == 0) or not gains(share):
+                    break
+            if best != FIRST_SHARE:
+                break
+        last = [record for record in records if record.paths == "other"] or records
+        kept = last[-1] if last else PathsRecord(paths="both", note="too little time to compare shares")
+        costs = {name: sum(getattr(each, name) for each in records) for name in ("measure_s", "compile_s", "share")}
+        return replace(kept, paths="both" if best else "camera", light_share=best, **costs)
+
+    return tuner.decide(
+        PathsRecord,
+        of={"paths": 1, "of": problem.pilot and problem.pilot.chosen},
+        needs=[race.PATHS_NEEDS],
+        integrator=problem.integrator,
+        measure=measure,
+        unmeasured=lambda note: PathsRecord(paths="both", note=f"{note}; half of them cost little anywhere"),
+        later=[race.LATER[option] for option in ("guiding", "sequence") if race.is_auto(problem.config, option)],
+    )
+
+
+def _of_share(problem: Problem, share: float) -> Tracer:
+    """The problem's integrator with this share of light paths; none of them leaves camera paths alone."""
+    tracer: Tracer = problem.integrator.afresh(paths="both", light_share=share)
+    return tracer
+
+
 def _guided(tuner: race.Tuner, trials: list[StepTrial]) -> GuidedRecord:
     """Whether the problem's integrator, whose estimator is settled, is to be guided; `trials` gets the steps of it."""
     problem = tuner.problem
@@ -191,7 +279,7 @@ def _guided(tuner: race.Tuner, trials: list[StepTrial]) -> GuidedRecord:
     return tuner.decide(
         GuidedRecord,
         # Learning is a larger part of a short run, where tables learn most often at first.
-        of={"guiding": 4, "of": problem.pilot and problem.pilot.chosen, "lessons": plan.lessons},
+        of={"guiding": 4, "of": problem.pilot and problem.pilot.chosen, "lessons": plan.lessons} | _sides(problem),
         # Where even numbers are likely to do better, to measure guiding alone would mislead.
         needs=(race.GUIDING_NEEDS, *([] if why is None else 2 * [race.SEQUENCE_NEEDS])),
         integrator=problem.integrator,
@@ -199,6 +287,12 @@ def _guided(tuner: race.Tuner, trials: list[StepTrial]) -> GuidedRecord:
         unmeasured=lambda note: GuidedRecord(guided=False, note=f"{note}; {why or 'it pays in long runs'}"),
         later=[(0.0, race.LATER["sequence"][1])] if sequence else [],
     )
+
+
+def _sides(problem: Problem) -> dict[str, Any]:
+    """Of what the integrator traces, what a decision depends on."""
+    sides = problem.sides
+    return {} if sides is None else {"sides": [sides.paths, sides.light_share]}
 
 
 def _sequence(tuner: race.Tuner, trials: list[StepTrial]) -> SequenceRecord:
@@ -231,7 +325,7 @@ def _sequence(tuner: race.Tuner, trials: list[StepTrial]) -> SequenceRecord:
         return SequenceRecord(low_discrepancy=not is_guided, note=note)
 
     guided = None if found is None else [found.guided, found.images]
-    of = {"sequence": 1, "of": [problem.pilot and problem.pilot.chosen, guided]}
+    of = {"sequence": 1, "of": [problem.pilot and problem.pilot.chosen, guided]} | _sides(problem)
     return tuner.decide(SequenceRecord, of, [race.SEQUENCE_NEEDS], plain, measure, unmeasured)
 
 

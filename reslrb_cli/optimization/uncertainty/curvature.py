@@ -36,7 +36,7 @@ import mitsuba as mi
 import numpy as np
 
 from reslrb_cli.integrators.step import known_step
-from reslrb_cli.optimization.loading import make_configured, render_in_passes
+from reslrb_cli.optimization.loading import make_configured, paths_of, render_in_passes
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.sensitivity import see_images, take_gradient, unrecorded
 from reslrb_cli.optimization.views import View, slope, to_tensor
@@ -263,7 +263,8 @@ class Curvature:
         if render is None or all(view.wanted.file is not None for view in trained):
             return []
         chosen = render.integrator or config.integrator
-        integrator = make_configured(chosen)
+        paths = paths_of(chosen, self.problem.scene, self.problem.sensors, self.problem.moves)
+        integrator = make_configured(chosen, paths)
         multiple = chosen.options().get("samples_per_pass")
         by_view = [self._noises(view, integrator, render.spp, multiple) for view in trained]
         return [list(sample) for sample in zip(*by_view, strict=True)]
