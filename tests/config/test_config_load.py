@@ -68,6 +68,7 @@ def test_defaults(tmp_path: Path) -> None:
     assert config.integrator.options() == {
         "max_depth": 8, "rr_depth": 5, "hide_emitters": False, "estimator": "auto", "freeze": True,
         "attached": "auto", "attached_sampling": "auto", "filter_normalization": "attached", "guiding": "auto",
+        "paths": "light", "light_share": "auto",
         "sequence": "auto",
     }  # fmt: skip
     assert config.loss.type == "l2"
@@ -368,8 +369,30 @@ def test_the_table_names_every_estimator() -> None:
 def test_options_and_defaults_are_the_estimators_own(name: str) -> None:
     options = Reslrb(estimator=name).options()  # type: ignore[arg-type]
     shared = {"max_depth", "rr_depth", "hide_emitters", "estimator", "freeze"}
-    shared |= {"attached", "filter_normalization", "attached_sampling", "guiding", "sequence"}
+    shared |= {"attached", "filter_normalization", "attached_sampling", "guiding", "sequence", "paths", "light_share"}
     assert {key: value for key, value in options.items() if key not in shared} == ESTIMATORS[name].OPTIONS
+
+
+def test_paths_that_an_estimator_named_leaves_to_nobody() -> None:
+    assert (Reslrb().paths, Reslrb().light_share) == ("light", "auto")
+    named = Reslrb(estimator="stack", paths="both")
+    assert (named.paths, named.light_share) == ("both", 0.5)
+    again = Reslrb(**Reslrb(paths="camera").model_dump())  # as a run's folder has it
+    assert again.paths == "camera"
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"paths": "camera", "estimator": "gather"}, "chooses among the connections of light paths"),
+        ({"paths": "light", "light_share": 0.3}, "has no effect with paths: light, but with both"),
+        ({"paths": "both", "light_share": 1.5}, "less than or equal to 1"),
+        ({"paths": "sideways"}, "'auto', 'light', 'camera' or 'both'"),
+    ],
+)
+def test_paths_that_cannot_be(options: dict[str, Any], words: str) -> None:
+    with pytest.raises(ValueError, match=words):
+        Reslrb(**options)
 
 
 def test_a_chosen_estimator_keeps_the_shared_options_alone() -> None:
