@@ -163,9 +163,9 @@ def _second_difference(problem: Problem, base: Sequence[Array], difference: Sequ
     """L(I + D) - 2 L(I) + L(I - D), over the views by their shares, D `factor` times the difference."""
     total = 0.0
     for image, change, view in zip(base, difference, problem.trained, strict=True):
-        for side, weight in ((1, 1), (0, -2), (-1, 1)):
+        for side, times in ((1, 1), (0, -2), (-1, 1)):
             at = mi.TensorXf((image + side * factor * change).astype(np.float32))
-            total += weight * float(view.judge(at)[0]) * view.share
+            total += times * float(view.judge(at)[0]) * view.share
     return total
 
 

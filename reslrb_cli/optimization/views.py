@@ -142,7 +142,7 @@ class Wanted:
     """What an experiment says of the view through `sensor`: its target's file, None of a rendered one, and its mask.
 
     `file_key` and `mask_key` are where they stand in the configuration. `exposure` is a number, or how it is recovered,
-    by which key; `weight` is the view's part of the loss, relative to the others', and `loss` its own, if it has one.
+    by which key; `part` is the view's part of the loss, relative to the others', and `loss` its own, if it has one.
     """
 
     sensor: int = 0
@@ -153,7 +153,7 @@ class Wanted:
     mask_key: str = "target.mask"
     exposure: float | str = 1.0
     exposure_key: str = SHARED
-    weight: float = 1.0
+    part: float = 1.0
     loss: LossConfig | None = None
     held_out: bool = False
 
@@ -185,7 +185,7 @@ def wanted_views(config: Config, scene: mi.Scene) -> list[Wanted]:
                 mask_key="target.mask" if spec.mask is None else f"{place}.mask",
                 exposure=exposure,
                 exposure_key=SHARED if spec.exposure is None else f"{SHARED}.{spec.sensor}",
-                weight=spec.weight,
+                part=spec.weight,
                 loss=spec.loss,
                 held_out=spec.sensor in held_out,
             )
@@ -344,10 +344,10 @@ def view_records(views: list[View]) -> list[dict[str, Any]]:
 def make_views(config: Config, scene: mi.Scene) -> list[View]:
     """The views of an experiment, without their targets. Raises ConfigError as `wanted_views` does."""
     wanted, views = wanted_views(config, scene), []
-    total = sum(one.weight for one in wanted if not one.held_out)
+    total = sum(one.part for one in wanted if not one.held_out)
     for one in wanted:
         kind = one.loss or config.loss
-        share = 1.0 if one.held_out else one.weight / total
+        share = 1.0 if one.held_out else one.part / total
         loss = make_loss(kind.type, **kind.options())
         views.append(View(one.sensor, loss, share, held_out=one.held_out, wanted=one))
     return views
