@@ -35,6 +35,7 @@ from reslrb_cli.transport.bsdf import Scattering, evaluate, tracked_factor, trac
 from reslrb_cli.transport.camera import CameraHooks, FilmRay, Met, NextEvent, camera_walk
 from reslrb_cli.transport.connection import forward_derivatives, transmittance
 from reslrb_cli.transport.factors import Product
+from reslrb_cli.transport.plan import Plan
 from reslrb_cli.transport.samples import Samples
 from reslrb_cli.transport.walk import Vertex
 
@@ -206,7 +207,7 @@ def differentiate_camera_paths(p: Pass, stack_size: int = STACK_SIZE) -> None:
         camera_walk(p.samples, Taking(p, pushed.tail, pushed.first, pushed.last), beyond)
 
 
-def camera_scratch_bytes(plan: Any, stack_size: int = STACK_SIZE) -> int:
+def camera_scratch_bytes(plan: Plan, stack_size: int = STACK_SIZE) -> int:
     """Thread-local bytes of each camera path that is being traced."""
     if not plan.differentiate_bsdfs:
         return 0

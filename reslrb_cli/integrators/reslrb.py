@@ -19,7 +19,12 @@ from typing_extensions import Self
 from reslrb_cli.errors import UnsupportedScene
 from reslrb_cli.estimators import ESTIMATORS
 from reslrb_cli.estimators.base import Estimator, Pass, one_of
-from reslrb_cli.estimators.camera import differentiate_camera_paths, splat_camera_paths, splat_camera_tangents
+from reslrb_cli.estimators.camera import (
+    camera_scratch_bytes,
+    differentiate_camera_paths,
+    splat_camera_paths,
+    splat_camera_tangents,
+)
 from reslrb_cli.guiding.collect import hear
 from reslrb_cli.guiding.tables import Purpose, learning_seed
 from reslrb_cli.integrators import freezing
@@ -260,6 +265,19 @@ class Reslrb(LightTracer):
         made = cls(kind(**own), motion=motion, guided=guiding == "on", low_discrepancy=low_discrepancy, **options)
         made.have_paths(paths, light_share)
         return made
+
+    def share_of_light(self, plan: Plan) -> float:
+        """The share of the samples that are light paths."""
+        return {"light": 1.0, "camera": 0.0}.get(plan.paths, self.light_share)
+
+    def kept(self, plan: Plan) -> Any:
+        """All that memory holds of a light path at once, as `Estimator.kept` has it; of camera paths it is nothing."""
+        return [] if plan.paths == "camera" else self.estimator.kept(plan)
+
+    def scratch_bytes(self, plan: Plan) -> int:
+        """Thread-local bytes of each path that is being traced, of either kind."""
+        light = 0 if plan.paths == "camera" else self.estimator.scratch_bytes(plan)
+        return light if plan.paths == "light" else max(light, camera_scratch_bytes(plan, self.estimator.stack_size))
 
     def image_estimator(self) -> Estimator | None:
         return None if self.estimator.splats_all else self.estimator

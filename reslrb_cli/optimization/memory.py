@@ -96,11 +96,12 @@ def estimate(problem: Problem, integrator: Reslrb, samples: int, fixed: int) -> 
         film, width = problem.scene.sensors()[index].film(), samples * count
         if problem.config.adjoint == "correlated" and samples == problem.config.run.spp:
             # Else dL/dI is known before the paths are traced, and nothing of them outlives the kernel.
-            paths = max(paths, sum(allocated(size * width) for size in entry_bytes(integrator.estimator.kept(plan))))
+            width = round(width * integrator.share_of_light(plan))
+            paths = max(paths, sum(allocated(size * width) for size in entry_bytes(integrator.kept(plan))))
         block = int(dr.prod(film.crop_size())) * (film.base_channels_count() + 1)
         images = max(images, FILM_IMAGES * allocated(4 * block), 2 * allocated(4 * block) + _replicas(block))
         targets += allocated(4 * block)
-        scratch = max(scratch, integrator.estimator.scratch_bytes(plan))
+        scratch = max(scratch, integrator.scratch_bytes(plan))
     copies = PARAMETER_COPIES + (0 if problem.config.optimizer.clamp_gradient is None else CLAMP_COPIES)
     for key in problem.selection.keys:
         size = int(dr.prod(dr.shape(problem.selection.value(key))))
@@ -239,7 +240,7 @@ def check_memory(problem: Problem, integrator: Reslrb) -> None:
     if not mi.variant().startswith("cuda"):  # where the driver sees to stacks, and says so
         most, size = local_bytes(), config.integrator.options().get("stack_size", 0)
         for plan in plans(problem, integrator):
-            needed = integrator.estimator.scratch_bytes(plan)
+            needed = integrator.scratch_bytes(plan)
             if needed > most:
                 reason = f"{size} vertices take {in_words(needed)} of a thread's stack for each path, which has "
                 reason += f"{in_words(most)}; take at most {size * most // needed} (longer paths are traced a second "
