@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from itertools import zip_longest
 
 from reslrb_cli.errors import printable
@@ -69,6 +70,23 @@ def line(cells: Sequence[str], widths: Sequence[int], align: str = "<") -> str:
     """
     sides = align.ljust(len(cells), align[-1])
     return "  ".join(f"{cell:{side}{width}}" for cell, side, width in zip(cells, sides, widths, strict=False)).rstrip()
+
+
+@dataclass(frozen=True)
+class Columns:
+    """Columns of a table whose lines are told one by one: their titles and widths, and `align` as of `line`."""
+
+    titles: Sequence[str]
+    widths: Sequence[int]
+    align: str
+
+    def head(self) -> str:
+        """The first line."""
+        return self.line(self.titles)
+
+    def line(self, cells: Sequence[str]) -> str:
+        """The line of these cells; those that are left out are the last."""
+        return line(cells, self.widths, self.align)
 
 
 def table(rows: Sequence[Sequence[str]], align: str = "<") -> list[str]:
