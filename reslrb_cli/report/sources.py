@@ -53,6 +53,21 @@ class Run:
         return results if isinstance(results, dict) else {}
 
     @property
+    def elapsed_s(self) -> float | None:
+        """Seconds in its iterations; None where it has none."""
+        return self.records[-1]["elapsed_s"] if self.records else None
+
+    @property
+    def codegen_s(self) -> float:
+        """Seconds of these in which kernels were generated and compiled."""
+        return sum(record["codegen_ms"] for record in self.records) / 1e3
+
+    @property
+    def peak(self) -> str:
+        """The most memory that it took, in words."""
+        return f"{max(record['peak_mib'] for record in self.records):.4g} MiB" if self.records else ""
+
+    @property
     def scales(self) -> dict[str, float | None]:
         """The root mean square of each parameter's true value, by key; None where it is not known."""
         about = self.results.get("parameters")

@@ -8,13 +8,16 @@ from __future__ import annotations
 
 import io
 import re
-from collections.abc import Iterable, Mapping, Sequence
+import shlex
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cache
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from markupsafe import Markup, escape
+
+from reslrb_cli.report.format import duration, number
 
 if TYPE_CHECKING:
     from jinja2 import Environment
@@ -23,36 +26,9 @@ if TYPE_CHECKING:
 COLORS = ("#3b7ddd", "#e07b39", "#2f9e62", "#d0517e", "#8b6fd6", "#b08900", "#1f9eb3", "#9c6b4f")
 
 
-@dataclass(frozen=True)
-class Piece:
-    """Words of a kind: a class of the style sheet, or `key`, `numbers`, `below`, `mark`, `swatch` or `title`."""
-
-    text: Any
-    kind: str
-
-
-#: What a cell, or a caption's line, may be.
-Words = str | Piece | Sequence[str | Piece]
-
-
-def key(text: object) -> Piece:
+def key(text: object) -> Markup:
     """A key or a path, which may be broken after its dots and the like."""
-    return Piece(str(text), "key")
-
-
-def titled(word: str, rest: str) -> Words:
-    """A line of a caption that begins with a title."""
-    return [Piece(word, "title"), rest]
-
-
-def table(head: Sequence[str], rows: Sequence[Sequence[Words]], kind: str = "") -> Markup:
-    """A table, with a heading for each column; nothing where it has no rows. `kind` is a class."""
-    return lay_out("table", head, rows, kind)
-
-
-def facts(known: Mapping[str, Words]) -> Markup:
-    """A table of names and what is known of them; empty ones are left out."""
-    return lay_out("facts", known)
+    return lay_out("key", str(text))
 
 
 def soft(line: str) -> Markup:
@@ -61,15 +37,18 @@ def soft(line: str) -> Markup:
 
 
 def lay_out(piece: str, *values: object) -> Markup:
-    """A piece of a page, by the macro of that name in `pieces.html.j2`."""
-    return Markup(getattr(_environment().get_template("pieces.html.j2").module, piece)(*values)).strip()
+    """A piece of a page: `FILE.MACRO` is the macro in the template `FILE.html.j2`, `MACRO` that in `pieces.html.j2`."""
+    file, _, macro = piece.rpartition(".")
+    made = getattr(_environment().get_template(f"{file or 'pieces'}.html.j2").module, macro)(*values)
+    return Markup(made).strip()
 
 
 def document(title: str, head: Markup, parts: Iterable[tuple[str, Markup]], refresh_s: int | None = None) -> str:
     """A whole page of sections, without those that are empty; with `refresh_s` it loads itself again after so many
-    seconds."""
+    seconds. Control characters, which a page must not hold, become replacement characters."""
     page = _environment().get_template("page.html.j2")
-    return page.render(title=title, head=head, parts=parts, refresh_s=refresh_s) + "\n"
+    text = page.render(title=title, head=head, parts=parts, refresh_s=refresh_s) + "\n"
+    return text.translate({ord(c): "\ufffd" for c in set(text) if not c.isprintable() and c not in "\n\t"})
 
 
 @cache
@@ -78,18 +57,19 @@ def _environment() -> Environment:
 
     made = Environment(
         loader=PackageLoader("reslrb_cli.report"), autoescape=True, undefined=StrictUndefined, trim_blocks=True,
-        lstrip_blocks=True, finalize=_printable,
+        lstrip_blocks=True, auto_reload=False,
     )  # fmt: skip
-    made.filters["breakable"] = lambda text: re.split(r"(?<=[._\-/])", text)
+    made.filters |= {
+        "number": number,
+        "duration": lambda seconds: "" if seconds is None else duration(seconds),
+        "mib": lambda size: f"{number(size / 2**20)} MiB",
+        "moment": lambda time: str(time or "").replace("T", " ").replace("+00:00", " UTC"),
+        "command": lambda words: shlex.join(map(str, words or ())),
+        "versions": lambda known: ", ".join(f"{name} {version}" for name, version in (known or {}).items()),
+        "breakable": lambda text: re.split(r"(?<=[._\-/])", text),
+    }
     made.globals["colors"] = COLORS
     return made
-
-
-def _printable(value: object) -> object:
-    """Text without control characters, which a page must not hold: they become replacement characters."""
-    if isinstance(value, Markup):
-        return value
-    return "".join(c if c.isprintable() or c in "\n\t" else "\ufffd" for c in str(value))
 
 
 Array = np.ndarray[Any, Any]
@@ -144,15 +124,8 @@ class Curve:
         return array[np.isfinite(array).all(axis=1)]
 
 
-class Titled(NamedTuple):
-    """A drawing with what stands above it, if anything."""
-
-    drawing: Markup
-    title: Words = ""
-
-
-def diagrams(*drawn: Titled) -> Markup:
-    """Diagrams beside each other, as many as there is room for; nothing where none of them shows anything."""
+def diagrams(*drawn: tuple[str, Markup]) -> Markup:
+    """Diagrams beside each other, each below its title, if it has one; nothing where none of them shows anything."""
     return lay_out("diagrams", drawn)
 
 
@@ -210,7 +183,7 @@ def diagram(
 
 def legend(names: Sequence[str]) -> Markup:
     """What the colours stand for; without a name, a place is left out."""
-    return lay_out("legend", {place: key(name) for place, name in enumerate(names) if name})
+    return lay_out("legend", names)
 
 
 def points_together(count: int) -> int:

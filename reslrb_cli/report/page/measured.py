@@ -18,22 +18,10 @@ from typing import Any
 from markupsafe import Markup
 
 from reslrb_cli.records.measurements import GradcheckRecord, MissingRecord, Verdict, record_of
-from reslrb_cli.report.format import count, duration, number
+from reslrb_cli.report.format import count, number
 from reslrb_cli.report.page.images import gradient_maps, image_rows, seen_tables
-from reslrb_cli.report.page.layout import (
-    Curve,
-    Piece,
-    Titled,
-    Words,
-    diagram,
-    diagrams,
-    key,
-    lay_out,
-    legend,
-    soft,
-    table,
-)
-from reslrb_cli.report.page.run import StepParts, bars, guarded, origin_facts, problems, record_parts
+from reslrb_cli.report.page.layout import Curve, diagram, diagrams, key, lay_out, legend, soft
+from reslrb_cli.report.page.run import StepParts, bars, guarded, problems, record_parts
 from reslrb_cli.report.page.values import convergence_of_all, parameter_table, texture_pictures
 from reslrb_cli.report.run_summary import worst
 from reslrb_cli.report.sources import Maps, Measurements, Run, Source
@@ -43,7 +31,6 @@ Entry = Mapping[str, Any]
 
 #: What can be varied: its name in the records, in words, and what they are called where they are fixed.
 SWEPT = {"max_depth": "path depth", "spp": "samples per pixel", "pixels": "pixels of the film", "texels": "texels"}
-_ENDED = {"out_of_memory": "out of memory", "failed": "failed"}
 
 
 def bench(objects: Sequence[Entry]) -> tuple[Markup, int]:
@@ -58,11 +45,15 @@ def bench(objects: Sequence[Entry]) -> tuple[Markup, int]:
         ]
         curves = [_curves(chosen, labels, name, what) for what in ("step_ms", "peak_mib")]
         drawn = zip(curves, ("time of a step (ms)", "peak memory (MiB)"), strict=True)
-        parts += diagrams(*(Titled(diagram(made, SWEPT[name], axis, log_x=2)) for made, axis in drawn))
+        parts += diagrams(*(("", diagram(made, SWEPT[name], axis, log_x=2)) for made, axis in drawn))
         others = [f"{SWEPT[other]} {number(_usual(other, entries))}" for other in varied if other != name]
         parts += soft(f"At {', '.join(others)}." if others else "")
-    parts += soft(_conditions(entries, varied)) + _bench_table(entries, varied)
-    return parts, len(objects) - len(entries)
+    usual = {name: _usual(name, entries) for name in SWEPT}
+    fixed = [f"{SWEPT[name]} {number(value)}" for name, value in usual.items() if value and name not in varied]
+    parts += lay_out("measured.conditions", fixed, "Medians; bands and brackets go from the least to the greatest.")
+    ordered = sorted(entries, key=lambda entry: [entry.get(name) or 0 for name in varied])
+    rows = [{"label": label(entry), "entry": entry} for entry in ordered]
+    return parts + lay_out("measured.bench", rows, {name: SWEPT[name] for name in varied}), len(objects) - len(entries)
 
 
 def label(entry: Entry) -> str:
@@ -99,43 +90,6 @@ def _curves(entries: Sequence[Entry], labels: Sequence[str], abscissa: str, what
             low, median, high = ([entry[what][end] for entry in rows] for end in ("min", "median", "max"))
             curves.append(Curve(name, xs, median, place, (low, high), points=True))
     return curves
-
-
-def _conditions(entries: Sequence[Entry], varied: Sequence[str]) -> str:
-    fixed = [f"{SWEPT[name]} {number(_usual(name, entries))}" for name in SWEPT
-             if name not in varied and _usual(name, entries)]  # fmt: skip
-    words = f"Fixed: {', '.join(fixed)}. " if fixed else ""
-    return f"{words}Medians; bands and brackets go from the least to the greatest."
-
-
-def _bench_table(entries: Sequence[Entry], varied: Sequence[str]) -> Markup:
-    head = ["integrator", *(SWEPT[name] for name in varied), "step", "kernels", "first step", "peak memory", "scratch"]
-    rows: list[list[Words]] = []
-    for entry in sorted(entries, key=lambda entry: [entry.get(name) or 0 for name in varied]):
-        cells: list[Words] = [key(label(entry)), *(number(entry.get(name), 6) for name in varied)]
-        if entry["status"] in _ENDED:
-            rows.append([*cells, Piece(_ENDED[entry["status"]], "worse"), "", "", "", ""])
-            continue
-        cold, scratch = entry.get("cold_ms"), entry.get("scratch_bytes")
-        rows.append([
-            *cells, _spread(entry.get("step_ms")), _spread(entry.get("kernel_ms")),
-            "" if cold is None else duration(cold / 1e3),
-            "" if entry.get("peak_mib") is None else f"{entry['peak_mib']:.4g} MiB",
-            "" if scratch is None else f"{scratch} B",
-        ])  # fmt: skip
-    return table(head, rows, "dense")
-
-
-def _spread(times: Mapping[str, float] | None) -> Words:
-    if not times:
-        return ""
-    return _with_ends(f"{number(times['median'], 3)} ms", times, "min", "max")
-
-
-def _with_ends(words: str, interval: Mapping[str, float | None], low: str = "low", high: str = "high") -> Words:
-    """Words, and the ends of their interval where it has both."""
-    ends = [number(interval.get(end), 3) for end in (low, high)]
-    return [words, " ", Piece(f"[{', '.join(ends)}]", "soft small")] if all(ends) else words
 
 
 Naming = Callable[[Entry], str]
@@ -177,7 +131,9 @@ def _steps(points: Sequence[Entry], methods: Sequence[Entry], name: Naming) -> M
     if len(quantities) > MOST_DRAWN:
         parts += soft(f"{len(quantities) - MOST_DRAWN} more parameters are in the table alone.")
     told = [entry for entry in methods if quantity(entry) in quantities]
-    parts += _error_table(told, quantities, name)
+    ordered = sorted(told, key=lambda entry: quantities.index(quantity(entry)))
+    rows = [{"name": name(entry), "of": quantity(entry), "entry": entry} for entry in ordered]
+    parts += lay_out("measured.methods", rows, len(quantities) > 1, _SHARES)
     return parts + Markup().join(soft(f"{name(entry)}: {entry['message']}") for entry in told if entry.get("message"))
 
 
@@ -193,7 +149,7 @@ def method_label(entry: Entry, with_spp: bool = False) -> str:
     return ", ".join(part for part in parts if part)
 
 
-def _error_diagram(points: Sequence[Entry], labels: Sequence[str], what: str, naming: Naming) -> Titled:
+def _error_diagram(points: Sequence[Entry], labels: Sequence[str], what: str, naming: Naming) -> tuple[str, Markup]:
     of_it = [entry for entry in points if quantity(entry) == what]
     curves = []
     for place, name in enumerate(labels):
@@ -202,57 +158,11 @@ def _error_diagram(points: Sequence[Entry], labels: Sequence[str], what: str, na
                             place, points=True))  # fmt: skip
     floors = [value for entry in of_it if isinstance(value := entry.get("reference_rmse"), int | float) and value > 0]
     drawing = diagram(curves, "time (s)", "relative error", 10, sorted(floors)[len(floors) // 2 :][:1])
-    return Titled(drawing, {"all": "all parameters", "image": "the image"}.get(what, key(what)))
+    return {"all": "all parameters", "image": "the image"}.get(what, key(what)), drawing
 
 
 def _time(entry: Entry) -> float:
     return float(entry.get("elapsed_s") or 0.0)
-
-
-def _error_table(methods: Sequence[Entry], quantities: Sequence[str], naming: Naming) -> Markup:
-    several = len(quantities) > 1
-    head = ["method", *["of"] * several, "slope", "efficiency", "bias, z", *_SHARES.values()]
-    rows: list[list[Words]] = []
-    for entry in sorted(methods, key=lambda entry: quantities.index(quantity(entry))):
-        biased = Piece("biased", "worse") if entry.get("biased") else ""
-        name: list[Words] = [[key(naming(entry)), " ", biased], *[key(quantity(entry))] * several]
-        if (ended := _ended(entry)) is not None:
-            rows.append([*name, ended, *[""] * (len(head) - len(name) - 1)])
-            continue
-        seconds, beyond = entry.get("seconds_to") or {}, entry.get("extrapolated") or ()
-        rows.append([
-            *name, figure_of(entry.get("slope")), figure_of(entry.get("efficiency")), _bias(entry),
-            *(seconds_of(seconds.get(share), share in beyond) for share in _SHARES),
-        ])  # fmt: skip
-    return table(head, rows, "dense")
-
-
-def _ended(entry: Entry) -> Piece | None:
-    """How a method ended before it was measured; None where it was not."""
-    status = str(entry.get("status", "ok"))
-    return None if status == "ok" else Piece(status.replace("_", " "), "worse")
-
-
-def _bias(entry: Entry) -> Words:
-    """The largest deviation in standard errors, and the limit that it keeps or exceeds."""
-    z, limit = entry.get("bias_z"), entry.get("bias_z_limit")
-    if not isinstance(z, int | float) or not isinstance(limit, int | float):
-        return figure_of(z)
-    return f"{abs(z):.2g} {'<' if abs(z) < limit else '>'} {limit:.2g}"
-
-
-def figure_of(value: Any) -> Words:
-    """A figure, and its interval where it has one: a number, or `{value, low, high}`."""
-    if isinstance(value, Mapping):
-        return _with_ends(number(value.get("value"), 3), value)
-    return number(value, 3) if isinstance(value, int | float) else ""
-
-
-def seconds_of(value: Any, extrapolated: bool) -> Words:
-    """A time; one that was extrapolated is marked, one that is never reached is a dash."""
-    if not isinstance(value, int | float):
-        return "—"
-    return [duration(value), " ", Piece("extrapolated", "soft small")] if extrapolated else duration(value)
 
 
 #: What is drawn against time: its name in the records, and in words.
@@ -266,10 +176,10 @@ def whole_runs(points: Sequence[Entry], methods: Sequence[Entry], naming: Naming
     if points:
         parts += soft("Whole optimisations at equal wall time, all costs counted. Medians over the seeds; bands "
                       "and brackets go from the least to the greatest.")  # fmt: skip
-    return parts + _runs_table(methods, naming)
+    return parts + lay_out("measured.runs", [{"name": naming(entry), "entry": entry} for entry in methods])
 
 
-def _runs_diagram(points: Sequence[Entry], labels: Sequence[str], of: str, naming: Naming) -> Titled:
+def _runs_diagram(points: Sequence[Entry], labels: Sequence[str], of: str, naming: Naming) -> tuple[str, Markup]:
     curves = []
     for place, name in enumerate(labels):
         found: dict[float, list[float]] = {}
@@ -280,28 +190,7 @@ def _runs_diagram(points: Sequence[Entry], labels: Sequence[str], of: str, namin
         medians = [statistics.median(found[time]) for time in times]
         band = [min(found[time]) for time in times], [max(found[time]) for time in times]
         curves.append(Curve(name, times, medians, place, band, points=True))
-    return Titled(diagram(curves, "time of a run (s)", _DRAWN[of]), _DRAWN[of])
-
-
-def _runs_table(methods: Sequence[Entry], naming: Naming) -> Markup:
-    rows: list[list[Words]] = []
-    for entry in methods:
-        ended, seconds = _ended(entry), entry.get("elapsed_s")
-        rows.append([
-            [key(naming(entry)), " ", ended or ""],
-            number(entry["runs"]) if _is_number(entry.get("runs")) else "",
-            duration(float(seconds)) if isinstance(seconds, int | float) else "",
-            *(_band(entry.get(what)) for what in ("iterations", "first_s", "loss", "parameter_error")),
-        ])  # fmt: skip
-    head = ["method", "runs", "time of each", "iterations", "s to the first", "final loss", "final error"]
-    return table(head, rows, "dense")
-
-
-def _band(value: Any) -> Words:
-    """A median, and the least and the greatest."""
-    if not isinstance(value, Mapping) or not all(_is_number(value.get(end)) for end in ("median", "low", "high")):
-        return ""
-    return _with_ends(number(value["median"], 3), value)
+    return _DRAWN[of], diagram(curves, "time of a run (s)", _DRAWN[of])
 
 
 def _is_number(value: Any) -> bool:
@@ -347,26 +236,17 @@ def run_comparison(runs: Sequence[Run]) -> Parts:
 
 def overview(runs: Sequence[Run]) -> Markup:
     """A line for each run: how it ended, what it came to, and what an iteration took."""
-    head = ("run", "status", "estimator", "iterations", "time", "loss", "parameter error", "an iteration",
-            "peak memory")  # fmt: skip
-    return table(head, [_line(run, place) for place, run in enumerate(runs)], "overview")
+    rows = [
+        {"run": run, "place": place, "estimator": _estimator(run), "loss": _final_loss(run), "error": _final_error(run),
+         "step": StepParts.of(run.records)}
+        for place, run in enumerate(runs)
+    ]  # fmt: skip
+    return lay_out("run.overview", rows)
 
 
-def _line(run: Run, place: int) -> list[Words]:
-    records, results, step = run.records, run.results, StepParts.of(run.records)
-    losses = [record["loss"] for record in records if record["loss"] is not None]
-    loss = results["loss"] if results.get("loss") is not None else losses[-1] if losses else None
-    return [
-        [Piece(place, "mark"), key(run.name)],
-        str(run.manifest.get("status", "unknown")),
-        _estimator(run),
-        str(len(records)),
-        duration(records[-1]["elapsed_s"]) if records else "",
-        number(loss),
-        _final_error(run),
-        "" if step is None else duration(step.step / 1e3),
-        f"{max(record['peak_mib'] for record in records):.4g} MiB" if records else "",
-    ]
+def _final_loss(run: Run) -> float | None:
+    losses = [record["loss"] for record in run.records if record["loss"] is not None]
+    return run.results["loss"] if run.results.get("loss") is not None else losses[-1] if losses else None
 
 
 def _estimator(run: Run) -> str:
@@ -399,9 +279,6 @@ def _each(runs: Sequence[Run], make: Callable[[Run], Markup]) -> Markup:
 HEADINGS = {"bench": "Cost of a step", "gradcheck": "Gradients against references",
             "convergence": "Error against run time", "maps": "Maps of gradients"}  # fmt: skip
 
-#: Verdicts that are told as a failure is.
-_BAD = (Verdict.FAILS,)
-
 
 def measured(source: Measurements | Maps) -> Markup:
     """Everything that there is to show of it."""
@@ -414,22 +291,21 @@ def measured(source: Measurements | Maps) -> Markup:
     words = [f"{count(len(source.damaged), 'line')} could not be read (the first is line {source.damaged[0]})."] if (
         source.damaged) else []  # fmt: skip
     words += [f"{count(unknown, 'line')} of other kinds, or damaged, left out."] if unknown else []
-    return markup + Markup().join([*map(soft, words), *map(origin_facts, source.origins)])
+    origins = [lay_out("run.origin", origin) for origin in source.origins]
+    return markup + Markup().join([*map(soft, words), *origins])
 
 
 def gradcheck(objects: Sequence[Mapping[str, Any]]) -> tuple[Markup, int]:
     """The comparisons as a table, what fails first, and what is missing; and how many lines are neither."""
     records = [record for entry in objects if (record := record_of(GradcheckRecord, entry)) is not None]
     missing = [found for entry in objects if (found := record_of(MissingRecord, entry)) is not None]
-    several = len({record.case for record in records}) > 1
-    head = ["case"] * several + list(HEAD)
-    rows: list[list[Words]] = []
-    for record in sorted(records, key=lambda record: record.verdict not in _BAD):
-        first, *rest, verdict = cells(record)
-        ended = Piece(verdict, "worse") if record.verdict in _BAD else verdict
-        rows.append([*[key(record.case)] * several, key(first), *rest, ended])
+    rows = [
+        {"case": record.case, "cells": cells(record), "fails": record.verdict is Verdict.FAILS} for record in records
+    ]
+    rows.sort(key=lambda row: not row["fails"])
     lines = [line for line in summary_lines(records) if not line.startswith("FAILS")] if records else []
     lines += [found.line() for found in missing]
-    failed = [failure_line(record) for record in records if record.verdict in _BAD]
-    markup = lay_out("note", failed, "failed") + Markup().join(lay_out("paragraph", line) for line in lines)
-    return markup + table(head, rows, "dense"), len(objects) - len(records) - len(missing)
+    failed = [failure_line(record) for record in records if record.verdict is Verdict.FAILS]
+    several = len({record.case for record in records}) > 1
+    markup = lay_out("measured.gradcheck", failed, lines, list(HEAD), several, rows)
+    return markup, len(objects) - len(records) - len(missing)

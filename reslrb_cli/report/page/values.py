@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,14 +17,11 @@ from markupsafe import Markup
 
 from reslrb_cli.records.images import finite_range, read_mask, read_parameters
 from reslrb_cli.report.format import number
-from reslrb_cli.report.page.images import Picture, gallery, show
+from reslrb_cli.report.page.images import Picture, gallery, show, titled
 from reslrb_cli.report.page.layout import (
     COLORS,
     MOST_POINTS,
     Curve,
-    Piece,
-    Titled,
-    Words,
     diagram,
     diagrams,
     key,
@@ -32,8 +29,6 @@ from reslrb_cli.report.page.layout import (
     legend,
     points_together,
     soft,
-    table,
-    titled,
 )
 from reslrb_cli.report.perceptual import PLACES, is_color
 from reslrb_cli.report.run_summary import is_settled, spread_words, units_differ, verdict_words
@@ -51,21 +46,19 @@ def parameter_table(results: Mapping[str, Any], end: str = "end") -> Markup:
     """Value and error of each parameter at the start and at the end, and the true value where it is known."""
     parameters = results.get("parameters") or {}
     has_truth = any(about.get("true") for about in parameters.values())
-    relative = units_differ(results)
-    head = ["parameter", "start", end] + ["true"] * has_truth + ["RMSE"] * has_truth
-    head += ["relative error"] * (has_truth and relative)
-    judged = any(verdict_words(results, name) for name in parameters)
-    head += ["spread", "verdict"] * judged
-    rows: list[list[Words]] = []
-    for name, about in parameters.items():
-        swatches = _swatches(name, about)
-        cells = [_value(about.get(moment), swatches.get(moment)) for _, moment in MOMENTS]
-        row = [_name(name, about), *cells[: 2 + has_truth]]
-        row += [_error(results, "parameter_rmse", name)] * has_truth
-        row += [_error(results, "relative_error", name)] * (has_truth and relative)
-        row += [Piece(spread_words(results, name, "±"), "number"), _verdict(results, name)] if judged else []
-        rows.append(row)
-    return table(head, rows, "parameters")
+    kinds = {"RMSE": "parameter_rmse"} | ({"relative error": "relative_error"} if units_differ(results) else {})
+    errors = kinds if has_truth else {}
+    rows = [
+        {
+            "name": name, "about": about, "notes": _notes(about), "swatches": _swatches(name, about),
+            "errors": [(results.get(kind) or {}).get(name) for kind in errors.values()],
+            "worse": name in (results.get("worse") or ()), "spread": spread_words(results, name, "±"),
+            "verdict": verdict_words(results, name), "settled": is_settled(results, name),
+        }
+        for name, about in parameters.items()
+    ]  # fmt: skip
+    moments = {"initial": "start", "final": end} | ({"true": "true"} if has_truth else {})
+    return lay_out("run.parameters", rows, moments, list(errors))
 
 
 def texture_pictures(
@@ -116,47 +109,14 @@ def _exposure(arrays: Mapping[str, Array | None]) -> float:
 
 
 def _picture(title: str, name: str, array: Array, about: Mapping[str, Any] | None, exposure: float) -> Picture:
-    caption: list[Words] = [titled(title, f", {array.shape[1]}×{array.shape[0]}")]
-    return show(array * exposure, f"{title}: {name}", *caption, *([_value(about)] if about else []))
+    value = [lay_out("run.value", about)] if about else []
+    return show(array * exposure, f"{title}: {name}", titled(title, f", {array.shape[1]}×{array.shape[0]}"), *value)
 
 
-def _name(name: str, about: Mapping[str, Any]) -> Words:
-    shape = "×".join(str(size) for size in about.get("shape") or ())
-    notes = [about.get("quantity") or "", shape if shape != "3" else ""]
-    reached = about.get("reached")
-    notes += [f"{100 * reached:.3g} % reached"] if reached is not None and reached < 1 else []
-    return [key(name), Piece(", ".join(note for note in notes if note), "below")]
-
-
-def _value(about: Mapping[str, Any] | None, swatch: str | None = None) -> Words:
-    if not about:
-        return ""
-    shown = [Piece(swatch, "swatch")] if swatch else []
-    if "value" in about:
-        values = about["value"] if isinstance(about["value"], list) else [about["value"]]
-        return [*shown, _numbers(values)]
-    if about["min"] == about["max"]:
-        return [*shown, _numbers([about["min"]]), " throughout"]
-    ends = Piece(Piece(" to ".join(number(about[end], 3) for end in ("min", "max")), "numbers"), "below")
-    return [*shown, "mean ", _numbers(about["mean"]), ends]
-
-
-def _numbers(values: Iterable[float | None]) -> Piece:
-    return Piece(" ".join(number(value, 3) for value in values), "numbers")
-
-
-def _error(results: Mapping[str, Any], kind: str, name: str) -> Words:
-    pair = (results.get(kind) or {}).get(name)
-    if pair is None:
-        return ""
-    known = [number(pair[moment], 3) for moment in ("initial", "final") if pair.get(moment) is not None]
-    words = Piece(" → ".join(known), "numbers")
-    return Piece([words, ", worse"], "worse") if name in (results.get("worse") or ()) else words
-
-
-def _verdict(results: Mapping[str, Any], name: str) -> Words:
-    words = verdict_words(results, name)
-    return words if is_settled(results, name) else Piece(words, "worse")
+def _notes(about: Mapping[str, Any]) -> list[str]:
+    shape, reached = "×".join(str(size) for size in about.get("shape") or ()), about.get("reached")
+    share = f"{100 * reached:.3g} % reached" if reached is not None and reached < 1 else ""
+    return [about.get("quantity") or "", shape if shape != "3" else "", share]
 
 
 def _swatches(key: str, about: Mapping[str, Any]) -> dict[str, str]:
@@ -251,7 +211,7 @@ def _both(curves: Sequence[tuple[Run, str, int, Callable[[Record], float | None]
             Curve(title, [record[name] for record in run.records], [value(record) for record in run.records], place)
             for run, title, place, value in curves
         ]
-        drawn.append(Titled(diagram(made, caption, label)))
+        drawn.append(("", diagram(made, caption, label)))
     return diagrams(*drawn)
 
 
