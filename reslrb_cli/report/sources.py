@@ -171,21 +171,22 @@ def _kind(entry: Mapping[str, Any]) -> str | None:
 def _record(entry: dict[str, Any]) -> dict[str, Any] | None:
     """A line of `metrics.jsonl`, changed so that its figures are figures; None where what each has is missing."""
     for key in _FIGURES:
-        if not _is_number(entry.get(key)):
+        if not is_number(entry.get(key)):
             return None
     for key in _ALL_FIGURES:
-        if not _is_number(entry.get(key)):
+        if not is_number(entry.get(key)):
             entry[key] = None
     errors = entry.get("parameter_errors")
     if not isinstance(errors, dict):
         errors = entry["parameter_errors"] = {}
     for key, value in errors.items():
-        if not _is_number(value):
+        if not is_number(value):
             errors[key] = None
     return entry
 
 
-def _is_number(value: Any) -> bool:
+def is_number(value: Any) -> bool:
+    """Whether it is a finite number."""
     kind = type(value)
     return (kind is float or kind is int) and -1e300 < value < 1e300
 

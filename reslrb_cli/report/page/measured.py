@@ -10,24 +10,26 @@
 
 from __future__ import annotations
 
-import statistics
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict
 from functools import partial
+from operator import itemgetter
 from typing import Any
 
 from markupsafe import Markup
 
-from reslrb_cli.records.measurements import GradcheckRecord, MissingRecord, Verdict, record_of
+from reslrb_cli.records.measurements import GradcheckRecord, MissingRecord, Spread, Verdict, record_of
 from reslrb_cli.report.format import count, number
 from reslrb_cli.report.page.images import gradient_maps, image_rows, seen_tables
 from reslrb_cli.report.page.layout import Curve, diagram, diagrams, key, lay_out, legend, soft
 from reslrb_cli.report.page.run import StepParts, bars, guarded, problems, record_parts
 from reslrb_cli.report.page.values import convergence_of_all, parameter_table, texture_pictures
 from reslrb_cli.report.run_summary import worst
-from reslrb_cli.report.sources import Maps, Measurements, Run, Source
+from reslrb_cli.report.sources import Maps, Measurements, Run, Source, is_number
 from reslrb_cli.report.tables import HEAD, cells, failure_line, summary_lines
 
 Entry = Mapping[str, Any]
+Naming = Callable[[Entry], str]
 
 #: What can be varied: its name in the records, in words, and what they are called where they are fixed.
 SWEPT = {"max_depth": "path depth", "spp": "samples per pixel", "pixels": "pixels of the film", "texels": "texels"}
@@ -37,23 +39,24 @@ def bench(objects: Sequence[Entry]) -> tuple[Markup, int]:
     """Diagrams and a table; and how many lines are no records of a bench."""
     entries = [_with_sizes(entry) for entry in objects if "integrator" in entry and "status" in entry]
     labels = list(dict.fromkeys(map(label, entries)))
-    varied = [name for name in SWEPT if len({entry[name] for entry in entries if entry.get(name)}) > 1] or ["max_depth"]
+    values = {name: [entry[name] for entry in entries if entry.get(name)] for name in SWEPT}
+    usual = {name: max(dict.fromkeys(found), key=found.count) for name, found in values.items() if found}
+    varied = [name for name in SWEPT if len(set(values[name])) > 1] or ["max_depth"]
     parts = legend(labels)
     for name in varied:
-        chosen = [
-            entry for entry in entries if all(_is_usual(entry, other, entries) for other in varied if other != name)
+        others = [other for other in varied if other != name]
+        chosen = [entry for entry in entries if all(entry.get(other) == usual[other] for other in others)]
+        drawn = [
+            ("", diagram(_curves(chosen, labels, label, name, what), SWEPT[name], words, log_x=2))
+            for what, words in (("step_ms", "time of a step (ms)"), ("peak_mib", "peak memory (MiB)"))
         ]
-        curves = [_curves(chosen, labels, name, what) for what in ("step_ms", "peak_mib")]
-        drawn = zip(curves, ("time of a step (ms)", "peak memory (MiB)"), strict=True)
-        parts += diagrams(*(("", diagram(made, SWEPT[name], axis, log_x=2)) for made, axis in drawn))
-        others = [f"{SWEPT[other]} {number(_usual(other, entries))}" for other in varied if other != name]
-        parts += soft(f"At {', '.join(others)}." if others else "")
-    usual = {name: _usual(name, entries) for name in SWEPT}
-    fixed = [f"{SWEPT[name]} {number(value)}" for name, value in usual.items() if value and name not in varied]
-    parts += lay_out("measured.conditions", fixed, "Medians; bands and brackets go from the least to the greatest.")
-    ordered = sorted(entries, key=lambda entry: [entry.get(name) or 0 for name in varied])
-    rows = [{"label": label(entry), "entry": entry} for entry in ordered]
-    return parts + lay_out("measured.bench", rows, {name: SWEPT[name] for name in varied}), len(objects) - len(entries)
+        at = ", ".join(f"{SWEPT[other]} {number(usual[other])}" for other in others)
+        parts += diagrams(*drawn) + soft(f"At {at}." if at else "")
+    fixed = [f"{SWEPT[name]} {number(value)}" for name, value in usual.items() if name not in varied]
+    entries.sort(key=lambda entry: [entry.get(name) or 0 for name in varied])
+    rows = [{"label": label(entry), "entry": entry} for entry in entries]
+    parts += lay_out("measured.bench", rows, {name: SWEPT[name] for name in varied}, fixed)
+    return parts, len(objects) - len(entries)
 
 
 def label(entry: Entry) -> str:
@@ -68,35 +71,23 @@ def _with_sizes(entry: Entry) -> dict[str, Any]:
     return {"pixels": pixels, "texels": entry.get("texels")} | dict(entry)
 
 
-def _usual(name: str, entries: Sequence[Entry]) -> Any:
-    """The value that most of the records have."""
-    values = [entry[name] for entry in entries if entry.get(name)]
-    return max(dict.fromkeys(values), key=values.count) if values else None
-
-
-def _is_usual(entry: Entry, name: str, entries: Sequence[Entry]) -> bool:
-    return bool(entry.get(name) == _usual(name, entries))
-
-
-def _curves(entries: Sequence[Entry], labels: Sequence[str], abscissa: str, what: str) -> list[Curve]:
+def _curves(entries: Sequence[Entry], labels: Sequence[str], naming: Naming, x: str, y: str) -> list[Curve]:
+    """A curve for each label, of the figures `y` over `x`; of those that are spreads the medians, with a band."""
     curves = []
     for place, name in enumerate(labels):
-        rows = [entry for entry in entries if label(entry) == name and entry.get("step_ms") and entry.get(abscissa)]
-        rows.sort(key=lambda entry: entry[abscissa])
-        xs = [entry[abscissa] for entry in rows]
-        if what == "peak_mib":
-            curves.append(Curve(name, xs, [entry.get(what) for entry in rows], place, points=True))
-        else:
-            low, median, high = ([entry[what][end] for entry in rows] for end in ("min", "median", "max"))
-            curves.append(Curve(name, xs, median, place, (low, high), points=True))
+        rows = sorted((row for row in entries if naming(row) == name and row.get(x)), key=lambda row: float(row[x]))
+        figures = [row.get(y) for row in rows]
+        spreads = [value for value in figures if isinstance(value, Mapping)]
+        if spreads:
+            rows = [row for row in rows if isinstance(row.get(y), Mapping)]
+            low, figures, high = ([value[end] for value in spreads] for end in ("min", "median", "max"))
+        xs, band = [row[x] for row in rows], (low, high) if spreads else None
+        curves.append(Curve(name, xs, figures, place, band, points=True))
     return curves
 
 
-Naming = Callable[[Entry], str]
-
 #: Quantities that are drawn, at most: all parameters together, the image, then single ones.
 MOST_DRAWN = 8
-_SHARES = {"0.1": "to 10 %", "0.03": "to 3 %", "0.01": "to 1 %"}
 
 
 def convergence(objects: Sequence[Entry]) -> tuple[Markup, int]:
@@ -112,8 +103,6 @@ def convergence(objects: Sequence[Entry]) -> tuple[Markup, int]:
         markup += _steps(kinds["point"], kinds["method"], name)
     if kinds["run_point"] or kinds["run_method"]:
         markup += whole_runs(kinds["run_point"], kinds["run_method"], name)
-        markup += Markup().join(soft(f"{name(entry)}: {entry['message']}") for entry in kinds["run_method"]
-                          if entry.get("message"))  # fmt: skip
     return markup, len(objects) - len(known) - len(said)
 
 
@@ -124,17 +113,15 @@ def _steps(points: Sequence[Entry], methods: Sequence[Entry], name: Naming) -> M
     quantities.sort(key=lambda what: {"all": 0, "image": 1}.get(what, 2))
     if len(quantities) == 2 and quantities[0] == "all":  # the only parameter is all of them
         del quantities[0]
-    drawn = [_error_diagram(points, labels, what, name) for what in quantities[:MOST_DRAWN]]
-    parts = legend(labels) + diagrams(*drawn)
-    if points:
-        parts += soft("Dots across: the standard error of the reference itself, below which nothing can be told.")
-    if len(quantities) > MOST_DRAWN:
-        parts += soft(f"{len(quantities) - MOST_DRAWN} more parameters are in the table alone.")
-    told = [entry for entry in methods if quantity(entry) in quantities]
-    ordered = sorted(told, key=lambda entry: quantities.index(quantity(entry)))
-    rows = [{"name": name(entry), "of": quantity(entry), "entry": entry} for entry in ordered]
-    parts += lay_out("measured.methods", rows, len(quantities) > 1, _SHARES)
-    return parts + Markup().join(soft(f"{name(entry)}: {entry['message']}") for entry in told if entry.get("message"))
+    drawn = [_error_diagram([entry for entry in points if quantity(entry) == what], labels, what, name)
+             for what in quantities[:MOST_DRAWN]]  # fmt: skip
+    rows = [
+        {"name": name(entry), "of": what, "place": quantities.index(what), "entry": entry}
+        for entry in methods
+        if (what := quantity(entry)) in quantities
+    ]
+    return legend(labels) + diagrams(*drawn) + lay_out(
+        "measured.methods", rows, bool(points), len(quantities), MOST_DRAWN)  # fmt: skip
 
 
 def quantity(entry: Entry) -> str:
@@ -150,51 +137,26 @@ def method_label(entry: Entry, with_spp: bool = False) -> str:
 
 
 def _error_diagram(points: Sequence[Entry], labels: Sequence[str], what: str, naming: Naming) -> tuple[str, Markup]:
-    of_it = [entry for entry in points if quantity(entry) == what]
-    curves = []
-    for place, name in enumerate(labels):
-        rows = sorted((entry for entry in of_it if naming(entry) == name and _time(entry)), key=_time)
-        curves.append(Curve(name, [_time(entry) for entry in rows], [entry.get("relative_rmse") for entry in rows],
-                            place, points=True))  # fmt: skip
-    floors = [value for entry in of_it if isinstance(value := entry.get("reference_rmse"), int | float) and value > 0]
-    drawing = diagram(curves, "time (s)", "relative error", 10, sorted(floors)[len(floors) // 2 :][:1])
+    floors = sorted(value for entry in points if is_number(value := entry.get("reference_rmse")) and value > 0)
+    curves = _curves(points, labels, naming, "elapsed_s", "relative_rmse")
+    drawing = diagram(curves, "time (s)", "relative error", 10, floors[len(floors) // 2 :][:1])
     return {"all": "all parameters", "image": "the image"}.get(what, key(what)), drawing
-
-
-def _time(entry: Entry) -> float:
-    return float(entry.get("elapsed_s") or 0.0)
-
-
-#: What is drawn against time: its name in the records, and in words.
-_DRAWN = {"loss": "loss", "parameter_error": "parameter error"}
 
 
 def whole_runs(points: Sequence[Entry], methods: Sequence[Entry], naming: Naming) -> Markup:
     """A diagram of the loss, one of the parameters' error where that is known, and a table; `naming` names a method."""
     labels = list(dict.fromkeys(map(naming, [*methods, *points])))
-    parts = legend(labels) + diagrams(*(_runs_diagram(points, labels, of, naming) for of in _DRAWN))
-    if points:
-        parts += soft("Whole optimisations at equal wall time, all costs counted. Medians over the seeds; bands "
-                      "and brackets go from the least to the greatest.")  # fmt: skip
-    return parts + lay_out("measured.runs", [{"name": naming(entry), "entry": entry} for entry in methods])
-
-
-def _runs_diagram(points: Sequence[Entry], labels: Sequence[str], of: str, naming: Naming) -> tuple[str, Markup]:
-    curves = []
-    for place, name in enumerate(labels):
-        found: dict[float, list[float]] = {}
+    drawn = []
+    for of, words in (("loss", "loss"), ("parameter_error", "parameter error")):
+        found: dict[tuple[str, float], list[float]] = {}
         for entry in points:
-            if naming(entry) == name and _is_number(entry.get(of)) and _is_number(entry.get("elapsed_s")):
-                found.setdefault(float(entry["elapsed_s"]), []).append(float(entry[of]))
-        times = sorted(found)
-        medians = [statistics.median(found[time]) for time in times]
-        band = [min(found[time]) for time in times], [max(found[time]) for time in times]
-        curves.append(Curve(name, times, medians, place, band, points=True))
-    return _DRAWN[of], diagram(curves, "time of a run (s)", _DRAWN[of])
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool)
+            if is_number(entry.get(of)) and is_number(entry.get("elapsed_s")):
+                found.setdefault((naming(entry), float(entry["elapsed_s"])), []).append(float(entry[of]))
+        spreads = [{"name": name, "s": time, of: asdict(Spread.of(values))} for (name, time), values in found.items()]
+        curves = _curves(spreads, labels, itemgetter("name"), "s", of)
+        drawn.append((words, diagram(curves, "time of a run (s)", words)))
+    rows = [{"name": naming(entry), "entry": entry} for entry in methods]
+    return legend(labels) + diagrams(*drawn) + lay_out("measured.runs", rows, bool(points))
 
 
 #: Names in the title of a page.

@@ -132,23 +132,6 @@ def correlated_bias_table(measured: Mapping[str, Any] | None) -> Markup:
     return lay_out("run.correlated_bias", bias, {row.key: share_words(row, "±") for row in bias.parameters})
 
 
-def not_finite(tally: Mapping[str, Any] | None) -> Markup:
-    """Values that were not finite, by parameter."""
-    if not tally or not tally.get("iterations"):
-        return Markup()
-    line = f"{tally['values']} values were not finite, in {tally['iterations']} iterations; none reached a parameter."
-    return lay_out("run.tally", line, "values of gradients and updates", tally["by_parameter"])
-
-
-def clamped(tally: Mapping[str, Any] | None) -> Markup:
-    """Gradients that were clamped, and the bias that this made."""
-    if not tally or not tally.get("iterations"):
-        return Markup()
-    line = f"{tally['entries']} entries of gradients were clamped, in {tally['iterations']} iterations."
-    biases = {name: number(bias) for name, bias in tally["bias"].items()}
-    return lay_out("run.tally", line, "bias, as the share of the gradient taken over the run", biases)
-
-
 #: Bytes of a configuration that is shown, at most.
 MOST_CONFIG = 2**20
 DAMAGED = "This part cannot be shown: what was recorded of it is damaged."
@@ -195,8 +178,8 @@ def record_parts(run: Run) -> dict[str, Markup]:
     """By title, those of the parts that tell how a run was done, of which nothing can be laid beside another run's."""
     results, manifest = run.results, run.manifest
     parts: dict[str, Callable[[], Markup]] = {
-        "Not finite": lambda: not_finite(results.get("nonfinite")),
-        "Clamped gradients": lambda: clamped(results.get("clamped")),
+        "Not finite": lambda: lay_out("run.not_finite", results.get("nonfinite") or {}),
+        "Clamped gradients": lambda: lay_out("run.clamped", results.get("clamped") or {}),
         "Run": lambda: run_facts(run),
         "Plan": lambda: lay_out("run.plan", plan["rows"]) if (plan := manifest.get("plan")) else Markup(),
         "Choice of the estimator": lambda: (
