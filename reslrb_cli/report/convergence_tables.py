@@ -1,8 +1,4 @@
-"""Convergence and whole optimisations as aligned tables, and what they come to in a sentence.
-
-The methods of a convergence have `method_columns`, and `closing_sentence` is what they come to; whole optimisations
-have `runs_columns`, and `runs_closing_sentence` says which method is the best.
-"""
+"""Convergence and whole optimisations as aligned tables, and what they come to in a sentence."""
 
 from __future__ import annotations
 

@@ -1,15 +1,8 @@
 """Errors as people see them: of images against their targets, and of recovered colours.
 
 Colours are linear sRGB (BT.709 primaries, D65), as Mitsuba's RGB variants have them. Arrays are (..., 3).
-
-- `ciede2000`, `itp`, `told`: differences between colours, by colour-science, and what is told of many of them.
-- `color_errors`: how far recovered colours are from the true ones.
-- `flip_map`: HDR-FLIP: how an error strikes someone who flips between two images, at all exposures that show something.
-  From the package `flip-evaluator`, which is an extra: `pip install reslrb[flip]`.
-- `image_errors`: the error of an image against its target.
-- `seen_errors`: the errors of a run, from the images and parameters in its folder.
-- `with_seen_errors`: the same for runs of which such errors were never recorded: they are found in what the folder
-  holds.
+HDR-FLIP tells how an error strikes someone who flips between two images, at all exposures that show something; its
+package `flip-evaluator` is an extra: `pip install reslrb[flip]`.
 """
 
 from __future__ import annotations

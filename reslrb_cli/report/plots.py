@@ -1,12 +1,4 @@
-"""Measurements as plots.
-
-- `plot_bench`: step time and peak memory against path depth, as in the paper's Figure 6, or against what else was
-  swept.
-- `plot_convergence`: error against run time, on logarithmic axes: one panel for all parameters together, and one for
-  each of several.
-- `plot_runs`: loss and parameter error of whole optimisations against run time: medians, and bands over the seeds.
-- `plot_maps`: maps of a texture's gradient, of its reference, and of their difference in standard errors.
-"""
+"""Measurements as pictures: what a bench, a convergence or whole optimisations came to, and maps of gradients."""
 
 from __future__ import annotations
 

@@ -1,8 +1,5 @@
 """A finished run in a few lines, for a terminal: how it ended, and its parameters.
 
-How it ended is a line: its loss, its errors, and what did not work (`last_line`). The parameters are a few aligned
-lines (`parameter_lines`).
-
 How certain its values are is said in words, of the manifest's `results`, whose `certainty` may be missing.
 """
 

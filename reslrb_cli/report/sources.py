@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeGuard
 
 import numpy as np
 
@@ -185,10 +185,9 @@ def _record(entry: dict[str, Any]) -> dict[str, Any] | None:
     return entry
 
 
-def is_number(value: Any) -> bool:
+def is_number(value: object) -> TypeGuard[float]:
     """Whether it is a finite number."""
-    kind = type(value)
-    return (kind is float or kind is int) and -1e300 < value < 1e300
+    return isinstance(value, float | int) and not isinstance(value, bool) and -1e300 < value < 1e300
 
 
 def _names(paths: Sequence[Path]) -> list[str]:

@@ -1,11 +1,4 @@
-"""Measurements as aligned tables: bench, conditioning, gradcheck and its suite.
-
-- `bench_columns`, `bench_cells`: the results of a bench.
-- `conditioning_lines`, `chain_lines`: conditioning.
-- `gradcheck_columns`, `cells`, `markdown_table`: the results of a gradcheck, aligned and as Markdown; `summary_lines`,
-  what they come to.
-- `suite_table`: the results of a suite of cases: one line for each case, with what each estimator came to.
-"""
+"""Measurements as aligned tables: bench, conditioning, gradcheck and its suite; and what a gradcheck comes to."""
 
 from __future__ import annotations
 

@@ -27,7 +27,7 @@ from report.measured import (
 from reslrb_cli.records.images import read_layers
 from reslrb_cli.records.manifest import Status, read_manifest
 from reslrb_cli.report import page as page_module
-from reslrb_cli.report.page import render_page, write_page, write_report
+from reslrb_cli.report.page import render, write_page, write_report
 from reslrb_cli.report.page.values import parameter_table, texture_pictures
 from reslrb_cli.report.perceptual import with_seen_errors
 from reslrb_cli.report.sources import read_sources
@@ -79,6 +79,10 @@ class Page(html.parser.HTMLParser):
 
     def row(self, section, first):
         return next(row for row in self.cells[section] if row and row[0].startswith(first))
+
+
+def render_run(folder):
+    return render(read_sources([folder]))
 
 
 def page_of(folder):
@@ -192,7 +196,7 @@ def test_dark_scenes_are_shown_brighter_and_say_so(tmp_path):
 
 def test_swatches_have_the_colours_of_the_values(tmp_path):
     """One exposure for all moments of a lamp, in sRGB; none for what is no colour."""
-    markup = render_page(make_run(tmp_path / "lamp", keys=(FLOOR, LAMP, "plate.eta.value")))
+    markup = render_run(make_run(tmp_path / "lamp", keys=(FLOOR, LAMP, "plate.eta.value")))
     swatches = [
         tuple(map(int, found.split(","))) for found in re.findall(r'"swatch" style="background:rgb\((.*?)\)"', markup)
     ]
@@ -250,7 +254,7 @@ EVIL = '<script>alert("1")</script>.a & b.value'
 def test_names_stay_text(tmp_path):
     folder = make_run(tmp_path / "<img src=x onerror=alert(1)>", keys=(EVIL, "\x1b[31m</pre>\u202e.value"))
     (folder / "config.yaml").write_text("name: </pre><script>alert(1)</script>\n")
-    markup = render_page(folder)
+    markup = render_run(folder)
     page = Page(markup)
     assert "script" not in page.tags
     assert page.tags.count("img") == len(page.pictures) == 9
@@ -261,7 +265,7 @@ def test_names_stay_text(tmp_path):
 
 
 def test_nothing_is_loaded(tmp_path):
-    markup = render_page(make_run(tmp_path / "lamp"))
+    markup = render_run(make_run(tmp_path / "lamp"))
     assert re.findall(r'(?:src|href)="(?!data:|#)[^"]*"', markup) == []
     assert "url(http" not in markup
     assert "default-src 'none'" in html.unescape(markup)

@@ -1,11 +1,4 @@
-"""The images on the page: start, end, target and maps of every sensor, and tables of what they come to.
-
-- `show`, `show_map`: arrays as pictures that a page holds in itself, in their own colours and in those of a scale.
-- `gradient_maps`: maps of gradients of textures: the gradient, its reference, and their difference in standard errors.
-- `view_table`: what of every view counts: its share of the loss, its exposure, and the pixels that are left out.
-- `seen_tables`: errors as people see them, as tables: of images, and of recovered colours.
-- `image_rows`: a row for every sensor.
-"""
+"""The images on the page: start, end, target and maps of every sensor, and tables of what they come to."""
 
 from __future__ import annotations
 

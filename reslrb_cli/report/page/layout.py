@@ -108,16 +108,6 @@ class Curve:
     band: tuple[Sequence[float | None], Sequence[float | None]] | None = None
     points: bool = False
 
-    @property
-    def color(self) -> str:
-        """As `#rrggbb`."""
-        return COLORS[self.place % len(COLORS)]
-
-    @property
-    def dashed(self) -> bool:
-        """Whether its colour has been used by another one before."""
-        return self.place >= len(COLORS)
-
     def known(self) -> Array:
         """Its points as (N, 2)."""
         array = np.array([self.xs, self.ys], dtype=np.float64).T  # None is NaN
@@ -206,12 +196,13 @@ def _labels(axis: Any) -> list[str]:
 def _draw(axis: Any, curve: Curve, points: Array) -> None:
     xs, ys = _thinned(points, points_together(len(points)))
     marker = "o" if curve.points or len(xs) == 1 else ""
-    style = "--" if curve.dashed else "-"
-    axis.plot(xs, ys, linewidth=1.5, color=curve.color, marker=marker, markersize=4, linestyle=style)
+    again, place = divmod(curve.place, len(COLORS))
+    style = "--" if again else "-"
+    axis.plot(xs, ys, linewidth=1.5, color=COLORS[place], marker=marker, markersize=4, linestyle=style)
     if curve.band is not None:
         low, high = ([np.nan if value is None else value for value in end] for end in curve.band)
         places = [np.nan if value is None else value for value in curve.xs]
-        axis.fill_between(places, low, high, color=curve.color, alpha=0.18, linewidth=0)
+        axis.fill_between(places, low, high, color=COLORS[place], alpha=0.18, linewidth=0)
 
 
 def _mark_decades(axis: Any, span: float) -> None:

@@ -1,12 +1,4 @@
-"""Parts of a page on a file of measurements, by the command that wrote it, on a folder of maps, and on several runs.
-
-- `bench`: what `bench` measured: time and memory of a step against what was varied, and all of it as a table.
-- `convergence`: what `convergence` measured: error against run time, by method.
-- `whole_runs`: what `convergence --runs` measured: whole optimisations against run time, medians and bands over the
-  seeds.
-- `several_parts`: several runs and measurements: what can be compared in one picture, then each by itself.
-- `measured`: everything that there is to show of one file, or of a folder of maps; `gradcheck` has its comparisons.
-"""
+"""Parts of a page on a file of measurements, by the command that wrote it, on a folder of maps, and on several runs."""
 
 from __future__ import annotations
 

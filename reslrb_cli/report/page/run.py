@@ -1,9 +1,4 @@
-"""The parts of the page that one run has.
-
-- `bars`: what an iteration takes, by part, in words and as bars.
-- `run_facts`, and the tables after it: what ran, on what, how long, and what was measured before it.
-- `run_parts`: all parts of a run, by title.
-"""
+"""The parts of the page that one run has: what it came to, what ran, on what, how long, and what it had measured."""
 
 from __future__ import annotations
 
@@ -23,7 +18,7 @@ from reslrb_cli.report.format import count, duration, number
 from reslrb_cli.report.page.images import image_rows, seen_tables, view_table
 from reslrb_cli.report.page.layout import lay_out, soft
 from reslrb_cli.report.page.values import convergence, parameter_table, texture_pictures
-from reslrb_cli.report.run_summary import certainty_words, error_line, measured_line, units_differ, warnings
+from reslrb_cli.report.run_summary import certainty_words, error_line, measured_line, warnings
 from reslrb_cli.report.sources import Run
 
 #: Steps that are left out of medians: the first ones compile kernels.
@@ -59,13 +54,9 @@ class StepParts:
 
     def words(self) -> str:
         """In a line."""
-        words = f"{duration(self.step / 1e3)} (median)"
-        parts = [
-            f"{duration(part / 1e3)} {what}"
-            for part, what in ((self.image, "up to image and loss"), (self.gradient, "for the gradient"))
-            if part is not None
-        ]
-        return f"{words}: {', '.join(parts)}" if parts else words
+        named = ((self.image, "up to image and loss"), (self.gradient, "for the gradient"))
+        parts = [f"{duration(part / 1e3)} {what}" for part, what in named if part is not None]
+        return f"{duration(self.step / 1e3)} (median){': ' if parts else ''}{', '.join(parts)}"
 
     def by_place(self) -> dict[int, float]:
         """Milliseconds by the place of the part's name in `PARTS`."""
@@ -86,9 +77,7 @@ PARTS = ("image and loss", "gradient", "whole step, not told apart", "update")
 def bars(runs: Sequence[Run]) -> Markup:
     """An iteration of each run as a bar of its parts, all on one scale; nothing where none has an iteration."""
     known = [(run.name, step.by_place()) for run in runs if (step := StepParts.of(run.records)) is not None]
-    if not known:
-        return Markup()
-    longest = max(sum(parts.values()) for _, parts in known) or 1.0
+    longest = max((sum(parts.values()) for _, parts in known), default=0) or 1.0
     rows = [
         (name, sum(parts.values()) / 1e3, [(k, f"{100 * ms / longest:.3g}", ms / 1e3) for k, ms in parts.items()])
         for name, parts in known
@@ -97,16 +86,10 @@ def bars(runs: Sequence[Run]) -> Markup:
     return lay_out("run.bars", rows, PARTS, [name if place in used else "" for place, name in enumerate(PARTS)])
 
 
-def run_facts(run: Run) -> Markup:
-    """When, on what and how the run was, what it took, what it came to, and the commands that do it again."""
-    again = ["reslrb", "optimize", str(run.path.absolute() / "config.yaml")]
-    return lay_out("run.run", run, StepParts.of(run.records), _wall(run.manifest), again)
-
-
 def _wall(manifest: Mapping[str, Any]) -> str:
     try:
-        start, end = (datetime.fromisoformat(str(manifest[key])) for key in ("started", "ended"))
-    except (KeyError, ValueError):
+        start, end = (datetime.fromisoformat(str(manifest.get(key))) for key in ("started", "ended"))
+    except ValueError:
         return ""
     pauses = ", and the time in which it was not at work" if manifest.get("resumed") else ""
     return f"{duration((end - start).total_seconds())}, with its images and files{pauses}"
@@ -139,11 +122,12 @@ DAMAGED = "This part cannot be shown: what was recorded of it is damaged."
 
 def header(run: Run) -> Markup:
     """The run's name, how it ended, what it came to, and what went wrong."""
-    status, results, records = str(run.manifest.get("status", "unknown")), run.results, run.records
-    parts = [f"{count(len(records), 'iteration')} in {duration(records[-1]['elapsed_s'])}"] if records else []
-    parts += [f"loss {number(results['loss'])}"] if results.get("loss") is not None else []
-    parts += [line for line in [error_line(results)] if line]
-    return lay_out("header", run.name, status, ", ".join(parts)) + problems(run)
+    parts = (
+        [f"{count(len(run.records), 'iteration')} in {duration(run.elapsed_s)}"] if run.elapsed_s is not None else []
+    )
+    parts += [f"loss {number(run.results['loss'])}"] if run.results.get("loss") is not None else []
+    parts += [line for line in [error_line(run.results)] if line]
+    return lay_out("header", run.name, run.manifest.get("status", "unknown"), ", ".join(parts)) + problems(run)
 
 
 def problems(run: Run) -> Markup:
@@ -161,9 +145,7 @@ def run_parts(run: Run) -> dict[str, Markup]:
     results = run.results
     parts: dict[str, Callable[[], Markup]] = {
         "Parameters": lambda: (
-            parameter_table(results, "now" if run.at_work else "end")
-            + _over_what(results)
-            + soft(certainty_words(results))
+            parameter_table(results, "now" if run.at_work else "end", notes=True) + soft(certainty_words(results))
         ),
         "Images": lambda: image_rows(run),
         "Views": lambda: view_table(run.manifest.get("views"), results),
@@ -180,7 +162,7 @@ def record_parts(run: Run) -> dict[str, Markup]:
     parts: dict[str, Callable[[], Markup]] = {
         "Not finite": lambda: lay_out("run.not_finite", results.get("nonfinite") or {}),
         "Clamped gradients": lambda: lay_out("run.clamped", results.get("clamped") or {}),
-        "Run": lambda: run_facts(run),
+        "Run": lambda: lay_out("run.run", run, StepParts.of(run.records), _wall(manifest)),
         "Plan": lambda: lay_out("run.plan", plan["rows"]) if (plan := manifest.get("plan")) else Markup(),
         "Choice of the estimator": lambda: (
             pilot_table(manifest.get("pilot"))
@@ -205,13 +187,6 @@ def guarded(make: Callable[[], Markup]) -> Markup:
         return make()
     except Exception:
         return lay_out("note", [DAMAGED])
-
-
-def _over_what(results: Mapping[str, Any]) -> Markup:
-    """What the errors are taken over."""
-    words = "Errors are root mean squares over the entries that light and sensor reach, in the parameter's unit"
-    words += "; relative ones are shares of the root mean square of the truth." if units_differ(results) else "."
-    return soft(words if results.get("parameter_rmse") else "")
 
 
 def _read(path: Path) -> str:

@@ -1,8 +1,4 @@
-"""The parameters on the page, with their errors, and curves of loss and errors.
-
-Parameters are numbers with swatches, and textures as pictures (`parameter_table`, `texture_pictures`). Curves are loss
-and errors of one run, or of several in one picture, against iterations and time (`convergence`, `convergence_of_all`).
-"""
+"""The parameters on the page as numbers, swatches and pictures, and curves of loss and errors of one run or several."""
 
 from __future__ import annotations
 
@@ -41,11 +37,15 @@ Array = np.ndarray[Any, Any]
 _FOLDERS = {"initial": "initial", "final": "", "true": "true"}
 
 
-def parameter_table(results: Mapping[str, Any], end: str = "end") -> Markup:
-    """Value and error of each parameter at the start and at the end, and the true value where it is known."""
+def parameter_table(results: Mapping[str, Any], end: str = "end", notes: bool = False) -> Markup:
+    """Value and error of each parameter at the start and at the end, and the true value where it is known.
+
+    With `notes` it says what errors are taken over.
+    """
     parameters = results.get("parameters") or {}
     has_truth = any(about.get("true") for about in parameters.values())
-    kinds = {"RMSE": "parameter_rmse"} | ({"relative error": "relative_error"} if units_differ(results) else {})
+    relative = units_differ(results)
+    kinds = {"RMSE": "parameter_rmse"} | ({"relative error": "relative_error"} if relative else {})
     errors = kinds if has_truth else {}
     rows = [
         {
@@ -57,7 +57,8 @@ def parameter_table(results: Mapping[str, Any], end: str = "end") -> Markup:
         for name, about in parameters.items()
     ]  # fmt: skip
     moments = {"initial": "start", "final": end} | ({"true": "true"} if has_truth else {})
-    return lay_out("run.parameters", rows, moments, list(errors))
+    noted = notes and bool(results.get("parameter_rmse"))
+    return lay_out("run.parameters", rows, moments, list(errors), noted, relative)
 
 
 def texture_pictures(
