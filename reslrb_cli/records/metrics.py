@@ -212,8 +212,17 @@ def _record(line: bytes, number: int, path: Path) -> Record:
     raise ConfigError(path, f"line {number + 1}", f"is not what a run writes ({reason})")
 
 
+class _Tally:
+    """What of a whole run is added up from its records."""
+
+    def to_json(self) -> dict[str, Any]:
+        """For the manifest."""
+        found: dict[str, Any] = finite(asdict(self))  # type: ignore[call-overload]  # of a dataclass derived from this
+        return found
+
+
 @dataclass
-class NonFiniteTally:
+class NonFiniteTally(_Tally):
     """Iterations with values that were not finite, the number of these values, and those of each parameter."""
 
     iterations: int = 0
@@ -226,10 +235,6 @@ class NonFiniteTally:
         self.values += record.nonfinite
         self.by_parameter.update(record.nonfinite_by_parameter)
 
-    def to_json(self) -> dict[str, Any]:
-        """For the manifest."""
-        return {"iterations": self.iterations, "values": self.values, "by_parameter": dict(self.by_parameter)}
-
     def __str__(self) -> str:
         """For the last line of a run; empty where all was finite."""
         if not self.iterations:
@@ -240,7 +245,7 @@ class NonFiniteTally:
 
 
 @dataclass
-class ClampTally:
+class ClampTally(_Tally):
     """Iterations in which gradients were clamped, the number of entries, and the bias over the run by parameter."""
 
     iterations: int = 0
@@ -253,11 +258,6 @@ class ClampTally:
             self.iterations += record.clamped.entries > 0
             self.entries += record.clamped.entries
             self.bias |= record.clamped.bias
-
-    def to_json(self) -> dict[str, Any]:
-        """For the manifest."""
-        found: dict[str, Any] = finite(asdict(self))
-        return found
 
     def __str__(self) -> str:
         """For the last line of a run; empty where nothing was clamped."""

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from markupsafe import Markup
 
-from reslrb_cli.records.images import finite_range, read_mask, read_parameters
+from reslrb_cli.records.images import finite_range, in_range, read_mask, read_parameters
 from reslrb_cli.report.format import number
 from reslrb_cli.report.page.images import gallery, show, titled
 from reslrb_cli.report.page.layout import (
@@ -100,9 +100,8 @@ def _visible(arrays: Mapping[str, Array], heights: bool) -> tuple[dict[str, Arra
     """
     if heights:
         low, high = finite_range(arrays.values())
-        span = (high - low) or 1.0
         words = f"black is {number(low, 3)}, white is {number(high, 3)}"
-        return {moment: (array - low) / span for moment, array in arrays.items()}, words
+        return {moment: in_range(array, low, high) for moment, array in arrays.items()}, words
     known = arrays.get("true", arrays.get("final"))
     exposure = exposure_for(known) if known is not None and float(np.nanmax(known)) > 1 else 1.0
     return {moment: array * exposure for moment, array in arrays.items()}, exposure_words(exposure)
