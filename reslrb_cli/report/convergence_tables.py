@@ -17,7 +17,7 @@ from reslrb_cli.records.measurements import (
     RunMethodRecord,
     RunPointRecord,
 )
-from reslrb_cli.report.format import Columns, count, number, shorten
+from reslrb_cli.report.format import Columns, count, interval, number, shorten
 
 #: Characters that a parameter's key may take.
 KEY_WIDTH = 28
@@ -44,7 +44,7 @@ def method_cells(record: MethodRecord, parameter: str | None = None) -> tuple[st
 
 
 def _range(value: Range | None) -> str:
-    return "" if value is None else f"{value.value:.3g} [{value.low:.3g}, {value.high:.3g}]"
+    return "" if value is None else interval(value.value, value.low, value.high, 3)
 
 
 def _deviation(record: MethodRecord) -> str:
@@ -145,8 +145,7 @@ def _ratio(one: MethodRecord, other: MethodRecord) -> tuple[float, float, float]
 
 
 def _times(one: MethodRecord, other: MethodRecord) -> str:
-    ratio, low, high = _ratio(one, other)
-    return f"{ratio:.2g} [{low:.2g}, {high:.2g}]"
+    return interval(*_ratio(one, other), 2)
 
 
 def runs_columns(labels: Sequence[str]) -> Columns:
@@ -171,9 +170,7 @@ def runs_cells(record: RunMethodRecord) -> tuple[str, ...]:
 
 def band(value: Band | None, digits: int) -> str:
     """A median with its band; nothing for None."""
-    return "" if value is None else (
-        f"{value.median:.{digits}g} [{value.low:.{digits}g}, {value.high:.{digits}g}]"
-    )  # fmt: skip
+    return "" if value is None else interval(value.median, value.low, value.high, digits)
 
 
 def best_line(record: RunBestRecord) -> str:
@@ -183,8 +180,7 @@ def best_line(record: RunBestRecord) -> str:
         words += ", the best of its rates"
         words += ", and the outermost that was tried" if record.outermost else ""
     if record.ratio is not None:
-        apart = f"{number(record.ratio.value, 3)} [{number(record.ratio.low, 3)}, {number(record.ratio.high, 3)}]"
-        words += f"; {apart} times that of {record.to}{' at its best' if record.at else ''}"
+        words += f"; {_range(record.ratio)} times that of {record.to}{' at its best' if record.at else ''}"
     return words
 
 

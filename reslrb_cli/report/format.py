@@ -33,6 +33,12 @@ def with_error(value: float, error: float, sign: str = "+-") -> str:
     return text if scale == 0 else f"({text})e{scale:+03d}"
 
 
+def interval(value: float, low: float, high: float, digits: int | str) -> str:
+    """A value with the ends of its interval; `digits` significant ones, or a format."""
+    spec = digits if isinstance(digits, str) else f".{digits}g"
+    return f"{value:{spec}} [{low:{spec}}, {high:{spec}}]"
+
+
 def duration(seconds: float) -> str:
     """A time in the units that a person would choose: `12.3 ms`, `4.56 s`, `3 min 20 s`, `2 h 5 min`."""
     if seconds < 1:

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from reslrb_cli.measure.bench import Result
 from reslrb_cli.measure.conditioning import QUANTITIES, Conditioning
 from reslrb_cli.records.measurements import GradcheckRecord, Kind, Reference, Spread, Verdict
-from reslrb_cli.report.format import Columns, number, table
+from reslrb_cli.report.format import Columns, interval, number, table
 
 
 def bench_columns(labels: Sequence[str], swept: str = "depth") -> Columns:
@@ -34,7 +34,7 @@ def _milliseconds(time: Spread | None) -> str:
 
 
 def _ratio(ratio: Spread | None) -> str:
-    return "" if ratio is None else f"{ratio.median:.2f} [{ratio.min:.2f}, {ratio.max:.2f}]"
+    return "" if ratio is None else interval(ratio.median, ratio.min, ratio.max, ".2f")
 
 
 def conditioning_lines(measured: Conditioning) -> list[str]:
@@ -157,10 +157,9 @@ def _markdown(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
 
 
 def _limited(value: float | None, limit: float | None, spec: str) -> str:
-    if value is None:
-        return ""
-    return f"{value:{spec}}" if limit is None else f"{value:{spec}} < {limit:{spec}}" if value < limit else (
-        f"{value:{spec}} > {limit:{spec}}")  # fmt: skip
+    if value is None or limit is None:
+        return "" if value is None else f"{value:{spec}}"
+    return f"{value:{spec}} {'<' if value < limit else '>'} {limit:{spec}}"
 
 
 def suite_table(records: Iterable[GradcheckRecord], about: Mapping[str, str]) -> str:

@@ -10,20 +10,16 @@ import io
 import re
 import shlex
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from functools import cache
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
 from markupsafe import Markup, escape
 
 from reslrb_cli.report.format import duration, number
+from reslrb_cli.report.plots import COLORS, Curve, draw
 
 if TYPE_CHECKING:
     from jinja2 import Environment
-
-#: Colours that can be told apart, on light and on dark. Further curves have them again, in dashes.
-COLORS = ("#3b7ddd", "#e07b39", "#2f9e62", "#d0517e", "#8b6fd6", "#b08900", "#1f9eb3", "#9c6b4f")
 
 
 def key(text: object) -> Markup:
@@ -72,14 +68,6 @@ def _environment() -> Environment:
     return made
 
 
-Array = np.ndarray[Any, Any]
-
-#: Points of a curve, at most; of a longer one each is the mean of some.
-MOST_POINTS = 600
-
-#: An axis is logarithmic where its values span more than this factor, and has ticks between its decades up to that one.
-LEAST_LOG, MOST_LABELLED = 5.0, 300.0
-
 #: Inches of a diagram; at its left, those of the axis's label and of a letter at its marks. Matplotlib would find out
 #: by drawing everything twice.
 WIDTH, HEIGHT, LABEL, LETTER = 5.2, 2.9, 0.34, 0.078
@@ -92,31 +80,6 @@ _CURVES = {
     "text.color": _INK, "axes.edgecolor": _INK, "axes.labelcolor": _INK, "xtick.color": _INK, "ytick.color": _INK,
     "grid.color": _INK, "figure.facecolor": "none", "axes.facecolor": "none", "savefig.facecolor": "none",
 }  # fmt: skip
-
-
-@dataclass(frozen=True)
-class Curve:
-    """One curve: points (x, y), those that are None or not finite left out. `place` chooses its colour and its dashes.
-
-    `band` has the ends of each point's interval, where there are such. `points`: each point has a mark.
-    """
-
-    name: str
-    xs: Sequence[float | None]
-    ys: Sequence[float | None]
-    place: int = 0
-    band: tuple[Sequence[float | None], Sequence[float | None]] | None = None
-    points: bool = False
-
-    def known(self) -> Array:
-        """Its points as (N, 2)."""
-        array = np.array([self.xs, self.ys], dtype=np.float64).T  # None is NaN
-        return array[np.isfinite(array).all(axis=1)]
-
-
-def diagrams(*drawn: tuple[str, Markup]) -> Markup:
-    """Diagrams beside each other, each below its title, if it has one; nothing where none of them shows anything."""
-    return lay_out("diagrams", drawn)
 
 
 def diagram(
@@ -132,7 +95,7 @@ def diagram(
     from matplotlib.backends.backend_svg import FigureCanvasSVG
     from matplotlib.figure import Figure
 
-    known = [(curve, points) for curve in curves if len(points := curve.known())]
+    known = [curve for curve in curves if len(curve.known())]
     if not known:
         return Markup()
     with matplotlib.rc_context(_CURVES):
@@ -140,22 +103,9 @@ def diagram(
         figure = Figure(figsize=(WIDTH, HEIGHT))
         FigureCanvasSVG(figure)
         axis = figure.subplots()
-        for curve, points in known:
-            _draw(axis, curve, points)
-        values = np.concatenate([points for _, points in known])
-        low, high = values.min(axis=0), values.max(axis=0)
+        draw(axis, known, log_x)
         for floor in floors:
             axis.axhline(floor, color=_INK, linewidth=1.0, linestyle=":")
-        if low[1] > 0 and high[1] > LEAST_LOG * low[1]:
-            axis.set_yscale("log")
-            _mark_decades(axis.yaxis, high[1] / low[1])
-        if log_x is not None and low[0] > 0 and high[0] > low[0]:
-            axis.set_xscale("log", base=log_x)
-            if log_x == 2:
-                axis.xaxis.set_major_formatter("{x:g}")
-                axis.set_xticks(sorted(set(values[:, 0])))
-            else:
-                _mark_decades(axis.xaxis, high[0] / low[0])
         axis.set_xlabel(caption)
         axis.set_ylabel(label)
         axis.grid(True, which="both", axis="y", alpha=0.16, linewidth=0.6)
@@ -171,16 +121,6 @@ def diagram(
     return Markup(drawing.replace("<svg ", f'<svg role="img" aria-label="{about}" ', 1))
 
 
-def legend(names: Sequence[str]) -> Markup:
-    """What the colours stand for; without a name, a place is left out."""
-    return lay_out("legend", names)
-
-
-def points_together(count: int) -> int:
-    """How many of `count` points make one that is drawn."""
-    return -(-count // MOST_POINTS)
-
-
 def _labels(axis: Any) -> list[str]:
     """What stands at the marks of an axis."""
     low, high = sorted(axis.get_view_interval())
@@ -191,34 +131,3 @@ def _labels(axis: Any) -> list[str]:
     ):
         found += formatter.format_ticks([place for place in places if low <= place <= high])
     return found
-
-
-def _draw(axis: Any, curve: Curve, points: Array) -> None:
-    xs, ys = _thinned(points, points_together(len(points)))
-    marker = "o" if curve.points or len(xs) == 1 else ""
-    again, place = divmod(curve.place, len(COLORS))
-    style = "--" if again else "-"
-    axis.plot(xs, ys, linewidth=1.5, color=COLORS[place], marker=marker, markersize=4, linestyle=style)
-    if curve.band is not None:
-        low, high = ([np.nan if value is None else value for value in end] for end in curve.band)
-        places = [np.nan if value is None else value for value in curve.xs]
-        axis.fill_between(places, low, high, color=COLORS[place], alpha=0.18, linewidth=0)
-
-
-def _mark_decades(axis: Any, span: float) -> None:
-    """Mark a logarithmic axis in plain text, which takes a fraction of the time of formulas."""
-    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
-
-    plain = FuncFormatter(lambda value, _: f"{value:g}")
-    axis.set_major_formatter(plain)
-    axis.set_minor_locator(LogLocator(subs=(2.0, 5.0)))
-    axis.set_minor_formatter(plain if span < MOST_LABELLED else NullFormatter())
-
-
-def _thinned(points: Array, together: int) -> tuple[Any, Any]:
-    """Means of so many points each; the last is of what is left."""
-    starts = np.arange(0, len(points), together)
-    sums = np.add.reduceat(points, starts, axis=0)
-    counts = np.diff([*starts, len(points)])
-    xs, ys = (sums / counts[:, None]).T
-    return xs, ys

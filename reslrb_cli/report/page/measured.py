@@ -13,9 +13,10 @@ from markupsafe import Markup
 from reslrb_cli.records.measurements import GradcheckRecord, MissingRecord, Spread, Verdict, record_of
 from reslrb_cli.report.format import count, number
 from reslrb_cli.report.page.images import gradient_maps, image_rows, seen_tables
-from reslrb_cli.report.page.layout import Curve, diagram, diagrams, key, lay_out, legend, soft
+from reslrb_cli.report.page.layout import diagram, key, lay_out, soft
 from reslrb_cli.report.page.run import StepParts, bars, guarded, problems, record_parts
 from reslrb_cli.report.page.values import convergence_of_all, parameter_table, texture_pictures
+from reslrb_cli.report.plots import Curve
 from reslrb_cli.report.run_summary import worst
 from reslrb_cli.report.sources import Maps, Measurements, Run, Source, is_number
 from reslrb_cli.report.tables import HEAD, cells, failure_line, summary_lines
@@ -34,7 +35,7 @@ def bench(objects: Sequence[Entry]) -> tuple[Markup, int]:
     values = {name: [entry[name] for entry in entries if entry.get(name)] for name in SWEPT}
     usual = {name: max(dict.fromkeys(found), key=found.count) for name, found in values.items() if found}
     varied = [name for name in SWEPT if len(set(values[name])) > 1] or ["max_depth"]
-    parts = legend(labels)
+    parts = lay_out("legend", labels)
     for name in varied:
         others = [other for other in varied if other != name]
         chosen = [entry for entry in entries if all(entry.get(other) == usual[other] for other in others)]
@@ -43,7 +44,7 @@ def bench(objects: Sequence[Entry]) -> tuple[Markup, int]:
             for what, words in (("step_ms", "time of a step (ms)"), ("peak_mib", "peak memory (MiB)"))
         ]
         at = ", ".join(f"{SWEPT[other]} {number(usual[other])}" for other in others)
-        parts += diagrams(*drawn) + soft(f"At {at}." if at else "")
+        parts += lay_out("diagrams", drawn) + soft(f"At {at}." if at else "")
     fixed = [f"{SWEPT[name]} {number(value)}" for name, value in usual.items() if name not in varied]
     entries.sort(key=lambda entry: [entry.get(name) or 0 for name in varied])
     rows = [{"label": label(entry), "entry": entry} for entry in entries]
@@ -112,7 +113,7 @@ def _steps(points: Sequence[Entry], methods: Sequence[Entry], name: Naming) -> M
         for entry in methods
         if (what := quantity(entry)) in quantities
     ]
-    return legend(labels) + diagrams(*drawn) + lay_out(
+    return lay_out("legend", labels) + lay_out("diagrams", drawn) + lay_out(
         "measured.methods", rows, bool(points), len(quantities), MOST_DRAWN)  # fmt: skip
 
 
@@ -148,7 +149,7 @@ def whole_runs(points: Sequence[Entry], methods: Sequence[Entry], naming: Naming
         curves = _curves(spreads, labels, itemgetter("name"), "s", of)
         drawn.append((words, diagram(curves, "time of a run (s)", words)))
     rows = [{"name": naming(entry), "entry": entry} for entry in methods]
-    return legend(labels) + diagrams(*drawn) + lay_out("measured.runs", rows, bool(points))
+    return lay_out("legend", labels) + lay_out("diagrams", drawn) + lay_out("measured.runs", rows, bool(points))
 
 
 #: Names in the title of a page.

@@ -14,19 +14,9 @@ from markupsafe import Markup
 from reslrb_cli.records.images import finite_range, in_range, read_mask, read_parameters
 from reslrb_cli.report.format import number
 from reslrb_cli.report.page.images import gallery, show, titled
-from reslrb_cli.report.page.layout import (
-    COLORS,
-    MOST_POINTS,
-    Curve,
-    diagram,
-    diagrams,
-    key,
-    lay_out,
-    legend,
-    points_together,
-    soft,
-)
+from reslrb_cli.report.page.layout import diagram, key, lay_out, soft
 from reslrb_cli.report.perceptual import PLACES, is_color
+from reslrb_cli.report.plots import COLORS, MOST_POINTS, Curve, points_together
 from reslrb_cli.report.run_summary import MOMENTS, is_settled, spread_words, units_differ, verdict_words
 from reslrb_cli.report.sources import Run
 from reslrb_cli.report.tonemap import encode, exposure_for, exposure_words
@@ -158,7 +148,7 @@ def convergence(run: Run) -> Markup:
     what = "relative error" if relative else "RMSE"
     curves = _both("loss", [(run, "loss", 0, _column(run, "loss"))])
     curves += _both(f"{what} by parameter", [(run, name, k, errors[name]) for k, name in enumerate(drawn)])
-    curves += legend(drawn)
+    curves += lay_out("legend", drawn)
     more, words = len(names) - len(drawn), f"The {MOST_CURVES} parameters that are the farthest off at the end; "
     return curves + soft(f"{words}{more} more are not drawn." if more else "") + _thinning([run])
 
@@ -168,7 +158,7 @@ def convergence_of_all(runs: Sequence[Run]) -> Markup:
     begun = [(place, run) for place, run in enumerate(runs) if run.records]
     if not begun:
         return lay_out("paragraph", "No iteration was completed.")
-    parts = legend([run.name if run.records else "" for run in runs])
+    parts = lay_out("legend", [run.name if run.records else "" for run in runs])
     parts += _both("loss", [(run, run.name, place, _column(run, "loss")) for place, run in begun])
     if any(units_differ(run.results) for run in runs):
         totals, label = [_total_relative(run) for _, run in begun], "relative error"
@@ -190,10 +180,11 @@ def convergence_of_all(runs: Sequence[Run]) -> Markup:
 
 def _both(label: str, curves: Sequence[tuple[Run, str, int, Figures]]) -> Markup:
     """The same curves in two diagrams beside each other, against iterations and against time."""
-    return diagrams(*(
+    drawn = [
         ("", diagram([Curve(title, _column(run, name), ys, k) for run, title, k, ys in curves], caption, label))
         for name, caption in ABSCISSAE
-    ))  # fmt: skip
+    ]
+    return lay_out("diagrams", drawn)
 
 
 def _thinning(runs: Sequence[Run]) -> Markup:
